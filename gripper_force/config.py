@@ -1,0 +1,202 @@
+"""The configuration: typed, with a default for everything, from YAML and ``--set key.path=value``."""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from gripper_force.errors import ConfigError
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+HARD_FORCE_LIMIT_N = 70.0
+"""No configuration may allow more: the least finger limit that is quoted for hands."""
+
+
+class Section(BaseModel):
+    """Base of every section: immutable, and an unknown key is an error."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class ServoConfig(Section):
+    """The servo and its bus."""
+
+    model: str = "XM430-W350"
+    port: str = Field(
+        "virtual:rig", description="a device path, or virtual:<name> for a bus in this process's memory"
+    )
+    id: int = Field(1, ge=0, le=252)
+    baud_rate: int = Field(1_000_000, gt=0)
+    current_limit_a: Positive = 1.2
+    bus_watchdog_ms: int = Field(40, ge=20, le=2540)
+    retries: int = Field(2, ge=0, le=10)
+    reply_margin_ms: Positive = Field(4.0, description="how long a reply may be late before a retry")
+
+
+class GripperConfig(Section):
+    """How the servo moves the jaws: one pinion, two racks."""
+
+    pinion_radius_m: Positive = 0.010
+    closing_sign: Literal[-1, 1] = 1
+    open_position_rad: Finite = Field(0.0, description="servo angle with the jaws open")
+    open_width_m: Positive = 0.092
+    nm_per_a: Positive | None = Field(None, description="torque constant at the horn; None: the model's own")
+    friction_n: NonNegative = Field(0.35, description="jaw force that friction takes while closing")
+
+
+class CameraConfig(Section):
+    """The camera."""
+
+    backend: str = "simulated"
+    rate_hz: Positive = 60.0
+
+
+class LoadCellConfig(Section):
+    """The force reference; ``none`` where none is fitted."""
+
+    backend: str = "simulated"
+    rate_hz: Positive = 200.0
+
+
+class VisionConfig(Section):
+    """Estimator and its input."""
+
+    checkpoint: str = Field("default", description="a path, or `default` for the one that is shipped")
+    threads: int = Field(2, ge=1, le=64)
+    region: tuple[int, int, int, int] | None = Field(
+        None, description="region of interest of the camera's frame in pixels: left, top, width, height"
+    )
+    lockstep_compute_ms: NonNegative = Field(
+        12.0, description="time one estimate takes on the simulated clock of a lockstep run"
+    )
+
+
+class ControlConfig(Section):
+    """Fusion, force loop, phases and limits."""
+
+    rate_hz: Positive = 200.0
+    feedback: Literal["fused", "current", "vision"] = "fused"
+    force_limit_n: Annotated[float, Field(gt=0, le=HARD_FORCE_LIMIT_N, allow_inf_nan=False)] = 12.0
+    approach_speed_m_s: Positive = Field(0.025, description="closing speed of one jaw before contact")
+    approach_force_n: Positive = Field(0.5, description="grip force allowed before contact")
+    ramp_n_s: Positive = 8.0
+    settle_s: Positive = Field(1.0, description="time within tolerance that makes a grasp `held`")
+    hold_s: NonNegative = Field(1.5, description="how long to hold after it is held, before the run ends")
+    timeout_s: Positive = 8.0
+    vision_timeout_ms: Positive = Field(60.0, description="age over which an estimate no longer counts")
+    vision_std_n: Positive = Field(1.5, description="claimed error over which an estimate is uncertain")
+    slip_width_m: Positive = Field(0.004, description="closing of the jaws during hold that means slip")
+    temperature_limit_c: Positive = 70.0
+
+
+class SimConfig(Section):
+    """The simulated world. Only read where a backend is simulated."""
+
+    detail: Literal["coarse", "medium", "fine"] = "medium"
+    lux: float | None = Field(None, description="350, 550, 750; None: drawn from the seed", gt=0)
+    randomise: bool = Field(
+        True, description="draw size, pose, camera, texture, light and motor from the seed"
+    )
+    stiffness_spread: float = Field(
+        0.05, ge=0, le=0.5, description="half-width of the uniform spread of the object's stiffness"
+    )
+    camera_latency_ms: NonNegative = 15.0
+    exposure_ms: NonNegative = 4.0
+
+
+class LogConfig(Section):
+    """Where runs are written."""
+
+    directory: Path = Path("runs")
+    report: bool = True
+
+
+class Config(Section):
+    """A whole run."""
+
+    object: str = "sponge"
+    target_n: Positive = 4.0
+    seed: int = Field(0, ge=0)
+    clock: Literal["lockstep", "realtime"] = "lockstep"
+    on_exit: Literal["release", "hold"] = Field(
+        "release", description="release: torque off on every way out; hold: keep the last goals"
+    )
+    servo: ServoConfig = ServoConfig()
+    gripper: GripperConfig = GripperConfig()
+    camera: CameraConfig = CameraConfig()
+    load_cell: LoadCellConfig = LoadCellConfig()
+    vision: VisionConfig = VisionConfig()
+    control: ControlConfig = ControlConfig()
+    sim: SimConfig = SimConfig()
+    log: LogConfig = LogConfig()
+
+
+def load_config(path: Path | None = None, overrides: list[str] | None = None) -> Config:
+    """Builds the configuration from defaults, a YAML file, and overrides, in that order.
+
+    Args:
+        path: YAML file, or None for the defaults.
+        overrides: Assignments ``key.path=value``; the value is read as YAML.
+
+    Raises:
+        ConfigError: A file, key or value is wrong. The sentence names it.
+    """
+    tree: dict[str, Any] = {}
+    if path is not None:
+        try:
+            loaded = yaml.safe_load(path.read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            reason = " ".join(str(error).split())
+            raise ConfigError(f"can't read the configuration {path}: {reason}") from error
+        if not isinstance(loaded, dict | None):
+            raise ConfigError(f"{path} holds no mapping of keys to values at its top level")
+        tree = loaded or {}
+    for assignment in overrides or []:
+        _assign(tree, assignment)
+    return config_from(tree, str(path) if path else "--set")
+
+
+def config_from(tree: dict[str, Any], where: str) -> Config:
+    """Validates a tree of keys. Raises `ConfigError` that names ``where``."""
+    try:
+        return Config.model_validate(tree)
+    except ValidationError as error:
+        raise ConfigError(_sentence(error, where)) from error
+
+
+def dump_config(config: Config) -> str:
+    """The whole configuration as YAML."""
+    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+
+
+def _assign(tree: dict[str, Any], assignment: str) -> None:
+    key, equals, text = assignment.partition("=")
+    if not equals or not key:
+        raise ConfigError(f"--set needs key.path=value, got {assignment!r}")
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"--set {key}: {text!r} is no value") from error
+    *parents, leaf = key.split(".")
+    for parent in parents:
+        tree = tree.setdefault(parent, {})
+        if not isinstance(tree, dict):
+            raise ConfigError(f"--set {key}: {parent!r} is a value, not a section")
+    tree[leaf] = value
+
+
+def _sentence(error: ValidationError, where: str) -> str:
+    first = error.errors()[0]
+    parts = [str(part) for part in first["loc"]]
+    key = ".".join(parts)
+    if first["type"] == "extra_forbidden":
+        section: Any = Config
+        for part in parts[:-1]:
+            section = section.model_fields[part].annotation
+        known = ", ".join(section.model_fields)
+        return f"unknown configuration key {key!r} (from {where}); known here: {known}"
+    return f"configuration key {key!r} (from {where}): {first['msg']}, got {first['input']!r}"

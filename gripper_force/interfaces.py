@@ -1,0 +1,116 @@
+"""What the core asks of a device. `gripper_hw` holds the classes; `gripper_force.backends` picks them by name."""
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from gripper_force.types import Frame, LoadCellSample, ServoCommand, ServoState
+
+
+@dataclass(slots=True)
+class BusStats:
+    """Counters of one servo bus since it was opened."""
+
+    cycles: int = 0
+    retries: int = 0
+    timeouts: int = 0
+    corrupt: int = 0
+
+
+class Servo(Protocol):
+    """The gripper's servo. One thread alone may call it, `emergency_stop` aside.
+
+    Every method may raise `DeviceLostError`, `DeviceTimeoutError` or `HardwareFaultError`.
+    """
+
+    @property
+    def stats(self) -> BusStats:
+        """Counters of retries and losses."""
+        ...
+
+    def start(self) -> ServoState:
+        """Checks the model, sets mode and limits, reads them back, arms the watchdog and turns torque on.
+
+        The present position is the goal when torque comes on, so nothing moves.
+        """
+        ...
+
+    def read(self) -> ServoState:
+        """Reads current, velocity, position, hardware error and temperature in one bus transaction."""
+        ...
+
+    def write(self, command: ServoCommand) -> None:
+        """Writes goal current and goal position in one bus transaction. Raises `NonFiniteError`."""
+        ...
+
+    def stop(self, *, hold: bool) -> None:
+        """Ends a run: torque off, or with ``hold`` the present goals are kept and the watchdog is disarmed."""
+        ...
+
+    def close(self) -> None:
+        """Releases the port. Does not change the torque. May be called twice."""
+        ...
+
+
+class Camera(Protocol):
+    """A gray camera."""
+
+    def start(self) -> None:
+        """Opens the device and begins to capture."""
+        ...
+
+    def newest(self) -> Frame | None:
+        """The newest frame that was not handed out yet, or None. Never blocks."""
+        ...
+
+    def close(self) -> None:
+        """Stops capturing. May be called twice."""
+        ...
+
+
+class LoadCell(Protocol):
+    """A force reference, fitted to calibrate and to check; no decision depends on it."""
+
+    def start(self) -> None:
+        """Opens the device and begins to sample."""
+        ...
+
+    def drain(self) -> list[LoadCellSample]:
+        """Every sample since the last call, oldest first. Never blocks."""
+        ...
+
+    def close(self) -> None:
+        """Stops sampling. May be called twice."""
+        ...
+
+
+class Clock(Protocol):
+    """Time as the session sees it."""
+
+    def now_ns(self) -> int:
+        """Monotonic time."""
+        ...
+
+    def sleep_until_ns(self, t_ns: int) -> None:
+        """Returns at ``t_ns``. In lockstep this is what makes the simulated world go on."""
+        ...
+
+
+@dataclass(slots=True)
+class Devices:
+    """What a run drives, built by `gripper_force.backends.open_devices`.
+
+    Attributes:
+        clock: The run's time.
+        servo: The gripper's servo; None in playback of a recording that has none.
+        camera: The camera, or None.
+        load_cell: The load cell, or None.
+        lockstep: True where the clock is simulated and the run is deterministic.
+        notes: Facts about the devices that the log should hold (a scene's drawn parameters, a serial number).
+    """
+
+    clock: Clock
+    servo: Servo
+    camera: Camera | None
+    load_cell: LoadCell | None
+    lockstep: bool
+    notes: dict[str, str] = field(default_factory=dict)

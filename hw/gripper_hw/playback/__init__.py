@@ -1,0 +1,1 @@
+"""A camera and a load cell that play a recording."""

@@ -1,0 +1,1 @@
+"""One MuJoCo world behind a virtual servo, a camera and a load cell."""
