@@ -1,4 +1,4 @@
-"""What the core asks of a device. `gripper_hw` holds the classes; `gripper_force.backends` picks them by name."""
+"""What the core asks of a device; `gripper_force.backends` picks the class by name."""
 
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -43,7 +43,7 @@ class Servo(Protocol):
         ...
 
     def stop(self, *, hold: bool) -> None:
-        """Ends a run: torque off, or with ``hold`` the present goals are kept and the watchdog is disarmed."""
+        """Ends a run: torque off; with ``hold`` the goals are kept and the watchdog is disarmed."""
         ...
 
     def close(self) -> None:
