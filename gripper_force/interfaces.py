@@ -27,6 +27,11 @@ class Servo(Protocol):
         """Counters of retries and losses."""
         ...
 
+    @property
+    def nm_per_a(self) -> float:
+        """Torque constant at the horn by the vendor's table: a prior, to be calibrated."""
+        ...
+
     def start(self) -> ServoState:
         """Checks the model, sets mode and limits, reads them back, arms the watchdog and turns torque on.
 
