@@ -40,26 +40,30 @@ class ServoConfig(Section):
 class GripperConfig(Section):
     """How the servo moves the jaws: one pinion, two racks."""
 
-    pinion_radius_m: Positive = 0.010
+    pinion_radius_m: Positive = 0.020
     closing_sign: Literal[-1, 1] = 1
     open_position_rad: Finite = Field(0.0, description="servo angle with the jaws open")
     open_width_m: Positive = 0.092
     nm_per_a: Positive | None = Field(None, description="torque constant at the horn; None: the model's own")
-    friction_n: NonNegative = Field(0.35, description="jaw force that friction takes while closing")
+    friction_n: NonNegative = Field(0.95, description="jaw force that friction takes while closing")
 
 
 class CameraConfig(Section):
     """The camera."""
 
-    backend: str = "simulated"
+    backend: str = Field("simulated", description="simulated, playback, none")
     rate_hz: Positive = 60.0
+    path: Path | None = Field(None, description="the log that backend `playback` plays")
+    speed: Literal["recorded", "full"] = Field("recorded", description="how fast it is played")
 
 
 class LoadCellConfig(Section):
     """The force reference; ``none`` where none is fitted."""
 
-    backend: str = "simulated"
+    backend: str = Field("simulated", description="simulated, playback, none")
     rate_hz: Positive = 200.0
+    path: Path | None = Field(None, description="the log that backend `playback` plays")
+    speed: Literal["recorded", "full"] = Field("recorded", description="how fast it is played")
 
 
 class VisionConfig(Section):

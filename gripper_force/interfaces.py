@@ -1,5 +1,6 @@
 """What the core asks of a device; `gripper_force.backends` picks the class by name."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -106,10 +107,11 @@ class Devices:
 
     Attributes:
         clock: The run's time.
-        servo: The gripper's servo; None in playback of a recording that has none.
+        servo: The gripper's servo.
         camera: The camera, or None.
         load_cell: The load cell, or None.
         lockstep: True where the clock is simulated and the run is deterministic.
+        check: Raises what broke in a thread of the devices' own, if anything did.
         notes: Facts about the devices that the log should hold (a scene's drawn parameters, a serial number).
     """
 
@@ -118,4 +120,5 @@ class Devices:
     camera: Camera | None
     load_cell: LoadCell | None
     lockstep: bool
+    check: Callable[[], None]
     notes: dict[str, str] = field(default_factory=dict)

@@ -1,0 +1,101 @@
+"""Names to classes. The core imports no device: a backend is a string here, imported when a run names it.
+
+Nothing falls back silently: what the configuration names is opened, or an error says why not.
+"""
+
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from importlib import import_module
+from typing import Any, Final
+
+from gripper_force.config import Config
+from gripper_force.errors import ConfigError
+from gripper_force.interfaces import Clock, Devices
+from gripper_force.types import NS_PER_S
+
+SERVO: Final = "gripper_hw.dynamixel.servo:DynamixelServo"
+RIG: Final = "gripper_hw.sim.rig:SimulatedRig"
+CAMERAS: Final = {
+    "none": None,
+    "simulated": RIG,
+    "playback": "gripper_hw.playback.camera:PlaybackCamera",
+}
+LOAD_CELLS: Final = {
+    "none": None,
+    "simulated": RIG,
+    "playback": "gripper_hw.playback.load_cell:PlaybackLoadCell",
+}
+
+
+class MonotonicClock:
+    """The host's monotonic time."""
+
+    def now_ns(self) -> int:
+        """Time since some start."""
+        return time.monotonic_ns()
+
+    def sleep_until_ns(self, t_ns: int) -> None:
+        """Sleeps until then; returns at once if it is past."""
+        if (left_ns := t_ns - time.monotonic_ns()) > 0:
+            time.sleep(left_ns / NS_PER_S)
+
+
+@contextmanager
+def open_devices(config: Config) -> Iterator[Devices]:
+    """Opens what the configuration names, and closes all of it on the way out, whatever happens.
+
+    Raises:
+        ConfigError: A backend is unknown, or two do not go together.
+        DeviceNotFoundError: A device is not there.
+        SimulationError: The simulated scene can't be built.
+    """
+    camera_class = _known(CAMERAS, "camera", config.camera.backend)
+    load_cell_class = _known(LOAD_CELLS, "load_cell", config.load_cell.backend)
+    with ExitStack() as stack:
+        rig: Any = None
+        if config.servo.port.startswith("virtual:") or RIG in (camera_class, load_cell_class):
+            rig = _load(RIG)(config)
+            stack.callback(rig.close)
+        elif config.clock == "lockstep":
+            raise ConfigError(
+                f"clock=lockstep needs a simulated servo, and servo.port is {config.servo.port!r}; "
+                "set clock=realtime, or servo.port=virtual:rig"
+            )
+        clock: Clock = rig.clock if rig is not None else MonotonicClock()
+        camera = _open(camera_class, rig, config.camera, clock, "camera")
+        load_cell = _open(load_cell_class, rig, config.load_cell, clock, "load_cell")
+        servo = _load(SERVO)(config.servo, clock.now_ns)
+        for device in (servo, camera, load_cell):
+            if device is not None:
+                stack.callback(device.close)
+        if rig is not None:
+            rig.start()
+        yield Devices(
+            clock=clock,
+            servo=servo,
+            camera=camera,
+            load_cell=load_cell,
+            lockstep=config.clock == "lockstep",
+            check=rig.check if rig is not None else lambda: None,
+            notes=rig.notes() if rig is not None else {},
+        )
+
+
+def _open(path: str | None, rig: Any, section: Any, clock: Clock, unit: str) -> Any:
+    if path is None:
+        return None
+    return getattr(rig, unit) if path == RIG else _load(path)(section, clock)
+
+
+def _known(backends: dict[str, str | None], unit: str, name: str) -> str | None:
+    try:
+        return backends[name]
+    except KeyError:
+        raise ConfigError(f"no {unit} backend {name!r}; there are {', '.join(backends)}") from None
+
+
+def _load(path: str) -> Any:
+    module, _, name = path.partition(":")
+    return getattr(import_module(module), name)
+

@@ -1,0 +1,132 @@
+"""Frames to visual estimates, in step with a simulated clock or in a thread beside a real one."""
+
+import threading
+import time
+from collections import deque
+from typing import NamedTuple, Protocol
+
+from gripper_force.errors import GripperError
+from gripper_force.interfaces import Camera, Clock
+from gripper_force.types import NS_PER_MS, Frame, Gray, VisualForce
+
+
+class Estimator(Protocol):
+    """What perception needs of `gripper_force.vision.estimator.ForceEstimator`."""
+
+    def update(self, gray: Gray) -> "Estimate | None":
+        """Takes the next frame; None while the reference is being collected."""
+        ...
+
+
+class Estimate(Protocol):
+    """A force with its claimed error."""
+
+    @property
+    def force_n(self) -> float:
+        """Contact force."""
+        ...
+
+    @property
+    def std_n(self) -> float:
+        """Its standard deviation."""
+        ...
+
+
+class Seen(NamedTuple):
+    """A frame, and what the estimator made of it."""
+
+    frame: Frame
+    visual: VisualForce | None
+
+
+def estimate(estimator: Estimator, frame: Frame) -> tuple[Estimate | None, float]:
+    """Runs the estimator on a frame and takes the time, in ms."""
+    begin_ns = time.perf_counter_ns()
+    result = estimator.update(frame.gray)
+    return result, (time.perf_counter_ns() - begin_ns) / NS_PER_MS
+
+
+class LockstepPerception:
+    """Estimates in the caller's thread; an estimate is there a fixed simulated time after its frame."""
+
+    def __init__(self, camera: Camera, estimator: Estimator | None, clock: Clock, compute_ms: float) -> None:
+        self._camera, self._estimator, self._clock = camera, estimator, clock
+        self._compute_ns = round(compute_ms * NS_PER_MS)
+        self._under_way: deque[tuple[int, Seen]] = deque()
+
+    def start(self) -> None:
+        """Nothing to start."""
+
+    def poll(self) -> list[Seen]:
+        """What has become ready since the last call, oldest first."""
+        now_ns = self._clock.now_ns()
+        busy = self._under_way and self._under_way[-1][0] > now_ns
+        if not busy and (frame := self._camera.newest()) is not None:
+            ready_ns = now_ns + (self._compute_ns if self._estimator else 0)
+            self._under_way.append((ready_ns, self._see(frame, ready_ns)))
+        ready = []
+        while self._under_way and self._under_way[0][0] <= now_ns:
+            ready.append(self._under_way.popleft()[1])
+        return ready
+
+    def close(self) -> None:
+        """Nothing to stop."""
+
+    def _see(self, frame: Frame, ready_ns: int) -> Seen:
+        if self._estimator is None:
+            return Seen(frame, None)
+        result, compute_ms = estimate(self._estimator, frame)
+        if result is None:
+            return Seen(frame, None)
+        return Seen(
+            frame, VisualForce(frame.t_ns, ready_ns, frame.seq, result.force_n, result.std_n, compute_ms)
+        )
+
+
+class ThreadedPerception:
+    """Estimates in a thread of its own, always on the newest frame."""
+
+    _IDLE_S = 0.001
+
+    def __init__(self, camera: Camera, estimator: Estimator | None, clock: Clock) -> None:
+        self._camera, self._estimator, self._clock = camera, estimator, clock
+        self._done: deque[Seen] = deque()
+        self._failure: GripperError | None = None
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="perception", daemon=True)
+
+    def start(self) -> None:
+        """Starts the thread."""
+        self._thread.start()
+
+    def poll(self) -> list[Seen]:
+        """What has become ready since the last call, oldest first. Raises what stopped the thread."""
+        if self._failure is not None:
+            raise self._failure
+        return [self._done.popleft() for _ in range(len(self._done))]
+
+    def close(self) -> None:
+        """Stops the thread. May be called twice."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def _run(self) -> None:
+        try:
+            while not self._stop.is_set():
+                frame = self._camera.newest()
+                if frame is None:
+                    self._stop.wait(self._IDLE_S)
+                    continue
+                self._done.append(Seen(frame, self._estimate(frame)))
+        except GripperError as error:
+            self._failure = error
+
+    def _estimate(self, frame: Frame) -> VisualForce | None:
+        if self._estimator is None:
+            return None
+        result, compute_ms = estimate(self._estimator, frame)
+        if result is None:
+            return None
+        ready_ns = self._clock.now_ns()
+        return VisualForce(frame.t_ns, ready_ns, frame.seq, result.force_n, result.std_n, compute_ms)

@@ -1,0 +1,21 @@
+"""MuJoCo with EGL, or one clear sentence. Import `mujoco` from here."""
+
+import os
+
+from gripper_force.errors import SimulationError
+
+NO_EGL = (
+    "MuJoCo can't draw on this machine because EGL is missing; "
+    "on Debian or Ubuntu: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri"
+)
+
+os.environ.setdefault("MUJOCO_GL", "egl")
+try:
+    import mujoco
+except (
+    AttributeError,
+    ImportError,
+) as error:  # what MuJoCo raises where libEGL, or a driver for it, is absent
+    raise SimulationError(NO_EGL) from error
+
+__all__ = ["NO_EGL", "mujoco"]

@@ -1,0 +1,216 @@
+"""The four objects of Shin et al. 2019 (fig. 4) as deformable MuJoCo bodies, each at three levels of detail.
+
+A level is a mesh and a time step. The finer one is what the coarser ones are measured against: docs/simulation.md
+has the table of speed against error.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from gripper_force.errors import ConfigError
+
+Detail = Literal["coarse", "medium", "fine"]
+Points = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+# Stiffer contacts than these chatter: 0 N dropouts and 50 N spikes were seen at solref .002.
+_SOFT_CONTACT = 'solref=".01 1" solimp=".9 .95 .001"'
+_SHELL_CONTACT = 'solref=".005 1" solimp=".95 .99 .001"'
+
+
+@dataclass(frozen=True)
+class ObjectModel:
+    """One object, ready to be put between the jaws.
+
+    Attributes:
+        body: MJCF inside the object's body; its origin stands on the table at the gripper's centre.
+        contact: MJCF contact attributes, shared by the object and the pads.
+        texture: Name of the texture image, or None for a plain material.
+        grip_height_m: Height of the jaws over the table.
+        timestep_s: Physics step that this mesh needs.
+    """
+
+    body: str
+    contact: str
+    texture: str | None
+    grip_height_m: float
+    timestep_s: float
+
+
+def build_object(name: str, detail: Detail, size: float, stiffness: float) -> ObjectModel:
+    """Builds an object.
+
+    Args:
+        name: A key of `OBJECTS`.
+        detail: Level of detail.
+        size: Factor on all lengths. Material moduli are scaled against it, so that it leaves the force at a
+            given travel of the jaws as it is.
+        stiffness: Factor on the force at a given travel of the jaws.
+
+    Raises:
+        ConfigError: No such object.
+    """
+    try:
+        builder = OBJECTS[name]
+    except KeyError:
+        raise ConfigError(f"no simulated object {name!r}; there are {', '.join(OBJECTS)}") from None
+    return builder(detail, size, stiffness)
+
+
+def _sponge(detail: Detail, size: float, stiffness: float) -> ObjectModel:
+    order, cells, dt, contact = {
+        "coarse": ("trilinear", (4, 2, 2), 0.0025, _SOFT_CONTACT),
+        "medium": ("quadratic", (2, 1, 1), 0.0025, _SOFT_CONTACT),
+        "fine": ("quadratic", (3, 2, 2), 0.00125, _SHELL_CONTACT),
+    }[detail]
+    lengths = np.array([0.06, 0.05, 0.05]) * size
+    counts = (9, 8, 7)
+    spacing = lengths / (np.array(counts) - 1)
+    grid = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), -1).reshape(-1, 3) * spacing
+    uv = np.c_[grid[:, 0] + 0.5 * grid[:, 1], grid[:, 2] + 0.5 * grid[:, 1]] / 0.1
+    nodes = 1 if order == "trilinear" else 2
+    young = 1.5e4 * stiffness / size  # a block's stiffness goes with E * area / length
+    body = f"""<flexcomp name="object" type="grid" dim="3" count="{_text(counts)}" spacing="{_text(spacing)}"
+      dof="{order}" cellcount="{_text(cells)}" pos="0 0 {lengths[2] / 2 + 0.001:.6g}" mass=".2" radius=".001"
+      material="object" flatskin="true" texcoord="{_text(uv)}">
+      <contact selfcollide="none" condim="3" friction=".6" {contact}/>
+      <elasticity young="{young:.6g}" poisson=".2" damping=".01"/>
+      <pin gridrange="0 0 0 {nodes * cells[0]} {nodes * cells[1]} 0"/></flexcomp>"""
+    return ObjectModel(body, contact, "sponge.png", 0.030, dt)
+
+
+def _tube(detail: Detail, size: float, stiffness: float) -> ObjectModel:
+    around, along, dt = {"coarse": (12, 5, 0.0025), "medium": (16, 7, 0.0025), "fine": (32, 15, 0.00125)}[
+        detail
+    ]
+    radius, length = 0.022 * size, 0.05 * size
+    points, uv, faces = _shell_of_revolution(radius, radius, length, around, along, seam_rad=-np.pi / 2)
+    points = points[:, [0, 2, 1]] - [0, length / 2, 0]  # the axis lies along y: both ends can be seen
+    points[:, 2] += radius + 0.0012
+    # A pinned strip: one pinned line would be a hinge.
+    pins = np.flatnonzero(points[:, 2] < 0.0012 + radius * (1 - np.cos(np.deg2rad(24))))
+    young = 3.0e7 * stiffness * size**2  # a ring's stiffness goes with E * thickness^3 * length / radius^3
+    body = _shell(points, uv, faces, pins, young, thickness=0.0022, damping=0.004, radius=0.0012)
+    return ObjectModel(body, _SHELL_CONTACT, "tube.png", 0.022, dt)
+
+
+def _cup(detail: Detail, size: float, stiffness: float) -> ObjectModel:
+    around, along, dt = {"coarse": (12, 6, 0.0025), "medium": (16, 8, 0.0025), "fine": (32, 16, 0.00125)}[
+        detail
+    ]
+    points, uv, faces = _shell_of_revolution(
+        0.026 * size, 0.037 * size, 0.085 * size, around, along, seam_rad=np.pi / 2, bottom=True
+    )
+    uv[:, 1] = 1 - uv[:, 1]
+    points[:, 2] += 0.0008
+    pins = np.flatnonzero(points[:, 2] < 0.001)
+    young = 1.5e8 * stiffness * size**2
+    body = _shell(points, uv, faces, pins, young, thickness=0.0011, damping=0.003, radius=0.0008)
+    return ObjectModel(body, _SHELL_CONTACT, "cup.png", 0.060, dt)
+
+
+def _stapler(detail: Detail, size: float, stiffness: float) -> ObjectModel:
+    # Two rigid parts and a spring: there is nothing to refine but the step. The moment 3.2 * angle + 40 * angle^3
+    # pushes on an arm that grows with the size, hence its powers.
+    dt = {"coarse": 0.0025, "medium": 0.00125, "fine": 0.0005}[detail]
+    linear, cubic = 3.2 * stiffness * size**2, 40.0 * stiffness * size**4
+    preload_deg = np.rad2deg(0.15 / 3.2)
+    s = size
+
+    def box(half: str, pos: str, material: str, extra: str = 'contype="0" conaffinity="0"') -> str:
+        lengths, centre = (_text(np.array(text.split(), float) * s) for text in (half, pos))
+        return f'<geom type="box" size="{lengths}" pos="{centre}" material="{material}" {extra}/>'
+
+    # It lies on its side, and a slide lets it centre itself: fixed to the world it would over-constrain the jaws.
+    body = f"""<body pos="{_text(np.array([-0.030, 0.045, 0.030]) * s)}" quat="-.5 .5 -.5 .5">
+      <joint name="self_centre" type="slide" axis="0 0 1" stiffness="20" damping="8"/>
+      <body pos="{-0.055 * s:.6g} 0 0">
+        {box(".062 .017 .004", ".06 0 .004", "pad", 'contype="0" conaffinity="1" condim="3" ' + _SOFT_CONTACT)}
+        {box(".052 .009 .006", ".062 0 .017", "steel")}
+        {box(".008 .016 .014", ".006 0 .018", "pad")}
+        <body pos="{_text(np.array([0.004, 0, 0.030]) * s)}">
+          <joint name="arm" type="hinge" axis="0 1 0" range="-1 8" stiffness="{linear:.6g} 0 {cubic:.6g}"
+                 springref="{-preload_deg:.6g}" damping=".05" armature="2e-5" solreflimit=".004 1"/>
+          {box(".056 .012 .005", ".058 0 .010", "object", 'euler="0 -7 0" mass=".05" ' + _SOFT_CONTACT)}
+          <geom type="capsule" size="{0.011 * s:.6g}" material="object" mass=".005" {_SOFT_CONTACT}
+                fromto="{_text(np.array([0.10, -0.004, 0.018, 0.10, 0.004, 0.018]) * s)}"/>
+          {box(".020 .0122 .0006", ".058 0 .0155", "finger", 'euler="0 -7 0" contype="0" conaffinity="0" mass="0"')}
+        </body>
+      </body></body>"""
+    return ObjectModel(body, _SOFT_CONTACT, None, 0.030 * s, dt)
+
+
+OBJECTS: dict[str, Callable[[Detail, float, float], ObjectModel]] = {
+    "sponge": _sponge,
+    "paper_cup": _cup,
+    "tube": _tube,
+    "stapler": _stapler,
+}
+
+
+def _shell_of_revolution(
+    bottom_radius: float,
+    top_radius: float,
+    height: float,
+    around: int,
+    along: int,
+    *,
+    seam_rad: float,
+    bottom: bool = False,
+) -> tuple[Points, Points, Indices]:
+    """Points (N, 3), texture coordinates (N, 2) and triangles (M, 3) of a wall along +z."""
+    ring, level = np.arange(around), np.arange(along)
+    angle = 2 * np.pi * ring / around + seam_rad
+    share = level / (along - 1)
+    radius = bottom_radius + (top_radius - bottom_radius) * share
+    points = np.stack(
+        [
+            radius[:, None] * np.cos(angle),
+            radius[:, None] * np.sin(angle),
+            np.broadcast_to(height * share[:, None], (along, around)),
+        ],
+        -1,
+    ).reshape(-1, 3)
+    uv = np.stack(np.broadcast_arrays(ring / around, share[:, None]), -1).reshape(-1, 2)
+    faces = []
+    for j in range(along - 1):
+        for i in range(around):
+            a, b = i + around * j, (i + 1) % around + around * j
+            d, c = a + around, b + around
+            # Diagonals alternate, or the shell would be stiffer one way round than the other.
+            faces += [(a, b, c), (a, c, d)] if (i + j) % 2 else [(a, b, d), (b, c, d)]
+    if bottom:
+        inner = points[:around] * [0.5, 0.5, 1.0]
+        first, centre = len(points), len(points) + around
+        points = np.vstack([points, inner, [[0, 0, 0]]])
+        uv = np.vstack([uv, np.full((around + 1, 2), 0.02)])
+        for i in range(around):
+            k = (i + 1) % around
+            faces += [(i, first + i, k), (k, first + i, first + k), (first + i, centre, first + k)]
+    return points, uv, np.array(faces)
+
+
+def _shell(
+    points: Points,
+    uv: Points,
+    faces: Indices,
+    pins: Indices,
+    young: float,
+    *,
+    thickness: float,
+    damping: float,
+    radius: float,
+) -> str:
+    return f"""<flexcomp name="object" type="direct" dim="2" mass=".2" radius="{radius}" material="object"
+      point="{_text(points)}" element="{_text(faces)}" texcoord="{_text(uv)}">
+      <contact selfcollide="none" condim="3" friction=".6" {_SHELL_CONTACT}/>
+      <elasticity young="{young:.6g}" poisson=".3" thickness="{thickness}" damping="{damping}" elastic2d="both"/>
+      <pin id="{_text(pins)}"/></flexcomp>"""
+
+
+def _text(values: npt.ArrayLike) -> str:
+    return " ".join(f"{value:.6g}" for value in np.asarray(values).ravel())

@@ -1,0 +1,206 @@
+"""The simulated rig: one world behind a virtual servo, a camera and a load cell."""
+
+import json
+import threading
+import time
+from collections import deque
+from dataclasses import asdict
+
+import numpy as np
+import numpy.typing as npt
+
+from gripper_force.backends import MonotonicClock
+from gripper_force.config import Config
+from gripper_force.errors import ConfigError, SimulationError
+from gripper_force.interfaces import Clock
+from gripper_force.types import NS_PER_MS, NS_PER_S, Frame, Gray, LoadCellSample
+from gripper_hw.dynamixel.control_table import load_model
+from gripper_hw.dynamixel.virtual import VirtualBus, VirtualServo, register_bus, unregister_bus
+from gripper_hw.sim.scene import Scene, draw_scene
+from gripper_hw.sim.world import World
+
+FRAME_SIDE = 128
+_FULL_LUX = 750.0
+_GAMMA = 2.2
+_READ_NOISE = 0.002
+_VIGNETTE = 0.12
+_REALTIME_SLICE_NS = 5 * NS_PER_MS
+_REALTIME_MAX_LAG_NS = 500 * NS_PER_MS
+
+
+class LockstepClock:
+    """Simulated time. To sleep is to let the world go on."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self._now_ns = 0
+
+    def now_ns(self) -> int:
+        """Simulated time."""
+        return self._now_ns
+
+    def sleep_until_ns(self, t_ns: int) -> None:
+        """Moves the world to ``t_ns``."""
+        self._now_ns = max(self._now_ns, t_ns)
+        self._world.advance_to(self._now_ns)
+
+
+class SimulatedCamera:
+    """Draws the world at the middle of each exposure and hands the picture on after the camera's latency."""
+
+    def __init__(self, world: World, scene: Scene, config: Config, clock: Clock, start_ns: int) -> None:
+        self._world, self._scene, self._clock, self._start_ns = world, scene, clock, start_ns
+        self._latency_ns = round(config.sim.camera_latency_ms * NS_PER_MS)
+        self._period_ns = round(NS_PER_S / config.camera.rate_hz)
+        self._rng = np.random.default_rng([config.seed, 2])
+        self._under_way: deque[Frame] = deque(maxlen=64)
+        self._seq = 0
+        self._started = False
+
+    def start(self) -> None:
+        """Begins to capture."""
+        if not self._started:
+            self._started = True
+            self._world.every(self._period_ns, self._capture)
+
+    def newest(self) -> Frame | None:
+        """The newest frame that has arrived and was not handed out, or None."""
+        now_ns, frame = self._clock.now_ns(), None
+        while self._under_way and self._under_way[0].received_ns <= now_ns:
+            frame = self._under_way.popleft()
+        return frame
+
+    def close(self) -> None:
+        """Nothing to release: the world owns the drawing context."""
+
+    def _capture(self, t_ns: int) -> None:
+        gray = expose(self._world.render(FRAME_SIDE), self._scene.lux, self._scene.shot_noise, self._rng)
+        t_ns += self._start_ns
+        self._under_way.append(Frame(t_ns, t_ns + self._latency_ns, self._seq, gray))
+        self._seq += 1
+
+
+class SimulatedLoadCell:
+    """Strain gauges behind the pads: the mean of both, with white noise."""
+
+    _NOISE_N = 0.01
+
+    def __init__(self, world: World, config: Config, start_ns: int) -> None:
+        self._world, self._start_ns = world, start_ns
+        self._period_ns = round(NS_PER_S / config.load_cell.rate_hz)
+        self._rng = np.random.default_rng([config.seed, 3])
+        self._samples: deque[LoadCellSample] = deque(maxlen=100_000)
+        self._started = False
+
+    def start(self) -> None:
+        """Begins to sample."""
+        if not self._started:
+            self._started = True
+            self._world.every(self._period_ns, self._sample)
+
+    def drain(self) -> list[LoadCellSample]:
+        """Every sample since the last call."""
+        return [self._samples.popleft() for _ in range(len(self._samples))]
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+    def _sample(self, t_ns: int) -> None:
+        force_n = self._world.force_n + float(self._rng.normal(0.0, self._NOISE_N))
+        self._samples.append(LoadCellSample(t_ns + self._start_ns, force_n, force_n))
+
+
+class SimulatedRig:
+    """Owns the world, and serves its servo as the port that the configuration names.
+
+    In lockstep the session's clock moves the world. In real time a thread of the rig's own keeps the world at the
+    host's time, and says so in a `SimulationError` where the machine is too slow for the scene.
+    """
+
+    def __init__(self, config: Config) -> None:
+        if not config.servo.port.startswith("virtual:"):
+            raise ConfigError(
+                f"servo.port {config.servo.port!r} is no virtual port, and a simulated camera or load cell "
+                "needs the simulated rig's servo; set servo.port to virtual:rig"
+            )
+        self.scene = draw_scene(config.object, config.seed, config.sim)
+        model = load_model(config.servo.model)
+        servo = VirtualServo(config.servo.id, model)
+        self._world = World(self.scene, config.gripper, servo, model.nm_per_a, config.seed)
+        self._exposure_ms = config.sim.exposure_ms
+        self._lockstep = config.clock == "lockstep"
+        start_ns = 0 if self._lockstep else time.monotonic_ns()
+        self.clock: Clock = LockstepClock(self._world) if self._lockstep else MonotonicClock()
+        self.camera = SimulatedCamera(self._world, self.scene, config, self.clock, start_ns)
+        self.load_cell = SimulatedLoadCell(self._world, config, start_ns)
+        self._bus_name = config.servo.port.removeprefix("virtual:")
+        register_bus(self._bus_name, VirtualBus([servo], self._bus_time_ns))
+        self._start_ns = start_ns
+        self._failure: SimulationError | None = None
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Sets the world going; in lockstep the clock does that."""
+        if not self._lockstep and self._thread is None:
+            self._thread = threading.Thread(target=self._keep_pace, name="simulated-rig", daemon=True)
+            self._thread.start()
+
+    def check(self) -> None:
+        """Raises what broke the world's own thread, if anything did."""
+        if self._failure is not None:
+            raise self._failure
+
+    def notes(self) -> dict[str, str]:
+        """What a log should know of the scene."""
+        return {"scene": json.dumps(asdict(self.scene)), "exposure_ms": str(self._exposure_ms)}
+
+    def close(self) -> None:
+        """Stops the world and takes its bus away. May be called twice."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join()
+            self._thread = None
+        unregister_bus(self._bus_name)
+        if self._lockstep:
+            self._world.close()
+
+    def _bus_time_ns(self) -> int:
+        # The firmware's clock is the world's, so that its watchdog counts simulated time.
+        return self._world.t_ns
+
+    def _keep_pace(self) -> None:
+        try:
+            while not self._stop.is_set():
+                due_ns = time.monotonic_ns() - self._start_ns
+                lag_ns = due_ns - self._world.t_ns
+                if lag_ns > _REALTIME_MAX_LAG_NS:
+                    raise SimulationError(  # noqa: TRY301
+                        f"this machine can't simulate {self.scene.object!r} ({self.scene.detail}) in real time: "
+                        "take sim.detail=coarse, or clock=lockstep"
+                    )
+                self._world.advance_to(min(due_ns, self._world.t_ns + _REALTIME_SLICE_NS))
+                if lag_ns < _REALTIME_SLICE_NS:
+                    self._stop.wait(1e-3)
+        except SimulationError as error:
+            self._failure = error
+        finally:
+            self._world.close()  # the drawing context belongs to this thread
+
+
+def expose(
+    picture: npt.NDArray[np.uint8], lux: float, shot_noise: float, rng: np.random.Generator
+) -> Gray:
+    """Turns a rendered picture (H, W, 3) into what a gray camera with locked exposure sees: (H, W) uint8.
+
+    The picture is linearised, lit, vignetted, given photon and read noise, and encoded again.
+    """
+    gray = picture.astype(np.float32) @ np.float32([0.299, 0.587, 0.114]) / 255.0  # (H, W)
+    height, width = gray.shape
+    y, x = np.ogrid[:height, :width]
+    radius2 = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / (width * width / 4)
+    linear = gray**_GAMMA * np.float32(lux / _FULL_LUX) * (1 - _VIGNETTE * radius2).astype(np.float32)
+    spread = np.sqrt(shot_noise**2 * linear + _READ_NOISE**2)
+    linear += rng.standard_normal(gray.shape, dtype=np.float32) * spread
+    encoded: Gray = (255 * np.clip(linear, 0, 1) ** (1 / _GAMMA)).astype(np.uint8)
+    return encoded

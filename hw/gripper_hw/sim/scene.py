@@ -1,0 +1,159 @@
+"""A scene: everything that is drawn from the seed, and the MJCF that it makes."""
+
+from dataclasses import dataclass
+from importlib import resources
+from string import Template
+
+import numpy as np
+import numpy.typing as npt
+
+from gripper_force.config import GripperConfig, SimConfig
+from gripper_hw.sim.objects import ObjectModel, build_object
+from gripper_hw.sim.textures import draw_textures
+
+LUX_LEVELS = (350.0, 550.0, 750.0)
+"""The paper's three light levels."""
+
+_PAD_HALF_THICKNESS_M = 0.004
+_CAMERA_POSITION_M = np.array([0.10, -0.30, 0.16])
+_CAMERA_TARGET_M = np.array([0.0, 0.0, 0.035])
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What one scene is made of. Each number but the first two may be drawn from the seed.
+
+    Attributes:
+        object: The object's name.
+        detail: Level of detail of its mesh.
+        size: Factor on the object's lengths.
+        stiffness: Factor on the object's force at a given travel.
+        offset_m: Place of the object against the gripper's centre, x and y.
+        yaw_deg: Turn of the object about the vertical.
+        camera_offset_m: Shift of the camera.
+        camera_target_offset_m: Shift of the point it looks at.
+        camera_fovy_deg: Vertical field of view.
+        lux: Illumination.
+        light_direction: Direction of the key light.
+        light_ambient: Share of the light that comes from everywhere.
+        texture_seed: Seed of the textures.
+        shot_noise: Photon noise at full scale.
+        nm_per_a: True torque constant over the catalogue's.
+        servo_friction_nm: Coulomb friction of motor and gears at the horn.
+        servo_damping_nm_s: Viscous friction at the horn.
+        jaw_friction_n: Coulomb friction of one rail.
+        backlash_m: Half of the gear play at the rack.
+    """
+
+    object: str
+    detail: str
+    size: float = 1.0
+    stiffness: float = 1.0
+    offset_m: tuple[float, float] = (0.0, 0.0)
+    yaw_deg: float = 0.0
+    camera_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    camera_target_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    camera_fovy_deg: float = 25.0
+    lux: float = 550.0
+    light_direction: tuple[float, float, float] = (-0.40, 0.55, -0.75)
+    light_ambient: float = 0.30
+    texture_seed: int = 0
+    shot_noise: float = 0.020
+    nm_per_a: float = 1.0
+    servo_friction_nm: float = 0.030
+    servo_damping_nm_s: float = 0.010
+    jaw_friction_n: float = 0.20
+    backlash_m: float = 0.0003
+
+
+def draw_scene(object_name: str, seed: int, config: SimConfig) -> Scene:
+    """Draws a scene. The same arguments give the same scene."""
+    rng = np.random.default_rng([seed, 0])
+    lux = float(config.lux or rng.choice(LUX_LEVELS))
+    if not config.randomise:
+        return Scene(object_name, config.detail, lux=lux)
+
+    def shift(*spread: float) -> tuple[float, ...]:
+        return tuple(float(v) for v in rng.uniform(-1, 1, len(spread)) * spread)
+
+    x, y = shift(0.0015, 0.003)
+    camera, target, light = shift(0.008, 0.008, 0.008), shift(0.004, 0.004, 0.004), shift(0.15, 0.15, 0.15)
+    return Scene(
+        object_name,
+        config.detail,
+        size=float(rng.uniform(0.96, 1.04)),
+        stiffness=float(1 + rng.uniform(-1, 1) * config.stiffness_spread),
+        offset_m=(x, y),
+        yaw_deg=float(rng.uniform(-4, 4)),
+        camera_offset_m=(camera[0], camera[1], camera[2]),
+        camera_target_offset_m=(target[0], target[1], target[2]),
+        camera_fovy_deg=float(rng.uniform(24, 26)),
+        lux=lux * float(rng.uniform(0.95, 1.05)),
+        light_direction=(-0.40 + light[0], 0.55 + light[1], -0.75 + light[2]),
+        light_ambient=float(rng.uniform(0.22, 0.38)),
+        texture_seed=int(rng.integers(2**31)),
+        shot_noise=float(rng.uniform(0.012, 0.024)),
+        nm_per_a=float(rng.uniform(0.92, 1.08)),
+        servo_friction_nm=float(rng.uniform(0.021, 0.039)),
+        servo_damping_nm_s=float(rng.uniform(0.007, 0.013)),
+        jaw_friction_n=float(rng.uniform(0.14, 0.26)),
+        backlash_m=float(rng.uniform(0.0002, 0.0004)),
+    )
+
+
+def scene_mjcf(scene: Scene, gripper: GripperConfig) -> tuple[str, dict[str, bytes]]:
+    """MJCF text and its assets. Raises `ConfigError` for an unknown object."""
+    model = build_object(scene.object, scene.detail, scene.size, scene.stiffness)  # type: ignore[arg-type]
+    position = _CAMERA_POSITION_M + scene.camera_offset_m
+    template = Template(
+        resources.files(__package__).joinpath("assets/gripper.xml").read_text(encoding="utf-8")
+    )
+    text = template.substitute(
+        object=scene.object,
+        timestep_s=model.timestep_s,
+        object_material=_material(model),
+        light_direction=_text(scene.light_direction),
+        light_diffuse=_text([1.0 - scene.light_ambient] * 3),
+        light_ambient=_text([scene.light_ambient] * 3),
+        camera_position=_text(position),
+        camera_axes=_text(_camera_axes(position, _CAMERA_TARGET_M + scene.camera_target_offset_m)),
+        camera_fovy=scene.camera_fovy_deg,
+        object_position=_text([*scene.offset_m, 0.0]),
+        object_yaw=scene.yaw_deg,
+        object_body=model.body,
+        contact=model.contact,
+        jaw_start=_text([gripper.open_width_m / 2 + _PAD_HALF_THICKNESS_M]),
+        jaw_travel=_text([gripper.open_width_m / 2 - 0.001]),
+        grip_height=_text([model.grip_height_m]),
+        rail_height=_text([model.grip_height_m + 0.085]),
+        jaw_friction_n=scene.jaw_friction_n,
+        rotor_inertia=1e-3,
+        servo_damping=scene.servo_damping_nm_s,
+        servo_friction_nm=scene.servo_friction_nm,
+        backlash_m=scene.backlash_m,
+        pinion_radius_m=gripper.pinion_radius_m,
+    )
+    return text, draw_textures(model.texture, scene.texture_seed)
+
+
+def _material(model: ObjectModel) -> str:
+    if model.texture is None:
+        return '<material name="object" rgba=".55 .16 .13 1" specular=".35" shininess=".4"/>'
+    return (
+        f'<texture name="object" type="2d" file="{model.texture}"/>'
+        '<material name="object" texture="object" specular=".05" shininess=".1"/>'
+    )
+
+
+def _camera_axes(
+    position: npt.NDArray[np.float64], target: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    backward = position - target
+    backward = backward / np.linalg.norm(backward)
+    right = np.cross([0.0, 0.0, 1.0], backward)
+    right = right / np.linalg.norm(right)
+    return np.concatenate([right, np.cross(backward, right)])
+
+
+def _text(values: npt.ArrayLike) -> str:
+    return " ".join(f"{value:.6g}" for value in np.asarray(values, float).ravel())

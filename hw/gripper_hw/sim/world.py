@@ -1,0 +1,153 @@
+"""The MuJoCo world: physics, contact force and pictures of one scene."""
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from gripper_force.config import GripperConfig
+from gripper_force.errors import SimulationError
+from gripper_force.types import NS_PER_S
+from gripper_hw.sim.engine import NO_EGL, mujoco
+from gripper_hw.sim.scene import Scene, scene_mjcf
+
+_MAX_PENETRATION_M = 0.004
+_GUARD_PERIOD_NS = 5_000_000
+_BROKEN = (
+    mujoco.mjtWarning.mjWARN_BADQACC,
+    mujoco.mjtWarning.mjWARN_BADQPOS,
+    mujoco.mjtWarning.mjWARN_BADQVEL,
+    mujoco.mjtWarning.mjWARN_CONTACTFULL,
+    mujoco.mjtWarning.mjWARN_CNSTRFULL,
+)
+# Each costs more than the whole of the rest of a 128x128 picture in software.
+_NOT_DRAWN = (
+    mujoco.mjtRndFlag.mjRND_SHADOW,
+    mujoco.mjtRndFlag.mjRND_REFLECTION,
+    mujoco.mjtRndFlag.mjRND_SKYBOX,
+    mujoco.mjtRndFlag.mjRND_HAZE,
+    mujoco.mjtRndFlag.mjRND_FOG,
+)
+
+
+class Motor(Protocol):
+    """The servo's firmware, stepped with the physics."""
+
+    def control(self, t_ns: int, position_rad: float, velocity_rad_s: float, current_noise_a: float) -> float:
+        """Takes what the encoder sees and returns the motor current in ampere."""
+        ...
+
+
+@dataclass
+class _Tap:
+    period_ns: int
+    due_ns: int
+    call: Callable[[int], None]
+
+
+class World:
+    """One scene in motion.
+
+    Attributes:
+        t_ns: Simulated time.
+        force_n: Grip force: mean of the normal forces on the two pads.
+    """
+
+    def __init__(
+        self, scene: Scene, gripper: GripperConfig, motor: Motor, nm_per_a: float, seed: int
+    ) -> None:
+        text, assets = scene_mjcf(scene, gripper)
+        try:
+            self._model: Any = mujoco.MjModel.from_xml_string(text, assets)
+        except ValueError as error:
+            raise SimulationError(f"MuJoCo refuses the scene of {scene.object!r}: {error}") from error
+        self._data: Any = mujoco.MjData(self._model)
+        self._scene, self._motor = scene, motor
+        self._nm_per_a = nm_per_a * scene.nm_per_a
+        self._rng = np.random.default_rng([seed, 1])
+        self._step_ns = round(self._model.opt.timestep * NS_PER_S)
+        servo = self._model.joint("servo")
+        self._qpos, self._dof = int(servo.qposadr[0]), int(servo.dofadr[0])
+        self._left = int(self._model.sensor("left_force").adr[0]) + 1
+        self._right = int(self._model.sensor("right_force").adr[0]) + 1
+        self._taps: list[_Tap] = []
+        self._renderer: Any = None
+        self.t_ns = 0
+        self.force_n = 0.0
+        mujoco.mj_forward(self._model, self._data)
+        self.every(_GUARD_PERIOD_NS, self._guard)
+
+    def every(self, period_ns: int, call: Callable[[int], None]) -> None:
+        """Calls ``call(t_ns)`` with the world at rest at each multiple of a period, to the next physics step."""
+        self._taps.append(_Tap(period_ns, self.t_ns + period_ns, call))
+
+    def advance_to(self, t_ns: int) -> None:
+        """Lets the world go on. Raises `SimulationError` once it can't be trusted any more."""
+        data = self._data
+        while self.t_ns + self._step_ns <= t_ns:
+            noise_a = float(self._rng.normal(0.0, 0.003))
+            current_a = self._motor.control(
+                self.t_ns, float(data.qpos[self._qpos]), float(data.qvel[self._dof]), noise_a
+            )
+            data.ctrl[0] = self._nm_per_a * current_a
+            try:
+                mujoco.mj_step(self._model, data)
+            except mujoco.FatalError as error:
+                raise SimulationError(self._broken(str(error))) from error
+            self.t_ns += self._step_ns
+            sensors = data.sensordata
+            self.force_n = 0.5 * (abs(float(sensors[self._left])) + abs(float(sensors[self._right])))
+            for tap in self._taps:
+                if tap.due_ns <= self.t_ns:
+                    tap.due_ns += tap.period_ns
+                    tap.call(self.t_ns)
+
+    def render(self, side: int) -> npt.NDArray[np.uint8]:
+        """A picture of the world as it stands: (side, side, 3) uint8. Raises `SimulationError` without EGL."""
+        if self._renderer is None:
+            self._renderer = self._new_renderer(side)
+        self._renderer.update_scene(self._data, "camera")
+        picture: npt.NDArray[np.uint8] = self._renderer.render()
+        return picture
+
+    def close(self) -> None:
+        """Frees the drawing context."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def _new_renderer(self, side: int) -> Any:
+        try:
+            renderer = mujoco.Renderer(self._model, side, side)
+        except (ImportError, RuntimeError, mujoco.FatalError) as error:
+            raise SimulationError(NO_EGL) from error
+        for flag in _NOT_DRAWN:
+            renderer.scene.flags[flag] = 0
+        return renderer
+
+    def _guard(self, _: int) -> None:
+        """`discrete` fails silently: a wrong world has to be looked for."""
+        data = self._data
+        if not np.isfinite(data.qacc).all():
+            raise SimulationError(self._broken("an acceleration is not finite"))
+        for warning in _BROKEN:
+            if data.warning[int(warning)].number:
+                raise SimulationError(self._broken(f"MuJoCo warns {warning.name}"))
+        if data.ncon and (depth := -float(data.contact.dist.min())) > _MAX_PENETRATION_M:
+            raise SimulationError(self._broken(f"a pad is {depth * 1e3:.1f} mm deep in the object"))
+        if self.force_n > 200.0:
+            raise SimulationError(self._broken(f"the grip force reads {self.force_n:.0f} N"))
+
+    def _broken(self, what: str) -> str:
+        s = self._scene
+        return (
+            f"the simulation of {s.object!r} ({s.detail}) broke at {self.t_ns / NS_PER_S:.3f} s: {what}; "
+            "take a finer sim.detail or another seed"
+        )
+
+    def __del__(self) -> None:
+        with suppress(Exception):
+            self.close()
