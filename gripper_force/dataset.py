@@ -1,0 +1,178 @@
+"""Logs as training and test clips."""
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+import yaml
+from rich.console import Console
+from rich.progress import track
+
+from gripper_force.errors import DataError
+from gripper_force.log import LogReader
+from gripper_force.types import NS_PER_MS, Frame, Gray, LoadCellSample
+from gripper_force.vision.preprocess import Preprocess, Region, shrink
+
+NEAR_NS: Final = 50 * NS_PER_MS
+"""A frame with no valid load-cell sample within this time has no label."""
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """One recording.
+
+    Attributes:
+        frames: Cropped and resized frames, (T, S, S) uint8.
+        forces_n: Load-cell force at each frame, (T,) float32; 0 where not valid.
+        valid: Whether the frame has a label, (T,) bool.
+        name: The log's file name without its suffix.
+        object: What was grasped.
+        set: What a split must keep on one side, such as all light levels of one rendering.
+    """
+
+    frames: Gray
+    forces_n: npt.NDArray[np.float32]
+    valid: npt.NDArray[np.bool_]
+    name: str
+    object: str
+    set: str
+
+
+def load_clips(
+    source: Path | Sequence[Path], preprocess: Preprocess, region: Region | None = None, workers: int = 1
+) -> list[Clip]:
+    """Reads logs in parallel processes, with a progress bar on stderr.
+
+    Args:
+        source: A folder that is searched for ``*.mcap``, or the logs themselves.
+        preprocess: Tells the size frames are reduced to.
+        region: Region of interest in pixels; None for the one in each log's own configuration.
+        workers: Processes to read with.
+
+    Returns:
+        A clip for each log, sorted by path.
+
+    Raises:
+        DataError: There are no logs, or one holds no frames or no labels.
+        LogError: A log can't be read.
+    """
+    paths = sorted(source.rglob("*.mcap")) if isinstance(source, Path) else sorted(source)
+    if not paths:
+        raise DataError(f"no logs (*.mcap) in {source}; record, simulate or import some first")
+    read = partial(_load_clip, preprocess=preprocess, region=region)
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        clips = track(pool.map(read, paths), "reading logs", len(paths), console=Console(stderr=True))
+        return list(clips)
+
+
+def split_by(
+    clips: Sequence[Clip], key: Literal["object", "set"], fraction: float, seed: int = 0
+) -> tuple[list[Clip], list[Clip]]:
+    """Draws whole objects or sets, so that nothing of what is held out is seen in training.
+
+    Args:
+        clips: What to split.
+        key: What to keep together. Sets are drawn for each object apart, so that both sides hold all objects
+            as far as they have two sets.
+        fraction: Share of objects or sets to hold out, at least one, as long as one stays.
+        seed: Of the draw.
+
+    Returns:
+        The rest, and what is held out.
+
+    Raises:
+        DataError: There are less than two objects or sets.
+    """
+    rng = np.random.default_rng(seed)
+    pools = (
+        [clips] if key == "object" else [[c for c in clips if c.object == o] for o in _names(clips, "object")]
+    )
+    held: set[str] = set()
+    for pool in pools:
+        names = _names(pool, key)
+        count = min(max(1, round(fraction * len(names))), len(names) - 1)
+        held.update(rng.choice(names, count, replace=False))
+    if not held:
+        raise DataError(f"a split by {key} needs at least two of them, got {_names(clips, key)}")
+    return [c for c in clips if getattr(c, key) not in held], [c for c in clips if getattr(c, key) in held]
+
+
+def digest(clips: Iterable[Clip]) -> str:
+    """SHA-256 over all frames and labels."""
+    sha = hashlib.sha256()
+    for clip in clips:
+        for part in (clip.frames, clip.forces_n, clip.valid):
+            sha.update(np.ascontiguousarray(part).data)
+    return sha.hexdigest()
+
+
+def label_frames(
+    frame_t_ns: npt.NDArray[np.int64],
+    samples: Sequence[LoadCellSample],
+    exposure_ns: int,
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
+    """Finds the load-cell force at each frame.
+
+    That is the mean of the valid samples within the exposure where it holds two or more, and a linear
+    interpolation at its middle otherwise. One frame of shift would cost 0.06 N.
+
+    Args:
+        frame_t_ns: Middle of each exposure, (T,).
+        samples: Load-cell samples by rising time.
+        exposure_ns: Length of the exposures; 0 where it is not known.
+
+    Returns:
+        Forces in N, (T,) float32, 0 where there is none, and whether there is one, (T,) bool.
+    """
+    good = [sample for sample in samples if sample.valid and np.isfinite(sample.force_n)]
+    if not good:
+        return np.zeros(len(frame_t_ns), np.float32), np.zeros(len(frame_t_ns), np.bool_)
+    t_ns = np.array([sample.t_ns for sample in good], np.int64)
+    force_n = np.array([sample.force_n for sample in good])
+    labels = np.interp(frame_t_ns, t_ns, force_n)
+    total = np.concatenate([[0.0], np.cumsum(force_n)])
+    first = np.searchsorted(t_ns, frame_t_ns - exposure_ns // 2, "left")
+    last = np.searchsorted(t_ns, frame_t_ns + exposure_ns // 2, "right")
+    several = last - first >= 2
+    labels[several] = (total[last] - total[first])[several] / (last - first)[several]
+    after = np.searchsorted(t_ns, frame_t_ns).clip(0, len(t_ns) - 1)
+    distance = np.minimum(np.abs(t_ns[after] - frame_t_ns), np.abs(t_ns[(after - 1).clip(0)] - frame_t_ns))
+    valid = distance <= NEAR_NS
+    return np.where(valid, labels, 0.0).astype(np.float32), valid
+
+
+def _load_clip(path: Path, preprocess: Preprocess, region: Region | None) -> Clip:
+    reader = LogReader(path)
+    config = yaml.safe_load(reader.config)
+    if region is None and config["vision"]["region"] is not None:
+        left, top, width, height = config["vision"]["region"]
+        region = (left, top, width, height)
+    small: list[Gray] = []
+    t_ns: list[int] = []
+    samples: list[LoadCellSample] = []
+    for record in reader.records(Frame, LoadCellSample):
+        if isinstance(record, Frame):
+            small.append(shrink(record.gray, region, preprocess.size))
+            t_ns.append(record.t_ns)
+        elif isinstance(record, LoadCellSample):
+            samples.append(record)
+    if not small:
+        raise DataError(f"{path} holds no camera frames")
+    samples.sort(key=lambda sample: sample.t_ns)
+    exposure_ns = round(float(reader.metadata.get("exposure_ms", "0")) * NS_PER_MS)
+    forces_n, valid = label_frames(np.array(t_ns, np.int64), samples, exposure_ns)
+    if not valid.any():
+        raise DataError(f"{path} holds no valid load-cell sample near any frame, so it has no labels")
+    name = path.stem
+    return Clip(np.stack(small), forces_n, valid, name, config["object"], reader.metadata.get("set", name))
+
+
+def _names(clips: Iterable[Clip], key: str) -> list[str]:
+    return sorted({getattr(clip, key) for clip in clips})

@@ -1,0 +1,143 @@
+"""How well a checkpoint does on recordings it has not seen."""
+
+from collections.abc import Sequence
+from typing import Final, TypedDict
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+from rich.console import Console
+from rich.progress import track
+
+from gripper_force import metrics
+from gripper_force.dataset import Clip
+from gripper_force.errors import DataError
+from gripper_force.vision.checkpoint import Checkpoint
+from gripper_force.vision.dense import predict
+
+CONTACT_N: Final = 0.25
+"""Measured force over which a frame counts as contact."""
+
+RIDGE_SIZE: Final = 32
+RIDGE_COMPONENTS: Final = 20
+RIDGE_PENALTY: Final = 1.0
+
+
+class ObjectResult(TypedDict):
+    """Errors on one object; ``contact_mae_n`` is NaN where it was never touched."""
+
+    mae_n: float
+    rmse_n: float
+    contact_mae_n: float
+    frames: int
+
+
+class Result(TypedDict):
+    """Errors over all frames, by object and by measured force."""
+
+    mae_n: float
+    rmse_n: float
+    bias_n: float
+    frames: int
+    per_object: dict[str, ObjectResult]
+    per_bin: list[metrics.Bin]
+
+
+def evaluate(checkpoint: Checkpoint, clips: Sequence[Clip]) -> Result:
+    """Estimates the force at each frame as a run would, and compares it with the load cell.
+
+    Frames that only served as reference are left out: a run gives no estimate for them.
+
+    Args:
+        checkpoint: The ensemble; computed on a GPU where there is one.
+        clips: Recordings, reduced to the checkpoint's size.
+
+    Raises:
+        DataError: There are no clips, no labels, or frames of another size.
+    """
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    preprocess = checkpoint.header.preprocess
+    networks = [network.to(device) for network in checkpoint.networks]
+    predictions = []
+    for clip in track(clips, "evaluating", console=Console(stderr=True)):
+        if clip.frames.shape[1] != preprocess.size:
+            raise DataError(f"{clip.name} has frames of {clip.frames.shape[1]} px, need {preprocess.size}")
+        predictions.append(predict(networks, preprocess, clip.frames, device).mean(0))
+    for network in networks:
+        network.cpu()
+    return _result(clips, predictions, preprocess.lead_in)
+
+
+def ridge_baseline(train_clips: Sequence[Clip], test_clips: Sequence[Clip]) -> Result:
+    """What a linear method gets: ridge regression on products of 20 principal components.
+
+    The components are of 32x32 frames minus each recording's first frame.
+
+    Raises:
+        DataError: There are no clips or no labels.
+    """
+    labels_n, valid = _joined(train_clips)
+    images = np.concatenate([_first_frame_difference(clip) for clip in train_clips])[valid]
+    centre = images.mean(0)
+    _, _, axes = np.linalg.svd((images - centre).T @ (images - centre))
+    axes = axes[:RIDGE_COMPONENTS].T  # (pixels, components)
+    scale = ((images - centre) @ axes).std(0) + 1e-6
+
+    def features(pixels: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
+        scores = ((pixels - centre) @ axes / scale).astype(np.float64)  # (N, components)
+        first, second = np.triu_indices(scores.shape[1])
+        return np.column_stack([np.ones(len(scores)), scores, scores[:, first] * scores[:, second]])
+
+    x = features(images)
+    weights = np.linalg.solve(x.T @ x + RIDGE_PENALTY * np.eye(x.shape[1]), x.T @ labels_n[valid])
+    predictions = [features(_first_frame_difference(clip)) @ weights for clip in test_clips]
+    return _result(test_clips, predictions, lead_in=0)
+
+
+def _result(clips: Sequence[Clip], predictions: Sequence[npt.NDArray[np.floating]], lead_in: int) -> Result:
+    measured_n, valid = _joined(clips)
+    valid &= np.concatenate([np.arange(len(clip.frames)) >= lead_in for clip in clips])
+    predicted_n = np.concatenate(predictions)
+    objects = np.concatenate([np.full(len(clip.frames), clip.object) for clip in clips])
+    predicted_n, measured_n, objects = predicted_n[valid], measured_n[valid], objects[valid]
+    return Result(
+        mae_n=metrics.mae(predicted_n, measured_n),
+        rmse_n=metrics.rmse(predicted_n, measured_n),
+        bias_n=metrics.bias(predicted_n, measured_n),
+        frames=len(measured_n),
+        per_object={
+            str(name): _object_result(predicted_n[objects == name], measured_n[objects == name])
+            for name in np.unique(objects)
+        },
+        per_bin=metrics.per_bin(predicted_n, measured_n),
+    )
+
+
+def _object_result(
+    predicted_n: npt.NDArray[np.floating], measured_n: npt.NDArray[np.float32]
+) -> ObjectResult:
+    contact = measured_n > CONTACT_N
+    return ObjectResult(
+        mae_n=metrics.mae(predicted_n, measured_n),
+        rmse_n=metrics.rmse(predicted_n, measured_n),
+        contact_mae_n=metrics.mae(predicted_n[contact], measured_n[contact])
+        if contact.any()
+        else float("nan"),
+        frames=len(measured_n),
+    )
+
+
+def _joined(clips: Sequence[Clip]) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
+    if not any(clip.valid.any() for clip in clips):
+        raise DataError("there is no frame with a label to compare with")
+    return np.concatenate([clip.forces_n for clip in clips]), np.concatenate([clip.valid for clip in clips])
+
+
+def _first_frame_difference(clip: Clip) -> npt.NDArray[np.float32]:
+    """Frames minus the first, (T, 32 * 32), in 0..1."""
+    size = (RIDGE_SIZE, RIDGE_SIZE)
+    small = [cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in clip.frames]
+    pixels = np.asarray(small, np.float32).reshape(len(small), -1) / 255
+    difference: npt.NDArray[np.float32] = pixels - pixels[0]
+    return difference

@@ -1,0 +1,63 @@
+"""Whole clips at once: what streaming does frame by frame, as batches on any device."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from gripper_force.types import Gray
+from gripper_force.vision.network import ForceNetwork
+from gripper_force.vision.preprocess import DIFFERENCE_GAIN, FLAT_STD, Preprocess
+
+CHUNK = 256
+"""Frames of a clip that pass the backbone together; bounds memory."""
+
+
+def normalise(frames: Tensor, reference: Tensor | None) -> Tensor:
+    """Standardises frames and subtracts their reference; equals `preprocess.Normaliser`.
+
+    Args:
+        frames: Gray levels, (B, T, S, S), uint8 or float32.
+        reference: The frames that show no contact, (B, R, S, S); None where no reference is used.
+
+    Returns:
+        The network's input, (B, T, 1, S, S) float32.
+    """
+    inputs = _standardise(frames)
+    if reference is not None:
+        inputs = DIFFERENCE_GAIN * (inputs - _standardise(reference).mean(1, keepdim=True))
+    return inputs[:, :, None]
+
+
+def _standardise(frames: Tensor) -> Tensor:
+    frames = frames.float()
+    std, mean = torch.std_mean(frames, dim=(-2, -1), correction=0, keepdim=True)
+    return (frames - mean) / std.clamp_min(FLAT_STD)
+
+
+@torch.inference_mode()
+def predict(
+    networks: Sequence[ForceNetwork], preprocess: Preprocess, frames: Gray, device: str = "cpu"
+) -> npt.NDArray[np.float32]:
+    """Estimates the force for every frame of one recording.
+
+    Args:
+        networks: Members of the ensemble, in evaluation mode, on ``device``.
+        preprocess: What they were trained with.
+        frames: The recording, cropped and resized, (T, S, S) uint8.
+        device: Where to compute.
+
+    Returns:
+        Each member's forces in N, (members, T).
+    """
+    clip = torch.from_numpy(frames)[None].to(device)  # (1, T, S, S)
+    reference = clip[:, : preprocess.reference_frames] if preprocess.reference else None
+    context = max(network.context for network in networks)
+    forces = []
+    for begin in range(0, clip.shape[1], CHUNK):
+        first = max(0, begin - context)
+        inputs = normalise(clip[:, first : begin + CHUNK], reference)
+        forces.append(torch.cat([network(inputs, begin - first) for network in networks]))  # (members, chunk)
+    return torch.cat(forces, dim=1).cpu().numpy()

@@ -1,0 +1,164 @@
+"""The force network of Shin et al. 2019: backbone, attention, average pooling, BLSTM, two dense layers.
+
+Three facts shape this module. Every frame passes the backbone once, also while streaming: only the maps of
+the last n frames and the pooled vectors of the last 20 are kept, and the result equals a whole window's.
+Frames before the first count as copies of the first; the paper leaves that open, and a still hand before
+contact looks just so. And the backward LSTM is read at the last step, as in the authors' public code, where
+it has seen one frame only.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from gripper_force.config import Positive, Section
+from gripper_force.vision.attention import ChannelAttention, SpatialAttention
+from gripper_force.vision.backbones import VGG_STRIDE, Vgg
+
+Count = Annotated[int, Field(ge=1)]
+
+
+class NetworkConfig(Section):
+    """The shape of one network.
+
+    Attributes:
+        attention: SSAM, SCAM, or none (the paper's baseline).
+        earlier_frames: n, the frames before the newest that attention sees.
+        reduction: r of SCAM's perceptron; the paper gives none, this is squeeze-and-excitation's.
+        size: Side of the input in pixels.
+        width: Multiplier of the backbone's channels.
+        window: Frames the BLSTM sees.
+        hidden: Units of each direction of the BLSTM.
+        head: Units of the dense layer.
+        label_scale_n: The last layer's output 1 means this force.
+    """
+
+    attention: Literal["none", "ssam", "scam"] = "none"
+    earlier_frames: Annotated[int, Field(ge=0)] = 1
+    reduction: Count = 16
+    size: Annotated[int, Field(ge=16, multiple_of=VGG_STRIDE)] = 128
+    width: Positive = 1.0
+    window: Count = 20
+    hidden: Count = 256
+    head: Count = 1024
+    label_scale_n: Positive = 20.0
+
+
+class LastStepBlstm(nn.Module):
+    """A bidirectional LSTM read at the last step.
+
+    There the backward direction has seen the last frame only, from a zero state: its recurrent weights and
+    its forget gate have no effect, so it is one linear layer with three gates.
+    """
+
+    def __init__(self, inputs: int, hidden: int) -> None:
+        super().__init__()
+        self.onward = nn.LSTM(inputs, hidden, batch_first=True)
+        self.backward_gates = nn.Linear(inputs, 3 * hidden)
+
+    def forward(self, windows: Tensor) -> Tensor:
+        """Maps windows (N, L, F) to the last step's two hidden states (N, 2*hidden)."""
+        onward = self.onward(windows)[0][:, -1]  # (N, hidden)
+        gate_in, candidate, gate_out = self.backward_gates(windows[:, -1]).chunk(3, dim=1)
+        cell = torch.sigmoid(gate_in) * torch.tanh(candidate)
+        return torch.cat([onward, torch.sigmoid(gate_out) * torch.tanh(cell)], dim=1)
+
+
+@dataclass(frozen=True, slots=True)
+class StreamState:
+    """What a stream remembers between frames.
+
+    Attributes:
+        maps: Feature maps of the last n frames, (B, n, C, H, W).
+        pooled: Pooled vectors of the last frames of the window, (B, window, C).
+        gates: Attention of the newest frame: SSAM (B, 1, H, W), SCAM (B, C, 1, 1), None without attention.
+    """
+
+    maps: Tensor
+    pooled: Tensor
+    gates: Tensor | None
+
+
+class ForceNetwork(nn.Module):
+    """Frames in, newtons out."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.backbone = Vgg(config.width)
+        channels = self.backbone.out_channels
+        self.attention: nn.Module | None = None
+        if config.attention == "ssam":
+            self.attention = SpatialAttention(channels, config.earlier_frames)
+        elif config.attention == "scam":
+            positions = (config.size // VGG_STRIDE) ** 2
+            self.attention = ChannelAttention(channels, config.earlier_frames, positions, config.reduction)
+        self.blstm = LastStepBlstm(channels, config.hidden)
+        self.dense = nn.Linear(2 * config.hidden, config.head)
+        self.out = nn.Linear(config.head, 1)
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # faster, the same numbers
+
+    @property
+    def context(self) -> int:
+        """Earlier frames that one estimate depends on."""
+        return self.config.window - 1 + (self.config.earlier_frames if self.attention else 0)
+
+    def forward(self, clips: Tensor, start: int = 0) -> Tensor:
+        """Estimates the force for the frames of whole clips; one backbone pass serves all windows.
+
+        Args:
+            clips: Prepared frames, (B, T, 1, S, S). Frames before the first count as copies of it.
+            start: First position of each clip to give an estimate for.
+
+        Returns:
+            Forces in N, (B, T - start).
+        """
+        batch, length = clips.shape[:2]
+        flat = self.backbone(clips.flatten(0, 1))  # (B*T, C, H, W)
+        maps = flat.view(batch, length, *flat.shape[1:])
+        earlier = maps[:, :1].expand(-1, self.config.earlier_frames, -1, -1, -1)
+        pooled, _ = self._attend(torch.cat([earlier, maps], dim=1))  # (B, T, C)
+        window = self.config.window
+        padded = torch.cat([pooled[:, :1].expand(-1, window - 1, -1), pooled], dim=1)
+        windows = padded.unfold(1, window, 1)[:, start:].transpose(2, 3)  # (B, T - start, window, C)
+        return self._regress(windows.flatten(0, 1)).view(batch, length - start)
+
+    def step(self, frame: Tensor, state: StreamState | None) -> tuple[Tensor, StreamState]:
+        """Estimates the force for the next frame of a stream, exactly as `forward` would.
+
+        Args:
+            frame: Prepared frame, (B, 1, S, S).
+            state: What the last step returned; None for the first frame.
+
+        Returns:
+            Forces in N, (B,), and the state for the next step.
+        """
+        newest = self.backbone(frame)[:, None]  # (B, 1, C, H, W)
+        earlier = newest.expand(-1, self.config.earlier_frames, -1, -1, -1) if state is None else state.maps
+        maps = torch.cat([earlier, newest], dim=1)  # (B, n + 1, C, H, W)
+        pooled, gates = self._attend(maps)  # (B, 1, C)
+        window = pooled.expand(-1, self.config.window, -1) if state is None else state.pooled
+        window = torch.cat([window[:, 1:], pooled], dim=1)
+        return self._regress(window), StreamState(maps[:, 1:], window, gates)
+
+    def _attend(self, maps: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Excites and pools the maps (B, n + T, C, H, W) that have n before them: (B, T, C), and gates."""
+        n = self.config.earlier_frames
+        length = maps.shape[1] - n
+        newest = maps[:, n:].flatten(0, 1)  # (B*T, C, H, W)
+        gates = None
+        if self.attention is not None:
+            shifted = [maps[:, k : k + length] for k in range(n + 1)]
+            newest, gates = self.attention(torch.cat(shifted, dim=2).flatten(0, 1), newest)
+        return newest.mean((2, 3)).view(maps.shape[0], length, -1), gates
+
+    def _regress(self, windows: Tensor) -> Tensor:
+        """Maps windows of pooled vectors (N, window, C) to forces in N, (N,)."""
+        # Mixed precision is for the backbone; here it would save nothing and cost digits of the label.
+        with torch.autocast(windows.device.type, enabled=False):
+            hidden = torch.tanh(self.dense(self.blstm(windows.float())))  # (N, head)
+            force: Tensor = self.out(hidden).squeeze(1) * self.config.label_scale_n
+        return force
