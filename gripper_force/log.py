@@ -313,11 +313,14 @@ class LogReader:
         self.config = self.attachments[CONFIG_NAME].decode(errors="replace")
 
     @property
+    def start_ns(self) -> int:
+        """Log time of the first record; 0 in an empty log."""
+        return min((chunk.start_ns for chunk in self._chunks), default=0)
+
+    @property
     def duration_ns(self) -> int:
         """Log time from the first record to the last."""
-        if not self._chunks:
-            return 0
-        return max(chunk.end_ns for chunk in self._chunks) - min(chunk.start_ns for chunk in self._chunks)
+        return max((chunk.end_ns for chunk in self._chunks), default=0) - self.start_ns
 
     @overload
     def records(self, a: type[A], /) -> Iterator[A]: ...

@@ -1,1 +1,128 @@
-"""A camera and a load cell that play a recording."""
+"""Recordings as devices: a camera and a load cell that play a log, or a grasp imported from elsewhere."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Literal
+
+from gripper_force.errors import DataError
+from gripper_force.interfaces import Clock
+from gripper_force.log import LogReader
+from gripper_force.types import Frame, LoadCellSample
+
+Speed = Literal["recorded", "full"]
+"""``recorded``: as the clock goes, times shifted to it; ``full``: as fast as asked, times as recorded."""
+
+
+class PlaybackCamera:
+    """Plays the frames of a log.
+
+    At recorded speed, `newest` is a camera's: frames that came while nobody asked are lost, and their numbers
+    skipped. At full speed, each call hands out the next frame. After the last frame it gives None for ever.
+
+    Args:
+        path: The log.
+        clock: The run's clock.
+        speed: See `Speed`.
+
+    Attributes:
+        finished: True once the last frame was handed out.
+
+    Raises:
+        LogError: The log can't be read.
+        DataError: It holds no frames.
+    """
+
+    def __init__(self, path: Path, clock: Clock, speed: Speed = "recorded") -> None:
+        log = LogReader(path)
+        self._clock = clock
+        self._speed = speed
+        self._log_start_ns = log.start_ns
+        self._shift_ns = 0
+        self._frames: Iterator[Frame] = log.records(Frame)
+        self._next = next(self._frames, None)
+        self.finished = False
+        if self._next is None:
+            raise DataError(f"{path} holds no camera frames to play")
+
+    def start(self) -> None:
+        """Begins to play: the log's first record is now."""
+        if self._speed == "recorded":
+            self._shift_ns = self._clock.now_ns() - self._log_start_ns
+
+    def newest(self) -> Frame | None:
+        """The newest frame that was not handed out yet, or None. Never blocks. Raises `LogError`."""
+        frame = None
+        if self._speed == "full":
+            frame = self._take()
+        else:
+            log_ns = self._clock.now_ns() - self._shift_ns
+            while self._next is not None and self._next.received_ns <= log_ns:
+                frame = self._take()
+        self.finished = self._next is None
+        if frame is None or not self._shift_ns:
+            return frame
+        return replace(
+            frame, t_ns=frame.t_ns + self._shift_ns, received_ns=frame.received_ns + self._shift_ns
+        )
+
+    def close(self) -> None:
+        """Stops playing. May be called twice."""
+        self._next = None
+        self._frames = iter(())
+
+    def _take(self) -> Frame | None:
+        frame, self._next = self._next, next(self._frames, None)
+        return frame
+
+
+class PlaybackLoadCell:
+    """Plays the load-cell samples of a log.
+
+    At recorded speed, `drain` gives the samples up to now; at full speed, all of them at the first call.
+
+    Args:
+        path: The log.
+        clock: The run's clock.
+        speed: See `Speed`.
+
+    Raises:
+        LogError: The log can't be read.
+        DataError: It holds no samples.
+    """
+
+    def __init__(self, path: Path, clock: Clock, speed: Speed = "recorded") -> None:
+        log = LogReader(path)
+        self._clock = clock
+        self._speed = speed
+        self._log_start_ns = log.start_ns
+        self._shift_ns = 0
+        self._samples = list(log.records(LoadCellSample))
+        self._taken = 0
+        if not self._samples:
+            raise DataError(f"{path} holds no load-cell samples to play")
+
+    @property
+    def finished(self) -> bool:
+        """True once the last sample was handed out."""
+        return self._taken == len(self._samples)
+
+    def start(self) -> None:
+        """Begins to play: the log's first record is now."""
+        if self._speed == "recorded":
+            self._shift_ns = self._clock.now_ns() - self._log_start_ns
+
+    def drain(self) -> list[LoadCellSample]:
+        """Every sample since the last call, oldest first. Never blocks."""
+        first = self._taken
+        if self._speed == "full":
+            self._taken = len(self._samples)
+        else:
+            log_ns = self._clock.now_ns() - self._shift_ns
+            while not self.finished and self._samples[self._taken].t_ns <= log_ns:
+                self._taken += 1
+        return [replace(s, t_ns=s.t_ns + self._shift_ns) for s in self._samples[first : self._taken]]
+
+    def close(self) -> None:
+        """Stops playing. May be called twice."""
+        self._taken = len(self._samples)

@@ -1,0 +1,322 @@
+"""A video and a table of forces, turned into a log, so recordings made elsewhere can be replayed and learnt.
+
+A recording is a video and a CSV table with the columns ``frame`` (from 0), ``t_s`` and ``force_n``; more
+columns are allowed. It is either a folder with one video and one table, or a pair ``X.avi`` and ``X.csv``. A
+name ``<date>_<object>_<trial>`` tells what was grasped.
+"""
+
+import csv
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+from rich.progress import track
+from scipy.ndimage import binary_propagation
+
+from gripper_force.config import Config, dump_config
+from gripper_force.errors import DataError
+from gripper_force.log import LogWriter
+from gripper_force.types import NS_PER_S, Frame, Gray, LoadCellSample
+from gripper_force.vision.preprocess import Region, shrink
+
+VIDEO_SUFFIXES: Final = frozenset({".avi", ".mp4", ".mkv", ".mov"})
+
+HAMPEL_HALF_WINDOW: Final = 3
+HAMPEL_SIGMAS: Final = 4.0
+HAMPEL_FLOOR_N: Final = 0.5
+"""Deviation from the local median that is never a spike, as that median can rest on equal values."""
+
+IMPOSSIBLE_N: Final = -0.3
+"""A grip pushes: a force below this, after tare, can't be. Beyond the drift seen on a quiet cell (0.1 N)."""
+FLANK_N: Final = -0.1
+"""A dip that reaches `IMPOSSIBLE_N` is rejected from where it leaves the cell's drift."""
+
+TARE_S: Final = 0.25
+TARE_SPREAD_N: Final = 0.05
+TARE_RISE_N: Final = 1.0
+
+Floats = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class ImportSummary:
+    """What became of one recording.
+
+    Attributes:
+        log: The log written.
+        object: What was grasped.
+        frames: Frames in the log.
+        samples: Load-cell samples in the log, the rejected ones among them.
+        spikes_rejected: Samples marked as not valid.
+        tare_n: Offset removed from every sample; 0 where none could be trusted.
+        tare_note: Why no tare was removed; empty where it was.
+        frames_without_force: Frames that have no row in the table.
+        forces_without_frame: Rows that have no frame in the video.
+    """
+
+    log: Path
+    object: str
+    frames: int
+    samples: int
+    spikes_rejected: int
+    tare_n: float
+    tare_note: str
+    frames_without_force: int
+    forces_without_frame: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ForceTable:
+    """The rows of a table of forces.
+
+    Attributes:
+        frame: Frame numbers, (N,), rising.
+        t_s: Times, (N,), rising.
+        force_n: Forces as measured, (N,).
+    """
+
+    frame: npt.NDArray[np.int64]
+    t_s: Floats
+    force_n: Floats
+
+
+def import_folder(folder: Path, out: Path, *, region: Region | None = None) -> list[ImportSummary]:
+    """Imports every recording of a folder into ``out/<recording>.mcap``, with a progress bar on stderr.
+
+    Raises:
+        DataError: There is none, one lacks its table, or one can't be used.
+        LogError: A log exists already or can't be written.
+    """
+    pairs = list(_recordings(folder))
+    if not pairs:
+        raise DataError(
+            f"{folder} holds no recordings: neither X.avi with X.csv nor folders with one of each"
+        )
+    steps = track(pairs, "importing", console=Console(stderr=True))
+    return [import_video(v, f, out / f"{name}.mcap", name=name, region=region) for name, v, f in steps]
+
+
+def import_video(
+    video: Path,
+    forces: Path,
+    out: Path,
+    *,
+    name: str | None = None,
+    object_name: str | None = None,
+    region: Region | None = None,
+    size: int = 128,
+) -> ImportSummary:
+    """Writes one recording as a log of gray frames and load-cell samples.
+
+    Spikes and impossible values stay in the log, marked as not valid; the reading before tare is kept beside
+    the force, and the table as an attachment.
+
+    Args:
+        video: The video.
+        forces: The table, see `read_forces`.
+        out: The log to write.
+        name: The recording's name, ``<date>_<object>_<trial>``; by default that of the video.
+        object_name: What was grasped; by default taken from the name.
+        region: Part of the frame to keep in pixels: left, top, width, height; None for the whole.
+        size: Side of the logged frames in pixels.
+
+    Raises:
+        DataError: The video or the table is missing or can't be used.
+        ConfigError: The region reaches beyond the frame.
+        LogError: The log exists already or can't be written.
+    """
+    name = name or video.stem
+    object_name = object_name or object_of(name)
+    table = read_forces(forces)
+    tare_n, tare_note = estimate_tare(table.t_s, table.force_n)
+    force_n = table.force_n - tare_n
+    rejected = find_spikes(force_n)
+    frames, rate_hz = _read_video(video, region, size)
+    metadata = {
+        "object": object_name,
+        "set": re.sub(r"_\d+$", "", name),
+        "source": name,
+        "spikes_rejected": str(int(rejected.sum())),
+        "tare_n": f"{tare_n:.5f}",
+        "tare_note": tare_note,
+    }
+    times_ns = _frame_times_ns(table, len(frames), rate_hz)
+    records: list[Frame | LoadCellSample]
+    records = [Frame(t, t, i, gray) for i, (t, gray) in enumerate(zip(times_ns, frames, strict=True))]
+    records += [
+        LoadCellSample(_ns(t_s), float(force), float(raw), not bad)
+        for t_s, force, raw, bad in zip(table.t_s, force_n, table.force_n, rejected, strict=True)
+    ]
+    with LogWriter(out, config=dump_config(Config(object=object_name)), metadata=metadata) as log:
+        log.attach(forces.name, forces.read_bytes(), "text/csv")
+        for record in sorted(records, key=lambda record: record.t_ns):
+            log.write(record)
+    with_row = int(np.isin(np.arange(len(frames)), table.frame).sum())
+    return ImportSummary(
+        log=out,
+        object=object_name,
+        frames=len(frames),
+        samples=len(rejected),
+        spikes_rejected=int(rejected.sum()),
+        tare_n=tare_n,
+        tare_note=tare_note,
+        frames_without_force=len(frames) - with_row,
+        forces_without_frame=len(rejected) - with_row,
+    )
+
+
+def object_of(name: str) -> str:
+    """What was grasped, by a recording's name: ``2023-12-16_foam_brick_2`` is a ``foam_brick``."""
+    found = re.fullmatch(r"(?:\d{4}-\d{2}-\d{2}_)?(.+?)(?:_\d+)?", name)
+    return found[1] if found else name
+
+
+def read_forces(path: Path) -> ForceTable:
+    """Reads a table with the columns ``frame``, ``t_s`` and ``force_n``.
+
+    Raises:
+        DataError: It is missing, empty, lacks a column, or holds a value that is no finite number, a frame
+            twice, or rows that are out of order. The sentence names the line.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file)
+            columns = ("frame", "t_s", "force_n")
+            missing = [column for column in columns if column not in (reader.fieldnames or [])]
+            if missing:
+                raise DataError(f"{path} lacks the column {missing[0]!r}; it needs frame, t_s and force_n")
+            rows = [
+                [_number(path, reader.line_num, column, row[column]) for column in columns] for row in reader
+            ]
+    except OSError as error:
+        raise DataError(f"can't read the table of forces {path}: {error.strerror}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise DataError(f"{path} is no CSV table: {error}") from error
+    if not rows:
+        raise DataError(f"{path} holds no rows")
+    values = np.array(rows)  # (N, 3)
+    disorder = np.flatnonzero((np.diff(values[:, 0]) <= 0) | (np.diff(values[:, 1]) <= 0))
+    if len(disorder):
+        row = int(disorder[0])
+        raise DataError(
+            f"{path}: frame {values[row + 1, 0]:.0f} at {values[row + 1, 1]:.4f} s follows frame "
+            f"{values[row, 0]:.0f} at {values[row, 1]:.4f} s; frames and times must rise from row to row"
+        )
+    return ForceTable(values[:, 0].astype(np.int64), values[:, 1], values[:, 2])
+
+
+def estimate_tare(t_s: Floats, force_n: Floats) -> tuple[float, str]:
+    """Offset of the load cell, from the start of a recording that starts without contact.
+
+    Args:
+        t_s: Times, (N,).
+        force_n: Forces as measured, (N,).
+
+    Returns:
+        The offset in N and an empty text; or 0 and the reason why the start can't be trusted as unloaded.
+    """
+    start = force_n[t_s < t_s[0] + TARE_S]
+    offset = float(np.median(start))
+    if len(start) < 3 or np.ptp(start) > TARE_SPREAD_N:
+        return (
+            0.0,
+            f"the force moves by {np.ptp(start):.2f} N in the first {TARE_S} s, so contact may be near",
+        )
+    if float(np.percentile(force_n, 25)) < offset - TARE_RISE_N:
+        return 0.0, "the force starts above its later level, so the gripper may start loaded"
+    if float(force_n.max()) < offset + TARE_RISE_N:
+        return 0.0, f"the force never rises by {TARE_RISE_N} N, so nothing tells that the start is unloaded"
+    return offset, ""
+
+
+def find_spikes(force_n: Floats) -> Bools:
+    """Samples that can't be a grip force.
+
+    A Hampel filter (Hampel 1974; median absolute deviation over a short window) takes what sticks out of its
+    neighbours. An HX711's smoothed spikes are wider than any such window, and are taken where they reach
+    below zero, flanks included; a wide spike upwards looks like a grip and stays.
+
+    Args:
+        force_n: Forces after tare, (N,).
+
+    Returns:
+        True where rejected, (N,).
+    """
+    # Mirrored through its ends, so that a ramp goes on beyond them.
+    padded = np.pad(force_n, HAMPEL_HALF_WINDOW, mode="reflect", reflect_type="odd")
+    windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * HAMPEL_HALF_WINDOW + 1)  # (N, 7)
+    median = np.median(windows, axis=1)
+    sigma = 1.4826 * np.median(np.abs(windows - median[:, None]), axis=1)
+    sticks_out = np.abs(force_n - median) > np.maximum(HAMPEL_SIGMAS * sigma, HAMPEL_FLOOR_N)
+    impossible = binary_propagation(force_n < IMPOSSIBLE_N, mask=force_n < FLANK_N)
+    return np.asarray(sticks_out | impossible, np.bool_)
+
+
+def _recordings(folder: Path) -> Iterator[tuple[str, Path, Path]]:
+    """Name, video and table of each recording, by name."""
+    if not folder.is_dir():
+        raise DataError(f"{folder} is no folder")
+    for entry in sorted(folder.iterdir()):
+        if entry.is_dir():
+            videos = [path for path in sorted(entry.iterdir()) if path.suffix.lower() in VIDEO_SUFFIXES]
+            tables = sorted(entry.glob("*.csv"))
+            if len(videos) == 1 and len(tables) == 1:
+                yield entry.name, videos[0], tables[0]
+            elif videos or tables:
+                raise DataError(
+                    f"{entry} holds {len(videos)} videos and {len(tables)} .csv tables; it needs one of each"
+                )
+        elif entry.suffix.lower() in VIDEO_SUFFIXES:
+            table = entry.with_suffix(".csv")
+            if not table.is_file():
+                raise DataError(f"{entry} has no table of forces; {table.name} should lie beside it")
+            yield entry.stem, entry, table
+
+
+def _number(path: Path, line: int, column: str, text: str | None) -> float:
+    try:
+        value = float(text or "")
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value) or (column == "frame" and value != int(value)):
+        kind = "frame number" if column == "frame" else "finite number"
+        raise DataError(f"{path}, line {line}: {column} is {text!r}, which is no {kind}")
+    return value
+
+
+def _read_video(video: Path, region: Region | None, size: int) -> tuple[list[Gray], float]:
+    """Every frame, (size, size) uint8, and the frame rate."""
+    if not video.is_file():
+        raise DataError(f"there is no video {video}")
+    frames: list[Gray] = []
+    capture = cv2.VideoCapture(str(video))
+    try:
+        rate_hz = float(capture.get(cv2.CAP_PROP_FPS))
+        while (read := capture.read())[0]:
+            gray = np.asarray(cv2.cvtColor(read[1], cv2.COLOR_BGR2GRAY), np.uint8)  # (H, W)
+            frames.append(shrink(gray, region, size))
+    finally:
+        capture.release()
+    if not frames or not 0 < rate_hz < math.inf:
+        raise DataError(f"no frame of {video} can be decoded, or it tells no frame rate; is it a video?")
+    return frames, rate_hz
+
+
+def _frame_times_ns(table: ForceTable, frames: int, rate_hz: float) -> list[int]:
+    """The table's times; between its rows interpolated, outside of them by the video's rate."""
+    index = np.arange(frames)
+    t_s = np.interp(index, table.frame, table.t_s)
+    t_s += np.minimum(index - table.frame[0], 0) / rate_hz + np.maximum(index - table.frame[-1], 0) / rate_hz
+    return [_ns(t) for t in t_s]
+
+
+def _ns(t_s: float) -> int:
+    return round(t_s * NS_PER_S)

@@ -1,0 +1,145 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gripper_hw.playback import PlaybackCamera, PlaybackLoadCell
+
+from gripper_force.errors import DataError, LogError
+from gripper_force.interfaces import Camera, LoadCell
+from gripper_force.log import LogReader, LogWriter
+from gripper_force.types import NS_PER_MS, Event, Frame, LoadCellSample
+
+FIRST_MS = 1000
+"""Log time of the first record."""
+
+
+class HandClock:
+    def __init__(self, t_ms: int) -> None:
+        self.t_ms = t_ms
+
+    def now_ns(self) -> int:
+        return self.t_ms * NS_PER_MS
+
+    def sleep_until_ns(self, t_ns: int) -> None:
+        self.t_ms = t_ns // NS_PER_MS
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    """Samples every 5 ms, and a frame every 20 ms that is received 15 ms late."""
+    path = tmp_path / "run.mcap"
+    with LogWriter(path, config="", metadata={}) as writer:
+        for i in range(60):
+            t_ns = (FIRST_MS + 5 * i) * NS_PER_MS
+            writer.write(LoadCellSample(t_ns, 0.1 * i, 1.0 * i, valid=i % 7 != 0))
+            if i % 4 == 3:
+                writer.write(Frame(t_ns - 15 * NS_PER_MS, t_ns, i // 4, np.full((4, 4), i, np.uint8)))
+    return path
+
+
+def recorded_frames(path: Path) -> list[tuple[int, int, int]]:
+    return [(f.t_ns, f.received_ns, f.seq) for f in LogReader(path).records(Frame)]
+
+
+def test_frames_come_when_they_came_with_times_on_the_runs_clock(log: Path) -> None:
+    clock = HandClock(50)
+    camera: Camera = PlaybackCamera(log, clock)
+    camera.start()
+    shift_ns = (50 - FIRST_MS) * NS_PER_MS
+    played = []
+    for t_ms in range(50, 400):
+        clock.t_ms = t_ms
+        frame = camera.newest()
+        if frame is not None:
+            assert frame.received_ns == clock.now_ns()
+            played.append((frame.t_ns - shift_ns, frame.received_ns - shift_ns, frame.seq))
+    assert played == recorded_frames(log)
+
+
+def test_a_slow_reader_gets_the_newest_frame_and_sees_the_gap(log: Path) -> None:
+    clock = HandClock(0)
+    camera = PlaybackCamera(log, clock)
+    camera.start()
+    assert camera.newest() is None
+    clock.t_ms = 100
+    frame = camera.newest()
+    assert frame is not None
+    assert frame.seq == 4
+    assert camera.newest() is None
+    assert not camera.finished
+
+
+def test_full_speed_hands_out_every_frame_as_recorded_whatever_the_clock_says(log: Path) -> None:
+    camera = PlaybackCamera(log, HandClock(7), "full")
+    camera.start()
+    played = []
+    while not camera.finished:
+        frame = camera.newest()
+        assert frame is not None
+        played.append((frame.t_ns, frame.received_ns, frame.seq))
+    assert played == recorded_frames(log)
+    assert camera.newest() is None
+
+
+def test_after_the_end_there_is_nothing_more(log: Path) -> None:
+    clock = HandClock(0)
+    camera, cell = PlaybackCamera(log, clock), PlaybackLoadCell(log, clock)
+    camera.start()
+    cell.start()
+    clock.t_ms = 10_000
+    frame = camera.newest()
+    assert frame is not None
+    assert frame.seq == 14
+    assert len(cell.drain()) == 60
+    assert camera.finished
+    assert cell.finished
+    assert camera.newest() is None
+    assert cell.drain() == []
+
+
+def test_samples_are_drained_once_and_in_step_with_the_frames(log: Path) -> None:
+    clock = HandClock(0)
+    cell: LoadCell = PlaybackLoadCell(log, clock)
+    cell.start()
+    shift_ns = FIRST_MS * NS_PER_MS
+    played = []
+    for t_ms in range(0, 300, 17):
+        clock.t_ms = t_ms
+        batch = cell.drain()
+        assert all(sample.t_ns <= clock.now_ns() for sample in batch)
+        played += [(s.t_ns + shift_ns, s.force_n, s.raw, s.valid) for s in batch]
+    clock.t_ms = 1000
+    played += [(s.t_ns + shift_ns, s.force_n, s.raw, s.valid) for s in cell.drain()]
+    recorded = LogReader(log).records(LoadCellSample)
+    assert played == [(s.t_ns, s.force_n, s.raw, s.valid) for s in recorded]
+
+
+def test_full_speed_drains_every_sample_at_once_as_recorded(log: Path) -> None:
+    cell = PlaybackLoadCell(log, HandClock(7), "full")
+    cell.start()
+    assert cell.drain() == list(LogReader(log).records(LoadCellSample))
+    assert cell.drain() == []
+
+
+def test_closed_devices_play_no_more_and_may_be_closed_again(log: Path) -> None:
+    clock = HandClock(0)
+    devices = PlaybackCamera(log, clock), PlaybackLoadCell(log, clock)
+    for device in devices:
+        device.start()
+        device.close()
+        device.close()
+    clock.t_ms = 500
+    assert devices[0].newest() is None
+    assert devices[1].drain() == []
+
+
+def test_a_recording_without_the_sensor_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with LogWriter(path, config="", metadata={}) as writer:
+        writer.write(Event(0, "session", "nothing else"))
+    with pytest.raises(DataError, match="no camera frames"):
+        PlaybackCamera(path, HandClock(0))
+    with pytest.raises(DataError, match="no load-cell samples"):
+        PlaybackLoadCell(path, HandClock(0))
+    with pytest.raises(LogError, match="No such file"):
+        PlaybackCamera(tmp_path / "missing.mcap", HandClock(0))
