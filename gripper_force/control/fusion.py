@@ -1,0 +1,180 @@
+"""One force estimate from motor current and vision.
+
+The motor current gives force at bus rate and without delay, but off by what friction and gearing are not known;
+vision gives force late and noisy, but at the object. A Kalman filter of one state holds the difference.
+"""
+
+import math
+from collections import deque
+
+from gripper_force.config import ControlConfig
+from gripper_force.control.transmission import GAIN_STD, Transmission
+from gripper_force.types import NS_PER_MS, NS_PER_S, Event, FusedForce, ServoState, Source, VisualForce
+
+CURRENT_FILTER_S = 0.03
+"""Time constant of the low-pass on the measured current (quantised, 0.24 N a step). The current-derived force
+lags by this much at a steady ramp; vision is compared with the same signal, so the lag leaves no lasting bias."""
+
+_DRIFT_N2_S = 0.03**2
+"""Growth of the bias' variance a second: friction wanders."""
+
+_VISION_FLOOR_N = 0.05
+"""No estimate is believed more than this, whatever it claims."""
+
+_SYSTEMATIC = 0.03
+"""Share of the force that vision may be off over a whole grasp, which no averaging removes."""
+
+_GATE = 10.8
+"""Chi-square, one degree of freedom: 0.1 % of good estimates are turned away."""
+
+_REENTRY = 20
+"""Estimates in a row that must be off to the same side before the filter gives way (1/3 s at 60 Hz)."""
+
+_HISTORY = 64
+"""Cycles of current-derived force kept: 320 ms at 200 Hz, several camera latencies."""
+
+
+class Fusion:
+    """Kalman filter on ``bias = force - current-derived force``.
+
+    Without vision for `ControlConfig.vision_timeout_ms` the source is the current alone, with the bias as it
+    stands and a variance that grows.
+    """
+
+    def __init__(self, config: ControlConfig, transmission: Transmission) -> None:
+        self._feedback = config.feedback
+        self._timeout_ns = round(config.vision_timeout_ms * NS_PER_MS)
+        self._std_limit_n = config.vision_std_n
+        self._transmission = transmission
+        self._history: deque[tuple[int, float]] = deque(maxlen=_HISTORY)
+        self._push_n = 0.0
+        self._current_n = 0.0
+        self._newest_seen_ns = -1
+        self._used_ns: int | None = None
+        self._visual_n = 0.0
+        self._visual_std_n = 0.0
+        self._source = Source.CURRENT
+        self._refusal = "no estimate"
+        self.restart()
+
+    def restart(self) -> None:
+        """Forgets the bias: a new grasp has its own."""
+        self._bias_n = 0.0
+        self._variance_n2 = self._prior_n2(self._current_n)
+        self._rejected = 0
+
+    def step(
+        self, t_ns: int, servo: ServoState, visual: VisualForce | None
+    ) -> tuple[FusedForce, tuple[Event, ...]]:
+        """One cycle.
+
+        Args:
+            t_ns: Now.
+            servo: This cycle's reading; its numbers are finite.
+            visual: The newest estimate, or None. The same one may be given again; it counts once.
+
+        Returns:
+            The estimate, and an event where vision drops out or comes back.
+        """
+        self._predict(servo)
+        if visual is not None and visual.t_ns > self._newest_seen_ns and self._feedback != "current":
+            self._newest_seen_ns = visual.t_ns
+            self._refusal = self._update(t_ns, visual)
+            if not self._refusal:
+                self._used_ns = t_ns
+                self._visual_n, self._visual_std_n = visual.force_n, visual.std_n
+        events = self._switch(t_ns)
+        return self._estimate(t_ns), events
+
+    def _predict(self, servo: ServoState) -> None:
+        before_n = self._current_n
+        push_n = self._transmission.force_n(servo.current_a)
+        dt_s = 0.0
+        if self._history:
+            dt_s = max(servo.t_ns - self._history[-1][0], 0) / NS_PER_S
+            self._push_n += (push_n - self._push_n) * dt_s / (dt_s + CURRENT_FILTER_S)
+        else:
+            self._push_n = push_n
+        # Coulomb friction is a play: the contact force stays until the push leaves it by the friction.
+        friction_n = self._transmission.friction_n
+        stuck_n = min(max(before_n, self._push_n - friction_n), self._push_n + friction_n)
+        self._current_n = max(stuck_n, 0.0)
+        # An unknown gain error g makes the bias g * force, so its variance follows the square of the force.
+        gain_n2 = GAIN_STD**2 * abs(self._current_n**2 - before_n**2)
+        self._variance_n2 = min(
+            self._variance_n2 + _DRIFT_N2_S * dt_s + gain_n2, self._prior_n2(self._current_n)
+        )
+        self._history.append((servo.t_ns, self._current_n))
+
+    def _update(self, t_ns: int, visual: VisualForce) -> str:
+        """Takes one estimate in. Returns why it was refused, or an empty text."""
+        age_ns = t_ns - visual.t_ns
+        if not (math.isfinite(visual.force_n) and math.isfinite(visual.std_n)):
+            self._used_ns = None  # a network that says this is not to be trusted with what it said before
+            return "it is not finite"
+        if not 0 <= age_ns <= self._timeout_ns:
+            return f"it is {age_ns / NS_PER_MS:.0f} ms old"
+        if visual.std_n > self._std_limit_n:
+            return f"it is uncertain by {visual.std_n:.2f} N"
+        noise_n2 = max(visual.std_n, _VISION_FLOOR_N) ** 2
+        current_n = self._current_at(visual.t_ns)
+        difference_n = visual.force_n - current_n
+        innovation_n = difference_n - self._bias_n
+        if difference_n**2 > 9 * (self._prior_n2(current_n) + noise_n2):
+            return f"it is off from the motor current by {difference_n:.2f} N"
+        if innovation_n**2 > _GATE * (self._variance_n2 + noise_n2):
+            self._rejected = _count(self._rejected, innovation_n)
+            if abs(self._rejected) < _REENTRY:
+                return f"it jumps by {innovation_n:.2f} N"
+            self._variance_n2 = self._prior_n2(current_n)
+        self._rejected = 0
+        gain = self._variance_n2 / (self._variance_n2 + noise_n2)
+        self._bias_n += gain * innovation_n
+        self._variance_n2 *= 1 - gain
+        return ""
+
+    def _current_at(self, t_ns: int) -> float:
+        """Current-derived force at a past time, linear between cycles, held beyond both ends."""
+        later_ns, later_n = self._history[-1]
+        for earlier_ns, earlier_n in reversed(self._history):
+            if earlier_ns <= t_ns:
+                if later_ns <= t_ns:
+                    return later_n
+                share = (t_ns - earlier_ns) / (later_ns - earlier_ns)
+                return earlier_n + share * (later_n - earlier_n)
+            later_ns, later_n = earlier_ns, earlier_n
+        return later_n
+
+    def _prior_n2(self, force_n: float) -> float:
+        return self._transmission.bias_std_n(force_n) ** 2
+
+    def _switch(self, t_ns: int) -> tuple[Event, ...]:
+        fresh = self._used_ns is not None and t_ns - self._used_ns <= self._timeout_ns
+        source = Source(self._feedback) if fresh else Source.CURRENT
+        if source == self._source:
+            return ()
+        self._source = source
+        if source != Source.CURRENT:
+            return (Event(t_ns, "vision", f"vision counts; the force estimate is {source}"),)
+        reason = f": {self._refusal}" if self._refusal else ": no new estimate"
+        return (Event(t_ns, "vision", f"vision dropped out{reason}; on motor current alone"),)
+
+    def _estimate(self, t_ns: int) -> FusedForce:
+        force_n, std_n = self._current_n + self._bias_n, math.sqrt(self._variance_n2)
+        if self._source == Source.VISION:
+            force_n, std_n = self._visual_n, max(self._visual_std_n, _VISION_FLOOR_N)
+        force_n = max(force_n, 0.0)
+        return FusedForce(
+            t_ns=t_ns,
+            force_n=force_n,
+            std_n=math.hypot(std_n, _SYSTEMATIC * force_n),
+            current_n=self._current_n,
+            bias_n=self._bias_n,
+            source=self._source,
+        )
+
+
+def _count(rejected: int, innovation_n: float) -> int:
+    """Adds one to a run of refusals on one side (its sign); the other side starts a new run."""
+    side = 1 if innovation_n > 0 else -1
+    return rejected + side if rejected * side > 0 else side

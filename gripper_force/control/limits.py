@@ -1,0 +1,85 @@
+"""The last word on every command."""
+
+import math
+
+from gripper_force.config import ControlConfig
+from gripper_force.control.transmission import Transmission
+from gripper_force.errors import NonFiniteError
+from gripper_force.types import ServoCommand
+
+_RISE_FACTOR = 4.0
+"""The push may rise this many times as fast as the force ramp."""
+
+_OVER_FORCE_FACTOR = 0.85
+"""What is left of the goal current after each cycle that sees too much force: half within 25 ms at 200 Hz."""
+
+
+class Limits:
+    """Bounds goal position and goal current, and puts the current on the servo's own grid.
+
+    One step of an XM430's goal current is 2.69 mA, some 0.24 N at the jaws, which is coarser than the force that
+    is asked for. The rounding error is therefore carried into the next cycle (first-order noise shaping): the
+    mean is exact, and the jaws' inertia smooths the rest.
+    """
+
+    def __init__(self, config: ControlConfig, transmission: Transmission, current_limit_a: float) -> None:
+        cap_n = config.force_limit_n + transmission.friction_n
+        self.ceiling_a = min(current_limit_a, abs(transmission.current_a(cap_n)))
+        self._force_limit_n = config.force_limit_n
+        self._rise_a_s = abs(transmission.current_a(_RISE_FACTOR * config.ramp_n_s))
+        self._step_a = transmission.current_step_a
+        ends = (transmission.open_position_rad, transmission.closed_position_rad)
+        self._low_rad, self._high_rad = min(ends), max(ends)
+        self._level_a = 0.0
+        self._rounding_a = 0.0
+        self._last_a = 0.0
+
+    def apply(
+        self, command: ServoCommand, force_n: float, dt_s: float, *, may_rise: bool
+    ) -> tuple[ServoCommand, bool]:
+        """Bounds a command.
+
+        Args:
+            command: What the controller wants.
+            force_n: The estimated contact force.
+            dt_s: Time since the last command.
+            may_rise: Whether the goal current may exceed the last one at all.
+
+        Returns:
+            The bounded command, and whether the force estimate is over its limit.
+
+        Raises:
+            NonFiniteError: A number of the command, or the estimate, is not finite.
+        """
+        self._refuse_non_finite(command, force_n)
+        ceiling_a = self.ceiling_a if may_rise else min(self.ceiling_a, self._last_a)
+        over = force_n > self._force_limit_n
+        if over:
+            ceiling_a = min(ceiling_a, _OVER_FORCE_FACTOR * self._last_a)
+        wanted_a = min(max(command.goal_current_a, 0.0), self._level_a + self._rise_a_s * dt_s, ceiling_a)
+        self._level_a = wanted_a
+        self._last_a = self._on_grid(wanted_a, ceiling_a)
+        position_rad = min(max(command.goal_position_rad, self._low_rad), self._high_rad)
+        return ServoCommand(command.t_ns, position_rad, self._last_a), over
+
+    def _on_grid(self, wanted_a: float, ceiling_a: float) -> float:
+        if self._step_a == 0:
+            return wanted_a
+        steps = round((wanted_a + self._rounding_a) / self._step_a)
+        steps = max(0, min(steps, math.floor(ceiling_a / self._step_a + 1e-9)))
+        given_a = min(steps * self._step_a, ceiling_a)
+        # Bounded, so that a limit that holds the current down leaves no debt.
+        error_a = self._rounding_a + wanted_a - given_a
+        self._rounding_a = min(max(error_a, -0.5 * self._step_a), 0.5 * self._step_a)
+        return given_a
+
+    @staticmethod
+    def _refuse_non_finite(command: ServoCommand, force_n: float) -> None:
+        numbers = {
+            "goal position": command.goal_position_rad,
+            "goal current": command.goal_current_a,
+            "force estimate": force_n,
+        }
+        for name, number in numbers.items():
+            if not math.isfinite(number):
+                raise NonFiniteError(f"control: the {name} is {number}; stop, and see the log of this cycle")

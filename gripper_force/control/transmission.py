@@ -1,0 +1,86 @@
+"""Servo angle and motor current to jaw width and jaw force: one pinion drives two racks."""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+from gripper_force.config import GripperConfig
+
+FRICTION_STD: Final = 0.25
+"""Standard deviation of true friction, as a share of the nominal."""
+
+GAIN_STD: Final = 0.06
+"""Standard deviation of the torque constant, as a share of the nominal (+-10 % uniform is 0.058)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Transmission:
+    """Nominal kinematics and statics of the gripper.
+
+    Forces here are the motor's push at each jaw, *before* friction: while closing, the contact sees
+    ``force_n - friction_n``. Positive closes.
+
+    Attributes:
+        pinion_radius_m: Pitch radius of the pinion.
+        closing_sign: Sign of the servo's rotation that closes the jaws.
+        open_position_rad: Servo angle with the jaws open.
+        open_width_m: Distance between the open jaws.
+        n_per_a: Push at each jaw per ampere.
+        friction_n: Coulomb friction at each jaw.
+        current_step_a: Resolution of the servo's goal current; 0 where it is not known.
+    """
+
+    pinion_radius_m: float
+    closing_sign: int
+    open_position_rad: float
+    open_width_m: float
+    n_per_a: float
+    friction_n: float
+    current_step_a: float = 0.0
+
+    @classmethod
+    def from_config(
+        cls, gripper: GripperConfig, servo_nm_per_a: float, current_step_a: float = 0.0
+    ) -> "Transmission":
+        """Builds it from the gripper's section; the servo's torque constant serves where none is configured."""
+        nm_per_a = servo_nm_per_a if gripper.nm_per_a is None else gripper.nm_per_a
+        return cls(
+            pinion_radius_m=gripper.pinion_radius_m,
+            closing_sign=gripper.closing_sign,
+            open_position_rad=gripper.open_position_rad,
+            open_width_m=gripper.open_width_m,
+            n_per_a=nm_per_a / (2 * gripper.pinion_radius_m),
+            friction_n=gripper.friction_n,
+            current_step_a=current_step_a,
+        )
+
+    @property
+    def closed_position_rad(self) -> float:
+        """Servo angle at which the jaws meet."""
+        return self.position_rad(0.0)
+
+    def width_m(self, position_rad: float) -> float:
+        """Distance between the jaws at a servo angle."""
+        closing_rad = self.closing_sign * (position_rad - self.open_position_rad)
+        return self.open_width_m - 2 * self.pinion_radius_m * closing_rad
+
+    def position_rad(self, width_m: float) -> float:
+        """Servo angle at a distance between the jaws."""
+        closing_rad = (self.open_width_m - width_m) / (2 * self.pinion_radius_m)
+        return self.open_position_rad + self.closing_sign * closing_rad
+
+    def closing_m_s(self, velocity_rad_s: float) -> float:
+        """Closing speed of one jaw."""
+        return self.closing_sign * self.pinion_radius_m * velocity_rad_s
+
+    def force_n(self, current_a: float) -> float:
+        """Push at each jaw for a signed motor current."""
+        return self.closing_sign * self.n_per_a * current_a
+
+    def current_a(self, force_n: float) -> float:
+        """Signed motor current for a push at each jaw."""
+        return self.closing_sign * force_n / self.n_per_a
+
+    def bias_std_n(self, force_n: float) -> float:
+        """How far the contact force may be from what the motor current says of it (one standard deviation)."""
+        return math.hypot(FRICTION_STD * self.friction_n, GAIN_STD * force_n)
