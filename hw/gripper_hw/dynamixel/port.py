@@ -1,0 +1,223 @@
+"""Ports the vendor's SDK talks through: a quiet serial line, and a virtual bus in this process's memory.
+
+Both raise `DeviceLostError` once the other end is gone, where the SDK's own would report "busy" for good.
+"""
+
+import contextlib
+import os
+import select
+import termios
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final, NoReturn, Protocol
+
+import serial
+from dynamixel_sdk import PortHandler
+
+from gripper_force.errors import ConfigError, DeviceError, DeviceLostError, DeviceNotFoundError
+from gripper_hw.dynamixel.virtual import VirtualBus, find_bus
+
+VIRTUAL_PREFIX: Final = "virtual:"
+
+_MAX_DRAINS: Final = 10
+
+
+class Port(Protocol):
+    """What the driver needs beyond the SDK's `PortHandler`."""
+
+    is_using: bool
+
+    def closePort(self) -> None:  # noqa: N802
+        """Releases the port. May be called twice."""
+        ...
+
+    def drain(self) -> None:
+        """Waits until no late answer comes any more, and throws away what came."""
+        ...
+
+
+def open_port(name: str, baud_rate: int, reply_margin_ms: float) -> Port:
+    """Opens a port, exclusively.
+
+    Args:
+        name: A device path, or ``virtual:<name>`` for a bus registered in this process.
+        baud_rate: Bits a second.
+        reply_margin_ms: Time a reply may be late beyond its own length on the wire.
+
+    Raises:
+        ConfigError: The adapter does not do this baud rate.
+        DeviceNotFoundError: There is no such port.
+        DeviceError: The port is in use, or may not be opened.
+    """
+    if name.startswith(VIRTUAL_PREFIX):
+        return MemoryPort(name)
+    port = SerialPort(name, reply_margin_ms)
+    if not port.setBaudRate(baud_rate):
+        raise ConfigError(f"servo.baud_rate {baud_rate} is none that Dynamixel adapters do; use e.g. 1000000")
+    return port
+
+
+class SerialPort(PortHandler):  # type: ignore[misc]
+    """A serial line that sleeps until bytes come, where the SDK's own polls for them."""
+
+    def __init__(self, name: str, reply_margin_ms: float) -> None:
+        super().__init__(name)
+        self.ser: serial.Serial | None = None
+        self._margin_ms = reply_margin_ms
+        self._sent = 0
+
+    def setupPort(self, cflag_baud: int) -> bool:  # noqa: N802
+        """Opens the line. Raises as `open_port` says."""
+        self.closePort()
+        try:
+            self.ser = serial.Serial(self.port_name, baudrate=cflag_baud, timeout=0, exclusive=True)
+        except (serial.SerialException, termios.error, OSError) as error:
+            raise _open_error(self.port_name, error) from error
+        # Only some adapters, and no pseudo-terminal, have a latency timer.
+        with contextlib.suppress(ValueError, OSError):
+            self.ser.set_low_latency_mode(True)
+        self.is_open = True
+        self.tx_time_per_byte = 10_000.0 / cflag_baud
+        return True
+
+    def closePort(self) -> None:  # noqa: N802
+        """Closes the line. May be called twice."""
+        self.is_open = False
+        self.is_using = False
+        if self.ser is not None:
+            with contextlib.suppress(OSError, termios.error):
+                self.ser.close()
+            self.ser = None
+
+    def clearPort(self) -> None:  # noqa: N802
+        """Throws away what was received."""
+        try:
+            termios.tcflush(self._fd(), termios.TCIFLUSH)
+        except (OSError, termios.error) as error:
+            self._lost(error)
+
+    def writePort(self, packet: Iterable[int]) -> int:  # noqa: N802
+        """Sends a packet and returns how many bytes were taken."""
+        data = bytes(packet)
+        self._sent = len(data)
+        try:
+            return os.write(self._fd(), data)
+        except BlockingIOError:
+            return 0
+        except OSError as error:
+            self._lost(error)
+
+    def readPort(self, length: int) -> bytes:  # noqa: N802
+        """Returns up to ``length`` bytes, as soon as there is one, or none once the packet's time is over."""
+        if length <= 0:
+            return b""
+        left_s = (self.packet_start_time + self.packet_timeout - self.getCurrentTime()) / 1e3
+        return self._read(length, max(0.0, left_s))
+
+    def getCurrentTime(self) -> float:  # noqa: N802
+        """Monotonic time in ms; the SDK's own steps with the wall clock."""
+        return time.monotonic() * 1e3
+
+    def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802
+        """Starts the time for a reply of ``packet_length`` bytes; the instruction is still on its way out."""
+        self.setPacketTimeoutMillis(self.tx_time_per_byte * (packet_length + self._sent) + self._margin_ms)
+
+    def drain(self) -> None:
+        """Reads until the line was quiet for one reply margin."""
+        for _ in range(_MAX_DRAINS):
+            if not self._read(4096, self._margin_ms / 1e3):
+                return
+
+    def _read(self, length: int, timeout_s: float) -> bytes:
+        try:
+            fd = self._fd()
+            if not select.select([fd], [], [], timeout_s)[0]:
+                return b""
+            data = os.read(fd, length)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            self._lost(error)
+        if not data:
+            self._lost(EOFError("end of file"))
+        return data
+
+    def _fd(self) -> int:
+        if self.ser is None or self.ser.fd is None:
+            self._lost(OSError("the port is closed"))
+        return self.ser.fd
+
+    def _lost(self, error: Exception) -> NoReturn:
+        self.is_using = False
+        raise DeviceLostError(
+            f"the servo's port {self.port_name} is gone ({error}); check cable and power, then start again"
+        ) from error
+
+
+class MemoryPort(PortHandler):  # type: ignore[misc]
+    """A line to a `VirtualBus` in this process. Never sleeps: an answer is there at once, or never."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self._name = name.removeprefix(VIRTUAL_PREFIX)
+        self._received = bytearray()
+        bus = find_bus(self._name)
+        if bus is None:
+            raise DeviceNotFoundError(
+                f"no virtual bus named {self._name!r} is registered in this process; "
+                "simulate one first, or set servo.port to a device path"
+            )
+        if bus in _in_use:
+            raise DeviceError(f"the port {name} is in use; close its other user first")
+        self._bus: VirtualBus | None = bus
+        _in_use.add(bus)
+
+    def closePort(self) -> None:  # noqa: N802
+        """Lets go of the bus. May be called twice."""
+        self.is_using = False
+        if self._bus is not None:
+            _in_use.discard(self._bus)
+            self._bus = None
+
+    def clearPort(self) -> None:  # noqa: N802
+        """Throws away what was received."""
+        self._received.clear()
+
+    def writePort(self, packet: Iterable[int]) -> int:  # noqa: N802
+        """Sends a packet; the answer is there when it returns."""
+        if self._bus is None or find_bus(self._name) is not self._bus:
+            self.is_using = False
+            raise DeviceLostError(f"the virtual bus {self._name!r} is gone; start again")
+        data = bytes(packet)
+        self._received += self._bus.transact(data)
+        return len(data)
+
+    def readPort(self, length: int) -> bytes:  # noqa: N802
+        """Returns up to ``length`` bytes."""
+        data = bytes(self._received[: max(0, length)])
+        del self._received[: len(data)]
+        return data
+
+    def isPacketTimeout(self) -> bool:  # noqa: N802
+        """True once all that came was read: no more will come."""
+        return not self._received
+
+    def drain(self) -> None:
+        """Throws away what was received."""
+        self._received.clear()
+
+
+_in_use: Final[set[VirtualBus]] = set()
+
+
+def _open_error(name: str, error: Exception) -> DeviceError:
+    if not Path(name).exists():
+        return DeviceNotFoundError(
+            f"there is no port {name}; plug the adapter in, or set servo.port to one of /dev/serial/by-id"
+        )
+    if isinstance(error, OSError) and error.errno == 13:
+        return DeviceError(f"no permission to open {name}; install hw/udev's rules or join the group dialout")
+    if isinstance(error, OSError) and error.errno == 11:
+        return DeviceError(f"the port {name} is in use by another program; close that first")
+    return DeviceError(f"can't open the port {name}: {error}")

@@ -1,0 +1,458 @@
+"""Dynamixel servos in current-based position mode, over the vendor's unmodified SDK.
+
+A cycle is one fast sync read and one sync write, both through indirect addresses, for all servos of a bus.
+Registers and their rules: https://emanual.robotis.com/docs/en/dxl/x/xm430-w350/.
+"""
+
+import math
+import struct
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
+from typing import Any, Final, TypeVar
+
+from dynamixel_sdk import COMM_RX_CORRUPT, COMM_SUCCESS, GroupSyncRead, GroupSyncWrite, PacketHandler
+
+from gripper_force.config import ServoConfig
+from gripper_force.errors import (
+    ConfigError,
+    DeviceError,
+    DeviceNotFoundError,
+    DeviceTimeoutError,
+    HardwareFaultError,
+    NonFiniteError,
+)
+from gripper_force.interfaces import BusStats
+from gripper_force.types import ServoCommand, ServoState
+from gripper_hw.dynamixel.control_table import (
+    CURRENT_BASED_POSITION_MODE,
+    REGISTERS,
+    VELOCITY_UNIT_RAD_S,
+    WATCHDOG_UNIT_MS,
+    IndirectWindow,
+    check_model_number,
+    load_model,
+    rad_from_ticks,
+    ticks_from_rad,
+)
+from gripper_hw.dynamixel.port import Port, open_port
+
+_READ_NAMES: Final = (
+    "present_current",
+    "present_velocity",
+    "present_position",
+    "hardware_error_status",
+    "present_temperature",
+    "bus_watchdog",
+)
+_READ_BLOCK: Final = struct.Struct("<hiiBBb")
+_WRITE_NAMES: Final = ("goal_current", "goal_position")
+_WRITE_BLOCK: Final = struct.Struct("<hi")
+_INDIRECT_ADDRESSES: Final = tuple(
+    register.address + offset
+    for register in (REGISTERS[name] for name in (*_READ_NAMES, *_WRITE_NAMES))
+    for offset in range(register.size)
+)
+
+_TORQUE_OFF_TRIES: Final = 5
+_ERROR_CRC: Final = 3
+_ERROR_MASK: Final = 0x7F  # the bit above is the alert, which the read block tells in full
+_ERRORS: Final = {
+    1: "result fail",
+    2: "instruction error",
+    4: "data range error",
+    5: "data length error",
+    6: "data limit error",
+    7: "access error",
+}
+_HARDWARE_ERRORS: Final = {
+    0x01: "input voltage",
+    0x04: "overheating",
+    0x08: "motor encoder",
+    0x10: "electrical shock",
+    0x20: "overload",
+}
+
+_T = TypeVar("_T")
+
+
+class DynamixelBus:
+    """Servos of one model on one port, read and written together.
+
+    Attributes:
+        model: Their model.
+        ids: Their ids, in the order of states and commands.
+        stats: Counters since construction.
+        firmware: Their firmware versions, known after `start`.
+    """
+
+    def __init__(
+        self, config: ServoConfig, ids: Sequence[int], clock_ns: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        """Takes note of what to drive; `start` opens the port.
+
+        Raises:
+            ConfigError: The model is not known, controls no current, or can't give the configured one.
+        """
+        self.model = load_model(config.model)
+        if config.current_limit_a > self.model.max_current_a:
+            raise ConfigError(
+                f"servo.current_limit_a is {config.current_limit_a:g}, but {self.model.name} allows at most "
+                f"{self.model.max_current_a:g}; lower it"
+            )
+        self.ids = tuple(ids)
+        self.stats = BusStats()
+        self.firmware: tuple[int, ...] = ()
+        self._config = config
+        self._clock_ns = clock_ns
+        self._packets = PacketHandler(2.0)
+        self._current_limit = math.floor(config.current_limit_a / self.model.current_unit_a)
+        self._watchdog = math.ceil(config.bus_watchdog_ms / WATCHDOG_UNIT_MS)
+        self._expected_watchdog = 0
+        self._port: Port | None = None
+        self._reader: Any = None
+        self._writer: Any = None
+
+    def start(self) -> tuple[ServoState, ...]:
+        """Opens the port, sets every servo up, and turns torque on at the present position with no current.
+
+        Torque is off, or was tried to be turned off, wherever this raises.
+
+        Raises:
+            DeviceNotFoundError: The port is not there, or a servo does not answer on it.
+            ConfigError: Another model answers.
+            HardwareFaultError: A servo reports an error of its own.
+            DeviceError: The port is in use, a firmware is too old, or a register does not take its value.
+        """
+        self._expected_watchdog = 0
+        self._port = open_port(self._config.port, self._config.baud_rate, self._config.reply_margin_ms)
+        with ExitStack() as undo:
+            undo.callback(self.close)
+            self.firmware = tuple(self._identify(id_) for id_ in self.ids)
+            undo.callback(self._abandon)
+            window = self._common_window()
+            for id_ in self.ids:
+                self._set_up(id_, window)
+            self._group(window)
+            for id_, state in zip(self.ids, self.read(), strict=True):
+                self._energise(id_, state)
+            self._expected_watchdog = self._watchdog
+            states = self.read()
+            undo.pop_all()
+        return states
+
+    def read(self) -> tuple[ServoState, ...]:
+        """Reads every servo in one transaction.
+
+        Raises:
+            HardwareFaultError: A servo's watchdog tripped, or it restarted and forgot its settings. A
+                hardware error is no reason to raise: the state carries it.
+            DeviceTimeoutError: No sound answer came, after every retry.
+            DeviceLostError: The port is gone.
+        """
+        t_ns, blocks = self._transact("a fast sync read", self._read_once)
+        self.stats.cycles += 1
+        return tuple(self._state(t_ns, id_, block) for id_, block in zip(self.ids, blocks, strict=True))
+
+    def write(self, commands: Sequence[ServoCommand]) -> None:
+        """Writes the goals of every servo in one transaction; the current is bounded by the configured limit.
+
+        Raises:
+            NonFiniteError: A goal is NaN or infinite. Nothing was sent.
+            DeviceTimeoutError: The port did not take the packet, after every retry.
+            DeviceLostError: The port is gone.
+        """
+        blocks = [self._goals(command) for command in commands]
+        self._transact("a sync write", lambda: self._write_once(blocks))
+
+    def stop(self, *, hold: bool) -> None:
+        """Turns torque off and makes sure; with ``hold`` disarms the watchdogs and keeps the goals instead.
+
+        Every servo is tried, whatever happens with the others.
+
+        Raises:
+            DeviceError: A servo could not be stopped. With ``hold``, also where its watchdog had already
+                tripped: then its torque is turned off.
+        """
+        action = self._hold if hold else self._torque_off
+        failure: DeviceError | None = None
+        for id_ in self.ids:
+            try:
+                action(id_)
+            except DeviceError as error:
+                failure = failure or error
+        if failure is not None:
+            raise failure
+        self._expected_watchdog = 0
+
+    def close(self) -> None:
+        """Releases the port and leaves torque as it is. May be called twice."""
+        if self._port is not None:
+            self._port.closePort()
+            self._port = self._reader = self._writer = None
+
+    # Start.
+
+    def _identify(self, id_: int) -> int:
+        where = f"the servo with id {id_} on {self._config.port}"
+        try:
+            number = self._transact(f"a ping of servo {id_}", lambda: self._ping_once(id_))
+        except DeviceTimeoutError as error:
+            raise DeviceNotFoundError(
+                f"{where} does not answer at {self._config.baud_rate} baud; "
+                "check its power, servo.id and servo.baud_rate"
+            ) from error
+        check_model_number(self.model, number, where)
+        firmware = self._get(id_, "firmware_version")
+        if firmware < self.model.min_firmware:
+            raise DeviceError(
+                f"{where} has firmware {firmware}, which lacks Fast Sync Read; update it to "
+                f"{self.model.min_firmware} or newer with DYNAMIXEL Wizard"
+            )
+        return firmware
+
+    def _common_window(self) -> IndirectWindow:
+        """One transaction has one address for all, so all must have their indirect data in one place."""
+        windows = {self.model.indirect_windows(firmware)[0] for firmware in self.firmware}
+        if len(windows) > 1:
+            raise DeviceError(
+                f"the servos on {self._config.port} have firmware {self.firmware}, which differ in their "
+                "indirect addresses; update all to the same version"
+            )
+        return windows.pop()
+
+    def _set_up(self, id_: int, window: IndirectWindow) -> None:
+        # In this order: to clear a watchdog that tripped in an earlier run would set the motor going again.
+        self._set(id_, "torque_enable", 0, tries=_TORQUE_OFF_TRIES)
+        self._set(id_, "bus_watchdog", 0)
+        hardware_error = self._get(id_, "hardware_error_status")
+        if hardware_error:
+            raise HardwareFaultError(
+                f"servo {id_} reports {_hardware_error_text(hardware_error)}; remove the cause, then "
+                "power-cycle or reboot it"
+            )
+        for name, value in (
+            ("return_delay_time", 0),
+            ("drive_mode", 0),
+            ("current_limit", self._current_limit),
+            ("operating_mode", CURRENT_BASED_POSITION_MODE),
+        ):
+            if self._get(id_, name) != value:  # the EEPROM wears out
+                self._set(id_, name, value)
+        for name, value in (("status_return_level", 2), ("profile_acceleration", 0), ("profile_velocity", 0)):
+            self._set(id_, name, value)
+        pointers = struct.pack(f"<{len(_INDIRECT_ADDRESSES)}H", *_INDIRECT_ADDRESSES)
+        self._write_bytes(id_, window.address, pointers)
+        if self._read_bytes(id_, window.address, len(pointers)) != pointers:
+            raise DeviceError(
+                f"servo {id_} did not take its indirect addresses; power-cycle it and start again"
+            )
+
+    def _group(self, window: IndirectWindow) -> None:
+        self._reader = GroupSyncRead(self._port, self._packets, window.data, _READ_BLOCK.size)
+        self._writer = GroupSyncWrite(
+            self._port, self._packets, window.data + _READ_BLOCK.size, _WRITE_BLOCK.size
+        )
+        for id_ in self.ids:
+            self._reader.addParam(id_)
+            self._writer.addParam(id_, bytes(_WRITE_BLOCK.size))
+
+    def _energise(self, id_: int, state: ServoState) -> None:
+        self._set(id_, "goal_current", 0)
+        self._set(id_, "goal_position", ticks_from_rad(state.position_rad))
+        self._set(id_, "bus_watchdog", self._watchdog)
+        self._set(id_, "torque_enable", 1)
+
+    def _abandon(self) -> None:
+        with suppress(DeviceError):  # the error that brought us here is the one to tell
+            self.stop(hold=False)
+
+    # Stop.
+
+    def _torque_off(self, id_: int) -> None:
+        self._set(id_, "torque_enable", 0, tries=_TORQUE_OFF_TRIES)
+        self._set(id_, "bus_watchdog", 0)
+
+    def _hold(self, id_: int) -> None:
+        # Disarming a watchdog that has tripped would set the motor going again.
+        if self._get(id_, "bus_watchdog") < 0:
+            self._torque_off(id_)
+            raise HardwareFaultError(
+                f"servo {id_} can't hold: its bus watchdog had tripped, so its torque was turned off"
+            )
+        self._set(id_, "bus_watchdog", 0)
+
+    # Cycle.
+
+    def _read_once(self) -> tuple[int, tuple[int, list[bytes]]]:
+        t_ns = self._clock_ns()
+        result = self._reader.fastSyncRead()
+        blocks = [bytes(self._reader.data_dict[id_]) for id_ in self.ids]
+        whole = all(len(block) == _READ_BLOCK.size for block in blocks)
+        return result if whole or result != COMM_SUCCESS else COMM_RX_CORRUPT, (t_ns, blocks)
+
+    def _write_once(self, blocks: Sequence[bytes]) -> tuple[int, None]:
+        for id_, block in zip(self.ids, blocks, strict=True):
+            self._writer.changeParam(id_, block)
+        return self._writer.txPacket(), None
+
+    def _state(self, t_ns: int, id_: int, block: bytes) -> ServoState:
+        current, velocity, ticks, hardware_error, temperature, watchdog = _READ_BLOCK.unpack(block)
+        if watchdog != self._expected_watchdog:
+            why = "its bus watchdog tripped" if watchdog < 0 else "it restarted and forgot its settings"
+            raise HardwareFaultError(
+                f"servo {id_} stopped by itself: {why}; stop the run, look for the cause, and start again"
+            )
+        return ServoState(
+            t_ns=t_ns,
+            position_rad=rad_from_ticks(ticks),
+            velocity_rad_s=velocity * VELOCITY_UNIT_RAD_S,
+            current_a=current * self.model.current_unit_a,
+            temperature_c=float(temperature),
+            hardware_error=hardware_error,
+        )
+
+    def _goals(self, command: ServoCommand) -> bytes:
+        if not (math.isfinite(command.goal_position_rad) and math.isfinite(command.goal_current_a)):
+            raise NonFiniteError(
+                f"the servo's goals must be finite, got position {command.goal_position_rad} rad and "
+                f"current {command.goal_current_a} A; nothing was sent"
+            )
+        current = max(0.0, command.goal_current_a) / self.model.current_unit_a
+        least, greatest = REGISTERS["goal_position"].range or (0, 0)
+        ticks = ticks_from_rad(command.goal_position_rad)
+        return _WRITE_BLOCK.pack(min(self._current_limit, round(current)), max(least, min(greatest, ticks)))
+
+    # Registers.
+
+    def _get(self, id_: int, name: str) -> int:
+        register = REGISTERS[name]
+        return register.decode(self._read_bytes(id_, register.address, register.size))
+
+    def _set(self, id_: int, name: str, value: int, tries: int = 1) -> None:
+        """Writes a register and reads it back."""
+        register = REGISTERS[name]
+        for left in reversed(range(tries)):
+            try:
+                self._write_bytes(id_, register.address, register.encode(value))
+                if self._get(id_, name) == value:
+                    return
+            except DeviceTimeoutError:
+                if not left:
+                    raise
+        raise DeviceError(f"servo {id_} did not keep {name} = {value}; power-cycle it and start again")
+
+    def _read_bytes(self, id_: int, address: int, size: int) -> bytes:
+        what = f"a read of {size} bytes at {address} of servo {id_}"
+
+        def once() -> tuple[int, bytes]:
+            data, result, error = self._packets.readTxRx(self._port, id_, address, size)
+            result = _checked(what, result, error)
+            return result if len(data) == size or result != COMM_SUCCESS else COMM_RX_CORRUPT, bytes(data)
+
+        return self._transact(what, once)
+
+    def _write_bytes(self, id_: int, address: int, data: bytes) -> None:
+        what = f"a write of {len(data)} bytes at {address} of servo {id_}"
+
+        def once() -> tuple[int, None]:
+            result, error = self._packets.writeTxRx(self._port, id_, address, len(data), data)
+            return _checked(what, result, error), None
+
+        self._transact(what, once)
+
+    def _ping_once(self, id_: int) -> tuple[int, int]:
+        number, result, _ = self._packets.ping(self._port, id_)
+        return result, number
+
+    def _transact(self, what: str, once: Callable[[], tuple[int, _T]]) -> _T:
+        """Tries a transaction until it succeeds; ``once`` returns the SDK's result code and a value.
+
+        The SDK takes a late answer for the next one's, as only the id is compared: after each failure the
+        line is drained first.
+        """
+        if self._port is None:
+            raise DeviceError(
+                f"the servo's port {self._config.port} is not open, so {what} was not sent; start first"
+            )
+        for attempt in range(self._config.retries + 1):
+            self.stats.retries += attempt > 0
+            try:
+                result, value = once()
+            except IndexError:  # the SDK indexes into answers that are too short
+                self._port.is_using = False
+                result = COMM_RX_CORRUPT
+            if result == COMM_SUCCESS:
+                return value
+            if result == COMM_RX_CORRUPT:
+                self.stats.corrupt += 1
+            else:
+                self.stats.timeouts += 1
+            self._port.drain()
+        raise DeviceTimeoutError(
+            f"no sound answer to {what} on {self._config.port} after {self._config.retries + 1} tries; check "
+            "cable, power, and that the adapter's latency timer is below servo.reply_margin_ms"
+        )
+
+
+class DynamixelServo:
+    """The gripper's servo: one id of a `DynamixelBus` (see `gripper_force.interfaces.Servo`)."""
+
+    def __init__(self, config: ServoConfig, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
+        """Takes note of what to drive; `start` opens the port. Raises as `DynamixelBus`."""
+        self._bus = DynamixelBus(config, (config.id,), clock_ns)
+        self.model = self._bus.model
+
+    @property
+    def stats(self) -> BusStats:
+        """Counters of retries and losses."""
+        return self._bus.stats
+
+    @property
+    def nm_per_a(self) -> float:
+        """Torque constant at the horn by the vendor's table: a prior, to be calibrated."""
+        return self.model.nm_per_a
+
+    @property
+    def current_step_a(self) -> float:
+        """Resolution of the goal current."""
+        return self.model.current_unit_a
+
+    @property
+    def firmware(self) -> int | None:
+        """Firmware version; None before `start`."""
+        return self._bus.firmware[0] if self._bus.firmware else None
+
+    def start(self) -> ServoState:
+        """Sets the servo up and turns torque on; raises as `DynamixelBus.start`."""
+        return self._bus.start()[0]
+
+    def read(self) -> ServoState:
+        """Reads the state in one transaction; raises as `DynamixelBus.read`."""
+        return self._bus.read()[0]
+
+    def write(self, command: ServoCommand) -> None:
+        """Writes the goals in one transaction; raises as `DynamixelBus.write`."""
+        self._bus.write((command,))
+
+    def stop(self, *, hold: bool) -> None:
+        """Turns torque off, or holds; raises as `DynamixelBus.stop`."""
+        self._bus.stop(hold=hold)
+
+    def close(self) -> None:
+        """Releases the port and leaves torque as it is. May be called twice."""
+        self._bus.close()
+
+
+def _checked(what: str, result: int, error: int) -> int:
+    """The SDK's result code, where the servo's own error number is no reason to raise `DeviceError`."""
+    number = error & _ERROR_MASK
+    if result != COMM_SUCCESS or number == 0:
+        return result
+    if number == _ERROR_CRC:
+        return int(COMM_RX_CORRUPT)  # our packet was damaged on its way: worth another try
+    raise DeviceError(f"{what} was refused: {_ERRORS.get(number, f'error {number}')}")
+
+
+def _hardware_error_text(bits: int) -> str:
+    return " and ".join(name for bit, name in _HARDWARE_ERRORS.items() if bits & bit) or f"error {bits:#x}"

@@ -1,0 +1,229 @@
+"""A virtual X-series bus that answers Protocol 2.0 bytes, and the names of ``virtual:<name>`` ports.
+
+Source: https://emanual.robotis.com/docs/en/dxl/protocol2/.
+"""
+
+import threading
+import time
+from collections.abc import Callable, Iterable
+from typing import Final
+
+from gripper_force.errors import ConfigError
+from gripper_hw.dynamixel.firmware import VirtualServo
+from gripper_hw.dynamixel.packets import (
+    ALERT,
+    BROADCAST_ID,
+    HEADER,
+    STATUS,
+    Error,
+    Instruction,
+    Packet,
+    Parser,
+    crc16,
+    status,
+)
+
+__all__ = ["VirtualBus", "VirtualServo", "find_bus", "register_bus", "unregister_bus"]
+
+_STALE_NS: Final = 20_000_000
+_CLEAR_TURNS: Final = b"\x01\x44\x58\x4c\x22"
+
+
+class VirtualBus:
+    """Servos on one line.
+
+    Attributes:
+        servos: Who is on the line.
+        lock: Held while a packet is carried out.
+        tamper: Fault hook: takes each answer off the line and returns what arrives, None for silence.
+    """
+
+    def __init__(
+        self,
+        servos: Iterable[VirtualServo],
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+        before_packet: Callable[[], None] | None = None,
+    ) -> None:
+        """Builds a bus.
+
+        Args:
+            servos: Who is on the line.
+            clock_ns: Time of the watchdogs and reboots.
+            before_packet: Called with the lock held before a packet is carried out; brings a plant up to now.
+        """
+        self.servos = tuple(servos)
+        self.lock = threading.RLock()
+        self.tamper: Callable[[bytes], bytes | None] | None = None
+        self._clock_ns = clock_ns
+        self._before_packet = before_packet
+        self._parser = Parser()
+        self._heard_ns = 0
+
+    def transact(self, data: bytes) -> bytes:
+        """Takes bytes off the line and returns the answer's; may break anywhere, may hold anything."""
+        with self.lock:
+            now_ns = self._clock_ns()
+            if now_ns - self._heard_ns > _STALE_NS:
+                self._parser = Parser()  # a packet that broke off is forgotten, as in a real servo
+            self._heard_ns = now_ns
+            answer = b"".join(self._carry_out(packet) for packet in self._parser.feed(data))
+        if answer and self.tamper is not None:
+            return self.tamper(answer) or b""
+        return answer
+
+    def _carry_out(self, packet: Packet) -> bytes:
+        if packet.instruction == STATUS:
+            return b""
+        if self._before_packet is not None:
+            self._before_packet()
+        now_ns = self._clock_ns()
+        live = {servo.id: servo for servo in self.servos if now_ns >= servo.silent_until_ns}
+        for servo in live.values():
+            servo.check_watchdog(now_ns)
+            if packet.intact:
+                servo.feed_watchdog(now_ns)
+        if packet.intact and packet.instruction in _GROUP_READS:
+            return self._group_read(packet, live)
+        if packet.intact and packet.instruction in _GROUP_WRITES:
+            for id_, address, data in _GROUP_WRITES[packet.instruction](packet.params):
+                if id_ in live:
+                    live[id_].write(address, data)
+            return b""
+        if packet.id != BROADCAST_ID:
+            return _answer(live[packet.id], packet, now_ns) if packet.id in live else b""
+        answers = [_answer(servo, packet, now_ns) for _, servo in sorted(live.items())]
+        return b"".join(answers) if packet.instruction == Instruction.PING else b""
+
+    def _group_read(self, packet: Packet, live: dict[int, VirtualServo]) -> bytes:
+        """Each servo answers after the one before it, so a missing one silences those behind it."""
+        reads = _GROUP_READS[packet.instruction](packet.params)
+        blocks = []
+        for id_, address, size in reads:
+            if id_ not in live or live[id_].get("status_return_level") == 0:
+                break
+            error, data = live[id_].read(address, size)
+            blocks.append((id_, error | _alert(live[id_]), data))
+        if packet.instruction in (Instruction.SYNC_READ, Instruction.BULK_READ):
+            return b"".join(status(*block) for block in blocks)
+        return _fast_status(blocks, 1 + sum(size + 4 for _, _, size in reads))
+
+
+def _fast_status(blocks: list[tuple[int, int, bytes]], length: int) -> bytes:
+    """One packet to which every servo adds a block; the CRC runs on, and nothing is stuffed."""
+    if not blocks:
+        return b""
+    answer = HEADER + bytes((BROADCAST_ID,)) + (length & 0xFFFF).to_bytes(2, "little") + bytes((STATUS,))
+    for id_, error, data in blocks:
+        answer += bytes((error, id_)) + data
+        answer += crc16(answer).to_bytes(2, "little")
+    return answer
+
+
+def _answer(servo: VirtualServo, packet: Packet, now_ns: int) -> bytes:
+    """Carries out one servo's instruction and builds its status packet."""
+    level = servo.get("status_return_level")
+    id_ = servo.id
+    if not packet.intact:
+        error, data = Error.CRC, b""
+    else:
+        error, data = _obey(servo, packet, now_ns)
+    return (
+        status(id_, error | _alert(servo), data)
+        if level >= _ANSWER_LEVELS.get(packet.instruction, 2)
+        else b""
+    )
+
+
+def _obey(servo: VirtualServo, packet: Packet, now_ns: int) -> tuple[Error, bytes]:
+    params = packet.params
+    head = int.from_bytes(params[:2], "little")
+    match packet.instruction:
+        case Instruction.PING:
+            return Error.NONE, servo.read(0, 2)[1] + servo.read(6, 1)[1]
+        case Instruction.READ if len(params) == 4:
+            return servo.read(head, int.from_bytes(params[2:4], "little"))
+        case Instruction.WRITE if len(params) > 2:
+            return servo.write(head, params[2:]), b""
+        case Instruction.REG_WRITE if len(params) > 2:
+            return servo.register_write(head, params[2:]), b""
+        case Instruction.ACTION:
+            return servo.action(), b""
+        case Instruction.REBOOT:
+            servo.reboot(now_ns)
+            return Error.NONE, b""
+        case Instruction.FACTORY_RESET if len(params) == 1:
+            return servo.factory_reset(params[0], now_ns), b""
+        case Instruction.CLEAR if params == _CLEAR_TURNS:
+            servo.clear_turns()
+            return Error.NONE, b""
+    return Error.INSTRUCTION, b""
+
+
+def _alert(servo: VirtualServo) -> int:
+    return ALERT if servo.alert else 0
+
+
+def _sync_read(params: bytes) -> list[tuple[int, int, int]]:
+    if len(params) < 5:
+        return []
+    address, size = _word(params, 0), _word(params, 2)
+    return [(id_, address, size) for id_ in params[4:]]
+
+
+def _bulk_read(params: bytes) -> list[tuple[int, int, int]]:
+    return [(params[at], _word(params, at + 1), _word(params, at + 3)) for at in range(0, len(params) - 4, 5)]
+
+
+def _sync_write(params: bytes) -> list[tuple[int, int, bytes]]:
+    if len(params) < 5:
+        return []
+    address, step = _word(params, 0), _word(params, 2) + 1
+    starts = range(4, len(params) - step + 1, step)
+    return [(params[at], address, params[at + 1 : at + step]) for at in starts]
+
+
+def _bulk_write(params: bytes) -> list[tuple[int, int, bytes]]:
+    writes = []
+    while len(params) >= 5 and len(params) >= 5 + (size := _word(params, 3)):
+        writes.append((params[0], _word(params, 1), params[5 : 5 + size]))
+        params = params[5 + size :]
+    return writes
+
+
+def _word(data: bytes, at: int) -> int:
+    return data[at] | data[at + 1] << 8
+
+
+_ANSWER_LEVELS: Final[dict[int, int]] = {Instruction.PING: 0, Instruction.READ: 1}
+_GROUP_READS: Final[dict[int, Callable[[bytes], list[tuple[int, int, int]]]]] = {
+    Instruction.SYNC_READ: _sync_read,
+    Instruction.FAST_SYNC_READ: _sync_read,
+    Instruction.BULK_READ: _bulk_read,
+    Instruction.FAST_BULK_READ: _bulk_read,
+}
+_GROUP_WRITES: Final[dict[int, Callable[[bytes], list[tuple[int, int, bytes]]]]] = {
+    Instruction.SYNC_WRITE: _sync_write,
+    Instruction.BULK_WRITE: _bulk_write,
+}
+
+_buses: Final[dict[str, VirtualBus]] = {}
+
+
+def register_bus(name: str, bus: VirtualBus) -> None:
+    """Makes a bus reachable as port ``virtual:<name>`` in this process.
+
+    Raises:
+        ConfigError: The name is taken.
+    """
+    if _buses.setdefault(name, bus) is not bus:
+        raise ConfigError(f"another virtual bus is already registered as {name!r}; unregister it first")
+
+
+def unregister_bus(name: str) -> None:
+    """Takes a bus away; a port that has it open sees it unplugged. An unknown name is no error."""
+    _buses.pop(name, None)
+
+
+def find_bus(name: str) -> VirtualBus | None:
+    """The bus that is registered as ``name``, or None."""
+    return _buses.get(name)
