@@ -98,4 +98,3 @@ def _known(backends: dict[str, str | None], unit: str, name: str) -> str | None:
 def _load(path: str) -> Any:
     module, _, name = path.partition(":")
     return getattr(import_module(module), name)
-

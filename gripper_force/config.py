@@ -45,6 +45,9 @@ class GripperConfig(Section):
     open_position_rad: Finite = Field(0.0, description="servo angle with the jaws open")
     open_width_m: Positive = 0.092
     nm_per_a: Positive | None = Field(None, description="torque constant at the horn; None: the model's own")
+    current_step_a: NonNegative | None = Field(
+        None, description="resolution of the goal current; None: the model's own"
+    )
     friction_n: NonNegative = Field(0.95, description="jaw force that friction takes while closing")
 
 
@@ -95,6 +98,10 @@ class ControlConfig(Section):
     vision_std_n: Positive = Field(1.5, description="claimed error over which an estimate is uncertain")
     slip_width_m: Positive = Field(0.004, description="closing of the jaws during hold that means slip")
     temperature_limit_c: Positive = 70.0
+    plant_lag_ms: Positive = Field(60.0, description="identified lag from motor current to contact force")
+    plant_delay_ms: Positive = Field(
+        60.0, description="identified delay from contact force to estimate: exposure to use, and half a frame"
+    )
 
 
 class SimConfig(Section):
@@ -170,6 +177,15 @@ def config_from(tree: dict[str, Any], where: str) -> Config:
         return Config.model_validate(tree)
     except ValidationError as error:
         raise ConfigError(_sentence(error, where)) from error
+
+
+def config_from_text(text: str, where: str) -> Config:
+    """Reads a configuration that `dump_config` wrote. Raises `ConfigError` that names ``where``."""
+    try:
+        tree = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"the configuration in {where} is not YAML") from error
+    return config_from(tree if isinstance(tree, dict) else {}, where)
 
 
 def dump_config(config: Config) -> str:

@@ -33,6 +33,11 @@ class Servo(Protocol):
         """Torque constant at the horn by the vendor's table: a prior, to be calibrated."""
         ...
 
+    @property
+    def current_step_a(self) -> float:
+        """Resolution of the goal current."""
+        ...
+
     def start(self) -> ServoState:
         """Checks the model, sets mode and limits, reads them back, arms the watchdog and turns torque on.
 

@@ -46,10 +46,28 @@ def estimate(estimator: Estimator, frame: Frame) -> tuple[Estimate | None, float
     return result, (time.perf_counter_ns() - begin_ns) / NS_PER_MS
 
 
+class Perception(Protocol):
+    """Eyes of a session."""
+
+    def start(self) -> None:
+        """Begins to look."""
+        ...
+
+    def poll(self) -> list[Seen]:
+        """What has become ready since the last call, oldest first."""
+        ...
+
+    def close(self) -> None:
+        """Stops looking. May be called twice."""
+        ...
+
+
 class LockstepPerception:
     """Estimates in the caller's thread; an estimate is there a fixed simulated time after its frame."""
 
-    def __init__(self, camera: Camera, estimator: Estimator | None, clock: Clock, compute_ms: float) -> None:
+    def __init__(
+        self, camera: Camera | None, estimator: Estimator | None, clock: Clock, compute_ms: float
+    ) -> None:
         self._camera, self._estimator, self._clock = camera, estimator, clock
         self._compute_ns = round(compute_ms * NS_PER_MS)
         self._under_way: deque[tuple[int, Seen]] = deque()
@@ -61,7 +79,7 @@ class LockstepPerception:
         """What has become ready since the last call, oldest first."""
         now_ns = self._clock.now_ns()
         busy = self._under_way and self._under_way[-1][0] > now_ns
-        if not busy and (frame := self._camera.newest()) is not None:
+        if not busy and self._camera is not None and (frame := self._camera.newest()) is not None:
             ready_ns = now_ns + (self._compute_ns if self._estimator else 0)
             self._under_way.append((ready_ns, self._see(frame, ready_ns)))
         ready = []
@@ -88,7 +106,7 @@ class ThreadedPerception:
 
     _IDLE_S = 0.001
 
-    def __init__(self, camera: Camera, estimator: Estimator | None, clock: Clock) -> None:
+    def __init__(self, camera: Camera | None, estimator: Estimator | None, clock: Clock) -> None:
         self._camera, self._estimator, self._clock = camera, estimator, clock
         self._done: deque[Seen] = deque()
         self._failure: GripperError | None = None
@@ -97,7 +115,8 @@ class ThreadedPerception:
 
     def start(self) -> None:
         """Starts the thread."""
-        self._thread.start()
+        if self._camera is not None:
+            self._thread.start()
 
     def poll(self) -> list[Seen]:
         """What has become ready since the last call, oldest first. Raises what stopped the thread."""
@@ -112,6 +131,7 @@ class ThreadedPerception:
             self._thread.join()
 
     def _run(self) -> None:
+        assert self._camera is not None
         try:
             while not self._stop.is_set():
                 frame = self._camera.newest()

@@ -1,7 +1,7 @@
 """The four objects of Shin et al. 2019 (fig. 4) as deformable MuJoCo bodies, each at three levels of detail.
 
-A level is a mesh and a time step. The finer one is what the coarser ones are measured against: docs/simulation.md
-has the table of speed against error.
+A level is a mesh and a time step. The finer one is what the coarser ones are measured against:
+docs/simulation.md has the table of speed against error.
 """
 
 from collections.abc import Callable
@@ -114,31 +114,36 @@ def _cup(detail: Detail, size: float, stiffness: float) -> ObjectModel:
 
 
 def _stapler(detail: Detail, size: float, stiffness: float) -> ObjectModel:
-    # Two rigid parts and a spring: there is nothing to refine but the step. The moment 3.2 * angle + 40 * angle^3
-    # pushes on an arm that grows with the size, hence its powers.
+    # Two rigid parts and a spring: only the step can be refined. The spring's moment pushes on an arm
+    # that grows with the size, hence its powers.
     dt = {"coarse": 0.0025, "medium": 0.00125, "fine": 0.0005}[detail]
     linear, cubic = 3.2 * stiffness * size**2, 40.0 * stiffness * size**4
     preload_deg = np.rad2deg(0.15 / 3.2)
     s = size
 
-    def box(half: str, pos: str, material: str, extra: str = 'contype="0" conaffinity="0"') -> str:
+    ghost = 'contype="0" conaffinity="0"'
+
+    def box(half: str, pos: str, material: str, extra: str) -> str:
         lengths, centre = (_text(np.array(text.split(), float) * s) for text in (half, pos))
         return f'<geom type="box" size="{lengths}" pos="{centre}" material="{material}" {extra}/>'
 
-    # It lies on its side, and a slide lets it centre itself: fixed to the world it would over-constrain the jaws.
+    solid = f'contype="0" conaffinity="1" condim="3" {_SOFT_CONTACT}'
+    tilt = 'euler="0 -7 0"'
+    # It lies on its side, and a slide lets it centre itself: fixed to the world it would over-constrain the
+    # jaws.
     body = f"""<body pos="{_text(np.array([-0.030, 0.045, 0.030]) * s)}" quat="-.5 .5 -.5 .5">
       <joint name="self_centre" type="slide" axis="0 0 1" stiffness="20" damping="8"/>
       <body pos="{-0.055 * s:.6g} 0 0">
-        {box(".062 .017 .004", ".06 0 .004", "pad", 'contype="0" conaffinity="1" condim="3" ' + _SOFT_CONTACT)}
-        {box(".052 .009 .006", ".062 0 .017", "steel")}
-        {box(".008 .016 .014", ".006 0 .018", "pad")}
+        {box(".062 .017 .004", ".06 0 .004", "pad", solid)}
+        {box(".052 .009 .006", ".062 0 .017", "steel", ghost)}
+        {box(".008 .016 .014", ".006 0 .018", "pad", ghost)}
         <body pos="{_text(np.array([0.004, 0, 0.030]) * s)}">
           <joint name="arm" type="hinge" axis="0 1 0" range="-1 8" stiffness="{linear:.6g} 0 {cubic:.6g}"
                  springref="{-preload_deg:.6g}" damping=".05" armature="2e-5" solreflimit=".004 1"/>
-          {box(".056 .012 .005", ".058 0 .010", "object", 'euler="0 -7 0" mass=".05" ' + _SOFT_CONTACT)}
+          {box(".056 .012 .005", ".058 0 .010", "object", f'{tilt} mass=".05" {_SOFT_CONTACT}')}
           <geom type="capsule" size="{0.011 * s:.6g}" material="object" mass=".005" {_SOFT_CONTACT}
                 fromto="{_text(np.array([0.10, -0.004, 0.018, 0.10, 0.004, 0.018]) * s)}"/>
-          {box(".020 .0122 .0006", ".058 0 .0155", "finger", 'euler="0 -7 0" contype="0" conaffinity="0" mass="0"')}
+          {box(".020 .0122 .0006", ".058 0 .0155", "finger", f'{tilt} mass="0" {ghost}')}
         </body>
       </body></body>"""
     return ObjectModel(body, _SOFT_CONTACT, None, 0.030 * s, dt)
@@ -208,7 +213,8 @@ def _shell(
     return f"""<flexcomp name="object" type="direct" dim="2" mass=".2" radius="{radius}" material="object"
       point="{_text(points)}" element="{_text(faces)}" texcoord="{_text(uv)}">
       <contact selfcollide="none" condim="3" friction=".6" {_SHELL_CONTACT}/>
-      <elasticity young="{young:.6g}" poisson=".3" thickness="{thickness}" damping="{damping}" elastic2d="both"/>
+      <elasticity young="{young:.6g}" poisson=".3" thickness="{thickness}" damping="{damping}"
+                  elastic2d="both"/>
       <pin id="{_text(pins)}"/></flexcomp>"""
 
 

@@ -6,6 +6,7 @@ import time
 from collections import deque
 from dataclasses import asdict
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -20,7 +21,11 @@ from gripper_hw.sim.scene import Scene, draw_scene
 from gripper_hw.sim.world import World
 
 FRAME_SIDE = 128
+_OVERSAMPLED = 2
+"""A pixel gathers light over its area; else edges would move by whole pixels, and force hides between them."""
+
 _FULL_LUX = 750.0
+_LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 _GAMMA = 2.2
 _READ_NOISE = 0.002
 _VIGNETTE = 0.12
@@ -74,7 +79,8 @@ class SimulatedCamera:
         """Nothing to release: the world owns the drawing context."""
 
     def _capture(self, t_ns: int) -> None:
-        gray = expose(self._world.render(FRAME_SIDE), self._scene.lux, self._scene.shot_noise, self._rng)
+        picture = self._world.render(_OVERSAMPLED * FRAME_SIDE)
+        gray = expose(picture, self._scene.lux, self._scene.shot_noise, self._rng)
         t_ns += self._start_ns
         self._under_way.append(Frame(t_ns, t_ns + self._latency_ns, self._seq, gray))
         self._seq += 1
@@ -113,8 +119,8 @@ class SimulatedLoadCell:
 class SimulatedRig:
     """Owns the world, and serves its servo as the port that the configuration names.
 
-    In lockstep the session's clock moves the world. In real time a thread of the rig's own keeps the world at the
-    host's time, and says so in a `SimulationError` where the machine is too slow for the scene.
+    In lockstep the session's clock moves the world. In real time a thread of the rig's own keeps the world at
+    the host's time, and says so in a `SimulationError` where the machine is too slow for the scene.
     """
 
     def __init__(self, config: Config) -> None:
@@ -176,8 +182,8 @@ class SimulatedRig:
                 lag_ns = due_ns - self._world.t_ns
                 if lag_ns > _REALTIME_MAX_LAG_NS:
                     raise SimulationError(  # noqa: TRY301
-                        f"this machine can't simulate {self.scene.object!r} ({self.scene.detail}) in real time: "
-                        "take sim.detail=coarse, or clock=lockstep"
+                        f"this machine can't simulate {self.scene.object!r} ({self.scene.detail}) in real "
+                        "time: take sim.detail=coarse, or clock=lockstep"
                     )
                 self._world.advance_to(min(due_ns, self._world.t_ns + _REALTIME_SLICE_NS))
                 if lag_ns < _REALTIME_SLICE_NS:
@@ -188,15 +194,15 @@ class SimulatedRig:
             self._world.close()  # the drawing context belongs to this thread
 
 
-def expose(
-    picture: npt.NDArray[np.uint8], lux: float, shot_noise: float, rng: np.random.Generator
-) -> Gray:
-    """Turns a rendered picture (H, W, 3) into what a gray camera with locked exposure sees: (H, W) uint8.
+def expose(picture: npt.NDArray[np.uint8], lux: float, shot_noise: float, rng: np.random.Generator) -> Gray:
+    """Turns a rendered picture (2H, 2W, 3) into what a gray camera with locked exposure sees: (H, W) uint8.
 
-    The picture is linearised, lit, vignetted, given photon and read noise, and encoded again.
+    The picture is averaged over each pixel, linearised, lit, vignetted, given photon and read noise, and encoded
+    again.
     """
-    gray = picture.astype(np.float32) @ np.float32([0.299, 0.587, 0.114]) / 255.0  # (H, W)
-    height, width = gray.shape
+    height, width = picture.shape[0] // _OVERSAMPLED, picture.shape[1] // _OVERSAMPLED
+    pixels = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
+    gray = pixels @ _LUMA / 255.0  # (H, W)
     y, x = np.ogrid[:height, :width]
     radius2 = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / (width * width / 4)
     linear = gray**_GAMMA * np.float32(lux / _FULL_LUX) * (1 - _VIGNETTE * radius2).astype(np.float32)

@@ -53,7 +53,7 @@ class Scene:
     yaw_deg: float = 0.0
     camera_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     camera_target_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    camera_fovy_deg: float = 25.0
+    camera_fovy_deg: float = 21.0
     lux: float = 550.0
     light_direction: tuple[float, float, float] = (-0.40, 0.55, -0.75)
     light_ambient: float = 0.30
@@ -87,7 +87,7 @@ def draw_scene(object_name: str, seed: int, config: SimConfig) -> Scene:
         yaw_deg=float(rng.uniform(-4, 4)),
         camera_offset_m=(camera[0], camera[1], camera[2]),
         camera_target_offset_m=(target[0], target[1], target[2]),
-        camera_fovy_deg=float(rng.uniform(24, 26)),
+        camera_fovy_deg=float(rng.uniform(20.2, 21.8)),
         lux=lux * float(rng.uniform(0.95, 1.05)),
         light_direction=(-0.40 + light[0], 0.55 + light[1], -0.75 + light[2]),
         light_ambient=float(rng.uniform(0.22, 0.38)),

@@ -1,7 +1,5 @@
 """Textures drawn from a seed."""
 
-from typing import cast
-
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -18,13 +16,14 @@ def draw_textures(object_texture: str | None, seed: int) -> dict[str, bytes]:
         images[object_texture] = {"sponge.png": _sponge, "cup.png": _cup, "tube.png": _tube}[object_texture](
             rng
         )
-    return {name: cast(bytes, cv2.imencode(".png", image)[1].tobytes()) for name, image in images.items()}
+    return {name: cv2.imencode(".png", image)[1].tobytes() for name, image in images.items()}
 
 
 def _clouds(rng: np.random.Generator, sigma: float) -> npt.NDArray[np.float32]:
     noise = rng.standard_normal((_SIDE, _SIDE)).astype(np.float32)
     smooth = np.asarray(cv2.GaussianBlur(noise, (0, 0), sigma, borderType=cv2.BORDER_REFLECT), np.float32)
-    return smooth / smooth.std()
+    scaled: npt.NDArray[np.float32] = smooth / smooth.std()
+    return scaled
 
 
 def _colour(gray: npt.NDArray[np.floating], blue: float, green: float, red: float) -> Image:

@@ -81,7 +81,7 @@ class World:
         self.every(_GUARD_PERIOD_NS, self._guard)
 
     def every(self, period_ns: int, call: Callable[[int], None]) -> None:
-        """Calls ``call(t_ns)`` with the world at rest at each multiple of a period, to the next physics step."""
+        """Calls ``call(t_ns)`` at each multiple of a period, to the next physics step."""
         self._taps.append(_Tap(period_ns, self.t_ns + period_ns, call))
 
     def advance_to(self, t_ns: int) -> None:
@@ -106,7 +106,7 @@ class World:
                     tap.call(self.t_ns)
 
     def render(self, side: int) -> npt.NDArray[np.uint8]:
-        """A picture of the world as it stands: (side, side, 3) uint8. Raises `SimulationError` without EGL."""
+        """The world as it stands, (side, side, 3) uint8. Raises `SimulationError` without EGL."""
         if self._renderer is None:
             self._renderer = self._new_renderer(side)
         self._renderer.update_scene(self._data, "camera")

@@ -1,0 +1,185 @@
+"""A log once more: the same functions over the same inputs, and every estimate against the load cell."""
+
+from collections import defaultdict
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gripper_force import metrics
+from gripper_force.config import Config, config_from_text
+from gripper_force.control.grasp import Decision
+from gripper_force.dataset import label_frames
+from gripper_force.errors import DataError
+from gripper_force.log import LogReader
+from gripper_force.session import controller_from, make_estimator
+from gripper_force.types import (
+    NS_PER_S,
+    Frame,
+    FusedForce,
+    GraspStatus,
+    LoadCellSample,
+    Request,
+    ServoCommand,
+    ServoState,
+    VisualForce,
+)
+from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
+from gripper_force.vision.estimator import ForceEstimator
+
+_CONTACT_N = 0.25
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """What a replay computed, and whether it is what the log holds.
+
+    Attributes:
+        estimates_identical: Every visual estimate came out as logged, to the bit; None without any.
+        decisions_identical: So did every command, status and fused force; None without any.
+        visual: Visual estimates, as computed now.
+        decisions: Decisions, as computed now.
+        load_cell: The log's load-cell samples.
+    """
+
+    estimates_identical: bool | None
+    decisions_identical: bool | None
+    visual: list[VisualForce]
+    decisions: list[Decision]
+    load_cell: list[LoadCellSample]
+
+
+def replay(path: Path, checkpoint_source: str | None = None, *, recover: bool = False) -> dict[str, Any]:
+    """Replays a log and reports it against its load cell.
+
+    Args:
+        path: Log of a run or of an imported recording.
+        checkpoint_source: Another checkpoint to estimate with, instead of the log's own.
+        recover: Whether to read what is whole of a truncated log.
+
+    Returns:
+        ``mae_n, rmse_n, bias_n, per_bin, frames`` of the estimate that the run acted on (or of vision, where
+        nothing acted), ``identical``, and the same figures with ``lag_s`` by source.
+
+    Raises:
+        LogError: The log can't be read.
+        CheckpointError: The checkpoint can't be read.
+        DataError: The log holds nothing to replay, or no load cell to compare with.
+    """
+    reader = LogReader(path, recover=recover)
+    config = config_from_text(reader.config, str(path))
+    checkpoint = _checkpoint(config, checkpoint_source)
+    replayed = run_again(reader, config, checkpoint)
+    flags = [f for f in (replayed.estimates_identical, replayed.decisions_identical) if f is not None]
+    sources = _sources(replayed)
+    best = next((sources[name] for name in ("fused", "visual") if name in sources), None)
+    if best is None:
+        raise DataError(f"{path} holds no estimate that could be compared with a load cell")
+    return {
+        **{key: best[key] for key in ("mae_n", "rmse_n", "bias_n", "per_bin", "frames")},
+        "per_object": {config.object: {k: best[k] for k in ("mae_n", "rmse_n", "bias_n", "frames")}},
+        "identical": bool(flags) and all(flags),
+        "sources": sources,
+        "log": str(path),
+    }
+
+
+def run_again(reader: LogReader, config: Config, checkpoint: Checkpoint | None) -> Replayed:
+    """Feeds estimator and controller from a log, in the order in which the run had its inputs."""
+    estimator = make_estimator(config, checkpoint)
+    runs = config.gripper.nm_per_a is not None  # a recording that was imported never had a controller
+    controller = controller_from(config) if runs else None
+    visual: list[VisualForce] = []
+    decisions: list[Decision] = []
+    cells: list[LoadCellSample] = []
+    logged: dict[type, list[Any]] = defaultdict(list)
+    fresh: VisualForce | None = None
+    request: Request | None = None
+    pending: dict[int, VisualForce] = {}
+    for record in reader.records():
+        logged[type(record)].append(record)
+        if isinstance(record, Frame) and estimator is not None:
+            if (seen := _see(estimator, record)) is not None:
+                visual.append(seen)
+                pending[record.seq] = seen
+        elif isinstance(record, VisualForce):
+            again = pending.pop(record.seq, None)
+            # The time an estimate was ready is the run's own, not this computer's.
+            fresh = record if again is None else replace(again, ready_ns=record.ready_ns)
+        elif isinstance(record, Request):
+            request = record
+        elif isinstance(record, ServoState) and controller is not None:
+            decisions.append(controller.step(record.t_ns, record, fresh, request))
+            fresh = request = None
+        elif isinstance(record, LoadCellSample):
+            cells.append(record)
+    return Replayed(
+        _same_estimates(logged[VisualForce], visual) if logged[VisualForce] else None,
+        _same_decisions(logged, decisions) if logged[ServoCommand] else None,
+        visual,
+        decisions,
+        cells,
+    )
+
+
+def _see(estimator: ForceEstimator, frame: Frame) -> VisualForce | None:
+    result = estimator.update(frame.gray)
+    if result is None:
+        return None
+    return VisualForce(frame.t_ns, frame.received_ns, frame.seq, result.force_n, result.std_n, 0.0)
+
+
+def _same_estimates(logged: list[VisualForce], again: list[VisualForce]) -> bool:
+    def key(v: VisualForce) -> tuple[int, float, float]:
+        return v.seq, v.force_n, v.std_n
+
+    # The last frames may have been seen and not been used any more.
+    return [key(v) for v in logged] == [key(v) for v in again[: len(logged)]]
+
+
+def _same_decisions(logged: dict[type, list[Any]], again: list[Decision]) -> bool:
+    return (
+        logged[ServoCommand] == [d.command for d in again]
+        and logged[FusedForce] == [d.estimate for d in again]
+        and logged[GraspStatus] == [d.status for d in again]
+    )
+
+
+def _checkpoint(config: Config, source: str | None) -> Checkpoint | None:
+    name = source or config.vision.checkpoint
+    return None if name == "none" else load_checkpoint(name)
+
+
+def _sources(replayed: Replayed) -> dict[str, dict[str, Any]]:
+    series: dict[str, tuple[list[int], list[float]]] = {}
+    if replayed.visual:
+        series["visual"] = [v.t_ns for v in replayed.visual], [v.force_n for v in replayed.visual]
+    if replayed.decisions:
+        estimates = [d.estimate for d in replayed.decisions]
+        times = [e.t_ns for e in estimates]
+        series["current"] = times, [e.current_n for e in estimates]
+        series["fused"] = times, [e.force_n for e in estimates]
+    cells = sorted(replayed.load_cell, key=lambda sample: sample.t_ns)
+    return {
+        name: figures
+        for name, (t_ns, force_n) in series.items()
+        if (figures := _figures(np.array(t_ns, np.int64), np.array(force_n), cells)) is not None
+    }
+
+
+def _figures(t_ns: Any, force_n: Any, cells: list[LoadCellSample]) -> dict[str, Any] | None:
+    measured_n, valid = label_frames(t_ns, cells, 0)
+    if not valid.any():
+        return None
+    t_s, predicted_n, measured_n = t_ns[valid] / NS_PER_S, force_n[valid], measured_n[valid]
+    contact = measured_n > _CONTACT_N
+    return {
+        "mae_n": metrics.mae(predicted_n, measured_n),
+        "rmse_n": metrics.rmse(predicted_n, measured_n),
+        "bias_n": metrics.bias(predicted_n, measured_n),
+        "contact_mae_n": metrics.mae(predicted_n[contact], measured_n[contact]) if contact.any() else None,
+        "lag_s": metrics.lag_s(t_s, predicted_n, t_s, measured_n),
+        "frames": len(predicted_n),
+        "per_bin": metrics.per_bin(predicted_n, measured_n),
+    }

@@ -1,0 +1,252 @@
+"""A run in time: devices, perception and the pure controller, cycle by cycle, into a log.
+
+This module alone owns the order of things within a cycle. It runs in lockstep with a simulated clock, or in
+real time; `gripper_force.replay` feeds the same controller from a log, in the order this one wrote it in.
+"""
+
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import cv2
+
+from gripper_force.backends import open_devices
+from gripper_force.config import Config, dump_config
+from gripper_force.control.grasp import Decision, GraspController
+from gripper_force.control.transmission import Transmission
+from gripper_force.errors import ConfigError
+from gripper_force.interfaces import Devices
+from gripper_force.log import LogWriter
+from gripper_force.perception import LockstepPerception, Perception, ThreadedPerception
+from gripper_force.types import NS_PER_S, Event, GraspStatus, Outcome, Phase, Request, RequestKind
+from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
+from gripper_force.vision.estimator import ForceEstimator
+
+_VISION_PATIENCE_NS = 2 * NS_PER_S
+_REALTIME_SWITCH_S = 2e-4
+_PACKAGES = ("gripper-force", "dynamixel-sdk", "mujoco", "numpy", "torch")
+
+Progress = Callable[[GraspStatus], None]
+
+
+class Session:
+    """One controller on one set of devices."""
+
+    def __init__(
+        self,
+        config: Config,
+        devices: Devices,
+        controller: GraspController,
+        perception: Perception,
+        log: LogWriter,
+    ) -> None:
+        self._config, self._devices = config, devices
+        self._controller, self._perception, self._log = controller, perception, log
+        self._period_ns = round(NS_PER_S / config.control.rate_hz)
+        self._due_ns = 0
+        self._stop = threading.Event()
+        self._last_retries = 0
+        self.sees = False
+        self.cycles = 0
+
+    def start(self) -> None:
+        """Arms the servo and starts the sensors."""
+        for sensor in (self._devices.camera, self._devices.load_cell):
+            if sensor is not None:
+                sensor.start()
+        self._devices.servo.start()
+        self._perception.start()
+        self._due_ns = self._devices.clock.now_ns()
+
+    def stop_soon(self) -> None:
+        """Makes the next cycle a stop, whatever else was asked. Any thread or signal handler may call it."""
+        self._stop.set()
+
+    def cycle(self, kind: RequestKind | None = None, target_n: float = 0.0) -> Decision:
+        """Waits for the next cycle and runs it: read, see, decide, write, log.
+
+        Args:
+            kind: A new request, or None to go on as before.
+            target_n: Wanted force of a grasp.
+
+        Raises:
+            DeviceError: The servo was lost or does not answer.
+            GripperError: A sensor, the estimator or the simulated world failed.
+        """
+        devices, log = self._devices, self._log
+        devices.clock.sleep_until_ns(self._due_ns)
+        self._due_ns = max(self._due_ns + self._period_ns, devices.clock.now_ns() - self._period_ns)
+        devices.check()
+        visual = None
+        for seen in self._perception.poll():
+            log.write(seen.frame)
+            if seen.visual is not None:
+                visual = seen.visual
+                log.write(visual)
+                self.sees = True
+        state = devices.servo.read()
+        request = self._request(state.t_ns, kind, target_n)
+        decision = self._controller.step(state.t_ns, state, visual, request)
+        devices.servo.write(decision.command)
+        self.cycles += 1
+        if request is not None:
+            log.write(request)
+        log.write(state)
+        for record in (decision.estimate, decision.command, decision.status, *decision.events):
+            log.write(record)
+        self._log_sensors(state.t_ns)
+        return decision
+
+    def close(self) -> None:
+        """Torque off, or hold, as configured; the log keeps what the load cell still had to say."""
+        try:
+            self._devices.servo.stop(hold=self._config.on_exit == "hold")
+        finally:
+            self._perception.close()
+        self._log_sensors(self._devices.clock.now_ns())
+
+    def _request(self, t_ns: int, kind: RequestKind | None, target_n: float) -> Request | None:
+        if self._stop.is_set():
+            self._stop.clear()
+            return Request(t_ns, RequestKind.STOP)
+        return None if kind is None else Request(t_ns, kind, target_n)
+
+    def _log_sensors(self, t_ns: int) -> None:
+        if self._devices.load_cell is not None:
+            for sample in self._devices.load_cell.drain():
+                self._log.write(sample)
+        stats = self._devices.servo.stats
+        if stats.retries > self._last_retries:
+            self._log.write(Event(t_ns, "servo", f"{stats.retries - self._last_retries} bus retries"))
+            self._last_retries = stats.retries
+
+
+@contextmanager
+def open_session(
+    config: Config, devices: Devices, path: Path, checkpoint: Checkpoint | None
+) -> Iterator[Session]:
+    """A session that runs, and on every way out stops the servo as configured and closes its log."""
+    config, controller = make_controller(config, devices)
+    estimator = make_estimator(config, checkpoint)
+    with ExitStack() as stack:
+        about = _metadata(config, devices, checkpoint)
+        log = stack.enter_context(LogWriter(path, config=dump_config(config), metadata=about))
+        session = Session(config, devices, controller, _perception(config, devices, estimator), log)
+        if not devices.lockstep:
+            # Python's default lets a thread that computes keep the control thread waiting for 5 ms.
+            stack.callback(sys.setswitchinterval, sys.getswitchinterval())
+            sys.setswitchinterval(_REALTIME_SWITCH_S)
+        stack.callback(_attach_reference, log, estimator)
+        stack.callback(session.close)
+        try:
+            session.start()
+            yield session
+        except BaseException as error:
+            log.write(Event(devices.clock.now_ns(), "session", f"{type(error).__name__}: {error}"))
+            raise
+
+
+def run_grasp(config: Config, path: Path, progress: Progress | None = None) -> None:
+    """Grasps, holds, releases and writes the log.
+
+    Args:
+        config: The run.
+        path: Log to write.
+        progress: Called after each change of phase.
+
+    Raises:
+        GripperError: Something failed. The servo was stopped as configured, and the log holds what was seen.
+    """
+    checkpoint = load_checkpoint(config.vision.checkpoint) if _wants_vision(config) else None
+    with open_devices(config) as devices, open_session(config, devices, path, checkpoint) as session:
+        _grasp(session, config, checkpoint is not None, progress)
+
+
+def make_controller(config: Config, devices: Devices) -> tuple[Config, GraspController]:
+    """Completes the configuration with what the servo knows of itself, and builds the controller from it."""
+    servo = devices.servo
+    gripper = config.gripper
+    if gripper.nm_per_a is None:
+        gripper = gripper.model_copy(update={"nm_per_a": servo.nm_per_a})
+    if gripper.current_step_a is None:
+        gripper = gripper.model_copy(update={"current_step_a": servo.current_step_a})
+    config = config.model_copy(update={"gripper": gripper})
+    return config, controller_from(config)
+
+
+def controller_from(config: Config) -> GraspController:
+    """Builds the controller of a completed configuration, such as a log holds."""
+    gripper = config.gripper
+    if gripper.nm_per_a is None:
+        raise ConfigError("this configuration was never completed by a servo: gripper.nm_per_a is not set")
+    transmission = Transmission.from_config(gripper, gripper.nm_per_a, gripper.current_step_a or 0.0)
+    return GraspController(config.control, transmission, config.servo.current_limit_a)
+
+
+def make_estimator(config: Config, checkpoint: Checkpoint | None) -> ForceEstimator | None:
+    """The estimator of a run, or None for a run without vision."""
+    if checkpoint is None:
+        return None
+    return ForceEstimator(checkpoint, config.vision.region, config.vision.threads)
+
+
+def _grasp(session: Session, config: Config, sees: bool, progress: Progress | None) -> None:
+    decision = session.cycle()
+    start_ns = last_ns = decision.status.t_ns
+    while sees and not session.sees and last_ns - start_ns < _VISION_PATIENCE_NS:
+        last_ns = session.cycle().status.t_ns
+    decision = session.cycle(RequestKind.GRASP, config.target_n)
+    phase = ""
+    ended_ns: int | None = None
+    while True:
+        status = decision.status
+        if progress is not None and status.phase != phase:
+            progress(status)
+        phase = status.phase
+        if status.outcome != Outcome.NONE and ended_ns is None:
+            ended_ns = status.t_ns
+        if ended_ns is not None:
+            keep_s = config.control.hold_s if status.outcome == Outcome.HELD else 0.0
+            if status.t_ns - ended_ns >= keep_s * NS_PER_S:
+                break
+        decision = session.cycle()
+    if config.on_exit == "hold":
+        return
+    decision = session.cycle(RequestKind.RELEASE)
+    while decision.status.phase == Phase.RELEASE:
+        decision = session.cycle()
+    if progress is not None:
+        progress(decision.status)
+
+
+def _wants_vision(config: Config) -> bool:
+    return config.camera.backend != "none" and config.vision.checkpoint != "none"
+
+
+def _perception(config: Config, devices: Devices, estimator: ForceEstimator | None) -> Perception:
+    if devices.lockstep:
+        return LockstepPerception(devices.camera, estimator, devices.clock, config.vision.lockstep_compute_ms)
+    return ThreadedPerception(devices.camera, estimator, devices.clock)
+
+
+def _metadata(config: Config, devices: Devices, checkpoint: Checkpoint | None) -> dict[str, str]:
+    versions = {f"version {name}": metadata.version(name) for name in _PACKAGES}
+    return {
+        "object": config.object,
+        "set": f"{config.object}-{config.seed}",
+        "clock": config.clock,
+        "checkpoint": checkpoint.digest if checkpoint else "",
+        "python": sys.version.split()[0],
+        **versions,
+        **devices.notes,
+    }
+
+
+def _attach_reference(log: LogWriter, estimator: ForceEstimator | None) -> None:
+    if estimator is not None and (reference := estimator.reference) is not None:
+        png: Any = cv2.imencode(".png", reference)[1]
+        log.attach("reference.png", png.tobytes(), "image/png")
