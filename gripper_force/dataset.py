@@ -20,6 +20,9 @@ from gripper_force.log import LogReader
 from gripper_force.types import NS_PER_MS, Frame, Gray, LoadCellSample
 from gripper_force.vision.preprocess import Preprocess, Region, shrink
 
+CONTACT_N: Final = 0.25
+"""Measured force over which a frame counts as contact."""
+
 NEAR_NS: Final = 50 * NS_PER_MS
 """A frame with no valid load-cell sample within this time has no label."""
 

@@ -11,13 +11,10 @@ from rich.console import Console
 from rich.progress import track
 
 from gripper_force import metrics
-from gripper_force.dataset import Clip
+from gripper_force.dataset import CONTACT_N, Clip
 from gripper_force.errors import DataError
 from gripper_force.vision.checkpoint import Checkpoint
 from gripper_force.vision.dense import predict
-
-CONTACT_N: Final = 0.25
-"""Measured force over which a frame counts as contact."""
 
 RIDGE_SIZE: Final = 32
 RIDGE_COMPONENTS: Final = 20

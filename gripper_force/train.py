@@ -22,17 +22,17 @@ from torch import Tensor, nn
 
 from gripper_force import metrics
 from gripper_force.config import NonNegative, Positive, Section
-from gripper_force.dataset import Clip, digest, split_by
+from gripper_force.dataset import CONTACT_N, Clip, digest, split_by
 from gripper_force.errors import CheckpointError, DataError
 from gripper_force.vision.checkpoint import Checkpoint, Header, Residual, load_checkpoint, save_checkpoint
 from gripper_force.vision.dense import normalise, predict
 from gripper_force.vision.network import ForceNetwork, NetworkConfig
 from gripper_force.vision.preprocess import Preprocess
 
-CONTACT_N: Final = 0.25
-"""Measured force over which a frame counts as contact."""
-
 STATE_EVERY_S: Final = 60.0
+
+RESIDUAL_PRIOR: Final = 20
+"""Frames that count as much as the error over all forces, in the error claimed for one force."""
 
 Share = Annotated[float, Field(ge=0, le=1)]
 
@@ -60,7 +60,7 @@ class TrainConfig(Section):
         validation: Share of each object's sets that is held out for the error the checkpoint claims.
         seed: Of weights and draws.
         device: Where to train; ``auto`` takes CUDA where it is there.
-        compile: Whether to compile the backbone; pays after some minutes on a GPU.
+        compile: Whether to compile the network; pays after some minutes on a GPU.
     """
 
     attentions: tuple[Literal["none", "ssam", "scam"], ...] = ("ssam", "scam")
@@ -117,7 +117,8 @@ def train(config: TrainConfig, clips: Sequence[Clip], out: Path, *, resume: bool
         device = "cuda" if torch.cuda.is_available() else "cpu"
     training, held_out = split_by(clips, "set", config.validation, config.seed)
     data = _Data(training, config, device)
-    identity = f"{config.model_dump_json(exclude={'device', 'compile'})} {digest(clips)}"
+    data_digest = digest(clips)
+    identity = f"{config.model_dump_json(exclude={'device', 'compile'})} {data_digest}"
     states = [out.with_suffix(f".{i}.state") for i in range(len(config.attentions))]
     networks = []
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[loss]}"))
@@ -128,12 +129,12 @@ def train(config: TrainConfig, clips: Sequence[Clip], out: Path, *, resume: bool
                 run.restore()
             run.train(data, progress)
             networks.append(run.network)
-    forces_n, measured_n = _on(held_out, networks, config.preprocess, device)
+    forces_n, measured_n = _estimates(held_out, networks, config.preprocess, device)
     header = Header(
         members=tuple(network.config for network in networks),
         preprocess=config.preprocess,
         residuals=tuple(_residuals(forces_n, measured_n)),
-        data_digest=digest(training),
+        data_digest=data_digest,
         metrics={
             "mae_n": metrics.mae(forces_n, measured_n),
             "rmse_n": metrics.rmse(forces_n, measured_n),
@@ -324,6 +325,9 @@ class _Run:
                 number, name = name.split(".")
                 moments.setdefault(int(number), {})[name] = tensor
         self.network.load_state_dict(weights)
+        for i, parameter in enumerate(self.network.parameters()):
+            for name in ("exp_avg", "exp_avg_sq"):  # the fused optimiser wants the parameter's memory format
+                moments[i][name] = torch.empty_like(parameter).copy_(moments[i][name])
         self._optimizer.load_state_dict({**self._optimizer.state_dict(), "state": moments})
         self._step, self._elapsed_s = int(progress["step"]), float(progress["elapsed_s"])
 
@@ -335,7 +339,7 @@ def one_cycle(done: float, warmup: float) -> float:
     return (1 + math.cos(math.pi * min(1.0, (done - warmup) / (1 - warmup)))) / 2
 
 
-def _on(
+def _estimates(
     clips: Sequence[Clip], networks: Sequence[ForceNetwork], preprocess: Preprocess, device: str
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
     """The ensemble's and the measured forces in N over all valid frames of the clips."""
@@ -345,10 +349,11 @@ def _on(
 
 def _residuals(forces_n: npt.NDArray[np.float32], measured_n: npt.NDArray[np.float32]) -> list[Residual]:
     """Root mean squared error by estimated force, which is what a run knows, in bins of 1 N."""
+    squared = np.square(forces_n - measured_n)
     newtons = np.floor(forces_n)
     residuals = []
     for newton in np.unique(newtons):
-        part = newtons == newton
-        std_n = metrics.rmse(forces_n[part], measured_n[part])
-        residuals.append(Residual(force_n=float(newton) + 0.5, std_n=std_n))
+        part = squared[newtons == newton]
+        variance = (part.sum() + RESIDUAL_PRIOR * squared.mean()) / (len(part) + RESIDUAL_PRIOR)
+        residuals.append(Residual(force_n=float(newton) + 0.5, std_n=math.sqrt(variance)))
     return residuals

@@ -1,0 +1,117 @@
+import hashlib
+from pathlib import Path
+
+import pytest
+import torch
+from pydantic import ValidationError
+from safetensors.torch import save_file
+
+from gripper_force.errors import CheckpointError
+from gripper_force.vision import checkpoint
+from gripper_force.vision.checkpoint import Header, Residual, load_checkpoint, save_checkpoint
+from gripper_force.vision.network import ForceNetwork, NetworkConfig
+from gripper_force.vision.preprocess import Preprocess
+
+SSAM = NetworkConfig(attention="ssam", size=16, width=0.25, hidden=6, head=7)
+SCAM = SSAM.model_copy(update={"attention": "scam"})
+
+
+def header(*members: NetworkConfig) -> Header:
+    return Header(
+        members=members,
+        preprocess=Preprocess(size=16),
+        residuals=(Residual(force_n=0.5, std_n=0.1), Residual(force_n=9.5, std_n=0.7)),
+        data_digest="abc",
+        metrics={"mae_n": 0.16},
+    )
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    torch.manual_seed(0)
+    path = tmp_path / "folder" / "two.safetensors"
+    save_checkpoint(path, [ForceNetwork(SSAM), ForceNetwork(SCAM)], header(SSAM, SCAM))
+    return path
+
+
+def test_round_trip(file: Path) -> None:
+    loaded = load_checkpoint(file)
+    assert loaded.header == header(SSAM, SCAM)
+    assert loaded.digest == hashlib.sha256(file.read_bytes()).hexdigest()
+    torch.manual_seed(0)
+    for network, config in zip(loaded.networks, (SSAM, SCAM), strict=True):
+        original = ForceNetwork(config).eval()
+        clip = torch.randn(1, 4, 1, 16, 16, generator=torch.Generator().manual_seed(1))
+        assert not network.training
+        assert all(parameter.dtype == torch.float32 for parameter in network.parameters())
+        torch.testing.assert_close(network(clip), original(clip), rtol=5e-3, atol=5e-3)
+
+
+def test_loading_is_bit_exact_after_the_first_rounding(file: Path, tmp_path: Path) -> None:
+    loaded = load_checkpoint(file)
+    again = tmp_path / "again.safetensors"
+    save_checkpoint(again, loaded.networks, loaded.header)
+    assert again.read_bytes() == file.read_bytes()
+
+
+def test_an_ensemble_of_full_size_fits_in_12_mb(tmp_path: Path) -> None:
+    configs = [NetworkConfig(attention="ssam"), NetworkConfig(attention="scam")]
+    path = tmp_path / "full.safetensors"
+    full = header(SSAM).model_copy(update={"members": tuple(configs), "preprocess": Preprocess()})
+    save_checkpoint(path, [ForceNetwork(config) for config in configs], full)
+    assert path.stat().st_size < 12e6
+
+
+def test_a_missing_file_says_how_to_get_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(CheckpointError, match="train one"):
+        load_checkpoint(tmp_path / "absent.safetensors")
+    monkeypatch.setattr(checkpoint, "DEFAULT_PATH", tmp_path / "default.safetensors")
+    with pytest.raises(CheckpointError, match=r"default\.safetensors"):
+        load_checkpoint()
+
+
+@pytest.mark.parametrize("keep", [0, 7, 100, -1])
+def test_a_cut_file_is_named(file: Path, keep: int) -> None:
+    file.write_bytes(file.read_bytes()[:keep])
+    with pytest.raises(CheckpointError, match="damaged"):
+        load_checkpoint(file)
+
+
+def test_a_folder_is_no_checkpoint(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError):
+        load_checkpoint(tmp_path)
+
+
+def test_other_safetensors_files_are_refused(file: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.safetensors"
+    save_file({"x": torch.zeros(1)}, other)
+    with pytest.raises(CheckpointError, match="not a gripper-force-network"):
+        load_checkpoint(other)
+    save_file({"x": torch.zeros(1)}, other, metadata={"format": checkpoint.FORMAT, "header": "{}"})
+    with pytest.raises(CheckpointError, match="header"):
+        load_checkpoint(other)
+    text = header(SCAM).model_dump_json()
+    save_file({"0.x": torch.zeros(1)}, other, metadata={"format": checkpoint.FORMAT, "header": text})
+    with pytest.raises(CheckpointError, match="member 0"):
+        load_checkpoint(other)
+
+
+def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
+    network = ForceNetwork(SSAM)
+    network.out.bias.data.fill_(torch.nan)
+    save_checkpoint(tmp_path / "nan.safetensors", [network], header(SSAM))
+    with pytest.raises(CheckpointError, match="NaN"):
+        load_checkpoint(tmp_path / "nan.safetensors")
+
+
+def test_a_header_holds_together() -> None:
+    with pytest.raises(ValidationError, match="at least one"):
+        header()
+    with pytest.raises(ValidationError, match="agree"):
+        header(SSAM.model_copy(update={"size": 32}))
+
+
+def test_a_place_that_can_not_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "occupied").write_text("")
+    with pytest.raises(CheckpointError, match="can't write"):
+        save_checkpoint(tmp_path / "occupied" / "x.safetensors", [ForceNetwork(SSAM)], header(SSAM))

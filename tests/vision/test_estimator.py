@@ -1,0 +1,109 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from gripper_force.errors import ConfigError, DataError, NonFiniteError
+from gripper_force.vision.checkpoint import Checkpoint, Header, Residual
+from gripper_force.vision.dense import predict
+from gripper_force.vision.estimator import Estimate, ForceEstimator
+from gripper_force.vision.network import ForceNetwork, NetworkConfig
+from gripper_force.vision.preprocess import Preprocess, shrink
+
+REGION = (10, 5, 40, 40)
+RESIDUALS = (Residual(force_n=-100, std_n=0), Residual(force_n=100, std_n=2))
+
+
+def ensemble(*attentions: str, reference: bool = True) -> Checkpoint:
+    torch.manual_seed(0)
+    configs = tuple(
+        NetworkConfig.model_validate({"attention": a, "size": 32, "width": 0.25, "hidden": 6, "head": 7})
+        for a in attentions
+    )
+    preprocess = Preprocess(size=32, reference=reference)
+    header = Header(members=configs, preprocess=preprocess, residuals=RESIDUALS, data_digest="", metrics={})
+    networks = tuple(ForceNetwork(config).eval().requires_grad_(False) for config in configs)
+    return Checkpoint(networks, header, digest="")
+
+
+@pytest.fixture
+def frames() -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, (30, 50, 60), np.uint8)
+
+
+def run(estimator: ForceEstimator, frames: np.ndarray) -> list[Estimate | None]:
+    return [estimator.update(frame) for frame in frames]
+
+
+def test_equals_the_whole_clip_at_once(frames: np.ndarray) -> None:
+    checkpoint = ensemble("ssam", "scam")
+    estimates = run(ForceEstimator(checkpoint, REGION, threads=1), frames)
+    small = np.stack([shrink(frame, REGION, 32) for frame in frames])
+    members = predict(checkpoint.networks, checkpoint.header.preprocess, small)  # (2, 30)
+    assert estimates[:3] == [None] * 3
+    for estimate, (ssam, scam) in zip(estimates[3:], members.T[3:].tolist(), strict=True):
+        assert estimate is not None
+        mean = (ssam + scam) / 2
+        assert estimate.force_n == pytest.approx(mean, abs=1e-4)
+        residual = (mean + 100) / 100
+        assert estimate.std_n == pytest.approx(math.hypot(residual, (ssam - scam) / 2), abs=1e-4)
+
+
+def test_reset_starts_a_new_run(frames: np.ndarray) -> None:
+    estimator = ForceEstimator(ensemble("ssam"), threads=1)
+    first = run(estimator, frames)
+    assert run(estimator, frames) != first
+    estimator.reset()
+    assert estimator.reference is None
+    assert run(estimator, frames) == first
+
+
+def test_without_a_reference_every_frame_counts(frames: np.ndarray) -> None:
+    estimator = ForceEstimator(ensemble("scam", reference=False), threads=1)
+    assert None not in run(estimator, frames)
+    assert estimator.reference is None
+
+
+def test_the_reference_is_what_the_region_shows(frames: np.ndarray) -> None:
+    estimator = ForceEstimator(ensemble("ssam"), REGION, threads=1)
+    run(estimator, frames)
+    expected = np.mean([shrink(frame, REGION, 32) for frame in frames[:4]], axis=0).round()
+    assert estimator.reference is not None
+    np.testing.assert_array_equal(estimator.reference, expected)
+
+
+def test_attention_is_that_of_the_newest_frame(frames: np.ndarray) -> None:
+    estimator = ForceEstimator(ensemble("scam", "ssam"), threads=1)
+    assert estimator.attention_map() is None
+    run(estimator, frames[:5])
+    earlier = estimator.attention_map()
+    estimator.update(frames[5])
+    newest = estimator.attention_map()
+    assert earlier is not None
+    assert newest is not None
+    assert newest.shape == (2, 2)
+    assert newest.dtype == np.float32
+    assert 0 < newest.min() < newest.max() < 1
+    assert not np.array_equal(earlier, newest)
+
+
+def test_no_map_without_spatial_attention(frames: np.ndarray) -> None:
+    estimator = ForceEstimator(ensemble("scam", "none"), threads=1)
+    run(estimator, frames[:5])
+    assert estimator.attention_map() is None
+
+
+def test_nan_never_leaves_the_network(frames: np.ndarray) -> None:
+    checkpoint = ensemble("ssam", "scam")
+    checkpoint.networks[1].out.bias.fill_(torch.nan)
+    estimator = ForceEstimator(checkpoint, threads=1)
+    with pytest.raises(NonFiniteError, match="nan"):
+        run(estimator, frames)
+
+
+def test_bad_frames_and_regions_are_named(frames: np.ndarray) -> None:
+    with pytest.raises(ConfigError, match="region"):
+        ForceEstimator(ensemble("ssam"), (0, 0, 100, 100), threads=1).update(frames[0])
+    with pytest.raises(DataError, match="gray"):
+        ForceEstimator(ensemble("ssam"), threads=1).update(frames)

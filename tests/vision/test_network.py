@@ -1,0 +1,135 @@
+from collections.abc import Iterator
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor, nn
+
+from gripper_force.vision.network import ForceNetwork, LastStepBlstm, NetworkConfig, StreamState
+
+TINY = NetworkConfig(size=16, width=0.25, window=5, hidden=6, head=7, reduction=4)
+
+
+def build(config: NetworkConfig, seed: int = 0) -> ForceNetwork:
+    """A network in evaluation mode whose every number matters, its batch statistics too."""
+    torch.manual_seed(seed)
+    network = ForceNetwork(config)
+    for module in network.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            nn.init.normal_(module.running_mean, std=0.1)
+            nn.init.uniform_(module.running_var, 0.5, 1.5)
+            nn.init.uniform_(module.weight, 0.5, 1.5)
+            nn.init.normal_(module.bias, std=0.1)
+    return network.eval()
+
+
+def as_torch_blstm(blstm: LastStepBlstm) -> nn.LSTM:
+    """The same weights in PyTorch's own bidirectional LSTM, with noise where no weight may matter."""
+    hidden = blstm.onward.hidden_size
+    full = nn.LSTM(blstm.onward.input_size, hidden, batch_first=True, bidirectional=True)
+    for name, weight in blstm.onward.named_parameters():
+        getattr(full, name).data.copy_(weight)
+    keep = torch.cat([torch.arange(hidden), torch.arange(2 * hidden, 4 * hidden)])  # in, (forget,) cell, out
+    full.weight_ih_l0_reverse.data[keep] = blstm.backward_gates.weight
+    full.bias_ih_l0_reverse.data[keep] = blstm.backward_gates.bias
+    full.bias_hh_l0_reverse.data.zero_()
+    return full
+
+
+def literal(network: ForceNetwork, frames: Tensor) -> Tensor:
+    """The newest force from the frames it depends on and nothing cached: (context + 1, 1, S, S) to ()."""
+    config = network.config
+    maps = [network.backbone(frame[None]) for frame in frames]
+    vectors = []
+    for t in range(len(maps) - config.window, len(maps)):
+        excited = maps[t]
+        if network.attention is not None:
+            stack = torch.cat(maps[t - config.earlier_frames : t + 1], dim=1)
+            excited, _ = network.attention(stack, maps[t])
+        vectors.append(excited.mean((2, 3)))
+    states, _ = as_torch_blstm(network.blstm)(torch.stack(vectors, dim=1))
+    return network.out(torch.tanh(network.dense(states[:, -1])))[0, 0] * config.label_scale_n
+
+
+def history(network: ForceNetwork, clip: Tensor, t: int) -> Tensor:
+    """The frames that the estimate at t depends on; copies of the first stand in for those before it."""
+    return clip[torch.arange(t - network.context, t + 1).clamp_min(0)]
+
+
+def stream(network: ForceNetwork, clip: Tensor) -> Iterator[Tensor]:
+    state: StreamState | None = None
+    for frame in clip:
+        force, state = network.step(frame[None], state)
+        yield force[0]
+
+
+def assert_same(actual: Tensor, expected: Tensor) -> None:
+    torch.testing.assert_close(actual, expected, rtol=1e-5, atol=1e-5)
+
+
+@torch.no_grad()
+def test_the_last_step_equals_a_bidirectional_lstm() -> None:
+    torch.manual_seed(0)
+    blstm = LastStepBlstm(4, 6)
+    windows = torch.randn(3, 20, 4)
+    expected = as_torch_blstm(blstm)(windows)[0][:, -1]
+    torch.testing.assert_close(blstm(windows), expected, rtol=1e-6, atol=1e-7)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    attention=st.sampled_from(["none", "ssam", "scam"]),
+    earlier=st.integers(0, 2),
+    length=st.integers(1, 12),
+    seed=st.integers(0, 99),
+)
+@torch.inference_mode()
+def test_streaming_and_whole_clips_equal_the_literal_window(
+    attention: str, earlier: int, length: int, seed: int
+) -> None:
+    config = NetworkConfig.model_validate(
+        {**TINY.model_dump(), "attention": attention, "earlier_frames": earlier}
+    )
+    network = build(config, seed)
+    clip = torch.randn(length, 1, 16, 16)
+    expected = torch.stack([literal(network, history(network, clip, t)) for t in range(length)])
+    assert_same(torch.stack(list(stream(network, clip))), expected)
+    assert_same(network(clip[None])[0], expected)
+    assert_same(network(clip[None], length - 1)[0], expected[-1:])
+
+
+@torch.inference_mode()
+def test_a_long_stream_does_not_drift() -> None:
+    network = build(TINY.model_copy(update={"attention": "scam"}))
+    clip = torch.randn(64, 1, 16, 16)[torch.arange(10_000) % 61]
+    for force in stream(network, clip):
+        newest = force
+    assert_same(newest, literal(network, history(network, clip, len(clip) - 1)))
+
+
+@pytest.mark.parametrize("attention", ["ssam", "scam"])
+@torch.inference_mode()
+def test_the_full_size_network_streams_exactly(attention: str) -> None:
+    network = build(NetworkConfig(attention=attention))
+    clip = torch.randn(24, 1, 128, 128)
+    *_, newest = stream(network, clip)
+    assert_same(newest, literal(network, history(network, clip, 23)))
+
+
+def test_batches_are_independent() -> None:
+    network = build(TINY.model_copy(update={"attention": "scam"}))
+    clips = torch.randn(3, 8, 1, 16, 16)
+    together = network(clips)
+    assert together.shape == (3, 8)
+    for clip, forces in zip(clips, together, strict=True):
+        assert_same(network(clip[None])[0], forces)
+
+
+def test_the_full_size_network_fits_the_paper() -> None:
+    network = ForceNetwork(NetworkConfig(attention="ssam"))
+    assert network.blstm.onward.hidden_size == 256
+    assert network.dense.out_features == 1024
+    assert network.config.window == 20
+    assert network.context == 20
+    assert 2.4e6 < sum(parameter.numel() for parameter in network.parameters()) < 2.8e6

@@ -1,0 +1,84 @@
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from pydantic import ValidationError
+
+from gripper_force.errors import ConfigError, DataError
+from gripper_force.vision.dense import normalise
+from gripper_force.vision.preprocess import Normaliser, Preprocess, shrink
+
+SMALL = Preprocess(size=16)
+
+
+def images(count: int) -> st.SearchStrategy:
+    return arrays(np.uint8, (count, 16, 16))
+
+
+def stream(preprocess: Preprocess, frames: np.ndarray) -> list[np.ndarray]:
+    normaliser = Normaliser(preprocess)
+    return [image for frame in frames for image in normaliser.push(frame)]
+
+
+def test_shrink_cuts_the_region_then_resizes() -> None:
+    gray = np.arange(40 * 60, dtype=np.uint16).reshape(40, 60).astype(np.uint8)
+    expected = cv2.resize(gray[4:36, 8:40], (16, 16), interpolation=cv2.INTER_AREA)
+    np.testing.assert_array_equal(shrink(gray, (8, 4, 32, 32), 16), expected)
+    assert shrink(gray, None, 16).shape == (16, 16)
+
+
+@pytest.mark.parametrize("region", [(-1, 0, 8, 8), (0, 0, 61, 8), (0, 33, 8, 8), (0, 0, 0, 8)])
+def test_a_region_beyond_the_frame_is_named(region: tuple[int, int, int, int]) -> None:
+    with pytest.raises(ConfigError, match=r"vision\.region.*60x40"):
+        shrink(np.zeros((40, 60), np.uint8), region, 16)
+
+
+@pytest.mark.parametrize("frame", [np.zeros((8, 8, 3), np.uint8), np.zeros((8, 8), np.float32)])
+def test_a_frame_that_is_no_gray_image_is_refused(frame: np.ndarray) -> None:
+    with pytest.raises(DataError, match="uint8"):
+        shrink(frame, None, 16)
+
+
+def test_size_must_suit_the_backbone() -> None:
+    with pytest.raises(ValidationError):
+        Preprocess(size=20)
+
+
+@given(images(7))
+def test_streaming_and_batches_agree(frames: np.ndarray) -> None:
+    clip = torch.from_numpy(frames)[None]
+    for preprocess in (SMALL, Preprocess(size=16, reference=False)):
+        reference = clip[:, : preprocess.reference_frames] if preprocess.reference else None
+        expected = normalise(clip, reference)[0, :, 0].numpy()
+        np.testing.assert_allclose(stream(preprocess, frames), expected, rtol=1e-4, atol=1e-4)
+
+
+@given(st.integers(0, 99), st.floats(0.5, 0.9), st.floats(0, 20))
+def test_gain_and_offset_of_the_light_make_no_difference(seed: int, gain: float, offset: float) -> None:
+    gray = 255 * torch.rand(1, 2, 16, 16, generator=torch.Generator().manual_seed(seed))
+    torch.testing.assert_close(
+        normalise(gain * gray + offset, None), normalise(gray, None), rtol=1e-3, atol=1e-3
+    )
+
+
+def test_a_flat_frame_gives_zeros_and_faint_noise_stays_faint() -> None:
+    frame = np.full((16, 16), 90, np.uint8)
+    (flat,) = stream(Preprocess(size=16, reference=False), frame[None])
+    assert not flat.any()
+    frame[0, 0] += 1
+    (faint,) = stream(Preprocess(size=16, reference=False), frame[None])
+    assert np.abs(faint).max() <= 1
+
+
+def test_the_reference_is_the_mean_of_the_first_frames() -> None:
+    rng = np.random.default_rng(0)
+    frames = rng.integers(0, 256, (6, 16, 16), np.uint8)
+    normaliser = Normaliser(SMALL)
+    assert [len(normaliser.push(frame)) for frame in frames] == [0, 0, 0, 4, 1, 1]
+    assert normaliser.reference_image is not None
+    np.testing.assert_array_equal(normaliser.reference_image, frames[:4].mean(0).round())
+    still = stream(SMALL, np.repeat(frames[:1], 5, axis=0))
+    np.testing.assert_allclose(still, 0, atol=1e-5)
