@@ -1,5 +1,6 @@
 """From a wanted force to a push of the motor."""
 
+import math
 from dataclasses import dataclass
 
 from gripper_force.config import ControlConfig
@@ -79,24 +80,27 @@ class ForceLoop:
         ramping = self.reference_n != target_n
         reference_n = self._profile.step(target_n, dt_s)
         error_n = reference_n - estimate.force_n
+        friction_n = self._transmission.friction_n
         if not ramping:
-            error_n = _deadband(error_n, tolerance_n(target_n))
+            error_n = self._act_on(error_n, tolerance_n(target_n))
         # On the way down friction helps to hold; asking for none of it can't drop the object.
-        friction_n = self._transmission.friction_n if self._rising else 0.0
+        ahead_n = reference_n + (friction_n if self._rising else 0.0)
         if self._vision_alone:
             self._trim_n += self._gains.integral_s * error_n * dt_s
-            push_n = reference_n + friction_n + self._gains.proportional * error_n + self._trim_n
+            push_n = ahead_n + self._gains.proportional * error_n + self._trim_n
         elif ramping:
-            push_n = reference_n - estimate.bias_n + friction_n
+            push_n = ahead_n - estimate.bias_n
         else:
             push_n = self._push_n + self._gains.integral_s * error_n * dt_s
-        room_n = 3 * self._transmission.bias_std_n(reference_n) + self._transmission.friction_n
+        room_n = 3 * self._transmission.bias_std_n(reference_n) + friction_n
         self._push_n = min(max(push_n, reference_n - room_n, 0.0), reference_n + room_n)
         return self._push_n
 
-
-def _deadband(error_n: float, tolerance: float) -> float:
-    """What of an error is acted on: little is forgiven from below, the whole tolerance from above."""
-    if error_n > 0:
-        return max(error_n - _DEADBAND * tolerance, 0.0)
-    return min(error_n + tolerance, 0.0)
+    def _act_on(self, error_n: float, tolerance: float) -> float:
+        """What of an error in hold is acted on: to go on is cheap, to turn back means to cross friction."""
+        onward_n = error_n if self._rising else -error_n
+        if onward_n < -tolerance:
+            self._rising = not self._rising
+            self._push_n += math.copysign(self._transmission.friction_n, error_n)
+            return error_n
+        return error_n if onward_n > _DEADBAND * tolerance else 0.0

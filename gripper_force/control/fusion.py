@@ -18,6 +18,12 @@ lags by this much at a steady ramp; vision is compared with the same signal, so 
 _DRIFT_N2_S = 0.03**2
 """Growth of the bias' variance a second: friction wanders."""
 
+_LOOSE_N2_S = 0.15**2
+"""The same for jaws that are about to open."""
+
+_FREE_NOISE_N = 0.5
+"""How far the push is from friction in one cycle of free travel; inertia makes the cycles alike."""
+
 _VISION_FLOOR_N = 0.05
 """No estimate is believed more than this, whatever it claims."""
 
@@ -60,11 +66,15 @@ class Fusion:
     def restart(self) -> None:
         """Forgets the bias: a new grasp has its own."""
         self._bias_n = 0.0
+        self.loosen()
+
+    def loosen(self) -> None:
+        """Doubts the bias: contact has stopped the jaws anywhere within the play of friction."""
         self._variance_n2 = self._prior_n2(self._current_n)
         self._rejected = 0
 
     def step(
-        self, t_ns: int, servo: ServoState, visual: VisualForce | None
+        self, t_ns: int, servo: ServoState, visual: VisualForce | None, *, free: bool = False
     ) -> tuple[FusedForce, tuple[Event, ...]]:
         """One cycle.
 
@@ -72,11 +82,14 @@ class Fusion:
             t_ns: Now.
             servo: This cycle's reading; its numbers are finite.
             visual: The newest estimate, or None. The same one may be given again; it counts once.
+            free: The jaws travel and touch nothing, so the force is zero and the push tells the friction.
 
         Returns:
             The estimate, and an event where vision drops out or comes back.
         """
         self._predict(servo)
+        if free:
+            self._correct(-self._current_n - self._bias_n, _FREE_NOISE_N**2)
         if visual is not None and visual.t_ns > self._newest_seen_ns and self._feedback != "current":
             self._newest_seen_ns = visual.t_ns
             self._refusal = self._update(t_ns, visual)
@@ -88,7 +101,8 @@ class Fusion:
 
     def _predict(self, servo: ServoState) -> None:
         before_n = self._current_n
-        push_n = self._transmission.force_n(servo.current_a)
+        moving_n = self._transmission.damping_n_s_m * self._transmission.closing_m_s(servo.velocity_rad_s)
+        push_n = self._transmission.force_n(servo.current_a) - moving_n
         dt_s = 0.0
         if self._history:
             dt_s = max(servo.t_ns - self._history[-1][0], 0) / NS_PER_S
@@ -97,13 +111,13 @@ class Fusion:
             self._push_n = push_n
         # Coulomb friction is a play: the contact force stays until the push leaves it by the friction.
         friction_n = self._transmission.friction_n
-        stuck_n = min(max(before_n, self._push_n - friction_n), self._push_n + friction_n)
-        self._current_n = max(stuck_n, 0.0)
+        self._current_n = min(max(before_n, self._push_n - friction_n), self._push_n + friction_n)
+        # The further the push has gone back through the play, the less is known of when the jaws let go.
+        back = 0.0 if friction_n == 0 else 0.5 + (self._current_n - self._push_n) / (2 * friction_n)
+        drift_n2 = (_DRIFT_N2_S + _LOOSE_N2_S * back) * dt_s
         # An unknown gain error g makes the bias g * force, so its variance follows the square of the force.
         gain_n2 = GAIN_STD**2 * abs(self._current_n**2 - before_n**2)
-        self._variance_n2 = min(
-            self._variance_n2 + _DRIFT_N2_S * dt_s + gain_n2, self._prior_n2(self._current_n)
-        )
+        self._variance_n2 = min(self._variance_n2 + drift_n2 + gain_n2, self._prior_n2(self._current_n))
         self._history.append((servo.t_ns, self._current_n))
 
     def _update(self, t_ns: int, visual: VisualForce) -> str:
@@ -128,10 +142,13 @@ class Fusion:
                 return f"it jumps by {innovation_n:.2f} N"
             self._variance_n2 = self._prior_n2(current_n)
         self._rejected = 0
+        self._correct(innovation_n, noise_n2)
+        return ""
+
+    def _correct(self, innovation_n: float, noise_n2: float) -> None:
         gain = self._variance_n2 / (self._variance_n2 + noise_n2)
         self._bias_n += gain * innovation_n
         self._variance_n2 *= 1 - gain
-        return ""
 
     def _current_at(self, t_ns: int) -> float:
         """Current-derived force at a past time, linear between cycles, held beyond both ends."""

@@ -31,6 +31,9 @@ _MAX_CYCLE_S = 0.05
 _IMPACT_M_S_PER_N = 0.010
 """Approach speed of one jaw for each newton wanted: on the stiffest object, impact stays below the target."""
 
+_TOUCH = 0.25
+"""Share of the target that the jaws may press with before contact is known."""
+
 _SPEED_UP_S = 0.1
 """Time in which the jaws' goal gathers speed."""
 
@@ -170,7 +173,9 @@ class GraspController:
         if self._width_m is None:  # nothing moves before the first request
             self._goal_width_m = width_m
         self._width_m = width_m
-        self._estimate, events = self._fusion.step(t_ns, servo, visual)
+        closing_m_s = self._transmission.closing_m_s(servo.velocity_rad_s)
+        free = self._phase == Phase.APPROACH and closing_m_s > _SLOWED * self._speed_m_s
+        self._estimate, events = self._fusion.step(t_ns, servo, visual, free=free)
         return list(events)
 
     def _obey(self, t_ns: int, request: Request, problem: str) -> str:
@@ -223,6 +228,10 @@ class GraspController:
         self._conclude(Outcome.FAULT, reason)
 
     @property
+    def _touch_n(self) -> float:
+        return min(self._config.approach_force_n, _TOUCH * self._target_n)
+
+    @property
     def _present_width_m(self) -> float:
         return self._goal_width_m if self._width_m is None else self._width_m
 
@@ -248,7 +257,7 @@ class GraspController:
             self._watch_time(t_ns)
 
     def _approach(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
-        self._push_n = self._free_push_n
+        self._push_n = self._approach_push_n()
         self._goal_width_m = self._travel.step(0.0, dt_s)
         self._goal_width_m = self._travel.value = max(self._goal_width_m, width_m - 2 * _LEAD_M)
         self._has_moved |= closing_m_s > _SLOWED * self._speed_m_s or self._phase_s > _START_UP_S
@@ -256,12 +265,19 @@ class GraspController:
             self._conclude(Outcome.NO_OBJECT, "closed without contact")
             self._release(self._reason)
         elif self._lasts(self._touches(closing_m_s), _DEBOUNCE_S, dt_s):
+            self._fusion.loosen()
             self._enter(Phase.CONTACT, f"contact at {width_m * 1e3:.1f} mm")
+
+    def _approach_push_n(self) -> float:
+        """Enough for friction as far as it is known yet, and a little more."""
+        moving_n = self._transmission.damping_n_s_m * self._speed_m_s
+        friction_n = self._transmission.friction_n - self._estimate.bias_n + 2 * self._estimate.std_n
+        return friction_n + moving_n + self._touch_n
 
     def _touches(self, closing_m_s: float) -> bool:
         if not self._has_moved:
             return False
-        pressing = self._estimate.current_n > 0.5 * self._config.approach_force_n
+        pressing = self._estimate.current_n + self._estimate.bias_n > 0.5 * self._touch_n
         stalled = closing_m_s < _STALLED * self._speed_m_s
         seen = self._estimate.source != Source.CURRENT and self._estimate.force_n > _SEEN_FORCE_N
         return (stalled and pressing) or (seen and closing_m_s < _SLOWED * self._speed_m_s)

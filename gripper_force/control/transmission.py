@@ -27,6 +27,7 @@ class Transmission:
         open_width_m: Distance between the open jaws.
         n_per_a: Push at each jaw per ampere.
         friction_n: Coulomb friction at each jaw.
+        damping_n_s_m: Viscous friction at each jaw.
         current_step_a: Resolution of the servo's goal current; 0 where it is not known.
     """
 
@@ -36,13 +37,14 @@ class Transmission:
     open_width_m: float
     n_per_a: float
     friction_n: float
+    damping_n_s_m: float
     current_step_a: float = 0.0
 
     @classmethod
     def from_config(
         cls, gripper: GripperConfig, servo_nm_per_a: float, current_step_a: float = 0.0
     ) -> "Transmission":
-        """Builds it from the gripper's section; the servo's torque constant serves where none is configured."""
+        """Builds it from the gripper's section; without a torque constant, by the servo's."""
         nm_per_a = servo_nm_per_a if gripper.nm_per_a is None else gripper.nm_per_a
         return cls(
             pinion_radius_m=gripper.pinion_radius_m,
@@ -51,6 +53,7 @@ class Transmission:
             open_width_m=gripper.open_width_m,
             n_per_a=nm_per_a / (2 * gripper.pinion_radius_m),
             friction_n=gripper.friction_n,
+            damping_n_s_m=gripper.damping_n_s_m,
             current_step_a=current_step_a,
         )
 
@@ -82,5 +85,5 @@ class Transmission:
         return self.closing_sign * force_n / self.n_per_a
 
     def bias_std_n(self, force_n: float) -> float:
-        """How far the contact force may be from what the motor current says of it (one standard deviation)."""
+        """Standard deviation of the contact force about what the motor current says of it."""
         return math.hypot(FRICTION_STD * self.friction_n, GAIN_STD * force_n)

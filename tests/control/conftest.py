@@ -154,7 +154,7 @@ def draw_run(seed: int, **control: object) -> Run:
         damping_n_s_m=float(rng.uniform(8.75, 16.0)),
         friction_n=float(rng.uniform(0.67, 1.23)),
         gain=float(rng.uniform(0.9, 1.1)),
-        contact_m=float(rng.uniform(0.010, 0.018)),
+        contact_m=float(rng.uniform(0.008, 0.014)),
     )
     eye = Eye(noise_n=float(rng.uniform(0.05, 0.15)), gain=float(rng.uniform(0.95, 1.05)))
     return Run(ControlConfig(**control), plant, eye, seed)  # type: ignore[arg-type]
