@@ -1,7 +1,7 @@
 """One force estimate from motor current and vision.
 
-The motor current gives force at bus rate and without delay, but off by what friction and gearing are not known;
-vision gives force late and noisy, but at the object. A Kalman filter of one state holds the difference.
+The motor current gives force at bus rate and without delay, but off by what is not known of friction and
+gearing; vision gives force late and noisy, but at the object. A Kalman filter of one state holds the difference.
 """
 
 import math
@@ -12,14 +12,18 @@ from gripper_force.control.transmission import GAIN_STD, Transmission
 from gripper_force.types import NS_PER_MS, NS_PER_S, Event, FusedForce, ServoState, Source, VisualForce
 
 CURRENT_FILTER_S = 0.03
-"""Time constant of the low-pass on the measured current (quantised, 0.24 N a step). The current-derived force
-lags by this much at a steady ramp; vision is compared with the same signal, so the lag leaves no lasting bias."""
+"""Time constant of the low-pass on the measured current, which is quantised in steps of about 0.1 N. The
+current-derived force lags by this much; vision is compared with the same signal, so no bias is left by it."""
 
 _DRIFT_N2_S = 0.03**2
 """Growth of the bias' variance a second: friction wanders."""
 
 _LOOSE_N2_S = 0.15**2
 """The same for jaws that are about to open."""
+
+OBSERVER_LAG_S = 0.09
+"""Lag of the bias while the jaws are stuck and about to open: the steady filter's ``sqrt(R / (rate * drift))`` for
+estimates good to 0.1 N at 60 Hz."""
 
 _FREE_NOISE_N = 0.5
 """How far the push is from friction in one cycle of free travel; inertia makes the cycles alike."""

@@ -57,6 +57,9 @@ _DEBOUNCE_S = 0.05
 _DWELL_S = 0.12
 """Time in contact before the ramp: the impact dies away and vision catches up."""
 
+_SETTLE_FILTER_S = 0.25
+"""Vision alone is noisy; whether the force has settled is judged by its mean over this time."""
+
 _CLOSED_M = 0.002
 """Width under which the jaws hold nothing."""
 
@@ -86,12 +89,13 @@ class GraspController:
     ``open -> approach -> contact -> ramp -> hold -> release -> open``, and ``fault`` from anywhere. A request
     pre-empts what goes on: a grasp while gripping ramps to the new target without letting go.
 
-    *Fault is latched.* A stop request, a hardware error, a temperature over the limit, or a reading that is not
-    finite leads there. The last goals stay, at a current that can only fall; what becomes of the torque is the
-    caller's matter. Only a release request leads out, and only once the cause is gone.
+    *Fault is latched.* A stop request, a hardware error, a temperature over the limit, or a reading that is
+    not finite leads there. The last goals stay, at a current that can only fall; what becomes of the torque is
+    the caller's matter. Only a release request leads out, and only once the cause is gone.
 
-    *The outcome* stays until the next grasp. After ``held`` it may still become ``slip``. The controller lets go
-    by itself only of nothing: after ``no_object`` it opens. After ``slip`` or ``timeout`` it goes on as it was.
+    *The outcome* stays until the next grasp. After ``held`` it may still become ``slip``. The controller lets
+    go by itself only of nothing: after ``no_object`` it opens. After ``slip`` or ``timeout`` it goes on as it
+    was. It never lets go because of a width.
     """
 
     def __init__(self, config: ControlConfig, transmission: Transmission, current_limit_a: float) -> None:
@@ -111,6 +115,7 @@ class GraspController:
         self._target_n = self._speed_m_s = self._held_width_m = 0.0
         self._grasp_ns = 0
         self._phase_s = self._sign_s = self._settled_s = 0.0
+        self._error_n = 0.0
         self._has_moved = self._was_over = False
 
     @property
@@ -288,12 +293,15 @@ class GraspController:
             self._conclude(Outcome.NO_OBJECT, "closed while the force was to rise")
             self._release(self._reason)
         elif self._loop.reference_n == self._target_n:
+            self._error_n = self._estimate.force_n - self._target_n
             self._enter(Phase.HOLD, f"at {self._target_n:g} N")
 
     def _hold(self, dt_s: float, width_m: float) -> None:
         self._push_n = self._loop.step(dt_s, self._target_n, self._estimate)
-        error_n = abs(self._estimate.force_n - self._target_n)
-        self._settled_s = self._settled_s + dt_s if error_n <= tolerance_n(self._target_n) else 0.0
+        error_n = self._estimate.force_n - self._target_n
+        self._error_n += (error_n - self._error_n) * dt_s / (dt_s + _SETTLE_FILTER_S)
+        is_near = abs(self._error_n) <= tolerance_n(self._target_n)
+        self._settled_s = self._settled_s + dt_s if is_near else 0.0
         if self._outcome == Outcome.NONE and self._settled_s >= self._config.settle_s:
             self._held_width_m = width_m
             self._conclude(Outcome.HELD, f"{self._estimate.force_n:.2f} N for {self._settled_s:.2f} s")
