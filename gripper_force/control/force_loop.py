@@ -33,12 +33,13 @@ class Margin:
 class ForceLoop:
     """Steers the contact force along a ramp to its target and holds it.
 
-    *Ramp.* The push is the reference, plus friction, less the filter's bias: a disturbance observer. The force
-    rises all the way, so the sign of friction is known. With vision alone the estimate comes too late to steer
-    by while the force moves, and the ramp runs on the nominal statics.
+    *Ramp.* The push is the reference, plus friction, less the filter's bias: a disturbance observer. The
+    force rises all the way, so the sign of friction is known. With vision alone the estimate comes too late
+    to steer by while the force moves, and the ramp runs on the nominal statics.
 
-    *Hold.* An integral (with vision alone: PI) trims the push. It has a deadband that is narrow onward and wide
-    backward: stuck jaws must cross twice the friction before they turn, and a loop that does so on noise hunts.
+    *Hold.* An integral (with vision alone: PI) trims the push. It has a deadband that is narrow onward and
+    wide backward: stuck jaws must cross twice the friction before they turn, and a loop that does so on noise
+    hunts.
 
     The push never leaves what friction and gearing make plausible for the reference, whatever is estimated;
     that bounds the integral too.
@@ -46,8 +47,8 @@ class ForceLoop:
 
     def __init__(self, config: ControlConfig, transmission: Transmission) -> None:
         lag_s, delay_s = config.plant_lag_ms * 1e-3, config.plant_delay_ms * 1e-3
-        # The current follows jaws that move at once, but of stuck ones vision alone tells, through the filter.
-        # To an integral the lags are more delay.
+        # The current follows jaws that move at once, but of stuck ones vision alone tells, through the
+        # filter. To an integral the lags are more delay.
         stuck = Plant(1.0, 0.0, delay_s + lag_s + OBSERVER_LAG_S)
         plants = {"hold": stuck, "vision": Plant(1.0, lag_s, delay_s)}
         self.margins = {

@@ -1,7 +1,8 @@
 """One force estimate from motor current and vision.
 
 The motor current gives force at bus rate and without delay, but off by what is not known of friction and
-gearing; vision gives force late and noisy, but at the object. A Kalman filter of one state holds the difference.
+gearing; vision gives force late and noisy, but at the object. A Kalman filter of one state holds the
+difference.
 """
 
 import math
@@ -22,8 +23,8 @@ _LOOSE_N2_S = 0.15**2
 """The same for jaws that are about to open."""
 
 OBSERVER_LAG_S = 0.09
-"""Lag of the bias while the jaws are stuck and about to open: the steady filter's ``sqrt(R / (rate * drift))`` for
-estimates good to 0.1 N at 60 Hz."""
+"""Lag of the bias while the jaws are stuck and about to open: the steady filter's the steady filter's
+square root of noise over drift, for estimates good to 0.1 N at 60 Hz."""
 
 _FREE_NOISE_N = 0.5
 """How far the push is from friction in one cycle of free travel; inertia makes the cycles alike."""

@@ -90,8 +90,8 @@ class GraspController:
     pre-empts what goes on: a grasp while gripping ramps to the new target without letting go.
 
     *Fault is latched.* A stop request, a hardware error, a temperature over the limit, or a reading that is
-    not finite leads there. The last goals stay, at a current that can only fall; what becomes of the torque is
-    the caller's matter. Only a release request leads out, and only once the cause is gone.
+    not finite leads there. The last goals stay, at a current that can only fall; what becomes of the torque
+    is the caller's matter. Only a release request leads out, and only once the cause is gone.
 
     *The outcome* stays until the next grasp. After ``held`` it may still become ``slip``. The controller lets
     go by itself only of nothing: after ``no_object`` it opens. After ``slip`` or ``timeout`` it goes on as it

@@ -17,9 +17,9 @@ _OVER_FORCE_FACTOR = 0.85
 class Limits:
     """Bounds goal position and goal current, and puts the current on the servo's own grid.
 
-    One step of an XM430's goal current is 2.69 mA, some 0.1 N at the jaws, which is coarser than the force that
-    is asked for. The rounding error is therefore carried into the next cycle (first-order noise shaping): the
-    mean is exact, and the jaws' inertia smooths the rest.
+    One step of an XM430's goal current is 2.69 mA, some 0.1 N at the jaws, which is coarser than the force
+    that is asked for. The rounding error is therefore carried into the next cycle (first-order noise
+    shaping): the mean is exact, and the jaws' inertia smooths the rest.
     """
 
     def __init__(self, config: ControlConfig, transmission: Transmission, current_limit_a: float) -> None:

@@ -22,7 +22,7 @@ class GraspScore:
         steady_n: Mean over the last `STEADY_S` of the hold.
         steady_error_n: ``steady_n - target_n``.
         overshoot_n: Most the load cell read above the target since the ramp began; 0 where it never did.
-        settle_s: Time from the start of the ramp until the force stays within tolerance; NaN where it never does.
+        settle_s: Time from the start of the ramp until the force stays within 5 % or 0.1 N; NaN: never.
     """
 
     target_n: float

@@ -1,4 +1,4 @@
-"""A gripper in forty lines: inertia, spring, Coulomb and viscous friction, a mode-5 servo, a late noisy eye."""
+"""A small gripper: inertia, spring, Coulomb and viscous friction, a mode-5 servo, a late and noisy eye."""
 
 import math
 from collections.abc import Callable
