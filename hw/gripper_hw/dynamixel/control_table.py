@@ -185,7 +185,7 @@ def _load(name: str) -> dict[str, Any]:
 
 def _registers() -> dict[str, Register]:
     rows = _load(_SHARED)["registers"].items()
-    return {name: Register(*row[:6], tuple(row[6]) if row[6] else None) for name, row in rows}
+    return {name: Register._make((*row[:6], row[6] and tuple(row[6]))) for name, row in rows}
 
 
 REGISTERS: Final = _registers()

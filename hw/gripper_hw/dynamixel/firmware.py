@@ -358,7 +358,7 @@ class VirtualServo:
             ("present_current", round(self._measured_a / self.model.current_unit_a)),
             ("present_pwm", round(self._pwm * _FULL_PWM)),
             ("present_input_voltage", round(self._voltage_v * 10)),
-            ("present_temperature", round(self._temperature_c)),
+            ("present_temperature", max(0, round(self._temperature_c))),
             ("realtime_tick", (self._t_ns or 0) // 1_000_000 % 32768),
             ("moving", int(abs(velocity) > self.get("moving_threshold"))),
         ):

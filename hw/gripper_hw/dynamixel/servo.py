@@ -54,6 +54,7 @@ _INDIRECT_ADDRESSES: Final = tuple(
     for offset in range(register.size)
 )
 
+_TRAVEL_RAD: Final = 255 * 2 * math.pi  # a turn less than Goal Position takes either way
 _TORQUE_OFF_TRIES: Final = 5
 _ERROR_CRC: Final = 3
 _ERROR_MASK: Final = 0x7F  # the bit above is the alert, which the read block tells in full
@@ -318,10 +319,9 @@ class DynamixelBus:
                 f"the servo's goals must be finite, got position {command.goal_position_rad} rad and "
                 f"current {command.goal_current_a} A; nothing was sent"
             )
-        current = max(0.0, command.goal_current_a) / self.model.current_unit_a
-        least, greatest = REGISTERS["goal_position"].range or (0, 0)
-        ticks = ticks_from_rad(command.goal_position_rad)
-        return _WRITE_BLOCK.pack(min(self._current_limit, round(current)), max(least, min(greatest, ticks)))
+        current = max(0.0, min(self._current_limit, command.goal_current_a / self.model.current_unit_a))
+        position_rad = max(-_TRAVEL_RAD, min(_TRAVEL_RAD, command.goal_position_rad))
+        return _WRITE_BLOCK.pack(round(current), ticks_from_rad(position_rad))
 
     # Registers.
 
@@ -362,8 +362,8 @@ class DynamixelBus:
         self._transact(what, once)
 
     def _ping_once(self, id_: int) -> tuple[int, int]:
-        number, result, _ = self._packets.ping(self._port, id_)
-        return result, number
+        number, result, error = self._packets.ping(self._port, id_)
+        return _checked(f"a ping of servo {id_}", result, error), number
 
     def _transact(self, what: str, once: Callable[[], tuple[int, _T]]) -> _T:
         """Tries a transaction until it succeeds; ``once`` returns the SDK's result code and a value.

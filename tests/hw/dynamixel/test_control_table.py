@@ -1,0 +1,97 @@
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gripper_force.errors import ConfigError
+from gripper_hw.dynamixel.control_table import (
+    REGISTERS,
+    check_model_number,
+    load_model,
+    model_names,
+    rad_from_ticks,
+    ticks_from_rad,
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "number", "unit_a", "limit", "nm_per_a"),
+    [
+        ("XM430-W350", 1020, 2.69e-3, 1193, 1.78),
+        ("XM430-W210", 1030, 2.69e-3, 1193, 1.30),
+        ("XL330-M288", 1200, 1e-3, 1750, 0.35),
+        ("XC330-T288", 1220, 1e-3, 910, 1.15),
+    ],
+)
+def test_models_match_the_vendors_tables(name, number, unit_a, limit, nm_per_a):
+    model = load_model(name)
+    assert (model.name, model.number, model.current_unit_a) == (name, number, unit_a)
+    assert model.max_current_a == pytest.approx(limit * unit_a)
+    assert model.nm_per_a == pytest.approx(nm_per_a, abs=0.006)
+    assert {0, 3, 5, 16} <= set(model.operating_modes)
+
+
+def test_an_unknown_model_is_refused_with_the_known_ones():
+    with pytest.raises(ConfigError) as caught:
+        load_model("AX-12")
+    assert all(name in str(caught.value) for name in model_names())
+    assert len(model_names()) == 4
+
+
+@pytest.mark.parametrize("name", ["XL430-W250", "XC430-W150", "XC430-W240"])
+def test_a_model_without_current_control_is_refused_with_the_reason(name):
+    with pytest.raises(ConfigError, match=r"no current control.*Present Load"):
+        load_model(name)
+
+
+def test_a_found_model_number_is_compared():
+    model = load_model("XM430-W350")
+    check_model_number(model, 1020, "it")
+    with pytest.raises(ConfigError, match=r"XM430-W210.*1030.*not the configured XM430-W350"):
+        check_model_number(model, 1030, "it")
+    with pytest.raises(ConfigError, match=r"XL430-W250.*Present Load"):
+        check_model_number(model, 1060, "it")
+    with pytest.raises(ConfigError, match=r"unknown model.*4711"):
+        check_model_number(model, 4711, "it")
+
+
+@pytest.mark.parametrize(
+    ("name", "firmware", "windows"),
+    [
+        ("XM430-W350", 45, [(168, 224, 28), (578, 634, 28)]),
+        ("XM430-W350", 52, [(168, 224, 28), (578, 634, 28)]),
+        ("XL330-M288", 51, [(168, 224, 28)]),
+        ("XL330-M288", 52, [(168, 208, 20)]),
+        ("XC330-T288", 53, [(168, 208, 20)]),
+    ],
+)
+def test_firmware_decides_the_indirect_windows(name, firmware, windows):
+    assert list(load_model(name).indirect_windows(firmware)) == windows
+
+
+def test_registers_do_not_overlap_and_say_where_they_lie():
+    ends = 0
+    for register in REGISTERS.values():
+        assert register.address >= ends
+        ends = register.address + register.size
+    assert REGISTERS["shutdown"].eeprom
+    assert not REGISTERS["torque_enable"].eeprom
+    assert [REGISTERS[f"present_{name}"].address for name in ("current", "velocity", "position")] == [
+        126,
+        128,
+        132,
+    ]
+
+
+@given(st.sampled_from(sorted(REGISTERS)), st.data())
+def test_register_values_survive_their_bytes(name, data):
+    register = REGISTERS[name]
+    bits = 8 * register.size
+    least, greatest = (-(1 << bits - 1), (1 << bits - 1) - 1) if register.signed else (0, (1 << bits) - 1)
+    value = data.draw(st.integers(least, greatest))
+    assert register.decode(register.encode(value)) == value
+
+
+@given(st.integers(-1_048_575, 1_048_575))
+def test_ticks_survive_radians(ticks):
+    assert ticks_from_rad(rad_from_ticks(ticks)) == ticks
+    assert rad_from_ticks(2048) == 0.0

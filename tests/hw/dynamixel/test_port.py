@@ -1,0 +1,91 @@
+import dynamixel_sdk as sdk
+import pytest
+
+from gripper_force.errors import ConfigError, DeviceError, DeviceLostError, DeviceNotFoundError
+from gripper_hw.dynamixel.packets import Instruction, frame
+from gripper_hw.dynamixel.port import SerialPort, open_port
+
+PACKETS = sdk.PacketHandler(2.0)
+PING = frame(1, Instruction.PING)
+
+
+@pytest.mark.parametrize(
+    ("name", "advice"),
+    [("/dev/ttyNotThere", "plug the adapter in"), ("virtual:nobody", "simulate one first")],
+)
+def test_a_missing_port_says_what_to_do(name, advice):
+    with pytest.raises(DeviceNotFoundError, match=advice):
+        open_port(name, 1_000_000, 4.0)
+
+
+def test_a_file_that_is_no_line_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DeviceError, match="can't open"):
+        open_port(str(tmp_path / "file"), 1_000_000, 4.0)
+
+
+def test_an_odd_baud_rate_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="baud_rate 12345"):
+        open_port(str(tmp_path), 12_345, 4.0)
+
+
+def test_a_port_is_exclusive_until_closed(line):
+    port = open_port(line.port, 1_000_000, 4.0)
+    with pytest.raises(DeviceError, match="in use"):
+        open_port(line.port, 1_000_000, 4.0)
+    port.closePort()
+    port.closePort()
+    open_port(line.port, 1_000_000, 4.0).closePort()
+
+
+def test_a_pulled_plug_is_told_each_time_and_leaves_no_port_busy(line):
+    port = open_port(line.port, 1_000_000, 4.0)
+    assert PACKETS.ping(port, 1)[1] == sdk.COMM_SUCCESS
+    line.unplug()
+    for _ in range(2):
+        with pytest.raises(DeviceLostError, match="gone"):
+            PACKETS.ping(port, 1)
+        assert not port.is_using
+    port.closePort()
+
+
+def test_a_closed_port_is_lost(line):
+    port = open_port(line.port, 1_000_000, 4.0)
+    port.closePort()
+    with pytest.raises(DeviceLostError):
+        PACKETS.ping(port, 1)
+
+
+def test_what_was_received_before_is_not_the_next_answer(line):
+    port = open_port(line.port, 1_000_000, 30.0)
+    port.writePort(PING)
+    port.drain()
+    port.setPacketTimeoutMillis(1.0)
+    assert port.readPort(100) == b""
+    port.closePort()
+
+
+def test_the_sdk_may_ask_for_less_than_nothing(line):
+    port = open_port(line.port, 1_000_000, 30.0)
+    port.writePort(PING)
+    assert port.readPort(-1) == b""
+    port.closePort()
+
+
+def test_an_answer_may_come_in_pieces(line):
+    port = open_port(line.port, 1_000_000, 100.0)
+    port.writePort(PING)
+    port.setPacketTimeout(14)
+    found = b""
+    while len(found) < 14:
+        found += port.readPort(5)
+    assert found[7] == 0x55
+    assert port.readPort(0) == b""
+    port.closePort()
+
+
+def test_the_time_for_an_answer_counts_the_wire_and_the_margin():
+    port = SerialPort("nowhere", reply_margin_ms=4.0)
+    port.tx_time_per_byte = 0.01
+    port.setPacketTimeout(100)
+    assert port.packet_timeout == pytest.approx(5.0)

@@ -1,0 +1,568 @@
+import itertools
+import math
+import struct
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gripper_force.config import ServoConfig
+from gripper_force.errors import (
+    ConfigError,
+    DeviceError,
+    DeviceLostError,
+    DeviceNotFoundError,
+    DeviceTimeoutError,
+    HardwareFaultError,
+    NonFiniteError,
+)
+from gripper_force.interfaces import Servo
+from gripper_force.types import ServoCommand
+from gripper_hw.dynamixel import control_table
+from gripper_hw.dynamixel.control_table import (
+    REGISTERS,
+    VELOCITY_UNIT_RAD_S,
+    load_model,
+    rad_from_ticks,
+    ticks_from_rad,
+)
+from gripper_hw.dynamixel.firmware import OVERHEATING_ERROR, OVERLOAD_ERROR, REBOOT_NS
+from gripper_hw.dynamixel.packets import BROADCAST_ID, Instruction, Packet, frame, status
+from gripper_hw.dynamixel.servo import DynamixelBus, DynamixelServo
+from gripper_hw.dynamixel.virtual import VirtualBus, VirtualServo, register_bus, unregister_bus
+
+MODEL = load_model("XM430-W350")
+MS = 1_000_000
+
+
+def drive(line, **config) -> DynamixelServo:
+    return DynamixelServo(line.config(**config), lambda: line.now_ns)
+
+
+def write_packet(name: str, value: int, id_: int = 1) -> Packet:
+    register = REGISTERS[name]
+    return Packet(id_, Instruction.WRITE, register.address.to_bytes(2, "little") + register.encode(value))
+
+
+def command(position_rad: float = 0.0, current_a: float = 0.1) -> ServoCommand:
+    return ServoCommand(0, position_rad, current_a)
+
+
+@pytest.fixture
+def started(line):
+    """A line and the servo that was started on it."""
+    servo = drive(line)
+    servo.start()
+    yield line, servo
+    servo.close()
+
+
+# Start.
+
+
+def test_start_sets_the_servo_up(line):
+    servo: Servo = drive(line, current_limit_a=1.0, bus_watchdog_ms=41)
+    firmware = line.bus.servos[0]
+    firmware.control(0, 1.0, 0.0)
+    state = servo.start()
+    assert state.position_rad == pytest.approx(1.0, abs=1e-3)
+    expected = {
+        "return_delay_time": 0,
+        "operating_mode": 5,
+        "current_limit": math.floor(1.0 / MODEL.current_unit_a),
+        "status_return_level": 2,
+        "bus_watchdog": 3,
+        "torque_enable": 1,
+        "goal_current": 0,
+        "goal_position": ticks_from_rad(1.0),
+    }
+    assert {name: firmware.get(name) for name in expected} == expected
+    assert servo.nm_per_a == MODEL.nm_per_a
+    servo.close()
+
+
+def test_start_writes_the_present_position_as_goal_before_torque_comes_on(line):
+    firmware = line.bus.servos[0]
+    firmware.control(0, -0.7, 0.0)
+    servo = drive(line)
+    servo.start()
+    servo.close()
+    writes = [packet for packet in line.packets() if packet.instruction == Instruction.WRITE]
+    goal = writes.index(write_packet("goal_position", ticks_from_rad(-0.7)))
+    watchdog = writes.index(write_packet("bus_watchdog", 2))
+    torque_off, torque_on = (writes.index(write_packet("torque_enable", value)) for value in (0, 1))
+    mode = writes.index(write_packet("operating_mode", 5))
+    assert torque_off == 0
+    assert torque_off < mode < goal < watchdog < torque_on == len(writes) - 1
+
+
+def test_start_reads_back_all_it_writes(memory_line):
+    drive(memory_line).start()
+    packets = memory_line.packets()
+    for write, read in itertools.pairwise(packets):
+        if write.instruction == Instruction.WRITE:
+            size = (len(write.params) - 2).to_bytes(2, "little")
+            assert read == Packet(1, Instruction.READ, write.params[:2] + size)
+
+
+def test_a_second_start_leaves_the_eeprom_alone(started):
+    line, servo = started
+    servo.stop(hold=False)
+    servo.close()
+    line.heard.clear()
+    servo.start()
+    writes = [packet for packet in line.packets() if packet.instruction == Instruction.WRITE]
+    assert all(int.from_bytes(packet.params[:2], "little") >= 64 for packet in writes)
+
+
+def test_a_tripped_watchdog_is_cleared_only_once_torque_is_off(memory_line):
+    firmware = memory_line.bus.servos[0]
+    firmware.set("torque_enable", 1)
+    firmware.set("bus_watchdog", -1)
+    drive(memory_line).start()
+    writes = [packet for packet in memory_line.packets() if packet.instruction == Instruction.WRITE]
+    assert writes[:2] == [write_packet("torque_enable", 0), write_packet("bus_watchdog", 0)]
+
+
+def test_nobody_at_that_id(line):
+    with pytest.raises(DeviceNotFoundError, match=r"id 9 .*does not answer"):
+        drive(line, id=9, reply_margin_ms=2.0).start()
+    drive(line).start()  # the port was let go of
+
+
+def test_another_model_is_left_alone(make_memory_line):
+    line = make_memory_line(VirtualServo(1, load_model("XM430-W210")))
+    with pytest.raises(ConfigError, match="XM430-W210"):
+        drive(line).start()
+    assert all(packet.instruction != Instruction.WRITE for packet in line.packets())
+
+
+def test_a_servo_without_current_control_is_refused_when_found(memory_line):
+    memory_line.bus.servos[0].set("model_number", 1060)
+    with pytest.raises(ConfigError, match=r"XL430-W250.*Present Load"):
+        drive(memory_line).start()
+
+
+@pytest.mark.parametrize("model", ["XL430-W250", "AX-12"])
+def test_a_model_that_will_not_do_is_refused_before_any_port_is_opened(model):
+    with pytest.raises(ConfigError, match=model):
+        DynamixelServo(ServoConfig(port="virtual:nobody", model=model))
+
+
+def test_more_current_than_the_model_allows_is_refused():
+    with pytest.raises(ConfigError, match=r"current_limit_a is 1.2.*0.91"):
+        DynamixelServo(ServoConfig(port="virtual:nobody", model="XC330-T288"))
+
+
+def test_old_firmware_is_refused(make_memory_line):
+    line = make_memory_line(VirtualServo(1, MODEL, firmware=44))
+    with pytest.raises(DeviceError, match=r"firmware 44.*update it to 45"):
+        drive(line).start()
+
+
+def test_a_hardware_error_refuses_start_and_leaves_torque_off(memory_line):
+    firmware = memory_line.bus.servos[0]
+    firmware.set("shutdown", 0)
+    firmware.set("torque_enable", 1)
+    firmware.raise_hardware_error(OVERLOAD_ERROR | OVERHEATING_ERROR)
+    with pytest.raises(HardwareFaultError, match="overheating and overload"):
+        drive(memory_line).start()
+    assert firmware.get("torque_enable") == 0
+
+
+def test_a_start_that_fails_late_turns_torque_off(memory_line):
+    firmware = memory_line.bus.servos[0]
+
+    def lose_the_last_read(answer):
+        return None if firmware.get("torque_enable") and answer[4] == BROADCAST_ID else answer
+
+    memory_line.bus.tamper = lose_the_last_read
+    with pytest.raises(DeviceTimeoutError):
+        drive(memory_line).start()
+    assert firmware.get("torque_enable") == 0
+
+
+def test_a_register_that_does_not_keep_its_value_is_told(memory_line):
+    firmware = memory_line.bus.servos[0]
+    real = firmware.write
+
+    def forgetful(address, data):
+        return (
+            real(address, b"\x03") if address == REGISTERS["operating_mode"].address else real(address, data)
+        )
+
+    firmware.write = forgetful
+    with pytest.raises(DeviceError, match="did not keep operating_mode = 5"):
+        drive(memory_line).start()
+
+
+@pytest.mark.parametrize(
+    ("model", "firmware", "data"),
+    [("XM430-W350", 52, 224), ("XL330-M288", 51, 224), ("XL330-M288", 52, 208), ("XC330-T288", 52, 208)],
+)
+def test_the_cycle_uses_the_models_indirect_data(make_memory_line, model, firmware, data):
+    line = make_memory_line(VirtualServo(1, load_model(model), firmware))
+    servo = drive(line, model=model, current_limit_a=0.9)
+    servo.start()
+    line.heard.clear()
+    servo.read()
+    servo.write(command())
+    read, write = line.packets()
+    assert (read.instruction, write.instruction) == (Instruction.FAST_SYNC_READ, Instruction.SYNC_WRITE)
+    assert (read.params[:4], read.params[4:]) == (struct.pack("<HH", data, 13), b"\x01")
+    assert write.params[:4] == struct.pack("<HH", data + 13, 6)
+    assert servo.firmware == firmware
+
+
+# The cycle.
+
+
+def test_read_gives_signed_si_units(started):
+    line, servo = started
+    firmware = line.bus.servos[0]
+    firmware.sense(temperature_c=41.0)
+    firmware.control(0, -2.0, -1.5, current_noise_a=-0.25)
+    line.now_ns = 7 * MS
+    state = servo.read()
+    assert state.t_ns == 7 * MS
+    assert state.position_rad == pytest.approx(-2.0, abs=1e-3)
+    assert state.velocity_rad_s == pytest.approx(-1.5, abs=VELOCITY_UNIT_RAD_S)
+    assert state.current_a == pytest.approx(-0.25, abs=MODEL.current_unit_a)
+    assert (state.temperature_c, state.hardware_error) == (41.0, 0)
+
+
+def test_data_that_looks_like_a_header_is_read_right(started):
+    """The SDK's removeStuffing misreads such data; fast sync read is not stuffed."""
+    line, servo = started
+    current, velocity, ticks = struct.unpack("<hii", bytes.fromhex("fffffd00aafffdfd0102"))
+    line.bus.servos[0].control(
+        0, rad_from_ticks(ticks), velocity * VELOCITY_UNIT_RAD_S, current * MODEL.current_unit_a
+    )
+    state = servo.read()
+    assert state.current_a == pytest.approx(current * MODEL.current_unit_a)
+    assert state.velocity_rad_s == pytest.approx(velocity * VELOCITY_UNIT_RAD_S)
+    assert state.position_rad == rad_from_ticks(ticks)
+
+
+def test_write_sets_both_goals_in_one_packet(started):
+    line, servo = started
+    line.heard.clear()
+    servo.write(command(0.5, 0.269))
+    servo.read()  # so that the write has been carried out
+    assert [packet.instruction for packet in line.packets()] == [
+        Instruction.SYNC_WRITE,
+        Instruction.FAST_SYNC_READ,
+    ]
+    firmware = line.bus.servos[0]
+    assert (firmware.get("goal_current"), firmware.get("goal_position")) == (100, ticks_from_rad(0.5))
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.floats(allow_nan=False, allow_infinity=False), st.floats(allow_nan=False, allow_infinity=False))
+def test_goals_stay_within_current_limit_and_travel(position_rad, current_a):
+    bus = VirtualBus([VirtualServo(1, MODEL)], lambda: 0)
+    register_bus("goals", bus)
+    servo = DynamixelServo(ServoConfig(port="virtual:goals", current_limit_a=0.5), lambda: 0)
+    servo.start()
+    servo.write(command(position_rad, current_a))
+    firmware = bus.servos[0]
+    expected_a = max(0.0, min(0.5, current_a))
+    assert firmware.get("goal_current") * MODEL.current_unit_a == pytest.approx(expected_a, abs=0.0028)
+    assert firmware.get("goal_current") * MODEL.current_unit_a <= 0.5
+    turns = max(-255.0, min(255.0, position_rad / (2 * math.pi)))
+    expected = 2048 + turns * 4096
+    assert firmware.get("goal_position") == pytest.approx(expected, abs=0.51)
+    servo.close()
+    unregister_bus("goals")
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_a_goal_that_is_no_number_is_refused_and_nothing_sent(started, bad):
+    line, servo = started
+    line.heard.clear()
+    for goals in (command(bad, 0.1), command(0.1, bad)):
+        with pytest.raises(NonFiniteError, match="nothing was sent"):
+            servo.write(goals)
+    assert line.heard == []
+
+
+def test_two_servos_are_read_and_written_together(make_line):
+    line = make_line(VirtualServo(1, MODEL), VirtualServo(2, MODEL))
+    bus = DynamixelBus(line.config(), (2, 1), lambda: line.now_ns)
+    bus.start()
+    for servo, position_rad in zip(line.bus.servos, (0.25, -0.25), strict=True):
+        servo.control(0, position_rad, 0.0)
+    line.heard.clear()
+    bus.write((command(0.2, 0.2), command(0.1, 0.1)))
+    second, first = bus.read()
+    assert (round(first.position_rad, 2), round(second.position_rad, 2)) == (0.25, -0.25)
+    assert len(line.packets()) == 2
+    assert [servo.get("goal_position") for servo in line.bus.servos] == [
+        ticks_from_rad(0.1),
+        ticks_from_rad(0.2),
+    ]
+    bus.stop(hold=False)
+    assert [servo.get("torque_enable") for servo in line.bus.servos] == [0, 0]
+    bus.close()
+
+
+def test_servos_whose_firmware_differs_in_indirect_data_are_refused(make_memory_line):
+    model = load_model("XL330-M288")
+    line = make_memory_line(VirtualServo(1, model, 51), VirtualServo(2, model, 52))
+    with pytest.raises(DeviceError, match=r"\(51, 52\).*same version"):
+        DynamixelBus(line.config(model="XL330-M288"), (1, 2)).start()
+
+
+def test_a_hardware_error_travels_in_the_state(started):
+    line, servo = started
+    line.bus.servos[0].raise_hardware_error(OVERLOAD_ERROR)
+    assert servo.read().hardware_error == OVERLOAD_ERROR
+
+
+def test_a_tripped_watchdog_is_told_and_not_cleared(started):
+    line, servo = started
+    line.now_ns += 41 * MS
+    for _ in range(2):
+        with pytest.raises(HardwareFaultError, match="watchdog tripped"):
+            servo.read()
+    assert line.bus.servos[0].get("bus_watchdog") == -1
+
+
+def test_reading_in_time_keeps_the_watchdog_quiet(started):
+    line, servo = started
+    for _ in range(10):
+        line.now_ns += 40 * MS
+        servo.read()
+    assert servo.stats.cycles == 12  # two of them in start
+
+
+def test_a_servo_that_restarted_is_told(started):
+    line, servo = started
+    line.bus.servos[0].reboot(line.now_ns)
+    line.now_ns += REBOOT_NS
+    with pytest.raises(HardwareFaultError, match="restarted and forgot"):
+        servo.read()
+
+
+# Stop.
+
+
+def test_stop_turns_torque_off_on_the_wire(started):
+    line, servo = started
+    line.heard.clear()
+    servo.stop(hold=False)
+    assert line.packets()[0] == write_packet("torque_enable", 0)
+    assert line.packets()[1].instruction == Instruction.READ
+    assert line.bus.servos[0].get("torque_enable") == 0
+
+
+def test_stop_with_hold_keeps_the_goals_and_disarms_the_watchdog(started):
+    line, servo = started
+    servo.write(command(0.5, 0.3))
+    line.heard.clear()
+    servo.stop(hold=True)
+    line.now_ns += 10_000 * MS
+    assert servo.read().hardware_error == 0
+    firmware = line.bus.servos[0]
+    assert (firmware.get("torque_enable"), firmware.get("bus_watchdog")) == (1, 0)
+    assert firmware.get("goal_position") == ticks_from_rad(0.5)
+    assert write_packet("torque_enable", 0) not in line.packets()
+
+
+def test_hold_after_a_trip_does_not_set_the_motor_going_again(started):
+    line, servo = started
+    servo.write(command(0.5, 0.3))
+    servo.read()
+    line.now_ns += 41 * MS
+    with pytest.raises(HardwareFaultError, match="can't hold"):
+        servo.stop(hold=True)
+    firmware = line.bus.servos[0]
+    assert (firmware.get("torque_enable"), firmware.get("bus_watchdog")) == (0, 0)
+    torque, watchdog = (
+        line.packets().index(write_packet(name, 0), 10) for name in ("torque_enable", "bus_watchdog")
+    )
+    assert torque < watchdog
+
+
+def test_stop_goes_on_through_lost_answers(memory_line):
+    servo = drive(memory_line, retries=0)
+    servo.start()
+    lost = iter(range(4))
+    memory_line.bus.tamper = lambda answer: answer if next(lost, None) is None else None
+    servo.stop(hold=False)
+    assert servo.stats.timeouts == 4
+    assert memory_line.bus.servos[0].get("torque_enable") == 0
+
+
+def test_stop_sends_torque_off_even_if_no_answer_ever_comes(memory_line):
+    servo = drive(memory_line)
+    servo.start()
+    memory_line.bus.tamper = lambda answer: None
+    memory_line.heard.clear()
+    with pytest.raises(DeviceTimeoutError):
+        servo.stop(hold=False)
+    assert memory_line.packets().count(write_packet("torque_enable", 0)) == 15
+    assert memory_line.bus.servos[0].get("torque_enable") == 0
+
+
+def test_stop_tries_every_servo(make_memory_line):
+    line = make_memory_line(VirtualServo(1, MODEL), VirtualServo(2, MODEL))
+    bus = DynamixelBus(line.config(), (1, 2), lambda: line.now_ns)
+    bus.start()
+    line.bus.servos[0].silent_until_ns = 10**12
+    with pytest.raises(DeviceTimeoutError, match="servo 1"):
+        bus.stop(hold=False)
+    assert [servo.get("torque_enable") for servo in line.bus.servos] == [1, 0]
+
+
+def test_what_is_not_started_says_so_rather_than_pretend(memory_line):
+    servo = drive(memory_line)
+    assert servo.firmware is None
+    for call in (servo.read, lambda: servo.write(command()), lambda: servo.stop(hold=False)):
+        with pytest.raises(DeviceError, match="not open"):
+            call()
+    servo.close()
+
+
+# Faults on the wire.
+
+
+def _first(count, damage):
+    """Damages the first answers and lets the others pass."""
+    left = iter(range(count))
+    return lambda answer: answer if next(left, None) is None else damage(answer)
+
+
+DAMAGES = {
+    "silence": lambda answer: None,
+    "truncated": lambda answer: answer[:-3],
+    "corrupt": lambda answer: answer[:-1] + bytes((answer[-1] ^ 0x5A,)),
+    "short, yet sound": lambda answer: frame(BROADCAST_ID, 0x55, b"\x00"),
+    "of another size": lambda answer: frame(BROADCAST_ID, 0x55, b"\x00\x01" + bytes(4)),
+    "of nobody": lambda answer: frame(BROADCAST_ID, 0x55, b"\x00\x07" + bytes(15)),
+    "of another servo": lambda answer: status(7, 0, bytes(15)),
+    "noise": lambda answer: b"\xff\xff\xfd\x00\x01\x00\x00" + bytes(20),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_damaged_answer_is_retried_and_counted(make_line, damage, count):
+    line = make_line()
+    servo = drive(line, reply_margin_ms=5.0)
+    servo.start()
+    line.bus.servos[0].control(0, 0.5, 0.0)
+    before = servo.stats.retries
+    line.bus.tamper = _first(count, DAMAGES[damage])
+    assert servo.read().position_rad == pytest.approx(0.5, abs=1e-3)
+    assert servo.stats.retries - before == count
+    assert servo.stats.timeouts + servo.stats.corrupt == servo.stats.retries
+    servo.close()
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damage_without_end_is_a_timeout(make_line, damage):
+    line = make_line()
+    servo = drive(line, reply_margin_ms=3.0)
+    servo.start()
+    line.bus.tamper = DAMAGES[damage]
+    line.heard.clear()
+    with pytest.raises(DeviceTimeoutError, match="after 3 tries"):
+        servo.read()
+    assert len(line.packets()) == 3
+    line.bus.tamper = None
+    servo.read()  # it comes back by itself
+    servo.close()
+
+
+def test_noise_before_an_answer_is_skipped(started):
+    line, servo = started
+    line.bus.tamper = lambda answer: b"\x00\xff\xff\x12" + answer
+    servo.read()
+    assert servo.stats.retries == 0
+
+
+def test_an_instruction_damaged_on_its_way_is_retried(memory_line):
+    memory_line.bus.tamper = _first(1, lambda answer: status(1, 3))
+    servo = drive(memory_line)
+    servo.start()
+    assert (servo.stats.retries, servo.stats.corrupt) == (1, 1)
+    memory_line.bus.tamper = _first(1, lambda answer: status(1, 3))
+    servo.stop(hold=False)
+    assert (servo.stats.retries, servo.stats.corrupt) == (2, 2)
+
+
+def test_a_late_answer_is_not_taken_for_the_next(make_line):
+    """The late answer of one read arrives before the retry: were it taken, the old position would be."""
+    line = make_line()
+    servo = drive(line, reply_margin_ms=5.0)
+    servo.start()
+    firmware = line.bus.servos[0]
+    late = []
+
+    def hold_back(answer):
+        if not late:
+            late.append(answer)
+            firmware.control(0, 1.0, 0.0)  # the world moves on
+            return None
+        return answer
+
+    port = servo._bus._port
+    drain = port.drain
+    before_drain = []
+
+    def deliver_then_drain():
+        before_drain.append(1)
+        _deliver(line, port, late[0])
+        drain()
+
+    port.drain = deliver_then_drain
+    line.bus.tamper = hold_back
+    assert servo.read().position_rad == pytest.approx(1.0, abs=1e-3)
+    assert before_drain == [1]
+    servo.close()
+
+
+def _deliver(line, port, answer):
+    """Puts bytes on the line without being asked."""
+    tamper, line.bus.tamper = line.bus.tamper, lambda _: answer
+    port.writePort(frame(1, Instruction.PING))
+    if line.port.startswith("/"):
+        while not port.ser.in_waiting:
+            pass
+    line.bus.tamper = tamper
+
+
+def test_a_pulled_plug_is_told_at_once(started):
+    line, servo = started
+    line.unplug()
+    for call in (servo.read, lambda: servo.write(command()), lambda: servo.stop(hold=False), servo.read):
+        with pytest.raises(DeviceLostError, match="gone"):
+            call()
+    assert servo.stats.timeouts == 0
+    servo.close()
+    servo.close()
+
+
+def test_a_servo_that_refuses_says_what(started):
+    line, servo = started
+    line.bus.servos[0].set("bus_watchdog", -1)
+    with pytest.raises(DeviceError, match="data range error"):
+        servo._bus._set(1, "goal_current", 1)
+
+
+def test_the_port_is_free_after_close(line):
+    first, second = drive(line), drive(line)
+    first.start()
+    with pytest.raises(DeviceError, match="in use"):
+        second.start()
+    first.close()
+    second.start()
+    second.close()
+
+
+def test_registers_of_the_cycle_exist_in_every_model():
+    for name in control_table.model_names():
+        model = load_model(name)
+        assert model.indirect_windows(model.min_firmware)[0].length >= 19
+        assert model.indirect_windows(99)[0].length >= 19
