@@ -119,9 +119,14 @@ class Run:
     latency_ms: Floats
 
     @property
+    def object(self) -> str:
+        """What was grasped, in words."""
+        return self.config.object.replace("_", " ").capitalize()
+
+    @property
     def title(self) -> str:
         """What was grasped, how hard, and what came of it."""
-        parts = [self.config.object.replace("_", " ")]
+        parts = [self.object]
         if self.target_n is not None:
             parts.append(f"target {self.target_n:g} N")
         if self.outcome:

@@ -5,7 +5,7 @@ from typing import Any, Final
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 
 from gripper_force.report.data import SOURCES, Floats, Run, bins
 from gripper_force.report.pictures import Picture
@@ -32,19 +32,19 @@ _BANDS: Final = ("#eef1f5", "#f8f9fb")
 
 def draw(run: Run, pictures: list[Picture]) -> Figure:
     """Force, error, latency and frames, one above the other; what the log lacks is left out."""
-    rows = [("force", 3.2)]
-    rows += [("error", 1.7)] if run.errors else []
-    rows += [("latency", 1.5)] if len(run.latency_ms) else []
-    rows += [("frames", 1.9)] if pictures else []
+    heights_in = {
+        "curves": 4.9 if run.errors else 3.2,
+        "latency": 1.6 if len(run.latency_ms) else 0.0,
+        "frames": 1.9 if pictures else 0.0,
+    }
+    heights_in = {name: height for name, height in heights_in.items() if height}
     with rc_context(_STYLE):
-        figure = Figure(figsize=(10, 0.6 + sum(height for _, height in rows)), layout="constrained")
-        figure.suptitle(run.title, x=0.01, ha="left", fontsize=13, fontweight="bold")
-        parts = figure.subfigures(len(rows), height_ratios=[height for _, height in rows], squeeze=False)
-        for (name, _), part in zip(rows, parts[:, 0], strict=True):
-            if name == "force":
-                _force(part.subplots(), run)
-            elif name == "error":
-                _error(part.subplots(), run)
+        figure = Figure(figsize=(10, 0.5 + sum(heights_in.values())), layout="constrained")
+        figure.suptitle(run.title, x=0.008, ha="left", fontsize=13, fontweight="bold")
+        parts = figure.subfigures(len(heights_in), height_ratios=list(heights_in.values()), squeeze=False)
+        for name, part in zip(heights_in, parts[:, 0], strict=True):
+            if name == "curves":
+                _curves(part, run)
             elif name == "latency":
                 left, right = part.subplots(1, 2)
                 _histogram(left, run.compute_ms, "estimator, ms per frame", SOURCES["vision"].light)
@@ -53,6 +53,17 @@ def draw(run: Run, pictures: list[Picture]) -> Figure:
                 for axes, picture in zip(part.subplots(1, len(pictures)), pictures, strict=True):
                     _frame(axes, picture)
     return figure
+
+
+def _curves(part: SubFigure, run: Run) -> None:
+    if run.errors:
+        force, error = part.subplots(2, sharex=True, height_ratios=(2, 1))
+        _error(error, run)
+    else:
+        force = error = part.subplots()
+    _force(force, run)
+    error.set_xlabel("time, s")
+    part.align_ylabels()
 
 
 def _bands(axes: Axes, run: Run, *, named: bool) -> None:
@@ -86,9 +97,8 @@ def _force(axes: Axes, run: Run) -> None:
     axes.set_ylim(low, high + 0.08 * (high - low))
     axes.set_ylabel("grip force, N")
     axes.set_title("Force")
-    axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=5, borderaxespad=0.2)
-    if not run.errors:
-        axes.set_xlabel("time, s")
+    if axes.get_lines():
+        axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=5, borderaxespad=0.2)
 
 
 def _error(axes: Axes, run: Run) -> None:
@@ -97,8 +107,7 @@ def _error(axes: Axes, run: Run) -> None:
     for source, series in run.errors.items():
         axes.plot(series.t_s, series.value_n, color=SOURCES[source].light, lw=1.0)
     axes.set_title("Error against the load cell")
-    axes.set_ylabel("N")
-    axes.set_xlabel("time, s")
+    axes.set_ylabel("error, N")
 
 
 def _histogram(axes: Axes, values_ms: Floats, name: str, colour: str) -> None:

@@ -20,8 +20,6 @@ from gripper_force.report.pictures import Picture
 _POINTS: Final = 2000
 """Points a curve is drawn with at most; more can't be seen."""
 _LINES: Final = 300
-_NAMED_BAND: Final = 0.06
-"""Share of the width a phase needs for its name to be written in."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +65,7 @@ def _palette(ground: str) -> str:
 
 def _headline(run: Run) -> str:
     badge = f'<span class="badge {escape(run.outcome)}">{escape(run.outcome.replace("_", " "))}</span>'
-    heading = f"<h1>{escape(run.config.object.replace('_', ' '))} {badge if run.outcome else ''}</h1>"
+    heading = f"<h1>{escape(run.object)} {badge if run.outcome else ''}</h1>"
     shown = "".join(
         f'<div class="card"><div class="what">{what}</div>'
         f'<div class="value">{value}<small> {unit}</small></div></div>'
@@ -176,9 +174,10 @@ def _events(run: Run) -> str:
 
 
 def _facts(run: Run) -> str:
-    return "".join(
+    rows = "".join(
         f"<tr><td>{escape(key)}</td><td>{escape(value)}</td></tr>" for key, value in run.metadata.items()
     )
+    return f"<details><summary>Versions and facts</summary><table>{rows}</table></details>" if rows else ""
 
 
 def _axes(run: Run, values: Floats, headroom: float = 0.0) -> _Axes:
@@ -191,7 +190,7 @@ def _chart(
     axes: _Axes, drawn: str, size: str, y_name: str, *, x_name: str = "s", bands: str = "", data: str = ""
 ) -> str:
     """A box of 100 by 100 that stretches to its place; words are HTML over it, so they keep their size."""
-    y_ticks, x_ticks = _ticks(axes.y, 5), _ticks(axes.x, 6)
+    y_ticks, x_ticks = _ticks(axes.y, 6), _ticks(axes.x, 8)
     grid = "".join(f"M0 {axes.top(y):.2f}H100" for y in y_ticks)
     words = "".join(f'<i class="y" style="top:{axes.top(y):.2f}%">{y:g}</i>' for y in y_ticks)
     words += "".join(f'<i class="x" style="left:{axes.left(x):.2f}%">{x:g}</i>' for x in x_ticks)
@@ -205,7 +204,11 @@ def _chart(
 
 
 def _ticks(limits: tuple[float, float], count: int) -> list[float]:
-    inside = (tick for tick in MaxNLocator(count).tick_values(*limits) if limits[0] <= tick <= limits[1])
+    inside = (
+        tick
+        for tick in MaxNLocator(count, steps=[1, 2, 5, 10]).tick_values(*limits)
+        if limits[0] <= tick <= limits[1]
+    )
     return [round(float(tick), 9) for tick in inside]
 
 
@@ -213,7 +216,7 @@ def _bands(run: Run, axes: _Axes, *, named: bool) -> str:
     bands = ""
     for i, span in enumerate(run.phases):
         left, width = axes.left(span.start_s), axes.left(span.end_s) - axes.left(span.start_s)
-        name = span.phase if named and width > 100 * _NAMED_BAND else ""
+        name = f"<span>{span.phase}</span>" if named else ""
         bands += f'<b class="band{i % 2}" style="left:{left:.2f}%;width:{width:.2f}%">{name}</b>'
     return bands
 

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 COUNT: Final = 6
 _SIDE: Final = 256
 _LEAD_S: Final = 0.3
-_OPACITY: Final = 0.6
+_OPACITY: Final = 0.5
+_TOUCHED: Final = 0.05
+"""Share of the largest force that shows where a recording without phases grips."""
 
 Colour = npt.NDArray[np.uint8]
 """An RGB image, (H, W, 3)."""
@@ -41,9 +43,9 @@ class Picture:
         """Time and forces, a line each."""
         lines = [f"{self.t_s:.2f} s"]
         if self.load_cell_n is not None:
-            lines.append(f"load cell {self.load_cell_n:.2f} N")
+            lines.append(f"load cell {_newtons(self.load_cell_n)}")
         if self.vision_n is not None:
-            lines.append(f"vision {self.vision_n:.2f} N")
+            lines.append(f"vision {_newtons(self.vision_n)}")
         return "\n".join(lines)
 
 
@@ -78,11 +80,20 @@ def _choose(times_ns: list[int], run: Run) -> set[int]:
     if not times_ns:
         return set()
     t_s = (np.array(times_ns) - run.zero_ns) / NS_PER_S
-    gripping = [span for span in run.phases if span.phase in {Phase.CONTACT, Phase.RAMP, Phase.HOLD}]
-    begin = gripping[0].start_s - _LEAD_S if gripping else t_s[0]
-    end = gripping[-1].end_s + _LEAD_S if gripping else t_s[-1]
-    nearest = [int(np.abs(t_s - t).argmin()) for t in np.linspace(begin, end, COUNT)]
-    return {times_ns[i] for i in nearest}
+    begin_s, end_s = _grip(run)
+    spread = np.linspace(max(begin_s - _LEAD_S, t_s[0]), min(end_s + _LEAD_S, t_s[-1]), COUNT)
+    return {times_ns[int(np.abs(t_s - t).argmin())] for t in spread}
+
+
+def _grip(run: Run) -> tuple[float, float]:
+    """When the grip begins and ends: by the phases, else by the load cell, else the whole log."""
+    phases = [span for span in run.phases if span.phase in {Phase.CONTACT, Phase.RAMP, Phase.HOLD}]
+    if phases:
+        return phases[0].start_s, phases[-1].end_s
+    cell = run.forces.get("load_cell")
+    if cell is not None and (touched := cell.value_n > _TOUCHED * cell.value_n.max()).any():
+        return float(cell.t_s[touched][0]), float(cell.t_s[touched][-1])
+    return run.begin_s, run.end_s
 
 
 def _estimator(run: Run) -> "tuple[ForceEstimator | None, str]":
@@ -123,3 +134,7 @@ def _at(run: Run, source: str, t_s: float) -> float | None:
     if series is None or not series.t_s[0] <= t_s <= series.t_s[-1]:
         return None
     return float(np.interp(t_s, series.t_s, series.value_n))
+
+
+def _newtons(force_n: float) -> str:
+    return f"{round(force_n, 2) + 0.0:.2f} N"  # adding 0 turns -0.0 into 0.0

@@ -173,7 +173,7 @@ def test_the_headline_tells_what_was_asked_and_what_came_of_it(page: str) -> Non
         assert what in text
         if value is not None:
             assert text[text.index(what) + 1] == value
-    assert "paper cup" in text
+    assert "Paper cup" in text
     assert "held" in text
     assert any(re.fullmatch(r"1\d\.\d / [34]\d\.\d", entry) for entry in text), "latency p50 / p99"
 
@@ -235,6 +235,18 @@ def test_frames_span_the_grip_and_carry_attention(grasp: Path) -> None:
     assert pictures[3].load_cell_n == pytest.approx(TARGET_N, abs=0.2)
 
 
+def test_frames_of_a_recording_span_its_touch(tmp_path: Path) -> None:
+    path = tmp_path / "egg.mcap"
+    with LogWriter(path, config="", metadata={}) as log:
+        for i in range(300):
+            t_ns = i * 20 * NS_PER_MS
+            log.write(Frame(t_ns, t_ns, i, picture(0.0)))
+            log.write(LoadCellSample(t_ns, 5.0 if 100 <= i < 200 else 0.01, 0.0))
+    pictures, note = take_pictures(path, read_run(path))
+    assert [round(p.t_s, 1) for p in pictures] == [1.7, 2.2, 2.7, 3.2, 3.8, 4.3]
+    assert note == ""
+
+
 def test_attention_of_another_checkpoint_is_not_shown(tmp_path: Path) -> None:
     missing = write_grasp(tmp_path / "missing.mcap")
     pictures, note = take_pictures(missing, read_run(missing))
@@ -249,7 +261,7 @@ def test_attention_of_another_checkpoint_is_not_shown(tmp_path: Path) -> None:
 def test_a_recording_without_a_run_is_reported_with_what_it_has(tmp_path: Path) -> None:
     paths = write_report(write_recording(tmp_path / "egg.mcap"))
     parsed = Page(paths.html.read_text(encoding="utf-8"))
-    assert "egg" in parsed.text
+    assert "Egg" in parsed.text
     assert "Force" in parsed.text
     for absent in ("Target", "Latency", "Error against the load cell", "Phases and events"):
         assert absent not in parsed.text
@@ -260,7 +272,7 @@ def test_a_recording_without_a_run_is_reported_with_what_it_has(tmp_path: Path) 
 def test_an_empty_log_is_reported_too(tmp_path: Path) -> None:
     path = tmp_path / "empty.mcap"
     LogWriter(path, config="", metadata={}).close()
-    assert "sponge" in Page(write_report(path).html.read_text(encoding="utf-8")).text
+    assert "Sponge" in Page(write_report(path).html.read_text(encoding="utf-8")).text
 
 
 def test_a_log_cut_short_is_reported_on_request(grasp: Path, tmp_path: Path) -> None:
