@@ -234,7 +234,8 @@ def _lines(
     before: GraspStatus | None = None
     for s in status:
         if before is None or s.phase != before.phase:
-            entries.append((s.t_ns, "phase", s.phase + (f": {s.reason}" if s.reason else "")))
+            why = f": {s.reason}" if s.reason not in {"", s.phase} else ""
+            entries.append((s.t_ns, "phase", s.phase + why))
         elif s.reason:
             entries.append((s.t_ns, "control", s.reason))
         if s.outcome and (before is None or s.outcome != before.outcome):
