@@ -117,7 +117,7 @@ class DynamixelBus:
     def start(self) -> tuple[ServoState, ...]:
         """Opens the port, sets every servo up, and turns torque on at the present position with no current.
 
-        Torque is off, or was tried to be turned off, wherever this raises.
+        Where this raises, torque is off or was tried to be turned off, unless another model answered.
 
         Raises:
             DeviceNotFoundError: The port is not there, or a servo does not answer on it.
@@ -172,8 +172,8 @@ class DynamixelBus:
         Every servo is tried, whatever happens with the others.
 
         Raises:
-            DeviceError: A servo could not be stopped. With ``hold``, also where its watchdog had already
-                tripped: then its torque is turned off.
+            DeviceError: A servo could not be stopped. With ``hold``, also where it had already stopped by
+                itself: then its torque is turned off.
         """
         action = self._hold if hold else self._torque_off
         failure: DeviceError | None = None
@@ -204,6 +204,7 @@ class DynamixelBus:
                 "check its power, servo.id and servo.baud_rate"
             ) from error
         check_model_number(self.model, number, where)
+        self._ask_for_answers(id_)
         firmware = self._get(id_, "firmware_version")
         if firmware < self.model.min_firmware:
             raise DeviceError(
@@ -211,6 +212,14 @@ class DynamixelBus:
                 f"{self.model.min_firmware} or newer with DYNAMIXEL Wizard"
             )
         return firmware
+
+    def _ask_for_answers(self, id_: int) -> None:
+        """Another program may have left the servo mute; a sync write is a write that awaits no answer."""
+        register = REGISTERS["status_return_level"]
+        self._transact(
+            f"a sync write to servo {id_}",
+            lambda: (self._packets.syncWriteTxOnly(self._port, register.address, 1, [id_, 2], 2), None),
+        )
 
     def _common_window(self) -> IndirectWindow:
         """One transaction has one address for all, so all must have their indirect data in one place."""
@@ -276,10 +285,10 @@ class DynamixelBus:
 
     def _hold(self, id_: int) -> None:
         # Disarming a watchdog that has tripped would set the motor going again.
-        if self._get(id_, "bus_watchdog") < 0:
+        if self._get(id_, "bus_watchdog") < 0 or not self._get(id_, "torque_enable"):
             self._torque_off(id_)
             raise HardwareFaultError(
-                f"servo {id_} can't hold: its bus watchdog had tripped, so its torque was turned off"
+                f"servo {id_} can't hold: it had stopped by itself, and its torque was turned off"
             )
         self._set(id_, "bus_watchdog", 0)
 

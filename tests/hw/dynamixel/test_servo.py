@@ -1,6 +1,7 @@
 import itertools
 import math
 import struct
+import time
 
 import pytest
 from hypothesis import given, settings
@@ -28,6 +29,7 @@ from gripper_hw.dynamixel.control_table import (
 )
 from gripper_hw.dynamixel.firmware import OVERHEATING_ERROR, OVERLOAD_ERROR, REBOOT_NS
 from gripper_hw.dynamixel.packets import BROADCAST_ID, Instruction, Packet, frame, status
+from gripper_hw.dynamixel.serve import PtyServer
 from gripper_hw.dynamixel.servo import DynamixelBus, DynamixelServo
 from gripper_hw.dynamixel.virtual import VirtualBus, VirtualServo, register_bus, unregister_bus
 
@@ -122,6 +124,16 @@ def test_a_tripped_watchdog_is_cleared_only_once_torque_is_off(memory_line):
     drive(memory_line).start()
     writes = [packet for packet in memory_line.packets() if packet.instruction == Instruction.WRITE]
     assert writes[:2] == [write_packet("torque_enable", 0), write_packet("bus_watchdog", 0)]
+
+
+@pytest.mark.parametrize("level", [0, 1])
+def test_a_servo_that_was_left_mute_is_started(line, level):
+    line.bus.servos[0].set("status_return_level", level)
+    servo = drive(line)
+    servo.start()
+    assert line.bus.servos[0].get("status_return_level") == 2
+    assert servo.stats.retries == 0
+    servo.close()
 
 
 def test_nobody_at_that_id(line):
@@ -384,6 +396,14 @@ def test_hold_after_a_trip_does_not_set_the_motor_going_again(started):
     assert torque < watchdog
 
 
+def test_a_servo_that_restarted_can_not_hold(memory_line):
+    servo = drive(memory_line)
+    servo.start()
+    memory_line.bus.servos[0].set("torque_enable", 0)
+    with pytest.raises(HardwareFaultError, match="can't hold"):
+        servo.stop(hold=True)
+
+
 def test_stop_goes_on_through_lost_answers(memory_line):
     servo = drive(memory_line, retries=0)
     servo.start()
@@ -449,7 +469,7 @@ DAMAGES = {
 @pytest.mark.parametrize("count", [1, 2])
 def test_a_damaged_answer_is_retried_and_counted(make_line, damage, count):
     line = make_line()
-    servo = drive(line, reply_margin_ms=5.0)
+    servo = drive(line)
     servo.start()
     line.bus.servos[0].control(0, 0.5, 0.0)
     before = servo.stats.retries
@@ -463,7 +483,7 @@ def test_a_damaged_answer_is_retried_and_counted(make_line, damage, count):
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_damage_without_end_is_a_timeout(make_line, damage):
     line = make_line()
-    servo = drive(line, reply_margin_ms=3.0)
+    servo = drive(line)
     servo.start()
     line.bus.tamper = DAMAGES[damage]
     line.heard.clear()
@@ -492,45 +512,25 @@ def test_an_instruction_damaged_on_its_way_is_retried(memory_line):
     assert (servo.stats.retries, servo.stats.corrupt) == (2, 2)
 
 
-def test_a_late_answer_is_not_taken_for_the_next(make_line):
-    """The late answer of one read arrives before the retry: were it taken, the old position would be."""
-    line = make_line()
-    servo = drive(line, reply_margin_ms=5.0)
-    servo.start()
-    firmware = line.bus.servos[0]
-    late = []
+def test_a_late_answer_is_not_taken_for_the_next():
+    """It comes after the time for it is over and before a retry without a pause would have had its own."""
+    firmware = VirtualServo(1, MODEL)
+    bus = VirtualBus([firmware], lambda: 0)
+    margin_s = 0.2
+    with PtyServer(bus) as server:
+        servo = DynamixelServo(ServoConfig(port=server.device_path, reply_margin_ms=margin_s * 1e3))
+        servo.start()
 
-    def hold_back(answer):
-        if not late:
-            late.append(answer)
+        def delay(answer):
+            bus.tamper = None
             firmware.control(0, 1.0, 0.0)  # the world moves on
-            return None
-        return answer
+            time.sleep(1.5 * margin_s)
+            return answer
 
-    port = servo._bus._port
-    drain = port.drain
-    before_drain = []
-
-    def deliver_then_drain():
-        before_drain.append(1)
-        _deliver(line, port, late[0])
-        drain()
-
-    port.drain = deliver_then_drain
-    line.bus.tamper = hold_back
-    assert servo.read().position_rad == pytest.approx(1.0, abs=1e-3)
-    assert before_drain == [1]
-    servo.close()
-
-
-def _deliver(line, port, answer):
-    """Puts bytes on the line without being asked."""
-    tamper, line.bus.tamper = line.bus.tamper, lambda _: answer
-    port.writePort(frame(1, Instruction.PING))
-    if line.port.startswith("/"):
-        while not port.ser.in_waiting:
-            pass
-    line.bus.tamper = tamper
+        bus.tamper = delay
+        assert servo.read().position_rad == pytest.approx(1.0, abs=1e-3)
+        assert (servo.stats.timeouts, servo.stats.retries) == (1, 1)
+        servo.close()
 
 
 def test_a_pulled_plug_is_told_at_once(started):

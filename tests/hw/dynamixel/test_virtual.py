@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gripper_force.errors import ConfigError
-from gripper_hw.dynamixel.control_table import REGISTERS, VELOCITY_UNIT_RAD_S, load_model, rad_from_ticks
+from gripper_hw.dynamixel.control_table import VELOCITY_UNIT_RAD_S, load_model, rad_from_ticks
 from gripper_hw.dynamixel.firmware import OVERLOAD_ERROR, REBOOT_NS
 from gripper_hw.dynamixel.packets import BROADCAST_ID, Error, Instruction, Packet, Parser, frame
 from gripper_hw.dynamixel.port import open_port
@@ -291,8 +291,3 @@ def test_names_are_looked_up_and_not_taken_twice(bus):
     unregister_bus("a")
     unregister_bus("a")
     assert find_bus("a") is None
-
-
-def test_registers_can_be_named(bus):
-    assert bus.servos[0].get("present_position") == 0  # not refreshed until it is read
-    assert bus.servos[0].read(REGISTERS["present_position"].address, 4)[1] == (2048).to_bytes(4, "little")
