@@ -27,6 +27,9 @@ from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
 from gripper_force.vision.estimator import ForceEstimator
 
 _VISION_PATIENCE_NS = 2 * NS_PER_S
+_REFERENCE_NS = NS_PER_S // 10
+"""Every run begins with frames that show no contact, so that its log can be replayed with vision."""
+
 _REALTIME_SWITCH_S = 2e-4
 _PACKAGES = ("gripper-force", "dynamixel-sdk", "mujoco", "numpy", "torch")
 
@@ -197,7 +200,7 @@ def make_estimator(config: Config, checkpoint: Checkpoint | None) -> ForceEstima
 def _grasp(session: Session, config: Config, sees: bool, progress: Progress | None) -> None:
     decision = session.cycle()
     start_ns = last_ns = decision.status.t_ns
-    while sees and not session.sees and last_ns - start_ns < _VISION_PATIENCE_NS:
+    while last_ns - start_ns < (_VISION_PATIENCE_NS if sees and not session.sees else _REFERENCE_NS):
         last_ns = session.cycle().status.t_ns
     decision = session.cycle(RequestKind.GRASP, config.target_n)
     phase = ""

@@ -1,6 +1,6 @@
 """Training data: logs of randomised touches in the simulated rig.
 
-A *press* closes, ramps to a random force, holds it or moves on to another, and opens, several times, as the
+A *press* closes, ramps to one to three random forces in turn, holds each for a while, and opens, as the
 paper's collector does (section IV-A). A *grasp* is one touch that ends as `gripper-force grasp` ends it. Both
 run the controller on motor current alone, so no network is needed to make the data that one is trained on.
 """
@@ -22,7 +22,7 @@ from gripper_force.types import NS_PER_S, Outcome, Phase, RequestKind
 Kind = Literal["press", "grasp"]
 OBJECTS = ("sponge", "paper_cup", "tube", "stapler")
 PEAK_N = 12.5
-_TOUCHES = 2
+_MAX_TARGETS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,16 +101,15 @@ def _target_n(rng: np.random.Generator) -> float:
 def _press(config: Config, path: Path, rng: np.random.Generator) -> None:
     with open_devices(config) as devices, open_session(config, devices, path, None) as session:
         _wait(session, 0.2)
-        for _ in range(_TOUCHES):
-            for _ in range(int(rng.integers(1, 4))):
-                _touch(session, _target_n(rng), config.control.timeout_s)
-                _wait(session, float(rng.uniform(0.05, 0.6)))
-            decision = session.cycle(RequestKind.RELEASE)
-            while decision.status.phase == Phase.RELEASE:
-                decision = session.cycle()
+        for _ in range(int(rng.integers(_MAX_TARGETS)) + 1):
+            _ramp(session, _target_n(rng), config.control.timeout_s)
+            _wait(session, float(rng.uniform(0.05, 0.6)))
+        decision = session.cycle(RequestKind.RELEASE)
+        while decision.status.phase == Phase.RELEASE:
+            decision = session.cycle()
 
 
-def _touch(session: Session, target_n: float, timeout_s: float) -> None:
+def _ramp(session: Session, target_n: float, timeout_s: float) -> None:
     decision = session.cycle(RequestKind.GRASP, target_n)
     end_ns = decision.status.t_ns + round(timeout_s * NS_PER_S)
     while decision.status.phase != Phase.HOLD and decision.status.t_ns < end_ns:

@@ -80,7 +80,7 @@ def _sponge(detail: Detail, size: float, stiffness: float) -> ObjectModel:
       <contact selfcollide="none" condim="3" friction=".6" {contact}/>
       <elasticity young="{young:.6g}" poisson=".2" damping=".01"/>
       <pin gridrange="0 0 0 {nodes * cells[0]} {nodes * cells[1]} 0"/></flexcomp>"""
-    return ObjectModel(body, contact, "sponge.png", 0.030, dt)
+    return ObjectModel(body, contact, "sponge.png", 0.030 * size, dt)
 
 
 def _tube(detail: Detail, size: float, stiffness: float) -> ObjectModel:
@@ -95,7 +95,7 @@ def _tube(detail: Detail, size: float, stiffness: float) -> ObjectModel:
     pins = np.flatnonzero(points[:, 2] < 0.0012 + radius * (1 - np.cos(np.deg2rad(24))))
     young = 3.0e7 * stiffness * size**2  # a ring's stiffness goes with E * thickness^3 * length / radius^3
     body = _shell(points, uv, faces, pins, young, thickness=0.0022, damping=0.004, radius=0.0012)
-    return ObjectModel(body, _SHELL_CONTACT, "tube.png", 0.022, dt)
+    return ObjectModel(body, _SHELL_CONTACT, "tube.png", 0.022 * size, dt)
 
 
 def _cup(detail: Detail, size: float, stiffness: float) -> ObjectModel:
@@ -110,7 +110,7 @@ def _cup(detail: Detail, size: float, stiffness: float) -> ObjectModel:
     pins = np.flatnonzero(points[:, 2] < 0.001)
     young = 1.5e8 * stiffness * size**2
     body = _shell(points, uv, faces, pins, young, thickness=0.0011, damping=0.003, radius=0.0008)
-    return ObjectModel(body, _SHELL_CONTACT, "cup.png", 0.060, dt)
+    return ObjectModel(body, _SHELL_CONTACT, "cup.png", 0.060 * size, dt)
 
 
 def _stapler(detail: Detail, size: float, stiffness: float) -> ObjectModel:

@@ -22,9 +22,10 @@ from gripper_hw.sim.world import World
 
 FRAME_SIDE = 128
 _OVERSAMPLED = 2
-"""A pixel gathers light over its area; else edges would move by whole pixels, and force hides between them."""
+"""A pixel gathers light over its area; else edges would move by whole pixels."""
 
-_FULL_LUX = 750.0
+_WHITE_LUX = 470.0
+"""Light at which a perfectly white surface fills the range: the locked exposure of the simulated camera."""
 _LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 _GAMMA = 2.2
 _READ_NOISE = 0.002
@@ -197,15 +198,14 @@ class SimulatedRig:
 def expose(picture: npt.NDArray[np.uint8], lux: float, shot_noise: float, rng: np.random.Generator) -> Gray:
     """Turns a rendered picture (2H, 2W, 3) into what a gray camera with locked exposure sees: (H, W) uint8.
 
-    The picture is averaged over each pixel, linearised, lit, vignetted, given photon and read noise, and encoded
-    again.
+    It is averaged over each pixel, linearised, lit, vignetted, given photon and read noise, and encoded again.
     """
     height, width = picture.shape[0] // _OVERSAMPLED, picture.shape[1] // _OVERSAMPLED
     pixels = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
     gray = pixels @ _LUMA / 255.0  # (H, W)
     y, x = np.ogrid[:height, :width]
     radius2 = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / (width * width / 4)
-    linear = gray**_GAMMA * np.float32(lux / _FULL_LUX) * (1 - _VIGNETTE * radius2).astype(np.float32)
+    linear = gray**_GAMMA * np.float32(lux / _WHITE_LUX) * (1 - _VIGNETTE * radius2).astype(np.float32)
     spread = np.sqrt(shot_noise**2 * linear + _READ_NOISE**2)
     linear += rng.standard_normal(gray.shape, dtype=np.float32) * spread
     encoded: Gray = (255 * np.clip(linear, 0, 1) ** (1 / _GAMMA)).astype(np.uint8)

@@ -15,8 +15,7 @@ LUX_LEVELS = (350.0, 550.0, 750.0)
 """The paper's three light levels."""
 
 _PAD_HALF_THICKNESS_M = 0.004
-_CAMERA_POSITION_M = np.array([0.10, -0.30, 0.16])
-_CAMERA_TARGET_M = np.array([0.0, 0.0, 0.035])
+_CAMERA_FROM_GRIP_M = np.array([0.10, -0.30, 0.125])
 
 
 @dataclass(frozen=True)
@@ -53,7 +52,7 @@ class Scene:
     yaw_deg: float = 0.0
     camera_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     camera_target_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    camera_fovy_deg: float = 21.0
+    camera_fovy_deg: float = 17.0
     lux: float = 550.0
     light_direction: tuple[float, float, float] = (-0.40, 0.55, -0.75)
     light_ambient: float = 0.30
@@ -87,7 +86,7 @@ def draw_scene(object_name: str, seed: int, config: SimConfig) -> Scene:
         yaw_deg=float(rng.uniform(-4, 4)),
         camera_offset_m=(camera[0], camera[1], camera[2]),
         camera_target_offset_m=(target[0], target[1], target[2]),
-        camera_fovy_deg=float(rng.uniform(20.2, 21.8)),
+        camera_fovy_deg=float(rng.uniform(16.4, 17.6)),
         lux=lux * float(rng.uniform(0.95, 1.05)),
         light_direction=(-0.40 + light[0], 0.55 + light[1], -0.75 + light[2]),
         light_ambient=float(rng.uniform(0.22, 0.38)),
@@ -104,7 +103,8 @@ def draw_scene(object_name: str, seed: int, config: SimConfig) -> Scene:
 def scene_mjcf(scene: Scene, gripper: GripperConfig) -> tuple[str, dict[str, bytes]]:
     """MJCF text and its assets. Raises `ConfigError` for an unknown object."""
     model = build_object(scene.object, scene.detail, scene.size, scene.stiffness)  # type: ignore[arg-type]
-    position = _CAMERA_POSITION_M + scene.camera_offset_m
+    grip = np.array([0.0, 0.0, model.grip_height_m])
+    position = grip + _CAMERA_FROM_GRIP_M + scene.camera_offset_m
     template = Template(
         resources.files(__package__).joinpath("assets/gripper.xml").read_text(encoding="utf-8")
     )
@@ -116,7 +116,7 @@ def scene_mjcf(scene: Scene, gripper: GripperConfig) -> tuple[str, dict[str, byt
         light_diffuse=_text([1.0 - scene.light_ambient] * 3),
         light_ambient=_text([scene.light_ambient] * 3),
         camera_position=_text(position),
-        camera_axes=_text(_camera_axes(position, _CAMERA_TARGET_M + scene.camera_target_offset_m)),
+        camera_axes=_text(_camera_axes(position, grip + scene.camera_target_offset_m)),
         camera_fovy=scene.camera_fovy_deg,
         object_position=_text([*scene.offset_m, 0.0]),
         object_yaw=scene.yaw_deg,
