@@ -334,6 +334,16 @@ def test_position_gains_act():
     )
 
 
+def test_the_integral_starts_anew_with_torque():
+    servo = make(POSITION_MODE, goal_position=2058, position_i_gain=10_000)
+    fresh_a = settle(servo)
+    settle(servo, start_ns=60 * MS)
+    servo.set("torque_enable", 0)
+    servo.control(120 * MS, 0.0, 0.0)
+    servo.set("torque_enable", 1)
+    assert settle(servo, start_ns=120 * MS) == pytest.approx(fresh_a, rel=1e-3)
+
+
 def test_velocity_mode_rests_at_its_goal():
     servo = make(VELOCITY_MODE, goal_velocity=100)
     assert settle(servo, velocity_rad_s=100 * VELOCITY_UNIT_RAD_S) == pytest.approx(0.0, abs=1e-9)

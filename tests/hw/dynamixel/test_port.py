@@ -1,9 +1,13 @@
+import os
+import pty
+import tty
+
 import dynamixel_sdk as sdk
 import pytest
 
 from gripper_force.errors import ConfigError, DeviceError, DeviceLostError, DeviceNotFoundError
 from gripper_hw.dynamixel.packets import Instruction, frame
-from gripper_hw.dynamixel.port import SerialPort, open_port
+from gripper_hw.dynamixel.port import open_port
 
 PACKETS = sdk.PacketHandler(2.0)
 PING = frame(1, Instruction.PING)
@@ -68,7 +72,10 @@ def test_what_was_received_before_is_not_the_next_answer(line):
 def test_the_sdk_may_ask_for_less_than_nothing(line):
     port = open_port(line.port, 1_000_000, 50.0)
     port.writePort(PING)
+    port.setPacketTimeoutMillis(1000.0)
+    assert port.readPort(1) == b"\xff"
     assert port.readPort(-1) == b""
+    assert port.readPort(1) == b"\xff"
     port.closePort()
 
 
@@ -84,8 +91,26 @@ def test_an_answer_may_come_in_pieces(line):
     port.closePort()
 
 
-def test_the_time_for_an_answer_counts_the_wire_and_the_margin():
-    port = SerialPort("nowhere", reply_margin_ms=4.0)
-    port.tx_time_per_byte = 0.01
-    port.setPacketTimeout(100)
-    assert port.packet_timeout == pytest.approx(5.0)
+@pytest.fixture
+def deaf_line():
+    """A port whose other end reads nothing."""
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    port = open_port(os.ttyname(slave), 57_600, 4.0)
+    yield port
+    port.closePort()
+    os.close(master)
+    os.close(slave)
+
+
+def test_the_time_for_an_answer_counts_both_packets_and_the_margin(deaf_line):
+    deaf_line.writePort(PING)
+    deaf_line.setPacketTimeout(100)
+    assert deaf_line.packet_timeout == pytest.approx(110 * 10_000 / 57_600 + 4.0)
+
+
+def test_a_line_that_takes_no_more_is_not_lost(deaf_line):
+    while deaf_line.writePort(bytes(1000)):
+        pass
+    assert PACKETS.ping(deaf_line, 1)[1] == sdk.COMM_TX_FAIL
+    assert not deaf_line.is_using

@@ -8,6 +8,7 @@ import pytest
 from gripper_force.errors import ConfigError
 from gripper_hw.dynamixel.control_table import load_model
 from gripper_hw.dynamixel.firmware import VirtualServo
+from gripper_hw.dynamixel.packets import Instruction, frame
 from gripper_hw.dynamixel.serve import BenchMotor, PtyServer, serve_virtual_servo
 from gripper_hw.dynamixel.virtual import VirtualBus
 
@@ -55,12 +56,19 @@ def test_nothing_is_left_behind():
 
 
 def test_a_client_that_never_reads_does_not_stop_the_bus():
+    answered = threading.Semaphore(0)
+
+    def flood(answer: bytes) -> bytes:
+        answered.release()
+        return bytes(100_000)
+
     bus = VirtualBus([VirtualServo(1, MODEL)])
-    bus.tamper = lambda answer: bytes(100_000)
+    bus.tamper = flood
     with PtyServer(bus) as server:
         handle = os.open(server.device_path, os.O_RDWR | os.O_NOCTTY)
-        for _ in range(5):
-            os.write(handle, bytes.fromhex("fffffd000103000119 4e".replace(" ", "")))
+        for _ in range(4):
+            os.write(handle, frame(1, Instruction.PING))
+            assert answered.acquire(timeout=10)
         os.close(handle)
 
 

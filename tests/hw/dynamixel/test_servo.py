@@ -425,6 +425,14 @@ def test_stop_sends_torque_off_even_if_no_answer_ever_comes(memory_line):
     assert memory_line.bus.servos[0].get("torque_enable") == 0
 
 
+def test_an_answer_that_is_too_short_is_no_value(started):
+    """The SDK fills short data up with the packet's CRC."""
+    line, servo = started
+    line.bus.tamper = _first(1, lambda answer: status(1, 0))
+    assert servo._bus._get(1, "present_position") == 2048
+    assert servo.stats.corrupt == 1
+
+
 def test_stop_tries_every_servo(make_memory_line):
     line = make_memory_line(VirtualServo(1, MODEL), VirtualServo(2, MODEL))
     bus = DynamixelBus(line.config(), (1, 2), lambda: line.now_ns)

@@ -102,6 +102,9 @@ def test_status_return_level_decides_who_is_answered(pair):
     assert PACKETS.read1ByteTxRx(port, 1, 68) == (1, OK, 0)
     servo.set("status_return_level", 0)
     assert PACKETS.read1ByteTxRx(port, 1, 68)[1] == sdk.COMM_RX_TIMEOUT
+    group = sdk.GroupSyncRead(port, PACKETS, LED, 1)
+    group.addParam(1)
+    assert group.fastSyncRead() == sdk.COMM_RX_TIMEOUT
     assert PACKETS.ping(port, 1)[1] == OK
 
 
