@@ -1,7 +1,7 @@
 """The configuration: typed, with a default for everything, from YAML and ``--set key.path=value``."""
 
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -20,6 +20,9 @@ class Section(BaseModel):
     """Base of every section: immutable, and an unknown key is an error."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+S = TypeVar("S", bound=Section)
 
 
 class ServoConfig(Section):
@@ -174,19 +177,38 @@ def load_config(path: Path | None = None, overrides: list[str] | None = None) ->
 
 def config_from(tree: dict[str, Any], where: str) -> Config:
     """Validates a tree of keys. Raises `ConfigError` that names ``where``."""
+    return _validated(Config, tree, where)
+
+
+def section_from(section: type[S], overrides: list[str] | None) -> S:
+    """Builds a section on its own, such as a recipe, from its defaults and assignments ``key=value``.
+
+    Raises:
+        ConfigError: A key or value is wrong.
+    """
+    tree: dict[str, Any] = {}
+    for assignment in overrides or []:
+        _assign(tree, assignment)
+    return _validated(section, tree, "--set")
+
+
+def _validated(section: type[S], tree: dict[str, Any], where: str) -> S:
     try:
-        return Config.model_validate(tree)
+        return section.model_validate(tree)
     except ValidationError as error:
-        raise ConfigError(_sentence(error, where)) from error
+        raise ConfigError(_sentence(section, error, where)) from error
 
 
-def config_from_text(text: str, where: str) -> Config:
+def config_from_text(text: str, where: str, overrides: list[str] | None = None) -> Config:
     """Reads a configuration that `dump_config` wrote. Raises `ConfigError` that names ``where``."""
     try:
         tree = yaml.safe_load(text)
     except yaml.YAMLError as error:
         raise ConfigError(f"the configuration in {where} is not YAML") from error
-    return config_from(tree if isinstance(tree, dict) else {}, where)
+    tree = tree if isinstance(tree, dict) else {}
+    for assignment in overrides or []:
+        _assign(tree, assignment)
+    return config_from(tree, where)
 
 
 def dump_config(config: Config) -> str:
@@ -210,12 +232,12 @@ def _assign(tree: dict[str, Any], assignment: str) -> None:
     tree[leaf] = value
 
 
-def _sentence(error: ValidationError, where: str) -> str:
+def _sentence(root: type[Section], error: ValidationError, where: str) -> str:
     first = error.errors()[0]
     parts = [str(part) for part in first["loc"]]
     key = ".".join(parts)
     if first["type"] == "extra_forbidden":
-        section: Any = Config
+        section: Any = root
         for part in parts[:-1]:
             section = section.model_fields[part].annotation
         known = ", ".join(section.model_fields)

@@ -50,12 +50,19 @@ class Replayed:
     load_cell: list[LoadCellSample]
 
 
-def replay(path: Path, checkpoint_source: str | None = None, *, recover: bool = False) -> dict[str, Any]:
+def replay(
+    path: Path,
+    checkpoint_source: str | None = None,
+    *,
+    overrides: list[str] | None = None,
+    recover: bool = False,
+) -> dict[str, Any]:
     """Replays a log and reports it against its load cell.
 
     Args:
         path: Log of a run or of an imported recording.
         checkpoint_source: Another checkpoint to estimate with, instead of the log's own.
+        overrides: Assignments ``key.path=value`` that change the log's own configuration, such as a gain.
         recover: Whether to read what is whole of a truncated log.
 
     Returns:
@@ -68,7 +75,7 @@ def replay(path: Path, checkpoint_source: str | None = None, *, recover: bool = 
         DataError: The log holds nothing to replay, or no load cell to compare with.
     """
     reader = LogReader(path, recover=recover)
-    config = config_from_text(reader.config, str(path))
+    config = config_from_text(reader.config, str(path), overrides)
     checkpoint = _checkpoint(config, checkpoint_source)
     replayed = run_again(reader, config, checkpoint)
     flags = [f for f in (replayed.estimates_identical, replayed.decisions_identical) if f is not None]

@@ -7,7 +7,7 @@ real time; `gripper_force.replay` feeds the same controller from a log, in the o
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from gripper_force.backends import open_devices
 from gripper_force.config import Config, dump_config
 from gripper_force.control.grasp import Decision, GraspController
 from gripper_force.control.transmission import Transmission
-from gripper_force.errors import ConfigError
+from gripper_force.errors import ConfigError, LogError
 from gripper_force.interfaces import Devices
 from gripper_force.log import LogWriter
 from gripper_force.perception import LockstepPerception, Perception, ThreadedPerception
@@ -53,6 +53,7 @@ class Session:
         self._due_ns = 0
         self._stop = threading.Event()
         self._last_retries = 0
+        self._armed = False
         self.sees = False
         self.cycles = 0
 
@@ -61,7 +62,8 @@ class Session:
         for sensor in (self._devices.camera, self._devices.load_cell):
             if sensor is not None:
                 sensor.start()
-        self._devices.servo.start()
+        self._devices.servo.start()  # where this raises, it has turned torque off itself
+        self._armed = True
         self._perception.start()
         self._due_ns = self._devices.clock.now_ns()
 
@@ -99,15 +101,19 @@ class Session:
         if request is not None:
             log.write(request)
         log.write(state)
-        for record in (decision.estimate, decision.command, decision.status, *decision.events):
-            log.write(record)
+        log.write(decision.estimate)
+        log.write(decision.command)
+        log.write(decision.status)
+        for event in decision.events:
+            log.write(event)
         self._log_sensors(state.t_ns)
         return decision
 
     def close(self) -> None:
         """Torque off, or hold, as configured; the log keeps what the load cell still had to say."""
         try:
-            self._devices.servo.stop(hold=self._config.on_exit == "hold")
+            if self._armed:
+                self._devices.servo.stop(hold=self._config.on_exit == "hold")
         finally:
             self._perception.close()
         self._log_sensors(self._devices.clock.now_ns())
@@ -149,7 +155,8 @@ def open_session(
             session.start()
             yield session
         except BaseException as error:
-            log.write(Event(devices.clock.now_ns(), "session", f"{type(error).__name__}: {error}"))
+            with suppress(LogError):  # the first error is the one to tell
+                log.write(Event(devices.clock.now_ns(), "session", f"{type(error).__name__}: {error}"))
             raise
 
 

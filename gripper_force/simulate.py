@@ -66,6 +66,7 @@ def make_log(task: Plan, out: Path, tree: dict[str, object]) -> Path:
     rng = np.random.default_rng([task.seed, 10])
     config = _randomised(config_from(tree, "simulate"), task, rng)
     path, unfinished = out / task.name, out / f".{task.name}.part"
+    unfinished.unlink(missing_ok=True)
     if task.kind == "grasp":
         run_grasp(config, unfinished)
     else:

@@ -4,6 +4,7 @@ import json
 import threading
 import time
 from collections import deque
+from contextlib import AbstractContextManager
 from dataclasses import asdict
 
 import cv2
@@ -117,6 +118,17 @@ class SimulatedLoadCell:
         self._samples.append(LoadCellSample(t_ns + self._start_ns, force_n, force_n))
 
 
+class _LockedMotor:
+    """Keeps the world's thread and the bus' apart."""
+
+    def __init__(self, servo: VirtualServo, lock: AbstractContextManager[object]) -> None:
+        self._servo, self._lock = servo, lock
+
+    def control(self, t_ns: int, position_rad: float, velocity_rad_s: float, current_noise_a: float) -> float:
+        with self._lock:
+            return self._servo.control(t_ns, position_rad, velocity_rad_s, current_noise_a)
+
+
 class SimulatedRig:
     """Owns the world, and serves its servo as the port that the configuration names.
 
@@ -133,7 +145,9 @@ class SimulatedRig:
         self.scene = draw_scene(config.object, config.seed, config.sim)
         model = load_model(config.servo.model)
         servo = VirtualServo(config.servo.id, model)
-        self._world = World(self.scene, config.gripper, servo, model.nm_per_a, config.seed)
+        bus = VirtualBus([servo], self._bus_time_ns)
+        motor = _LockedMotor(servo, bus.lock)
+        self._world = World(self.scene, config.gripper, motor, model.nm_per_a, config.seed)
         self._exposure_ms = config.sim.exposure_ms
         self._lockstep = config.clock == "lockstep"
         start_ns = 0 if self._lockstep else time.monotonic_ns()
@@ -141,7 +155,7 @@ class SimulatedRig:
         self.camera = SimulatedCamera(self._world, self.scene, config, self.clock, start_ns)
         self.load_cell = SimulatedLoadCell(self._world, config, start_ns)
         self._bus_name = config.servo.port.removeprefix("virtual:")
-        register_bus(self._bus_name, VirtualBus([servo], self._bus_time_ns))
+        register_bus(self._bus_name, bus)
         self._start_ns = start_ns
         self._failure: SimulationError | None = None
         self._stop = threading.Event()
@@ -198,7 +212,7 @@ class SimulatedRig:
 def expose(picture: npt.NDArray[np.uint8], lux: float, shot_noise: float, rng: np.random.Generator) -> Gray:
     """Turns a rendered picture (2H, 2W, 3) into what a gray camera with locked exposure sees: (H, W) uint8.
 
-    It is averaged over each pixel, linearised, lit, vignetted, given photon and read noise, and encoded again.
+    It is averaged over each pixel, linearised, lit, vignetted, given photon and read noise, and encoded.
     """
     height, width = picture.shape[0] // _OVERSAMPLED, picture.shape[1] // _OVERSAMPLED
     pixels = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)

@@ -1,0 +1,394 @@
+"""The command line: parse, call, print.
+
+Every command takes ``--set key.path=value`` and ``--json``. With ``--json`` one JSON object goes to stdout;
+progress and messages go to stderr always. Bad input is one sentence on stderr and exit code 2.
+
+What a command needs is imported when it runs: ``gripper-force --help`` must answer at once.
+"""
+
+import json
+import math
+import os
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any, NoReturn
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from gripper_force.config import Config, load_config
+from gripper_force.errors import DataError, GripperError
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+import_app = typer.Typer(no_args_is_help=True, help="Turn other recordings into logs.")
+app.add_typer(import_app, name="import")
+
+err = Console(stderr=True, highlight=False)
+out = Console(highlight=False)
+
+ConfigPath = Annotated[Path | None, typer.Option("--config", help="YAML file with configuration keys.")]
+Overrides = Annotated[
+    list[str] | None, typer.Option("--set", help="Set one configuration key: key.path=value. Repeatable.")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
+Jobs = Annotated[int, typer.Option(min=1, help="Processes to use.")]
+
+_INTERRUPTED = 130
+_CORES = os.cpu_count() or 1
+
+
+def main() -> NoReturn:
+    """Entry point: runs a command and turns every foreseen failure into a sentence and an exit code."""
+    signal.signal(signal.SIGTERM, _terminate)
+    try:
+        app()
+    except GripperError as error:
+        err.print(f"[bold red]error:[/] {_plain(error)}")
+        if "--json" in sys.argv:
+            sys.stdout.write(json.dumps({"error": str(error)}) + "\n")
+        sys.exit(2)
+    except KeyboardInterrupt:
+        err.print("interrupted; what ran was stopped as configured, and its log is whole")
+        sys.exit(_INTERRUPTED)
+    sys.exit(0)
+
+
+@app.command()
+def grasp(
+    config: ConfigPath = None,
+    set_: Overrides = None,
+    as_json: AsJson = False,
+    object_: Annotated[str | None, typer.Option("--object", help="What to grasp.")] = None,
+    target_n: Annotated[float | None, typer.Option(help="Wanted force in newtons.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the simulated scene.")] = None,
+    feedback: Annotated[str | None, typer.Option(help="fused, current or vision.")] = None,
+    trials: Annotated[
+        int, typer.Option(min=0, help="Run so many grasps of all four objects, with targets of 1 to 8 N.")
+    ] = 0,
+    jobs: Jobs = _CORES,
+) -> None:
+    """Grasp with the wanted force, and report how well."""
+    from gripper_force import grasp as job
+
+    settings = _load(
+        config,
+        set_,
+        {"object": object_, "target_n": target_n, "seed": seed, "control.feedback": feedback},
+    )
+    if not trials:
+        result = job.grasp(settings, progress=lambda s: err.print(_phase_line(s)))
+        _print(result, as_json, _grasp_table)
+        return
+    if jobs > 1:  # two processes that both want all cores take longer than one after the other
+        settings = settings.model_copy(update={"vision": settings.vision.model_copy(update={"threads": 1})})
+    results = []
+    with _bar("grasping", trials) as advance:
+        for one in job.trials(settings, trials, jobs):
+            results.append(one)
+            advance(f"{one['object']} {one['target_n']:.1f} N: {one['result']}")
+    summary = job.overall(results, settings.control.force_limit_n)
+    _print({"trials": results, "summary": summary}, as_json, _trials_table)
+
+
+@app.command()
+def replay(
+    log: Annotated[Path, typer.Argument(help="Log of a run or of an imported recording.")],
+    as_json: AsJson = False,
+    checkpoint: Annotated[str | None, typer.Option(help="Estimate with another checkpoint.")] = None,
+    set_: Overrides = None,
+    recover: Annotated[bool, typer.Option(help="Read what is whole of a truncated log.")] = False,
+    report: Annotated[bool, typer.Option(help="Write the report again, beside the log.")] = False,
+) -> None:
+    """Run estimator and controller again on a log, and compare them with its load cell."""
+    from gripper_force.replay import replay as job
+
+    result = job(log, checkpoint, overrides=set_, recover=recover)
+    if report:
+        from gripper_force.report import write_report
+
+        result["report"] = str(write_report(log, recover=recover).html)
+    _print(result, as_json, _replay_table)
+
+
+@app.command()
+def simulate(
+    folder: Annotated[Path, typer.Option("--out", help="Folder for the logs.")] = Path("data/sim"),
+    presses: Annotated[int, typer.Option(min=0, help="Logs of random forces, one after the other.")] = 200,
+    grasps: Annotated[int, typer.Option(min=0, help="Logs of grasps.")] = 20,
+    first_seed: Annotated[
+        int, typer.Option(min=0, help="Seed of the first log. Training data start at 100000.")
+    ] = 100_000,
+    jobs: Jobs = _CORES,
+    config: ConfigPath = None,
+    set_: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Write logs of randomised touches, to train and to evaluate on. Goes on where it was broken off."""
+    from gripper_force.simulate import plan
+    from gripper_force.simulate import simulate as job
+
+    settings = _load(config, set_, {})
+    plans = plan("press", presses, first_seed) + plan("grasp", grasps, first_seed + presses)
+    made = 0
+    with _bar("simulating", len(plans)) as advance:
+        present = sum((folder / p.name).exists() for p in plans)
+        for _ in range(present):
+            advance("")
+        for path in job(plans, folder, settings, jobs):
+            made += 1
+            advance(path.name)
+    _print({"logs": len(plans), "made": made, "folder": str(folder)}, as_json)
+
+
+@app.command()
+def train(
+    data: Annotated[Path, typer.Argument(help="Folder with logs.")],
+    checkpoint: Annotated[Path, typer.Option("--out", help="Checkpoint to write.")] = Path(
+        "force.safetensors"
+    ),
+    recipe: Annotated[
+        list[str] | None, typer.Option("--set", help="Set one key of the recipe: key=value. Repeatable.")
+    ] = None,
+    hold_out: Annotated[
+        list[str] | None, typer.Option(help="Object to leave out of the training. Repeatable.")
+    ] = None,
+    resume: Annotated[bool, typer.Option(help="Go on from the states of a run that was broken off.")] = False,
+    jobs: Jobs = _CORES,
+    as_json: AsJson = False,
+) -> None:
+    """Train the force network on logs."""
+    from gripper_force.dataset import load_clips
+    from gripper_force.train import TrainConfig
+    from gripper_force.train import train as job
+
+    settings = _section(TrainConfig, recipe)
+    clips = load_clips(data, settings.preprocess, workers=jobs)
+    clips = [clip for clip in clips if clip.object not in (hold_out or [])]
+    result = job(settings, clips, checkpoint, resume=resume)
+    metrics = result.header.metrics
+    _print({"checkpoint": str(checkpoint), "digest": result.digest, **metrics}, as_json)
+
+
+@app.command()
+def evaluate(
+    data: Annotated[Path, typer.Argument(help="Folder with logs that training has not seen.")],
+    checkpoint: Annotated[str | None, typer.Option(help="Checkpoint, or `default`.")] = None,
+    only: Annotated[
+        list[str] | None, typer.Option("--object", help="Only logs of this object. Repeatable.")
+    ] = None,
+    jobs: Jobs = _CORES,
+    set_: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Compare a checkpoint's estimates with the load cell, over all logs of a folder."""
+    from gripper_force.dataset import load_clips
+    from gripper_force.evaluate import evaluate as job
+    from gripper_force.vision.checkpoint import load_checkpoint
+
+    vision = _load(None, set_, {"vision.checkpoint": checkpoint}).vision
+    loaded = load_checkpoint(vision.checkpoint)
+    clips = load_clips(data, loaded.header.preprocess, vision.region, workers=jobs)
+    clips = [clip for clip in clips if not only or clip.object in only]
+    if not clips:
+        raise DataError(f"no log in {data} is of {', '.join(only or [])}")
+    _print(dict(job(loaded, clips)), as_json, _errors_table)
+
+
+@import_app.command("video")
+def import_video(
+    video: Annotated[Path, typer.Argument(help="Clip, or a folder of recordings.")],
+    forces: Annotated[Path | None, typer.Argument(help="Table with frame, t_s and force_n.")] = None,
+    folder: Annotated[Path, typer.Option("--out", help="Folder for the logs.")] = Path("data/imported"),
+    object_: Annotated[str | None, typer.Option("--object", help="What was grasped.")] = None,
+    set_: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Import a video and its load-cell table, or a folder of them; spikes and tare are handled and counted."""
+    from gripper_force import video_import as job
+
+    region = _load(None, set_, {}).vision.region
+
+    if video.is_dir():
+        summaries = job.import_folder(video, folder, region=region)
+    elif forces is None:
+        raise DataError(f"{video} needs its load-cell table: import video CLIP.avi FORCES.csv")
+    else:
+        log = folder / f"{video.stem}.mcap"
+        summaries = [job.import_video(video, forces, log, object_name=object_, region=region)]
+    rows = [_jsonable(summary) for summary in summaries]
+    _print({"logs": rows}, as_json, _imports_table)
+
+
+@app.command("virtual-servo")
+def virtual_servo(
+    model: Annotated[str | None, typer.Option(help="Servo model.")] = None,
+    ids: Annotated[list[int] | None, typer.Option("--id", help="Servo id. Repeatable.")] = None,
+    set_: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Serve virtual servos at a device path that any Dynamixel client can open, until Ctrl-C."""
+    from importlib import import_module
+
+    servo = _load(None, set_, {"servo.model": model}).servo
+    who = ids or [servo.id]
+    serve = import_module("gripper_hw.dynamixel.serve").serve_virtual_servo
+    with serve(servo.model, who) as server:
+        _print({"port": server.device_path, "model": servo.model, "ids": who}, as_json)
+        sys.stdout.flush()
+        err.print("serving until Ctrl-C")
+        signal.pause()
+
+
+def _terminate(_signal: int, _frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
+def _load(path: Path | None, overrides: list[str] | None, options: dict[str, Any]) -> Config:
+    given = [f"{key}={json.dumps(value)}" for key, value in options.items() if value is not None]
+    return load_config(path, [*(overrides or []), *given])
+
+
+def _section(section: Any, overrides: list[str] | None) -> Any:
+    from gripper_force.config import section_from
+
+    return section_from(section, overrides)
+
+
+@contextmanager
+def _bar(label: str, total: int) -> Iterator[Any]:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, TextColumn("{task.fields[note]}"), console=err) as progress:
+        task = progress.add_task(label, total=total, note="")
+        yield lambda note: progress.update(task, advance=1, note=note)
+
+
+def _print(result: dict[str, Any], as_json: bool, render: Any = None) -> None:
+    if as_json:
+        sys.stdout.write(json.dumps(_jsonable(result), allow_nan=False) + "\n")
+    elif render is None:
+        _pairs(result)
+    else:
+        render(result)
+
+
+def _jsonable(value: Any) -> Any:
+    """NaN has no place in JSON; a figure without a meaning is null."""
+    if isinstance(value, dict):
+        return {str(key): _jsonable(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_jsonable(item) for item in value]
+    if hasattr(value, "__dataclass_fields__"):
+        return {name: _jsonable(getattr(value, name)) for name in value.__dataclass_fields__}
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return str(value) if isinstance(value, Path) else value
+
+
+def _number(value: Any, unit: str = "", digits: int = 3) -> str:
+    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+        return "-"
+    return f"{value:.{digits}f}{unit}" if isinstance(value, float) else f"{value}{unit}"
+
+
+def _pairs(pairs: dict[str, Any]) -> None:
+    table = Table(box=None, show_header=False, pad_edge=False)
+    for name, value in pairs.items():
+        table.add_row(f"[dim]{name}[/]", _number(value))
+    out.print(table)
+
+
+def _phase_line(status: Any) -> str:
+    note = f" [bold]{status.outcome}[/]" if status.outcome else ""
+    return f"[dim]{status.t_ns / 1e9 % 1e4:8.2f} s[/] {status.phase}{note} [dim]{status.reason}[/]"
+
+
+def _grasp_table(r: dict[str, Any]) -> None:
+    share = ""
+    if r["steady_error_n"] is not None:
+        share = f" ({100 * r['steady_error_n'] / r['target_n']:+.1f} %)"
+    _pairs(
+        {
+            "result": r["result"],
+            "object": r["object"],
+            "target": _number(r["target_n"], " N", 2),
+            "load cell, mean": _number(r["load_cell_mean_n"], " N"),
+            "steady error": _number(r["steady_error_n"], " N") + share,
+            "overshoot": _number(r["overshoot_n"], " N"),
+            "settling time": _number(r["settle_s"], " s", 2),
+            "estimator p50, p99": f"{_number(r['estimator_p50_ms'], '', 1)}, "
+            f"{_number(r['estimator_p99_ms'], '', 1)} ms",
+            "control loop": _number(r["loop_hz"], " Hz", 1),
+            "log": r["log"],
+            "report": r["report"] or "-",
+        }
+    )
+
+
+def _trials_table(r: dict[str, Any]) -> None:
+    table = Table(
+        "object", "target N", "load cell N", "error %", "overshoot N", "settle s", "result", box=None
+    )
+    for t in r["trials"]:
+        error = None if t["steady_error_n"] is None else 100 * t["steady_error_n"] / t["target_n"]
+        table.add_row(
+            t["object"],
+            _number(t["target_n"], digits=2),
+            _number(t["load_cell_mean_n"], digits=2),
+            _number(error, digits=1),
+            _number(t["overshoot_n"], digits=2),
+            _number(t["settle_s"], digits=2),
+            t["result"],
+        )
+    out.print(table)
+    _pairs(r["summary"])
+
+
+def _errors_table(r: dict[str, Any]) -> None:
+    _pairs({key: r[key] for key in ("mae_n", "rmse_n", "bias_n", "frames")})
+    table = Table("object", "MAE N", "RMSE N", "contact MAE N", "frames", box=None)
+    for name, o in r["per_object"].items():
+        contact = _number(o.get("contact_mae_n"))
+        table.add_row(name, _number(o["mae_n"]), _number(o["rmse_n"]), contact, str(o["frames"]))
+    out.print(table)
+    _bins_table(r["per_bin"])
+
+
+def _bins_table(bins: list[dict[str, Any]]) -> None:
+    table = Table("force N", "MAE N", "bias N", "frames", box=None)
+    for b in bins:
+        span = f"{b['from_n']:.0f}-{b['to_n']:.0f}"
+        table.add_row(span, _number(b["mae_n"]), _number(b["bias_n"]), str(b["frames"]))
+    out.print(table)
+
+
+def _replay_table(r: dict[str, Any]) -> None:
+    identical = {True: "yes, to the bit", False: "no", None: "nothing to compare"}[r["identical"]]
+    _pairs({"identical": identical, "log": r["log"], **({"report": r["report"]} if "report" in r else {})})
+    table = Table("source", "MAE N", "RMSE N", "bias N", "contact MAE N", "lag ms", "samples", box=None)
+    for name, s in r["sources"].items():
+        figures = (s["mae_n"], s["rmse_n"], s["bias_n"], s["contact_mae_n"])
+        lag = _number(1e3 * s["lag_s"], digits=0)
+        table.add_row(name, *(_number(value) for value in figures), lag, str(s["frames"]))
+    out.print(table)
+    _bins_table(r["per_bin"])
+
+
+def _imports_table(r: dict[str, Any]) -> None:
+    table = Table("log", "object", "frames", "spikes", "tare N", "note", box=None)
+    for row in r["logs"]:
+        tare = _number(row["tare_n"], digits=3)
+        name = Path(row["log"]).name
+        table.add_row(
+            name, row["object"], str(row["frames"]), str(row["spikes_rejected"]), tare, row["tare_note"]
+        )
+    out.print(table)
+
+
+def _plain(error: GripperError) -> str:
+    return str(error).replace("[", r"\[")

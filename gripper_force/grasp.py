@@ -1,0 +1,164 @@
+"""The main job: grasp, and say how well, once or over many trials."""
+
+import multiprocessing
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gripper_force.config import Config, config_from, config_from_text
+from gripper_force.control.score import score_grasp
+from gripper_force.errors import DataError
+from gripper_force.log import LogReader
+from gripper_force.report import write_report
+from gripper_force.session import run_grasp
+from gripper_force.types import NS_PER_S, GraspStatus, LoadCellSample, Outcome, ServoState, VisualForce
+
+TRIAL_OBJECTS = ("sponge", "paper_cup", "tube", "stapler")
+TRIAL_TARGETS_N = (1.0, 8.0)
+WITHIN_SHARE, WITHIN_N = 0.08, 0.25
+"""A trial counts as good within this share of its target, or within this force."""
+
+Summary = dict[str, Any]
+
+
+def grasp(config: Config, progress: Callable[[GraspStatus], None] | None = None) -> Summary:
+    """Runs one grasp, writes its log and its report, and sums it up.
+
+    Returns:
+        ``result, object, target_n, load_cell_mean_n, steady_error_n, overshoot_n, settle_s, estimator_p50_ms,
+        estimator_p99_ms, loop_hz, log, report`` and the seed and the peak force; None where a figure has no
+        meaning, such as without a load cell.
+
+    Raises:
+        GripperError: The run failed; its log holds what was seen.
+    """
+    path = _new_log(config)
+    run_grasp(config, path, progress)
+    report = str(write_report(path).html) if config.log.report else None
+    return {**summarise(path), "report": report}
+
+
+def trials(config: Config, count: int, jobs: int) -> Iterator[Summary]:
+    """Runs ``count`` grasps, each of the objects in turn, with targets and seeds drawn from ``config.seed``.
+
+    Args:
+        config: Everything else.
+        count: Number of grasps.
+        jobs: Processes. A lockstep run comes out the same in any number of them.
+
+    Yields:
+        The summary of each, in order, with its ``seed``.
+    """
+    rng = np.random.default_rng([config.seed, 20])
+    plan = [
+        config.model_copy(
+            update={
+                "object": TRIAL_OBJECTS[i % len(TRIAL_OBJECTS)],
+                "target_n": round(float(rng.uniform(*TRIAL_TARGETS_N)), 3),
+                "seed": config.seed + i,
+            }
+        )
+        for i in range(count)
+    ]
+    trees = [trial.model_dump(mode="json") for trial in plan]
+    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+        try:
+            yield from pool.map(_trial, trees)
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def summarise(path: Path) -> Summary:
+    """Reads the figures of a grasp from its log."""
+    reader = LogReader(path)
+    statuses: list[GraspStatus] = []
+    cells: list[LoadCellSample] = []
+    cycles_ns: list[int] = []
+    compute_ms: list[float] = []
+    for record in reader.records(GraspStatus, LoadCellSample, ServoState, VisualForce):
+        if isinstance(record, GraspStatus):
+            statuses.append(record)
+        elif isinstance(record, LoadCellSample):
+            cells.append(record)
+        elif isinstance(record, ServoState):
+            cycles_ns.append(record.t_ns)
+        elif isinstance(record, VisualForce):
+            compute_ms.append(record.compute_ms)
+    config = config_from_text(reader.config, str(path))
+    outcomes = [s.outcome for s in statuses if s.outcome != Outcome.NONE]
+    span_s = (cycles_ns[-1] - cycles_ns[0]) / NS_PER_S if len(cycles_ns) > 1 else 0.0
+    return {
+        "result": outcomes[-1] if outcomes else "interrupted",
+        "object": config.object,
+        "target_n": config.target_n,
+        "seed": config.seed,
+        **_score(cells, statuses, config.target_n),
+        "peak_n": max((c.force_n for c in cells if c.valid), default=None),
+        "estimator_p50_ms": float(np.percentile(compute_ms, 50)) if compute_ms else None,
+        "estimator_p99_ms": float(np.percentile(compute_ms, 99)) if compute_ms else None,
+        "loop_hz": (len(cycles_ns) - 1) / span_s if span_s else None,
+        "log": str(path),
+    }
+
+
+def overall(results: list[Summary], force_limit_n: float) -> Summary:
+    """The figures over all trials."""
+    scored = [r for r in results if r["steady_error_n"] is not None]
+    error_n = np.array([abs(r["steady_error_n"]) for r in scored])
+    target_n = np.array([r["target_n"] for r in scored])
+    share = error_n / target_n
+    good = (share <= WITHIN_SHARE) | (error_n <= WITHIN_N)
+    overshoot = np.array([r["overshoot_n"] for r in scored]) / target_n
+    peaks = [r["peak_n"] for r in results if r["peak_n"] is not None]
+    return {
+        "trials": len(results),
+        "held": sum(r["result"] == Outcome.HELD for r in results),
+        "median_error_percent": _percentile(100 * share, 50),
+        "p90_error_percent": _percentile(100 * share, 90),
+        "median_error_n": _percentile(error_n, 50),
+        "good_percent": 100 * int(good.sum()) / len(results),
+        "median_overshoot_percent": _percentile(100 * overshoot, 50),
+        "max_overshoot_percent": _percentile(100 * overshoot, 100),
+        "median_settle_s": _percentile([r["settle_s"] for r in scored if r["settle_s"] is not None], 50),
+        "peak_n": max(peaks, default=None),
+        "over_limit": sum(peak > force_limit_n for peak in peaks),
+        "estimator_p50_ms": _percentile(
+            [r["estimator_p50_ms"] for r in results if r["estimator_p50_ms"]], 50
+        ),
+    }
+
+
+def _trial(tree: dict[str, Any]) -> Summary:
+    return grasp(config_from(tree, "trials"))
+
+
+def _score(cells: list[LoadCellSample], statuses: list[GraspStatus], target_n: float) -> Summary:
+    try:
+        score = score_grasp(cells, statuses, target_n)
+    except DataError:
+        return dict.fromkeys(("load_cell_mean_n", "steady_error_n", "overshoot_n", "settle_s"))
+    return {
+        "load_cell_mean_n": score.steady_n,
+        "steady_error_n": score.steady_error_n,
+        "overshoot_n": score.overshoot_n,
+        "settle_s": score.settle_s if np.isfinite(score.settle_s) else None,
+    }
+
+
+def _percentile(values: Any, q: float) -> float | None:
+    return float(np.percentile(values, q)) if len(values) else None
+
+
+def _new_log(config: Config) -> Path:
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    stem = f"{stamp}-{config.object}-{config.target_n:g}N-{config.control.feedback}-seed{config.seed}"
+    path = config.log.directory / f"{stem}.mcap"
+    again = 1
+    while path.exists():
+        again += 1
+        path = config.log.directory / f"{stem}-{again}.mcap"
+    return path
