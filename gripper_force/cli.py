@@ -209,7 +209,7 @@ def import_video(
     set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Import a video and its load-cell table, or a folder of them; spikes and tare are handled and counted."""
+    """Import a video and its load-cell table, or a folder of them. Spikes and tare are counted."""
     from gripper_force import video_import as job
 
     region = _load(None, set_, {}).vision.region

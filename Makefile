@@ -1,0 +1,38 @@
+# Two commands do everything: `make grasp` and `make test`. Each first sets up what is missing.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+EGL_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri
+
+.PHONY: grasp test setup setup-dev format clean
+
+grasp: setup
+	$(BIN)/gripper-force grasp $(ARGS)
+
+test: setup-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/pytest $(ARGS)
+
+format: setup-dev
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+setup: $(VENV)/installed
+setup-dev: $(VENV)/installed-dev
+
+$(VENV)/installed: pyproject.toml scripts/system-packages
+	PYTHON=$(PYTHON) scripts/system-packages $(EGL_PACKAGES)
+	test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable .
+	touch $@
+
+$(VENV)/installed-dev: $(VENV)/installed
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	touch $@
+
+clean:
+	rm -rf $(VENV)
