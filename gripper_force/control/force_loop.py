@@ -7,7 +7,7 @@ from gripper_force.control.fusion import OBSERVER_LAG_S
 from gripper_force.control.profile import Profile
 from gripper_force.control.transmission import Transmission
 from gripper_force.control.tuning import Gains, Plant, phase_margin_deg, simc
-from gripper_force.types import FusedForce
+from gripper_force.types import FusedForce, Source
 
 _RAMP_S = 0.4
 """Time in which the ramp gathers and loses its speed: longer than a quarter swing of the softest object."""
@@ -15,6 +15,10 @@ _RAMP_S = 0.4
 _ONWARD = 0.25
 _BACKWARD = 0.5
 """Deadband of the hold as shares of the tolerance."""
+
+_TURN = 0.25
+"""Share of the friction that is still asked for once the push has turned back: within the play the jaws rest,
+whatever the true friction is, and the integral does what is missing. It can't drop the object either."""
 
 
 def tolerance_n(target_n: float) -> float:
@@ -84,14 +88,14 @@ class ForceLoop:
         ramping = self.reference_n != target_n
         reference_n = self._profile.step(target_n, dt_s)
         error_n = 0.0
-        if not ramping:
+        # A push that rests keeps a force that rests; the current alone has no news of friction to act on.
+        if not ramping and estimate.source != Source.CURRENT:
             error_n = self._beyond_deadband(reference_n - estimate.force_n, tolerance_n(target_n))
             self._trim_n += self._gains.integral_s * error_n * dt_s
-        elif not self._vision_alone:
+        elif ramping and not self._vision_alone:
             self._trim_n = -estimate.bias_n
         friction_n = self._transmission.friction_n
-        # On the way down friction helps to hold; asking for none of it can't drop the object.
-        ahead_n = reference_n + (friction_n if self._rising else 0.0)
+        ahead_n = reference_n + friction_n * (1.0 if self._rising else _TURN)
         room_n = 3 * self._transmission.bias_std_n(reference_n) + friction_n
         low_n, high_n = max(reference_n - room_n, 0.0), reference_n + room_n
         self._trim_n = min(max(self._trim_n, low_n - ahead_n), high_n - ahead_n)

@@ -12,10 +12,6 @@ from gripper_force.config import ControlConfig
 from gripper_force.control.transmission import GAIN_STD, Transmission
 from gripper_force.types import NS_PER_MS, NS_PER_S, Event, FusedForce, ServoState, Source, VisualForce
 
-CURRENT_FILTER_S = 0.03
-"""Time constant of the low-pass on the measured current, which is quantised in steps of about 0.1 N. The
-current-derived force lags by this much; vision is compared with the same signal, so no bias is left by it."""
-
 _DRIFT_N2_S = 0.03**2
 """Growth of the bias' variance a second: friction wanders."""
 
@@ -35,8 +31,8 @@ _VISION_FLOOR_N = 0.05
 _SYSTEMATIC = 0.03
 """Share of the force that vision may be off over a whole grasp, which no averaging removes."""
 
-_GATE = 10.8
-"""Chi-square, one degree of freedom: 0.1 % of good estimates are turned away."""
+_GATE = 3.29
+"""Standard deviations of the innovation: 0.1 % of good estimates are turned away (chi-square, 10.8)."""
 
 _REENTRY = 20
 """Estimates in a row that must be off to the same side before the filter gives way (1/3 s at 60 Hz)."""
@@ -48,6 +44,10 @@ _HISTORY = 64
 class Fusion:
     """Kalman filter on ``bias = force - current-derived force``.
 
+    The measured current is noisy and quantised (0.1 N a step), and the contact force follows it with the
+    plant's lag: a low-pass of that lag serves both. Vision is compared with the same signal, at its capture
+    time.
+
     Without vision for `ControlConfig.vision_timeout_ms` the source is the current alone, with the bias as it
     stands and a variance that grows.
     """
@@ -55,6 +55,7 @@ class Fusion:
     def __init__(self, config: ControlConfig, transmission: Transmission) -> None:
         self._feedback = config.feedback
         self._timeout_ns = round(config.vision_timeout_ms * NS_PER_MS)
+        self._lag_s = config.plant_lag_ms * 1e-3
         self._std_limit_n = config.vision_std_n
         self._transmission = transmission
         self._history: deque[tuple[int, float]] = deque(maxlen=_HISTORY)
@@ -111,7 +112,7 @@ class Fusion:
         dt_s = 0.0
         if self._history:
             dt_s = max(servo.t_ns - self._history[-1][0], 0) / NS_PER_S
-            self._push_n += (push_n - self._push_n) * dt_s / (dt_s + CURRENT_FILTER_S)
+            self._push_n += (push_n - self._push_n) * dt_s / (dt_s + self._lag_s)
         else:
             self._push_n = push_n
         # Coulomb friction is a play: the contact force stays until the push leaves it by the friction.
@@ -139,9 +140,9 @@ class Fusion:
         current_n = self._current_at(visual.t_ns)
         difference_n = visual.force_n - current_n
         innovation_n = difference_n - self._bias_n
-        if difference_n**2 > 9 * (self._prior_n2(current_n) + noise_n2):
+        if abs(difference_n) > 3 * math.sqrt(self._prior_n2(current_n) + noise_n2):
             return f"it is off from the motor current by {difference_n:.2f} N"
-        if innovation_n**2 > _GATE * (self._variance_n2 + noise_n2):
+        if abs(innovation_n) > _GATE * math.sqrt(self._variance_n2 + noise_n2):
             self._rejected = _count(self._rejected, innovation_n)
             if abs(self._rejected) < _REENTRY:
                 return f"it jumps by {innovation_n:.2f} N"

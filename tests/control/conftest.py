@@ -160,7 +160,7 @@ def draw_run(seed: int, **control: object) -> Run:
     return Run(ControlConfig(**control), plant, eye, seed)  # type: ignore[arg-type]
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def transmission() -> Transmission:
     return TRANSMISSION
 

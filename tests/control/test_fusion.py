@@ -1,0 +1,166 @@
+import math
+
+import numpy as np
+import pytest
+
+from gripper_force.config import ControlConfig
+from gripper_force.control.fusion import Fusion
+from gripper_force.types import ServoState, VisualForce
+
+MS = 1_000_000
+
+
+class Bench:
+    """A motor that pushes with a known force, and an eye that is 40 ms late."""
+
+    def __init__(self, transmission, **control):
+        self.transmission = transmission
+        self.fusion = Fusion(ControlConfig(**control), transmission)
+        self.t_ns = 0
+        self.events = []
+        self.estimate = None
+
+    def run(self, time_s, push_n, seen_n=None, std_n=0.1, latency_ms=40, noise=None, free=False):
+        """`push_n` is a function of the time in seconds; `seen_n` is what vision says of a capture time."""
+        for _ in range(round(time_s * 200)):
+            t_s = self.t_ns / 1e9
+            servo = ServoState(self.t_ns, 0.0, 0.0, self.transmission.current_a(push_n(t_s)), 30.0, 0)
+            visual = None
+            if seen_n is not None and self.t_ns // (5 * MS) % 3 == 0:
+                capture_ns = self.t_ns - latency_ms * MS
+                force_n = seen_n(capture_ns / 1e9) + (noise.normal(0, std_n) if noise else 0.0)
+                visual = VisualForce(capture_ns, self.t_ns, self.t_ns, force_n, std_n, 10.0)
+            self.estimate, events = self.fusion.step(self.t_ns, servo, visual, free=free)
+            self.events += [event.text for event in events]
+            self.t_ns += 5 * MS
+        return self.estimate
+
+
+@pytest.fixture
+def bench(transmission):
+    return lambda **control: Bench(transmission, **control)
+
+
+def test_current_alone_subtracts_friction(bench, transmission):
+    b = bench(feedback="current")
+    estimate = b.run(1.0, lambda _: 3.0 + transmission.friction_n, lambda _: 9.0)
+    assert estimate.force_n == pytest.approx(3.0, abs=1e-6)
+    assert (estimate.source, estimate.bias_n, b.events) == ("current", 0.0, [])
+
+
+def test_friction_is_a_play(bench, transmission):
+    b = bench(feedback="current")
+    b.run(1.0, lambda _: 3.0 + transmission.friction_n)
+    assert b.run(1.0, lambda _: 3.0 - 0.9 * transmission.friction_n).force_n == pytest.approx(3.0, abs=1e-6)
+    assert b.run(1.0, lambda _: 2.0 - transmission.friction_n).force_n == pytest.approx(2.0, abs=1e-6)
+
+
+def test_vision_finds_the_bias(bench):
+    b = bench()
+    estimate = b.run(2.0, lambda _: 4.0, lambda _: 3.4, noise=np.random.default_rng(0))
+    assert estimate.force_n == pytest.approx(3.4, abs=0.05)
+    assert estimate.source == "fused"
+    assert estimate.std_n < 0.2
+    assert b.events == ["vision counts; the force estimate is fused"]
+
+
+def test_latency_leaves_no_error_on_a_ramp(bench, transmission):
+    """The comparison is made at the capture time, so a ramp that vision sees late makes no bias."""
+    b = bench()
+    friction_n = transmission.friction_n
+    b.run(0.5, lambda _: friction_n, lambda _: 0.0)
+    ramp = lambda t: max(4.0 * (t - 0.5), 0.0)  # noqa: E731
+    lag_s = 0.06  # of the plant, on both sides of the comparison
+    estimate = b.run(1.5, lambda t: ramp(t) + friction_n, lambda t: ramp(t - lag_s))
+    assert estimate.bias_n == pytest.approx(0.0, abs=0.03)
+
+
+def test_free_travel_tells_friction(bench, transmission):
+    b = bench(feedback="current")
+    estimate = b.run(1.0, lambda _: transmission.friction_n + 0.2, free=True)
+    assert estimate.bias_n == pytest.approx(-0.2, abs=0.02)
+    assert estimate.force_n == pytest.approx(0.0, abs=0.02)
+    b.fusion.restart()
+    assert b.run(0.005, lambda _: transmission.friction_n + 0.2).bias_n == 0.0
+
+
+@pytest.mark.parametrize(
+    ("seen_n", "std_n", "latency_ms", "reason"),
+    [
+        (math.nan, 0.1, 40, "finite"),
+        (3.0, math.inf, 40, "finite"),
+        (3.0, 0.1, 61, "61 ms old"),
+        (3.0, 0.1, -10, "-10 ms old"),
+        (3.0, 1.6, 40, "uncertain by 1.60 N"),
+        (9.0, 0.1, 40, "off from the motor current by"),
+    ],
+)
+def test_bad_vision_drops_out_and_is_named(bench, seen_n, std_n, latency_ms, reason):
+    b = bench()
+    b.run(1.0, lambda _: 4.0, lambda _: 3.2)
+    before = b.estimate
+    estimate = b.run(0.2, lambda _: 4.0, lambda _: seen_n, std_n=std_n, latency_ms=latency_ms)
+    assert estimate.source == "current"
+    assert estimate.force_n == pytest.approx(before.force_n, abs=0.02)
+    assert len(b.events) == 2
+    assert reason in b.events[-1]
+    b.run(0.2, lambda _: 4.0, lambda _: 3.2)
+    assert b.events[-1] == "vision counts; the force estimate is fused"
+
+
+def test_not_finite_drops_out_in_the_same_cycle(bench):
+    b = bench()
+    b.run(1.0, lambda _: 4.0, lambda _: 3.2)
+    while b.t_ns // (5 * MS) % 3:
+        b.run(0.005, lambda _: 4.0)
+    assert b.run(0.005, lambda _: 4.0, lambda _: math.nan).source == "current"
+
+
+def test_silence_widens(bench):
+    b = bench()
+    sharp = b.run(1.0, lambda _: 4.0, lambda _: 3.2).std_n
+    wide = b.run(5.0, lambda _: 4.0)
+    assert wide.source == "current"
+    assert wide.std_n > sharp
+    assert "no new estimate" in b.events[-1]
+
+
+def test_a_jump_is_gated_until_it_lasts(bench):
+    b = bench()
+    b.run(2.0, lambda _: 4.0, lambda _: 3.2)
+    assert b.run(0.2, lambda _: 4.0, lambda _: 2.6).bias_n == pytest.approx(3.2 - 3.05, abs=0.05)
+    assert "jumps by" in b.events[-1]
+    assert b.run(1.0, lambda _: 4.0, lambda _: 2.6).force_n == pytest.approx(2.6, abs=0.05)
+
+
+def test_jumps_to_both_sides_never_get_in(bench):
+    b = bench()
+    b.run(2.0, lambda _: 4.0, lambda _: 3.05)
+    estimate = b.run(2.0, lambda _: 4.0, lambda t: 3.05 + (0.6 if round(t * 1000) // 15 % 2 else -0.6))
+    assert estimate.source == "current"
+    assert estimate.force_n == pytest.approx(3.05, abs=0.05)
+
+
+def test_vision_alone_is_the_newest_estimate(bench):
+    b = bench(feedback="vision")
+    assert b.run(1.0, lambda _: 4.0, lambda t: 3.0 + 0.1 * t).force_n == pytest.approx(3.095, abs=0.006)
+    assert b.estimate.source == "vision"
+    assert b.run(0.1, lambda _: 4.0).source == "current"
+    assert b.run(0.1, lambda _: 4.0).force_n == pytest.approx(3.07, abs=0.05)
+
+
+def test_the_same_estimate_counts_once(transmission):
+    fusion = Fusion(ControlConfig(), transmission)
+    visual = VisualForce(0, 0, 0, 0.3, 0.1, 1.0)
+    for i in range(5):
+        estimate, _ = fusion.step(i * 5 * MS, ServoState(i * 5 * MS, 0.0, 0.0, 0.0, 30.0, 0), visual)
+        if i == 0:
+            first = estimate.bias_n
+    assert estimate.bias_n == first != 0.0
+
+
+def test_a_gripper_without_friction(bench, transmission):
+    import dataclasses
+
+    b = Bench(dataclasses.replace(transmission, friction_n=0.0))
+    assert b.run(1.0, lambda _: 2.0).force_n == pytest.approx(2.0, abs=1e-6)

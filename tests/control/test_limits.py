@@ -1,0 +1,78 @@
+import math
+from dataclasses import replace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gripper_force.config import ControlConfig, GripperConfig
+from gripper_force.control.limits import Limits
+from gripper_force.control.transmission import Transmission
+from gripper_force.errors import NonFiniteError
+from gripper_force.types import ServoCommand
+
+COARSE = Transmission.from_config(GripperConfig(), 1.78, 0.00269)
+FINE = replace(COARSE, current_step_a=0.0)
+CONFIG = ControlConfig()
+
+numbers = st.floats(allow_nan=False, allow_infinity=False)
+cycles = st.lists(
+    st.tuples(numbers, numbers, st.floats(-5, 30), st.floats(0, 0.05), st.booleans()), min_size=1, max_size=40
+)
+
+
+@settings(deadline=None, max_examples=200)
+@given(cycles, st.sampled_from([COARSE, FINE]), st.floats(0.01, 3.0))
+def test_no_output_ever_leaves_the_limits(cycles, transmission, limit_a):
+    limits = Limits(CONFIG, transmission, limit_a)
+    cap_a = min(limit_a, (CONFIG.force_limit_n + transmission.friction_n) / transmission.n_per_a)
+    last_a = 0.0
+    for position_rad, current_a, force_n, dt_s, may_rise in cycles:
+        out, over = limits.apply(ServoCommand(0, position_rad, current_a), force_n, dt_s, may_rise=may_rise)
+        assert 0.0 <= out.goal_current_a <= cap_a
+        low, high = sorted((transmission.open_position_rad, transmission.closed_position_rad))
+        assert low <= out.goal_position_rad <= high
+        assert over == (force_n > CONFIG.force_limit_n)
+        if over or not may_rise:
+            assert out.goal_current_a <= last_a
+        if over:
+            assert out.goal_current_a <= 0.85 * last_a
+        rise_a = 4 * CONFIG.ramp_n_s / transmission.n_per_a * dt_s + 1.5 * transmission.current_step_a
+        assert out.goal_current_a <= last_a + rise_a + 1e-12
+        last_a = out.goal_current_a
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("where", [0, 1, 2])
+def test_non_finite_is_refused(bad, where):
+    values = [0.0, 0.0, 0.0]
+    values[where] = bad
+    name = ("goal position", "goal current", "force estimate")[where]
+    with pytest.raises(NonFiniteError, match=name):
+        Limits(CONFIG, FINE, 1.0).apply(
+            ServoCommand(0, values[0], values[1]), values[2], 0.005, may_rise=True
+        )
+
+
+@settings(deadline=None)
+@given(st.floats(0.01, 0.2))
+def test_rounding_keeps_the_mean_current(wanted_a):
+    limits = Limits(CONFIG, COARSE, 1.0)
+    given_a = []
+    for _ in range(600):
+        out, _ = limits.apply(ServoCommand(0, 0.0, wanted_a), 0.0, 0.05, may_rise=True)
+        given_a.append(out.goal_current_a)
+    tail = given_a[-500:]
+    assert sum(tail) / 500 == pytest.approx(wanted_a, abs=COARSE.current_step_a / 400)
+    assert all(abs(a / COARSE.current_step_a - round(a / COARSE.current_step_a)) < 1e-6 for a in tail)
+
+
+def test_over_force_halves_within_five_cycles():
+    limits = Limits(CONFIG, FINE, 1.0)
+    wanted = ServoCommand(0, 0.0, 0.2)
+    for _ in range(100):
+        limits.apply(wanted, 5.0, 0.005, may_rise=True)
+    for _ in range(5):
+        out, over = limits.apply(wanted, 13.0, 0.005, may_rise=True)
+    assert over
+    assert out.goal_current_a < 0.1
