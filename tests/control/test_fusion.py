@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -159,8 +160,14 @@ def test_the_same_estimate_counts_once(transmission):
     assert estimate.bias_n == first != 0.0
 
 
-def test_a_gripper_without_friction(bench, transmission):
-    import dataclasses
-
-    b = Bench(dataclasses.replace(transmission, friction_n=0.0))
+def test_a_gripper_without_friction(transmission):
+    b = Bench(replace(transmission, friction_n=0.0))
     assert b.run(1.0, lambda _: 2.0).force_n == pytest.approx(2.0, abs=1e-6)
+
+
+def test_an_estimate_from_before_the_first_reading_meets_the_oldest_current(transmission):
+    fusion = Fusion(ControlConfig(), transmission)
+    servo = ServoState(50 * MS, 0.0, 0.0, transmission.current_a(1.0), 30.0, 0)
+    estimate, _ = fusion.step(50 * MS, servo, VisualForce(10 * MS, 50 * MS, 0, 0.3, 0.1, 1.0))
+    assert estimate.source == "fused"
+    assert 0.0 < estimate.bias_n < 0.3 - estimate.current_n
