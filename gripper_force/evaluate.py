@@ -18,7 +18,8 @@ from gripper_force.vision.dense import predict
 
 RIDGE_SIZE: Final = 32
 RIDGE_COMPONENTS: Final = 20
-RIDGE_PENALTY: Final = 1.0
+RIDGE_PENALTY: Final = 0.2
+"""For each frame; objects transfer best between 0.02 and 0.2."""
 
 
 class ObjectResult(TypedDict):
@@ -77,18 +78,24 @@ def ridge_baseline(train_clips: Sequence[Clip], test_clips: Sequence[Clip]) -> R
     labels_n, valid = _joined(train_clips)
     images = np.concatenate([_first_frame_difference(clip) for clip in train_clips])[valid]
     centre = images.mean(0)
-    _, _, axes = np.linalg.svd((images - centre).T @ (images - centre))
-    axes = axes[:RIDGE_COMPONENTS].T  # (pixels, components)
+    _, axes = np.linalg.eigh((images - centre).T @ (images - centre))
+    axes = axes[:, -RIDGE_COMPONENTS:]  # (pixels, components)
     scale = ((images - centre) @ axes).std(0) + 1e-6
 
     def features(pixels: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
         scores = ((pixels - centre) @ axes / scale).astype(np.float64)  # (N, components)
         first, second = np.triu_indices(scores.shape[1])
-        return np.column_stack([np.ones(len(scores)), scores, scores[:, first] * scores[:, second]])
+        return np.column_stack([scores, scores[:, first] * scores[:, second]])
 
-    x = features(images)
-    weights = np.linalg.solve(x.T @ x + RIDGE_PENALTY * np.eye(x.shape[1]), x.T @ labels_n[valid])
-    predictions = [features(_first_frame_difference(clip)) @ weights for clip in test_clips]
+    x, y = features(images), labels_n[valid].astype(np.float64)
+    x_mean, y_mean = x.mean(0), y.mean()
+    covariance = (x - x_mean).T @ (x - x_mean) / len(x)
+    weights = np.linalg.solve(
+        covariance + RIDGE_PENALTY * np.eye(x.shape[1]), (x - x_mean).T @ (y - y_mean) / len(x)
+    )
+    predictions = [
+        (features(_first_frame_difference(clip)) - x_mean) @ weights + y_mean for clip in test_clips
+    ]
     return _result(test_clips, predictions, lead_in=0)
 
 

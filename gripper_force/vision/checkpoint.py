@@ -18,6 +18,8 @@ from gripper_force.vision.network import ForceNetwork, NetworkConfig
 from gripper_force.vision.preprocess import Preprocess
 
 FORMAT: Final = "gripper-force-network/1"
+"""Key of the header in the file's metadata: the only one, as safetensors keeps no order of keys."""
+
 DEFAULT_PATH: Final = Path(__file__).with_name("default.safetensors")
 
 
@@ -82,7 +84,7 @@ def save_checkpoint(path: Path, networks: Sequence[ForceNetwork], header: Header
         for i, network in enumerate(networks)
         for name, tensor in network.state_dict().items()
     }
-    data = save(tensors, metadata={"format": FORMAT, "header": header.model_dump_json()})
+    data = save(tensors, metadata={FORMAT: header.model_dump_json()})
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
@@ -108,10 +110,10 @@ def load_checkpoint(source: str | Path = "default") -> Checkpoint:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
     except (OSError, SafetensorError) as error:
         raise CheckpointError(f"{path} is damaged or no safetensors file: {error}") from error
-    if metadata.get("format") != FORMAT:
-        raise CheckpointError(f"{path} is not a {FORMAT} checkpoint; train one with `gripper-force train`")
+    if FORMAT not in metadata:
+        raise CheckpointError(f"{path} is not a {FORMAT} file; train one with `gripper-force train`")
     try:
-        header = Header.model_validate_json(metadata.get("header", ""))
+        header = Header.model_validate_json(metadata[FORMAT])
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])

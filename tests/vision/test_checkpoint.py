@@ -87,11 +87,11 @@ def test_other_safetensors_files_are_refused(file: Path, tmp_path: Path) -> None
     save_file({"x": torch.zeros(1)}, other)
     with pytest.raises(CheckpointError, match="not a gripper-force-network"):
         load_checkpoint(other)
-    save_file({"x": torch.zeros(1)}, other, metadata={"format": checkpoint.FORMAT, "header": "{}"})
+    save_file({"x": torch.zeros(1)}, other, metadata={checkpoint.FORMAT: "{}"})
     with pytest.raises(CheckpointError, match="header"):
         load_checkpoint(other)
     text = header(SCAM).model_dump_json()
-    save_file({"0.x": torch.zeros(1)}, other, metadata={"format": checkpoint.FORMAT, "header": text})
+    save_file({"0.x": torch.zeros(1)}, other, metadata={checkpoint.FORMAT: text})
     with pytest.raises(CheckpointError, match="member 0"):
         load_checkpoint(other)
 
