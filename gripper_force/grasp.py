@@ -1,8 +1,10 @@
 """The main job: grasp, and say how well, once or over many trials."""
 
+import json
 import multiprocessing
 import time
-from collections.abc import Callable, Iterator
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -13,9 +15,18 @@ from gripper_force.config import Config, config_from, config_from_text
 from gripper_force.control.score import score_grasp
 from gripper_force.errors import DataError
 from gripper_force.log import LogReader
+from gripper_force.replay import compare
 from gripper_force.report import write_report
 from gripper_force.session import run_grasp
-from gripper_force.types import NS_PER_S, GraspStatus, LoadCellSample, Outcome, ServoState, VisualForce
+from gripper_force.types import (
+    NS_PER_S,
+    FusedForce,
+    GraspStatus,
+    LoadCellSample,
+    Outcome,
+    ServoState,
+    VisualForce,
+)
 
 TRIAL_OBJECTS = ("sponge", "paper_cup", "tube", "stapler")
 TRIAL_TARGETS_N = (1.0, 8.0)
@@ -75,19 +86,12 @@ def trials(config: Config, count: int, jobs: int) -> Iterator[Summary]:
 def summarise(path: Path) -> Summary:
     """Reads the figures of a grasp from its log."""
     reader = LogReader(path)
-    statuses: list[GraspStatus] = []
-    cells: list[LoadCellSample] = []
-    cycles_ns: list[int] = []
-    compute_ms: list[float] = []
-    for record in reader.records(GraspStatus, LoadCellSample, ServoState, VisualForce):
-        if isinstance(record, GraspStatus):
-            statuses.append(record)
-        elif isinstance(record, LoadCellSample):
-            cells.append(record)
-        elif isinstance(record, ServoState):
-            cycles_ns.append(record.t_ns)
-        elif isinstance(record, VisualForce):
-            compute_ms.append(record.compute_ms)
+    records: dict[type, list[Any]] = defaultdict(list)
+    for record in reader.records(GraspStatus, LoadCellSample, ServoState, VisualForce, FusedForce):
+        records[type(record)].append(record)
+    statuses, cells = records[GraspStatus], sorted(records[LoadCellSample], key=lambda c: c.t_ns)
+    cycles_ns = [state.t_ns for state in records[ServoState]]
+    compute_ms = [visual.compute_ms for visual in records[VisualForce]]
     config = config_from_text(reader.config, str(path))
     outcomes = [s.outcome for s in statuses if s.outcome != Outcome.NONE]
     span_s = (cycles_ns[-1] - cycles_ns[0]) / NS_PER_S if len(cycles_ns) > 1 else 0.0
@@ -98,9 +102,15 @@ def summarise(path: Path) -> Summary:
         "seed": config.seed,
         **_score(cells, statuses, config.target_n),
         "peak_n": max((c.force_n for c in cells if c.valid), default=None),
-        "estimator_p50_ms": float(np.percentile(compute_ms, 50)) if compute_ms else None,
-        "estimator_p99_ms": float(np.percentile(compute_ms, 99)) if compute_ms else None,
+        "estimator_p50_ms": _percentile(compute_ms, 50),
+        "estimator_p99_ms": _percentile(compute_ms, 99),
         "loop_hz": (len(cycles_ns) - 1) / span_s if span_s else None,
+        "estimate_mae_n": {
+            "visual": _mae_n([(v.t_ns, v.force_n) for v in records[VisualForce]], cells),
+            "current": _mae_n([(f.t_ns, f.current_n) for f in records[FusedForce]], cells),
+            "fused": _mae_n([(f.t_ns, f.force_n) for f in records[FusedForce]], cells),
+            "floor": _floor_n(reader.metadata, cells),
+        },
         "log": str(path),
     }
 
@@ -134,6 +144,28 @@ def overall(results: list[Summary], force_limit_n: float) -> Summary:
 
 def _trial(tree: dict[str, Any]) -> Summary:
     return grasp(config_from(tree, "trials"))
+
+
+def _mae_n(estimates: list[tuple[int, float]], cells: list[LoadCellSample]) -> float | None:
+    """Mean error of an estimate over the whole run."""
+    figures = compare([t for t, _ in estimates], [f for _, f in estimates], cells)
+    return None if figures is None else float(figures["mae_n"])
+
+
+def _floor_n(metadata: Mapping[str, str], cells: list[LoadCellSample]) -> float | None:
+    """What no look at an object can avoid: its stiffness is its own, and only its kind's is known."""
+    if "scene" not in metadata or not cells:
+        return None
+    stiffness = float(json.loads(metadata["scene"])["stiffness"])
+    return float(np.mean([abs(c.force_n) for c in cells])) * abs(1 - 1 / stiffness)
+
+
+def _mean_mae_n(results: list[Summary]) -> dict[str, float | None]:
+    means = {}
+    for source in results[0]["estimate_mae_n"]:
+        values = [v for r in results if (v := r["estimate_mae_n"][source]) is not None]
+        means[source] = float(np.mean(values)) if values else None
+    return means
 
 
 def _score(cells: list[LoadCellSample], statuses: list[GraspStatus], target_n: float) -> Summary:

@@ -1,6 +1,7 @@
 """A log once more: the same functions over the same inputs, and every estimate against the load cell."""
 
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -171,15 +172,28 @@ def _sources(replayed: Replayed) -> dict[str, dict[str, Any]]:
     return {
         name: figures
         for name, (t_ns, force_n) in series.items()
-        if (figures := _figures(np.array(t_ns, np.int64), np.array(force_n), cells)) is not None
+        if (figures := compare(t_ns, force_n, cells)) is not None
     }
 
 
-def _figures(t_ns: Any, force_n: Any, cells: list[LoadCellSample]) -> dict[str, Any] | None:
-    measured_n, valid = label_frames(t_ns, cells, 0)
+def compare(
+    t_ns: Sequence[int], force_n: Sequence[float], cells: Sequence[LoadCellSample]
+) -> dict[str, Any] | None:
+    """An estimate against the load cell: ``mae_n, rmse_n, bias_n, contact_mae_n, lag_s, frames, per_bin``.
+
+    Args:
+        t_ns: Times of the estimates, rising.
+        force_n: The estimates.
+        cells: Load-cell samples by rising time.
+
+    Returns:
+        The figures, or None where the load cell has no valid sample near any estimate.
+    """
+    times_ns, estimates_n = np.array(t_ns, np.int64), np.array(force_n)
+    measured_n, valid = label_frames(times_ns, cells, 0)
     if not valid.any():
         return None
-    t_s, predicted_n, measured_n = t_ns[valid] / NS_PER_S, force_n[valid], measured_n[valid]
+    t_s, predicted_n, measured_n = times_ns[valid] / NS_PER_S, estimates_n[valid], measured_n[valid]
     contact = measured_n > _CONTACT_N
     return {
         "mae_n": metrics.mae(predicted_n, measured_n),
