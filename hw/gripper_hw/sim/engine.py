@@ -18,4 +18,11 @@ except (
 ) as error:  # what MuJoCo raises where libEGL, or a driver for it, is absent
     raise SimulationError(NO_EGL) from error
 
+
+def _quiet(_: str) -> None:
+    """Takes the place of a MUJOCO_LOG.TXT in the working directory: `World` looks at every warning itself."""
+
+
+mujoco.set_mju_user_warning(_quiet)
+
 __all__ = ["NO_EGL", "mujoco"]

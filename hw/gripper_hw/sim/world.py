@@ -15,14 +15,8 @@ from gripper_hw.sim.engine import NO_EGL, mujoco
 from gripper_hw.sim.scene import Scene, scene_mjcf
 
 _MAX_PENETRATION_M = 0.004
+_MAX_RACK_SLIP_M = 0.005
 _GUARD_PERIOD_NS = 5_000_000
-_BROKEN = (
-    mujoco.mjtWarning.mjWARN_BADQACC,
-    mujoco.mjtWarning.mjWARN_BADQPOS,
-    mujoco.mjtWarning.mjWARN_BADQVEL,
-    mujoco.mjtWarning.mjWARN_CONTACTFULL,
-    mujoco.mjtWarning.mjWARN_CNSTRFULL,
-)
 # Each costs more than the whole of the rest of a 128x128 picture in software.
 _NOT_DRAWN = (
     mujoco.mjtRndFlag.mjRND_SHADOW,
@@ -133,11 +127,13 @@ class World:
         data = self._data
         if not np.isfinite(data.qacc).all():
             raise SimulationError(self._broken("an acceleration is not finite"))
-        for warning in _BROKEN:
-            if data.warning[int(warning)].number:
-                raise SimulationError(self._broken(f"MuJoCo warns {warning.name}"))
+        for kind, warning in enumerate(data.warning):
+            if warning.number:
+                raise SimulationError(self._broken(f"MuJoCo warns {mujoco.mjtWarning(kind).name}"))
         if data.ncon and (depth := -float(data.contact.dist.min())) > _MAX_PENETRATION_M:
             raise SimulationError(self._broken(f"a pad is {depth * 1e3:.1f} mm deep in the object"))
+        if (slip := abs(float(data.ten_length[0]))) > _MAX_RACK_SLIP_M:
+            raise SimulationError(self._broken(f"the rack has slipped {slip * 1e3:.1f} mm on its pinion"))
         if self.force_n > 200.0:
             raise SimulationError(self._broken(f"the grip force reads {self.force_n:.0f} N"))
 
