@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from gripper_force import metrics
 from gripper_force.config import NonNegative, Positive, Section
 from gripper_force.dataset import CONTACT_N, Clip, digest, split_by
-from gripper_force.errors import CheckpointError, DataError
+from gripper_force.errors import CheckpointError, DataError, NonFiniteError
 from gripper_force.vision.checkpoint import Checkpoint, Header, Residual, load_checkpoint, save_checkpoint
 from gripper_force.vision.dense import normalise, predict
 from gripper_force.vision.network import ForceNetwork, NetworkConfig
@@ -97,7 +97,8 @@ class TrainConfig(Section):
 def train(config: TrainConfig, clips: Sequence[Clip], out: Path, *, resume: bool = False) -> Checkpoint:
     """Trains an ensemble and writes its checkpoint.
 
-    Each member's state is kept beside ``out`` every minute, until the checkpoint is written.
+    Each member's state is kept beside ``out`` every minute, until the checkpoint is written. With ``steps``,
+    on the CPU with one thread, a seed fixes the result to the bit, broken off and resumed or not.
 
     Args:
         config: The recipe.
@@ -109,7 +110,8 @@ def train(config: TrainConfig, clips: Sequence[Clip], out: Path, *, resume: bool
         The checkpoint as written.
 
     Raises:
-        DataError: The data have no two sets of any object, or hold no contact.
+        DataError: The data have no two sets of any object, hold no contact, or a recording is too short.
+        NonFiniteError: The training diverged.
         CheckpointError: A state is of another recipe or other data, or a file can't be written.
     """
     device = config.device
@@ -151,15 +153,17 @@ class _Data:
     """All training frames on one device, and lists to draw clips from."""
 
     def __init__(self, clips: Sequence[Clip], config: TrainConfig, device: str) -> None:
+        for clip in clips:
+            if len(clip.frames) < config.preprocess.reference_frames:
+                raise DataError(f"{clip.name} has {len(clip.frames)} frames, too few for its own reference")
         lengths = [len(clip.frames) for clip in clips]
         forces_n = np.concatenate([clip.forces_n for clip in clips])
         valid = np.concatenate([clip.valid for clip in clips])
         self._config = config
         self._device = device
         self._begin = np.repeat(np.cumsum([0, *lengths[:-1]]), lengths)  # (N,)
-        self._frames = torch.from_numpy(np.concatenate([clip.frames for clip in clips])).to(
-            device
-        )  # (N, S, S)
+        frames = np.concatenate([clip.frames for clip in clips])  # (N, S, S)
+        self._frames = torch.from_numpy(frames).to(device)
         self._labels = torch.from_numpy(forces_n).to(device)  # (N,)
         self._valid = torch.from_numpy(valid).to(device)  # (N,)
         self._all = np.flatnonzero(valid)
@@ -262,6 +266,10 @@ class _Run:
             loss = self._update(forward, data)
             if self._step % 10 == 0:
                 rmse_n = math.sqrt(loss.item()) * self.network.config.label_scale_n
+                if not math.isfinite(rmse_n):
+                    raise NonFiniteError(
+                        f"the training of {self._label} diverged by step {self._step}; lower learning_rate"
+                    )
                 smooth = rmse_n if math.isnan(smooth) else 0.9 * smooth + 0.1 * rmse_n
                 progress.update(task, completed=min(1.0, self._done), loss=f"RMSE {smooth:.3f} N")
             self._step += 1

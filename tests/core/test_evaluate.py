@@ -97,5 +97,5 @@ def test_the_baseline_finds_a_smooth_law() -> None:
         one.frames[...] = (one.frames + rng.integers(0, 3, one.frames.shape)).clip(0, 255)
     result = ridge_baseline(clips[:8], clips[8:])
     constant = np.abs(clips[0].forces_n - clips[0].forces_n.mean()).mean()
-    assert result["mae_n"] < 0.3 * constant
+    assert result["mae_n"] < 0.4 * constant
     assert result["frames"] == 30

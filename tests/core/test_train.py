@@ -7,7 +7,7 @@ import torch
 
 from gripper_force import train as train_module
 from gripper_force.dataset import Clip, digest
-from gripper_force.errors import CheckpointError, DataError
+from gripper_force.errors import CheckpointError, DataError, NonFiniteError
 from gripper_force.train import TrainConfig, one_cycle, train
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.dense import normalise, predict
@@ -142,9 +142,17 @@ def test_a_time_budget_ends_the_training(
     assert learning_rates[-1] < 1
 
 
+def test_divergence_is_named(clips: list[Clip], tmp_path: Path) -> None:
+    clips[0].forces_n[:] = clips[1].forces_n[:] = clips[2].forces_n[:] = np.inf
+    with pytest.raises(NonFiniteError, match="ssam diverged"):
+        train(QUICK, clips, tmp_path / "out.safetensors")
+
+
 def test_data_without_contact_or_split_are_refused(clips: list[Clip], tmp_path: Path) -> None:
     with pytest.raises(DataError, match="two"):
         train(QUICK, clips[:1], tmp_path / "out.safetensors")
+    with pytest.raises(DataError, match="too few"):
+        train(QUICK, [*clips, press(7, frames=3), press(8, frames=3)], tmp_path / "out.safetensors")
     for clip in clips:
         clip.forces_n[:] = 0
     with pytest.raises(DataError, match="contact"):
