@@ -65,12 +65,14 @@ def trials(config: Config, count: int, jobs: int) -> Iterator[Summary]:
         The summary of each, in order, with its ``seed``.
     """
     rng = np.random.default_rng([config.seed, 20])
+    quiet = config.log.model_copy(update={"report": False})  # `replay LOG --report` draws any of them
     plan = [
         config.model_copy(
             update={
                 "object": TRIAL_OBJECTS[i % len(TRIAL_OBJECTS)],
                 "target_n": round(float(rng.uniform(*TRIAL_TARGETS_N)), 3),
                 "seed": config.seed + i,
+                "log": quiet,
             }
         )
         for i in range(count)
