@@ -82,10 +82,14 @@ def open_devices(config: Config) -> Iterator[Devices]:
         )
 
 
-def _open(path: str | None, rig: Any, section: Any, clock: Clock, unit: str) -> Any:
-    if path is None:
+def _open(backend: str | None, rig: Any, section: Any, clock: Clock, unit: str) -> Any:
+    if backend is None:
         return None
-    return getattr(rig, unit) if path == RIG else _load(path)(section, clock)
+    if backend == RIG:
+        return getattr(rig, unit)
+    if section.path is None:
+        raise ConfigError(f"{unit}.backend={section.backend} needs {unit}.path, the log to play")
+    return _load(backend)(section.path, clock, section.speed)
 
 
 def _known(backends: dict[str, str | None], unit: str, name: str) -> str | None:
