@@ -19,12 +19,12 @@ RIG: Final = "gripper_hw.sim.rig:SimulatedRig"
 CAMERAS: Final = {
     "none": None,
     "simulated": RIG,
-    "playback": "gripper_hw.playback.camera:PlaybackCamera",
+    "playback": "gripper_hw.playback:PlaybackCamera",
 }
 LOAD_CELLS: Final = {
     "none": None,
     "simulated": RIG,
-    "playback": "gripper_hw.playback.load_cell:PlaybackLoadCell",
+    "playback": "gripper_hw.playback:PlaybackLoadCell",
 }
 
 
@@ -63,12 +63,10 @@ def open_devices(config: Config) -> Iterator[Devices]:
                 "set clock=realtime, or servo.port=virtual:rig"
             )
         clock: Clock = rig.clock if rig is not None else MonotonicClock()
-        camera = _open(camera_class, rig, config.camera, clock, "camera")
-        load_cell = _open(load_cell_class, rig, config.load_cell, clock, "load_cell")
+        camera = _open(stack, camera_class, rig, config.camera, clock, "camera")
+        load_cell = _open(stack, load_cell_class, rig, config.load_cell, clock, "load_cell")
         servo = _load(SERVO)(config.servo, clock.now_ns)
-        for device in (servo, camera, load_cell):
-            if device is not None:
-                stack.callback(device.close)
+        stack.callback(servo.close)
         if rig is not None:
             rig.start()
         yield Devices(
@@ -82,14 +80,17 @@ def open_devices(config: Config) -> Iterator[Devices]:
         )
 
 
-def _open(backend: str | None, rig: Any, section: Any, clock: Clock, unit: str) -> Any:
+def _open(stack: ExitStack, backend: str | None, rig: Any, section: Any, clock: Clock, unit: str) -> Any:
     if backend is None:
         return None
     if backend == RIG:
-        return getattr(rig, unit)
-    if section.path is None:
+        device = getattr(rig, unit)
+    elif section.path is None:
         raise ConfigError(f"{unit}.backend={section.backend} needs {unit}.path, the log to play")
-    return _load(backend)(section.path, clock, section.speed)
+    else:
+        device = _load(backend)(section.path, clock, section.speed)
+    stack.callback(device.close)
+    return device
 
 
 def _known(backends: dict[str, str | None], unit: str, name: str) -> str | None:

@@ -49,7 +49,7 @@ def main() -> NoReturn:
     try:
         app()
     except GripperError as error:
-        err.print(f"[bold red]error:[/] {_plain(error)}")
+        err.print(f"[bold red]error:[/] {_plain(error)}", soft_wrap=True)
         if "--json" in sys.argv:
             sys.stdout.write(json.dumps({"error": str(error)}) + "\n")
         sys.exit(2)

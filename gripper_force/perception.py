@@ -5,7 +5,6 @@ import time
 from collections import deque
 from typing import NamedTuple, Protocol
 
-from gripper_force.errors import GripperError
 from gripper_force.interfaces import Camera, Clock
 from gripper_force.types import NS_PER_MS, Frame, Gray, VisualForce
 
@@ -109,7 +108,7 @@ class ThreadedPerception:
     def __init__(self, camera: Camera | None, estimator: Estimator | None, clock: Clock) -> None:
         self._camera, self._estimator, self._clock = camera, estimator, clock
         self._done: deque[Seen] = deque()
-        self._failure: GripperError | None = None
+        self._failure: Exception | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="perception", daemon=True)
 
@@ -139,7 +138,7 @@ class ThreadedPerception:
                     self._stop.wait(self._IDLE_S)
                     continue
                 self._done.append(Seen(frame, self._estimate(frame)))
-        except GripperError as error:
+        except Exception as error:  # it is the control thread's to raise
             self._failure = error
 
     def _estimate(self, frame: Frame) -> VisualForce | None:

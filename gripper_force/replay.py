@@ -68,7 +68,8 @@ def replay(
 
     Returns:
         ``mae_n, rmse_n, bias_n, per_bin, frames`` of the estimate that the run acted on (or of vision, where
-        nothing acted), ``identical``, and the same figures with ``lag_s`` by source.
+        nothing acted), ``identical`` (None where the log holds no run), and the same figures with ``lag_s``
+        by source.
 
     Raises:
         LogError: The log can't be read.
@@ -87,7 +88,7 @@ def replay(
     return {
         **{key: best[key] for key in ("mae_n", "rmse_n", "bias_n", "per_bin", "frames")},
         "per_object": {config.object: {k: best[k] for k in ("mae_n", "rmse_n", "bias_n", "frames")}},
-        "identical": bool(flags) and all(flags),
+        "identical": all(flags) if flags else None,
         "sources": sources,
         "log": str(path),
     }

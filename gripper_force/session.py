@@ -4,6 +4,7 @@ This module alone owns the order of things within a cycle. It runs in lockstep w
 real time; `gripper_force.replay` feeds the same controller from a log, in the order this one wrote it in.
 """
 
+import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -52,6 +53,7 @@ class Session:
         self._period_ns = round(NS_PER_S / config.control.rate_hz)
         self._due_ns = 0
         self._stop = threading.Event()
+        self._interrupted = False
         self._last_retries = 0
         self._armed = False
         self.sees = False
@@ -71,6 +73,22 @@ class Session:
         """Makes the next cycle a stop, whatever else was asked. Any thread or signal handler may call it."""
         self._stop.set()
 
+    def interrupt(self) -> None:
+        """Makes the next cycle raise `KeyboardInterrupt` before it talks to the servo.
+
+        Raises:
+            KeyboardInterrupt: The one asked for before has not come yet.
+        """
+        if self._interrupted:
+            raise KeyboardInterrupt
+        self._interrupted = True
+
+    def end_if_interrupted(self) -> None:
+        """Raises the `KeyboardInterrupt` that is due, if one is."""
+        if self._interrupted:
+            self._interrupted = False
+            raise KeyboardInterrupt("the run was interrupted")
+
     def cycle(self, kind: RequestKind | None = None, target_n: float = 0.0) -> Decision:
         """Waits for the next cycle and runs it: read, see, decide, write, log.
 
@@ -80,11 +98,13 @@ class Session:
 
         Raises:
             DeviceError: The servo was lost or does not answer.
+            KeyboardInterrupt: See `interrupt`.
             GripperError: A sensor, the estimator or the simulated world failed.
         """
         devices, log = self._devices, self._log
         devices.clock.sleep_until_ns(self._due_ns)
         self._due_ns = max(self._due_ns + self._period_ns, devices.clock.now_ns() - self._period_ns)
+        self.end_if_interrupted()
         devices.check()
         visual = None
         for seen in self._perception.poll():
@@ -150,6 +170,7 @@ def open_session(
             stack.callback(sys.setswitchinterval, sys.getswitchinterval())
             sys.setswitchinterval(_REALTIME_SWITCH_S)
         stack.callback(_attach_reference, log, estimator)
+        stack.enter_context(_signals_wait(session))
         stack.callback(session.close)
         try:
             session.start()
@@ -158,6 +179,25 @@ def open_session(
             with suppress(LogError):  # the first error is the one to tell
                 log.write(Event(devices.clock.now_ns(), "session", f"{type(error).__name__}: {error}"))
             raise
+
+
+@contextmanager
+def _signals_wait(session: Session) -> Iterator[None]:
+    """Ctrl-C and SIGTERM end the run between two cycles, as one within a bus transaction would leave it torn.
+
+    A second one, while the first still waits, ends it at once.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread may set handlers, and only there do they raise
+        return
+    signals = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda *_: session.interrupt()) for number in signals]
+    try:
+        yield
+    finally:
+        for number, handler in zip(signals, before, strict=True):
+            signal.signal(number, handler)
+    session.end_if_interrupted()
 
 
 def run_grasp(config: Config, path: Path, progress: Progress | None = None) -> None:

@@ -386,10 +386,10 @@ class DynamixelBus:
             )
         for attempt in range(self._config.retries + 1):
             self.stats.retries += attempt > 0
+            self._port.is_using = False  # an interrupted transaction would leave it set for ever
             try:
                 result, value = once()
             except IndexError:  # the SDK indexes into answers that are too short
-                self._port.is_using = False
                 result = COMM_RX_CORRUPT
             if result == COMM_SUCCESS:
                 return value

@@ -157,7 +157,7 @@ class SimulatedRig:
         self._bus_name = config.servo.port.removeprefix("virtual:")
         register_bus(self._bus_name, bus)
         self._start_ns = start_ns
-        self._failure: SimulationError | None = None
+        self._failure: Exception | None = None
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -203,7 +203,7 @@ class SimulatedRig:
                 self._world.advance_to(min(due_ns, self._world.t_ns + _REALTIME_SLICE_NS))
                 if lag_ns < _REALTIME_SLICE_NS:
                     self._stop.wait(1e-3)
-        except SimulationError as error:
+        except Exception as error:  # `check` raises it in the session's thread
             self._failure = error
         finally:
             self._world.close()  # the drawing context belongs to this thread

@@ -1,0 +1,158 @@
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gripper_force.config import (
+    HARD_FORCE_LIMIT_N,
+    Config,
+    ControlConfig,
+    config_from,
+    config_from_text,
+    dump_config,
+    load_config,
+    section_from,
+)
+from gripper_force.errors import ConfigError
+
+positive = st.floats(1e-6, 1e6)
+configs = st.builds(
+    lambda tree: config_from(tree, "the test"),
+    st.fixed_dictionaries(
+        {
+            "object": st.text(max_size=20),
+            "target_n": positive,
+            "seed": st.integers(0, 2**63),
+            "vision": st.fixed_dictionaries(
+                {
+                    "region": st.none() | st.tuples(*[st.integers(-9, 9999)] * 4),
+                    "lockstep_compute_ms": positive,
+                }
+            ),
+            "gripper": st.fixed_dictionaries({"nm_per_a": st.none() | positive}),
+            "camera": st.fixed_dictionaries({"path": st.none() | st.just("some where/log.mcap")}),
+            "sim": st.fixed_dictionaries({"lux": st.none() | positive, "randomise": st.booleans()}),
+        }
+    ),
+)
+
+
+def test_everything_has_a_default() -> None:
+    assert load_config() == Config()
+
+
+@settings(max_examples=50, deadline=None)
+@given(configs)
+def test_what_is_dumped_is_read_back_as_it_was(config: Config) -> None:
+    assert config_from_text(dump_config(config), "the test") == config
+
+
+@pytest.mark.parametrize(
+    ("key", "known"),
+    [("colour", "object, target_n, seed"), ("control.ramp", "rate_hz, feedback, force_limit_n")],
+)
+def test_an_unknown_key_is_named_with_the_known_ones(tmp_path: Path, key: str, known: str) -> None:
+    with pytest.raises(ConfigError, match=f"unknown configuration key '{key}'") as caught:
+        load_config(None, [f"{key}=1"])
+    assert known in str(caught.value)
+    path = tmp_path / "scene.yaml"
+    head, *rest = key.split(".")
+    path.write_text(f"{head}: {{{rest[0]}: 1}}" if rest else f"{head}: 1")
+    with pytest.raises(ConfigError, match=f"'{key}' .*{path}") as caught:
+        load_config(path)
+    assert known in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("assignment", "key"),
+    [
+        ("target_n=0", "target_n"),
+        ("target_n=.nan", "target_n"),
+        ("target_n=.inf", "target_n"),
+        ("target_n=much", "target_n"),
+        ("seed=-1", "seed"),
+        ("clock=late", "clock"),
+        ("servo.id=253", "servo.id"),
+        ("servo.bus_watchdog_ms=10", "servo.bus_watchdog_ms"),
+        ("gripper.closing_sign=0", "gripper.closing_sign"),
+        ("vision.region=[1, 2, 3]", "vision.region"),
+        (f"control.force_limit_n={HARD_FORCE_LIMIT_N + 0.1}", "control.force_limit_n"),
+        ("control=5", "control"),
+    ],
+)
+def test_a_value_out_of_range_is_refused_with_its_key_and_itself(assignment: str, key: str) -> None:
+    with pytest.raises(ConfigError, match=f"configuration key '{key}") as caught:
+        load_config(None, [assignment])
+    assert "--set" in str(caught.value)
+    assert ", got " in str(caught.value)
+
+
+def test_overrides_are_yaml_and_the_last_one_wins(tmp_path: Path) -> None:
+    path = tmp_path / "scene.yaml"
+    path.write_text("object: tube\ntarget_n: 2\nvision: {threads: 3}\n")
+    config = load_config(path, ["target_n=5", "target_n=6.5", "vision.region=[1, 2, 30, 40]"])
+    assert (config.object, config.target_n, config.vision.threads) == ("tube", 6.5, 3)
+    assert config.vision.region == (1, 2, 30, 40)
+    assert load_config(None, ["gripper.nm_per_a=null"]).gripper.nm_per_a is None
+    assert load_config(None, ["object=a=b"]).object == "a=b"
+
+
+@pytest.mark.parametrize(
+    ("assignment", "sentence"),
+    [
+        ("target_n", r"--set needs key\.path=value, got 'target_n'"),
+        ("=3", r"--set needs key\.path=value, got '=3'"),
+        ("target_n=[1", r"--set target_n: '\[1' is no value"),
+        ("seed.a.b=3", "'seed' is a value, not a section"),
+    ],
+)
+def test_an_assignment_that_is_none_is_refused(tmp_path: Path, assignment: str, sentence: str) -> None:
+    path = tmp_path / "scene.yaml"
+    path.write_text("seed: 4")
+    with pytest.raises(ConfigError, match=sentence):
+        load_config(path, [assignment])
+
+
+@pytest.mark.parametrize(
+    ("data", "sentence"),
+    [
+        (b"- a\n- b\n", "holds no mapping of keys to values"),
+        (b"a: [1\n", "can't read the configuration"),
+        (b"\xff\xfe\x00", "can't read the configuration"),
+        (None, "can't read the configuration .*No such file"),
+    ],
+)
+def test_a_file_that_is_no_configuration_is_named(tmp_path: Path, data: bytes | None, sentence: str) -> None:
+    path = tmp_path / "scene.yaml"
+    if data is not None:
+        path.write_bytes(data)
+    with pytest.raises(ConfigError, match=sentence) as caught:
+        load_config(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "scene.yaml"
+    path.write_text("# nothing yet\n")
+    assert load_config(path) == Config()
+
+
+def test_a_section_stands_alone() -> None:
+    assert section_from(ControlConfig, ["ramp_n_s=3"]) == ControlConfig(ramp_n_s=3)
+    with pytest.raises(ConfigError, match=r"unknown configuration key 'ramp'.*ramp_n_s"):
+        section_from(ControlConfig, ["ramp=3"])
+
+
+@pytest.mark.parametrize("text", ["a: [1", "object: {a: 1}"])
+def test_a_logs_configuration_that_is_damaged_is_named(text: str) -> None:
+    with pytest.raises(ConfigError, match=r"run\.mcap"):
+        config_from_text(text, "run.mcap")
+
+
+def test_a_configuration_can_not_be_changed() -> None:
+    config: Any = Config()
+    with pytest.raises(ValueError, match="frozen"):
+        config.seed = 3
