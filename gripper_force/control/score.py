@@ -12,6 +12,9 @@ from gripper_force.types import NS_PER_S, GraspStatus, LoadCellSample, Phase
 STEADY_S = 1.0
 """The last part of the hold whose mean counts."""
 
+_RAMPING = (Phase.RAMP, Phase.HOLD)
+_GRASPING = (Phase.APPROACH, Phase.CONTACT, *_RAMPING)
+
 
 @dataclass(frozen=True, slots=True)
 class GraspScore:
@@ -21,7 +24,7 @@ class GraspScore:
         target_n: What was asked.
         steady_n: Mean over the last `STEADY_S` of the hold.
         steady_error_n: ``steady_n - target_n``.
-        overshoot_n: Most the load cell read above the target since the ramp began; 0 where it never did.
+        overshoot_n: Most the load cell read above the target, the first touch included; 0 where it never did.
         settle_s: Time from the start of the ramp until the force stays within 5 % or 0.1 N; NaN: never.
     """
 
@@ -49,7 +52,9 @@ def score_grasp(
     if not held_ns:
         raise DataError("there is no hold to score in this run; the grasp ended before it reached its target")
     end_ns = held_ns[-1]
-    ramp_ns = _last_start_ns(statuses, end_ns)
+    ramp_ns = _start_of(_RAMPING, statuses, end_ns)
+    touch_ns = _start_of(_GRASPING, statuses, end_ns)
+    peak_n = max((s.force_n for s in samples if s.valid and touch_ns <= s.t_ns <= end_ns), default=0.0)
     cell = [(s.t_ns, s.force_n) for s in samples if s.valid and ramp_ns <= s.t_ns <= end_ns]
     if not cell or cell[-1][0] < held_ns[0]:
         raise DataError("the load cell has no valid sample during the hold; check it in the log")
@@ -63,16 +68,16 @@ def score_grasp(
         target_n=target_n,
         steady_n=steady_n,
         steady_error_n=steady_n - target_n,
-        overshoot_n=max(float(force_n.max()) - target_n, 0.0),
+        overshoot_n=max(peak_n - target_n, 0.0),
         settle_s=float(t_s[first_inside]) if first_inside < len(t_s) else math.nan,
     )
 
 
-def _last_start_ns(statuses: Sequence[GraspStatus], end_ns: int) -> int:
-    """When the ramp that led to the hold at ``end_ns`` began."""
+def _start_of(phases: tuple[Phase, ...], statuses: Sequence[GraspStatus], end_ns: int) -> int:
+    """When the unbroken run of these phases began that lasted to ``end_ns``."""
     start_ns = end_ns
     for status in reversed([s for s in statuses if s.t_ns <= end_ns]):
-        if status.phase not in (Phase.RAMP, Phase.HOLD):
+        if status.phase not in phases:
             break
         start_ns = status.t_ns
     return start_ns

@@ -22,12 +22,12 @@ def cell(force_of_s, seconds):
 
 
 def test_scores_a_known_curve():
-    states = statuses(Phase.APPROACH, Phase.RAMP, Phase.HOLD, Phase.HOLD, Phase.HOLD, Phase.RELEASE)
+    states = statuses(Phase.OPEN, Phase.RAMP, Phase.HOLD, Phase.HOLD, Phase.HOLD, Phase.RELEASE)
     force = lambda t: 9.0 if t < 1 else 0.0 if t > 5 else 4.5 if t < 2 else 4.08  # noqa: E731
     score = score_grasp(cell(force, 6), states, 4.0)
     assert score.steady_n == pytest.approx(4.08)
     assert score.steady_error_n == pytest.approx(0.08)
-    assert score.overshoot_n == pytest.approx(0.5)  # the 9 N came before the ramp
+    assert score.overshoot_n == pytest.approx(0.5)  # the 9 N came before the grasp
     assert score.settle_s == pytest.approx(1.0)
 
 
@@ -37,6 +37,13 @@ def test_the_last_grasp_counts_and_rejected_samples_do_not():
     samples[450] = LoadCellSample(450 * 10 * MS, -70.0, 0.0, valid=False)
     score = score_grasp(samples, states, 1.0)
     assert (score.steady_error_n, score.overshoot_n, score.settle_s) == (0.0, 0.0, 0.0)
+
+
+def test_a_hard_first_touch_is_overshoot():
+    states = statuses(Phase.APPROACH, Phase.CONTACT, Phase.RAMP, Phase.HOLD)
+    score = score_grasp(cell(lambda t: 3.0 if 0.5 < t < 1.5 else 2.0, 4), states, 2.0)
+    assert score.overshoot_n == pytest.approx(1.0)
+    assert score.settle_s == 0.0  # which counts from the ramp on
 
 
 def test_never_settled_is_nan():
