@@ -1,0 +1,83 @@
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from gripper_force.config import GripperConfig
+from gripper_force.errors import ConfigError
+from gripper_hw.sim.engine import mujoco
+from gripper_hw.sim.objects import OBJECTS, Detail, build_object
+from gripper_hw.sim.scene import Scene, scene_mjcf
+
+DETAILS = get_args(Detail)
+RADIUS_M = GripperConfig().pinion_radius_m
+
+
+def model_of(name: str, detail: str = "coarse", size: float = 1.0, stiffness: float = 1.0) -> mujoco.MjModel:
+    scene = Scene(name, detail, size=size, stiffness=stiffness)
+    return mujoco.MjModel.from_xml_string(*scene_mjcf(scene, GripperConfig()))
+
+
+def press(model: mujoco.MjModel, force_n: float, time_s: float) -> tuple[float, float]:
+    """Closes slowly with a constant torque. Returns travel of the right jaw in m, and grip force in N.
+
+    Nothing but the object resists in the end, so that what the object takes is what the motor gives.
+    """
+    data = mujoco.MjData(model)
+    data.ctrl[0] = 2 * force_n * RADIUS_M
+    model.dof_frictionloss[:] = 0
+    model.dof_damping[model.joint("servo").dofadr] = force_n * RADIUS_M / 0.8
+    while data.time < time_s:
+        mujoco.mj_step(model, data)
+    return float(data.joint("right").qpos[0]), float(np.mean(np.abs(data.sensordata[[1, 5]])))
+
+
+def travel_at(name: str, force_n: float, size: float = 1.0, stiffness: float = 1.0) -> float:
+    """How far the jaws go on from a touch of 0.5 N to a force."""
+    model = model_of(name, "medium", size, stiffness)
+    return press(model, force_n, 1.6)[0] - press(model, 0.5, 1.6)[0]
+
+
+def test_an_unknown_object_is_named_with_the_known_ones() -> None:
+    with pytest.raises(ConfigError, match="no simulated object 'egg'; there are sponge, paper_cup, tube"):
+        build_object("egg", "coarse", 1.0, 1.0)
+
+
+@pytest.mark.parametrize("detail", DETAILS)
+@pytest.mark.parametrize("name", OBJECTS)
+def test_every_object_stands_still_untouched_at_every_level(name: str, detail: str) -> None:
+    model = model_of(name, detail)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    shape = np.concatenate([data.flexvert_xpos.ravel(), data.xpos.ravel()])
+    for _ in range(8):
+        mujoco.mj_step(model, data)
+    moved = np.concatenate([data.flexvert_xpos.ravel(), data.xpos.ravel()]) - shape
+    assert np.abs(moved).max() < 4e-4
+    assert not any(warning.number for warning in data.warning)
+    assert float(data.sensordata[1]) == 0.0
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+def test_a_finer_level_costs_no_less(name: str) -> None:
+    models = [model_of(name, detail) for detail in DETAILS]
+    cost = [model.nv / model.opt.timestep for model in models]
+    assert cost == sorted(cost)
+    assert cost[0] < cost[2]
+    steps = [model.opt.timestep for model in models]
+    assert steps == sorted(steps, reverse=True)
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+def test_every_object_takes_what_the_motor_gives(name: str) -> None:
+    travel_m, force_n = press(model_of(name), 3.0, 1.5)
+    assert force_n == pytest.approx(3.0, abs=0.1)
+    assert 0.005 < travel_m < 0.04
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+def test_size_leaves_stiffness_alone_and_stiffness_scales_the_force(name: str) -> None:
+    travel_m = travel_at(name, 4.0)
+    for size in (0.96, 1.04):
+        assert travel_at(name, 4.0, size=size) == pytest.approx(travel_m, rel=0.06)
+    assert 0.94 < travel_at(name, 4.0, stiffness=1.05) / travel_m < 0.975

@@ -1,0 +1,61 @@
+from dataclasses import asdict, replace
+
+import pytest
+
+from gripper_force.config import GripperConfig, SimConfig
+from gripper_force.errors import ConfigError
+from gripper_hw.sim.scene import LUX_LEVELS, Scene, draw_scene, scene_mjcf
+
+
+def test_a_seed_draws_one_scene_and_another_seed_another() -> None:
+    config = SimConfig()
+    assert draw_scene("tube", 3, config) == draw_scene("tube", 3, config)
+    first, second = asdict(draw_scene("tube", 3, config)), asdict(draw_scene("tube", 4, config))
+    same = {name for name in first if first[name] == second[name]}
+    assert same == {"object", "detail"}
+
+
+def test_what_is_asked_for_is_not_drawn() -> None:
+    scene = draw_scene("cup", 3, SimConfig(randomise=False, lux=350, detail="fine"))
+    assert scene == Scene("cup", "fine", lux=350.0)
+    assert {draw_scene("cup", i, SimConfig(randomise=False)).lux for i in range(20)} == set(LUX_LEVELS)
+    assert draw_scene("cup", 3, SimConfig(lux=350)).lux == pytest.approx(350, rel=0.051)
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.3])
+def test_stiffness_stays_within_its_spread_and_fills_it(spread: float) -> None:
+    config = SimConfig(stiffness_spread=spread)
+    off = [abs(draw_scene("tube", seed, config).stiffness - 1) for seed in range(50)]
+    assert max(off) <= spread
+    assert max(off) >= 0.8 * spread
+
+
+def test_every_drawn_number_reaches_the_model() -> None:
+    gripper = GripperConfig()
+    plain = Scene("sponge", "coarse")
+    before = scene_mjcf(plain, gripper)
+    drawn = asdict(draw_scene("sponge", 1, SimConfig()))
+    for name in drawn.keys() - {"object", "detail", "lux", "shot_noise", "nm_per_a"}:
+        after = scene_mjcf(replace(plain, **{name: drawn[name]}), gripper)
+        if name != "texture_seed":
+            assert after[0] != before[0], name
+        else:
+            assert after[1] != before[1]
+
+
+def test_no_name_is_left_unfilled_and_the_textures_are_there() -> None:
+    for name, texture in [
+        ("sponge", "sponge.png"),
+        ("paper_cup", "cup.png"),
+        ("tube", "tube.png"),
+        ("stapler", None),
+    ]:
+        text, assets = scene_mjcf(Scene(name, "coarse"), GripperConfig())
+        assert "$" not in text.split("-->", 1)[1]
+        assert set(assets) == {"table.png"} | ({texture} if texture else set())
+        assert all(data.startswith(b"\x89PNG") for data in assets.values())
+
+
+def test_an_unknown_object_is_named() -> None:
+    with pytest.raises(ConfigError, match="no simulated object 'egg'"):
+        scene_mjcf(Scene("egg", "coarse"), GripperConfig())

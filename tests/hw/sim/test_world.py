@@ -1,0 +1,166 @@
+import math
+import os
+import subprocess
+import sys
+import textwrap
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gripper_force.config import GripperConfig
+from gripper_force.errors import SimulationError
+from gripper_force.types import NS_PER_MS
+from gripper_hw.sim.engine import NO_EGL
+from gripper_hw.sim.scene import Scene
+from gripper_hw.sim.world import World
+
+NM_PER_A = 1.78
+RADIUS_M = GripperConfig().pinion_radius_m
+
+
+class Current:
+    """A motor that is given its current by hand, and a brake so that it closes slowly."""
+
+    def __init__(self, current_a: float, brake_a_s: float = 0.0) -> None:
+        self.current_a = current_a
+        self.brake_a_s = brake_a_s
+        self.seen: list[tuple[int, float]] = []
+
+    def control(self, t_ns: int, position_rad: float, velocity_rad_s: float, current_noise_a: float) -> float:
+        self.seen.append((t_ns, position_rad))
+        return self.current_a - self.brake_a_s * velocity_rad_s
+
+
+@pytest.fixture
+def make_world() -> Iterator[Callable[..., World]]:
+    worlds: list[World] = []
+
+    def make(motor: Current, seed: int = 0, **scene: object) -> World:
+        drawn = Scene(**{"object": "stapler", "detail": "coarse"} | scene)  # type: ignore[arg-type]
+        worlds.append(World(drawn, GripperConfig(), motor, NM_PER_A, seed))
+        return worlds[-1]
+
+    yield make
+    for world in worlds:
+        world.close()
+
+
+@pytest.mark.parametrize("gain", [0.9, 1.1])
+def test_the_grip_is_the_motors_torque_through_the_pinion_less_friction(
+    make_world: Callable[..., World], gain: float
+) -> None:
+    current_a = 0.13
+    scene = Scene("stapler", "coarse")
+    world = make_world(Current(current_a, brake_a_s=0.02), nm_per_a=gain)
+    world.advance_to(2500 * NS_PER_MS)
+    given_n = gain * NM_PER_A * current_a / RADIUS_M / 2
+    friction_n = scene.servo_friction_nm / RADIUS_M / 2 + scene.jaw_friction_n
+    assert given_n - friction_n < world.force_n < given_n - 0.1 * friction_n
+
+
+def test_the_motor_is_stepped_with_the_physics(make_world: Callable[..., World]) -> None:
+    motor = Current(0.1)
+    world = make_world(motor)
+    world.advance_to(101 * NS_PER_MS)
+    assert [t_ns for t_ns, _ in motor.seen] == list(range(0, 100 * NS_PER_MS, 2_500_000))
+    assert world.t_ns == 100 * NS_PER_MS
+    assert motor.seen[0][1] == 0.0
+    assert motor.seen[-1][1] > 0.1
+
+
+def test_a_tap_is_called_at_each_multiple_of_its_period(make_world: Callable[..., World]) -> None:
+    world = make_world(Current(0.0))
+    calls: list[int] = []
+    world.every(16_666_667, calls.append)
+    world.advance_to(1000 * NS_PER_MS)
+    assert len(calls) == 59
+    late_ns = np.array(calls) - 16_666_667 * np.arange(1, 60)
+    assert (late_ns >= 0).all()
+    assert (late_ns <= 2_500_000).all()
+
+
+@pytest.mark.parametrize(
+    ("current_a", "why"),
+    [
+        (math.nan, "BADCTRL"),
+        (math.inf, "BADCTRL"),
+        (1e7, "BADQACC"),
+        (-1e7, "BADQACC"),
+        (1e3, "slipped"),
+        (10.0, "deep in the object"),
+    ],
+)
+def test_an_absurd_torque_breaks_loudly(
+    make_world: Callable[..., World],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    current_a: float,
+    why: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    world = make_world(Current(current_a))
+    with pytest.raises(SimulationError, match=rf"the simulation of 'stapler' \(coarse\) .*{why}") as caught:
+        world.advance_to(300 * NS_PER_MS)
+    assert "take a finer sim.detail or another seed" in str(caught.value)
+    assert not list(tmp_path.iterdir())  # MuJoCo would leave a MUJOCO_LOG.TXT there
+    assert capfd.readouterr().err == ""
+
+
+def test_a_scene_that_mujoco_refuses_is_named(make_world: Callable[..., World]) -> None:
+    with pytest.raises(SimulationError, match="MuJoCo refuses the scene of 'sponge'"):
+        make_world(Current(0.0), object="sponge", size=-1.0)
+
+
+def test_the_picture_shows_the_jaws_move(make_world: Callable[..., World]) -> None:
+    world = make_world(Current(0.1))
+    before = world.render(64)
+    assert before.shape == (64, 64, 3)
+    assert before.std() > 20
+    assert (world.render(64) == before).all()
+    world.advance_to(300 * NS_PER_MS)
+    assert np.abs(world.render(64).astype(int) - before).max() > 40
+
+
+NO_LIBRARY = """
+    import ctypes
+    import ctypes.util
+
+    load, find = ctypes.CDLL.__init__, ctypes.util.find_library
+
+    def refuse(self, name, *args, **kwargs):
+        if name and "EGL" in str(name):
+            raise OSError(f"{name}: cannot open shared object file")
+        load(self, name, *args, **kwargs)
+
+    ctypes.CDLL.__init__ = refuse
+    ctypes.util.find_library = lambda name: None if "EGL" in name else find(name)
+"""
+
+
+@pytest.mark.parametrize("lacks", ["library", "driver"])
+def test_without_egl_one_sentence_names_the_packages(lacks: str, tmp_path: Path) -> None:
+    env = dict(os.environ)
+    if lacks == "library":
+        (tmp_path / "sitecustomize.py").write_text(textwrap.dedent(NO_LIBRARY))
+        env["PYTHONPATH"] = str(tmp_path)
+    else:
+        env["__EGL_VENDOR_LIBRARY_FILENAMES"] = "/nonexistent"
+    code = "from gripper_force.cli import main; main()"
+    args = [
+        "grasp",
+        "--object",
+        "stapler",
+        "--set",
+        "vision.checkpoint=none",
+        "--set",
+        f"log.directory={tmp_path}",
+    ]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *args], env=env, capture_output=True, text=True, check=False, timeout=120
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == f"error: {NO_EGL}\n"
+    assert "apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri" in NO_EGL
