@@ -1,7 +1,7 @@
 """Force from a real finger camera, on objects that training has not seen.
 
 Imports a folder of recordings (`<date>_<object>_<trial>/video.avi` with `load_cell.csv`), splits the objects
-into folds, trains on all folds but one and evaluates on that one, beside a ridge regression on the same split.
+into folds, trains on all folds but one and evaluates on that one, with a ridge regression beside it.
 
     python examples/real_grasps.py FOLDER [--folds 3] [--minutes 8]
 """
