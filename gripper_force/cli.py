@@ -350,11 +350,11 @@ def _trials_table(r: dict[str, Any]) -> None:
 
 
 def _errors_table(r: dict[str, Any]) -> None:
-    _pairs({key: r[key] for key in ("mae_n", "rmse_n", "bias_n", "frames")})
-    table = Table("object", "MAE N", "RMSE N", "contact MAE N", "frames", box=None)
+    _pairs({key: r[key] for key in ("mae_n", "rmse_n", "bias_n", "floor_n", "frames")})
+    table = Table("object", "MAE N", "RMSE N", "contact MAE N", "floor N", "frames", box=None)
     for name, o in r["per_object"].items():
-        contact = _number(o.get("contact_mae_n"))
-        table.add_row(name, _number(o["mae_n"]), _number(o["rmse_n"]), contact, str(o["frames"]))
+        figures = (o["mae_n"], o["rmse_n"], o["contact_mae_n"], o["floor_n"])
+        table.add_row(name, *(_number(value) for value in figures), str(o["frames"]))
     out.print(table)
     _bins_table(r["per_bin"])
 

@@ -1,7 +1,8 @@
 """Logs as training and test clips."""
 
 import hashlib
-from collections.abc import Iterable, Sequence
+import json
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -38,6 +39,7 @@ class Clip:
         name: The log's file name without its suffix.
         object: What was grasped.
         set: What a split must keep on one side, such as all light levels of one rendering.
+        stiffness: A simulated object's own stiffness over its kind's; NaN where it is not known.
     """
 
     frames: Gray
@@ -46,6 +48,7 @@ class Clip:
     name: str
     object: str
     set: str
+    stiffness: float = float("nan")
 
 
 def load_clips(
@@ -174,7 +177,28 @@ def _load_clip(path: Path, preprocess: Preprocess, region: Region | None) -> Cli
     if not valid.any():
         raise DataError(f"{path} holds no valid load-cell sample near any frame, so it has no labels")
     name = path.stem
-    return Clip(np.stack(small), forces_n, valid, name, config["object"], reader.metadata.get("set", name))
+    set_ = reader.metadata.get("set", name)
+    stiffness = stiffness_of(reader.metadata)
+    return Clip(np.stack(small), forces_n, valid, name, config["object"], set_, stiffness)
+
+
+def stiffness_of(metadata: Mapping[str, str]) -> float:
+    """A simulated object's own stiffness over its kind's, from a log's metadata; NaN for real ones."""
+    return float(json.loads(metadata["scene"])["stiffness"]) if "scene" in metadata else float("nan")
+
+
+def stiffness_floor_n(forces_n: npt.NDArray[np.floating], stiffness: float) -> npt.NDArray[np.floating]:
+    """Error that no look at an object avoids: it shows travel, and of its stiffness only its kind's is known.
+
+    Args:
+        forces_n: True forces, (N,).
+        stiffness: The object's own stiffness over its kind's.
+
+    Returns:
+        Absolute errors in N, (N,).
+    """
+    floor_n: npt.NDArray[np.floating] = np.abs(forces_n) * abs(1 - 1 / stiffness)
+    return floor_n
 
 
 def _names(clips: Iterable[Clip], key: str) -> list[str]:

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import track
 
 from gripper_force import metrics
-from gripper_force.dataset import CONTACT_N, Clip
+from gripper_force.dataset import CONTACT_N, Clip, stiffness_floor_n
 from gripper_force.errors import DataError
 from gripper_force.vision.checkpoint import Checkpoint
 from gripper_force.vision.dense import predict
@@ -28,15 +28,20 @@ class ObjectResult(TypedDict):
     mae_n: float
     rmse_n: float
     contact_mae_n: float
+    floor_n: float
     frames: int
 
 
 class Result(TypedDict):
-    """Errors over all frames, by object and by measured force."""
+    """Errors over all frames, by object and by measured force.
+
+    ``floor_n`` is the MAE that the spread of stiffness alone costs; NaN for recordings of real objects.
+    """
 
     mae_n: float
     rmse_n: float
     bias_n: float
+    floor_n: float
     frames: int
     per_object: dict[str, ObjectResult]
     per_bin: list[metrics.Bin]
@@ -103,15 +108,19 @@ def _result(clips: Sequence[Clip], predictions: Sequence[npt.NDArray[np.floating
     measured_n, valid = _joined(clips)
     valid &= np.concatenate([np.arange(len(clip.frames)) >= lead_in for clip in clips])
     predicted_n = np.concatenate(predictions)
-    objects = np.concatenate([np.full(len(clip.frames), clip.object) for clip in clips])
-    predicted_n, measured_n, objects = predicted_n[valid], measured_n[valid], objects[valid]
+    floors_n = np.concatenate([stiffness_floor_n(clip.forces_n, clip.stiffness) for clip in clips])[valid]
+    objects = np.concatenate([np.full(len(clip.frames), clip.object) for clip in clips])[valid]
+    predicted_n, measured_n = predicted_n[valid], measured_n[valid]
     return Result(
         mae_n=metrics.mae(predicted_n, measured_n),
         rmse_n=metrics.rmse(predicted_n, measured_n),
         bias_n=metrics.bias(predicted_n, measured_n),
+        floor_n=float(floors_n.mean()),
         frames=len(measured_n),
         per_object={
-            str(name): _object_result(predicted_n[objects == name], measured_n[objects == name])
+            str(name): _object_result(
+                *(part[objects == name] for part in (predicted_n, measured_n, floors_n))
+            )
             for name in np.unique(objects)
         },
         per_bin=metrics.per_bin(predicted_n, measured_n),
@@ -119,7 +128,9 @@ def _result(clips: Sequence[Clip], predictions: Sequence[npt.NDArray[np.floating
 
 
 def _object_result(
-    predicted_n: npt.NDArray[np.floating], measured_n: npt.NDArray[np.float32]
+    predicted_n: npt.NDArray[np.floating],
+    measured_n: npt.NDArray[np.float32],
+    floors_n: npt.NDArray[np.floating],
 ) -> ObjectResult:
     contact = measured_n > CONTACT_N
     return ObjectResult(
@@ -128,6 +139,7 @@ def _object_result(
         contact_mae_n=metrics.mae(predicted_n[contact], measured_n[contact])
         if contact.any()
         else float("nan"),
+        floor_n=float(floors_n.mean()),
         frames=len(measured_n),
     )
 

@@ -1,6 +1,5 @@
 """The main job: grasp, and say how well, once or over many trials."""
 
-import json
 import multiprocessing
 import time
 from collections import defaultdict
@@ -13,6 +12,7 @@ import numpy as np
 
 from gripper_force.config import Config, config_from, config_from_text
 from gripper_force.control.score import score_grasp
+from gripper_force.dataset import stiffness_floor_n, stiffness_of
 from gripper_force.errors import DataError
 from gripper_force.log import LogReader
 from gripper_force.replay import compare
@@ -155,11 +155,11 @@ def _mae_n(estimates: list[tuple[int, float]], cells: list[LoadCellSample]) -> f
 
 
 def _floor_n(metadata: Mapping[str, str], cells: list[LoadCellSample]) -> float | None:
-    """What no look at an object can avoid: its stiffness is its own, and only its kind's is known."""
+    """What the spread of stiffness alone costs; None for a real object."""
     if "scene" not in metadata or not cells:
         return None
-    stiffness = float(json.loads(metadata["scene"])["stiffness"])
-    return float(np.mean([abs(c.force_n) for c in cells])) * abs(1 - 1 / stiffness)
+    forces_n = np.array([c.force_n for c in cells])
+    return float(stiffness_floor_n(forces_n, stiffness_of(metadata)).mean())
 
 
 def _mean_mae_n(results: list[Summary]) -> dict[str, float | None]:

@@ -11,7 +11,7 @@ import numpy as np
 from gripper_force import metrics
 from gripper_force.config import Config, config_from_text
 from gripper_force.control.grasp import Decision
-from gripper_force.dataset import label_frames
+from gripper_force.dataset import CONTACT_N, label_frames
 from gripper_force.errors import DataError
 from gripper_force.log import LogReader
 from gripper_force.session import controller_from, make_estimator
@@ -28,8 +28,6 @@ from gripper_force.types import (
 )
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
 from gripper_force.vision.estimator import ForceEstimator
-
-_CONTACT_N = 0.25
 
 
 @dataclass(frozen=True)
@@ -195,7 +193,7 @@ def compare(
     if not valid.any():
         return None
     t_s, predicted_n, measured_n = times_ns[valid] / NS_PER_S, estimates_n[valid], measured_n[valid]
-    contact = measured_n > _CONTACT_N
+    contact = measured_n > CONTACT_N
     return {
         "mae_n": metrics.mae(predicted_n, measured_n),
         "rmse_n": metrics.rmse(predicted_n, measured_n),
