@@ -53,9 +53,10 @@ def main() -> NoReturn:
         if "--json" in sys.argv:
             sys.stdout.write(json.dumps({"error": str(error)}) + "\n")
         sys.exit(2)
-    except KeyboardInterrupt:
-        err.print("interrupted; what ran was stopped as configured, and its log is whole")
-        sys.exit(_INTERRUPTED)
+    except SystemExit as end:
+        if end.code == _INTERRUPTED:  # what typer makes of a KeyboardInterrupt
+            err.print("interrupted; what ran was stopped as configured, and its log is whole", soft_wrap=True)
+        raise
     sys.exit(0)
 
 

@@ -209,8 +209,13 @@ def run_grasp(config: Config, path: Path, progress: Progress | None = None) -> N
         progress: Called after each change of phase.
 
     Raises:
+        ConfigError: The target is over the force limit.
         GripperError: Something failed. The servo was stopped as configured, and the log holds what was seen.
     """
+    if config.target_n > config.control.force_limit_n:
+        raise ConfigError(
+            f"target_n {config.target_n:g} N is over control.force_limit_n {config.control.force_limit_n:g} N"
+        )
     checkpoint = load_checkpoint(config.vision.checkpoint) if _wants_vision(config) else None
     with open_devices(config) as devices, open_session(config, devices, path, checkpoint) as session:
         _grasp(session, config, checkpoint is not None, progress)
