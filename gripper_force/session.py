@@ -269,8 +269,8 @@ def _grasp(session: Session, config: Config, sees: bool, progress: Progress | No
             if status.t_ns - ended_ns >= keep_s * NS_PER_S:
                 break
         decision = session.cycle()
-    if config.on_exit == "hold":
-        return
+    if config.on_exit == "hold" or status.outcome == Outcome.FAULT:
+        return  # a fault is latched: nothing moves until somebody has looked
     decision = session.cycle(RequestKind.RELEASE)
     while decision.status.phase == Phase.RELEASE:
         decision = session.cycle()
