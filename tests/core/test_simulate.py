@@ -1,0 +1,80 @@
+from pathlib import Path
+
+import pytest
+
+from gripper_force.config import Config, config_from_text, load_config
+from gripper_force.errors import ConfigError
+from gripper_force.log import LogReader
+from gripper_force.simulate import OBJECTS, PEAK_N, Plan, make_log, plan, simulate
+from gripper_force.types import Frame, GraspStatus, LoadCellSample, Phase
+
+
+@pytest.fixture
+def config(quick: list[str]) -> Config:
+    return load_config(None, [*quick, "control.timeout_s=1"])
+
+
+def test_a_plan_is_always_the_same_and_takes_the_objects_in_turn() -> None:
+    plans = plan("press", 6, 100)
+    assert plans == plan("press", 6, 100)
+    assert [p.object for p in plans] == [*OBJECTS, *OBJECTS[:2]]
+    assert [p.seed for p in plans] == list(range(100, 106))
+    assert len({p.name for p in plans + plan("grasp", 6, 100)}) == 12
+    assert plan("grasp", 2, 7, ("tube",)) == [Plan("grasp", "tube", 7), Plan("grasp", "tube", 8)]
+
+
+@pytest.mark.parametrize("kind", ["press", "grasp"])
+def test_a_log_holds_a_touch_and_says_what_it_is(kind: str, config: Config, tmp_path: Path) -> None:
+    task = Plan("press" if kind == "press" else "grasp", "stapler", 100_003)
+    path = make_log(task, tmp_path, config.model_dump(mode="json"))
+    assert path == tmp_path / f"{kind}-stapler-100003.mcap"
+    assert list(tmp_path.iterdir()) == [path]
+    log = LogReader(path)
+    assert (log.metadata["object"], log.metadata["set"]) == ("stapler", "stapler-100003")
+    assert log.metadata["exposure_ms"] == "4.0"
+    assert max(s.force_n for s in log.records(LoadCellSample)) > 0.5
+    phases = [s.phase for s in log.records(GraspStatus)]
+    assert phases[-1] == Phase.OPEN
+    assert phases.count("open") > 20  # what comes before the touch, for the reference
+    made = config_from_text(log.config, str(path))
+    assert made.control.feedback == "current"
+    assert 0.5 <= made.target_n <= PEAK_N
+
+
+def test_a_seed_makes_one_log_and_another_seed_another(config: Config, tmp_path: Path) -> None:
+    def forces(seed: int, folder: str) -> list[float]:
+        (tmp_path / folder).mkdir()
+        path = make_log(Plan("press", "stapler", seed), tmp_path / folder, config.model_dump(mode="json"))
+        return [s.force_n for s in LogReader(path).records(LoadCellSample)]
+
+    first = forces(1, "a")
+    assert forces(1, "b") == first
+    assert forces(2, "c") != first
+
+
+def test_frames_are_in_the_log(config: Config, tmp_path: Path) -> None:
+    camera = config.camera.model_copy(update={"backend": "simulated", "rate_hz": 10.0})
+    seen = config.model_copy(update={"camera": camera})
+    path = make_log(Plan("press", "stapler", 3), tmp_path, seen.model_dump(mode="json"))
+    frames = list(LogReader(path).records(Frame))
+    assert len(frames) > 5
+    assert frames[0].gray.shape == (128, 128)
+
+
+def test_what_was_broken_off_goes_on(config: Config, tmp_path: Path) -> None:
+    plans = plan("press", 2, 5, ("stapler",))
+    kept, missing = (tmp_path / p.name for p in plans)
+    kept.write_bytes(b"made before")
+    leftover = tmp_path / f".{missing.name}.part"
+    leftover.write_bytes(b"half a log")
+    assert list(simulate(plans, tmp_path, config, jobs=1)) == [missing]
+    assert kept.read_bytes() == b"made before"
+    assert LogReader(missing).complete
+    assert not leftover.exists()
+    assert list(simulate(plans, tmp_path, config, jobs=1)) == []
+
+
+def test_a_scene_that_fails_leaves_no_log_under_its_name(config: Config, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no simulated object 'egg'"):
+        make_log(Plan("press", "egg", 5), tmp_path, config.model_dump(mode="json"))
+    assert not list(tmp_path.glob("*.mcap"))
