@@ -1,0 +1,266 @@
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from gripper_force import cli
+from gripper_force.errors import ConfigError
+
+
+class Done(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+    def json(self) -> dict[str, Any]:
+        assert self.code == 0, self.err
+        (line,) = self.out.splitlines()
+        loaded: dict[str, Any] = json.loads(line)
+        return loaded
+
+
+Run = Callable[..., Done]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Iterator[Run]:
+    """The command itself, but for the process."""
+    monkeypatch.chdir(tmp_path)
+    handler = signal.getsignal(signal.SIGTERM)
+
+    def call(*arguments: object) -> Done:
+        monkeypatch.setattr(sys, "argv", ["gripper-force", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        said = capsys.readouterr()
+        return Done(int(end.value.code or 0), said.out, said.err)
+
+    yield call
+    signal.signal(signal.SIGTERM, handler)
+
+
+@pytest.fixture
+def sets(quick: list[str], tmp_path: Path) -> list[str]:
+    return [part for one in (*quick, f"log.directory={tmp_path}/runs") for part in ("--set", one)]
+
+
+def commands(group: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    yield path
+    for name, command in getattr(group, "commands", {}).items():
+        yield from commands(command, (*path, name))
+
+
+@pytest.mark.parametrize("path", list(commands(typer.main.get_command(cli.app))), ids=" ".join)
+def test_every_command_explains_itself(path: tuple[str, ...]) -> None:
+    result = CliRunner().invoke(cli.app, [*path, "--help"])
+    assert result.exit_code == 0
+    assert "Usage:" in result.output
+
+
+def test_the_command_line_answers_without_what_is_heavy() -> None:
+    code = "import sys, gripper_force.cli; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    heavy = {"torch", "mujoco", "cv2", "matplotlib", "scipy", "numpy", "dynamixel_sdk", "depthai", "mcap"}
+    assert not heavy & set(done.stdout.split())
+
+
+GRASP_KEYS = {"result", "object", "target_n", "load_cell_mean_n", "steady_error_n", "overshoot_n", "settle_s"}
+GRASP_KEYS |= {"estimator_p50_ms", "estimator_p99_ms", "loop_hz", "log", "report"}
+ERROR_KEYS = {"mae_n", "rmse_n", "bias_n", "per_object", "per_bin", "frames"}
+
+
+def test_grasp_prints_one_json_object(run: Run, sets: list[str]) -> None:
+    done = run("grasp", "--json", "--object", "stapler", "--target-n", 2.5, "--seed", 3, *sets)
+    result = done.json()
+    assert set(result) >= GRASP_KEYS
+    assert (result["result"], result["object"], result["target_n"]) == ("held", "stapler", 2.5)
+    assert result["estimator_p50_ms"] is None
+    assert Path(result["log"]).is_file()
+    assert Path(result["report"]).read_text().startswith("<!")
+    for phase in ("approach", "contact", "ramp", "hold"):
+        assert phase in done.err
+
+
+def test_grasp_prints_a_table_for_people(run: Run, sets: list[str]) -> None:
+    done = run("grasp", *sets, "--set", "log.report=false")
+    assert done.code == 0
+    for text in ("held", "stapler", "3.00 N", "steady error", "200.0 Hz"):
+        assert text in done.out
+
+
+def test_trials_print_each_and_a_summary(run: Run, sets: list[str]) -> None:
+    result = run("grasp", "--json", "--trials", 1, "--jobs", 1, *sets).json()
+    assert set(result) == {"trials", "summary"}
+    (trial,) = result["trials"]
+    assert set(trial) >= GRASP_KEYS
+    assert trial["object"] == "sponge"
+    assert result["summary"]["trials"] == 1
+    assert result["summary"]["median_error_percent"] is not None
+
+
+def test_replay_prints_one_json_object(run: Run, fused_log: Path) -> None:
+    result = run("replay", fused_log, "--json").json()
+    assert set(result) >= ERROR_KEYS | {"identical"}
+    assert result["identical"] is True
+    table = run("replay", fused_log)
+    assert table.code == 0
+    assert "yes, to the bit" in table.out
+    changed = run("replay", fused_log, "--set", "control.ramp_n_s=4", "--json").json()
+    assert changed["identical"] is False
+
+
+def write_recording(folder: Path) -> tuple[Path, Path]:
+    """A bright bar that widens with the force, and the forces."""
+    force_n = np.interp(np.arange(60), [0, 15, 30, 45, 50, 60], [0, 0, 20, 20, 0, 0])
+    video, table = folder / "touch.avi", folder / "touch.csv"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (64, 64))
+    for force in force_n:
+        image = np.full((64, 64, 3), 60, np.uint8)
+        image[:, : 20 + int(force)] = 200
+        writer.write(image)
+    writer.release()
+    rows = [f"{i},{i / 30:.6f},{force:.5f}" for i, force in enumerate(force_n)]
+    table.write_text("\n".join(["frame,t_s,force_n", *rows, ""]))
+    return video, table
+
+
+def test_a_recording_is_imported_replayed_and_evaluated(
+    run: Run, tmp_path: Path, tiny_checkpoint: Path
+) -> None:
+    video, table = write_recording(tmp_path)
+    imported = run("import", "video", video, table, "--out", "logs", "--object", "foam", "--json").json()
+    (row,) = imported["logs"]
+    assert (row["object"], row["frames"], row["spikes_rejected"]) == ("foam", 60, 0)
+    replayed = run("replay", row["log"], "--checkpoint", tiny_checkpoint, "--json").json()
+    assert set(replayed) >= ERROR_KEYS
+    assert replayed["identical"] is None
+    assert set(replayed["sources"]) == {"visual"}
+    people = run("replay", row["log"], "--checkpoint", tiny_checkpoint)
+    assert "nothing to compare" in people.out
+    evaluated = run(
+        "evaluate", "logs", "--checkpoint", tiny_checkpoint, "--object", "foam", "--jobs", 1, "--json"
+    ).json()
+    assert set(evaluated) >= ERROR_KEYS
+    assert set(evaluated["per_object"]) == {"foam"}
+    assert evaluated["mae_n"] == pytest.approx(replayed["mae_n"], rel=0.2)
+
+
+# Bad input.
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--set", "control.ramp=3"], "unknown configuration key 'control.ramp'"),
+        (["--set", "seed=x"], "configuration key 'seed'"),
+        (["--object", "egg"], "no simulated object 'egg'; there are sponge, paper_cup, tube, stapler"),
+        (["--feedback", "guess"], "configuration key 'control.feedback'"),
+        (["--target-n", "13"], "target_n 13 N is over control.force_limit_n 12 N"),
+        (["--set", "camera.backend=oak9"], "no camera backend 'oak9'; there are none, simulated"),
+        (["--set", "load_cell.backend=scale"], "no load_cell backend 'scale'"),
+        (["--set", "servo.port=/dev/ttyUSB7", "--set", "load_cell.backend=none"], "clock=lockstep needs"),
+        (
+            [
+                "--set",
+                "servo.port=/dev/ttyUSB7",
+                "--set",
+                "load_cell.backend=none",
+                "--set",
+                "clock=realtime",
+            ],
+            "there is no port /dev/ttyUSB7",
+        ),
+        (["--set", "servo.model=XW999"], "XW999"),
+        (["--config", "gone.yaml"], "can't read the configuration gone.yaml"),
+        (["--set", "camera.backend=simulated", "--set", "vision.checkpoint=gone"], "no checkpoint at gone"),
+    ],
+)
+def test_bad_input_to_grasp_is_one_sentence(
+    run: Run, sets: list[str], arguments: list[str], sentence: str
+) -> None:
+    done = run("grasp", *sets, *arguments)
+    assert (done.code, done.out) == (2, "")
+    (line,) = done.err.splitlines()
+    assert line.startswith("error: ")
+    assert sentence in line
+
+
+def test_with_json_the_error_is_json_too(run: Run) -> None:
+    done = run("grasp", "--json", "--set", "[bold]=3")
+    assert done.code == 2
+    assert "unknown configuration key '[bold]'" in json.loads(done.out)["error"]
+    assert "unknown configuration key '[bold]'" in done.err
+
+
+def test_a_truncated_log_is_refused_and_recovered_on_request(
+    run: Run, fused_log: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(fused_log.read_bytes()[:-1000])
+    done = run("replay", path)
+    assert done.code == 2
+    assert "can be recovered, --recover reads them" in done.err
+    assert run("replay", path, "--recover", "--json").json()["frames"] > 100
+
+
+def test_a_file_that_is_no_checkpoint_is_named(
+    run: Run, fused_log: Path, tiny_checkpoint: Path, tmp_path: Path
+) -> None:
+    from safetensors.torch import load_file, save_file
+
+    garbage, foreign, short = (tmp_path / f"{n}.safetensors" for n in ("garbage", "foreign", "short"))
+    garbage.write_bytes(b"no weights" * 100)
+    save_file(load_file(tiny_checkpoint), foreign)
+    short.write_bytes(tiny_checkpoint.read_bytes()[:-100])
+    for path, sentence in ((garbage, "damaged"), (foreign, "is not a gripper-force"), (short, "damaged")):
+        done = run("replay", fused_log, "--checkpoint", path)
+        assert done.code == 2
+        (line,) = done.err.splitlines()
+        assert str(path) in line
+        assert sentence in line
+
+
+def test_a_video_needs_its_table(run: Run, tmp_path: Path) -> None:
+    video, table = write_recording(tmp_path)
+    table.unlink()
+    assert "needs its load-cell table" in run("import", "video", video).err
+    done = run("import", "video", video, table)
+    assert done.code == 2
+    assert "can't read the table" in done.err
+    assert "touch.avi has no table of forces" in run("import", "video", tmp_path).err
+
+
+def test_an_empty_folder_has_nothing_to_evaluate(run: Run, tmp_path: Path, tiny_checkpoint: Path) -> None:
+    done = run("evaluate", tmp_path, "--checkpoint", tiny_checkpoint)
+    assert (done.code, done.out) == (2, "")
+    assert "no logs (*.mcap)" in done.err
+
+
+def test_wrong_usage_is_told_by_the_parser(run: Run) -> None:
+    done = run("grasp", "--jobs", "0")
+    assert done.code == 2
+    assert "Traceback" not in done.err
+
+
+# In between.
+
+
+def test_a_figure_that_is_no_number_is_null() -> None:
+    value = {"a": float("nan"), "b": [1.5, float("inf")], "c": Path("x"), 3: (None, True)}
+    assert cli._jsonable(value) == {"a": None, "b": [1.5, None], "c": "x", "3": [None, True]}
+
+
+def test_options_win_over_overrides() -> None:
+    config = cli._load(None, ["seed=3", "object=tube"], {"seed": 4, "object": None})
+    assert (config.seed, config.object) == (4, "tube")
+    with pytest.raises(ConfigError, match="configuration key 'target_n'"):
+        cli._load(None, None, {"target_n": -1.0})
