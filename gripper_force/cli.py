@@ -86,8 +86,6 @@ def grasp(
         result = job.grasp(settings, progress=lambda s: err.print(_phase_line(s)))
         _print(result, as_json, _grasp_table)
         return
-    if jobs > 1:  # two processes that both want all cores take longer than one after the other
-        settings = settings.model_copy(update={"vision": settings.vision.model_copy(update={"threads": 1})})
     results = []
     with _bar("grasping", trials) as advance:
         for one in job.trials(settings, trials, jobs):

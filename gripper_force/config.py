@@ -77,7 +77,9 @@ class VisionConfig(Section):
     """Estimator and its input."""
 
     checkpoint: str = Field("default", description="a path, or `default` for the one that is shipped")
-    threads: int = Field(2, ge=1, le=64)
+    threads: int = Field(
+        1, ge=1, le=64, description="more help only on cores that nothing else uses: they wait for each other"
+    )
     region: tuple[int, int, int, int] | None = Field(
         None, description="region of interest of the camera's frame in pixels: left, top, width, height"
     )
