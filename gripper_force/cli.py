@@ -157,6 +157,7 @@ def train(
     hold_out: Annotated[
         list[str] | None, typer.Option(help="Object to leave out of the training. Repeatable.")
     ] = None,
+    init: Annotated[str | None, typer.Option(help="Checkpoint to begin with.")] = None,
     resume: Annotated[bool, typer.Option(help="Go on from the states of a run that was broken off.")] = False,
     jobs: Jobs = _CORES,
     as_json: AsJson = False,
@@ -165,11 +166,13 @@ def train(
     from gripper_force.dataset import load_clips
     from gripper_force.train import TrainConfig
     from gripper_force.train import train as job
+    from gripper_force.vision.checkpoint import load_checkpoint
 
     settings = _section(TrainConfig, recipe)
     clips = load_clips(data, settings.preprocess, workers=jobs)
     clips = [clip for clip in clips if clip.object not in (hold_out or [])]
-    result = job(settings, clips, checkpoint, resume=resume)
+    start = load_checkpoint(init) if init else None
+    result = job(settings, clips, checkpoint, init=start, resume=resume)
     metrics = result.header.metrics
     _print({"checkpoint": str(checkpoint), "digest": result.digest, **metrics}, as_json)
 

@@ -49,6 +49,9 @@ class TrainConfig(Section):
         minutes: Time for the whole ensemble; stands in for ``steps`` where given.
         clips: Clips a step.
         clip_frames: Frames a clip; those from the window's length on carry a loss.
+        short_share: Share of the training, from its start, on clips of `short_frames`, as many more as cost
+            the same: what the backbone has to learn needs many scenes, not many moments of one.
+        short_frames: Frames of such a clip; the window before it is copies of its first, as at a run's start.
         learning_rate: Peak of the one-cycle schedule.
         weight_decay: Of AdamW.
         warmup: Share of the training in which the learning rate rises.
@@ -71,6 +74,8 @@ class TrainConfig(Section):
     minutes: Positive | None = None
     clips: Annotated[int, Field(ge=1)] = 12
     clip_frames: Annotated[int, Field(ge=1)] = 22
+    short_share: Share = 0.6
+    short_frames: Annotated[int, Field(ge=1)] = 4
     learning_rate: Positive = 1e-3
     weight_decay: NonNegative = 0.01
     warmup: Annotated[float, Field(gt=0, lt=1)] = 0.25
@@ -94,7 +99,14 @@ class TrainConfig(Section):
         )
 
 
-def train(config: TrainConfig, clips: Sequence[Clip], out: Path, *, resume: bool = False) -> Checkpoint:
+def train(
+    config: TrainConfig,
+    clips: Sequence[Clip],
+    out: Path,
+    *,
+    init: Checkpoint | None = None,
+    resume: bool = False,
+) -> Checkpoint:
     """Trains an ensemble and writes its checkpoint.
 
     Each member's state is kept beside ``out`` every minute, until the checkpoint is written. With ``steps``,
@@ -104,6 +116,7 @@ def train(config: TrainConfig, clips: Sequence[Clip], out: Path, *, resume: bool
         config: The recipe.
         clips: Training data; sets are held out of it for validation.
         out: The checkpoint to write.
+        init: Checkpoint whose weights to begin with, instead of random ones.
         resume: Whether to go on from the states of a run that was broken off.
 
     Returns:
@@ -120,13 +133,16 @@ def train(config: TrainConfig, clips: Sequence[Clip], out: Path, *, resume: bool
     training, held_out = split_by(clips, "set", config.validation, config.seed)
     data = _Data(training, config, device)
     data_digest = digest(clips)
-    identity = f"{config.model_dump_json(exclude={'device', 'compile'})} {data_digest}"
+    start = init.digest if init is not None else ""
+    identity = f"{config.model_dump_json(exclude={'device', 'compile'})} {data_digest} {start}"
     states = [out.with_suffix(f".{i}.state") for i in range(len(config.attentions))]
     networks = []
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[loss]}"))
     with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as progress:
         for member, state in enumerate(states):
             run = _Run(config, member, device, state, identity)
+            if init is not None:
+                run.begin_with(init)
             if resume:
                 run.restore()
             run.train(data, progress)
@@ -175,18 +191,25 @@ class _Data:
         newtons = np.floor(forces_n[self._contact])
         self._levels = [self._contact[newtons == n] for n in np.unique(newtons)]
 
-    def batch(self, step: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Draws the clips of one step, which depend on the seed and the step alone.
+    def batch(self, step: int, *, short: bool) -> tuple[Tensor, Tensor, Tensor]:
+        """Draws the clips of one step, which depend on the seed, the step and their length alone.
+
+        Args:
+            step: Number of the step.
+            short: Whether to draw many short clips instead of fewer long ones.
 
         Returns:
             Inputs (B, T, 1, S, S), forces in N (B, T), and which of these are valid (B, T).
         """
         config = self._config
+        length, count = config.clip_frames, config.clips
+        if short:
+            length, count = config.short_frames, config.clips * config.clip_frames // config.short_frames
         rng = np.random.default_rng((config.seed, step))
-        ends = self._ends(rng)
+        ends = self._ends(rng, count)
         begin = self._begin[ends]
         # Frames before a recording's first are copies of it, as for the estimator.
-        index = np.maximum(ends[:, None] + np.arange(1 - config.clip_frames, 1), begin[:, None])  # (B, T)
+        index = np.maximum(ends[:, None] + np.arange(1 - length, 1), begin[:, None])  # (B, T)
         # The reference goes through the same distortion as the clip: it shares the camera and the light.
         lead = begin[:, None] + np.arange(config.preprocess.reference_frames)  # (B, R)
         gray = self._distorted(rng, np.concatenate([lead, index], axis=1))  # (B, R + T, S, S)
@@ -195,9 +218,9 @@ class _Data:
         where = torch.from_numpy(index).to(self._device)
         return inputs, self._labels[where], self._valid[where]
 
-    def _ends(self, rng: np.random.Generator) -> npt.NDArray[np.int64]:
-        draws = rng.random(self._config.clips)
-        ends = rng.choice(self._all, self._config.clips)
+    def _ends(self, rng: np.random.Generator, count: int) -> npt.NDArray[np.int64]:
+        draws = rng.random(count)
+        ends = rng.choice(self._all, count)
         by_force = draws < self._config.force_share
         in_contact = ~by_force & (draws < self._config.force_share + self._config.contact_share)
         ends[in_contact] = rng.choice(self._contact, int(in_contact.sum()))
@@ -236,6 +259,7 @@ class _Run:
         self._device = device
         self._state = state
         self._identity = identity
+        self._member = member
         self._label = config.attentions[member]
         self.network = ForceNetwork(config.network(member)).to(device)
         self._optimizer = torch.optim.AdamW(
@@ -253,6 +277,13 @@ class _Run:
         if self._config.minutes is None:
             return self._step / self._config.steps
         return self._elapsed_s / (60 * self._config.minutes / len(self._config.attentions))
+
+    def begin_with(self, checkpoint: Checkpoint) -> None:
+        """Takes this member's weights from a checkpoint of the same networks."""
+        wanted = [self._config.network(i) for i in range(len(self._config.attentions))]
+        if [network.config for network in checkpoint.networks] != wanted:
+            raise CheckpointError("the checkpoint to begin with holds other networks than this recipe trains")
+        self.network.load_state_dict(checkpoint.networks[self._member].state_dict())
 
     def train(self, data: _Data, progress: Progress) -> None:
         """Steps until the budget is spent, then leaves the network in evaluation mode."""
@@ -284,7 +315,7 @@ class _Run:
     def _update(self, forward: Callable[[Tensor, int], Tensor], data: _Data) -> Tensor:
         for group in self._optimizer.param_groups:
             group["lr"] = self._config.learning_rate * one_cycle(self._done, self._config.warmup)
-        inputs, forces_n, valid = data.batch(self._step)
+        inputs, forces_n, valid = data.batch(self._step, short=self._done < self._config.short_share)
         first = min(self.network.config.window, inputs.shape[1]) - 1
         with torch.autocast(self._device, torch.bfloat16):
             predicted_n = forward(inputs, first)

@@ -28,8 +28,8 @@ _FREE_NOISE_N = 0.5
 _VISION_FLOOR_N = 0.05
 """No estimate is believed more than this, whatever it claims."""
 
-_SYSTEMATIC = 0.03
-"""Share of the force that vision may be off over a whole grasp, which no averaging removes."""
+_FRAME_NOISE_N = 0.15
+"""What differs from frame to frame of a picture that rests. The rest of the claimed error stays as it is."""
 
 _GATE = 3.29
 """Standard deviations of the innovation: 0.1 % of good estimates are turned away (chi-square, 10.8)."""
@@ -42,7 +42,11 @@ _HISTORY = 64
 
 
 class Fusion:
-    """Kalman filter on ``bias = force - current-derived force``.
+    """Kalman filter on the difference between vision and the current-derived force, and a share of it.
+
+    Neither side's error averages out, however many frames there are: friction and gearing are what they are,
+    and one object in one pose is one picture. The filter therefore tracks only their *difference*, and the
+    estimate takes that share of it to which the two claimed variances entitle vision.
 
     The measured current is noisy and quantised (0.1 N a step), and the contact force follows it with the
     plant's lag: a low-pass of that lag serves both. Vision is compared with the same signal, at its capture
@@ -71,7 +75,8 @@ class Fusion:
 
     def restart(self) -> None:
         """Forgets the bias: a new grasp has its own."""
-        self._bias_n = 0.0
+        self._difference_n = 0.0
+        self._share = 1.0
         self.loosen()
 
     def loosen(self) -> None:
@@ -95,7 +100,7 @@ class Fusion:
         """
         self._predict(servo)
         if free:
-            self._correct(-self._current_n - self._bias_n, _FREE_NOISE_N**2)
+            self._correct(-self._current_n - self._difference_n, _FREE_NOISE_N**2)
         if visual is not None and visual.t_ns > self._newest_seen_ns and self._feedback != "current":
             self._newest_seen_ns = visual.t_ns
             self._refusal = self._update(t_ns, visual)
@@ -136,24 +141,25 @@ class Fusion:
             return f"it is {age_ns / NS_PER_MS:.0f} ms old"
         if visual.std_n > self._std_limit_n:
             return f"it is uncertain by {visual.std_n:.2f} N"
-        noise_n2 = max(visual.std_n, _VISION_FLOOR_N) ** 2
+        claimed_n2 = max(visual.std_n, _VISION_FLOOR_N) ** 2
         current_n = self._current_at(visual.t_ns)
         difference_n = visual.force_n - current_n
-        innovation_n = difference_n - self._bias_n
-        if abs(difference_n) > 3 * math.sqrt(self._prior_n2(current_n) + noise_n2):
+        innovation_n = difference_n - self._difference_n
+        if abs(difference_n) > 3 * math.sqrt(self._prior_n2(current_n) + claimed_n2):
             return f"it is off from the motor current by {difference_n:.2f} N"
-        if abs(innovation_n) > _GATE * math.sqrt(self._variance_n2 + noise_n2):
+        if abs(innovation_n) > _GATE * math.sqrt(self._variance_n2 + claimed_n2):
             self._rejected = _count(self._rejected, innovation_n)
             if abs(self._rejected) < _REENTRY:
                 return f"it jumps by {innovation_n:.2f} N"
             self._variance_n2 = self._prior_n2(current_n)
         self._rejected = 0
-        self._correct(innovation_n, noise_n2)
+        self._correct(innovation_n, _FRAME_NOISE_N**2)
+        self._share = self._prior_n2(current_n) / (self._prior_n2(current_n) + claimed_n2)
         return ""
 
     def _correct(self, innovation_n: float, noise_n2: float) -> None:
         gain = self._variance_n2 / (self._variance_n2 + noise_n2)
-        self._bias_n += gain * innovation_n
+        self._difference_n += gain * innovation_n
         self._variance_n2 *= 1 - gain
 
     def _current_at(self, t_ns: int) -> float:
@@ -183,16 +189,18 @@ class Fusion:
         return (Event(t_ns, "vision", f"vision dropped out{reason}; on motor current alone"),)
 
     def _estimate(self, t_ns: int) -> FusedForce:
-        force_n, std_n = self._current_n + self._bias_n, math.sqrt(self._variance_n2)
+        bias_n = self._share * self._difference_n
+        force_n = self._current_n + bias_n
+        std_n = math.sqrt(self._variance_n2 + (1 - self._share) * self._prior_n2(self._current_n))
         if self._source == Source.VISION:
             force_n, std_n = self._visual_n, max(self._visual_std_n, _VISION_FLOOR_N)
         force_n = max(force_n, 0.0)
         return FusedForce(
             t_ns=t_ns,
             force_n=force_n,
-            std_n=math.hypot(std_n, _SYSTEMATIC * force_n),
+            std_n=std_n,
             current_n=self._current_n,
-            bias_n=self._bias_n,
+            bias_n=bias_n,
             source=self._source,
         )
 

@@ -161,7 +161,7 @@ def test_data_without_contact_or_split_are_refused(clips: list[Clip], tmp_path: 
 
 def test_batches_hold_what_a_run_would_see(clips: list[Clip]) -> None:
     plain = QUICK.model_copy(update={"shift_px": 0, "light": 0.0, "noise": 0.0, "clips": 40})
-    inputs, forces_n, valid = train_module._Data(clips, plain, "cpu").batch(step=0)
+    inputs, forces_n, valid = train_module._Data(clips, plain, "cpu").batch(step=0, short=False)
     assert inputs.shape == (40, plain.clip_frames, 1, 16, 16)
     assert valid.all()
     frames = torch.from_numpy(np.stack([clip.frames for clip in clips]))
@@ -176,7 +176,7 @@ def test_frames_without_label_carry_no_loss(clips: list[Clip]) -> None:
     for clip in clips:
         clip.valid[::2] = False
         clip.forces_n[::2] = 1e9
-    _, forces_n, valid = train_module._Data(clips, QUICK, "cpu").batch(step=0)
+    _, forces_n, valid = train_module._Data(clips, QUICK, "cpu").batch(step=0, short=False)
     assert valid[:, -1].all()
     assert not valid.all()
     assert (forces_n[valid] < 10).all()
@@ -184,11 +184,11 @@ def test_frames_without_label_carry_no_loss(clips: list[Clip]) -> None:
 
 def test_rare_forces_are_drawn_more_often(clips: list[Clip]) -> None:
     config = QUICK.model_copy(update={"clips": 300, "force_share": 1.0})
-    _, forces_n, _ = train_module._Data(clips, config, "cpu").batch(step=0)
+    _, forces_n, _ = train_module._Data(clips, config, "cpu").batch(step=0, short=False)
     counts = np.bincount(forces_n[:, -1].int().numpy(), minlength=8)
     assert counts.min() > 20
     none = QUICK.model_copy(update={"clips": 300, "force_share": 0.0, "contact_share": 0.0})
-    _, forces_n, _ = train_module._Data(clips, none, "cpu").batch(step=0)
+    _, forces_n, _ = train_module._Data(clips, none, "cpu").batch(step=0, short=False)
     assert (forces_n[:, -1] == 0).float().mean() > 0.15
 
 
@@ -205,7 +205,7 @@ def test_a_checkpoint_in_evaluation_mode_is_as_good_as_in_training(clips: list[C
     config = QUICK.model_copy(update={"steps": 60, "clips": 8})
     train(config, clips, tmp_path / "out.safetensors")
     (network,) = load_checkpoint(tmp_path / "out.safetensors").networks
-    inputs, forces_n, _ = train_module._Data(clips, config, "cpu").batch(step=1000)
+    inputs, forces_n, _ = train_module._Data(clips, config, "cpu").batch(step=1000, short=False)
     with torch.no_grad():
         evaluated = (network(inputs, 19) - forces_n[:, 19:]).abs().mean()
         trained = (network.train()(inputs, 19) - forces_n[:, 19:]).abs().mean()

@@ -76,7 +76,8 @@ def draw_scene(object_name: str, seed: int, config: SimConfig) -> Scene:
         return tuple(float(v) for v in rng.uniform(-1, 1, len(spread)) * spread)
 
     x, y = shift(0.0015, 0.003)
-    camera, target, light = shift(0.008, 0.008, 0.008), shift(0.004, 0.004, 0.004), shift(0.15, 0.15, 0.15)
+    # The camera is bolted to the gripper: what varies is how well, and its lens.
+    camera, target, light = shift(0.003, 0.003, 0.003), shift(0.0015, 0.0015, 0.0015), shift(0.15, 0.15, 0.15)
     return Scene(
         object_name,
         config.detail,
@@ -86,7 +87,7 @@ def draw_scene(object_name: str, seed: int, config: SimConfig) -> Scene:
         yaw_deg=float(rng.uniform(-4, 4)),
         camera_offset_m=(camera[0], camera[1], camera[2]),
         camera_target_offset_m=(target[0], target[1], target[2]),
-        camera_fovy_deg=float(rng.uniform(16.4, 17.6)),
+        camera_fovy_deg=float(rng.uniform(16.8, 17.2)),
         lux=lux * float(rng.uniform(0.95, 1.05)),
         light_direction=(-0.40 + light[0], 0.55 + light[1], -0.75 + light[2]),
         light_ambient=float(rng.uniform(0.22, 0.38)),
