@@ -14,6 +14,8 @@ from gripper_hw.sim.textures import draw_textures
 LUX_LEVELS = (350.0, 550.0, 750.0)
 """The paper's three light levels."""
 
+# MuJoCo's default friction is soft: under a constant push it creeps, and in three seconds it is gone.
+_HARD_FRICTION = 'solreffriction=".004 1" solimpfriction=".999 .9999 .001"'
 _PAD_HALF_THICKNESS_M = 0.004
 _CAMERA_FROM_GRIP_M = np.array([0.10, -0.30, 0.125])
 
@@ -131,6 +133,7 @@ def scene_mjcf(scene: Scene, gripper: GripperConfig) -> tuple[str, dict[str, byt
         rotor_inertia=1e-3,
         servo_damping=scene.servo_damping_nm_s,
         servo_friction_nm=scene.servo_friction_nm,
+        hard_friction=_HARD_FRICTION,
         backlash_m=scene.backlash_m,
         pinion_radius_m=gripper.pinion_radius_m,
     )
