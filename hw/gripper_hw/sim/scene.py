@@ -15,7 +15,7 @@ LUX_LEVELS = (350.0, 550.0, 750.0)
 """The paper's three light levels."""
 
 # MuJoCo's default friction is soft: under a constant push it creeps, and in three seconds it is gone.
-_HARD_FRICTION = 'solreffriction=".004 1" solimpfriction=".999 .9999 .001"'
+_HARD_FRICTION = 'solreffriction=".005 1" solimpfriction=".99 .999 .001"'
 _PAD_HALF_THICKNESS_M = 0.004
 _CAMERA_FROM_GRIP_M = np.array([0.10, -0.30, 0.125])
 
