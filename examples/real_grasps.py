@@ -3,7 +3,7 @@
 Imports a folder of recordings (`<date>_<object>_<trial>/video.avi` with `load_cell.csv`), splits the objects
 into folds, trains on all folds but one and evaluates on that one, with a ridge regression beside it.
 
-    python examples/real_grasps.py FOLDER [--folds 3] [--minutes 8]
+    python examples/real_grasps.py FOLDER [--folds 3] [--minutes 5]
 """
 
 import argparse
@@ -37,7 +37,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("recordings", type=Path)
     parser.add_argument("--folds", type=int, default=3)
-    parser.add_argument("--minutes", type=float, default=8.0, help="training time of one fold")
+    parser.add_argument("--minutes", type=float, default=5.0, help="training time of one fold")
     parser.add_argument("--out", type=Path, default=Path("data/real"))
     options = parser.parse_args()
 
@@ -49,6 +49,7 @@ def main() -> None:
         width=0.5,
         clips=20,
         clip_frames=26,
+        short_share=0.0,
         minutes=options.minutes,
     )
     clips = load_clips(options.out, recipe.preprocess, workers=2)

@@ -2,12 +2,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from gripper_hw.playback import PlaybackCamera, PlaybackLoadCell
 
 from gripper_force.errors import DataError, LogError
 from gripper_force.interfaces import Camera, LoadCell
 from gripper_force.log import LogReader, LogWriter
 from gripper_force.types import NS_PER_MS, Event, Frame, LoadCellSample
+from gripper_hw.playback import PlaybackCamera, PlaybackLoadCell
 
 FIRST_MS = 1000
 """Log time of the first record."""
