@@ -141,6 +141,10 @@ def overall(results: list[Summary], force_limit_n: float) -> Summary:
         "estimator_p50_ms": _percentile(
             [r["estimator_p50_ms"] for r in results if r["estimator_p50_ms"]], 50
         ),
+        "estimate_mae_n": {
+            name: _mean_mae_n([r for r in results if name in ("all", r["object"])])
+            for name in ("all", *dict.fromkeys(r["object"] for r in results))
+        },
     }
 
 
