@@ -348,7 +348,13 @@ def _trials_table(r: dict[str, Any]) -> None:
             t["result"],
         )
     out.print(table)
-    _pairs(r["summary"])
+    summary = dict(r["summary"])
+    errors = summary.pop("estimate_mae_n")
+    _pairs(summary)
+    table = Table("MAE over the whole run, N", "vision", "current", "fused", "floor", box=None)
+    for name, e in errors.items():
+        table.add_row(name, *(_number(e[key]) for key in ("visual", "current", "fused", "floor")))
+    out.print(table)
 
 
 def _errors_table(r: dict[str, Any]) -> None:
