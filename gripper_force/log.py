@@ -46,7 +46,15 @@ METADATA_NAME: Final = "gripper_force"
 _MAGIC: Final = b"\x89MCAP0\r\n"
 _FRAMING: Final = struct.Struct("<BQ")
 _TIMES: Final = struct.Struct("<QQ")
-_DAMAGE: Final = (McapError, DecodeError, zstandard.ZstdError, struct.error, ValueError, MemoryError)
+_DAMAGE: Final = (
+    McapError,
+    DecodeError,
+    zstandard.ZstdError,
+    struct.error,
+    ValueError,
+    MemoryError,
+    OverflowError,
+)
 """What the decoders let out on damaged bytes."""
 
 _FIELD_TYPES: Final = {

@@ -28,7 +28,7 @@ class Line:
         return [packet for data in self.heard for packet in parser.feed(data)]
 
     def config(self, **values: object) -> ServoConfig:
-        return ServoConfig.model_validate({"port": self.port, "reply_margin_ms": 50.0} | values)
+        return ServoConfig.model_validate({"port": self.port, "reply_margin_ms": 250.0} | values)
 
 
 class RecordingBus(VirtualBus):

@@ -34,16 +34,16 @@ def test_an_odd_baud_rate_is_refused(tmp_path):
 
 
 def test_a_port_is_exclusive_until_closed(line):
-    port = open_port(line.port, 1_000_000, 50.0)
+    port = open_port(line.port, 1_000_000, 250.0)
     with pytest.raises(DeviceError, match="in use"):
-        open_port(line.port, 1_000_000, 50.0)
+        open_port(line.port, 1_000_000, 250.0)
     port.closePort()
     port.closePort()
-    open_port(line.port, 1_000_000, 50.0).closePort()
+    open_port(line.port, 1_000_000, 250.0).closePort()
 
 
 def test_a_pulled_plug_is_told_each_time_and_leaves_no_port_busy(line):
-    port = open_port(line.port, 1_000_000, 50.0)
+    port = open_port(line.port, 1_000_000, 250.0)
     assert PACKETS.ping(port, 1)[1] == sdk.COMM_SUCCESS
     line.unplug()
     for _ in range(2):
@@ -54,14 +54,14 @@ def test_a_pulled_plug_is_told_each_time_and_leaves_no_port_busy(line):
 
 
 def test_a_closed_port_is_lost(line):
-    port = open_port(line.port, 1_000_000, 50.0)
+    port = open_port(line.port, 1_000_000, 250.0)
     port.closePort()
     with pytest.raises(DeviceLostError):
         PACKETS.ping(port, 1)
 
 
 def test_what_was_received_before_is_not_the_next_answer(line):
-    port = open_port(line.port, 1_000_000, 50.0)
+    port = open_port(line.port, 1_000_000, 250.0)
     port.writePort(PING)
     port.drain()
     port.setPacketTimeoutMillis(1.0)
@@ -70,7 +70,7 @@ def test_what_was_received_before_is_not_the_next_answer(line):
 
 
 def test_the_sdk_may_ask_for_less_than_nothing(line):
-    port = open_port(line.port, 1_000_000, 50.0)
+    port = open_port(line.port, 1_000_000, 250.0)
     port.writePort(PING)
     port.setPacketTimeoutMillis(1000.0)
     assert port.readPort(1) == b"\xff"
