@@ -56,12 +56,14 @@ def test_a_run_that_ended_before_anything_was_interrupted(tmp_path: Path) -> Non
 def result(target_n: float, error_n: float | None, **more: Any) -> dict[str, Any]:
     some = {
         "result": "held",
+        "object": "tube",
         "target_n": target_n,
         "steady_error_n": error_n,
         "overshoot_n": 0.1 * target_n,
         "settle_s": 1.0,
         "peak_n": 1.1 * target_n,
         "estimator_p50_ms": 5.0,
+        "estimate_mae_n": {"visual": None, "current": 0.3, "fused": 0.1, "floor": 0.05},
     }
     return some | more
 
@@ -80,6 +82,14 @@ def test_trials_are_summed_up_by_their_share_of_the_target() -> None:
     assert summary["median_error_n"] == pytest.approx(0.35)
     assert summary["max_overshoot_percent"] == pytest.approx(10.0)
     assert summary["peak_n"] == 12.5
+
+
+def test_estimates_are_averaged_by_object() -> None:
+    errors = {"visual": None, "current": 0.5, "fused": 0.3, "floor": None}
+    results = [result(2.0, 0.1), result(3.0, 0.1, object="sponge", estimate_mae_n=errors)]
+    means = overall(results, force_limit_n=12.0)["estimate_mae_n"]
+    assert means["all"] == pytest.approx({"visual": None, "current": 0.4, "fused": 0.2, "floor": 0.05})
+    assert means["sponge"] == errors
 
 
 def test_trials_without_any_figure_still_sum_up() -> None:
