@@ -55,7 +55,7 @@ def main() -> NoReturn:
         sys.exit(2)
     except SystemExit as end:
         if end.code == _INTERRUPTED:  # what typer makes of a KeyboardInterrupt
-            err.print("interrupted; what ran was stopped as configured, and its log is whole", soft_wrap=True)
+            err.print("interrupted; what ran was stopped as configured", soft_wrap=True)
         raise
     sys.exit(0)
 
