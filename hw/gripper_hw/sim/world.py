@@ -127,9 +127,8 @@ class World:
         data = self._data
         if not np.isfinite(data.qacc).all():
             raise SimulationError(self._broken("an acceleration is not finite"))
-        for kind, warning in enumerate(data.warning):
-            if warning.number:
-                raise SimulationError(self._broken(f"MuJoCo warns {mujoco.mjtWarning(kind).name}"))
+        if (warnings := np.flatnonzero(data.warning.number)).size:
+            raise SimulationError(self._broken(f"MuJoCo warns {mujoco.mjtWarning(int(warnings[0])).name}"))
         if data.ncon and (depth := -float(data.contact.dist.min())) > _MAX_PENETRATION_M:
             raise SimulationError(self._broken(f"a pad is {depth * 1e3:.1f} mm deep in the object"))
         if (slip := abs(float(data.ten_length[0]))) > _MAX_RACK_SLIP_M:
