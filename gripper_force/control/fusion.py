@@ -18,11 +18,6 @@ _DRIFT_N2_S = 0.03**2
 _LOOSE_N2_S = 0.15**2
 """The same for jaws that are about to open."""
 
-OBSERVER_LAG_S = 0.09
-"""Lag of the bias while the jaws are stuck and about to open: the steady filter's square root of noise over
-drift, for frames that scatter by 0.1 N at 60 Hz. At `_FRAME_NOISE_N` it is 0.13 s, which leaves the hold loop
-tuned for this value a phase margin of 56 degrees instead of 61."""
-
 _FREE_NOISE_N = 0.5
 """How far the push is from friction in one cycle of free travel; inertia makes the cycles alike."""
 
@@ -31,6 +26,12 @@ _VISION_FLOOR_N = 0.05
 
 _FRAME_NOISE_N = 0.15
 """What differs from frame to frame of a picture that rests. The rest of the claimed error stays as it is."""
+
+_FRAME_HZ = 60.0
+
+OBSERVER_LAG_S = math.sqrt(_FRAME_NOISE_N**2 / (_FRAME_HZ * _LOOSE_N2_S))
+"""Lag of the bias while the jaws are stuck and about to open: the steady filter's square root of noise over
+drift, 0.13 s."""
 
 _GATE = 3.29
 """Standard deviations of the innovation: 0.1 % of good estimates are turned away (chi-square, 10.8)."""
