@@ -158,13 +158,18 @@ class Session:
 def open_session(
     config: Config, devices: Devices, path: Path, checkpoint: Checkpoint | None
 ) -> Iterator[Session]:
-    """A session that runs, and on every way out stops the servo as configured and closes its log."""
+    """A session that runs, and on every way out stops the servo as configured and closes its log.
+
+    A session that never came to a cycle leaves no log.
+    """
     config, controller = make_controller(config, devices)
     estimator = make_estimator(config, checkpoint)
     with ExitStack() as stack:
         about = _metadata(config, devices, checkpoint)
-        log = stack.enter_context(LogWriter(path, config=dump_config(config), metadata=about))
+        log = LogWriter(path, config=dump_config(config), metadata=about)
         session = Session(config, devices, controller, _perception(config, devices, estimator), log)
+        stack.callback(_discard_unused, session, path)
+        stack.enter_context(log)
         if not devices.lockstep:
             # Python's default lets a thread that computes keep the control thread waiting for 5 ms.
             stack.callback(sys.setswitchinterval, sys.getswitchinterval())
@@ -299,6 +304,11 @@ def _metadata(config: Config, devices: Devices, checkpoint: Checkpoint | None) -
         **versions,
         **devices.notes,
     }
+
+
+def _discard_unused(session: Session, path: Path) -> None:
+    if session.cycles == 0:
+        path.unlink(missing_ok=True)
 
 
 def _attach_reference(log: LogWriter, estimator: ForceEstimator | None) -> None:
