@@ -83,12 +83,7 @@ def open_devices(config: Config) -> Iterator[Devices]:
 def _open(stack: ExitStack, backend: str | None, rig: Any, section: Any, clock: Clock, unit: str) -> Any:
     if backend is None:
         return None
-    if backend == RIG:
-        device = getattr(rig, unit)
-    elif section.path is None:
-        raise ConfigError(f"{unit}.backend={section.backend} needs {unit}.path, the log to play")
-    else:
-        device = _load(backend)(section.path, clock, section.speed)
+    device = getattr(rig, unit) if backend == RIG else _load(backend)(section, clock)
     stack.callback(device.close)
     return device
 

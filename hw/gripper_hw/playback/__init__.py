@@ -1,42 +1,44 @@
-"""Recordings as devices: a camera and a load cell that play a log, or a grasp imported from elsewhere."""
+"""Recordings as devices: a camera and a load cell that play a log, or a grasp imported from elsewhere.
+
+At speed ``recorded`` they go as the clock goes, with times shifted to it; at speed ``full`` as fast as they
+are asked, with times as recorded.
+"""
 
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
-from gripper_force.errors import DataError
+from gripper_force.config import CameraConfig, LoadCellConfig
+from gripper_force.errors import ConfigError, DataError
 from gripper_force.interfaces import Clock
 from gripper_force.log import LogReader
 from gripper_force.types import Frame, LoadCellSample
-
-Speed = Literal["recorded", "full"]
-"""``recorded``: as the clock goes, times shifted to it; ``full``: as fast as asked, times as recorded."""
 
 
 class PlaybackCamera:
     """Plays the frames of a log.
 
-    At recorded speed, `newest` is a camera's: frames that came while nobody asked are lost, and their numbers
-    skipped. At full speed, each call hands out the next frame. After the last frame it gives None for ever.
+    At speed ``recorded``, `newest` is a camera's: frames that came while nobody asked are lost, and their
+    numbers skipped. At speed ``full``, each call hands out the next frame. After the last it gives None.
 
     Args:
-        path: The log.
+        config: Its section of the configuration: the log's path, and the speed.
         clock: The run's clock.
-        speed: See `Speed`.
 
     Attributes:
         finished: True once the last frame was handed out.
 
     Raises:
+        ConfigError: No path is configured.
         LogError: The log can't be read.
         DataError: It holds no frames.
     """
 
-    def __init__(self, path: Path, clock: Clock, speed: Speed = "recorded") -> None:
+    def __init__(self, config: CameraConfig, clock: Clock) -> None:
+        path = _path(config.path, "camera")
         log = LogReader(path)
         self._clock = clock
-        self._speed = speed
+        self._speed = config.speed
         self._log_start_ns = log.start_ns
         self._shift_ns = 0
         self._frames: Iterator[Frame] = log.records(Frame)
@@ -82,19 +84,20 @@ class PlaybackLoadCell:
     At recorded speed, `drain` gives the samples up to now; at full speed, all of them at the first call.
 
     Args:
-        path: The log.
+        config: Its section of the configuration: the log's path, and the speed.
         clock: The run's clock.
-        speed: See `Speed`.
 
     Raises:
+        ConfigError: No path is configured.
         LogError: The log can't be read.
         DataError: It holds no samples.
     """
 
-    def __init__(self, path: Path, clock: Clock, speed: Speed = "recorded") -> None:
+    def __init__(self, config: LoadCellConfig, clock: Clock) -> None:
+        path = _path(config.path, "load_cell")
         log = LogReader(path)
         self._clock = clock
-        self._speed = speed
+        self._speed = config.speed
         self._log_start_ns = log.start_ns
         self._shift_ns = 0
         self._samples = list(log.records(LoadCellSample))
@@ -126,3 +129,9 @@ class PlaybackLoadCell:
     def close(self) -> None:
         """Stops playing. May be called twice."""
         self._taken = len(self._samples)
+
+
+def _path(path: Path | None, unit: str) -> Path:
+    if path is None:
+        raise ConfigError(f"{unit}.backend=playback needs {unit}.path, the log to play")
+    return path

@@ -1,8 +1,10 @@
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
 
+from gripper_force.config import CameraConfig, LoadCellConfig
 from gripper_force.errors import DataError, LogError
 from gripper_force.interfaces import Camera, LoadCell
 from gripper_force.log import LogReader, LogWriter
@@ -37,13 +39,25 @@ def log(tmp_path: Path) -> Path:
     return path
 
 
+def camera_of(
+    path: Path, clock: HandClock, speed: Literal["recorded", "full"] = "recorded"
+) -> PlaybackCamera:
+    return PlaybackCamera(CameraConfig(backend="playback", path=path, speed=speed), clock)
+
+
+def load_cell_of(
+    path: Path, clock: HandClock, speed: Literal["recorded", "full"] = "recorded"
+) -> PlaybackLoadCell:
+    return PlaybackLoadCell(LoadCellConfig(backend="playback", path=path, speed=speed), clock)
+
+
 def recorded_frames(path: Path) -> list[tuple[int, int, int]]:
     return [(f.t_ns, f.received_ns, f.seq) for f in LogReader(path).records(Frame)]
 
 
 def test_frames_come_when_they_came_with_times_on_the_runs_clock(log: Path) -> None:
     clock = HandClock(50)
-    camera: Camera = PlaybackCamera(log, clock)
+    camera: Camera = camera_of(log, clock)
     camera.start()
     shift_ns = (50 - FIRST_MS) * NS_PER_MS
     played = []
@@ -58,7 +72,7 @@ def test_frames_come_when_they_came_with_times_on_the_runs_clock(log: Path) -> N
 
 def test_a_slow_reader_gets_the_newest_frame_and_sees_the_gap(log: Path) -> None:
     clock = HandClock(0)
-    camera = PlaybackCamera(log, clock)
+    camera = camera_of(log, clock)
     camera.start()
     assert camera.newest() is None
     clock.t_ms = 100
@@ -70,7 +84,7 @@ def test_a_slow_reader_gets_the_newest_frame_and_sees_the_gap(log: Path) -> None
 
 
 def test_full_speed_hands_out_every_frame_as_recorded_whatever_the_clock_says(log: Path) -> None:
-    camera = PlaybackCamera(log, HandClock(7), "full")
+    camera = camera_of(log, HandClock(7), "full")
     camera.start()
     played = []
     while not camera.finished:
@@ -83,7 +97,7 @@ def test_full_speed_hands_out_every_frame_as_recorded_whatever_the_clock_says(lo
 
 def test_after_the_end_there_is_nothing_more(log: Path) -> None:
     clock = HandClock(0)
-    camera, cell = PlaybackCamera(log, clock), PlaybackLoadCell(log, clock)
+    camera, cell = camera_of(log, clock), load_cell_of(log, clock)
     camera.start()
     cell.start()
     clock.t_ms = 10_000
@@ -99,7 +113,7 @@ def test_after_the_end_there_is_nothing_more(log: Path) -> None:
 
 def test_samples_are_drained_once_and_in_step_with_the_frames(log: Path) -> None:
     clock = HandClock(0)
-    cell: LoadCell = PlaybackLoadCell(log, clock)
+    cell: LoadCell = load_cell_of(log, clock)
     cell.start()
     shift_ns = FIRST_MS * NS_PER_MS
     played = []
@@ -115,7 +129,7 @@ def test_samples_are_drained_once_and_in_step_with_the_frames(log: Path) -> None
 
 
 def test_full_speed_drains_every_sample_at_once_as_recorded(log: Path) -> None:
-    cell = PlaybackLoadCell(log, HandClock(7), "full")
+    cell = load_cell_of(log, HandClock(7), "full")
     cell.start()
     assert cell.drain() == list(LogReader(log).records(LoadCellSample))
     assert cell.drain() == []
@@ -123,7 +137,7 @@ def test_full_speed_drains_every_sample_at_once_as_recorded(log: Path) -> None:
 
 def test_closed_devices_play_no_more_and_may_be_closed_again(log: Path) -> None:
     clock = HandClock(0)
-    devices = PlaybackCamera(log, clock), PlaybackLoadCell(log, clock)
+    devices = camera_of(log, clock), load_cell_of(log, clock)
     for device in devices:
         device.start()
         device.close()
@@ -138,8 +152,8 @@ def test_a_recording_without_the_sensor_is_refused(tmp_path: Path) -> None:
     with LogWriter(path, config="", metadata={}) as writer:
         writer.write(Event(0, "session", "nothing else"))
     with pytest.raises(DataError, match="no camera frames"):
-        PlaybackCamera(path, HandClock(0))
+        camera_of(path, HandClock(0))
     with pytest.raises(DataError, match="no load-cell samples"):
-        PlaybackLoadCell(path, HandClock(0))
+        load_cell_of(path, HandClock(0))
     with pytest.raises(LogError, match="No such file"):
-        PlaybackCamera(tmp_path / "missing.mcap", HandClock(0))
+        camera_of(tmp_path / "missing.mcap", HandClock(0))
