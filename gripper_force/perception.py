@@ -3,6 +3,7 @@
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 from gripper_force.interfaces import Camera, Clock
@@ -32,17 +33,41 @@ class Estimate(Protocol):
 
 
 class Seen(NamedTuple):
-    """A frame, and what the estimator made of it."""
+    """A frame, what the estimator made of it, and what went wrong, if anything did."""
 
     frame: Frame
     visual: VisualForce | None
+    problem: str = ""
 
 
-def estimate(estimator: Estimator, frame: Frame) -> tuple[Estimate | None, float]:
-    """Runs the estimator on a frame and takes the time, in ms."""
-    begin_ns = time.perf_counter_ns()
-    result = estimator.update(frame.gray)
-    return result, (time.perf_counter_ns() - begin_ns) / NS_PER_MS
+class _Sight:
+    """Runs the estimator on frames, and survives what it raises.
+
+    An error on the frames before the first estimate means that the run is set up wrongly, and is raised. A
+    later one costs the estimate of its frame: the controller goes on with the motor current alone.
+    """
+
+    def __init__(self, estimator: Estimator | None) -> None:
+        self._estimator = estimator
+        self._works = False
+
+    def see(self, frame: Frame, ready_ns: Callable[[], int]) -> Seen:
+        """Makes an estimate of a frame, which is ready at the time that is asked for once it is made."""
+        if self._estimator is None:
+            return Seen(frame, None)
+        begin_ns = time.perf_counter_ns()
+        try:
+            result = self._estimator.update(frame.gray)
+        except Exception as error:
+            if not self._works:
+                raise
+            return Seen(frame, None, f"{type(error).__name__}: {error}")
+        compute_ms = (time.perf_counter_ns() - begin_ns) / NS_PER_MS
+        if result is None:
+            return Seen(frame, None)
+        self._works = True
+        visual = VisualForce(frame.t_ns, ready_ns(), frame.seq, result.force_n, result.std_n, compute_ms)
+        return Seen(frame, visual)
 
 
 class Perception(Protocol):
@@ -67,8 +92,8 @@ class LockstepPerception:
     def __init__(
         self, camera: Camera | None, estimator: Estimator | None, clock: Clock, compute_ms: float
     ) -> None:
-        self._camera, self._estimator, self._clock = camera, estimator, clock
-        self._compute_ns = round(compute_ms * NS_PER_MS)
+        self._camera, self._sight, self._clock = camera, _Sight(estimator), clock
+        self._compute_ns = round(compute_ms * NS_PER_MS) if estimator is not None else 0
         self._under_way: deque[tuple[int, Seen]] = deque()
 
     def start(self) -> None:
@@ -79,8 +104,8 @@ class LockstepPerception:
         now_ns = self._clock.now_ns()
         busy = self._under_way and self._under_way[-1][0] > now_ns
         if not busy and self._camera is not None and (frame := self._camera.newest()) is not None:
-            ready_ns = now_ns + (self._compute_ns if self._estimator else 0)
-            self._under_way.append((ready_ns, self._see(frame, ready_ns)))
+            ready_ns = now_ns + self._compute_ns
+            self._under_way.append((ready_ns, self._sight.see(frame, lambda: ready_ns)))
         ready = []
         while self._under_way and self._under_way[0][0] <= now_ns:
             ready.append(self._under_way.popleft()[1])
@@ -89,16 +114,6 @@ class LockstepPerception:
     def close(self) -> None:
         """Nothing to stop."""
 
-    def _see(self, frame: Frame, ready_ns: int) -> Seen:
-        if self._estimator is None:
-            return Seen(frame, None)
-        result, compute_ms = estimate(self._estimator, frame)
-        if result is None:
-            return Seen(frame, None)
-        return Seen(
-            frame, VisualForce(frame.t_ns, ready_ns, frame.seq, result.force_n, result.std_n, compute_ms)
-        )
-
 
 class ThreadedPerception:
     """Estimates in a thread of its own, always on the newest frame."""
@@ -106,7 +121,7 @@ class ThreadedPerception:
     _IDLE_S = 0.001
 
     def __init__(self, camera: Camera | None, estimator: Estimator | None, clock: Clock) -> None:
-        self._camera, self._estimator, self._clock = camera, estimator, clock
+        self._camera, self._sight, self._clock = camera, _Sight(estimator), clock
         self._done: deque[Seen] = deque()
         self._failure: Exception | None = None
         self._stop = threading.Event()
@@ -137,15 +152,6 @@ class ThreadedPerception:
                 if frame is None:
                     self._stop.wait(self._IDLE_S)
                     continue
-                self._done.append(Seen(frame, self._estimate(frame)))
+                self._done.append(self._sight.see(frame, self._clock.now_ns))
         except Exception as error:  # it is the control thread's to raise
             self._failure = error
-
-    def _estimate(self, frame: Frame) -> VisualForce | None:
-        if self._estimator is None:
-            return None
-        result, compute_ms = estimate(self._estimator, frame)
-        if result is None:
-            return None
-        ready_ns = self._clock.now_ns()
-        return VisualForce(frame.t_ns, ready_ns, frame.seq, result.force_n, result.std_n, compute_ms)

@@ -23,7 +23,7 @@ from gripper_force.errors import ConfigError, LogError
 from gripper_force.interfaces import Devices
 from gripper_force.log import LogWriter
 from gripper_force.perception import LockstepPerception, Perception, ThreadedPerception
-from gripper_force.types import NS_PER_S, Event, GraspStatus, Outcome, Phase, Request, RequestKind
+from gripper_force.types import NS_PER_S, Event, GraspStatus, Outcome, Phase, Record, Request, RequestKind
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
 from gripper_force.vision.estimator import ForceEstimator
 
@@ -55,6 +55,9 @@ class Session:
         self._stop = threading.Event()
         self._interrupted = False
         self._last_retries = 0
+        self._problem = ""
+        self._lost_records = 0
+        self._log_error: LogError | None = None
         self._armed = False
         self.sees = False
         self.cycles = 0
@@ -99,33 +102,36 @@ class Session:
         Raises:
             DeviceError: The servo was lost or does not answer.
             KeyboardInterrupt: See `interrupt`.
-            GripperError: A sensor, the estimator or the simulated world failed.
+            GripperError: A sensor or the simulated world failed, or the first frames gave no estimate.
         """
-        devices, log = self._devices, self._log
+        devices, log = self._devices, self._write
         devices.clock.sleep_until_ns(self._due_ns)
         self._due_ns = max(self._due_ns + self._period_ns, devices.clock.now_ns() - self._period_ns)
         self.end_if_interrupted()
         devices.check()
         visual = None
         for seen in self._perception.poll():
-            log.write(seen.frame)
+            log(seen.frame)
             if seen.visual is not None:
                 visual = seen.visual
-                log.write(visual)
+                log(visual)
                 self.sees = True
+            if seen.problem not in ("", self._problem):
+                log(Event(seen.frame.received_ns, "vision", f"no estimate: {seen.problem}"))
+            self._problem = seen.problem
         state = devices.servo.read()
         request = self._request(state.t_ns, kind, target_n)
         decision = self._controller.step(state.t_ns, state, visual, request)
         devices.servo.write(decision.command)
         self.cycles += 1
         if request is not None:
-            log.write(request)
-        log.write(state)
-        log.write(decision.estimate)
-        log.write(decision.command)
-        log.write(decision.status)
+            log(request)
+        log(state)
+        log(decision.estimate)
+        log(decision.command)
+        log(decision.status)
         for event in decision.events:
-            log.write(event)
+            log(event)
         self._log_sensors(state.t_ns)
         return decision
 
@@ -138,6 +144,35 @@ class Session:
             self._perception.close()
         self._log_sensors(self._devices.clock.now_ns())
 
+    def raise_losses(self) -> None:
+        """Tells of a disk that failed, which must not end a grasp, once the grasp has ended.
+
+        Raises:
+            LogError: Records are missing from the log.
+        """
+        if self._log_error is not None:
+            raise LogError(
+                f"{self._log_error}; the run went on, and its log lacks {self._lost_records} records: free "
+                "some space, or set log.directory elsewhere"
+            )
+
+    def attach(self, name: str, data: bytes, media_type: str) -> None:
+        """Adds a file to the log."""
+        with self._losses_counted():
+            self._log.attach(name, data, media_type)
+
+    def _write(self, record: Record) -> None:
+        with self._losses_counted():
+            self._log.write(record)
+
+    @contextmanager
+    def _losses_counted(self) -> Iterator[None]:
+        try:
+            yield
+        except LogError as error:
+            self._lost_records += 1
+            self._log_error = self._log_error or error
+
     def _request(self, t_ns: int, kind: RequestKind | None, target_n: float) -> Request | None:
         if self._stop.is_set():
             self._stop.clear()
@@ -147,10 +182,10 @@ class Session:
     def _log_sensors(self, t_ns: int) -> None:
         if self._devices.load_cell is not None:
             for sample in self._devices.load_cell.drain():
-                self._log.write(sample)
+                self._write(sample)
         stats = self._devices.servo.stats
         if stats.retries > self._last_retries:
-            self._log.write(Event(t_ns, "servo", f"{stats.retries - self._last_retries} bus retries"))
+            self._write(Event(t_ns, "servo", f"{stats.retries - self._last_retries} bus retries"))
             self._last_retries = stats.retries
 
 
@@ -174,7 +209,7 @@ def open_session(
             # Python's default lets a thread that computes keep the control thread waiting for 5 ms.
             stack.callback(sys.setswitchinterval, sys.getswitchinterval())
             sys.setswitchinterval(_REALTIME_SWITCH_S)
-        stack.callback(_attach_reference, log, estimator)
+        stack.callback(_attach_reference, session, estimator)
         stack.enter_context(_signals_wait(session))
         stack.callback(session.close)
         try:
@@ -184,6 +219,7 @@ def open_session(
             with suppress(LogError):  # the first error is the one to tell
                 log.write(Event(devices.clock.now_ns(), "session", f"{type(error).__name__}: {error}"))
             raise
+    session.raise_losses()
 
 
 @contextmanager
@@ -311,7 +347,7 @@ def _discard_unused(session: Session, path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def _attach_reference(log: LogWriter, estimator: ForceEstimator | None) -> None:
+def _attach_reference(session: Session, estimator: ForceEstimator | None) -> None:
     if estimator is not None and (reference := estimator.reference) is not None:
         png: Any = cv2.imencode(".png", reference)[1]
-        log.attach("reference.png", png.tobytes(), "image/png")
+        session.attach("reference.png", png.tobytes(), "image/png")

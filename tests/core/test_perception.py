@@ -19,14 +19,15 @@ class Guess(NamedTuple):
 class Eye:
     """Says how many frames it has seen, after one reference frame."""
 
-    def __init__(self, error: Exception | None = None) -> None:
+    def __init__(self, error: Exception | None = None, at: int = 1) -> None:
         self.count = 0
         self.error = error
+        self.at = at
 
     def update(self, gray: Gray) -> Guess | None:
-        if self.error is not None:
-            raise self.error
         self.count += 1
+        if self.error is not None and self.count == self.at:
+            raise self.error
         return Guess(float(self.count), 0.5) if self.count > 1 else None
 
 
@@ -113,11 +114,27 @@ def test_without_an_estimator_frames_pass_at_once() -> None:
     assert LockstepPerception(None, None, clock, 12.0).poll() == []
 
 
-def test_in_lockstep_the_estimators_error_is_the_callers() -> None:
+@pytest.mark.parametrize("at", [1, 2])
+def test_in_lockstep_an_error_before_the_first_estimate_is_the_callers(at: int) -> None:
     camera = Shutter()
-    camera.give(0)
+    eyes = LockstepPerception(camera, Eye(DataError("no picture"), at), Hand(), 0.0)
+    for _ in range(at - 1):
+        camera.give(0)
+        eyes.poll()
+    camera.give(1)
     with pytest.raises(DataError, match="no picture"):
-        LockstepPerception(camera, Eye(DataError("no picture")), Hand(), 0.0).poll()
+        eyes.poll()
+
+
+def test_a_later_error_costs_one_estimate_and_is_told() -> None:
+    camera = Shutter()
+    eyes = LockstepPerception(camera, Eye(RuntimeError("no kernel"), at=4), Hand(), 0.0)
+    seen = []
+    for seq in range(6):
+        camera.give(seq)
+        seen += eyes.poll()
+    assert [s.visual is None for s in seen] == [True, False, False, True, False, False]
+    assert [s.problem for s in seen] == ["", "", "", "RuntimeError: no kernel", "", ""]
 
 
 def gather(eyes: ThreadedPerception, count: int) -> list[Seen]:
@@ -159,6 +176,17 @@ def test_what_stops_the_thread_is_raised_by_poll(error: Exception) -> None:
     with pytest.raises(type(error), match="no "):
         gather(eyes, 1)
     eyes.close()
+
+
+def test_a_thread_survives_a_later_error() -> None:
+    camera = Shutter()
+    for seq in range(5):
+        camera.give(seq)
+    eyes = ThreadedPerception(camera, Eye(RuntimeError("no kernel"), at=3), Hand())
+    eyes.start()
+    seen = gather(eyes, 5)
+    eyes.close()
+    assert [s.problem for s in seen] == ["", "", "RuntimeError: no kernel", "", ""]
 
 
 def test_closing_leaves_no_thread_started_or_not() -> None:

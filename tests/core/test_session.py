@@ -298,30 +298,32 @@ class Failing:
 
     reference = None
 
-    def __init__(self, force_n: float, last: int = 0) -> None:
+    def __init__(self, force_n: float) -> None:
         self.force_n = force_n
-        self.last = last
-        self.seen = 0
+        self.fails = False
 
     def update(self, gray: object) -> Guess:
-        self.seen += 1
-        if self.seen == self.last:
+        if self.fails:
             raise DataError("no picture")
         return Guess(self.force_n, 0.1)
 
 
-def test_torque_is_off_after_the_estimator_fails(
-    open_rig: tuple[ExitStack, OpenRig], monkeypatch: pytest.MonkeyPatch
+def test_the_grip_is_kept_on_motor_current_where_the_estimator_fails(
+    open_rig: tuple[ExitStack, OpenRig], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     run, begin = open_rig
-    estimator = Failing(0.0)
+    estimator = Failing(2.0)
     monkeypatch.setattr(session_module, "make_estimator", lambda *_: estimator)
     rig = begin(camera=Gray())
     rig.grip()
-    estimator.last = estimator.seen + 1
-    with pytest.raises(DataError, match="no picture"), run:
-        rig.go_on(10)
-    assert rig.is_off()
+    estimator.fails = True
+    rig.go_on(100)
+    assert rig.register("torque_enable") == 1
+    assert rig.register("goal_current") > 0
+    run.close()
+    told = events(tmp_path / "run.mcap")
+    assert told.count("no estimate: DataError: no picture") == 1
+    assert list(LogReader(tmp_path / "run.mcap").records(FusedForce))[-1].source == "current"
 
 
 @pytest.mark.parametrize("force_n", [math.nan, math.inf, -math.inf])
@@ -542,6 +544,31 @@ def test_a_signal_ends_the_command_with_torque_off_and_a_whole_log(
     (path,) = tmp_path.glob("*.mcap")
     assert events(path)[-1] == "KeyboardInterrupt: the run was interrupted"
     assert list(LogReader(path).records(GraspStatus))[-1].phase == Phase.HOLD
+
+
+FULL_DISK = """
+import resource, signal
+from gripper_force.cli import main
+
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
+main()
+"""
+
+
+def test_a_full_disk_does_not_end_the_grasp_and_is_told_after_it(quick: list[str], tmp_path: Path) -> None:
+    sets = [*quick, f"log.directory={tmp_path}", "control.hold_s=0.2"]
+    arguments = [part for assignment in sets for part in ("--set", assignment)]
+    ended = subprocess.run(
+        [sys.executable, "-c", FULL_DISK, "grasp", *arguments], capture_output=True, text=True, timeout=60
+    )
+    assert ended.returncode == 2, ended.stderr
+    assert "Traceback" not in ended.stderr
+    told = " ".join(ended.stderr.split())
+    assert "File too large; the run went on, and its log lacks" in told
+    assert told.index(" open held") < told.index("File too large")
+    (path,) = tmp_path.glob("*.mcap")
+    assert list(LogReader(path, recover=True).records(GraspStatus))
 
 
 # Real time.
