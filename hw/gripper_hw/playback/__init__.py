@@ -6,7 +6,6 @@ are asked, with times as recorded.
 
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 from gripper_force.config import CameraConfig, LoadCellConfig
 from gripper_force.errors import ConfigError, DataError
@@ -15,7 +14,32 @@ from gripper_force.log import LogReader
 from gripper_force.types import Frame, LoadCellSample
 
 
-class PlaybackCamera:
+class _Playback:
+    """A log, and the time it is shifted by.
+
+    Raises:
+        ConfigError: No path is configured.
+        LogError: The log can't be read.
+    """
+
+    def __init__(self, config: CameraConfig | LoadCellConfig, clock: Clock, unit: str) -> None:
+        if config.path is None:
+            raise ConfigError(f"{unit}.backend=playback needs {unit}.path, the log to play")
+        self._log = LogReader(config.path)
+        self._clock = clock
+        self._speed = config.speed
+        self._shift_ns = 0
+
+    def start(self) -> None:
+        """Begins to play: the log's first record is now."""
+        if self._speed == "recorded":
+            self._shift_ns = self._clock.now_ns() - self._log.start_ns
+
+    def _log_now_ns(self) -> int:
+        return self._clock.now_ns() - self._shift_ns
+
+
+class PlaybackCamera(_Playback):
     """Plays the frames of a log.
 
     At speed ``recorded``, `newest` is a camera's: frames that came while nobody asked are lost, and their
@@ -35,22 +59,12 @@ class PlaybackCamera:
     """
 
     def __init__(self, config: CameraConfig, clock: Clock) -> None:
-        path = _path(config.path, "camera")
-        log = LogReader(path)
-        self._clock = clock
-        self._speed = config.speed
-        self._log_start_ns = log.start_ns
-        self._shift_ns = 0
-        self._frames: Iterator[Frame] = log.records(Frame)
+        super().__init__(config, clock, "camera")
+        self._frames: Iterator[Frame] = self._log.records(Frame)
         self._next = next(self._frames, None)
         self.finished = False
         if self._next is None:
-            raise DataError(f"{path} holds no camera frames to play")
-
-    def start(self) -> None:
-        """Begins to play: the log's first record is now."""
-        if self._speed == "recorded":
-            self._shift_ns = self._clock.now_ns() - self._log_start_ns
+            raise DataError(f"{config.path} holds no camera frames to play")
 
     def newest(self) -> Frame | None:
         """The newest frame that was not handed out yet, or None. Never blocks. Raises `LogError`."""
@@ -58,7 +72,7 @@ class PlaybackCamera:
         if self._speed == "full":
             frame = self._take()
         else:
-            log_ns = self._clock.now_ns() - self._shift_ns
+            log_ns = self._log_now_ns()
             while self._next is not None and self._next.received_ns <= log_ns:
                 frame = self._take()
         self.finished = self._next is None
@@ -78,7 +92,7 @@ class PlaybackCamera:
         return frame
 
 
-class PlaybackLoadCell:
+class PlaybackLoadCell(_Playback):
     """Plays the load-cell samples of a log.
 
     At recorded speed, `drain` gives the samples up to now; at full speed, all of them at the first call.
@@ -94,26 +108,16 @@ class PlaybackLoadCell:
     """
 
     def __init__(self, config: LoadCellConfig, clock: Clock) -> None:
-        path = _path(config.path, "load_cell")
-        log = LogReader(path)
-        self._clock = clock
-        self._speed = config.speed
-        self._log_start_ns = log.start_ns
-        self._shift_ns = 0
-        self._samples = list(log.records(LoadCellSample))
+        super().__init__(config, clock, "load_cell")
+        self._samples = list(self._log.records(LoadCellSample))
         self._taken = 0
         if not self._samples:
-            raise DataError(f"{path} holds no load-cell samples to play")
+            raise DataError(f"{config.path} holds no load-cell samples to play")
 
     @property
     def finished(self) -> bool:
         """True once the last sample was handed out."""
         return self._taken == len(self._samples)
-
-    def start(self) -> None:
-        """Begins to play: the log's first record is now."""
-        if self._speed == "recorded":
-            self._shift_ns = self._clock.now_ns() - self._log_start_ns
 
     def drain(self) -> list[LoadCellSample]:
         """Every sample since the last call, oldest first. Never blocks."""
@@ -121,7 +125,7 @@ class PlaybackLoadCell:
         if self._speed == "full":
             self._taken = len(self._samples)
         else:
-            log_ns = self._clock.now_ns() - self._shift_ns
+            log_ns = self._log_now_ns()
             while not self.finished and self._samples[self._taken].t_ns <= log_ns:
                 self._taken += 1
         return [replace(s, t_ns=s.t_ns + self._shift_ns) for s in self._samples[first : self._taken]]
@@ -129,9 +133,3 @@ class PlaybackLoadCell:
     def close(self) -> None:
         """Stops playing. May be called twice."""
         self._taken = len(self._samples)
-
-
-def _path(path: Path | None, unit: str) -> Path:
-    if path is None:
-        raise ConfigError(f"{unit}.backend=playback needs {unit}.path, the log to play")
-    return path
