@@ -6,6 +6,9 @@ from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
+import numpy as np
+
+from gripper_force.errors import GripperError
 from gripper_force.interfaces import Camera, Clock
 from gripper_force.types import NS_PER_MS, Frame, Gray, VisualForce
 
@@ -40,33 +43,52 @@ class Seen(NamedTuple):
     problem: str = ""
 
 
-class _Sight:
+class Sight:
     """Runs the estimator on frames, and survives what it raises.
 
     An error on the frames before the first estimate means that the run is set up wrongly, and is raised. A
-    later one costs the estimate of its frame: the controller goes on with the motor current alone.
+    later one costs the estimate of its frame: the controller goes on with the motor current alone. So does a
+    frame that is its forerunner to the bit: sensors have noise, and a camera that hangs has none. In a
+    recording that stands still from the start it means nothing.
     """
 
     def __init__(self, estimator: Estimator | None) -> None:
         self._estimator = estimator
         self._works = False
+        self._last: Gray | None = None
+        self._may_repeat = False
 
-    def see(self, frame: Frame, ready_ns: Callable[[], int]) -> Seen:
-        """Makes an estimate of a frame, which is ready at the time that is asked for once it is made."""
+    def see(self, frame: Frame, now_ns: Callable[[], int] | None = None) -> Seen:
+        """Makes an estimate of a frame.
+
+        Args:
+            frame: The next frame.
+            now_ns: Tells, once it is made, when it was ready; None: when the frame came.
+
+        Raises:
+            Exception: What the estimator raised before its first estimate.
+        """
         if self._estimator is None:
             return Seen(frame, None)
+        repeats = self._last is not None and np.array_equal(frame.gray, self._last)
+        self._last = frame.gray
+        self._may_repeat |= repeats and not self._works
+        if repeats and not self._may_repeat:
+            return Seen(frame, None, "the camera repeats its last picture; see whether it hangs")
         begin_ns = time.perf_counter_ns()
         try:
             result = self._estimator.update(frame.gray)
         except Exception as error:
             if not self._works:
                 raise
-            return Seen(frame, None, f"{type(error).__name__}: {error}")
+            own = isinstance(error, GripperError)
+            return Seen(frame, None, str(error) if own else f"{type(error).__name__}: {error}")
         compute_ms = (time.perf_counter_ns() - begin_ns) / NS_PER_MS
         if result is None:
             return Seen(frame, None)
         self._works = True
-        visual = VisualForce(frame.t_ns, ready_ns(), frame.seq, result.force_n, result.std_n, compute_ms)
+        ready_ns = frame.received_ns if now_ns is None else now_ns()
+        visual = VisualForce(frame.t_ns, ready_ns, frame.seq, result.force_n, result.std_n, compute_ms)
         return Seen(frame, visual)
 
 
@@ -92,7 +114,7 @@ class LockstepPerception:
     def __init__(
         self, camera: Camera | None, estimator: Estimator | None, clock: Clock, compute_ms: float
     ) -> None:
-        self._camera, self._sight, self._clock = camera, _Sight(estimator), clock
+        self._camera, self._sight, self._clock = camera, Sight(estimator), clock
         self._compute_ns = round(compute_ms * NS_PER_MS) if estimator is not None else 0
         self._under_way: deque[tuple[int, Seen]] = deque()
 
@@ -121,7 +143,7 @@ class ThreadedPerception:
     _IDLE_S = 0.001
 
     def __init__(self, camera: Camera | None, estimator: Estimator | None, clock: Clock) -> None:
-        self._camera, self._sight, self._clock = camera, _Sight(estimator), clock
+        self._camera, self._sight, self._clock = camera, Sight(estimator), clock
         self._done: deque[Seen] = deque()
         self._failure: Exception | None = None
         self._stop = threading.Event()

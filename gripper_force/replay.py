@@ -14,6 +14,7 @@ from gripper_force.control.grasp import Decision
 from gripper_force.dataset import CONTACT_N, label_frames
 from gripper_force.errors import DataError
 from gripper_force.log import LogReader
+from gripper_force.perception import Sight
 from gripper_force.session import controller_from, make_estimator
 from gripper_force.types import (
     NS_PER_S,
@@ -27,7 +28,6 @@ from gripper_force.types import (
     VisualForce,
 )
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
-from gripper_force.vision.estimator import ForceEstimator
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def replay(
 
 def run_again(reader: LogReader, config: Config, checkpoint: Checkpoint | None) -> Replayed:
     """Feeds estimator and controller from a log, in the order in which the run had its inputs."""
-    estimator = make_estimator(config, checkpoint)
+    sight = Sight(make_estimator(config, checkpoint))
     runs = config.gripper.nm_per_a is not None  # a recording that was imported never had a controller
     controller = controller_from(config) if runs else None
     visual: list[VisualForce] = []
@@ -106,8 +106,8 @@ def run_again(reader: LogReader, config: Config, checkpoint: Checkpoint | None) 
     pending: dict[int, VisualForce] = {}
     for record in reader.records():
         logged[type(record)].append(record)
-        if isinstance(record, Frame) and estimator is not None:
-            if (seen := _see(estimator, record)) is not None:
+        if isinstance(record, Frame):
+            if (seen := sight.see(record).visual) is not None:
                 visual.append(seen)
                 pending[record.seq] = seen
         elif isinstance(record, VisualForce):
@@ -128,13 +128,6 @@ def run_again(reader: LogReader, config: Config, checkpoint: Checkpoint | None) 
         decisions,
         cells,
     )
-
-
-def _see(estimator: ForceEstimator, frame: Frame) -> VisualForce | None:
-    result = estimator.update(frame.gray)
-    if result is None:
-        return None
-    return VisualForce(frame.t_ns, frame.received_ns, frame.seq, result.force_n, result.std_n, 0.0)
 
 
 def _same_estimates(logged: list[VisualForce], again: list[VisualForce]) -> bool:

@@ -1,5 +1,6 @@
 """Camera frames over a grasp, and where the network looked."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -9,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib import colormaps
 
-from gripper_force.errors import CheckpointError
+from gripper_force.errors import CheckpointError, DataError
 from gripper_force.log import LogReader
 from gripper_force.report.data import Run
 from gripper_force.types import NS_PER_S, Frame, Gray, Phase
@@ -66,7 +67,8 @@ def take_pictures(path: Path, run: Run, *, recover: bool = False) -> tuple[list[
     pictures = []
     for frame in log.records(Frame):
         if estimator is not None:
-            estimator.update(frame.gray)
+            with suppress(DataError):  # the run went on without this frame as well
+                estimator.update(frame.gray)
         if frame.t_ns in wanted:
             attention = estimator.attention_map() if estimator is not None else None
             pictures.append(_picture(frame, run, attention))

@@ -11,6 +11,7 @@ from gripper_force.errors import NonFiniteError
 from gripper_force.types import Gray
 from gripper_force.vision.checkpoint import Checkpoint
 from gripper_force.vision.network import StreamState
+from gripper_force.vision.plausible import Plausibility
 from gripper_force.vision.preprocess import Normaliser, Region, shrink
 
 
@@ -51,6 +52,7 @@ class ForceEstimator:
 
     def reset(self) -> None:
         """Forgets the stream: the next frames are the first of a new run, and its reference."""
+        self._plausibility = Plausibility()
         self._normaliser = Normaliser(self._preprocess)
         self._states: list[StreamState | None] = [None] * len(self._networks)
 
@@ -69,12 +71,14 @@ class ForceEstimator:
             The estimate for this frame, or None while the reference frames are being collected.
 
         Raises:
-            DataError: The frame is not a gray image of bytes.
+            DataError: The frame is not a gray image of bytes, or not what a working camera would see.
             ConfigError: The region of interest reaches beyond the frame.
             NonFiniteError: A network gave NaN or infinity.
         """
         forces: list[float] = []
-        for frame in self._normaliser.push(shrink(gray, self._region, self._preprocess.size)):
+        small = shrink(gray, self._region, self._preprocess.size)
+        self._plausibility.check(small)
+        for frame in self._normaliser.push(small):
             forces = self._infer(frame)
         if not forces:
             return None

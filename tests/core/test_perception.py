@@ -49,9 +49,9 @@ class Shutter:
     def __init__(self) -> None:
         self.frames: deque[Frame] = deque()
 
-    def give(self, seq: int, t_ms: int = 0) -> None:
+    def give(self, seq: int, t_ms: int = 0, level: int | None = None) -> None:
         t_ns = t_ms * NS_PER_MS
-        self.frames.append(Frame(t_ns, t_ns, seq, np.zeros((2, 2), np.uint8)))
+        self.frames.append(Frame(t_ns, t_ns, seq, np.full((2, 2), seq if level is None else level, np.uint8)))
 
     def newest(self) -> Frame | None:
         return self.frames.popleft() if self.frames else None
@@ -135,6 +135,28 @@ def test_a_later_error_costs_one_estimate_and_is_told() -> None:
         seen += eyes.poll()
     assert [s.visual is None for s in seen] == [True, False, False, True, False, False]
     assert [s.problem for s in seen] == ["", "", "", "RuntimeError: no kernel", "", ""]
+
+
+def test_a_camera_that_hangs_gives_no_estimates() -> None:
+    camera, eye = Shutter(), Eye()
+    eyes = LockstepPerception(camera, eye, Hand(), 0.0)
+    seen = []
+    for seq, level in enumerate((1, 2, 3, 3, 3, 4)):
+        camera.give(seq, level=level)
+        seen += eyes.poll()
+    assert ["hangs" in s.problem for s in seen] == [False, False, False, True, True, False]
+    assert [s.visual is None for s in seen] == [True, False, False, True, True, False]
+    assert eye.count == 4
+
+
+def test_a_recording_may_stand_still() -> None:
+    camera, eye = Shutter(), Eye()
+    eyes = LockstepPerception(camera, eye, Hand(), 0.0)
+    for seq in range(5):
+        camera.give(seq, level=7)
+        (seen,) = eyes.poll()
+        assert seen.problem == ""
+    assert eye.count == 5
 
 
 def gather(eyes: ThreadedPerception, count: int) -> list[Seen]:

@@ -278,7 +278,7 @@ def test_torque_is_off_after_the_devices_report_a_failure(open_rig: tuple[ExitSt
 
 
 class Gray:
-    """A camera that sees nothing, once in four cycles."""
+    """A camera that sees nothing but its own noise, once in four cycles."""
 
     def __init__(self) -> None:
         self.asked = 0
@@ -290,7 +290,8 @@ class Gray:
     def newest(self) -> Frame | None:
         self.asked += 1
         t_ns = self.asked * 5 * NS_PER_MS
-        return None if self.asked % 4 else Frame(t_ns, t_ns, self.asked // 4, np.zeros((2, 2), np.uint8))
+        gray = np.full((2, 2), self.asked % 251, np.uint8)
+        return None if self.asked % 4 else Frame(t_ns, t_ns, self.asked // 4, gray)
 
 
 class Failing:
@@ -322,7 +323,7 @@ def test_the_grip_is_kept_on_motor_current_where_the_estimator_fails(
     assert rig.register("goal_current") > 0
     run.close()
     told = events(tmp_path / "run.mcap")
-    assert told.count("no estimate: DataError: no picture") == 1
+    assert told.count("no estimate: no picture") == 1
     assert list(LogReader(tmp_path / "run.mcap").records(FusedForce))[-1].source == "current"
 
 
