@@ -377,6 +377,8 @@ def _bins_table(bins: list[dict[str, Any]]) -> None:
 
 def _replay_table(r: dict[str, Any]) -> None:
     identical = {True: "yes, to the bit", False: "no", None: "nothing to compare"}[r["identical"]]
+    if r["note"]:
+        identical += f": {r['note']}"
     _pairs({"identical": identical, "log": r["log"], **({"report": r["report"]} if "report" in r else {})})
     table = Table("source", "MAE N", "RMSE N", "bias N", "contact MAE N", "lag ms", "samples", box=None)
     for name, s in r["sources"].items():

@@ -66,8 +66,8 @@ def replay(
 
     Returns:
         ``mae_n, rmse_n, bias_n, per_bin, frames`` of the estimate that the run acted on (or of vision, where
-        nothing acted), ``identical`` (None where the log holds no run), and the same figures with ``lag_s``
-        by source.
+        nothing acted), ``identical`` (None where the log holds no run), ``note`` (why it can't be), and the
+        same figures with ``lag_s`` by source.
 
     Raises:
         LogError: The log can't be read.
@@ -87,6 +87,7 @@ def replay(
         **{key: best[key] for key in ("mae_n", "rmse_n", "bias_n", "per_bin", "frames")},
         "per_object": {config.object: {k: best[k] for k in ("mae_n", "rmse_n", "bias_n", "frames")}},
         "identical": all(flags) if flags else None,
+        "note": _note(reader, checkpoint),
         "sources": sources,
         "log": str(path),
     }
@@ -146,6 +147,14 @@ def _same_decisions(logged: dict[type, list[Any]], again: list[Decision]) -> boo
         (logged[GraspStatus], [d.status for d in again]),
     )
     return all(a == b[: len(a)] and len(b) - len(a) <= 1 for a, b in pairs)
+
+
+def _note(reader: LogReader, checkpoint: Checkpoint | None) -> str:
+    """Why the estimates can't come out the same, or an empty text."""
+    used = reader.metadata.get("checkpoint", "")
+    if checkpoint is None or used in ("", checkpoint.digest):
+        return ""
+    return f"the run's checkpoint was {used[:12]}, this one is {checkpoint.digest[:12]}: estimates differ"
 
 
 def _checkpoint(config: Config, source: str | None) -> Checkpoint | None:

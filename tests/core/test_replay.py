@@ -35,6 +35,7 @@ def tampered(log: Path, path: Path, change: Callable[[Record], Record | None]) -
 def test_a_lockstep_run_comes_out_the_same(fused_log: Path) -> None:
     result = replay(fused_log)
     assert result["identical"] is True
+    assert result["note"] == ""
     assert set(result) >= {"mae_n", "rmse_n", "bias_n", "per_object", "per_bin", "frames", "log"}
     assert set(result["sources"]) == {"visual", "current", "fused"}
     assert result["mae_n"] == result["sources"]["fused"]["mae_n"]
@@ -91,6 +92,7 @@ def test_another_checkpoint_estimates_otherwise(
     save_checkpoint(other, tiny.networks, tiny.header)
     first, second = replay(fused_log), replay(fused_log, str(other))
     assert second["identical"] is False
+    assert load_checkpoint(other).digest[:12] in second["note"]
     moved = second["sources"]["visual"]["bias_n"] - first["sources"]["visual"]["bias_n"]
     assert moved == pytest.approx(1.0, abs=0.05)
 
