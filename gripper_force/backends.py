@@ -25,6 +25,8 @@ LOAD_CELLS: Final = {
     "none": None,
     "simulated": RIG,
     "playback": "gripper_hw.playback:PlaybackLoadCell",
+    "serial": "gripper_hw.load_cells.serial:SerialLoadCell",
+    "phidget": "gripper_hw.load_cells.phidget:PhidgetLoadCell",
 }
 
 

@@ -67,8 +67,22 @@ class CameraConfig(Section):
 class LoadCellConfig(Section):
     """The force reference; ``none`` where none is fitted."""
 
-    backend: str = Field("simulated", description="simulated, playback, none")
-    rate_hz: Positive = 200.0
+    backend: str = Field("simulated", description="simulated, playback, serial, phidget, none")
+    rate_hz: Positive = Field(
+        200.0, description="of `simulated` and `phidget` (at most 122); a board on a serial port has its own"
+    )
+    port: str | None = Field(None, description="the device path that backend `serial` reads")
+    baud_rate: int = Field(115_200, gt=0)
+    format: Literal["hx711", "cas"] = Field(
+        "hx711", description="what `serial` reads: counts of an HX711 board, or a weighing indicator's frames"
+    )
+    channel: int = Field(0, ge=0, le=3, description="the bridge input that backend `phidget` reads")
+    tare_raw: Finite = Field(0.0, description="the reading without load: counts, kg, or V/V")
+    n_per_raw: Finite | None = Field(
+        None,
+        description="newtons for one unit of the reading; None: 9.80665 for an indicator's kg, and any other "
+        "cell is not calibrated, so that none of its samples is valid",
+    )
     path: Path | None = Field(None, description="the log that backend `playback` plays")
     speed: Literal["recorded", "full"] = Field("recorded", description="how fast it is played")
 

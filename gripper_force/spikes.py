@@ -33,6 +33,8 @@ def find_spikes(force_n: Floats) -> Bools:
     Returns:
         True where rejected, (N,).
     """
+    if not len(force_n):
+        return np.zeros(0, np.bool_)
     # Mirrored through its ends, so that a ramp goes on beyond them.
     padded = np.pad(force_n, HAMPEL_HALF_WINDOW, mode="reflect", reflect_type="odd")
     windows = np.lib.stride_tricks.sliding_window_view(padded, 2 * HAMPEL_HALF_WINDOW + 1)  # (N, 7)

@@ -22,7 +22,7 @@ def changed(config: Config, **sections: dict[str, object]) -> Config:
 
 @pytest.mark.parametrize(
     ("unit", "known"),
-    [("camera", "none, simulated, playback"), ("load_cell", "none, simulated, playback")],
+    [("camera", "none, simulated, playback"), ("load_cell", "none, simulated, playback, serial, phidget")],
 )
 def test_an_unknown_backend_is_named_with_the_known_ones(config: Config, unit: str, known: str) -> None:
     with (

@@ -22,7 +22,7 @@ def test_one_wild_sample_in_a_hold_is_always_found(index: int, height_n: float, 
 
 
 @settings(max_examples=100, deadline=None)
-@given(st.lists(st.floats(-100, 100), min_size=1, max_size=40))
+@given(st.lists(st.floats(-100, 100), max_size=40))
 def test_what_reaches_below_the_possible_never_counts(values: list[float]) -> None:
     force_n = np.array(values)
     assert find_spikes(force_n)[force_n < IMPOSSIBLE_N].all()

@@ -1,0 +1,1 @@
+"""Load cells: boards and weighing indicators on a serial port, and Phidget bridges."""

@@ -1,0 +1,90 @@
+"""The lines that load cells print on a serial port, as bytes: no parser ever raises."""
+
+import math
+import re
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+LONGEST_LINE: Final = 256
+"""Bytes without an end of line beyond this are no load cell's."""
+
+HX711_MIN: Final = -0x800000
+HX711_MAX: Final = 0x7FFFFF
+"""The converter has 24 bits, and gives one of these two where its input is out of range."""
+
+_HX711: Final = re.compile(rb"\s*(?:\d+,)?([+-]?\d{1,8})\s*")
+_CAS: Final = re.compile(rb"(?:(ST|US|OL),(?:GS|NT),(?:..,)?)?(.{8})(?: ?(kg|g | g))?", re.DOTALL)
+_CAS_LENGTHS: Final = frozenset({8, 16, 20})
+_DECIMAL: Final = re.compile(rb" *([+-]?) *(\d+\.?\d*|\.\d+) *")
+_KG: Final = {b"kg": 1.0, b"g": 1e-3}
+
+
+class Reading(NamedTuple):
+    """What a line says.
+
+    Attributes:
+        raw: The reading, in the sensor's own unit; NaN where it has none.
+        saturated: The sensor says that it is beyond its range.
+    """
+
+    raw: float
+    saturated: bool = False
+
+
+def parse_hx711(line: bytes) -> Reading | None:
+    """Reads ``<raw>`` or ``<micros>,<raw>`` in counts, as boards with an HX711 converter print them.
+
+    See https://cdn.sparkfun.com/datasheets/Sensors/ForceFlex/hx711_english.pdf for the counts.
+
+    Returns:
+        The reading, or None where the line is none.
+    """
+    found = _HX711.fullmatch(line)
+    if found is None or not HX711_MIN <= (raw := int(found[1])) <= HX711_MAX:
+        return None
+    return Reading(float(raw), saturated=raw in (HX711_MIN, HX711_MAX))
+
+
+def parse_cas(line: bytes) -> Reading | None:
+    """Reads a weighing indicator's frame without its end of line, in kg.
+
+    With CR and LF a frame has 22 bytes (``ST,GS,<id><lamp>,<8 bytes> kg``), 18 (``ST,GS,<8 bytes>kg``) or 10
+    (the 8 bytes alone, taken as kg). The lamp byte is no ASCII: its bit 7 is set. See the appendix "Data
+    format" of the CAS CI-400's manual: https://www.easymanua.ls/cas/ci-400-series/manual?p=103
+
+    Returns:
+        The reading, or None where the line is none.
+    """
+    found = _CAS.fullmatch(line.removesuffix(b"\r"))
+    if found is None or len(found[0]) not in _CAS_LENGTHS:
+        return None
+    state, data, unit = found.groups()
+    number = _DECIMAL.fullmatch(data)
+    if number is None:
+        return Reading(math.nan, saturated=True) if state == b"OL" else None
+    raw = float(number[1] + number[2]) * _KG[unit.strip() if unit else b"kg"]
+    return Reading(raw, saturated=state == b"OL")
+
+
+PARSERS: Final[dict[str, Callable[[bytes], Reading | None]]] = {"hx711": parse_hx711, "cas": parse_cas}
+"""By the value of ``load_cell.format``."""
+
+
+class LineSplitter:
+    """Cuts received bytes into lines. Leaves out the first: it may have begun before the port was open."""
+
+    def __init__(self) -> None:
+        self._begun = bytearray()
+        self._torn = True
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """The lines that ``data`` completes, without the line feeds."""
+        *lines, rest = (self._begun + data).split(b"\n")
+        if self._torn and lines:
+            del lines[0]
+            self._torn = False
+        if len(rest) > LONGEST_LINE:
+            rest = bytearray()
+            self._torn = True
+        self._begun = bytearray(rest)
+        return [bytes(line) for line in lines]

@@ -1,0 +1,116 @@
+"""A load cell that prints lines on a serial port."""
+
+import math
+import termios
+import threading
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+import serial
+
+from gripper_force.config import LoadCellConfig
+from gripper_force.errors import ConfigError, DeviceError, DeviceNotFoundError
+from gripper_force.interfaces import Clock
+from gripper_hw.load_cells.lines import PARSERS, LineSplitter
+from gripper_hw.load_cells.screening import LiveLoadCell
+
+RECONNECT_S: Final = 0.5
+"""Pause between two tries to open a port that went away."""
+
+STANDARD_GRAVITY_M_S2: Final = 9.80665
+
+
+class SerialLoadCell(LiveLoadCell):
+    """Reads the port in a thread of its own, which opens it again after it went away.
+
+    A sample carries the time at which its line was complete.
+
+    Args:
+        config: Its section of the configuration: port, baud rate, format, tare and scale.
+        clock: The run's clock.
+
+    Raises:
+        ConfigError: No port is configured, or the clock is a simulated one.
+    """
+
+    def __init__(self, config: LoadCellConfig, clock: Clock) -> None:
+        counts = config.format == "hx711"
+        super().__init__(config, clock, unit_n=math.nan if counts else STANDARD_GRAVITY_M_S2, noisy=counts)
+        if config.port is None:
+            raise ConfigError("load_cell.backend=serial needs load_cell.port; take one of /dev/serial/by-id")
+        self._name = config.port
+        self._parse = PARSERS[config.format]
+        self._stop = threading.Event()
+        self._lock = threading.Lock()
+        self._port: serial.Serial | None = None
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Opens the port, exclusively, and begins to read.
+
+        Raises:
+            DeviceNotFoundError: There is no such port.
+            DeviceError: It is in use, or can't be opened.
+        """
+        if self._thread is None:
+            port = self._open()
+            self._thread = threading.Thread(target=self._run, args=(port,), name="load-cell", daemon=True)
+            self._thread.start()
+
+    def close(self) -> None:
+        """Stops reading and releases the port. May be called twice."""
+        self._stop.set()
+        with self._lock:
+            if self._port is not None:
+                self._port.cancel_read()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _run(self, port: serial.Serial | None) -> None:
+        while port is not None:
+            try:
+                with port:
+                    self._listen(port)
+            except (OSError, termios.error):
+                self.stats.losses += 1
+            port = self._reopen()
+
+    def _listen(self, port: serial.Serial) -> None:
+        lines = LineSplitter()
+        with self._lock:
+            self._port = port
+        try:
+            while not self._stop.is_set():
+                for line in lines.feed(port.read(max(1, port.in_waiting))):
+                    if (reading := self._parse(line)) is None:
+                        self.stats.unreadable += 1
+                    else:
+                        self._add(reading.raw, saturated=reading.saturated)
+        finally:
+            with self._lock:
+                self._port = None
+
+    def _reopen(self) -> serial.Serial | None:
+        while not self._stop.wait(RECONNECT_S):
+            with suppress(DeviceError):
+                return self._open()
+        return None
+
+    def _open(self) -> serial.Serial:
+        try:
+            return serial.Serial(self._name, self._config.baud_rate, exclusive=True)
+        except (OSError, ValueError, termios.error) as error:
+            raise _open_error(self._name, error) from error
+
+
+def _open_error(name: str, error: Exception) -> DeviceError:
+    if not Path(name).exists():
+        return DeviceNotFoundError(
+            f"there is no load cell at {name}; plug it in, or set load_cell.port to one of /dev/serial/by-id"
+        )
+    if isinstance(error, OSError) and error.errno == 13:
+        return DeviceError(f"no permission to open {name}; join the group dialout and log in again")
+    if isinstance(error, OSError) and error.errno == 11:
+        return DeviceError(f"the load cell's port {name} is in use by another program; close that first")
+    return DeviceError(f"can't open the load cell's port {name}: {error}")

@@ -1,0 +1,169 @@
+import math
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gripper_force.config import LoadCellConfig
+from gripper_force.errors import ConfigError
+from gripper_force.spikes import HAMPEL_HALF_WINDOW, find_spikes
+from gripper_force.types import NS_PER_S, LoadCellSample
+from gripper_hw.load_cells.screening import PATIENCE_NS, STUCK_NS, LiveLoadCell, Screen
+
+RATE_HZ = 80
+PERIOD_NS = NS_PER_S // RATE_HZ
+START_NS = 5 * NS_PER_S
+
+Floats = npt.NDArray[np.float64]
+
+
+def screened(
+    screen: Screen, raws: npt.ArrayLike, every: int = 1, period_ns: int = PERIOD_NS
+) -> list[LoadCellSample]:
+    """Adds readings, takes samples after every few of them, and at last what is left."""
+    t_ns, taken = START_NS, []
+    for i, raw in enumerate(np.asarray(raws, np.float64)):
+        t_ns += period_ns
+        screen.add(t_ns, float(raw))
+        if i % every == 0:
+            taken += screen.take(t_ns)
+    return taken + screen.take(t_ns + PATIENCE_NS + 1)
+
+
+def calibrated(*, noisy: bool = True) -> Screen:
+    return Screen(0.0, 1.0, noisy=noisy)
+
+
+raw_readings = st.floats(-1e9, 1e9) | st.sampled_from([math.nan, math.inf, -math.inf])
+anything = st.lists(st.tuples(raw_readings, st.booleans()), max_size=40)
+batches = st.integers(1, 9)
+
+
+@given(anything, batches, st.floats(-1e6, 1e6), st.floats(-1e6, 1e6) | st.just(math.nan))
+def test_every_reading_is_handed_out_once_in_order_and_unchanged(
+    readings: list[tuple[float, bool]], every: int, tare_raw: float, n_per_raw: float
+) -> None:
+    screen, taken = Screen(tare_raw, n_per_raw, noisy=True), []
+    for i, (raw, saturated) in enumerate(readings):
+        screen.add(i * PERIOD_NS, raw, saturated=saturated)
+        if i % every == 0:
+            taken += screen.take(i * PERIOD_NS)
+    taken += screen.take(len(readings) * PERIOD_NS + PATIENCE_NS + 1)
+    assert [s.t_ns for s in taken] == [i * PERIOD_NS for i in range(len(readings))]
+    assert np.array_equal([s.raw for s in taken], [raw for raw, _ in readings], equal_nan=True)
+    assert all(math.isfinite(s.force_n) for s in taken if s.valid)
+    stats = screen.stats
+    rejected = stats.saturated + stats.stuck + stats.not_finite + stats.spikes
+    assert rejected == sum(not s.valid for s in taken)
+
+
+@given(st.lists(st.floats(0.0, 60.0), max_size=40), batches)
+def test_live_samples_are_judged_as_those_of_a_recording(forces_n: list[float], every: int) -> None:
+    taken = screened(calibrated(noisy=False), forces_n, every)
+    expected = ~find_spikes(np.array(forces_n)) if forces_n else []
+    assert [s.valid for s in taken] == list(expected)
+
+
+def ramp(rise: float, top_n: float) -> Floats:
+    """Nothing, a ramp over some samples, a hold, and a release from one sample to the next."""
+    return np.interp(np.arange(60), [0, 10, 10 + rise, 45, 46], [0, 0, top_n, top_n, 0])
+
+
+def wave(period: float, top_n: float) -> Floats:
+    return top_n * np.sin(np.pi * np.arange(60) / period) ** 2
+
+
+@given(
+    st.one_of(
+        st.builds(ramp, st.floats(0.1, 30.0), st.floats(0.0, 60.0)),
+        st.builds(wave, st.floats(20.0, 200.0), st.floats(0.0, 60.0)),
+    ),
+    batches,
+    st.floats(0.01, 100.0),
+    st.integers(-100_000, 100_000),
+)
+def test_smooth_forces_are_never_rejected(
+    force_n: Floats, every: int, n_per_raw: float, tare_raw: float
+) -> None:
+    taken = screened(Screen(tare_raw, n_per_raw, noisy=False), force_n / n_per_raw + tare_raw, every)
+    assert all(s.valid for s in taken)
+    assert [s.force_n for s in taken] == pytest.approx(list(force_n), abs=1e-5)
+
+
+@given(st.integers(1, 58), st.floats(3.0, 500.0), st.sampled_from([-1, 1]), batches)
+def test_a_spike_within_a_hold_is_rejected_alone(index: int, height_n: float, sign: int, every: int) -> None:
+    force_n = np.full(60, 5.0) + 0.02 * np.sin(np.arange(60))
+    force_n[index] += sign * height_n
+    screen = calibrated()
+    assert [i for i, s in enumerate(screened(screen, force_n, every)) if not s.valid] == [index]
+    assert screen.stats.spikes == 1
+
+
+def test_a_wide_dip_below_zero_is_rejected() -> None:
+    force_n = np.full(60, 2.0)
+    force_n[20:28] = [-3, -20, -60, -70, -70, -50, -10, -4]
+    screen = calibrated(noisy=False)
+    invalid = [i for i, s in enumerate(screened(screen, force_n)) if not s.valid]
+    assert invalid == list(range(20, 28))
+    assert screen.stats.spikes == 8
+
+
+def test_a_sample_waits_for_those_after_it_but_not_for_ever() -> None:
+    screen = calibrated()
+    for i in range(HAMPEL_HALF_WINDOW):
+        screen.add(START_NS + i, float(i))
+        assert screen.take(START_NS + i) == []
+    screen.add(START_NS + 3, 3.0)
+    assert [s.raw for s in screen.take(START_NS + 3)] == [0.0]
+    assert screen.take(START_NS + PATIENCE_NS) == []
+    assert [s.raw for s in screen.take(START_NS + 3 + PATIENCE_NS)] == [1.0, 2.0]
+    assert [s.raw for s in screen.take(START_NS + 4 + PATIENCE_NS)] == [3.0]
+
+
+def test_a_converter_that_says_the_same_for_too_long_is_stuck() -> None:
+    raws = np.concatenate([np.arange(10), np.full(2 * RATE_HZ, 9.0), [10, 11]])
+    screen = calibrated()
+    taken = screened(screen, raws)
+    since_ns = taken[9].t_ns
+    assert all(s.valid == (s.raw != 9.0 or s.t_ns - since_ns <= STUCK_NS) for s in taken)
+    assert screen.stats.stuck == sum(not s.valid for s in taken) > 0.9 * RATE_HZ
+
+
+def test_an_indicator_may_rest_on_one_value() -> None:
+    assert all(s.valid for s in screened(calibrated(noisy=False), np.full(3 * RATE_HZ, 0.135)))
+
+
+def test_the_same_reading_after_a_gap_is_not_stuck() -> None:
+    assert all(s.valid for s in screened(calibrated(), np.full(5, 7.0), period_ns=STUCK_NS + 1))
+
+
+def test_a_saturated_reading_is_kept_and_hides_no_spike_beside_it() -> None:
+    screen = calibrated()
+    for i in range(20):
+        raw = {10: 8_388_607.0, 11: 50.0}.get(i, 5.0 + 0.01 * (i % 3))
+        screen.add(START_NS + i, raw, saturated=i == 10)
+    taken = screen.take(START_NS + NS_PER_S * 2)
+    assert [i for i, s in enumerate(taken) if not s.valid] == [10, 11]
+    assert taken[10].raw == 8_388_607.0
+    assert (screen.stats.saturated, screen.stats.spikes) == (1, 1)
+
+
+def test_without_a_scale_there_are_readings_and_no_forces() -> None:
+    screen = Screen(0.0, math.nan, noisy=True)
+    taken = screened(screen, np.arange(10))
+    assert [s.raw for s in taken] == list(range(10))
+    assert not any(s.valid for s in taken)
+    assert screen.stats.not_finite == 10
+
+
+def test_a_real_cell_keeps_no_simulated_time() -> None:
+    class Simulated:
+        def now_ns(self) -> int:
+            return 0
+
+        def sleep_until_ns(self, t_ns: int) -> None: ...
+
+    with pytest.raises(ConfigError, match=r"load_cell\.backend=serial can't keep .*set clock=realtime"):
+        LiveLoadCell(LoadCellConfig(backend="serial"), Simulated(), unit_n=1.0, noisy=True)
