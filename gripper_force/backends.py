@@ -20,6 +20,8 @@ CAMERAS: Final = {
     "none": None,
     "simulated": RIG,
     "playback": "gripper_hw.playback:PlaybackCamera",
+    "oak": "gripper_hw.cameras.oak:OakCamera",
+    "uvc": "gripper_hw.cameras.uvc:UvcCamera",
 }
 LOAD_CELLS: Final = {
     "none": None,

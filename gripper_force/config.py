@@ -58,10 +58,26 @@ class GripperConfig(Section):
 class CameraConfig(Section):
     """The camera."""
 
-    backend: str = Field("simulated", description="simulated, playback, none")
+    backend: str = Field("simulated", description="simulated, oak, uvc, playback, none")
     rate_hz: Positive = 60.0
     path: Path | None = Field(None, description="the log that backend `playback` plays")
     speed: Literal["recorded", "full"] = Field("recorded", description="how fast it is played")
+    device: int | str | None = Field(
+        None, description="oak: id or address, None: the only one; uvc: index, /dev path or name"
+    )
+    region: tuple[int, int, int, int] | None = Field(
+        None,
+        description="oak, uvc: part of the sensor's picture whose middle square becomes the frame: left, "
+        "top, width, height in pixels; vision.region is a part of that frame",
+    )
+    side_px: int = Field(128, ge=16, le=800, description="oak, uvc: side of the frame")
+    exposure_us: int | None = Field(4000, gt=0, description="oak, uvc: None: automatic")
+    gain: int | None = Field(
+        None, ge=0, description="oak: ISO, None: 100; uvc: the driver's own unit, None: left as it is"
+    )
+    timeout_ms: Positive = Field(
+        250.0, description="oak, uvc: age of the last frame over which the camera counts as lost"
+    )
 
 
 class LoadCellConfig(Section):

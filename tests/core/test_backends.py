@@ -22,7 +22,10 @@ def changed(config: Config, **sections: dict[str, object]) -> Config:
 
 @pytest.mark.parametrize(
     ("unit", "known"),
-    [("camera", "none, simulated, playback"), ("load_cell", "none, simulated, playback, serial, phidget")],
+    [
+        ("camera", "none, simulated, playback, oak, uvc"),
+        ("load_cell", "none, simulated, playback, serial, phidget"),
+    ],
 )
 def test_an_unknown_backend_is_named_with_the_known_ones(config: Config, unit: str, known: str) -> None:
     with (

@@ -1,0 +1,101 @@
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gripper_force.backends import MonotonicClock
+from gripper_force.config import CameraConfig
+from gripper_force.errors import ConfigError, DeviceLostError
+from gripper_hw.cameras import reader
+from gripper_hw.cameras.reader import BackgroundCamera, Read, Shot, square
+
+
+class SimulatedClock:
+    def now_ns(self) -> int:
+        return 0
+
+    def sleep_until_ns(self, t_ns: int) -> None:
+        raise NotImplementedError
+
+
+class Camera(BackgroundCamera):
+    """Reads what it is given."""
+
+    read: Callable[[], Shot | None]
+
+    @contextmanager
+    def _opened(self) -> Iterator[Read]:
+        yield self.read
+
+
+def test_a_simulated_clock_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"camera\.backend=oak .*; set clock=realtime"):
+        Camera(CameraConfig(backend="oak"), SimulatedClock())
+
+
+def test_a_camera_that_gives_no_frame_at_all_can_not_be_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reader, "_FIRST_FRAME_NS", 1_000_000)
+    camera = Camera(CameraConfig(backend="oak"), MonotonicClock())
+    camera.read = lambda: None
+    with pytest.raises(DeviceLostError, match="the oak camera gave no frame for 1 ms; "):
+        camera.start()
+    camera.close()
+
+
+def test_a_defect_in_the_thread_is_raised_to_who_asks(monkeypatch: pytest.MonkeyPatch) -> None:
+    camera = Camera(CameraConfig(backend="oak"), MonotonicClock())
+    camera.read = lambda: 1 // 0  # type: ignore[assignment, return-value]
+    with pytest.raises(ZeroDivisionError):
+        camera.start()
+    with pytest.raises(ZeroDivisionError):
+        camera.newest()
+    camera.close()
+
+
+def test_a_program_that_forgets_to_close_still_releases_the_device() -> None:
+    program = """
+from contextlib import contextmanager
+from gripper_force.backends import MonotonicClock
+from gripper_force.config import CameraConfig
+from gripper_hw.cameras.reader import BackgroundCamera, Shot
+
+class Camera(BackgroundCamera):
+    @contextmanager
+    def _opened(self):
+        yield lambda: Shot(0, 0, None)
+        print("released")
+
+Camera(CameraConfig(backend="oak"), MonotonicClock()).start()
+"""
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert ended.stdout == "released\n"
+
+
+numbers = st.integers(-20, 200)
+
+
+@given(st.tuples(numbers, numbers, numbers, numbers), st.integers(1, 150), st.integers(1, 150))
+def test_the_square_lies_in_the_middle_of_a_region_that_lies_in_the_picture(
+    region: tuple[int, int, int, int], width: int, height: int
+) -> None:
+    left, top, columns, rows = region
+    inside = min(left, top) >= 0 < min(columns, rows) and left + columns <= width and top + rows <= height
+    config = CameraConfig(region=region)
+    if not inside:
+        with pytest.raises(ConfigError, match=r"camera\.region"):
+            square(config, width, height)
+        return
+    x, y, side = square(config, width, height)
+    assert side == min(columns, rows)
+    for start, low, size in ((x, left, columns), (y, top, rows)):
+        assert low <= start
+        assert start + side <= low + size
+        assert abs((start - low) - (low + size - start - side)) <= 1
+
+
+def test_without_a_region_the_whole_picture_counts() -> None:
+    assert square(CameraConfig(), 1280, 800) == (240, 0, 800)
