@@ -144,7 +144,8 @@ def make_oak(plugged: threading.Event) -> Callable[..., OakCamera]:
             sensor = pipeline.create(HostSensor, plugged, shown, colour, config.exposure_us or 0)
             return pipeline, sensor.output
 
-        return OakCamera(CameraConfig(backend="oak", **config), MonotonicClock(), source)
+        section = CameraConfig(backend="oak", **{"timeout_ms": 2000} | config)  # a machine may be busy
+        return OakCamera(section, MonotonicClock(), source)
 
     return make
 

@@ -1,5 +1,4 @@
 import os
-import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -132,9 +131,7 @@ def test_a_pipeline_that_can_not_be_built_or_run_is_one_sentence(make_oak: MakeO
         with_a_devices(dai.node.Sync).start()
 
 
-def test_a_pipeline_that_ends_is_a_loss_and_a_new_one_is_built(
-    make_oak: MakeOak, take: Take, plugged: threading.Event
-) -> None:
+def test_a_pipeline_that_ends_is_a_loss_and_a_new_one_is_built(make_oak: MakeOak, take: Take) -> None:
     camera, pipelines = make_oak(), []
     source = camera._source
 

@@ -26,9 +26,7 @@ def test_a_picture_is_cropped_shrunk_and_gray(make_uvc: MakeUvc, take: Take) -> 
     frames = take(camera, 3)
     camera.close()
     assert {frame.gray.shape for frame in frames} == {(50, 50)}
-    levels = [int(frame.gray.mean()) for frame in frames]
-    assert levels == sorted(levels)
-    assert all(abs(level - 8 * frame.seq) <= 3 for level, frame in zip(levels, frames, strict=True))
+    assert all(abs(frame.gray.mean() - 8 * (frame.seq % 30)) <= 3 for frame in frames)
 
 
 def test_a_region_beyond_the_picture_is_refused(make_uvc: MakeUvc) -> None:
