@@ -30,6 +30,13 @@ LOAD_CELLS: Final = {
     "serial": "gripper_hw.load_cells.serial:SerialLoadCell",
     "phidget": "gripper_hw.load_cells.phidget:PhidgetLoadCell",
 }
+PROBES: Final = {
+    "servo": "gripper_hw.dynamixel.probe",
+    "camera": "gripper_hw.cameras.probe",
+    "load cell": "gripper_hw.load_cells.probe",
+    "simulation": "gripper_hw.sim.probe",
+}
+"""Modules with a function ``probe`` for `gripper_force.doctor`, in the order of its table."""
 
 
 class MonotonicClock:

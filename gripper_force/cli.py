@@ -19,6 +19,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -247,6 +248,31 @@ def virtual_servo(
         signal.pause()
 
 
+@app.command()
+def doctor(
+    config: ConfigPath = None,
+    set_: Overrides = None,
+    setup: Annotated[
+        bool, typer.Option("--setup", help="Show what would change in the servo's registers, ask, change it.")
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="With --setup: do not ask.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Look at every device and this machine, and say what to do. Exit code 1 if something is to be done."""
+    from gripper_force import doctor as job
+
+    settings = _load(config, set_, {})
+    if setup:
+        _print(job.setup(settings, lambda servo, changes: _agreed(servo, changes, yes)), as_json, _setup_line)
+        return
+    with err.status("looking"):
+        checks = list(job.doctor(settings))
+    ok = all(check.ok is not False for check in checks)
+    _print({"checks": checks, "ok": ok}, as_json, _checks_table)
+    if not ok:
+        raise typer.Exit(1)
+
+
 def _terminate(_signal: int, _frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
@@ -398,6 +424,29 @@ def _imports_table(r: dict[str, Any]) -> None:
             name, row["object"], str(row["frames"]), str(row["spikes_rejected"]), tare, row["tare_note"]
         )
     out.print(table)
+
+
+def _checks_table(r: dict[str, Any]) -> None:
+    marks = {True: "[green]ok[/]", False: "[bold red]problem[/]", None: "-"}
+    table = Table(box=None, show_header=False, pad_edge=False)
+    for check in r["checks"]:
+        advice = f"\n[yellow]{escape(check.advice)}[/]" if check.advice else ""
+        style = "dim" if check.ok is None else ""
+        table.add_row(marks[check.ok], check.unit, check.name, escape(check.found) + advice, style=style)
+    out.print(table)
+
+
+def _agreed(servo: str, changes: list[Any], yes: bool) -> bool:
+    table = Table(servo, "is", "becomes", box=None, pad_edge=False)
+    for change in changes:
+        table.add_row(change.register, change.old, change.new)
+    err.print(table)
+    return yes or typer.confirm(f"Write these to {servo}?", err=True)
+
+
+def _setup_line(r: dict[str, Any]) -> None:
+    done = "set up, and read back" if r["applied"] else "left as it is"
+    out.print(f"servo {r['servo']}: {done if r['changes'] else 'nothing to change'}")
 
 
 def _plain(error: GripperError) -> str:

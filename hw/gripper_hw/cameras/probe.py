@@ -1,0 +1,94 @@
+"""Which cameras are there, and how fast and how late are the frames of the configured one?"""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from gripper_force.backends import open_devices
+from gripper_force.config import Config
+from gripper_force.doctor import Check, gather, judged, only, rate_hz, time_of
+from gripper_force.types import NS_PER_MS, Frame
+
+_SYSFS = Path("/sys")
+_LUXONIS = "03e7"
+_USB3_MBPS = 5000
+_LEAST_RATE = 0.9
+
+
+def probe(config: Config, sysfs: Path = _SYSFS) -> Iterator[Check]:
+    """Lists cameras, and looks through the configured one for a second.
+
+    Args:
+        config: The run.
+        sysfs: Where the kernel lists devices.
+
+    Raises:
+        GripperError: See `open_devices` and the camera's start.
+    """
+    for name in (*_oak_devices(), *_video_devices(sysfs / "class/video4linux")):
+        yield Check("camera", "listed", name, None)
+    if config.camera.backend == "none":
+        yield Check("camera", "backend", "none", None)
+        return
+    with open_devices(only(config, "camera")) as devices:
+        camera = devices.camera
+        assert camera is not None
+        camera.start()
+
+        def take() -> list[Frame]:
+            return [] if (frame := camera.newest()) is None else [frame]
+
+        frames = gather(devices, take)
+        if config.camera.backend == "oak":  # until it is opened, a device shows as USB 2
+            yield from _usb_checks(sysfs / "bus/usb/devices")
+    yield from _frame_checks(config, frames)
+
+
+def _frame_checks(config: Config, frames: list[Frame]) -> Iterator[Check]:
+    if len(frames) < 2:
+        advice = "check its cable, or the log that it plays"
+        yield Check("camera", "frames", f"{len(frames)} came", False, advice)
+        return
+    height, width = frames[0].gray.shape
+    lost = frames[-1].seq - frames[0].seq + 1 - len(frames)
+    yield Check("camera", "frames", f"{width}x{height} pixels, {lost} of {lost + len(frames)} lost", True)
+    rate, asked = rate_hz([frame.t_ns for frame in frames]), config.camera.rate_hz
+    if config.camera.backend == "playback":
+        yield Check("camera", "rate", f"{rate:.1f} Hz of playback", True)
+    else:
+        found = f"{rate:.1f} Hz of {config.camera.backend}, in {time_of(config)}; {asked:g} Hz asked"
+        enough = rate >= _LEAST_RATE * asked
+        advice = "set camera.rate_hz to what it gives, shorten camera.exposure_us, or add light"
+        yield judged("camera", "rate", found, enough, advice)
+    latency_ms = float(np.median([frame.received_ns - frame.t_ns for frame in frames])) / NS_PER_MS
+    limit_ms = config.control.vision_timeout_ms
+    found = f"median {latency_ms:.1f} ms from exposure to use"
+    advice = f"no estimate would be younger than control.vision_timeout_ms={limit_ms:g}: shorten the exposure"
+    yield judged("camera", "latency", found, latency_ms < limit_ms, advice)
+
+
+def _oak_devices() -> Iterator[str]:
+    os.environ.setdefault("DEPTHAI_LEVEL", "error")  # its log would go to stdout
+    import depthai as dai
+
+    devices = dai.Device.getAllAvailableDevices()
+    yield from (f"OAK {info.deviceId} at {info.name}" for info in devices)
+    if not devices:
+        yield "no free OAK"
+
+
+def _video_devices(folder: Path) -> Iterator[str]:
+    nodes = sorted(folder.glob("video*"))
+    yield from (f"/dev/{node.name}: {(node / 'name').read_text().strip()}" for node in nodes)
+    if not nodes:
+        yield "no /dev/video*"
+
+
+def _usb_checks(folder: Path) -> Iterator[Check]:
+    for vendor in sorted(folder.glob("*/idVendor")):
+        if vendor.read_text().strip() == _LUXONIS:
+            mbps = float((vendor.parent / "speed").read_text())
+            advice = "that is USB 2: a USB 3 cable and port have less latency"
+            yield judged("camera", "USB", f"{mbps:g} Mb/s", mbps >= _USB3_MBPS, advice, harmless=True)

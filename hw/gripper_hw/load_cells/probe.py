@@ -1,0 +1,44 @@
+"""Is there a load cell, how fast and how quiet is it, and what of it is rejected?"""
+
+from collections.abc import Iterator
+from dataclasses import asdict
+
+import numpy as np
+
+from gripper_force.backends import open_devices
+from gripper_force.config import Config
+from gripper_force.doctor import Check, gather, judged, only, rate_hz, time_of
+
+_LEAST_VALID = 0.9
+
+
+def probe(config: Config) -> Iterator[Check]:
+    """Samples the configured load cell for a second. Raises as `open_devices` and the cell's start."""
+    if config.load_cell.backend == "none":
+        yield Check("load cell", "backend", "none", None)
+        return
+    with open_devices(only(config, "load_cell")) as devices:
+        cell = devices.load_cell
+        assert cell is not None
+        cell.start()
+        samples = gather(devices, cell.drain)
+        stats = getattr(cell, "stats", None)  # of the live ones: what they reject, and why
+    causes = ", ".join(f"{count} {cause}" for cause, count in asdict(stats).items() if count) if stats else ""
+    if len(samples) < 2:
+        advice = "check its cable and supply, load_cell.baud_rate and load_cell.format"
+        yield Check("load cell", "rate", f"{len(samples)} samples {causes}".strip(), False, advice)
+        return
+    rate = rate_hz([sample.t_ns for sample in samples])
+    yield Check(
+        "load cell", "rate", f"{rate:.1f} Hz of {config.load_cell.backend}, in {time_of(config)}", True
+    )
+    forces_n = [sample.force_n for sample in samples if sample.valid]
+    if forces_n:
+        noise = f"{np.std(forces_n):.4f} N std about {np.mean(forces_n):.3f} N"
+        yield Check("load cell", "noise", noise, True)
+    valid = len(forces_n) >= _LEAST_VALID * len(samples)
+    advice = "check its wiring and shielding, and that it is not loaded beyond its range"
+    if stats and stats.not_finite:
+        advice = "set load_cell.n_per_raw, newtons for one unit of its reading, and load_cell.tare_raw"
+    rejected = f"{len(samples) - len(forces_n)} of {len(samples)} samples"
+    yield judged("load cell", "rejected", rejected + (f" ({causes})" if causes else ""), valid, advice)

@@ -1,0 +1,34 @@
+"""Can this machine draw a simulated scene?"""
+
+from collections.abc import Iterator
+
+from gripper_force.backends import CAMERAS, LOAD_CELLS, RIG
+from gripper_force.config import Config
+from gripper_force.doctor import Check, time_ms
+
+
+def probe(config: Config) -> Iterator[Check]:
+    """Draws a small picture of the configured scene, if anything is simulated.
+
+    Raises:
+        ConfigError: There is no such object.
+        SimulationError: EGL is missing.
+    """
+    backends = CAMERAS.get(config.camera.backend), LOAD_CELLS.get(config.load_cell.backend)
+    if not config.servo.port.startswith("virtual:") and RIG not in backends:
+        yield Check("simulation", "EGL", "not needed: nothing is simulated", None)
+        return
+    from gripper_hw.dynamixel.control_table import load_model
+    from gripper_hw.dynamixel.firmware import VirtualServo
+    from gripper_hw.sim.scene import draw_scene
+    from gripper_hw.sim.world import World  # where EGL is missing, this import raises
+
+    model = load_model("XM430-W350")
+    scene = draw_scene(config.object, config.seed, config.sim)
+    world = World(scene, config.gripper, VirtualServo(1, model), model.nm_per_a, config.seed)
+    try:
+        world.render(16)  # the first one makes the drawing context
+        median_ms, _ = time_ms(lambda: world.render(16), 5)
+    finally:
+        world.close()
+    yield Check("simulation", "EGL", f"draws 16x16 pixels of {config.object!r} in {median_ms:.1f} ms", True)

@@ -1,0 +1,31 @@
+import os
+import subprocess
+import sys
+
+from gripper_force.config import Config
+from gripper_force.doctor import Check
+from gripper_hw.sim.probe import probe
+
+
+def test_a_scene_is_drawn() -> None:
+    (check,) = probe(Config.model_validate({"object": "stapler", "sim": {"detail": "coarse"}}))
+    assert (check.unit, check.name, check.ok) == ("simulation", "EGL", True)
+    assert check.found.startswith("draws 16x16 pixels of 'stapler'")
+
+
+def test_without_egl_it_says_what_to_install() -> None:
+    code = (
+        "from gripper_force import config, doctor\n"
+        "doctor.PROBES = {'simulation': 'gripper_hw.sim.probe'}\n"
+        "print(next(doctor.doctor(config.Config())))"
+    )
+    env = {**os.environ, "__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent"}
+    done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True)
+    assert "ok=False" in done.stdout
+    assert "advice='on Debian or Ubuntu: apt-get install libegl1" in done.stdout
+
+
+def test_it_is_not_asked_where_nothing_is_simulated() -> None:
+    none = {"backend": "none"}
+    config = Config.model_validate({"servo": {"port": "/dev/nowhere"}, "camera": none, "load_cell": none})
+    assert list(probe(config)) == [Check("simulation", "EGL", "not needed: nothing is simulated", None)]
