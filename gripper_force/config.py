@@ -52,7 +52,7 @@ class GripperConfig(Section):
         None, description="resolution of the goal current; None: the model's own"
     )
     friction_n: NonNegative = Field(0.95, description="jaw force that friction takes while closing")
-    damping_n_s_m: NonNegative = Field(12.5, description="viscous friction of one jaw, motor included")
+    damping_n_s_m: NonNegative = Field(14.5, description="viscous friction of one jaw, motor included")
 
 
 class CameraConfig(Section):

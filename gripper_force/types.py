@@ -159,6 +159,7 @@ class FusedForce:
         std_n: Its standard deviation.
         current_n: What the motor current alone says.
         bias_n: Correction of the current-derived force, held by the filter.
+        friction_n: Coulomb friction of one jaw, as free travel told it.
         source: Which sensors the estimate rests on (a `Source` value).
     """
 
@@ -167,6 +168,7 @@ class FusedForce:
     std_n: float
     current_n: float
     bias_n: float
+    friction_n: float
     source: str
 
 

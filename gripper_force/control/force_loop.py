@@ -94,7 +94,7 @@ class ForceLoop:
             self._trim_n += self._gains.integral_s * error_n * dt_s
         elif ramping and not self._vision_alone:
             self._trim_n = -estimate.bias_n
-        friction_n = self._transmission.friction_n
+        friction_n = estimate.friction_n
         ahead_n = reference_n + friction_n * (1.0 if self._rising else _TURN)
         room_n = 3 * self._transmission.bias_std_n(reference_n) + friction_n
         low_n, high_n = max(reference_n - room_n, 0.0), reference_n + room_n

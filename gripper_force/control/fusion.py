@@ -9,7 +9,7 @@ import math
 from collections import deque
 
 from gripper_force.config import ControlConfig
-from gripper_force.control.transmission import GAIN_STD, Transmission
+from gripper_force.control.transmission import FRICTION_STD, GAIN_STD, Transmission
 from gripper_force.types import NS_PER_MS, NS_PER_S, Event, FusedForce, ServoState, Source, VisualForce
 
 _DRIFT_N2_S = 0.03**2
@@ -20,6 +20,9 @@ _LOOSE_N2_S = 0.15**2
 
 _FREE_NOISE_N = 0.5
 """How far the push is from friction in one cycle of free travel; inertia makes the cycles alike."""
+
+_FREE_FLOOR_N = 0.08
+"""What free travel leaves unknown of friction under load: viscous friction, and what differs with place."""
 
 _VISION_FLOOR_N = 0.05
 """No estimate is believed more than this, whatever it claims."""
@@ -50,6 +53,9 @@ class Fusion:
     and one object in one pose is one picture. The filter therefore tracks only their *difference*, and the
     estimate takes that share of it to which the two claimed variances entitle vision.
 
+    Friction is what the push is in free travel. Known from there, it leaves the gearing as the current's
+    error.
+
     The measured current is noisy and quantised (0.1 N a step), and the contact force follows it with the
     plant's lag: a low-pass of that lag serves both. Vision is compared with the same signal, at its capture
     time.
@@ -79,6 +85,8 @@ class Fusion:
         """Forgets the bias: a new grasp has its own."""
         self._difference_n = 0.0
         self._share = 1.0
+        self._friction_n = self._transmission.friction_n
+        self._friction_n2 = (FRICTION_STD * self._friction_n) ** 2
         self.loosen()
 
     def loosen(self) -> None:
@@ -100,9 +108,7 @@ class Fusion:
         Returns:
             The estimate, and an event where vision drops out or comes back.
         """
-        self._predict(servo)
-        if free:
-            self._correct(-self._current_n - self._difference_n, _FREE_NOISE_N**2)
+        self._predict(servo, free)
         if visual is not None and visual.t_ns > self._newest_seen_ns and self._feedback != "current":
             self._newest_seen_ns = visual.t_ns
             self._refusal = self._update(t_ns, visual)
@@ -112,7 +118,7 @@ class Fusion:
         events = self._switch(t_ns)
         return self._estimate(t_ns), events
 
-    def _predict(self, servo: ServoState) -> None:
+    def _predict(self, servo: ServoState, free: bool) -> None:
         before_n = self._current_n
         moving_n = self._transmission.damping_n_s_m * self._transmission.closing_m_s(servo.velocity_rad_s)
         push_n = self._transmission.force_n(servo.current_a) - moving_n
@@ -122,16 +128,25 @@ class Fusion:
             self._push_n += (push_n - self._push_n) * dt_s / (dt_s + self._lag_s)
         else:
             self._push_n = push_n
+        if free:
+            self._learn_friction()
         # Coulomb friction is a play: the contact force stays until the push leaves it by the friction.
-        friction_n = self._transmission.friction_n
+        friction_n = self._friction_n
         self._current_n = min(max(before_n, self._push_n - friction_n), self._push_n + friction_n)
+        if free:
+            self._current_n = self._difference_n = 0.0
         # The further the push has gone back through the play, the less is known of when the jaws let go.
-        back = 0.0 if friction_n == 0 else 0.5 + (self._current_n - self._push_n) / (2 * friction_n)
+        back = 0.0 if friction_n == 0 or free else 0.5 + (self._current_n - self._push_n) / (2 * friction_n)
         drift_n2 = (_DRIFT_N2_S + _LOOSE_N2_S * back) * dt_s
         # An unknown gain error g makes the bias g * force, so its variance follows the square of the force.
         gain_n2 = GAIN_STD**2 * abs(self._current_n**2 - before_n**2)
         self._variance_n2 = min(self._variance_n2 + drift_n2 + gain_n2, self._prior_n2(self._current_n))
         self._history.append((servo.t_ns, self._current_n))
+
+    def _learn_friction(self) -> None:
+        gain = self._friction_n2 / (self._friction_n2 + _FREE_NOISE_N**2)
+        self._friction_n = max(self._friction_n + gain * (self._push_n - self._friction_n), 0.0)
+        self._friction_n2 *= 1 - gain
 
     def _update(self, t_ns: int, visual: VisualForce) -> str:
         """Takes one estimate in. Returns why it was refused, or an empty text."""
@@ -177,7 +192,7 @@ class Fusion:
         return later_n
 
     def _prior_n2(self, force_n: float) -> float:
-        return self._transmission.bias_std_n(force_n) ** 2
+        return self._friction_n2 + _FREE_FLOOR_N**2 + (GAIN_STD * force_n) ** 2
 
     def _switch(self, t_ns: int) -> tuple[Event, ...]:
         fresh = self._used_ns is not None and t_ns - self._used_ns <= self._timeout_ns
@@ -203,6 +218,7 @@ class Fusion:
             std_n=std_n,
             current_n=self._current_n,
             bias_n=bias_n,
+            friction_n=self._friction_n,
             source=self._source,
         )
 

@@ -2,13 +2,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gripper_force.config import ControlConfig
+from gripper_force.config import ControlConfig, GripperConfig
 from gripper_force.control.force_loop import ForceLoop, tolerance_n
 from gripper_force.types import FusedForce
 
 
 def estimate(force_n, bias_n=0.0, source="fused"):
-    return FusedForce(0, force_n, 0.05, force_n - bias_n, bias_n, source)
+    return FusedForce(0, force_n, 0.05, force_n - bias_n, bias_n, GripperConfig().friction_n, source)
 
 
 def ramp(loop, target_n, bias_n=0.0):

@@ -3,6 +3,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from gripper_force.config import ControlConfig
 from gripper_force.control.fusion import Fusion
@@ -78,11 +80,23 @@ def test_latency_leaves_no_error_on_a_ramp(bench, transmission):
 
 def test_free_travel_tells_friction(bench, transmission):
     b = bench(feedback="current")
-    estimate = b.run(1.0, lambda _: transmission.friction_n + 0.2, free=True)
-    assert estimate.bias_n == pytest.approx(-0.2, abs=0.02)
-    assert estimate.force_n == pytest.approx(0.0, abs=0.02)
+    nominal_n = transmission.friction_n
+    before = b.run(0.5, lambda _: nominal_n + 0.2)
+    estimate = b.run(1.0, lambda _: nominal_n + 0.2, free=True)
+    assert estimate.friction_n == pytest.approx(nominal_n + 0.2, abs=0.02)
+    assert estimate.force_n == 0.0
+    assert estimate.std_n < before.std_n
+    pressing = b.run(1.0, lambda _: nominal_n + 3.2)
+    assert pressing.force_n == pytest.approx(3.0, abs=0.02)
     b.fusion.restart()
-    assert b.run(0.005, lambda _: transmission.friction_n + 0.2).bias_n == 0.0
+    assert b.run(0.005, lambda _: nominal_n + 3.2).friction_n == nominal_n
+
+
+@given(st.lists(st.floats(-50, 50), min_size=1, max_size=30))
+def test_whatever_the_push_friction_is_never_negative(transmission, pushes_n):
+    b = Bench(transmission, feedback="current")
+    for push_n in pushes_n:
+        assert b.run(0.005, lambda _, n=push_n: n, free=True).friction_n >= 0
 
 
 @pytest.mark.parametrize(

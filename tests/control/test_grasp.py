@@ -59,6 +59,21 @@ def test_fused_holds_what_was_asked(drawn_run, target_n):
     assert max(overshoot) < max(0.12 * target_n, 0.2)
 
 
+@pytest.mark.parametrize("feedback", ["fused", "current"])
+def test_the_approach_learns_friction_and_touches_gently(drawn_run, feedback):
+    nominal_n, learned_n = [], []
+    for seed in range(8):
+        run = drawn_run(seed, feedback=feedback)
+        true_n = run.plant.friction_n / run.plant.gain
+        nominal_n.append(run.transmission.friction_n - true_n)
+        learned_n.append(run_to(run, "contact").last.estimate.friction_n - true_n)
+        # What 1.3 kg at 25 mm/s press into 3 kN/m, and the touch.
+        assert max(sample.force_n for sample in run.cell) < 2.2
+    # A way of 8 mm may be too short to get even.
+    assert (np.abs(learned_n) < np.abs(nominal_n) + 0.1).all()
+    assert np.median(np.abs(learned_n)) < 0.5 * np.median(np.abs(nominal_n))
+
+
 @pytest.mark.parametrize("target_n", [2.0, 8.0])
 def test_current_alone_is_within_friction_and_gearing(drawn_run, target_n):
     for seed in range(4):

@@ -349,7 +349,7 @@ def fill(path: Path) -> None:
     with LogWriter(path, config="x" * 100, metadata={}) as log:
         try:
             for i in range(100_000):
-                log.write(FusedForce(i * NS_PER_MS, 0.5, 0.1 * i, 1.0 / (1 + i), 0.0, "fused"))
+                log.write(FusedForce(i * NS_PER_MS, 0.5, 0.1 * i, 1.0 / (1 + i), 0.0, 0.9, "fused"))
         except LogError:
             with pytest.raises(LogError, match="failed before"):
                 log.write(Event(0, "session", "more"))

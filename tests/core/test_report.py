@@ -64,7 +64,7 @@ def write_grasp(path: Path, *, checkpoint: Path | None = None, digest: str = "")
         outcome = "held" if t_s > 3.4 else ""
         reason = "steady within 0.2 N" if 3.4 < t_s <= 3.41 else ""
         current_n = 0.85 * true_n + 0.3 * (t_s > 0.5) + rng.normal(0, 0.05)
-        fused = FusedForce(t_ns, true_n + rng.normal(0, 0.06), 0.2, current_n, 0.1, "fused")
+        fused = FusedForce(t_ns, true_n + rng.normal(0, 0.06), 0.2, current_n, 0.1, 0.9, "fused")
         reference_n = float(np.interp(t_s, [1.4, 2.2, 5.0, 5.01], [0, TARGET_N, TARGET_N, 0]))
         status = GraspStatus(t_ns, phase, outcome, reference_n, 0.04, reason)
         cell = LoadCellSample(t_ns, true_n + rng.normal(0, 0.03), 0.0, valid=i % 50 != 0)

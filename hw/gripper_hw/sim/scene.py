@@ -14,8 +14,9 @@ from gripper_hw.sim.textures import draw_textures
 LUX_LEVELS = (350.0, 550.0, 750.0)
 """The paper's three light levels."""
 
-# MuJoCo's default friction is soft: under a constant push it creeps, and in three seconds it is gone.
-_HARD_FRICTION = 'solreffriction=".005 1" solimpfriction=".99 .999 .001"'
+# MuJoCo's default friction is soft: under a constant push it creeps, and in three seconds it is gone. All of
+# it acts at the horn, for on light jaws friction this hard makes the pads chatter.
+_HARD_FRICTION = 'solreffriction=".005 1" solimpfriction=".997 .999 .001"'
 _PAD_HALF_THICKNESS_M = 0.004
 _CAMERA_FROM_GRIP_M = np.array([0.10, -0.30, 0.125])
 
@@ -42,7 +43,7 @@ class Scene:
         nm_per_a: True torque constant over the catalogue's.
         servo_friction_nm: Coulomb friction of motor and gears at the horn.
         servo_damping_nm_s: Viscous friction at the horn.
-        jaw_friction_n: Coulomb friction of one rail.
+        jaw_friction_n: Coulomb friction of one rail; it is felt at the horn.
         backlash_m: Half of the gear play at the rack.
     """
 
@@ -129,10 +130,9 @@ def scene_mjcf(scene: Scene, gripper: GripperConfig) -> tuple[str, dict[str, byt
         jaw_travel=_text([gripper.open_width_m / 2 - 0.001]),
         grip_height=_text([model.grip_height_m]),
         rail_height=_text([model.grip_height_m + 0.085]),
-        jaw_friction_n=scene.jaw_friction_n,
         rotor_inertia=1e-3,
         servo_damping=scene.servo_damping_nm_s,
-        servo_friction_nm=scene.servo_friction_nm,
+        friction_nm=scene.servo_friction_nm + 2 * gripper.pinion_radius_m * scene.jaw_friction_n,
         hard_friction=_HARD_FRICTION,
         backlash_m=scene.backlash_m,
         pinion_radius_m=gripper.pinion_radius_m,
