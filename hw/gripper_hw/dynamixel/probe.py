@@ -24,6 +24,9 @@ from gripper_hw.dynamixel.servo import _READ_BLOCK, DynamixelBus, _hardware_erro
 
 _SYSFS: Final = Path("/sys/bus/usb-serial/devices")
 _CYCLES: Final = 200
+_PATIENCE_MS: Final = 100.0
+"""More than servo.reply_margin_ms: a line that is too slow for a run is to be measured, not to fail."""
+
 _BAUD_RATES: Final = (57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
 _MODES: Final = {
     0: "current",
@@ -88,7 +91,8 @@ class _Line(DynamixelBus):
     """The bus without a start: it stays as it is."""
 
     def __enter__(self) -> Self:
-        self._port = open_port(self._config.port, self._config.baud_rate, self._config.reply_margin_ms)
+        margin_ms = max(_PATIENCE_MS, self._config.reply_margin_ms)
+        self._port = open_port(self._config.port, self._config.baud_rate, margin_ms)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -135,7 +139,7 @@ class _Line(DynamixelBus):
         median_ms, p99_ms = time_ms(lambda: self._transact("a fast sync read", self._read_once), _CYCLES)
         found = f"median {median_ms:.2f} ms, p99 {p99_ms:.2f} ms of {_CYCLES} reads"
         good, lockstep = p99_ms <= 1e3 / config.control.rate_hz, config.clock == "lockstep"
-        advice = f"longer than a cycle at control.rate_hz={config.control.rate_hz:g}: lower that"
+        advice = f"longer than a cycle at control.rate_hz={config.control.rate_hz:g}: close what computes, or lower it"
         yield judged(unit, "bus cycle", found, good, advice, harmless=lockstep)
 
     def set_up(self, id_: int, agree: Agree) -> dict[str, Any]:
