@@ -29,9 +29,11 @@ class _Playback:
         self._clock = clock
         self._speed = config.speed
         self._shift_ns = 0
+        self._started = False
 
     def start(self) -> None:
         """Begins to play: the log's first record is now."""
+        self._started = True
         if self._speed == "recorded":
             self._shift_ns = self._clock.now_ns() - self._log.start_ns
 
@@ -69,9 +71,9 @@ class PlaybackCamera(_Playback):
     def newest(self) -> Frame | None:
         """The newest frame that was not handed out yet, or None. Never blocks. Raises `LogError`."""
         frame = None
-        if self._speed == "full":
+        if self._speed == "full" and self._started:
             frame = self._take()
-        else:
+        elif self._started:
             log_ns = self._log_now_ns()
             while self._next is not None and self._next.received_ns <= log_ns:
                 frame = self._take()
@@ -122,9 +124,9 @@ class PlaybackLoadCell(_Playback):
     def drain(self) -> list[LoadCellSample]:
         """Every sample since the last call, oldest first. Never blocks."""
         first = self._taken
-        if self._speed == "full":
+        if self._speed == "full" and self._started:
             self._taken = len(self._samples)
-        else:
+        elif self._started:
             log_ns = self._log_now_ns()
             while not self.finished and self._samples[self._taken].t_ns <= log_ns:
                 self._taken += 1

@@ -62,7 +62,7 @@ class SimulatedCamera:
         self._rng = np.random.default_rng([config.seed, 2])
         self._under_way: deque[Frame] = deque(maxlen=64)
         self._seq = 0
-        self._started = False
+        self._started = self._closed = False
 
     def start(self) -> None:
         """Begins to capture."""
@@ -78,9 +78,13 @@ class SimulatedCamera:
         return frame
 
     def close(self) -> None:
-        """Nothing to release: the world owns the drawing context."""
+        """Stops capturing; the world owns the drawing context. May be called twice."""
+        self._closed = True
+        self._under_way.clear()
 
     def _capture(self, t_ns: int) -> None:
+        if self._closed:
+            return
         picture = self._world.render(_OVERSAMPLED * FRAME_SIDE)
         gray = expose(picture, self._scene.lux, self._scene.shot_noise, self._rng)
         t_ns += self._start_ns
@@ -98,7 +102,7 @@ class SimulatedLoadCell:
         self._period_ns = round(NS_PER_S / config.load_cell.rate_hz)
         self._rng = np.random.default_rng([config.seed, 3])
         self._samples: deque[LoadCellSample] = deque(maxlen=100_000)
-        self._started = False
+        self._started = self._closed = False
 
     def start(self) -> None:
         """Begins to sample."""
@@ -111,9 +115,13 @@ class SimulatedLoadCell:
         return [self._samples.popleft() for _ in range(len(self._samples))]
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Stops sampling. May be called twice."""
+        self._closed = True
+        self._samples.clear()
 
     def _sample(self, t_ns: int) -> None:
+        if self._closed:
+            return
         force_n = self._world.force_n + float(self._rng.normal(0.0, self._NOISE_N))
         self._samples.append(LoadCellSample(t_ns + self._start_ns, force_n, force_n))
 

@@ -26,13 +26,6 @@ REAL = ("oak", "uvc")
 ALL = ("simulated", "playback", *REAL)
 
 
-def all_but(name: str, why: str) -> pytest.MarkDecorator:
-    """Every camera, one of which does not keep a promise yet."""
-    broken = pytest.mark.xfail(strict=True, reason=why)
-    cameras = [pytest.param(c, marks=broken) if c == name else c for c in ALL]
-    return pytest.mark.parametrize("stand", cameras, indirect=True)
-
-
 @dataclass
 class Stand:
     """A camera, its clock, how to open the same thing again, and whether that is refused."""
@@ -85,7 +78,6 @@ def test_every_camera_is_held_to_the_contract() -> None:
         assert callable(getattr(import_module(module), name))
 
 
-@all_but("playback", "it plays by the clock before it was started")
 def test_there_is_nothing_before_the_start(stand: Stand) -> None:
     assert stand.camera.newest() is None
 
@@ -121,7 +113,6 @@ def test_to_start_twice_changes_nothing(stand: Stand, take: Take) -> None:
     take(stand.camera, 3, stand.wait)
 
 
-@all_but("simulated", "its world goes on")
 def test_a_closed_camera_has_nothing_more_and_may_be_closed_again(stand: Stand, take: Take) -> None:
     stand.camera.start()
     take(stand.camera, 2, stand.wait)

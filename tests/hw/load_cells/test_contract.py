@@ -16,7 +16,7 @@ from gripper_force.log import LogWriter
 from gripper_force.types import NS_PER_MS, LoadCellSample
 from gripper_hw.load_cells.serial import SerialLoadCell
 from gripper_hw.playback import PlaybackLoadCell
-from gripper_hw.sim.rig import SimulatedLoadCell, SimulatedRig
+from gripper_hw.sim.rig import SimulatedRig
 
 PERIOD_NS = 5 * NS_PER_MS
 
@@ -81,14 +81,8 @@ def fitted(request: pytest.FixtureRequest, quick: list[str], tmp_path: Path) -> 
         yield fitted
 
 
-def test_nothing_comes_before_the_start_or_after_the_end(
-    fitted: Fitted, collect, request: pytest.FixtureRequest
-) -> None:
+def test_nothing_comes_before_the_start_or_after_the_end(fitted: Fitted, collect) -> None:
     cell = fitted.cell
-    if isinstance(cell, PlaybackLoadCell):
-        request.applymarker(pytest.mark.xfail(reason="it plays before its start", strict=True))
-    if isinstance(cell, SimulatedLoadCell):
-        request.applymarker(pytest.mark.xfail(reason="its close does not stop it", strict=True))
     fitted.pause()
     assert cell.drain() == []
     cell.start()
