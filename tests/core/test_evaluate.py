@@ -42,9 +42,8 @@ def _one_thread() -> Iterator[None]:
 def clip(name: str, object_name: str, seed: int, size: int = 16) -> Clip:
     rng = np.random.default_rng(seed)
     forces_n = np.maximum(0, np.linspace(-3, 6, 30)).astype(np.float32)
-    frames = rng.integers(0, 40, (size, size)) + np.outer(forces_n, rng.integers(5, 25, size * size)).reshape(
-        30, size, size
-    )
+    change = np.outer(forces_n, rng.integers(-5, 6, size * size)).reshape(30, size, size)
+    frames = rng.integers(60, 140, (size, size)) + change
     return Clip(
         frames.clip(0, 255).astype(np.uint8), forces_n, np.ones(30, np.bool_), name, object_name, name
     )
