@@ -87,6 +87,7 @@ class Fusion:
         self._share = 1.0
         self._friction_n = self._transmission.friction_n
         self._friction_n2 = (FRICTION_STD * self._friction_n) ** 2
+        self._hidden_n2 = 0.0
         self.loosen()
 
     def loosen(self) -> None:
@@ -95,7 +96,13 @@ class Fusion:
         self._rejected = 0
 
     def step(
-        self, t_ns: int, servo: ServoState, visual: VisualForce | None, *, free: bool = False
+        self,
+        t_ns: int,
+        servo: ServoState,
+        visual: VisualForce | None,
+        *,
+        free: bool = False,
+        opening: bool = False,
     ) -> tuple[FusedForce, tuple[Event, ...]]:
         """One cycle.
 
@@ -104,11 +111,14 @@ class Fusion:
             servo: This cycle's reading; its numbers are finite.
             visual: The newest estimate, or None. The same one may be given again; it counts once.
             free: The jaws travel and touch nothing, so the force is zero and the push tells the friction.
+            opening: The jaws let go, and friction hides from the current how far they have.
 
         Returns:
             The estimate, and an event where vision drops out or comes back.
         """
+        self._hidden_n2 = self._friction_n**2 if opening else 0.0
         self._predict(servo, free)
+        self._variance_n2 = max(self._variance_n2, self._hidden_n2)
         if visual is not None and visual.t_ns > self._newest_seen_ns and self._feedback != "current":
             self._newest_seen_ns = visual.t_ns
             self._refusal = self._update(t_ns, visual)
@@ -192,7 +202,7 @@ class Fusion:
         return later_n
 
     def _prior_n2(self, force_n: float) -> float:
-        return self._friction_n2 + _FREE_FLOOR_N**2 + (GAIN_STD * force_n) ** 2
+        return self._friction_n2 + _FREE_FLOOR_N**2 + (GAIN_STD * force_n) ** 2 + self._hidden_n2
 
     def _switch(self, t_ns: int) -> tuple[Event, ...]:
         fresh = self._used_ns is not None and t_ns - self._used_ns <= self._timeout_ns

@@ -191,7 +191,8 @@ class GraspController:
         self._width_m = width_m
         closing_m_s = self._transmission.closing_m_s(servo.velocity_rad_s)
         free = self._cruises(closing_m_s)
-        self._estimate, events = self._fusion.step(t_ns, servo, visual, free=free)
+        opening = self._phase == Phase.RELEASE
+        self._estimate, events = self._fusion.step(t_ns, servo, visual, free=free, opening=opening)
         return list(events)
 
     def _obey(self, t_ns: int, request: Request, problem: str) -> str:

@@ -23,7 +23,9 @@ class Bench:
         self.events = []
         self.estimate = None
 
-    def run(self, time_s, push_n, seen_n=None, std_n=0.1, latency_ms=40, noise=None, free=False):
+    def run(
+        self, time_s, push_n, seen_n=None, std_n=0.1, latency_ms=40, noise=None, free=False, opening=False
+    ):
         """`push_n` is a function of the time in seconds; `seen_n` is what vision says of a capture time."""
         for _ in range(round(time_s * 200)):
             t_s = self.t_ns / 1e9
@@ -33,7 +35,7 @@ class Bench:
                 capture_ns = self.t_ns - latency_ms * MS
                 force_n = seen_n(capture_ns / 1e9) + (noise.normal(0, std_n) if noise else 0.0)
                 visual = VisualForce(capture_ns, self.t_ns, self.t_ns, force_n, std_n, 10.0)
-            self.estimate, events = self.fusion.step(self.t_ns, servo, visual, free=free)
+            self.estimate, events = self.fusion.step(self.t_ns, servo, visual, free=free, opening=opening)
             self.events += [event.text for event in events]
             self.t_ns += 5 * MS
         return self.estimate
@@ -90,6 +92,18 @@ def test_free_travel_tells_friction(bench, transmission):
     assert pressing.force_n == pytest.approx(3.0, abs=0.02)
     b.fusion.restart()
     assert b.run(0.005, lambda _: nominal_n + 3.2).friction_n == nominal_n
+
+
+def test_jaws_that_open_are_believed_to_the_eye(bench, transmission):
+    friction_n = transmission.friction_n
+    estimates = []
+    for opening in (False, True):
+        b = bench()
+        b.run(1.0, lambda _: 3.0 + friction_n, lambda _: 3.0)
+        # Within the play, the current says that nothing has changed.
+        estimates.append(b.run(0.3, lambda _: 3.0 - 0.5 * friction_n, lambda _: 2.2, opening=opening).force_n)
+    assert estimates[1] == pytest.approx(2.2, abs=0.1)
+    assert estimates[0] > estimates[1]
 
 
 @given(st.lists(st.floats(-50, 50), min_size=1, max_size=30))
