@@ -1,6 +1,5 @@
 """Which cameras are there, and how fast and how late are the frames of the configured one?"""
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -70,7 +69,6 @@ def _frame_checks(config: Config, frames: list[Frame]) -> Iterator[Check]:
 
 
 def _oak_devices() -> Iterator[str]:
-    os.environ.setdefault("DEPTHAI_LEVEL", "error")  # its log would go to stdout
     import depthai as dai
 
     devices = dai.Device.getAllAvailableDevices()
