@@ -1,10 +1,10 @@
 """The configuration: typed, with a default for everything, from YAML and ``--set key.path=value``."""
 
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Final, Literal, Self, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from gripper_force.errors import ConfigError
 
@@ -162,6 +162,80 @@ class LogConfig(Section):
     report: bool = True
 
 
+FAULTS: Final[dict[str, dict[str, str]]] = {
+    "servo": {
+        "off": "its power is cut; when that comes back, its RAM has been reset",
+        "stuck": "its Bus Watchdog has tripped",
+        "wrong": "it reports an overload",
+        "intermittent": "its power is cut for 5 ms every 0.3 s",
+    },
+    "bus": {
+        "off": "the adapter is unplugged",
+        "garbage": "every answer is corrupted",
+        "wrong": "every answer carries another id",
+        "slow": "every answer comes after the driver has given it up",
+        "delayed": "every answer is that of the request before",
+        "intermittent": "half of the answers are lost",
+    },
+    "plant": {
+        "wrong": "the motor gives more current than its goal asks, by 0.02 A more every 10 ms",
+    },
+    "camera": {
+        "off": "no frame comes",
+        "stuck": "the last picture comes again and again",
+        "garbage": "every pixel is noise",
+        "wrong": "six times the light falls in",
+        "slow": "5 frames a second come",
+        "delayed": "every frame comes 0.3 s late",
+        "intermittent": "four of five frames are lost",
+    },
+    "load_cell": {
+        "off": "no sample comes",
+        "stuck": "the last reading comes again and again",
+        "garbage": "readings anywhere within 200 N, or not finite",
+        "wrong": "it reads its full scale",
+        "slow": "2 samples a second come",
+        "delayed": "every sample comes 0.5 s late",
+        "intermittent": "every second 0.3 s lack all samples",
+    },
+    "estimator": {
+        "off": "it raises an exception",
+        "stuck": "it hangs",
+        "garbage": "its estimates are not finite",
+        "wrong": "it sees a third less force than there is",
+        "intermittent": "it raises an exception at every second frame",
+    },
+    "clock": {
+        "stuck": "the process is stopped, as by SIGSTOP",
+        "wrong": "the wall clock jumps back by a day",
+        "slow": "every cycle comes 15 ms late",
+    },
+    "disk": {
+        "off": "it is full: no write succeeds",
+        "slow": "every write takes 50 ms",
+        "intermittent": "every second write fails",
+    },
+}
+"""The faults that can be injected, in the vocabulary of PX4
+(https://docs.px4.io/main/en/debug/failure_injection.html): unit, kind, and what it means there."""
+
+
+class FaultConfig(Section):
+    """A fault, on purpose: `FAULTS` says which there are and what each does."""
+
+    unit: Literal["servo", "bus", "plant", "camera", "load_cell", "estimator", "clock", "disk"]
+    kind: Literal["ok", "off", "stuck", "garbage", "wrong", "slow", "delayed", "intermittent"]
+    at_s: NonNegative = Field(0.0, description="when it begins, after the run's start")
+    for_s: Annotated[float, Field(gt=0)] = Field(float("inf"), description="how long it lasts")
+
+    @model_validator(mode="after")
+    def _is_supported(self) -> Self:
+        if self.kind != "ok" and self.kind not in FAULTS[self.unit]:
+            known = ", ".join(("ok", *FAULTS[self.unit]))
+            raise ValueError(f"a {self.unit} can't be made {self.kind}; known here: {known}")
+        return self
+
+
 class Config(Section):
     """A whole run."""
 
@@ -180,6 +254,9 @@ class Config(Section):
     control: ControlConfig = ControlConfig()
     sim: SimConfig = SimConfig()
     log: LogConfig = LogConfig()
+    faults: tuple[FaultConfig, ...] = Field(
+        (), description="faults to inject into the stand-ins: unit, kind, at_s, for_s"
+    )
 
 
 def load_config(path: Path | None = None, overrides: list[str] | None = None) -> Config:
@@ -271,7 +348,7 @@ def _sentence(root: type[Section], error: ValidationError, where: str) -> str:
     if first["type"] == "extra_forbidden":
         section: Any = root
         for part in parts[:-1]:
-            section = section.model_fields[part].annotation
+            section = FaultConfig if part.isdigit() else section.model_fields[part].annotation
         known = ", ".join(section.model_fields)
         return f"unknown configuration key {key!r} (from {where}); known here: {known}"
     return f"configuration key {key!r} (from {where}): {first['msg']}, got {first['input']!r}"
