@@ -38,6 +38,11 @@ class Servo(Protocol):
         """Resolution of the goal current."""
         ...
 
+    @property
+    def voltage_range_v(self) -> tuple[float, float]:
+        """Least and greatest supply it works at, by the vendor's table."""
+        ...
+
     def start(self) -> ServoState:
         """Checks the model, sets mode and limits, reads them back, arms the watchdog and turns torque on.
 
@@ -46,7 +51,7 @@ class Servo(Protocol):
         ...
 
     def read(self) -> ServoState:
-        """Reads current, velocity, position, hardware error and temperature in one bus transaction."""
+        """Reads all of a `ServoState` in one bus transaction."""
         ...
 
     def write(self, command: ServoCommand) -> None:
@@ -116,6 +121,7 @@ class Devices:
         camera: The camera, or None.
         load_cell: The load cell, or None.
         lockstep: True where the clock is simulated and the run is deterministic.
+        start_ns: The run's start on its clock.
         check: Raises what broke in a thread of the devices' own, if anything did.
         notes: Facts about the devices that the log should hold (a scene's drawn parameters, a serial number).
     """
@@ -125,5 +131,6 @@ class Devices:
     camera: Camera | None
     load_cell: LoadCell | None
     lockstep: bool
+    start_ns: int
     check: Callable[[], None]
     notes: dict[str, str] = field(default_factory=dict)

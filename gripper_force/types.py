@@ -68,6 +68,7 @@ class ServoState:
         velocity_rad_s: Angular velocity of the horn.
         current_a: Motor current, signed.
         temperature_c: Temperature of the servo.
+        voltage_v: Supply at the servo.
         hardware_error: The Hardware Error Status byte (0: none).
     """
 
@@ -76,6 +77,7 @@ class ServoState:
     velocity_rad_s: float
     current_a: float
     temperature_c: float
+    voltage_v: float
     hardware_error: int
 
 

@@ -73,6 +73,7 @@ class Plant:
             velocity_rad_s=round(self.v_m_s / TRANSMISSION.pinion_radius_m / 0.024) * 0.024,
             current_a=round(measured_a / STEP_A) * STEP_A,
             temperature_c=35.0,
+            voltage_v=12.0,
             hardware_error=0,
         )
 

@@ -29,7 +29,7 @@ class Bench:
         """`push_n` is a function of the time in seconds; `seen_n` is what vision says of a capture time."""
         for _ in range(round(time_s * 200)):
             t_s = self.t_ns / 1e9
-            servo = ServoState(self.t_ns, 0.0, 0.0, self.transmission.current_a(push_n(t_s)), 30.0, 0)
+            servo = ServoState(self.t_ns, 0.0, 0.0, self.transmission.current_a(push_n(t_s)), 30.0, 12.0, 0)
             visual = None
             if seen_n is not None and self.t_ns // (5 * MS) % 3 == 0:
                 capture_ns = self.t_ns - latency_ms * MS
@@ -182,7 +182,7 @@ def test_the_same_estimate_counts_once(transmission):
     fusion = Fusion(ControlConfig(), transmission)
     visual = VisualForce(0, 0, 0, 0.3, 0.1, 1.0)
     for i in range(5):
-        estimate, _ = fusion.step(i * 5 * MS, ServoState(i * 5 * MS, 0.0, 0.0, 0.0, 30.0, 0), visual)
+        estimate, _ = fusion.step(i * 5 * MS, ServoState(i * 5 * MS, 0.0, 0.0, 0.0, 30.0, 12.0, 0), visual)
         if i == 0:
             first = estimate.bias_n
     assert estimate.bias_n == first != 0.0
@@ -195,7 +195,7 @@ def test_a_gripper_without_friction(transmission):
 
 def test_an_estimate_from_before_the_first_reading_meets_the_oldest_current(transmission):
     fusion = Fusion(ControlConfig(), transmission)
-    servo = ServoState(50 * MS, 0.0, 0.0, transmission.current_a(1.0), 30.0, 0)
+    servo = ServoState(50 * MS, 0.0, 0.0, transmission.current_a(1.0), 30.0, 12.0, 0)
     estimate, _ = fusion.step(50 * MS, servo, VisualForce(10 * MS, 50 * MS, 0, 0.3, 0.1, 1.0))
     assert estimate.source == "fused"
     assert 0.0 < estimate.bias_n < 0.3 - estimate.current_n

@@ -301,7 +301,7 @@ def test_margins_are_reported(transmission):
 
 
 wild = st.one_of(st.floats(-10, 10), st.sampled_from([math.nan, math.inf, -math.inf]))
-servos = st.builds(ServoState, st.just(0), wild, wild, wild, wild, st.sampled_from([0, 0, 0, 32]))
+servos = st.builds(ServoState, st.just(0), wild, wild, wild, wild, wild, st.sampled_from([0, 0, 0, 32]))
 visuals = st.one_of(
     st.none(),
     st.builds(

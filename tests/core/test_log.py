@@ -63,7 +63,7 @@ def run(path: Path, count: int = 40) -> list[Record]:
     with LogWriter(path, config="target_n: 4.0\n", metadata={"version": "1.2"}) as log:
         for i in range(count):
             t_ns = i * 10 * NS_PER_MS
-            records.append(ServoState(t_ns, 0.1 * i, 0.0, 0.2, 30.0, 0))
+            records.append(ServoState(t_ns, 0.1 * i, 0.0, 0.2, 30.0, 12.0, 0))
             if i % 3 == 0:
                 gray = rng.integers(0, 256, (4, 5), dtype=np.uint8)
                 records.append(Frame(t_ns - 5, t_ns, i, gray))
@@ -306,7 +306,7 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     [
         Event(-1, "session", "before time began"),
         Event(0, "session", "\ud800"),
-        ServoState(0, 0.0, 0.0, 0.0, 0.0, 2**63),
+        ServoState(0, 0.0, 0.0, 0.0, 0.0, 0.0, 2**63),
         Frame(0, 0, 0, np.zeros((2, 2, 3), np.uint8)),
         Frame(0, 0, 0, np.zeros((2, 2))),  # type: ignore[arg-type]
     ],

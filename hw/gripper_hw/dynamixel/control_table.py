@@ -75,6 +75,7 @@ class ServoModel:
         stall_current_a: Current at stall.
         no_load_rpm: Speed without load.
         nominal_voltage_v: Supply the three values above hold for.
+        voltage_range_v: Least and greatest supply.
         operating_modes: Values that Operating Mode accepts.
         min_firmware: The first firmware that answers Fast Sync Read.
         indirect: First firmware to the indirect windows it has, in order of firmware.
@@ -88,6 +89,7 @@ class ServoModel:
     stall_current_a: float
     no_load_rpm: float
     nominal_voltage_v: float
+    voltage_range_v: tuple[float, float]
     operating_modes: tuple[int, ...]
     min_firmware: int
     indirect: dict[int, tuple[IndirectWindow, ...]]
@@ -136,7 +138,8 @@ def load_model(name: str) -> ServoModel:
     if name not in model_names():
         raise ConfigError(f"unknown servo model {name!r}; known: {', '.join(model_names())}")
     tree = _load(f"{name}.yaml")
-    tree["operating_modes"] = tuple(tree["operating_modes"])
+    for row in ("operating_modes", "voltage_range_v"):
+        tree[row] = tuple(tree[row])
     tree["indirect"] = {
         first: tuple(IndirectWindow(*window) for window in windows)
         for first, windows in sorted(tree["indirect"].items())

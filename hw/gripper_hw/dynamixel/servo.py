@@ -37,22 +37,22 @@ from gripper_hw.dynamixel.control_table import (
 )
 from gripper_hw.dynamixel.port import Port, open_port
 
-_READ_NAMES: Final = (
-    "present_current",
-    "present_velocity",
-    "present_position",
-    "hardware_error_status",
-    "present_temperature",
-    "bus_watchdog",
-)
-_READ_BLOCK: Final = struct.Struct("<hiiBBb")
-_WRITE_NAMES: Final = ("goal_current", "goal_position")
+_READ: Final = {  # name: bytes
+    "present_current": 2,
+    "present_velocity": 2,  # the upper half only repeats the sign, and room is scarce: 20 bytes on an XL330
+    "present_position": 4,
+    "hardware_error_status": 1,
+    "present_temperature": 1,
+    "present_input_voltage": 2,
+    "bus_watchdog": 1,
+}
+_READ_BLOCK: Final = struct.Struct("<hhiBBHb")
+_WRITE: Final = {"goal_current": 2, "goal_position": 4}
 _WRITE_BLOCK: Final = struct.Struct("<hi")
 _INDIRECT_ADDRESSES: Final = tuple(
-    register.address + offset
-    for register in (REGISTERS[name] for name in (*_READ_NAMES, *_WRITE_NAMES))
-    for offset in range(register.size)
+    REGISTERS[name].address + offset for name, size in (_READ | _WRITE).items() for offset in range(size)
 )
+_VOLTAGE_UNIT_V: Final = 0.1
 
 _TRAVEL_RAD: Final = 255 * 2 * math.pi  # a turn less than Goal Position takes either way
 _TORQUE_OFF_TRIES: Final = 5
@@ -307,7 +307,7 @@ class DynamixelBus:
         return self._writer.txPacket(), None
 
     def _state(self, t_ns: int, id_: int, block: bytes) -> ServoState:
-        current, velocity, ticks, hardware_error, temperature, watchdog = _READ_BLOCK.unpack(block)
+        current, velocity, ticks, hardware_error, temperature, voltage, watchdog = _READ_BLOCK.unpack(block)
         if watchdog != self._expected_watchdog:
             why = "its bus watchdog tripped" if watchdog < 0 else "it restarted and forgot its settings"
             raise HardwareFaultError(
@@ -319,6 +319,7 @@ class DynamixelBus:
             velocity_rad_s=velocity * VELOCITY_UNIT_RAD_S,
             current_a=current * self.model.current_unit_a,
             temperature_c=float(temperature),
+            voltage_v=voltage * _VOLTAGE_UNIT_V,
             hardware_error=hardware_error,
         )
 
@@ -426,6 +427,11 @@ class DynamixelServo:
     def current_step_a(self) -> float:
         """Resolution of the goal current."""
         return self.model.current_unit_a
+
+    @property
+    def voltage_range_v(self) -> tuple[float, float]:
+        """Least and greatest supply it works at, by the vendor's table."""
+        return self.model.voltage_range_v
 
     @property
     def firmware(self) -> int | None:

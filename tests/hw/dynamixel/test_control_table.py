@@ -14,20 +14,22 @@ from gripper_hw.dynamixel.control_table import (
 
 
 @pytest.mark.parametrize(
-    ("name", "number", "unit_a", "limit", "nm_per_a"),
+    ("name", "number", "unit_a", "limit", "nm_per_a", "range_v"),
     [
-        ("XM430-W350", 1020, 2.69e-3, 1193, 1.78),
-        ("XM430-W210", 1030, 2.69e-3, 1193, 1.30),
-        ("XL330-M288", 1200, 1e-3, 1750, 0.35),
-        ("XC330-T288", 1220, 1e-3, 910, 1.15),
+        ("XM430-W350", 1020, 2.69e-3, 1193, 1.78, (10.0, 14.8)),
+        ("XM430-W210", 1030, 2.69e-3, 1193, 1.30, (10.0, 14.8)),
+        ("XL330-M288", 1200, 1e-3, 1750, 0.35, (3.7, 6.0)),
+        ("XC330-T288", 1220, 1e-3, 910, 1.15, (6.5, 12.0)),
     ],
 )
-def test_models_match_the_vendors_tables(name, number, unit_a, limit, nm_per_a):
+def test_models_match_the_vendors_tables(name, number, unit_a, limit, nm_per_a, range_v):
     model = load_model(name)
     assert (model.name, model.number, model.current_unit_a) == (name, number, unit_a)
     assert model.max_current_a == pytest.approx(limit * unit_a)
     assert model.nm_per_a == pytest.approx(nm_per_a, abs=0.006)
     assert {0, 3, 5, 16} <= set(model.operating_modes)
+    assert model.voltage_range_v == range_v
+    assert range_v[0] < model.nominal_voltage_v < range_v[1]
 
 
 def test_an_unknown_model_is_refused_with_the_known_ones():

@@ -232,7 +232,7 @@ def test_the_cycle_uses_the_models_indirect_data(make_memory_line, model, firmwa
 def test_read_gives_signed_si_units(started):
     line, servo = started
     firmware = line.bus.servos[0]
-    firmware.sense(temperature_c=41.0)
+    firmware.sense(temperature_c=41.0, voltage_v=11.3)
     firmware.control(0, -2.0, -1.5, current_noise_a=-0.25)
     line.now_ns = 7 * MS
     state = servo.read()
@@ -240,13 +240,13 @@ def test_read_gives_signed_si_units(started):
     assert state.position_rad == pytest.approx(-2.0, abs=1e-3)
     assert state.velocity_rad_s == pytest.approx(-1.5, abs=VELOCITY_UNIT_RAD_S)
     assert state.current_a == pytest.approx(-0.25, abs=MODEL.current_unit_a)
-    assert (state.temperature_c, state.hardware_error) == (41.0, 0)
+    assert (state.temperature_c, state.voltage_v, state.hardware_error) == (41.0, pytest.approx(11.3), 0)
 
 
 def test_data_that_looks_like_a_header_is_read_right(started):
     """The SDK's removeStuffing misreads such data; fast sync read is not stuffed."""
     line, servo = started
-    current, velocity, ticks = struct.unpack("<hii", bytes.fromhex("fffffd00aafffdfd0102"))
+    current, velocity, ticks = struct.unpack("<hhi", bytes.fromhex("fffffd00aafffdfd"))
     line.bus.servos[0].control(
         0, rad_from_ticks(ticks), velocity * VELOCITY_UNIT_RAD_S, current * MODEL.current_unit_a
     )
