@@ -38,6 +38,13 @@ PROBES: Final = {
 }
 """Modules with a function ``probe`` for `gripper_force.doctor`, in the order of its table."""
 
+FUZZ_TARGETS: Final = (
+    "gripper_force.stability.targets",
+    "gripper_hw.dynamixel.fuzz",
+    "gripper_hw.load_cells.fuzz",
+)
+"""Modules with a list ``TARGETS`` for `gripper_force.stability.fuzz`."""
+
 
 class MonotonicClock:
     """The host's monotonic time."""
@@ -73,6 +80,11 @@ def open_devices(config: Config) -> Iterator[Devices]:
                 f"clock=lockstep needs a simulated servo, and servo.port is {config.servo.port!r}; "
                 "set clock=realtime, or servo.port=virtual:rig"
             )
+        if config.faults and rig is None:
+            raise ConfigError(
+                f"faults are only injected into stand-ins, and servo.port is {config.servo.port!r}; set "
+                "servo.port=virtual:rig, or faults=[]"
+            )
         clock: Clock = rig.clock if rig is not None else MonotonicClock()
         camera = _open(stack, camera_class, rig, config.camera, clock, "camera")
         load_cell = _open(stack, load_cell_class, rig, config.load_cell, clock, "load_cell")
@@ -86,6 +98,7 @@ def open_devices(config: Config) -> Iterator[Devices]:
             camera=camera,
             load_cell=load_cell,
             lockstep=config.clock == "lockstep",
+            start_ns=rig.start_ns if rig is not None else clock.now_ns(),
             check=rig.check if rig is not None else lambda: None,
             notes=rig.notes() if rig is not None else {},
         )

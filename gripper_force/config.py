@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from gripper_force.errors import ConfigError
 
@@ -130,14 +130,34 @@ class ControlConfig(Section):
     settle_s: Positive = Field(1.0, description="time within tolerance that makes a grasp `held`")
     hold_s: NonNegative = Field(1.5, description="how long to hold after it is held, before the run ends")
     timeout_s: Positive = 8.0
-    vision_timeout_ms: Positive = Field(60.0, description="age over which an estimate no longer counts")
+    vision_timeout_ms: Positive = Field(
+        50.0, description="age over which an estimate no longer counts: two frames missed at 60 a second"
+    )
     vision_std_n: Positive = Field(1.5, description="claimed error over which an estimate is uncertain")
     slip_width_m: Positive = Field(0.004, description="closing of the jaws during hold that means slip")
+    on_fault: Literal["limp", "hold", "open"] = Field(
+        "limp",
+        description="after a fault or a stop: no torque; hold with a force that can only fall; open the jaws",
+    )
+    warm_c: Positive = Field(
+        60.0, description="servo temperature from which a hold is eased, down to 60 % at the limit"
+    )
     temperature_limit_c: Positive = 70.0
+    voltage_limits_v: tuple[Positive, Positive] | None = Field(
+        None, description="supply of the servo, least and most; None: what its model is made for"
+    )
     plant_lag_ms: Positive = Field(60.0, description="identified lag from motor current to contact force")
     plant_delay_ms: Positive = Field(
         60.0, description="identified delay from contact force to estimate: exposure to use, and half a frame"
     )
+
+    @model_validator(mode="after")
+    def _limits_are_in_order(self) -> Self:
+        if self.warm_c >= self.temperature_limit_c:
+            raise ValueError(f"warm_c {self.warm_c:g} must lie below temperature_limit_c")
+        if self.voltage_limits_v is not None and self.voltage_limits_v[0] >= self.voltage_limits_v[1]:
+            raise ValueError("the first of voltage_limits_v must lie below the second")
+        return self
 
 
 class SimConfig(Section):
@@ -224,7 +244,10 @@ class FaultConfig(Section):
     """A fault, on purpose: `FAULTS` says which there are and what each does."""
 
     unit: Literal["servo", "bus", "plant", "camera", "load_cell", "estimator", "clock", "disk"]
-    kind: Literal["ok", "off", "stuck", "garbage", "wrong", "slow", "delayed", "intermittent"]
+    kind: Annotated[
+        Literal["ok", "off", "stuck", "garbage", "wrong", "slow", "delayed", "intermittent"],
+        BeforeValidator(lambda kind: "off" if kind is False else kind),  # what YAML makes of a bare off
+    ]
     at_s: NonNegative = Field(0.0, description="when it begins, after the run's start")
     for_s: Annotated[float, Field(gt=0)] = Field(float("inf"), description="how long it lasts")
 

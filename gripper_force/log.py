@@ -176,12 +176,24 @@ class LogWriter:
         path: A new file; its folder is made if need be.
         config: The run's configuration as YAML.
         metadata: Versions, digests and other facts.
+        through: What the bytes pass on their way to the file.
+
+    Attributes:
+        waiting: Records of the open chunk; they are lost where it can't be written.
 
     Raises:
         LogError: The file exists already, or can't be written (every method).
     """
 
-    def __init__(self, path: Path, *, config: str, metadata: Mapping[str, str]) -> None:
+    def __init__(
+        self,
+        path: Path,
+        *,
+        config: str,
+        metadata: Mapping[str, str],
+        through: Callable[[BinaryIO], BinaryIO] = lambda file: file,
+    ) -> None:
+        self.waiting = 0
         self._path = path
         self._failed = False
         self._closed = False
@@ -189,7 +201,7 @@ class LogWriter:
         self._chunk_start_ns: int | None = None
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file: BinaryIO = path.open("xb")
+            self._file = through(path.open("xb"))
         except OSError as error:
             reason = "it exists already, and a log is never overwritten" if path.exists() else error.strerror
             raise LogError(f"can't write the log {path}: {reason}") from error
@@ -227,11 +239,12 @@ class LogWriter:
             channel = self._channels.get(record_type) or self._register(record_type)
             sequence = record.seq if isinstance(record, Frame) else 0
             self._writer.add_message(channel, log_ns, data, publish_time=log_ns, sequence=sequence)
+            self.waiting += 1
             if self._chunk_start_ns is None:
                 self._chunk_start_ns = log_ns
             if log_ns - self._chunk_start_ns >= CHUNK_NS:
                 self._writer.flush()
-                self._chunk_start_ns = None
+                self._chunk_start_ns, self.waiting = None, 0
 
     def attach(self, name: str, data: bytes, media_type: str) -> None:
         """Adds a file, such as a YAML profile."""
@@ -248,6 +261,7 @@ class LogWriter:
                 with self._guard():
                     self._writer.finish()
                     self._file.flush()
+                    self.waiting = 0
         finally:
             self._closed = True
             # After a failure, which was reported, closing may fail once more on the bytes still held.

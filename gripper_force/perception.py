@@ -141,6 +141,7 @@ class ThreadedPerception:
     """Estimates in a thread of its own, always on the newest frame."""
 
     _IDLE_S = 0.001
+    _PATIENCE_S = 1.0
 
     def __init__(self, camera: Camera | None, estimator: Estimator | None, clock: Clock) -> None:
         self._camera, self._sight, self._clock = camera, Sight(estimator), clock
@@ -161,10 +162,10 @@ class ThreadedPerception:
         return [self._done.popleft() for _ in range(len(self._done))]
 
     def close(self) -> None:
-        """Stops the thread. May be called twice."""
+        """Stops the thread, or leaves it behind where a model hangs. May be called twice."""
         self._stop.set()
         if self._thread.is_alive():
-            self._thread.join()
+            self._thread.join(self._PATIENCE_S)
 
     def _run(self) -> None:
         assert self._camera is not None

@@ -8,28 +8,48 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, cast
 
 import cv2
 
 from gripper_force.backends import open_devices
 from gripper_force.config import Config, dump_config
-from gripper_force.control.grasp import Decision, GraspController
+from gripper_force.control.grasp import Decision, GraspController, is_open
+from gripper_force.control.limits import largest_target_n
 from gripper_force.control.transmission import Transmission
-from gripper_force.errors import ConfigError, LogError
+from gripper_force.errors import ConfigError
+from gripper_force.faults import Faults, FaultyEstimator, FaultyFile
 from gripper_force.interfaces import Devices
 from gripper_force.log import LogWriter
-from gripper_force.perception import LockstepPerception, Perception, ThreadedPerception
-from gripper_force.types import NS_PER_S, Event, GraspStatus, Outcome, Phase, Record, Request, RequestKind
+from gripper_force.perception import Estimator, LockstepPerception, Perception, ThreadedPerception
+from gripper_force.recorder import Recorder
+from gripper_force.types import (
+    NS_PER_MS,
+    NS_PER_S,
+    Event,
+    GraspStatus,
+    LoadCellSample,
+    Outcome,
+    Phase,
+    Request,
+    RequestKind,
+)
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
 from gripper_force.vision.estimator import ForceEstimator
 
 _VISION_PATIENCE_NS = 2 * NS_PER_S
 _REFERENCE_NS = NS_PER_S // 10
 """Every run begins with frames that show no contact, so that its log can be replayed with vision."""
+
+_OPENING_NS = 3 * NS_PER_S
+"""How long jaws that are to open at a fault may take."""
+
+_CELL_PATIENCE_NS = 75 * NS_PER_MS
+_CELL_PERIODS = 8
+"""A load cell without a sound sample for so long, and for so many of its periods, says nothing any more."""
 
 _REALTIME_SWITCH_S = 2e-4
 _PACKAGES = ("gripper-force", "dynamixel-sdk", "mujoco", "numpy", "torch")
@@ -38,7 +58,13 @@ Progress = Callable[[GraspStatus], None]
 
 
 class Session:
-    """One controller on one set of devices."""
+    """One controller on one set of devices.
+
+    Attributes:
+        sees: Whether there was a visual estimate yet.
+        failed: Whether the run is at fault, so that it is to end as ``control.on_fault`` says.
+        cycles: Cycles run.
+    """
 
     def __init__(
         self,
@@ -46,19 +72,19 @@ class Session:
         devices: Devices,
         controller: GraspController,
         perception: Perception,
-        log: LogWriter,
+        recorder: Recorder,
     ) -> None:
         self._config, self._devices = config, devices
-        self._controller, self._perception, self._log = controller, perception, log
+        self._controller, self._perception, self._recorder = controller, perception, recorder
         self._period_ns = round(NS_PER_S / config.control.rate_hz)
         self._due_ns = 0
         self._stop = threading.Event()
         self._interrupted = False
         self._last_retries = 0
         self._problem = ""
-        self._lost_records = 0
-        self._log_error: LogError | None = None
+        self._cell = _CellWatch()
         self._armed = False
+        self.failed = False
         self.sees = False
         self.cycles = 0
 
@@ -104,7 +130,7 @@ class Session:
             KeyboardInterrupt: See `interrupt`.
             GripperError: A sensor or the simulated world failed, or the first frames gave no estimate.
         """
-        devices, log = self._devices, self._write
+        devices, log = self._devices, self._recorder.write
         devices.clock.sleep_until_ns(self._due_ns)
         self._due_ns = max(self._due_ns + self._period_ns, devices.clock.now_ns() - self._period_ns)
         self.end_if_interrupted()
@@ -124,6 +150,7 @@ class Session:
         decision = self._controller.step(state.t_ns, state, visual, request)
         devices.servo.write(decision.command)
         self.cycles += 1
+        self.failed = decision.status.phase == Phase.FAULT
         if request is not None:
             log(request)
         log(state)
@@ -135,43 +162,26 @@ class Session:
         self._log_sensors(state.t_ns)
         return decision
 
+    def fail(self, error: BaseException) -> None:
+        """Takes note of what ends the run; Ctrl-C is no fault."""
+        self.failed |= isinstance(error, Exception)
+        self._recorder.write(
+            Event(self._devices.clock.now_ns(), "session", f"{type(error).__name__}: {error}")
+        )
+
     def close(self) -> None:
         """Torque off, or hold, as configured; the log keeps what the load cell still had to say."""
+        hold = self._config.control.on_fault if self.failed else self._config.on_exit
         try:
             if self._armed:
-                self._devices.servo.stop(hold=self._config.on_exit == "hold")
+                self._devices.servo.stop(hold=hold == "hold")
         finally:
             self._perception.close()
         self._log_sensors(self._devices.clock.now_ns())
 
-    def raise_losses(self) -> None:
-        """Tells of a disk that failed, which must not end a grasp, once the grasp has ended.
-
-        Raises:
-            LogError: Records are missing from the log.
-        """
-        if self._log_error is not None:
-            raise LogError(
-                f"{self._log_error}; the run went on, and its log lacks {self._lost_records} records: free "
-                "some space, or set log.directory elsewhere"
-            )
-
     def attach(self, name: str, data: bytes, media_type: str) -> None:
         """Adds a file to the log."""
-        with self._losses_counted():
-            self._log.attach(name, data, media_type)
-
-    def _write(self, record: Record) -> None:
-        with self._losses_counted():
-            self._log.write(record)
-
-    @contextmanager
-    def _losses_counted(self) -> Iterator[None]:
-        try:
-            yield
-        except LogError as error:
-            self._lost_records += 1
-            self._log_error = self._log_error or error
+        self._recorder.attach(name, data, media_type)
 
     def _request(self, t_ns: int, kind: RequestKind | None, target_n: float) -> Request | None:
         if self._stop.is_set():
@@ -181,12 +191,38 @@ class Session:
 
     def _log_sensors(self, t_ns: int) -> None:
         if self._devices.load_cell is not None:
-            for sample in self._devices.load_cell.drain():
-                self._write(sample)
+            samples = self._devices.load_cell.drain()
+            for sample in samples:
+                self._recorder.write(sample)
+            if text := self._cell.look(t_ns, samples):
+                self._recorder.write(Event(t_ns, "load_cell", text))
         stats = self._devices.servo.stats
         if stats.retries > self._last_retries:
-            self._write(Event(t_ns, "servo", f"{stats.retries - self._last_retries} bus retries"))
+            self._recorder.write(Event(t_ns, "servo", f"{stats.retries - self._last_retries} bus retries"))
             self._last_retries = stats.retries
+
+
+class _CellWatch:
+    """Says when the load cell stops giving sound samples to compare with, and when it gives them again."""
+
+    def __init__(self) -> None:
+        self._last_ns: int | None = None
+        self._period_ns = 0.0
+        self._silent = False
+
+    def look(self, t_ns: int, samples: list[LoadCellSample]) -> str:
+        """Takes what came in a cycle. Returns the news, or an empty text."""
+        last_ns = t_ns if self._last_ns is None else self._last_ns
+        sound_ns = [sample.t_ns for sample in samples if sample.valid]
+        if sound_ns:
+            self._period_ns += 0.2 * ((sound_ns[-1] - last_ns) / len(sound_ns) - self._period_ns)
+            last_ns = sound_ns[-1]
+        self._last_ns = last_ns
+        silent = t_ns - last_ns > max(_CELL_PATIENCE_NS, _CELL_PERIODS * self._period_ns)
+        if silent == self._silent:
+            return ""
+        self._silent = silent
+        return "no sound sample; nothing to compare with" if silent else "sound samples again"
 
 
 @contextmanager
@@ -200,11 +236,10 @@ def open_session(
     config, controller = make_controller(config, devices)
     estimator = make_estimator(config, checkpoint)
     with ExitStack() as stack:
-        about = _metadata(config, devices, checkpoint)
-        log = LogWriter(path, config=dump_config(config), metadata=about)
-        session = Session(config, devices, controller, _perception(config, devices, estimator), log)
+        recorder = _recorder(config, devices, path, checkpoint)
+        session = Session(config, devices, controller, _perception(config, devices, estimator), recorder)
         stack.callback(_discard_unused, session, path)
-        stack.enter_context(log)
+        stack.callback(recorder.close)
         if not devices.lockstep:
             # Python's default lets a thread that computes keep the control thread waiting for 5 ms.
             stack.callback(sys.setswitchinterval, sys.getswitchinterval())
@@ -216,10 +251,9 @@ def open_session(
             session.start()
             yield session
         except BaseException as error:
-            with suppress(LogError):  # the first error is the one to tell
-                log.write(Event(devices.clock.now_ns(), "session", f"{type(error).__name__}: {error}"))
+            session.fail(error)
             raise
-    session.raise_losses()
+    recorder.raise_losses()
 
 
 @contextmanager
@@ -253,9 +287,11 @@ def run_grasp(config: Config, path: Path, progress: Progress | None = None) -> N
         ConfigError: The target is over the force limit.
         GripperError: Something failed. The servo was stopped as configured, and the log holds what was seen.
     """
-    if config.target_n > config.control.force_limit_n:
+    limit_n = config.control.force_limit_n
+    if config.target_n > largest_target_n(limit_n):
         raise ConfigError(
-            f"target_n {config.target_n:g} N is over control.force_limit_n {config.control.force_limit_n:g} N"
+            f"target_n {config.target_n:g} N is too near to control.force_limit_n {limit_n:g} N; ask for at "
+            f"most {largest_target_n(limit_n):g} N, or raise the limit"
         )
     checkpoint = load_checkpoint(config.vision.checkpoint) if _wants_vision(config) else None
     with open_devices(config) as devices, open_session(config, devices, path, checkpoint) as session:
@@ -270,7 +306,10 @@ def make_controller(config: Config, devices: Devices) -> tuple[Config, GraspCont
         gripper = gripper.model_copy(update={"nm_per_a": servo.nm_per_a})
     if gripper.current_step_a is None:
         gripper = gripper.model_copy(update={"current_step_a": servo.current_step_a})
-    config = config.model_copy(update={"gripper": gripper})
+    control = config.control
+    if control.voltage_limits_v is None:
+        control = control.model_copy(update={"voltage_limits_v": servo.voltage_range_v})
+    config = config.model_copy(update={"gripper": gripper, "control": control})
     return config, controller_from(config)
 
 
@@ -310,8 +349,11 @@ def _grasp(session: Session, config: Config, sees: bool, progress: Progress | No
             if status.t_ns - ended_ns >= keep_s * NS_PER_S:
                 break
         decision = session.cycle()
-    if config.on_exit == "hold" or status.outcome == Outcome.FAULT:
-        return  # a fault is latched: nothing moves until somebody has looked
+    if status.outcome == Outcome.FAULT:
+        _end_fault(session, config, status)
+        return
+    if config.on_exit == "hold":
+        return
     decision = session.cycle(RequestKind.RELEASE)
     while decision.status.phase == Phase.RELEASE:
         decision = session.cycle()
@@ -319,11 +361,36 @@ def _grasp(session: Session, config: Config, sees: bool, progress: Progress | No
         progress(decision.status)
 
 
+def _end_fault(session: Session, config: Config, status: GraspStatus) -> None:
+    """Lets jaws that are to open do so; otherwise nothing moves until somebody has looked."""
+    end_ns = status.t_ns + _OPENING_NS
+    while config.control.on_fault == "open" and status.t_ns < end_ns:
+        if is_open(config.gripper.open_width_m, status.width_m):
+            return
+        status = session.cycle().status
+
+
 def _wants_vision(config: Config) -> bool:
     return config.camera.backend != "none" and config.vision.checkpoint != "none"
 
 
-def _perception(config: Config, devices: Devices, estimator: ForceEstimator | None) -> Perception:
+def _recorder(config: Config, devices: Devices, path: Path, checkpoint: Checkpoint | None) -> Recorder:
+    about = _metadata(config, devices, checkpoint)
+    faults, clock, lockstep = Faults(config.faults, devices.start_ns), devices.clock, devices.lockstep
+
+    def through(file: BinaryIO) -> BinaryIO:
+        return (
+            cast(BinaryIO, FaultyFile(file, faults, clock, lockstep=lockstep)) if faults.has("disk") else file
+        )
+
+    log = LogWriter(path, config=dump_config(config), metadata=about, through=through)
+    return Recorder(log, lockstep=lockstep)
+
+
+def _perception(config: Config, devices: Devices, estimator: Estimator | None) -> Perception:
+    faults = Faults(config.faults, devices.start_ns)
+    if estimator is not None and faults.has("estimator"):
+        estimator = FaultyEstimator(estimator, faults, devices.clock, lockstep=devices.lockstep)
     if devices.lockstep:
         return LockstepPerception(devices.camera, estimator, devices.clock, config.vision.lockstep_compute_ms)
     return ThreadedPerception(devices.camera, estimator, devices.clock)

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from gripper_force.config import ControlConfig
 from gripper_force.control.force_loop import ForceLoop, Margin, tolerance_n
 from gripper_force.control.fusion import Fusion
-from gripper_force.control.limits import Limits
+from gripper_force.control.limits import Limits, largest_target_n
 from gripper_force.control.profile import Profile
+from gripper_force.control.safety import Safety, is_sound
 from gripper_force.control.transmission import Transmission
 from gripper_force.types import (
     NS_PER_S,
@@ -98,9 +99,11 @@ class GraspController:
     ``open -> approach -> contact -> ramp -> hold -> release -> open``, and ``fault`` from anywhere. A request
     pre-empts what goes on: a grasp while gripping ramps to the new target without letting go.
 
-    *Fault is latched.* A stop request, a hardware error, a temperature over the limit, or a reading that is
-    not finite leads there. The last goals stay, at a current that can only fall; what becomes of the torque
-    is the caller's matter. Only a release request leads out, and only once the cause is gone.
+    *Fault is latched.* A stop request leads there, and whatever trips `Safety`. The jaws then go limp, hold
+    where they are with a current that can only fall, or open, as ``on_fault`` says. Only a release request
+    leads out, and only once the cause is gone.
+
+    *A servo that grows hot* holds less, and says so.
 
     *The outcome* stays until the next grasp. After ``held`` it may still become ``slip``. The controller lets
     go by itself only of nothing: after ``no_object`` it opens. After ``slip`` or ``timeout`` it goes on as it
@@ -113,7 +116,9 @@ class GraspController:
         self._fusion = Fusion(config, transmission)
         self._loop = ForceLoop(config, transmission)
         self._limits = Limits(config, transmission, current_limit_a)
+        self._safety = Safety(config)
         self._travel = Profile(_SPEED_UP_S)
+        self._largest_target_n = largest_target_n(config.force_limit_n)
         self._free_push_n = config.approach_force_n + transmission.friction_n
         self._phase, self._outcome, self._reason = Phase.OPEN, Outcome.NONE, ""
         self._estimate = FusedForce(
@@ -128,6 +133,7 @@ class GraspController:
         self._phase_s = self._sign_s = self._settled_s = 0.0
         self._error_n = self._cruise_n = 0.0
         self._has_moved = self._was_over = False
+        self._easing = 1.0
 
     @property
     def margins(self) -> dict[str, Margin]:
@@ -150,11 +156,11 @@ class GraspController:
         """
         dt_s = self._elapsed_s(t_ns)
         self._reason = ""
-        problem = self._problem(servo)
+        tripped = self._safety.check(servo, dt_s, over_force=self._was_over)
         events = self._sense(t_ns, servo, visual)
-        if problem and self._phase != Phase.FAULT:
-            self._fail(problem)
-        if request is not None and (refusal := self._obey(t_ns, request, problem)):
+        if tripped:
+            self._fail()
+        if request is not None and (refusal := self._obey(t_ns, request)):
             events.append(Event(t_ns, "control", f"refused {request.kind!r}: {refusal}"))
         if self._width_m is not None:
             self._act(t_ns, dt_s, self._width_m, self._transmission.closing_m_s(servo.velocity_rad_s))
@@ -171,18 +177,8 @@ class GraspController:
         self._t_ns = t_ns
         return min(max(t_ns - before_ns, 0) / NS_PER_S, _MAX_CYCLE_S)
 
-    def _problem(self, servo: ServoState) -> str:
-        """What forbids to go on, or an empty text."""
-        if not _finite(servo):
-            return "the servo's reading is not finite"
-        if servo.hardware_error:
-            return f"the servo reports hardware error 0x{servo.hardware_error:02x}"
-        if servo.temperature_c > self._config.temperature_limit_c:
-            return f"the servo is at {servo.temperature_c:.0f} C"
-        return ""
-
     def _sense(self, t_ns: int, servo: ServoState, visual: VisualForce | None) -> list[Event]:
-        if not _finite(servo):
+        if not is_sound(servo):
             self._estimate = dataclasses.replace(self._estimate, t_ns=t_ns)
             return []
         width_m = self._transmission.width_m(servo.position_rad)
@@ -191,22 +187,35 @@ class GraspController:
         self._width_m = width_m
         closing_m_s = self._transmission.closing_m_s(servo.velocity_rad_s)
         free = self._cruises(closing_m_s)
-        opening = self._phase == Phase.RELEASE
-        self._estimate, events = self._fusion.step(t_ns, servo, visual, free=free, opening=opening)
-        return list(events)
+        opening = self._phase == Phase.RELEASE or self._opens_at_fault
+        self._estimate, fused = self._fusion.step(t_ns, servo, visual, free=free, opening=opening)
+        return [*fused, *self._ease(t_ns, servo.temperature_c)]
 
-    def _obey(self, t_ns: int, request: Request, problem: str) -> str:
+    def _ease(self, t_ns: int, temperature_c: float) -> list[Event]:
+        """Lowers the hold of a servo that grows hot, before the servo itself drops it."""
+        before, self._easing = self._easing, self._safety.easing(temperature_c)
+        if self._easing == before or self._phase not in (Phase.RAMP, Phase.HOLD):
+            return []
+        self._loop.retarget(self._wanted_n)
+        return [
+            Event(t_ns, "control", f"the servo is at {temperature_c:.0f} C; holding {self._wanted_n:.2f} N")
+        ]
+
+    def _obey(self, t_ns: int, request: Request) -> str:
         """Takes a request. Returns why it is refused, or an empty text."""
         if request.kind == RequestKind.STOP:
-            self._fail("stop requested")
-        elif self._phase == Phase.FAULT and (problem or request.kind != RequestKind.RELEASE):
-            return problem or "stopped or at fault; request a release first"
+            if self._safety.trip("stop requested"):
+                self._fail()
+        elif self._phase == Phase.FAULT and request.kind != RequestKind.RELEASE:
+            return "stopped or at fault; request a release first"
         elif request.kind == RequestKind.RELEASE:
+            if cause := self._safety.reset():
+                return cause
             self._release("release requested")
         elif request.kind != RequestKind.GRASP:
             return "there is no such request"
-        elif not 0 < request.target_n <= self._config.force_limit_n:
-            return f"a target of {request.target_n} N is not within 0 to {self._config.force_limit_n} N"
+        elif not 0 < request.target_n <= self._largest_target_n:
+            return f"a target of {request.target_n} N is not within 0 to {self._largest_target_n:g} N"
         else:
             self._grasp(t_ns, request.target_n)
         return ""
@@ -225,7 +234,7 @@ class GraspController:
         if self._phase == Phase.CONTACT:
             return
         if self._phase in (Phase.RAMP, Phase.HOLD):
-            self._loop.retarget(target_n)
+            self._loop.retarget(self._wanted_n)
             self._enter(Phase.RAMP, f"new target {target_n:g} N")
             return
         self._fusion.restart()
@@ -238,11 +247,24 @@ class GraspController:
         self._travel.start(self._present_width_m, 2 * self._config.approach_speed_m_s)
         self._enter(Phase.RELEASE, reason)
 
-    def _fail(self, reason: str) -> None:
-        if self._phase not in _GRIPPING:
+    def _fail(self) -> None:
+        reason = self._safety.reason
+        if self._config.on_fault == "open":
+            self._release(reason)
+        elif self._config.on_fault == "limp":
+            self._push_n = 0.0
+        if self._phase not in (*_GRIPPING, Phase.RELEASE):
             self._goal_width_m = self._present_width_m
         self._enter(Phase.FAULT, reason)
         self._conclude(Outcome.FAULT, reason)
+
+    @property
+    def _opens_at_fault(self) -> bool:
+        return self._phase == Phase.FAULT and self._config.on_fault == "open"
+
+    @property
+    def _wanted_n(self) -> float:
+        return self._target_n * self._easing
 
     @property
     def _touch_n(self) -> float:
@@ -260,13 +282,15 @@ class GraspController:
             case Phase.APPROACH:
                 self._approach(dt_s, width_m, closing_m_s)
             case Phase.CONTACT if self._phase_s >= _DWELL_S:
-                self._loop.start(self._estimate.force_n, self._target_n)
+                self._loop.start(self._estimate.force_n, self._wanted_n)
                 self._enter(Phase.RAMP, "contact has settled")
             case Phase.RAMP:
                 self._ramp(dt_s, width_m)
             case Phase.HOLD:
                 self._hold(dt_s, width_m)
             case Phase.RELEASE:
+                self._open(dt_s, width_m)
+            case Phase.FAULT if self._opens_at_fault:
                 self._open(dt_s, width_m)
         if self._phase in _GRIPPING:
             self._goal_width_m = max(width_m - 2 * _SQUEEZE_M, 0.0)
@@ -314,24 +338,24 @@ class GraspController:
         return (stalled and pressing) or (seen and closing_m_s < _SLOWED * self._speed_m_s)
 
     def _ramp(self, dt_s: float, width_m: float) -> None:
-        self._push_n = self._loop.step(dt_s, self._target_n, self._estimate)
+        self._push_n = self._loop.step(dt_s, self._wanted_n, self._estimate)
         if width_m < _CLOSED_M:
             self._conclude(Outcome.NO_OBJECT, "closed while the force was to rise")
             self._release(self._reason)
-        elif self._loop.reference_n == self._target_n:
-            self._error_n = self._estimate.force_n - self._target_n
-            self._enter(Phase.HOLD, f"at {self._target_n:g} N")
+        elif self._loop.reference_n == self._wanted_n:
+            self._error_n = self._estimate.force_n - self._wanted_n
+            self._enter(Phase.HOLD, f"at {self._wanted_n:g} N")
 
     def _hold(self, dt_s: float, width_m: float) -> None:
-        self._push_n = self._loop.step(dt_s, self._target_n, self._estimate)
-        error_n = self._estimate.force_n - self._target_n
+        self._push_n = self._loop.step(dt_s, self._wanted_n, self._estimate)
+        error_n = self._estimate.force_n - self._wanted_n
         self._error_n += (error_n - self._error_n) * dt_s / (dt_s + _SETTLE_FILTER_S)
-        is_near = abs(self._error_n) <= tolerance_n(self._target_n)
+        is_near = abs(self._error_n) <= tolerance_n(self._wanted_n)
         self._settled_s = self._settled_s + dt_s if is_near else 0.0
         if self._outcome == Outcome.NONE and self._settled_s >= self._config.settle_s:
             self._held_width_m = width_m
             self._conclude(Outcome.HELD, f"{self._estimate.force_n:.2f} N for {self._settled_s:.2f} s")
-        collapsed = self._lasts(self._estimate.force_n < _COLLAPSED * self._target_n, _COLLAPSE_S, dt_s)
+        collapsed = self._lasts(self._estimate.force_n < _COLLAPSED * self._wanted_n, _COLLAPSE_S, dt_s)
         if self._outcome in (Outcome.NONE, Outcome.HELD) and (slip := self._slip(width_m, collapsed)):
             self._conclude(Outcome.SLIP, slip)
 
@@ -350,9 +374,10 @@ class GraspController:
         open_width_m = self._transmission.open_width_m
         self._goal_width_m = self._travel.step(open_width_m, dt_s)
         self._goal_width_m = self._travel.value = min(self._goal_width_m, width_m + 2 * _LEAD_M)
-        if width_m > open_width_m - _OPEN_M:
+        if is_open(open_width_m, width_m):
             self._goal_width_m = open_width_m
-            self._enter(Phase.OPEN, "open")
+            if self._phase == Phase.RELEASE:
+                self._enter(Phase.OPEN, "open")
 
     def _watch_time(self, t_ns: int) -> None:
         if t_ns - self._grasp_ns > self._config.timeout_s * NS_PER_S:
@@ -370,8 +395,9 @@ class GraspController:
             self._transmission.position_rad(self._goal_width_m),
             abs(self._transmission.current_a(self._push_n)),
         )
-        may_rise = self._phase != Phase.FAULT
-        return self._limits.apply(wanted, self._estimate.force_n, dt_s, may_rise=may_rise)
+        may_rise = self._phase != Phase.FAULT or self._opens_at_fault
+        estimate = self._estimate
+        return self._limits.apply(wanted, estimate.force_n, estimate.friction_n, dt_s, may_rise=may_rise)
 
     def _status(self, t_ns: int) -> GraspStatus:
         return GraspStatus(
@@ -384,8 +410,6 @@ class GraspController:
         )
 
 
-def _finite(servo: ServoState) -> bool:
-    return all(
-        math.isfinite(number)
-        for number in (servo.position_rad, servo.velocity_rad_s, servo.current_a, servo.temperature_c)
-    )
+def is_open(open_width_m: float, width_m: float) -> bool:
+    """Whether jaws of an open width count as open."""
+    return width_m > open_width_m - _OPEN_M

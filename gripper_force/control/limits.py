@@ -3,15 +3,28 @@
 import math
 
 from gripper_force.config import ControlConfig
-from gripper_force.control.transmission import Transmission
+from gripper_force.control.transmission import FRICTION_STD, Transmission
 from gripper_force.errors import NonFiniteError
 from gripper_force.types import ServoCommand
 
 _RISE_FACTOR = 4.0
 """The push may rise this many times as fast as the force ramp."""
 
+_CERTAIN_SHARE = 0.95
+"""Share of the force limit to which the current is held: the torque constant is known to 10 %, and a force
+5 % beyond the limit is the most that may happen, whatever vision says."""
+
 _OVER_FORCE_FACTOR = 0.85
 """What is left of the goal current after each cycle that sees too much force: half within 25 ms at 200 Hz."""
+
+
+_TARGET_SHARE = 0.9
+"""Most of the force limit that can be asked for: a tenth is left to overshoot."""
+
+
+def largest_target_n(force_limit_n: float) -> float:
+    """The largest force that may be asked for under a force limit."""
+    return _TARGET_SHARE * force_limit_n
 
 
 class Limits:
@@ -23,8 +36,7 @@ class Limits:
     """
 
     def __init__(self, config: ControlConfig, transmission: Transmission, current_limit_a: float) -> None:
-        cap_n = config.force_limit_n + transmission.friction_n
-        self.ceiling_a = min(current_limit_a, abs(transmission.current_a(cap_n)))
+        self._transmission, self._current_limit_a = transmission, current_limit_a
         self._force_limit_n = config.force_limit_n
         self._rise_a_s = abs(transmission.current_a(_RISE_FACTOR * config.ramp_n_s))
         self._step_a = transmission.current_step_a
@@ -35,13 +47,14 @@ class Limits:
         self._last_a = 0.0
 
     def apply(
-        self, command: ServoCommand, force_n: float, dt_s: float, *, may_rise: bool
+        self, command: ServoCommand, force_n: float, friction_n: float, dt_s: float, *, may_rise: bool
     ) -> tuple[ServoCommand, bool]:
         """Bounds a command.
 
         Args:
             command: What the controller wants.
             force_n: The estimated contact force.
+            friction_n: What friction is known to take of the push.
             dt_s: Time since the last command.
             may_rise: Whether the goal current may exceed the last one at all.
 
@@ -51,8 +64,10 @@ class Limits:
         Raises:
             NonFiniteError: A number of the command, or the estimate, is not finite.
         """
-        self._refuse_non_finite(command, force_n)
-        ceiling_a = self.ceiling_a if may_rise else min(self.ceiling_a, self._last_a)
+        self._refuse_non_finite(command, force_n, friction_n)
+        ceiling_a = self.ceiling_a(friction_n)
+        if not may_rise:
+            ceiling_a = min(ceiling_a, self._last_a)
         over = force_n > self._force_limit_n
         if over:
             ceiling_a = min(ceiling_a, _OVER_FORCE_FACTOR * self._last_a)
@@ -61,6 +76,12 @@ class Limits:
         self._last_a = self._on_grid(wanted_a, ceiling_a)
         position_rad = min(max(command.goal_position_rad, self._low_rad), self._high_rad)
         return ServoCommand(command.t_ns, position_rad, self._last_a), over
+
+    def ceiling_a(self, friction_n: float) -> float:
+        """The most current that the force limit and the servo's own limit leave."""
+        most_friction_n = (1 + 3 * FRICTION_STD) * self._transmission.friction_n
+        most_n = _CERTAIN_SHARE * self._force_limit_n + min(max(friction_n, 0.0), most_friction_n)
+        return min(self._current_limit_a, abs(self._transmission.current_a(most_n)))
 
     def _on_grid(self, wanted_a: float, ceiling_a: float) -> float:
         if self._step_a == 0:
@@ -74,11 +95,12 @@ class Limits:
         return given_a
 
     @staticmethod
-    def _refuse_non_finite(command: ServoCommand, force_n: float) -> None:
+    def _refuse_non_finite(command: ServoCommand, force_n: float, friction_n: float) -> None:
         numbers = {
             "goal position": command.goal_position_rad,
             "goal current": command.goal_current_a,
             "force estimate": force_n,
+            "friction estimate": friction_n,
         }
         for name, number in numbers.items():
             if not math.isfinite(number):

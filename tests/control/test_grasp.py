@@ -215,8 +215,53 @@ def test_stop_wins_in_every_phase(make_run, phase):
     assert run.last.status.phase == "open"
 
 
+def test_at_fault_the_jaws_go_limp(make_run):
+    run = run_to(make_run(), "hold")
+    run.go(0.005, "stop")
+    assert run.last.command.goal_current_a == 0.0
+    run.go(1.0)
+    assert run.plant.force_n() <= run.plant.friction_n + 0.01
+
+
+def test_at_fault_the_hold_is_kept(make_run):
+    run = run_to(make_run(on_fault="hold"), "hold")
+    before_n = run.plant.force_n()
+    run.go(1.0, "stop")
+    assert run.plant.force_n() == pytest.approx(before_n, abs=0.1)
+
+
+@pytest.mark.parametrize("phase", ["approach", "ramp", "hold"])
+def test_at_fault_the_jaws_open(make_run, phase):
+    run = run_to(make_run(on_fault="open"), phase).go(3.0, "stop")
+    assert run.last.status.phase == "fault"
+    assert run.plant.x_m < 0.002
+    run.go(0.1, "grasp", 3.0)
+    assert run.last.status.phase == "fault"
+
+
+def test_a_servo_that_grows_hot_holds_less_and_says_so(make_run):
+    run = run_to(make_run(), "hold").go(1.0)
+    before_n, before_a = run.plant.force_n(), run.last.command.goal_current_a
+    run.spoil = lambda _, servo: replace(servo, temperature_c=65.0)
+    run.go(3.0)
+    assert run.last.status.outcome == "held"
+    assert run.last.status.reference_n == pytest.approx(0.8 * 4.0)
+    assert run.last.command.goal_current_a < before_a
+    assert run.plant.force_n() < before_n
+    assert any("at 65 C; holding 3.20 N" in text for text in run.texts)
+    run.spoil = lambda _, servo: servo
+    run.go(3.0)
+    assert run.last.status.reference_n == 4.0
+
+
+@pytest.mark.parametrize("gain", [0.92, 1.08])
+def test_an_eye_that_sees_too_little_can_not_force_the_limit(make_run, gain):
+    run = make_run(force_limit_n=5.0, plant={"gain": gain}, eye={"gain": 0.6}).grasp(4.4, 6.0)
+    assert max(sample.force_n for sample in run.cell) <= 1.05 * 5.0
+
+
 def test_stop_freezes_moving_jaws(make_run):
-    run = run_to(make_run(), "approach").go(0.3)
+    run = run_to(make_run(on_fault="hold"), "approach").go(0.3)
     run.go(0.2, "stop")
     where_m = run.plant.x_m
     run.go(1.0)

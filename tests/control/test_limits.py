@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gripper_force.config import ControlConfig, GripperConfig
-from gripper_force.control.limits import Limits
+from gripper_force.control.limits import Limits, largest_target_n
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import NonFiniteError
 from gripper_force.types import ServoCommand
@@ -17,7 +17,9 @@ CONFIG = ControlConfig()
 
 numbers = st.floats(allow_nan=False, allow_infinity=False)
 cycles = st.lists(
-    st.tuples(numbers, numbers, st.floats(-5, 30), st.floats(0, 0.05), st.booleans()), min_size=1, max_size=40
+    st.tuples(numbers, numbers, st.floats(-5, 30), numbers, st.floats(0, 0.05), st.booleans()),
+    min_size=1,
+    max_size=40,
 )
 
 
@@ -25,10 +27,12 @@ cycles = st.lists(
 @given(cycles, st.sampled_from([COARSE, FINE]), st.floats(0.01, 3.0))
 def test_no_output_ever_leaves_the_limits(cycles, transmission, limit_a):
     limits = Limits(CONFIG, transmission, limit_a)
-    cap_a = min(limit_a, (CONFIG.force_limit_n + transmission.friction_n) / transmission.n_per_a)
     last_a = 0.0
-    for position_rad, current_a, force_n, dt_s, may_rise in cycles:
-        out, over = limits.apply(ServoCommand(0, position_rad, current_a), force_n, dt_s, may_rise=may_rise)
+    for position_rad, current_a, force_n, friction_n, dt_s, may_rise in cycles:
+        wanted = ServoCommand(0, position_rad, current_a)
+        out, over = limits.apply(wanted, force_n, friction_n, dt_s, may_rise=may_rise)
+        believed_n = min(max(friction_n, 0.0), 2 * transmission.friction_n)
+        cap_a = min(limit_a, (CONFIG.force_limit_n + believed_n) / transmission.n_per_a)
         assert 0.0 <= out.goal_current_a <= cap_a
         low, high = sorted((transmission.open_position_rad, transmission.closed_position_rad))
         assert low <= out.goal_position_rad <= high
@@ -43,14 +47,14 @@ def test_no_output_ever_leaves_the_limits(cycles, transmission, limit_a):
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("where", [0, 1, 2])
+@pytest.mark.parametrize("where", [0, 1, 2, 3])
 def test_non_finite_is_refused(bad, where):
-    values = [0.0, 0.0, 0.0]
+    values = [0.0, 0.0, 0.0, 0.0]
     values[where] = bad
-    name = ("goal position", "goal current", "force estimate")[where]
+    name = ("goal position", "goal current", "force estimate", "friction estimate")[where]
     with pytest.raises(NonFiniteError, match=name):
         Limits(CONFIG, FINE, 1.0).apply(
-            ServoCommand(0, values[0], values[1]), values[2], 0.005, may_rise=True
+            ServoCommand(0, values[0], values[1]), values[2], values[3], 0.005, may_rise=True
         )
 
 
@@ -60,7 +64,7 @@ def test_rounding_keeps_the_mean_current(wanted_a):
     limits = Limits(CONFIG, COARSE, 1.0)
     given_a = []
     for _ in range(600):
-        out, _ = limits.apply(ServoCommand(0, 0.0, wanted_a), 0.0, 0.05, may_rise=True)
+        out, _ = limits.apply(ServoCommand(0, 0.0, wanted_a), 0.0, 0.95, 0.05, may_rise=True)
         given_a.append(out.goal_current_a)
     tail = given_a[-500:]
     assert sum(tail) / 500 == pytest.approx(wanted_a, abs=COARSE.current_step_a / 400)
@@ -71,8 +75,20 @@ def test_over_force_halves_within_five_cycles():
     limits = Limits(CONFIG, FINE, 1.0)
     wanted = ServoCommand(0, 0.0, 0.2)
     for _ in range(100):
-        limits.apply(wanted, 5.0, 0.005, may_rise=True)
+        limits.apply(wanted, 5.0, 0.95, 0.005, may_rise=True)
     for _ in range(5):
-        out, over = limits.apply(wanted, 13.0, 0.005, may_rise=True)
+        out, over = limits.apply(wanted, 13.0, 0.95, 0.005, may_rise=True)
     assert over
     assert out.goal_current_a < 0.1
+
+
+@settings(deadline=None)
+@given(st.floats(0.9, 1.1), st.floats(0.5, 1.5), st.floats(2.0, 60.0))
+def test_the_ceiling_keeps_the_limit_whatever_the_torque_constant_is(gain, friction_n, limit_n):
+    config = ControlConfig(force_limit_n=limit_n)
+    ceiling_a = Limits(config, FINE, 99.0).ceiling_a(friction_n)
+    assert gain * FINE.force_n(ceiling_a) - friction_n <= 1.05 * limit_n + 0.1 * friction_n
+
+
+def test_the_largest_target_leaves_room_below_the_limit():
+    assert largest_target_n(10.0) == pytest.approx(9.0)

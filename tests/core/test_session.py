@@ -227,7 +227,7 @@ def test_progress_tells_each_phase_once(quick: list[str], tmp_path: Path) -> Non
 
 
 def test_a_target_over_the_limit_is_refused_before_anything_moves(quick: list[str], tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"target_n 13 N is over control\.force_limit_n 12 N"):
+    with pytest.raises(ConfigError, match=r"target_n 13 N is too near to control\.force_limit_n 12 N"):
         run_grasp(load_config(None, [*quick, "target_n=13"]), tmp_path / "run.mcap")
     assert not list(tmp_path.iterdir())
 
@@ -353,7 +353,7 @@ def test_an_estimate_that_is_no_number_never_reaches_the_servo(
 @pytest.mark.parametrize("how", ["end", "error"])
 def test_hold_keeps_the_grip_and_disarms_the_watchdog(open_rig: tuple[ExitStack, OpenRig], how: str) -> None:
     run, begin = open_rig
-    rig = begin("on_exit=hold")
+    rig = begin("on_exit=hold", "control.on_fault=hold")
     rig.grip()
     goal = rig.register("goal_current")
     assert rig.register("bus_watchdog") > 0
@@ -366,6 +366,26 @@ def test_hold_keeps_the_grip_and_disarms_the_watchdog(open_rig: tuple[ExitStack,
     assert rig.register("goal_current") == goal > 0
     assert rig.register("bus_watchdog") == 0
     assert rig.last_write_to(BUS_WATCHDOG) == b"\0"
+
+
+@pytest.mark.parametrize("on_fault", ["limp", "hold", "open"])
+def test_a_fault_ends_as_configured(quick: list[str], tmp_path: Path, on_fault: str) -> None:
+    path = tmp_path / "run.mcap"
+    config = load_config(None, [*quick, f"control.on_fault={on_fault}"])
+    with open_devices(config) as devices:
+        bus = virtual.find_bus("rig")
+        assert bus is not None
+        with open_session(config, devices, path, None) as session:
+
+            def stop(status: GraspStatus) -> None:
+                if status.phase == Phase.HOLD:
+                    session.stop_soon()
+
+            session_module._grasp(session, config, False, stop)
+        last = list(LogReader(path).records(GraspStatus))[-1]
+        assert (last.phase, last.outcome) == (Phase.FAULT, Outcome.FAULT)
+        assert bus.servos[0].get("torque_enable") == (on_fault == "hold")
+        assert (last.width_m > 0.085) == (on_fault == "open")
 
 
 def test_hold_does_not_release_at_the_end_of_a_grasp(quick: list[str], tmp_path: Path) -> None:
@@ -413,6 +433,15 @@ def test_bus_retries_are_logged(open_rig: tuple[ExitStack, OpenRig], tmp_path: P
     rig.session.cycle()
     run.close()
     assert events(tmp_path / "run.mcap") == ["1 bus retries"]
+
+
+def test_a_load_cell_that_falls_silent_is_told(quick: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    run_grasp(load_config(None, [*quick, "faults=[{unit: load_cell, kind: off, at_s: 1, for_s: 0.5}]"]), path)
+    told = [e for e in LogReader(path).records(Event) if e.unit == "load_cell"]
+    assert [e.text for e in told] == ["no sound sample; nothing to compare with", "sound samples again"]
+    assert 1.0e9 < told[0].t_ns < 1.1e9
+    assert told[1].t_ns < 1.6e9
 
 
 # Stop and signals.

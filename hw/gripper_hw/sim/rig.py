@@ -4,7 +4,7 @@ import json
 import threading
 import time
 from collections import deque
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import asdict
 
 import cv2
@@ -14,10 +14,12 @@ import numpy.typing as npt
 from gripper_force.backends import MonotonicClock
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, SimulationError
-from gripper_force.interfaces import Clock
+from gripper_force.faults import Faults
+from gripper_force.interfaces import Camera, Clock, LoadCell
 from gripper_force.types import NS_PER_MS, NS_PER_S, Frame, Gray, LoadCellSample
 from gripper_hw.dynamixel.control_table import load_model
 from gripper_hw.dynamixel.virtual import VirtualBus, VirtualServo, register_bus, unregister_bus
+from gripper_hw.sim.faults import FaultyCamera, FaultyClock, FaultyLoadCell
 from gripper_hw.sim.scene import Scene, draw_scene
 from gripper_hw.sim.world import World
 
@@ -159,12 +161,24 @@ class SimulatedRig:
         self._exposure_ms = config.sim.exposure_ms
         self._lockstep = config.clock == "lockstep"
         start_ns = 0 if self._lockstep else time.monotonic_ns()
-        self.clock: Clock = LockstepClock(self._world) if self._lockstep else MonotonicClock()
-        self.camera = SimulatedCamera(self._world, self.scene, config, self.clock, start_ns)
-        self.load_cell = SimulatedLoadCell(self._world, config, start_ns)
+        faults = Faults(config.faults, start_ns)
+        clock: Clock = LockstepClock(self._world) if self._lockstep else MonotonicClock()
+        self.clock: Clock = clock
+        self._closing = ExitStack()
+        if faults.has("clock"):
+            self.clock = FaultyClock(clock, faults)
+            self._closing.callback(self.clock.close)
+        camera = SimulatedCamera(self._world, self.scene, config, clock, start_ns)
+        self.camera: Camera = camera
+        if faults.has("camera"):
+            self.camera = FaultyCamera(camera, faults, clock, config.seed)
+        load_cell = SimulatedLoadCell(self._world, config, start_ns)
+        self.load_cell: LoadCell = load_cell
+        if faults.has("load_cell"):
+            self.load_cell = FaultyLoadCell(load_cell, faults, clock, config.seed)
         self._bus_name = config.servo.port.removeprefix("virtual:")
         register_bus(self._bus_name, bus)
-        self._start_ns = start_ns
+        self.start_ns = start_ns
         self._failure: Exception | None = None
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
@@ -191,6 +205,7 @@ class SimulatedRig:
             self._thread.join()
             self._thread = None
         unregister_bus(self._bus_name)
+        self._closing.close()
         if self._lockstep:
             self._world.close()
 
@@ -201,7 +216,7 @@ class SimulatedRig:
     def _keep_pace(self) -> None:
         try:
             while not self._stop.is_set():
-                due_ns = time.monotonic_ns() - self._start_ns
+                due_ns = time.monotonic_ns() - self.start_ns
                 lag_ns = due_ns - self._world.t_ns
                 if lag_ns > _REALTIME_MAX_LAG_NS:
                     raise SimulationError(  # noqa: TRY301

@@ -1,0 +1,125 @@
+import math
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gripper_force.config import ControlConfig, config_from
+from gripper_force.control.safety import Safety, is_sound
+from gripper_force.errors import ConfigError
+from gripper_force.types import ServoState
+
+CONFIG = ControlConfig(voltage_limits_v=(10.0, 14.8))
+WELL = ServoState(
+    t_ns=0,
+    position_rad=0.3,
+    velocity_rad_s=0.0,
+    current_a=0.1,
+    temperature_c=35.0,
+    voltage_v=12.0,
+    hardware_error=0,
+)
+ILL = {
+    "position": ({"position_rad": math.nan}, "not finite"),
+    "velocity": ({"velocity_rad_s": math.inf}, "not finite"),
+    "current": ({"current_a": -math.inf}, "not finite"),
+    "temperature is nan": ({"temperature_c": math.nan}, "not finite"),
+    "voltage is nan": ({"voltage_v": math.nan}, "not finite"),
+    "overload": ({"hardware_error": 0x20}, "hardware error 0x20"),
+    "hot": ({"temperature_c": 71.0}, "71 C"),
+    "low": ({"voltage_v": 9.9}, "supply is at 9.9 V"),
+    "high": ({"voltage_v": 15.0}, "supply is at 15.0 V"),
+    "leap": ({"position_rad": 0.3 + 0.051}, "leapt"),
+}
+
+
+def check(safety, servo, dt_s=0.005, over_force=False):
+    return safety.check(servo, dt_s, over_force=over_force)
+
+
+def tripped_by(change):
+    safety = Safety(CONFIG)
+    assert not check(safety, WELL)
+    assert check(safety, replace(WELL, **change))
+    return safety
+
+
+@pytest.mark.parametrize(("change", "reason"), ILL.values(), ids=ILL)
+def test_what_forbids_to_go_on_trips_it_at_once(change, reason):
+    assert reason in tripped_by(change).reason
+
+
+@pytest.mark.parametrize(("change", "reason"), ILL.values(), ids=ILL)
+def test_it_is_latched_and_opens_only_once_the_cause_is_gone(change, reason):
+    safety = tripped_by(change)
+    assert reason in safety.reset()
+    assert reason in safety.reason
+    healed = replace(WELL, position_rad=change.get("position_rad", WELL.position_rad))
+    healed = healed if is_sound(healed) else WELL
+    assert not check(safety, healed)
+    assert reason in safety.reason  # still: nobody has asked
+    assert safety.reset() == ""
+    assert safety.reason == ""
+
+
+def test_the_first_reason_stays():
+    safety = Safety(CONFIG)
+    assert safety.trip("stop requested")
+    assert not safety.trip("something else")
+    assert not check(safety, replace(WELL, hardware_error=1))
+    assert safety.reason == "stop requested"
+
+
+def test_without_limits_any_voltage_will_do():
+    assert not check(Safety(ControlConfig()), replace(WELL, voltage_v=3.0))
+
+
+def test_a_fast_horn_does_not_leap():
+    safety = Safety(CONFIG)
+    for i in range(20):
+        moved = replace(WELL, t_ns=i * 5_000_000, position_rad=0.3 + i * 0.005 * 11)
+        assert not check(safety, moved)
+
+
+def test_a_force_that_stays_over_its_limit_trips_it():
+    safety = Safety(CONFIG)
+    assert not any(check(safety, WELL, over_force=i % 40 != 0) for i in range(400))
+    assert any(check(safety, WELL, over_force=True) for _ in range(60))
+    assert "over its limit" in safety.reason
+
+
+@given(st.floats(-40, 120), st.floats(0, 20))
+def test_a_hotter_servo_never_holds_more(temperature_c, hotter_c):
+    safety = Safety(CONFIG)
+    cooler, hotter = safety.easing(temperature_c), safety.easing(temperature_c + hotter_c)
+    assert 0.6 <= hotter <= cooler <= 1.0
+    assert cooler == 1.0 or temperature_c > CONFIG.warm_c
+
+
+readings = st.builds(
+    ServoState,
+    t_ns=st.integers(0, 10**12),
+    position_rad=st.floats(),
+    velocity_rad_s=st.floats(),
+    current_a=st.floats(),
+    temperature_c=st.floats(),
+    voltage_v=st.floats(),
+    hardware_error=st.integers(0, 255),
+)
+
+
+@given(st.lists(st.tuples(readings, st.booleans(), st.booleans())))
+def test_it_is_never_open_in_a_cycle_that_has_a_cause(cycles):
+    safety = Safety(CONFIG)
+    for servo, over_force, asks in cycles:
+        check(safety, servo, over_force=over_force)
+        refused = safety.reset() if asks else ""
+        assert not refused or safety.reason
+        assert safety.reason or (is_sound(servo) and not servo.hardware_error)
+
+
+@pytest.mark.parametrize("control", [{"warm_c": 70.0}, {"voltage_limits_v": [14.8, 10.0]}])
+def test_limits_out_of_order_are_refused(control):
+    with pytest.raises(ConfigError, match="must lie below"):
+        config_from({"control": control}, "test")
