@@ -20,7 +20,7 @@ from gripper_hw.dynamixel.virtual import VirtualBus, find_bus
 
 VIRTUAL_PREFIX: Final = "virtual:"
 
-_MAX_DRAINS: Final = 10
+_MAX_BYTES: Final = 4096  # what a scan of all ids brings; more is a line that never falls silent
 
 
 class Port(Protocol):
@@ -33,7 +33,7 @@ class Port(Protocol):
         ...
 
     def drain(self) -> None:
-        """Waits until no late answer comes any more, and throws away what came."""
+        """Throws away what comes until the time for an answer is over."""
         ...
 
 
@@ -66,6 +66,7 @@ class SerialPort(PortHandler):  # type: ignore[misc]
         self.ser: serial.Serial | None = None
         self._margin_ms = reply_margin_ms
         self._sent = 0
+        self._left = 0
 
     def setupPort(self, cflag_baud: int) -> bool:  # noqa: N802
         """Opens the line. Raises as `open_port` says."""
@@ -101,6 +102,7 @@ class SerialPort(PortHandler):  # type: ignore[misc]
         """Sends a packet and returns how many bytes were taken."""
         data = bytes(packet)
         self._sent = len(data)
+        self._left = _MAX_BYTES
         try:
             return os.write(self._fd(), data)
         except BlockingIOError:
@@ -110,10 +112,13 @@ class SerialPort(PortHandler):  # type: ignore[misc]
 
     def readPort(self, length: int) -> bytes:  # noqa: N802
         """Returns up to ``length`` bytes, as soon as there is one, or none once the packet's time is over."""
+        length = min(length, self._left)
         if length <= 0:
             return b""
         left_s = (self.packet_start_time + self.packet_timeout - self.getCurrentTime()) / 1e3
-        return self._read(length, max(0.0, left_s))
+        data = self._read(length, max(0.0, left_s))
+        self._left -= len(data)
+        return data
 
     def getCurrentTime(self) -> float:  # noqa: N802
         """Monotonic time in ms; the SDK's own steps with the wall clock."""
@@ -124,10 +129,9 @@ class SerialPort(PortHandler):  # type: ignore[misc]
         self.setPacketTimeoutMillis(self.tx_time_per_byte * (packet_length + self._sent) + self._margin_ms)
 
     def drain(self) -> None:
-        """Reads until the line was quiet for one reply margin."""
-        for _ in range(_MAX_DRAINS):
-            if not self._read(4096, self._margin_ms / 1e3):
-                return
+        """Throws away what comes until the time for an answer is over."""
+        while not self.isPacketTimeout():
+            self.readPort(_MAX_BYTES)
 
     def _read(self, length: int, timeout_s: float) -> bytes:
         try:

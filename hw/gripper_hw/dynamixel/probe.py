@@ -5,7 +5,6 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final, Self
 
-from dynamixel_sdk import GroupSyncRead
 from serial.tools import list_ports
 
 from gripper_force.backends import open_devices
@@ -20,7 +19,7 @@ from gripper_hw.dynamixel.control_table import (
     model_names,
 )
 from gripper_hw.dynamixel.port import VIRTUAL_PREFIX, open_port
-from gripper_hw.dynamixel.servo import _READ_BLOCK, DynamixelBus, _hardware_error_text
+from gripper_hw.dynamixel.servo import DynamixelBus, _hardware_error_text
 
 _SYSFS: Final = Path("/sys/bus/usb-serial/devices")
 _CYCLES: Final = 200
@@ -133,9 +132,7 @@ class _Line(DynamixelBus):
                 yield judged(unit, name.replace("_", " "), text, same, advice, harmless=True)
         if not able:
             return
-        size = _READ_BLOCK.size
-        self._reader = GroupSyncRead(self._port, self._packets, REGISTERS["present_current"].address, size)
-        self._reader.addParam(id_)
+        self._data = REGISTERS["present_current"].address  # as many bytes as a cycle's, wherever they lie
         median_ms, p99_ms = time_ms(lambda: self._transact("a fast sync read", self._read_once), _CYCLES)
         found = f"median {median_ms:.2f} ms, p99 {p99_ms:.2f} ms of {_CYCLES} reads"
         rate_hz, lockstep = config.control.rate_hz, config.clock == "lockstep"

@@ -9,9 +9,16 @@ import struct
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
-from dynamixel_sdk import COMM_RX_CORRUPT, COMM_SUCCESS, GroupSyncRead, GroupSyncWrite, PacketHandler
+from dynamixel_sdk import COMM_RX_CORRUPT, COMM_SUCCESS, PacketHandler
+from dynamixel_sdk.protocol2_packet_handler import (
+    PKT_ERROR,
+    PKT_ID,
+    PKT_INSTRUCTION,
+    PKT_LENGTH_H,
+    PKT_LENGTH_L,
+)
 
 from gripper_force.config import ServoConfig
 from gripper_force.errors import (
@@ -35,6 +42,7 @@ from gripper_hw.dynamixel.control_table import (
     rad_from_ticks,
     ticks_from_rad,
 )
+from gripper_hw.dynamixel.packets import BROADCAST_ID
 from gripper_hw.dynamixel.port import Port, open_port
 
 _READ: Final = {  # name: bytes
@@ -53,6 +61,10 @@ _INDIRECT_ADDRESSES: Final = tuple(
     REGISTERS[name].address + offset for name, size in (_READ | _WRITE).items() for offset in range(size)
 )
 _VOLTAGE_UNIT_V: Final = 0.1
+
+_LENGTHS: Final = 8
+"""A read asks for 0 to 7 bytes more than it needs, each time another number: an answer to one of the seven
+requests before has another length. The most fills the 20 bytes of an XL330's indirect data."""
 
 _TRAVEL_RAD: Final = 255 * 2 * math.pi  # a turn less than Goal Position takes either way
 _TORQUE_OFF_TRIES: Final = 5
@@ -111,8 +123,8 @@ class DynamixelBus:
         self._watchdog = math.ceil(config.bus_watchdog_ms / WATCHDOG_UNIT_MS)
         self._expected_watchdog = 0
         self._port: Port | None = None
-        self._reader: Any = None
-        self._writer: Any = None
+        self._requests = 0
+        self._data = 0  # where the cycle reads, and behind it writes
 
     def start(self) -> tuple[ServoState, ...]:
         """Opens the port, sets every servo up, and turns torque on at the present position with no current.
@@ -134,7 +146,7 @@ class DynamixelBus:
             window = self._common_window()
             for id_ in self.ids:
                 self._set_up(id_, window)
-            self._group(window)
+            self._data = window.data
             for id_, state in zip(self.ids, self.read(), strict=True):
                 self._energise(id_, state)
             self._expected_watchdog = self._watchdog
@@ -190,7 +202,7 @@ class DynamixelBus:
         """Releases the port and leaves torque as it is. May be called twice."""
         if self._port is not None:
             self._port.closePort()
-            self._port = self._reader = self._writer = None
+            self._port = None
 
     # Start.
 
@@ -215,11 +227,9 @@ class DynamixelBus:
 
     def _ask_for_answers(self, id_: int) -> None:
         """Another program may have left the servo mute; a sync write is a write that awaits no answer."""
-        register = REGISTERS["status_return_level"]
-        self._transact(
-            f"a sync write to servo {id_}",
-            lambda: (self._packets.syncWriteTxOnly(self._port, register.address, 1, [id_, 2], 2), None),
-        )
+        address = REGISTERS["status_return_level"].address
+        params = bytes((id_, 2))
+        self._transact(f"a sync write to servo {id_}", lambda: (self._sync_write(address, 1, params), None))
 
     def _common_window(self) -> IndirectWindow:
         """One transaction has one address for all, so all must have their indirect data in one place."""
@@ -258,15 +268,6 @@ class DynamixelBus:
                 f"servo {id_} did not take its indirect addresses; power-cycle it and start again"
             )
 
-    def _group(self, window: IndirectWindow) -> None:
-        self._reader = GroupSyncRead(self._port, self._packets, window.data, _READ_BLOCK.size)
-        self._writer = GroupSyncWrite(
-            self._port, self._packets, window.data + _READ_BLOCK.size, _WRITE_BLOCK.size
-        )
-        for id_ in self.ids:
-            self._reader.addParam(id_)
-            self._writer.addParam(id_, bytes(_WRITE_BLOCK.size))
-
     def _energise(self, id_: int, state: ServoState) -> None:
         self._set(id_, "goal_current", 0)
         self._set(id_, "goal_position", ticks_from_rad(state.position_rad))
@@ -296,15 +297,18 @@ class DynamixelBus:
 
     def _read_once(self) -> tuple[int, tuple[int, list[bytes]]]:
         t_ns = self._clock_ns()
-        result = self._reader.fastSyncRead()
-        blocks = [bytes(self._reader.data_dict[id_]) for id_ in self.ids]
-        whole = all(len(block) == _READ_BLOCK.size for block in blocks)
-        return result if whole or result != COMM_SUCCESS else COMM_RX_CORRUPT, (t_ns, blocks)
+        asked = self._length(_READ_BLOCK.size)
+        sent = self._packets.syncReadTx(self._port, self._data, asked, self.ids, len(self.ids), True)
+        step = asked + 4  # error number and id come before a servo's data, a CRC after
+        result, answer = self._answer(sent, BROADCAST_ID, step * len(self.ids) - 2)
+        if result == COMM_SUCCESS and answer[1::step] != bytes(self.ids):
+            result = COMM_RX_CORRUPT
+        starts = range(2, len(answer), step)
+        return result, (t_ns, [answer[start : start + _READ_BLOCK.size] for start in starts])
 
     def _write_once(self, blocks: Sequence[bytes]) -> tuple[int, None]:
-        for id_, block in zip(self.ids, blocks, strict=True):
-            self._writer.changeParam(id_, block)
-        return self._writer.txPacket(), None
+        params = b"".join(bytes((id_,)) + block for id_, block in zip(self.ids, blocks, strict=True))
+        return self._sync_write(self._data + _READ_BLOCK.size, _WRITE_BLOCK.size, params), None
 
     def _state(self, t_ns: int, id_: int, block: bytes) -> ServoState:
         current, velocity, ticks, hardware_error, temperature, voltage, watchdog = _READ_BLOCK.unpack(block)
@@ -356,9 +360,10 @@ class DynamixelBus:
         what = f"a read of {size} bytes at {address} of servo {id_}"
 
         def once() -> tuple[int, bytes]:
-            data, result, error = self._packets.readTxRx(self._port, id_, address, size)
-            result = _checked(what, result, error)
-            return result if len(data) == size or result != COMM_SUCCESS else COMM_RX_CORRUPT, bytes(data)
+            asked = self._length(size)
+            sent = self._packets.readTx(self._port, id_, address, asked)
+            result, answer = self._answer(sent, id_, 1 + asked)
+            return _checked(what, result, answer[0] if answer else 0), answer[1 : 1 + size]
 
         return self._transact(what, once)
 
@@ -371,16 +376,41 @@ class DynamixelBus:
 
         self._transact(what, once)
 
+    def _sync_write(self, address: int, size: int, params: bytes) -> int:
+        result: int = self._packets.syncWriteTxOnly(self._port, address, size, params, len(params))
+        return result
+
+    def _length(self, size: int) -> int:
+        """How many bytes a read asks for to get ``size``: see `_LENGTHS`."""
+        self._requests += 1
+        return size + self._requests % _LENGTHS
+
+    def _answer(self, sent: int, id_: int, size: int) -> tuple[int, bytes]:
+        """Listens for the answer to what was ``sent``, and passes over those to requests before.
+
+        The SDK's own reads compare the id alone, and cut an answer to the length that they look for.
+
+        Returns:
+            The SDK's result code, and ``size`` bytes from the error number on; or 1, where that is no 0.
+        """
+        result = sent
+        while result == COMM_SUCCESS:
+            packet, result = self._packets.rxPacket(self._port, id_ == BROADCAST_ID)
+            if result != COMM_SUCCESS:
+                break
+            length = packet[PKT_LENGTH_L] | packet[PKT_LENGTH_H] << 8
+            answer = bytes(packet[PKT_ERROR : PKT_INSTRUCTION + length - 2])
+            whole = len(answer) == size or (len(answer) == 1 and answer[0] & _ERROR_MASK)
+            if whole and packet[PKT_ID] == id_:
+                return result, answer
+        return result, b""
+
     def _ping_once(self, id_: int) -> tuple[int, int]:
         number, result, error = self._packets.ping(self._port, id_)
         return _checked(f"a ping of servo {id_}", result, error), number
 
     def _transact(self, what: str, once: Callable[[], tuple[int, _T]]) -> _T:
-        """Tries a transaction until it succeeds; ``once`` returns the SDK's result code and a value.
-
-        The SDK takes a late answer for the next one's, as only the id is compared: after each failure the
-        line is drained first.
-        """
+        """Tries a transaction until it succeeds; ``once`` returns the SDK's result code and a value."""
         if self._port is None:
             raise DeviceError(
                 f"the servo's port {self._config.port} is not open, so {what} was not sent; start first"
@@ -398,7 +428,7 @@ class DynamixelBus:
                 self.stats.corrupt += 1
             else:
                 self.stats.timeouts += 1
-            self._port.drain()
+            self._port.drain()  # or the rest of a damaged answer would meet the next request on the line
         raise DeviceTimeoutError(
             f"no sound answer to {what} on {self._config.port} after {self._config.retries + 1} tries; check "
             "cable, power, and that the adapter's latency timer is below servo.reply_margin_ms"

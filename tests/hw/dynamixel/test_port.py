@@ -1,5 +1,6 @@
 import os
 import pty
+import threading
 import tty
 
 import dynamixel_sdk as sdk
@@ -63,6 +64,7 @@ def test_a_closed_port_is_lost(line):
 def test_what_was_received_before_is_not_the_next_answer(line):
     port = open_port(line.port, 1_000_000, 250.0)
     port.writePort(PING)
+    port.setPacketTimeoutMillis(100.0)
     port.drain()
     port.setPacketTimeoutMillis(1.0)
     assert port.readPort(100) == b""
@@ -107,6 +109,28 @@ def test_the_time_for_an_answer_counts_both_packets_and_the_margin(deaf_line):
     deaf_line.writePort(PING)
     deaf_line.setPacketTimeout(100)
     assert deaf_line.packet_timeout == pytest.approx(110 * 10_000 / 57_600 + 4.0)
+
+
+def test_a_line_that_never_falls_silent_is_given_up():
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    port = open_port(os.ttyname(slave), 1_000_000, 4.0)
+    done = threading.Event()
+
+    def babble():
+        while not done.is_set():
+            os.write(master, bytes(64))
+
+    thread = threading.Thread(target=babble)
+    thread.start()
+    assert PACKETS.ping(port, 1)[1] == sdk.COMM_RX_CORRUPT
+    port.drain()
+    done.set()
+    port.clearPort()  # or the last write would wait for ever
+    thread.join()
+    port.closePort()
+    os.close(master)
+    os.close(slave)
 
 
 def test_a_line_that_takes_no_more_is_not_lost(deaf_line):
