@@ -47,7 +47,7 @@ _REFERENCE_NS = NS_PER_S // 10
 _OPENING_NS = 3 * NS_PER_S
 """How long jaws that are to open at a fault may take."""
 
-_CELL_PATIENCE_NS = 75 * NS_PER_MS
+_CELL_PATIENCE_NS = 45 * NS_PER_MS
 _CELL_PERIODS = 8
 """A load cell without a sound sample for so long, and for so many of its periods, says nothing any more."""
 

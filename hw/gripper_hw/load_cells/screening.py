@@ -14,8 +14,14 @@ from gripper_force.interfaces import Clock
 from gripper_force.spikes import HAMPEL_HALF_WINDOW, find_spikes
 from gripper_force.types import NS_PER_S, LoadCellSample
 
-STUCK_NS: Final = NS_PER_S
-"""A reading that stays the same to the bit for longer is no live converter's, as that always has noise."""
+STUCK_NS: Final = NS_PER_S // 20
+STUCK_SAMPLES: Final = 10
+"""A reading that stays the same to the bit for longer, and for so many samples, is no live converter's, as
+that always has noise."""
+
+DOUBT_SAMPLES: Final = 20
+DOUBT_SHARE: Final = 0.4
+"""Where more of the last samples than this were rejected, none of the others is to be believed either."""
 
 PATIENCE_NS: Final = NS_PER_S
 """How long a sample waits for those after it. At 10 samples/s, the slowest HX711, they take 0.3 s."""
@@ -30,6 +36,7 @@ class LoadCellStats:
         stuck: The reading stayed the same for too long.
         not_finite: The force is no finite number; that of every sample where the cell is not calibrated.
         spikes: See `find_spikes`.
+        doubtful: Too many of the samples around it were rejected.
         unreadable: Lines that are none of the configured format; they give no sample.
         losses: How often the device went away.
     """
@@ -38,6 +45,7 @@ class LoadCellStats:
     stuck: int = 0
     not_finite: int = 0
     spikes: int = 0
+    doubtful: int = 0
     unreadable: int = 0
     losses: int = 0
 
@@ -60,18 +68,20 @@ class Screen:
         self._waiting: list[LoadCellSample] = []
         self._before_n: deque[float] = deque(maxlen=HAMPEL_HALF_WINDOW)
         self._last_raw = math.nan
-        self._last_ns = self._same_since_ns = 0
+        self._last_ns = self._same_since_ns = self._same = 0
+        self._rejected: deque[bool] = deque(maxlen=DOUBT_SAMPLES)
 
     def add(self, t_ns: int, raw: float, *, saturated: bool = False) -> None:
         """Takes a reading that came at ``t_ns``."""
-        if raw != self._last_raw or t_ns - self._last_ns > STUCK_NS:
-            self._same_since_ns = t_ns
+        if raw != self._last_raw or t_ns - self._last_ns > PATIENCE_NS:
+            self._same_since_ns, self._same = t_ns, 0
+        self._same += 1
         self._last_raw, self._last_ns = raw, t_ns
         force_n = (raw - self._tare_raw) * self._n_per_raw
         valid = False
         if saturated:
             self.stats.saturated += 1
-        elif self._noisy and t_ns - self._same_since_ns > STUCK_NS:
+        elif self._noisy and self._same > STUCK_SAMPLES and t_ns - self._same_since_ns > STUCK_NS:
             self.stats.stuck += 1
         elif not math.isfinite(force_n):
             self.stats.not_finite += 1
@@ -95,6 +105,10 @@ class Screen:
                 if next(spikes):
                     self.stats.spikes += 1
                     taken[i] = replace(sample, valid=False)
+            self._rejected.append(not taken[i].valid)
+            if taken[i].valid and sum(self._rejected) > DOUBT_SHARE * DOUBT_SAMPLES:
+                self.stats.doubtful += 1
+                taken[i] = replace(sample, valid=False)
         return taken
 
     def _ready(self, now_ns: int) -> int:

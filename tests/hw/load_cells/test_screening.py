@@ -3,14 +3,22 @@ import math
 import numpy as np
 import numpy.typing as npt
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from gripper_force.config import LoadCellConfig
 from gripper_force.errors import ConfigError
 from gripper_force.spikes import HAMPEL_HALF_WINDOW, find_spikes
 from gripper_force.types import NS_PER_S, LoadCellSample
-from gripper_hw.load_cells.screening import PATIENCE_NS, STUCK_NS, LiveLoadCell, Screen
+from gripper_hw.load_cells.screening import (
+    DOUBT_SAMPLES,
+    DOUBT_SHARE,
+    PATIENCE_NS,
+    STUCK_NS,
+    STUCK_SAMPLES,
+    LiveLoadCell,
+    Screen,
+)
 
 RATE_HZ = 80
 PERIOD_NS = NS_PER_S // RATE_HZ
@@ -55,14 +63,15 @@ def test_every_reading_is_handed_out_once_in_order_and_unchanged(
     assert np.array_equal([s.raw for s in taken], [raw for raw, _ in readings], equal_nan=True)
     assert all(math.isfinite(s.force_n) for s in taken if s.valid)
     stats = screen.stats
-    rejected = stats.saturated + stats.stuck + stats.not_finite + stats.spikes
+    rejected = stats.saturated + stats.stuck + stats.not_finite + stats.spikes + stats.doubtful
     assert rejected == sum(not s.valid for s in taken)
 
 
 @given(st.lists(st.floats(0.0, 60.0), max_size=40), batches)
 def test_live_samples_are_judged_as_those_of_a_recording(forces_n: list[float], every: int) -> None:
     taken = screened(calibrated(noisy=False), forces_n, every)
-    expected = ~find_spikes(np.array(forces_n)) if forces_n else []
+    expected = ~find_spikes(np.array(forces_n)) if forces_n else np.array([])
+    assume((~expected.astype(bool)).sum() <= DOUBT_SHARE * DOUBT_SAMPLES)
     assert [s.valid for s in taken] == list(expected)
 
 
@@ -126,9 +135,23 @@ def test_a_converter_that_says_the_same_for_too_long_is_stuck() -> None:
     raws = np.concatenate([np.arange(10), np.full(2 * RATE_HZ, 9.0), [10, 11]])
     screen = calibrated()
     taken = screened(screen, raws)
-    since_ns = taken[9].t_ns
-    assert all(s.valid == (s.raw != 9.0 or s.t_ns - since_ns <= STUCK_NS) for s in taken)
-    assert screen.stats.stuck == sum(not s.valid for s in taken) > 0.9 * RATE_HZ
+    since_ns, least_ns = taken[9].t_ns, max(STUCK_NS, (STUCK_SAMPLES - 1) * PERIOD_NS)
+    assert all(s.valid for s in taken if s.t_ns - since_ns <= least_ns)
+    assert not any(s.valid for s in taken if s.raw == 9.0 and s.t_ns - since_ns > least_ns)
+    assert screen.stats.stuck > 1.8 * RATE_HZ
+
+
+def test_among_garbage_little_is_believed() -> None:
+    rng = np.random.default_rng(0)
+    raws = np.concatenate(
+        [5 + 0.02 * rng.normal(size=30), rng.uniform(-200, 200, 200), 5 + 0.02 * rng.normal(size=60)]
+    )
+    screen = calibrated()
+    taken = screened(screen, raws)
+    believed = [i for i, s in enumerate(taken) if s.valid and 30 + DOUBT_SAMPLES <= i < 225]
+    assert len(believed) < 175 / 3
+    assert screen.stats.doubtful > 50
+    assert all(s.valid for s in taken[260:])
 
 
 def test_an_indicator_may_rest_on_one_value() -> None:
@@ -136,7 +159,7 @@ def test_an_indicator_may_rest_on_one_value() -> None:
 
 
 def test_the_same_reading_after_a_gap_is_not_stuck() -> None:
-    assert all(s.valid for s in screened(calibrated(), np.full(5, 7.0), period_ns=STUCK_NS + 1))
+    assert all(s.valid for s in screened(calibrated(), np.full(50, 7.0), period_ns=PATIENCE_NS + 1))
 
 
 def test_a_saturated_reading_is_kept_and_hides_no_spike_beside_it() -> None:
