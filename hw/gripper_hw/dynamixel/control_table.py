@@ -29,7 +29,7 @@ class Register(NamedTuple):
         access: ``r`` or ``rw``.
         signed: Two's complement.
         unit: Unit of one step; empty for a pure number.
-        initial: Factory setting; None where each model has its own.
+        initial: Factory setting; None where a model has its own, or lacks the register.
         range: Least and greatest value that may be written; None where nothing but the size bounds it.
     """
 

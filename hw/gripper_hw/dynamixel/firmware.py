@@ -1,7 +1,8 @@
 """What runs inside one virtual X-series servo: its control table, access rules, safety and motor control.
 
 Source: https://emanual.robotis.com/docs/en/dxl/x/xm430-w350/ and https://emanual.robotis.com/docs/en/dxl/protocol2/.
-Left out: profiles, the secondary id, reverse drive, and feed-forward gains, which are stored and do nothing.
+Left out: profiles, the secondary id, reverse drive, feed-forward gains, PWM Slope and Startup Configuration,
+which are stored and do nothing, and the backup of the control table.
 """
 
 import math
@@ -63,6 +64,7 @@ class VirtualServo:
         model: Its model.
         tripped: True after a Bus Watchdog trip, until 0 is written to the watchdog: the goals are read-only.
         silent_until_ns: It is rebooting, and deaf, before this time.
+        excess_a: Fault: current that the motor is given beyond what its goals ask, while torque is on.
     """
 
     def __init__(self, id: int, model: ServoModel, firmware: int = 52) -> None:
@@ -86,6 +88,7 @@ class VirtualServo:
         self._fed_ns = 0
         self._registered: tuple[int, bytes] | None = None
         self.silent_until_ns = 0
+        self.excess_a = 0.0
         self._reset(eeprom=True)
         self._poke("firmware_version", firmware)
         self._poke("id", id)
@@ -119,12 +122,13 @@ class VirtualServo:
         if self._torque_on and not self.tripped:
             wanted_a = self._wanted_current_a(dt_s)
             self._current_a += (wanted_a - self._current_a) * -math.expm1(-dt_s / CURRENT_LOOP_S)
+            given_a = self._current_a + math.copysign(self.excess_a, self._current_a)
         else:
-            self._current_a = 0.0
+            given_a = self._current_a = 0.0
             self._pwm = 0.0
             self._integral = 0.0
-        self._measured_a = self._current_a + current_noise_a
-        return self._current_a
+        self._measured_a = given_a + current_noise_a
+        return given_a
 
     def sense(self, *, temperature_c: float | None = None, voltage_v: float | None = None) -> None:
         """Sets temperature and supply, and raises the hardware error that they mean."""
@@ -379,11 +383,13 @@ def _pointers(windows: tuple[IndirectWindow, ...]) -> dict[int, int]:
 
 
 def _registers_of(model: ServoModel, windows: tuple[IndirectWindow, ...]) -> tuple[Register, ...]:
-    """The shared registers with the model's own values, and its indirect addresses and data."""
+    """The shared registers that the model has, with its own values, and its indirect addresses and data."""
     pointers = _pointers(windows)
     own = {"model_number": model.number, **model.initial}
     registers = [
-        register._replace(initial=own.get(name, register.initial)) for name, register in REGISTERS.items()
+        register._replace(initial=initial)
+        for name, register in REGISTERS.items()
+        if (initial := own.get(name, register.initial)) is not None
     ]
     greatest = max([*pointers, _LAST_ADDRESS])
     for data, pointer in pointers.items():

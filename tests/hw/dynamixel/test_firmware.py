@@ -25,6 +25,9 @@ from gripper_hw.dynamixel.firmware import (
 from gripper_hw.dynamixel.packets import Error
 
 MODEL = load_model("XM430-W350")
+COMPLETE = load_model("XL330-M288")
+"""It has every register."""
+
 MS = 1_000_000
 
 
@@ -71,11 +74,17 @@ def test_read_only_registers_refuse_writes(name):
     assert write(VirtualServo(1, MODEL), name, 0) is Error.ACCESS
 
 
+def test_a_model_has_its_own_registers_only():
+    startup = REGISTERS["startup_configuration"].address
+    assert VirtualServo(1, COMPLETE).read(startup, 1) == (Error.NONE, b"\0")
+    assert VirtualServo(1, MODEL).read(startup, 1) == (Error.ACCESS, b"")
+
+
 @pytest.mark.parametrize(
     "name", [name for name, entry in REGISTERS.items() if entry.access == "rw" and entry.eeprom]
 )
 def test_the_eeprom_is_locked_while_torque_is_on(name):
-    servo = VirtualServo(1, MODEL)
+    servo = VirtualServo(1, COMPLETE)
     before = servo.get(name)
     assert write(servo, name, before) is Error.NONE or name == "secondary_id"
     servo.set("torque_enable", 1)
@@ -86,7 +95,7 @@ def test_the_eeprom_is_locked_while_torque_is_on(name):
     "name", [name for name, entry in REGISTERS.items() if entry.access == "rw" and entry.range]
 )
 def test_values_beyond_the_range_are_refused_and_the_bounds_taken(name):
-    servo = VirtualServo(1, MODEL)
+    servo = VirtualServo(1, COMPLETE)
     servo.set("operating_mode", CURRENT_BASED_POSITION_MODE)
     register = REGISTERS[name]
     for bound, beyond in (
