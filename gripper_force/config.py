@@ -24,6 +24,9 @@ class Section(BaseModel):
 
 S = TypeVar("S", bound=Section)
 
+_NO_YAML = (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, RecursionError)
+"""What the parser lets out: of a date such as 2001-99-99, a number such as 0b, a tag such as !!bool x."""
+
 
 class ServoConfig(Section):
     """The servo and its bus."""
@@ -295,13 +298,10 @@ def load_config(path: Path | None = None, overrides: list[str] | None = None) ->
     tree: dict[str, Any] = {}
     if path is not None:
         try:
-            loaded = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-            reason = " ".join(str(error).split())
-            raise ConfigError(f"can't read the configuration {path}: {reason}") from error
-        if not isinstance(loaded, dict | None):
-            raise ConfigError(f"{path} holds no mapping of keys to values at its top level")
-        tree = loaded or {}
+            text = path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(f"can't read the configuration {path}: {error}") from error
+        tree = _tree(text, str(path))
     for assignment in overrides or []:
         _assign(tree, assignment)
     return config_from(tree, str(path) if path else "--set")
@@ -333,11 +333,7 @@ def _validated(section: type[S], tree: dict[str, Any], where: str) -> S:
 
 def config_from_text(text: str, where: str, overrides: list[str] | None = None) -> Config:
     """Reads a configuration that `dump_config` wrote. Raises `ConfigError` that names ``where``."""
-    try:
-        tree = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"the configuration in {where} is not YAML") from error
-    tree = tree if isinstance(tree, dict) else {}
+    tree = _tree(text, where)
     for assignment in overrides or []:
         _assign(tree, assignment)
     return config_from(tree, where)
@@ -348,14 +344,25 @@ def dump_config(config: Config) -> str:
     return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
 
 
+def _tree(text: str, where: str) -> dict[str, Any]:
+    loaded = _parse(text, f"can't read the configuration {where}")
+    if not isinstance(loaded, dict | None):
+        raise ConfigError(f"{where} holds no mapping of keys to values at its top level")
+    return loaded or {}
+
+
+def _parse(text: str, what_fails: str) -> Any:
+    try:
+        return yaml.safe_load(text)
+    except _NO_YAML as error:
+        raise ConfigError(f"{what_fails}: {' '.join(str(error).split())}") from error
+
+
 def _assign(tree: dict[str, Any], assignment: str) -> None:
     key, equals, text = assignment.partition("=")
     if not equals or not key:
         raise ConfigError(f"--set needs key.path=value, got {assignment!r}")
-    try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"--set {key}: {text!r} is no value") from error
+    value = _parse(text, f"--set {key}: {text!r} is no value")
     *parents, leaf = key.split(".")
     for parent in parents:
         tree = tree.setdefault(parent, {})

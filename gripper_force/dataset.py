@@ -2,7 +2,8 @@
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -12,10 +13,10 @@ from typing import Final, Literal
 
 import numpy as np
 import numpy.typing as npt
-import yaml
 from rich.console import Console
 from rich.progress import track
 
+from gripper_force.config import config_from_text
 from gripper_force.errors import DataError
 from gripper_force.log import LogReader
 from gripper_force.types import NS_PER_MS, Frame, Gray, LoadCellSample
@@ -72,7 +73,7 @@ def load_clips(
     paths = sorted(source.rglob("*.mcap")) if isinstance(source, Path) else sorted(source)
     if not paths:
         raise DataError(f"no logs (*.mcap) in {source}; record, simulate or import some first")
-    read = partial(_load_clip, preprocess=preprocess, region=region)
+    read = partial(load_clip, preprocess=preprocess, region=region)
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
         clips = track(pool.map(read, paths), "reading logs", len(paths), console=Console(stderr=True))
         return list(clips)
@@ -154,12 +155,11 @@ def label_frames(
     return np.where(valid, labels, 0.0).astype(np.float32), valid
 
 
-def _load_clip(path: Path, preprocess: Preprocess, region: Region | None) -> Clip:
+def load_clip(path: Path, preprocess: Preprocess, region: Region | None) -> Clip:
+    """Reads one log; see `load_clips`."""
     reader = LogReader(path)
-    config = yaml.safe_load(reader.config)
-    if region is None and config["vision"]["region"] is not None:
-        left, top, width, height = config["vision"]["region"]
-        region = (left, top, width, height)
+    config = config_from_text(reader.config, str(path))
+    region = region or config.vision.region
     small: list[Gray] = []
     t_ns: list[int] = []
     samples: list[LoadCellSample] = []
@@ -172,19 +172,35 @@ def _load_clip(path: Path, preprocess: Preprocess, region: Region | None) -> Cli
     if not small:
         raise DataError(f"{path} holds no camera frames")
     samples.sort(key=lambda sample: sample.t_ns)
-    exposure_ns = round(float(reader.metadata.get("exposure_ms", "0")) * NS_PER_MS)
+    exposure_ns = round(_known(reader.metadata, "exposure_ms", float, 0.0) * NS_PER_MS)
     forces_n, valid = label_frames(np.array(t_ns, np.int64), samples, exposure_ns)
     if not valid.any():
         raise DataError(f"{path} holds no valid load-cell sample near any frame, so it has no labels")
     name = path.stem
     set_ = reader.metadata.get("set", name)
     stiffness = stiffness_of(reader.metadata)
-    return Clip(np.stack(small), forces_n, valid, name, config["object"], set_, stiffness)
+    return Clip(np.stack(small), forces_n, valid, name, config.object, set_, stiffness)
 
 
 def stiffness_of(metadata: Mapping[str, str]) -> float:
-    """A simulated object's own stiffness over its kind's, from a log's metadata; NaN for real ones."""
-    return float(json.loads(metadata["scene"])["stiffness"]) if "scene" in metadata else float("nan")
+    """A simulated object's own stiffness over its kind's, from a log's metadata; NaN for real ones.
+
+    Raises:
+        DataError: The metadata tell of a scene, and not of a stiffness above 0.
+    """
+    return _known(metadata, "scene", lambda scene: float(json.loads(scene)["stiffness"]), float("nan"))
+
+
+def _known(metadata: Mapping[str, str], key: str, read: Callable[[str], float], otherwise: float) -> float:
+    if key not in metadata:
+        return otherwise
+    try:
+        value = read(metadata[key])
+    except (ValueError, LookupError, TypeError, RecursionError):
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise DataError(f"a log's metadata {key!r} hold no number above 0: {metadata[key][:80]!r}")
+    return value
 
 
 def stiffness_floor_n(forces_n: npt.NDArray[np.floating], stiffness: float) -> npt.NDArray[np.floating]:

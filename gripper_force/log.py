@@ -46,13 +46,13 @@ METADATA_NAME: Final = "gripper_force"
 _MAGIC: Final = b"\x89MCAP0\r\n"
 _FRAMING: Final = struct.Struct("<BQ")
 _TIMES: Final = struct.Struct("<QQ")
+_MAX_CHUNK: Final = 1 << 28
 _DAMAGE: Final = (
     McapError,
     DecodeError,
     zstandard.ZstdError,
     struct.error,
     ValueError,
-    MemoryError,
     OverflowError,
 )
 """What the decoders let out on damaged bytes."""
@@ -139,6 +139,8 @@ def _decode_frame(message: McapMessage) -> Frame:
     image = RawImage.FromString(message.data)
     if image.encoding not in {"mono8", "8UC1"}:
         raise ValueError(f"an image is {image.encoding!r}, not mono8")
+    if not (image.height and 0 < image.width <= image.step):
+        raise ValueError(f"an image has {image.width}x{image.height} pixels in rows of {image.step}")
     rows = np.frombuffer(image.data, np.uint8).reshape(image.height, image.step)
     gray = rows[:, : image.width].copy()  # a writable array of its own, as torch wants it  # (H, W)
     t_ns = image.timestamp.seconds * NS_PER_S + image.timestamp.nanos
@@ -375,7 +377,7 @@ class LogReader:
         with self.path.open("rb") as file:
             for chunk in self._chunks:
                 file.seek(chunk.offset)
-                whole = Chunk.read(_stream(file.read(chunk.length)))
+                whole = _modest(Chunk.read(_stream(file.read(chunk.length))))
                 for item in breakup_chunk(whole, validate_crc=True):
                     if isinstance(item, McapMessage):
                         if item.channel_id not in codecs:
@@ -441,6 +443,20 @@ class LogReader:
             f"{self.path} is cut short or damaged: {count} records ({self.duration_ns / NS_PER_S:.2f} s) "
             "can be recovered, --recover reads them"
         )
+
+
+def _modest(chunk: Chunk) -> Chunk:
+    """The chunk, once it is known that unpacking it takes no more memory than it says, and not much."""
+    match chunk.compression:
+        case "zstd":
+            size = zstandard.frame_content_size(chunk.data)
+        case "":
+            size = len(chunk.data)
+        case other:
+            raise ValueError(f"a chunk is compressed as {other!r}")
+    if size != chunk.uncompressed_size or size > _MAX_CHUNK:
+        raise ValueError(f"a chunk says that it holds {chunk.uncompressed_size} bytes, and holds {size}")
+    return chunk
 
 
 def _stream(data: bytes) -> ReadDataStream:

@@ -7,9 +7,8 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-import yaml
 
-from gripper_force.config import Config, config_from
+from gripper_force.config import Config, config_from_text
 from gripper_force.control.score import GraspScore, score_grasp
 from gripper_force.errors import DataError
 from gripper_force.log import LogReader
@@ -162,7 +161,7 @@ def read_run(path: Path, *, recover: bool = False) -> Run:
     ages = [frame.received_ns - frame.t_ns for frame in log.records(Frame)]
     return Run(
         name=path.stem,
-        config=config_from(yaml.safe_load(log.config) or {}, str(path)),
+        config=config_from_text(log.config, str(path)),
         config_text=log.config,
         metadata=log.metadata,
         zero_ns=zero_ns,

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from gripper_force.config import Config, dump_config
-from gripper_force.dataset import NEAR_NS, Clip, digest, label_frames, load_clips, split_by
-from gripper_force.errors import DataError
+from gripper_force.dataset import NEAR_NS, Clip, digest, label_frames, load_clip, load_clips, split_by
+from gripper_force.errors import ConfigError, DataError
 from gripper_force.log import LogWriter
 from gripper_force.types import NS_PER_MS, Frame, LoadCellSample
 from gripper_force.vision.preprocess import Preprocess, shrink
@@ -105,6 +105,25 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
     write_log(tmp_path / "bare.mcap", [frame(0, 0)], {})
     with pytest.raises(DataError, match=r"bare\.mcap holds no valid load-cell sample"):
         load_clips([tmp_path / "bare.mcap"], SMALL)
+
+
+@pytest.mark.parametrize(
+    "metadata",
+    [{"exposure_ms": "long"}, {"exposure_ms": "1e999"}, {"scene": "{}"}, {"scene": '{"stiffness": 0}'}],
+)
+def test_metadata_without_the_number_they_should_hold_are_named(
+    tmp_path: Path, metadata: dict[str, str]
+) -> None:
+    write_log(tmp_path / "a.mcap", [frame(0, 0), sample(0, 1.0)], metadata)
+    with pytest.raises(DataError, match="hold no number above 0"):
+        load_clip(tmp_path / "a.mcap", SMALL, None)
+
+
+def test_a_log_with_a_damaged_configuration_is_named(tmp_path: Path) -> None:
+    with LogWriter(tmp_path / "a.mcap", config="camera: {rate_hz: 2001-99-99}", metadata={}):
+        pass
+    with pytest.raises(ConfigError, match=r"a\.mcap"):
+        load_clip(tmp_path / "a.mcap", SMALL, None)
 
 
 @pytest.mark.parametrize("key", ["object", "set"])

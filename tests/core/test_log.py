@@ -1,5 +1,6 @@
 import errno
 import io
+import re
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_args
@@ -12,10 +13,10 @@ from google.protobuf.message_factory import GetMessageClass
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 
 from gripper_force.errors import LogError
-from gripper_force.log import CHUNK_NS, LogReader, LogWriter
+from gripper_force.log import _CODECS, CHUNK_NS, LogReader, LogWriter
 from gripper_force.types import (
     NS_PER_MS,
     Event,
@@ -271,6 +272,40 @@ def test_a_log_of_another_program_is_refused(tmp_path: Path) -> None:
         LogReader(path)
     path = _foreign(tmp_path / "topic.mcap", "/imu", "a.Imu", b"")
     with pytest.raises(LogError, match="the topic /imu, which"):
+        list(LogReader(path).records())
+
+
+@pytest.mark.parametrize(
+    ("kind", "old", "new", "why"),
+    [
+        (CompressionType.LZ4, rb"", rb"", "compressed as 'lz4'"),
+        (
+            CompressionType.ZSTD,
+            rb".{8}(.{4}\x04\0\0\0zstd)",
+            b"\0\0\0\0\1\0\0\0\\1",
+            "says that it holds 4294967296",
+        ),
+        (CompressionType.NONE, rb"\x15\x03", b"\x15\0", "0x2 pixels in rows of 3"),
+        (CompressionType.NONE, rb"-\x03", b"-\x02", "3x2 pixels in rows of 2"),
+        (CompressionType.NONE, rb"mono8", rb"mono9", "'mono9', not mono8"),
+    ],
+)
+def test_a_chunk_that_lies_is_refused(
+    tmp_path: Path, kind: CompressionType, old: bytes, new: bytes, why: str
+) -> None:
+    path, codec = tmp_path / "run.mcap", _CODECS[Frame]
+    with path.open("wb") as file:
+        writer = Writer(file, compression=kind, enable_crcs=False)
+        writer.start()
+        writer.add_attachment(0, 0, "config.yaml", "application/yaml", b"")
+        schema = writer.register_schema(codec.schema_name, "protobuf", codec.schema)
+        channel = writer.register_channel(codec.topic, "protobuf", schema)
+        writer.add_message(channel, 1, codec.encode(Frame(1, 1, 1, np.zeros((2, 3), np.uint8))), 1)
+        writer.finish()
+    content, count = re.subn(old, new, path.read_bytes(), count=1, flags=re.DOTALL)
+    assert count
+    path.write_bytes(content)
+    with pytest.raises(LogError, match=why):
         list(LogReader(path).records())
 
 
