@@ -191,7 +191,7 @@ class MemoryPort(PortHandler):  # type: ignore[misc]
     def writePort(self, packet: Iterable[int]) -> int:  # noqa: N802
         """Sends a packet; the answer is there when it returns."""
         if self._bus is None or find_bus(self._name) is not self._bus:
-            self.is_using = False
+            self.closePort()  # as with a device file: plugged in again, it is another one
             raise DeviceLostError(f"the virtual bus {self._name!r} is gone; start again")
         data = bytes(packet)
         self._received += self._bus.transact(data)

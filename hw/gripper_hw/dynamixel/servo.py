@@ -215,6 +215,8 @@ class DynamixelBus:
                 f"{where} does not answer at {self._config.baud_rate} baud; "
                 "check its power, servo.id and servo.baud_rate"
             ) from error
+        if number != self.model.number:  # a late answer can pass for a ping's, and not for a read's
+            number = self._get(id_, "model_number")
         check_model_number(self.model, number, where)
         self._ask_for_answers(id_)
         firmware = self._get(id_, "firmware_version")

@@ -35,7 +35,10 @@ class VirtualBus:
     Attributes:
         servos: Who is on the line.
         lock: Held while a packet is carried out.
+        clock_ns: Time of the watchdogs and reboots.
+        before_packet: Called with the lock held before a packet is carried out; brings a plant up to now.
         tamper: Fault hook: takes each answer off the line and returns what arrives, None for silence.
+        is_unplugged: Fault hook: whether nothing leads to it now.
     """
 
     def __init__(
@@ -48,21 +51,22 @@ class VirtualBus:
 
         Args:
             servos: Who is on the line.
-            clock_ns: Time of the watchdogs and reboots.
-            before_packet: Called with the lock held before a packet is carried out; brings a plant up to now.
+            clock_ns: See the attributes.
+            before_packet: See the attributes.
         """
         self.servos = tuple(servos)
         self.lock = threading.RLock()
+        self.clock_ns = clock_ns
         self.tamper: Callable[[bytes], bytes | None] | None = None
-        self._clock_ns = clock_ns
-        self._before_packet = before_packet
+        self.is_unplugged: Callable[[], bool] = lambda: False
+        self.before_packet = before_packet
         self._parser = Parser()
         self._heard_ns = 0
 
     def transact(self, data: bytes) -> bytes:
         """Takes bytes off the line and returns the answer's; may break anywhere, may hold anything."""
         with self.lock:
-            now_ns = self._clock_ns()
+            now_ns = self.clock_ns()
             if now_ns - self._heard_ns > _STALE_NS:
                 self._parser = Parser()  # a packet that broke off is forgotten, as in a real servo
             self._heard_ns = now_ns
@@ -74,9 +78,9 @@ class VirtualBus:
     def _carry_out(self, packet: Packet) -> bytes:
         if packet.instruction == STATUS:
             return b""
-        if self._before_packet is not None:
-            self._before_packet()
-        now_ns = self._clock_ns()
+        if self.before_packet is not None:
+            self.before_packet()
+        now_ns = self.clock_ns()
         live = {servo.id: servo for servo in self.servos if now_ns >= servo.silent_until_ns}
         for servo in live.values():
             servo.check_watchdog(now_ns)
@@ -225,5 +229,6 @@ def unregister_bus(name: str) -> None:
 
 
 def find_bus(name: str) -> VirtualBus | None:
-    """The bus that is registered as ``name``, or None."""
-    return _buses.get(name)
+    """The bus that is registered as ``name`` and plugged in, or None."""
+    bus = _buses.get(name)
+    return None if bus is None or bus.is_unplugged() else bus

@@ -18,6 +18,7 @@ from gripper_force.faults import Faults
 from gripper_force.interfaces import Camera, Clock, LoadCell
 from gripper_force.types import NS_PER_MS, NS_PER_S, Frame, Gray, LoadCellSample
 from gripper_hw.dynamixel.control_table import load_model
+from gripper_hw.dynamixel.faults import WireFaults
 from gripper_hw.dynamixel.virtual import VirtualBus, VirtualServo, register_bus, unregister_bus
 from gripper_hw.sim.faults import FaultyCamera, FaultyClock, FaultyLoadCell
 from gripper_hw.sim.scene import Scene, draw_scene
@@ -131,11 +132,15 @@ class SimulatedLoadCell:
 class _LockedMotor:
     """Keeps the world's thread and the bus' apart."""
 
-    def __init__(self, servo: VirtualServo, lock: AbstractContextManager[object]) -> None:
-        self._servo, self._lock = servo, lock
+    def __init__(
+        self, servo: VirtualServo, lock: AbstractContextManager[object], faults: WireFaults | None
+    ) -> None:
+        self._servo, self._lock, self._faults = servo, lock, faults
 
     def control(self, t_ns: int, position_rad: float, velocity_rad_s: float, current_noise_a: float) -> float:
         with self._lock:
+            if self._faults is not None:
+                self._faults.update(t_ns)
             return self._servo.control(t_ns, position_rad, velocity_rad_s, current_noise_a)
 
 
@@ -156,12 +161,12 @@ class SimulatedRig:
         model = load_model(config.servo.model)
         servo = VirtualServo(config.servo.id, model)
         bus = VirtualBus([servo], self._bus_time_ns)
-        motor = _LockedMotor(servo, bus.lock)
-        self._world = World(self.scene, config.gripper, motor, model.nm_per_a, config.seed)
-        self._exposure_ms = config.sim.exposure_ms
         self._lockstep = config.clock == "lockstep"
         start_ns = 0 if self._lockstep else time.monotonic_ns()
         faults = Faults(config.faults, start_ns)
+        motor = _LockedMotor(servo, bus.lock, WireFaults(bus, faults, config.seed) if config.faults else None)
+        self._world = World(self.scene, config.gripper, motor, model.nm_per_a, config.seed)
+        self._exposure_ms = config.sim.exposure_ms
         clock: Clock = LockstepClock(self._world) if self._lockstep else MonotonicClock()
         self.clock: Clock = clock
         self._closing = ExitStack()
