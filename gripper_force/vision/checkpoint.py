@@ -130,12 +130,16 @@ def _stored(tensor: Tensor) -> Tensor:
 
 def _member(path: Path, index: int, config: NetworkConfig, tensors: dict[str, Tensor]) -> ForceNetwork:
     prefix = f"{index}."
-    network = ForceNetwork(config)
-    state = {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
+    with torch.device("meta"):  # a header may claim any size: only what the weights confirm takes memory
+        network = ForceNetwork(config)
+    dtypes = {name: tensor.dtype for name, tensor in network.state_dict().items()}
+    own = {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
+    # A copy, as what was read is a map of the file, which may be written again.
+    state = {name: t.to(dtypes.get(name, t.dtype), copy=True) for name, t in own.items()}
     try:
-        network.load_state_dict(state)
+        network.load_state_dict(state, assign=True)
     except RuntimeError as error:
         raise CheckpointError(f"{path}: the weights of member {index} don't fit its header") from error
     if not all(bool(tensor.isfinite().all()) for tensor in state.values()):
         raise CheckpointError(f"{path}: the weights of member {index} hold NaN or infinity")
-    return network.eval().requires_grad_(False)
+    return network.in_fast_layout().eval().requires_grad_(False)

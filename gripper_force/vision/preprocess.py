@@ -34,9 +34,9 @@ class Preprocess(Section):
         reference_frames: How many frames that mean is taken over.
     """
 
-    size: Annotated[int, Field(ge=16, multiple_of=16)] = 128
+    size: Annotated[int, Field(ge=16, le=1024, multiple_of=16)] = 128
     reference: bool = True
-    reference_frames: Annotated[int, Field(ge=1)] = 4
+    reference_frames: Annotated[int, Field(ge=1, le=1000)] = 4
 
     @property
     def lead_in(self) -> int:

@@ -96,6 +96,21 @@ def test_other_safetensors_files_are_refused(file: Path, tmp_path: Path) -> None
         load_checkpoint(other)
 
 
+def test_a_header_that_claims_a_giant_takes_no_memory_for_it(file: Path) -> None:
+    giant = header(SSAM.model_copy(update={"hidden": 100_000, "head": 100_000}))  # 80 GB
+    save_checkpoint(file, [ForceNetwork(SSAM)], giant)
+    with pytest.raises(CheckpointError, match="member 0 don't fit"):
+        load_checkpoint(file)
+
+
+def test_what_was_loaded_outlives_its_file(file: Path) -> None:
+    weight = load_checkpoint(file).networks[0].out.bias
+    before = weight.clone()
+    with file.open("r+b") as opened:
+        opened.write(bytes(file.stat().st_size))
+    assert torch.equal(weight, before)
+
+
 def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
     network = ForceNetwork(SSAM)
     network.out.bias.data.fill_(torch.nan)
