@@ -40,7 +40,7 @@ class ServoConfig(Section):
     current_limit_a: Positive = 1.2
     bus_watchdog_ms: int = Field(40, ge=20, le=2540)
     retries: int = Field(2, ge=0, le=10)
-    reply_margin_ms: Positive = Field(4.0, description="how long a reply may be late before a retry")
+    reply_margin_ms: Positive = Field(3.0, description="how long a reply may be late before a retry")
 
 
 class GripperConfig(Section):
@@ -201,7 +201,7 @@ FAULTS: Final[dict[str, dict[str, str]]] = {
         "intermittent": "half of the answers are lost",
     },
     "plant": {
-        "wrong": "the motor gives more current than its goal asks, by 0.02 A more every 10 ms",
+        "wrong": "the motor gives more current than its goal asks, by 0.1 A more every second",
     },
     "camera": {
         "off": "no frame comes",

@@ -14,7 +14,7 @@ _REQUESTS_LATE: Final = {"delayed": 1, "slow": 3}
 _LOST_SHARE: Final = 0.5
 _CUT_NS: Final = 5 * NS_PER_MS
 _CUT_PERIOD_NS: Final = 300 * NS_PER_MS
-_EXCESS_A_S: Final = 2.0
+_EXCESS_A_S: Final = 0.1
 
 
 class WireFaults:
@@ -68,10 +68,9 @@ class WireFaults:
         return answer
 
     def _damaged(self, answer: bytes) -> bytes:
-        """Up to 16 bits in a row, which is what the checksum promises to tell."""
-        at = self._random.randrange(len(answer) - 1)
-        burst = int.from_bytes(answer[at : at + 2], "little") ^ self._random.randrange(1, 0x10000)
-        return answer[:at] + burst.to_bytes(2, "little") + answer[at + 2 :]
+        """One byte; of damage to more the checksum lets one in 65,536 pass."""
+        at = self._random.randrange(len(answer))
+        return answer[:at] + bytes((answer[at] ^ self._random.randrange(1, 256),)) + answer[at + 1 :]
 
 
 class _Fault:

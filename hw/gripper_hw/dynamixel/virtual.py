@@ -70,10 +70,10 @@ class VirtualBus:
             if now_ns - self._heard_ns > _STALE_NS:
                 self._parser = Parser()  # a packet that broke off is forgotten, as in a real servo
             self._heard_ns = now_ns
-            answer = b"".join(self._carry_out(packet) for packet in self._parser.feed(data))
-        if answer and self.tamper is not None:
-            return self.tamper(answer) or b""
-        return answer
+            answers = [self._carry_out(packet) for packet in self._parser.feed(data)]
+        if self.tamper is not None:
+            answers = [self.tamper(answer) or b"" for answer in answers if answer]
+        return b"".join(answers)
 
     def _carry_out(self, packet: Packet) -> bytes:
         if packet.instruction == STATUS:

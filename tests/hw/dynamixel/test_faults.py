@@ -207,17 +207,15 @@ def test_an_answer_up_to_seven_requests_late_is_not_believed(late, retries, seed
 
 
 @settings(deadline=None, max_examples=100)
-@given(st.integers(0, 100), st.integers(1, 2**16 - 1))
-def test_no_burst_of_damage_is_believed(at, bits):
-    """The checksum tells any damage to 16 bits in a row, unless it moves where the packet ends."""
+@given(st.integers(0, 100), st.integers(1, 255))
+def test_no_damaged_byte_is_believed(at, bits):
     with bench(retries=0) as b:
         b.servo.start()
         b.go_on()
 
         def damage(answer):
-            start = at % (len(answer) - 1)
-            burst = int.from_bytes(answer[start : start + 2], "little") ^ bits
-            return answer[:start] + burst.to_bytes(2, "little") + answer[start + 2 :]
+            where = at % len(answer)
+            return answer[:where] + bytes((answer[where] ^ bits,)) + answer[where + 1 :]
 
         b.bus.tamper = damage
         with pytest.raises(DeviceTimeoutError):
@@ -286,19 +284,19 @@ def test_an_overload_is_in_the_state_and_takes_torque():
 
 
 def test_a_motor_with_more_current_than_its_goal_asks_says_so_and_obeys_torque_off():
-    with bench(fault("plant", "wrong", at_s=0.05), bus_watchdog_ms=2540) as b:
+    with bench(fault("plant", "wrong", for_s=1.0)) as b:
         b.servo.start()
         b.servo.write(ServoCommand(0, 1.0, 0.2))
-        for _ in range(10):
+        given_a = []
+        for _ in range(160):
             b.go_on()
-            b.servo.read()
-        steady_a = b.servo.read().current_a
-        for elapsed_ms in (5, 10, 15, 20):
-            b.now_ns += CYCLE_NS
             b.servo.read()  # the fault acts on packets
-            given_a = b.firmware.control(b.now_ns, b.position_rad, 0.0)
-            assert given_a == pytest.approx(steady_a + 0.002 * elapsed_ms, abs=0.004)
-            assert b.servo.read().current_a == pytest.approx(given_a, abs=MODEL.current_unit_a)
+            given_a.append(b.firmware.control(b.now_ns, b.position_rad, 0.0))
+            assert b.servo.read().current_a == pytest.approx(given_a[-1], abs=MODEL.current_unit_a)
+        before, half, full = given_a[8], given_a[83], given_a[158]
+        assert before == pytest.approx(0.2, abs=0.01)
+        assert full - before == pytest.approx(2 * (half - before), rel=0.1)
+        assert full > 0.26
         b.servo.stop(hold=False)
         assert b.firmware.control(b.now_ns, b.position_rad, 0.0) == 0.0
 
@@ -327,10 +325,10 @@ def rig(unit: str, kind: str, **span: float):
 
 
 def read_on(devices) -> None:
-    for cycle in range(3, 20):
+    for cycle in range(3, 100):
         devices.clock.sleep_until_ns(cycle * CYCLE_NS)
         state = devices.servo.read()
-        if state.hardware_error or state.current_a > 0.1:
+        if state.hardware_error or state.current_a > 0.02:
             raise HardwareFaultError(str(state))
 
 
