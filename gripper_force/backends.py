@@ -45,6 +45,9 @@ FUZZ_TARGETS: Final = (
 )
 """Modules with a list ``TARGETS`` for `gripper_force.stability.fuzz`."""
 
+BUS_COST: Final = "gripper_hw.dynamixel.cost:bus_cost"
+"""What a servo bus cycle costs, for `gripper_force.bench`."""
+
 
 class MonotonicClock:
     """The host's monotonic time."""
@@ -73,7 +76,7 @@ def open_devices(config: Config) -> Iterator[Devices]:
     with ExitStack() as stack:
         rig: Any = None
         if config.servo.port.startswith("virtual:") or RIG in (camera_class, load_cell_class):
-            rig = _load(RIG)(config)
+            rig = load(RIG)(config)
             stack.callback(rig.close)
         elif config.clock == "lockstep":
             raise ConfigError(
@@ -88,7 +91,7 @@ def open_devices(config: Config) -> Iterator[Devices]:
         clock: Clock = rig.clock if rig is not None else MonotonicClock()
         camera = _open(stack, camera_class, rig, config.camera, clock, "camera")
         load_cell = _open(stack, load_cell_class, rig, config.load_cell, clock, "load_cell")
-        servo = _load(SERVO)(config.servo, clock.now_ns)
+        servo = load(SERVO)(config.servo, clock.now_ns)
         stack.callback(servo.close)
         if rig is not None:
             rig.start()
@@ -107,7 +110,7 @@ def open_devices(config: Config) -> Iterator[Devices]:
 def _open(stack: ExitStack, backend: str | None, rig: Any, section: Any, clock: Clock, unit: str) -> Any:
     if backend is None:
         return None
-    device = getattr(rig, unit) if backend == RIG else _load(backend)(section, clock)
+    device = getattr(rig, unit) if backend == RIG else load(backend)(section, clock)
     stack.callback(device.close)
     return device
 
@@ -119,6 +122,7 @@ def _known(backends: dict[str, str | None], unit: str, name: str) -> str | None:
         raise ConfigError(f"no {unit} backend {name!r}; there are {', '.join(backends)}") from None
 
 
-def _load(path: str) -> Any:
+def load(path: str) -> Any:
+    """Imports what a string names: ``module:name``."""
     module, _, name = path.partition(":")
     return getattr(import_module(module), name)

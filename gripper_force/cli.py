@@ -24,7 +24,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from gripper_force.config import Config, load_config
-from gripper_force.errors import DataError, GripperError
+from gripper_force.errors import ConfigError, DataError, GripperError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 import_app = typer.Typer(no_args_is_help=True, help="Turn other recordings into logs.")
@@ -273,6 +273,25 @@ def doctor(
         raise typer.Exit(1)
 
 
+@app.command()
+def bench(
+    bus: Annotated[bool, typer.Option("--bus", help="A cycle of the servo's bus, by the driver.")] = False,
+    cycles: Annotated[int, typer.Option(min=1, help="How many of each.")] = 1000,
+    as_json: AsJson = False,
+) -> None:
+    """Measure what parts of a run cost on this machine, beside what others use."""
+    from gripper_force import bench as job
+
+    if not bus:
+        raise ConfigError("bench measures what it is told to; say --bus")
+    costs: list[Any] = []
+    with _bar("measuring", len(job.BUS_SETTINGS)) as advance:
+        for setting in job.bus(cycles):
+            costs += setting
+            advance(f"{setting[0].baud_rate} baud, {setting[0].latency_ms:g} ms")
+    _print({"bus": costs, "load": os.getloadavg()[0], "cores": _CORES}, as_json, _bus_table)
+
+
 def _terminate(_signal: int, _frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
@@ -434,6 +453,18 @@ def _checks_table(r: dict[str, Any]) -> None:
         style = "dim" if check.ok is None else ""
         table.add_row(marks[check.ok], check.unit, check.name, escape(check.found) + advice, style=style)
     out.print(table)
+
+
+def _bus_table(r: dict[str, Any]) -> None:
+    columns = ("baud", "latency ms", "client", "line ms", "p50 ms", "p99 ms", "p50 / line", "CPU at 200 Hz %")
+    table = Table(*columns, box=None)
+    for c in r["bus"]:
+        figures = (c.line_ms, c.p50_ms, c.p99_ms, c.p50_ms / c.line_ms)
+        numbers = (_number(value) for value in figures)
+        share = _number(100 * c.cpu_share, digits=1)
+        table.add_row(str(c.baud_rate), _number(c.latency_ms, digits=0), c.client, *numbers, share)
+    out.print(table)
+    out.print(f"[dim]load {r['load']:.1f} on {r['cores']} cores[/]")
 
 
 def _agreed(servo: str, changes: list[Any], yes: bool) -> bool:

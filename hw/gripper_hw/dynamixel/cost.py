@@ -1,0 +1,184 @@
+"""What a bus cycle costs beyond its bytes' time on the wire, by the driver and by a plain loop of the SDK."""
+
+import multiprocessing
+import os
+import pty
+import signal
+import time
+import tty
+from collections.abc import Callable, Iterator, MutableSequence, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from multiprocessing.connection import Connection
+from typing import Final
+
+import numpy as np
+from dynamixel_sdk import GroupSyncRead, GroupSyncWrite, PacketHandler, PortHandler
+
+from gripper_force.bench import BusCost
+from gripper_force.config import ServoConfig
+from gripper_force.types import NS_PER_MS, NS_PER_S, ServoCommand
+from gripper_hw.dynamixel.control_table import REGISTERS, load_model
+from gripper_hw.dynamixel.firmware import VirtualServo
+from gripper_hw.dynamixel.servo import DynamixelBus
+from gripper_hw.dynamixel.virtual import VirtualBus
+
+_MODEL: Final = "XM430-W350"
+_IDS: Final = (1, 2)
+_RATE_HZ: Final = 200
+_TURN: Final = 50
+"""Cycles of one client before those of the other."""
+
+_BITS_A_BYTE: Final = 10
+_LOOK_UP: Final = 1000
+"""Polls between two looks whether the parent still listens."""
+
+_PATIENCE_MS: Final = 1000.0
+"""More than a session's: on a busy machine the line itself may be late, and is to be measured anyhow."""
+
+Cycle = Callable[[], object]
+
+
+def bus_cost(baud_rate: int, latency_ms: float, cycles: int) -> tuple[BusCost, ...]:
+    """Measures two clients in turn: the driver, and GroupSyncRead and GroupSyncWrite over the SDK's own port.
+
+    Args:
+        baud_rate: Bits a second.
+        latency_ms: How much later than on the wire an answer comes out of the adapter.
+        cycles: How many of each client.
+
+    Raises:
+        DeviceError: The driver gave the line up.
+    """
+    with _line(baud_rate, latency_ms) as (paths, sent), ExitStack() as stack:
+        clients = {
+            "driver": stack.enter_context(_driver(paths[0], baud_rate)),
+            "plain SDK": stack.enter_context(_plain_sdk(paths[1], baud_rate)),
+        }
+        turns = [(name, min(_TURN, cycles - done)) for done in range(0, cycles, _TURN) for name in clients]
+        times_ns: dict[str, list[int]] = {name: [] for name in clients}
+        shares: dict[str, list[float]] = {name: [] for name in clients}
+        begun = list(sent)
+        for name, count in turns:
+            times_ns[name] += [_time_ns(clients[name]) for _ in range(count)]
+        bytes_ = [after - before for before, after in zip(begun, sent, strict=True)]
+        for name, count in turns:
+            shares[name].append(_cpu_share(clients[name], count))
+    costs = []
+    for name, count in zip(clients, bytes_, strict=True):
+        line_ms = _wire_ns(count, baud_rate) / cycles / NS_PER_MS + latency_ms
+        p50_ms, p99_ms = (float(ms) for ms in np.percentile(times_ns[name], (50, 99)) / NS_PER_MS)
+        share = float(np.median(shares[name]))
+        costs.append(BusCost(name, baud_rate, latency_ms, line_ms, p50_ms, p99_ms, share))
+    return tuple(costs)
+
+
+@contextmanager
+def _driver(path: str, baud_rate: int) -> Iterator[Cycle]:
+    config = ServoConfig(
+        model=_MODEL, port=path, baud_rate=baud_rate, bus_watchdog_ms=2540, reply_margin_ms=_PATIENCE_MS
+    )
+    bus = DynamixelBus(config, _IDS)
+
+    def cycle() -> None:
+        bus.write([ServoCommand(state.t_ns, state.position_rad, 0.1) for state in bus.read()])
+
+    bus.start()
+    try:
+        yield cycle
+        bus.stop(hold=False)
+    finally:
+        bus.close()
+
+
+@contextmanager
+def _plain_sdk(path: str, baud_rate: int) -> Iterator[Cycle]:
+    port, packets = PortHandler(path), PacketHandler(2.0)
+    port.setBaudRate(baud_rate)
+    current, velocity, position, goal = (
+        REGISTERS[name]
+        for name in ("present_current", "present_velocity", "present_position", "goal_position")
+    )
+    reader = GroupSyncRead(port, packets, current.address, current.size + velocity.size + position.size)
+    writer = GroupSyncWrite(port, packets, goal.address, goal.size)
+    for id_ in _IDS:
+        reader.addParam(id_)
+        writer.addParam(id_, bytes(goal.size))
+
+    def cycle() -> None:
+        reader.txRxPacket()
+        for id_ in _IDS:
+            ticks = [reader.getData(id_, r.address, r.size) for r in (current, velocity, position)][-1]
+            writer.changeParam(id_, goal.encode(ticks))
+        writer.txPacket()
+
+    try:
+        yield cycle
+    finally:
+        port.closePort()
+
+
+def _time_ns(cycle: Cycle) -> int:
+    start_ns = time.perf_counter_ns()
+    cycle()
+    return time.perf_counter_ns() - start_ns
+
+
+def _cpu_share(cycle: Cycle, cycles: int) -> float:
+    """Share of a CPU that this thread takes for so many cycles at 200 Hz."""
+    start_ns, cpu_ns = time.monotonic_ns(), time.thread_time_ns()
+    for i in range(1, cycles + 1):
+        cycle()
+        time.sleep(max(0.0, (start_ns + i * NS_PER_S / _RATE_HZ - time.monotonic_ns()) / NS_PER_S))
+    return (time.thread_time_ns() - cpu_ns) / (time.monotonic_ns() - start_ns)
+
+
+def _wire_ns(count: int, baud_rate: int) -> float:
+    return count * _BITS_A_BYTE * NS_PER_S / baud_rate
+
+
+# The line: a process of its own, as it must neither share Python's lock with a client nor be late.
+
+
+@contextmanager
+def _line(baud_rate: int, latency_ms: float) -> Iterator[tuple[list[str], Sequence[int]]]:
+    """Serves a virtual bus to two clients: their paths, and how many bytes went over the wire for each."""
+    context = multiprocessing.get_context("spawn")
+    sent: MutableSequence[int] = context.RawArray("q", 2)
+    here, there = context.Pipe()
+    process = context.Process(target=_serve, args=(there, sent, baud_rate, latency_ms), daemon=True)
+    process.start()
+    there.close()
+    try:
+        yield here.recv(), sent
+    finally:
+        here.close()
+        process.join()
+
+
+def _serve(parent: Connection, sent: MutableSequence[int], baud_rate: int, latency_ms: float) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's, which lets go then
+    bus = VirtualBus(VirtualServo(id_, load_model(_MODEL)) for id_ in _IDS)
+    masters = []
+    paths = []
+    for _ in sent:
+        master, slave = pty.openpty()
+        tty.setraw(slave)
+        os.set_blocking(master, False)
+        masters.append(master)
+        paths.append(os.ttyname(slave))
+    parent.send(paths)
+    free_ns = 0.0  # when the wire is
+    looks = 0
+    # It polls: to be woken would take as long as the bytes at 4 Mbaud.
+    while (looks := looks + 1) % _LOOK_UP or not parent.poll():
+        for i, master in enumerate(masters):
+            with suppress(BlockingIOError):
+                request = os.read(master, 4096)
+                free_ns = max(free_ns, time.monotonic_ns()) + _wire_ns(len(request), baud_rate)
+                answer = bus.transact(request)
+                sent[i] += len(request) + len(answer)
+                if answer:
+                    free_ns += _wire_ns(len(answer), baud_rate)
+                    while time.monotonic_ns() < free_ns + latency_ms * NS_PER_MS:
+                        pass
+                    os.write(master, answer)

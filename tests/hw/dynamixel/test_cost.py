@@ -1,0 +1,17 @@
+from gripper_hw.dynamixel.cost import bus_cost
+
+
+def test_no_answer_comes_before_its_bytes_were_on_the_wire() -> None:
+    cycles, baud_rate, latency_ms = 4, 57_600, 5.0
+    ours, theirs = bus_cost(baud_rate, latency_ms, cycles)
+    assert (ours.client, theirs.client) == ("driver", "plain SDK")
+    for cost in (ours, theirs):
+        assert (cost.baud_rate, cost.latency_ms) == (baud_rate, latency_ms)
+        assert latency_ms < cost.line_ms
+        assert cost.line_ms / 2 < cost.p50_ms <= cost.p99_ms  # the first cycle finds a free line
+        assert cost.cpu_share > 0
+    # A sync read of ten bytes and a sync write of four, for two servos: 16, 42 and 24 bytes. The last write
+    # may still be on its way when the bytes are counted.
+    a_byte_ms = 10_000 / baud_rate
+    assert (82 - 24 / cycles) * a_byte_ms <= theirs.line_ms - latency_ms + 1e-9
+    assert theirs.line_ms - latency_ms <= 82 * a_byte_ms + 1e-9
