@@ -292,6 +292,33 @@ def bench(
     _print({"bus": costs, "load": os.getloadavg()[0], "cores": _CORES}, as_json, _bus_table)
 
 
+@app.command()
+def stability(
+    fuzz: Annotated[
+        int | None, typer.Option(min=1, help="Feed so many random and damaged inputs to all readers.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the inputs or of the first scene.")] = 0,
+    only: Annotated[
+        str | None, typer.Option(help="With --fuzz: one target, or one input as <target>:<number>.")
+    ] = None,
+    folder: Annotated[Path, typer.Option("--out", help="Folder for inputs that are findings.")] = Path(
+        "runs/fuzz"
+    ),
+    jobs: Jobs = _CORES,
+    as_json: AsJson = False,
+) -> None:
+    """Show that hostile input is survived. Exit code 1 where it is not."""
+    if fuzz is None:
+        raise ConfigError("stability needs to be told what to do: --fuzz N")
+    from gripper_force.stability import fuzz as job
+
+    with _bar("fuzzing", fuzz) as advance:
+        result = job.fuzz(fuzz, seed, jobs, folder, advance, only=only)
+    _print(result, as_json, _fuzz_table)
+    if result["findings"]:
+        raise typer.Exit(1)
+
+
 def _terminate(_signal: int, _frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
@@ -312,7 +339,7 @@ def _bar(label: str, total: int) -> Iterator[Any]:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, TextColumn("{task.fields[note]}"), console=err) as progress:
         task = progress.add_task(label, total=total, note="")
-        yield lambda note: progress.update(task, advance=1, note=note)
+        yield lambda note, steps=1: progress.update(task, advance=steps, note=note)
 
 
 def _print(result: dict[str, Any], as_json: bool, render: Any = None) -> None:
@@ -453,6 +480,17 @@ def _checks_table(r: dict[str, Any]) -> None:
         style = "dim" if check.ok is None else ""
         table.add_row(marks[check.ok], check.unit, check.name, escape(check.found) + advice, style=style)
     out.print(table)
+
+
+def _fuzz_table(r: dict[str, Any]) -> None:
+    table = Table("target", "inputs", "results", "typed errors", "findings", box=None)
+    for name, row in r["targets"].items():
+        table.add_row(name, *(str(row[key]) for key in ("inputs", "results", "typed_errors", "findings")))
+    out.print(table)
+    for finding in r["findings"]:
+        out.print(f"[bold red]{escape(f'{finding.target}:{finding.index}')}[/] {escape(finding.error)}")
+        out.print(f"  kept as {finding.file}", soft_wrap=True)
+    _pairs({"inputs": r["inputs"], "seed": r["seed"], "seconds": r["wall_s"]})
 
 
 def _bus_table(r: dict[str, Any]) -> None:

@@ -1,0 +1,1 @@
+"""What a run must survive: hostile input, a long life, and failing parts."""
