@@ -12,14 +12,13 @@ from gripper_force.config import Config, ServoConfig
 from gripper_force.doctor import Agree, Change, Check, judged, only, time_ms
 from gripper_force.errors import DeviceError, DeviceTimeoutError, GripperError
 from gripper_hw.dynamixel.control_table import (
-    CURRENT_BASED_POSITION_MODE,
     REGISTERS,
     check_model_number,
     load_model,
     model_names,
 )
 from gripper_hw.dynamixel.port import VIRTUAL_PREFIX, open_port
-from gripper_hw.dynamixel.servo import DynamixelBus, _hardware_error_text
+from gripper_hw.dynamixel.servo import DynamixelBus, hardware_error_text
 
 _SYSFS: Final = Path("/sys/bus/usb-serial/devices")
 _CYCLES: Final = 200
@@ -121,7 +120,7 @@ class _Line(DynamixelBus):
             advice = "its Status Return Level may be 0, which a run sets right; else check the cable"
             yield Check(unit, "registers", "it answers a ping, and no read", False, advice)
             return
-        text, advice = _hardware_error_text(error), "remove the cause, then power-cycle or reboot it"
+        text, advice = hardware_error_text(error), "remove the cause, then power-cycle or reboot it"
         yield judged(unit, "hardware error", text if error else "none", not error, advice)
         advice = "it holds as it was told to, and the next run lets go first"
         yield judged(unit, "torque", "on" if torque else "off", not torque, advice, harmless=True)
@@ -159,16 +158,7 @@ class _Line(DynamixelBus):
 
     def _wanted(self) -> dict[str, int]:
         """What a start writes once torque is off."""
-        return {
-            "return_delay_time": 0,
-            "drive_mode": 0,
-            "current_limit": self._current_limit,
-            "operating_mode": CURRENT_BASED_POSITION_MODE,
-            "status_return_level": 2,
-            "bus_watchdog": 0,
-            "profile_acceleration": 0,
-            "profile_velocity": 0,
-        }
+        return self.settings | {"bus_watchdog": 0}
 
     def _values(self, id_: int) -> dict[str, int]:
         return {name: self._get(id_, name) for name in self._wanted()}

@@ -126,6 +126,19 @@ class DynamixelBus:
         self._requests = 0
         self._data = 0  # where the cycle reads, and behind it writes
 
+    @property
+    def settings(self) -> dict[str, int]:
+        """What every servo's registers hold in a run, from before torque comes on."""
+        return {
+            "return_delay_time": 0,
+            "drive_mode": 0,
+            "current_limit": self._current_limit,
+            "operating_mode": CURRENT_BASED_POSITION_MODE,
+            "status_return_level": 2,
+            "profile_acceleration": 0,
+            "profile_velocity": 0,
+        }
+
     def start(self) -> tuple[ServoState, ...]:
         """Opens the port, sets every servo up, and turns torque on at the present position with no current.
 
@@ -250,19 +263,12 @@ class DynamixelBus:
         hardware_error = self._get(id_, "hardware_error_status")
         if hardware_error:
             raise HardwareFaultError(
-                f"servo {id_} reports {_hardware_error_text(hardware_error)}; remove the cause, then "
+                f"servo {id_} reports {hardware_error_text(hardware_error)}; remove the cause, then "
                 "power-cycle or reboot it"
             )
-        for name, value in (
-            ("return_delay_time", 0),
-            ("drive_mode", 0),
-            ("current_limit", self._current_limit),
-            ("operating_mode", CURRENT_BASED_POSITION_MODE),
-        ):
-            if self._get(id_, name) != value:  # the EEPROM wears out
+        for name, value in self.settings.items():
+            if not REGISTERS[name].eeprom or self._get(id_, name) != value:  # the EEPROM wears out
                 self._set(id_, name, value)
-        for name, value in (("status_return_level", 2), ("profile_acceleration", 0), ("profile_velocity", 0)):
-            self._set(id_, name, value)
         pointers = struct.pack(f"<{len(_INDIRECT_ADDRESSES)}H", *_INDIRECT_ADDRESSES)
         self._write_bytes(id_, window.address, pointers)
         if self._read_bytes(id_, window.address, len(pointers)) != pointers:
@@ -501,5 +507,6 @@ def _checked(what: str, result: int, error: int) -> int:
     raise DeviceError(f"{what} was refused: {_ERRORS.get(number, f'error {number}')}")
 
 
-def _hardware_error_text(bits: int) -> str:
+def hardware_error_text(bits: int) -> str:
+    """What the bits of Hardware Error Status mean."""
     return " and ".join(name for bit, name in _HARDWARE_ERRORS.items() if bits & bit) or f"error {bits:#x}"
