@@ -23,10 +23,14 @@ class PtyServer:
     """Serves a bus at `device_path` until closed. A context manager.
 
     Clients may come and go. The path needs no baud rate: bytes pass at once.
+
+    Attributes:
+        bus: What is served.
+        device_path: Where.
     """
 
     def __init__(self, bus: VirtualBus) -> None:
-        self._bus = bus
+        self.bus = bus
         self._master, self._slave = pty.openpty()
         tty.setraw(self._slave)
         os.set_blocking(self._master, False)
@@ -61,7 +65,7 @@ class PtyServer:
                 ready, _, _ = select.select([self._master, self._wake_read], [], [])
                 if self._wake_read in ready:
                     return
-                answer = self._bus.transact(os.read(self._master, 4096))
+                answer = self.bus.transact(os.read(self._master, 4096))
                 with contextlib.suppress(BlockingIOError):  # a line does not wait for who listens
                     os.write(self._master, answer)
 
