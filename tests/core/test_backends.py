@@ -91,7 +91,7 @@ def closed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     def device(name: str) -> SimpleNamespace:
         return SimpleNamespace(close=lambda: calls.append(name), start=lambda: calls.append(f"{name} starts"))
 
-    real = backends._load
+    real = backends.load
 
     def load(path: str) -> object:
         if path == backends.SERVO:
@@ -103,7 +103,7 @@ def closed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         rig.camera, rig.load_cell = device("camera"), device("load cell")
         return lambda *_: rig
 
-    monkeypatch.setattr(backends, "_load", load)
+    monkeypatch.setattr(backends, "load", load)
     return calls
 
 
