@@ -51,7 +51,7 @@ def test_what_is_missing_is_a_problem_with_something_to_do(tmp_path: Path) -> No
     assert set(problems) >= {"servo", "camera", "load cell", "network"}
     assert all(problem["advice"] for problem in problems.values())
     assert problems["servo"]["found"] == "there is no port /dev/nowhere"
-    assert problems["servo"]["advice"].startswith("plug the adapter in")
+    assert problems["servo"]["advice"].startswith("plug it in")
 
 
 def test_a_defect_of_one_probe_hides_no_other(monkeypatch: pytest.MonkeyPatch) -> None:

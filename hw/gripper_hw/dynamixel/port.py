@@ -9,7 +9,6 @@ import select
 import termios
 import time
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Final, NoReturn, Protocol
 
 import serial
@@ -17,6 +16,7 @@ from dynamixel_sdk import PortHandler
 
 from gripper_force.errors import ConfigError, DeviceError, DeviceLostError, DeviceNotFoundError
 from gripper_hw.dynamixel.virtual import VirtualBus, find_bus
+from gripper_hw.serial_line import open_line
 
 VIRTUAL_PREFIX: Final = "virtual:"
 
@@ -71,10 +71,7 @@ class SerialPort(PortHandler):  # type: ignore[misc]
     def setupPort(self, cflag_baud: int) -> bool:  # noqa: N802
         """Opens the line. Raises as `open_port` says."""
         self.closePort()
-        try:
-            self.ser = serial.Serial(self.port_name, baudrate=cflag_baud, timeout=0, exclusive=True)
-        except (serial.SerialException, termios.error, OSError) as error:
-            raise _open_error(self.port_name, error) from error
+        self.ser = open_line(self.port_name, cflag_baud, unit="servo", timeout_s=0)
         # Only some adapters, and no pseudo-terminal, have a latency timer.
         with contextlib.suppress(ValueError, OSError):
             self.ser.set_low_latency_mode(True)
@@ -213,15 +210,3 @@ class MemoryPort(PortHandler):  # type: ignore[misc]
 
 
 _in_use: Final[set[VirtualBus]] = set()
-
-
-def _open_error(name: str, error: Exception) -> DeviceError:
-    if not Path(name).exists():
-        return DeviceNotFoundError(
-            f"there is no port {name}; plug the adapter in, or set servo.port to one of /dev/serial/by-id"
-        )
-    if isinstance(error, OSError) and error.errno == 13:
-        return DeviceError(f"no permission to open {name}; install hw/udev's rules or join the group dialout")
-    if isinstance(error, OSError) and error.errno == 11:
-        return DeviceError(f"the port {name} is in use by another program; close that first")
-    return DeviceError(f"can't open the port {name}: {error}")

@@ -4,16 +4,16 @@ import math
 import termios
 import threading
 from contextlib import suppress
-from pathlib import Path
 from typing import Final
 
 import serial
 
 from gripper_force.config import LoadCellConfig
-from gripper_force.errors import ConfigError, DeviceError, DeviceNotFoundError
+from gripper_force.errors import ConfigError, DeviceError
 from gripper_force.interfaces import Clock
 from gripper_hw.load_cells.lines import PARSERS, LineSplitter
 from gripper_hw.load_cells.screening import LiveLoadCell
+from gripper_hw.serial_line import open_line
 
 RECONNECT_S: Final = 0.5
 """Pause between two tries to open a port that went away."""
@@ -98,19 +98,4 @@ class SerialLoadCell(LiveLoadCell):
         return None
 
     def _open(self) -> serial.Serial:
-        try:
-            return serial.Serial(self._name, self._config.baud_rate, exclusive=True)
-        except (OSError, ValueError, termios.error) as error:
-            raise _open_error(self._name, error) from error
-
-
-def _open_error(name: str, error: Exception) -> DeviceError:
-    if not Path(name).exists():
-        return DeviceNotFoundError(
-            f"there is no load cell at {name}; plug it in, or set load_cell.port to one of /dev/serial/by-id"
-        )
-    if isinstance(error, OSError) and error.errno == 13:
-        return DeviceError(f"no permission to open {name}; join the group dialout and log in again")
-    if isinstance(error, OSError) and error.errno == 11:
-        return DeviceError(f"the load cell's port {name} is in use by another program; close that first")
-    return DeviceError(f"can't open the load cell's port {name}: {error}")
+        return open_line(self._name, self._config.baud_rate, unit="load_cell", timeout_s=None)

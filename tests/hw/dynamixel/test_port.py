@@ -16,7 +16,7 @@ PING = frame(1, Instruction.PING)
 
 @pytest.mark.parametrize(
     ("name", "advice"),
-    [("/dev/ttyNotThere", "plug the adapter in"), ("virtual:nobody", "simulate one first")],
+    [("/dev/ttyNotThere", "plug it in"), ("virtual:nobody", "simulate one first")],
 )
 def test_a_missing_port_says_what_to_do(name, advice):
     with pytest.raises(DeviceNotFoundError, match=advice):

@@ -78,7 +78,7 @@ def test_a_cell_that_is_away_can_be_drained_and_closed(board, cell, collect, wai
 
 def test_a_port_that_is_not_there_is_one_sentence(tmp_path):
     cell = SerialLoadCell(LoadCellConfig(backend="serial", port=str(tmp_path / "no")), MonotonicClock())
-    with pytest.raises(DeviceNotFoundError, match=r"there is no load cell at .*/no; plug it in") as caught:
+    with pytest.raises(DeviceNotFoundError, match=r"there is no port .*/no; plug it in") as caught:
         cell.start()
     assert "\n" not in str(caught.value)
     assert cell.drain() == []
