@@ -99,7 +99,7 @@ def closed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         if path != backends.RIG:
             return real(path)
         rig = device("rig")
-        rig.clock, rig.check, rig.notes = MonotonicClock(), lambda: None, dict
+        rig.clock, rig.start_ns, rig.check, rig.notes = MonotonicClock(), 0, lambda: None, dict
         rig.camera, rig.load_cell = device("camera"), device("load cell")
         return lambda *_: rig
 
