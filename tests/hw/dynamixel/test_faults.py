@@ -318,7 +318,8 @@ def rig(unit: str, kind: str, **span: float):
         }
     )
     with open_devices(config) as devices:
-        devices.servo.start()
+        state = devices.servo.start()
+        devices.servo.write(ServoCommand(0, state.position_rad + 2.0, 0.2))
         devices.clock.sleep_until_ns(10 * NS_PER_MS)
         devices.servo.read()
         yield devices
@@ -328,7 +329,7 @@ def read_on(devices) -> None:
     for cycle in range(3, 100):
         devices.clock.sleep_until_ns(cycle * CYCLE_NS)
         state = devices.servo.read()
-        if state.hardware_error or state.current_a > 0.02:
+        if state.hardware_error or state.current_a > 0.22:
             raise HardwareFaultError(str(state))
 
 
