@@ -510,7 +510,15 @@ def _agreed(servo: str, changes: list[Any], yes: bool) -> bool:
     for change in changes:
         table.add_row(change.register, change.old, change.new)
     err.print(table)
-    return yes or typer.confirm(f"Write these to {servo}?", err=True)
+    try:
+        return yes or typer.confirm(f"Write these to {servo}?", err=True)
+    except typer.Abort as abort:
+        if not isinstance(abort.__context__, EOFError):
+            raise
+        err.print()
+        raise ConfigError(
+            f"no answer came, so nothing was written to {servo}; say --yes where nobody can be asked"
+        ) from abort
 
 
 def _setup_line(r: dict[str, Any]) -> None:

@@ -73,7 +73,7 @@ class PhidgetLoadCell(LiveLoadCell):
             if error.code == _TIMED_OUT:
                 raise DeviceNotFoundError(
                     f"no Phidget bridge answers for input {self._config.channel}; check its cable, and that "
-                    "Phidgets' own udev rule is installed"
+                    "hw/udev's rules are installed"
                 ) from error
             raise DeviceError(f"the Phidget bridge refuses: {error.description}; plug it in again") from error
         self._channel = channel
