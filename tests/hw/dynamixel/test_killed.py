@@ -1,4 +1,4 @@
-"""A grasp that is killed or stopped in mid-motion, in a process of its own, on a servo in another."""
+"""Grasps that are killed or stopped in mid-motion, in processes of their own, on servos in others."""
 
 import json
 import signal
@@ -10,7 +10,6 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import dynamixel_sdk as sdk
-import pytest
 
 from gripper_force.log import LogReader
 from gripper_force.types import NS_PER_MS, ServoCommand, ServoState
@@ -18,6 +17,7 @@ from gripper_hw.dynamixel.control_table import REGISTERS
 from gripper_hw.dynamixel.packets import Error
 
 COMMAND = [sys.executable, "-c", "from gripper_force.cli import main; main()"]
+SIGNALS = (signal.SIGKILL, signal.SIGSTOP)
 PACKETS = sdk.PacketHandler(2.0)
 STARVED_MS = 400
 """How late a busy machine may let a process come to its next cycle."""
@@ -35,12 +35,6 @@ def process(*arguments: str) -> Iterator[subprocess.Popen[str]]:
             child.kill()
 
 
-@pytest.fixture(scope="module")
-def device_path() -> Iterator[str]:
-    with process("virtual-servo", "--json") as child:
-        yield json.loads(child.stdout.readline())["port"]
-
-
 def read(port: sdk.PortHandler, name: str) -> int:
     register = REGISTERS[name]
     data, result, _ = PACKETS.readTxRx(port, 1, register.address, register.size)
@@ -48,46 +42,63 @@ def read(port: sdk.PortHandler, name: str) -> int:
     return register.decode(bytes(data))
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
-def test_the_servo_lets_go_by_itself_and_the_log_is_whole(device_path, quick, tmp_path: Path, number):
+def grasp(port: str, folder: Path, quick: list[str]) -> list[str]:
     settings = {
-        "servo.port": device_path,
+        "servo.port": port,
         "clock": "realtime",
         "load_cell.backend": "none",
         "servo.reply_margin_ms": STARVED_MS,
         "servo.bus_watchdog_ms": 2 * STARVED_MS,
-        "gripper.open_width_m": 0.5,  # so far that it is on its way for ten seconds
+        "gripper.open_width_m": 2.0,  # so far that it is on its way for 40 s
         "control.timeout_s": 60,
-        "log.directory": tmp_path,
+        "log.directory": folder,
         "log.report": "false",
     }
     sets = [*quick, *(f"{key}={value}" for key, value in settings.items())]
+    return ["grasp", *(part for one in sets for part in ("--set", one))]
+
+
+def test_the_servo_lets_go_by_itself_and_the_log_is_whole(quick, tmp_path):
     with ExitStack() as stack:
-        child = stack.enter_context(process("grasp", *(part for one in sets for part in ("--set", one))))
-        assert any("approach" in line for line in child.stderr), child.stdout.read()
+        ports, children = [], []
+        for number in SIGNALS:
+            served = stack.enter_context(process("virtual-servo", "--json"))
+            ports.append(json.loads(served.stdout.readline())["port"])
+            folder = tmp_path / number.name
+            children.append(stack.enter_context(process(*grasp(ports[-1], folder, quick))))
+        for child in children:
+            assert any("approach" in line for line in child.stderr), child.stdout.read()
         time.sleep(1.0)  # some way
-        assert child.poll() is None
+        assert [child.poll() for child in children] == [None, None]
         sent_ns = time.monotonic_ns()
-        child.send_signal(number)
+        for number, child in zip(SIGNALS, children, strict=True):
+            child.send_signal(number)
         time.sleep(3 * STARVED_MS / 1e3)  # in silence: any packet would feed the watchdog
+        for port in ports:
+            check_servo(port)
+    for number in SIGNALS:
+        check_log(tmp_path / number.name, sent_ns)
 
-        port = sdk.PortHandler(device_path)
-        stack.callback(port.closePort)
-        assert port.openPort()
-        assert read(port, "bus_watchdog") == -1
-        assert read(port, "goal_current") != 0
-        assert read(port, "present_current") == 0
-        goal = REGISTERS["goal_current"].address
-        assert PACKETS.write2ByteTxRx(port, 1, goal, 100) == (sdk.COMM_SUCCESS, Error.DATA_RANGE)
-        stopped_at = read(port, "present_position")
-        time.sleep(0.1)
-        assert read(port, "present_position") == stopped_at
-        assert read(port, "goal_position") != stopped_at
 
-    (path,) = tmp_path.glob("*.mcap")
+def check_servo(device_path: str) -> None:
+    port = sdk.PortHandler(device_path)
+    assert port.openPort()
+    assert read(port, "bus_watchdog") == -1
+    assert read(port, "goal_current") != 0
+    assert read(port, "present_current") == 0
+    goal = REGISTERS["goal_current"].address
+    assert PACKETS.write2ByteTxRx(port, 1, goal, 100) == (sdk.COMM_SUCCESS, Error.DATA_RANGE)
+    stopped_at = read(port, "present_position")
+    time.sleep(0.1)
+    assert read(port, "present_position") == stopped_at
+    assert read(port, "goal_position") != stopped_at
+    port.closePort()
+
+
+def check_log(folder: Path, sent_ns: int) -> None:
+    (path,) = folder.glob("*.mcap")
     log = LogReader(path, recover=True)
     states, commands = list(log.records(ServoState)), list(log.records(ServoCommand))
     assert states[-1].position_rad > states[0].position_rad + 0.01  # it was on its way
     assert abs(len(states) - len(commands)) <= 1
-    lost_ms = (sent_ns - states[-1].t_ns) / NS_PER_MS
-    assert lost_ms < 100 + STARVED_MS
+    assert (sent_ns - states[-1].t_ns) / NS_PER_MS < 100 + STARVED_MS
