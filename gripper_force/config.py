@@ -201,7 +201,7 @@ FAULTS: Final[dict[str, dict[str, str]]] = {
         "intermittent": "half of the answers are lost",
     },
     "plant": {
-        "wrong": "the motor gives more current than its goal asks, by 0.1 A more every second",
+        "wrong": "the motor gives more current than its goal asks, by 50 % more every second",
     },
     "camera": {
         "off": "no frame comes",

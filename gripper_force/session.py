@@ -20,7 +20,7 @@ from gripper_force.config import Config, dump_config
 from gripper_force.control.grasp import Decision, GraspController, is_open
 from gripper_force.control.limits import largest_target_n
 from gripper_force.control.transmission import Transmission
-from gripper_force.errors import ConfigError
+from gripper_force.errors import ConfigError, DeviceError, GripperError
 from gripper_force.faults import Faults, FaultyEstimator, FaultyFile
 from gripper_force.interfaces import Devices
 from gripper_force.log import LogWriter
@@ -51,6 +51,9 @@ _CELL_PATIENCE_NS = 45 * NS_PER_MS
 _CELL_PERIODS = 8
 """A load cell without a sound sample for so long, and for so many of its periods, says nothing any more."""
 
+_SUPPLY_SLACK_V = 0.5
+"""A supply that is set to the end of a servo's range reads a little beyond it."""
+
 _REALTIME_SWITCH_S = 2e-4
 _PACKAGES = ("gripper-force", "dynamixel-sdk", "mujoco", "numpy", "torch")
 
@@ -80,13 +83,19 @@ class Session:
         self._due_ns = 0
         self._stop = threading.Event()
         self._interrupted = False
-        self._last_retries = 0
+        self._tallies = {unit: _Tally() for unit in ("servo", "camera", "load_cell")}
         self._problem = ""
         self._cell = _CellWatch()
+        self._error: BaseException | None = None
         self._armed = False
         self.failed = False
         self.sees = False
         self.cycles = 0
+
+    @property
+    def lost_records(self) -> int:
+        """Records that the log lacks, because the disk failed or was too slow."""
+        return self._recorder.lost
 
     def start(self) -> None:
         """Arms the servo and starts the sensors."""
@@ -164,6 +173,7 @@ class Session:
 
     def fail(self, error: BaseException) -> None:
         """Takes note of what ends the run; Ctrl-C is no fault."""
+        self._error = error
         self.failed |= isinstance(error, Exception)
         self._recorder.write(
             Event(self._devices.clock.now_ns(), "session", f"{type(error).__name__}: {error}")
@@ -175,9 +185,14 @@ class Session:
         try:
             if self._armed:
                 self._devices.servo.stop(hold=hold == "hold")
+        except DeviceError as second:
+            first = self._error
+            if not isinstance(first, GripperError):
+                raise
+            raise type(first)(f"{first}; nor could it be stopped: {second}") from first
         finally:
             self._perception.close()
-        self._log_sensors(self._devices.clock.now_ns())
+        self._log_sensors(self._devices.clock.now_ns(), at_end=True)
 
     def attach(self, name: str, data: bytes, media_type: str) -> None:
         """Adds a file to the log."""
@@ -189,17 +204,41 @@ class Session:
             return Request(t_ns, RequestKind.STOP)
         return None if kind is None else Request(t_ns, kind, target_n)
 
-    def _log_sensors(self, t_ns: int) -> None:
-        if self._devices.load_cell is not None:
-            samples = self._devices.load_cell.drain()
+    def _log_sensors(self, t_ns: int, *, at_end: bool = False) -> None:
+        devices = self._devices
+        if devices.load_cell is not None:
+            samples = devices.load_cell.drain()
             for sample in samples:
                 self._recorder.write(sample)
             if text := self._cell.look(t_ns, samples):
                 self._recorder.write(Event(t_ns, "load_cell", text))
-        stats = self._devices.servo.stats
-        if stats.retries > self._last_retries:
-            self._recorder.write(Event(t_ns, "servo", f"{stats.retries - self._last_retries} bus retries"))
-            self._last_retries = stats.retries
+        counts = {"servo": {"bus retries": devices.servo.stats.retries}}
+        if devices.camera is not None:
+            counts["camera"] = devices.camera.counts()
+        if devices.load_cell is not None:
+            counts["load_cell"] = devices.load_cell.counts()
+        for unit, count in counts.items():
+            if text := self._tallies[unit].look(t_ns, count, at_end=at_end):
+                self._recorder.write(Event(t_ns, unit, text))
+
+
+class _Tally:
+    """Says by how much a device's counts of what went wrong have risen, once a second at most."""
+
+    def __init__(self) -> None:
+        self._told: dict[str, int] = {}
+        self._next_ns = 0
+
+    def look(self, t_ns: int, counts: dict[str, int], *, at_end: bool) -> str:
+        """Takes the counts of a cycle. Returns the news, or an empty text."""
+        if counts == self._told or (t_ns < self._next_ns and not at_end):
+            return ""
+        risen = {cause: count - self._told.get(cause, 0) for cause, count in counts.items()}
+        self._told = counts
+        news = [f"{count} {cause.replace('_', ' ')}" for cause, count in risen.items() if count]
+        if news:
+            self._next_ns = t_ns + NS_PER_S
+        return ", ".join(news)
 
 
 class _CellWatch:
@@ -293,9 +332,9 @@ def run_grasp(config: Config, path: Path, progress: Progress | None = None) -> N
             f"target_n {config.target_n:g} N is too near to control.force_limit_n {limit_n:g} N; ask for at "
             f"most {largest_target_n(limit_n):g} N, or raise the limit"
         )
-    checkpoint = load_checkpoint(config.vision.checkpoint) if _wants_vision(config) else None
+    checkpoint = checkpoint_of(config)
     with open_devices(config) as devices, open_session(config, devices, path, checkpoint) as session:
-        _grasp(session, config, checkpoint is not None, progress)
+        grasp_in(session, config, checkpoint is not None, progress)
 
 
 def make_controller(config: Config, devices: Devices) -> tuple[Config, GraspController]:
@@ -308,7 +347,9 @@ def make_controller(config: Config, devices: Devices) -> tuple[Config, GraspCont
         gripper = gripper.model_copy(update={"current_step_a": servo.current_step_a})
     control = config.control
     if control.voltage_limits_v is None:
-        control = control.model_copy(update={"voltage_limits_v": servo.voltage_range_v})
+        low_v, high_v = servo.voltage_range_v
+        slack = {"voltage_limits_v": (low_v - _SUPPLY_SLACK_V, high_v + _SUPPLY_SLACK_V)}
+        control = control.model_copy(update=slack)
     config = config.model_copy(update={"gripper": gripper, "control": control})
     return config, controller_from(config)
 
@@ -329,7 +370,15 @@ def make_estimator(config: Config, checkpoint: Checkpoint | None) -> ForceEstima
     return ForceEstimator(checkpoint, config.vision.region, config.vision.threads)
 
 
-def _grasp(session: Session, config: Config, sees: bool, progress: Progress | None) -> None:
+def checkpoint_of(config: Config) -> Checkpoint | None:
+    """The network that the configuration names, or None for a run without vision."""
+    if config.camera.backend == "none" or config.vision.checkpoint == "none":
+        return None
+    return load_checkpoint(config.vision.checkpoint)
+
+
+def grasp_in(session: Session, config: Config, sees: bool, progress: Progress | None = None) -> None:
+    """Grasps, holds and releases in a session that is open; see `run_grasp`."""
     decision = session.cycle()
     start_ns = last_ns = decision.status.t_ns
     while last_ns - start_ns < (_VISION_PATIENCE_NS if sees and not session.sees else _REFERENCE_NS):
@@ -368,10 +417,6 @@ def _end_fault(session: Session, config: Config, status: GraspStatus) -> None:
         if is_open(config.gripper.open_width_m, status.width_m):
             return
         status = session.cycle().status
-
-
-def _wants_vision(config: Config) -> bool:
-    return config.camera.backend != "none" and config.vision.checkpoint != "none"
 
 
 def _recorder(config: Config, devices: Devices, path: Path, checkpoint: Checkpoint | None) -> Recorder:

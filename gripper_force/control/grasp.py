@@ -1,7 +1,6 @@
 """The grasp: phases, outcomes, and what is commanded in each."""
 
 import dataclasses
-import math
 from dataclasses import dataclass
 
 from gripper_force.config import ControlConfig
@@ -133,6 +132,7 @@ class GraspController:
         self._phase_s = self._sign_s = self._settled_s = 0.0
         self._error_n = self._cruise_n = 0.0
         self._has_moved = self._was_over = False
+        self._goal_current_a = 0.0
         self._easing = 1.0
 
     @property
@@ -156,7 +156,7 @@ class GraspController:
         """
         dt_s = self._elapsed_s(t_ns)
         self._reason = ""
-        tripped = self._safety.check(servo, dt_s, over_force=self._was_over)
+        tripped = self._safety.check(servo, self._goal_current_a, dt_s, over_force=self._was_over)
         events = self._sense(t_ns, servo, visual)
         if tripped:
             self._fail()
@@ -165,6 +165,7 @@ class GraspController:
         if self._width_m is not None:
             self._act(t_ns, dt_s, self._width_m, self._transmission.closing_m_s(servo.velocity_rad_s))
         command, is_over = self._bound(t_ns, dt_s)
+        self._goal_current_a = command.goal_current_a
         if is_over and not self._was_over:
             events.append(Event(t_ns, "control", f"{self._estimate.force_n:.2f} N is over the limit; eased"))
         self._was_over = is_over
@@ -238,6 +239,7 @@ class GraspController:
             self._enter(Phase.RAMP, f"new target {target_n:g} N")
             return
         self._fusion.restart()
+        self._limits.begin()
         self._speed_m_s = min(self._config.approach_speed_m_s, _IMPACT_M_S_PER_N * target_n)
         self._has_moved = False
         self._cruise_n = 0.0

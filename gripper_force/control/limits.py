@@ -10,6 +10,9 @@ from gripper_force.types import ServoCommand
 _RISE_FACTOR = 4.0
 """The push may rise this many times as fast as the force ramp."""
 
+_OVER_FORCE_CEILING = 0.95
+"""A current that proved too much is not reached again in the same grasp."""
+
 _CERTAIN_SHARE = 0.95
 """Share of the force limit to which the current is held: the torque constant is known to 10 %, and a force
 5 % beyond the limit is the most that may happen, whatever vision says."""
@@ -42,9 +45,11 @@ class Limits:
         self._step_a = transmission.current_step_a
         ends = (transmission.open_position_rad, transmission.closed_position_rad)
         self._low_rad, self._high_rad = min(ends), max(ends)
+        self._lowered_a = math.inf
         self._level_a = 0.0
         self._rounding_a = 0.0
         self._last_a = 0.0
+        self._over = False
 
     def apply(
         self, command: ServoCommand, force_n: float, friction_n: float, dt_s: float, *, may_rise: bool
@@ -65,17 +70,24 @@ class Limits:
             NonFiniteError: A number of the command, or the estimate, is not finite.
         """
         self._refuse_non_finite(command, force_n, friction_n)
-        ceiling_a = self.ceiling_a(friction_n)
+        ceiling_a = min(self.ceiling_a(friction_n), self._lowered_a)
         if not may_rise:
             ceiling_a = min(ceiling_a, self._last_a)
         over = force_n > self._force_limit_n
         if over:
+            if not self._over:
+                self._lowered_a = _OVER_FORCE_CEILING * self._last_a
             ceiling_a = min(ceiling_a, _OVER_FORCE_FACTOR * self._last_a)
+        self._over = over
         wanted_a = min(max(command.goal_current_a, 0.0), self._level_a + self._rise_a_s * dt_s, ceiling_a)
         self._level_a = wanted_a
         self._last_a = self._on_grid(wanted_a, ceiling_a)
         position_rad = min(max(command.goal_position_rad, self._low_rad), self._high_rad)
         return ServoCommand(command.t_ns, position_rad, self._last_a), over
+
+    def begin(self) -> None:
+        """A new grasp: what was too much for the last one no longer counts."""
+        self._lowered_a = math.inf
 
     def ceiling_a(self, friction_n: float) -> float:
         """The most current that the force limit and the servo's own limit leave."""

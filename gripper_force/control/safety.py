@@ -12,6 +12,11 @@ _LEAP_RAD_S = 20.0
 _OVER_FORCE_S = 0.25
 """The limits ease within 10 ms what is too much. A force that stays too high for so long does not obey."""
 
+_EXCESS_A = 0.03
+_EXCESS_SHARE = 0.15
+_EXCESS_S = 0.02
+"""A motor that takes more than its goal allows, by so much and for so long, does not obey."""
+
 _EASED = 0.6
 """What is left of the wanted force at the temperature limit: a third of the heat."""
 
@@ -30,13 +35,14 @@ class Safety:
         self._config = config
         self._cause = ""
         self._last: ServoState | None = None
-        self._over_s = 0.0
+        self._over_s = self._excess_s = 0.0
 
-    def check(self, servo: ServoState, dt_s: float, *, over_force: bool) -> bool:
+    def check(self, servo: ServoState, goal_current_a: float, dt_s: float, *, over_force: bool) -> bool:
         """Takes a cycle's reading.
 
         Args:
             servo: What the servo says of itself.
+            goal_current_a: What the last cycle allowed it.
             dt_s: Time since the last cycle.
             over_force: The last cycle's force estimate was over its limit.
 
@@ -44,6 +50,8 @@ class Safety:
             Whether the latch has tripped in this cycle.
         """
         self._over_s = self._over_s + dt_s if over_force else 0.0
+        excess = abs(servo.current_a) > (1 + _EXCESS_SHARE) * goal_current_a + _EXCESS_A
+        self._excess_s = self._excess_s + dt_s if excess else 0.0
         self._cause = self._why_not(servo)
         if is_sound(servo):
             self._last = servo
@@ -81,6 +89,8 @@ class Safety:
             return f"the servo's supply is at {servo.voltage_v:.1f} V, outside {low_v:g} to {high_v:g} V"
         if self._last is not None and self._leaps(self._last, servo):
             return f"the servo's position leapt to {servo.position_rad:.3f} rad"
+        if self._excess_s > _EXCESS_S:
+            return f"the motor takes {abs(servo.current_a):.3f} A, more than its goal allows"
         if self._over_s > _OVER_FORCE_S:
             return f"the force stayed over its limit for {_OVER_FORCE_S:g} s"
         return ""

@@ -90,5 +90,21 @@ def test_the_ceiling_keeps_the_limit_whatever_the_torque_constant_is(gain, frict
     assert gain * FINE.force_n(ceiling_a) - friction_n <= 1.05 * limit_n + 0.1 * friction_n
 
 
+def test_a_current_that_was_too_much_is_not_reached_again():
+    limits = Limits(CONFIG, FINE, 1.0)
+    wanted = ServoCommand(0, 0.0, 0.2)
+
+    def run(force_n, cycles=100):
+        return [
+            limits.apply(wanted, force_n, 0.95, 0.005, may_rise=True)[0].goal_current_a for _ in range(cycles)
+        ]
+
+    assert run(5.0)[-1] == pytest.approx(0.2)
+    assert run(13.0, 3)[-1] < 0.15
+    assert run(5.0)[-1] == pytest.approx(0.95 * 0.2)
+    limits.begin()
+    assert run(5.0)[-1] == pytest.approx(0.2)
+
+
 def test_the_largest_target_leaves_room_below_the_limit():
     assert largest_target_n(10.0) == pytest.approx(9.0)

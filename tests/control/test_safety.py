@@ -34,8 +34,8 @@ ILL = {
 }
 
 
-def check(safety, servo, dt_s=0.005, over_force=False):
-    return safety.check(servo, dt_s, over_force=over_force)
+def check(safety, servo, dt_s=0.005, over_force=False, goal_current_a=0.1):
+    return safety.check(servo, goal_current_a, dt_s, over_force=over_force)
 
 
 def tripped_by(change):
@@ -87,6 +87,14 @@ def test_a_force_that_stays_over_its_limit_trips_it():
     assert not any(check(safety, WELL, over_force=i % 40 != 0) for i in range(400))
     assert any(check(safety, WELL, over_force=True) for _ in range(60))
     assert "over its limit" in safety.reason
+
+
+def test_a_motor_that_takes_more_than_its_goal_trips_it():
+    safety = Safety(CONFIG)
+    assert not any(check(safety, replace(WELL, current_a=0.14)) for _ in range(100))
+    assert not any(check(safety, replace(WELL, current_a=-0.3 if i % 4 else 0.1)) for i in range(100))
+    assert any(check(safety, replace(WELL, current_a=-0.15)) for _ in range(6))
+    assert "takes 0.150 A" in safety.reason
 
 
 @given(st.floats(-40, 120), st.floats(0, 20))

@@ -1,5 +1,6 @@
 import dataclasses
 import math
+import re
 import signal
 import subprocess
 import sys
@@ -7,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from itertools import pairwise
+from itertools import count, pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -287,6 +288,9 @@ class Gray:
 
     def close(self) -> None: ...
 
+    def counts(self) -> dict[str, int]:
+        return {}
+
     def newest(self) -> Frame | None:
         self.asked += 1
         t_ns = self.asked * 5 * NS_PER_MS
@@ -381,7 +385,7 @@ def test_a_fault_ends_as_configured(quick: list[str], tmp_path: Path, on_fault: 
                 if status.phase == Phase.HOLD:
                     session.stop_soon()
 
-            session_module._grasp(session, config, False, stop)
+            session_module.grasp_in(session, config, False, stop)
         last = list(LogReader(path).records(GraspStatus))[-1]
         assert (last.phase, last.outcome) == (Phase.FAULT, Outcome.FAULT)
         assert bus.servos[0].get("torque_enable") == (on_fault == "hold")
@@ -435,6 +439,22 @@ def test_bus_retries_are_logged(open_rig: tuple[ExitStack, OpenRig], tmp_path: P
     assert events(tmp_path / "run.mcap") == ["1 bus retries"]
 
 
+def test_what_goes_wrong_again_and_again_is_told_once_a_second(
+    open_rig: tuple[ExitStack, OpenRig], tmp_path: Path
+) -> None:
+    run, begin = open_rig
+    rig = begin()
+    answers = count()
+    rig.bus.tamper = lambda answer: None if next(answers) % 2 else answer  # every read needs two tries
+    for _ in range(210):
+        rig.session.cycle()
+    rig.bus.tamper = None
+    run.close()
+    first, second, last = (int(text.removesuffix(" bus retries")) for text in events(tmp_path / "run.mcap"))
+    assert (first, second) == (1, 200)
+    assert last in (8, 9)
+
+
 def test_a_load_cell_that_falls_silent_is_told(quick: list[str], tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     run_grasp(load_config(None, [*quick, "faults=[{unit: load_cell, kind: off, at_s: 1, for_s: 0.5}]"]), path)
@@ -442,6 +462,18 @@ def test_a_load_cell_that_falls_silent_is_told(quick: list[str], tmp_path: Path)
     assert [e.text for e in told] == ["no sound sample; nothing to compare with", "sound samples again"]
     assert 1.0e9 < told[0].t_ns < 1.1e9
     assert told[1].t_ns < 1.6e9
+
+
+def test_samples_that_are_rejected_are_told_with_their_causes(quick: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    fault = "faults=[{unit: load_cell, kind: wrong, at_s: 1, for_s: 0.5}]"
+    run_grasp(load_config(None, [*quick, fault]), path)
+    log = LogReader(path)
+    told = " ".join(e.text for e in log.records(Event) if e.unit == "load_cell")
+    rejected = sum(not sample.valid for sample in log.records(LoadCellSample))
+    assert rejected >= 90
+    counted = [int(n) for n in re.findall(r"(\d+) (?:saturated|stuck|not finite|spikes|doubtful)", told)]
+    assert sum(counted) == rejected
 
 
 # Stop and signals.

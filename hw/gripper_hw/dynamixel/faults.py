@@ -14,7 +14,7 @@ _REQUESTS_LATE: Final = {"delayed": 1, "slow": 3}
 _LOST_SHARE: Final = 0.5
 _CUT_NS: Final = 5 * NS_PER_MS
 _CUT_PERIOD_NS: Final = 300 * NS_PER_MS
-_EXCESS_A_S: Final = 0.1
+_EXCESS_PER_S: Final = 0.5
 
 
 class WireFaults:
@@ -39,12 +39,12 @@ class WireFaults:
     def update(self, t_ns: int) -> None:
         """Makes of the servos what their faults leave of them. Call it with the bus's lock held."""
         kind, plant = self._servo.at(t_ns), self._plant.at(t_ns)
-        excess_a = _EXCESS_A_S * (t_ns - self._plant.since_ns) / NS_PER_S if plant == "wrong" else 0.0
+        excess = _EXCESS_PER_S * (t_ns - self._plant.since_ns) / NS_PER_S if plant == "wrong" else 0.0
         is_cut = kind == "off" or (
             kind == "intermittent" and (t_ns - self._servo.since_ns) % _CUT_PERIOD_NS < _CUT_NS
         )
         for servo in self._bus.servos:
-            servo.excess_a = excess_a
+            servo.excess = excess
             if is_cut:
                 _cut_power(servo, t_ns)
             elif kind == "stuck":

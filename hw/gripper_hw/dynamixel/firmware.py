@@ -64,7 +64,7 @@ class VirtualServo:
         model: Its model.
         tripped: True after a Bus Watchdog trip, until 0 is written to the watchdog: the goals are read-only.
         silent_until_ns: It is rebooting, and deaf, before this time.
-        excess_a: Fault: current that the motor is given beyond what its goals ask, while torque is on.
+        excess: Fault: share of its current that the motor is given beyond what its goals ask.
     """
 
     def __init__(self, id: int, model: ServoModel, firmware: int = 52) -> None:
@@ -88,7 +88,7 @@ class VirtualServo:
         self._fed_ns = 0
         self._registered: tuple[int, bytes] | None = None
         self.silent_until_ns = 0
-        self.excess_a = 0.0
+        self.excess = 0.0
         self._reset(eeprom=True)
         self._poke("firmware_version", firmware)
         self._poke("id", id)
@@ -122,7 +122,7 @@ class VirtualServo:
         if self._torque_on and not self.tripped:
             wanted_a = self._wanted_current_a(dt_s)
             self._current_a += (wanted_a - self._current_a) * -math.expm1(-dt_s / CURRENT_LOOP_S)
-            given_a = self._current_a + math.copysign(self.excess_a, self._current_a)
+            given_a = self._current_a * (1 + self.excess)
         else:
             given_a = self._current_a = 0.0
             self._pwm = 0.0

@@ -329,7 +329,7 @@ def read_on(devices) -> None:
     for cycle in range(3, 100):
         devices.clock.sleep_until_ns(cycle * CYCLE_NS)
         state = devices.servo.read()
-        if state.hardware_error or state.current_a > 0.22:
+        if state.hardware_error or state.current_a > 0.21:
             raise HardwareFaultError(str(state))
 
 

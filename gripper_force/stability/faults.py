@@ -1,0 +1,384 @@
+"""The fault matrix: every part fails in mid-grasp, and the log tells what became of the object.
+
+Each row breaks one part of the simulated rig at a seeded moment between the first touch and the end of the
+hold. A run without the fault stands beside it. Rows that end a process are real processes in real time.
+"""
+
+import multiprocessing
+import signal
+import tempfile
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from enum import StrEnum
+from itertools import pairwise
+from pathlib import Path
+from statistics import median
+from typing import Any, Final
+
+import numpy as np
+
+from gripper_force.backends import KILL_TRIAL, load, open_devices
+from gripper_force.config import Config, config_from
+from gripper_force.errors import GripperError, LogError
+from gripper_force.grasp import TRIAL_OBJECTS, TRIAL_TARGETS_N
+from gripper_force.interfaces import Devices
+from gripper_force.log import LogReader
+from gripper_force.session import checkpoint_of, grasp_in, open_session
+from gripper_force.types import (
+    NS_PER_MS,
+    NS_PER_S,
+    Event,
+    FusedForce,
+    GraspStatus,
+    LoadCellSample,
+    Phase,
+    ServoCommand,
+    Source,
+    VisualForce,
+)
+
+LIMIT_SHARE: Final = 1.25
+"""The force limit of each run over its target; a limit that is far away tests nothing."""
+
+TOLERANCE: Final = 0.05
+"""A peak may exceed the limit by this share."""
+
+_AFTER_NS = 300 * NS_PER_MS
+_MOST_LOST_MS = 100 + 5
+"""A chunk of the log, and a cycle."""
+
+_GRIPPING = (Phase.CONTACT, Phase.RAMP, Phase.HOLD)
+
+Summary = dict[str, Any]
+
+
+class Expected(StrEnum):
+    """What is to follow from a fault."""
+
+    STOP = "stop, latched"
+    STOP_OR_CARRY_ON = "retries carry it, or stop"
+    CURRENT_ALONE = "current alone"
+    CAP = "the current's cap holds"
+    EASED = "eased"
+    COMPARISON_INVALID = "control unchanged, comparison marked invalid"
+    NO_EFFECT = "no effect"
+    CARRY_ON = "control goes on, losses counted"
+    WATCHDOG = "the servo's watchdog trips"
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A line of the matrix.
+
+    Attributes:
+        name: What breaks.
+        unit: Of `gripper_force.config.FAULTS`; ``process`` for a signal.
+        kind: Likewise; or the signal's name.
+        expected: What is to follow.
+        within_ms: In which time; None where only what follows counts.
+        for_s: How long the fault lasts.
+    """
+
+    name: str
+    unit: str
+    kind: str
+    expected: Expected
+    within_ms: float | None
+    for_s: float = 1.0
+
+
+_CYCLE_MS = 5.0
+_TWO_FRAMES_MS = 2e3 / 60 + _CYCLE_MS
+_THREE_FRAMES_MS = 3e3 / 60 + _CYCLE_MS
+
+ROWS: Final = (
+    Row("process killed", "process", "SIGKILL", Expected.WATCHDOG, 60.0),
+    Row("process stopped", "process", "SIGSTOP", Expected.WATCHDOG, 60.0),
+    Row("control loop wedged", "clock", "stuck", Expected.STOP, None, 0.5),
+    Row("bus: adapter unplugged", "bus", "off", Expected.STOP, 20.0),
+    Row("bus: answers corrupted", "bus", "garbage", Expected.STOP, 20.0),
+    Row("bus: answers with another id", "bus", "wrong", Expected.STOP, 20.0),
+    Row("bus: answers too late", "bus", "slow", Expected.STOP, 20.0),
+    Row("bus: answers one request behind", "bus", "delayed", Expected.STOP, 20.0),
+    Row("bus: half of the answers lost", "bus", "intermittent", Expected.STOP_OR_CARRY_ON, None),
+    Row("servo: hardware error", "servo", "wrong", Expected.STOP, _CYCLE_MS),
+    Row("servo: watchdog at -1", "servo", "stuck", Expected.STOP, _CYCLE_MS),
+    Row("servo: power lost", "servo", "off", Expected.STOP, 20.0),
+    Row("servo: brownout, RAM reset", "servo", "intermittent", Expected.STOP, 20.0),
+    Row("camera: no frames", "camera", "off", Expected.CURRENT_ALONE, _TWO_FRAMES_MS),
+    Row("camera: picture stands still", "camera", "stuck", Expected.CURRENT_ALONE, _TWO_FRAMES_MS),
+    Row("camera: 5 frames a second", "camera", "slow", Expected.CURRENT_ALONE, _TWO_FRAMES_MS),
+    Row("camera: frames 0.3 s late", "camera", "delayed", Expected.CURRENT_ALONE, _TWO_FRAMES_MS),
+    Row("camera: most frames lost", "camera", "intermittent", Expected.CURRENT_ALONE, _TWO_FRAMES_MS),
+    Row("camera: noise", "camera", "garbage", Expected.CURRENT_ALONE, _THREE_FRAMES_MS),
+    Row("camera: wrong exposure", "camera", "wrong", Expected.CURRENT_ALONE, _THREE_FRAMES_MS),
+    Row("estimator: not finite", "estimator", "garbage", Expected.CURRENT_ALONE, _CYCLE_MS),
+    Row("estimator: exception", "estimator", "off", Expected.CURRENT_ALONE, _TWO_FRAMES_MS),
+    Row("estimator: hangs", "estimator", "stuck", Expected.CURRENT_ALONE, _TWO_FRAMES_MS),
+    Row("estimator: a third too low", "estimator", "wrong", Expected.CAP, None),
+    Row("load cell: no samples", "load_cell", "off", Expected.COMPARISON_INVALID, 100.0),
+    Row("load cell: stuck", "load_cell", "stuck", Expected.COMPARISON_INVALID, 100.0),
+    Row("load cell: garbage", "load_cell", "garbage", Expected.COMPARISON_INVALID, 100.0),
+    Row("load cell: saturated", "load_cell", "wrong", Expected.COMPARISON_INVALID, 100.0),
+    Row("load cell: 2 samples a second", "load_cell", "slow", Expected.COMPARISON_INVALID, 100.0),
+    Row("load cell: 0.5 s late", "load_cell", "delayed", Expected.COMPARISON_INVALID, 100.0),
+    Row("load cell: comes and goes", "load_cell", "intermittent", Expected.COMPARISON_INVALID, 400.0),
+    Row("over-force: motor gives too much", "plant", "wrong", Expected.EASED, 10.0, 2.0),
+    Row("wall clock jumps", "clock", "wrong", Expected.NO_EFFECT, None),
+    Row("disk full", "disk", "off", Expected.CARRY_ON, None),
+    Row("disk: I/O errors", "disk", "intermittent", Expected.CARRY_ON, None),
+    Row("disk slow", "disk", "slow", Expected.CARRY_ON, None),
+)
+
+
+def run_matrix(config: Config, seeds: int, jobs: int, rows: Sequence[Row] = ROWS) -> Iterator[Summary]:
+    """Runs every row with every seed.
+
+    Args:
+        config: Everything but object, target, force limit, seed and faults.
+        seeds: Grasps of each row.
+        jobs: Processes.
+        rows: Lines of the matrix.
+
+    Yields:
+        For each row, in order: ``row, expected, within_ms, runs, ok, results, peak_over_limit, worst_ms,
+        median_ms, lost_records, failures``.
+    """
+    drawn = [_draw(config, i).model_dump(mode="json") for i in range(seeds)]
+    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+        try:
+            sound = list(pool.map(_sound, drawn)) if any(row.unit != "process" for row in rows) else []
+            simulated = [row for row in rows if row.unit != "process"]
+            runs = {
+                row: [
+                    pool.submit(_broken, tree, row, before) for tree, before in zip(drawn, sound, strict=True)
+                ]
+                for row in simulated
+            }
+            for row in rows:
+                outcomes = (
+                    [run.result() for run in runs[row]] if row in runs else [_kill(t, row) for t in drawn]
+                )
+                yield _summary(row, outcomes)
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _draw(config: Config, index: int) -> Config:
+    rng = np.random.default_rng([config.seed, 30, index])
+    target_n = round(float(rng.uniform(*TRIAL_TARGETS_N)), 3)
+    return config.model_copy(
+        update={
+            "object": TRIAL_OBJECTS[index % len(TRIAL_OBJECTS)],
+            "target_n": target_n,
+            "seed": config.seed + index,
+            "control": config.control.model_copy(update={"force_limit_n": LIMIT_SHARE * target_n}),
+        }
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """What one grasp left behind."""
+
+    result: str
+    cycles: int
+    lost: int
+    peak_n: float
+    log: LogReader
+
+    def records(self, kind: type) -> list[Any]:
+        return list(self.log.records(kind))
+
+
+@dataclass(frozen=True, slots=True)
+class _Sound:
+    """The grasp without the fault: when there was contact, and what was commanded."""
+
+    begin_s: float
+    end_s: float
+    cycles: int
+    peak_n: float
+    commands: tuple[ServoCommand, ...]
+
+
+def _sound(tree: dict[str, Any]) -> _Sound:
+    config = config_from(tree, "stability")
+    with tempfile.TemporaryDirectory() as folder:
+        run = _grasp(config, Path(folder))
+        gripping = [s.t_ns / NS_PER_S for s in run.records(GraspStatus) if s.phase in _GRIPPING]
+        if not gripping:
+            raise GripperError(
+                f"the grasp of {config.object!r} with seed {config.seed} fails without a fault"
+            )
+        return _Sound(gripping[0], gripping[-1], run.cycles, run.peak_n, tuple(run.records(ServoCommand)))
+
+
+def _broken(tree: dict[str, Any], row: Row, sound: _Sound) -> Summary:
+    config = config_from(tree, "stability")
+    rng = np.random.default_rng([config.seed, 31])
+    at_s = float(rng.uniform(sound.begin_s + 0.05, max(sound.end_s - 0.5, sound.begin_s + 0.06)))
+    fault = {"unit": row.unit, "kind": row.kind, "at_s": at_s, "for_s": row.for_s}
+    config = config_from({**tree, "faults": [fault]}, "stability")
+    with tempfile.TemporaryDirectory() as folder:
+        run = _grasp(config, Path(folder))
+        took_ms, why_not = _judge(row, run, sound, config, round(at_s * NS_PER_S))
+    peak_n = sound.peak_n if row.unit == "load_cell" else run.peak_n  # the broken cell can't tell
+    over = peak_n / config.control.force_limit_n - 1
+    if over > TOLERANCE:
+        why_not = f"the peak is {100 * over:.1f} % over the limit"
+    elif not why_not and row.within_ms is not None and not (took_ms is not None and took_ms <= row.within_ms):
+        why_not = f"it took {took_ms} ms"
+    return {
+        "seed": config.seed,
+        "result": run.result,
+        "over": over,
+        "took_ms": took_ms,
+        "lost": run.lost,
+        "why_not": why_not,
+    }
+
+
+def _grasp(config: Config, folder: Path) -> _Run:
+    """Grasps, and watches for a while what becomes of the object afterwards."""
+    path, checkpoint, error_name, session = folder / "run.mcap", checkpoint_of(config), "", None
+    with open_devices(config) as devices:
+        try:
+            with open_session(config, devices, path, checkpoint) as session:
+                grasp_in(session, config, checkpoint is not None)
+        except LogError:
+            pass  # of the losses, which are counted
+        except GripperError as error:
+            error_name = type(error).__name__
+        peak_n = _watch(devices)
+    if session is None:
+        raise GripperError(
+            f"the grasp of {config.object!r} with seed {config.seed} never began: {error_name}"
+        )
+    log = LogReader(path, recover=True)
+    outcomes = [status.outcome for status in log.records(GraspStatus) if status.outcome]
+    cells_n = [sample.force_n for sample in log.records(LoadCellSample) if sample.valid]
+    return _Run(
+        result=error_name or (outcomes[-1] if outcomes else "interrupted"),
+        cycles=session.cycles,
+        lost=session.lost_records,
+        peak_n=max([peak_n, *cells_n]),
+        log=log,
+    )
+
+
+def _watch(devices: Devices) -> float:
+    """The highest force after the run has ended and nobody is in charge any more."""
+    devices.clock.sleep_until_ns(devices.clock.now_ns() + _AFTER_NS)
+    samples = devices.load_cell.drain() if devices.load_cell is not None else []
+    return max((sample.force_n for sample in samples if sample.valid), default=0.0)
+
+
+def _judge(row: Row, run: _Run, sound: _Sound, config: Config, at_ns: int) -> tuple[float | None, str]:
+    """When the safe state was there, in ms after the fault, and what is wrong with it, if anything is."""
+    match row.expected:
+        case Expected.STOP | Expected.STOP_OR_CARRY_ON:
+            stop_ns = _stop_ns(run)
+            if stop_ns is None:
+                return None, "" if row.expected == Expected.STOP_OR_CARRY_ON else f"it went on: {run.result}"
+            return _ms(stop_ns - at_ns), ""
+        case Expected.CURRENT_ALONE:
+            return _judge_vision(row, run, config, at_ns)
+        case Expected.CAP:
+            return None, "" if run.result in _FINISHED else run.result
+        case Expected.EASED:
+            return _judge_easing(run, config.control.force_limit_n)
+        case Expected.COMPARISON_INVALID:
+            told = [e.t_ns for e in run.records(Event) if e.unit == "load_cell" and e.t_ns >= at_ns]
+            same = tuple(run.records(ServoCommand)) == sound.commands
+            return _ms(told[0] - at_ns) if told else None, "" if same else "the commands are not the same"
+        case Expected.NO_EFFECT:
+            same = tuple(run.records(ServoCommand)) == sound.commands
+            return None, "" if same else "the commands are not the same"
+        case Expected.CARRY_ON:
+            missed = sound.cycles - run.cycles
+            return None, f"{missed} cycles are missing" if missed else ""
+        case _:
+            raise AssertionError(row.expected)
+
+
+_FINISHED: Final = ("held", "timeout", "slip")
+
+
+def _ms(time_ns: float) -> float:
+    return time_ns / NS_PER_MS
+
+
+def _stop_ns(run: _Run) -> int | None:
+    """When the run stopped: the controller at fault, or the session ended by an error."""
+    faults = [s.t_ns for s in run.records(GraspStatus) if s.phase == Phase.FAULT]
+    errors = [e.t_ns for e in run.records(Event) if e.unit == "session"]
+    return min([*faults, *errors], default=None)
+
+
+def _judge_vision(row: Row, run: _Run, config: Config, at_ns: int) -> tuple[float | None, str]:
+    """The time from when the first estimate that the fault took away was due."""
+    alone = [f.t_ns for f in run.records(FusedForce) if f.t_ns >= at_ns and f.source == Source.CURRENT]
+    if not alone:
+        return None, "vision never dropped out"
+    compute_ns = round(config.vision.lockstep_compute_ms * NS_PER_MS)
+    passes = row.kind in ("slow", "intermittent")  # what still comes is sound
+    good = [
+        v.ready_ns
+        for v in run.records(VisualForce)
+        if v.ready_ns <= alone[0] and (passes or v.ready_ns - compute_ns < at_ns)
+    ]
+    due_ns = max(at_ns, good[-1] + round(NS_PER_S / config.camera.rate_hz)) if good else at_ns
+    return max(_ms(alone[0] - due_ns), 0.0), "" if run.result in _FINISHED else run.result
+
+
+def _judge_easing(run: _Run, limit_n: float) -> tuple[float | None, str]:
+    """The longest time from an estimate over the limit to a goal current that is lower."""
+    over = {f.t_ns for f in run.records(FusedForce) if f.force_n > limit_n}
+    worst_ns, since_ns = 0, None
+    for before, now in pairwise(run.records(ServoCommand)):
+        if now.goal_current_a < before.goal_current_a or now.goal_current_a == 0:
+            worst_ns = max(worst_ns, now.t_ns - since_ns) if since_ns is not None else worst_ns
+            since_ns = None
+        elif now.t_ns in over and since_ns is None:
+            since_ns = now.t_ns
+    return _ms(worst_ns), ""
+
+
+def _kill(tree: dict[str, Any], row: Row) -> Summary:
+    config = config_from(tree, "stability")
+    with tempfile.TemporaryDirectory() as folder:
+        trial = load(KILL_TRIAL)(config, Path(folder), signal.Signals[row.kind])
+    over = trial.peak_n / config.control.force_limit_n - 1
+    why_not = "" if trial.tripped_ms is not None else "the watchdog did not trip"
+    if trial.lost_ms > _MOST_LOST_MS:
+        why_not = f"the log lacks the last {trial.lost_ms:.0f} ms"
+    return {
+        "seed": config.seed,
+        "result": "watchdog tripped" if trial.tripped_ms is not None else "goes on",
+        "over": over,
+        "took_ms": trial.tripped_ms,
+        "lost": 0,
+        "lost_ms": trial.lost_ms,
+        "why_not": why_not,
+    }
+
+
+def _summary(row: Row, outcomes: list[Summary]) -> Summary:
+    took_ms = [o["took_ms"] for o in outcomes if o["took_ms"] is not None]
+    results = sorted({o["result"] for o in outcomes})
+    return {
+        "row": row.name,
+        "expected": str(row.expected),
+        "within_ms": row.within_ms,
+        "runs": len(outcomes),
+        "ok": sum(not o["why_not"] for o in outcomes),
+        "results": {r: sum(o["result"] == r for o in outcomes) for r in results},
+        "peak_over_limit": max(o["over"] for o in outcomes),
+        "median_ms": median(took_ms) if took_ms else None,
+        "worst_ms": max(took_ms, default=None),
+        "lost_records": max(o["lost"] for o in outcomes),
+        "lost_ms": max((o.get("lost_ms", 0.0) for o in outcomes), default=0.0),
+        "failures": {o["seed"]: o["why_not"] for o in outcomes if o["why_not"]},
+    }
