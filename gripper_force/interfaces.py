@@ -78,6 +78,10 @@ class Camera(Protocol):
         """The newest frame that was not handed out yet, or None. Never blocks."""
         ...
 
+    def counts(self) -> dict[str, int]:
+        """What went wrong since it was made: cause to how often."""
+        ...
+
     def close(self) -> None:
         """Stops capturing. May be called twice."""
         ...
@@ -92,6 +96,10 @@ class LoadCell(Protocol):
 
     def drain(self) -> list[LoadCellSample]:
         """Every sample since the last call, oldest first. Never blocks."""
+        ...
+
+    def counts(self) -> dict[str, int]:
+        """What went wrong since it was made: cause to how often."""
         ...
 
     def close(self) -> None:

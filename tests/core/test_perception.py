@@ -60,6 +60,9 @@ class Shutter:
 
     def close(self) -> None: ...
 
+    def counts(self) -> dict[str, int]:
+        return {}
+
 
 def seqs(seen: list[Seen]) -> list[int]:
     return [s.frame.seq for s in seen]

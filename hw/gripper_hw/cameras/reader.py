@@ -38,9 +38,6 @@ class BackgroundCamera(ABC):
         config: Its section of the configuration.
         clock: The run's clock.
 
-    Attributes:
-        losses: How often the camera was gone, or gave no frame for ``camera.timeout_ms``.
-
     Raises:
         ConfigError: The clock is a simulated one.
     """
@@ -48,7 +45,7 @@ class BackgroundCamera(ABC):
     def __init__(self, config: CameraConfig, clock: Clock) -> None:
         if not isinstance(clock, MonotonicClock):
             raise ConfigError(f"camera.backend={config.backend} can't see simulated time; set clock=realtime")
-        self.losses = 0
+        self._losses = 0
         self._config, self._clock = config, clock
         self._newest: Frame | None = None
         self._next_seq = 0
@@ -91,6 +88,10 @@ class BackgroundCamera(ABC):
             frame, self._newest = self._newest, None
         return frame
 
+    def counts(self) -> dict[str, int]:
+        """How often the camera was gone, or gave no frame for ``camera.timeout_ms``."""
+        return {"losses": self._losses}
+
     def close(self) -> None:
         """Stops capturing, once the device's library returns. May be called twice."""
         self._stop.set()
@@ -130,7 +131,7 @@ class BackgroundCamera(ABC):
                     self._keep(shot, shift)
                     shot = self._next_shot(read, round(self._config.timeout_ms * NS_PER_MS))
             except DeviceLostError:
-                self.losses += 1
+                self._losses += 1
 
     def _next_shot(self, read: Read, patience_ns: int) -> Shot | None:
         """The next picture, or None if the camera is to be closed. Raises `DeviceLostError`."""

@@ -1,7 +1,6 @@
 """Is there a load cell, how fast and how quiet is it, and what of it is rejected?"""
 
 from collections.abc import Iterator
-from dataclasses import asdict
 
 import numpy as np
 
@@ -22,8 +21,8 @@ def probe(config: Config) -> Iterator[Check]:
         assert cell is not None
         cell.start()
         samples = gather(devices, cell.drain)
-        stats = getattr(cell, "stats", None)  # of the live ones: what they reject, and why
-    causes = ", ".join(f"{count} {cause}" for cause, count in asdict(stats).items() if count) if stats else ""
+        counts = cell.counts()
+    causes = ", ".join(f"{count} {cause.replace('_', ' ')}" for cause, count in counts.items() if count)
     if len(samples) < 2:
         advice = "check its cable and supply, load_cell.baud_rate and load_cell.format"
         yield Check("load cell", "rate", f"{len(samples)} samples {causes}".strip(), False, advice)
@@ -38,7 +37,7 @@ def probe(config: Config) -> Iterator[Check]:
         yield Check("load cell", "noise", noise, True)
     valid = len(forces_n) >= _LEAST_VALID * len(samples)
     advice = "check its wiring and shielding, and that it is not loaded beyond its range"
-    if stats and stats.not_finite:
+    if counts.get("not_finite"):
         advice = "set load_cell.n_per_raw, newtons for one unit of its reading, and load_cell.tare_raw"
     rejected = f"{len(samples) - len(forces_n)} of {len(samples)} samples"
     yield judged("load cell", "rejected", rejected + (f" ({causes})" if causes else ""), valid, advice)

@@ -111,6 +111,10 @@ class Screen:
                 taken[i] = replace(sample, valid=False)
         return taken
 
+    def counts(self) -> dict[str, int]:
+        """The counters by name."""
+        return {name: getattr(self.stats, name) for name in LoadCellStats.__slots__}
+
     def _ready(self, now_ns: int) -> int:
         """How many of the waiting samples have the followers they need, or waited for them long enough."""
         ready, followers = len(self._waiting), 0
@@ -152,6 +156,10 @@ class LiveLoadCell:
     def drain(self) -> list[LoadCellSample]:
         """The samples since the last call that can be judged by now, oldest first. Never blocks or raises."""
         return self._screen.take(self._clock.now_ns())
+
+    def counts(self) -> dict[str, int]:
+        """What went wrong since it was made: cause to how often (see `LoadCellStats`)."""
+        return self._screen.counts()
 
     def _add(self, raw: float, *, saturated: bool = False) -> None:
         self._screen.add(self._clock.now_ns(), raw, saturated=saturated)

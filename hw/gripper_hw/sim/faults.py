@@ -69,6 +69,10 @@ class FaultyCamera:
         self._last = frame
         return frame
 
+    def counts(self) -> dict[str, int]:
+        """What the camera within counts."""
+        return self._camera.counts()
+
     def close(self) -> None:
         """Stops capturing. May be called twice."""
         self._camera.close()
@@ -109,6 +113,10 @@ class FaultyLoadCell:
             sample = self._late.popleft()
             self._read(kind, sample.t_ns if kind == "delayed" else on_time_ns, sample.raw)
         return self._screen.take(now_ns)
+
+    def counts(self) -> dict[str, int]:
+        """What the screen rejects: cause to how often."""
+        return self._screen.counts()
 
     def close(self) -> None:
         """Stops sampling. May be called twice."""

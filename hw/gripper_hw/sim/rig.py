@@ -80,6 +80,10 @@ class SimulatedCamera:
             frame = self._under_way.popleft()
         return frame
 
+    def counts(self) -> dict[str, int]:
+        """Nothing goes wrong here."""
+        return {}
+
     def close(self) -> None:
         """Stops capturing; the world owns the drawing context. May be called twice."""
         self._closed = True
@@ -116,6 +120,10 @@ class SimulatedLoadCell:
     def drain(self) -> list[LoadCellSample]:
         """Every sample since the last call."""
         return [self._samples.popleft() for _ in range(len(self._samples))]
+
+    def counts(self) -> dict[str, int]:
+        """Nothing goes wrong here."""
+        return {}
 
     def close(self) -> None:
         """Stops sampling. May be called twice."""

@@ -144,7 +144,7 @@ def test_a_pipeline_that_ends_is_a_loss_and_a_new_one_is_built(make_oak: MakeOak
     take(camera, 2)
     pipelines[0][0].stop()
     deadline = time.monotonic() + 30
-    while camera.losses == 0:
+    while not camera.counts()["losses"]:
         assert time.monotonic() < deadline
         time.sleep(0.002)
     camera.newest()

@@ -117,6 +117,7 @@ def test_each_sample_comes_once_and_in_order(fitted: Fitted, collect) -> None:
     numbers = [fitted.number(sample) for sample in samples]
     assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
     assert all(sample.valid for sample in samples)
+    assert not any(fitted.cell.counts().values())
 
 
 @pytest.mark.parametrize("board", ["hx711", "cas"], indirect=True)

@@ -36,7 +36,7 @@ def test_a_cell_without_a_scale_is_a_problem(board) -> None:
     found = rows(REAL | {"load_cell": section})
     assert "noise" not in found
     assert found["rejected"].ok is False
-    assert "not_finite" in found["rejected"].found
+    assert "not finite" in found["rejected"].found
     assert "set load_cell.n_per_raw" in found["rejected"].advice
 
 
