@@ -398,6 +398,8 @@ def _grasp_table(r: dict[str, Any]) -> None:
             "estimator p50, p99": f"{_number(r['estimator_p50_ms'], '', 1)}, "
             f"{_number(r['estimator_p99_ms'], '', 1)} ms",
             "control loop": _number(r["loop_hz"], " Hz", 1),
+            "camera": _number(r["camera_hz"], " Hz", 1),
+            "samples rejected": _number(r["samples_rejected"]),
             "log": r["log"],
             "report": r["report"] or "-",
         }

@@ -41,8 +41,8 @@ def grasp(config: Config, progress: Callable[[GraspStatus], None] | None = None)
 
     Returns:
         ``result, object, target_n, load_cell_mean_n, steady_error_n, overshoot_n, settle_s, estimator_p50_ms,
-        estimator_p99_ms, loop_hz, log, report`` and the seed and the peak force; None where a figure has no
-        meaning, such as without a load cell.
+        estimator_p99_ms, loop_hz, camera_hz, samples_rejected, log, report`` and the seed and the peak force;
+        None where a figure has no meaning, such as without a load cell.
 
     Raises:
         GripperError: The run failed; its log holds what was seen.
@@ -93,7 +93,9 @@ def summarise(path: Path) -> Summary:
         records[type(record)].append(record)
     statuses, cells = records[GraspStatus], sorted(records[LoadCellSample], key=lambda c: c.t_ns)
     cycles_ns = [state.t_ns for state in records[ServoState]]
-    compute_ms = [visual.compute_ms for visual in records[VisualForce]]
+    visuals = records[VisualForce]
+    compute_ms = [visual.compute_ms for visual in visuals]
+    seen_s = (visuals[-1].t_ns - visuals[0].t_ns) / NS_PER_S if len(visuals) > 1 else 0.0
     config = config_from_text(reader.config, str(path))
     outcomes = [s.outcome for s in statuses if s.outcome != Outcome.NONE]
     span_s = (cycles_ns[-1] - cycles_ns[0]) / NS_PER_S if len(cycles_ns) > 1 else 0.0
@@ -107,8 +109,10 @@ def summarise(path: Path) -> Summary:
         "estimator_p50_ms": _percentile(compute_ms, 50),
         "estimator_p99_ms": _percentile(compute_ms, 99),
         "loop_hz": (len(cycles_ns) - 1) / span_s if span_s else None,
+        "camera_hz": (visuals[-1].seq - visuals[0].seq) / seen_s if seen_s else None,
+        "samples_rejected": sum(not cell.valid for cell in cells) if cells else None,
         "estimate_mae_n": {
-            "visual": _mae_n([(v.t_ns, v.force_n) for v in records[VisualForce]], cells),
+            "visual": _mae_n([(v.t_ns, v.force_n) for v in visuals], cells),
             "current": _mae_n([(f.t_ns, f.current_n) for f in records[FusedForce]], cells),
             "fused": _mae_n([(f.t_ns, f.force_n) for f in records[FusedForce]], cells),
             "floor": _floor_n(reader.metadata, cells),

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from gripper_force import grasp as grasp_module
-from gripper_force.config import Config, load_config
+from gripper_force.config import Config, config_from_text, load_config
 from gripper_force.grasp import overall, summarise, trials
 from gripper_force.log import LogReader, LogWriter
 from gripper_force.types import LoadCellSample, VisualForce
@@ -23,6 +23,9 @@ def test_a_summary_is_what_the_log_says(fused_log: Path) -> None:
     times = [v.compute_ms for v in log.records(VisualForce)]
     assert summary["estimator_p50_ms"] == pytest.approx(np.percentile(times, 50))
     assert summary["estimator_p99_ms"] == pytest.approx(np.percentile(times, 99))
+    camera = config_from_text(log.config, "it").camera
+    assert summary["camera_hz"] == pytest.approx(camera.rate_hz, rel=0.02)
+    assert summary["samples_rejected"] == 0
 
 
 def test_what_was_not_measured_is_none(fused_log: Path, tmp_path: Path) -> None:
@@ -40,6 +43,8 @@ def test_what_was_not_measured_is_none(fused_log: Path, tmp_path: Path) -> None:
         "settle_s",
         "peak_n",
         "estimator_p50_ms",
+        "camera_hz",
+        "samples_rejected",
     ):
         assert summary[name] is None
     assert summary["loop_hz"] == pytest.approx(200.0)
