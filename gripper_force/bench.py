@@ -17,7 +17,8 @@ class BusCost:
     """What a cycle takes, a read of two servos and a write of their goals, by one client at one setting.
 
     Attributes:
-        client: ``driver``, or ``plain SDK`` for a loop as the SDK's examples have it.
+        client: ``driver``; ``plain SDK``, GroupSyncRead and GroupSyncWrite over the SDK's own port, as in its
+            examples; or ``bare bytes``, packets made beforehand: what this machine takes to carry them.
         baud_rate: Bits a second.
         latency_ms: See `BUS_SETTINGS`.
         line_ms: What the line alone takes: the bytes' own time, and the latency.
@@ -36,7 +37,7 @@ class BusCost:
 
 
 def bus(cycles: int) -> Iterator[tuple[BusCost, ...]]:
-    """Measures the servo's driver and a plain loop of the vendor's SDK, setting by setting.
+    """Measures the servo's driver, beside what `BusCost` names, setting by setting.
 
     Args:
         cycles: How many of each client at each setting.

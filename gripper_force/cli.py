@@ -496,15 +496,27 @@ def _fuzz_table(r: dict[str, Any]) -> None:
 
 
 def _bus_table(r: dict[str, Any]) -> None:
-    columns = ("baud", "latency ms", "client", "line ms", "p50 ms", "p99 ms", "p50 / line", "CPU at 200 Hz %")
+    columns = ("Mbaud", "latency ms", "client", "line ms", "p50 ms", "p99 ms", "p50/line", "CPU % at 200Hz")
     table = Table(*columns, box=None)
     for c in r["bus"]:
         figures = (c.line_ms, c.p50_ms, c.p99_ms, c.p50_ms / c.line_ms)
         numbers = (_number(value) for value in figures)
         share = _number(100 * c.cpu_share, digits=1)
-        table.add_row(str(c.baud_rate), _number(c.latency_ms, digits=0), c.client, *numbers, share)
+        setting = (f"{c.baud_rate / 1e6:g}", f"{c.latency_ms:g}")
+        table.add_row(*setting, c.client, *numbers, share)
     out.print(table)
     out.print(f"[dim]load {r['load']:.1f} on {r['cores']} cores[/]")
+
+
+def _soak_table(r: dict[str, Any]) -> None:
+    table = Table("simulated s", "memory MB", "files", "threads", box=None)
+    for s in r["samples"]:
+        table.add_row(
+            _number(s.simulated_s, digits=0), _number(s.memory_mb, digits=1), str(s.handles), str(s.threads)
+        )
+    out.print(table)
+    summary = {key: value for key, value in r.items() if key not in ("samples", "outcomes")}
+    _pairs({**summary, "outcomes": ", ".join(f"{n} {name}" for name, n in r["outcomes"].items())})
 
 
 def _agreed(servo: str, changes: list[Any], yes: bool) -> bool:

@@ -11,5 +11,5 @@ def test_the_bus_is_measured_and_shown(monkeypatch: pytest.MonkeyPatch) -> None:
     call = ["bench", "--bus", "--cycles", "2"]
     assert "plain SDK" in CliRunner().invoke(cli.app, call).stdout
     told = json.loads(CliRunner().invoke(cli.app, [*call, "--json"]).stdout)
-    assert [cost["client"] for cost in told["bus"]] == ["driver", "plain SDK"]
+    assert [cost["client"] for cost in told["bus"]] == ["driver", "plain SDK", "bare bytes"]
     assert {"load", "cores"} < set(told)

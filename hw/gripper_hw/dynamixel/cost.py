@@ -3,11 +3,13 @@
 import multiprocessing
 import os
 import pty
+import select
 import signal
+import struct
 import time
 import tty
 from collections.abc import Callable, Iterator, MutableSequence, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from multiprocessing.connection import Connection
 from typing import Final
 
@@ -19,6 +21,7 @@ from gripper_force.config import ServoConfig
 from gripper_force.types import NS_PER_MS, NS_PER_S, ServoCommand
 from gripper_hw.dynamixel.control_table import REGISTERS, load_model
 from gripper_hw.dynamixel.firmware import VirtualServo
+from gripper_hw.dynamixel.packets import BROADCAST_ID, Instruction, frame
 from gripper_hw.dynamixel.servo import DynamixelBus
 from gripper_hw.dynamixel.virtual import VirtualBus
 
@@ -28,9 +31,12 @@ _RATE_HZ: Final = 200
 _TURN: Final = 50
 """Cycles of one client before those of the other."""
 
+_FIRMWARE: Final = 52
+_READ_SIZE, _WRITE_OFFSET, _WRITE_SIZE = 16, 13, 6
+"""As the driver's; it reads 13 to 20 bytes in turn."""
+
 _BITS_A_BYTE: Final = 10
-_LOOK_UP: Final = 1000
-"""Polls between two looks whether the parent still listens."""
+_OVERSLEPT_NS: Final = 150_000
 
 _PATIENCE_MS: Final = 1000.0
 """More than a session's: on a busy machine the line itself may be late, and is to be measured anyhow."""
@@ -39,7 +45,7 @@ Cycle = Callable[[], object]
 
 
 def bus_cost(baud_rate: int, latency_ms: float, cycles: int) -> tuple[BusCost, ...]:
-    """Measures two clients in turn: the driver, and GroupSyncRead and GroupSyncWrite over the SDK's own port.
+    """Measures the clients that `BusCost` names, in turn.
 
     Args:
         baud_rate: Bits a second.
@@ -53,6 +59,7 @@ def bus_cost(baud_rate: int, latency_ms: float, cycles: int) -> tuple[BusCost, .
         clients = {
             "driver": stack.enter_context(_driver(paths[0], baud_rate)),
             "plain SDK": stack.enter_context(_plain_sdk(paths[1], baud_rate)),
+            "bare bytes": stack.enter_context(_bare_bytes(paths[2])),
         }
         turns = [(name, min(_TURN, cycles - done)) for done in range(0, cycles, _TURN) for name in clients]
         times_ns: dict[str, list[int]] = {name: [] for name in clients}
@@ -117,6 +124,29 @@ def _plain_sdk(path: str, baud_rate: int) -> Iterator[Cycle]:
         port.closePort()
 
 
+@contextmanager
+def _bare_bytes(path: str) -> Iterator[Cycle]:
+    """The driver's packets, made beforehand: what the machine itself takes to carry them to and fro."""
+    data = load_model(_MODEL).indirect_windows(_FIRMWARE)[0].data
+    read = frame(BROADCAST_ID, Instruction.FAST_SYNC_READ, struct.pack("<HH", data, _READ_SIZE) + bytes(_IDS))
+    goals = b"".join(bytes((id_,)) + bytes(_WRITE_SIZE) for id_ in _IDS)
+    params = struct.pack("<HH", data + _WRITE_OFFSET, _WRITE_SIZE) + goals
+    write = frame(BROADCAST_ID, Instruction.SYNC_WRITE, params)
+    line = os.open(path, os.O_RDWR | os.O_NOCTTY)
+
+    def cycle() -> None:
+        os.write(line, read)
+        left = 8 + (_READ_SIZE + 4) * len(_IDS)
+        while left > 0:
+            left -= len(os.read(line, left))
+        os.write(line, write)
+
+    try:
+        yield cycle
+    finally:
+        os.close(line)
+
+
 def _time_ns(cycle: Cycle) -> int:
     start_ns = time.perf_counter_ns()
     cycle()
@@ -141,9 +171,9 @@ def _wire_ns(count: int, baud_rate: int) -> float:
 
 @contextmanager
 def _line(baud_rate: int, latency_ms: float) -> Iterator[tuple[list[str], Sequence[int]]]:
-    """Serves a virtual bus to two clients: their paths, and how many bytes went over the wire for each."""
+    """Serves a virtual bus to three clients: their paths, and how many bytes went over the wire for each."""
     context = multiprocessing.get_context("spawn")
-    sent: MutableSequence[int] = context.RawArray("q", 2)
+    sent: MutableSequence[int] = context.RawArray("q", 3)
     here, there = context.Pipe()
     process = context.Process(target=_serve, args=(there, sent, baud_rate, latency_ms), daemon=True)
     process.start()
@@ -158,27 +188,30 @@ def _line(baud_rate: int, latency_ms: float) -> Iterator[tuple[list[str], Sequen
 def _serve(parent: Connection, sent: MutableSequence[int], baud_rate: int, latency_ms: float) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's, which lets go then
     bus = VirtualBus(VirtualServo(id_, load_model(_MODEL)) for id_ in _IDS)
-    masters = []
+    clients = {}
     paths = []
-    for _ in sent:
+    for i in range(len(sent)):
         master, slave = pty.openpty()
         tty.setraw(slave)
-        os.set_blocking(master, False)
-        masters.append(master)
+        clients[master] = i
         paths.append(os.ttyname(slave))
     parent.send(paths)
     free_ns = 0.0  # when the wire is
-    looks = 0
-    # It polls: to be woken would take as long as the bytes at 4 Mbaud.
-    while (looks := looks + 1) % _LOOK_UP or not parent.poll():
-        for i, master in enumerate(masters):
-            with suppress(BlockingIOError):
-                request = os.read(master, 4096)
-                free_ns = max(free_ns, time.monotonic_ns()) + _wire_ns(len(request), baud_rate)
-                answer = bus.transact(request)
-                sent[i] += len(request) + len(answer)
-                if answer:
-                    free_ns += _wire_ns(len(answer), baud_rate)
-                    while time.monotonic_ns() < free_ns + latency_ms * NS_PER_MS:
-                        pass
-                    os.write(master, answer)
+    while parent.fileno() not in (ready := select.select([parent.fileno(), *clients], [], [])[0]):
+        for master in ready:
+            request = os.read(master, 4096)
+            free_ns = max(free_ns, time.monotonic_ns()) + _wire_ns(len(request), baud_rate)
+            answer = bus.transact(request)
+            sent[clients[master]] += len(request) + len(answer)
+            if answer:
+                free_ns += _wire_ns(len(answer), baud_rate)
+                _wait_until(free_ns + latency_ms * NS_PER_MS)
+                os.write(master, answer)
+
+
+def _wait_until(t_ns: float) -> None:
+    """Sleeps, but for the last moments: a sleep ends late."""
+    if (left_ns := t_ns - _OVERSLEPT_NS - time.monotonic_ns()) > 0:
+        time.sleep(left_ns / NS_PER_S)
+    while time.monotonic_ns() < t_ns:
+        pass

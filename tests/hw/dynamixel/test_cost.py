@@ -3,9 +3,9 @@ from gripper_hw.dynamixel.cost import bus_cost
 
 def test_no_answer_comes_before_its_bytes_were_on_the_wire() -> None:
     cycles, baud_rate, latency_ms = 4, 57_600, 5.0
-    ours, theirs = bus_cost(baud_rate, latency_ms, cycles)
-    assert (ours.client, theirs.client) == ("driver", "plain SDK")
-    for cost in (ours, theirs):
+    ours, theirs, bare = bus_cost(baud_rate, latency_ms, cycles)
+    assert [c.client for c in (ours, theirs, bare)] == ["driver", "plain SDK", "bare bytes"]
+    for cost in (ours, theirs, bare):
         assert (cost.baud_rate, cost.latency_ms) == (baud_rate, latency_ms)
         assert latency_ms < cost.line_ms
         assert cost.line_ms / 2 < cost.p50_ms <= cost.p99_ms  # the first cycle finds a free line
