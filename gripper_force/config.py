@@ -134,8 +134,9 @@ class ControlConfig(Section):
     hold_s: NonNegative = Field(1.5, description="how long to hold after it is held, before the run ends")
     timeout_s: Positive = 8.0
     vision_timeout_ms: Positive = Field(
-        50.0, description="age over which an estimate no longer counts: two frames missed at 60 a second"
+        45.0, description="time without a new estimate after which vision drops out: two of 60 frames a second"
     )
+    vision_age_ms: Positive = Field(100.0, description="age of its frame over which an estimate is refused")
     vision_std_n: Positive = Field(1.5, description="claimed error over which an estimate is uncertain")
     slip_width_m: Positive = Field(0.004, description="closing of the jaws during hold that means slip")
     on_fault: Literal["limp", "hold", "open"] = Field(

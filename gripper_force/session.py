@@ -377,8 +377,8 @@ def checkpoint_of(config: Config) -> Checkpoint | None:
     return load_checkpoint(config.vision.checkpoint)
 
 
-def grasp_in(session: Session, config: Config, sees: bool, progress: Progress | None = None) -> None:
-    """Grasps, holds and releases in a session that is open; see `run_grasp`."""
+def grasp_in(session: Session, config: Config, sees: bool, progress: Progress | None = None) -> str:
+    """Grasps, holds and releases in a session that is open; see `run_grasp`. Returns the outcome."""
     decision = session.cycle()
     start_ns = last_ns = decision.status.t_ns
     while last_ns - start_ns < (_VISION_PATIENCE_NS if sees and not session.sees else _REFERENCE_NS):
@@ -400,14 +400,15 @@ def grasp_in(session: Session, config: Config, sees: bool, progress: Progress | 
         decision = session.cycle()
     if status.outcome == Outcome.FAULT:
         _end_fault(session, config, status)
-        return
+        return status.outcome
     if config.on_exit == "hold":
-        return
+        return status.outcome
     decision = session.cycle(RequestKind.RELEASE)
     while decision.status.phase == Phase.RELEASE:
         decision = session.cycle()
     if progress is not None:
         progress(decision.status)
+    return decision.status.outcome
 
 
 def _end_fault(session: Session, config: Config, status: GraspStatus) -> None:

@@ -67,6 +67,7 @@ class Fusion:
     def __init__(self, config: ControlConfig, transmission: Transmission) -> None:
         self._feedback = config.feedback
         self._timeout_ns = round(config.vision_timeout_ms * NS_PER_MS)
+        self._most_age_ns = round(config.vision_age_ms * NS_PER_MS)
         self._lag_s = config.plant_lag_ms * 1e-3
         self._std_limit_n = config.vision_std_n
         self._transmission = transmission
@@ -164,7 +165,7 @@ class Fusion:
         if not (math.isfinite(visual.force_n) and math.isfinite(visual.std_n)):
             self._used_ns = None  # a network that says this is not to be trusted with what it said before
             return "it is not finite"
-        if not 0 <= age_ns <= self._timeout_ns:
+        if not 0 <= age_ns <= self._most_age_ns:
             return f"it is {age_ns / NS_PER_MS:.0f} ms old"
         if visual.std_n > self._std_limit_n:
             return f"it is uncertain by {visual.std_n:.2f} N"

@@ -132,7 +132,7 @@ class GraspController:
         self._phase_s = self._sign_s = self._settled_s = 0.0
         self._error_n = self._cruise_n = 0.0
         self._has_moved = self._was_over = False
-        self._goal_current_a = 0.0
+        self._goal_current_a = self._motor_n = 0.0
         self._easing = 1.0
 
     @property
@@ -186,6 +186,7 @@ class GraspController:
         if self._width_m is None:  # nothing moves before the first request
             self._goal_width_m = width_m
         self._width_m = width_m
+        self._motor_n = self._transmission.force_n(servo.current_a)
         closing_m_s = self._transmission.closing_m_s(servo.velocity_rad_s)
         free = self._cruises(closing_m_s)
         opening = self._phase == Phase.RELEASE or self._opens_at_fault
@@ -398,8 +399,8 @@ class GraspController:
             abs(self._transmission.current_a(self._push_n)),
         )
         may_rise = self._phase != Phase.FAULT or self._opens_at_fault
-        estimate = self._estimate
-        return self._limits.apply(wanted, estimate.force_n, estimate.friction_n, dt_s, may_rise=may_rise)
+        force_n, friction_n = self._estimate.force_n, self._estimate.friction_n
+        return self._limits.apply(wanted, force_n, friction_n, self._motor_n, dt_s, may_rise=may_rise)
 
     def _status(self, t_ns: int) -> GraspStatus:
         return GraspStatus(

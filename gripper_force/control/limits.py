@@ -8,7 +8,7 @@ from gripper_force.errors import NonFiniteError
 from gripper_force.types import ServoCommand
 
 _RISE_FACTOR = 4.0
-"""The push may rise this many times as fast as the force ramp."""
+"""The push may rise this many times as fast as the force ramp, unless the force was over its limit."""
 
 _OVER_FORCE_CEILING = 0.95
 """A current that proved too much is not reached again in the same grasp."""
@@ -52,7 +52,14 @@ class Limits:
         self._over = False
 
     def apply(
-        self, command: ServoCommand, force_n: float, friction_n: float, dt_s: float, *, may_rise: bool
+        self,
+        command: ServoCommand,
+        force_n: float,
+        friction_n: float,
+        push_n: float,
+        dt_s: float,
+        *,
+        may_rise: bool,
     ) -> tuple[ServoCommand, bool]:
         """Bounds a command.
 
@@ -60,6 +67,7 @@ class Limits:
             command: What the controller wants.
             force_n: The estimated contact force.
             friction_n: What friction is known to take of the push.
+            push_n: The motor's present push, by its current.
             dt_s: Time since the last command.
             may_rise: Whether the goal current may exceed the last one at all.
 
@@ -69,7 +77,7 @@ class Limits:
         Raises:
             NonFiniteError: A number of the command, or the estimate, is not finite.
         """
-        self._refuse_non_finite(command, force_n, friction_n)
+        self._refuse_non_finite(command, force_n, friction_n, push_n)
         ceiling_a = min(self.ceiling_a(friction_n), self._lowered_a)
         if not may_rise:
             ceiling_a = min(ceiling_a, self._last_a)
@@ -77,9 +85,12 @@ class Limits:
         if over:
             if not self._over:
                 self._lowered_a = _OVER_FORCE_CEILING * self._last_a
-            ceiling_a = min(ceiling_a, _OVER_FORCE_FACTOR * self._last_a)
+            # Friction may hold the force up. A push that can't give the limit any more need not fall further.
+            eases = push_n > self._force_limit_n - friction_n
+            ceiling_a = min(ceiling_a, (_OVER_FORCE_FACTOR if eases else 1.0) * self._last_a)
         self._over = over
-        wanted_a = min(max(command.goal_current_a, 0.0), self._level_a + self._rise_a_s * dt_s, ceiling_a)
+        rise_a_s = self._rise_a_s / (1.0 if self._lowered_a == math.inf else _RISE_FACTOR)
+        wanted_a = min(max(command.goal_current_a, 0.0), self._level_a + rise_a_s * dt_s, ceiling_a)
         self._level_a = wanted_a
         self._last_a = self._on_grid(wanted_a, ceiling_a)
         position_rad = min(max(command.goal_position_rad, self._low_rad), self._high_rad)
@@ -107,12 +118,13 @@ class Limits:
         return given_a
 
     @staticmethod
-    def _refuse_non_finite(command: ServoCommand, force_n: float, friction_n: float) -> None:
+    def _refuse_non_finite(command: ServoCommand, force_n: float, friction_n: float, push_n: float) -> None:
         numbers = {
             "goal position": command.goal_position_rad,
             "goal current": command.goal_current_a,
             "force estimate": force_n,
             "friction estimate": friction_n,
+            "motor's push": push_n,
         }
         for name, number in numbers.items():
             if not math.isfinite(number):

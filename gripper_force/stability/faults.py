@@ -4,9 +4,11 @@ Each row breaks one part of the simulated rig at a seeded moment between the fir
 hold. A run without the fault stands beside it. Rows that end a process are real processes in real time.
 """
 
+import math
 import multiprocessing
 import signal
 import tempfile
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -20,7 +22,7 @@ import numpy as np
 
 from gripper_force.backends import KILL_TRIAL, load, open_devices
 from gripper_force.config import Config, config_from
-from gripper_force.errors import GripperError, LogError
+from gripper_force.errors import DataError, GripperError, LogError
 from gripper_force.grasp import TRIAL_OBJECTS, TRIAL_TARGETS_N
 from gripper_force.interfaces import Devices
 from gripper_force.log import LogReader
@@ -44,7 +46,10 @@ LIMIT_SHARE: Final = 1.25
 TOLERANCE: Final = 0.05
 """A peak may exceed the limit by this share."""
 
+_BEGIN = "<!-- matrix: made by `gripper-force stability --faults` -->"
+_END = "<!-- end of matrix -->"
 _AFTER_NS = 300 * NS_PER_MS
+_LET_GO = 0.97
 _MOST_LOST_MS = 100 + 5
 """A chunk of the log, and a cycle."""
 
@@ -132,18 +137,22 @@ ROWS: Final = (
 )
 
 
-def run_matrix(config: Config, seeds: int, jobs: int, rows: Sequence[Row] = ROWS) -> Iterator[Summary]:
+def run_matrix(
+    config: Config, seeds: int, live_seeds: int, jobs: int, rows: Sequence[Row] = ROWS
+) -> Iterator[Summary]:
     """Runs every row with every seed.
 
     Args:
         config: Everything but object, target, force limit, seed and faults.
-        seeds: Grasps of each row.
+        seeds: Grasps of each row, in lockstep.
+        live_seeds: Grasps of each row in real time, one after the other.
         jobs: Processes.
         rows: Lines of the matrix.
 
     Yields:
         For each row, in order: ``row, expected, within_ms, runs, ok, results, peak_over_limit, worst_ms,
-        median_ms, lost_records, failures``.
+        median_ms, lost_records, lost_ms, failures``, and of the real time ``live_runs, live_median_ms,
+        live_worst_ms, live_peak_over_limit, live_results``.
     """
     drawn = [_draw(config, i).model_dump(mode="json") for i in range(seeds)]
     with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
@@ -156,11 +165,16 @@ def run_matrix(config: Config, seeds: int, jobs: int, rows: Sequence[Row] = ROWS
                 ]
                 for row in simulated
             }
+            done = {row: [run.result() for run in runs[row]] for row in simulated}
             for row in rows:
-                outcomes = (
-                    [run.result() for run in runs[row]] if row in runs else [_kill(t, row) for t in drawn]
-                )
-                yield _summary(row, outcomes)
+                if row not in done:
+                    yield _summary(row, [], [_kill(tree, row) for tree in drawn])
+                    continue
+                live = [  # one after the other: real time wants the machine for itself
+                    pool.submit(_broken, tree, row, before, "realtime").result()
+                    for tree, before in zip(drawn[:live_seeds], sound, strict=False)
+                ]
+                yield _summary(row, done[row], live)
         finally:
             pool.shutdown(cancel_futures=True)
 
@@ -183,6 +197,7 @@ class _Run:
     """What one grasp left behind."""
 
     result: str
+    start_ns: int
     cycles: int
     lost: int
     peak_n: float
@@ -215,15 +230,15 @@ def _sound(tree: dict[str, Any]) -> _Sound:
         return _Sound(gripping[0], gripping[-1], run.cycles, run.peak_n, tuple(run.records(ServoCommand)))
 
 
-def _broken(tree: dict[str, Any], row: Row, sound: _Sound) -> Summary:
+def _broken(tree: dict[str, Any], row: Row, sound: _Sound, clock: str = "lockstep") -> Summary:
     config = config_from(tree, "stability")
     rng = np.random.default_rng([config.seed, 31])
     at_s = float(rng.uniform(sound.begin_s + 0.05, max(sound.end_s - 0.5, sound.begin_s + 0.06)))
     fault = {"unit": row.unit, "kind": row.kind, "at_s": at_s, "for_s": row.for_s}
-    config = config_from({**tree, "faults": [fault]}, "stability")
+    config = config_from({**tree, "faults": [fault], "clock": clock}, "stability")
     with tempfile.TemporaryDirectory() as folder:
         run = _grasp(config, Path(folder))
-        took_ms, why_not = _judge(row, run, sound, config, round(at_s * NS_PER_S))
+        took_ms, why_not = _judge(row, run, sound, config, run.start_ns + round(at_s * NS_PER_S))
     peak_n = sound.peak_n if row.unit == "load_cell" else run.peak_n  # the broken cell can't tell
     over = peak_n / config.control.force_limit_n - 1
     if over > TOLERANCE:
@@ -242,25 +257,24 @@ def _broken(tree: dict[str, Any], row: Row, sound: _Sound) -> Summary:
 
 def _grasp(config: Config, folder: Path) -> _Run:
     """Grasps, and watches for a while what becomes of the object afterwards."""
-    path, checkpoint, error_name, session = folder / "run.mcap", checkpoint_of(config), "", None
+    path, checkpoint, result, session = folder / "run.mcap", checkpoint_of(config), "", None
     with open_devices(config) as devices:
         try:
             with open_session(config, devices, path, checkpoint) as session:
-                grasp_in(session, config, checkpoint is not None)
+                result = grasp_in(session, config, checkpoint is not None)
         except LogError:
             pass  # of the losses, which are counted
         except GripperError as error:
-            error_name = type(error).__name__
+            result = type(error).__name__
         peak_n = _watch(devices)
+        start_ns = devices.start_ns
     if session is None:
-        raise GripperError(
-            f"the grasp of {config.object!r} with seed {config.seed} never began: {error_name}"
-        )
+        raise GripperError(f"the grasp of {config.object!r} with seed {config.seed} never began: {result}")
     log = LogReader(path, recover=True)
-    outcomes = [status.outcome for status in log.records(GraspStatus) if status.outcome]
     cells_n = [sample.force_n for sample in log.records(LoadCellSample) if sample.valid]
     return _Run(
-        result=error_name or (outcomes[-1] if outcomes else "interrupted"),
+        result=result,
+        start_ns=start_ns,
         cycles=session.cycles,
         lost=session.lost_records,
         peak_n=max([peak_n, *cells_n]),
@@ -277,9 +291,12 @@ def _watch(devices: Devices) -> float:
 
 def _judge(row: Row, run: _Run, sound: _Sound, config: Config, at_ns: int) -> tuple[float | None, str]:
     """When the safe state was there, in ms after the fault, and what is wrong with it, if anything is."""
+    live = config.clock == "realtime"  # no two such runs are the same
     match row.expected:
         case Expected.STOP | Expected.STOP_OR_CARRY_ON:
             stop_ns = _stop_ns(run)
+            if row.unit == "clock" and stop_ns is not None:
+                stop_ns = _let_go_ns(run, at_ns) or stop_ns
             if stop_ns is None:
                 return None, "" if row.expected == Expected.STOP_OR_CARRY_ON else f"it went on: {run.result}"
             return _ms(stop_ns - at_ns), ""
@@ -291,13 +308,13 @@ def _judge(row: Row, run: _Run, sound: _Sound, config: Config, at_ns: int) -> tu
             return _judge_easing(run, config.control.force_limit_n)
         case Expected.COMPARISON_INVALID:
             told = [e.t_ns for e in run.records(Event) if e.unit == "load_cell" and e.t_ns >= at_ns]
-            same = tuple(run.records(ServoCommand)) == sound.commands
+            same = live or tuple(run.records(ServoCommand)) == sound.commands
             return _ms(told[0] - at_ns) if told else None, "" if same else "the commands are not the same"
         case Expected.NO_EFFECT:
-            same = tuple(run.records(ServoCommand)) == sound.commands
+            same = live or tuple(run.records(ServoCommand)) == sound.commands
             return None, "" if same else "the commands are not the same"
         case Expected.CARRY_ON:
-            missed = sound.cycles - run.cycles
+            missed = 0 if live else sound.cycles - run.cycles
             return None, f"{missed} cycles are missing" if missed else ""
         case _:
             raise AssertionError(row.expected)
@@ -317,6 +334,12 @@ def _stop_ns(run: _Run) -> int | None:
     return min([*faults, *errors], default=None)
 
 
+def _let_go_ns(run: _Run, at_ns: int) -> int | None:
+    """When the force began to fall, for a loop that was not there to see the watchdog trip."""
+    cells = [(s.t_ns, s.force_n) for s in run.records(LoadCellSample) if s.t_ns >= at_ns and s.valid]
+    return next((t_ns for t_ns, force_n in cells if force_n < _LET_GO * cells[0][1]), None)
+
+
 def _judge_vision(row: Row, run: _Run, config: Config, at_ns: int) -> tuple[float | None, str]:
     """The time from when the first estimate that the fault took away was due."""
     alone = [f.t_ns for f in run.records(FusedForce) if f.t_ns >= at_ns and f.source == Source.CURRENT]
@@ -330,26 +353,37 @@ def _judge_vision(row: Row, run: _Run, config: Config, at_ns: int) -> tuple[floa
         if v.ready_ns <= alone[0] and (passes or v.ready_ns - compute_ns < at_ns)
     ]
     due_ns = max(at_ns, good[-1] + round(NS_PER_S / config.camera.rate_hz)) if good else at_ns
+    if row.unit == "estimator" and row.kind == "garbage":
+        due_ns = min(v.ready_ns for v in run.records(VisualForce) if not math.isfinite(v.force_n))
     return max(_ms(alone[0] - due_ns), 0.0), "" if run.result in _FINISHED else run.result
 
 
 def _judge_easing(run: _Run, limit_n: float) -> tuple[float | None, str]:
-    """The longest time from an estimate over the limit to a goal current that is lower."""
-    over = {f.t_ns for f in run.records(FusedForce) if f.force_n > limit_n}
+    """The longest time from an estimate that rises over the limit to a goal current that is lower."""
+    over = {f.t_ns: f.force_n > limit_n for f in run.records(FusedForce)}
     worst_ns, since_ns = 0, None
     for before, now in pairwise(run.records(ServoCommand)):
-        if now.goal_current_a < before.goal_current_a or now.goal_current_a == 0:
-            worst_ns = max(worst_ns, now.t_ns - since_ns) if since_ns is not None else worst_ns
-            since_ns = None
-        elif now.t_ns in over and since_ns is None:
+        if over[now.t_ns] and not over[before.t_ns]:
             since_ns = now.t_ns
+        if since_ns is not None and (now.goal_current_a < before.goal_current_a or now.goal_current_a == 0):
+            worst_ns, since_ns = max(worst_ns, now.t_ns - since_ns), None
     return _ms(worst_ns), ""
 
 
 def _kill(tree: dict[str, Any], row: Row) -> Summary:
     config = config_from(tree, "stability")
     with tempfile.TemporaryDirectory() as folder:
-        trial = load(KILL_TRIAL)(config, Path(folder), signal.Signals[row.kind])
+        try:
+            trial = load(KILL_TRIAL)(config, Path(folder), signal.Signals[row.kind])
+        except GripperError as error:
+            return {
+                "seed": config.seed,
+                "result": "never gripped",
+                "over": -1.0,
+                "took_ms": None,
+                "lost": 0,
+                "why_not": str(error),
+            }
     over = trial.peak_n / config.control.force_limit_n - 1
     why_not = "" if trial.tripped_ms is not None else "the watchdog did not trip"
     if trial.lost_ms > _MOST_LOST_MS:
@@ -365,20 +399,78 @@ def _kill(tree: dict[str, Any], row: Row) -> Summary:
     }
 
 
-def _summary(row: Row, outcomes: list[Summary]) -> Summary:
-    took_ms = [o["took_ms"] for o in outcomes if o["took_ms"] is not None]
-    results = sorted({o["result"] for o in outcomes})
+def _summary(row: Row, outcomes: list[Summary], live: list[Summary]) -> Summary:
+    both = outcomes or live
     return {
         "row": row.name,
         "expected": str(row.expected),
         "within_ms": row.within_ms,
-        "runs": len(outcomes),
-        "ok": sum(not o["why_not"] for o in outcomes),
-        "results": {r: sum(o["result"] == r for o in outcomes) for r in results},
-        "peak_over_limit": max(o["over"] for o in outcomes),
-        "median_ms": median(took_ms) if took_ms else None,
-        "worst_ms": max(took_ms, default=None),
-        "lost_records": max(o["lost"] for o in outcomes),
-        "lost_ms": max((o.get("lost_ms", 0.0) for o in outcomes), default=0.0),
-        "failures": {o["seed"]: o["why_not"] for o in outcomes if o["why_not"]},
+        "runs": len(both),
+        "ok": sum(not o["why_not"] for o in both),
+        "results": dict(Counter(o["result"] for o in both)),
+        "peak_over_limit": max(o["over"] for o in both),
+        "median_ms": _median_ms(outcomes),
+        "worst_ms": _worst_ms(outcomes),
+        "lost_records": max(o["lost"] for o in both),
+        "lost_ms": max(o.get("lost_ms", 0.0) for o in both),
+        "failures": {o["seed"]: o["why_not"] for o in both if o["why_not"]},
+        "live_runs": len(live),
+        "live_median_ms": _median_ms(live),
+        "live_worst_ms": _worst_ms(live),
+        "live_peak_over_limit": max((o["over"] for o in live), default=None),
+        "live_results": dict(Counter(o["result"] for o in live)),
     }
+
+
+def _median_ms(outcomes: list[Summary]) -> float | None:
+    took_ms = [o["took_ms"] for o in outcomes if o["took_ms"] is not None]
+    return median(took_ms) if took_ms else None
+
+
+def _worst_ms(outcomes: list[Summary]) -> float | None:
+    return max((o["took_ms"] for o in outcomes if o["took_ms"] is not None), default=None)
+
+
+def markdown(summaries: Sequence[Summary]) -> str:
+    """The matrix as a table in Markdown."""
+    head = (
+        "| fault | expected | within | runs as expected | result | peak over limit | time: median, worst "
+        "| real time: median, worst | lost |\n|---|---|---|---|---|---|---|---|---|\n"
+    )
+    return head + "".join(_markdown_row(s) for s in summaries)
+
+
+def _markdown_row(s: Summary) -> str:
+    results = ", ".join(f"{name} {count}" for name, count in sorted(s["results"].items()))
+    lost = f"{s['lost_records']} records" if s["lost_records"] else "-"
+    cells = (
+        s["row"],
+        s["expected"],
+        "-" if s["within_ms"] is None else f"{s['within_ms']:.0f} ms",
+        f"{s['ok']} of {s['runs']}",
+        results,
+        f"{100 * s['peak_over_limit']:+.0f} %",
+        _times(s["median_ms"], s["worst_ms"]),
+        _times(s["live_median_ms"], s["live_worst_ms"]),
+        f"{s['lost_ms']:.0f} ms" if s["lost_ms"] else lost,
+    )
+    return "| " + " | ".join(cells) + " |\n"
+
+
+def _times(middle_ms: float | None, worst_ms: float | None) -> str:
+    return "-" if middle_ms is None or worst_ms is None else f"{middle_ms:.0f}, {worst_ms:.0f} ms"
+
+
+def write_between_markers(path: Path, table: str) -> None:
+    """Puts the table into a Markdown file, in the place of the last one.
+
+    Raises:
+        DataError: The file is not there, or has no place for it.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        before, rest = text.split(_BEGIN)
+        _, after = rest.split(_END)
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path} has no lines {_BEGIN!r} and {_END!r} to put the matrix between") from error
+    path.write_text(f"{before}{_BEGIN}\n\n{table}\n{_END}{after}", encoding="utf-8")

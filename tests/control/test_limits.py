@@ -17,7 +17,7 @@ CONFIG = ControlConfig()
 
 numbers = st.floats(allow_nan=False, allow_infinity=False)
 cycles = st.lists(
-    st.tuples(numbers, numbers, st.floats(-5, 30), numbers, st.floats(0, 0.05), st.booleans()),
+    st.tuples(numbers, numbers, st.floats(-5, 30), numbers, numbers, st.floats(0, 0.05), st.booleans()),
     min_size=1,
     max_size=40,
 )
@@ -28,9 +28,9 @@ cycles = st.lists(
 def test_no_output_ever_leaves_the_limits(cycles, transmission, limit_a):
     limits = Limits(CONFIG, transmission, limit_a)
     last_a = 0.0
-    for position_rad, current_a, force_n, friction_n, dt_s, may_rise in cycles:
+    for position_rad, current_a, force_n, friction_n, push_n, dt_s, may_rise in cycles:
         wanted = ServoCommand(0, position_rad, current_a)
-        out, over = limits.apply(wanted, force_n, friction_n, dt_s, may_rise=may_rise)
+        out, over = limits.apply(wanted, force_n, friction_n, push_n, dt_s, may_rise=may_rise)
         believed_n = min(max(friction_n, 0.0), 2 * transmission.friction_n)
         cap_a = min(limit_a, (CONFIG.force_limit_n + believed_n) / transmission.n_per_a)
         assert 0.0 <= out.goal_current_a <= cap_a
@@ -39,7 +39,7 @@ def test_no_output_ever_leaves_the_limits(cycles, transmission, limit_a):
         assert over == (force_n > CONFIG.force_limit_n)
         if over or not may_rise:
             assert out.goal_current_a <= last_a
-        if over:
+        if over and push_n > CONFIG.force_limit_n - friction_n:
             assert out.goal_current_a <= 0.85 * last_a
         rise_a = 4 * CONFIG.ramp_n_s / transmission.n_per_a * dt_s + 1.5 * transmission.current_step_a
         assert out.goal_current_a <= last_a + rise_a + 1e-12
@@ -47,14 +47,14 @@ def test_no_output_ever_leaves_the_limits(cycles, transmission, limit_a):
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("where", [0, 1, 2, 3])
+@pytest.mark.parametrize("where", [0, 1, 2, 3, 4])
 def test_non_finite_is_refused(bad, where):
-    values = [0.0, 0.0, 0.0, 0.0]
+    values = [0.0, 0.0, 0.0, 0.0, 0.0]
     values[where] = bad
-    name = ("goal position", "goal current", "force estimate", "friction estimate")[where]
+    name = ("goal position", "goal current", "force estimate", "friction estimate", "motor's push")[where]
     with pytest.raises(NonFiniteError, match=name):
         Limits(CONFIG, FINE, 1.0).apply(
-            ServoCommand(0, values[0], values[1]), values[2], values[3], 0.005, may_rise=True
+            ServoCommand(0, values[0], values[1]), *values[2:], 0.005, may_rise=True
         )
 
 
@@ -64,7 +64,7 @@ def test_rounding_keeps_the_mean_current(wanted_a):
     limits = Limits(CONFIG, COARSE, 1.0)
     given_a = []
     for _ in range(600):
-        out, _ = limits.apply(ServoCommand(0, 0.0, wanted_a), 0.0, 0.95, 0.05, may_rise=True)
+        out, _ = limits.apply(ServoCommand(0, 0.0, wanted_a), 0.0, 0.95, 0.0, 0.05, may_rise=True)
         given_a.append(out.goal_current_a)
     tail = given_a[-500:]
     assert sum(tail) / 500 == pytest.approx(wanted_a, abs=COARSE.current_step_a / 400)
@@ -75,9 +75,9 @@ def test_over_force_halves_within_five_cycles():
     limits = Limits(CONFIG, FINE, 1.0)
     wanted = ServoCommand(0, 0.0, 0.2)
     for _ in range(100):
-        limits.apply(wanted, 5.0, 0.95, 0.005, may_rise=True)
+        limits.apply(wanted, 5.0, 0.95, 6.0, 0.005, may_rise=True)
     for _ in range(5):
-        out, over = limits.apply(wanted, 13.0, 0.95, 0.005, may_rise=True)
+        out, over = limits.apply(wanted, 13.0, 0.95, 14.0, 0.005, may_rise=True)
     assert over
     assert out.goal_current_a < 0.1
 
@@ -96,7 +96,8 @@ def test_a_current_that_was_too_much_is_not_reached_again():
 
     def run(force_n, cycles=100):
         return [
-            limits.apply(wanted, force_n, 0.95, 0.005, may_rise=True)[0].goal_current_a for _ in range(cycles)
+            limits.apply(wanted, force_n, 0.95, force_n + 1, 0.005, may_rise=True)[0].goal_current_a
+            for _ in range(cycles)
         ]
 
     assert run(5.0)[-1] == pytest.approx(0.2)
@@ -104,6 +105,16 @@ def test_a_current_that_was_too_much_is_not_reached_again():
     assert run(5.0)[-1] == pytest.approx(0.95 * 0.2)
     limits.begin()
     assert run(5.0)[-1] == pytest.approx(0.2)
+
+
+def test_a_force_that_friction_holds_up_is_not_eased_until_the_object_drops():
+    limits = Limits(CONFIG, FINE, 1.0)
+    for _ in range(100):
+        limits.apply(ServoCommand(0, 0.0, 0.2), 5.0, 0.95, 6.0, 0.005, may_rise=True)
+    for _ in range(50):
+        out, over = limits.apply(ServoCommand(0, 0.0, 0.3), 12.1, 0.95, 11.0, 0.005, may_rise=True)
+    assert over
+    assert out.goal_current_a == pytest.approx(0.95 * 0.2)
 
 
 def test_the_largest_target_leaves_room_below_the_limit():

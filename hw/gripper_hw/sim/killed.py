@@ -1,6 +1,5 @@
 """A grasp in a process of its own that is killed or stopped, with the world and its servo in this one."""
 
-import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -8,6 +7,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from signal import SIGKILL, Signals
+from subprocess import DEVNULL, Popen
 from typing import Final
 
 import numpy as np
@@ -69,7 +69,8 @@ def kill_trial(config: Config, folder: Path, number: Signals) -> KillTrial:
         server = stack.enter_context(PtyServer(bus))
         rig.load_cell.start()
         rig.start()
-        child = subprocess.Popen(_command(config, server.device_path, folder), stdout=subprocess.DEVNULL)
+        command = _command(config, server.device_path, folder)
+        child = Popen(command, stdout=DEVNULL, stderr=DEVNULL)
         stack.callback(child.wait)
         stack.callback(child.kill)
         forces_n = [0.0]
@@ -114,6 +115,7 @@ def _wait(condition: Callable[[], bool], goes_on: Callable[[], bool], most_ns: i
 def _command(config: Config, port: str, folder: Path) -> list[str]:
     settings = {
         "servo.port": port,
+        "servo.reply_margin_ms": 20,  # three processes share this machine with the world
         "clock": "realtime",
         "camera.backend": "none",
         "load_cell.backend": "none",

@@ -1,0 +1,100 @@
+from pathlib import Path
+
+import pytest
+
+from gripper_force.config import FAULTS, Config, load_config
+from gripper_force.errors import DataError
+from gripper_force.stability import faults
+from gripper_force.stability.faults import ROWS, Row, markdown, run_matrix, write_between_markers
+
+SIMULATED = [row for row in ROWS if row.unit != "process"]
+SHORT = ["object=stapler", "sim.detail=coarse", "control.settle_s=0.4", "control.hold_s=0.4", "seed=5"]
+BLIND = ["camera.backend=none", "vision.checkpoint=none", "control.feedback=current"]
+
+
+def needs_eyes(row: Row) -> bool:
+    return row.unit in ("camera", "estimator")
+
+
+@pytest.fixture(scope="session")
+def without_fault() -> dict[bool, tuple[dict[str, object], faults._Sound]]:
+    """A grasp that goes well, with eyes and without."""
+
+    def tree(overrides: list[str]) -> dict[str, object]:
+        return faults._draw(load_config(None, overrides), 0).model_dump(mode="json")
+
+    trees = {True: tree(SHORT), False: tree([*SHORT, *BLIND])}
+    return {eyes: (t, faults._sound(t)) for eyes, t in trees.items()}
+
+
+def test_every_fault_that_can_be_injected_has_a_row() -> None:
+    rows = {(row.unit, row.kind) for row in SIMULATED}
+    left_out = {("estimator", "intermittent"), ("clock", "slow")}
+    assert rows | left_out == {(unit, kind) for unit, kinds in FAULTS.items() for kind in kinds}
+
+
+@pytest.mark.parametrize("row", SIMULATED, ids=lambda row: f"{row.unit}-{row.kind}")
+def test_a_row_ends_as_expected(
+    row: Row, without_fault: dict[bool, tuple[dict[str, object], faults._Sound]]
+) -> None:
+    tree, sound = without_fault[needs_eyes(row)]
+    outcome = faults._broken(tree, row, sound)
+    assert outcome["why_not"] == ""
+    assert outcome["over"] <= faults.TOLERANCE
+
+
+@pytest.mark.parametrize(("unit", "kind"), [("estimator", "intermittent"), ("clock", "slow")])
+def test_what_is_merely_a_nuisance_is_lived_with(
+    unit: str, kind: str, without_fault: dict[bool, tuple[dict[str, object], faults._Sound]]
+) -> None:
+    row = Row("nuisance", unit, kind, faults.Expected.CAP, None)
+    tree, sound = without_fault[needs_eyes(row)]
+    outcome = faults._broken(tree, row, sound)
+    assert outcome["why_not"] == ""
+
+
+def test_a_row_that_does_not_end_as_expected_is_told(
+    without_fault: dict[bool, tuple[dict[str, object], faults._Sound]],
+) -> None:
+    tree, sound = without_fault[False]
+    harmless = Row("harmless", "clock", "wrong", faults.Expected.STOP, 20.0)
+    assert faults._broken(tree, harmless, sound)["why_not"] == "it went on: held"
+    too_slow = Row("too slow", "bus", "off", faults.Expected.STOP, -1.0)
+    assert faults._broken(tree, too_slow, sound)["why_not"].startswith("it took")
+
+
+@pytest.fixture(scope="module")
+def matrix() -> list[faults.Summary]:
+    config: Config = load_config(None, [*SHORT, *BLIND])
+    rows = [row for row in ROWS if (row.unit, row.kind) in (("bus", "off"), ("disk", "off"))]
+    return list(run_matrix(config, 1, 0, 1, rows))
+
+
+def test_the_matrix_sums_up_each_row(matrix: list[faults.Summary]) -> None:
+    bus, disk = matrix
+    assert (bus["row"], bus["runs"], bus["ok"]) == ("bus: adapter unplugged", 1, 1)
+    assert bus["results"] == {"DeviceLostError": 1}
+    assert bus["worst_ms"] <= 20.0
+    assert disk["lost_records"] > 100
+    assert disk["results"] == {"held": 1}
+
+
+def test_the_matrix_goes_between_its_markers(matrix: list[faults.Summary], tmp_path: Path) -> None:
+    page = tmp_path / "reliability.md"
+    page.write_text(f"# Before\n{faults._BEGIN}\nold\n{faults._END}\nafter\n")
+    for _ in range(2):
+        write_between_markers(page, markdown(matrix))
+    text = page.read_text()
+    assert text.startswith("# Before\n")
+    assert text.endswith(f"{faults._END}\nafter\n")
+    assert "old" not in text
+    assert text.count("| bus: adapter unplugged | stop, latched | 20 ms | 1 of 1 | DeviceLostError 1 |") == 1
+    with pytest.raises(DataError, match="to put the matrix between"):
+        write_between_markers(tmp_path / "missing.md", "")
+
+
+def test_the_shipped_page_has_a_place_for_the_matrix() -> None:
+    page = Path(__file__).parents[3] / "docs" / "reliability.md"
+    text = page.read_text(encoding="utf-8")
+    assert all(row.name in text for row in ROWS)
+    assert text.count(faults._BEGIN) == text.count(faults._END) == 1
