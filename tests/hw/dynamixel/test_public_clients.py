@@ -22,6 +22,8 @@ HOW = (
 # both to a goal and sees them come there. The table of the XL330 is the one that all three know.
 ROBOTIS = """
 from dynamixel_sdk import *
+from dynamixel_sdk import port_handler
+port_handler.LATENCY_TIMER = 1000  # a busy machine is later than any adapter
 port, packets = PortHandler(path), PacketHandler(2.0)
 port.openPort()
 port.setBaudRate(1_000_000)
