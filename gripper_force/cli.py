@@ -294,8 +294,18 @@ def bench(
 
 @app.command()
 def stability(
+    faults: Annotated[bool, typer.Option("--faults", help="Break each part in mid-grasp.")] = False,
+    seeds: Annotated[int, typer.Option(min=1, help="With --faults: grasps of each row.")] = 20,
+    live: Annotated[int, typer.Option(min=0, help="With --faults: of these, also in real time.")] = 2,
+    write: Annotated[
+        Path | None, typer.Option(help="With --faults: Markdown file to put the matrix into.")
+    ] = None,
     fuzz: Annotated[
         int | None, typer.Option(min=1, help="Feed so many random and damaged inputs to all readers.")
+    ] = None,
+    soak: Annotated[
+        float | None,
+        typer.Option(min=0, help="Grasp again and again for so many simulated seconds (coarse scenes)."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the inputs or of the first scene.")] = 0,
     only: Annotated[
@@ -305,18 +315,41 @@ def stability(
         "runs/fuzz"
     ),
     jobs: Jobs = _CORES,
+    config: ConfigPath = None,
+    set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show that hostile input is survived. Exit code 1 where it is not."""
-    if fuzz is None:
-        raise ConfigError("stability needs to be told what to do: --fuzz N")
-    from gripper_force.stability import fuzz as job
+    """Show that faults, hostile input and long use are survived. Exit code 1 where they are not."""
+    if [faults, fuzz is not None, soak is not None].count(True) != 1:
+        raise ConfigError("stability does one thing at a time: --faults, --fuzz N or --soak SECONDS")
+    if faults:
+        result = _fault_matrix(_load(config, set_, {"seed": seed}), seeds, live, jobs, write)
+        _print(result, as_json, _faults_table)
+    elif fuzz is not None:
+        from gripper_force.stability.fuzz import fuzz as feed
 
-    with _bar("fuzzing", fuzz) as advance:
-        result = job.fuzz(fuzz, seed, jobs, folder, advance, only=only)
-    _print(result, as_json, _fuzz_table)
-    if result["findings"]:
+        with _bar("fuzzing", fuzz) as advance:
+            result = feed(fuzz, seed, jobs, folder, advance, only=only)
+        _print(result, as_json, _fuzz_table)
+    else:
+        from gripper_force.stability.soak import soak as grasp_on
+
+        settings = _load(config, ["sim.detail=coarse", *(set_ or [])], {"seed": seed})
+        with _bar("soaking", round(soak or 0)) as advance:
+            result = grasp_on(settings, soak or 0, advance)
+        _print(result, as_json, _soak_table)
+    if not result["ok"]:
         raise typer.Exit(1)
+
+
+def _fault_matrix(settings: Config, seeds: int, live: int, jobs: int, page: Path | None) -> dict[str, Any]:
+    from gripper_force.stability.faults import count_grasps, markdown, run_matrix, write_between_markers
+
+    with _bar("breaking things", count_grasps(seeds, live)) as advance:
+        rows = list(run_matrix(settings, seeds, live, jobs, advance=advance))
+    if page is not None:
+        write_between_markers(page, markdown(rows))
+    return {"rows": rows, "ok": all(row["ok"] == row["runs"] for row in rows)}
 
 
 def _terminate(_signal: int, _frame: FrameType | None) -> None:
@@ -506,6 +539,27 @@ def _bus_table(r: dict[str, Any]) -> None:
         table.add_row(*setting, c.client, *numbers, share)
     out.print(table)
     out.print(f"[dim]load {r['load']:.1f} on {r['cores']} cores[/]")
+
+
+def _faults_table(r: dict[str, Any]) -> None:
+    table = Table(
+        "fault", "expected", "as expected", "worst ms", "of", "live ms", "peak over limit", box=None
+    )
+    for row in r["rows"]:
+        colour = "green" if row["ok"] == row["runs"] else "bold red"
+        table.add_row(
+            row["row"],
+            row["expected"],
+            f"[{colour}]{row['ok']} of {row['runs']}[/]",
+            _number(row["worst_ms"], digits=1),
+            _number(row["within_ms"], digits=0),
+            _number(row["live_worst_ms"], digits=1),
+            f"{100 * row['peak_over_limit']:+.1f} %",
+        )
+    out.print(table)
+    for row in r["rows"]:
+        for seed, why_not in row["failures"].items():
+            out.print(f"[bold red]{row['row']}[/], seed {seed}: {_plain(why_not)}", soft_wrap=True)
 
 
 def _soak_table(r: dict[str, Any]) -> None:

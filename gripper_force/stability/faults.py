@@ -9,7 +9,7 @@ import multiprocessing
 import signal
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from enum import StrEnum
@@ -138,7 +138,12 @@ ROWS: Final = (
 
 
 def run_matrix(
-    config: Config, seeds: int, live_seeds: int, jobs: int, rows: Sequence[Row] = ROWS
+    config: Config,
+    seeds: int,
+    live_seeds: int,
+    jobs: int,
+    rows: Sequence[Row] = ROWS,
+    advance: Callable[[str], None] = lambda _: None,
 ) -> Iterator[Summary]:
     """Runs every row with every seed.
 
@@ -148,6 +153,7 @@ def run_matrix(
         live_seeds: Grasps of each row in real time, one after the other.
         jobs: Processes.
         rows: Lines of the matrix.
+        advance: Called after each grasp, with the row's name; see `count_grasps`.
 
     Yields:
         For each row, in order: ``row, expected, within_ms, runs, ok, results, peak_over_limit, worst_ms,
@@ -156,27 +162,39 @@ def run_matrix(
     """
     drawn = [_draw(config, i).model_dump(mode="json") for i in range(seeds)]
     with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+
+        def awaited(runs: Iterable[Any], name: str) -> list[Any]:
+            results = []
+            for run in runs:
+                results.append(run.result())
+                advance(name)
+            return results
+
         try:
-            sound = list(pool.map(_sound, drawn)) if any(row.unit != "process" for row in rows) else []
             simulated = [row for row in rows if row.unit != "process"]
+            without = [pool.submit(_sound, tree) for tree in drawn] if simulated else []
+            sound = awaited(without, "without a fault")
             runs = {
-                row: [
-                    pool.submit(_broken, tree, row, before) for tree, before in zip(drawn, sound, strict=True)
-                ]
+                row: [pool.submit(_broken, *one, row) for one in zip(drawn, sound, strict=True)]
                 for row in simulated
             }
-            done = {row: [run.result() for run in runs[row]] for row in simulated}
-            for row in rows:
-                if row not in done:
-                    yield _summary(row, [], [_kill(tree, row) for tree in drawn])
-                    continue
-                live = [  # one after the other: real time wants the machine for itself
-                    pool.submit(_broken, tree, row, before, "realtime").result()
-                    for tree, before in zip(drawn[:live_seeds], sound, strict=False)
-                ]
-                yield _summary(row, done[row], live)
+            done = {row: awaited(runs[row], row.name) for row in simulated}
+            live = list(zip(drawn, sound, strict=False))[:live_seeds]
+            for row in rows:  # real time wants the machine for itself
+                if row in done:
+                    now = (pool.submit(_broken, *one, row, "realtime") for one in live)
+                    yield _summary(row, done[row], awaited(now, f"{row.name}, in real time"))
+                else:
+                    killed = (pool.submit(_kill, tree, row) for tree in drawn)
+                    yield _summary(row, [], awaited(killed, row.name))
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+def count_grasps(seeds: int, live_seeds: int, rows: Sequence[Row] = ROWS) -> int:
+    """How many grasps `run_matrix` does."""
+    simulated = sum(row.unit != "process" for row in rows)
+    return seeds * (len(rows) + bool(simulated)) + min(live_seeds, seeds) * simulated
 
 
 def _draw(config: Config, index: int) -> Config:
@@ -230,7 +248,7 @@ def _sound(tree: dict[str, Any]) -> _Sound:
         return _Sound(gripping[0], gripping[-1], run.cycles, run.peak_n, tuple(run.records(ServoCommand)))
 
 
-def _broken(tree: dict[str, Any], row: Row, sound: _Sound, clock: str = "lockstep") -> Summary:
+def _broken(tree: dict[str, Any], sound: _Sound, row: Row, clock: str = "lockstep") -> Summary:
     config = config_from(tree, "stability")
     rng = np.random.default_rng([config.seed, 31])
     at_s = float(rng.uniform(sound.begin_s + 0.05, max(sound.end_s - 0.5, sound.begin_s + 0.06)))

@@ -5,7 +5,14 @@ import pytest
 from gripper_force.config import FAULTS, Config, load_config
 from gripper_force.errors import DataError
 from gripper_force.stability import faults
-from gripper_force.stability.faults import ROWS, Row, markdown, run_matrix, write_between_markers
+from gripper_force.stability.faults import (
+    ROWS,
+    Row,
+    count_grasps,
+    markdown,
+    run_matrix,
+    write_between_markers,
+)
 
 SIMULATED = [row for row in ROWS if row.unit != "process"]
 SHORT = ["object=stapler", "sim.detail=coarse", "control.settle_s=0.4", "control.hold_s=0.4", "seed=5"]
@@ -38,7 +45,7 @@ def test_a_row_ends_as_expected(
     row: Row, without_fault: dict[bool, tuple[dict[str, object], faults._Sound]]
 ) -> None:
     tree, sound = without_fault[needs_eyes(row)]
-    outcome = faults._broken(tree, row, sound)
+    outcome = faults._broken(tree, sound, row)
     assert outcome["why_not"] == ""
     assert outcome["over"] <= faults.TOLERANCE
 
@@ -49,7 +56,7 @@ def test_what_is_merely_a_nuisance_is_lived_with(
 ) -> None:
     row = Row("nuisance", unit, kind, faults.Expected.CAP, None)
     tree, sound = without_fault[needs_eyes(row)]
-    outcome = faults._broken(tree, row, sound)
+    outcome = faults._broken(tree, sound, row)
     assert outcome["why_not"] == ""
 
 
@@ -58,16 +65,19 @@ def test_a_row_that_does_not_end_as_expected_is_told(
 ) -> None:
     tree, sound = without_fault[False]
     harmless = Row("harmless", "clock", "wrong", faults.Expected.STOP, 20.0)
-    assert faults._broken(tree, harmless, sound)["why_not"] == "it went on: held"
+    assert faults._broken(tree, sound, harmless)["why_not"] == "it went on: held"
     too_slow = Row("too slow", "bus", "off", faults.Expected.STOP, -1.0)
-    assert faults._broken(tree, too_slow, sound)["why_not"].startswith("it took")
+    assert faults._broken(tree, sound, too_slow)["why_not"].startswith("it took")
 
 
 @pytest.fixture(scope="module")
 def matrix() -> list[faults.Summary]:
     config: Config = load_config(None, [*SHORT, *BLIND])
     rows = [row for row in ROWS if (row.unit, row.kind) in (("bus", "off"), ("disk", "off"))]
-    return list(run_matrix(config, 1, 0, 1, rows))
+    steps: list[str] = []
+    summaries = list(run_matrix(config, 1, 1, 1, rows, steps.append))
+    assert len(steps) == count_grasps(1, 1, rows)
+    return summaries
 
 
 def test_the_matrix_sums_up_each_row(matrix: list[faults.Summary]) -> None:
