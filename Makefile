@@ -16,6 +16,8 @@ test: setup-dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto $(ARGS)
+	$(BIN)/coverage run -m pytest -q tests/control/test_safety.py tests/control/test_limits.py
+	$(BIN)/coverage report
 
 format: setup-dev
 	$(BIN)/ruff check --fix .

@@ -126,7 +126,7 @@ class ControlConfig(Section):
 
     rate_hz: Positive = 200.0
     feedback: Literal["fused", "current", "vision"] = "fused"
-    force_limit_n: Annotated[float, Field(gt=0, le=HARD_FORCE_LIMIT_N, allow_inf_nan=False)] = 12.0
+    force_limit_n: Annotated[float, Field(gt=0, le=HARD_FORCE_LIMIT_N, allow_inf_nan=False)] = 10.0
     approach_speed_m_s: Positive = Field(0.025, description="closing speed of one jaw before contact")
     approach_force_n: Positive = Field(0.5, description="grip force allowed before contact")
     ramp_n_s: Positive = 8.0
@@ -134,7 +134,7 @@ class ControlConfig(Section):
     hold_s: NonNegative = Field(1.5, description="how long to hold after it is held, before the run ends")
     timeout_s: Positive = 8.0
     vision_timeout_ms: Positive = Field(
-        45.0, description="time without a new estimate after which vision drops out: two of 60 frames a second"
+        45.0, description="time without an estimate after which vision drops out: two frames at 60 a second"
     )
     vision_age_ms: Positive = Field(100.0, description="age of its frame over which an estimate is refused")
     vision_std_n: Positive = Field(1.5, description="claimed error over which an estimate is uncertain")

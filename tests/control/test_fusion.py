@@ -118,14 +118,14 @@ def test_whatever_the_push_friction_is_never_negative(transmission, pushes_n):
     [
         (math.nan, 0.1, 40, "finite"),
         (3.0, math.inf, 40, "finite"),
-        (3.0, 0.1, 101, "101 ms old"),
+        (3.0, 0.1, 61, "61 ms old"),
         (3.0, 0.1, -10, "-10 ms old"),
         (3.0, 1.6, 40, "uncertain by 1.60 N"),
         (9.0, 0.1, 40, "off from the motor current by"),
     ],
 )
 def test_bad_vision_drops_out_and_is_named(bench, seen_n, std_n, latency_ms, reason):
-    b = bench()
+    b = bench(vision_age_ms=60.0)
     b.run(1.0, lambda _: 4.0, lambda _: 3.2)
     before = b.estimate
     estimate = b.run(0.2, lambda _: 4.0, lambda _: seen_n, std_n=std_n, latency_ms=latency_ms)

@@ -112,7 +112,7 @@ def test_a_force_that_friction_holds_up_is_not_eased_until_the_object_drops():
     for _ in range(100):
         limits.apply(ServoCommand(0, 0.0, 0.2), 5.0, 0.95, 6.0, 0.005, may_rise=True)
     for _ in range(50):
-        out, over = limits.apply(ServoCommand(0, 0.0, 0.3), 12.1, 0.95, 11.0, 0.005, may_rise=True)
+        out, over = limits.apply(ServoCommand(0, 0.0, 0.3), 10.1, 0.95, 9.0, 0.005, may_rise=True)
     assert over
     assert out.goal_current_a == pytest.approx(0.95 * 0.2)
 

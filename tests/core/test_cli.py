@@ -164,7 +164,7 @@ def test_a_recording_is_imported_replayed_and_evaluated(
         (["--set", "seed=x"], "configuration key 'seed'"),
         (["--object", "egg"], "no simulated object 'egg'; there are sponge, paper_cup, tube, stapler"),
         (["--feedback", "guess"], "configuration key 'control.feedback'"),
-        (["--target-n", "13"], "target_n 13 N is too near to control.force_limit_n 12 N"),
+        (["--target-n", "13"], "target_n 13 N is too near to control.force_limit_n 10 N"),
         (["--set", "camera.backend=oak9"], "no camera backend 'oak9'; there are none, simulated"),
         (["--set", "load_cell.backend=scale"], "no load_cell backend 'scale'"),
         (["--set", "servo.port=/dev/ttyUSB7", "--set", "load_cell.backend=none"], "clock=lockstep needs"),

@@ -228,7 +228,7 @@ def test_progress_tells_each_phase_once(quick: list[str], tmp_path: Path) -> Non
 
 
 def test_a_target_over_the_limit_is_refused_before_anything_moves(quick: list[str], tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"target_n 13 N is too near to control\.force_limit_n 12 N"):
+    with pytest.raises(ConfigError, match=r"target_n 13 N is too near to control\.force_limit_n 10 N"):
         run_grasp(load_config(None, [*quick, "target_n=13"]), tmp_path / "run.mcap")
     assert not list(tmp_path.iterdir())
 
