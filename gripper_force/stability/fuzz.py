@@ -127,8 +127,8 @@ def fuzz(
         only: A target's name, which then gets all inputs; or ``<name>:<number>`` for that input alone.
 
     Returns:
-        ``targets`` (by name: ``inputs``, ``results``, ``typed_errors``, ``findings``), ``findings`` (one of
-        each kind), ``inputs``, ``seed`` and ``wall_s``.
+        ``ok`` (nothing was found), ``targets`` (by name: ``inputs``, ``results``, ``typed_errors``,
+        ``findings``), ``findings`` (one of each kind), ``inputs``, ``seed`` and ``wall_s``.
 
     Raises:
         ConfigError: There is no such target.
@@ -161,6 +161,7 @@ def fuzz(
         if plan[t]
     }
     return {
+        "ok": not findings,
         "targets": {
             name: {"inputs": sum(row), "results": row[0], "typed_errors": row[1], "findings": row[2]}
             for name, row in counts.items()

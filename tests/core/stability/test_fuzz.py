@@ -121,8 +121,9 @@ def test_an_input_that_is_none_is_named(planted: Path) -> None:
             fuzz(1, 0, 1, planted, only=only)
 
 
-def test_stability_needs_to_be_told_what_to_do() -> None:
-    done = CliRunner().invoke(cli.app, ["stability"])
+@pytest.mark.parametrize("options", [[], ["--fuzz", "1", "--soak", "1"]])
+def test_stability_does_one_thing_at_a_time(options: list[str]) -> None:
+    done = CliRunner().invoke(cli.app, ["stability", *options])
     assert isinstance(done.exception, ConfigError)
 
 
