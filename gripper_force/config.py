@@ -382,4 +382,5 @@ def _sentence(root: type[Section], error: ValidationError, where: str) -> str:
             section = FaultConfig if part.isdigit() else section.model_fields[part].annotation
         known = ", ".join(section.model_fields)
         return f"unknown configuration key {key!r} (from {where}); known here: {known}"
-    return f"configuration key {key!r} (from {where}): {first['msg']}, got {first['input']!r}"
+    reason = first["msg"].removeprefix("Value error, ")
+    return f"configuration key {key!r} (from {where}): {reason}, got {first['input']!r}"
