@@ -1,6 +1,6 @@
 """Figures of merit for a predicted against a measured signal."""
 
-from typing import TypedDict
+from typing import Final, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -8,6 +8,10 @@ from scipy import signal
 
 Signal = npt.ArrayLike
 """A one-dimensional series of numbers."""
+
+
+LONGEST_S: Final = 7200.0
+"""No run is longer; a damaged time would ask for any amount of memory."""
 
 
 class Bin(TypedDict):
@@ -67,11 +71,12 @@ def lag_s(
         step_s: Resolution. Both are interpolated to it over the span they share.
 
     Returns:
-        Lag in s; positive where the signal comes later; NaN where either does not move or they share no span.
+        Lag in s; positive where the signal comes later; NaN where either does not move, or they share no span
+        or one of more than `LONGEST_S`.
     """
     t, t_ref = np.asarray(t_s, np.float64), np.asarray(reference_t_s, np.float64)
     begin, end = max(t[0], t_ref[0]), min(t[-1], t_ref[-1])
-    if end - begin < 2 * step_s:
+    if not 2 * step_s <= end - begin <= LONGEST_S:
         return float("nan")
     grid = np.arange(begin, end, step_s)
     a = signal.detrend(np.interp(grid, t, np.asarray(values, np.float64)), type="constant")

@@ -43,3 +43,8 @@ def test_no_lag_without_movement_or_overlap() -> None:
     t_s = np.arange(0, 1, 0.01)
     assert np.isnan(metrics.lag_s(t_s, np.ones(100), t_s, np.sin(t_s)))
     assert np.isnan(metrics.lag_s(t_s, np.sin(t_s), t_s + 5, np.sin(t_s)))
+
+
+def test_a_damaged_time_takes_no_memory() -> None:
+    t_s = np.array([0.0, 1.0, 1e9])
+    assert np.isnan(metrics.lag_s(t_s, t_s, t_s, t_s))
