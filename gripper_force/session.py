@@ -27,11 +27,9 @@ from gripper_force.log import LogWriter
 from gripper_force.perception import Estimator, LockstepPerception, Perception, ThreadedPerception
 from gripper_force.recorder import Recorder
 from gripper_force.types import (
-    NS_PER_MS,
     NS_PER_S,
     Event,
     GraspStatus,
-    LoadCellSample,
     Outcome,
     Phase,
     Request,
@@ -39,6 +37,7 @@ from gripper_force.types import (
 )
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
 from gripper_force.vision.estimator import ForceEstimator
+from gripper_force.watch import CellWatch, Tally
 
 _VISION_PATIENCE_NS = 2 * NS_PER_S
 _REFERENCE_NS = NS_PER_S // 10
@@ -46,10 +45,6 @@ _REFERENCE_NS = NS_PER_S // 10
 
 _OPENING_NS = 3 * NS_PER_S
 """How long jaws that are to open at a fault may take."""
-
-_CELL_PATIENCE_NS = 45 * NS_PER_MS
-_CELL_PERIODS = 8
-"""A load cell without a sound sample for so long, and for so many of its periods, says nothing any more."""
 
 _SUPPLY_SLACK_V = 0.5
 """A supply that is set to the end of a servo's range reads a little beyond it."""
@@ -83,9 +78,9 @@ class Session:
         self._due_ns = 0
         self._stop = threading.Event()
         self._interrupted = False
-        self._tallies = {unit: _Tally() for unit in ("servo", "camera", "load_cell")}
+        self._tallies = {unit: Tally() for unit in ("servo", "camera", "load_cell")}
         self._problem = ""
-        self._cell = _CellWatch()
+        self._cell = CellWatch()
         self._error: BaseException | None = None
         self._armed = False
         self.failed = False
@@ -220,48 +215,6 @@ class Session:
         for unit, count in counts.items():
             if text := self._tallies[unit].look(t_ns, count, at_end=at_end):
                 self._recorder.write(Event(t_ns, unit, text))
-
-
-class _Tally:
-    """Says by how much a device's counts of what went wrong have risen, once a second at most."""
-
-    def __init__(self) -> None:
-        self._told: dict[str, int] = {}
-        self._next_ns = 0
-
-    def look(self, t_ns: int, counts: dict[str, int], *, at_end: bool) -> str:
-        """Takes the counts of a cycle. Returns the news, or an empty text."""
-        if counts == self._told or (t_ns < self._next_ns and not at_end):
-            return ""
-        risen = {cause: count - self._told.get(cause, 0) for cause, count in counts.items()}
-        self._told = counts
-        news = [f"{count} {cause.replace('_', ' ')}" for cause, count in risen.items() if count]
-        if news:
-            self._next_ns = t_ns + NS_PER_S
-        return ", ".join(news)
-
-
-class _CellWatch:
-    """Says when the load cell stops giving sound samples to compare with, and when it gives them again."""
-
-    def __init__(self) -> None:
-        self._last_ns: int | None = None
-        self._period_ns = 0.0
-        self._silent = False
-
-    def look(self, t_ns: int, samples: list[LoadCellSample]) -> str:
-        """Takes what came in a cycle. Returns the news, or an empty text."""
-        last_ns = t_ns if self._last_ns is None else self._last_ns
-        sound_ns = [sample.t_ns for sample in samples if sample.valid]
-        if sound_ns:
-            self._period_ns += 0.2 * ((sound_ns[-1] - last_ns) / len(sound_ns) - self._period_ns)
-            last_ns = sound_ns[-1]
-        self._last_ns = last_ns
-        silent = t_ns - last_ns > max(_CELL_PATIENCE_NS, _CELL_PERIODS * self._period_ns)
-        if silent == self._silent:
-            return ""
-        self._silent = silent
-        return "no sound sample; nothing to compare with" if silent else "sound samples again"
 
 
 @contextmanager

@@ -12,6 +12,9 @@ from gripper_force.types import NS_PER_S, GraspStatus, LoadCellSample, Phase
 STEADY_S = 1.0
 """The last part of the hold whose mean counts."""
 
+LONGEST_GAP_S = 0.25
+"""Without a sound sample for longer in that part, there is nothing to compare with."""
+
 _RAMPING = (Phase.RAMP, Phase.HOLD)
 _GRASPING = (Phase.APPROACH, Phase.CONTACT, *_RAMPING)
 
@@ -46,7 +49,7 @@ def score_grasp(
         target_n: What was asked.
 
     Raises:
-        DataError: The force was never held, or the load cell said nothing meanwhile.
+        DataError: The force was never held, or the load cell said nothing meanwhile, or too little.
     """
     held_ns = [s.t_ns for s in statuses if s.phase == Phase.HOLD]
     if not held_ns:
@@ -60,7 +63,12 @@ def score_grasp(
         raise DataError("the load cell has no valid sample during the hold; check it in the log")
     t_s = (np.array([t for t, _ in cell]) - ramp_ns) / NS_PER_S  # (N,)
     force_n = np.array([f for _, f in cell])  # (N,)
-    last = t_s >= max(t_s[-1] - STEADY_S, (held_ns[0] - ramp_ns) / NS_PER_S)
+    held_s, end_s = (held_ns[0] - ramp_ns) / NS_PER_S, (end_ns - ramp_ns) / NS_PER_S
+    begin_s = max(end_s - STEADY_S, held_s)
+    last = t_s >= begin_s
+    gap_s = float(np.diff([begin_s, *t_s[last], end_s]).max())
+    if gap_s > LONGEST_GAP_S or not last.any():
+        raise DataError(f"the load cell gave no sound sample for {gap_s:.2f} s of the hold; see the log")
     steady_n = float(force_n[last].mean())
     outside = np.flatnonzero(np.abs(force_n - target_n) > max(0.05 * target_n, 0.1))
     first_inside = int(outside[-1]) + 1 if outside.size else 0

@@ -50,6 +50,17 @@ def test_never_settled_is_nan():
     assert math.isnan(score_grasp(cell(lambda _: 2.0, 2), statuses(Phase.RAMP, Phase.HOLD), 4.0).settle_s)
 
 
+@pytest.mark.parametrize(("gap_s", "counts"), [(0.2, True), (0.3, False)])
+def test_a_load_cell_with_a_gap_in_the_hold_compares_nothing(gap_s, counts):
+    states = statuses(Phase.RAMP, Phase.HOLD, Phase.HOLD)
+    samples = [s for s in cell(lambda _: 2.0, 3) if not 2.5 <= s.t_ns / 1e9 < 2.5 + gap_s]
+    if counts:
+        assert score_grasp(samples, states, 2.0).steady_error_n == 0.0
+    else:
+        with pytest.raises(DataError, match=r"no sound sample for 0\.31 s of the hold"):
+            score_grasp(samples, states, 2.0)
+
+
 def test_nothing_to_score():
     with pytest.raises(DataError, match="no hold"):
         score_grasp(cell(lambda _: 1.0, 1), statuses(Phase.APPROACH), 4.0)
