@@ -8,9 +8,10 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from gripper_force.errors import ConfigError
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Finite = Annotated[float, Field(allow_inf_nan=False)]
+# No quantity of a gripper is beyond these, and what is computed from it stays finite.
+Positive = Annotated[float, Field(ge=1e-9, le=1e9, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
+Finite = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
 
 HARD_FORCE_LIMIT_N = 70.0
 """No configuration may allow more: the least finger limit that is quoted for hands."""
@@ -51,7 +52,7 @@ class GripperConfig(Section):
     open_position_rad: Finite = Field(0.0, description="servo angle with the jaws open")
     open_width_m: Positive = 0.092
     nm_per_a: Positive | None = Field(None, description="torque constant at the horn; None: the model's own")
-    current_step_a: NonNegative | None = Field(
+    current_step_a: Positive | None = Field(
         None, description="resolution of the goal current; None: the model's own"
     )
     friction_n: NonNegative = Field(0.95, description="jaw force that friction takes while closing")
