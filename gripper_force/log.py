@@ -144,6 +144,8 @@ def _decode_frame(message: McapMessage) -> Frame:
     rows = np.frombuffer(image.data, np.uint8).reshape(image.height, image.step)
     gray = rows[:, : image.width].copy()  # a writable array of its own, as torch wants it  # (H, W)
     t_ns = image.timestamp.seconds * NS_PER_S + image.timestamp.nanos
+    if not max(abs(t_ns), message.log_time) < 2**63:
+        raise ValueError(f"an image was taken at {t_ns} ns and came at {message.log_time} ns")
     return Frame(t_ns, message.log_time, message.sequence, gray)
 
 

@@ -162,7 +162,7 @@ class Fusion:
     def _update(self, t_ns: int, visual: VisualForce) -> str:
         """Takes one estimate in. Returns why it was refused, or an empty text."""
         age_ns = t_ns - visual.t_ns
-        if not (math.isfinite(visual.force_n) and math.isfinite(visual.std_n)):
+        if not (abs(visual.force_n) <= 1e9 and abs(visual.std_n) <= 1e9):
             self._used_ns = None  # a network that says this is not to be trusted with what it said before
             return "it is not finite"
         if not 0 <= age_ns <= self._most_age_ns:

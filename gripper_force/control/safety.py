@@ -102,7 +102,7 @@ class Safety:
 
 
 def is_sound(servo: ServoState) -> bool:
-    """Whether every number of a reading is finite."""
+    """Whether every number of a reading is finite, and small enough to be reckoned with."""
     numbers = (
         servo.position_rad,
         servo.velocity_rad_s,
@@ -110,4 +110,4 @@ def is_sound(servo: ServoState) -> bool:
         servo.temperature_c,
         servo.voltage_v,
     )
-    return all(math.isfinite(number) for number in numbers)
+    return all(abs(number) <= 1e9 for number in numbers)

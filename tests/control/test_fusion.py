@@ -118,6 +118,7 @@ def test_whatever_the_push_friction_is_never_negative(transmission, pushes_n):
     [
         (math.nan, 0.1, 40, "finite"),
         (3.0, math.inf, 40, "finite"),
+        (1e300, 0.3, 40, "finite"),
         (3.0, 0.1, 61, "61 ms old"),
         (3.0, 0.1, -10, "-10 ms old"),
         (3.0, 1.6, 40, "uncertain by 1.60 N"),

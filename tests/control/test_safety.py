@@ -24,6 +24,7 @@ ILL = {
     "position": ({"position_rad": math.nan}, "not finite"),
     "velocity": ({"velocity_rad_s": math.inf}, "not finite"),
     "current": ({"current_a": -math.inf}, "not finite"),
+    "current is absurd": ({"current_a": 1e300}, "not finite"),
     "temperature is nan": ({"temperature_c": math.nan}, "not finite"),
     "voltage is nan": ({"voltage_v": math.nan}, "not finite"),
     "overload": ({"hardware_error": 0x20}, "hardware error 0x20"),

@@ -303,6 +303,12 @@ def test_a_log_of_another_program_is_refused(tmp_path: Path) -> None:
         ),
         (CompressionType.NONE, rb"\x15\x03", b"\x15\0", "0x2 pixels in rows of 3"),
         (CompressionType.NONE, rb"-\x03", b"-\x02", "3x2 pixels in rows of 2"),
+        (
+            CompressionType.NONE,
+            rb"\x01\0{7}(\x01\0{7}\n\x02\x10\x01)",
+            b"\1\0\0\0\0\0\0\x80\\1",
+            "came at 9223372036854775809 ns",
+        ),
         (CompressionType.NONE, rb"mono8", rb"mono9", "'mono9', not mono8"),
     ],
 )
