@@ -212,7 +212,7 @@ def estimate_tare(t_s: Floats, force_n: Floats) -> tuple[float, str]:
     Returns:
         The offset in N and an empty text; or 0 and the reason why the start can't be trusted as unloaded.
     """
-    start = force_n[t_s < t_s[0] + TARE_S]
+    start = force_n[t_s <= t_s[0] + TARE_S]
     offset = float(np.median(start))
     if len(start) < 3 or np.ptp(start) > TARE_SPREAD_N:
         return (

@@ -206,6 +206,12 @@ def test_spikes_are_rejected_and_stay_in_the_log(folder: Path, tmp_path: Path) -
     assert samples[55].raw == -70.0
 
 
+def test_a_clock_that_started_long_ago_gives_no_tare() -> None:
+    tare_n, note = estimate_tare(np.array([1e18, 2e18]), np.array([0.0, 1.0]))
+    assert tare_n == 0.0
+    assert "contact may be near" in note
+
+
 def test_tare_is_only_trusted_where_the_start_is_quiet_and_unloaded() -> None:
     t_s = np.arange(60) / RATE_HZ
     assert estimate_tare(t_s, grip() + 0.55) == (pytest.approx(0.55), "")
