@@ -228,6 +228,36 @@ def import_video(
     _print({"logs": rows}, as_json, _imports_table)
 
 
+@import_app.command("database")
+def import_database(
+    database: Annotated[
+        Path, typer.Argument(help="Folder that holds folders <object>_<degrees>_<illumination>.")
+    ],
+    folder: Annotated[Path, typer.Option("--out", help="Folder for the logs.")] = Path("data/shin2019"),
+    rate_hz: Annotated[float, typer.Option(help="Frame rate, for the times of the images.")] = 149.0,
+    set_: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Import the published database of Shin et al. 2019, a log for every four touches. Damage is named.
+
+    Goes on where it was broken off.
+    """
+    from gripper_force.database_import import find_environments, import_environment
+
+    settings = _load(None, set_, {"camera.rate_hz": rate_hz})
+    environments, ignored = find_environments(database)
+    rows = []
+    with _bar("importing", len(environments)) as advance:
+        for path in environments:
+            rows.append(
+                import_environment(
+                    path, folder, rate_hz=settings.camera.rate_hz, region=settings.vision.region
+                )
+            )
+            advance(path.name)
+    _print({"environments": rows, "ignored": ignored}, as_json, _database_table)
+
+
 @app.command("virtual-servo")
 def virtual_servo(
     model: Annotated[str | None, typer.Option(help="Servo model.")] = None,
@@ -505,6 +535,19 @@ def _imports_table(r: dict[str, Any]) -> None:
             name, row["object"], str(row["frames"]), str(row["spikes_rejected"]), tare, row["tare_note"]
         )
     out.print(table)
+
+
+def _database_table(r: dict[str, Any]) -> None:
+    columns = ("object", "degrees", "lux", "logs", "kept", "touches", "frames", "spikes_rejected")
+    table = Table("folder", *(name.removesuffix("_rejected") for name in columns), box=None)
+    for row in r["environments"]:
+        table.add_row(row.folder, *(str(getattr(row, name)) for name in columns))
+    out.print(table)
+    for row in r["environments"]:
+        for problem in row.problems:
+            out.print(f"[yellow]{escape(row.folder)}[/] {escape(problem)}", soft_wrap=True)
+    if r["ignored"]:
+        out.print(f"[yellow]not imported[/] {escape(', '.join(r['ignored']))}", soft_wrap=True)
 
 
 def _checks_table(r: dict[str, Any]) -> None:

@@ -8,7 +8,7 @@ name ``<date>_<object>_<trial>`` tells what was grasped.
 import csv
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -126,39 +126,29 @@ def import_video(
     object_name = object_name or object_of(name)
     table = read_forces(forces)
     tare_n, tare_note = estimate_tare(table.t_s, table.force_n)
-    force_n = table.force_n - tare_n
-    rejected = find_spikes(force_n)
-    frames, rate_hz = _read_video(video, region, size)
+    samples = load_cell_samples([_ns(t_s) for t_s in table.t_s], table.force_n, tare_n)
+    gray, rate_hz = _read_video(video, region, size)
+    times_ns = _frame_times_ns(table, len(gray), rate_hz)
+    frames = [Frame(t, t, i, image) for i, (t, image) in enumerate(zip(times_ns, gray, strict=True))]
     metadata = {
         "object": object_name,
         "set": re.sub(r"_\d+$", "", name),
         "source": name,
-        "spikes_rejected": str(int(rejected.sum())),
         "tare_n": f"{tare_n:.5f}",
         "tare_note": tare_note,
     }
-    times_ns = _frame_times_ns(table, len(frames), rate_hz)
-    records: list[Frame | LoadCellSample]
-    records = [Frame(t, t, i, gray) for i, (t, gray) in enumerate(zip(times_ns, frames, strict=True))]
-    records += [
-        LoadCellSample(_ns(t_s), float(force), float(raw), not bad)
-        for t_s, force, raw, bad in zip(table.t_s, force_n, table.force_n, rejected, strict=True)
-    ]
-    with LogWriter(out, config=dump_config(Config(object=object_name)), metadata=metadata) as log:
-        log.attach(forces.name, forces.read_bytes(), "text/csv")
-        for record in sorted(records, key=lambda record: record.t_ns):
-            log.write(record)
+    spikes = write_recording(out, Config(object=object_name), metadata, frames, samples, forces)
     with_row = int(np.isin(np.arange(len(frames)), table.frame).sum())
     return ImportSummary(
         log=out,
         object=object_name,
         frames=len(frames),
-        samples=len(rejected),
-        spikes_rejected=int(rejected.sum()),
+        samples=len(samples),
+        spikes_rejected=spikes,
         tare_n=tare_n,
         tare_note=tare_note,
         frames_without_force=len(frames) - with_row,
-        forces_without_frame=len(rejected) - with_row,
+        forces_without_frame=len(samples) - with_row,
     )
 
 
@@ -224,6 +214,48 @@ def estimate_tare(t_s: Floats, force_n: Floats) -> tuple[float, str]:
     if float(force_n.max()) < offset + TARE_RISE_N:
         return 0.0, f"the force never rises by {TARE_RISE_N} N, so nothing tells that the start is unloaded"
     return offset, ""
+
+
+def load_cell_samples(t_ns: Sequence[int], raw_n: Floats, tare_n: float = 0.0) -> list[LoadCellSample]:
+    """Samples with their tare removed and their spikes marked as not valid.
+
+    Args:
+        t_ns: Times, (N,).
+        raw_n: Forces as measured, (N,).
+        tare_n: Offset to remove.
+    """
+    force_n = raw_n - tare_n
+    return [
+        LoadCellSample(t, float(force), float(raw), not bad)
+        for t, force, raw, bad in zip(t_ns, force_n, raw_n, find_spikes(force_n), strict=True)
+    ]
+
+
+def write_recording(
+    out: Path,
+    config: Config,
+    metadata: dict[str, str],
+    frames: list[Frame],
+    samples: list[LoadCellSample],
+    table: Path | None = None,
+) -> int:
+    """Writes an imported recording as a log, and the table it came from as an attachment.
+
+    Returns:
+        How many samples are not valid; the log's metadata say so too.
+
+    Raises:
+        LogError: The log exists already or can't be written.
+    """
+    spikes = sum(not sample.valid for sample in samples)
+    records: list[Frame | LoadCellSample] = [*frames, *samples]
+    metadata = {**metadata, "spikes_rejected": str(spikes)}
+    with LogWriter(out, config=dump_config(config), metadata=metadata) as log:
+        if table is not None:
+            log.attach(table.name, table.read_bytes(), "text/csv")
+        for record in sorted(records, key=lambda record: record.t_ns):
+            log.write(record)
+    return spikes
 
 
 def _recordings(folder: Path) -> Iterator[tuple[str, Path, Path]]:

@@ -154,6 +154,31 @@ def test_a_recording_is_imported_replayed_and_evaluated(
     assert evaluated["mae_n"] == pytest.approx(replayed["mae_n"], rel=0.2)
 
 
+def test_a_published_database_is_imported_and_its_damage_told(run: Run, tmp_path: Path) -> None:
+    folder = tmp_path / "db" / "sponge_30_100"
+    folder.mkdir(parents=True)
+    for number in range(1, 5):
+        cv2.imwrite(str(folder / f"{number}.jpg"), np.full((16, 16, 3), 60 + number, np.uint8))
+    (folder / "test.txt").write_text("1,0.0,0\n2,0.5\n3,1.0,0\n4,0.5,0\n")
+    (tmp_path / "db" / "notes[1].txt").touch()
+    result = run("import", "database", "db", "--out", "logs", "--rate-hz", 100, "--json").json()
+    (row,) = result["environments"]
+    assert (row["object"], row["degrees"], row["lux"], row["logs"], row["frames"]) == (
+        "sponge",
+        30,
+        750,
+        1,
+        4,
+    )
+    assert result["ignored"] == ["notes[1].txt"]
+    assert Path("logs/sponge_30_100-01.mcap").is_file()
+    people = run("import", "database", "db", "--out", "logs")
+    for text in ("sponge_30_100", "line 2, '2,0.5'", "the first is 2", "not imported notes[1].txt"):
+        assert text in people.out
+    assert "camera.rate_hz" in run("import", "database", "db", "--rate-hz", 0).err
+    assert "name the folder that holds these" in run("import", "database", "logs").err
+
+
 # Bad input.
 
 
