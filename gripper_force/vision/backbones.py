@@ -1,23 +1,34 @@
-"""Convolutional backbones: one frame in, one feature map out."""
+"""Convolutional backbones: one gray frame in, one feature map out."""
+
+from itertools import pairwise
+from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 VGG_CHANNELS = (16, 32, 64, 128, 256)
-VGG_STRIDE = 16
 
 
-class Vgg(nn.Module):
+class Backbone(nn.Module):
+    """Maps frames (N, 1, S, S) to feature maps (N, out_channels, S/stride, S/stride), none negative."""
+
+    stride: ClassVar[int]
+    out_channels: int
+
+
+class Vgg(Backbone):
     """The VGG-like network of Shin et al. 2019, table 2: five pairs of 3x3 convolutions.
 
     A 2x2 max pooling follows each of the first four pairs, and batch normalisation follows each pooling; the
     latter is in the authors' public code, not in the paper.
     """
 
+    stride = 16
+
     def __init__(self, width: float) -> None:
         super().__init__()
-        channels = [max(1, round(width * c)) for c in VGG_CHANNELS]
+        channels = [_scaled(c, width) for c in VGG_CHANNELS]
         inputs = [1, *channels[:-1]]
         self.out_channels = channels[-1]
         self.first = nn.ModuleList(
@@ -35,3 +46,92 @@ class Vgg(nn.Module):
                 # Pooling before the rectifier gives the same numbers for a quarter of its work.
                 x = self.norm[i](F.relu(F.max_pool2d(x, 2)))  # (N, C_i, S / 2^(i+1), S / 2^(i+1))
         return torch.relu(x)
+
+
+class ResNet18(Backbone):
+    """The 18-layer network of He et al. 2016 (https://arxiv.org/abs/1512.03385, table 1) without its head.
+
+    Shin et al. name it and give no sizes (table 6); only the gray input differs from the original. Their
+    public code holds a fragment that normalises before the convolutions instead, which nothing there calls.
+    """
+
+    stride = 32
+
+    def __init__(self, width: float) -> None:
+        super().__init__()
+        channels = [_scaled(c, width) for c in (64, 128, 256, 512)]
+        self.out_channels = channels[-1]
+        self.stem = _convolution(1, channels[0], 7, stride=2)
+        blocks = [_Residual(channels[0], channels[0], 1), _Residual(channels[0], channels[0], 1)]
+        for inputs, outputs in pairwise(channels):
+            blocks += [_Residual(inputs, outputs, 2), _Residual(outputs, outputs, 1)]
+        self.blocks = nn.Sequential(*blocks)
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """Maps frames (N, 1, S, S) to feature maps (N, C, S/32, S/32)."""
+        # Pooling before the rectifier, as in `Vgg`.
+        x = F.relu(F.max_pool2d(self.stem(frames), 3, stride=2, padding=1))  # (N, C_0, S/4, S/4)
+        maps: Tensor = self.blocks(x)
+        return maps
+
+
+class Mobile(Backbone):
+    """A small network of the inverted residuals of MobileNetV2 (Sandler et al. 2018).
+
+    The original's 17 blocks take a CPU longer than `Vgg` does for a frame of 64 pixels, as the time goes into
+    calls and not into arithmetic. Six blocks at Vgg's stride take less than half of it.
+    """
+
+    stride = 16
+
+    def __init__(self, width: float) -> None:
+        super().__init__()
+        stem, *channels, self.out_channels = (_scaled(c, width) for c in (16, 24, 48, 96, 256))
+        self.stem = _convolution(1, stem, 3, stride=2)
+        blocks = []
+        for inputs, outputs in pairwise([stem, *channels]):
+            blocks += [_InvertedResidual(inputs, outputs, 2), _InvertedResidual(outputs, outputs, 1)]
+        self.blocks = nn.Sequential(*blocks)
+        self.last = _convolution(channels[-1], self.out_channels, 1)
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """Maps frames (N, 1, S, S) to feature maps (N, C, S/16, S/16)."""
+        return F.relu6(self.last(self.blocks(F.relu6(self.stem(frames)))))
+
+
+class _Residual(nn.Module):
+    """Two 3x3 convolutions beside a shortcut."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int) -> None:
+        super().__init__()
+        self.first = _convolution(inputs, outputs, 3, stride)
+        self.second = _convolution(outputs, outputs, 3)
+        self.shortcut = _convolution(inputs, outputs, 1, stride) if stride > 1 else nn.Identity()
+
+    def forward(self, x: Tensor) -> Tensor:
+        return F.relu(self.second(F.relu(self.first(x))) + self.shortcut(x))
+
+
+class _InvertedResidual(nn.Module):
+    """Wide inside, narrow outside, one 3x3 filter for each channel between; no rectifier at the end."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int, expansion: int = 4) -> None:
+        super().__init__()
+        inner = expansion * inputs
+        self.widen = _convolution(inputs, inner, 1)
+        self.filter = _convolution(inner, inner, 3, stride, groups=inner)
+        self.narrow = _convolution(inner, outputs, 1)
+        self.shortcut = stride == 1
+
+    def forward(self, x: Tensor) -> Tensor:
+        y: Tensor = self.narrow(F.relu6(self.filter(F.relu6(self.widen(x)))))
+        return x + y if self.shortcut else y
+
+
+def _convolution(inputs: int, outputs: int, kernel: int, stride: int = 1, groups: int = 1) -> nn.Sequential:
+    convolution = nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, groups=groups, bias=False)
+    return nn.Sequential(convolution, nn.BatchNorm2d(outputs))
+
+
+def _scaled(channels: int, width: float) -> int:
+    return max(1, round(width * channels))

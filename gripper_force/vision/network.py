@@ -8,15 +8,30 @@ it has seen one frame only.
 """
 
 from dataclasses import dataclass
-from typing import Annotated, Literal, Self
+from typing import Annotated, Final, Literal, Self
 
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor, nn
+from torch.utils.flop_counter import FlopCounterMode
 
 from gripper_force.config import Positive, Section
-from gripper_force.vision.attention import ChannelAttention, SpatialAttention
-from gripper_force.vision.backbones import VGG_STRIDE, Vgg
+from gripper_force.vision.attention import (
+    Cbam,
+    ChannelAttention,
+    Pooling,
+    SpatialAttention,
+    SqueezeExcitation,
+)
+from gripper_force.vision.backbones import Backbone, Mobile, ResNet18, Vgg
+
+BACKBONES: Final[dict[str, type[Vgg | ResNet18 | Mobile]]] = {
+    "vgg": Vgg,
+    "resnet18": ResNet18,
+    "mobile": Mobile,
+}
+
+Attention = Literal["none", "ssam", "scam", "se", "cbam"]
 
 Count = Annotated[int, Field(ge=1, le=100_000)]
 
@@ -25,9 +40,11 @@ class NetworkConfig(Section):
     """The shape of one network.
 
     Attributes:
-        attention: SSAM, SCAM, or none (the paper's baseline).
-        earlier_frames: n, the frames before the newest that attention sees.
-        reduction: r of SCAM's perceptron; the paper gives none, this is squeeze-and-excitation's.
+        attention: SSAM, SCAM, none (the paper's baseline), or SE or CBAM for comparison.
+        earlier_frames: n, the frames before the newest that SSAM and SCAM see; the others see none.
+        pooling: How SSAM and SCAM squeeze: weighted or global average pooling.
+        reduction: r of the perceptron; the paper gives none, this is that of SE and CBAM.
+        backbone: The paper's VGG-like network, its ResNet with 18 layers, or a small one for slow computers.
         size: Side of the input in pixels.
         width: Multiplier of the backbone's channels.
         window: Frames the BLSTM sees.
@@ -36,15 +53,35 @@ class NetworkConfig(Section):
         label_scale_n: The last layer's output 1 means this force.
     """
 
-    attention: Literal["none", "ssam", "scam"] = "none"
+    attention: Attention = "none"
     earlier_frames: Annotated[int, Field(ge=0, le=20)] = 1
+    pooling: Pooling = "wap"
     reduction: Count = 16
-    size: Annotated[int, Field(ge=16, le=1024, multiple_of=VGG_STRIDE)] = 128
+    backbone: Literal["vgg", "resnet18", "mobile"] = "vgg"
+    size: Annotated[int, Field(ge=16, le=1024)] = 128
     width: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] = 1.0
     window: Annotated[int, Field(ge=1, le=1000)] = 20
     hidden: Count = 256
     head: Count = 1024
     label_scale_n: Positive = 20.0
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        stride = BACKBONES[self.backbone].stride
+        if self.size % stride:
+            raise ValueError(
+                f"size {self.size} does not suit the backbone {self.backbone}: take a multiple of {stride}"
+            )
+        if self.pooling == "gap" and not self.sequential:
+            raise ValueError(
+                f"pooling gap is a choice of ssam and scam: with the attention {self.attention} leave it out"
+            )
+        return self
+
+    @property
+    def sequential(self) -> bool:
+        """Whether attention may see earlier frames."""
+        return self.attention in ("ssam", "scam")
 
 
 class LastStepBlstm(nn.Module):
@@ -74,7 +111,8 @@ class StreamState:
     Attributes:
         maps: Feature maps of the last n frames, (B, n, C, H, W).
         pooled: Pooled vectors of the last frames of the window, (B, window, C).
-        gates: Attention of the newest frame: SSAM (B, 1, H, W), SCAM (B, C, 1, 1), None without attention.
+        gates: Attention of the newest frame: of positions (B, 1, H, W) from SSAM and CBAM, of channels
+            (B, C, 1, 1) from SCAM and SE, None without attention.
     """
 
     maps: Tensor
@@ -88,14 +126,10 @@ class ForceNetwork(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config
-        self.backbone = Vgg(config.width)
+        self.backbone: Backbone = BACKBONES[config.backbone](config.width)
+        self.earlier_frames = config.earlier_frames if config.sequential else 0
         channels = self.backbone.out_channels
-        self.attention: nn.Module | None = None
-        if config.attention == "ssam":
-            self.attention = SpatialAttention(channels, config.earlier_frames)
-        elif config.attention == "scam":
-            positions = (config.size // VGG_STRIDE) ** 2
-            self.attention = ChannelAttention(channels, config.earlier_frames, positions, config.reduction)
+        self.attention = _attention(config, channels, self.backbone.stride)
         self.blstm = LastStepBlstm(channels, config.hidden)
         self.dense = nn.Linear(2 * config.hidden, config.head)
         self.out = nn.Linear(config.head, 1)
@@ -109,7 +143,7 @@ class ForceNetwork(nn.Module):
     @property
     def context(self) -> int:
         """Earlier frames that one estimate depends on."""
-        return self.config.window - 1 + (self.config.earlier_frames if self.attention else 0)
+        return self.config.window - 1 + self.earlier_frames
 
     def forward(self, clips: Tensor, start: int = 0) -> Tensor:
         """Estimates the force for the frames of whole clips; one backbone pass serves all windows.
@@ -124,7 +158,7 @@ class ForceNetwork(nn.Module):
         batch, length = clips.shape[:2]
         flat = self.backbone(clips.flatten(0, 1))  # (B*T, C, H, W)
         maps = flat.view(batch, length, *flat.shape[1:])
-        earlier = maps[:, :1].expand(-1, self.config.earlier_frames, -1, -1, -1)
+        earlier = maps[:, :1].expand(-1, self.earlier_frames, -1, -1, -1)
         pooled, _ = self._attend(torch.cat([earlier, maps], dim=1))  # (B, T, C)
         window = self.config.window
         padded = torch.cat([pooled[:, :1].expand(-1, window - 1, -1), pooled], dim=1)
@@ -142,7 +176,7 @@ class ForceNetwork(nn.Module):
             Forces in N, (B,), and the state for the next step.
         """
         newest = self.backbone(frame)[:, None]  # (B, 1, C, H, W)
-        earlier = newest.expand(-1, self.config.earlier_frames, -1, -1, -1) if state is None else state.maps
+        earlier = newest.expand(-1, self.earlier_frames, -1, -1, -1) if state is None else state.maps
         maps = torch.cat([earlier, newest], dim=1)  # (B, n + 1, C, H, W)
         pooled, gates = self._attend(maps)  # (B, 1, C)
         window = pooled.expand(-1, self.config.window, -1) if state is None else state.pooled
@@ -151,7 +185,7 @@ class ForceNetwork(nn.Module):
 
     def _attend(self, maps: Tensor) -> tuple[Tensor, Tensor | None]:
         """Excites and pools the maps (B, n + T, C, H, W) that have n before them: (B, T, C), and gates."""
-        n = self.config.earlier_frames
+        n = self.earlier_frames
         length = maps.shape[1] - n
         newest = maps[:, n:].flatten(0, 1)  # (B*T, C, H, W)
         gates = None
@@ -167,3 +201,36 @@ class ForceNetwork(nn.Module):
             hidden = torch.tanh(self.dense(self.blstm(windows.float())))  # (N, head)
             force: Tensor = self.out(hidden).squeeze(1) * self.config.label_scale_n
         return force
+
+
+def _attention(config: NetworkConfig, channels: int, stride: int) -> nn.Module | None:
+    match config.attention:
+        case "ssam":
+            return SpatialAttention(channels, config.earlier_frames, config.pooling)
+        case "scam":
+            positions = (config.size // stride) ** 2
+            return ChannelAttention(
+                channels, config.earlier_frames, positions, config.reduction, config.pooling
+            )
+        case "se":
+            return SqueezeExcitation(channels, config.reduction)
+        case "cbam":
+            return Cbam(channels, config.reduction)
+        case "none":
+            return None
+
+
+def cost(config: NetworkConfig) -> tuple[int, int]:
+    """What a network takes.
+
+    Returns:
+        Its parameters, and the multiply-adds of one `ForceNetwork.step` in convolutions and matrix products.
+        SCAM's weighted pooling, a few thousand, is not among them.
+    """
+    network = ForceNetwork(config).eval()
+    with torch.no_grad(), FlopCounterMode(display=False) as counter:
+        network.step(torch.zeros(1, 1, config.size, config.size), None)
+    # On a CPU the counter does not see into an LSTM.
+    recurrent = config.window * sum(w.numel() for w in network.blstm.onward.parameters() if w.dim() > 1)
+    parameters = sum(parameter.numel() for parameter in network.parameters())
+    return parameters, recurrent + counter.get_total_flops() // 2

@@ -1,9 +1,11 @@
 import hashlib
+import json
 from pathlib import Path
 
 import pytest
 import torch
 from pydantic import ValidationError
+from safetensors import safe_open
 from safetensors.torch import save_file
 
 from gripper_force.errors import CheckpointError
@@ -45,6 +47,40 @@ def test_round_trip(file: Path) -> None:
         assert not network.training
         assert all(parameter.dtype == torch.float32 for parameter in network.parameters())
         torch.testing.assert_close(network(clip), original(clip), rtol=5e-3, atol=5e-3)
+
+
+def test_an_older_header_takes_the_defaults_of_what_it_lacks(file: Path, tmp_path: Path) -> None:
+    with safe_open(file, "pt") as opened:
+        fields = json.loads(opened.metadata()[checkpoint.FORMAT])
+        tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118 - not a mapping
+    for member in fields["members"]:
+        assert (member.pop("backbone"), member.pop("pooling")) == ("vgg", "wap")
+    save_file(tensors, tmp_path / "older.safetensors", {checkpoint.FORMAT: json.dumps(fields)})
+    older, newer = load_checkpoint(tmp_path / "older.safetensors"), load_checkpoint(file)
+    assert older.header == newer.header
+    clip = torch.randn(1, 4, 1, 16, 16)
+    for first, second in zip(older.networks, newer.networks, strict=True):
+        assert torch.equal(first(clip), second(clip))
+
+
+@pytest.mark.parametrize(
+    "choices",
+    [
+        {"attention": "ssam", "pooling": "gap"},
+        {"attention": "scam", "pooling": "gap", "backbone": "mobile"},
+        {"attention": "se", "backbone": "resnet18"},
+        {"attention": "cbam", "backbone": "mobile"},
+    ],
+)
+@torch.inference_mode()
+def test_every_kind_of_network_comes_back(choices: dict[str, str], tmp_path: Path) -> None:
+    config = NetworkConfig.model_validate(SSAM.model_dump() | choices | {"size": 32})
+    network = ForceNetwork(config).eval()
+    whole = header(SSAM).model_copy(update={"members": (config,), "preprocess": Preprocess(size=32)})
+    save_checkpoint(tmp_path / "one.safetensors", [network], whole)
+    (loaded,) = load_checkpoint(tmp_path / "one.safetensors").networks
+    clip = torch.randn(1, 4, 1, 32, 32)
+    torch.testing.assert_close(loaded(clip), network(clip), rtol=5e-3, atol=5e-3)
 
 
 def test_loading_is_bit_exact_after_the_first_rounding(file: Path, tmp_path: Path) -> None:

@@ -1,14 +1,23 @@
 from collections.abc import Iterator
+from itertools import pairwise
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
 from torch import Tensor, nn
 
-from gripper_force.vision.network import ForceNetwork, LastStepBlstm, NetworkConfig, StreamState
+from gripper_force.vision.network import (
+    ForceNetwork,
+    LastStepBlstm,
+    NetworkConfig,
+    StreamState,
+    cost,
+)
 
 TINY = NetworkConfig(size=16, width=0.25, window=5, hidden=6, head=7, reduction=4)
+SIZES = {"vgg": 32, "resnet18": 64, "mobile": 32}
 
 
 def build(config: NetworkConfig, seed: int = 0) -> ForceNetwork:
@@ -45,8 +54,8 @@ def literal(network: ForceNetwork, frames: Tensor) -> Tensor:
     for t in range(len(maps) - config.window, len(maps)):
         excited = maps[t]
         if network.attention is not None:
-            stack = torch.cat(maps[t - config.earlier_frames : t + 1], dim=1)
-            excited, _ = network.attention(stack, maps[t])
+            seen = config.earlier_frames if config.attention in ("ssam", "scam") else 0
+            excited, _ = network.attention(torch.cat(maps[t - seen : t + 1], dim=1), maps[t])
         vectors.append(excited.mean((2, 3)))
     states, _ = as_torch_blstm(network.blstm)(torch.stack(vectors, dim=1))
     return network.out(torch.tanh(network.dense(states[:, -1])))[0, 0] * config.label_scale_n
@@ -79,20 +88,23 @@ def test_the_last_step_equals_a_bidirectional_lstm() -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(
-    attention=st.sampled_from(["none", "ssam", "scam"]),
+    attention=st.sampled_from(["none", "ssam wap", "ssam gap", "scam wap", "scam gap", "se", "cbam"]),
+    backbone=st.sampled_from(sorted(SIZES)),
     earlier=st.integers(0, 2),
     length=st.integers(1, 12),
     seed=st.integers(0, 99),
 )
 @torch.inference_mode()
 def test_streaming_and_whole_clips_equal_the_literal_window(
-    attention: str, earlier: int, length: int, seed: int
+    attention: str, backbone: str, earlier: int, length: int, seed: int
 ) -> None:
-    config = NetworkConfig.model_validate(
-        {**TINY.model_dump(), "attention": attention, "earlier_frames": earlier}
-    )
-    network = build(config, seed)
-    clip = torch.randn(length, 1, 16, 16)
+    name, *pooling = attention.split()
+    size = SIZES[backbone]
+    choices = {"attention": name, "backbone": backbone, "size": size, "earlier_frames": earlier}
+    if pooling:
+        choices["pooling"] = pooling[0]
+    network = build(NetworkConfig.model_validate(TINY.model_dump() | choices), seed)
+    clip = torch.randn(length, 1, size, size)
     expected = torch.stack([literal(network, history(network, clip, t)) for t in range(length)])
     assert_same(torch.stack(list(stream(network, clip))), expected)
     assert_same(network(clip[None])[0], expected)
@@ -108,10 +120,12 @@ def test_a_long_stream_does_not_drift() -> None:
     assert_same(newest, literal(network, history(network, clip, len(clip) - 1)))
 
 
-@pytest.mark.parametrize("attention", ["ssam", "scam"])
+@pytest.mark.parametrize(
+    ("attention", "backbone"), [("ssam", "vgg"), ("scam", "vgg"), ("scam", "resnet18"), ("cbam", "mobile")]
+)
 @torch.inference_mode()
-def test_the_full_size_network_streams_exactly(attention: str) -> None:
-    network = build(NetworkConfig(attention=attention))
+def test_full_size_networks_stream_exactly(attention: str, backbone: str) -> None:
+    network = build(NetworkConfig.model_validate({"attention": attention, "backbone": backbone}))
     clip = torch.randn(24, 1, 128, 128)
     *_, newest = stream(network, clip)
     assert_same(newest, literal(network, history(network, clip, 23)))
@@ -133,3 +147,66 @@ def test_the_full_size_network_fits_the_paper() -> None:
     assert network.config.window == 20
     assert network.context == 20
     assert 2.4e6 < sum(parameter.numel() for parameter in network.parameters()) < 2.8e6
+
+
+@pytest.mark.parametrize("backbone", SIZES)
+@pytest.mark.parametrize("attention", ["ssam", "scam", "se", "cbam"])
+def test_every_parameter_learns(attention: str, backbone: str) -> None:
+    size = SIZES[backbone]
+    choices = {"attention": attention, "backbone": backbone, "size": size}
+    network = build(NetworkConfig.model_validate(TINY.model_dump() | choices)).train()
+    with torch.autocast("cpu", torch.bfloat16):
+        forces = network(torch.randn(2, 3, 1, size, size))
+    forces.square().mean().backward()  # type: ignore[no-untyped-call]
+    for name, parameter in network.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all(), name
+
+
+def test_attention_to_the_newest_map_alone_keeps_no_maps() -> None:
+    frame = torch.zeros(1, 1, 16, 16)
+    for attention in ("none", "se", "cbam"):
+        network = build(TINY.model_copy(update={"attention": attention, "earlier_frames": 2}))
+        assert network.context == 4
+        assert network.step(frame, None)[1].maps.shape[1] == 0
+    network = build(TINY.model_copy(update={"attention": "ssam", "earlier_frames": 2}))
+    assert network.context == 6
+    assert network.step(frame, None)[1].maps.shape[1] == 2
+
+
+@pytest.mark.parametrize(
+    ("choices", "message"),
+    [
+        ({"backbone": "resnet18", "size": 48}, "size 48 .* resnet18: take a multiple of 32"),
+        ({"size": 24}, "size 24 .* vgg: take a multiple of 16"),
+        (
+            {"attention": "se", "pooling": "gap"},
+            "a choice of ssam and scam: with the attention se leave",
+        ),
+        ({"attention": "none", "pooling": "gap"}, "with the attention none"),
+        ({"attention": "eca"}, "attention"),
+        ({"backbone": "vit"}, "backbone"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(choices: dict[str, object], message: str) -> None:
+    with pytest.raises(ValidationError, match=message):
+        NetworkConfig.model_validate(choices)
+
+
+def test_cost_is_that_of_the_layers_added_up() -> None:
+    channels, side, convolutions, weights = [1, 16, 32, 64, 128, 256], 64, 0, 0
+    for inputs, outputs in pairwise(channels):
+        pair = 9 * (inputs + outputs) * outputs
+        convolutions += side**2 * pair
+        weights += pair + 2 * outputs
+        side //= 2
+    weights += 2 * (16 + 32 + 64 + 128)  # batch normalisation
+    blstm = 256 * 4 * (256 + 256)
+    backward, dense, out = 256 * 3 * 256, 512 * 1024, 1024
+    weights += blstm + 2 * 4 * 256 + backward + 3 * 256 + dense + 1024 + out + 1
+    assert cost(NetworkConfig(size=64)) == (weights, convolutions + 20 * blstm + backward + dense + out)
+    ssam = 2 * 256
+    assert cost(NetworkConfig(attention="ssam", size=64)) == (
+        weights + ssam + 1,
+        convolutions + 16 * ssam + 20 * blstm + backward + dense + out,
+    )
