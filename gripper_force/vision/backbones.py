@@ -79,7 +79,7 @@ class Mobile(Backbone):
     """A small network of the inverted residuals of MobileNetV2 (Sandler et al. 2018).
 
     The original's 17 blocks take a CPU longer than `Vgg` does for a frame of 64 pixels, as the time goes into
-    calls and not into arithmetic. Six blocks at Vgg's stride take less than half of it.
+    calls and not into arithmetic. Six blocks at Vgg's stride take about half of Vgg's.
     """
 
     stride = 16
