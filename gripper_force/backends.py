@@ -108,6 +108,7 @@ def open_devices(config: Config) -> Iterator[Devices]:
             start_ns=rig.start_ns if rig is not None else clock.now_ns(),
             check=rig.check if rig is not None else lambda: None,
             notes=rig.notes() if rig is not None else {},
+            relight=rig.relight if rig is not None else None,
         )
 
 

@@ -124,26 +124,37 @@ def simulate(
     first_seed: Annotated[
         int, typer.Option(min=0, help="Seed of the first log. Training data start at 100000.")
     ] = 100_000,
+    protocol: Annotated[
+        str | None, typer.Option(help="shin2019: the paper's sets instead, into OUT/train and OUT/test.")
+    ] = None,
+    scale: Annotated[
+        str, typer.Option(help="With --protocol: full (720 logs) or small (80: 0 and 30 degrees, one light).")
+    ] = "full",
     jobs: Jobs = _CORES,
     config: ConfigPath = None,
     set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
     """Write logs of randomised touches, to train and to evaluate on. Goes on where it was broken off."""
-    from gripper_force.simulate import plan
-    from gripper_force.simulate import simulate as job
+    from gripper_force import simulate as job
 
-    settings = _load(config, set_, {})
-    plans = plan("press", presses, first_seed) + plan("grasp", grasps, first_seed + presses)
+    plans: list[Any]
+    if protocol is None:
+        settings = _load(config, set_, {})
+        plans = job.plan("press", presses, first_seed) + job.plan("grasp", grasps, first_seed + presses)
+    elif protocol == "shin2019":
+        settings = _load(config, [f"camera.rate_hz={job.PROTOCOL_RATE_HZ}", *(set_ or [])], {})
+        plans = list(job.plan_protocol(scale))
+    else:
+        raise ConfigError(f"no protocol {protocol!r}; there is shin2019")
+    names = [name for p in plans for name in p.names]
     made = 0
-    with _bar("simulating", len(plans)) as advance:
-        present = sum((folder / p.name).exists() for p in plans)
-        for _ in range(present):
-            advance("")
-        for path in job(plans, folder, settings, jobs):
+    with _bar("simulating", len(names)) as advance:
+        advance("", sum((folder / name).exists() for name in names))
+        for path in job.simulate(plans, folder, settings, jobs):
             made += 1
             advance(path.name)
-    _print({"logs": len(plans), "made": made, "folder": str(folder)}, as_json)
+    _print({"logs": len(names), "made": made, "folder": str(folder)}, as_json)
 
 
 @app.command()

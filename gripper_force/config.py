@@ -170,6 +170,9 @@ class SimConfig(Section):
 
     detail: Literal["coarse", "medium", "fine"] = "medium"
     lux: float | None = Field(None, description="350, 550, 750; None: drawn from the seed", gt=0)
+    yaw_deg: float = Field(
+        0.0, ge=-90, le=90, description="turn of the object about the vertical, on top of what is drawn"
+    )
     randomise: bool = Field(
         True, description="draw size, pose, camera, texture, light and motor from the seed"
     )

@@ -254,6 +254,12 @@ def test_a_file_that_is_no_checkpoint_is_named(
         assert sentence in line
 
 
+def test_a_protocol_and_its_scale_are_known_by_name(run: Run) -> None:
+    assert "no protocol 'shin'; there is shin2019" in run("simulate", "--protocol", "shin").err
+    unknown = run("simulate", "--protocol", "shin2019", "--scale", "huge")
+    assert (unknown.code, "there are full, small" in unknown.err) == (2, True)
+
+
 def test_a_video_needs_its_table(run: Run, tmp_path: Path) -> None:
     video, table = write_recording(tmp_path)
     table.unlink()

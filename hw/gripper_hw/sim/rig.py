@@ -165,6 +165,7 @@ class SimulatedRig:
                 f"servo.port {config.servo.port!r} is no virtual port, and a simulated camera or load cell "
                 "needs the simulated rig's servo; set servo.port to virtual:rig"
             )
+        self._config = config
         self.scene = draw_scene(config.object, config.seed, config.sim)
         model = load_model(config.servo.model)
         servo = VirtualServo(config.servo.id, model)
@@ -210,6 +211,13 @@ class SimulatedRig:
     def notes(self) -> dict[str, str]:
         """What a log should know of the scene."""
         return {"scene": json.dumps(asdict(self.scene)), "exposure_ms": str(self._exposure_ms)}
+
+    def relight(self, lux: float) -> tuple[Camera, dict[str, str]]:
+        """A further camera, which sees what a rig of its own with this ``sim.lux`` would, and its notes."""
+        config = self._config.model_copy(update={"sim": self._config.sim.model_copy(update={"lux": lux})})
+        scene = draw_scene(config.object, config.seed, config.sim)
+        camera = SimulatedCamera(self._world, scene, config, self.clock, self.start_ns)
+        return camera, {**self.notes(), "scene": json.dumps(asdict(scene))}
 
     def close(self) -> None:
         """Stops the world and takes its bus away. May be called twice."""

@@ -73,7 +73,7 @@ def draw_scene(object_name: str, seed: int, config: SimConfig) -> Scene:
     rng = np.random.default_rng([seed, 0])
     lux = float(config.lux or rng.choice(LUX_LEVELS))
     if not config.randomise:
-        return Scene(object_name, config.detail, lux=lux)
+        return Scene(object_name, config.detail, yaw_deg=config.yaw_deg, lux=lux)
 
     def shift(*spread: float) -> tuple[float, ...]:
         return tuple(float(v) for v in rng.uniform(-1, 1, len(spread)) * spread)
@@ -87,7 +87,7 @@ def draw_scene(object_name: str, seed: int, config: SimConfig) -> Scene:
         size=float(rng.uniform(0.96, 1.04)),
         stiffness=float(1 + rng.uniform(-1, 1) * config.stiffness_spread),
         offset_m=(x, y),
-        yaw_deg=float(rng.uniform(-4, 4)),
+        yaw_deg=config.yaw_deg + float(rng.uniform(-4, 4)),
         camera_offset_m=(camera[0], camera[1], camera[2]),
         camera_target_offset_m=(target[0], target[1], target[2]),
         camera_fovy_deg=float(rng.uniform(16.8, 17.2)),

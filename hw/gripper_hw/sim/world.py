@@ -69,6 +69,7 @@ class World:
         self._right = int(self._model.sensor("right_force").adr[0]) + 1
         self._taps: list[_Tap] = []
         self._renderer: Any = None
+        self._picture: tuple[int, npt.NDArray[np.uint8]] | None = None
         self.t_ns = 0
         self.force_n = 0.0
         mujoco.mj_forward(self._model, self._data)
@@ -103,9 +104,10 @@ class World:
         """The world as it stands, (side, side, 3) uint8. Raises `SimulationError` without EGL."""
         if self._renderer is None:
             self._renderer = self._new_renderer(side)
-        self._renderer.update_scene(self._data, "camera")
-        picture: npt.NDArray[np.uint8] = self._renderer.render()
-        return picture
+        if self._picture is None or self._picture[0] != self.t_ns:  # one drawing serves all light levels
+            self._renderer.update_scene(self._data, "camera")
+            self._picture = self.t_ns, self._renderer.render()
+        return self._picture[1]
 
     def close(self) -> None:
         """Frees the drawing context."""

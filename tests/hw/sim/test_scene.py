@@ -22,6 +22,26 @@ def test_what_is_asked_for_is_not_drawn() -> None:
     assert draw_scene("cup", 3, SimConfig(lux=350)).lux == pytest.approx(350, rel=0.051)
 
 
+@pytest.mark.parametrize("randomise", [True, False])
+def test_a_turn_and_a_light_change_nothing_else_of_the_scene(randomise: bool) -> None:
+    config = SimConfig(randomise=randomise, lux=550)
+    asked = SimConfig(randomise=randomise, lux=350, yaw_deg=20)
+    before, after = (draw_scene("tube", 3, c) for c in (config, asked))
+    assert after.yaw_deg == before.yaw_deg + 20
+    assert after.lux == pytest.approx(before.lux * 350 / 550)
+    assert replace(after, yaw_deg=before.yaw_deg, lux=before.lux) == before
+
+
+def test_the_scenes_of_old_logs_are_drawn_again_to_the_bit() -> None:
+    scene = draw_scene("sponge", 100_000, SimConfig())
+    assert (scene.yaw_deg, scene.lux, scene.texture_seed, scene.backlash_m) == (
+        2.9191085508820542,
+        363.61738826701986,
+        270442807,
+        0.00023587746804863647,
+    )
+
+
 @pytest.mark.parametrize("spread", [0.0, 0.3])
 def test_stiffness_stays_within_its_spread_and_fills_it(spread: float) -> None:
     config = SimConfig(stiffness_spread=spread)
