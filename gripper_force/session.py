@@ -43,8 +43,8 @@ _VISION_PATIENCE_NS = 2 * NS_PER_S
 _REFERENCE_NS = NS_PER_S // 10
 """Every run begins with frames that show no contact, so that its log can be replayed with vision."""
 
-_OPENING_NS = 3 * NS_PER_S
-"""How long jaws that are to open at a fault may take."""
+_OPENING_NS = 5 * NS_PER_S
+"""How long jaws may take to open."""
 
 _SUPPLY_SLACK_V = 0.5
 """A supply that is set to the end of a servo's range reads a little beyond it."""
@@ -352,25 +352,27 @@ def grasp_in(session: Session, config: Config, sees: bool, progress: Progress | 
                 break
         decision = session.cycle()
     if status.outcome == Outcome.FAULT:
-        _end_fault(session, config, status)
-        return status.outcome
+        if config.control.on_fault == "open":
+            _let_open(session, config, status)
+        return status.outcome  # otherwise nothing moves until somebody has looked
     if config.on_exit == "hold":
         return status.outcome
-    decision = session.cycle(RequestKind.RELEASE)
-    while decision.status.phase == Phase.RELEASE:
-        decision = session.cycle()
+    status = release(session, config)
     if progress is not None:
-        progress(decision.status)
-    return decision.status.outcome
+        progress(status)
+    return status.outcome
 
 
-def _end_fault(session: Session, config: Config, status: GraspStatus) -> None:
-    """Lets jaws that are to open do so; otherwise nothing moves until somebody has looked."""
+def release(session: Session, config: Config) -> GraspStatus:
+    """Opens the jaws and returns how far that came: an object that catches on them can keep them closed."""
+    return _let_open(session, config, session.cycle(RequestKind.RELEASE).status)
+
+
+def _let_open(session: Session, config: Config, status: GraspStatus) -> GraspStatus:
     end_ns = status.t_ns + _OPENING_NS
-    while config.control.on_fault == "open" and status.t_ns < end_ns:
-        if is_open(config.gripper.open_width_m, status.width_m):
-            return
+    while status.t_ns < end_ns and not is_open(config.gripper.open_width_m, status.width_m):
         status = session.cycle().status
+    return status
 
 
 def _recorder(config: Config, devices: Devices, path: Path, checkpoint: Checkpoint | None) -> Recorder:

@@ -23,7 +23,7 @@ from gripper_force.config import Config, config_from, config_from_text, dump_con
 from gripper_force.errors import ConfigError, SimulationError
 from gripper_force.interfaces import Camera, LoadCell
 from gripper_force.log import LogReader, LogWriter
-from gripper_force.session import Session, open_session, run_grasp
+from gripper_force.session import Session, open_session, release, run_grasp
 from gripper_force.types import NS_PER_S, Frame, Gray, LoadCellSample, Outcome, Phase, RequestKind
 
 Kind = Literal["press", "grasp"]
@@ -350,9 +350,7 @@ def _press(config: Config, path: Path, rng: np.random.Generator) -> None:
         for _ in range(int(rng.integers(_MAX_TARGETS)) + 1):
             _ramp(session, _target_n(rng), config.control.timeout_s)
             _wait(session, float(rng.uniform(0.05, 0.6)))
-        decision = session.cycle(RequestKind.RELEASE)
-        while decision.status.phase == Phase.RELEASE:
-            decision = session.cycle()
+        release(session, config)
 
 
 def _ramp(session: Session, target_n: float, timeout_s: float) -> float:
