@@ -284,7 +284,9 @@ def _number(path: Path, line: int, column: str, text: str | None) -> float:
         value = float(text or "")
     except ValueError:
         value = math.nan
-    if not math.isfinite(value) or (column == "frame" and value != int(value)):
+    # From 2**53 on a float does not tell two frames apart.
+    whole = value.is_integer() and abs(value) < 2**53
+    if not math.isfinite(value) or (column == "frame" and not whole):
         kind = "frame number" if column == "frame" else "finite number"
         raise DataError(f"{path}, line {line}: {column} is {text!r}, which is no {kind}")
     return value

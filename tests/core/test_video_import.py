@@ -150,6 +150,7 @@ def test_frames_and_rows_that_have_no_partner_are_counted(folder: Path, tmp_path
         ("frame,t_s,force_n\n0,0,nan\n", "line 2: force_n is 'nan', which is no finite number"),
         ("frame,t_s,force_n\n0,0\n", "line 2: force_n is None"),
         ("frame,t_s,force_n\n0.5,0,1\n", "line 2: frame is '0.5', which is no frame number"),
+        ("frame,t_s,force_n\n1e19,0,1\n", "line 2: frame is '1e19', which is no frame number"),
         ("frame,t_s,force_n\n0,0,1\n0,0.03,1\n", "frame 0 at 0.0300 s follows frame 0 at"),
         ("frame,t_s,force_n\n0,0.03,1\n1,0,1\n", "frame 1 at 0.0000 s follows frame 0 at 0.0300 s"),
         ("\0\xff", "lacks the column"),
