@@ -387,4 +387,6 @@ def _sentence(root: type[Section], error: ValidationError, where: str) -> str:
         known = ", ".join(section.model_fields)
         return f"unknown configuration key {key!r} (from {where}); known here: {known}"
     reason = first["msg"].removeprefix("Value error, ")
+    if not parts:
+        return f"the configuration (from {where}) does not fit together: {reason}"
     return f"configuration key {key!r} (from {where}): {reason}, got {first['input']!r}"

@@ -111,6 +111,16 @@ def split_by(
     return [c for c in clips if getattr(c, key) not in held], [c for c in clips if getattr(c, key) in held]
 
 
+def check_size(clips: Iterable[Clip], preprocess: Preprocess) -> None:
+    """Raises `DataError` where a clip's frames are of another size than the networks take."""
+    for clip in clips:
+        if clip.frames.shape[1] != preprocess.size:
+            raise DataError(
+                f"{clip.name} has frames of {clip.frames.shape[1]} px, the network needs {preprocess.size}; "
+                "load the log for this network"
+            )
+
+
 def digest(clips: Iterable[Clip]) -> str:
     """SHA-256 over all frames and labels."""
     sha = hashlib.sha256()

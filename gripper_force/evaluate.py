@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import track
 
 from gripper_force import metrics
-from gripper_force.dataset import CONTACT_N, Clip, stiffness_floor_n
+from gripper_force.dataset import CONTACT_N, Clip, check_size, stiffness_floor_n
 from gripper_force.errors import DataError
 from gripper_force.vision.checkpoint import Checkpoint
 from gripper_force.vision.dense import predict
@@ -50,8 +50,6 @@ class Result(TypedDict):
 def evaluate(checkpoint: Checkpoint, clips: Sequence[Clip]) -> Result:
     """Estimates the force at each frame as a run would, and compares it with the load cell.
 
-    Frames that only served as reference are left out: a run gives no estimate for them.
-
     Args:
         checkpoint: The ensemble; computed on a GPU where there is one.
         clips: Recordings, reduced to the checkpoint's size.
@@ -59,17 +57,34 @@ def evaluate(checkpoint: Checkpoint, clips: Sequence[Clip]) -> Result:
     Raises:
         DataError: There are no clips, no labels, or frames of another size.
     """
+    means_n = [members_n.mean(0) for members_n in estimates(checkpoint, clips)]
+    return compare(clips, means_n, checkpoint.header.preprocess.lead_in)
+
+
+def estimates(checkpoint: Checkpoint, clips: Sequence[Clip]) -> list[npt.NDArray[np.float32]]:
+    """Each member's estimate for each frame, so that ensembles can be put together afterwards.
+
+    Args:
+        checkpoint: The networks; computed on a GPU where there is one.
+        clips: Recordings, reduced to the checkpoint's size.
+
+    Returns:
+        Forces in N of each clip, (members, T).
+
+    Raises:
+        DataError: Frames are of another size.
+    """
     device = "cuda" if torch.cuda.is_available() else "cpu"
     preprocess = checkpoint.header.preprocess
+    check_size(clips, preprocess)
     networks = [network.to(device) for network in checkpoint.networks]
-    predictions = []
-    for clip in track(clips, "evaluating", console=Console(stderr=True)):
-        if clip.frames.shape[1] != preprocess.size:
-            raise DataError(f"{clip.name} has frames of {clip.frames.shape[1]} px, need {preprocess.size}")
-        predictions.append(predict(networks, preprocess, clip.frames, device).mean(0))
+    forces_n = [
+        predict(networks, preprocess, clip.frames, device)
+        for clip in track(clips, "evaluating", console=Console(stderr=True))
+    ]
     for network in networks:
         network.cpu()
-    return _result(clips, predictions, preprocess.lead_in)
+    return forces_n
 
 
 def ridge_baseline(train_clips: Sequence[Clip], test_clips: Sequence[Clip]) -> Result:
@@ -101,10 +116,21 @@ def ridge_baseline(train_clips: Sequence[Clip], test_clips: Sequence[Clip]) -> R
     predictions = [
         (features(_first_frame_difference(clip)) - x_mean) @ weights + y_mean for clip in test_clips
     ]
-    return _result(test_clips, predictions, lead_in=0)
+    return compare(test_clips, predictions, lead_in=0)
 
 
-def _result(clips: Sequence[Clip], predictions: Sequence[npt.NDArray[np.floating]], lead_in: int) -> Result:
+def compare(clips: Sequence[Clip], predictions: Sequence[npt.NDArray[np.floating]], lead_in: int) -> Result:
+    """Compares estimates with the load cell, over all frames that have a label.
+
+    Args:
+        clips: Recordings.
+        predictions: Estimates for each clip's frames in N, (T,).
+        lead_in: First frames of each clip to leave out: where they only serve as reference, a run gives no
+            estimate for them.
+
+    Raises:
+        DataError: There are no clips or no labels.
+    """
     measured_n, valid = _joined(clips)
     valid &= np.concatenate([np.arange(len(clip.frames)) >= lead_in for clip in clips])
     predicted_n = np.concatenate(predictions)

@@ -8,12 +8,12 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final, Literal, Self
 
 import numpy as np
 import numpy.typing as npt
 import torch
-from pydantic import Field
+from pydantic import Field, ValidationError, model_validator
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from safetensors import SafetensorError, safe_open
@@ -22,11 +22,12 @@ from torch import Tensor, nn
 
 from gripper_force import metrics
 from gripper_force.config import NonNegative, Positive, Section
-from gripper_force.dataset import CONTACT_N, Clip, digest, split_by
+from gripper_force.dataset import CONTACT_N, Clip, check_size, digest, split_by
 from gripper_force.errors import CheckpointError, DataError, NonFiniteError
+from gripper_force.vision.attention import Pooling
 from gripper_force.vision.checkpoint import Checkpoint, Header, Residual, load_checkpoint, save_checkpoint
 from gripper_force.vision.dense import normalise, predict
-from gripper_force.vision.network import ForceNetwork, NetworkConfig
+from gripper_force.vision.network import Attention, BackboneName, ForceNetwork, NetworkConfig
 from gripper_force.vision.preprocess import Preprocess
 
 STATE_EVERY_S: Final = 60.0
@@ -42,7 +43,9 @@ class TrainConfig(Section):
 
     Attributes:
         attentions: One member of the ensemble each.
-        earlier_frames: n of the attention modules.
+        earlier_frames: n of SSAM and SCAM.
+        pooling: Of SSAM and SCAM: weighted or global average pooling.
+        backbone: Of all members.
         width: Multiplier of the backbone's channels.
         preprocess: How frames are prepared.
         steps: Optimiser steps for each member.
@@ -66,9 +69,11 @@ class TrainConfig(Section):
         compile: Whether to compile the network; pays after some minutes on a GPU.
     """
 
-    attentions: tuple[Literal["none", "ssam", "scam"], ...] = ("ssam", "scam")
-    earlier_frames: Annotated[int, Field(ge=0)] = 1
-    width: Positive = 1.0
+    attentions: Annotated[tuple[Attention, ...], Field(min_length=1)] = ("ssam", "scam")
+    earlier_frames: Annotated[int, Field(ge=0, le=20)] = 1
+    pooling: Pooling = "wap"
+    backbone: BackboneName = "vgg"
+    width: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] = 1.0
     preprocess: Preprocess = Preprocess()
     steps: Annotated[int, Field(ge=1)] = 1000
     minutes: Positive | None = None
@@ -89,13 +94,24 @@ class TrainConfig(Section):
     device: Literal["auto", "cpu", "cuda"] = "auto"
     compile: bool = False
 
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        try:
+            self.network(0)
+        except ValidationError as error:
+            raise ValueError(error.errors()[0]["msg"].removeprefix("Value error, ")) from error
+        return self
+
     def network(self, member: int) -> NetworkConfig:
         """The shape of one member."""
+        attention = self.attentions[member]
         return NetworkConfig(
-            attention=self.attentions[member],
+            attention=attention,
             earlier_frames=self.earlier_frames,
-            width=self.width,
+            pooling=self.pooling if attention in ("ssam", "scam") else "wap",
+            backbone=self.backbone,
             size=self.preprocess.size,
+            width=self.width,
         )
 
 
@@ -104,6 +120,7 @@ def train(
     clips: Sequence[Clip],
     out: Path,
     *,
+    validation_clips: Sequence[Clip] | None = None,
     init: Checkpoint | None = None,
     resume: bool = False,
 ) -> Checkpoint:
@@ -114,8 +131,10 @@ def train(
 
     Args:
         config: The recipe.
-        clips: Training data; sets are held out of it for validation.
+        clips: Training data.
         out: The checkpoint to write.
+        validation_clips: What the error that the checkpoint claims is measured on; None: sets that are held
+            out of ``clips``.
         init: Checkpoint whose weights to begin with, instead of random ones.
         resume: Whether to go on from the states of a run that was broken off.
 
@@ -123,18 +142,22 @@ def train(
         The checkpoint as written.
 
     Raises:
-        DataError: The data have no two sets of any object, hold no contact, or a recording is too short.
+        DataError: The data have no two sets of any object, hold no contact, or a recording is too short or of
+            another size.
         NonFiniteError: The training diverged.
         CheckpointError: A state is of another recipe or other data, or a file can't be written.
     """
     device = config.device
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
-    training, held_out = split_by(clips, "set", config.validation, config.seed)
+    if validation_clips is None:
+        training, held_out = split_by(clips, "set", config.validation, config.seed)
+    else:
+        training, held_out = clips, validation_clips
+    check_size([*training, *held_out], config.preprocess)
     data = _Data(training, config, device)
-    data_digest = digest(clips)
     start = init.digest if init is not None else ""
-    identity = f"{config.model_dump_json(exclude={'device', 'compile'})} {data_digest} {start}"
+    identity = f"{config.model_dump_json(exclude={'device', 'compile'})} {digest(training)} {start}"
     states = [out.with_suffix(f".{i}.state") for i in range(len(config.attentions))]
     networks = []
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[loss]}"))
@@ -152,7 +175,7 @@ def train(
         members=tuple(network.config for network in networks),
         preprocess=config.preprocess,
         residuals=tuple(_residuals(forces_n, measured_n)),
-        data_digest=data_digest,
+        data_digest=digest(clips),
         metrics={
             "mae_n": metrics.mae(forces_n, measured_n),
             "rmse_n": metrics.rmse(forces_n, measured_n),

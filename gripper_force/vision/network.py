@@ -32,6 +32,7 @@ BACKBONES: Final[dict[str, type[Vgg | ResNet18 | Mobile]]] = {
 }
 
 Attention = Literal["none", "ssam", "scam", "se", "cbam"]
+BackboneName = Literal["vgg", "resnet18", "mobile"]
 
 Count = Annotated[int, Field(ge=1, le=100_000)]
 
@@ -57,7 +58,7 @@ class NetworkConfig(Section):
     earlier_frames: Annotated[int, Field(ge=0, le=20)] = 1
     pooling: Pooling = "wap"
     reduction: Count = 16
-    backbone: Literal["vgg", "resnet18", "mobile"] = "vgg"
+    backbone: BackboneName = "vgg"
     size: Annotated[int, Field(ge=16, le=1024)] = 128
     width: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] = 1.0
     window: Annotated[int, Field(ge=1, le=1000)] = 20

@@ -79,7 +79,7 @@ def test_contact_is_told_apart(checkpoint: Checkpoint) -> None:
 
 
 def test_clips_must_fit(checkpoint: Checkpoint) -> None:
-    with pytest.raises(DataError, match="32 px, need 16"):
+    with pytest.raises(DataError, match="32 px, the network needs 16"):
         evaluate(checkpoint, [clip("a", "cup", 0, size=32)])
     unlabelled = clip("a", "cup", 0)
     unlabelled.valid[:] = False

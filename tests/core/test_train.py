@@ -1,4 +1,5 @@
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -6,8 +7,9 @@ import pytest
 import torch
 
 from gripper_force import train as train_module
+from gripper_force.config import section_from
 from gripper_force.dataset import Clip, digest
-from gripper_force.errors import CheckpointError, DataError, NonFiniteError
+from gripper_force.errors import CheckpointError, ConfigError, DataError, NonFiniteError
 from gripper_force.train import TrainConfig, one_cycle, train
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.dense import normalise, predict
@@ -70,6 +72,42 @@ def test_the_checkpoint_tells_where_it_comes_from(clips: list[Clip], tmp_path: P
     assert [r.force_n for r in header.residuals] == sorted(r.force_n for r in header.residuals)
     assert all(r.std_n > 0 for r in header.residuals)
     assert list(out.parent.iterdir()) == [out]
+
+
+@pytest.mark.parametrize("attention", ["none", "ssam", "scam", "se", "cbam"])
+@pytest.mark.parametrize(("backbone", "pooling"), [("vgg", "gap"), ("resnet18", "wap"), ("mobile", "wap")])
+def test_every_network_can_be_trained(
+    attention: str, backbone: str, pooling: str, clips: list[Clip], tmp_path: Path
+) -> None:
+    recipe = {"attentions": [attention], "backbone": backbone, "pooling": pooling, "steps": 2, "clips": 2}
+    config = TrainConfig.model_validate({**QUICK.model_dump(), **recipe, "preprocess": {"size": 32}})
+    larger = [replace(clip, frames=clip.frames.repeat(2, axis=1).repeat(2, axis=2)) for clip in clips]
+    checkpoint = train(config, larger, tmp_path / "out.safetensors")
+    (member,) = checkpoint.header.members
+    assert (member.attention, member.backbone) == (attention, backbone)
+    assert member.pooling == (pooling if attention in ("ssam", "scam") else "wap")
+
+
+def test_networks_that_cannot_be_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"resnet18: take a multiple of 32"):
+        section_from(TrainConfig, ["backbone=resnet18", "preprocess.size=48"])
+    with pytest.raises(ConfigError, match="attentions"):
+        section_from(TrainConfig, ["attentions=[]"])
+
+
+def test_validation_clips_can_be_given(clips: list[Clip], tmp_path: Path) -> None:
+    out = tmp_path / "out.safetensors"
+    checkpoint = train(QUICK, clips[:-1], out, validation_clips=clips[-1:])
+    forces_n = predict(checkpoint.networks, QUICK.preprocess, clips[-1].frames)[0]
+    claimed = checkpoint.header.metrics["mae_n"]
+    assert claimed == pytest.approx(np.abs(forces_n - clips[-1].forces_n).mean(), rel=0.01)
+    with pytest.raises(DataError, match="p5 has frames of 16 px"):
+        train(
+            QUICK.model_copy(update={"preprocess": Preprocess(size=32)}),
+            clips[-1:],
+            out,
+            validation_clips=clips[-1:],
+        )
 
 
 def test_a_seed_fixes_the_result(clips: list[Clip], tmp_path: Path) -> None:
