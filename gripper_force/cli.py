@@ -341,6 +341,9 @@ def stability(
     write: Annotated[
         Path | None, typer.Option(help="With --faults: Markdown file to put the matrix into.")
     ] = None,
+    resume: Annotated[
+        bool, typer.Option(help="With --faults: go on where the last matrix was broken off.")
+    ] = False,
     fuzz: Annotated[
         int | None, typer.Option(min=1, help="Feed so many random and damaged inputs to all readers.")
     ] = None,
@@ -364,7 +367,7 @@ def stability(
     if [faults, fuzz is not None, soak is not None].count(True) != 1:
         raise ConfigError("stability does one thing at a time: --faults, --fuzz N or --soak SECONDS")
     if faults:
-        result = _fault_matrix(_load(config, set_, {"seed": seed}), seeds, live, jobs, write)
+        result = _fault_matrix(_load(config, set_, {"seed": seed}), seeds, live, jobs, write, resume)
         _print(result, as_json, _faults_table)
     elif fuzz is not None:
         from gripper_force.stability.fuzz import fuzz as feed
@@ -383,11 +386,14 @@ def stability(
         raise typer.Exit(1)
 
 
-def _fault_matrix(settings: Config, seeds: int, live: int, jobs: int, page: Path | None) -> dict[str, Any]:
+def _fault_matrix(
+    settings: Config, seeds: int, live: int, jobs: int, page: Path | None, resume: bool
+) -> dict[str, Any]:
     from gripper_force.stability.faults import count_grasps, markdown, run_matrix, write_between_markers
 
     with _bar("breaking things", count_grasps(seeds, live)) as advance:
-        rows = list(run_matrix(settings, seeds, live, jobs, advance=advance))
+        keep = settings.log.directory / "faults.jsonl"
+        rows = list(run_matrix(settings, seeds, live, jobs, keep, resume=resume, advance=advance))
     if page is not None:
         write_between_markers(page, markdown(rows))
     return {"rows": rows, "ok": all(row["ok"] == row["runs"] for row in rows)}

@@ -47,6 +47,8 @@ class Sample:
 def soak(config: Config, simulated_s: float, advance: Advance = lambda _note, _done: None) -> dict[str, Any]:
     """Grasps the four objects in turn, with rising seeds and drawn targets, for a simulated time.
 
+    Broken off by Ctrl-C, it returns what was seen so far, with ``ok`` False.
+
     Args:
         config: Everything but object, target, seed and the folder of logs, which are deleted as it goes.
         simulated_s: How long; the warm-up and two more grasps are run in any case.
@@ -61,17 +63,22 @@ def soak(config: Config, simulated_s: float, advance: Advance = lambda _note, _d
     rng = np.random.default_rng([config.seed, 30])
     samples = [_look(0.0)]
     outcomes: Counter[str] = Counter()
-    done_s = 0.0
+    done_s, fewest = 0.0, WARM_UP + 3
     with tempfile.TemporaryDirectory(prefix="soak-") as folder:
         log = config.log.model_copy(update={"directory": Path(folder), "report": False})
-        while done_s < simulated_s or len(samples) < WARM_UP + 3:
+        while done_s < simulated_s or len(samples) < fewest:
             number = len(samples) - 1
             drawn = {
                 "object": TRIAL_OBJECTS[number % len(TRIAL_OBJECTS)],
                 "target_n": round(float(rng.uniform(*TRIAL_TARGETS_N)), 3),
                 "seed": config.seed + number,
             }
-            outcome = str(grasp(config.model_copy(update={"log": log, **drawn}))["result"])
+            try:
+                outcome = str(grasp(config.model_copy(update={"log": log, **drawn}))["result"])
+            except KeyboardInterrupt:
+                if len(samples) < fewest:
+                    raise
+                break  # what was seen so far is worth telling
             outcomes[outcome] += 1
             before_s = done_s
             for path in Path(folder).iterdir():
@@ -80,8 +87,10 @@ def soak(config: Config, simulated_s: float, advance: Advance = lambda _note, _d
             samples.append(_look(done_s))
             note = f"{drawn['object']}: {outcome}, {samples[-1].memory_mb:.0f} MB"
             advance(note, int(done_s) - int(before_s))
+    flat = judge(samples)
     return {
-        **judge(samples),
+        **flat,
+        "ok": flat["ok"] and done_s >= simulated_s,
         "grasps": len(samples) - 1,
         "outcomes": dict(outcomes),
         "simulated_s": round(done_s, 1),

@@ -2,21 +2,18 @@ from pathlib import Path
 
 import pytest
 
-from gripper_force.config import FAULTS, Config, load_config
+from gripper_force.config import FAULTS, load_config
 from gripper_force.errors import DataError
 from gripper_force.stability import faults
-from gripper_force.stability.faults import (
-    ROWS,
-    Row,
-    count_grasps,
-    markdown,
-    run_matrix,
-    write_between_markers,
-)
+from gripper_force.stability.faults import count_grasps, markdown, run_matrix, write_between_markers
+from gripper_force.stability.rows import ROWS, Expected, Row
+from gripper_force.stability.verdict import Sound
 
 SIMULATED = [row for row in ROWS if row.unit != "process"]
 SHORT = ["object=stapler", "sim.detail=coarse", "control.settle_s=0.4", "control.hold_s=0.4", "seed=5"]
 BLIND = ["camera.backend=none", "vision.checkpoint=none", "control.feedback=current"]
+FAST = load_config(None, [*SHORT, *BLIND])
+TWO_ROWS = [row for row in ROWS if (row.unit, row.kind) in (("bus", "off"), ("disk", "off"))]
 
 
 def needs_eyes(row: Row) -> bool:
@@ -24,7 +21,7 @@ def needs_eyes(row: Row) -> bool:
 
 
 @pytest.fixture(scope="session")
-def without_fault() -> dict[bool, tuple[dict[str, object], faults._Sound]]:
+def without_fault() -> dict[bool, tuple[dict[str, object], Sound]]:
     """A grasp that goes well, with eyes and without."""
 
     def tree(overrides: list[str]) -> dict[str, object]:
@@ -41,9 +38,7 @@ def test_every_fault_that_can_be_injected_has_a_row() -> None:
 
 
 @pytest.mark.parametrize("row", SIMULATED, ids=lambda row: f"{row.unit}-{row.kind}")
-def test_a_row_ends_as_expected(
-    row: Row, without_fault: dict[bool, tuple[dict[str, object], faults._Sound]]
-) -> None:
+def test_a_row_ends_as_expected(row: Row, without_fault: dict[bool, tuple[dict[str, object], Sound]]) -> None:
     tree, sound = without_fault[needs_eyes(row)]
     outcome = faults._broken(tree, sound, row)
     assert outcome["why_not"] == ""
@@ -52,32 +47,58 @@ def test_a_row_ends_as_expected(
 
 @pytest.mark.parametrize(("unit", "kind"), [("estimator", "intermittent"), ("clock", "slow")])
 def test_what_is_merely_a_nuisance_is_lived_with(
-    unit: str, kind: str, without_fault: dict[bool, tuple[dict[str, object], faults._Sound]]
+    unit: str, kind: str, without_fault: dict[bool, tuple[dict[str, object], Sound]]
 ) -> None:
-    row = Row("nuisance", unit, kind, faults.Expected.CAP, None)
+    row = Row("nuisance", unit, kind, Expected.CAP, None)
     tree, sound = without_fault[needs_eyes(row)]
     outcome = faults._broken(tree, sound, row)
     assert outcome["why_not"] == ""
 
 
 def test_a_row_that_does_not_end_as_expected_is_told(
-    without_fault: dict[bool, tuple[dict[str, object], faults._Sound]],
+    without_fault: dict[bool, tuple[dict[str, object], Sound]],
 ) -> None:
     tree, sound = without_fault[False]
-    harmless = Row("harmless", "clock", "wrong", faults.Expected.STOP, 20.0)
+    harmless = Row("harmless", "clock", "wrong", Expected.STOP, 20.0)
     assert faults._broken(tree, sound, harmless)["why_not"] == "it went on: held"
-    too_slow = Row("too slow", "bus", "off", faults.Expected.STOP, -1.0)
+    too_slow = Row("too slow", "bus", "off", Expected.STOP, -1.0)
     assert faults._broken(tree, sound, too_slow)["why_not"].startswith("it took")
 
 
 @pytest.fixture(scope="module")
-def matrix() -> list[faults.Summary]:
-    config: Config = load_config(None, [*SHORT, *BLIND])
-    rows = [row for row in ROWS if (row.unit, row.kind) in (("bus", "off"), ("disk", "off"))]
+def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("matrix") / "faults.jsonl"
+
+
+@pytest.fixture(scope="module")
+def matrix(kept: Path) -> list[faults.Summary]:
     steps: list[str] = []
-    summaries = list(run_matrix(config, 1, 1, 1, rows, steps.append))
-    assert len(steps) == count_grasps(1, 1, rows)
+    summaries = list(run_matrix(FAST, 1, 1, 1, kept, rows=TWO_ROWS, advance=steps.append))
+    assert len(steps) == count_grasps(1, 1, TWO_ROWS)
     return summaries
+
+
+def test_a_matrix_that_was_broken_off_goes_on(matrix: list[faults.Summary], kept: Path) -> None:
+    lines = kept.read_text().splitlines()
+    kept.write_text("\n".join(lines[:-1]) + "\n")
+    again = list(run_matrix(FAST, 1, 1, 1, kept, resume=True, rows=TWO_ROWS))
+    assert again[0] == matrix[0]
+    assert kept.read_text().splitlines()[:-1] == lines[:-1]
+    assert len(kept.read_text().splitlines()) == len(lines)
+
+
+def test_outcomes_of_another_configuration_are_not_mixed_in(matrix: list[faults.Summary], kept: Path) -> None:
+    other = FAST.model_copy(update={"seed": 6})
+    with pytest.raises(DataError, match="is of another configuration; run without --resume"):
+        list(run_matrix(other, 1, 1, 1, kept, resume=True, rows=TWO_ROWS))
+
+
+@pytest.mark.parametrize("damage", ["{", "[1, 2]", "7"])
+def test_outcomes_that_are_damaged_are_refused(damage: str, tmp_path: Path) -> None:
+    kept = tmp_path / "faults.jsonl"
+    kept.write_text(damage)
+    with pytest.raises(DataError, match="run without --resume"):
+        list(run_matrix(FAST, 1, 1, 1, kept, resume=True, rows=TWO_ROWS))
 
 
 def test_the_matrix_sums_up_each_row(matrix: list[faults.Summary]) -> None:

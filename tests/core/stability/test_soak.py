@@ -59,6 +59,27 @@ def test_a_few_grasps_leave_nothing_behind(monkeypatch: pytest.MonkeyPatch, quic
     assert (last["handles"], last["threads"]) == (warm["handles"], warm["threads"])
 
 
+@pytest.mark.parametrize("grasps", [3, 12])
+def test_ctrl_c_tells_what_was_seen_so_far(grasps: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    left = iter(range(grasps))
+
+    def broken_off(config: Config) -> dict[str, Any]:
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+        with LogWriter(config.log.directory / "run.mcap", config="", metadata={}) as log:
+            log.write(Event(0, "session", "tick"))
+            log.write(Event(NS_PER_S, "session", "tick"))
+        return {"result": "held"}
+
+    monkeypatch.setattr(soaking, "grasp", broken_off)
+    if grasps < WARM_UP:
+        with pytest.raises(KeyboardInterrupt):
+            soak(Config(), 3600)
+        return
+    report = soak(Config(), 3600)
+    assert (report["ok"], report["grasps"], report["simulated_s"]) == (False, 12, 12.0)
+
+
 def test_a_thread_and_a_file_that_are_left_open_are_found(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
