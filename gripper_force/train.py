@@ -150,10 +150,9 @@ def train(
     device = config.device
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
-    if validation_clips is None:
+    training, held_out = clips, validation_clips
+    if held_out is None:
         training, held_out = split_by(clips, "set", config.validation, config.seed)
-    else:
-        training, held_out = clips, validation_clips
     check_size([*training, *held_out], config.preprocess)
     data = _Data(training, config, device)
     start = init.digest if init is not None else ""
