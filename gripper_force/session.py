@@ -30,6 +30,7 @@ from gripper_force.types import (
     NS_PER_S,
     Event,
     GraspStatus,
+    LoadCellSample,
     Outcome,
     Phase,
     Request,
@@ -62,6 +63,8 @@ class Session:
         sees: Whether there was a visual estimate yet.
         failed: Whether the run is at fault, so that it is to end as ``control.on_fault`` says.
         cycles: Cycles run.
+        frames: Frames logged.
+        felt: The newest valid sample of the load cell, or None.
     """
 
     def __init__(
@@ -85,7 +88,8 @@ class Session:
         self._armed = False
         self.failed = False
         self.sees = False
-        self.cycles = 0
+        self.cycles = self.frames = 0
+        self.felt: LoadCellSample | None = None
 
     @property
     def lost_records(self) -> int:
@@ -142,6 +146,7 @@ class Session:
         visual = None
         for seen in self._perception.poll():
             log(seen.frame)
+            self.frames += 1
             if seen.visual is not None:
                 visual = seen.visual
                 log(visual)
@@ -205,6 +210,8 @@ class Session:
             samples = devices.load_cell.drain()
             for sample in samples:
                 self._recorder.write(sample)
+                if sample.valid:
+                    self.felt = sample
             if text := self._cell.look(t_ns, samples):
                 self._recorder.write(Event(t_ns, "load_cell", text))
         counts = {"servo": {"bus retries": devices.servo.stats.retries}}

@@ -21,10 +21,11 @@ import numpy as np
 from gripper_force.backends import open_devices
 from gripper_force.config import Config, config_from, config_from_text, dump_config
 from gripper_force.errors import ConfigError, SimulationError
-from gripper_force.interfaces import Camera, LoadCell
+from gripper_force.interfaces import Camera
 from gripper_force.log import LogReader, LogWriter
 from gripper_force.session import Session, open_session, release, run_grasp
-from gripper_force.types import NS_PER_S, Frame, Gray, LoadCellSample, Outcome, Phase, RequestKind
+from gripper_force.touches import ramp, touch, wait
+from gripper_force.types import Frame, Gray
 
 Kind = Literal["press", "grasp"]
 OBJECTS = ("sponge", "paper_cup", "tube", "stapler")
@@ -46,9 +47,8 @@ SCALES: Final[dict[str, tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]
 _PROTOCOL_SEED: Final = 700_000
 _TOUCHES: Final = 4
 _PROTOCOL_PEAK_N: Final = 12.0
-_CLEAR_M: Final = 0.004
 _FREE_N: Final = 0.1
-"""How much wider than the object the jaws open between two touches, and what may still be felt then."""
+"""What may still be felt between two touches."""
 
 _DRAWS: Final = 8
 _NEXT_DRAW: Final = 1000
@@ -209,10 +209,9 @@ def _run_set(config: Config, task: SetPlan, seed: int, logs: dict[int, Path]) ->
             )
         relit = [devices.relight(lux) for lux in others]
         devices.camera = lit = _LitCamera(devices.camera, [camera for camera, _ in relit])
-        devices.load_cell = cell = _FeltCell(devices.load_cell)
         devices.notes.update(protocol="shin2019", degrees=str(task.degrees), split=task.split, lux=str(first))
         with open_session(config, devices, logs[first], None) as session:
-            _touch_four_times(session, task, cell, rng, config.control.timeout_s)
+            _touch_four_times(session, task, rng, config.control.timeout_s)
     for lux, (_, notes), grays in zip(others, relit, lit.grays, strict=True):
         _relight(logs[first], logs[lux], lux, {**notes, "lux": str(lux)}, grays)
 
@@ -240,29 +239,6 @@ class _LitCamera:
     def close(self) -> None:
         for camera in (self._first, *self._others):
             camera.close()
-
-
-class _FeltCell:
-    """A load cell that tells its newest force."""
-
-    def __init__(self, cell: LoadCell) -> None:
-        self._cell = cell
-        self.force_n = 0.0
-
-    def start(self) -> None:
-        self._cell.start()
-
-    def drain(self) -> list[LoadCellSample]:
-        samples = self._cell.drain()
-        if samples:
-            self.force_n = samples[-1].force_n
-        return samples
-
-    def counts(self) -> dict[str, int]:
-        return self._cell.counts()
-
-    def close(self) -> None:
-        self._cell.close()
 
 
 def _relight(source: Path, path: Path, lux: int, notes: dict[str, str], grays: dict[int, Gray]) -> None:
@@ -296,27 +272,21 @@ def _set_config(config: Config, task: SetPlan, seed: int, lux: int, rng: np.rand
     )
 
 
-def _touch_four_times(
-    session: Session, task: SetPlan, cell: _FeltCell, rng: np.random.Generator, timeout_s: float
-) -> None:
-    _wait(session, 0.1)
+def _touch_four_times(session: Session, task: SetPlan, rng: np.random.Generator, timeout_s: float) -> None:
+    wait(session, 0.1)
     for _ in range(_TOUCHES):
-        touch_m = _ramp(session, float(rng.uniform(1.0, _PROTOCOL_PEAK_N)), timeout_s)
-        decision = session.cycle()
-        if decision.status.phase != Phase.HOLD:
+        problem = touch(
+            session,
+            float(rng.uniform(1.0, _PROTOCOL_PEAK_N)),
+            float(rng.uniform(0.03, 0.1)),
+            free_n=_FREE_N,
+            timeout_s=timeout_s,
+            patience_s=1.0,
+        )
+        if problem:
             raise SimulationError(
-                f"a touch of {task.object!r} at {task.degrees} degrees came to no force: "
-                f"{decision.status.outcome} in phase {decision.status.phase}; take another seed"
+                f"a touch of {task.object!r} at {task.degrees} degrees {problem}; take another seed"
             )
-        _wait(session, float(rng.uniform(0.03, 0.1)))  # what is felt comes after what is asked for
-        decision = session.cycle(RequestKind.RELEASE)
-        end_ns = decision.status.t_ns + NS_PER_S
-        while decision.status.width_m < touch_m + _CLEAR_M or cell.force_n > _FREE_N:
-            if decision.status.t_ns > end_ns:
-                raise SimulationError(
-                    f"{task.object!r} at {task.degrees} degrees caught on a pad; take another seed"
-                )
-            decision = session.cycle()
 
 
 def _randomised(config: Config, task: Plan, rng: np.random.Generator) -> Config:
@@ -346,29 +316,8 @@ def _target_n(rng: np.random.Generator) -> float:
 
 def _press(config: Config, path: Path, rng: np.random.Generator) -> None:
     with open_devices(config) as devices, open_session(config, devices, path, None) as session:
-        _wait(session, 0.2)
+        wait(session, 0.2)
         for _ in range(int(rng.integers(_MAX_TARGETS)) + 1):
-            _ramp(session, _target_n(rng), config.control.timeout_s)
-            _wait(session, float(rng.uniform(0.05, 0.6)))
+            ramp(session, _target_n(rng), config.control.timeout_s)
+            wait(session, float(rng.uniform(0.05, 0.6)))
         release(session, config)
-
-
-def _ramp(session: Session, target_n: float, timeout_s: float) -> float:
-    """Returns the width in metres at which the jaws met the object."""
-    decision = session.cycle(RequestKind.GRASP, target_n)
-    touch_m = decision.status.width_m
-    end_ns = decision.status.t_ns + round(timeout_s * NS_PER_S)
-    while decision.status.phase != Phase.HOLD and decision.status.t_ns < end_ns:
-        if decision.status.outcome != Outcome.NONE:
-            break
-        if decision.status.phase == Phase.APPROACH:
-            touch_m = decision.status.width_m
-        decision = session.cycle()
-    return touch_m
-
-
-def _wait(session: Session, duration_s: float) -> None:
-    decision = session.cycle()
-    end_ns = decision.status.t_ns + round(duration_s * NS_PER_S)
-    while decision.status.t_ns < end_ns:
-        decision = session.cycle()
