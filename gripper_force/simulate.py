@@ -267,7 +267,9 @@ def _set_config(config: Config, task: SetPlan, seed: int, lux: int, rng: np.rand
             "target_n": _PROTOCOL_PEAK_N,
             "control": control,
             "vision": config.vision.model_copy(update={"checkpoint": "none"}),
-            "sim": config.sim.model_copy(update={"lux": float(lux), "yaw_deg": float(task.degrees)}),
+            "sim": config.sim.model_copy(
+                update={"lux": float(lux), "yaw_deg": float(task.degrees), "tool": "rods"}  # as the paper's
+            ),
         }
     )
 

@@ -24,7 +24,7 @@ from gripper_force.types import Frame, GraspStatus, LoadCellSample, Phase, Recor
 
 @pytest.fixture
 def config(quick: list[str]) -> Config:
-    return load_config(None, [*quick, "control.timeout_s=1"])
+    return load_config(None, [*quick, "control.timeout_s=2"])
 
 
 def test_a_plan_is_always_the_same_and_takes_the_objects_in_turn() -> None:
@@ -153,7 +153,7 @@ def test_all_lights_of_a_set_are_one_physics_as_if_each_was_made_alone(
     phases = [s.phase for s in LogReader(paths[0]).records(GraspStatus)]
     assert sum(a != b == Phase.APPROACH for a, b in pairwise(phases)) == 4
     made = config_from_text(logs[2].config, "the log").sim
-    assert (made.lux, made.yaw_deg) == (750, 20)
+    assert (made.lux, made.yaw_deg, made.tool) == (750, 20, "rods")
 
 
 def test_of_a_set_only_what_is_missing_is_made_and_bad_draws_are_drawn_again(

@@ -18,6 +18,11 @@ LUX_LEVELS = (350.0, 550.0, 750.0)
 # it acts at the horn, for on light jaws friction this hard makes the pads chatter.
 _HARD_FRICTION = 'solreffriction=".005 1" solimpfriction=".997 .999 .001"'
 _PAD_HALF_THICKNESS_M = 0.004
+_ROD_RADIUS_M = 0.012
+_ROD_LENGTH_M = 0.020
+_FINGER_X_M = {"pads": 0.009, "rods": 0.022}
+"""How far behind the middle of a pad its finger is."""
+
 _CAMERA_FROM_GRIP_M = np.array([0.10, -0.30, 0.125])
 
 
@@ -28,6 +33,7 @@ class Scene:
     Attributes:
         object: The object's name.
         detail: Level of detail of its mesh.
+        tool: What touches it, as in `gripper_force.config.SimConfig`.
         size: Factor on the object's lengths.
         stiffness: Factor on the object's force at a given travel.
         offset_m: Place of the object against the gripper's centre, x and y.
@@ -49,6 +55,7 @@ class Scene:
 
     object: str
     detail: str
+    tool: str = "pads"
     size: float = 1.0
     stiffness: float = 1.0
     offset_m: tuple[float, float] = (0.0, 0.0)
@@ -73,7 +80,7 @@ def draw_scene(object_name: str, seed: int, config: SimConfig) -> Scene:
     rng = np.random.default_rng([seed, 0])
     lux = float(config.lux or rng.choice(LUX_LEVELS))
     if not config.randomise:
-        return Scene(object_name, config.detail, yaw_deg=config.yaw_deg, lux=lux)
+        return Scene(object_name, config.detail, config.tool, yaw_deg=config.yaw_deg, lux=lux)
 
     def shift(*spread: float) -> tuple[float, ...]:
         return tuple(float(v) for v in rng.uniform(-1, 1, len(spread)) * spread)
@@ -84,6 +91,7 @@ def draw_scene(object_name: str, seed: int, config: SimConfig) -> Scene:
     return Scene(
         object_name,
         config.detail,
+        config.tool,
         size=float(rng.uniform(0.96, 1.04)),
         stiffness=float(1 + rng.uniform(-1, 1) * config.stiffness_spread),
         offset_m=(x, y),
@@ -128,6 +136,9 @@ def scene_mjcf(scene: Scene, gripper: GripperConfig) -> tuple[str, dict[str, byt
         contact=model.contact,
         jaw_start=_text([gripper.open_width_m / 2 + _PAD_HALF_THICKNESS_M]),
         jaw_travel=_text([gripper.open_width_m / 2 - 0.001]),
+        left_tool=_tool(scene.tool, -1),
+        right_tool=_tool(scene.tool, 1),
+        finger_x=_FINGER_X_M[scene.tool],
         grip_height=_text([model.grip_height_m]),
         rail_height=_text([model.grip_height_m + 0.085]),
         rotor_inertia=1e-3,
@@ -138,6 +149,15 @@ def scene_mjcf(scene: Scene, gripper: GripperConfig) -> tuple[str, dict[str, byt
         pinion_radius_m=gripper.pinion_radius_m,
     )
     return text, draw_textures(model.texture, scene.texture_seed)
+
+
+def _tool(name: str, side: int) -> str:
+    if name == "pads":
+        return 'type="box" size=".004 .012 .011"'
+    # The tips are where the pads' faces would be.
+    centre = _ROD_RADIUS_M - _PAD_HALF_THICKNESS_M
+    ends = _text([side * centre, 0, 0, side * (centre + _ROD_LENGTH_M), 0, 0])
+    return f'type="capsule" size="{_ROD_RADIUS_M}" fromto="{ends}"'
 
 
 def _material(model: ObjectModel) -> str:

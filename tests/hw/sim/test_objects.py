@@ -32,6 +32,22 @@ def press(model: mujoco.MjModel, force_n: float, time_s: float) -> tuple[float, 
     return float(data.joint("right").qpos[0]), float(np.mean(np.abs(data.sensordata[[1, 5]])))
 
 
+@pytest.mark.parametrize("name", OBJECTS)
+def test_rods_press_a_turned_object_and_let_go_of_it(name: str) -> None:
+    scene = Scene(name, "coarse", "rods", yaw_deg=34, offset_m=(0.0015, 0.003))
+    model = mujoco.MjModel.from_xml_string(*scene_mjcf(scene, GripperConfig()))
+    data = mujoco.MjData(model)
+    forces_n = []
+    for torque_nm in (0.4, -0.4):
+        data.ctrl[0] = torque_nm
+        end_s = data.time + 1.0
+        while data.time < end_s:
+            mujoco.mj_step(model, data)
+        forces_n.append(float(np.mean(np.abs(data.sensordata[[1, 5]]))))
+    assert forces_n[0] == pytest.approx(0.4 / 2 / RADIUS_M, abs=2.5)  # less what friction takes
+    assert forces_n[1] == 0
+
+
 def travel_at(name: str, force_n: float, size: float = 1.0, stiffness: float = 1.0) -> float:
     """How far the jaws go on from a touch of 0.5 N to a force."""
     model = model_of(name, "medium", size, stiffness)

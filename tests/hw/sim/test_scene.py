@@ -4,6 +4,7 @@ import pytest
 
 from gripper_force.config import GripperConfig, SimConfig
 from gripper_force.errors import ConfigError
+from gripper_hw.sim.engine import mujoco
 from gripper_hw.sim.scene import LUX_LEVELS, Scene, draw_scene, scene_mjcf
 
 
@@ -12,12 +13,12 @@ def test_a_seed_draws_one_scene_and_another_seed_another() -> None:
     assert draw_scene("tube", 3, config) == draw_scene("tube", 3, config)
     first, second = asdict(draw_scene("tube", 3, config)), asdict(draw_scene("tube", 4, config))
     same = {name for name in first if first[name] == second[name]}
-    assert same == {"object", "detail"}
+    assert same == {"object", "detail", "tool"}
 
 
 def test_what_is_asked_for_is_not_drawn() -> None:
-    scene = draw_scene("cup", 3, SimConfig(randomise=False, lux=350, detail="fine"))
-    assert scene == Scene("cup", "fine", lux=350.0)
+    scene = draw_scene("cup", 3, SimConfig(randomise=False, lux=350, detail="fine", tool="rods"))
+    assert scene == Scene("cup", "fine", "rods", lux=350.0)
     assert {draw_scene("cup", i, SimConfig(randomise=False)).lux for i in range(20)} == set(LUX_LEVELS)
     assert draw_scene("cup", 3, SimConfig(lux=350)).lux == pytest.approx(350, rel=0.051)
 
@@ -55,7 +56,7 @@ def test_every_drawn_number_reaches_the_model() -> None:
     plain = Scene("sponge", "coarse")
     before = scene_mjcf(plain, gripper)
     drawn = asdict(draw_scene("sponge", 1, SimConfig()))
-    for name in drawn.keys() - {"object", "detail", "lux", "shot_noise", "nm_per_a"}:
+    for name in drawn.keys() - {"object", "detail", "tool", "lux", "shot_noise", "nm_per_a"}:
         after = scene_mjcf(replace(plain, **{name: drawn[name]}), gripper)
         if name != "texture_seed":
             assert after[0] != before[0], name
@@ -74,6 +75,17 @@ def test_no_name_is_left_unfilled_and_the_textures_are_there() -> None:
         assert "$" not in text.split("-->", 1)[1]
         assert set(assets) == {"table.png"} | ({texture} if texture else set())
         assert all(data.startswith(b"\x89PNG") for data in assets.values())
+
+
+def test_jaws_end_in_pads_or_in_rods_and_meet_an_object_at_the_same_width() -> None:
+    pads, rods = (
+        mujoco.MjModel.from_xml_string(*scene_mjcf(Scene("stapler", "coarse", tool), GripperConfig()))
+        for tool in ("pads", "rods")
+    )
+    for side, sign in (("left", 1), ("right", -1)):
+        pad, rod = pads.geom(f"pad_{side}"), rods.geom(f"pad_{side}")
+        assert (pad.type[0], rod.type[0]) == (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CAPSULE)
+        assert rod.pos[0] + sign * (rod.size[0] + rod.size[1]) == pytest.approx(sign * pad.size[0])
 
 
 def test_an_unknown_object_is_named() -> None:
