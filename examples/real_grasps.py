@@ -14,7 +14,8 @@ import numpy as np
 
 from gripper_force.dataset import Clip, load_clips
 from gripper_force.evaluate import Result, evaluate, ridge_baseline
-from gripper_force.train import TrainConfig, train
+from gripper_force.recipe import TrainConfig
+from gripper_force.train import train
 from gripper_force.video_import import import_folder
 from gripper_force.vision.preprocess import Preprocess
 

@@ -164,6 +164,9 @@ def train(
         "force.safetensors"
     ),
     recipe: Annotated[
+        str, typer.Option(help="short_clips, our own, or shin2019, the paper's.")
+    ] = "short_clips",
+    set_: Annotated[
         list[str] | None, typer.Option("--set", help="Set one key of the recipe: key=value. Repeatable.")
     ] = None,
     hold_out: Annotated[
@@ -174,13 +177,13 @@ def train(
     jobs: Jobs = _CORES,
     as_json: AsJson = False,
 ) -> None:
-    """Train the force network on logs."""
+    """Train the force network on logs; under `torchrun`, in several processes."""
     from gripper_force.dataset import load_clips
-    from gripper_force.train import TrainConfig
+    from gripper_force.recipe import recipe as named
     from gripper_force.train import train as job
     from gripper_force.vision.checkpoint import load_checkpoint
 
-    settings = _section(TrainConfig, recipe)
+    settings = named(recipe, set_)
     clips = load_clips(data, settings.preprocess, workers=jobs)
     clips = [clip for clip in clips if clip.object not in (hold_out or [])]
     start = load_checkpoint(init) if init else None
@@ -406,12 +409,6 @@ def _terminate(_signal: int, _frame: FrameType | None) -> None:
 def _load(path: Path | None, overrides: list[str] | None, options: dict[str, Any]) -> Config:
     given = [f"{key}={json.dumps(value)}" for key, value in options.items() if value is not None]
     return load_config(path, [*(overrides or []), *given])
-
-
-def _section(section: Any, overrides: list[str] | None) -> Any:
-    from gripper_force.config import section_from
-
-    return section_from(section, overrides)
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """The configuration: typed, with a default for everything, from YAML and ``--set key.path=value``."""
 
+from copy import deepcopy
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self, TypeVar
 
@@ -322,13 +323,18 @@ def config_from(tree: dict[str, Any], where: str) -> Config:
     return _validated(Config, tree, where)
 
 
-def section_from(section: type[S], overrides: list[str] | None) -> S:
+def section_from(section: type[S], overrides: list[str] | None, tree: dict[str, Any] | None = None) -> S:
     """Builds a section on its own, such as a recipe, from its defaults and assignments ``key=value``.
+
+    Args:
+        section: What to build.
+        overrides: Assignments, which have the last word.
+        tree: Keys that differ from the defaults.
 
     Raises:
         ConfigError: A key or value is wrong.
     """
-    tree: dict[str, Any] = {}
+    tree = deepcopy(tree or {})
     for assignment in overrides or []:
         _assign(tree, assignment)
     return _validated(section, tree, "--set")

@@ -199,7 +199,7 @@ class ForceNetwork(nn.Module):
         """Maps windows of pooled vectors (N, window, C) to forces in N, (N,)."""
         # Mixed precision is for the backbone; here it would save nothing and cost digits of the label.
         with torch.autocast(windows.device.type, enabled=False):
-            hidden = torch.tanh(self.dense(self.blstm(windows.float())))  # (N, head)
+            hidden = torch.tanh(self.dense(self.blstm(windows.to(self.dense.weight.dtype))))  # (N, head)
             force: Tensor = self.out(hidden).squeeze(1) * self.config.label_scale_n
         return force
 

@@ -1,0 +1,181 @@
+"""Several processes, on one machine or more, that train one network: what `torchrun` starts.
+
+Each takes its share of a step's clips. Gradients are added up, and batch normalisation uses the statistics of
+all clips, so that a step is that of one process but for rounding.
+"""
+
+import itertools
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Final
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+from torch.distributed.rendezvous import rendezvous
+
+from gripper_force.errors import ConfigError
+
+
+@dataclass(frozen=True, slots=True)
+class Ranks:
+    """This process among those that train together.
+
+    Attributes:
+        device: Where it computes.
+        rank: Its number. The first, 0, writes files and tells of progress.
+        count: How many there are.
+    """
+
+    device: str
+    rank: int = 0
+    count: int = 1
+
+    @property
+    def first(self) -> bool:
+        """Whether this process writes files and tells of progress."""
+        return self.rank == 0
+
+    @property
+    def share(self) -> slice:
+        """This process's part of a step's clips."""
+        return slice(self.rank, None, self.count)
+
+    def add_up(self, tensors: Iterable[Tensor]) -> None:
+        """Replaces tensors of one type by their sums over all processes."""
+        if self.count == 1:
+            return
+        tensors = list(tensors)
+        flat = torch.cat([tensor.reshape(-1) for tensor in tensors])
+        dist.all_reduce(flat)
+        for tensor, total in zip(tensors, torch.split(flat, [t.numel() for t in tensors]), strict=True):
+            tensor.copy_(total.view_as(tensor))
+
+    def as_first(self, value: float) -> float:
+        """The first process's value of something that every process measures for itself."""
+        if self.count == 1:
+            return value
+        told = torch.tensor([value], dtype=torch.float64, device=self.device)
+        dist.broadcast(told, 0)
+        return told.item()
+
+    def wait(self) -> None:
+        """Returns when all processes have come here."""
+        if self.count > 1:
+            dist.barrier()
+
+    def agree(self, text: str, what: str) -> None:
+        """Raises `ConfigError` unless all processes give the same text."""
+        if self.count == 1:
+            return
+        texts: list[Any] = [None] * self.count
+        dist.all_gather_object(texts, text)
+        if len(set(texts)) > 1:
+            raise ConfigError(
+                f"the training processes have different {what}; give all the same files and keys"
+            )
+
+
+@contextmanager
+def joined(device: str) -> Iterator[Ranks]:
+    """Joins the processes that `torchrun` has started, or stays alone; leaves them on every way out.
+
+    Args:
+        device: ``cpu``, ``cuda``, or ``auto`` for CUDA where it is there. With CUDA each process of a machine
+            takes a GPU of its own.
+
+    Raises:
+        ConfigError: The others can't be joined, or there are fewer GPUs than processes.
+    """
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    count = int(os.environ.get("WORLD_SIZE", "1"))
+    if count == 1:
+        yield Ranks(device)
+        return
+    if device == "cuda":
+        local, gpus = int(os.environ["LOCAL_RANK"]), torch.cuda.device_count()
+        if local >= gpus:
+            raise ConfigError(
+                f"{gpus} GPUs are too few for this machine's training processes; start so many with "
+                "`torchrun --nproc-per-node`, or say --set device=cpu"
+            )
+        device = f"cuda:{local}"
+        torch.cuda.set_device(local)
+    try:
+        store, rank = _meeting_place()
+        # Under a name of its own each time: what an earlier training left there would let one go on alone.
+        named = dist.PrefixStore(f"{next(_TIMES)}", store)  # type: ignore[attr-defined]
+        backend = "gloo" if device == "cpu" else "nccl"
+        dist.init_process_group(backend, store=named, rank=rank, world_size=count)
+    except (RuntimeError, ValueError) as error:
+        raise ConfigError(
+            f"can't join the other training processes, start all by torchrun: {error}"
+        ) from error
+    try:
+        yield Ranks(device, rank, count)
+    finally:
+        dist.destroy_process_group()
+
+
+_TIMES: Final = itertools.count()
+
+
+@cache
+def _meeting_place() -> tuple[Any, int]:
+    """A store that all processes see, and this one's rank, from what `torchrun` set in the environment."""
+    store, rank, _ = next(iter(rendezvous("env://")))
+    return store, rank
+
+
+class _Sum(torch.autograd.Function):
+    @staticmethod
+    def forward(_: Any, part: Tensor) -> Tensor:
+        total = part.clone()
+        dist.all_reduce(total)
+        return total
+
+    @staticmethod
+    def backward(_: Any, gradient: Tensor) -> Tensor:
+        total = gradient.clone()
+        dist.all_reduce(total)
+        return total
+
+
+def _total(part: Tensor) -> Tensor:
+    """Sum over all processes; so is its gradient."""
+    total: Tensor = _Sum.apply(part)  # type: ignore[no-untyped-call]
+    return total
+
+
+class _WholeBatchNorm(nn.BatchNorm2d):
+    """Batch normalisation by the statistics of all processes; torch's own refuses CPUs."""
+
+    def forward(self, maps: Tensor) -> Tensor:
+        if not self.training:
+            return super().forward(maps)
+        assert self.running_mean is not None
+        assert self.running_var is not None
+        assert self.num_batches_tracked is not None
+        assert self.momentum is not None
+        x = maps.float()  # (B, C, H, W)
+        size = _total(x.new_tensor(x[:, 0].numel()))
+        mean = _total(x.sum((0, 2, 3))) / size  # (C,)
+        centred = x - mean[:, None, None]
+        variance = _total(centred.square().sum((0, 2, 3))) / size
+        with torch.no_grad():
+            self.num_batches_tracked.add_(1)
+            self.running_mean.lerp_(mean, self.momentum)
+            self.running_var.lerp_(variance * size / (size - 1), self.momentum)
+        scale = self.weight * (variance + self.eps).rsqrt()
+        return (centred * scale[:, None, None] + self.bias[:, None, None]).to(maps.dtype)
+
+
+def share_statistics(network: nn.Module) -> None:
+    """Lets batch normalisation use all processes' statistics in training."""
+    for module in network.modules():
+        if isinstance(module, nn.BatchNorm2d):
+            module.__class__ = _WholeBatchNorm
