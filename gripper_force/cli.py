@@ -158,6 +158,50 @@ def simulate(
 
 
 @app.command()
+def record(
+    folder: Annotated[Path, typer.Option("--out", help="Folder for the logs.")] = Path("data/real"),
+    object_: Annotated[str | None, typer.Option("--object", help="What lies between the jaws.")] = None,
+    sets: Annotated[int, typer.Option(min=1, help="Sets in all, with those that are there already.")] = 15,
+    touches: Annotated[int, typer.Option(min=1, help="Touches of each set.")] = 4,
+    peak_n: Annotated[
+        float | None,
+        typer.Option(help="Touches press up to 1 N to this. By default 12, or what the force limit leaves."),
+    ] = None,
+    degrees: Annotated[
+        float | None, typer.Option(help="Angle of the press, noted in the logs and their names.")
+    ] = None,
+    lux: Annotated[float | None, typer.Option(help="Light level, noted likewise.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the peaks, and of simulated scenes.")] = None,
+    config: ConfigPath = None,
+    set_: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Record sets of touches with servo, camera and load cell, to train and to evaluate on.
+
+    The jaws open, rest, and press with random forces. Every fifth set goes into OUT/test, the others into
+    OUT/train. At the end each set is judged: frames, losses, forces, and whether camera and load cell agree
+    in time. Sets that are there already are kept, so a recording that was broken off goes on.
+    """
+    from gripper_force import record as job
+    from gripper_force.recorded import summarise
+
+    options = {"object": object_, "seed": seed, "sim.yaw_deg": degrees, "sim.lux": lux}
+    settings = _load(config, set_, options)
+    plan = job.Plan(sets, touches, peak_n, degrees, lux)
+    paths = plan.paths(settings, folder)
+    with _bar("recording", sets) as advance:
+        advance("", sum(path.exists() for path in paths))
+
+        def tell(number: int, touch: int, force_n: float) -> None:
+            what = f"touch {touch} of {touches}" if touch else "at rest"
+            advance(f"set {number}, {what}: {force_n:.1f} N", 0)
+
+        for path in job.record(settings, plan, folder, tell):
+            advance(path.name)
+    _print(summarise(paths), as_json, _sets_table)
+
+
+@app.command()
 def train(
     data: Annotated[Path, typer.Argument(help="Folder with logs.")],
     checkpoint: Annotated[Path, typer.Option("--out", help="Checkpoint to write.")] = Path(
@@ -215,6 +259,53 @@ def evaluate(
     if not clips:
         raise DataError(f"no log in {data} is of {', '.join(only or [])}")
     _print(dict(job(loaded, clips)), as_json, _errors_table)
+
+
+@app.command()
+def reproduce(
+    what: Annotated[str, typer.Argument(help="3, 4, 5, 6, 7, 8, 9, fig6, fig7, fig8, fig9, claims or all.")],
+    scale: Annotated[
+        str, typer.Option(help="small (two CPU cores, some two hours) or full (for a GPU).")
+    ] = "small",
+    data: Annotated[
+        Path | None,
+        typer.Option(help="Folder with logs in train/ and test/. By default they are simulated first."),
+    ] = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option("--out", help="Folder for the networks; what is there is not trained again."),
+    ] = None,
+    write: Annotated[
+        Path | None, typer.Option(help="Markdown file to put tables and figures into, such as docs/paper.md.")
+    ] = None,
+    jobs: Jobs = _CORES,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="Set one key of the scale: key=value. Repeatable.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make the paper's tables and figures again, beside its own numbers. Goes on where it was broken off."""
+    from gripper_force.config import section_from
+    from gripper_force.reproduce import page
+    from gripper_force.reproduce.models import SCALES, Scale
+
+    names = page.asked_for(what)
+    if scale not in SCALES:
+        raise ConfigError(f"no scale {scale!r}; there are {', '.join(SCALES)}")
+    settings = section_from(Scale, [*(f"{k}={json.dumps(v)}" for k, v in SCALES[scale]), *(set_ or [])])
+    out_ = folder or Path("runs/paper") / scale
+    result, test = page.reproduce(names, settings, data, out_, jobs, _bar)
+    pictures = write.with_suffix("") if write else out_
+    pictures.mkdir(parents=True, exist_ok=True)
+    for name, figure in result.figures.items():
+        figure.savefig(pictures / f"{name}.png")
+    text = page.markdown(result, scale, settings, test, pictures.name)
+    if write is not None:
+        from gripper_force.report.markers import write_between
+
+        write_between(write, scale, text)
+    drawn = {name: str(pictures / f"{name}.png") for name in result.figures}
+    _print({"tables": result.tables, "figures": drawn}, as_json, _paper_tables)
 
 
 @import_app.command("video")
@@ -392,13 +483,14 @@ def stability(
 def _fault_matrix(
     settings: Config, seeds: int, live: int, jobs: int, page: Path | None, resume: bool
 ) -> dict[str, Any]:
-    from gripper_force.stability.faults import count_grasps, markdown, run_matrix, write_between_markers
+    from gripper_force.report.markers import write_between
+    from gripper_force.stability.faults import count_grasps, markdown, run_matrix
 
     with _bar("breaking things", count_grasps(seeds, live)) as advance:
         keep = settings.log.directory / "faults.jsonl"
         rows = list(run_matrix(settings, seeds, live, jobs, keep, resume=resume, advance=advance))
     if page is not None:
-        write_between_markers(page, markdown(rows))
+        write_between(page, "matrix", markdown(rows))
     return {"rows": rows, "ok": all(row["ok"] == row["runs"] for row in rows)}
 
 
@@ -538,6 +630,41 @@ def _replay_table(r: dict[str, Any]) -> None:
         table.add_row(name, *(_number(value) for value in figures), lag, str(s["frames"]))
     out.print(table)
     _bins_table(r["per_bin"])
+
+
+def _paper_tables(r: dict[str, Any]) -> None:
+    from gripper_force.reproduce.tables import show
+
+    for made in r["tables"]:
+        table = Table(*made.columns, title=made.title, title_justify="left", box=None)
+        for row in made.rows:
+            table.add_row(*map(show, row))
+        out.print(table)
+        out.print()
+    for name, path in r["figures"].items():
+        out.print(f"{name}: {path}", soft_wrap=True)
+
+
+def _sets_table(r: dict[str, Any]) -> None:
+    table = Table("set", "frames", "frames/s", "lost", "samples/s", "rejected", "peak N", "lag ms", box=None)
+    for s in (*r["sets"], {**r["overall"], "set": "all"}):
+        table.add_row(
+            s["set"],
+            str(s["frames"]),
+            f"{s['camera_hz']:.1f} of {s['camera_hz_asked']:g}",
+            str(s["frames_lost"]),
+            _number(s["load_cell_hz"], digits=1),
+            str(s["samples_rejected"]),
+            _number(s["peak_n"], digits=1),
+            "-" if s["lag_ms"] is None else f"{s['lag_ms']:.1f} ± {s['lag_spread_ms']:.1f}",
+        )
+    out.print(table)
+    table = Table("force N", "frames", box=None)
+    for n, count in r["overall"]["histogram"].items():
+        table.add_row(f"{n}-{n + 1}", str(count))
+    out.print(table)
+    for warning in r["warnings"]:
+        out.print(f"[yellow]{escape(warning)}[/]", soft_wrap=True)
 
 
 def _imports_table(r: dict[str, Any]) -> None:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure, SubFigure
 from gripper_force.report.data import SOURCES, Floats, Run, bins
 from gripper_force.report.pictures import Picture
 
-_STYLE: Final[dict[Any, Any]] = {
+STYLE: Final[dict[Any, Any]] = {
     "font.size": 9.0,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -38,7 +38,7 @@ def draw(run: Run, pictures: list[Picture]) -> Figure:
         "frames": 1.9 if pictures else 0.0,
     }
     heights_in = {name: height for name, height in heights_in.items() if height}
-    with rc_context(_STYLE):
+    with rc_context(STYLE):
         figure = Figure(figsize=(10, 0.5 + sum(heights_in.values())), layout="constrained")
         figure.suptitle(run.title, x=0.008, ha="left", fontsize=13, fontweight="bold")
         parts = figure.subfigures(len(heights_in), height_ratios=list(heights_in.values()), squeeze=False)

@@ -43,8 +43,6 @@ LIMIT_SHARE: Final = 1.25
 TOLERANCE: Final = 0.05
 """A peak may exceed the limit by this share."""
 
-_BEGIN = "<!-- matrix: made by `gripper-force stability --faults` -->"
-_END = "<!-- end of matrix -->"
 _AFTER_NS = 300 * NS_PER_MS
 _MOST_LOST_MS = 100 + 5
 """A chunk of the log, and a cycle."""
@@ -334,18 +332,3 @@ def _peaks(lockstep: float, live: float | None) -> str:
 
 def _times(middle_ms: float | None, worst_ms: float | None) -> str:
     return "-" if middle_ms is None or worst_ms is None else f"{middle_ms:.0f}, {worst_ms:.0f} ms"
-
-
-def write_between_markers(path: Path, table: str) -> None:
-    """Puts the table into a Markdown file, in the place of the last one.
-
-    Raises:
-        DataError: The file is not there, or has no place for it.
-    """
-    try:
-        text = path.read_text(encoding="utf-8")
-        before, rest = text.split(_BEGIN)
-        _, after = rest.split(_END)
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path} has no lines {_BEGIN!r} and {_END!r} to put the matrix between") from error
-    path.write_text(f"{before}{_BEGIN}\n\n{table}\n{_END}{after}", encoding="utf-8")
