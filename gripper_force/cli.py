@@ -228,12 +228,14 @@ def train(
     from gripper_force.vision.checkpoint import load_checkpoint
 
     settings = named(recipe, set_)
-    clips = load_clips(data, settings.preprocess, workers=jobs)
+    quiet = os.environ.get("RANK", "0") != "0"  # of torchrun's processes the first one speaks
+    clips = load_clips(data, settings.preprocess, workers=jobs, quiet=quiet)
     clips = [clip for clip in clips if clip.object not in (hold_out or [])]
     start = load_checkpoint(init) if init else None
     result = job(settings, clips, checkpoint, init=start, resume=resume)
     metrics = result.header.metrics
-    _print({"checkpoint": str(checkpoint), "digest": result.digest, **metrics}, as_json)
+    if not quiet:
+        _print({"checkpoint": str(checkpoint), "digest": result.digest, **metrics}, as_json)
 
 
 @app.command()

@@ -53,7 +53,12 @@ class Clip:
 
 
 def load_clips(
-    source: Path | Sequence[Path], preprocess: Preprocess, region: Region | None = None, workers: int = 1
+    source: Path | Sequence[Path],
+    preprocess: Preprocess,
+    region: Region | None = None,
+    workers: int = 1,
+    *,
+    quiet: bool = False,
 ) -> list[Clip]:
     """Reads logs in parallel processes, with a progress bar on stderr.
 
@@ -62,6 +67,7 @@ def load_clips(
         preprocess: Tells the size frames are reduced to.
         region: Region of interest in pixels; None for the one in each log's own configuration.
         workers: Processes to read with.
+        quiet: Whether to show no progress.
 
     Returns:
         A clip for each log, sorted by path.
@@ -75,8 +81,8 @@ def load_clips(
         raise DataError(f"no logs (*.mcap) in {source}; record, simulate or import some first")
     read = partial(load_clip, preprocess=preprocess, region=region)
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        clips = track(pool.map(read, paths), "reading logs", len(paths), console=Console(stderr=True))
-        return list(clips)
+        console = Console(stderr=True, quiet=quiet)
+        return list(track(pool.map(read, paths), "reading logs", len(paths), console=console))
 
 
 def split_by(
