@@ -119,17 +119,24 @@ def replay(
 @app.command()
 def simulate(
     folder: Annotated[Path, typer.Option("--out", help="Folder for the logs.")] = Path("data/sim"),
-    presses: Annotated[int, typer.Option(min=0, help="Logs of random forces, one after the other.")] = 200,
-    grasps: Annotated[int, typer.Option(min=0, help="Logs of grasps.")] = 20,
+    presses: Annotated[
+        int | None, typer.Option(min=0, help="Logs of random forces, one after the other.  [default: 200]")
+    ] = None,
+    grasps: Annotated[int | None, typer.Option(min=0, help="Logs of grasps.  [default: 20]")] = None,
     first_seed: Annotated[
-        int, typer.Option(min=0, help="Seed of the first log. Training data start at 100000.")
-    ] = 100_000,
+        int | None,
+        typer.Option(min=0, help="Seed of the first log. Training data start at 100000.  [default: 100000]"),
+    ] = None,
     protocol: Annotated[
         str | None, typer.Option(help="shin2019: the paper's sets instead, into OUT/train and OUT/test.")
     ] = None,
     scale: Annotated[
-        str, typer.Option(help="With --protocol: full (720 logs) or small (80: 0 and 30 degrees, one light).")
-    ] = "full",
+        str | None,
+        typer.Option(
+            help="With --protocol: full (720 logs) or small (80: 0 and 30 degrees, one light).  "
+            "[default: full]"
+        ),
+    ] = None,
     jobs: Jobs = _CORES,
     config: ConfigPath = None,
     set_: Overrides = None,
@@ -140,11 +147,21 @@ def simulate(
 
     plans: list[Any]
     if protocol is None:
+        if scale is not None:
+            raise ConfigError("--scale is of a protocol's sets: add --protocol shin2019, or leave it out")
         settings = _load(config, set_, {})
-        plans = job.plan("press", presses, first_seed) + job.plan("grasp", grasps, first_seed + presses)
+        count, seed = 200 if presses is None else presses, 100_000 if first_seed is None else first_seed
+        plans = job.plan("press", count, seed)
+        plans += job.plan("grasp", 20 if grasps is None else grasps, seed + count)
     elif protocol == "shin2019":
+        given = {"--presses": presses, "--grasps": grasps, "--first-seed": first_seed}
+        if idle := [name for name, value in given.items() if value is not None]:
+            raise ConfigError(
+                f"the sets of --protocol are fixed, so {' and '.join(idle)} can't be heeded: leave out one "
+                "or the other"
+            )
         settings = _load(config, [f"camera.rate_hz={job.PROTOCOL_RATE_HZ}", *(set_ or [])], {})
-        plans = list(job.plan_protocol(scale))
+        plans = list(job.plan_protocol(scale or "full"))
     else:
         raise ConfigError(f"no protocol {protocol!r}; there is shin2019")
     names = [name for p in plans for name in p.names]
@@ -168,9 +185,12 @@ def record(
         typer.Option(help="Touches press up to 1 N to this. By default 12, or what the force limit leaves."),
     ] = None,
     degrees: Annotated[
-        float | None, typer.Option(help="Angle of the press, noted in the logs and their names.")
+        float | None,
+        typer.Option(help="Angle of the press, noted in logs and names; a simulated object is turned so."),
     ] = None,
-    lux: Annotated[float | None, typer.Option(help="Light level, noted likewise.")] = None,
+    lux: Annotated[
+        float | None, typer.Option(help="Light level, noted likewise; a simulated rig is lit so.")
+    ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the peaks, and of simulated scenes.")] = None,
     config: ConfigPath = None,
     set_: Overrides = None,

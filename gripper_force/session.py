@@ -360,7 +360,7 @@ def grasp_in(session: Session, config: Config, sees: bool, progress: Progress | 
         decision = session.cycle()
     if status.outcome == Outcome.FAULT:
         if config.control.on_fault == "open":
-            _let_open(session, config, status)
+            let_open(session, config, status)
         return status.outcome  # otherwise nothing moves until somebody has looked
     if config.on_exit == "hold":
         return status.outcome
@@ -372,10 +372,11 @@ def grasp_in(session: Session, config: Config, sees: bool, progress: Progress | 
 
 def release(session: Session, config: Config) -> GraspStatus:
     """Opens the jaws and returns how far that came: an object that catches on them can keep them closed."""
-    return _let_open(session, config, session.cycle(RequestKind.RELEASE).status)
+    return let_open(session, config, session.cycle(RequestKind.RELEASE).status)
 
 
-def _let_open(session: Session, config: Config, status: GraspStatus) -> GraspStatus:
+def let_open(session: Session, config: Config, status: GraspStatus) -> GraspStatus:
+    """Goes on until jaws that are opening are open, or have had their time. Returns how far that came."""
     end_ns = status.t_ns + _OPENING_NS
     while status.t_ns < end_ns and not is_open(config.gripper.open_width_m, status.width_m):
         status = session.cycle().status
