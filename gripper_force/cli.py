@@ -21,7 +21,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
+from rich.table import Column, Table
 
 from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError, DataError, GripperError
@@ -668,12 +668,15 @@ def _paper_tables(r: dict[str, Any]) -> None:
 
 
 def _sets_table(r: dict[str, Any]) -> None:
-    table = Table("set", "frames", "frames/s", "lost", "samples/s", "rejected", "peak N", "lag ms", box=None)
+    rate = f"Hz of {r['overall']['camera_hz_asked']:g}"
+    names = ("set", "frames", rate, "lost", "cell Hz", "rejected", "peak N", "lag ms")
+    columns = [Column(name, no_wrap=True) for name in names]
+    table = Table(*columns, box=None, pad_edge=False, collapse_padding=True)
     for s in (*r["sets"], {**r["overall"], "set": "all"}):
         table.add_row(
             s["set"],
             str(s["frames"]),
-            f"{s['camera_hz']:.1f} of {s['camera_hz_asked']:g}",
+            _number(s["camera_hz"], digits=1),
             str(s["frames_lost"]),
             _number(s["load_cell_hz"], digits=1),
             str(s["samples_rejected"]),

@@ -154,6 +154,29 @@ def test_a_recording_is_imported_replayed_and_evaluated(
     assert evaluated["mae_n"] == pytest.approx(replayed["mae_n"], rel=0.2)
 
 
+def test_sets_are_recorded_judged_and_kept(run: Run, sets: list[str]) -> None:
+    eyes = ("--set", "camera.backend=simulated", "--set", "camera.rate_hz=20", "--set", "control.ramp_n_s=30")
+    asked = ("record", "--object", "stapler", "--sets", 1, "--touches", 1, "--out", "data", "--lux", 350)
+    result = run(*asked, *sets, *eyes, "--json").json()
+    assert set(result) == {"sets", "overall", "warnings"}
+    (one,) = result["sets"]
+    assert Path(one["log"]) == Path("data/train/stapler-350lux-01.mcap")
+    made_ns = Path(one["log"]).stat().st_mtime_ns
+    keys = {"frames", "camera_hz", "camera_hz_asked", "frames_lost", "samples_rejected", "histogram"}
+    keys |= {"lag_ms", "lag_spread_ms"}
+    assert set(one) >= keys
+    assert set(result["overall"]) >= keys
+    again = run(*asked, *sets, *eyes)
+    assert again.code == 0
+    for text in ("stapler-350lux-01", "Hz of 20", "lag ms", "0-1"):
+        assert text in again.out
+    assert Path(one["log"]).stat().st_mtime_ns == made_ns
+    replayed = run("replay", one["log"], "--json").json()
+    assert replayed["identical"] is True
+    blind = run("record", *sets, "--json")
+    assert (blind.code, "record needs a camera" in blind.err) == (2, True)
+
+
 def test_a_published_database_is_imported_and_its_damage_told(run: Run, tmp_path: Path) -> None:
     folder = tmp_path / "db" / "sponge_30_100"
     folder.mkdir(parents=True)
