@@ -433,20 +433,47 @@ def doctor(
 @app.command()
 def bench(
     bus: Annotated[bool, typer.Option("--bus", help="A cycle of the servo's bus, by the driver.")] = False,
-    cycles: Annotated[int, typer.Option(min=1, help="How many of each.")] = 1000,
+    cycles: Annotated[int, typer.Option(min=1, help="With --bus: how many of each.")] = 1000,
+    training: Annotated[
+        Path | None, typer.Option(help="Ways to train on this folder of logs: error against minutes.")
+    ] = None,
+    minutes: Annotated[float, typer.Option(min=0.01, help="With --training: for each way.")] = 30.0,
+    folder: Annotated[
+        Path, typer.Option("--out", help="With --training: where to keep what is measured.")
+    ] = Path("runs/bench"),
+    jobs: Jobs = _CORES,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="With --training: a key for all recipes. Repeatable.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Measure what parts of a run cost on this machine, beside what others use."""
     from gripper_force import bench as job
 
-    if not bus:
-        raise ConfigError("bench measures what it is told to; say --bus")
+    if bus == (training is not None):
+        raise ConfigError("bench measures one thing at a time: --bus or --training DATA")
+    if training is not None:
+        _print(_learning(training, minutes, set_ or [], folder, jobs), as_json, _learning_table)
+        return
     costs: list[Any] = []
     with _bar("measuring", len(job.BUS_SETTINGS)) as advance:
         for setting in job.bus(cycles):
             costs += setting
             advance(f"{setting[0].baud_rate} baud, {setting[0].latency_ms:g} ms")
     _print({"bus": costs, "load": os.getloadavg()[0], "cores": _CORES}, as_json, _bus_table)
+
+
+def _learning(data: Path, minutes: float, overrides: list[str], out_: Path, jobs: int) -> dict[str, Any]:
+    from functools import partial
+
+    from gripper_force.dataset import load_clips
+    from gripper_force.learning import learn, reached
+
+    points = []
+    for point in learn(partial(load_clips, data, workers=jobs), minutes, overrides, out_):
+        points.append(point)
+        err.print(f"{point.way}, {point.minutes:.2f} min: {point.mae_n:.3f} N")
+    return {"points": points, "as_good_as_paper_min": reached(points), "cores": _CORES, "folder": out_}
 
 
 @app.command()
@@ -748,6 +775,15 @@ def _bus_table(r: dict[str, Any]) -> None:
         table.add_row(*setting, c.client, *numbers, share)
     out.print(table)
     out.print(f"[dim]load {r['load']:.1f} on {r['cores']} cores[/]")
+
+
+def _learning_table(r: dict[str, Any]) -> None:
+    table = Table("way", "minutes", "steps", "MAE N", "RMSE N", box=None)
+    for p in r["points"]:
+        table.add_row(p.way, _number(p.minutes, digits=2), str(p.steps), _number(p.mae_n), _number(p.rmse_n))
+    out.print(table)
+    _pairs({f"{way}: as good as the paper's, min": m for way, m in r["as_good_as_paper_min"].items()})
+    _pairs({"kept in": str(r["folder"])})
 
 
 def _faults_table(r: dict[str, Any]) -> None:

@@ -31,9 +31,9 @@ class Trainer:
         self._batches = batches
         self._ranks = ranks
         self._name = config.attentions[member]
-        self._steps = config.steps
+        self._last = config.steps
         if config.epochs is not None:
-            self._steps = math.ceil(config.epochs * batches.labels / config.clips)
+            self._last = math.ceil(config.epochs * batches.labels / config.clips)
         self.network = ForceNetwork(config.network(member)).to(ranks.device)
         if ranks.count > 1:
             share_statistics(self.network)
@@ -44,7 +44,7 @@ class Trainer:
             fused=True,
         )
         self._forward = torch.compile(self.network) if config.compile else self.network
-        self._step = 0
+        self.step = 0  # how many are done
         self._elapsed_s = 0.0
         self._smooth_n = math.nan
 
@@ -52,7 +52,7 @@ class Trainer:
     def done(self) -> float:
         """Share of the training that is done, in 0..1 and beyond."""
         if self._config.minutes is None:
-            return self._step / self._steps
+            return self.step / self._last
         return self._elapsed_s / (60 * self._config.minutes / len(self._config.attentions))
 
     def steps(self, until: float = 1.0) -> Iterator[float]:
@@ -68,14 +68,14 @@ class Trainer:
         began = time.monotonic() - self._elapsed_s
         while self.done < until:
             loss = self._update()
-            if self._step % 10 == 0:  # not more often, as a GPU must be waited for
+            if self.step % 10 == 0:  # not more often, as a GPU must be waited for
                 rmse_n = math.sqrt(loss.item()) * self.network.config.label_scale_n
                 if not math.isfinite(rmse_n):
                     raise NonFiniteError(
-                        f"the training of {self._name} diverged by step {self._step}; lower learning_rate"
+                        f"the training of {self._name} diverged by step {self.step}; lower learning_rate"
                     )
-                self._smooth_n = rmse_n if self._step == 0 else 0.9 * self._smooth_n + 0.1 * rmse_n
-            self._step += 1
+                self._smooth_n = rmse_n if self.step == 0 else 0.9 * self._smooth_n + 0.1 * rmse_n
+            self.step += 1
             self._elapsed_s = self._ranks.as_first(time.monotonic() - began)
             yield self._smooth_n
         self.network.eval()
@@ -91,7 +91,7 @@ class Trainer:
         elif done < config.short_share:
             count, length = count * length // config.short_frames, config.short_frames
         first = length - 1 if config.windows == "separate" else min(window, length) - 1
-        inputs, forces_n, valid = self._batches.batch(self._step, count, length)
+        inputs, forces_n, valid = self._batches.batch(self.step, count, length)
         labels = valid[:, first:].sum()
         self._ranks.add_up([labels])
         with torch.autocast(inputs.device.type, torch.bfloat16, enabled=config.precision == "bfloat16"):
@@ -117,7 +117,7 @@ class Trainer:
         for i, moments in self._optimizer.state_dict()["state"].items():
             tensors |= {f"optimizer.{i}.{name}": t.contiguous() for name, t in moments.items()}
         progress = {
-            "step": str(self._step),
+            "step": str(self.step),
             "elapsed_s": str(self._elapsed_s),
             "smooth_n": str(self._smooth_n),
             "identity": identity,
@@ -162,7 +162,7 @@ class Trainer:
             for name in ("exp_avg", "exp_avg_sq"):  # the fused optimiser wants the parameter's memory format
                 moments[i][name] = torch.empty_like(parameter).copy_(moments[i][name])
         self._optimizer.load_state_dict({**self._optimizer.state_dict(), "state": moments})
-        self._step, self._elapsed_s = int(progress["step"]), float(progress["elapsed_s"])
+        self.step, self._elapsed_s = int(progress["step"]), float(progress["elapsed_s"])
         self._smooth_n = float(progress["smooth_n"])
 
 
