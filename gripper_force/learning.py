@@ -84,6 +84,7 @@ def learn(load: Load, minutes: float, overrides: Sequence[str], out: Path) -> It
     if any(len(config.attentions) > 1 for config in configs.values()):
         raise ConfigError("one network is trained each way: set attentions to one")
     points: list[Point] = []
+    _keep(points, configs, out)  # fails now where it would fail later
     with joined(configs[PAPER].device) as ranks:
         if ranks.count > 1:
             raise ConfigError("ways of training are compared in one process; start it without torchrun")

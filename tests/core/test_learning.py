@@ -54,3 +54,6 @@ def test_when_a_way_is_as_good_as_the_paper_is_told() -> None:
 def test_one_network_is_trained_each_way(clips: list[Clip], tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="set attentions to one"):
         next(learn(lambda _: clips, 1.0, ["attentions=[ssam, scam]"], tmp_path))
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="name another folder"):
+        next(learn(lambda _: clips, 1.0, KEYS, tmp_path / "file"))
