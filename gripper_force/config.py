@@ -173,8 +173,8 @@ class SimConfig(Section):
     lux: float | None = Field(None, description="350, 550, 750; None: drawn from the seed", gt=0)
     tool: Literal["pads", "rods"] = Field(
         "pads",
-        description="what the jaws end in: flat pads; or round-tipped rods, which press a turned object on its "
-        "wall, where the edge of a pad would meet its rim and catch there",
+        description="what the jaws end in: flat pads; or round-tipped rods, which press a turned object on "
+        "its wall, where the edge of a pad would meet its rim and catch there",
     )
     yaw_deg: float = Field(
         0.0, ge=-90, le=90, description="turn of the object about the vertical, on top of what is drawn"

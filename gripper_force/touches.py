@@ -5,8 +5,9 @@ from typing import Final, Protocol
 from gripper_force.control.grasp import Decision
 from gripper_force.types import NS_PER_S, LoadCellSample, Outcome, Phase, RequestKind
 
-_CLEAR_M: Final = 0.004
-"""How much wider than the object the jaws open between two touches."""
+_CLEAR_M: Final = 0.008
+"""How much wider than the object the jaws open between two touches: with less of a run-up they don't come to
+their speed, and a controller that has not seen them move takes long to believe in contact."""
 
 
 class Toucher(Protocol):

@@ -283,6 +283,22 @@ def test_a_protocol_and_its_scale_are_known_by_name(run: Run) -> None:
     assert (unknown.code, "there are full, small" in unknown.err) == (2, True)
 
 
+@pytest.mark.parametrize(
+    ("args", "sentence"),
+    [
+        (["--scale", "small"], "add --protocol shin2019"),
+        (["--protocol", "shin2019", "--presses", "9"], "--presses can't be heeded"),
+        (["--protocol", "shin2019", "--grasps", "0", "--first-seed", "7"], "--grasps and --first-seed can't"),
+    ],
+)
+def test_what_a_simulation_would_not_heed_is_an_error(
+    args: list[str], sentence: str, run: Run, tmp_path: Path
+) -> None:
+    done = run("simulate", "--out", tmp_path / "sets", *args)
+    assert (done.code, sentence in done.err) == (2, True)
+    assert not (tmp_path / "sets").exists()
+
+
 def test_a_video_needs_its_table(run: Run, tmp_path: Path) -> None:
     video, table = write_recording(tmp_path)
     table.unlink()

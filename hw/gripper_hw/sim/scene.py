@@ -19,7 +19,6 @@ LUX_LEVELS = (350.0, 550.0, 750.0)
 _HARD_FRICTION = 'solreffriction=".005 1" solimpfriction=".997 .999 .001"'
 _PAD_HALF_THICKNESS_M = 0.004
 _ROD_RADIUS_M = 0.012
-_ROD_LENGTH_M = 0.020
 _FINGER_X_M = {"pads": 0.009, "rods": 0.022}
 """How far behind the middle of a pad its finger is."""
 
@@ -51,6 +50,7 @@ class Scene:
         servo_damping_nm_s: Viscous friction at the horn.
         jaw_friction_n: Coulomb friction of one rail; it is felt at the horn.
         backlash_m: Half of the gear play at the rack.
+        rod_length_m: How far a rod, where that is the tool, stands out of its finger.
     """
 
     object: str
@@ -73,6 +73,7 @@ class Scene:
     servo_damping_nm_s: float = 0.010
     jaw_friction_n: float = 0.20
     backlash_m: float = 0.0003
+    rod_length_m: float = 0.020
 
 
 def draw_scene(object_name: str, seed: int, config: SimConfig) -> Scene:
@@ -109,6 +110,8 @@ def draw_scene(object_name: str, seed: int, config: SimConfig) -> Scene:
         servo_damping_nm_s=float(rng.uniform(0.007, 0.013)),
         jaw_friction_n=float(rng.uniform(0.14, 0.26)),
         backlash_m=float(rng.uniform(0.0002, 0.0004)),
+        # How far the jaws are closed is no measure of the force: how tools are mounted differs by more.
+        rod_length_m=0.020 + (float(rng.uniform(-0.003, 0.003)) if config.tool == "rods" else 0.0),
     )
 
 
@@ -136,8 +139,8 @@ def scene_mjcf(scene: Scene, gripper: GripperConfig) -> tuple[str, dict[str, byt
         contact=model.contact,
         jaw_start=_text([gripper.open_width_m / 2 + _PAD_HALF_THICKNESS_M]),
         jaw_travel=_text([gripper.open_width_m / 2 - 0.001]),
-        left_tool=_tool(scene.tool, -1),
-        right_tool=_tool(scene.tool, 1),
+        left_tool=_tool(scene, -1),
+        right_tool=_tool(scene, 1),
         finger_x=_FINGER_X_M[scene.tool],
         grip_height=_text([model.grip_height_m]),
         rail_height=_text([model.grip_height_m + 0.085]),
@@ -151,12 +154,12 @@ def scene_mjcf(scene: Scene, gripper: GripperConfig) -> tuple[str, dict[str, byt
     return text, draw_textures(model.texture, scene.texture_seed)
 
 
-def _tool(name: str, side: int) -> str:
-    if name == "pads":
+def _tool(scene: Scene, side: int) -> str:
+    if scene.tool == "pads":
         return 'type="box" size=".004 .012 .011"'
-    # The tips are where the pads' faces would be.
-    centre = _ROD_RADIUS_M - _PAD_HALF_THICKNESS_M
-    ends = _text([side * centre, 0, 0, side * (centre + _ROD_LENGTH_M), 0, 0])
+    # The tip of a rod of 20 mm is where a pad's face would be.
+    root = _ROD_RADIUS_M - _PAD_HALF_THICKNESS_M + 0.020
+    ends = _text([side * (root - scene.rod_length_m), 0, 0, side * root, 0, 0])
     return f'type="capsule" size="{_ROD_RADIUS_M}" fromto="{ends}"'
 
 

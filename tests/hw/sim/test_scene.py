@@ -13,7 +13,7 @@ def test_a_seed_draws_one_scene_and_another_seed_another() -> None:
     assert draw_scene("tube", 3, config) == draw_scene("tube", 3, config)
     first, second = asdict(draw_scene("tube", 3, config)), asdict(draw_scene("tube", 4, config))
     same = {name for name in first if first[name] == second[name]}
-    assert same == {"object", "detail", "tool"}
+    assert same == {"object", "detail", "tool", "rod_length_m"}
 
 
 def test_what_is_asked_for_is_not_drawn() -> None:
@@ -43,6 +43,13 @@ def test_the_scenes_of_old_logs_are_drawn_again_to_the_bit() -> None:
     )
 
 
+def test_rods_are_mounted_anew_for_each_scene_and_that_changes_nothing_else() -> None:
+    pads, rods = (draw_scene("tube", 3, SimConfig(tool=tool)) for tool in ("pads", "rods"))
+    assert replace(rods, tool="pads", rod_length_m=pads.rod_length_m) == pads
+    lengths_m = [draw_scene("tube", seed, SimConfig(tool="rods")).rod_length_m for seed in range(50)]
+    assert 0.017 <= min(lengths_m) < 0.018 < 0.022 < max(lengths_m) <= 0.023
+
+
 @pytest.mark.parametrize("spread", [0.0, 0.3])
 def test_stiffness_stays_within_its_spread_and_fills_it(spread: float) -> None:
     config = SimConfig(stiffness_spread=spread)
@@ -53,9 +60,9 @@ def test_stiffness_stays_within_its_spread_and_fills_it(spread: float) -> None:
 
 def test_every_drawn_number_reaches_the_model() -> None:
     gripper = GripperConfig()
-    plain = Scene("sponge", "coarse")
+    plain = Scene("sponge", "coarse", "rods")
     before = scene_mjcf(plain, gripper)
-    drawn = asdict(draw_scene("sponge", 1, SimConfig()))
+    drawn = asdict(draw_scene("sponge", 1, SimConfig(tool="rods")))
     for name in drawn.keys() - {"object", "detail", "tool", "lux", "shot_noise", "nm_per_a"}:
         after = scene_mjcf(replace(plain, **{name: drawn[name]}), gripper)
         if name != "texture_seed":
