@@ -1,13 +1,17 @@
 """Made-up recordings to train on."""
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from gripper_force.config import dump_config, load_config
 from gripper_force.dataset import Clip
+from gripper_force.log import LogWriter
 from gripper_force.recipe import TrainConfig
+from gripper_force.types import NS_PER_MS, Frame, LoadCellSample
 from gripper_force.vision.preprocess import Preprocess
 
 
@@ -56,3 +60,15 @@ def press() -> Callable[..., Clip]:
 def clips(press: Callable[..., Clip]) -> list[Clip]:
     """Six sets of one object."""
     return [press(seed) for seed in range(6)]
+
+
+@pytest.fixture
+def few_logs(clips: list[Clip], tmp_path: Path) -> Path:
+    """Three of the clips as logs in a folder."""
+    config = dump_config(load_config(None, ["object=disc"]))
+    for clip in clips[:3]:
+        with LogWriter(tmp_path / f"logs/{clip.name}.mcap", config=config, metadata={"set": clip.set}) as log:
+            for i, (gray, force_n) in enumerate(zip(clip.frames, clip.forces_n.tolist(), strict=True)):
+                log.write(Frame(i * 20 * NS_PER_MS, i * 20 * NS_PER_MS, i, gray))
+                log.write(LoadCellSample(i * 20 * NS_PER_MS, force_n, force_n, True))
+    return tmp_path / "logs"

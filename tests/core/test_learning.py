@@ -3,7 +3,9 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
+from gripper_force import cli
 from gripper_force.dataset import Clip
 from gripper_force.errors import ConfigError
 from gripper_force.learning import WAYS, Point, learn, reached
@@ -57,3 +59,13 @@ def test_one_network_is_trained_each_way(clips: list[Clip], tmp_path: Path) -> N
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="name another folder"):
         next(learn(lambda _: clips, 1.0, KEYS, tmp_path / "file"))
+
+
+def test_the_command_shows_what_was_measured(few_logs: Path, tmp_path: Path) -> None:
+    sets = [part for key in KEYS for part in ("--set", key)]
+    call = ["bench", "--training", str(few_logs), "--minutes", "0.01", "--jobs", "1", *sets]
+    shown = CliRunner().invoke(cli.app, [*call, "--out", str(tmp_path / "kept")])
+    assert "as good as the paper's" in shown.stdout
+    assert "learning.png" in {path.name for path in (tmp_path / "kept").iterdir()}
+    for wrong in (["bench"], [*call, "--bus"]):
+        assert isinstance(CliRunner().invoke(cli.app, wrong).exception, ConfigError)

@@ -1,3 +1,4 @@
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -5,13 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from typer.testing import CliRunner
 
+from gripper_force import cli
 from gripper_force import train as train_module
 from gripper_force.dataset import Clip, digest
-from gripper_force.errors import CheckpointError, DataError, NonFiniteError
+from gripper_force.errors import CheckpointError, ConfigError, DataError, NonFiniteError
 from gripper_force.recipe import TrainConfig
 from gripper_force.train import train
 from gripper_force.trainer import Trainer
+from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.dense import predict
 from gripper_force.vision.preprocess import Preprocess
 
@@ -140,3 +144,17 @@ def test_data_without_contact_or_split_are_refused(
         clip.forces_n[:] = 0
     with pytest.raises(DataError, match="contact"):
         train(small_recipe, clips, tmp_path / "out.safetensors")
+
+
+def test_the_command_takes_a_recipe(few_logs: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.safetensors"
+    keys = ["preprocess.size=16", "attentions=[cbam]", "epochs=null", "steps=1", "clips=2", "device=cpu"]
+    sets = [part for key in keys for part in ("--set", key)]
+    call = ["train", str(few_logs), "--recipe", "shin2019", "--out", str(out), "--jobs", "1", *sets, "--json"]
+    told = json.loads(CliRunner().invoke(cli.app, call).stdout)
+    assert set(told) == {"checkpoint", "digest", "mae_n", "rmse_n", "bias_n"}
+    header = load_checkpoint(out).header
+    assert [member.attention for member in header.members] == ["cbam"]
+    assert not header.preprocess.reference
+    refused = CliRunner().invoke(cli.app, ["train", str(few_logs), "--recipe", "shin"]).exception
+    assert isinstance(refused, ConfigError)
