@@ -24,5 +24,7 @@ def _quiet(_: str) -> None:
 
 
 mujoco.set_mju_user_warning(_quiet)
+# Each scene draws textures of its own: a cache of them would grow with every grasp, and never be used again.
+mujoco.mj_setCacheCapacity(mujoco.mj_getCache(), 0)
 
 __all__ = ["NO_EGL", "mujoco"]

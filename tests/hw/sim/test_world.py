@@ -12,7 +12,7 @@ import pytest
 from gripper_force.config import GripperConfig
 from gripper_force.errors import SimulationError
 from gripper_force.types import NS_PER_MS
-from gripper_hw.sim.engine import NO_EGL
+from gripper_hw.sim.engine import NO_EGL, mujoco
 from gripper_hw.sim.scene import Scene
 from gripper_hw.sim.world import World
 
@@ -112,6 +112,12 @@ def test_an_absurd_torque_breaks_loudly(
 def test_a_scene_that_mujoco_refuses_is_named(make_world: Callable[..., World]) -> None:
     with pytest.raises(SimulationError, match="MuJoCo refuses the scene of 'sponge'"):
         make_world(Current(0.0), object="sponge", size=-1.0)
+
+
+def test_the_textures_of_past_worlds_are_not_kept(make_world: Callable[..., World]) -> None:
+    for seed in range(3):
+        make_world(Current(0.0), object="sponge", texture_seed=seed)
+    assert mujoco.mj_getCacheSize(mujoco.mj_getCache()) == 0
 
 
 def test_the_picture_shows_the_jaws_move(make_world: Callable[..., World]) -> None:
