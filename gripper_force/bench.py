@@ -1,10 +1,17 @@
 """What parts of a run cost on this machine, beside what others use: both take turns, so their ratio holds."""
 
-from collections.abc import Iterator
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Final
 
 from gripper_force.backends import BUS_COST, load
+from gripper_force.errors import GripperError
 
 BUS_SETTINGS: Final = tuple(
     (baud_rate, latency_ms) for latency_ms in (0.0, 1.0) for baud_rate in (1_000_000, 2_000_000, 4_000_000)
@@ -47,3 +54,73 @@ def bus(cycles: int) -> Iterator[tuple[BusCost, ...]]:
     """
     for baud_rate, latency_ms in BUS_SETTINGS:
         yield load(BUS_COST)(baud_rate, latency_ms, cycles)
+
+
+COMMANDS: Final = (
+    "--help",
+    "grasp",
+    "replay runs/*.mcap --report",
+    "grasp --trials 8",
+    "record --object tube --sets 1 --out recorded",
+    "simulate --presses 8 --grasps 0 --first-seed 800000 --out data",
+    "simulate --presses 0 --grasps 4 --first-seed 801000 --out tests",
+    "train data --out force.safetensors --set steps=20",
+    "evaluate tests --checkpoint force.safetensors",
+    "reproduce 7",
+    "stability --fuzz 10000",
+    "stability --soak 60",
+    "bench --bus --cycles 100",
+    "doctor",
+)
+"""What `commands` measures, in this order, in one folder: some need what others made."""
+
+_SOUND: Final = (0, 1)
+"""Exit codes: done, and done with something found."""
+
+
+@dataclass(frozen=True, slots=True)
+class CommandCost:
+    """What a command takes.
+
+    Attributes:
+        command: Its arguments.
+        wall_s: Time.
+        cpu_s: Time of the CPUs, of all its processes.
+        memory_mb: Peak memory (resident set) of its largest process.
+    """
+
+    command: str
+    wall_s: float
+    cpu_s: float
+    memory_mb: float
+
+
+def commands(lines: Sequence[str] = COMMANDS) -> Iterator[CommandCost]:
+    """Runs commands, each in a process of its own, in a folder that is gone afterwards.
+
+    Raises:
+        GripperError: One failed.
+    """
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        for line in lines:
+            words = [found for word in line.split() for found in _expanded(folder, word)]
+            with (folder / "stderr").open("w+", encoding="utf-8") as stderr:
+                begin_s = time.monotonic()
+                process = subprocess.Popen(
+                    [sys.executable, "-c", "from gripper_force.cli import main; main()", *words],
+                    cwd=folder,
+                    stdout=subprocess.DEVNULL,
+                    stderr=stderr,
+                )
+                _, status, usage = os.wait4(process.pid, 0)
+                process.returncode = os.waitstatus_to_exitcode(status)
+                wall_s = time.monotonic() - begin_s
+                if process.returncode not in _SOUND:
+                    stderr.seek(0)
+                    raise GripperError(f"gripper-force {line} failed: {stderr.read().strip()[-500:]}")
+            yield CommandCost(line, wall_s, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024)
+
+
+def _expanded(folder: Path, word: str) -> list[str]:
+    return [str(path.relative_to(folder)) for path in folder.glob(word)] if "*" in word else [word]

@@ -434,6 +434,7 @@ def doctor(
 def bench(
     bus: Annotated[bool, typer.Option("--bus", help="A cycle of the servo's bus, by the driver.")] = False,
     cycles: Annotated[int, typer.Option(min=1, help="With --bus: how many of each.")] = 1000,
+    commands: Annotated[bool, typer.Option("--commands", help="Time and memory of most commands.")] = False,
     training: Annotated[
         Path | None, typer.Option(help="Ways to train on this folder of logs: error against minutes.")
     ] = None,
@@ -450,10 +451,18 @@ def bench(
     """Measure what parts of a run cost on this machine, beside what others use."""
     from gripper_force import bench as job
 
-    if bus == (training is not None):
-        raise ConfigError("bench measures one thing at a time: --bus or --training DATA")
+    if [bus, commands, training is not None].count(True) != 1:
+        raise ConfigError("bench measures one thing at a time: --bus, --commands or --training DATA")
     if training is not None:
         _print(_learning(training, minutes, set_ or [], folder, jobs), as_json, _learning_table)
+        return
+    if commands:
+        taken = []
+        with _bar("running", len(job.COMMANDS)) as advance:
+            for cost in job.commands():
+                taken.append(cost)
+                advance(cost.command)
+        _print({"commands": taken, "load": os.getloadavg()[0], "cores": _CORES}, as_json, _commands_table)
         return
     costs: list[Any] = []
     with _bar("measuring", len(job.BUS_SETTINGS)) as advance:
@@ -762,6 +771,15 @@ def _fuzz_table(r: dict[str, Any]) -> None:
         out.print(f"[bold red]{escape(f'{finding.target}:{finding.index}')}[/] {escape(finding.error)}")
         out.print(f"  kept as {finding.file}", soft_wrap=True)
     _pairs({"inputs": r["inputs"], "seed": r["seed"], "seconds": r["wall_s"]})
+
+
+def _commands_table(r: dict[str, Any]) -> None:
+    table = Table("gripper-force", "time s", "CPU s", "memory MB", box=None)
+    for c in r["commands"]:
+        figures = (_number(c.wall_s, digits=1), _number(c.cpu_s, digits=1), _number(c.memory_mb, digits=0))
+        table.add_row(c.command, *figures)
+    out.print(table)
+    out.print(f"[dim]load {r['load']:.1f} on {r['cores']} cores[/]")
 
 
 def _bus_table(r: dict[str, Any]) -> None:
