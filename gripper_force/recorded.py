@@ -23,6 +23,11 @@ _SMALL_PX: Final = 48
 _STRONG: Final = 0.5
 """Touches of less than this share of the strongest tell little: friction shapes how they let go."""
 
+_HOLE: Final = 1.75
+"""A gap between frames of so many times the usual one is no jitter."""
+
+_SLOW_HZ: Final = 50.0
+
 Summary = dict[str, Any]
 
 
@@ -166,6 +171,11 @@ def _warnings(overall: Summary) -> list[str]:
         )
     if overall["frames_lost"]:
         warnings.append(f"{overall['frames_lost']} of {overall['frames']} frames were lost")
+    if overall["load_cell_hz"] < _SLOW_HZ:
+        warnings.append(
+            f"the load cell gave {overall['load_cell_hz']:.0f} valid samples/s; below {_SLOW_HZ:g} a lag is "
+            "not to be trusted, and frames between two samples get an interpolated force"
+        )
     half_frame_ms = 500 / overall["camera_hz"]
     lag_ms = overall["lag_ms"]
     if lag_ms is None:
@@ -199,4 +209,5 @@ def _rate_hz(t_ns: npt.NDArray[np.int64]) -> float:
 def _lost(t_ns: npt.NDArray[np.int64], seq: npt.NDArray[np.int64]) -> int:
     """By the camera's numbers, or, as not every driver tells them, by holes in time."""
     gaps_ns = np.diff(t_ns)
-    return int(max((np.diff(seq) - 1).sum(), (np.rint(gaps_ns / np.median(gaps_ns)) - 1).sum()))
+    period_ns = gaps_ns[gaps_ns < _HOLE * np.median(gaps_ns)].mean()
+    return int(max((np.diff(seq) - 1).sum(), (np.rint(gaps_ns / period_ns) - 1).clip(0).sum()))

@@ -2,8 +2,10 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from gripper_force import recorded as module
 from gripper_force.config import load_config
 from gripper_force.errors import DataError
 from gripper_force.log import LogReader, LogWriter
@@ -97,6 +99,20 @@ def test_what_was_lost_or_rejected_is_counted(log: Path, tmp_path: Path) -> None
     assert two["sets"][0]["frames_lost"] == one["sets"][0]["frames_lost"]
     assert "frames/s where 30 were asked for" in one["warnings"][0]
     assert "frames were lost" in one["warnings"][1]
+
+
+def test_jitter_is_no_loss() -> None:
+    t_ns = (np.arange(500) / 180 // 0.0025 * 2.5e6).astype(np.int64)  # stamped on a grid of 2.5 ms
+    assert module._lost(t_ns, np.arange(500)) == 0
+    assert module._lost(np.delete(t_ns, [50, 100, 101]), np.arange(497)) == 3
+
+
+def test_a_load_cell_that_is_slow_is_told(log: Path, tmp_path: Path) -> None:
+    def slow(records: Iterator[Record]) -> Iterable[Record]:
+        return (one for i, one in enumerate(records) if not isinstance(one, LoadCellSample) or i % 16 == 0)
+
+    result = summarise([changed(log, tmp_path / "slow.mcap", slow)])
+    assert "below 50 a lag is not to be trusted" in result["warnings"][0]
 
 
 def test_a_log_without_frames_is_named(log: Path, tmp_path: Path) -> None:
