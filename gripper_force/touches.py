@@ -42,7 +42,8 @@ def touch(
     touch_m = ramp(rig, peak_n, timeout_s)
     status = rig.cycle().status
     if status.phase != Phase.HOLD:
-        return f"came to no force: {status.outcome} in phase {status.phase}"
+        outcome = status.outcome.replace("_", " ") or f"not within {timeout_s:g} s"
+        return f"came to no force: {outcome}, in phase {status.phase}"
     wait(rig, hold_s)
     status = rig.cycle(RequestKind.RELEASE).status
     end_ns = status.t_ns + round(patience_s * NS_PER_S)
