@@ -1,7 +1,8 @@
 """The command line: parse, call, print.
 
 Every command takes ``--set key.path=value`` and ``--json``. With ``--json`` one JSON object goes to stdout;
-progress and messages go to stderr always. Bad input is one sentence on stderr and exit code 2.
+progress and messages go to stderr always. Bad input is one sentence on stderr and exit code 2; a command that did its
+work, and what it found is not well, ends with exit code 1.
 
 What a command needs is imported when it runs: ``gripper-force --help`` must answer at once.
 """
@@ -75,7 +76,7 @@ def grasp(
     ] = 0,
     jobs: Jobs = _CORES,
 ) -> None:
-    """Grasp with the wanted force, and report how well."""
+    """Grasp with the wanted force, and report how well. Exit code 1 where nothing was held."""
     from gripper_force import grasp as job
 
     settings = _load(
@@ -86,6 +87,8 @@ def grasp(
     if not trials:
         result = job.grasp(settings, progress=lambda s: err.print(_phase_line(s)))
         _print(result, as_json, _grasp_table)
+        if result["result"] != "held":
+            raise typer.Exit(1)
         return
     results = []
     with _bar("grasping", trials) as advance:

@@ -97,6 +97,12 @@ def test_grasp_prints_a_table_for_people(run: Run, sets: list[str]) -> None:
         assert text in done.out
 
 
+def test_a_grasp_that_did_not_hold_has_an_exit_code(run: Run, sets: list[str]) -> None:
+    fault = "faults=[{unit: servo, kind: wrong, at_s: 0.4}]"
+    done = run("grasp", "--json", *sets, "--set", "log.report=false", "--set", fault)
+    assert (json.loads(done.out)["result"], done.code) == ("fault", 1)
+
+
 def test_trials_print_each_and_a_summary(run: Run, sets: list[str]) -> None:
     result = run("grasp", "--json", "--trials", 1, "--jobs", 1, *sets).json()
     assert set(result) == {"trials", "summary"}
