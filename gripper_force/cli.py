@@ -1,8 +1,8 @@
 """The command line: parse, call, print.
 
 Every command takes ``--set key.path=value`` and ``--json``. With ``--json`` one JSON object goes to stdout;
-progress and messages go to stderr always. Bad input is one sentence on stderr and exit code 2. A command that did
-its work, and what came out is not well, ends with exit code 1.
+progress and messages go to stderr always. Bad input is one sentence on stderr and exit code 2. Exit code 1
+says that a command did its work and what came out is not well.
 
 What a command needs is imported when it runs: ``gripper-force --help`` must answer at once.
 """

@@ -73,7 +73,7 @@ class Scale(Section):
     protocol: Literal["small", "full"] = "small"
     size: Annotated[int, Field(ge=32, le=1024, multiple_of=32)] = 64
     width: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] = 0.5
-    steps: Annotated[int, Field(ge=1)] = 1500
+    steps: Annotated[int, Field(ge=1)] = 1100
     seeds: Annotated[int, Field(ge=1, le=100)] = 3
 
     def recipe(self, net: str, seed: int) -> TrainConfig:
