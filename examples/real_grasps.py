@@ -3,73 +3,141 @@
 Imports a folder of recordings (`<date>_<object>_<trial>/video.avi` with `load_cell.csv`), splits the objects
 into folds, trains on all folds but one and evaluates on that one, with a ridge regression beside it.
 
-    python examples/real_grasps.py FOLDER [--folds 3] [--minutes 5]
+    python examples/real_grasps.py FOLDER [--folds 5] [--minutes 5]             # the last rung alone
+    python examples/real_grasps.py FOLDER [--folds 5] [--minutes 5] --ladder    # what each thing brings
+
+Each result is kept in OUT/results.json as it comes; the same command goes on where it was broken off.
 """
 
 import argparse
-import sys
+import json
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
+from rich.console import Console
+from rich.progress import track
 
-from gripper_force.dataset import Clip, load_clips
-from gripper_force.evaluate import Result, evaluate, ridge_baseline
+from gripper_force.dataset import CONTACT_N, Clip, load_clips
+from gripper_force.evaluate import compare, estimates, ridge_baseline
 from gripper_force.recipe import TrainConfig
 from gripper_force.train import train
 from gripper_force.video_import import import_folder
-from gripper_force.vision.preprocess import Preprocess
+
+BASE: dict[str, Any] = {
+    "preprocess": {"size": 64},
+    "attentions": ["ssam"],
+    "width": 0.5,
+    "clips": 20,
+    "clip_frames": 26,
+    "short_share": 0.0,
+}
+BARE = {"shift_px": 0, "light": 0.0, "noise": 0.0}
+RUNGS: dict[str, dict[str, Any]] = {
+    "no attention, no reference, no augmentation": {
+        "attentions": ["none"],
+        "preprocess": {"size": 64, "reference": False},
+        **BARE,
+    },
+    "+ reference frame": {"attentions": ["none"], **BARE},
+    "+ augmentation": {"attentions": ["none"]},
+    "channel attention": {"attentions": ["scam"]},
+    "spatial and channel, averaged": {"attentions": ["ssam", "scam"]},
+    "two plain networks, averaged": {"attentions": ["none", "none"]},
+    "deeper: ResNet-18": {"backbone": "resnet18"},
+    "spatial attention": {},
+}
+"""What each changes in `BASE`. The averaged ones have the same minutes for both networks together."""
+
+DEFAULT = "spatial attention"
+RIDGE = "ridge regression"
 
 
-def contact_mae_n(result: Result) -> float:
-    """Error on frames in contact, over all objects."""
-    parts = result["per_object"].values()
-    return float(np.average([p["contact_mae_n"] for p in parts], weights=[p["frames"] for p in parts]))
+def run(rung: str, fold: list[str], clips: list[Clip], minutes: float, out: Path) -> list[dict[str, Any]]:
+    """Trains without the fold's objects, and tells of each of them how well the network does there."""
+    torch.set_num_threads(1)
+    training = [clip for clip in clips if clip.object not in fold]
+    test = [clip for clip in clips if clip.object in fold]
+    if rung == RIDGE:
+        per_object = ridge_baseline(training, test)["per_object"]
+        return [{"object": name, **result} for name, result in per_object.items()]
+    recipe = TrainConfig(**{**BASE, **RUNGS[rung], "minutes": minutes})
+    checkpoint = train(recipe, training, out / f"{rung}-{fold[0]}.safetensors")
+    forces_n = [members_n.mean(0) for members_n in estimates(checkpoint, test)]
+    per_object = compare(test, forces_n, recipe.preprocess.lead_in)["per_object"]
+    rows = []
+    for name, result in per_object.items():
+        pairs = [(c, f) for c, f in zip(test, forces_n, strict=True) if c.object == name]
+        touched = [c.valid & (c.forces_n > CONTACT_N) for c, _ in pairs]
+        measured_n = np.concatenate([c.forces_n[t] for (c, _), t in zip(pairs, touched, strict=True)])
+        estimated_n = np.concatenate([f[t] for (_, f), t in zip(pairs, touched, strict=True)])
+        gain = float(estimated_n @ measured_n / (measured_n @ measured_n))
+        rows.append(
+            {
+                "object": name,
+                **result,
+                "gain": gain,
+                "correlation": float(np.corrcoef(estimated_n, measured_n)[0, 1]),
+                "one_gain_mae_n": float(np.abs(estimated_n / gain - measured_n).mean()),
+            }
+        )
+    return rows
 
 
-def run_fold(clips: list[Clip], held_out: list[str], recipe: TrainConfig, out: Path) -> tuple[Result, Result]:
-    """Trains without these objects and evaluates on them: the network's result, and the ridge's."""
-    training = [clip for clip in clips if clip.object not in held_out]
-    test = [clip for clip in clips if clip.object in held_out]
-    return evaluate(train(recipe, training, out), test), ridge_baseline(training, test)
+def summary(results: dict[str, list[dict[str, Any]]], rung: str) -> str:
+    """A row: MAE over all frames and over frames in contact, mean and s.d. over folds."""
+    parts = [rows for key, rows in results.items() if key.startswith(f"{rung}: ")]
+    cells = []
+    for figure in ("mae_n", "contact_mae_n"):
+        folds = [np.average([r[figure] for r in rows], weights=[r["frames"] for r in rows]) for rows in parts]
+        cells.append(f"{np.mean(folds):.2f} ± {np.std(folds):.2f}")
+    return f"| {rung} | " + " | ".join(cells) + f" | {len(parts)} |"
 
 
 def main() -> None:
-    """Prints the table."""
+    """Prints the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("recordings", type=Path)
-    parser.add_argument("--folds", type=int, default=3)
-    parser.add_argument("--minutes", type=float, default=5.0, help="training time of one fold")
+    parser.add_argument("--folds", type=int, default=5)
+    parser.add_argument("--minutes", type=float, default=5.0, help="training time of one fold, on one thread")
+    parser.add_argument("--ladder", action="store_true", help="all rungs, not only the last")
+    parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("data/real"))
     options = parser.parse_args()
 
     if not any(options.out.glob("*.mcap")):
         import_folder(options.recordings, options.out)
-    recipe = TrainConfig(
-        preprocess=Preprocess(size=64),
-        attentions=("ssam",),
-        width=0.5,
-        clips=20,
-        clip_frames=26,
-        short_share=0.0,
-        minutes=options.minutes,
-    )
-    clips = load_clips(options.out, recipe.preprocess, workers=2)
+    kept = options.out / "results.json"
+    results = json.loads(kept.read_text()) if kept.exists() else {}
+    clips = load_clips(options.out, TrainConfig(**BASE).preprocess, workers=options.jobs)
     objects = np.random.default_rng(0).permutation(sorted({clip.object for clip in clips}))
-    rows = []
-    print("| held out | network, MAE N | in contact | ridge, MAE N | in contact |\n|---|---|---|---|---|")
-    for fold in np.array_split(objects, options.folds):
-        held_out = [str(name) for name in fold]
-        ours, ridge = run_fold(clips, held_out, recipe, options.out / "fold.safetensors")
-        row = (ours["mae_n"], contact_mae_n(ours), ridge["mae_n"], contact_mae_n(ridge))
-        rows.append(row)
-        print(f"| {', '.join(held_out)} | " + " | ".join(f"{v:.2f}" for v in row) + " |")
-        sys.stdout.flush()
-    mean, spread = np.mean(rows, axis=0), np.std(rows, axis=0)
-    print(
-        "| mean ± s.d. | "
-        + " | ".join(f"{m:.2f} ± {s:.2f}" for m, s in zip(mean, spread, strict=True))
-        + " |"
-    )
+    folds = [[str(name) for name in fold] for fold in np.array_split(objects, options.folds)]
+    rungs = [RIDGE, *RUNGS] if options.ladder else [RIDGE, DEFAULT]
+    wanted = {f"{r}: {options.minutes:g} min, {', '.join(f)}": (r, f) for f in folds for r in rungs}
+    with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn")) as pool:
+        missing = {
+            pool.submit(run, rung, fold, clips, options.minutes, options.out): key
+            for key, (rung, fold) in wanted.items()
+            if key not in results
+        }
+        done = track(as_completed(missing), "folds", len(missing), console=Console(stderr=True))
+        for future in done:
+            results[missing[future]] = future.result()
+            kept.write_text(json.dumps(results, indent=1))
+
+    print("| | MAE N | in contact | folds |\n|---|---|---|---|")
+    mine = {key: results[key] for key in wanted}
+    for rung in rungs:
+        print(summary(mine, rung))
+    print("\n| held out | MAE N | in contact | with its gain known | gain | correlation |")
+    print("|---|---|---|---|---|---|")
+    for key, rows in mine.items():
+        for r in rows if key.startswith(DEFAULT) else []:
+            figures = ("mae_n", "contact_mae_n", "one_gain_mae_n", "gain", "correlation")
+            print(f"| {r['object']} | " + " | ".join(f"{r[name]:.2f}" for name in figures) + " |")
 
 
 if __name__ == "__main__":
