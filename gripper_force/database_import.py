@@ -7,7 +7,7 @@ Its layout, by https://github.com/hyeon-jo/Interaction-force-estimation-based-on
 *Sets.* Nothing in a folder tells where one of the paper's sets ends. A set is four touches (its table 1), so
 a folder is cut in the rest after each fourth touch, and where numbers are missing for longer than the network
 looks back. In a split each log is a set of its own: the paper collected sets "for each environment", so none
-was seen under two lights.
+was seen under two lights. As in the simulated protocol, sets 13 to 15 of each folder are for test.
 
 *Forces* stay as published, so that errors compare with the paper's; only spikes are marked as not valid.
 
@@ -30,6 +30,7 @@ import numpy.typing as npt
 from gripper_force.config import CameraConfig, Config
 from gripper_force.dataset import CONTACT_N
 from gripper_force.errors import DataError
+from gripper_force.simulate import split_of
 from gripper_force.types import NS_PER_S, Frame, Gray
 from gripper_force.video_import import load_cell_samples, write_recording
 from gripper_force.vision.preprocess import Region, shrink
@@ -124,7 +125,7 @@ def import_environment(
 
     Args:
         folder: One of `find_environments`.
-        out: Where the logs go.
+        out: Where the logs go, into ``train`` and ``test`` as those of `simulate.plan_protocol`.
         rate_hz: Frame rate that the numbers of the images are turned into times with.
         region: Part of the images to keep in pixels: left, top, width, height; None for the whole.
         size: Side of the logged frames in pixels.
@@ -159,7 +160,7 @@ def import_environment(
     empty: list[str] = []
     kept = frame_count = spikes = 0
     for i, (part, (_, touches)) in enumerate(zip(parts, sets, strict=True), start=1):
-        log = out / f"{folder.name}-{i:02d}.mcap"
+        log = out / split_of(i) / f"{folder.name}-{i:02d}.mcap"
         if log.exists():
             kept += 1
             continue
@@ -175,8 +176,8 @@ def import_environment(
             empty.append(log.stem)
             continue
         samples = load_cell_samples([t_ns[n] for n in labelled], np.array([forces_n[n] for n in labelled]))
-        metadata = {**about, "set": log.stem, "touches": str(touches)}
-        unfinished = out / f".{log.name}.part"
+        metadata = {**about, "set": log.stem, "split": split_of(i), "touches": str(touches)}
+        unfinished = log.with_name(f".{log.name}.part")
         unfinished.unlink(missing_ok=True)
         spikes += write_recording(unfinished, config, metadata, frames, samples)
         unfinished.rename(log)

@@ -95,13 +95,18 @@ class SetPlan:
     @property
     def split(self) -> str:
         """Which side of the protocol's split the set is on: ``train`` or ``test``."""
-        return "test" if self.number in TEST_SETS else "train"
+        return split_of(self.number)
 
     @property
     def names(self) -> tuple[str, ...]:
         """The logs' file names, one for each light level."""
         stem = f"{self.split}/{self.object}-{self.degrees:02d}-{self.number:02d}"
         return tuple(f"{stem}-{lux}.mcap" for lux in self.lux)
+
+
+def split_of(number: int) -> str:
+    """Which side of the paper's split a set is on, by its number from 1: ``train`` or ``test``."""
+    return "test" if number in TEST_SETS else "train"
 
 
 def plan(kind: Kind, count: int, first_seed: int, objects: tuple[str, ...] = OBJECTS) -> list[Plan]:

@@ -66,7 +66,7 @@ def test_an_environment_becomes_a_log_for_every_four_touches(environment: Path, 
     assert (row.folder, row.object, row.degrees, row.lux) == ("papercup_10_70", "paper_cup", 10, 550)
     assert (row.logs, row.kept, row.touches, row.frames, row.spikes_rejected) == (2, 0, 6, 240, 0)
     assert row.problems == ()
-    first, second = sorted((tmp_path / "out").iterdir())
+    first, second = sorted((tmp_path / "out" / "train").iterdir())
     assert (first.name, second.name) == ("papercup_10_70-01.mcap", "papercup_10_70-02.mcap")
     logs = [LogReader(path) for path in (first, second)]
     assert [log.metadata["touches"] for log in logs] == ["4", "2"]
@@ -88,9 +88,19 @@ def test_an_environment_becomes_a_log_for_every_four_touches(environment: Path, 
     assert samples[-1].t_ns == frames[-1].t_ns == round((frames[-1].seq - 164) * 1e9 / 149)
 
 
+def test_the_last_of_the_papers_sets_are_for_test(tmp_path: Path) -> None:
+    folder = write_environment(tmp_path / "db" / "sponge_0_50", touches(4 * 15))
+    assert import_environment(folder, tmp_path / "out").logs == 15
+    assert len(list((tmp_path / "out" / "train").iterdir())) == 12
+    test = sorted(path.stem for path in (tmp_path / "out" / "test").iterdir())
+    assert test == ["sponge_0_50-13", "sponge_0_50-14", "sponge_0_50-15"]
+
+
 def test_logs_load_as_clips_that_begin_without_contact(environment: Path, tmp_path: Path) -> None:
     import_environment(environment, tmp_path / "out")
-    clips = [load_clip(path, Preprocess(size=16), None) for path in sorted((tmp_path / "out").iterdir())]
+    clips = [
+        load_clip(path, Preprocess(size=16), None) for path in sorted((tmp_path / "out" / "train").iterdir())
+    ]
     assert [(clip.object, clip.set) for clip in clips] == [
         ("paper_cup", "papercup_10_70-01"),
         ("paper_cup", "papercup_10_70-02"),
@@ -101,7 +111,7 @@ def test_logs_load_as_clips_that_begin_without_contact(environment: Path, tmp_pa
 
 def test_rate_region_and_size_are_the_callers(environment: Path, tmp_path: Path) -> None:
     import_environment(environment, tmp_path / "out", rate_hz=30, region=(8, 0, 8, 8), size=32)
-    log = LogReader(tmp_path / "out" / "papercup_10_70-01.mcap")
+    log = LogReader(tmp_path / "out" / "train" / "papercup_10_70-01.mcap")
     assert config_from_text(log.config, "the log").camera.rate_hz == 30
     frames = list(log.records(Frame))
     assert [f.t_ns for f in frames] == [round(i * 1e9 / 30) for i in range(len(frames))]
@@ -109,7 +119,7 @@ def test_rate_region_and_size_are_the_callers(environment: Path, tmp_path: Path)
     assert frames[0].gray.min() > 180
     with pytest.raises(ConfigError, match="region"):
         import_environment(environment, tmp_path / "other", region=(0, 0, 99, 9))
-    assert not list((tmp_path / "other").glob("*.mcap"))
+    assert not list((tmp_path / "other").rglob("*.mcap"))
 
 
 @pytest.mark.parametrize(
@@ -123,7 +133,7 @@ def test_the_object_is_read_from_the_folders_name(names: tuple[str, str], tmp_pa
 def test_what_was_broken_off_goes_on(environment: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     import_environment(environment, out)
-    first, second = sorted(out.iterdir())
+    first, second = sorted((out / "train").iterdir())
     whole = second.read_bytes()
     first.write_bytes(b"made before")
     second.unlink()
@@ -132,7 +142,7 @@ def test_what_was_broken_off_goes_on(environment: Path, tmp_path: Path) -> None:
     assert (row.logs, row.kept, row.frames) == (2, 1, 80)
     assert first.read_bytes() == b"made before"
     assert second.read_bytes() == whole
-    assert sorted(out.iterdir()) == [first, second]
+    assert sorted((out / "train").iterdir()) == [first, second]
 
 
 # Sets.
@@ -175,7 +185,7 @@ def test_a_small_hole_is_bridged_and_seen_in_the_numbers(environment: Path, tmp_
     write_table(environment, [(n, f) for n, f in enumerate(touches(6), start=4) if not 30 <= n < 40])
     row = import_environment(environment, tmp_path / "out")
     assert (row.logs, row.problems) == (2, ())
-    frames = list(LogReader(tmp_path / "out" / "papercup_10_70-01.mcap").records(Frame))
+    frames = list(LogReader(tmp_path / "out" / "train" / "papercup_10_70-01.mcap").records(Frame))
     assert (frames[26].seq, frames[26].t_ns) == (40, round(36 * 1e9 / 149))
 
 
@@ -198,7 +208,7 @@ def test_images_and_forces_without_a_partner_are_named(environment: Path, tmp_pa
         "3 images have no force, the first is 241",
     )
     assert row.frames == 238
-    log = LogReader(tmp_path / "out" / "papercup_10_70-01.mcap")
+    log = LogReader(tmp_path / "out" / "train" / "papercup_10_70-01.mcap")
     assert {12, 17}.isdisjoint(frame.seq for frame in log.records(Frame))
 
 
@@ -234,7 +244,7 @@ def test_numbers_out_of_order_are_named_and_sorted(environment: Path, tmp_path: 
     assert problem_of(environment, tmp_path) == (
         "1 lines were out of order and were sorted, the first is line 12, number 14 after 15"
     )
-    samples = list(LogReader(tmp_path / "out" / "papercup_10_70-01.mcap").records(LoadCellSample))
+    samples = list(LogReader(tmp_path / "out" / "train" / "papercup_10_70-01.mcap").records(LoadCellSample))
     assert [s.force_n for s in samples] == pytest.approx(touches(6)[: len(samples)] - 0.003, abs=1e-7)
 
 
@@ -286,7 +296,7 @@ def test_spikes_are_rejected_and_stay_in_the_log(environment: Path, tmp_path: Pa
     force_n[36] = -9.0
     write_table(environment, list(enumerate(force_n, start=4)))
     row = import_environment(environment, tmp_path / "out")
-    samples = list(LogReader(tmp_path / "out" / "papercup_10_70-01.mcap").records(LoadCellSample))
+    samples = list(LogReader(tmp_path / "out" / "train" / "papercup_10_70-01.mcap").records(LoadCellSample))
     assert row.spikes_rejected == 1
     assert [s.raw for s in samples if not s.valid] == [-9.0]
 
