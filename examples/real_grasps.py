@@ -23,8 +23,8 @@ from rich.progress import track
 
 from gripper_force.dataset import CONTACT_N, Clip, load_clips
 from gripper_force.evaluate import compare, estimates, ridge_baseline
-from gripper_force.recipe import TrainConfig
-from gripper_force.train import train
+from gripper_force.training.recipe import TrainConfig
+from gripper_force.training.train import train
 from gripper_force.video_import import import_folder
 
 BASE: dict[str, Any] = {

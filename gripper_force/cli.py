@@ -1,4 +1,4 @@
-"""The command line: parse, call, print.
+"""The command line: parse, call, and let `gripper_force.console` print.
 
 Every command takes ``--set key.path=value`` and ``--json``. With ``--json`` one JSON object goes to stdout;
 progress and messages go to stderr always. Bad input is one sentence on stderr and exit code 2. Exit code 1
@@ -8,31 +8,22 @@ What a command needs is imported when it runs: ``gripper-force --help`` must ans
 """
 
 import json
-import math
 import os
 import signal
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any, NoReturn
 
 import typer
-from rich.console import Console
-from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Column, Table
 
+from gripper_force import console
 from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError, DataError, GripperError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 import_app = typer.Typer(no_args_is_help=True, help="Turn other recordings into logs.")
 app.add_typer(import_app, name="import")
-
-err = Console(stderr=True, highlight=False)
-out = Console(highlight=False)
 
 ConfigPath = Annotated[Path | None, typer.Option("--config", help="YAML file with configuration keys.")]
 Overrides = Annotated[
@@ -51,13 +42,13 @@ def main() -> NoReturn:
     try:
         app()
     except GripperError as error:
-        err.print(f"[bold red]error:[/] {_plain(error)}", soft_wrap=True)
+        console.err.print(f"[bold red]error:[/] {console.plain(error)}", soft_wrap=True)
         if "--json" in sys.argv:
             sys.stdout.write(json.dumps({"error": str(error)}) + "\n")
         sys.exit(2)
     except SystemExit as end:
         if end.code == _INTERRUPTED:  # what typer makes of a KeyboardInterrupt
-            err.print("interrupted; what ran was stopped as configured", soft_wrap=True)
+            console.err.print("interrupted; what ran was stopped as configured", soft_wrap=True)
         raise
     sys.exit(0)
 
@@ -85,18 +76,18 @@ def grasp(
         {"object": object_, "target_n": target_n, "seed": seed, "control.feedback": feedback},
     )
     if not trials:
-        result = job.grasp(settings, progress=lambda s: err.print(_phase_line(s)))
-        _print(result, as_json, _grasp_table)
+        result = job.grasp(settings, progress=lambda s: console.err.print(console.phase_line(s)))
+        console.show(result, as_json, console.grasp_table)
         if result["result"] != "held":
             raise typer.Exit(1)
         return
     results = []
-    with _bar("grasping", trials) as advance:
+    with console.bar("grasping", trials) as advance:
         for one in job.trials(settings, trials, jobs):
             results.append(one)
             advance(f"{one['object']} {one['target_n']:.1f} N: {one['result']}")
     summary = job.overall(results, settings.control.force_limit_n)
-    _print({"trials": results, "summary": summary}, as_json, _trials_table)
+    console.show({"trials": results, "summary": summary}, as_json, console.trials_table)
 
 
 @app.command()
@@ -116,7 +107,7 @@ def replay(
         from gripper_force.report import write_report
 
         result["report"] = str(write_report(log, recover=recover).html)
-    _print(result, as_json, _replay_table)
+    console.show(result, as_json, console.replay_table)
 
 
 @app.command()
@@ -169,12 +160,12 @@ def simulate(
         raise ConfigError(f"no protocol {protocol!r}; there is shin2019")
     names = [name for p in plans for name in p.names]
     made = 0
-    with _bar("simulating", len(names)) as advance:
+    with console.bar("simulating", len(names)) as advance:
         advance("", sum((folder / name).exists() for name in names))
         for path in job.simulate(plans, folder, settings, jobs):
             made += 1
             advance(path.name)
-    _print({"logs": len(names), "made": made, "folder": str(folder)}, as_json)
+    console.show({"logs": len(names), "made": made, "folder": str(folder)}, as_json)
 
 
 @app.command()
@@ -205,14 +196,14 @@ def record(
     OUT/train. At the end each set is judged: frames, losses, forces, and whether camera and load cell agree
     in time. Sets that are there already are kept, so a recording that was broken off goes on.
     """
-    from gripper_force import record as job
-    from gripper_force.recorded import summarise
+    from gripper_force.recording import record as job
+    from gripper_force.recording.summary import summarise
 
     options = {"object": object_, "seed": seed, "sim.yaw_deg": degrees, "sim.lux": lux}
     settings = _load(config, set_, options)
     plan = job.Plan(sets, touches, peak_n, degrees, lux)
     paths = plan.paths(settings, folder)
-    with _bar("recording", sets) as advance:
+    with console.bar("recording", sets) as advance:
         advance("", sum(path.exists() for path in paths))
 
         def tell(number: int, touch: int, force_n: float) -> None:
@@ -221,7 +212,7 @@ def record(
 
         for path in job.record(settings, plan, folder, tell):
             advance(path.name)
-    _print(summarise(paths), as_json, _sets_table)
+    console.show(summarise(paths), as_json, console.sets_table)
 
 
 @app.command()
@@ -246,8 +237,8 @@ def train(
 ) -> None:
     """Train the force network on logs; under `torchrun`, in several processes."""
     from gripper_force.dataset import load_clips
-    from gripper_force.recipe import recipe as named
-    from gripper_force.train import train as job
+    from gripper_force.training.recipe import recipe as named
+    from gripper_force.training.train import train as job
     from gripper_force.vision.checkpoint import load_checkpoint
 
     settings = named(recipe, set_)
@@ -258,7 +249,7 @@ def train(
     result = job(settings, clips, checkpoint, init=start, resume=resume)
     metrics = result.header.metrics
     if not quiet:
-        _print({"checkpoint": str(checkpoint), "digest": result.digest, **metrics}, as_json)
+        console.show({"checkpoint": str(checkpoint), "digest": result.digest, **metrics}, as_json)
 
 
 @app.command()
@@ -283,7 +274,7 @@ def evaluate(
     clips = [clip for clip in clips if not only or clip.object in only]
     if not clips:
         raise DataError(f"no log in {data} is of {', '.join(only or [])}")
-    _print(dict(job(loaded, clips)), as_json, _errors_table)
+    console.show(dict(job(loaded, clips)), as_json, console.errors_table)
 
 
 @app.command()
@@ -319,7 +310,7 @@ def reproduce(
         raise ConfigError(f"no scale {scale!r}; there are {', '.join(SCALES)}")
     settings = section_from(Scale, [*(f"{k}={json.dumps(v)}" for k, v in SCALES[scale]), *(set_ or [])])
     out_ = folder or Path("runs/paper") / scale
-    result, test = page.reproduce(names, settings, data, out_, jobs, _bar)
+    result, test = page.reproduce(names, settings, data, out_, jobs, console.bar)
     pictures = write.with_suffix("") if write else out_
     pictures.mkdir(parents=True, exist_ok=True)
     for name, figure in result.figures.items():
@@ -330,7 +321,7 @@ def reproduce(
 
         write_between(write, scale, text)
     drawn = {name: str(pictures / f"{name}.png") for name in result.figures}
-    _print({"tables": result.tables, "figures": drawn}, as_json, _paper_tables)
+    console.show({"tables": result.tables, "figures": drawn}, as_json, console.paper_tables)
 
 
 @import_app.command("video")
@@ -354,8 +345,8 @@ def import_video(
     else:
         log = folder / f"{video.stem}.mcap"
         summaries = [job.import_video(video, forces, log, object_name=object_, region=region)]
-    rows = [_jsonable(summary) for summary in summaries]
-    _print({"logs": rows}, as_json, _imports_table)
+    rows = [console.jsonable(summary) for summary in summaries]
+    console.show({"logs": rows}, as_json, console.imports_table)
 
 
 @import_app.command("database")
@@ -377,7 +368,7 @@ def import_database(
     settings = _load(None, set_, {"camera.rate_hz": rate_hz})
     environments, ignored = find_environments(database)
     rows = []
-    with _bar("importing", len(environments)) as advance:
+    with console.bar("importing", len(environments)) as advance:
         for path in environments:
             rows.append(
                 import_environment(
@@ -385,7 +376,7 @@ def import_database(
                 )
             )
             advance(path.name)
-    _print({"environments": rows, "ignored": ignored}, as_json, _database_table)
+    console.show({"environments": rows, "ignored": ignored}, as_json, console.database_table)
 
 
 @app.command("virtual-servo")
@@ -402,9 +393,9 @@ def virtual_servo(
     who = ids or [servo.id]
     serve = import_module("gripper_hw.dynamixel.serve").serve_virtual_servo
     with serve(servo.model, who) as server:
-        _print({"port": server.device_path, "model": servo.model, "ids": who}, as_json)
+        console.show({"port": server.device_path, "model": servo.model, "ids": who}, as_json)
         sys.stdout.flush()
-        err.print("serving until Ctrl-C")
+        console.err.print("serving until Ctrl-C")
         signal.pause()
 
 
@@ -423,12 +414,16 @@ def doctor(
 
     settings = _load(config, set_, {})
     if setup:
-        _print(job.setup(settings, lambda servo, changes: _agreed(servo, changes, yes)), as_json, _setup_line)
+        console.show(
+            job.setup(settings, lambda servo, changes: _agreed(servo, changes, yes)),
+            as_json,
+            console.setup_line,
+        )
         return
-    with err.status("looking"):
+    with console.err.status("looking"):
         checks = list(job.doctor(settings))
     ok = all(check.ok is not False for check in checks)
-    _print({"checks": checks, "ok": ok}, as_json, _checks_table)
+    console.show({"checks": checks, "ok": ok}, as_json, console.checks_table)
     if not ok:
         raise typer.Exit(1)
 
@@ -457,34 +452,36 @@ def bench(
     if [bus, commands, training is not None].count(True) != 1:
         raise ConfigError("bench measures one thing at a time: --bus, --commands or --training DATA")
     if training is not None:
-        _print(_learning(training, minutes, set_ or [], folder, jobs), as_json, _learning_table)
+        console.show(_learning(training, minutes, set_ or [], folder, jobs), as_json, console.learning_table)
         return
     if commands:
         taken = []
-        with _bar("running", len(job.COMMANDS)) as advance:
+        with console.bar("running", len(job.COMMANDS)) as advance:
             for cost in job.commands():
                 taken.append(cost)
                 advance(cost.command)
-        _print({"commands": taken, "load": os.getloadavg()[0], "cores": _CORES}, as_json, _commands_table)
+        console.show(
+            {"commands": taken, "load": os.getloadavg()[0], "cores": _CORES}, as_json, console.commands_table
+        )
         return
     costs: list[Any] = []
-    with _bar("measuring", len(job.BUS_SETTINGS)) as advance:
+    with console.bar("measuring", len(job.BUS_SETTINGS)) as advance:
         for setting in job.bus(cycles):
             costs += setting
             advance(f"{setting[0].baud_rate} baud, {setting[0].latency_ms:g} ms")
-    _print({"bus": costs, "load": os.getloadavg()[0], "cores": _CORES}, as_json, _bus_table)
+    console.show({"bus": costs, "load": os.getloadavg()[0], "cores": _CORES}, as_json, console.bus_table)
 
 
 def _learning(data: Path, minutes: float, overrides: list[str], out_: Path, jobs: int) -> dict[str, Any]:
     from functools import partial
 
     from gripper_force.dataset import load_clips
-    from gripper_force.learning import learn, reached
+    from gripper_force.training.learning import learn, reached
 
     points = []
     for point in learn(partial(load_clips, data, workers=jobs), minutes, overrides, out_):
         points.append(point)
-        err.print(f"{point.way}, {point.minutes:.2f} min: {point.mae_n:.3f} N")
+        console.err.print(f"{point.way}, {point.minutes:.2f} min: {point.mae_n:.3f} N")
     return {"points": points, "as_good_as_paper_min": reached(points), "cores": _CORES, "folder": out_}
 
 
@@ -523,20 +520,20 @@ def stability(
         raise ConfigError("stability does one thing at a time: --faults, --fuzz N or --soak SECONDS")
     if faults:
         result = _fault_matrix(_load(config, set_, {"seed": seed}), seeds, live, jobs, write, resume)
-        _print(result, as_json, _faults_table)
+        console.show(result, as_json, console.faults_table)
     elif fuzz is not None:
         from gripper_force.stability.fuzz import fuzz as feed
 
-        with _bar("fuzzing", fuzz) as advance:
+        with console.bar("fuzzing", fuzz) as advance:
             result = feed(fuzz, seed, jobs, folder, advance, only=only)
-        _print(result, as_json, _fuzz_table)
+        console.show(result, as_json, console.fuzz_table)
     else:
         from gripper_force.stability.soak import soak as grasp_on
 
         settings = _load(config, ["sim.detail=coarse", *(set_ or [])], {"seed": seed})
-        with _bar("soaking", round(soak or 0)) as advance:
+        with console.bar("soaking", round(soak or 0)) as advance:
             result = grasp_on(settings, soak or 0, advance)
-        _print(result, as_json, _soak_table)
+        console.show(result, as_json, console.soak_table)
     if not result["ok"]:
         raise typer.Exit(1)
 
@@ -547,7 +544,7 @@ def _fault_matrix(
     from gripper_force.report.markers import write_between
     from gripper_force.stability.faults import count_grasps, markdown, run_matrix
 
-    with _bar("breaking things", count_grasps(seeds, live)) as advance:
+    with console.bar("breaking things", count_grasps(seeds, live)) as advance:
         keep = settings.log.directory / "faults.jsonl"
         rows = list(run_matrix(settings, seeds, live, jobs, keep, resume=resume, advance=advance))
     if page is not None:
@@ -564,301 +561,14 @@ def _load(path: Path | None, overrides: list[str] | None, options: dict[str, Any
     return load_config(path, [*(overrides or []), *given])
 
 
-@contextmanager
-def _bar(label: str, total: int) -> Iterator[Any]:
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, TextColumn("{task.fields[note]}"), console=err) as progress:
-        task = progress.add_task(label, total=total, note="")
-        yield lambda note, steps=1: progress.update(task, advance=steps, note=note)
-
-
-def _print(result: dict[str, Any], as_json: bool, render: Any = None) -> None:
-    if as_json:
-        sys.stdout.write(json.dumps(_jsonable(result), allow_nan=False) + "\n")
-    elif render is None:
-        _pairs(result)
-    else:
-        render(result)
-
-
-def _jsonable(value: Any) -> Any:
-    """NaN has no place in JSON; a figure without a meaning is null."""
-    if isinstance(value, dict):
-        return {str(key): _jsonable(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_jsonable(item) for item in value]
-    if hasattr(value, "__dataclass_fields__"):
-        return {name: _jsonable(getattr(value, name)) for name in value.__dataclass_fields__}
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    return str(value) if isinstance(value, Path) else value
-
-
-def _number(value: Any, unit: str = "", digits: int = 3) -> str:
-    if value is None or (isinstance(value, float) and not math.isfinite(value)):
-        return "-"
-    return f"{value:.{digits}f}{unit}" if isinstance(value, float) else f"{value}{unit}"
-
-
-def _pairs(pairs: dict[str, Any]) -> None:
-    table = Table(box=None, show_header=False, pad_edge=False)
-    for name, value in pairs.items():
-        table.add_row(f"[dim]{name}[/]", _number(value))
-    out.print(table)
-
-
-def _phase_line(status: Any) -> str:
-    note = f" [bold]{status.outcome}[/]" if status.outcome else ""
-    return f"[dim]{status.t_ns / 1e9 % 1e4:8.2f} s[/] {status.phase}{note} [dim]{status.reason}[/]"
-
-
-def _grasp_table(r: dict[str, Any]) -> None:
-    share = ""
-    if r["steady_error_n"] is not None:
-        share = f" ({100 * r['steady_error_n'] / r['target_n']:+.1f} %)"
-    _pairs(
-        {
-            "result": r["result"],
-            "object": r["object"],
-            "target": _number(r["target_n"], " N", 2),
-            "load cell, mean": _number(r["load_cell_mean_n"], " N"),
-            "steady error": _number(r["steady_error_n"], " N") + share,
-            "overshoot": _number(r["overshoot_n"], " N"),
-            "settling time": _number(r["settle_s"], " s", 2),
-            "estimator p50, p99": f"{_number(r['estimator_p50_ms'], '', 1)}, "
-            f"{_number(r['estimator_p99_ms'], '', 1)} ms",
-            "control loop": _number(r["loop_hz"], " Hz", 1),
-            "camera": _number(r["camera_hz"], " Hz", 1),
-            "samples rejected": _number(r["samples_rejected"]),
-            "log": r["log"],
-            "report": r["report"] or "-",
-        }
-    )
-
-
-def _trials_table(r: dict[str, Any]) -> None:
-    table = Table(
-        "object", "target N", "load cell N", "error %", "overshoot N", "settle s", "result", box=None
-    )
-    for t in r["trials"]:
-        error = None if t["steady_error_n"] is None else 100 * t["steady_error_n"] / t["target_n"]
-        table.add_row(
-            t["object"],
-            _number(t["target_n"], digits=2),
-            _number(t["load_cell_mean_n"], digits=2),
-            _number(error, digits=1),
-            _number(t["overshoot_n"], digits=2),
-            _number(t["settle_s"], digits=2),
-            t["result"],
-        )
-    out.print(table)
-    summary = dict(r["summary"])
-    errors = summary.pop("estimate_mae_n")
-    _pairs(summary)
-    table = Table("MAE over the whole run, N", "vision", "current", "fused", "floor", box=None)
-    for name, e in errors.items():
-        table.add_row(name, *(_number(e[key]) for key in ("visual", "current", "fused", "floor")))
-    out.print(table)
-
-
-def _errors_table(r: dict[str, Any]) -> None:
-    _pairs({key: r[key] for key in ("mae_n", "rmse_n", "bias_n", "floor_n", "frames")})
-    table = Table("object", "MAE N", "RMSE N", "contact MAE N", "floor N", "frames", box=None)
-    for name, o in r["per_object"].items():
-        figures = (o["mae_n"], o["rmse_n"], o["contact_mae_n"], o["floor_n"])
-        table.add_row(name, *(_number(value) for value in figures), str(o["frames"]))
-    out.print(table)
-    _bins_table(r["per_bin"])
-
-
-def _bins_table(bins: list[dict[str, Any]]) -> None:
-    table = Table("force N", "MAE N", "bias N", "frames", box=None)
-    for b in bins:
-        span = f"{b['from_n']:.0f}-{b['to_n']:.0f}"
-        table.add_row(span, _number(b["mae_n"]), _number(b["bias_n"]), str(b["frames"]))
-    out.print(table)
-
-
-def _replay_table(r: dict[str, Any]) -> None:
-    identical = {True: "yes, to the bit", False: "no", None: "nothing to compare"}[r["identical"]]
-    if r["note"]:
-        identical += f": {r['note']}"
-    _pairs({"identical": identical, "log": r["log"], **({"report": r["report"]} if "report" in r else {})})
-    table = Table("source", "MAE N", "RMSE N", "bias N", "contact MAE N", "lag ms", "samples", box=None)
-    for name, s in r["sources"].items():
-        figures = (s["mae_n"], s["rmse_n"], s["bias_n"], s["contact_mae_n"])
-        lag = _number(1e3 * s["lag_s"], digits=0)
-        table.add_row(name, *(_number(value) for value in figures), lag, str(s["frames"]))
-    out.print(table)
-    _bins_table(r["per_bin"])
-
-
-def _paper_tables(r: dict[str, Any]) -> None:
-    from gripper_force.reproduce.tables import show
-
-    for made in r["tables"]:
-        table = Table(*made.columns, title=made.title, title_justify="left", box=None)
-        for row in made.rows:
-            table.add_row(*map(show, row))
-        out.print(table)
-        out.print()
-    for name, path in r["figures"].items():
-        out.print(f"{name}: {path}", soft_wrap=True)
-
-
-def _sets_table(r: dict[str, Any]) -> None:
-    rate = f"Hz of {r['overall']['camera_hz_asked']:g}"
-    names = ("set", "frames", rate, "lost", "cell Hz", "rejected", "peak N", "lag ms")
-    columns = [Column(name, no_wrap=True) for name in names]
-    table = Table(*columns, box=None, pad_edge=False, collapse_padding=True)
-    for s in (*r["sets"], {**r["overall"], "set": "all"}):
-        table.add_row(
-            s["set"],
-            str(s["frames"]),
-            _number(s["camera_hz"], digits=1),
-            str(s["frames_lost"]),
-            _number(s["load_cell_hz"], digits=1),
-            str(s["samples_rejected"]),
-            _number(s["peak_n"], digits=1),
-            "-" if s["lag_ms"] is None else f"{s['lag_ms']:.1f} ± {s['lag_spread_ms']:.1f}",
-        )
-    out.print(table)
-    table = Table("force N", "frames", box=None)
-    for n, count in r["overall"]["histogram"].items():
-        table.add_row(f"{n}-{n + 1}", str(count))
-    out.print(table)
-    for warning in r["warnings"]:
-        out.print(f"[yellow]{escape(warning)}[/]", soft_wrap=True)
-
-
-def _imports_table(r: dict[str, Any]) -> None:
-    table = Table("log", "object", "frames", "spikes", "tare N", "note", box=None)
-    for row in r["logs"]:
-        tare = _number(row["tare_n"], digits=3)
-        name = Path(row["log"]).name
-        table.add_row(
-            name, row["object"], str(row["frames"]), str(row["spikes_rejected"]), tare, row["tare_note"]
-        )
-    out.print(table)
-
-
-def _database_table(r: dict[str, Any]) -> None:
-    columns = ("object", "degrees", "lux", "logs", "kept", "touches", "frames", "spikes_rejected")
-    table = Table("folder", *(name.removesuffix("_rejected") for name in columns), box=None)
-    for row in r["environments"]:
-        table.add_row(row.folder, *(str(getattr(row, name)) for name in columns))
-    out.print(table)
-    for row in r["environments"]:
-        for problem in row.problems:
-            out.print(f"[yellow]{escape(row.folder)}[/] {escape(problem)}", soft_wrap=True)
-    if r["ignored"]:
-        out.print(f"[yellow]not imported[/] {escape(', '.join(r['ignored']))}", soft_wrap=True)
-
-
-def _checks_table(r: dict[str, Any]) -> None:
-    marks = {True: "[green]ok[/]", False: "[bold red]problem[/]", None: "-"}
-    table = Table(box=None, show_header=False, pad_edge=False)
-    for check in r["checks"]:
-        advice = f"\n[yellow]{escape(check.advice)}[/]" if check.advice else ""
-        style = "dim" if check.ok is None else ""
-        table.add_row(marks[check.ok], check.unit, check.name, escape(check.found) + advice, style=style)
-    out.print(table)
-
-
-def _fuzz_table(r: dict[str, Any]) -> None:
-    table = Table("target", "inputs", "results", "typed errors", "findings", box=None)
-    for name, row in r["targets"].items():
-        table.add_row(name, *(str(row[key]) for key in ("inputs", "results", "typed_errors", "findings")))
-    out.print(table)
-    for finding in r["findings"]:
-        out.print(f"[bold red]{escape(f'{finding.target}:{finding.index}')}[/] {escape(finding.error)}")
-        out.print(f"  kept as {finding.file}", soft_wrap=True)
-    _pairs({"inputs": r["inputs"], "seed": r["seed"], "seconds": r["wall_s"]})
-
-
-def _commands_table(r: dict[str, Any]) -> None:
-    table = Table("gripper-force", "time s", "CPU s", "memory MB", box=None)
-    for c in r["commands"]:
-        figures = (_number(c.wall_s, digits=1), _number(c.cpu_s, digits=1), _number(c.memory_mb, digits=0))
-        table.add_row(c.command, *figures)
-    out.print(table)
-    out.print(f"[dim]load {r['load']:.1f} on {r['cores']} cores[/]")
-
-
-def _bus_table(r: dict[str, Any]) -> None:
-    columns = ("Mbaud", "latency ms", "client", "line ms", "p50 ms", "p99 ms", "p50/line", "CPU % at 200Hz")
-    table = Table(*columns, box=None)
-    for c in r["bus"]:
-        figures = (c.line_ms, c.p50_ms, c.p99_ms, c.p50_ms / c.line_ms)
-        numbers = (_number(value) for value in figures)
-        share = _number(100 * c.cpu_share, digits=1)
-        setting = (f"{c.baud_rate / 1e6:g}", f"{c.latency_ms:g}")
-        table.add_row(*setting, c.client, *numbers, share)
-    out.print(table)
-    out.print(f"[dim]load {r['load']:.1f} on {r['cores']} cores[/]")
-
-
-def _learning_table(r: dict[str, Any]) -> None:
-    table = Table("way", "minutes", "steps", "MAE N", "RMSE N", box=None)
-    for p in r["points"]:
-        table.add_row(p.way, _number(p.minutes, digits=2), str(p.steps), _number(p.mae_n), _number(p.rmse_n))
-    out.print(table)
-    _pairs({f"{way}: as good as the paper's, min": m for way, m in r["as_good_as_paper_min"].items()})
-    _pairs({"kept in": str(r["folder"])})
-
-
-def _faults_table(r: dict[str, Any]) -> None:
-    table = Table(
-        "fault", "expected", "as expected", "worst ms", "of", "live ms", "peak over limit", box=None
-    )
-    for row in r["rows"]:
-        colour = "green" if row["ok"] == row["runs"] else "bold red"
-        table.add_row(
-            row["row"],
-            row["expected"],
-            f"[{colour}]{row['ok']} of {row['runs']}[/]",
-            _number(row["worst_ms"], digits=1),
-            _number(row["within_ms"], digits=0),
-            _number(row["live_worst_ms"], digits=1),
-            f"{100 * row['peak_over_limit']:+.1f} %",
-        )
-    out.print(table)
-    for row in r["rows"]:
-        for seed, why_not in row["failures"].items():
-            out.print(f"[bold red]{row['row']}[/], seed {seed}: {_plain(why_not)}", soft_wrap=True)
-
-
-def _soak_table(r: dict[str, Any]) -> None:
-    table = Table("simulated s", "memory MB", "files", "threads", box=None)
-    for s in r["samples"]:
-        table.add_row(
-            _number(s.simulated_s, digits=0), _number(s.memory_mb, digits=1), str(s.handles), str(s.threads)
-        )
-    out.print(table)
-    summary = {key: value for key, value in r.items() if key not in ("samples", "outcomes")}
-    _pairs({**summary, "outcomes": ", ".join(f"{n} {name}" for name, n in r["outcomes"].items())})
-
-
 def _agreed(servo: str, changes: list[Any], yes: bool) -> bool:
-    table = Table(servo, "is", "becomes", box=None, pad_edge=False)
-    for change in changes:
-        table.add_row(change.register, change.old, change.new)
-    err.print(table)
+    console.changes_table(servo, changes)
     try:
         return yes or typer.confirm(f"Write these to {servo}?", err=True)
     except typer.Abort as abort:
         if not isinstance(abort.__context__, EOFError):
             raise
-        err.print()
+        console.err.print()
         raise ConfigError(
             f"no answer came, so nothing was written to {servo}; say --yes where nobody can be asked"
         ) from abort
-
-
-def _setup_line(r: dict[str, Any]) -> None:
-    done = "set up, and read back" if r["applied"] else "left as it is"
-    out.print(f"servo {r['servo']}: {done if r['changes'] else 'nothing to change'}")
-
-
-def _plain(error: GripperError) -> str:
-    return str(error).replace("[", r"\[")

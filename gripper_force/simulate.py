@@ -23,8 +23,8 @@ from gripper_force.config import Config, config_from, config_from_text, dump_con
 from gripper_force.errors import ConfigError, SimulationError
 from gripper_force.interfaces import Camera
 from gripper_force.log import LogReader, LogWriter
+from gripper_force.recording.touches import ramp, touch, wait
 from gripper_force.session import Session, open_session, release, run_grasp
-from gripper_force.touches import ramp, touch, wait
 from gripper_force.types import Frame, Gray
 
 Kind = Literal["press", "grasp"]

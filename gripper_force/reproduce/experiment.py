@@ -21,7 +21,7 @@ from gripper_force.errors import DataError
 from gripper_force.evaluate import estimates
 from gripper_force.reproduce.models import MODELS, Scale
 from gripper_force.simulate import PROTOCOL_RATE_HZ, plan_protocol, simulate
-from gripper_force.train import train
+from gripper_force.training.train import train
 from gripper_force.vision.checkpoint import load_checkpoint
 
 Floats = npt.NDArray[np.float64]

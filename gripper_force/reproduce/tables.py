@@ -8,9 +8,9 @@ from typing import Final
 import numpy as np
 import torch
 
-from gripper_force.recipe import TrainConfig
 from gripper_force.reproduce.experiment import Test
 from gripper_force.reproduce.models import BASELINE, NETS, PROPOSED, SINGLE_FRAME, TWO_PLAIN
+from gripper_force.training.recipe import TrainConfig
 from gripper_force.types import NS_PER_MS
 from gripper_force.vision.network import ForceNetwork
 

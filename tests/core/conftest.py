@@ -10,7 +10,7 @@ import torch
 from gripper_force.config import dump_config, load_config
 from gripper_force.dataset import Clip
 from gripper_force.log import LogWriter
-from gripper_force.recipe import TrainConfig
+from gripper_force.training.recipe import TrainConfig
 from gripper_force.types import NS_PER_MS, Frame, LoadCellSample
 from gripper_force.vision.preprocess import Preprocess
 

@@ -12,7 +12,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from gripper_force import cli
+from gripper_force import cli, console
 from gripper_force.errors import ConfigError
 
 
@@ -332,7 +332,7 @@ def test_wrong_usage_is_told_by_the_parser(run: Run) -> None:
 
 def test_a_figure_that_is_no_number_is_null() -> None:
     value = {"a": float("nan"), "b": [1.5, float("inf")], "c": Path("x"), 3: (None, True)}
-    assert cli._jsonable(value) == {"a": None, "b": [1.5, None], "c": "x", "3": [None, True]}
+    assert console.jsonable(value) == {"a": None, "b": [1.5, None], "c": "x", "3": [None, True]}
 
 
 def test_options_win_over_overrides() -> None:

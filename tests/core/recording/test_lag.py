@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from gripper_force.lag import Floats, camera_lags_s, load_cell_lag_s
+from gripper_force.recording.lag import Floats, camera_lags_s, load_cell_lag_s
 from gripper_force.types import Gray
 
 SERVO_S = np.arange(0, 8, 0.005)

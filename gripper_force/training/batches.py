@@ -9,8 +9,8 @@ from torch import Tensor
 
 from gripper_force.dataset import CONTACT_N, Clip
 from gripper_force.errors import DataError
-from gripper_force.parallel import Ranks
-from gripper_force.recipe import TrainConfig
+from gripper_force.training.parallel import Ranks
+from gripper_force.training.recipe import TrainConfig
 from gripper_force.vision.dense import normalise
 
 

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gripper_force import record as module
 from gripper_force.config import Config, config_from_text, load_config
 from gripper_force.dataset import load_clip
 from gripper_force.errors import ConfigError, DataError, DeviceError
 from gripper_force.interfaces import Devices, LoadCell
 from gripper_force.log import LogReader
-from gripper_force.record import Plan, record
+from gripper_force.recording import record as module
+from gripper_force.recording.record import Plan, record
 from gripper_force.types import Frame, GraspStatus, LoadCellSample, Phase, Request, RequestKind
 from gripper_force.vision.preprocess import Preprocess
 from gripper_hw.dynamixel import virtual

@@ -16,12 +16,12 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from gripper_force import metrics
-from gripper_force.batches import Batches
 from gripper_force.dataset import Clip, check_size, digest, split_by
 from gripper_force.errors import CheckpointError, ConfigError
-from gripper_force.parallel import Ranks, joined
-from gripper_force.recipe import TrainConfig as TrainConfig
-from gripper_force.trainer import Trainer, estimates
+from gripper_force.training.batches import Batches
+from gripper_force.training.parallel import Ranks, joined
+from gripper_force.training.recipe import TrainConfig as TrainConfig
+from gripper_force.training.trainer import Trainer, estimates
 from gripper_force.vision.checkpoint import Checkpoint, Header, Residual, load_checkpoint, save_checkpoint
 
 STATE_EVERY_S: Final = 60.0

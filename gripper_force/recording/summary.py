@@ -12,8 +12,8 @@ import numpy.typing as npt
 from gripper_force.config import config_from_text
 from gripper_force.dataset import label_frames
 from gripper_force.errors import DataError
-from gripper_force.lag import camera_lags_s, load_cell_lag_s
 from gripper_force.log import LogReader
+from gripper_force.recording.lag import camera_lags_s, load_cell_lag_s
 from gripper_force.types import NS_PER_S, Frame, GraspStatus, LoadCellSample, Request, RequestKind
 from gripper_force.vision.preprocess import shrink
 
@@ -33,7 +33,7 @@ Summary = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class TouchLag:
-    """How the timestamps of one touch agree; NaN where that can't be told. See `gripper_force.lag`.
+    """How the timestamps of one touch agree; NaN where that can't be told. See `gripper_force.recording.lag`.
 
     Attributes:
         force_n: Force when the jaws were told to let go.
@@ -56,7 +56,7 @@ def summarise(paths: Sequence[Path]) -> Summary:
         ``lag_ms`` is the median over strong touches of the time by which the camera's timestamps are late
         against the load cell's (negative: early), ``lag_spread_ms`` half of the span of the middle 68 % of
         these. Its parts ``camera_lag_ms`` and ``load_cell_lag_ms`` are against the servo. See
-        `gripper_force.lag`.
+        `gripper_force.recording.lag`.
 
     Raises:
         LogError: A log can't be read.

@@ -9,12 +9,12 @@ import torch
 from typer.testing import CliRunner
 
 from gripper_force import cli
-from gripper_force import train as train_module
 from gripper_force.dataset import Clip, digest
 from gripper_force.errors import CheckpointError, ConfigError, DataError, NonFiniteError
-from gripper_force.recipe import TrainConfig
-from gripper_force.train import train
-from gripper_force.trainer import Trainer
+from gripper_force.training import train as train_module
+from gripper_force.training.recipe import TrainConfig
+from gripper_force.training.train import train
+from gripper_force.training.trainer import Trainer
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.dense import predict
 from gripper_force.vision.preprocess import Preprocess

@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gripper_force import recorded as module
 from gripper_force.config import load_config
 from gripper_force.errors import DataError
 from gripper_force.log import LogReader, LogWriter
-from gripper_force.record import Plan, record
-from gripper_force.recorded import summarise
+from gripper_force.recording import summary as module
+from gripper_force.recording.record import Plan, record
+from gripper_force.recording.summary import summarise
 from gripper_force.types import NS_PER_MS, Frame, LoadCellSample, Record
 
 Change = Callable[[Iterator[Record]], Iterable[Record]]

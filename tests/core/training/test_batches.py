@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 import torch
 
-from gripper_force.batches import Batches
 from gripper_force.dataset import Clip
-from gripper_force.parallel import Ranks
-from gripper_force.recipe import TrainConfig
+from gripper_force.training.batches import Batches
+from gripper_force.training.parallel import Ranks
+from gripper_force.training.recipe import TrainConfig
 from gripper_force.vision.dense import normalise
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -2,7 +2,7 @@
 
 A *set* is the paper's (section IV-A): some touches with random peaks, one log. Each begins with open jaws at
 rest, for the frames of the network's reference. Frames keep the camera's timestamps, and forces are found at
-these; `gripper_force.recorded` tells how far the two clocks agree.
+these; `gripper_force.recording.summary` tells how far the two clocks agree.
 
 The run is a grasp's: the same controller on motor current alone, with its limits. A set whose camera or load
 cell falls silent, or whose touches are not felt, is of no use, and ends the recording with a sentence.
@@ -24,8 +24,8 @@ from gripper_force.control.limits import largest_target_n
 from gripper_force.dataset import CONTACT_N
 from gripper_force.errors import ConfigError, DataError, DeviceError
 from gripper_force.interfaces import Devices
+from gripper_force.recording.touches import touch
 from gripper_force.session import Session, let_open, open_session, release
-from gripper_force.touches import touch
 from gripper_force.types import (
     NS_PER_MS,
     NS_PER_S,

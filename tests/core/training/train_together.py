@@ -10,12 +10,12 @@ import numpy as np
 import torch
 import torch.distributed as dist
 
-from gripper_force import train as train_module
 from gripper_force.dataset import Clip
 from gripper_force.errors import ConfigError
-from gripper_force.recipe import TrainConfig
-from gripper_force.train import train
-from gripper_force.trainer import Trainer
+from gripper_force.training import train as train_module
+from gripper_force.training.recipe import TrainConfig
+from gripper_force.training.train import train
+from gripper_force.training.trainer import Trainer
 from gripper_force.vision.preprocess import Preprocess
 
 

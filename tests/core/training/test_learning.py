@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 from gripper_force import cli
 from gripper_force.dataset import Clip
 from gripper_force.errors import ConfigError
-from gripper_force.learning import WAYS, Point, learn, reached
+from gripper_force.training.learning import WAYS, Point, learn, reached
 from gripper_force.vision.preprocess import Preprocess
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gripper_force.errors import ConfigError
-from gripper_force.parallel import Ranks, joined
+from gripper_force.training.parallel import Ranks, joined
 from gripper_force.vision.checkpoint import load_checkpoint
 
 SCRIPT = Path(__file__).with_name("train_together.py")

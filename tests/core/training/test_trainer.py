@@ -3,13 +3,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from gripper_force import trainer as trainer_module
-from gripper_force.batches import Batches
 from gripper_force.dataset import Clip
-from gripper_force.parallel import Ranks
-from gripper_force.recipe import TrainConfig
-from gripper_force.train import train
-from gripper_force.trainer import Trainer, one_cycle, squared_error, tenths
+from gripper_force.training import trainer as trainer_module
+from gripper_force.training.batches import Batches
+from gripper_force.training.parallel import Ranks
+from gripper_force.training.recipe import TrainConfig
+from gripper_force.training.train import train
+from gripper_force.training.trainer import Trainer, one_cycle, squared_error, tenths
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.network import ForceNetwork, NetworkConfig
 

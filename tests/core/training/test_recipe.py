@@ -1,7 +1,7 @@
 import pytest
 
 from gripper_force.errors import ConfigError
-from gripper_force.recipe import RECIPES, TrainConfig, recipe
+from gripper_force.training.recipe import RECIPES, TrainConfig, recipe
 
 
 def test_the_papers_recipe() -> None:

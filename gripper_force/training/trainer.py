@@ -12,11 +12,11 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from gripper_force.batches import Batches
 from gripper_force.dataset import Clip
 from gripper_force.errors import CheckpointError, NonFiniteError
-from gripper_force.parallel import Ranks, share_statistics
-from gripper_force.recipe import TrainConfig
+from gripper_force.training.batches import Batches
+from gripper_force.training.parallel import Ranks, share_statistics
+from gripper_force.training.recipe import TrainConfig
 from gripper_force.vision.dense import predict
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess
