@@ -66,7 +66,7 @@ def load_clips(
         source: A folder that is searched for ``*.mcap``, or the logs themselves.
         preprocess: Tells the size frames are reduced to.
         region: Region of interest in pixels; None for the one in each log's own configuration.
-        workers: Processes to read with.
+        workers: Processes to read with; 1 is this one.
         quiet: Whether to show no progress.
 
     Returns:
@@ -80,8 +80,10 @@ def load_clips(
     if not paths:
         raise DataError(f"no logs (*.mcap) in {source}; record, simulate or import some first")
     read = partial(load_clip, preprocess=preprocess, region=region)
+    console = Console(stderr=True, quiet=quiet)
+    if workers == 1:  # a process takes some seconds to begin
+        return list(track(map(read, paths), "reading logs", len(paths), console=console))
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        console = Console(stderr=True, quiet=quiet)
         return list(track(pool.map(read, paths), "reading logs", len(paths), console=console))
 
 
