@@ -123,7 +123,8 @@ def test_a_line_that_never_falls_silent_is_given_up():
 
     thread = threading.Thread(target=babble)
     thread.start()
-    assert PACKETS.ping(port, 1)[1] == sdk.COMM_RX_CORRUPT
+    # On a busy machine the other thread may come too late for one try.
+    assert any(PACKETS.ping(port, 1)[1] == sdk.COMM_RX_CORRUPT for _ in range(50))
     port.drain()
     done.set()
     port.clearPort()  # or the last write would wait for ever
