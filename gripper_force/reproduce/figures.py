@@ -98,7 +98,7 @@ def _look(axes: Axes, clip: Clip, index: int, network: ForceNetwork, preprocess:
     axes.imshow(overlay(gray, gates))
     axes.set_axis_off()
     axes.set_title(
-        f"{clip.object}, {clip.forces_n[index]:.1f} N", fontsize=8, fontweight="normal", loc="center"
+        f"{clip.object}, {abs(clip.forces_n[index]):.1f} N", fontsize=8, fontweight="normal", loc="center"
     )
 
 
