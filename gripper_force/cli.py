@@ -315,7 +315,7 @@ def reproduce(
     pictures.mkdir(parents=True, exist_ok=True)
     for name, figure in result.figures.items():
         figure.savefig(pictures / f"{name}.png")
-    text = page.markdown(result, scale, settings, test, pictures.name)
+    text = page.markdown(what, result, scale, settings, test, pictures.name)
     if write is not None:
         from gripper_force.report.markers import write_between
 

@@ -97,11 +97,13 @@ def _make(names: Sequence[str], test: Test | None, scale: Scale, out: Path, adva
     return Result(tuple(made), drawn)
 
 
-def markdown(result: Result, scale_name: str, scale: Scale, test: Test | None, pictures: str) -> str:
+def markdown(
+    what: str, result: Result, scale_name: str, scale: Scale, test: Test | None, pictures: str
+) -> str:
     """What was made, in Markdown; ``pictures`` is the folder of the figures, as the page names it."""
     recipe = f"{scale.size}x{scale.size} pixels, width {scale.width:g}, {scale.steps} steps a network"
     lines = [
-        f"Made by `gripper-force reproduce all --scale {scale_name}`:",
+        f"Made by `gripper-force reproduce {what} --scale {scale_name}`:",
         f"{recipe}, {scale.seeds} seeds.",
     ]
     if test is not None:

@@ -29,6 +29,7 @@ def test_a_figure_is_made_from_logs_and_put_into_a_page(touches: Path, tmp_path:
     assert picture.stat().st_size > 10_000
     text = page.read_text()
     assert "(paper/fig8.png)" in text
+    assert "`gripper-force reproduce fig8 --scale small`" in text
     assert "32x32 pixels, width 0.25, 2 steps a network, 1 seeds" in text
 
 
