@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import io
+import json
 import multiprocessing
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -123,10 +124,10 @@ def run(scale: Scale, models: Iterable[str], data: Path, out: Path, jobs: int, a
         advance: Told of each network that is done.
 
     Raises:
-        DataError: There are no logs of the protocol, or the folder holds networks of another scale.
+        DataError: There are no logs of the protocol, or ``out`` holds networks of another scale or data.
         CheckpointError: The folder holds networks of other data.
     """
-    _stamp(scale, out)
+    _stamp(scale, data, out)
     # A run that is broken off should have each network with the first seeds.
     nets = [(net, seed) for seed in range(scale.seeds) for net in networks(models)]
     missing = [pair for pair in nets if not _estimates_path(out, *pair).exists()]
@@ -171,13 +172,16 @@ def _estimates_path(out: Path, net: str, seed: int) -> Path:
     return out / f"{net}-{seed}.npy"
 
 
-def _stamp(scale: Scale, out: Path) -> None:
-    """Keeps networks of one scale in a folder."""
+def _stamp(scale: Scale, data: Path, out: Path) -> None:
+    """Keeps networks of one scale and one folder of data in a folder."""
     out.mkdir(parents=True, exist_ok=True)
-    stamp, text = out / "scale.json", scale.model_dump_json(exclude={"seeds"})
+    stamp = out / "made_of.json"
+    text = json.dumps([scale.model_dump(exclude={"seeds"}), str(data.resolve())])
     begun = any(out.glob("*.safetensors")) or any(out.glob("*.state"))
     if begun and not (stamp.exists() and stamp.read_text(encoding="utf-8") == text):
-        raise DataError(f"{out} holds networks of another scale; take another folder with --out")
+        raise DataError(
+            f"{out} holds networks of another scale or other data; take another folder with --out"
+        )
     stamp.write_text(text, encoding="utf-8")
 
 

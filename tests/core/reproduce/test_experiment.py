@@ -44,8 +44,10 @@ def test_networks_of_another_scale_are_not_mixed_in(
     ran: tuple[Estimates, Path, list[str]], touches: Path
 ) -> None:
     other = TINY.model_copy(update={"steps": 3})
-    with pytest.raises(DataError, match="another scale; take another folder"):
+    with pytest.raises(DataError, match="another scale or other data; take another folder"):
         run(other, [BASELINE], touches, ran[1], 1, lambda _: None)
+    with pytest.raises(DataError, match="another scale or other data; take another folder"):
+        run(TINY, [BASELINE], touches / "train", ran[1], 1, lambda _: None)
 
 
 def test_estimates_of_other_sets_are_refused(ran: tuple[Estimates, Path, list[str]], touches: Path) -> None:
