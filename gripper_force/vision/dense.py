@@ -37,7 +37,6 @@ def _standardise(frames: Tensor) -> Tensor:
     return (frames - mean) / std.clamp_min(FLAT_STD)
 
 
-@torch.inference_mode()
 def predict(
     networks: Sequence[ForceNetwork], preprocess: Preprocess, frames: Gray, device: str = "cpu"
 ) -> npt.NDArray[np.float32]:
@@ -52,12 +51,26 @@ def predict(
     Returns:
         Each member's forces in N, (members, T).
     """
+    return features(networks, preprocess, frames, device)[0]
+
+
+@torch.inference_mode()
+def features(
+    networks: Sequence[ForceNetwork], preprocess: Preprocess, frames: Gray, device: str = "cpu"
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """As `predict`, with what the members' last layers make their forces from.
+
+    Returns:
+        Each member's forces in N, (members, T), and the members' features side by side, (T, heads).
+    """
     clip = torch.from_numpy(frames)[None].to(device)  # (1, T, S, S)
     reference = clip[:, : preprocess.reference_frames] if preprocess.reference else None
     context = max(network.context for network in networks)
-    forces = []
+    forces, read = [], []
     for begin in range(0, clip.shape[1], CHUNK):
         first = max(0, begin - context)
         inputs = normalise(clip[:, first : begin + CHUNK], reference)
-        forces.append(torch.cat([network(inputs, begin - first) for network in networks]))  # (members, chunk)
-    return torch.cat(forces, dim=1).cpu().numpy()
+        part = [network.features(inputs, begin - first)[0] for network in networks]  # (chunk, head) each
+        forces.append(torch.stack([n.force_n(f) for n, f in zip(networks, part, strict=True)]))
+        read.append(torch.cat(part, dim=1))
+    return torch.cat(forces, dim=1).cpu().numpy(), torch.cat(read).cpu().numpy()

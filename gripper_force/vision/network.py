@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from gripper_force.config import Positive, Section
+from gripper_force.schema import Positive, Section
 from gripper_force.vision.attention import (
     Cbam,
     ChannelAttention,
@@ -112,12 +112,14 @@ class StreamState:
     Attributes:
         maps: Feature maps of the last n frames, (B, n, C, H, W).
         pooled: Pooled vectors of the last frames of the window, (B, window, C).
+        features: What the last layer makes the newest force from, (B, head).
         gates: Attention of the newest frame: of positions (B, 1, H, W) from SSAM and CBAM, of channels
             (B, C, 1, 1) from SCAM and SE, None without attention.
     """
 
     maps: Tensor
     pooled: Tensor
+    features: Tensor
     gates: Tensor | None
 
 
@@ -156,6 +158,11 @@ class ForceNetwork(nn.Module):
         Returns:
             Forces in N, (B, T - start).
         """
+        features = self.features(clips, start)  # (B, T - start, head)
+        return self.force_n(features.flatten(0, 1)).view(features.shape[:2])
+
+    def features(self, clips: Tensor, start: int = 0) -> Tensor:
+        """What the last layer makes each frame's force from, (B, T - start, head); see `forward`."""
         batch, length = clips.shape[:2]
         flat = self.backbone(clips.flatten(0, 1))  # (B*T, C, H, W)
         maps = flat.view(batch, length, *flat.shape[1:])
@@ -164,7 +171,13 @@ class ForceNetwork(nn.Module):
         window = self.config.window
         padded = torch.cat([pooled[:, :1].expand(-1, window - 1, -1), pooled], dim=1)
         windows = padded.unfold(1, window, 1)[:, start:].transpose(2, 3)  # (B, T - start, window, C)
-        return self._regress(windows.flatten(0, 1)).view(batch, length - start)
+        return self._read(windows.flatten(0, 1)).view(batch, length - start, -1)
+
+    def force_n(self, features: Tensor) -> Tensor:
+        """The last layer: features (N, head) to forces in N, (N,)."""
+        with torch.autocast(features.device.type, enabled=False):
+            force: Tensor = self.out(features).squeeze(1) * self.config.label_scale_n
+        return force
 
     def step(self, frame: Tensor, state: StreamState | None) -> tuple[Tensor, StreamState]:
         """Estimates the force for the next frame of a stream, exactly as `forward` would.
@@ -182,7 +195,8 @@ class ForceNetwork(nn.Module):
         pooled, gates = self._attend(maps)  # (B, 1, C)
         window = pooled.expand(-1, self.config.window, -1) if state is None else state.pooled
         window = torch.cat([window[:, 1:], pooled], dim=1)
-        return self._regress(window), StreamState(maps[:, 1:], window, gates)
+        features = self._read(window)
+        return self.force_n(features), StreamState(maps[:, 1:], window, features, gates)
 
     def _attend(self, maps: Tensor) -> tuple[Tensor, Tensor | None]:
         """Excites and pools the maps (B, n + T, C, H, W) that have n before them: (B, T, C), and gates."""
@@ -195,13 +209,11 @@ class ForceNetwork(nn.Module):
             newest, gates = self.attention(torch.cat(shifted, dim=2).flatten(0, 1), newest)
         return newest.mean((2, 3)).view(maps.shape[0], length, -1), gates
 
-    def _regress(self, windows: Tensor) -> Tensor:
-        """Maps windows of pooled vectors (N, window, C) to forces in N, (N,)."""
+    def _read(self, windows: Tensor) -> Tensor:
+        """Maps windows of pooled vectors (N, window, C) to features, (N, head)."""
         # Mixed precision is for the backbone; here it would save nothing and cost digits of the label.
         with torch.autocast(windows.device.type, enabled=False):
-            hidden = torch.tanh(self.dense(self.blstm(windows.to(self.dense.weight.dtype))))  # (N, head)
-            force: Tensor = self.out(hidden).squeeze(1) * self.config.label_scale_n
-        return force
+            return torch.tanh(self.dense(self.blstm(windows.to(self.dense.weight.dtype))))
 
 
 def _attention(config: NetworkConfig, channels: int, stride: int) -> nn.Module | None:

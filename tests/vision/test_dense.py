@@ -23,3 +23,15 @@ def test_chunks_make_no_difference(chunk: int, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(dense, "CHUNK", chunk)
     forces = dense.predict(networks, Preprocess(size=16), frames)
     np.testing.assert_allclose(forces, whole, rtol=1e-5, atol=1e-5)
+
+
+def test_features_are_what_the_last_layers_make_the_forces_from() -> None:
+    torch.manual_seed(0)
+    networks = [ForceNetwork(NetworkConfig(size=16, width=0.25, hidden=6, head=h)).eval() for h in (7, 5)]
+    frames = np.random.default_rng(0).integers(0, 256, (12, 16, 16), np.uint8)
+    forces, features = dense.features(networks, Preprocess(size=16), frames)
+    assert features.shape == (12, 7 + 5)
+    with torch.inference_mode():
+        parts = torch.from_numpy(features).split([7, 5], dim=1)
+        again = torch.stack([network.force_n(part) for network, part in zip(networks, parts, strict=True)])
+    np.testing.assert_array_equal(forces, again)
