@@ -1,4 +1,4 @@
-"""The four objects of Shin et al. 2019 (fig. 4) as deformable MuJoCo bodies, each at three levels of detail.
+"""The four objects of Shin et al. 2019 (fig. 4) and a gauge as MuJoCo bodies, each at three levels of detail.
 
 A level is a mesh and a time step. The finer one is what the coarser ones are measured against:
 docs/simulation.md has the table of speed against error.
@@ -20,6 +20,13 @@ Indices = npt.NDArray[np.int64]
 # Stiffer contacts than these chatter: 0 N dropouts and 50 N spikes were seen at solref .002.
 _SOFT_CONTACT = 'solref=".01 1" solimp=".9 .95 .001"'
 _SHELL_CONTACT = 'solref=".005 1" solimp=".95 .99 .001"'
+
+
+BLOCK_WIDTH_M = 0.030
+"""Width of the gauge ``block`` between the jaws."""
+
+GAUGES = frozenset({"block"})
+"""Objects that are known exactly: no size or stiffness is drawn for them."""
 
 
 @dataclass(frozen=True)
@@ -149,11 +156,24 @@ def _stapler(detail: Detail, size: float, stiffness: float) -> ObjectModel:
     return ObjectModel(body, _SOFT_CONTACT, None, 0.030 * s, dt)
 
 
+def _block(detail: Detail, size: float, _stiffness: float) -> ObjectModel:
+    # A load cell's body between the jaws: rigid, and free to centre and to align itself.
+    dt = {"coarse": 0.0025, "medium": 0.00125, "fine": 0.0005}[detail]
+    half = np.array([BLOCK_WIDTH_M / 2, 0.012, 0.020]) * size
+    body = f"""<body pos="0 0 {0.030 * size:.6g}">
+      <joint name="self_centre" type="slide" axis="1 0 0" stiffness="20" damping="8"/>
+      <joint name="self_align" type="hinge" axis="0 0 1" stiffness=".002" damping=".002"/>
+      <geom type="box" size="{_text(half)}" material="steel" mass=".1" contype="0" conaffinity="1" condim="3"
+            {_SOFT_CONTACT}/></body>"""
+    return ObjectModel(body, _SOFT_CONTACT, None, 0.030 * size, dt)
+
+
 OBJECTS: dict[str, Callable[[Detail, float, float], ObjectModel]] = {
     "sponge": _sponge,
     "paper_cup": _cup,
     "tube": _tube,
     "stapler": _stapler,
+    "block": _block,
 }
 
 

@@ -1,6 +1,6 @@
 """A scene: everything that is drawn from the seed, and the MJCF that it makes."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from string import Template
 
@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gripper_force.config import GripperConfig, SimConfig
-from gripper_hw.sim.objects import ObjectModel, build_object
+from gripper_hw.sim.objects import GAUGES, ObjectModel, build_object
 from gripper_hw.sim.textures import draw_textures
 
 LUX_LEVELS = (350.0, 550.0, 750.0)
@@ -78,6 +78,11 @@ class Scene:
 
 def draw_scene(object_name: str, seed: int, config: SimConfig) -> Scene:
     """Draws a scene. The same arguments give the same scene."""
+    scene = _draw(object_name, seed, config)
+    return replace(scene, size=1.0, stiffness=1.0) if object_name in GAUGES else scene
+
+
+def _draw(object_name: str, seed: int, config: SimConfig) -> Scene:
     rng = np.random.default_rng([seed, 0])
     lux = float(config.lux or rng.choice(LUX_LEVELS))
     if not config.randomise:

@@ -6,7 +6,7 @@ import pytest
 from gripper_force.config import GripperConfig
 from gripper_force.errors import ConfigError
 from gripper_hw.sim.engine import mujoco
-from gripper_hw.sim.objects import OBJECTS, Detail, build_object
+from gripper_hw.sim.objects import BLOCK_WIDTH_M, GAUGES, OBJECTS, Detail, build_object
 from gripper_hw.sim.scene import Scene, scene_mjcf
 
 DETAILS = get_args(Detail)
@@ -91,9 +91,30 @@ def test_every_object_takes_what_the_motor_gives(name: str) -> None:
     assert 0.005 < travel_m < 0.04
 
 
-@pytest.mark.parametrize("name", OBJECTS)
+@pytest.mark.parametrize("name", OBJECTS.keys() - GAUGES)
 def test_size_leaves_stiffness_alone_and_stiffness_scales_the_force(name: str) -> None:
     travel_m = travel_at(name, 4.0)
     for size in (0.96, 1.04):
         assert travel_at(name, 4.0, size=size) == pytest.approx(travel_m, rel=0.06)
     assert 0.94 < travel_at(name, 4.0, stiffness=1.05) / travel_m < 0.975
+
+
+@pytest.mark.parametrize("tool", ["pads", "rods"])
+@pytest.mark.parametrize("detail", DETAILS)
+def test_the_block_is_as_wide_as_it_is_said_to_be_and_reads_a_clean_force(detail: str, tool: str) -> None:
+    scene = Scene("block", detail, tool, yaw_deg=4, offset_m=(0.0015, 0.003))
+    model = mujoco.MjModel.from_xml_string(*scene_mjcf(scene, GripperConfig()))
+    model.dof_frictionloss[:] = 0
+    data = mujoco.MjData(model)
+    widths_m, forces_n = [], []
+    for asked_n in (3.0, 10.0, 3.0):
+        data.ctrl[0] = 2 * asked_n * RADIUS_M
+        model.dof_damping[model.joint("servo").dofadr] = asked_n * RADIUS_M / 0.8
+        end_s = data.time + 1.6
+        while data.time < end_s:
+            mujoco.mj_step(model, data)
+            forces_n.append(float(np.mean(np.abs(data.sensordata[[1, 5]]))))
+        assert forces_n[-1] == pytest.approx(asked_n, abs=0.01)
+        widths_m.append(GripperConfig().open_width_m - 2 * float(data.joint("right").qpos[0]))
+    assert max(forces_n) < 10.5
+    assert all(BLOCK_WIDTH_M - 0.002 < width_m < BLOCK_WIDTH_M for width_m in widths_m)  # tips give way

@@ -58,6 +58,11 @@ def test_stiffness_stays_within_its_spread_and_fills_it(spread: float) -> None:
     assert max(off) >= 0.8 * spread
 
 
+def test_a_gauge_is_known_exactly() -> None:
+    scene = draw_scene("block", 3, SimConfig(stiffness_spread=0.5))
+    assert replace(draw_scene("tube", 3, SimConfig()), object="block", size=1.0, stiffness=1.0) == scene
+
+
 def test_every_drawn_number_reaches_the_model() -> None:
     gripper = GripperConfig()
     plain = Scene("sponge", "coarse", "rods")
@@ -77,6 +82,7 @@ def test_no_name_is_left_unfilled_and_the_textures_are_there() -> None:
         ("paper_cup", "cup.png"),
         ("tube", "tube.png"),
         ("stapler", None),
+        ("block", None),
     ]:
         text, assets = scene_mjcf(Scene(name, "coarse"), GripperConfig())
         assert "$" not in text.split("-->", 1)[1]
