@@ -24,6 +24,8 @@ from gripper_force.errors import ConfigError, DataError, GripperError
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 import_app = typer.Typer(no_args_is_help=True, help="Turn other recordings into logs.")
 app.add_typer(import_app, name="import")
+calibrate_app = typer.Typer(no_args_is_help=True, help="Find out what this rig and its objects are like.")
+app.add_typer(calibrate_app, name="calibrate")
 
 ConfigPath = Annotated[Path | None, typer.Option("--config", help="YAML file with configuration keys.")]
 Overrides = Annotated[
@@ -301,9 +303,9 @@ def reproduce(
     as_json: AsJson = False,
 ) -> None:
     """Make the paper's tables and figures again, beside its own numbers. Goes on where it was broken off."""
-    from gripper_force.config import section_from
     from gripper_force.reproduce import page
     from gripper_force.reproduce.models import SCALES, Scale
+    from gripper_force.schema import section_from
 
     names = page.asked_for(what)
     if scale not in SCALES:

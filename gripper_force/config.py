@@ -1,33 +1,27 @@
 """The configuration: typed, with a default for everything, from YAML and ``--set key.path=value``."""
 
-from copy import deepcopy
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, Self, TypeVar
+from typing import Annotated, Final, Literal, Self
 
-import yaml
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
-from gripper_force.errors import ConfigError
-
-# No quantity of a gripper is beyond these, and what is computed from it stays finite.
-Positive = Annotated[float, Field(ge=1e-9, le=1e9, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
-Finite = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
+from gripper_force.rig import read_rig
+from gripper_force.schema import (
+    Finite,
+    NonNegative,
+    Positive,
+    Section,
+    Tree,
+    assign,
+    dump,
+    merged,
+    read_tree,
+    tree_from,
+    validated,
+)
 
 HARD_FORCE_LIMIT_N = 70.0
 """No configuration may allow more: the least finger limit that is quoted for hands."""
-
-
-class Section(BaseModel):
-    """Base of every section: immutable, and an unknown key is an error."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-S = TypeVar("S", bound=Section)
-
-_NO_YAML = (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, RecursionError)
-"""What the parser lets out: of a date such as 2001-99-99, a number such as 0b, a tag such as !!bool x."""
 
 
 class ServoConfig(Section):
@@ -189,6 +183,20 @@ class SimConfig(Section):
     exposure_ms: NonNegative = 4.0
 
 
+class CalibrationConfig(Section):
+    """What is known of this rig and of the object."""
+
+    rig: Path | None = Field(
+        None,
+        description="a rig profile of `gripper-force calibrate`: its values stand before the defaults and "
+        "give way to the configuration file and to --set",
+    )
+    object: str | None = Field(None, description="an object profile's name or path")
+    on_mismatch: Literal["refuse", "warn"] = Field(
+        "refuse", description="what to do where a profile is of another device than the run's"
+    )
+
+
 class LogConfig(Section):
     """Where runs are written."""
 
@@ -290,6 +298,7 @@ class Config(Section):
     vision: VisionConfig = VisionConfig()
     control: ControlConfig = ControlConfig()
     sim: SimConfig = SimConfig()
+    calibration: CalibrationConfig = CalibrationConfig()
     log: LogConfig = LogConfig()
     faults: tuple[FaultConfig, ...] = Field(
         (), description="faults to inject into the stand-ins: unit, kind, at_s, for_s"
@@ -297,7 +306,7 @@ class Config(Section):
 
 
 def load_config(path: Path | None = None, overrides: list[str] | None = None) -> Config:
-    """Builds the configuration from defaults, a YAML file, and overrides, in that order.
+    """Builds the configuration from defaults, a rig profile, a YAML file, and overrides, in that order.
 
     Args:
         path: YAML file, or None for the defaults.
@@ -306,98 +315,44 @@ def load_config(path: Path | None = None, overrides: list[str] | None = None) ->
     Raises:
         ConfigError: A file, key or value is wrong. The sentence names it.
     """
-    tree: dict[str, Any] = {}
-    if path is not None:
-        try:
-            text = path.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"can't read the configuration {path}: {error}") from error
-        tree = _tree(text, str(path))
+    tree = read_tree(path) if path is not None else {}
     for assignment in overrides or []:
-        _assign(tree, assignment)
-    return config_from(tree, str(path) if path else "--set")
+        assign(tree, assignment)
+    where = str(path) if path else "--set"
+    return config_from(merged(_rig_settings(tree, where), tree), where)
 
 
-def config_from(tree: dict[str, Any], where: str) -> Config:
-    """Validates a tree of keys. Raises `ConfigError` that names ``where``."""
-    return _validated(Config, tree, where)
-
-
-def section_from(section: type[S], overrides: list[str] | None, tree: dict[str, Any] | None = None) -> S:
-    """Builds a section on its own, such as a recipe, from its defaults and assignments ``key=value``.
-
-    Args:
-        section: What to build.
-        overrides: Assignments, which have the last word.
-        tree: Keys that differ from the defaults.
-
-    Raises:
-        ConfigError: A key or value is wrong.
-    """
-    tree = deepcopy(tree or {})
-    for assignment in overrides or []:
-        _assign(tree, assignment)
-    return _validated(section, tree, "--set")
-
-
-def _validated(section: type[S], tree: dict[str, Any], where: str) -> S:
-    try:
-        return section.model_validate(tree)
-    except ValidationError as error:
-        raise ConfigError(_sentence(section, error, where)) from error
+def config_from(tree: Tree, where: str) -> Config:
+    """Validates a tree of keys, and reads nothing else. Raises `ConfigError` that names ``where``."""
+    return validated(Config, tree, where)
 
 
 def config_from_text(text: str, where: str, overrides: list[str] | None = None) -> Config:
-    """Reads a configuration that `dump_config` wrote. Raises `ConfigError` that names ``where``."""
-    tree = _tree(text, where)
+    """Reads a configuration that `dump_config` wrote.
+
+    It holds what a rig profile set; one that the overrides name stands before it and gives way to them.
+
+    Raises:
+        ConfigError: A key or value is wrong. The sentence names it and ``where``.
+    """
+    given: Tree = {}
     for assignment in overrides or []:
-        _assign(tree, assignment)
+        assign(given, assignment)
+    tree = merged(tree_from(text, where), _rig_settings(given, "--set"))
+    for assignment in overrides or []:
+        assign(tree, assignment)
     return config_from(tree, where)
 
 
 def dump_config(config: Config) -> str:
     """The whole configuration as YAML."""
-    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+    return dump(config)
 
 
-def _tree(text: str, where: str) -> dict[str, Any]:
-    loaded = _parse(text, f"can't read the configuration {where}")
-    if not isinstance(loaded, dict | None):
-        raise ConfigError(f"{where} holds no mapping of keys to values at its top level")
-    return loaded or {}
-
-
-def _parse(text: str, what_fails: str) -> Any:
-    try:
-        return yaml.safe_load(text)
-    except _NO_YAML as error:
-        raise ConfigError(f"{what_fails}: {' '.join(str(error).split())}") from error
-
-
-def _assign(tree: dict[str, Any], assignment: str) -> None:
-    key, equals, text = assignment.partition("=")
-    if not equals or not key:
-        raise ConfigError(f"--set needs key.path=value, got {assignment!r}")
-    value = _parse(text, f"--set {key}: {text!r} is no value")
-    *parents, leaf = key.split(".")
-    for parent in parents:
-        tree = tree.setdefault(parent, {})
-        if not isinstance(tree, dict):
-            raise ConfigError(f"--set {key}: {parent!r} is a value, not a section")
-    tree[leaf] = value
-
-
-def _sentence(root: type[Section], error: ValidationError, where: str) -> str:
-    first = error.errors()[0]
-    parts = [str(part) for part in first["loc"]]
-    key = ".".join(parts)
-    if first["type"] == "extra_forbidden":
-        section: Any = root
-        for part in parts[:-1]:
-            section = FaultConfig if part.isdigit() else section.model_fields[part].annotation
-        known = ", ".join(section.model_fields)
-        return f"unknown configuration key {key!r} (from {where}); known here: {known}"
-    reason = first["msg"].removeprefix("Value error, ")
-    if not parts:
-        return f"the configuration (from {where}) does not fit together: {reason}"
-    return f"configuration key {key!r} (from {where}): {reason}, got {first['input']!r}"
+def _rig_settings(tree: Tree, where: str) -> Tree:
+    """What the rig profile sets that the tree names."""
+    section = tree.get("calibration")
+    if not isinstance(section, dict) or section.get("rig") is None:
+        return {}
+    calibration = validated(Config, {"calibration": section}, where).calibration
+    return read_rig(calibration.rig).settings() if calibration.rig is not None else {}

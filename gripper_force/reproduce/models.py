@@ -4,7 +4,7 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field
 
-from gripper_force.config import Section
+from gripper_force.schema import Section
 from gripper_force.training.recipe import TrainConfig
 from gripper_force.vision.preprocess import Preprocess
 

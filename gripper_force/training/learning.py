@@ -11,10 +11,10 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from gripper_force import metrics
-from gripper_force.config import section_from
 from gripper_force.dataset import Clip, split_by
 from gripper_force.errors import ConfigError
 from gripper_force.report.figure import STYLE
+from gripper_force.schema import section_from
 from gripper_force.training.batches import Batches
 from gripper_force.training.parallel import joined
 from gripper_force.training.recipe import RECIPES, TrainConfig

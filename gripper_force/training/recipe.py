@@ -4,8 +4,8 @@ from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
-from gripper_force.config import NonNegative, Positive, Section, section_from
 from gripper_force.errors import ConfigError
+from gripper_force.schema import NonNegative, Positive, Section, section_from
 from gripper_force.vision.attention import Pooling
 from gripper_force.vision.network import Attention, BackboneName, NetworkConfig
 from gripper_force.vision.preprocess import Preprocess

@@ -13,8 +13,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
-from gripper_force.config import Finite, NonNegative, Section
 from gripper_force.errors import CheckpointError
+from gripper_force.schema import Finite, NonNegative, Section
 from gripper_force.vision.network import ForceNetwork, NetworkConfig
 from gripper_force.vision.preprocess import Preprocess
 

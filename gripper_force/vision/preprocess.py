@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from gripper_force.config import Section
 from gripper_force.errors import ConfigError, DataError
+from gripper_force.schema import Section
 from gripper_force.types import Gray
 
 Region = tuple[int, int, int, int]

@@ -8,12 +8,10 @@ from hypothesis import strategies as st
 from gripper_force.config import (
     HARD_FORCE_LIMIT_N,
     Config,
-    ControlConfig,
     config_from,
     config_from_text,
     dump_config,
     load_config,
-    section_from,
 )
 from gripper_force.errors import ConfigError
 
@@ -150,10 +148,39 @@ def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:
     assert load_config(path) == Config()
 
 
-def test_a_section_stands_alone() -> None:
-    assert section_from(ControlConfig, ["ramp_n_s=3"]) == ControlConfig(ramp_n_s=3)
-    with pytest.raises(ConfigError, match=r"unknown configuration key 'ramp'.*ramp_n_s"):
-        section_from(ControlConfig, ["ramp=3"])
+RIG = """
+format: gripper-force-rig/1
+load_cell:
+  {date: 2026-01-02T03:04:05Z, sensor: serial hx711, tare_raw: {value: 8000}, n_per_raw: {value: 1.0e-4},
+   force_n: [0, 20], noise_n: 0.01, drift_n_min: {value: 0.0}}
+"""
+
+
+def test_a_rig_profile_stands_before_the_defaults_and_gives_way_to_file_and_set(tmp_path: Path) -> None:
+    rig, scene = tmp_path / "rig.yaml", tmp_path / "scene.yaml"
+    rig.write_text(RIG)
+    scene.write_text(f"calibration: {{rig: {rig}}}\nload_cell: {{tare_raw: 7000, backend: serial}}")
+    cell = load_config(scene).load_cell
+    assert (cell.tare_raw, cell.n_per_raw, cell.backend) == (7000, 1e-4, "serial")
+    cell = load_config(None, [f"calibration.rig={rig}", "load_cell.n_per_raw=2"]).load_cell
+    assert (cell.tare_raw, cell.n_per_raw) == (8000, 2)
+
+
+def test_a_log_keeps_its_values_unless_a_rig_profile_is_named(tmp_path: Path) -> None:
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(RIG)
+    logged = dump_config(load_config(None, [f"calibration.rig={rig}", "load_cell.tare_raw=7000"]))
+    again = ["load_cell.n_per_raw=2", f"calibration.rig={rig}"]
+    assert config_from_text(logged, "run.mcap", again).load_cell.tare_raw == 8000
+    assert config_from_text(logged, "run.mcap", again).load_cell.n_per_raw == 2
+    rig.unlink()
+    assert config_from_text(logged, "run.mcap").load_cell.tare_raw == 7000
+
+
+@pytest.mark.parametrize("value", ["/no/such.yaml", "[1]", "3"])
+def test_a_rig_profile_that_is_none_is_named(value: str) -> None:
+    with pytest.raises(ConfigError, match=r"rig"):
+        load_config(None, [f"calibration.rig={value}"])
 
 
 @pytest.mark.parametrize("text", ["a: [1", "object: {a: 1}"])

@@ -1,0 +1,142 @@
+"""What all that is typed and kept as YAML shares: sections, numbers, reading, and the error's sentence."""
+
+from copy import deepcopy
+from inspect import isclass
+from pathlib import Path
+from typing import Annotated, Any, TypeVar, get_args
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from gripper_force.errors import ConfigError
+
+# No quantity of a gripper is beyond these, and what is computed from it stays finite.
+Positive = Annotated[float, Field(ge=1e-9, le=1e9, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
+Finite = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
+
+Tree = dict[str, Any]
+"""Keys to values and to trees."""
+
+
+class Section(BaseModel):
+    """Base of every section: immutable, and an unknown key is an error."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+S = TypeVar("S", bound=Section)
+
+_NO_YAML = (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, RecursionError)
+"""What the parser lets out: of a date such as 2001-99-99, a number such as 0b, a tag such as !!bool x."""
+
+
+def read_tree(path: Path, what: str = "configuration") -> Tree:
+    """The keys of a YAML file. Raises `ConfigError` that names it."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"can't read the {what} {path}: {error}") from error
+    return tree_from(text, str(path), what)
+
+
+def tree_from(text: str, where: str, what: str = "configuration") -> Tree:
+    """The keys of a YAML text. Raises `ConfigError` that names ``where``."""
+    loaded = _parse(text, f"can't read the {what} {where}")
+    if not isinstance(loaded, dict | None):
+        raise ConfigError(f"{where} holds no mapping of keys to values at its top level")
+    return loaded or {}
+
+
+def dump(section: Section) -> str:
+    """A whole section as YAML."""
+    return yaml.safe_dump(section.model_dump(mode="json"), sort_keys=False)
+
+
+def assign(tree: Tree, assignment: str) -> None:
+    """Puts ``key.path=value`` into a tree; the value is read as YAML. Raises `ConfigError`."""
+    key, equals, text = assignment.partition("=")
+    if not equals or not key:
+        raise ConfigError(f"--set needs key.path=value, got {assignment!r}")
+    value = _parse(text, f"--set {key}: {text!r} is no value")
+    *parents, leaf = key.split(".")
+    for parent in parents:
+        tree = tree.setdefault(parent, {})
+        if not isinstance(tree, dict):
+            raise ConfigError(f"--set {key}: {parent!r} is a value, not a section")
+    tree[leaf] = value
+
+
+def merged(under: Tree, over: Tree) -> Tree:
+    """A tree with the keys of both; where both have one, it is the second's."""
+    both = dict(under)
+    for key, value in over.items():
+        below = both.get(key)
+        both[key] = merged(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
+    return both
+
+
+def section_from(section: type[S], overrides: list[str] | None, tree: Tree | None = None) -> S:
+    """Builds a section on its own, such as a recipe, from its defaults and assignments ``key=value``.
+
+    Args:
+        section: What to build.
+        overrides: Assignments, which have the last word.
+        tree: Keys that differ from the defaults.
+
+    Raises:
+        ConfigError: A key or value is wrong.
+    """
+    tree = deepcopy(tree or {})
+    for assignment in overrides or []:
+        assign(tree, assignment)
+    return validated(section, tree, "--set")
+
+
+def validated(section: type[S], tree: Tree, where: str, what: str = "configuration") -> S:
+    """Builds a section from a tree of keys.
+
+    Args:
+        section: What to build.
+        tree: Keys that differ from the defaults.
+        where: Where they come from, for the error.
+        what: What the section is, for the error.
+
+    Raises:
+        ConfigError: A key or value is wrong.
+    """
+    try:
+        return section.model_validate(tree)
+    except ValidationError as error:
+        raise ConfigError(_sentence(section, error, where, what)) from error
+
+
+def _parse(text: str, what_fails: str) -> Any:
+    try:
+        return yaml.safe_load(text)
+    except _NO_YAML as error:
+        raise ConfigError(f"{what_fails}: {' '.join(str(error).split())}") from error
+
+
+def _sentence(root: type[Section], error: ValidationError, where: str, what: str) -> str:
+    first = error.errors()[0]
+    parts = [str(part) for part in first["loc"]]
+    key = ".".join(parts)
+    if first["type"] == "extra_forbidden":
+        known = ", ".join(_section_at(root, parts[:-1]).model_fields)
+        return f"unknown {what} key {key!r} (from {where}); known here: {known}"
+    reason = first["msg"].removeprefix("Value error, ")
+    if not parts:
+        return f"the {what} (from {where}) does not fit together: {reason}"
+    return f"{what} key {key!r} (from {where}): {reason}, got {first['input']!r}"
+
+
+def _section_at(root: type[Section], parts: list[str]) -> type[Section]:
+    """The section that a path leads to, through optional sections and tuples of sections."""
+    section = root
+    for part in parts:
+        if part in section.model_fields:
+            annotation = section.model_fields[part].annotation
+            kinds = (annotation, *get_args(annotation))
+            section = next(kind for kind in kinds if isclass(kind) and issubclass(kind, Section))
+    return section

@@ -1,0 +1,76 @@
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gripper_force.errors import ConfigError
+from gripper_force.schema import (
+    Section,
+    Tree,
+    assign,
+    dump,
+    merged,
+    read_tree,
+    section_from,
+    tree_from,
+    validated,
+)
+
+
+class Part(Section):
+    size: int = 1
+
+
+class Whole(Section):
+    part: Part | None = None
+    parts: tuple[Part, ...] = ()
+    name: str = "one"
+
+
+trees = st.recursive(
+    st.integers(), lambda inner: st.dictionaries(st.sampled_from("abc"), inner, max_size=3), max_leaves=9
+)
+mappings = st.dictionaries(st.sampled_from("abc"), trees, max_size=3)
+
+
+@given(mappings, mappings)
+def test_merging_keeps_every_key_and_the_second_has_the_last_word(under: Tree, over: Tree) -> None:
+    both = merged(under, over)
+    assert set(both) == set(under) | set(over)
+    assert merged(both, over) == both
+    assert merged({}, over) == over == merged(over, {})
+
+
+def test_what_is_dumped_is_read_back(tmp_path: Path) -> None:
+    whole = Whole(part=Part(size=3), parts=(Part(), Part(size=2)))
+    path = tmp_path / "whole.yaml"
+    path.write_text(dump(whole))
+    assert validated(Whole, read_tree(path), "there") == whole
+
+
+@pytest.mark.parametrize("tree", [{"part": {"sise": 1}}, {"parts": [{}, {"sise": 1}]}])
+def test_an_unknown_key_is_named_with_those_of_its_section(tree: Tree) -> None:
+    with pytest.raises(
+        ConfigError, match=r"unknown profile key 'part.*sise' \(from there\); known here: size$"
+    ):
+        validated(Whole, tree, "there", "profile")
+
+
+def test_a_wrong_value_is_named_with_what_it_is_of() -> None:
+    with pytest.raises(ConfigError, match=r"profile key 'part.size' \(from there\): .*, got 'big'"):
+        validated(Whole, {"part": {"size": "big"}}, "there", "profile")
+    with pytest.raises(ConfigError, match="can't read the profile there"):
+        tree_from("a: [1", "there", "profile")
+
+
+def test_a_section_stands_alone() -> None:
+    assert section_from(Part, ["size=3"], {"size": 2}) == Part(size=3)
+    with pytest.raises(ConfigError, match=r"unknown configuration key 'sise'.*size"):
+        section_from(Part, ["sise=3"])
+
+
+def test_an_assignment_makes_the_sections_it_needs() -> None:
+    tree: Tree = {}
+    assign(tree, "a.b=[1, 2]")
+    assert tree == {"a": {"b": [1, 2]}}
