@@ -34,4 +34,4 @@ def test_features_are_what_the_last_layers_make_the_forces_from() -> None:
     with torch.inference_mode():
         parts = torch.from_numpy(features).split([7, 5], dim=1)
         again = torch.stack([network.force_n(part) for network, part in zip(networks, parts, strict=True)])
-    np.testing.assert_array_equal(forces, again)
+    np.testing.assert_allclose(forces, again, rtol=1e-6)
