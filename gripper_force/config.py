@@ -176,6 +176,20 @@ class SimConfig(Section):
     randomise: bool = Field(
         True, description="draw size, pose, camera, texture, light and motor from the seed"
     )
+    object_seed: int | None = Field(
+        None,
+        ge=0,
+        description="draws what the object itself is: size, stiffness, texture; None: the run's seed does",
+    )
+    rig_seed: int | None = Field(
+        None,
+        ge=0,
+        description="draws the gripper and what is around it: camera, light, noise, table, motor, friction, "
+        "gears, rods; None: the run's seed does",
+    )
+    size_spread: float = Field(
+        0.04, ge=0, le=0.15, description="half-width of the uniform spread of the object's size"
+    )
     stiffness_spread: float = Field(
         0.05, ge=0, le=0.5, description="half-width of the uniform spread of the object's stiffness"
     )

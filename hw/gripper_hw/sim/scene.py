@@ -43,7 +43,8 @@ class Scene:
         lux: Illumination.
         light_direction: Direction of the key light.
         light_ambient: Share of the light that comes from everywhere.
-        texture_seed: Seed of the textures.
+        texture_seed: Seed of the object's texture.
+        table_seed: Seed of the table's.
         shot_noise: Photon noise at full scale.
         nm_per_a: True torque constant over the catalogue's.
         servo_friction_nm: Coulomb friction of motor and gears at the horn.
@@ -67,6 +68,7 @@ class Scene:
     light_direction: tuple[float, float, float] = (-0.40, 0.55, -0.75)
     light_ambient: float = 0.30
     texture_seed: int = 0
+    table_seed: int = 0
     shot_noise: float = 0.020
     nm_per_a: float = 1.0
     servo_friction_nm: float = 0.030
@@ -77,9 +79,28 @@ class Scene:
 
 
 def draw_scene(object_name: str, seed: int, config: SimConfig) -> Scene:
-    """Draws a scene. The same arguments give the same scene."""
-    scene = _draw(object_name, seed, config)
-    return replace(scene, size=1.0, stiffness=1.0) if object_name in GAUGES else scene
+    """Draws a scene. The same arguments give the same scene.
+
+    Args:
+        object_name: The object's name.
+        seed: Draws how the object is placed, and whatever ``config`` names no seed for.
+        config: What else is asked for: ``object_seed`` draws the object itself, ``rig_seed`` the gripper and
+            its surroundings.
+    """
+
+    def drawn(own_seed: int | None) -> Scene:
+        return _draw(object_name, seed if own_seed is None else own_seed, config)
+
+    placed, itself, rig = drawn(None), drawn(config.object_seed), drawn(config.rig_seed)
+    known = object_name in GAUGES
+    return replace(
+        rig,
+        size=1.0 if known else itself.size,
+        stiffness=1.0 if known else itself.stiffness,
+        texture_seed=itself.texture_seed,
+        offset_m=placed.offset_m,
+        yaw_deg=placed.yaw_deg,
+    )
 
 
 def _draw(object_name: str, seed: int, config: SimConfig) -> Scene:
@@ -98,7 +119,7 @@ def _draw(object_name: str, seed: int, config: SimConfig) -> Scene:
         object_name,
         config.detail,
         config.tool,
-        size=float(rng.uniform(0.96, 1.04)),
+        size=float(rng.uniform(1 - config.size_spread, 1 + config.size_spread)),
         stiffness=float(1 + rng.uniform(-1, 1) * config.stiffness_spread),
         offset_m=(x, y),
         yaw_deg=config.yaw_deg + float(rng.uniform(-4, 4)),
@@ -108,7 +129,8 @@ def _draw(object_name: str, seed: int, config: SimConfig) -> Scene:
         lux=lux * float(rng.uniform(0.95, 1.05)),
         light_direction=(-0.40 + light[0], 0.55 + light[1], -0.75 + light[2]),
         light_ambient=float(rng.uniform(0.22, 0.38)),
-        texture_seed=int(rng.integers(2**31)),
+        texture_seed=(textures := int(rng.integers(2**31))),
+        table_seed=textures,
         shot_noise=float(rng.uniform(0.012, 0.024)),
         nm_per_a=float(rng.uniform(0.92, 1.08)),
         servo_friction_nm=float(rng.uniform(0.021, 0.039)),
@@ -156,7 +178,7 @@ def scene_mjcf(scene: Scene, gripper: GripperConfig) -> tuple[str, dict[str, byt
         backlash_m=scene.backlash_m,
         pinion_radius_m=gripper.pinion_radius_m,
     )
-    return text, draw_textures(model.texture, scene.texture_seed)
+    return text, draw_textures(model.texture, scene.texture_seed, scene.table_seed)
 
 
 def _tool(scene: Scene, side: int) -> str:

@@ -8,11 +8,12 @@ Image = npt.NDArray[np.uint8]
 _SIDE = 256
 
 
-def draw_textures(object_texture: str | None, seed: int) -> dict[str, bytes]:
+def draw_textures(object_texture: str | None, seed: int, table_seed: int) -> dict[str, bytes]:
     """PNG files by name: the table and, if the object has one, its own."""
-    rng = np.random.default_rng(seed)
-    images = {"table.png": _table(rng)}
+    images = {"table.png": _table(np.random.default_rng(table_seed))}
     if object_texture is not None:
+        rng = np.random.default_rng(seed)
+        _table(rng)  # objects of one seed keep their texture: this was once the only table
         images[object_texture] = {"sponge.png": _sponge, "cup.png": _cup, "tube.png": _tube}[object_texture](
             rng
         )

@@ -1,6 +1,8 @@
 from dataclasses import asdict, replace
 
 import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
 
 from gripper_force.config import GripperConfig, SimConfig
 from gripper_force.errors import ConfigError
@@ -50,6 +52,36 @@ def test_rods_are_mounted_anew_for_each_scene_and_that_changes_nothing_else() ->
     assert 0.017 <= min(lengths_m) < 0.018 < 0.022 < max(lengths_m) <= 0.023
 
 
+@given(st.integers(0, 2**32), st.integers(0, 2**32), st.integers(0, 2**32))
+def test_one_object_on_one_rig_is_touched_again_in_another_place(own: int, seed: int, other: int) -> None:
+    assume(seed != other)
+    config = SimConfig(object_seed=own, rig_seed=own + 1, size_spread=0.15)
+    first, again = (asdict(draw_scene("tube", s, config)) for s in (seed, other))
+    assert {name for name in first if first[name] != again[name]} == {"offset_m", "yaw_deg"}
+    itself = {"size", "stiffness", "texture_seed"}
+    drawn = SimConfig(size_spread=0.15)
+    of_object, of_rig = (asdict(draw_scene("tube", s, drawn)) for s in (own, own + 1))
+    for name in first.keys() - {"offset_m", "yaw_deg"}:
+        assert first[name] == (of_object if name in itself else of_rig)[name], name
+
+
+def test_the_texture_goes_with_the_object_and_the_table_with_the_rig() -> None:
+    def textures(**seeds: int) -> dict[str, bytes]:
+        return scene_mjcf(draw_scene("tube", 1, SimConfig(**seeds)), GripperConfig())[1]  # type: ignore[arg-type]
+
+    plain, other_object, other_rig = textures(), textures(object_seed=2), textures(rig_seed=2)
+    assert plain["table.png"] == other_object["table.png"] != other_rig["table.png"]
+    assert plain["tube.png"] == other_rig["tube.png"] != other_object["tube.png"]
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.15])
+def test_size_stays_within_its_spread_and_fills_it(spread: float) -> None:
+    config = SimConfig(size_spread=spread)
+    off = [abs(draw_scene("tube", seed, config).size - 1) for seed in range(50)]
+    assert max(off) <= spread + 1e-12
+    assert max(off) >= 0.8 * spread
+
+
 @pytest.mark.parametrize("spread", [0.0, 0.3])
 def test_stiffness_stays_within_its_spread_and_fills_it(spread: float) -> None:
     config = SimConfig(stiffness_spread=spread)
@@ -70,7 +102,7 @@ def test_every_drawn_number_reaches_the_model() -> None:
     drawn = asdict(draw_scene("sponge", 1, SimConfig(tool="rods")))
     for name in drawn.keys() - {"object", "detail", "tool", "lux", "shot_noise", "nm_per_a"}:
         after = scene_mjcf(replace(plain, **{name: drawn[name]}), gripper)
-        if name != "texture_seed":
+        if name not in ("texture_seed", "table_seed"):
             assert after[0] != before[0], name
         else:
             assert after[1] != before[1]
