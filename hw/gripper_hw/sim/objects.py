@@ -1,6 +1,6 @@
-"""The four objects of Shin et al. 2019 (fig. 4) and a gauge as MuJoCo bodies, each at three levels of detail.
+"""The four objects of Shin et al. 2019 (fig. 4), a ball and a gauge as MuJoCo bodies, at three levels each.
 
-A level is a mesh and a time step. The finer one is what the coarser ones are measured against:
+A level of detail is a mesh and a time step. The finer one is what the coarser ones are measured against:
 docs/simulation.md has the table of speed against error.
 """
 
@@ -27,6 +27,9 @@ BLOCK_WIDTH_M = 0.030
 
 GAUGES = frozenset({"block"})
 """Objects that are known exactly: no size or stiffness is drawn for them."""
+
+FOR_PADS_ALONE = frozenset({"ball"})
+"""Objects that the tip of a rod would dent until their mesh turns inside out."""
 
 
 @dataclass(frozen=True)
@@ -168,13 +171,56 @@ def _block(detail: Detail, size: float, _stiffness: float) -> ObjectModel:
     return ObjectModel(body, _SOFT_CONTACT, None, 0.030 * size, dt)
 
 
+def _ball(detail: Detail, size: float, stiffness: float) -> ObjectModel:
+    cells, dt = {"coarse": (4, 0.0025), "medium": (6, 0.0025), "fine": (8, 0.00125)}[detail]
+    radius = 0.024 * size
+    points, tetrahedra = _solid_ball(cells)
+    # Seen from the front: the angle from there is the distance from the texture's middle.
+    across = points[:, [0, 2]] / np.maximum(np.hypot(points[:, 0], points[:, 2]), 1e-9)[:, None]
+    uv = 0.5 + across * (np.arccos(np.clip(-points[:, 1], -1, 1)) / (2 * np.pi))[:, None]
+    points = points * radius + [0, 0, radius + 0.001]
+    pins = np.flatnonzero(points[:, 2] < 0.001 + 0.15 * radius)
+    young = 9.0e4 * stiffness / size**0.75  # between a block's 1 and the 1/2 of two spheres that just touch
+    body = f"""<flexcomp name="object" type="direct" dim="3" mass=".2" radius=".001" material="object"
+      point="{_text(points)}" element="{_text(tetrahedra)}" texcoord="{_text(uv)}">
+      <contact selfcollide="none" condim="3" friction=".6" {_SHELL_CONTACT}/>
+      <elasticity young="{young:.6g}" poisson=".2" damping=".01"/>
+      <pin id="{_text(pins)}"/></flexcomp>"""
+    return ObjectModel(body, _SHELL_CONTACT, "ball.png", radius, dt)
+
+
 OBJECTS: dict[str, Callable[[Detail, float, float], ObjectModel]] = {
     "sponge": _sponge,
     "paper_cup": _cup,
     "tube": _tube,
     "stapler": _stapler,
+    "ball": _ball,
     "block": _block,
 }
+
+
+def _solid_ball(cells: int) -> tuple[Points, Indices]:
+    """Points (N, 3) of a unit ball and tetrahedra (M, 4): a cube of cells, blown up to a ball."""
+    count = cells + 1
+    cube = np.stack(np.meshgrid(*[np.linspace(-1, 1, count)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    u, v = np.roll(cube, -1, axis=1) ** 2, np.roll(cube, -2, axis=1) ** 2
+    points = cube * np.sqrt(1 - u / 2 - v / 2 + u * v / 3)
+    number = np.arange(count**3).reshape(count, count, count)
+    tetrahedra = []
+    for i, j, k in np.ndindex(cells, cells, cells):
+        # Neighbours are mirrored, so that their diagonals meet.
+        (a, b, c, d), (e, f, g, h) = (
+            number[i + x, j : j + 2, k : k + 2].ravel() for x in ((0, 1) if (i + j + k) % 2 else (1, 0))
+        )
+        tetrahedra += [(a, b, c, e), (d, c, b, h), (f, e, h, b), (g, h, e, c), (b, c, e, h)]
+    return points, _outward(points, np.array(tetrahedra))
+
+
+def _outward(points: Points, tetrahedra: Indices) -> Indices:
+    """The same tetrahedra with corners in such an order that each volume is positive."""
+    corners = points[tetrahedra]  # (M, 4, 3)
+    negative = np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0
+    return np.where(negative[:, None], tetrahedra[:, [0, 1, 3, 2]], tetrahedra)
 
 
 def _shell_of_revolution(

@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gripper_force.config import GripperConfig, SimConfig
-from gripper_hw.sim.objects import GAUGES, ObjectModel, build_object
+from gripper_force.errors import ConfigError
+from gripper_hw.sim.objects import FOR_PADS_ALONE, GAUGES, ObjectModel, build_object
 from gripper_hw.sim.textures import draw_textures
 
 LUX_LEVELS = (350.0, 550.0, 750.0)
@@ -143,7 +144,9 @@ def _draw(object_name: str, seed: int, config: SimConfig) -> Scene:
 
 
 def scene_mjcf(scene: Scene, gripper: GripperConfig) -> tuple[str, dict[str, bytes]]:
-    """MJCF text and its assets. Raises `ConfigError` for an unknown object."""
+    """MJCF text and its assets. Raises `ConfigError` for an unknown object, or a tool not for it."""
+    if scene.tool == "rods" and scene.object in FOR_PADS_ALONE:
+        raise ConfigError(f"rods would dent the simulated {scene.object} beyond its model; set sim.tool=pads")
     model = build_object(scene.object, scene.detail, scene.size, scene.stiffness)  # type: ignore[arg-type]
     grip = np.array([0.0, 0.0, model.grip_height_m])
     position = grip + _CAMERA_FROM_GRIP_M + scene.camera_offset_m

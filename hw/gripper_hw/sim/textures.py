@@ -14,9 +14,7 @@ def draw_textures(object_texture: str | None, seed: int, table_seed: int) -> dic
     if object_texture is not None:
         rng = np.random.default_rng(seed)
         _table(rng)  # objects of one seed keep their texture: this was once the only table
-        images[object_texture] = {"sponge.png": _sponge, "cup.png": _cup, "tube.png": _tube}[object_texture](
-            rng
-        )
+        images[object_texture] = _OF_OBJECTS[object_texture](rng)
     return {name: cv2.imencode(".png", image)[1].tobytes() for name, image in images.items()}
 
 
@@ -70,3 +68,14 @@ def _tube(rng: np.random.Generator) -> Image:
         y = int((j + 0.5) * _SIDE / 6)
         cv2.line(image, (0, y), (_SIDE, y), (215, 220, 215), 5)
     return image
+
+
+def _ball(rng: np.random.Generator) -> Image:
+    image = np.full((_SIDE, _SIDE, 3), (60, 130, 200), np.uint8)
+    bands = _clouds(rng, 14)
+    image[np.abs(bands) < 0.35] = (200, 220, 235)
+    image[bands > 1.1] = (60, 60, 70)
+    return image
+
+
+_OF_OBJECTS = {"sponge.png": _sponge, "cup.png": _cup, "tube.png": _tube, "ball.png": _ball}

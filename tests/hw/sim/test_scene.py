@@ -114,6 +114,7 @@ def test_no_name_is_left_unfilled_and_the_textures_are_there() -> None:
         ("paper_cup", "cup.png"),
         ("tube", "tube.png"),
         ("stapler", None),
+        ("ball", "ball.png"),
         ("block", None),
     ]:
         text, assets = scene_mjcf(Scene(name, "coarse"), GripperConfig())
