@@ -32,6 +32,9 @@ Overrides = Annotated[
     list[str] | None, typer.Option("--set", help="Set one configuration key: key.path=value. Repeatable.")
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
+RigPath = Annotated[
+    Path, typer.Option("--rig", help="Rig profile to write; only what is calibrated is replaced in it.")
+]
 Jobs = Annotated[int, typer.Option(min=1, help="Processes to use.")]
 
 _INTERRUPTED = 130
@@ -381,6 +384,38 @@ def import_database(
     console.show({"environments": rows, "ignored": ignored}, as_json, console.database_table)
 
 
+@calibrate_app.command("load-cell")
+def calibrate_load_cell(
+    mass_kg: Annotated[float | None, typer.Option(help="Known mass to put on the load cell.")] = None,
+    force_n: Annotated[float | None, typer.Option(help="Its weight, instead.")] = None,
+    rig: RigPath = Path("rig.yaml"),
+    seconds: Annotated[float, typer.Option(min=1, help="How long to read each load.")] = 10.0,
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Do not wait for Enter: go on once the reading says so.")
+    ] = False,
+    config: ConfigPath = None,
+    set_: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Find a load cell's tare and scale with a known mass: empty, loaded, empty again."""
+    from gripper_calibration.procedures import load_cell as job
+
+    if (mass_kg is None) == (force_n is None):
+        raise ConfigError("say what is put on the load cell: --mass-kg or --force-n")
+    weight_n = force_n if force_n is not None else (mass_kg or 0.0) * job.STANDARD_GRAVITY_M_S2
+    settings = _load(config, set_, {})
+    with console.err.status("reading") as status:
+        result = job.calibrate(
+            settings,
+            weight_n,
+            rig,
+            ask=lambda what: _ask(what, yes, status),
+            seconds=seconds,
+            progress=lambda step, raw: status.update(f"{step}: {raw:.6g}"),
+        )
+    console.show(result, as_json)
+
+
 @app.command("virtual-servo")
 def virtual_servo(
     model: Annotated[str | None, typer.Option(help="Servo model.")] = None,
@@ -561,6 +596,22 @@ def _terminate(_signal: int, _frame: FrameType | None) -> None:
 def _load(path: Path | None, overrides: list[str] | None, options: dict[str, Any]) -> Config:
     given = [f"{key}={json.dumps(value)}" for key, value in options.items() if value is not None]
     return load_config(path, [*(overrides or []), *given])
+
+
+def _ask(what: str, yes: bool, status: Any) -> None:
+    """Says what a person is to do, and waits for Enter."""
+    if yes:
+        console.err.print(what, soft_wrap=True)
+        return
+    if not sys.stdin.isatty():
+        raise ConfigError(
+            f"nobody can be asked here to do this: {what}; run it in a terminal, or say --yes where it is "
+            "done without being asked"
+        )
+    status.stop()
+    console.err.print(f"{what}, then press Enter ", end="", soft_wrap=True)
+    sys.stdin.readline()
+    status.start()
 
 
 def _agreed(servo: str, changes: list[Any], yes: bool) -> bool:

@@ -1,0 +1,1 @@
+"""Fits: numbers in, values with intervals out; no device, no file."""

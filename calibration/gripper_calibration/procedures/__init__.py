@@ -1,0 +1,1 @@
+"""Procedures: what to do with the devices so that a fit gets its numbers."""
