@@ -5,6 +5,7 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
+from gripper_force.object_profile import find_object, read_object
 from gripper_force.rig import read_rig
 from gripper_force.schema import (
     Finite,
@@ -70,7 +71,9 @@ class CameraConfig(Section):
         "top, width, height in pixels; vision.region is a part of that frame",
     )
     side_px: int = Field(128, ge=16, le=800, description="oak, uvc: side of the frame")
-    exposure_us: int | None = Field(4000, gt=0, description="oak, uvc: None: automatic")
+    exposure_us: int | None = Field(
+        4000, gt=0, description="None: automatic, and of the simulated camera as at 4000"
+    )
     gain: int | None = Field(
         None, ge=0, description="oak: ISO, None: 100; uvc: the driver's own unit, None: left as it is"
     )
@@ -146,6 +149,7 @@ class ControlConfig(Section):
     voltage_limits_v: tuple[Positive, Positive] | None = Field(
         None, description="supply of the servo, least and most; None: what its model is made for"
     )
+    plant_gain: Positive = Field(1.0, description="identified contact force for one newton of motor push")
     plant_lag_ms: Positive = Field(60.0, description="identified lag from motor current to contact force")
     plant_delay_ms: Positive = Field(
         60.0, description="identified delay from contact force to estimate: exposure to use, and half a frame"
@@ -193,8 +197,9 @@ class SimConfig(Section):
     stiffness_spread: float = Field(
         0.05, ge=0, le=0.5, description="half-width of the uniform spread of the object's stiffness"
     )
+    markers: bool = Field(False, description="whether each finger carries an ArUco marker beside its pad")
     camera_latency_ms: NonNegative = 15.0
-    exposure_ms: NonNegative = 4.0
+    exposure_ms: NonNegative = Field(4.0, description="at a camera.exposure_us of 4000")
 
 
 class CalibrationConfig(Section):
@@ -318,9 +323,17 @@ class Config(Section):
         (), description="faults to inject into the stand-ins: unit, kind, at_s, for_s"
     )
 
+    def camera_settings(self) -> Tree:
+        """What an object profile is bound to: keys of how the camera looks, and their values."""
+        camera = self.camera.model_dump(
+            mode="json", include={"backend", "rate_hz", "region", "side_px", "exposure_us", "gain"}
+        )
+        settings = {f"camera.{key}": value for key, value in camera.items()}
+        return {**settings, "vision.region": self.vision.region and list(self.vision.region)}
+
 
 def load_config(path: Path | None = None, overrides: list[str] | None = None) -> Config:
-    """Builds the configuration from defaults, a rig profile, a YAML file, and overrides, in that order.
+    """Builds the configuration from defaults, profiles, a YAML file, and overrides, in that order.
 
     Args:
         path: YAML file, or None for the defaults.
@@ -333,7 +346,7 @@ def load_config(path: Path | None = None, overrides: list[str] | None = None) ->
     for assignment in overrides or []:
         assign(tree, assignment)
     where = str(path) if path else "--set"
-    return config_from(merged(_rig_settings(tree, where), tree), where)
+    return config_from(merged(_calibrated(tree, where), tree), where)
 
 
 def config_from(tree: Tree, where: str) -> Config:
@@ -344,7 +357,7 @@ def config_from(tree: Tree, where: str) -> Config:
 def config_from_text(text: str, where: str, overrides: list[str] | None = None) -> Config:
     """Reads a configuration that `dump_config` wrote.
 
-    It holds what a rig profile set; one that the overrides name stands before it and gives way to them.
+    It holds what profiles set; one that the overrides name stands before it and gives way to them.
 
     Raises:
         ConfigError: A key or value is wrong. The sentence names it and ``where``.
@@ -352,7 +365,7 @@ def config_from_text(text: str, where: str, overrides: list[str] | None = None) 
     given: Tree = {}
     for assignment in overrides or []:
         assign(given, assignment)
-    tree = merged(tree_from(text, where), _rig_settings(given, "--set"))
+    tree = merged(tree_from(text, where), _calibrated(given, "--set"))
     for assignment in overrides or []:
         assign(tree, assignment)
     return config_from(tree, where)
@@ -363,10 +376,13 @@ def dump_config(config: Config) -> str:
     return dump(config)
 
 
-def _rig_settings(tree: Tree, where: str) -> Tree:
-    """What the rig profile sets that the tree names."""
+def _calibrated(tree: Tree, where: str) -> Tree:
+    """What the rig profile and the object profile set that the tree names."""
     section = tree.get("calibration")
-    if not isinstance(section, dict) or section.get("rig") is None:
+    if not isinstance(section, dict):
         return {}
     calibration = validated(Config, {"calibration": section}, where).calibration
-    return read_rig(calibration.rig).settings() if calibration.rig is not None else {}
+    rig = read_rig(calibration.rig).settings() if calibration.rig is not None else {}
+    if calibration.object is None:
+        return rig
+    return merged(rig, read_object(find_object(calibration.object)).settings())

@@ -28,8 +28,10 @@ FRAME_SIDE = 128
 _OVERSAMPLED = 2
 """A pixel gathers light over its area; else edges would move by whole pixels."""
 
+_EXPOSURE_US = 4000
 _WHITE_LUX = 470.0
-"""Light at which a perfectly white surface fills the range: the locked exposure of the simulated camera."""
+"""Light at which a perfectly white surface fills the range at that exposure."""
+
 _LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 _GAMMA = 2.2
 _READ_NOISE = 0.002
@@ -62,6 +64,7 @@ class SimulatedCamera:
         self._world, self._scene, self._clock, self._start_ns = world, scene, clock, start_ns
         self._latency_ns = round(config.sim.camera_latency_ms * NS_PER_MS)
         self._period_ns = round(NS_PER_S / config.camera.rate_hz)
+        self._exposure = _exposure(config)
         self._rng = np.random.default_rng([config.seed, 2])
         self._under_way: deque[Frame] = deque(maxlen=64)
         self._seq = 0
@@ -93,7 +96,7 @@ class SimulatedCamera:
         if self._closed:
             return
         picture = self._world.render(_OVERSAMPLED * FRAME_SIDE)
-        gray = expose(picture, self._scene.lux, self._scene.shot_noise, self._rng)
+        gray = expose(picture, self._scene.lux * self._exposure, self._scene.shot_noise, self._rng)
         t_ns += self._start_ns
         self._under_way.append(Frame(t_ns, t_ns + self._latency_ns, self._seq, gray))
         self._seq += 1
@@ -175,7 +178,7 @@ class SimulatedRig:
         faults = Faults(config.faults, start_ns)
         motor = _LockedMotor(servo, bus.lock, WireFaults(bus, faults, config.seed) if config.faults else None)
         self._world = World(self.scene, config.gripper, motor, model.nm_per_a, config.seed)
-        self._exposure_ms = config.sim.exposure_ms
+        self._exposure_ms = config.sim.exposure_ms * _exposure(config)
         clock: Clock = LockstepClock(self._world) if self._lockstep else MonotonicClock()
         self.clock: Clock = clock
         self._closing = ExitStack()
@@ -251,6 +254,11 @@ class SimulatedRig:
             self._failure = error
         finally:
             self._world.close()  # the drawing context belongs to this thread
+
+
+def _exposure(config: Config) -> float:
+    """Share of the light that falls in, against the simulated camera's usual exposure."""
+    return (config.camera.exposure_us or _EXPOSURE_US) / _EXPOSURE_US
 
 
 def expose(picture: npt.NDArray[np.uint8], lux: float, shot_noise: float, rng: np.random.Generator) -> Gray:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from gripper_force.config import GripperConfig, SimConfig
 from gripper_force.errors import ConfigError
 from gripper_hw.sim.objects import FOR_PADS_ALONE, GAUGES, ObjectModel, build_object
-from gripper_hw.sim.textures import draw_textures
+from gripper_hw.sim.textures import draw_markers, draw_textures
 
 LUX_LEVELS = (350.0, 550.0, 750.0)
 """The paper's three light levels."""
@@ -22,6 +22,12 @@ _PAD_HALF_THICKNESS_M = 0.004
 _ROD_RADIUS_M = 0.012
 _FINGER_X_M = {"pads": 0.009, "rods": 0.022}
 """How far behind the middle of a pad its finger is."""
+
+_MARKER_MATERIALS = "".join(
+    f'<texture name="marker_{i}" type="2d" file="marker_{i}.png"/>'
+    f'<material name="marker_{i}" texture="marker_{i}" specular="0" shininess="0"/>'
+    for i in (0, 1)
+)
 
 _CAMERA_FROM_GRIP_M = np.array([0.10, -0.30, 0.125])
 
@@ -53,6 +59,7 @@ class Scene:
         jaw_friction_n: Coulomb friction of one rail; it is felt at the horn.
         backlash_m: Half of the gear play at the rack.
         rod_length_m: How far a rod, where that is the tool, stands out of its finger.
+        markers: Whether each finger carries an ArUco marker.
     """
 
     object: str
@@ -77,6 +84,7 @@ class Scene:
     jaw_friction_n: float = 0.20
     backlash_m: float = 0.0003
     rod_length_m: float = 0.020
+    markers: bool = False
 
 
 def draw_scene(object_name: str, seed: int, config: SimConfig) -> Scene:
@@ -96,6 +104,7 @@ def draw_scene(object_name: str, seed: int, config: SimConfig) -> Scene:
     known = object_name in GAUGES
     return replace(
         rig,
+        markers=config.markers,
         size=1.0 if known else itself.size,
         stiffness=1.0 if known else itself.stiffness,
         texture_seed=itself.texture_seed,
@@ -171,6 +180,9 @@ def scene_mjcf(scene: Scene, gripper: GripperConfig) -> tuple[str, dict[str, byt
         jaw_travel=_text([gripper.open_width_m / 2 - 0.001]),
         left_tool=_tool(scene, -1),
         right_tool=_tool(scene, 1),
+        left_marker=_marker(scene, -1),
+        right_marker=_marker(scene, 1),
+        marker_materials=_MARKER_MATERIALS if scene.markers else "",
         finger_x=_FINGER_X_M[scene.tool],
         grip_height=_text([model.grip_height_m]),
         rail_height=_text([model.grip_height_m + 0.085]),
@@ -181,7 +193,8 @@ def scene_mjcf(scene: Scene, gripper: GripperConfig) -> tuple[str, dict[str, byt
         backlash_m=scene.backlash_m,
         pinion_radius_m=gripper.pinion_radius_m,
     )
-    return text, draw_textures(model.texture, scene.texture_seed, scene.table_seed)
+    images = draw_textures(model.texture, scene.texture_seed, scene.table_seed)
+    return text, images | (draw_markers() if scene.markers else {})
 
 
 def _tool(scene: Scene, side: int) -> str:
@@ -191,6 +204,17 @@ def _tool(scene: Scene, side: int) -> str:
     root = _ROD_RADIUS_M - _PAD_HALF_THICKNESS_M + 0.020
     ends = _text([side * (root - scene.rod_length_m), 0, 0, side * root, 0, 0])
     return f'type="capsule" size="{_ROD_RADIUS_M}" fromto="{ends}"'
+
+
+def _marker(scene: Scene, side: int) -> str:
+    """A plate on a jaw, where the finger of a pad is: nearer to the object it would hide the contact."""
+    if not scene.markers:
+        return ""
+    place = _text([side * _FINGER_X_M["pads"], -0.0125, 0.0])
+    return (
+        f'<geom type="box" size=".008 .008 .0003" euler="90 0 0" pos="{place}" contype="0" conaffinity="0" '
+        f'mass="0" material="marker_{(side + 1) // 2}"/>'
+    )
 
 
 def _material(model: ObjectModel) -> str:

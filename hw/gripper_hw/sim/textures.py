@@ -18,6 +18,16 @@ def draw_textures(object_texture: str | None, seed: int, table_seed: int) -> dic
     return {name: cv2.imencode(".png", image)[1].tobytes() for name, image in images.items()}
 
 
+def draw_markers() -> dict[str, bytes]:
+    """PNG files by name: the ArUco markers 0 and 1, each in its quiet zone."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    sheets = {
+        f"marker_{i}.png": np.pad(cv2.aruco.generateImageMarker(dictionary, i, 192), 32, constant_values=255)
+        for i in (0, 1)
+    }
+    return {name: cv2.imencode(".png", sheet)[1].tobytes() for name, sheet in sheets.items()}
+
+
 def _clouds(rng: np.random.Generator, sigma: float) -> npt.NDArray[np.float32]:
     noise = rng.standard_normal((_SIDE, _SIDE)).astype(np.float32)
     smooth = np.asarray(cv2.GaussianBlur(noise, (0, 0), sigma, borderType=cv2.BORDER_REFLECT), np.float32)

@@ -116,6 +116,24 @@ def test_the_notes_hold_the_scene_and_the_exposure(make_rig: MakeRig) -> None:
     assert notes["exposure_ms"] == "7.0"
 
 
+def first_gray(rig: SimulatedRig) -> np.ndarray:
+    rig.camera.start()
+    rig.clock.sleep_until_ns(100 * NS_PER_MS)
+    frame = rig.camera.newest()
+    assert frame is not None
+    rig.close()
+    return frame.gray
+
+
+def test_a_longer_exposure_is_brighter_up_to_what_the_camera_can_say(make_rig: MakeRig) -> None:
+    grays = {us: first_gray(make_rig(f"camera.exposure_us={us}")) for us in ("null", 2000, 4000, 400_000)}
+    assert (grays["null"] == grays[4000]).all()
+    ratio = np.median(grays[4000] / np.maximum(grays[2000], 1.0))
+    assert ratio == pytest.approx(2 ** (1 / 2.2), rel=0.03)
+    assert np.mean(grays[400_000] == 255) > 0.5
+    assert make_rig("camera.exposure_us=6000").notes()["exposure_ms"] == "6.0"
+
+
 def test_the_servos_watchdog_counts_simulated_time(make_rig: MakeRig) -> None:
     rig = make_rig()
     servo = servo_of(rig)

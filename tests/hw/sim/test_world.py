@@ -6,6 +6,7 @@ import textwrap
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -128,6 +129,21 @@ def test_the_picture_shows_the_jaws_move(make_world: Callable[..., World]) -> No
     assert (world.render(64) == before).all()
     world.advance_to(300 * NS_PER_MS)
     assert np.abs(world.render(64).astype(int) - before).max() > 40
+
+
+@pytest.mark.parametrize("tool", ["pads", "rods"])
+def test_markers_can_be_read_off_the_picture_and_change_no_physics(
+    make_world: Callable[..., World], tool: str
+) -> None:
+    worlds = [make_world(Current(0.2, 0.1), object="tube", tool=tool, markers=on) for on in (True, False)]
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    seen = []
+    for world in worlds:
+        world.advance_to(1500 * NS_PER_MS)
+        _, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(world.render(256))
+        seen.append(set() if ids is None else set(ids.ravel().tolist()))
+    assert seen == [{0, 1}, set()]
+    assert worlds[0].force_n == worlds[1].force_n > 1.0
 
 
 NO_LIBRARY = """
