@@ -15,7 +15,7 @@ from gripper_force.dataset import CONTACT_N, label_frames
 from gripper_force.errors import DataError
 from gripper_force.log import LogReader
 from gripper_force.perception import Sight
-from gripper_force.session import controller_from, make_estimator
+from gripper_force.session import controller_from, correction_of, make_estimator
 from gripper_force.types import (
     NS_PER_S,
     Frame,
@@ -87,7 +87,7 @@ def replay(
         **{key: best[key] for key in ("mae_n", "rmse_n", "bias_n", "per_bin", "frames")},
         "per_object": {config.object: {k: best[k] for k in ("mae_n", "rmse_n", "bias_n", "frames")}},
         "identical": all(flags) if flags else None,
-        "note": _note(reader, checkpoint),
+        "note": _note(reader, config, checkpoint),
         "sources": sources,
         "log": str(path),
     }
@@ -95,7 +95,7 @@ def replay(
 
 def run_again(reader: LogReader, config: Config, checkpoint: Checkpoint | None) -> Replayed:
     """Feeds estimator and controller from a log, in the order in which the run had its inputs."""
-    sight = Sight(make_estimator(config, checkpoint))
+    sight = Sight(make_estimator(config, checkpoint, correction_of(config, checkpoint)))
     runs = config.gripper.nm_per_a is not None  # a recording that was imported never had a controller
     controller = controller_from(config) if runs else None
     visual: list[VisualForce] = []
@@ -149,12 +149,19 @@ def _same_decisions(logged: dict[type, list[Any]], again: list[Decision]) -> boo
     return all(a == b[: len(a)] and len(b) - len(a) <= 1 for a, b in pairs)
 
 
-def _note(reader: LogReader, checkpoint: Checkpoint | None) -> str:
+def _note(reader: LogReader, config: Config, checkpoint: Checkpoint | None) -> str:
     """Why the estimates can't come out the same, or an empty text."""
     used = reader.metadata.get("checkpoint", "")
-    if checkpoint is None or used in ("", checkpoint.digest):
+    if checkpoint is None or used == "":
         return ""
-    return f"the run's checkpoint was {used[:12]}, this one is {checkpoint.digest[:12]}: estimates differ"
+    if used != checkpoint.digest:
+        return f"the run's checkpoint was {used[:12]}, this one is {checkpoint.digest[:12]}: estimates differ"
+    correction = correction_of(config, checkpoint)
+    profile, used = (correction.profile.weights if correction else ""), reader.metadata.get("profile", "")
+    if used != profile:
+        names = [text[:12] or "none" for text in (used, profile)]
+        return f"the run's object profile was {names[0]}, this one is {names[1]}: estimates differ"
+    return ""
 
 
 def _checkpoint(config: Config, source: str | None) -> Checkpoint | None:

@@ -24,6 +24,7 @@ from gripper_force.errors import ConfigError, DeviceError, GripperError
 from gripper_force.faults import Faults, FaultyEstimator, FaultyFile
 from gripper_force.interfaces import Devices
 from gripper_force.log import LogWriter
+from gripper_force.object_profile import find_object, read_object
 from gripper_force.perception import Estimator, LockstepPerception, Perception, ThreadedPerception
 from gripper_force.recorder import Recorder
 from gripper_force.types import (
@@ -37,6 +38,7 @@ from gripper_force.types import (
     RequestKind,
 )
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
+from gripper_force.vision.correction import Correction, load_correction
 from gripper_force.vision.estimator import ForceEstimator
 from gripper_force.watch import CellWatch, Tally
 
@@ -233,9 +235,10 @@ def open_session(
     A session that never came to a cycle leaves no log.
     """
     config, controller = make_controller(config, devices)
-    estimator = make_estimator(config, checkpoint)
+    correction = correction_of(config, checkpoint)
+    estimator = make_estimator(config, checkpoint, correction)
     with ExitStack() as stack:
-        recorder = _recorder(config, devices, path, checkpoint)
+        recorder = _recorder(config, devices, path, checkpoint, correction)
         session = Session(config, devices, controller, _perception(config, devices, estimator), recorder)
         stack.callback(_discard_unused, session, path)
         stack.callback(recorder.close)
@@ -283,18 +286,30 @@ def run_grasp(config: Config, path: Path, progress: Progress | None = None) -> N
         progress: Called after each change of phase.
 
     Raises:
-        ConfigError: The target is over the force limit.
+        ConfigError: The target is over the force limit, or more than a profile was calibrated with.
         GripperError: Something failed. The servo was stopped as configured, and the log holds what was seen.
     """
+    _check_target(config)
+    checkpoint = checkpoint_of(config)
+    with open_devices(config) as devices, open_session(config, devices, path, checkpoint) as session:
+        grasp_in(session, config, checkpoint is not None, progress)
+
+
+def _check_target(config: Config) -> None:
     limit_n = config.control.force_limit_n
     if config.target_n > largest_target_n(limit_n):
         raise ConfigError(
             f"target_n {config.target_n:g} N is too near to control.force_limit_n {limit_n:g} N; ask for at "
             f"most {largest_target_n(limit_n):g} N, or raise the limit"
         )
-    checkpoint = checkpoint_of(config)
-    with open_devices(config) as devices, open_session(config, devices, path, checkpoint) as session:
-        grasp_in(session, config, checkpoint is not None, progress)
+    if config.calibration.object is not None:
+        path = find_object(config.calibration.object)
+        most_n = read_object(path).force_n
+        if config.target_n > most_n:
+            raise ConfigError(
+                f"target_n {config.target_n:g} N is more than the object profile {path} was calibrated with, "
+                f"{most_n:.1f} N; ask for less, or calibrate up to more"
+            )
 
 
 def make_controller(config: Config, devices: Devices) -> tuple[Config, GraspController]:
@@ -323,11 +338,32 @@ def controller_from(config: Config) -> GraspController:
     return GraspController(config.control, transmission, config.servo.current_limit_a)
 
 
-def make_estimator(config: Config, checkpoint: Checkpoint | None) -> ForceEstimator | None:
+def make_estimator(
+    config: Config, checkpoint: Checkpoint | None, correction: Correction | None
+) -> ForceEstimator | None:
     """The estimator of a run, or None for a run without vision."""
     if checkpoint is None:
         return None
-    return ForceEstimator(checkpoint, config.vision.region, config.vision.threads)
+    return ForceEstimator(checkpoint, config.vision.region, config.vision.threads, correction)
+
+
+def correction_of(config: Config, checkpoint: Checkpoint | None) -> Correction | None:
+    """What the object's profile makes of estimates, or None without a profile or without vision.
+
+    Raises:
+        ConfigError: The profile can't be read, or is of another network or camera, and that is refused.
+    """
+    if config.calibration.object is None or checkpoint is None:
+        return None
+    path = find_object(config.calibration.object)
+    profile = read_object(path)
+    differ = profile.mismatches(checkpoint.digest, config.camera_settings())
+    if differ and config.calibration.on_mismatch == "refuse":
+        raise ConfigError(
+            f"the object profile {path} is of {'; '.join(differ)}; calibrate again, or set "
+            "calibration.on_mismatch=warn"
+        )
+    return load_correction(path, profile, differ)
 
 
 def checkpoint_of(config: Config) -> Checkpoint | None:
@@ -383,8 +419,16 @@ def let_open(session: Session, config: Config, status: GraspStatus) -> GraspStat
     return status
 
 
-def _recorder(config: Config, devices: Devices, path: Path, checkpoint: Checkpoint | None) -> Recorder:
+def _recorder(
+    config: Config,
+    devices: Devices,
+    path: Path,
+    checkpoint: Checkpoint | None,
+    correction: Correction | None,
+) -> Recorder:
     about = _metadata(config, devices, checkpoint)
+    if correction is not None:
+        about["profile"] = correction.profile.weights
     faults, clock, lockstep = Faults(config.faults, devices.start_ns), devices.clock, devices.lockstep
 
     def through(file: BinaryIO) -> BinaryIO:
@@ -393,7 +437,11 @@ def _recorder(config: Config, devices: Devices, path: Path, checkpoint: Checkpoi
         )
 
     log = LogWriter(path, config=dump_config(config), metadata=about, through=through)
-    return Recorder(log, lockstep=lockstep)
+    recorder = Recorder(log, lockstep=lockstep)
+    if correction is not None and correction.differs:
+        text = f"the object profile is of {'; '.join(correction.differs)}"
+        recorder.write(Event(devices.start_ns, "session", text))
+    return recorder
 
 
 def _perception(config: Config, devices: Devices, estimator: Estimator | None) -> Perception:

@@ -7,9 +7,10 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from gripper_force.errors import NonFiniteError
+from gripper_force.errors import DataError, NonFiniteError
 from gripper_force.types import Gray
 from gripper_force.vision.checkpoint import Checkpoint
+from gripper_force.vision.correction import Correction
 from gripper_force.vision.network import StreamState
 from gripper_force.vision.plausible import Plausibility
 from gripper_force.vision.preprocess import Normaliser, Region, shrink
@@ -20,9 +21,9 @@ class Estimate:
     """One estimate.
 
     Attributes:
-        force_n: Contact force, the mean over the ensemble.
-        std_n: Standard deviation claimed for it: the error measured in validation at that force, and half the
-            spread of the members, as independent.
+        force_n: Contact force: the mean over the ensemble, corrected by the object's profile.
+        std_n: Standard deviation claimed for it: as the profile's interval says, or, without a profile, the
+            error measured in validation at that force, and half the spread of the members, as independent.
     """
 
     force_n: float
@@ -32,18 +33,26 @@ class Estimate:
 class ForceEstimator:
     """Runs an ensemble over a stream of frames. Deterministic; one thread alone may call it."""
 
-    def __init__(self, checkpoint: Checkpoint, region: Region | None = None, threads: int = 2) -> None:
+    def __init__(
+        self,
+        checkpoint: Checkpoint,
+        region: Region | None = None,
+        threads: int = 2,
+        correction: Correction | None = None,
+    ) -> None:
         """Makes the ensemble ready; the first estimate is as fast as any.
 
         Args:
             checkpoint: The ensemble.
             region: Region of interest of the camera's frame in pixels; None for the whole frame.
             threads: CPU threads of this process that PyTorch may use.
+            correction: What the object's profile makes of the estimates.
         """
         torch.set_num_threads(threads)
         self._region = region
         self._preprocess = checkpoint.header.preprocess
         self._networks = checkpoint.networks
+        self._correction = correction
         self._residual_forces = [residual.force_n for residual in checkpoint.header.residuals]
         self._residual_stds = [residual.std_n for residual in checkpoint.header.residuals]
         self.reset()
@@ -71,7 +80,8 @@ class ForceEstimator:
             The estimate for this frame, or None while the reference frames are being collected.
 
         Raises:
-            DataError: The frame is not a gray image of bytes, or not what a working camera would see.
+            DataError: The frame is not a gray image of bytes, not what a working camera would see, or too
+                unlike all that the object's profile was calibrated with.
             ConfigError: The region of interest reaches beyond the frame.
             NonFiniteError: A network gave NaN or infinity.
         """
@@ -85,6 +95,8 @@ class ForceEstimator:
         if not all(math.isfinite(force) for force in forces):
             raise NonFiniteError(f"the network gave {forces} N; check the checkpoint and the camera's image")
         force_n = sum(forces) / len(forces)
+        if self._correction is not None:
+            return self._corrected(self._correction, force_n)
         residual_n = float(np.interp(force_n, self._residual_forces, self._residual_stds))
         return Estimate(force_n, math.hypot(residual_n, (max(forces) - min(forces)) / 2))
 
@@ -94,6 +106,18 @@ class ForceEstimator:
             if network.config.attention == "ssam" and state is not None and state.gates is not None:
                 return np.asarray(state.gates[0, 0].numpy(), np.float32)
         return None
+
+    def _corrected(self, correction: Correction, force_n: float) -> Estimate:
+        read = [state.features[0].numpy() for state in self._states if state is not None]
+        features = np.concatenate(read)[None]  # (1, F)
+        strangeness = float(correction.strangeness(features)[0])
+        if strangeness > 1:
+            raise DataError(
+                f"what is seen is {strangeness:.1f} times as unlike the touches of the profile "
+                f"{correction.profile.object!r} as these are among each other; see whether it is that object"
+            )
+        corrected_n = correction.force_n([force_n], features)
+        return Estimate(float(corrected_n[0]), float(correction.std_n(corrected_n)[0]))
 
     @torch.inference_mode()
     def _infer(self, frame: npt.NDArray[np.float32]) -> list[float]:
