@@ -1,0 +1,167 @@
+"""What the fits need of logs: touches, and what servo and load cell tell of an object and of the loop."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from gripper_calibration.fits.plant import Press
+from gripper_calibration.fits.touches import Floats, Touches
+from gripper_force.config import Config, config_from_text
+from gripper_force.control.transmission import Transmission
+from gripper_force.dataset import CONTACT_N, load_clip
+from gripper_force.errors import DataError
+from gripper_force.log import LogReader
+from gripper_force.metrics import lag_s
+from gripper_force.types import NS_PER_S, Frame, GraspStatus, LoadCellSample, Phase, ServoState
+from gripper_force.vision.checkpoint import Checkpoint
+from gripper_force.vision.dense import features
+
+_CONTACT_SHARE: Final = 0.05
+_FREE_FRAMES: Final = 5
+"""So many frames without contact end a touch."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """Some logs of one object.
+
+    Attributes:
+        touches: What camera and load cell tell.
+        camera: The camera's settings, by key of the configuration.
+        presses: What servo and load cell tell of the loop.
+        travel_m: By how much the jaws closed on the object in each press, (N,) each.
+        delay_s: From the contact force to an estimate that can be used, the network's time aside.
+    """
+
+    touches: Touches
+    camera: dict[str, Any]
+    presses: list[Press]
+    travel_m: list[Floats]
+    delay_s: float
+
+
+def read(paths: Sequence[Path], checkpoint: Checkpoint) -> Recorded:
+    """Reads logs, one after the other; see `read_one`.
+
+    Raises:
+        DataError: There are none, one can't be used, or they are of different cameras.
+        LogError: A log can't be read.
+    """
+    if not paths:
+        raise DataError("there is no log to calibrate from; record some touches first")
+    parts = [read_one(path, checkpoint) for path in paths]
+    first = parts[0]
+    for path, part in zip(paths, parts, strict=True):
+        if part.camera != first.camera:
+            key = next(key for key, value in part.camera.items() if first.camera.get(key) != value)
+            raise DataError(
+                f"{path} was seen with {key} {part.camera[key]}, and {paths[0]} with {first.camera.get(key)}; "
+                "calibrate each on its own"
+            )
+    return join(parts)
+
+
+def join(parts: Sequence[Recorded]) -> Recorded:
+    """Several recordings as one; touches are numbered on."""
+    begin = np.cumsum([0, *(len(part.touches.numbers) for part in parts[:-1])])
+    touches = [part.touches for part in parts]
+    return Recorded(
+        touches=Touches(
+            np.concatenate([t.features for t in touches]),
+            np.concatenate([t.estimate_n for t in touches]),
+            np.concatenate([t.force_n for t in touches]),
+            np.concatenate([t.touch + offset for t, offset in zip(touches, begin, strict=True)]),
+        ),
+        camera=parts[0].camera,
+        presses=[press for part in parts for press in part.presses],
+        travel_m=[travel for part in parts for travel in part.travel_m],
+        delay_s=float(np.median([part.delay_s for part in parts])),
+    )
+
+
+def read_one(path: Path, checkpoint: Checkpoint) -> Recorded:
+    """Reads a log. A recording that was imported tells of touches alone.
+
+    Raises:
+        DataError: It holds no frames or no labels.
+        LogError: It can't be read.
+    """
+    preprocess = checkpoint.header.preprocess
+    clip = load_clip(path, preprocess, None)
+    forces_n, read_out = features(checkpoint.networks, preprocess, clip.frames)
+    labelled = clip.valid & (np.arange(len(clip.frames)) >= preprocess.lead_in)
+    estimate_n = forces_n.mean(0).astype(np.float64)
+    felt_n = clip.forces_n.astype(np.float64)
+    numbers = np.unique(touch_of(felt_n)[labelled], return_inverse=True)[1]
+    reader = LogReader(path)
+    config = config_from_text(reader.config, str(path))
+    presses, travel_m = _mechanics(reader, config)
+    t_ns, late_ns = _frame_times(reader)
+    t_s = t_ns[labelled] / NS_PER_S
+    seen_s = lag_s(t_s, estimate_n[labelled], t_s, felt_n[labelled])
+    return Recorded(
+        touches=Touches(read_out[labelled], estimate_n[labelled], felt_n[labelled], numbers),
+        camera=config.camera_settings(),
+        presses=presses,
+        travel_m=travel_m,
+        # A frame is used for as long as the next one takes to come.
+        delay_s=late_ns / NS_PER_S + 0.5 / config.camera.rate_hz + max(seen_s, 0.0),
+    )
+
+
+def touch_of(force_n: Floats) -> npt.NDArray[np.int64]:
+    """Number of the touch that each frame belongs to, (T,): from the middle of one rest to that of the next."""
+    contact = force_n > max(CONTACT_N, _CONTACT_SHARE * float(force_n.max(initial=0.0)))
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], contact, [False]]).astype(np.int8)))
+    begins, ends = edges[::2], edges[1::2]
+    number = np.zeros(len(force_n), np.int64)
+    for end, begin in zip(ends[:-1], begins[1:], strict=True):
+        if begin - end >= _FREE_FRAMES:
+            number[(begin + end) // 2 :] += 1
+    return number
+
+
+def _frame_times(reader: LogReader) -> tuple[npt.NDArray[np.int64], float]:
+    """When each frame was taken, (T,), and how late it came, in the median."""
+    times = [(frame.t_ns, frame.received_ns - frame.t_ns) for frame in reader.records(Frame)]
+    table = np.array(times, np.int64)
+    return table[:, 0], float(np.median(table[:, 1]))
+
+
+def _mechanics(reader: LogReader, config: Config) -> tuple[list[Press], list[Floats]]:
+    """Ramps with their holds, and the jaws' way on the object in each."""
+    gripper = config.gripper
+    if gripper.nm_per_a is None:
+        return [], []
+    transmission = Transmission.from_config(gripper, gripper.nm_per_a)
+    states: list[ServoState] = []
+    phases: list[str] = []
+    cells: list[LoadCellSample] = []
+    for record in reader.records(ServoState, GraspStatus, LoadCellSample):
+        if isinstance(record, ServoState):
+            states.append(record)
+        elif isinstance(record, GraspStatus):
+            phases.append(record.phase)
+        elif isinstance(record, LoadCellSample) and record.valid:
+            cells.append(record)
+    if not cells:
+        return [], []
+    cells.sort(key=lambda cell: cell.t_ns)
+    count = min(len(states), len(phases))
+    pressing = np.isin(phases[:count], (Phase.RAMP, Phase.HOLD))
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], pressing, [False]]).astype(np.int8)))
+    cell_s = np.array([cell.t_ns for cell in cells]) / NS_PER_S
+    cell_n = np.array([cell.force_n for cell in cells])
+    presses, travel_m = [], []
+    for begin, end in zip(edges[::2], edges[1::2], strict=True):
+        part = states[begin:end]
+        t_s = np.array([state.t_ns for state in part]) / NS_PER_S
+        push_n = np.array([transmission.force_n(state.current_a) for state in part])
+        width_m = np.array([transmission.width_m(state.position_rad) for state in part])
+        presses.append(Press(t_s, push_n - transmission.friction_n, np.interp(t_s, cell_s, cell_n)))
+        travel_m.append(width_m[0] - width_m)
+    return presses, travel_m
