@@ -59,8 +59,8 @@ def read(paths: Sequence[Path], checkpoint: Checkpoint) -> Recorded:
         if part.camera != first.camera:
             key = next(key for key, value in part.camera.items() if first.camera.get(key) != value)
             raise DataError(
-                f"{path} was seen with {key} {part.camera[key]}, and {paths[0]} with {first.camera.get(key)}; "
-                "calibrate each on its own"
+                f"{path} was seen with {key} {part.camera[key]}, and {paths[0]} with "
+                f"{first.camera.get(key)}; calibrate each on its own"
             )
     return join(parts)
 
@@ -114,7 +114,7 @@ def read_one(path: Path, checkpoint: Checkpoint) -> Recorded:
 
 
 def touch_of(force_n: Floats) -> npt.NDArray[np.int64]:
-    """Number of the touch that each frame belongs to, (T,): from the middle of one rest to that of the next."""
+    """Number of each frame's touch, (T,), which goes from the middle of one rest to that of the next."""
     contact = force_n > max(CONTACT_N, _CONTACT_SHARE * float(force_n.max(initial=0.0)))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], contact, [False]]).astype(np.int8)))
     begins, ends = edges[::2], edges[1::2]

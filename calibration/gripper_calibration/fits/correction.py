@@ -1,9 +1,9 @@
 """The correction of one object from its touches: which one the touches can bear, and how good it is.
 
-Candidates are tried from the simplest on: the network as it is, a line, curves, and each with the last layer
-refitted. Each touch is estimated from all others, and of the candidates that are no worse than the best by more
-than one standard error the simplest is taken (L. Breiman et al., Classification and Regression Trees, 1984,
-section 3.4.3). So touches that contradict each other leave the network as it is, with a wide interval.
+Candidates are tried from the simplest on: the network as it is, a line, curves, and a line with the last layer
+refitted. Each touch is estimated from all others, and of the candidates that are no worse than the best by
+more than one standard error the simplest is taken (L. Breiman et al., Classification and Regression Trees,
+1984, section 3.4.3). So touches that contradict each other leave the network as it is, with a wide interval.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -19,7 +19,7 @@ from gripper_calibration.fits.output import BENDS, fit_curve, fit_line, identity
 from gripper_calibration.fits.touches import Floats, Touches, check
 from gripper_force.errors import DataError
 from gripper_force.object_profile import Interval, OutputCurve
-from gripper_force.vision.correction import Features, HeadAndGate, curve_n
+from gripper_force.vision.correction import HeadAndGate, curve_n
 
 COVERAGE: Final = 0.9
 
@@ -95,8 +95,8 @@ def fit_correction(touches: Touches, coverage: float = COVERAGE, advance: Advanc
     line = fit_line(touches)
     if line.gain < _LEAST_GAIN:
         raise DataError(
-            f"the load cell feels {line.gain:.2f} N for one that the network sees; that is no calibration but "
-            "another quantity: see load_cell.n_per_raw, vision.region and the checkpoint"
+            f"the load cell feels {line.gain:.2f} N for each that the network sees; so far off it is no "
+            "calibration: see load_cell.n_per_raw, vision.region and the checkpoint"
         )
     thin = touches.thinned(_FRAMES)
     ridge = Ridge(thin.features)
@@ -166,10 +166,8 @@ def _candidates() -> list[Candidate]:
     curves: list[tuple[str, str | float]] = [("a line", "affine")]
     curves += [(f"a curve (bend {bend:g})", bend) for bend in BENDS]
     alone = [Candidate("the network as it is", "identity", None), *(Candidate(n, c, None) for n, c in curves)]
-    # The head bends what a line leaves, as far as the touches say so; curves and heads would do it twice.
-    heads = [
-        Candidate(f"a line, and the last layer (penalty {p:.0e})", "affine", float(p)) for p in PENALTIES
-    ]
+    # The last layer bends what a line leaves; a curve besides would do it twice.
+    heads = [Candidate(f"a line, and the last layer ({p:.0e})", "affine", float(p)) for p in PENALTIES]
     return alone + heads
 
 
@@ -178,7 +176,7 @@ _AFFINE: Final = next(c for c in _CANDIDATES if c.curve == "affine" and c.penalt
 
 
 def _simplest(error_n: Floats) -> int:
-    """The first candidate that is no worse than the best by more than one standard error of the difference."""
+    """The first candidate that is no worse than the best by more than a standard error of the difference."""
     best = int(error_n.mean(0).argmin())
     more_n = error_n - error_n[:, [best]]  # (K, candidates)
     allowed_n = more_n.std(0, ddof=1) / np.sqrt(len(error_n))
@@ -216,11 +214,10 @@ def _fits(
 
 
 def _arrays(ridge: Ridge, head: Floats | None, offset: float) -> HeadAndGate:
-    single: Callable[[Floats | list[float]], Features] = lambda values: np.asarray(values, np.float32)  # noqa: E731
     return HeadAndGate(
-        head=single(np.zeros_like(ridge.mean) if head is None else head),
-        offset=single([offset]),
-        mean=single(ridge.mean),
-        axes=single(ridge.axes(gate.AXES)),
-        spread=single([ridge.spread]),
+        head=(np.zeros_like(ridge.mean) if head is None else head).astype(np.float32),
+        offset=np.array([offset], np.float32),
+        mean=ridge.mean.astype(np.float32),
+        axes=ridge.axes(gate.AXES).astype(np.float32),
+        spread=np.array([ridge.spread], np.float32),
     )

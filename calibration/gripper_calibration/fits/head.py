@@ -1,7 +1,7 @@
-"""The network's last layer refitted in closed form: ridge regression on its features, for many penalties at once.
+"""The network's last layer refitted in closed form: ridge regression on its features, for many penalties.
 
-The regression is on what the output correction leaves, so that its zero is the network with that correction, and
-penalties draw towards it (A. E. Hoerl and R. W. Kennard, Technometrics 12 (1970) 55-67,
+The regression is on what the output correction leaves, so that its zero is the network with that correction,
+and penalties draw towards it (A. E. Hoerl and R. W. Kennard, Technometrics 12 (1970) 55-67,
 doi:10.1080/00401706.1970.10488634). There are more features than frames: the eigenvectors of the frames' Gram
 matrix are a stable factorisation, and serve all penalties and all right sides.
 """

@@ -1,13 +1,13 @@
-"""Correction of the network's output: a line where touches are few, a curve that never falls where they are more.
+"""Correction of the network's output: a line where touches are few, else a curve that never falls.
 
 *The line.* Each touch has a line of its own: how an object lies between the jaws changes what is seen by some
 percent. So a touch tells the object's line up to that scatter, however many frames it has, as studies do in a
 meta-analysis with random effects (R. DerSimonian and N. Laird, Controlled Clinical Trials 7 (1986) 177-188,
-doi:10.1016/0197-2456(86)90046-2), with a prior that the network was right. A load cell's spikes are held down by
-Huber's weights (P. J. Huber, Annals of Mathematical Statistics 35 (1964) 73, doi:10.1214/aoms/1177703732).
+doi:10.1016/0197-2456(86)90046-2), with a prior that the network was right. A load cell's spikes are held down
+by Huber's weights (P. J. Huber, Annals of Mathematical Statistics 35 (1964) 73, doi:10.1214/aoms/1177703732).
 
-*The curve.* Straight pieces with slopes that are not negative, drawn to the line by a penalty on how the slopes
-differ from its own.
+*The curve.* Straight pieces with slopes that are not negative, drawn to the line by a penalty on how the
+slopes differ from its own.
 """
 
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ _ROUNDS: Final = 10
 _PIECE_N: Final = 1.5
 _MOST_PIECES: Final = 8
 BENDS: Final = (0.03, 0.1, 0.3)
-"""How far a curve's slopes are thought to differ from its line's: standard deviations, the straightest first."""
+"""How far a curve's slopes are thought to differ from its line's, as standard deviations."""
 
 _SMALLEST_SLOPE: Final = 1e-3
 
@@ -102,7 +102,7 @@ def fit_line(touches: Touches) -> Line:
     return Line(
         gain=float(1 + line[0]),
         offset_n=float(line[1]),
-        covariance=np.linalg.inv(precision),
+        covariance=np.asarray(np.linalg.inv(precision), np.float64),
         touch_std=np.sqrt(touch_var),
         frame_std_n=frame_std_n,
     )

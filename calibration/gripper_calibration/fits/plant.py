@@ -1,4 +1,4 @@
-"""The force loop's plant with an object: from the motor's push to the contact force, and on to an estimate."""
+"""The force loop's plant with an object: from the motor's push to the contact force, and to its estimate."""
 
 from dataclasses import dataclass
 from typing import Final

@@ -64,7 +64,8 @@ def check(touches: Touches) -> None:
         raise DataError("the touches hold values that are not finite; see what the load cell gave")
     if len(touches.force_n) < _LEAST_FRAMES:
         raise DataError(
-            f"{len(touches.force_n)} frames have a label, and a calibration needs {_LEAST_FRAMES}; touch longer"
+            f"{len(touches.force_n)} frames have a label, and a calibration needs {_LEAST_FRAMES}; touch "
+            "longer"
         )
     peak_n = float(np.quantile(touches.force_n, 0.99))
     if peak_n < LEAST_PEAK_N:
