@@ -416,6 +416,37 @@ def calibrate_load_cell(
     console.show(result, as_json)
 
 
+@calibrate_app.command("servo")
+def calibrate_servo(
+    gauge_mm: Annotated[
+        list[float],
+        typer.Option(
+            help="Width of the load cell between the jaws. Another width tells the pinion's radius."
+        ),
+    ],
+    rig: RigPath = Path("rig.yaml"),
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Do not wait for Enter: the load cell is there.")
+    ] = False,
+    config: ConfigPath = None,
+    set_: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Find a servo's torque, friction and jaw geometry with the load cell between the jaws."""
+    from gripper_calibration.procedures import servo as job
+
+    settings = _load(config, set_, {})
+    with console.err.status("moving") as status:
+        result = job.calibrate(
+            settings,
+            [width / 1e3 for width in gauge_mm],
+            rig,
+            ask=lambda what: _ask(what, yes, status),
+            progress=lambda step, force_n: status.update(f"{step}: {force_n:.1f} N"),
+        )
+    console.show(result, as_json)
+
+
 @app.command("virtual-servo")
 def virtual_servo(
     model: Annotated[str | None, typer.Option(help="Servo model.")] = None,

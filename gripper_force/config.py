@@ -104,6 +104,11 @@ class LoadCellConfig(Section):
     path: Path | None = Field(None, description="the log that backend `playback` plays")
     speed: Literal["recorded", "full"] = Field("recorded", description="how fast it is played")
 
+    @property
+    def sensor(self) -> str:
+        """What the unit of the reading goes with: the backend, and of a serial one the format."""
+        return f"{self.backend} {self.format}" if self.backend == "serial" else self.backend
+
 
 class VisionConfig(Section):
     """Estimator and its input."""

@@ -37,6 +37,11 @@ class Estimate(Section):
             raise ValueError(f"the value {self.value:g} must lie between low and high")
         return self
 
+    @property
+    def half(self) -> float:
+        """Half of the interval's width; 0 where the value was given."""
+        return 0.0 if self.low is None or self.high is None else (self.high - self.low) / 2
+
 
 class LoadCellCalibration(Section):
     """A load cell's tare and scale.
@@ -91,13 +96,43 @@ class ServoCalibration(Section):
 
 
 class CameraCalibration(Section):
-    """What is known of the camera.
+    """How a camera sees the jaws, and when.
 
     Attributes:
         date: When it was calibrated.
+        backend: The camera's backend.
+        side_px: Side of its frames.
+        rate_hz: Its frame rate.
+        gain: Its gain.
+        exposure_us: The exposure at which the picture is neither dark nor clipped.
+        mean: Mean gray value there.
+        clipped: Share of clipped pixels there.
+        region: Region of interest of the frame: left, top, width, height in pixels.
+        markers: Whether markers on the jaws told the region.
+        lag_ms: Time by which its timestamps are late against the load cell's.
+        delay_ms: From the contact force to an estimate that can be used: exposure to use, and half a frame.
+        reference: File beside the profile with the picture of open jaws.
     """
 
     date: AwareDatetime
+    backend: str
+    side_px: int
+    rate_hz: Positive
+    gain: int | None
+    exposure_us: int
+    mean: NonNegative
+    clipped: NonNegative
+    region: tuple[int, int, int, int]
+    markers: bool
+    lag_ms: Estimate
+    delay_ms: Estimate
+    reference: str
+
+    def mismatches(self, camera: Tree) -> list[str]:
+        """What differs between the calibration and a run's section ``camera``, in words."""
+        mine = self.model_dump(mode="json")
+        keys = ("backend", "side_px", "rate_hz", "gain", "exposure_us")
+        return [f"camera.{key} {mine[key]}, not {camera[key]}" for key in keys if mine[key] != camera[key]]
 
 
 class RigProfile(Section):
@@ -122,7 +157,29 @@ class RigProfile(Section):
                 "open_position_rad": servo.open_position_rad.value,
                 "open_width_m": servo.open_width_m,
             }
+        if (camera := self.camera) is not None:
+            tree["camera"] = {"exposure_us": camera.exposure_us}
+            tree["vision"] = {"region": list(camera.region)}
+            tree["control"] = {"plant_delay_ms": camera.delay_ms.value}
         return tree
+
+    def mismatches(self, model: str, sensor: str, camera: Tree) -> list[str]:
+        """What a run has otherwise than the profile, in words.
+
+        Args:
+            model: The run's servo.
+            sensor: Its load cell; one without raw readings is never another.
+            camera: Its section ``camera``; a run without a camera has no other.
+        """
+        differ = []
+        if self.servo is not None and self.servo.model != model:
+            differ.append(f"a servo {self.servo.model}, and this one is {model}")
+        real = sensor not in ("none", "simulated", "playback")
+        if self.load_cell is not None and real and self.load_cell.sensor != sensor:
+            differ.append(f"a load cell {self.load_cell.sensor}, and this one is {sensor}")
+        if self.camera is not None and camera["backend"] != "none":
+            differ += self.camera.mismatches(camera)
+        return differ
 
 
 def read_rig(path: Path) -> RigProfile:

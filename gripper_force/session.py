@@ -27,6 +27,7 @@ from gripper_force.log import LogWriter
 from gripper_force.object_profile import find_object, read_object
 from gripper_force.perception import Estimator, LockstepPerception, Perception, ThreadedPerception
 from gripper_force.recorder import Recorder
+from gripper_force.rig import read_rig
 from gripper_force.types import (
     NS_PER_S,
     Event,
@@ -302,6 +303,13 @@ def _check_target(config: Config) -> None:
             f"target_n {config.target_n:g} N is too near to control.force_limit_n {limit_n:g} N; ask for at "
             f"most {largest_target_n(limit_n):g} N, or raise the limit"
         )
+    if config.calibration.rig is not None:
+        servo = read_rig(config.calibration.rig).servo
+        if servo is not None and config.target_n > servo.force_n[1]:
+            raise ConfigError(
+                f"target_n {config.target_n:g} N is more than the rig profile {config.calibration.rig} was "
+                f"calibrated with, {servo.force_n[1]:.1f} N; ask for less, or calibrate up to more"
+            )
     if config.calibration.object is not None:
         path = find_object(config.calibration.object)
         most_n = read_object(path).force_n
@@ -364,6 +372,26 @@ def correction_of(config: Config, checkpoint: Checkpoint | None) -> Correction |
             "calibration.on_mismatch=warn"
         )
     return load_correction(path, profile, differ)
+
+
+def rig_mismatches(config: Config) -> list[str]:
+    """What differs between the rig profile's devices and the run's, in words.
+
+    Raises:
+        ConfigError: The profile can't be read, or something differs, and that is refused.
+    """
+    path = config.calibration.rig
+    if path is None:
+        return []
+    differ = read_rig(path).mismatches(
+        config.servo.model, config.load_cell.sensor, config.camera.model_dump(mode="json")
+    )
+    if differ and config.calibration.on_mismatch == "refuse":
+        raise ConfigError(
+            f"the rig profile {path} is of {'; '.join(differ)}; calibrate again, or set "
+            "calibration.on_mismatch=warn"
+        )
+    return differ
 
 
 def checkpoint_of(config: Config) -> Checkpoint | None:
@@ -436,11 +464,15 @@ def _recorder(
             cast(BinaryIO, FaultyFile(file, faults, clock, lockstep=lockstep)) if faults.has("disk") else file
         )
 
+    differ = {
+        "object profile": () if correction is None else correction.differs,
+        "rig profile": rig_mismatches(config),
+    }
     log = LogWriter(path, config=dump_config(config), metadata=about, through=through)
     recorder = Recorder(log, lockstep=lockstep)
-    if correction is not None and correction.differs:
-        text = f"the object profile is of {'; '.join(correction.differs)}"
-        recorder.write(Event(devices.start_ns, "session", text))
+    for profile, found in differ.items():
+        if found:
+            recorder.write(Event(devices.start_ns, "session", f"the {profile} is of {'; '.join(found)}"))
     return recorder
 
 

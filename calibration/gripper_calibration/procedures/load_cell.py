@@ -78,7 +78,7 @@ def calibrate(
         weighing = weigh(cell, clock, force_n, ask=ask, seconds=seconds, progress=progress)
     found = LoadCellCalibration(
         date=datetime.now(UTC).replace(microsecond=0),
-        sensor=f"{section.backend} {section.format}" if section.backend == "serial" else section.backend,
+        sensor=section.sensor,
         tare_raw=weighing.tare_raw,
         n_per_raw=weighing.n_per_raw,
         force_n=(0.0, force_n),
