@@ -447,6 +447,100 @@ def calibrate_servo(
     console.show(result, as_json)
 
 
+@calibrate_app.command("camera")
+def calibrate_camera(
+    rig: RigPath = Path("rig.yaml"),
+    region: Annotated[
+        str | None,
+        typer.Option(help="Region of interest of the frame: left,top,width,height. Default: by markers."),
+    ] = None,
+    exposure_us: Annotated[
+        list[int] | None, typer.Option(min=1, help="An exposure to try. Repeatable. Default: a ladder.")
+    ] = None,
+    touches: Annotated[int, typer.Option(min=3, help="How often to touch the object.")] = 10,
+    object_: Annotated[str | None, typer.Option("--object", help="What is between the jaws.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the touches, and of a simulated scene.")] = None,
+    config: ConfigPath = None,
+    set_: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Find a camera's region of interest, exposure and lag, by touching an object that gives way."""
+    from gripper_calibration.procedures import camera as job
+
+    settings = _load(config, set_, {"object": object_, "seed": seed})
+    with console.err.status("looking") as status:
+        result = job.calibrate(
+            settings,
+            rig,
+            region=None if region is None else _region(region),
+            exposures_us=exposure_us or job.EXPOSURES_US,
+            touches=touches,
+            progress=lambda step, force_n: status.update(f"{step}: {force_n:.1f} N"),
+        )
+    console.show(result, as_json)
+
+
+@calibrate_app.command("object")
+def calibrate_object(
+    name: Annotated[str, typer.Argument(help="The object; of a simulated rig one that it knows.")],
+    touches: Annotated[int, typer.Option(min=1, help="How many touches there are to be.")] = 8,
+    peak_n: Annotated[float | None, typer.Option(help="The most to press with.")] = None,
+    logs: Annotated[
+        list[Path] | None,
+        typer.Option("--from", help="Calibrate on these logs, or folders of them, and touch nothing."),
+    ] = None,
+    folder: Annotated[
+        Path | None, typer.Option(help="Where the touches are kept; those that are there are not done again.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Profile to write. Default: NAME.yaml in your own folder of profiles.")
+    ] = None,
+    pause: Annotated[
+        bool, typer.Option("--pause", help="Wait for Enter before each touch, to put the object down anew.")
+    ] = False,
+    config: ConfigPath = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the touches, and of a simulated scene.")] = None,
+    set_: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Learn an object by touching it with the load cell in place. Ctrl-C calibrates on what there is."""
+    from gripper_calibration.procedures import object as job
+    from gripper_force.object_profile import user_folder
+
+    settings = _load(config, set_, {"object": name, "seed": seed})
+    if logs is None:
+        paths = _touches(settings, touches, peak_n, folder or Path("data/touches") / name, pause)
+    else:
+        paths = [p for path in logs for p in (sorted(path.rglob("*.mcap")) if path.is_dir() else [path])]
+    with console.bar("calibrating", len(paths) + 2) as advance:
+        result = job.calibrate(settings, name, paths, out or user_folder() / f"{name}.yaml", advance)
+    console.show(result, as_json, console.object_table)
+
+
+def _touches(settings: Config, touches: int, peak_n: float | None, folder: Path, pause: bool) -> list[Path]:
+    from gripper_calibration.procedures import object as job
+
+    paths = []
+    with console.err.status("touching") as status:
+        try:
+            for path in job.touch(
+                settings,
+                touches,
+                peak_n,
+                folder,
+                ask=lambda number: _ask(f"Put the object down for touch {number}", not pause, status),
+                progress=lambda number, _, force_n: status.update(
+                    f"touch {number} of {touches}: {force_n:.1f} N"
+                ),
+            ):
+                paths.append(path)
+        except KeyboardInterrupt:
+            if not paths:
+                raise
+            console.err.print(f"stopped after {len(paths)} of {touches} touches; calibrating on these")
+    return paths
+
+
 @app.command("virtual-servo")
 def virtual_servo(
     model: Annotated[str | None, typer.Option(help="Servo model.")] = None,
@@ -627,6 +721,14 @@ def _terminate(_signal: int, _frame: FrameType | None) -> None:
 def _load(path: Path | None, overrides: list[str] | None, options: dict[str, Any]) -> Config:
     given = [f"{key}={json.dumps(value)}" for key, value in options.items() if value is not None]
     return load_config(path, [*(overrides or []), *given])
+
+
+def _region(text: str) -> tuple[int, int, int, int]:
+    try:
+        left, top, width, height = (int(part) for part in text.split(","))
+    except ValueError:
+        raise ConfigError(f"--region needs left,top,width,height in pixels, got {text!r}") from None
+    return left, top, width, height
 
 
 def _ask(what: str, yes: bool, status: Any) -> None:

@@ -312,6 +312,30 @@ def soak_table(r: dict[str, Any]) -> None:
     _pairs({**summary, "outcomes": ", ".join(f"{n} {name}" for name, n in r["outcomes"].items())})
 
 
+def object_table(r: dict[str, Any]) -> None:
+    """An object's profile."""
+    after_n = r["after_n"]
+    interval, plant = r["interval"], r["plant"]
+    _pairs(
+        {
+            "object": r["object"],
+            "touches": f"{r['touches']} with {r['frames']} frames, up to {r['force_n']:.1f} N",
+            "error before": _number(r["before_n"], "N"),
+            "error after": "not known with so few touches" if after_n is None else _number(after_n, "N"),
+            "correction": r["correction"],
+            "interval": f"{100 * interval['coverage']:.0f} % within {interval['base_n']:.2f} N at no force, "
+            f"{math.hypot(interval['base_n'], 5 * interval['share']):.2f} N at 5 N",
+            "stiffness": _number(r["stiffness_n_m"], "N/m", 0),
+            "loop": "not known: no servo in these logs"
+            if plant is None
+            else f"gain {plant['gain']:.2f}, lag {plant['lag_ms']:.0f} ms, delay {plant['delay_ms']:.0f} ms, "
+            f"phase margin {plant['phase_margin_deg']:.0f} degrees",
+            "profile": str(r["profile"]),
+            "report": str(r["report"]),
+        }
+    )
+
+
 def changes_table(servo: str, changes: list[Any]) -> None:
     """Registers that would change, on stderr."""
     table = Table(servo, "is", "becomes", box=None, pad_edge=False)

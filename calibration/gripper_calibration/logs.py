@@ -44,16 +44,12 @@ class Recorded:
     delay_s: float
 
 
-def read(paths: Sequence[Path], checkpoint: Checkpoint) -> Recorded:
-    """Reads logs, one after the other; see `read_one`.
+def join(parts: Sequence[Recorded], paths: Sequence[Path]) -> Recorded:
+    """Several recordings, each of a log, as one; touches are numbered on.
 
     Raises:
-        DataError: There are none, one can't be used, or they are of different cameras.
-        LogError: A log can't be read.
+        DataError: They are of different cameras.
     """
-    if not paths:
-        raise DataError("there is no log to calibrate from; record some touches first")
-    parts = [read_one(path, checkpoint) for path in paths]
     first = parts[0]
     for path, part in zip(paths, parts, strict=True):
         if part.camera != first.camera:
@@ -62,21 +58,16 @@ def read(paths: Sequence[Path], checkpoint: Checkpoint) -> Recorded:
                 f"{path} was seen with {key} {part.camera[key]}, and {paths[0]} with "
                 f"{first.camera.get(key)}; calibrate each on its own"
             )
-    return join(parts)
-
-
-def join(parts: Sequence[Recorded]) -> Recorded:
-    """Several recordings as one; touches are numbered on."""
-    begin = np.cumsum([0, *(len(part.touches.numbers) for part in parts[:-1])])
+    begins = np.cumsum([0, *(len(part.touches.numbers) for part in parts[:-1])])
     touches = [part.touches for part in parts]
     return Recorded(
         touches=Touches(
             np.concatenate([t.features for t in touches]),
             np.concatenate([t.estimate_n for t in touches]),
             np.concatenate([t.force_n for t in touches]),
-            np.concatenate([t.touch + offset for t, offset in zip(touches, begin, strict=True)]),
+            np.concatenate([t.touch + begin for t, begin in zip(touches, begins, strict=True)]),
         ),
-        camera=parts[0].camera,
+        camera=first.camera,
         presses=[press for part in parts for press in part.presses],
         travel_m=[travel for part in parts for travel in part.travel_m],
         delay_s=float(np.median([part.delay_s for part in parts])),

@@ -75,6 +75,7 @@ class Plan:
         peak_n: The most that a touch presses with; None for `PEAK_N`, or what the force limit leaves.
         degrees: Angle of the press, if it is to be noted.
         lux: Light level, if it is to be noted.
+        test_every: Of so many sets the last is for test, in a folder of its own; None: none is.
     """
 
     sets: int
@@ -82,14 +83,21 @@ class Plan:
     peak_n: float | None = None
     degrees: float | None = None
     lux: float | None = None
+    test_every: int | None = TEST_EVERY
 
     def paths(self, config: Config, out: Path) -> list[Path]:
-        """The logs, in order: every fifth in the folder ``test``, the others in ``train``."""
+        """The logs, in order: those for test in the folder ``test``, the others in ``train``."""
         parts = [config.object]
         parts += [] if self.degrees is None else [f"{self.degrees:g}deg"]
         parts += [] if self.lux is None else [f"{self.lux:g}lux"]
         stem = "-".join(parts)
-        return [out / _split(n) / f"{stem}-{n:02d}.mcap" for n in range(1, self.sets + 1)]
+        return [out / self.split(n) / f"{stem}-{n:02d}.mcap" for n in range(1, self.sets + 1)]
+
+    def split(self, number: int) -> str:
+        """What a set is for: ``train`` or ``test``, or an empty text."""
+        if self.test_every is None:
+            return ""
+        return "train" if number % self.test_every else "test"
 
 
 def record(config: Config, plan: Plan, out: Path, progress: Progress) -> Iterator[Path]:
@@ -111,7 +119,8 @@ def record(config: Config, plan: Plan, out: Path, progress: Progress) -> Iterato
         unfinished = path.with_name(f".{path.name}.part")
         unfinished.unlink(missing_ok=True)
         one = config.model_copy(update={"seed": config.seed + number - 1, "target_n": peak_n})
-        notes = {"set": path.stem, "split": _split(number)}
+        notes = {"set": path.stem}
+        notes |= {"split": split} if (split := plan.split(number)) else {}
         notes |= {} if plan.degrees is None else {"degrees": f"{plan.degrees:g}"}
         notes |= {} if plan.lux is None else {"lux": f"{plan.lux:g}"}
         with open_devices(one) as devices:
@@ -258,7 +267,3 @@ def _rest(rig: _Rig) -> tuple[float, float]:
             f"load_cell.tare_raw={np.median([sample.raw for sample in felt.values()]):.8g}"
         )
     return rest_n, rest_n + max(_FREE_N, 4 * float(np.std(forces_n)))
-
-
-def _split(number: int) -> str:
-    return "train" if number % TEST_EVERY else "test"

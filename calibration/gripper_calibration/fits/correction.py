@@ -1,8 +1,8 @@
 """The correction of one object from its touches: which one the touches can bear, and how good it is.
 
-Candidates are tried from the simplest on: the network as it is, a line, curves, and a line with the last layer
-refitted. Each touch is estimated from all others, and of the candidates that are no worse than the best by
-more than one standard error the simplest is taken (L. Breiman et al., Classification and Regression Trees,
+Candidates are tried from the simplest on: the network as it is, a line, curves, and a line with the last
+layer refitted. Each touch is estimated from all others, and of the candidates that are no worse than the best
+by more than one standard error the simplest is taken (L. Breiman et al., Classification and Regression Trees,
 1984, section 3.4.3). So touches that contradict each other leave the network as it is, with a wide interval.
 """
 

@@ -1,11 +1,11 @@
 """How far off a corrected estimate is at most, with a stated probability.
 
 *From three touches on* by conformal prediction: the errors on each touch, as corrected by all others (after
-the jackknife+ of R. F. Barber et al., Annals of Statistics 49 (2021) 486, doi:10.1214/20-AOS1965), are divided
-by their own growth with the force, and the quantile that leaves the promised share below is taken, each touch
-counting the same. Frames of one touch err together, so there are as many draws as touches, not frames: of K
-touches, a new one is spread about their mean by sqrt(1 + 1/K) times as much as they are, and so the quantile
-grows. docs/calibration.md shows how often new touches were within.
+the jackknife+ of R. F. Barber et al., Annals of Statistics 49 (2021) 486, doi:10.1214/20-AOS1965), are
+divided by their own growth with the force, and the quantile that leaves the promised share below is taken,
+each touch counting the same. Frames of one touch err together, so there are as many draws as touches, not
+frames: of K touches, a new one is spread about their mean by sqrt(1 + 1/K) times as much as they are, and so
+the quantile grows. docs/calibration.md shows how often new touches were within.
 
 *With one or two* that quantile is not to be had, and the interval is what the line's model says.
 """
