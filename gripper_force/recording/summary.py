@@ -93,13 +93,13 @@ def _summary(path: Path) -> Summary:
     cells = sorted(records[LoadCellSample], key=lambda sample: sample.t_ns)
     cell_ns = np.array([sample.t_ns for sample in cells if sample.valid], np.int64)
     forces_n, valid = label_frames(frame_ns, cells, 0)
-    releases_ns = _releases(records[Request])
-    lags = _lags(frame_ns, np.stack(images), cells, records[GraspStatus], releases_ns)
+    let_go_ns = releases_ns(records[Request])
+    lags = _lags(frame_ns, np.stack(images), cells, records[GraspStatus], let_go_ns)
     return {
         "log": str(path),
         "object": config.object,
         "set": reader.metadata.get("set", path.stem),
-        "touches": len(releases_ns),
+        "touches": len(let_go_ns),
         "frames": len(images),
         "camera_hz": _rate_hz(frame_ns),
         "camera_hz_asked": config.camera.rate_hz,
@@ -119,14 +119,14 @@ def _lags(
     images: npt.NDArray[np.uint8],
     cells: list[LoadCellSample],
     statuses: list[GraspStatus],
-    releases_ns: list[int],
+    let_go_ns: list[int],
 ) -> list[TouchLag]:
     good = [sample for sample in cells if sample.valid]
     cell_s = np.array([sample.t_ns for sample in good]) / NS_PER_S
     force_n = np.array([sample.force_n for sample in good])
     servo_s = np.array([status.t_ns for status in statuses]) / NS_PER_S
     width_m = np.array([status.width_m for status in statuses])
-    releases_s = (np.array(releases_ns) / NS_PER_S).tolist()
+    releases_s = (np.array(let_go_ns) / NS_PER_S).tolist()
     cameras_s = camera_lags_s(frame_ns / NS_PER_S, images, servo_s, width_m, releases_s)
     lags = []
     for at_s, camera_s in zip(releases_s, cameras_s.tolist(), strict=True):
@@ -136,7 +136,7 @@ def _lags(
     return lags
 
 
-def _releases(requests: list[Request]) -> list[int]:
+def releases_ns(requests: list[Request]) -> list[int]:
     """When each touch was let go; the last release only opens the jaws."""
     kinds = [request.kind for request in requests]
     pairs = zip([RequestKind.RELEASE, *kinds], requests, strict=False)
