@@ -53,6 +53,10 @@ class GripperConfig(Section):
     )
     friction_n: NonNegative = Field(0.95, description="jaw force that friction takes while closing")
     damping_n_s_m: NonNegative = Field(14.5, description="viscous friction of one jaw, motor included")
+    friction_std: NonNegative = Field(0.25, description="standard deviation of true friction over friction_n")
+    gain_std: NonNegative = Field(
+        0.06, description="of the true torque constant over nm_per_a: +-10 % uniform is 0.058"
+    )
 
 
 class CameraConfig(Section):

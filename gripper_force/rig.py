@@ -19,6 +19,15 @@ from gripper_force.schema import (
 
 FORMAT: Final = "gripper-force-rig/1"
 
+_GAIN_DRIFT: Final = 0.02
+"""A magnet of neodymium gives 0.11 % less a kelvin, and a motor that works warms by 20 K and more."""
+
+_FRICTION_DRIFT: Final = 0.1
+"""What grease, wear and the place on the rack make of friction, as a share of it: an assumption."""
+
+_NORMAL: Final = 1.96
+"""Half of a 95 % interval in standard deviations."""
+
 Range = Annotated[tuple[NonNegative, NonNegative], Field(description="least and most")]
 
 
@@ -151,8 +160,10 @@ class RigProfile(Section):
         if (servo := self.servo) is not None:
             tree["gripper"] = {
                 "nm_per_a": servo.nm_per_a.value,
-                "friction_n": servo.friction_n.value,
-                "damping_n_s_m": servo.damping_n_s_m.value,
+                "friction_n": max(servo.friction_n.value, 0.0),
+                "friction_std": _std(servo.friction_n, _FRICTION_DRIFT),
+                "gain_std": _std(servo.nm_per_a, _GAIN_DRIFT),
+                "damping_n_s_m": max(servo.damping_n_s_m.value, 0.0),
                 "pinion_radius_m": servo.pinion_radius_m.value,
                 "open_position_rad": servo.open_position_rad.value,
                 "open_width_m": servo.open_width_m,
@@ -180,6 +191,12 @@ class RigProfile(Section):
         if self.camera is not None and camera["backend"] != "none":
             differ += self.camera.mismatches(camera)
         return differ
+
+
+def _std(estimate: Estimate, drift: float) -> float:
+    """Standard deviation in use, as a share of the value: the interval's, and at least what it drifts by."""
+    share = estimate.half / (_NORMAL * abs(estimate.value)) if estimate.value else 0.0
+    return min(max(share, drift), 1.0)
 
 
 def read_rig(path: Path) -> RigProfile:

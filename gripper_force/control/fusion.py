@@ -9,7 +9,7 @@ import math
 from collections import deque
 
 from gripper_force.config import ControlConfig
-from gripper_force.control.transmission import FRICTION_STD, GAIN_STD, Transmission
+from gripper_force.control.transmission import Transmission
 from gripper_force.types import NS_PER_MS, NS_PER_S, Event, FusedForce, ServoState, Source, VisualForce
 
 _DRIFT_N2_S = 0.03**2
@@ -87,7 +87,7 @@ class Fusion:
         self._difference_n = 0.0
         self._share = 1.0
         self._friction_n = self._transmission.friction_n
-        self._friction_n2 = (FRICTION_STD * self._friction_n) ** 2
+        self._friction_n2 = (self._transmission.friction_std * self._friction_n) ** 2
         self._hidden_n2 = 0.0
         self.loosen()
 
@@ -150,7 +150,7 @@ class Fusion:
         back = 0.0 if friction_n == 0 or free else 0.5 + (self._current_n - self._push_n) / (2 * friction_n)
         drift_n2 = (_DRIFT_N2_S + _LOOSE_N2_S * back) * dt_s
         # An unknown gain error g makes the bias g * force, so its variance follows the square of the force.
-        gain_n2 = GAIN_STD**2 * abs(self._current_n**2 - before_n**2)
+        gain_n2 = self._transmission.gain_std**2 * abs(self._current_n**2 - before_n**2)
         self._variance_n2 = min(self._variance_n2 + drift_n2 + gain_n2, self._prior_n2(self._current_n))
         self._history.append((servo.t_ns, self._current_n))
 
@@ -203,7 +203,8 @@ class Fusion:
         return later_n
 
     def _prior_n2(self, force_n: float) -> float:
-        return self._friction_n2 + _FREE_FLOOR_N**2 + (GAIN_STD * force_n) ** 2 + self._hidden_n2
+        gain_n2 = (self._transmission.gain_std * force_n) ** 2
+        return self._friction_n2 + _FREE_FLOOR_N**2 + gain_n2 + self._hidden_n2
 
     def _switch(self, t_ns: int) -> tuple[Event, ...]:
         fresh = self._used_ns is not None and t_ns - self._used_ns <= self._timeout_ns

@@ -3,7 +3,7 @@
 import math
 
 from gripper_force.config import ControlConfig
-from gripper_force.control.transmission import FRICTION_STD, Transmission
+from gripper_force.control.transmission import Transmission
 from gripper_force.errors import NonFiniteError
 from gripper_force.types import ServoCommand
 
@@ -102,7 +102,7 @@ class Limits:
 
     def ceiling_a(self, friction_n: float) -> float:
         """The most current that the force limit and the servo's own limit leave."""
-        most_friction_n = (1 + 3 * FRICTION_STD) * self._transmission.friction_n
+        most_friction_n = (1 + 3 * self._transmission.friction_std) * self._transmission.friction_n
         most_n = _CERTAIN_SHARE * self._force_limit_n + min(max(friction_n, 0.0), most_friction_n)
         return min(self._current_limit_a, abs(self._transmission.current_a(most_n)))
 

@@ -2,15 +2,8 @@
 
 import math
 from dataclasses import dataclass
-from typing import Final
 
 from gripper_force.config import GripperConfig
-
-FRICTION_STD: Final = 0.25
-"""Standard deviation of true friction, as a share of the nominal."""
-
-GAIN_STD: Final = 0.06
-"""Standard deviation of the torque constant, as a share of the nominal (+-10 % uniform is 0.058)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +22,8 @@ class Transmission:
         friction_n: Coulomb friction at each jaw.
         damping_n_s_m: Viscous friction at each jaw.
         current_step_a: Resolution of the servo's goal current; 0 where it is not known.
+        friction_std: Standard deviation of true friction, as a share of `friction_n`.
+        gain_std: Standard deviation of the true torque constant, as a share of the nominal.
     """
 
     pinion_radius_m: float
@@ -39,6 +34,8 @@ class Transmission:
     friction_n: float
     damping_n_s_m: float
     current_step_a: float = 0.0
+    friction_std: float = 0.25
+    gain_std: float = 0.06
 
     @classmethod
     def from_config(
@@ -55,6 +52,8 @@ class Transmission:
             friction_n=gripper.friction_n,
             damping_n_s_m=gripper.damping_n_s_m,
             current_step_a=current_step_a,
+            friction_std=gripper.friction_std,
+            gain_std=gripper.gain_std,
         )
 
     @property
@@ -86,4 +85,4 @@ class Transmission:
 
     def bias_std_n(self, force_n: float) -> float:
         """Standard deviation of the contact force about what the motor current says of it."""
-        return math.hypot(FRICTION_STD * self.friction_n, GAIN_STD * force_n)
+        return math.hypot(self.friction_std * self.friction_n, self.gain_std * force_n)

@@ -42,3 +42,9 @@ def test_a_configured_torque_constant_goes_before_the_servos():
 def test_uncertainty_grows_with_force():
     gripper = Transmission.from_config(GripperConfig(), 1.78)
     assert gripper.bias_std_n(8.0) > gripper.bias_std_n(0.0) == pytest.approx(0.25 * gripper.friction_n)
+
+
+def test_what_was_calibrated_is_less_uncertain():
+    gripper = Transmission.from_config(GripperConfig(friction_std=0.1, gain_std=0.02), 1.78)
+    assert gripper.bias_std_n(0.0) == pytest.approx(0.1 * gripper.friction_n)
+    assert gripper.bias_std_n(1e3) == pytest.approx(0.02 * 1e3, rel=1e-3)

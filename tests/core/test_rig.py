@@ -55,6 +55,8 @@ def test_what_it_sets_are_keys_of_the_configuration(tmp_path: Path) -> None:
     config = load_config(None, [f"calibration.rig={path}"])
     assert (config.gripper.nm_per_a, config.gripper.open_width_m) == (1.7, 0.09)
     assert config.load_cell.tare_raw == 8000
+    assert config.gripper.friction_std == pytest.approx(0.1, abs=0.05)
+    assert config.gripper.gain_std == 0.02
 
 
 @pytest.mark.parametrize(
