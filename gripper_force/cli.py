@@ -522,13 +522,17 @@ def _touches(settings: Config, touches: int, peak_n: float | None, folder: Path,
 
     paths = []
     with console.err.status("touching") as status:
+
+        def ask(number: int) -> None:
+            _ask(f"Put the object down for touch {number}", False, status)
+
         try:
             for path in job.touch(
                 settings,
                 touches,
                 peak_n,
                 folder,
-                ask=lambda number: _ask(f"Put the object down for touch {number}", not pause, status),
+                ask=ask if pause else lambda _: None,
                 progress=lambda number, _, force_n: status.update(
                     f"touch {number} of {touches}: {force_n:.1f} N"
                 ),

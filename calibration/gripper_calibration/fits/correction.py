@@ -58,6 +58,7 @@ class Fitted:
         left_out_n: What each touch was estimated at from all others, (N,); NaN with less than 3 touches.
         errors_n: MAE of each candidate on touches left out, by name.
         before_n: MAE of the network as it is, on all frames.
+        after_n: MAE of `left_out_n`; None where there were too few touches.
     """
 
     output: OutputCurve
@@ -68,11 +69,7 @@ class Fitted:
     left_out_n: Floats
     errors_n: dict[str, float]
     before_n: float
-
-    @property
-    def after_n(self) -> float | None:
-        """MAE on touches left out; None where there were too few."""
-        return self.errors_n.get(self.candidate)
+    after_n: float | None
 
     def predict(self, touches: Touches) -> Floats:
         """Corrected forces, (N,)."""
@@ -129,6 +126,7 @@ def fit_correction(touches: Touches, coverage: float = COVERAGE, advance: Advanc
         left_out_n=left_out_n,
         errors_n=errors_n,
         before_n=float(np.abs(touches.estimate_n - touches.force_n).mean()),
+        after_n=float(np.abs(left_out_n - touches.force_n).mean()) if errors_n else None,
     )
 
 

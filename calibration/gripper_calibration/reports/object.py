@@ -52,7 +52,7 @@ def draw(
         left.plot(line, half_n, color=FIT, label=label)
         left.plot(line, -half_n, color=FIT)
         name(left, "what is left, by force", "load cell, N", "error, N")
-        left.legend(loc="lower left")
+        left.legend(loc="upper left")
         counts = sorted({count for count, _, _ in curve})
         for count, mae_n, _ in curve:
             enough.plot(count, mae_n, ".", color=DATA)

@@ -1,0 +1,202 @@
+"""What calibrating on an object brings, on simulated objects that training never saw.
+
+The objects differ from training's in stiffness (up to a half, training 5 %), size (up to 10 %, training 4 %)
+and texture, and a fifth one, a ball, is of another kind. Each lies on one rig, is touched again and again, and
+put down anew each time. The last touches are for test alone.
+
+    python examples/calibration_check.py                # error and interval against the number of touches
+    python examples/calibration_check.py --grasps 40    # grasps with a profile of 8 touches, and without
+
+What is there in OUT is not made again.
+"""
+
+import argparse
+import json
+import multiprocessing
+import os
+from collections import defaultdict
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+
+from gripper_calibration import logs
+from gripper_calibration.fits.correction import fit_correction
+from gripper_calibration.procedures.object import calibrate, touch
+from gripper_force.config import Config, load_config
+from gripper_force.grasp import grasp
+from gripper_force.object_profile import read_object
+from gripper_force.vision.checkpoint import load_checkpoint
+
+KINDS = ("sponge", "paper_cup", "tube", "stapler", "ball")
+COUNTS = (1, 2, 4, 8, 16)
+TOUCHES, TESTED = 24, 8
+DRAWS = 4
+PROFILE = 8
+TARGETS_N = (1.0, 8.0)
+
+
+def configure(kind: str, number: int, out: Path, *more: str) -> Config:
+    """The rig with one of the objects on it."""
+    which = 970_000 + number
+    keys = [f"object={kind}", "sim.stiffness_spread=0.5", "sim.size_spread=0.1", f"seed={100 * which}"]
+    return load_config(
+        None, [*keys, f"sim.object_seed={which}", f"sim.rig_seed={which}", f"log.directory={out}", *more]
+    )
+
+
+def errors(kind: str, number: int, out: Path) -> list[dict[str, Any]]:
+    """Touches an object, and calibrates on ever more touches. A row for each draw."""
+    kept = out / f"{kind}-{number}.json"
+    if kept.exists():
+        rows: list[dict[str, Any]] = json.loads(kept.read_text())
+        return rows
+    paths = list(touch(configure(kind, number, out), TOUCHES, None, out / f"{kind}-{number}"))
+    checkpoint = load_checkpoint()
+    touches = logs.join([logs.read_one(path, checkpoint) for path in paths], paths).touches
+    test = touches.only(touches.numbers[-TESTED:])
+    rng = np.random.default_rng(number)
+    before_n = float(np.abs(test.estimate_n - test.force_n).mean())
+    rows = []
+    for count in COUNTS:
+        for _ in range(DRAWS):
+            drawn = rng.choice(touches.numbers[:-TESTED], count, replace=False)
+            fitted = fit_correction(touches.only([int(n) for n in drawn]))
+            after_n = fitted.predict(test)
+            error_n = np.abs(after_n - test.force_n)
+            within = error_n <= np.hypot(fitted.interval.base_n, fitted.interval.share * after_n)
+            rows.append(
+                {
+                    "object": kind,
+                    "touches": count,
+                    "before_n": before_n,
+                    "after_n": float(error_n.mean()),
+                    "within": float(within.mean()),
+                    "half_width_n": float(np.hypot(fitted.interval.base_n, 5 * fitted.interval.share)),
+                    "gated": float((fitted.arrays.strangeness(test.features) > fitted.gate).mean()),
+                }
+            )
+    kept.write_text(json.dumps(rows))
+    return rows
+
+
+def one_grasp(
+    kind: str, number: int, trial: int, target_n: float, profile: str, feedback: str, out: Path
+) -> Any:
+    """One grasp, with a profile of the object or with none."""
+    kept = out / f"grasp-{kind}-{number}-{trial}-{'profile' if profile else 'none'}-{feedback}.json"
+    if not kept.exists():
+        known = [f"calibration.object={profile}"] if profile else []
+        keys = [f"target_n={target_n}", f"control.feedback={feedback}", "log.report=false", *known]
+        config = configure(kind, number, out / "runs", *keys)
+        result = grasp(config.model_copy(update={"seed": config.seed + 50 + trial}))
+        kept.write_text(json.dumps(result))
+    return json.loads(kept.read_text())
+
+
+def profile_of(kind: str, number: int, out: Path) -> str:
+    """A profile of the object's first touches."""
+    path = out / f"{kind}-{number}.yaml"
+    if not path.exists():
+        config = configure(kind, number, out)
+        touched = list(touch(config, PROFILE, None, out / f"{kind}-{number}"))
+        calibrate(config, kind, touched, path, lambda _: None)
+    return str(path)
+
+
+def errors_table(rows: list[dict[str, Any]]) -> None:
+    """Prints what the touches bring."""
+    print("| touches | MAE N before | after | ratio | within the 90 % interval | half-width at 5 N | gated |")
+    print("|---|---|---|---|---|---|---|")
+    for count in COUNTS:
+        part = [row for row in rows if row["touches"] == count]
+        mean = {key: float(np.mean([row[key] for row in part])) for key in part[0] if key != "object"}
+        print(
+            f"| {count} | {mean['before_n']:.3f} | {mean['after_n']:.3f} | "
+            f"{mean['before_n'] / mean['after_n']:.1f} | {100 * mean['within']:.0f} % | "
+            f"{mean['half_width_n']:.2f} N | {100 * mean['gated']:.1f} % |"
+        )
+    print("\n| object | before | " + " | ".join(f"{count} touches" for count in COUNTS) + " |")
+    print("|---|---|" + "---|" * len(COUNTS))
+    for kind in KINDS:
+        own = [row for row in rows if row["object"] == kind]
+        cells = [np.mean([r["after_n"] for r in own if r["touches"] == count]) for count in COUNTS]
+        print(
+            f"| {kind} | {np.mean([r['before_n'] for r in own]):.3f} | "
+            + " | ".join(f"{cell:.3f}" for cell in cells)
+            + " |"
+        )
+
+
+def grasps_table(results: dict[tuple[str, str], list[dict[str, Any]]]) -> None:
+    """Prints what grasps get out of it."""
+    print(
+        "| feedback | profile | median error | within 8 % or 0.25 N | MAE of estimate | held | over limit |"
+    )
+    print("|---|---|---|---|---|---|---|")
+    for (feedback, known), grasps in results.items():
+        scored = [g for g in grasps if g["steady_error_n"] is not None]
+        error_n = np.array([abs(g["steady_error_n"]) for g in scored])
+        share = error_n / np.array([g["target_n"] for g in scored])
+        good = (share <= 0.08) | (error_n <= 0.25)
+        source = "fused" if feedback == "fused" else "visual"
+        mae_n = np.mean([v for g in grasps if (v := g["estimate_mae_n"][source]) is not None])
+        held = sum(g["result"] == "held" for g in grasps)
+        over = sum(g["peak_n"] > 10 for g in grasps)
+        print(
+            f"| {feedback} | {known} | {100 * np.median(share):.1f} % | "
+            f"{100 * good.sum() / len(grasps):.0f} % | {mae_n:.3f} N | {held} of {len(grasps)} | {over} |"
+        )
+
+
+def main() -> None:
+    """Prints the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--each", type=int, default=3, help="objects of each kind")
+    parser.add_argument("--grasps", type=int, default=0, help="so many grasps with and without a profile")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--out", type=Path, default=Path("data/calibration"))
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    objects = [(kind, 10 * k + n) for n in range(options.each) for k, kind in enumerate(KINDS)]
+    console = Console(stderr=True)
+    with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn")) as pool:
+        if not options.grasps:
+            done = [pool.submit(errors, *which, options.out) for which in objects]
+            errors_table([r for f in track(done, "objects", console=console) for r in f.result()])
+            return
+        made = [pool.submit(profile_of, *which, options.out) for which in objects]
+        profiles = [future.result() for future in track(made, "profiles", console=console)]
+        rng = np.random.default_rng(20)
+        most_n = [read_object(Path(profile)).force_n for profile in profiles]
+        plan = [
+            (i % len(objects), i, round(min(float(rng.uniform(*TARGETS_N)), most_n[i % len(objects)]), 3))
+            for i in range(options.grasps)
+        ]
+        pending = {
+            (feedback, known): [
+                pool.submit(
+                    one_grasp,
+                    *objects[i],
+                    trial,
+                    target_n,
+                    profiles[i] if known == "yes" else "",
+                    feedback,
+                    options.out,
+                )
+                for i, trial, target_n in plan
+            ]
+            for feedback in ("fused", "vision")
+            for known in ("no", "yes")
+        }
+        results = defaultdict(list)
+        for key, futures in pending.items():
+            results[key] = [f.result() for f in track(futures, " ".join(key), console=console)]
+        grasps_table(results)
+
+
+if __name__ == "__main__":
+    main()
