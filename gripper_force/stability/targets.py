@@ -3,6 +3,7 @@
 import json
 import struct
 from collections.abc import Iterable, Iterator
+from datetime import UTC, datetime
 from functools import cache
 from io import BytesIO
 from itertools import pairwise
@@ -30,6 +31,8 @@ from gripper_force.grasp import summarise
 from gripper_force.log import LogReader, LogWriter
 from gripper_force.replay import replay
 from gripper_force.report.data import read_run
+from gripper_force.rig import Estimate, LoadCellCalibration, RigProfile, ServoCalibration
+from gripper_force.schema import dump
 from gripper_force.session import controller_from
 from gripper_force.stability.fuzz import Target
 from gripper_force.types import (
@@ -67,6 +70,38 @@ def _configs() -> list[bytes]:
 def _read_config(data: bytes, path: Path) -> None:
     path.write_bytes(data)
     _use_config(load_config(path))
+
+
+def _rigs() -> list[bytes]:
+    date, found = datetime(2026, 1, 2, tzinfo=UTC), Estimate(value=1.7, low=1.69, high=1.72)
+    servo = ServoCalibration(
+        date=date,
+        model="XM430-W350",
+        nm_per_a=found,
+        friction_n=found,
+        damping_n_s_m=found,
+        pinion_radius_m=Estimate(value=0.02),
+        open_position_rad=found,
+        open_width_m=0.09,
+        force_n=(0.3, 9.5),
+        speed_m_s=(0.01, 0.05),
+        residual_n=0.1,
+    )
+    cell = LoadCellCalibration(
+        date=date,
+        sensor="serial hx711",
+        tare_raw=found,
+        n_per_raw=found,
+        force_n=(0, 9.8),
+        noise_n=0.01,
+        drift_n_min=found,
+    )
+    return [dump(RigProfile(servo=servo)).encode(), dump(RigProfile(load_cell=cell)).encode()]
+
+
+def _read_rig(data: bytes, path: Path) -> None:
+    path.write_bytes(data)
+    _use_config(load_config(None, [f"calibration.rig={path}"]))
 
 
 def _assignments() -> list[bytes]:
@@ -316,6 +351,7 @@ _TYPES: Final = tuple(b"F32 F16 BF16 F8_E4M3 I64 BOOL".split())
 
 TARGETS: Final = [
     Target("config", _configs, _read_config, 6, _YAML_WORDS),
+    Target("rig profile", _rigs, _read_rig, 6, _YAML_WORDS),
     Target("assignment", _assignments, _assign, 8, _YAML_WORDS),
     Target("log", _logs, _read_log, 3, _LOG_WORDS),
     Target("log replayed", _logs, _replay_log, 2, _LOG_WORDS),
