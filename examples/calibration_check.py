@@ -1,7 +1,7 @@
 """What calibrating on an object brings, on simulated objects that training never saw.
 
 The objects differ from training's in stiffness (up to a half, training 5 %), size (up to 10 %, training 4 %)
-and texture, and a fifth one, a ball, is of another kind. Each lies on one rig, is touched again and again, and
+and texture, and a fifth one, a ball, is of another kind. Each lies on one rig, is touched again and again and
 put down anew each time. The last touches are for test alone.
 
     python examples/calibration_check.py                # error and interval against the number of touches

@@ -1,0 +1,160 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gripper_calibration.fits.correction import fit_correction, learning_curve
+from gripper_calibration.fits.touches import Floats, Touches
+from gripper_force.errors import DataError
+
+FEATURES = 40
+
+
+def touched(
+    count: int,
+    *,
+    gain: float = 1.0,
+    offset_n: float = 0.0,
+    bend: float = 0.0,
+    scatter: float = 0.0,
+    noise_n: float = 0.02,
+    peak_n: float = 8.0,
+    seed: int = 0,
+) -> Touches:
+    """Touches whose true force is a line through the network's estimate, or bent away from it."""
+    rng = np.random.default_rng(seed)
+    mix = np.random.default_rng(99).normal(size=(3, FEATURES))  # one network
+    parts: list[tuple[Floats, Floats, Floats]] = []
+    for _ in range(count):
+        rise = np.sin(np.linspace(0, np.pi, 60)).clip(0) * rng.uniform(0.4, 1) * peak_n
+        estimate_n = np.concatenate([np.zeros(15), rise, np.zeros(15)])
+        own = gain * (1 + scatter * rng.normal())
+        force_n = own * estimate_n + offset_n + bend * np.square(estimate_n) / peak_n
+        hidden = np.column_stack([estimate_n, np.square(estimate_n) / peak_n, rng.normal(size=90)])
+        features = np.tanh(0.1 * hidden @ mix) + 0.01 * rng.normal(size=(90, FEATURES))
+        parts.append((features, estimate_n, force_n + noise_n * rng.normal(size=90)))
+    features, estimate_n, force_n = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return Touches(features.astype(np.float32), estimate_n, force_n, np.repeat(np.arange(count), 90))
+
+
+@pytest.mark.parametrize("count", [1, 2, 4, 8])
+@pytest.mark.parametrize("gain", [0.6, 1.5])
+def test_a_wrong_gain_is_put_right_by_a_few_touches(count: int, gain: float) -> None:
+    fitted = fit_correction(touched(count, gain=gain, scatter=0.01))
+    new = touched(5, gain=gain, scatter=0.01, seed=1)
+    before_n = np.abs(new.estimate_n - new.force_n).mean()
+    after_n = np.abs(fitted.predict(new) - new.force_n).mean()
+    assert after_n < 0.25 * before_n
+    assert (fitted.after_n is None) == (count < 3)
+
+
+def test_what_is_right_stays_as_it_is() -> None:
+    fitted = fit_correction(touched(8))
+    assert fitted.candidate == "the network as it is"
+    assert fitted.output.force_n == fitted.output.estimate_n
+
+
+def test_a_bend_is_followed_where_touches_tell_of_it() -> None:
+    fitted = fit_correction(touched(8, bend=-0.4))
+    new = touched(5, bend=-0.4, seed=1)
+    assert np.abs(fitted.predict(new) - new.force_n).mean() < 0.06
+    assert fitted.candidate != "a line"
+
+
+def test_touches_that_contradict_each_other_leave_a_wide_interval() -> None:
+    agreeing, torn = (fit_correction(touched(8, scatter=scatter, seed=3)) for scatter in (0.01, 0.4))
+    assert torn.interval.share > 5 * agreeing.interval.share
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_few_touches_have_a_wider_interval_than_many(count: int) -> None:
+    few, many = (fit_correction(touched(n, gain=1.3, scatter=0.03)) for n in (count, 16))
+    assert few.interval.share > many.interval.share
+
+
+def test_spikes_of_the_load_cell_do_not_move_the_line() -> None:
+    touches = touched(2, gain=0.7)
+    spiky = touches.force_n.copy()
+    spiky[np.random.default_rng(0).choice(len(spiky), 8, replace=False)] = -70.0
+    fitted = fit_correction(Touches(touches.features, touches.estimate_n, spiky, touches.touch))
+    assert fitted.output.force_n[1] / fitted.output.estimate_n[1] == pytest.approx(0.7, abs=0.06)
+
+
+def test_new_touches_are_within_the_interval_as_often_as_promised() -> None:
+    within = []
+    for seed in range(20):
+        fitted = fit_correction(touched(8, gain=1.2, scatter=0.04, seed=2 * seed))
+        new = touched(20, gain=1.2, scatter=0.04, seed=2 * seed + 1)
+        predicted_n = fitted.predict(new)
+        half_n = np.hypot(fitted.interval.base_n, fitted.interval.share * predicted_n)
+        within.append((np.abs(predicted_n - new.force_n) <= half_n).mean())
+    assert np.mean(within) == pytest.approx(0.9, abs=0.03)
+
+
+def test_frames_of_another_object_are_stranger_than_those_of_new_touches() -> None:
+    fitted = fit_correction(touched(8))
+    new, other = touched(5, seed=1), touched(5, seed=1)
+    other.features[:, ::2] *= -1
+    assert (fitted.arrays.strangeness(new.features) > fitted.gate).mean() < 0.02
+    assert (fitted.arrays.strangeness(other.features) > fitted.gate).mean() > 0.5
+
+
+def test_how_many_touches_are_enough_goes_down_and_tests_on_others() -> None:
+    rows = list(learning_curve(touched(9, gain=1.4, scatter=0.02), draws=2))
+    assert {count for count, _, _ in rows} == {1, 2, 4, 8}
+    assert all(mae_n < 0.5 and 0 <= share <= 1 for _, mae_n, share in rows)
+
+
+@pytest.mark.parametrize(
+    ("touches", "sentence"),
+    [
+        (touched(3, peak_n=0.3), "no more than"),
+        (touched(3, gain=-1.0), "no more than"),
+        (touched(1).only([7]), "0 frames"),
+        (
+            Touches(*(lambda t: (t.features, np.full_like(t.force_n, 2.0), t.force_n, t.touch))(touched(3))),
+            "corr",
+        ),
+        (touched(4, noise_n=20.0), "correlation"),
+        (touched(4, gain=0.1, peak_n=40.0), "0.1[0-9] N for each"),
+    ],
+    ids=["light", "wrong sign", "none", "constant", "noise", "another quantity"],
+)
+def test_what_tells_nothing_is_refused(touches: Touches, sentence: str) -> None:
+    with pytest.raises(DataError, match=sentence):
+        fit_correction(touches)
+
+
+def test_values_that_are_not_finite_are_refused() -> None:
+    touches = touched(2)
+    touches.force_n[3] = np.nan
+    with pytest.raises(DataError, match="not finite"):
+        fit_correction(touches)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    count=st.integers(1, 5),
+    gain=st.floats(0.3, 3.0),
+    offset_n=st.floats(-0.5, 0.5),
+    scatter=st.floats(0, 0.5),
+    noise_n=st.floats(0, 1.0),
+    repeat=st.booleans(),
+    seed=st.integers(0, 100),
+)
+def test_a_fit_is_refused_or_finite_and_never_falls(
+    count: int, gain: float, offset_n: float, scatter: float, noise_n: float, repeat: bool, seed: int
+) -> None:
+    touches = touched(count, gain=gain, offset_n=offset_n, scatter=scatter, noise_n=noise_n, seed=seed)
+    if repeat:  # a camera that hangs: features without any spread
+        touches.features[:] = touches.features[0]
+    try:
+        fitted = fit_correction(touches)
+    except DataError:
+        return
+    predicted_n = fitted.predict(touches)
+    assert np.isfinite(predicted_n).all()
+    assert (np.diff(fitted.output.force_n) >= 0).all()
+    assert 0 < fitted.interval.base_n < 100
+    if fitted.after_n is not None:
+        assert fitted.after_n <= fitted.errors_n["the network as it is"] + 3 * noise_n + 0.1
