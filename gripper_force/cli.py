@@ -413,7 +413,7 @@ def calibrate_load_cell(
             seconds=seconds,
             progress=lambda step, raw: status.update(f"{step}: {raw:.6g}"),
         )
-    console.show(result, as_json)
+    console.show(result, as_json, console.rig_table)
 
 
 @calibrate_app.command("servo")
@@ -444,7 +444,7 @@ def calibrate_servo(
             ask=lambda what: _ask(what, yes, status),
             progress=lambda step, force_n: status.update(f"{step}: {force_n:.1f} N"),
         )
-    console.show(result, as_json)
+    console.show(result, as_json, console.rig_table)
 
 
 @calibrate_app.command("camera")
@@ -477,7 +477,7 @@ def calibrate_camera(
             touches=touches,
             progress=lambda step, force_n: status.update(f"{step}: {force_n:.1f} N"),
         )
-    console.show(result, as_json)
+    console.show(result, as_json, console.rig_table)
 
 
 @calibrate_app.command("object")

@@ -312,6 +312,21 @@ def soak_table(r: dict[str, Any]) -> None:
     _pairs({**summary, "outcomes": ", ".join(f"{n} {name}" for name, n in r["outcomes"].items())})
 
 
+def rig_table(r: dict[str, Any]) -> None:
+    """What a calibration of the rig found, each value with its 95 % interval."""
+    _pairs({name: _found(value) for name, value in r.items()})
+
+
+def _found(value: Any) -> Any:
+    if isinstance(value, list):
+        return ", ".join(f"{item:.5g}" for item in value)
+    if not isinstance(value, dict):
+        return value
+    if value["low"] is None:
+        return f"{value['value']:.6g} (given)"
+    return f"{value['value']:.6g} ({value['low']:.6g} to {value['high']:.6g})"
+
+
 def object_table(r: dict[str, Any]) -> None:
     """An object's profile."""
     after_n = r["after_n"]

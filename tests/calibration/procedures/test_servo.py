@@ -7,6 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from gripper_calibration.procedures.servo import calibrate
+from gripper_force import console
 from gripper_force.cli import app
 from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError, DataError, DeviceError
@@ -111,6 +112,14 @@ def test_what_fails_is_named_and_leaves_no_torque(
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
     assert all(bus is not None and bus.servos[0].get("torque_enable") == 0 for bus in buses)
+
+
+def test_a_person_reads_values_with_their_intervals(capsys: pytest.CaptureFixture[str]) -> None:
+    measured, given = {"value": 1.7, "low": 1.6, "high": 1.8}, {"value": 0.02, "low": None, "high": None}
+    console.rig_table({"nm_per_a": measured, "pinion_radius_m": given, "force_n": [0.3, 9.5]})
+    printed = capsys.readouterr().out
+    for told in ("1.7 (1.6 to 1.8)", "0.02 (given)", "0.3, 9.5"):
+        assert told in printed
 
 
 def test_without_a_terminal_nobody_is_asked(tmp_path: Path) -> None:
