@@ -290,8 +290,10 @@ class _Jaws:
         """Lets the current rise until the peak is felt, and fall until nothing is."""
         step_a = abs(self._nominal.current_a(rate_n_s)) / _RATE_HZ
         most_a = 1.5 * abs(self._nominal.current_a(peak_n + self._nominal.friction_n))
-        first, mark = len(self._states), len(self._felt)
         current_a = abs(self.state.current_a)
+        for _ in range(round(_REST_S * _RATE_HZ)):  # what the throw against the gauge gave is no push's force
+            self.cycle(self.closing_rad + _BEYOND_RAD, current_a)
+        first, mark = len(self._states), len(self._felt)
         while self.force_n < peak_n:
             if current_a > min(most_a, self._config.servo.current_limit_a):
                 raise DataError(
