@@ -1,12 +1,15 @@
 import math
+from datetime import date
 
 import numpy as np
 import pytest
 import torch
 
 from gripper_force.errors import ConfigError, DataError, NonFiniteError
+from gripper_force.object_profile import Interval, ObjectProfile, OutputCurve
 from gripper_force.vision.checkpoint import Checkpoint, Header, Residual
-from gripper_force.vision.dense import predict
+from gripper_force.vision.correction import Correction, HeadAndGate
+from gripper_force.vision.dense import features, predict
 from gripper_force.vision.estimator import Estimate, ForceEstimator
 from gripper_force.vision.network import ForceNetwork, NetworkConfig
 from gripper_force.vision.preprocess import Preprocess, shrink
@@ -107,3 +110,50 @@ def test_bad_frames_and_regions_are_named(frames: np.ndarray) -> None:
         ForceEstimator(ensemble("ssam"), (0, 0, 100, 100), threads=1).update(frames[0])
     with pytest.raises(DataError, match="gray"):
         ForceEstimator(ensemble("ssam"), threads=1).update(frames)
+
+
+def correction(gate: float, mean: np.ndarray) -> Correction:
+    """Half of the force and 0.2 N, a head that counts one feature, and a plane of one dimension."""
+    rng = np.random.default_rng(0)
+    unit = rng.normal(size=(len(mean), 1))
+    profile = ObjectProfile(
+        object="mug",
+        date=date(2026, 1, 2),
+        checkpoint="",
+        camera={},
+        touches=3,
+        frames=30,
+        force_n=5.0,
+        output=OutputCurve(kind="affine", estimate_n=(0.0, 2.0), force_n=(0.2, 1.2)),
+        interval=Interval(coverage=0.9, base_n=0.3, share=0.1),
+        gate=gate,
+        before_n=0.5,
+        weights="",
+    )
+    head = np.zeros(len(mean), np.float32)
+    head[3] = 2.0
+    arrays = HeadAndGate(
+        head, np.array([0.1], np.float32), mean, unit / np.linalg.norm(unit), np.array([1.0], np.float32)
+    )
+    return Correction(profile, arrays)
+
+
+def test_a_profile_corrects_each_frame_as_it_would_the_whole_clip(frames: np.ndarray) -> None:
+    checkpoint = ensemble("ssam", "scam")
+    small = np.stack([shrink(frame, REGION, 32) for frame in frames])
+    forces, read = features(checkpoint.networks, checkpoint.header.preprocess, small)
+    profile = correction(1e6, read.mean(0))
+    estimates = run(ForceEstimator(checkpoint, REGION, 1, profile), frames)
+    expected = 0.5 * forces.mean(0) + 0.2 + 2.0 * read[:, 3] + 0.1
+    for estimate, force_n in zip(estimates[3:], expected[3:].tolist(), strict=True):
+        assert estimate is not None
+        assert estimate.force_n == pytest.approx(force_n, abs=1e-4)
+        half_n = math.hypot(0.3, 0.1 * force_n) + max(force_n - 5, 0)
+        assert estimate.std_n == pytest.approx(half_n / 1.6449, abs=1e-3)
+
+
+def test_what_a_profile_does_not_know_gives_no_estimate(frames: np.ndarray) -> None:
+    checkpoint = ensemble("ssam")
+    estimator = ForceEstimator(checkpoint, REGION, 1, correction(1e-6, np.zeros(7, np.float32)))
+    with pytest.raises(DataError, match=r"profile 'mug'.*see whether it is that object"):
+        run(estimator, frames)
