@@ -213,7 +213,11 @@ def _solid_ball(cells: int) -> tuple[Points, Indices]:
             number[i + x, j : j + 2, k : k + 2].ravel() for x in ((0, 1) if (i + j + k) % 2 else (1, 0))
         )
         tetrahedra += [(a, b, c, e), (d, c, b, h), (f, e, h, b), (g, h, e, c), (b, c, e, h)]
-    return points, _outward(points, np.array(tetrahedra))
+    corners = np.array(tetrahedra)
+    # Along the cube's edges there are some with all corners on the ball: flat ones, which turn inside out.
+    outside = np.abs(cube).max(axis=1) == 1
+    used, corners = np.unique(corners[~outside[corners].all(axis=1)], return_inverse=True)
+    return points[used], _outward(points[used], corners.reshape(-1, 4))
 
 
 def _outward(points: Points, tetrahedra: Indices) -> Indices:

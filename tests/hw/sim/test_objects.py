@@ -1,4 +1,5 @@
 from typing import get_args
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -124,3 +125,12 @@ def test_the_block_is_as_wide_as_it_is_said_to_be_and_reads_a_clean_force(detail
         widths_m.append(GripperConfig().open_width_m - 2 * float(data.joint("right").qpos[0]))
     assert max(forces_n) < 10.5
     assert all(BLOCK_WIDTH_M - 0.002 < width_m < BLOCK_WIDTH_M for width_m in widths_m)  # tips give way
+
+
+def test_no_part_of_the_ball_is_so_flat_that_it_turns_inside_out() -> None:
+    text = ElementTree.fromstring(build_object("ball", "fine", 1.0, 1.0).body)
+    points = np.array(text.attrib["point"].split(), float).reshape(-1, 3)
+    corners = points[np.array(text.attrib["element"].split(), int).reshape(-1, 4)]
+    volumes = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6
+    assert volumes.min() > 0.2 * np.median(volumes)
+    assert volumes.sum() == pytest.approx(4 / 3 * np.pi * 0.024**3, rel=0.04)
