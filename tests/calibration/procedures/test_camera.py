@@ -16,6 +16,7 @@ from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
 from gripper_force.log import LogReader, LogWriter
 from gripper_force.recording.record import Plan, record
 from gripper_force.rig import read_rig
+from gripper_force.session import rig_mismatches
 from gripper_force.types import NS_PER_MS, Frame
 
 QUICK = ["object=stapler", "sim.detail=coarse", "vision.checkpoint=none", "seed=2"]
@@ -91,13 +92,15 @@ def test_another_camera_than_the_profiles_is_told(tmp_path: Path) -> None:
     found = read_rig(rig).camera
     assert found is not None
     assert (found.region, found.markers) == ((4, 4, 120, 120), False)
-    camera = load_config(None, [f"calibration.rig={rig}"]).camera.model_dump(mode="json")
-    assert found.mismatches(camera) == []
-    other = {**camera, "backend": "uvc", "exposure_us": 500}
-    assert found.mismatches(other) == [
-        "camera.backend simulated, not uvc",
-        "camera.exposure_us 4000, not 500",
-    ]
+    named = [*QUICK, f"calibration.rig={rig}"]
+    assert rig_mismatches(load_config(None, named)) == []
+    another = load_config(None, [*named, "camera.exposure_us=500", "camera.side_px=64"])
+    why = "of camera.side_px 128, not 64; camera.exposure_us 4000, not 500; calibrate again"
+    with pytest.raises(ConfigError, match=why):
+        rig_mismatches(another)
+    warned = load_config(None, [*named, "camera.exposure_us=500", "calibration.on_mismatch=warn"])
+    assert rig_mismatches(warned) == ["camera.exposure_us 4000, not 500"]
+    assert rig_mismatches(load_config(None, [*named, "camera.backend=none"])) == []
 
 
 def test_without_markers_nothing_is_written_and_the_way_out_is_named(tmp_path: Path) -> None:
