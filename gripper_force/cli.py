@@ -67,6 +67,9 @@ def grasp(
     target_n: Annotated[float | None, typer.Option(help="Wanted force in newtons.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the simulated scene.")] = None,
     feedback: Annotated[str | None, typer.Option(help="fused, current or vision.")] = None,
+    profile: Annotated[
+        str | None, typer.Option(help="Object profile, by name or path; own: the one with the object's name.")
+    ] = None,
     trials: Annotated[
         int, typer.Option(min=0, help="Run so many grasps of all four objects, with targets of 1 to 8 N.")
     ] = 0,
@@ -78,7 +81,13 @@ def grasp(
     settings = _load(
         config,
         set_,
-        {"object": object_, "target_n": target_n, "seed": seed, "control.feedback": feedback},
+        {
+            "object": object_,
+            "target_n": target_n,
+            "seed": seed,
+            "control.feedback": feedback,
+            "calibration.object": profile,
+        },
     )
     if not trials:
         result = job.grasp(settings, progress=lambda s: console.err.print(console.phase_line(s)))
@@ -261,6 +270,9 @@ def train(
 def evaluate(
     data: Annotated[Path, typer.Argument(help="Folder with logs that training has not seen.")],
     checkpoint: Annotated[str | None, typer.Option(help="Checkpoint, or `default`.")] = None,
+    profile: Annotated[
+        str | None, typer.Option(help="Object profile, by name or path; own: the one with each log's object.")
+    ] = None,
     only: Annotated[
         list[str] | None, typer.Option("--object", help="Only logs of this object. Repeatable.")
     ] = None,
@@ -271,15 +283,22 @@ def evaluate(
     """Compare a checkpoint's estimates with the load cell, over all logs of a folder."""
     from gripper_force.dataset import load_clips
     from gripper_force.evaluate import evaluate as job
+    from gripper_force.session import correction_of
     from gripper_force.vision.checkpoint import load_checkpoint
 
-    vision = _load(None, set_, {"vision.checkpoint": checkpoint}).vision
+    settings = _load(None, set_, {"vision.checkpoint": checkpoint, "calibration.object": profile})
+    vision = settings.vision
     loaded = load_checkpoint(vision.checkpoint)
     clips = load_clips(data, loaded.header.preprocess, vision.region, workers=jobs)
     clips = [clip for clip in clips if not only or clip.object in only]
     if not clips:
         raise DataError(f"no log in {data} is of {', '.join(only or [])}")
-    console.show(dict(job(loaded, clips)), as_json, console.errors_table)
+
+    def correct(clip: Any) -> Any:
+        return correction_of(settings.model_copy(update={"object": clip.object}), loaded)
+
+    corrected = None if settings.calibration.object is None else correct
+    console.show(dict(job(loaded, clips, corrected)), as_json, console.errors_table)
 
 
 @app.command()

@@ -5,7 +5,6 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from gripper_force.object_profile import find_object, read_object
 from gripper_force.rig import read_rig
 from gripper_force.schema import (
     Finite,
@@ -129,6 +128,10 @@ class VisionConfig(Section):
     )
 
 
+_CAUTIOUS: Final = (1.0, 60.0, 60.0)
+"""Gain, lag and delay in ms of a plant that was not identified."""
+
+
 class ControlConfig(Section):
     """Fusion, force loop, phases and limits."""
 
@@ -158,10 +161,16 @@ class ControlConfig(Section):
     voltage_limits_v: tuple[Positive, Positive] | None = Field(
         None, description="supply of the servo, least and most; None: what its model is made for"
     )
-    plant_gain: Positive = Field(1.0, description="identified contact force for one newton of motor push")
-    plant_lag_ms: Positive = Field(60.0, description="identified lag from motor current to contact force")
-    plant_delay_ms: Positive = Field(
-        60.0, description="identified delay from contact force to estimate: exposure to use, and half a frame"
+    plant_gain: Positive | None = Field(
+        None, description="contact force for one newton of motor push; None: the object profile's, or 1"
+    )
+    plant_lag_ms: Positive | None = Field(
+        None, description="lag from motor current to contact force; None: the object profile's, or 60"
+    )
+    plant_delay_ms: Positive | None = Field(
+        None,
+        description="delay from contact force to estimate: exposure to use, and half a frame; None: the "
+        "object profile's, or 60",
     )
 
     @model_validator(mode="after")
@@ -171,6 +180,15 @@ class ControlConfig(Section):
         if self.voltage_limits_v is not None and self.voltage_limits_v[0] >= self.voltage_limits_v[1]:
             raise ValueError("the first of voltage_limits_v must lie below the second")
         return self
+
+    @property
+    def plant(self) -> tuple[float, float, float]:
+        """Gain, lag in s and delay in s of the force loop's plant; cautious ones where nothing is known."""
+        given = (self.plant_gain, self.plant_lag_ms, self.plant_delay_ms)
+        gain, lag_ms, delay_ms = (
+            known if one is None else one for one, known in zip(given, _CAUTIOUS, strict=True)
+        )
+        return gain, lag_ms * 1e-3, delay_ms * 1e-3
 
 
 class SimConfig(Section):
@@ -219,7 +237,9 @@ class CalibrationConfig(Section):
         description="a rig profile of `gripper-force calibrate`: its values stand before the defaults and "
         "give way to the configuration file and to --set",
     )
-    object: str | None = Field(None, description="an object profile's name or path")
+    object: str | None = Field(
+        None, description="an object profile's name or path; own: the one that has the object's name"
+    )
     on_mismatch: Literal["refuse", "warn"] = Field(
         "refuse", description="what to do where a profile is of another device than the run's"
     )
@@ -332,6 +352,11 @@ class Config(Section):
         (), description="faults to inject into the stand-ins: unit, kind, at_s, for_s"
     )
 
+    @property
+    def profile(self) -> str | None:
+        """Name or path of the object profile, or None."""
+        return self.object if self.calibration.object == "own" else self.calibration.object
+
     def camera_settings(self) -> Tree:
         """What an object profile is bound to: keys of how the camera looks, and their values."""
         camera = self.camera.model_dump(
@@ -342,7 +367,7 @@ class Config(Section):
 
 
 def load_config(path: Path | None = None, overrides: list[str] | None = None) -> Config:
-    """Builds the configuration from defaults, profiles, a YAML file, and overrides, in that order.
+    """Builds the configuration from defaults, a rig profile, a YAML file, and overrides, in that order.
 
     Args:
         path: YAML file, or None for the defaults.
@@ -355,7 +380,7 @@ def load_config(path: Path | None = None, overrides: list[str] | None = None) ->
     for assignment in overrides or []:
         assign(tree, assignment)
     where = str(path) if path else "--set"
-    return config_from(merged(_calibrated(tree, where), tree), where)
+    return config_from(merged(_rig_settings(tree, where), tree), where)
 
 
 def config_from(tree: Tree, where: str) -> Config:
@@ -366,7 +391,7 @@ def config_from(tree: Tree, where: str) -> Config:
 def config_from_text(text: str, where: str, overrides: list[str] | None = None) -> Config:
     """Reads a configuration that `dump_config` wrote.
 
-    It holds what profiles set; one that the overrides name stands before it and gives way to them.
+    It holds what a rig profile set; one that the overrides name stands before it and gives way to them.
 
     Raises:
         ConfigError: A key or value is wrong. The sentence names it and ``where``.
@@ -374,7 +399,7 @@ def config_from_text(text: str, where: str, overrides: list[str] | None = None) 
     given: Tree = {}
     for assignment in overrides or []:
         assign(given, assignment)
-    tree = merged(tree_from(text, where), _calibrated(given, "--set"))
+    tree = merged(tree_from(text, where), _rig_settings(given, "--set"))
     for assignment in overrides or []:
         assign(tree, assignment)
     return config_from(tree, where)
@@ -385,13 +410,10 @@ def dump_config(config: Config) -> str:
     return dump(config)
 
 
-def _calibrated(tree: Tree, where: str) -> Tree:
-    """What the rig profile and the object profile set that the tree names."""
+def _rig_settings(tree: Tree, where: str) -> Tree:
+    """What the rig profile sets that the tree names."""
     section = tree.get("calibration")
-    if not isinstance(section, dict):
+    if not isinstance(section, dict) or section.get("rig") is None:
         return {}
     calibration = validated(Config, {"calibration": section}, where).calibration
-    rig = read_rig(calibration.rig).settings() if calibration.rig is not None else {}
-    if calibration.object is None:
-        return rig
-    return merged(rig, read_object(find_object(calibration.object)).settings())
+    return read_rig(calibration.rig).settings() if calibration.rig is not None else {}

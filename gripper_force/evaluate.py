@@ -1,6 +1,6 @@
 """How well a checkpoint does on recordings it has not seen."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Final, TypedDict
 
 import cv2
@@ -14,7 +14,8 @@ from gripper_force import metrics
 from gripper_force.dataset import CONTACT_N, Clip, check_size, stiffness_floor_n
 from gripper_force.errors import DataError
 from gripper_force.vision.checkpoint import Checkpoint
-from gripper_force.vision.dense import predict
+from gripper_force.vision.correction import Correction
+from gripper_force.vision.dense import features, predict
 
 RIDGE_SIZE: Final = 32
 RIDGE_COMPONENTS: Final = 20
@@ -47,17 +48,23 @@ class Result(TypedDict):
     per_bin: list[metrics.Bin]
 
 
-def evaluate(checkpoint: Checkpoint, clips: Sequence[Clip]) -> Result:
+def evaluate(
+    checkpoint: Checkpoint, clips: Sequence[Clip], correct: Callable[[Clip], Correction] | None = None
+) -> Result:
     """Estimates the force at each frame as a run would, and compares it with the load cell.
 
     Args:
-        checkpoint: The ensemble; computed on a GPU where there is one.
+        checkpoint: The ensemble; computed on a GPU where there is one, or, with profiles, on the CPU.
         clips: Recordings, reduced to the checkpoint's size.
+        correct: What the profile of a recording's object makes of the estimates.
 
     Raises:
         DataError: There are no clips, no labels, or frames of another size.
     """
-    means_n = [members_n.mean(0) for members_n in estimates(checkpoint, clips)]
+    if correct is None:
+        means_n = [members_n.mean(0) for members_n in estimates(checkpoint, clips)]
+    else:
+        means_n = [_corrected_n(checkpoint, clip, correct(clip)) for clip in _shown(clips)]
     return compare(clips, means_n, checkpoint.header.preprocess.lead_in)
 
 
@@ -78,13 +85,21 @@ def estimates(checkpoint: Checkpoint, clips: Sequence[Clip]) -> list[npt.NDArray
     preprocess = checkpoint.header.preprocess
     check_size(clips, preprocess)
     networks = [network.to(device) for network in checkpoint.networks]
-    forces_n = [
-        predict(networks, preprocess, clip.frames, device)
-        for clip in track(clips, "evaluating", console=Console(stderr=True))
-    ]
+    forces_n = [predict(networks, preprocess, clip.frames, device) for clip in _shown(clips)]
     for network in networks:
         network.cpu()
     return forces_n
+
+
+def _corrected_n(checkpoint: Checkpoint, clip: Clip, correction: Correction) -> npt.NDArray[np.float32]:
+    preprocess = checkpoint.header.preprocess
+    check_size([clip], preprocess)
+    forces_n, read_out = features(checkpoint.networks, preprocess, clip.frames)
+    return correction.force_n(forces_n.mean(0), read_out).astype(np.float32)
+
+
+def _shown(clips: Sequence[Clip]) -> Iterable[Clip]:
+    return track(clips, "evaluating", console=Console(stderr=True))
 
 
 def ridge_baseline(train_clips: Sequence[Clip], test_clips: Sequence[Clip]) -> Result:

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Final, Literal, Self
 from pydantic import Field, model_validator
 
 from gripper_force.errors import ConfigError
-from gripper_force.schema import Finite, NonNegative, Positive, Section, Tree, dump, read_tree, validated
+from gripper_force.schema import Finite, NonNegative, Positive, Section, dump, read_tree, validated
 
 FORMAT: Final = "gripper-force-object/1"
 
@@ -118,13 +118,6 @@ class ObjectProfile(Section):
     before_n: NonNegative
     after_n: NonNegative | None = None
     weights: str
-
-    def settings(self) -> Tree:
-        """The configuration keys that it sets."""
-        if self.plant is None:
-            return {}
-        keys = {"plant_gain": self.plant.gain, "plant_lag_ms": self.plant.lag_ms}
-        return {"control": {**keys, "plant_delay_ms": self.plant.delay_ms}}
 
     def mismatches(self, checkpoint: str, camera: dict[str, Any]) -> list[str]:
         """What differs between the calibration and a run, in words."""

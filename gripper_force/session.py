@@ -16,7 +16,7 @@ from typing import Any, BinaryIO, cast
 import cv2
 
 from gripper_force.backends import open_devices
-from gripper_force.config import Config, dump_config
+from gripper_force.config import Config, ControlConfig, dump_config
 from gripper_force.control.grasp import Decision, GraspController, is_open
 from gripper_force.control.limits import largest_target_n
 from gripper_force.control.transmission import Transmission
@@ -310,8 +310,8 @@ def _check_target(config: Config) -> None:
                 f"target_n {config.target_n:g} N is more than the rig profile {config.calibration.rig} was "
                 f"calibrated with, {servo.force_n[1]:.1f} N; ask for less, or calibrate up to more"
             )
-    if config.calibration.object is not None:
-        path = find_object(config.calibration.object)
+    if config.profile is not None:
+        path = find_object(config.profile)
         most_n = read_object(path).force_n
         if config.target_n > most_n:
             raise ConfigError(
@@ -333,8 +333,17 @@ def make_controller(config: Config, devices: Devices) -> tuple[Config, GraspCont
         low_v, high_v = servo.voltage_range_v
         slack = {"voltage_limits_v": (low_v - _SUPPLY_SLACK_V, high_v + _SUPPLY_SLACK_V)}
         control = control.model_copy(update=slack)
+    control = _with_plant(config, control)
     config = config.model_copy(update={"gripper": gripper, "control": control})
     return config, controller_from(config)
+
+
+def _with_plant(config: Config, control: ControlConfig) -> ControlConfig:
+    """Completes the force loop's plant with what the object's profile knows of it."""
+    if config.profile is None or (plant := read_object(find_object(config.profile)).plant) is None:
+        return control
+    known = {"plant_gain": plant.gain, "plant_lag_ms": plant.lag_ms, "plant_delay_ms": plant.delay_ms}
+    return control.model_copy(update={k: v for k, v in known.items() if getattr(control, k) is None})
 
 
 def controller_from(config: Config) -> GraspController:
@@ -361,9 +370,9 @@ def correction_of(config: Config, checkpoint: Checkpoint | None) -> Correction |
     Raises:
         ConfigError: The profile can't be read, or is of another network or camera, and that is refused.
     """
-    if config.calibration.object is None or checkpoint is None:
+    if config.profile is None or checkpoint is None:
         return None
-    path = find_object(config.calibration.object)
+    path = find_object(config.profile)
     profile = read_object(path)
     differ = profile.mismatches(checkpoint.digest, config.camera_settings())
     if differ and config.calibration.on_mismatch == "refuse":

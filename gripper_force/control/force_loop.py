@@ -50,11 +50,11 @@ class ForceLoop:
     """
 
     def __init__(self, config: ControlConfig, transmission: Transmission) -> None:
-        lag_s, delay_s = config.plant_lag_ms * 1e-3, config.plant_delay_ms * 1e-3
+        gain, lag_s, delay_s = config.plant
         # The current follows jaws that move at once, but of stuck ones vision alone tells, through the
         # filter. To an integral the lags are more delay.
-        stuck = Plant(config.plant_gain, 0.0, delay_s + lag_s + OBSERVER_LAG_S)
-        plants = {"hold": stuck, "vision": Plant(config.plant_gain, lag_s, delay_s)}
+        stuck = Plant(gain, 0.0, delay_s + lag_s + OBSERVER_LAG_S)
+        plants = {"hold": stuck, "vision": Plant(gain, lag_s, delay_s)}
         self.margins = {
             name: Margin(gains := simc(plant), phase_margin_deg(plant, gains))
             for name, plant in plants.items()

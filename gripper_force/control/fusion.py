@@ -68,7 +68,7 @@ class Fusion:
         self._feedback = config.feedback
         self._timeout_ns = round(config.vision_timeout_ms * NS_PER_MS)
         self._most_age_ns = round(config.vision_age_ms * NS_PER_MS)
-        self._lag_s = config.plant_lag_ms * 1e-3
+        _, self._lag_s, _ = config.plant
         self._std_limit_n = config.vision_std_n
         self._transmission = transmission
         self._history: deque[tuple[int, float]] = deque(maxlen=_HISTORY)

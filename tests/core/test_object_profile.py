@@ -56,15 +56,6 @@ def test_ones_own_come_before_those_that_are_shipped(tmp_path: Path, monkeypatch
     assert find_object("some/where.yaml") == Path("some/where.yaml")
 
 
-def test_sets_the_loops_plant_and_gives_way_to_what_is_set(tmp_path: Path) -> None:
-    path = tmp_path / "mug.yaml"
-    write_object(path, profile())
-    control = load_config(None, [f"calibration.object={path}", "control.plant_delay_ms=70"]).control
-    assert (control.plant_gain, control.plant_lag_ms, control.plant_delay_ms) == (0.9, 30, 70)
-    write_object(path, profile(plant=None))
-    assert load_config(None, [f"calibration.object={path}"]).control == load_config().control
-
-
 def test_names_what_differs() -> None:
     settings = load_config(None, ["camera.rate_hz=30"]).camera_settings()
     assert profile().mismatches("a" * 64, load_config().camera_settings()) == []

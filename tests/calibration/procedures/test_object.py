@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from gripper_calibration.procedures.object import calibrate, touch
+from gripper_force.backends import open_devices
 from gripper_force.cli import app
 from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError, DataError
@@ -15,6 +16,7 @@ from gripper_force.grasp import grasp
 from gripper_force.log import LogReader
 from gripper_force.object_profile import read_object, weights_path
 from gripper_force.replay import replay
+from gripper_force.session import make_controller
 from gripper_force.types import Event
 
 QUICK = [
@@ -69,7 +71,7 @@ def test_a_profile_tells_of_the_object_and_halves_the_error(profile: Path) -> No
 
 
 def test_a_grasp_with_it_is_corrected_and_replays_to_the_bit(profile: Path, tmp_path: Path) -> None:
-    alone = grasp(run(tmp_path, "control.plant_lag_ms=60"))
+    alone = grasp(run(tmp_path))
     known = grasp(run(tmp_path, f"calibration.object={profile}"))
     assert known["estimate_mae_n"]["visual"] < 0.7 * alone["estimate_mae_n"]["visual"]
     log = Path(known["log"])
@@ -80,12 +82,14 @@ def test_a_grasp_with_it_is_corrected_and_replays_to_the_bit(profile: Path, tmp_
     assert "profile was" in other["note"]
 
 
-def test_its_plant_gives_way_to_what_is_set(profile: Path) -> None:
+def test_its_plant_tunes_the_loop_and_gives_way_to_what_is_set(profile: Path) -> None:
     plant = read_object(profile).plant
     assert plant is not None
-    assert load_config(None, [f"calibration.object={profile}"]).control.plant_lag_ms == plant.lag_ms
-    given = load_config(None, [f"calibration.object={profile}", "control.plant_lag_ms=77"])
-    assert given.control.plant_lag_ms == 77
+    for keys, lag_ms in (([], plant.lag_ms), (["control.plant_lag_ms=77"], 77)):
+        config = load_config(None, [*QUICK, f"calibration.object={profile}", *keys])
+        with open_devices(config) as devices:
+            control = make_controller(config, devices)[0].control
+        assert control.plant == pytest.approx((plant.gain, lag_ms * 1e-3, plant.delay_ms * 1e-3))
 
 
 def test_more_than_was_pressed_with_is_refused(profile: Path, tmp_path: Path) -> None:
