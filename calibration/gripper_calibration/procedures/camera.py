@@ -137,8 +137,8 @@ def calibrate(
     height, width = seen.reference.shape
     found_region = region_about(seen.markers, width, height) if region is None else region
     lag = lag_of(seen.touches)
-    compute_ms = _compute_ms(_with(config, "vision", region=found_region), seen.reference)
-    wait_ms = seen.use_ms + compute_ms + 500 / seen.rate_hz
+    taken_ms = compute_ms(_with(config, "vision", region=found_region), seen.reference)
+    wait_ms = seen.use_ms + taken_ms + 500 / seen.rate_hz
     camera = config.camera
     found = CameraCalibration(
         date=datetime.now(UTC).replace(microsecond=0),
@@ -164,7 +164,7 @@ def calibrate(
         **found.model_dump(mode="json"),
         "correlation_lag_ms": float(np.nanmedian(telling_ms)),
         "use_ms": seen.use_ms,
-        "compute_ms": compute_ms,
+        "compute_ms": taken_ms,
         "touches": len(seen.touches),
         "touches_that_tell": len(telling_ms),
         "rig": rig,
@@ -272,7 +272,7 @@ def _picture(config: Config) -> Gray:
         return gray
 
 
-def _compute_ms(config: Config, gray: Gray) -> float:
+def compute_ms(config: Config, gray: Gray) -> float:
     """What the network takes for a picture: on a simulated clock what it is said to, else as measured."""
     checkpoint = checkpoint_of(config)
     if checkpoint is None:
@@ -280,12 +280,12 @@ def _compute_ms(config: Config, gray: Gray) -> float:
     if config.clock == "lockstep":
         return config.vision.lockstep_compute_ms
     estimator = ForceEstimator(checkpoint, config.vision.region, config.vision.threads)
-    taken_ms = []
+    each_ms = []
     for _ in range(_TIMED_FRAMES):
         begin_ns = time.perf_counter_ns()
         estimator.update(gray)
-        taken_ms.append((time.perf_counter_ns() - begin_ns) / NS_PER_MS)
-    return float(np.median(taken_ms))
+        each_ms.append((time.perf_counter_ns() - begin_ns) / NS_PER_MS)
+    return float(np.median(each_ms))
 
 
 def _with(config: Config, section: str, **values: object) -> Config:

@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from gripper_calibration.fits.camera import lag_of
-from gripper_calibration.procedures.camera import calibrate, watch
+from gripper_calibration.procedures.camera import calibrate, compute_ms, watch
 from gripper_force.cli import app
 from gripper_force.config import load_config
 from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
@@ -61,6 +61,14 @@ def test_the_cameras_latency_and_the_wait_for_a_cycle_are_seen(log: Path) -> Non
     assert seen.rate_hz == pytest.approx(60, rel=0.05)  # of whole physics steps
     assert len(seen.widest_markers) == 2
     assert watch(log, (10, 10, 100, 100)).markers == []
+
+
+def test_what_the_network_takes_is_measured_on_a_clock_that_is_real(log: Path, tiny_checkpoint: Path) -> None:
+    gray = watch(log, None).reference
+    assert compute_ms(load_config(None, QUICK), gray) == 0.0
+    config = load_config(None, [*QUICK, f"vision.checkpoint={tiny_checkpoint}"])
+    assert compute_ms(config, gray) == config.vision.lockstep_compute_ms
+    assert 0 < compute_ms(config.model_copy(update={"clock": "realtime"}), gray) < 1000
 
 
 def test_the_command_writes_profile_reference_and_report(tmp_path: Path) -> None:
