@@ -380,7 +380,8 @@ def correction_of(config: Config, checkpoint: Checkpoint | None) -> Correction |
             f"the object profile {path} is of {'; '.join(differ)}; calibrate again, or set "
             "calibration.on_mismatch=warn"
         )
-    return load_correction(path, profile, differ)
+    features = sum(member.head for member in checkpoint.header.members)
+    return load_correction(path, profile, features, differ)
 
 
 def rig_mismatches(config: Config) -> list[str]:

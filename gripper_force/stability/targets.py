@@ -3,8 +3,9 @@
 import json
 import struct
 from collections.abc import Iterable, Iterator
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime
 from functools import cache
+from hashlib import sha256
 from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
@@ -29,6 +30,7 @@ from gripper_force.dataset import load_clip
 from gripper_force.errors import GripperError
 from gripper_force.grasp import summarise
 from gripper_force.log import LogReader, LogWriter
+from gripper_force.object_profile import Interval, ObjectProfile, OutputCurve, read_object, weights_path
 from gripper_force.replay import replay
 from gripper_force.report.data import read_run
 from gripper_force.rig import Estimate, LoadCellCalibration, RigProfile, ServoCalibration
@@ -46,6 +48,7 @@ from gripper_force.types import (
 )
 from gripper_force.video_import import estimate_tare, read_forces
 from gripper_force.vision.checkpoint import FORMAT, Header, Residual, load_checkpoint
+from gripper_force.vision.correction import Correction, HeadAndGate, load_correction, write_arrays
 from gripper_force.vision.estimator import ForceEstimator
 from gripper_force.vision.network import ForceNetwork, NetworkConfig
 from gripper_force.vision.preprocess import Preprocess
@@ -61,6 +64,60 @@ _CONFIG: Final = Config(gripper=GripperConfig(nm_per_a=1.8, current_step_a=0.003
 # Configuration.
 
 
+def _object(weights: str = "") -> ObjectProfile:
+    return ObjectProfile(
+        object="mug",
+        date=date(2026, 1, 2),
+        checkpoint="",
+        camera={"camera.rate_hz": 60.0},
+        touches=3,
+        frames=300,
+        force_n=8.0,
+        output=OutputCurve(kind="monotone", estimate_n=(0.0, 4.0, 9.0), force_n=(0.1, 3.5, 8.0)),
+        interval=Interval(coverage=0.9, base_n=0.1, share=0.03),
+        gate=0.02,
+        before_n=0.4,
+        weights=weights,
+    )
+
+
+_SOME_FEATURES: Final = np.linspace(-1, 1, 8, dtype=np.float32)[None]
+_HALF: Final = HeadAndGate(
+    head=np.ones(8, np.float32),
+    offset=np.ones(1, np.float32),
+    mean=np.ones(8, np.float32),
+    axes=np.eye(8, 2, dtype=np.float32),
+    spread=np.ones(1, np.float32),
+)
+
+
+def _objects() -> list[bytes]:
+    return [dump(_object()).encode()]
+
+
+def _read_object(data: bytes, path: Path) -> None:
+    _correct(Correction(read_object(path), _HALF))
+
+
+def _halves() -> list[bytes]:
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "mug.yaml"
+        write_arrays(path, _HALF)
+        return [weights_path(path).read_bytes()]
+
+
+def _read_half(data: bytes, path: Path) -> None:
+    weights_path(path).write_bytes(data)
+    _correct(load_correction(path, _object(sha256(data).hexdigest()), 8))
+
+
+def _correct(correction: Correction) -> None:
+    force_n = correction.force_n([-1.0, 0.0, 5.0, 30.0], np.repeat(_SOME_FEATURES, 4, 0))
+    assert not np.isnan(force_n).any()
+    assert (correction.half_width_n(force_n) > 0).all()
+    assert correction.strangeness(_SOME_FEATURES) >= 0
+
+
 def _configs() -> list[bytes]:
     whole = dump_config(_CONFIG).encode()
     short = b"object: sponge\ntarget_n: 4.0\nservo: {id: 1}\nvision:\n  region: [0, 0, 64, 64]\n"
@@ -73,9 +130,9 @@ def _read_config(data: bytes, path: Path) -> None:
 
 
 def _rigs() -> list[bytes]:
-    date, found = datetime(2026, 1, 2, tzinfo=UTC), Estimate(value=1.7, low=1.69, high=1.72)
+    at, found = datetime(2026, 1, 2, tzinfo=UTC), Estimate(value=1.7, low=1.69, high=1.72)
     servo = ServoCalibration(
-        date=date,
+        date=at,
         model="XM430-W350",
         nm_per_a=found,
         friction_n=found,
@@ -88,7 +145,7 @@ def _rigs() -> list[bytes]:
         residual_n=0.1,
     )
     cell = LoadCellCalibration(
-        date=date,
+        date=at,
         sensor="serial hx711",
         tare_raw=found,
         n_per_raw=found,
@@ -352,6 +409,8 @@ _TYPES: Final = tuple(b"F32 F16 BF16 F8_E4M3 I64 BOOL".split())
 TARGETS: Final = [
     Target("config", _configs, _read_config, 6, _YAML_WORDS),
     Target("rig profile", _rigs, _read_rig, 6, _YAML_WORDS),
+    Target("object profile", _objects, _read_object, 6, _YAML_WORDS),
+    Target("half of an object profile", _halves, _read_half, 3, _TYPES, _true_length),
     Target("assignment", _assignments, _assign, 8, _YAML_WORDS),
     Target("log", _logs, _read_log, 3, _LOG_WORDS),
     Target("log replayed", _logs, _replay_log, 2, _LOG_WORDS),

@@ -120,11 +120,19 @@ def write_arrays(path: Path, arrays: HeadAndGate) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def load_correction(path: Path, profile: ObjectProfile, differs: Sequence[str] = ()) -> Correction:
-    """Reads the file beside a profile; ``differs`` as in `Correction`.
+def load_correction(
+    path: Path, profile: ObjectProfile, features: int, differs: Sequence[str] = ()
+) -> Correction:
+    """Reads the file beside a profile.
+
+    Args:
+        path: The profile.
+        profile: What is in it.
+        features: F, of all of the network's last layers together.
+        differs: As in `Correction`.
 
     Raises:
-        ConfigError: It is missing, damaged, or of another profile.
+        ConfigError: It is missing, damaged, of another profile, or of a network with other features.
     """
     beside = weights_path(path)
     try:
@@ -136,6 +144,15 @@ def load_correction(path: Path, profile: ObjectProfile, differs: Sequence[str] =
     try:
         tensors = load(data)
         arrays = HeadAndGate(**{name: tensors[name].astype(np.float32) for name in _NAMES})
-    except (SafetensorError, KeyError) as error:
+    except (SafetensorError, KeyError, ValueError, TypeError) as error:
         raise ConfigError(f"{beside} is no half of an object profile: {error}") from error
+    shapes = {name: getattr(arrays, name).shape for name in _NAMES}
+    flat = {"head": (features,), "mean": (features,), "offset": (1,), "spread": (1,)}
+    wrong = [name for name, shape in flat.items() if shapes[name] != shape]
+    if wrong or len(shapes["axes"]) != 2 or shapes["axes"][0] != features:
+        raise ConfigError(
+            f"{beside} is for another network: this one has {features} features, and the shapes are {shapes}"
+        )
+    if not all(np.isfinite(getattr(arrays, name)).all() for name in _NAMES) or arrays.spread[0] <= 0:
+        raise ConfigError(f"{beside} holds values that are not finite; calibrate again")
     return Correction(profile, arrays, differs)
