@@ -96,6 +96,7 @@ def _objects() -> list[bytes]:
 
 
 def _read_object(data: bytes, path: Path) -> None:
+    path.write_bytes(data)
     _correct(Correction(read_object(path), _HALF))
 
 
