@@ -335,6 +335,11 @@ def object_table(r: dict[str, Any]) -> None:
         {
             "object": r["object"],
             "touches": f"{r['touches']} with {r['frames']} frames, up to {r['force_n']:.1f} N",
+            **(
+                {}
+                if (at := r["crushed_at_n"]) is None
+                else {"crushed": f"it stayed narrower after {at:.1f} N"}
+            ),
             "error before": _number(r["before_n"], "N"),
             "error after": "not known with so few touches" if after_n is None else _number(after_n, "N"),
             "correction": r["correction"],

@@ -91,7 +91,7 @@ class ObjectProfile(Section):
         camera: The camera's settings, by key of the configuration.
         touches: Touches it was calibrated on.
         frames: Their frames.
-        force_n: Largest force that was pressed with. It holds up to there.
+        force_n: Largest force that the object was pressed with and sprang back from. It holds up to there.
         output: Correction of the network's output.
         interval: How far off it is at most.
         gate: How unlike the calibration's frames a frame may be (see `vision.correction`), 0 to 1.

@@ -33,14 +33,14 @@ class Recorded:
         touches: What camera and load cell tell.
         camera: The camera's settings, by key of the configuration.
         presses: What servo and load cell tell of the loop.
-        travel_m: By how much the jaws closed on the object in each press, (N,) each.
+        width_m: Distance between the jaws in each press, (N,) each.
         delay_s: From the contact force to an estimate that can be used, the network's time aside.
     """
 
     touches: Touches
     camera: dict[str, Any]
     presses: list[Press]
-    travel_m: list[Floats]
+    width_m: list[Floats]
     delay_s: float
 
 
@@ -69,7 +69,7 @@ def join(parts: Sequence[Recorded], paths: Sequence[Path]) -> Recorded:
         ),
         camera=first.camera,
         presses=[press for part in parts for press in part.presses],
-        travel_m=[travel for part in parts for travel in part.travel_m],
+        width_m=[width for part in parts for width in part.width_m],
         delay_s=float(np.median([part.delay_s for part in parts])),
     )
 
@@ -90,7 +90,7 @@ def read_one(path: Path, checkpoint: Checkpoint) -> Recorded:
     numbers = np.unique(touch_of(felt_n)[labelled], return_inverse=True)[1]
     reader = LogReader(path)
     config = config_from_text(reader.config, str(path))
-    presses, travel_m = _mechanics(reader, config)
+    presses, width_m = _mechanics(reader, config)
     t_ns, late_ns = _frame_times(reader)
     t_s = t_ns[labelled] / NS_PER_S
     seen_s = lag_s(t_s, estimate_n[labelled], t_s, felt_n[labelled])
@@ -98,7 +98,7 @@ def read_one(path: Path, checkpoint: Checkpoint) -> Recorded:
         touches=Touches(read_out[labelled], estimate_n[labelled], felt_n[labelled], numbers),
         camera=config.camera_settings(),
         presses=presses,
-        travel_m=travel_m,
+        width_m=width_m,
         # A frame is used for as long as the next one takes to come.
         delay_s=late_ns / NS_PER_S + 0.5 / config.camera.rate_hz + max(seen_s, 0.0),
     )
@@ -124,7 +124,7 @@ def _frame_times(reader: LogReader) -> tuple[npt.NDArray[np.int64], float]:
 
 
 def _mechanics(reader: LogReader, config: Config) -> tuple[list[Press], list[Floats]]:
-    """Ramps with their holds, and the jaws' way on the object in each."""
+    """Ramps with their holds, and the distance between the jaws in each."""
     gripper = config.gripper
     if gripper.nm_per_a is None:
         return [], []
@@ -147,12 +147,11 @@ def _mechanics(reader: LogReader, config: Config) -> tuple[list[Press], list[Flo
     edges = np.flatnonzero(np.diff(np.concatenate([[False], pressing, [False]]).astype(np.int8)))
     cell_s = np.array([cell.t_ns for cell in cells]) / NS_PER_S
     cell_n = np.array([cell.force_n for cell in cells])
-    presses, travel_m = [], []
+    presses, widths_m = [], []
     for begin, end in zip(edges[::2], edges[1::2], strict=True):
         part = states[begin:end]
         t_s = np.array([state.t_ns for state in part]) / NS_PER_S
         push_n = np.array([transmission.force_n(state.current_a) for state in part])
-        width_m = np.array([transmission.width_m(state.position_rad) for state in part])
+        widths_m.append(np.array([transmission.width_m(state.position_rad) for state in part]))
         presses.append(Press(t_s, push_n - transmission.friction_n, np.interp(t_s, cell_s, cell_n)))
-        travel_m.append(width_m[0] - width_m)
-    return presses, travel_m
+    return presses, widths_m

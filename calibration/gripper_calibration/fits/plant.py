@@ -16,6 +16,10 @@ _LEAST_RISE_N: Final = 0.5
 _FEWEST: Final = 20
 _LEAST_DELAY_S: Final = 0.002
 _GAINS: Final = (0.3, 3.0)
+_LEAST_DENT_M: Final = 0.001
+_CLEAR_DENT: Final = 4.0
+_AFTERWARDS: Final = 2
+"""A dent is this deep, and clear of how the object lies each time, in so many touches afterwards at least."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,23 +71,44 @@ def fit_plant(presses: list[Press], delay_s: float) -> LoopPlant | None:
     )
 
 
-def stiffness_n_m(travel_m: list[Floats], force_n: list[Floats]) -> Floats:
+def stiffness_n_m(width_m: list[Floats], force_n: list[Floats]) -> Floats:
     """Slope of force over travel, between a third and two thirds of the largest force, of each touch, (K,).
 
     Args:
-        travel_m: By how much the jaws have closed on the object while the force rose, (N,) for each touch.
+        width_m: Distance between the jaws while the force rose, (N,) for each touch.
         force_n: What the load cell felt, (N,) for each touch.
     """
     peak_n = max((float(force.max()) for force in force_n if len(force)), default=0.0)
     slopes = []
-    for travel, force in zip(travel_m, force_n, strict=True):
+    for width, force in zip(width_m, force_n, strict=True):
         part = (force > peak_n / 3) & (force < 2 * peak_n / 3)
         if part.sum() >= _FEWEST and np.ptp(force[part]) > _LEAST_RISE_N / 2:
             # Travel is the cleaner of the two, and the force is what its noise is in.
-            slope = float(np.polyfit(travel[part] - travel[part].mean(), force[part], 1)[0])
+            slope = -float(np.polyfit(width[part] - width[part].mean(), force[part], 1)[0])
             if slope > 0:
                 slopes.append(slope)
     return np.array(slopes)
+
+
+def crushed_by(contact_m: Floats, peak_n: Floats) -> int | None:
+    """The touch after which the object has stayed narrower, or None where it has sprung back from all.
+
+    Args:
+        contact_m: Distance between the jaws where each touch met it, in the order they were done, (K,).
+        peak_n: Largest force of each, (K,).
+    """
+    found, most = None, 0.0
+    for last in range(1, len(contact_m) - _AFTERWARDS):
+        before, after = contact_m[: last + 1], contact_m[last + 1 :]
+        scatter_m = max(float(np.median(np.abs(part - np.median(part)))) for part in (before, after))
+        dent_m = float(np.median(before) - np.median(after))
+        # The split that explains most of the spread is where it changed.
+        explained = len(before) * len(after) * float(before.mean() - after.mean()) ** 2
+        if dent_m > _LEAST_DENT_M + _CLEAR_DENT * scatter_m and explained > most:
+            found, most = last, explained
+    if found is None or peak_n[found] < peak_n[: found + 1].max():
+        return None
+    return found
 
 
 def _evenly(press: Press) -> tuple[Floats, Floats] | None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from gripper_calibration import logs
 from gripper_calibration.fits.correction import COVERAGE, Fitted, fit_correction, learning_curve
-from gripper_calibration.fits.plant import fit_plant, stiffness_n_m
+from gripper_calibration.fits.plant import crushed_by, fit_plant, stiffness_n_m
 from gripper_calibration.reports.object import draw
 from gripper_force.config import Config
 from gripper_force.errors import DataError
@@ -99,7 +99,11 @@ def calibrate(
     advance("fitted")
     curve = list(learning_curve(touches, COVERAGE))
     advance("how many touches are enough")
-    stiffness = stiffness_n_m(recorded.travel_m, [press.force_n for press in recorded.presses])
+    forces_n = [press.force_n for press in recorded.presses]
+    stiffness = stiffness_n_m(recorded.width_m, forces_n)
+    peaks_n = np.array([force_n.max() for force_n in forces_n])
+    crushed = crushed_by(np.array([width_m[0] for width_m in recorded.width_m]), peaks_n)
+    bore_n = float(touches.force_n.max() if crushed is None else peaks_n[:crushed].max())
     profile = ObjectProfile(
         object=name,
         date=datetime.now(UTC).date(),
@@ -107,7 +111,7 @@ def calibrate(
         camera=recorded.camera,
         touches=len(touches.numbers),
         frames=len(touches.touch),
-        force_n=float(touches.force_n.max()),
+        force_n=bore_n,
         output=fitted.output,
         interval=fitted.interval,
         gate=fitted.gate,
@@ -124,6 +128,7 @@ def calibrate(
         **profile.model_dump(mode="json"),
         "correction": fitted.candidate,
         "candidates_mae_n": fitted.errors_n,
+        "crushed_at_n": None if crushed is None else float(peaks_n[crushed]),
         "stiffness_std_n_m": float(stiffness.std(ddof=1)) if len(stiffness) > 1 else None,
         "touches_needed": _table(curve),
         "profile": out,

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from gripper_calibration.fits.plant import Press, fit_plant, stiffness_n_m
+from gripper_calibration.fits.plant import Press, crushed_by, fit_plant, stiffness_n_m
 
 
 def pressed(gain: float, lag_s: float, friction_n: float, seed: int = 0, noise_n: float = 0.01) -> Press:
@@ -39,5 +39,24 @@ def test_what_hardly_moves_tells_no_plant() -> None:
 def test_stiffness_is_the_slope_in_the_middle() -> None:
     travel_m = np.linspace(0, 0.01, 200)
     force_n = 300 * travel_m + 1e6 * np.clip(travel_m - 0.0095, 0, None) ** 2
-    slopes = stiffness_n_m([travel_m, travel_m[:30]], [force_n, force_n[:30]])
+    slopes = stiffness_n_m([0.05 - travel_m, 0.05 - travel_m[:30]], [force_n, force_n[:30]])
     assert slopes == pytest.approx([300], rel=1e-6)
+
+
+@given(st.lists(st.floats(-0.001, 0.001), min_size=8, max_size=8), st.integers(2, 5))
+def test_an_object_that_stays_narrower_was_crushed_by_the_hardest_touch_so_far(
+    lies_m: list[float], last: int
+) -> None:
+    peak_n = np.array([2.0, 5.0, 3.0, 4.0, 2.0, 3.0, 5.0, 1.0])
+    peak_n[last] = 9.0
+    contact_m = 0.05 + np.array(lies_m)
+    contact_m[last + 1 :] -= 0.012
+    assert crushed_by(contact_m, peak_n) == last
+
+
+def test_an_object_that_springs_back_was_not_crushed() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        assert crushed_by(0.05 + rng.uniform(-0.002, 0.002, 12), rng.uniform(1, 9, 12)) is None
+    assert crushed_by(np.array([0.05, 0.03]), np.array([1.0, 2.0])) is None
+    assert crushed_by(np.array([]), np.array([])) is None
