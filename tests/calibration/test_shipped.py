@@ -1,0 +1,22 @@
+from pathlib import Path
+
+import pytest
+
+from gripper_force.config import load_config
+from gripper_force.grasp import TRIAL_OBJECTS
+from gripper_force.object_profile import find_object, read_object
+from gripper_force.session import correction_of
+from gripper_force.vision.checkpoint import load_checkpoint
+
+
+@pytest.mark.parametrize("name", TRIAL_OBJECTS)
+def test_a_shipped_profile_is_of_the_shipped_network_and_the_usual_camera(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    assert read_object(find_object(name)).object == name
+    config = load_config(None, [f"object={name}", "calibration.object=own"])
+    correction = correction_of(config, load_checkpoint())
+    assert correction is not None
+    assert correction.differs == ()
+    assert correction.profile.force_n > 8
