@@ -283,7 +283,7 @@ def evaluate(
     """Compare a checkpoint's estimates with the load cell, over all logs of a folder."""
     from gripper_force.dataset import load_clips
     from gripper_force.evaluate import evaluate as job
-    from gripper_force.session import correction_of
+    from gripper_force.profiles import correction_of
     from gripper_force.vision.checkpoint import load_checkpoint
 
     settings = _load(None, set_, {"vision.checkpoint": checkpoint, "calibration.object": profile})

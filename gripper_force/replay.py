@@ -15,7 +15,8 @@ from gripper_force.dataset import CONTACT_N, label_frames
 from gripper_force.errors import DataError
 from gripper_force.log import LogReader
 from gripper_force.perception import Sight
-from gripper_force.session import controller_from, correction_of, make_estimator
+from gripper_force.profiles import correction_of
+from gripper_force.session import controller_from, make_estimator
 from gripper_force.types import (
     NS_PER_S,
     Frame,

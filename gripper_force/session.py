@@ -16,7 +16,7 @@ from typing import Any, BinaryIO, cast
 import cv2
 
 from gripper_force.backends import open_devices
-from gripper_force.config import Config, ControlConfig, dump_config
+from gripper_force.config import Config, dump_config
 from gripper_force.control.grasp import Decision, GraspController, is_open
 from gripper_force.control.limits import largest_target_n
 from gripper_force.control.transmission import Transmission
@@ -24,10 +24,9 @@ from gripper_force.errors import ConfigError, DeviceError, GripperError
 from gripper_force.faults import Faults, FaultyEstimator, FaultyFile
 from gripper_force.interfaces import Devices
 from gripper_force.log import LogWriter
-from gripper_force.object_profile import find_object, read_object
 from gripper_force.perception import Estimator, LockstepPerception, Perception, ThreadedPerception
+from gripper_force.profiles import check_target, correction_of, rig_mismatches, with_plant
 from gripper_force.recorder import Recorder
-from gripper_force.rig import read_rig
 from gripper_force.types import (
     NS_PER_S,
     Event,
@@ -39,7 +38,7 @@ from gripper_force.types import (
     RequestKind,
 )
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
-from gripper_force.vision.correction import Correction, load_correction
+from gripper_force.vision.correction import Correction
 from gripper_force.vision.estimator import ForceEstimator
 from gripper_force.watch import CellWatch, Tally
 
@@ -303,21 +302,7 @@ def _check_target(config: Config) -> None:
             f"target_n {config.target_n:g} N is too near to control.force_limit_n {limit_n:g} N; ask for at "
             f"most {largest_target_n(limit_n):g} N, or raise the limit"
         )
-    if config.calibration.rig is not None:
-        servo = read_rig(config.calibration.rig).servo
-        if servo is not None and config.target_n > servo.force_n[1]:
-            raise ConfigError(
-                f"target_n {config.target_n:g} N is more than the rig profile {config.calibration.rig} was "
-                f"calibrated with, {servo.force_n[1]:.1f} N; ask for less, or calibrate up to more"
-            )
-    if config.profile is not None:
-        path = find_object(config.profile)
-        most_n = read_object(path).force_n
-        if config.target_n > most_n:
-            raise ConfigError(
-                f"target_n {config.target_n:g} N is more than the object profile {path} was calibrated with, "
-                f"{most_n:.1f} N; ask for less, or calibrate up to more"
-            )
+    check_target(config)
 
 
 def make_controller(config: Config, devices: Devices) -> tuple[Config, GraspController]:
@@ -333,17 +318,9 @@ def make_controller(config: Config, devices: Devices) -> tuple[Config, GraspCont
         low_v, high_v = servo.voltage_range_v
         slack = {"voltage_limits_v": (low_v - _SUPPLY_SLACK_V, high_v + _SUPPLY_SLACK_V)}
         control = control.model_copy(update=slack)
-    control = _with_plant(config, control)
+    control = with_plant(config, control)
     config = config.model_copy(update={"gripper": gripper, "control": control})
     return config, controller_from(config)
-
-
-def _with_plant(config: Config, control: ControlConfig) -> ControlConfig:
-    """Completes the force loop's plant with what the object's profile knows of it."""
-    if config.profile is None or (plant := read_object(find_object(config.profile)).plant) is None:
-        return control
-    known = {"plant_gain": plant.gain, "plant_lag_ms": plant.lag_ms, "plant_delay_ms": plant.delay_ms}
-    return control.model_copy(update={k: v for k, v in known.items() if getattr(control, k) is None})
 
 
 def controller_from(config: Config) -> GraspController:
@@ -362,46 +339,6 @@ def make_estimator(
     if checkpoint is None:
         return None
     return ForceEstimator(checkpoint, config.vision.region, config.vision.threads, correction)
-
-
-def correction_of(config: Config, checkpoint: Checkpoint | None) -> Correction | None:
-    """What the object's profile makes of estimates, or None without a profile or without vision.
-
-    Raises:
-        ConfigError: The profile can't be read, or is of another network or camera, and that is refused.
-    """
-    if config.profile is None or checkpoint is None:
-        return None
-    path = find_object(config.profile)
-    profile = read_object(path)
-    differ = profile.mismatches(checkpoint.digest, config.camera_settings())
-    if differ and config.calibration.on_mismatch == "refuse":
-        raise ConfigError(
-            f"the object profile {path} is of {'; '.join(differ)}; calibrate again, or set "
-            "calibration.on_mismatch=warn"
-        )
-    features = sum(member.head for member in checkpoint.header.members)
-    return load_correction(path, profile, features, differ)
-
-
-def rig_mismatches(config: Config) -> list[str]:
-    """What differs between the rig profile's devices and the run's, in words.
-
-    Raises:
-        ConfigError: The profile can't be read, or something differs, and that is refused.
-    """
-    path = config.calibration.rig
-    if path is None:
-        return []
-    differ = read_rig(path).mismatches(
-        config.servo.model, config.load_cell.sensor, config.camera.model_dump(mode="json")
-    )
-    if differ and config.calibration.on_mismatch == "refuse":
-        raise ConfigError(
-            f"the rig profile {path} is of {'; '.join(differ)}; calibrate again, or set "
-            "calibration.on_mismatch=warn"
-        )
-    return differ
 
 
 def checkpoint_of(config: Config) -> Checkpoint | None:

@@ -14,9 +14,9 @@ from gripper_force.cli import app
 from gripper_force.config import load_config
 from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
 from gripper_force.log import LogReader, LogWriter
+from gripper_force.profiles import rig_mismatches
 from gripper_force.recording.record import Plan, record
 from gripper_force.rig import read_rig
-from gripper_force.session import rig_mismatches
 from gripper_force.types import NS_PER_MS, Frame
 
 QUICK = ["object=stapler", "sim.detail=coarse", "vision.checkpoint=none", "seed=2", "camera.rate_hz=30"]
