@@ -27,6 +27,7 @@ from gripper_calibration import logs
 from gripper_calibration.fits.correction import fit_correction
 from gripper_calibration.procedures.object import calibrate, touch
 from gripper_force.config import Config, load_config
+from gripper_force.errors import DataError
 from gripper_force.grasp import grasp
 from gripper_force.object_profile import read_object
 from gripper_force.vision.checkpoint import load_checkpoint
@@ -64,15 +65,18 @@ def errors(kind: str, number: int, out: Path) -> list[dict[str, Any]]:
     for count in COUNTS:
         for _ in range(DRAWS):
             drawn = rng.choice(touches.numbers[:-TESTED], count, replace=False)
-            fitted = fit_correction(touches.only([int(n) for n in drawn]))
+            row: dict[str, Any] = {"object": kind, "touches": count, "before_n": before_n}
+            try:
+                fitted = fit_correction(touches.only([int(n) for n in drawn]))
+            except DataError:  # a light touch may tell nothing: the network then stays as it is
+                rows.append({**row, "after_n": before_n, "refused": 1.0})
+                continue
             after_n = fitted.predict(test)
             error_n = np.abs(after_n - test.force_n)
             within = error_n <= np.hypot(fitted.interval.base_n, fitted.interval.share * after_n)
             rows.append(
                 {
-                    "object": kind,
-                    "touches": count,
-                    "before_n": before_n,
+                    **row,
                     "after_n": float(error_n.mean()),
                     "within": float(within.mean()),
                     "half_width_n": float(np.hypot(fitted.interval.base_n, 5 * fitted.interval.share)),
@@ -109,15 +113,20 @@ def profile_of(kind: str, number: int, out: Path) -> str:
 
 def errors_table(rows: list[dict[str, Any]]) -> None:
     """Prints what the touches bring."""
-    print("| touches | MAE N before | after | ratio | within the 90 % interval | half-width at 5 N | gated |")
-    print("|---|---|---|---|---|---|---|")
+    print(
+        "| touches | MAE N before | after | ratio | within 90 % interval | half-width at 5 N | gated | refused |"
+    )
+    print("|---|---|---|---|---|---|---|---|")
     for count in COUNTS:
         part = [row for row in rows if row["touches"] == count]
-        mean = {key: float(np.mean([row[key] for row in part])) for key in part[0] if key != "object"}
+        keys = ("before_n", "after_n", "within", "half_width_n", "gated", "refused")
+        known = {key: [row[key] for row in part if key in row] for key in keys}
+        mean = {key: float(np.mean(values)) if values else 0.0 for key, values in known.items()}
+        refused = len(known["refused"])
         print(
             f"| {count} | {mean['before_n']:.3f} | {mean['after_n']:.3f} | "
             f"{mean['before_n'] / mean['after_n']:.1f} | {100 * mean['within']:.0f} % | "
-            f"{mean['half_width_n']:.2f} N | {100 * mean['gated']:.1f} % |"
+            f"{mean['half_width_n']:.2f} N | {100 * mean['gated']:.1f} % | {refused} of {len(part)} |"
         )
     print("\n| object | before | " + " | ".join(f"{count} touches" for count in COUNTS) + " |")
     print("|---|---|" + "---|" * len(COUNTS))
