@@ -114,7 +114,7 @@ def profile_of(kind: str, number: int, out: Path) -> str:
 def errors_table(rows: list[dict[str, Any]]) -> None:
     """Prints what the touches bring."""
     print(
-        "| touches | MAE N before | after | ratio | within 90 % interval | half-width at 5 N | gated | refused |"
+        "| touches | MAE N before | after | ratio | in 90 % interval | half-width at 5 N | gated | refused |"
     )
     print("|---|---|---|---|---|---|---|---|")
     for count in COUNTS:
