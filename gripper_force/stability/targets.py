@@ -108,8 +108,9 @@ def _halves() -> list[bytes]:
 
 
 def _read_half(data: bytes, path: Path) -> None:
-    weights_path(path).write_bytes(data)
-    _correct(load_correction(path, _object(sha256(data).hexdigest()), 8))
+    profile = path.with_name("half.yaml")
+    weights_path(profile).write_bytes(data)
+    _correct(load_correction(profile, _object(sha256(data).hexdigest()), 8))
 
 
 def _correct(correction: Correction) -> None:
