@@ -95,7 +95,7 @@ def one_grasp(
     if not kept.exists():
         known = [f"calibration.object={profile}"] if profile else []
         keys = [f"target_n={target_n}", f"control.feedback={feedback}", "log.report=false", *known]
-        config = configure(kind, number, out / "runs", *keys)
+        config = configure(kind, number, kept.with_suffix(""), *keys)
         result = grasp(config.model_copy(update={"seed": config.seed + 50 + trial}))
         kept.write_text(json.dumps(result))
     return json.loads(kept.read_text())
@@ -180,7 +180,7 @@ def main() -> None:
         made = [pool.submit(profile_of, *which, options.out) for which in objects]
         profiles = [future.result() for future in track(made, "profiles", console=console)]
         rng = np.random.default_rng(20)
-        most_n = [read_object(Path(profile)).force_n for profile in profiles]
+        most_n = [read_object(Path(profile)).force_n - 0.001 for profile in profiles]
         plan = [
             (i % len(objects), i, round(min(float(rng.uniform(*TARGETS_N)), most_n[i % len(objects)]), 3))
             for i in range(options.grasps)
