@@ -73,13 +73,13 @@ def errors(kind: str, number: int, out: Path) -> list[dict[str, Any]]:
                 continue
             after_n = fitted.predict(test)
             error_n = np.abs(after_n - test.force_n)
-            within = error_n <= np.hypot(fitted.interval.base_n, fitted.interval.share * after_n)
+            within = error_n <= fitted.interval.half_width_n(after_n)
             rows.append(
                 {
                     **row,
                     "after_n": float(error_n.mean()),
                     "within": float(within.mean()),
-                    "half_width_n": float(np.hypot(fitted.interval.base_n, 5 * fitted.interval.share)),
+                    "half_width_n": float(fitted.interval.half_width_n(5.0)),
                     "gated": float((fitted.arrays.strangeness(test.features) > fitted.gate).mean()),
                 }
             )

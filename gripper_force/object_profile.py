@@ -10,10 +10,12 @@ from importlib.resources import as_file, files
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from gripper_force.errors import ConfigError
-from gripper_force.schema import Finite, NonNegative, Positive, Section, dump, read_tree, validated
+from gripper_force.schema import Finite, NonNegative, Positive, Section, dump, read_section
 
 FORMAT: Final = "gripper-force-object/1"
 
@@ -59,6 +61,11 @@ class Interval(Section):
     coverage: Annotated[float, Field(gt=0, lt=1)]
     base_n: Positive
     share: NonNegative
+
+    def half_width_n(self, force_n: npt.ArrayLike) -> npt.NDArray[np.float64]:
+        """Half-width about forces, (N,)."""
+        width: npt.NDArray[np.float64] = np.hypot(self.base_n, self.share * np.asarray(force_n, np.float64))
+        return width
 
 
 class LoopPlant(Section):
@@ -137,13 +144,7 @@ def weights_path(path: Path) -> Path:
 
 def read_object(path: Path) -> ObjectProfile:
     """Reads an object profile. Raises `ConfigError` that names the file and what is wrong with it."""
-    tree = read_tree(path, "object profile")
-    if tree.get("format") != FORMAT:
-        raise ConfigError(
-            f"{path} is no object profile of format {FORMAT}, it says {tree.get('format')!r}; make one with "
-            "`gripper-force calibrate object NAME`"
-        )
-    return validated(ObjectProfile, tree, str(path), "object profile")
+    return read_section(ObjectProfile, path, FORMAT, "object profile")
 
 
 def write_object(path: Path, profile: ObjectProfile) -> None:

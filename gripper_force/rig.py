@@ -13,8 +13,7 @@ from gripper_force.schema import (
     Section,
     Tree,
     dump,
-    read_tree,
-    validated,
+    read_section,
 )
 
 FORMAT: Final = "gripper-force-rig/1"
@@ -201,13 +200,7 @@ def _std(estimate: Estimate, drift: float) -> float:
 
 def read_rig(path: Path) -> RigProfile:
     """Reads a rig profile. Raises `ConfigError` that names the file and what is wrong with it."""
-    tree = read_tree(path, "rig profile")
-    if tree.get("format") != FORMAT:
-        raise ConfigError(
-            f"{path} is no rig profile of format {FORMAT}, it says {tree.get('format')!r}; make one with "
-            "`gripper-force calibrate`"
-        )
-    return validated(RigProfile, tree, str(path), "rig profile")
+    return read_section(RigProfile, path, FORMAT, "rig profile")
 
 
 def update_rig(path: Path, section: LoadCellCalibration | ServoCalibration | CameraCalibration) -> RigProfile:

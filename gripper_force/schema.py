@@ -111,6 +111,21 @@ def validated(section: type[S], tree: Tree, where: str, what: str = "configurati
         raise ConfigError(_sentence(section, error, where, what)) from error
 
 
+def read_section(section: type[S], path: Path, format_: str, what: str) -> S:
+    """Reads a YAML file that says its own format under the key ``format``.
+
+    Raises:
+        ConfigError: It can't be read, is of another format, or a key or value is wrong.
+    """
+    tree = read_tree(path, what)
+    if tree.get("format") != format_:
+        raise ConfigError(
+            f"{path} is no {what} of format {format_}, it says {tree.get('format')!r}; make one with "
+            "`gripper-force calibrate`"
+        )
+    return validated(section, tree, str(path), what)
+
+
 def _parse(text: str, what_fails: str) -> Any:
     try:
         return yaml.safe_load(text)

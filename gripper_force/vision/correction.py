@@ -82,10 +82,8 @@ class Correction:
     def half_width_n(self, force_n: npt.ArrayLike) -> Floats:
         """Half-width of the interval about corrected forces, (N,); it grows beyond the forces calibrated."""
         force = np.asarray(force_n, np.float64)
-        interval = self.profile.interval
-        beyond_n = np.clip(force - self.profile.force_n, 0, None)
-        width: Floats = np.hypot(interval.base_n, interval.share * force) + beyond_n
-        return width
+        beyond_n: Floats = np.clip(force - self.profile.force_n, 0, None)
+        return self.profile.interval.half_width_n(force) + beyond_n
 
     def std_n(self, force_n: npt.ArrayLike) -> Floats:
         """The standard deviation of an error that is normal with that interval, (N,)."""

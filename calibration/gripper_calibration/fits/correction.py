@@ -148,8 +148,9 @@ def learning_curve(
                 fitted = fit_correction(touches.only(drawn), coverage)
             except DataError:  # so few touches may all have been light ones
                 continue
-            error_n = np.abs(fitted.predict(rest) - rest.force_n)
-            half_n = np.hypot(fitted.interval.base_n, fitted.interval.share * fitted.predict(rest))
+            predicted_n = fitted.predict(rest)
+            error_n = np.abs(predicted_n - rest.force_n)
+            half_n = fitted.interval.half_width_n(predicted_n)
             yield count, float(error_n.mean()), float((error_n <= half_n).mean())
         advance()
 

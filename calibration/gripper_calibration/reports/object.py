@@ -25,8 +25,8 @@ def draw(
     error_n = after_n - touches.force_n
     reach_n = max(float(touches.force_n.max()), float(touches.estimate_n.max()))
     line = np.linspace(0, reach_n, 100)
-    half_n = np.hypot(profile.interval.base_n, profile.interval.share * line)
-    share = np.abs(error_n) <= np.hypot(profile.interval.base_n, profile.interval.share * after_n)
+    half_n = profile.interval.half_width_n(line)
+    share = np.abs(error_n) <= profile.interval.half_width_n(after_n)
     title = (
         f"{profile.object}: {profile.touches} touches, MAE {profile.before_n:.3f} N before, "
         f"{np.abs(error_n).mean():.3f} N after ({how})"

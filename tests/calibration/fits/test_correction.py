@@ -86,7 +86,7 @@ def test_new_touches_are_within_the_interval_as_often_as_promised() -> None:
         fitted = fit_correction(touched(8, gain=1.2, scatter=0.04, seed=2 * seed))
         new = touched(20, gain=1.2, scatter=0.04, seed=2 * seed + 1)
         predicted_n = fitted.predict(new)
-        half_n = np.hypot(fitted.interval.base_n, fitted.interval.share * predicted_n)
+        half_n = fitted.interval.half_width_n(predicted_n)
         within.append((np.abs(predicted_n - new.force_n) <= half_n).mean())
     assert np.mean(within) == pytest.approx(0.9, abs=0.03)
 
