@@ -7,7 +7,7 @@ from pydantic import Field, ValidationError, model_validator
 from gripper_force.errors import ConfigError
 from gripper_force.schema import NonNegative, Positive, Section, section_from
 from gripper_force.vision.attention import Pooling
-from gripper_force.vision.network import Attention, BackboneName, NetworkConfig
+from gripper_force.vision.network import Attention, BackboneName, Count, NetworkConfig
 from gripper_force.vision.preprocess import Preprocess
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -48,6 +48,8 @@ class TrainConfig(Section):
         pooling: Of SSAM and SCAM: weighted or global average pooling.
         backbone: Of all members.
         width: Multiplier of the backbone's channels.
+        hidden: Units of each direction of the BLSTM.
+        head: Units of the dense layer.
         preprocess: How frames are prepared.
         steps: Optimiser steps for each member.
         epochs: Passes over the training set for each member; stands in for ``steps`` where given. In a pass
@@ -83,6 +85,8 @@ class TrainConfig(Section):
     pooling: Pooling = "wap"
     backbone: BackboneName = "vgg"
     width: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] = 1.0
+    hidden: Count = 256
+    head: Count = 1024
     preprocess: Preprocess = Preprocess()
     steps: Annotated[int, Field(ge=1)] = 1000
     epochs: Positive | None = None
@@ -130,6 +134,8 @@ class TrainConfig(Section):
             backbone=self.backbone,
             size=self.preprocess.size,
             width=self.width,
+            hidden=self.hidden,
+            head=self.head,
         )
 
 
