@@ -50,7 +50,7 @@ KILL_TRIAL: Final = "gripper_hw.sim.killed:kill_trial"
 """A grasp whose process is killed, for `gripper_force.stability.faults`."""
 
 BUS_COST: Final = "gripper_hw.dynamixel.cost:bus_cost"
-"""What a servo bus cycle costs, for `gripper_force.bench`."""
+"""What a servo bus cycle costs, for `gripper_force.bench.bus`."""
 
 
 class MonotonicClock:

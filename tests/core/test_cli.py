@@ -13,6 +13,7 @@ import typer
 from typer.testing import CliRunner
 
 from gripper_force import cli, console
+from gripper_force.cli.options import load_settings
 from gripper_force.errors import ConfigError
 
 
@@ -336,7 +337,7 @@ def test_a_figure_that_is_no_number_is_null() -> None:
 
 
 def test_options_win_over_overrides() -> None:
-    config = cli._load(None, ["seed=3", "object=tube"], {"seed": 4, "object": None})
+    config = load_settings(None, ["seed=3", "object=tube"], {"seed": 4, "object": None})
     assert (config.seed, config.object) == (4, "tube")
     with pytest.raises(ConfigError, match="configuration key 'target_n'"):
-        cli._load(None, None, {"target_n": -1.0})
+        load_settings(None, None, {"target_n": -1.0})

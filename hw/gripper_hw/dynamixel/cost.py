@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from dynamixel_sdk import GroupSyncRead, GroupSyncWrite, PacketHandler, PortHandler
 
-from gripper_force.bench import BusCost
+from gripper_force.bench.bus import BusCost
 from gripper_force.config import ServoConfig
 from gripper_force.types import NS_PER_MS, NS_PER_S, ServoCommand
 from gripper_hw.dynamixel.control_table import REGISTERS, load_model

@@ -1,0 +1,29 @@
+"""Options that commands share, and the configuration that they make."""
+
+import json
+import os
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from gripper_force.config import Config, load_config
+
+CORES = os.cpu_count() or 1
+
+ConfigPath = Annotated[Path | None, typer.Option("--config", help="YAML file with configuration keys.")]
+Overrides = Annotated[
+    list[str] | None, typer.Option("--set", help="Set one configuration key: key.path=value. Repeatable.")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
+Jobs = Annotated[int, typer.Option(min=1, help="Processes to use.")]
+
+
+def load_settings(path: Path | None, overrides: list[str] | None, options: dict[str, Any]) -> Config:
+    """The configuration of a command; an option that was given wins over ``--set``.
+
+    Raises:
+        ConfigError: A file, key or value is wrong. The sentence names it.
+    """
+    given = [f"{key}={json.dumps(value)}" for key, value in options.items() if value is not None]
+    return load_config(path, [*(overrides or []), *given])

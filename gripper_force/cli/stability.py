@@ -1,0 +1,77 @@
+"""The command that shows what is survived."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from gripper_force import console
+from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, load_settings
+from gripper_force.config import Config
+from gripper_force.errors import ConfigError
+
+
+def stability(
+    faults: Annotated[bool, typer.Option("--faults", help="Break each part in mid-grasp.")] = False,
+    seeds: Annotated[int, typer.Option(min=1, help="With --faults: grasps of each row.")] = 20,
+    live: Annotated[int, typer.Option(min=0, help="With --faults: of these, also in real time.")] = 2,
+    write: Annotated[
+        Path | None, typer.Option(help="With --faults: Markdown file to put the matrix into.")
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option(help="With --faults: go on where the last matrix was broken off.")
+    ] = False,
+    fuzz: Annotated[
+        int | None, typer.Option(min=1, help="Feed so many random and damaged inputs to all readers.")
+    ] = None,
+    soak: Annotated[
+        float | None,
+        typer.Option(min=0, help="Grasp again and again for so many simulated seconds (coarse scenes)."),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the inputs or of the first scene.")] = 0,
+    only: Annotated[
+        str | None, typer.Option(help="With --fuzz: one target, or one input as <target>:<number>.")
+    ] = None,
+    folder: Annotated[Path, typer.Option("--out", help="Folder for inputs that are findings.")] = Path(
+        "runs/fuzz"
+    ),
+    jobs: Jobs = CORES,
+    config: ConfigPath = None,
+    set_: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Show that faults, hostile input and long use are survived. Exit code 1 where they are not."""
+    if [faults, fuzz is not None, soak is not None].count(True) != 1:
+        raise ConfigError("stability does one thing at a time: --faults, --fuzz N or --soak SECONDS")
+    if faults:
+        result = _fault_matrix(load_settings(config, set_, {"seed": seed}), seeds, live, jobs, write, resume)
+        console.show(result, as_json, console.faults_table)
+    elif fuzz is not None:
+        from gripper_force.stability.fuzz import fuzz as feed
+
+        with console.bar("fuzzing", fuzz) as advance:
+            result = feed(fuzz, seed, jobs, folder, advance, only=only)
+        console.show(result, as_json, console.fuzz_table)
+    else:
+        from gripper_force.stability.soak import soak as grasp_on
+
+        settings = load_settings(config, ["sim.detail=coarse", *(set_ or [])], {"seed": seed})
+        with console.bar("soaking", round(soak or 0)) as advance:
+            result = grasp_on(settings, soak or 0, advance)
+        console.show(result, as_json, console.soak_table)
+    if not result["ok"]:
+        raise typer.Exit(1)
+
+
+def _fault_matrix(
+    settings: Config, seeds: int, live: int, jobs: int, page: Path | None, resume: bool
+) -> dict[str, Any]:
+    from gripper_force.report.markers import write_between
+    from gripper_force.stability.faults import count_grasps, markdown, run_matrix
+
+    with console.bar("breaking things", count_grasps(seeds, live)) as advance:
+        keep = settings.log.directory / "faults.jsonl"
+        rows = list(run_matrix(settings, seeds, live, jobs, keep, resume=resume, advance=advance))
+    if page is not None:
+        write_between(page, "matrix", markdown(rows))
+    return {"rows": rows, "ok": all(row["ok"] == row["runs"] for row in rows)}
