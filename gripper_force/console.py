@@ -278,6 +278,21 @@ def learning_table(r: dict[str, Any]) -> None:
     _pairs({"kept in": str(r["folder"])})
 
 
+def numerics_tables(r: dict[str, Any]) -> None:
+    """Hard cases for the numbers, part by part."""
+    from gripper_force.stability.numerics import said
+
+    for name, rows in r["parts"].items():
+        title = f"{name} ({r['seconds'][name]:.0f} s)"
+        table = Table("case", "how", "found", "bound", title=title, title_justify="left", box=None)
+        for row in rows:
+            colour = "green" if row.ok else "bold red"
+            found = f"[{colour}]{said(row.figure, row.unit)}[/]"
+            table.add_row(escape(row.case), escape(row.detail), found, said(row.bound, row.unit))
+        out.print(table)
+        out.print()
+
+
 def faults_table(r: dict[str, Any]) -> None:
     """The fault matrix."""
     table = Table(

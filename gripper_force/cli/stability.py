@@ -1,22 +1,29 @@
 """The command that shows what is survived."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from gripper_force import console
 from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, load_settings
-from gripper_force.config import Config
 from gripper_force.errors import ConfigError
+
+if TYPE_CHECKING:
+    from gripper_force.config import Config
 
 
 def stability(
+    part: Annotated[
+        list[str] | None,
+        typer.Option(help="Hard cases for the numbers of this part alone: filter. Repeatable."),
+    ] = None,
     faults: Annotated[bool, typer.Option("--faults", help="Break each part in mid-grasp.")] = False,
     seeds: Annotated[int, typer.Option(min=1, help="With --faults: grasps of each row.")] = 20,
     live: Annotated[int, typer.Option(min=0, help="With --faults: of these, also in real time.")] = 2,
     write: Annotated[
-        Path | None, typer.Option(help="With --faults: Markdown file to put the matrix into.")
+        Path | None,
+        typer.Option(help="Markdown file to put the tables into; maps go into a folder beside it."),
     ] = None,
     resume: Annotated[
         bool, typer.Option(help="With --faults: go on where the last matrix was broken off.")
@@ -40,10 +47,17 @@ def stability(
     set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show that faults, hostile input and long use are survived. Exit code 1 where they are not."""
-    if [faults, fuzz is not None, soak is not None].count(True) != 1:
-        raise ConfigError("stability does one thing at a time: --faults, --fuzz N or --soak SECONDS")
-    if faults:
+    """Show that hard cases for the numbers, faults, hostile input and long use are survived.
+
+    Without --faults, --fuzz or --soak: the numbers. Exit code 1 where a case breaks its bound.
+    """
+    modes = [faults, fuzz is not None, soak is not None].count(True)
+    if modes > 1 or (modes == 1 and part):
+        raise ConfigError("stability does one thing at a time: --part, --faults, --fuzz N or --soak SECONDS")
+    if not modes:
+        result = _numbers(load_settings(config, set_, {"seed": seed}), part or [], write)
+        console.show(result, as_json, console.numerics_tables)
+    elif faults:
         result = _fault_matrix(load_settings(config, set_, {"seed": seed}), seeds, live, jobs, write, resume)
         console.show(result, as_json, console.faults_table)
     elif fuzz is not None:
@@ -63,8 +77,20 @@ def stability(
         raise typer.Exit(1)
 
 
+def _numbers(settings: "Config", parts: list[str], page: Path | None) -> dict[str, Any]:
+    from gripper_force.report.markers import write_between
+    from gripper_force.stability.numerics import PARTS, markdown, run
+
+    with console.bar("hard cases", len(parts or PARTS)) as advance:
+        result = run(settings, parts, page and page.with_suffix(""), advance)
+    if page is not None:
+        for name, rows in result["parts"].items():
+            write_between(page, name, markdown(rows))
+    return result
+
+
 def _fault_matrix(
-    settings: Config, seeds: int, live: int, jobs: int, page: Path | None, resume: bool
+    settings: "Config", seeds: int, live: int, jobs: int, page: Path | None, resume: bool
 ) -> dict[str, Any]:
     from gripper_force.report.markers import write_between
     from gripper_force.stability.faults import count_grasps, markdown, run_matrix

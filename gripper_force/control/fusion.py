@@ -85,7 +85,7 @@ class Fusion:
     def restart(self) -> None:
         """Forgets the bias: a new grasp has its own."""
         self._difference_n = 0.0
-        self._share = 1.0
+        self._odds = 0.0
         self._friction_n = self._transmission.friction_n
         self._friction_n2 = (self._transmission.friction_std * self._friction_n) ** 2
         self._hidden_n2 = 0.0
@@ -157,7 +157,7 @@ class Fusion:
     def _learn_friction(self) -> None:
         gain = self._friction_n2 / (self._friction_n2 + _FREE_NOISE_N**2)
         self._friction_n = max(self._friction_n + gain * (self._push_n - self._friction_n), 0.0)
-        self._friction_n2 *= 1 - gain
+        self._friction_n2 = _both_n2(self._friction_n2, _FREE_NOISE_N**2)
 
     def _update(self, t_ns: int, visual: VisualForce) -> str:
         """Takes one estimate in. Returns why it was refused, or an empty text."""
@@ -182,13 +182,13 @@ class Fusion:
             self._variance_n2 = self._prior_n2(current_n)
         self._rejected = 0
         self._correct(innovation_n, _FRAME_NOISE_N**2)
-        self._share = self._prior_n2(current_n) / (self._prior_n2(current_n) + claimed_n2)
+        self._odds = claimed_n2 / self._prior_n2(current_n)
         return ""
 
     def _correct(self, innovation_n: float, noise_n2: float) -> None:
         gain = self._variance_n2 / (self._variance_n2 + noise_n2)
         self._difference_n += gain * innovation_n
-        self._variance_n2 *= 1 - gain
+        self._variance_n2 = _both_n2(self._variance_n2, noise_n2)
 
     def _current_at(self, t_ns: int) -> float:
         """Current-derived force at a past time, linear between cycles, held beyond both ends."""
@@ -218,9 +218,10 @@ class Fusion:
         return (Event(t_ns, "vision", f"vision dropped out{reason}; on motor current alone"),)
 
     def _estimate(self, t_ns: int) -> FusedForce:
-        bias_n = self._share * self._difference_n
+        share = 1 / (1 + self._odds)
+        bias_n = share * self._difference_n
         force_n = self._current_n + bias_n
-        std_n = math.sqrt(self._variance_n2 + (1 - self._share) * self._prior_n2(self._current_n))
+        std_n = math.sqrt(self._variance_n2 + self._odds * share * self._prior_n2(self._current_n))
         if self._source == Source.VISION:
             force_n, std_n = self._visual_n, max(self._visual_std_n, _VISION_FLOOR_N)
         force_n = max(force_n, 0.0)
@@ -233,6 +234,11 @@ class Fusion:
             friction_n=self._friction_n,
             source=self._source,
         )
+
+
+def _both_n2(one_n2: float, other_n2: float) -> float:
+    """Variance of what two sources say together. One less the gain would lose it where one is far larger."""
+    return one_n2 * other_n2 / (one_n2 + other_n2)
 
 
 def _count(rejected: int, innovation_n: float) -> int:

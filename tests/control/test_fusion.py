@@ -200,3 +200,12 @@ def test_an_estimate_from_before_the_first_reading_meets_the_oldest_current(tran
     estimate, _ = fusion.step(50 * MS, servo, VisualForce(10 * MS, 50 * MS, 0, 0.3, 0.1, 1.0))
     assert estimate.source == "fused"
     assert 0.0 < estimate.bias_n < 0.3 - estimate.current_n
+
+
+def test_a_rig_that_is_hardly_known_leaves_vision_its_own_error(transmission):
+    """One less a gain close to one has no digits left."""
+    loose = Bench(replace(transmission, friction_std=1e9))
+    known = Bench(replace(transmission, friction_std=1e2))
+    ends = [b.run(1.0, lambda _: 4.0, lambda _: 3.4) for b in (loose, known)]
+    assert ends[0].std_n == pytest.approx(ends[1].std_n, rel=1e-3)
+    assert ends[0].std_n > 0.1
