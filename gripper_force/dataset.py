@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +20,9 @@ from gripper_force.config import config_from_text
 from gripper_force.errors import DataError
 from gripper_force.log import LogReader
 from gripper_force.types import NS_PER_MS, Frame, Gray, LoadCellSample
-from gripper_force.vision.preprocess import Preprocess, Region, shrink
+
+if TYPE_CHECKING:  # labels need no OpenCV
+    from gripper_force.vision.preprocess import Preprocess, Region
 
 CONTACT_N: Final = 0.25
 """Measured force over which a frame counts as contact."""
@@ -54,8 +56,8 @@ class Clip:
 
 def load_clips(
     source: Path | Sequence[Path],
-    preprocess: Preprocess,
-    region: Region | None = None,
+    preprocess: "Preprocess",
+    region: "Region | None" = None,
     workers: int = 1,
     *,
     quiet: bool = False,
@@ -119,7 +121,7 @@ def split_by(
     return [c for c in clips if getattr(c, key) not in held], [c for c in clips if getattr(c, key) in held]
 
 
-def check_size(clips: Iterable[Clip], preprocess: Preprocess) -> None:
+def check_size(clips: Iterable[Clip], preprocess: "Preprocess") -> None:
     """Raises `DataError` where a clip's frames are of another size than the networks take."""
     for clip in clips:
         if clip.frames.shape[1] != preprocess.size:
@@ -173,8 +175,10 @@ def label_frames(
     return np.where(valid, labels, 0.0).astype(np.float32), valid
 
 
-def load_clip(path: Path, preprocess: Preprocess, region: Region | None) -> Clip:
+def load_clip(path: Path, preprocess: "Preprocess", region: "Region | None") -> Clip:
     """Reads one log; see `load_clips`."""
+    from gripper_force.vision.preprocess import shrink
+
     reader = LogReader(path)
     config = config_from_text(reader.config, str(path))
     region = region or config.vision.region

@@ -16,7 +16,6 @@ from gripper_force.dataset import stiffness_floor_n, stiffness_of
 from gripper_force.errors import DataError
 from gripper_force.log import LogReader
 from gripper_force.replay import compare
-from gripper_force.report import write_report
 from gripper_force.session import run_grasp
 from gripper_force.types import (
     NS_PER_S,
@@ -49,8 +48,12 @@ def grasp(config: Config, progress: Callable[[GraspStatus], None] | None = None)
     """
     path = _new_log(config)
     run_grasp(config, path, progress)
-    report = str(write_report(path).html) if config.log.report else None
-    return {**summarise(path), "report": report}
+    result = {**summarise(path), "report": None}
+    if config.log.report:
+        from gripper_force.report import write_report
+
+        result["report"] = str(write_report(path).html)
+    return result
 
 
 def trials(config: Config, count: int, jobs: int) -> Iterator[Summary]:

@@ -4,7 +4,6 @@ from typing import Final, TypedDict
 
 import numpy as np
 import numpy.typing as npt
-from scipy import signal
 
 Signal = npt.ArrayLike
 """A one-dimensional series of numbers."""
@@ -79,12 +78,14 @@ def lag_s(
     if not 2 * step_s <= end - begin <= LONGEST_S:
         return float("nan")
     grid = np.arange(begin, end, step_s)
-    a = signal.detrend(np.interp(grid, t, np.asarray(values, np.float64)), type="constant")
-    b = signal.detrend(np.interp(grid, t_ref, np.asarray(reference, np.float64)), type="constant")
+    a = np.interp(grid, t, np.asarray(values, np.float64))
+    b = np.interp(grid, t_ref, np.asarray(reference, np.float64))
     if np.ptp(a) == 0 or np.ptp(b) == 0:
         return float("nan")
-    correlation = signal.correlate(a, b, mode="full", method="fft")
-    return float((int(correlation.argmax()) - (len(grid) - 1)) * step_s)
+    size = 1 << (2 * len(grid)).bit_length()  # both fit in beside each other, so that nothing wraps round
+    spectrum = np.fft.rfft(a - a.mean(), size) * np.fft.rfft(b - b.mean(), size).conj()
+    shift = int(np.fft.irfft(spectrum, size).argmax())
+    return float((shift if shift < size // 2 else shift - size) * step_s)
 
 
 def _error(predicted: Signal, measured: Signal) -> npt.NDArray[np.float64]:

@@ -1,11 +1,15 @@
 """What the rig profile and the object profile that a configuration names mean for its run."""
 
+from typing import TYPE_CHECKING
+
 from gripper_force.config import Config, ControlConfig
 from gripper_force.errors import ConfigError
 from gripper_force.object_profile import find_object, read_object
 from gripper_force.rig import read_rig
-from gripper_force.vision.checkpoint import Checkpoint
-from gripper_force.vision.correction import Correction, load_correction
+
+if TYPE_CHECKING:  # a run without vision loads none of it
+    from gripper_force.vision.checkpoint import Checkpoint
+    from gripper_force.vision.correction import Correction
 
 
 def check_target(config: Config) -> None:
@@ -32,7 +36,7 @@ def with_plant(config: Config, control: ControlConfig) -> ControlConfig:
     return control.model_copy(update={k: v for k, v in known.items() if getattr(control, k) is None})
 
 
-def correction_of(config: Config, checkpoint: Checkpoint | None) -> Correction | None:
+def correction_of(config: Config, checkpoint: "Checkpoint | None") -> "Correction | None":
     """What the object's profile makes of estimates, or None without a profile or without vision.
 
     Raises:
@@ -48,6 +52,8 @@ def correction_of(config: Config, checkpoint: Checkpoint | None) -> Correction |
             f"the object profile {path} is of {'; '.join(differ)}; calibrate again, or set "
             "calibration.on_mismatch=warn"
         )
+    from gripper_force.vision.correction import load_correction
+
     features = sum(member.head for member in checkpoint.header.members)
     return load_correction(path, profile, features, differ)
 

@@ -4,7 +4,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -28,7 +28,9 @@ from gripper_force.types import (
     ServoState,
     VisualForce,
 )
-from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
+
+if TYPE_CHECKING:
+    from gripper_force.vision.checkpoint import Checkpoint
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,7 @@ def replay(
     }
 
 
-def run_again(reader: LogReader, config: Config, checkpoint: Checkpoint | None) -> Replayed:
+def run_again(reader: LogReader, config: Config, checkpoint: "Checkpoint | None") -> Replayed:
     """Feeds estimator and controller from a log, in the order in which the run had its inputs."""
     sight = Sight(make_estimator(config, checkpoint, correction_of(config, checkpoint)))
     runs = config.gripper.nm_per_a is not None  # a recording that was imported never had a controller
@@ -150,7 +152,7 @@ def _same_decisions(logged: dict[type, list[Any]], again: list[Decision]) -> boo
     return all(a == b[: len(a)] and len(b) - len(a) <= 1 for a, b in pairs)
 
 
-def _note(reader: LogReader, config: Config, checkpoint: Checkpoint | None) -> str:
+def _note(reader: LogReader, config: Config, checkpoint: "Checkpoint | None") -> str:
     """Why the estimates can't come out the same, or an empty text."""
     used = reader.metadata.get("checkpoint", "")
     if checkpoint is None or used == "":
@@ -165,9 +167,13 @@ def _note(reader: LogReader, config: Config, checkpoint: Checkpoint | None) -> s
     return ""
 
 
-def _checkpoint(config: Config, source: str | None) -> Checkpoint | None:
+def _checkpoint(config: Config, source: str | None) -> "Checkpoint | None":
     name = source or config.vision.checkpoint
-    return None if name == "none" else load_checkpoint(name)
+    if name == "none":
+        return None
+    from gripper_force.vision.checkpoint import load_checkpoint
+
+    return load_checkpoint(name)
 
 
 def _sources(replayed: Replayed) -> dict[str, dict[str, Any]]:

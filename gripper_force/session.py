@@ -11,9 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from importlib import metadata
 from pathlib import Path
-from typing import Any, BinaryIO, cast
-
-import cv2
+from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
 from gripper_force.backends import open_devices
 from gripper_force.config import Config, dump_config
@@ -37,10 +35,12 @@ from gripper_force.types import (
     Request,
     RequestKind,
 )
-from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
-from gripper_force.vision.correction import Correction
-from gripper_force.vision.estimator import ForceEstimator
 from gripper_force.watch import CellWatch, Tally
+
+if TYPE_CHECKING:  # a run without vision loads none of it
+    from gripper_force.vision.checkpoint import Checkpoint
+    from gripper_force.vision.correction import Correction
+    from gripper_force.vision.estimator import ForceEstimator
 
 _VISION_PATIENCE_NS = 2 * NS_PER_S
 _REFERENCE_NS = NS_PER_S // 10
@@ -228,7 +228,7 @@ class Session:
 
 @contextmanager
 def open_session(
-    config: Config, devices: Devices, path: Path, checkpoint: Checkpoint | None
+    config: Config, devices: Devices, path: Path, checkpoint: "Checkpoint | None"
 ) -> Iterator[Session]:
     """A session that runs, and on every way out stops the servo as configured and closes its log.
 
@@ -333,18 +333,22 @@ def controller_from(config: Config) -> GraspController:
 
 
 def make_estimator(
-    config: Config, checkpoint: Checkpoint | None, correction: Correction | None
-) -> ForceEstimator | None:
+    config: Config, checkpoint: "Checkpoint | None", correction: "Correction | None"
+) -> "ForceEstimator | None":
     """The estimator of a run, or None for a run without vision."""
     if checkpoint is None:
         return None
+    from gripper_force.vision.estimator import ForceEstimator
+
     return ForceEstimator(checkpoint, config.vision.region, config.vision.threads, correction)
 
 
-def checkpoint_of(config: Config) -> Checkpoint | None:
+def checkpoint_of(config: Config) -> "Checkpoint | None":
     """The network that the configuration names, or None for a run without vision."""
     if config.camera.backend == "none" or config.vision.checkpoint == "none":
         return None
+    from gripper_force.vision.checkpoint import load_checkpoint
+
     return load_checkpoint(config.vision.checkpoint)
 
 
@@ -398,8 +402,8 @@ def _recorder(
     config: Config,
     devices: Devices,
     path: Path,
-    checkpoint: Checkpoint | None,
-    correction: Correction | None,
+    checkpoint: "Checkpoint | None",
+    correction: "Correction | None",
 ) -> Recorder:
     about = _metadata(config, devices, checkpoint)
     if correction is not None:
@@ -432,7 +436,7 @@ def _perception(config: Config, devices: Devices, estimator: Estimator | None) -
     return ThreadedPerception(devices.camera, estimator, devices.clock)
 
 
-def _metadata(config: Config, devices: Devices, checkpoint: Checkpoint | None) -> dict[str, str]:
+def _metadata(config: Config, devices: Devices, checkpoint: "Checkpoint | None") -> dict[str, str]:
     versions = {f"version {name}": metadata.version(name) for name in _PACKAGES}
     return {
         "object": config.object,
@@ -450,7 +454,9 @@ def _discard_unused(session: Session, path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def _attach_reference(session: Session, estimator: ForceEstimator | None) -> None:
+def _attach_reference(session: Session, estimator: "ForceEstimator | None") -> None:
     if estimator is not None and (reference := estimator.reference) is not None:
+        import cv2
+
         png: Any = cv2.imencode(".png", reference)[1]
         session.attach("reference.png", png.tobytes(), "image/png")

@@ -4,7 +4,6 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import binary_propagation
 
 HAMPEL_HALF_WINDOW: Final = 3
 HAMPEL_SIGMAS: Final = 4.0
@@ -41,5 +40,7 @@ def find_spikes(force_n: Floats) -> Bools:
     median = np.median(windows, axis=1)
     sigma = 1.4826 * np.median(np.abs(windows - median[:, None]), axis=1)
     sticks_out = np.abs(force_n - median) > np.maximum(HAMPEL_SIGMAS * sigma, HAMPEL_FLOOR_N)
-    impossible = binary_propagation(force_n < IMPOSSIBLE_N, mask=force_n < FLANK_N)
+    dips = force_n < FLANK_N
+    part = np.cumsum(np.diff(dips, prepend=False))  # numbers the dips, and what lies between them
+    impossible = dips & np.isin(part, part[force_n < IMPOSSIBLE_N])
     return np.asarray(sticks_out | impossible, np.bool_)

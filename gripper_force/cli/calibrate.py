@@ -2,14 +2,16 @@
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from gripper_force import console
 from gripper_force.cli.options import AsJson, ConfigPath, Overrides, load_settings
-from gripper_force.config import Config
 from gripper_force.errors import ConfigError
+
+if TYPE_CHECKING:
+    from gripper_force.config import Config
 
 app = typer.Typer(no_args_is_help=True, help="Find out what this rig and its objects are like.")
 
@@ -151,7 +153,7 @@ def object_(
     console.show(result, as_json, console.object_table)
 
 
-def _touches(settings: Config, touches: int, peak_n: float | None, folder: Path, pause: bool) -> list[Path]:
+def _touches(settings: "Config", touches: int, peak_n: float | None, folder: Path, pause: bool) -> list[Path]:
     from gripper_calibration.procedures import object as job
 
     paths = []

@@ -3,11 +3,12 @@
 import json
 import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gripper_force.config import Config, load_config
+if TYPE_CHECKING:  # --help needs no configuration
+    from gripper_force.config import Config
 
 CORES = os.cpu_count() or 1
 
@@ -19,11 +20,13 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on s
 Jobs = Annotated[int, typer.Option(min=1, help="Processes to use.")]
 
 
-def load_settings(path: Path | None, overrides: list[str] | None, options: dict[str, Any]) -> Config:
+def load_settings(path: Path | None, overrides: list[str] | None, options: dict[str, Any]) -> "Config":
     """The configuration of a command; an option that was given wins over ``--set``.
 
     Raises:
         ConfigError: A file, key or value is wrong. The sentence names it.
     """
+    from gripper_force.config import load_config
+
     given = [f"{key}={json.dumps(value)}" for key, value in options.items() if value is not None]
     return load_config(path, [*(overrides or []), *given])

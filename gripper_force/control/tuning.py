@@ -8,8 +8,6 @@ import cmath
 import math
 from dataclasses import dataclass
 
-from scipy.optimize import brentq
-
 
 @dataclass(frozen=True, slots=True)
 class Plant:
@@ -51,14 +49,12 @@ def simc(plant: Plant) -> Gains:
 
 def phase_margin_deg(plant: Plant, gains: Gains) -> float:
     """Phase left at the frequency where the open loop's magnitude falls through one."""
-
-    def excess(log_omega: float) -> float:
-        omega = math.exp(log_omega)
-        return math.log(abs(plant.response(omega) * gains.response(omega)))
-
-    # The integral action makes the magnitude fall from infinity; four decades hold any crossing.
-    scale = math.log(1 / plant.delay_s)
-    omega = math.exp(float(brentq(excess, scale - 10.0, scale + 10.0)))
+    # There lag^2 w^4 + (1 - (gain P)^2) w^2 = (gain I)^2. Of the root's two forms, take the one in which
+    # nothing cancels.
+    fall = 1 - (plant.gain * gains.proportional) ** 2
+    integral = plant.gain * gains.integral_s
+    root = math.hypot(fall, 2 * plant.lag_s * integral)
+    omega = math.sqrt(2 * integral**2 / (root + fall) if fall > 0 else (root - fall) / (2 * plant.lag_s**2))
     lag_rad = plant.delay_s * omega + math.atan(plant.lag_s * omega)
     lead_rad = cmath.phase(gains.response(omega))
     return math.degrees(math.pi + lead_rad - lag_rad)

@@ -1,4 +1,4 @@
-"""Ports the vendor's SDK talks through: a quiet serial line, and a virtual bus in this process's memory.
+"""What the vendor's SDK talks through: a quiet serial line, or a virtual bus (see `memory_port`).
 
 Both raise `DeviceLostError` once the other end is gone, where the SDK's own would report "busy" for good.
 """
@@ -14,8 +14,7 @@ from typing import Final, NoReturn, Protocol
 import serial
 from dynamixel_sdk import PortHandler
 
-from gripper_force.errors import ConfigError, DeviceError, DeviceLostError, DeviceNotFoundError
-from gripper_hw.dynamixel.virtual import VirtualBus, find_bus
+from gripper_force.errors import ConfigError, DeviceLostError
 from gripper_hw.serial_line import open_line
 
 VIRTUAL_PREFIX: Final = "virtual:"
@@ -51,6 +50,8 @@ def open_port(name: str, baud_rate: int, reply_margin_ms: float) -> Port:
         DeviceError: The port is in use, or may not be opened.
     """
     if name.startswith(VIRTUAL_PREFIX):
+        from gripper_hw.dynamixel.memory_port import MemoryPort
+
         return MemoryPort(name)
     port = SerialPort(name, reply_margin_ms)
     if not port.setBaudRate(baud_rate):
@@ -154,59 +155,3 @@ class SerialPort(PortHandler):  # type: ignore[misc]
         raise DeviceLostError(
             f"the servo's port {self.port_name} is gone ({error}); check cable and power, then start again"
         ) from error
-
-
-class MemoryPort(PortHandler):  # type: ignore[misc]
-    """A line to a `VirtualBus` in this process. Never sleeps: an answer is there at once, or never."""
-
-    def __init__(self, name: str) -> None:
-        super().__init__(name)
-        self._name = name.removeprefix(VIRTUAL_PREFIX)
-        self._received = bytearray()
-        bus = find_bus(self._name)
-        if bus is None:
-            raise DeviceNotFoundError(
-                f"no virtual bus named {self._name!r} is registered in this process; "
-                "simulate one first, or set servo.port to a device path"
-            )
-        if bus in _in_use:
-            raise DeviceError(f"the port {name} is in use; close its other user first")
-        self._bus: VirtualBus | None = bus
-        _in_use.add(bus)
-
-    def closePort(self) -> None:  # noqa: N802
-        """Lets go of the bus. May be called twice."""
-        self.is_using = False
-        if self._bus is not None:
-            _in_use.discard(self._bus)
-            self._bus = None
-
-    def clearPort(self) -> None:  # noqa: N802
-        """Throws away what was received."""
-        self._received.clear()
-
-    def writePort(self, packet: Iterable[int]) -> int:  # noqa: N802
-        """Sends a packet; the answer is there when it returns."""
-        if self._bus is None or find_bus(self._name) is not self._bus:
-            self.closePort()  # as with a device file: plugged in again, it is another one
-            raise DeviceLostError(f"the virtual bus {self._name!r} is gone; start again")
-        data = bytes(packet)
-        self._received += self._bus.transact(data)
-        return len(data)
-
-    def readPort(self, length: int) -> bytes:  # noqa: N802
-        """Returns up to ``length`` bytes."""
-        data = bytes(self._received[: max(0, length)])
-        del self._received[: len(data)]
-        return data
-
-    def isPacketTimeout(self) -> bool:  # noqa: N802
-        """True once all that came was read: no more will come."""
-        return not self._received
-
-    def drain(self) -> None:
-        """Throws away what was received."""
-        self._received.clear()
-
-
-_in_use: Final[set[VirtualBus]] = set()

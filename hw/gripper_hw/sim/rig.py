@@ -6,8 +6,8 @@ import time
 from collections import deque
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import asdict
+from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -18,11 +18,12 @@ from gripper_force.faults import Faults
 from gripper_force.interfaces import Camera, Clock, LoadCell
 from gripper_force.types import NS_PER_MS, NS_PER_S, Frame, Gray, LoadCellSample
 from gripper_hw.dynamixel.control_table import load_model
-from gripper_hw.dynamixel.faults import WireFaults
 from gripper_hw.dynamixel.virtual import VirtualBus, VirtualServo, register_bus, unregister_bus
-from gripper_hw.sim.faults import FaultyCamera, FaultyClock, FaultyLoadCell
 from gripper_hw.sim.scene import Scene, draw_scene
 from gripper_hw.sim.world import World
+
+if TYPE_CHECKING:
+    from gripper_hw.dynamixel.faults import WireFaults
 
 FRAME_SIDE = 128
 _OVERSAMPLED = 2
@@ -144,7 +145,7 @@ class _LockedMotor:
     """Keeps the world's thread and the bus' apart."""
 
     def __init__(
-        self, servo: VirtualServo, lock: AbstractContextManager[object], faults: WireFaults | None
+        self, servo: VirtualServo, lock: AbstractContextManager[object], faults: "WireFaults | None"
     ) -> None:
         self._servo, self._lock, self._faults = servo, lock, faults
 
@@ -176,29 +177,40 @@ class SimulatedRig:
         self._lockstep = config.clock == "lockstep"
         start_ns = 0 if self._lockstep else time.monotonic_ns()
         faults = Faults(config.faults, start_ns)
-        motor = _LockedMotor(servo, bus.lock, WireFaults(bus, faults, config.seed) if config.faults else None)
-        self._world = World(self.scene, config.gripper, motor, model.nm_per_a, config.seed)
+        wire = None
+        if config.faults:
+            from gripper_hw.dynamixel.faults import WireFaults
+
+            wire = WireFaults(bus, faults, config.seed)
+        motor = _LockedMotor(servo, bus.lock, wire)
+        seen = config.camera.backend == "simulated"
+        self._world = World(self.scene, config.gripper, motor, model.nm_per_a, config.seed, seen=seen)
         self._exposure_ms = config.sim.exposure_ms * _exposure(config)
         clock: Clock = LockstepClock(self._world) if self._lockstep else MonotonicClock()
         self.clock: Clock = clock
+        self.camera: Camera = SimulatedCamera(self._world, self.scene, config, clock, start_ns)
+        self.load_cell: LoadCell = SimulatedLoadCell(self._world, config, start_ns)
         self._closing = ExitStack()
-        if faults.has("clock"):
-            self.clock = FaultyClock(clock, faults)
-            self._closing.callback(self.clock.close)
-        camera = SimulatedCamera(self._world, self.scene, config, clock, start_ns)
-        self.camera: Camera = camera
-        if faults.has("camera"):
-            self.camera = FaultyCamera(camera, faults, clock, config.seed)
-        load_cell = SimulatedLoadCell(self._world, config, start_ns)
-        self.load_cell: LoadCell = load_cell
-        if faults.has("load_cell"):
-            self.load_cell = FaultyLoadCell(load_cell, faults, clock, config.seed)
+        if config.faults:
+            self._break_devices(faults, config.seed)
         self._bus_name = config.servo.port.removeprefix("virtual:")
         register_bus(self._bus_name, bus)
         self.start_ns = start_ns
         self._failure: Exception | None = None
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
+
+    def _break_devices(self, faults: Faults, seed: int) -> None:
+        from gripper_hw.sim.faults import FaultyCamera, FaultyClock, FaultyLoadCell
+
+        clock = self.clock
+        if faults.has("clock"):
+            self.clock = faulty = FaultyClock(clock, faults)
+            self._closing.callback(faulty.close)
+        if faults.has("camera"):
+            self.camera = FaultyCamera(self.camera, faults, clock, seed)
+        if faults.has("load_cell"):
+            self.load_cell = FaultyLoadCell(self.load_cell, faults, clock, seed)
 
     def start(self) -> None:
         """Sets the world going; in lockstep the clock does that."""
@@ -266,6 +278,8 @@ def expose(picture: npt.NDArray[np.uint8], lux: float, shot_noise: float, rng: n
 
     It is averaged over each pixel, linearised, lit, vignetted, given photon and read noise, and encoded.
     """
+    import cv2
+
     height, width = picture.shape[0] // _OVERSAMPLED, picture.shape[1] // _OVERSAMPLED
     pixels = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
     gray = pixels @ _LUMA / 255.0  # (H, W)

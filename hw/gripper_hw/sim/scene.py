@@ -1,5 +1,7 @@
 """A scene: everything that is drawn from the seed, and the MJCF that it makes."""
 
+import base64
+import re
 from dataclasses import dataclass, replace
 from importlib import resources
 from string import Template
@@ -10,7 +12,6 @@ import numpy.typing as npt
 from gripper_force.config import GripperConfig, SimConfig
 from gripper_force.errors import ConfigError
 from gripper_hw.sim.objects import FOR_PADS_ALONE, GAUGES, ObjectModel, build_object
-from gripper_hw.sim.textures import draw_markers, draw_textures
 
 LUX_LEVELS = (350.0, 550.0, 750.0)
 """The paper's three light levels."""
@@ -27,6 +28,10 @@ _MARKER_MATERIALS = "".join(
     f'<texture name="marker_{i}" type="2d" file="marker_{i}.png"/>'
     f'<material name="marker_{i}" texture="marker_{i}" specular="0" shininess="0"/>'
     for i in (0, 1)
+)
+
+_BLANK_PNG = base64.b64decode(
+    "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVQIHWNoAAAAggCB8KrjIgAAAABJRU5ErkJggg=="
 )
 
 _CAMERA_FROM_GRIP_M = np.array([0.10, -0.30, 0.125])
@@ -152,8 +157,12 @@ def _draw(object_name: str, seed: int, config: SimConfig) -> Scene:
     )
 
 
-def scene_mjcf(scene: Scene, gripper: GripperConfig) -> tuple[str, dict[str, bytes]]:
-    """MJCF text and its assets. Raises `ConfigError` for an unknown object, or a tool not for it."""
+def scene_mjcf(scene: Scene, gripper: GripperConfig, *, seen: bool = True) -> tuple[str, dict[str, bytes]]:
+    """MJCF text and its assets, blank ones for a scene that is not ``seen``.
+
+    Raises:
+        ConfigError: The object is unknown, or the tool is not for it.
+    """
     if scene.tool == "rods" and scene.object in FOR_PADS_ALONE:
         raise ConfigError(f"rods would dent the simulated {scene.object} beyond its model; set sim.tool=pads")
     model = build_object(scene.object, scene.detail, scene.size, scene.stiffness)  # type: ignore[arg-type]
@@ -193,6 +202,10 @@ def scene_mjcf(scene: Scene, gripper: GripperConfig) -> tuple[str, dict[str, byt
         backlash_m=scene.backlash_m,
         pinion_radius_m=gripper.pinion_radius_m,
     )
+    if not seen:
+        return text, dict.fromkeys(re.findall(r'file="(.+?)"', text), _BLANK_PNG)
+    from gripper_hw.sim.textures import draw_markers, draw_textures
+
     images = draw_textures(model.texture, scene.texture_seed, scene.table_seed)
     return text, images | (draw_markers() if scene.markers else {})
 

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from gripper_force.config import GripperConfig
 from gripper_force.errors import SimulationError
 from gripper_force.types import NS_PER_S
-from gripper_hw.sim.engine import NO_EGL, mujoco
+from gripper_hw.sim.engine import mujoco, new_renderer
 from gripper_hw.sim.scene import Scene, scene_mjcf
 
 _MAX_PENETRATION_M = 0.004
@@ -45,15 +45,30 @@ class _Tap:
 class World:
     """One scene in motion.
 
+    Args:
+        scene: What is simulated.
+        gripper: The gripper's geometry.
+        motor: The servo's firmware.
+        nm_per_a: Its torque constant by the catalogue.
+        seed: Draws the current's noise.
+        seen: Whether it may be drawn; a world that no camera sees has no textures.
+
     Attributes:
         t_ns: Simulated time.
         force_n: Grip force: mean of the normal forces on the two pads.
     """
 
     def __init__(
-        self, scene: Scene, gripper: GripperConfig, motor: Motor, nm_per_a: float, seed: int
+        self,
+        scene: Scene,
+        gripper: GripperConfig,
+        motor: Motor,
+        nm_per_a: float,
+        seed: int,
+        *,
+        seen: bool = True,
     ) -> None:
-        text, assets = scene_mjcf(scene, gripper)
+        text, assets = scene_mjcf(scene, gripper, seen=seen)
         try:
             self._model: Any = mujoco.MjModel.from_xml_string(text, assets)
         except ValueError as error:
@@ -116,10 +131,7 @@ class World:
             self._renderer = None
 
     def _new_renderer(self, side: int) -> Any:
-        try:
-            renderer = mujoco.Renderer(self._model, side, side)
-        except (ImportError, RuntimeError, mujoco.FatalError) as error:
-            raise SimulationError(NO_EGL) from error
+        renderer = new_renderer(self._model, side)
         for flag in _NOT_DRAWN:
             renderer.scene.flags[flag] = 0
         return renderer
