@@ -254,6 +254,16 @@ def commands_table(r: dict[str, Any]) -> None:
     out.print(f"[dim]load {r['load']:.1f} on {r['cores']} cores[/]")
 
 
+def startup_table(r: dict[str, Any]) -> None:
+    """What scenes take to start."""
+    table = Table("scene", "time s", "memory MB", "loaded", "threads", box=None)
+    for s in r["startup"]:
+        figures = (_number(s.time_s, digits=2), _number(s.memory_mb, digits=0))
+        table.add_row(s.scene, *figures, ", ".join(s.loaded), ", ".join(s.threads))
+    out.print(table)
+    out.print(f"[dim]load {r['load']:.1f} on {r['cores']} cores[/]")
+
+
 def bus_table(r: dict[str, Any]) -> None:
     """What a bus cycle takes."""
     columns = ("Mbaud", "latency ms", "client", "line ms", "p50 ms", "p99 ms", "p50/line", "CPU % at 200Hz")

@@ -10,15 +10,12 @@ from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
-import torch
 
 from gripper_force.backends import PROBES, MonotonicClock
 from gripper_force.config import Config
 from gripper_force.errors import GripperError
 from gripper_force.interfaces import Devices
 from gripper_force.types import NS_PER_MS, NS_PER_S
-from gripper_force.vision.checkpoint import load_checkpoint
-from gripper_force.vision.estimator import ForceEstimator
 
 _FIRST_NS: Final = 5 * NS_PER_S
 """How long a sensor may take to wake up: an Arduino restarts when its port is opened."""
@@ -150,14 +147,19 @@ def _guarded(unit: str, checks: Iterable[Check]) -> Iterator[Check]:
 
 def _network(config: Config) -> Iterator[Check]:
     vision = config.vision
+    if config.camera.backend == "none" or vision.checkpoint == "none":
+        yield Check("network", "step", "not needed: no camera, or no checkpoint", None)
+        return
+    import torch
+
+    from gripper_force.vision.checkpoint import load_checkpoint
+    from gripper_force.vision.estimator import ForceEstimator
+
     threads = f"{vision.threads} of {os.cpu_count()} threads"
     yield Check("network", "torch", f"{torch.__version__}, {threads}", True)
     cpu = Path("/proc/cpuinfo").read_text(encoding="utf-8")
     bfloat16 = re.search(r"\b(\w*bf16)\b", cpu)
     yield Check("network", "bfloat16", bfloat16[0] if bfloat16 else "not in this CPU", None)
-    if vision.checkpoint == "none":
-        yield Check("network", "step", "no checkpoint", None)
-        return
     estimator = ForceEstimator(load_checkpoint(vision.checkpoint), threads=vision.threads)
     gray = np.random.default_rng(0).integers(0, 256, (128, 128), np.uint8)
     while estimator.update(gray) is None:

@@ -400,12 +400,11 @@ def virtual_servo(
     as_json: AsJson = False,
 ) -> None:
     """Serve virtual servos at a device path that any Dynamixel client can open, until Ctrl-C."""
-    from importlib import import_module
+    from gripper_force.backends import VIRTUAL_SERVO, load
 
     servo = load_settings(None, set_, {"servo.model": model}).servo
     who = ids or [servo.id]
-    serve = import_module("gripper_hw.dynamixel.serve").serve_virtual_servo
-    with serve(servo.model, who) as server:
+    with load(VIRTUAL_SERVO)(servo.model, who) as server:
         console.show({"port": server.device_path, "model": servo.model, "ids": who}, as_json)
         sys.stdout.flush()
         console.err.print("serving until Ctrl-C")

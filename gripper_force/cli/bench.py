@@ -18,6 +18,9 @@ def bench(
     training: Annotated[
         Path | None, typer.Option(help="Ways to train on this folder of logs: error against minutes.")
     ] = None,
+    startup: Annotated[
+        bool, typer.Option("--startup", help="What each kind of scene takes until its first cycle.")
+    ] = False,
     minutes: Annotated[float, typer.Option(min=0.01, help="With --training: for each way.")] = 30.0,
     folder: Annotated[
         Path, typer.Option("--out", help="With --training: where to keep what is measured.")
@@ -32,10 +35,15 @@ def bench(
     from gripper_force.bench import bus as bus_job
     from gripper_force.bench import commands as commands_job
 
-    if [bus, commands, training is not None].count(True) != 1:
-        raise ConfigError("bench measures one thing at a time: --bus, --commands or --training DATA")
+    if [bus, commands, startup, training is not None].count(True) != 1:
+        raise ConfigError(
+            "bench measures one thing at a time: --bus, --commands, --startup or --training DATA"
+        )
     if training is not None:
         console.show(_learning(training, minutes, set_ or [], folder, jobs), as_json, console.learning_table)
+        return
+    if startup:
+        console.show(_startup(), as_json, console.startup_table)
         return
     if commands:
         taken = []
@@ -53,6 +61,17 @@ def bench(
             costs += setting
             advance(f"{setting[0].baud_rate} baud, {setting[0].latency_ms:g} ms")
     console.show({"bus": costs, "load": os.getloadavg()[0], "cores": CORES}, as_json, console.bus_table)
+
+
+def _startup() -> dict[str, Any]:
+    from gripper_force.bench import startup as job
+
+    rows = []
+    with console.bar("starting", len(job.SCENES)) as advance:
+        for row in job.startup(job.SCENES):
+            rows.append(row)
+            advance(row.scene)
+    return {"startup": rows, "load": os.getloadavg()[0], "cores": CORES}
 
 
 def _learning(data: Path, minutes: float, overrides: list[str], out_: Path, jobs: int) -> dict[str, Any]:

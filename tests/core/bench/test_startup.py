@@ -1,0 +1,38 @@
+import json
+from collections.abc import Iterator
+
+import pytest
+from typer.testing import CliRunner
+
+from gripper_force import cli
+from gripper_force.bench import startup
+from gripper_force.bench.startup import SCENES, Scene, start
+from gripper_force.errors import GripperError
+
+
+@pytest.fixture(scope="module")
+def places() -> Iterator[dict[str, str]]:
+    with startup.stand_ins() as places:
+        yield places
+
+
+@pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.name)
+def test_a_scene_loads_and_runs_only_what_it_asks_for(scene: Scene, places: dict[str, str]) -> None:
+    started = start(scene, places)
+    assert set(started.loaded) <= scene.asks_for
+    assert set(started.threads) == scene.threads
+    assert started.time_s > 0
+    assert 10 < started.memory_mb < 2000
+
+
+def test_a_scene_that_does_not_start_is_told(places: dict[str, str]) -> None:
+    with pytest.raises(GripperError, match=r"(?s)the scene 'broken' did not start: .*no_such_key"):
+        start(Scene("broken", settings=("no_such_key=1",)), places)
+
+
+def test_what_starting_takes_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(startup, "SCENES", SCENES[:1])
+    assert "--help" in CliRunner().invoke(cli.app, ["bench", "--startup"]).stdout
+    told = json.loads(CliRunner().invoke(cli.app, ["bench", "--startup", "--json"]).stdout)
+    (row,) = told["startup"]
+    assert (row["scene"], row["loaded"], row["threads"]) == ("--help", [], [])
