@@ -116,7 +116,19 @@ class LoadCellConfig(Section):
 class VisionConfig(Section):
     """Estimator and its input."""
 
-    checkpoint: str = Field("default", description="a path, or `default` for the one that is shipped")
+    checkpoint: str = Field(
+        "default",
+        description="a path; default or small, which are shipped; or auto: the cheapest of these that keeps "
+        "`budget`. What `gripper-force export` wrote is one too",
+    )
+    engine: Literal["torch", "compiled", "openvino", "onnxruntime", "auto"] = Field(
+        "torch",
+        description="what computes the network; auto: the fastest that is installed, with as many threads as "
+        "serve it, measured once on each machine",
+    )
+    precision: Literal["float32", "bfloat16"] = Field(
+        "float32", description="of the arithmetic; bfloat16 with openvino only"
+    )
     threads: int = Field(
         1, ge=1, le=64, description="more help only on cores that nothing else uses: they wait for each other"
     )
@@ -130,6 +142,13 @@ class VisionConfig(Section):
 
 _CAUTIOUS: Final = (1.0, 60.0, 60.0)
 """Gain, lag and delay in ms of a plant that was not identified."""
+
+
+class BudgetConfig(Section):
+    """What a scene may cost, and how far off it may be; what is chosen by ``auto`` keeps it."""
+
+    latency_ms: Positive | None = Field(None, description="99th percentile of an estimate's time")
+    error_n: Positive | None = Field(None, description="mean absolute error of the visual estimate")
 
 
 class ControlConfig(Section):
@@ -344,6 +363,7 @@ class Config(Section):
     camera: CameraConfig = CameraConfig()
     load_cell: LoadCellConfig = LoadCellConfig()
     vision: VisionConfig = VisionConfig()
+    budget: BudgetConfig = BudgetConfig()
     control: ControlConfig = ControlConfig()
     sim: SimConfig = SimConfig()
     calibration: CalibrationConfig = CalibrationConfig()
