@@ -33,7 +33,7 @@ $(VENV)/installed: pyproject.toml scripts/system-packages
 	touch $@
 
 $(VENV)/installed-dev: $(VENV)/installed
-	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev,engines]'
 	touch $@
 
 clean:

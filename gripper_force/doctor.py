@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from importlib import import_module
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar
 
@@ -150,17 +151,19 @@ def _network(config: Config) -> Iterator[Check]:
     if config.camera.backend == "none" or vision.checkpoint == "none":
         yield Check("network", "step", "not needed: no camera, or no checkpoint", None)
         return
-    import torch
+    from gripper_force.session import settled
+    from gripper_force.vision.choice import ENGINE_PACKAGES
+    from gripper_force.vision.estimator import open_estimator
+    from gripper_force.vision.exported import read_model
 
-    from gripper_force.vision.checkpoint import load_checkpoint
-    from gripper_force.vision.estimator import ForceEstimator
-
-    threads = f"{vision.threads} of {os.cpu_count()} threads"
-    yield Check("network", "torch", f"{torch.__version__}, {threads}", True)
+    vision = settled(config)[0].vision
+    package = ENGINE_PACKAGES[vision.engine]
+    estimator = open_estimator(read_model(vision.checkpoint), vision)
+    threads = f"{vision.precision}, {vision.threads} of {os.cpu_count()} threads"
+    yield Check("network", vision.engine, f"{package} {version(package)}, {threads}", True)
     cpu = Path("/proc/cpuinfo").read_text(encoding="utf-8")
     bfloat16 = re.search(r"\b(\w*bf16)\b", cpu)
     yield Check("network", "bfloat16", bfloat16[0] if bfloat16 else "not in this CPU", None)
-    estimator = ForceEstimator(load_checkpoint(vision.checkpoint), threads=vision.threads)
     gray = np.random.default_rng(0).integers(0, 256, (128, 128), np.uint8)
     while estimator.update(gray) is None:
         pass

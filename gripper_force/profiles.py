@@ -10,6 +10,7 @@ from gripper_force.rig import read_rig
 if TYPE_CHECKING:  # a run without vision loads none of it
     from gripper_force.vision.checkpoint import Checkpoint
     from gripper_force.vision.correction import Correction
+    from gripper_force.vision.header import Model
 
 
 def check_target(config: Config) -> None:
@@ -36,7 +37,7 @@ def with_plant(config: Config, control: ControlConfig) -> ControlConfig:
     return control.model_copy(update={k: v for k, v in known.items() if getattr(control, k) is None})
 
 
-def correction_of(config: Config, checkpoint: "Checkpoint | None") -> "Correction | None":
+def correction_of(config: Config, checkpoint: "Model | Checkpoint | None") -> "Correction | None":
     """What the object's profile makes of estimates, or None without a profile or without vision.
 
     Raises:

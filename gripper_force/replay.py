@@ -30,7 +30,7 @@ from gripper_force.types import (
 )
 
 if TYPE_CHECKING:
-    from gripper_force.vision.checkpoint import Checkpoint
+    from gripper_force.vision.header import Model
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def replay(
     }
 
 
-def run_again(reader: LogReader, config: Config, checkpoint: "Checkpoint | None") -> Replayed:
+def run_again(reader: LogReader, config: Config, checkpoint: "Model | None") -> Replayed:
     """Feeds estimator and controller from a log, in the order in which the run had its inputs."""
     sight = Sight(make_estimator(config, checkpoint, correction_of(config, checkpoint)))
     runs = config.gripper.nm_per_a is not None  # a recording that was imported never had a controller
@@ -152,7 +152,7 @@ def _same_decisions(logged: dict[type, list[Any]], again: list[Decision]) -> boo
     return all(a == b[: len(a)] and len(b) - len(a) <= 1 for a, b in pairs)
 
 
-def _note(reader: LogReader, config: Config, checkpoint: "Checkpoint | None") -> str:
+def _note(reader: LogReader, config: Config, checkpoint: "Model | None") -> str:
     """Why the estimates can't come out the same, or an empty text."""
     used = reader.metadata.get("checkpoint", "")
     if checkpoint is None or used == "":
@@ -167,13 +167,13 @@ def _note(reader: LogReader, config: Config, checkpoint: "Checkpoint | None") ->
     return ""
 
 
-def _checkpoint(config: Config, source: str | None) -> "Checkpoint | None":
+def _checkpoint(config: Config, source: str | None) -> "Model | None":
     name = source or config.vision.checkpoint
     if name == "none":
         return None
-    from gripper_force.vision.checkpoint import load_checkpoint
+    from gripper_force.vision.exported import read_model
 
-    return load_checkpoint(name)
+    return read_model(name)
 
 
 def _sources(replayed: Replayed) -> dict[str, dict[str, Any]]:

@@ -38,9 +38,9 @@ from gripper_force.types import (
 from gripper_force.watch import CellWatch, Tally
 
 if TYPE_CHECKING:  # a run without vision loads none of it
-    from gripper_force.vision.checkpoint import Checkpoint
     from gripper_force.vision.correction import Correction
     from gripper_force.vision.estimator import ForceEstimator
+    from gripper_force.vision.header import Model
 
 _VISION_PATIENCE_NS = 2 * NS_PER_S
 _REFERENCE_NS = NS_PER_S // 10
@@ -228,17 +228,20 @@ class Session:
 
 @contextmanager
 def open_session(
-    config: Config, devices: Devices, path: Path, checkpoint: "Checkpoint | None"
+    config: Config, devices: Devices, path: Path, checkpoint: "Model | None"
 ) -> Iterator[Session]:
     """A session that runs, and on every way out stops the servo as configured and closes its log.
 
     A session that never came to a cycle leaves no log.
     """
+    config, why = settled(config) if checkpoint is not None else (config, "")
     config, controller = make_controller(config, devices)
     correction = correction_of(config, checkpoint)
     estimator = make_estimator(config, checkpoint, correction)
     with ExitStack() as stack:
         recorder = _recorder(config, devices, path, checkpoint, correction)
+        if why:
+            recorder.write(Event(devices.start_ns, "vision", why))
         session = Session(config, devices, controller, _perception(config, devices, estimator), recorder)
         stack.callback(_discard_unused, session, path)
         stack.callback(recorder.close)
@@ -333,23 +336,37 @@ def controller_from(config: Config) -> GraspController:
 
 
 def make_estimator(
-    config: Config, checkpoint: "Checkpoint | None", correction: "Correction | None"
+    config: Config, checkpoint: "Model | None", correction: "Correction | None"
 ) -> "ForceEstimator | None":
     """The estimator of a run, or None for a run without vision."""
     if checkpoint is None:
         return None
-    from gripper_force.vision.estimator import ForceEstimator
+    from gripper_force.vision.estimator import open_estimator
 
-    return ForceEstimator(checkpoint, config.vision.region, config.vision.threads, correction)
+    return open_estimator(checkpoint, config.vision, correction)
 
 
-def checkpoint_of(config: Config) -> "Checkpoint | None":
+def checkpoint_of(config: Config) -> "Model | None":
     """The network that the configuration names, or None for a run without vision."""
     if config.camera.backend == "none" or config.vision.checkpoint == "none":
         return None
-    from gripper_force.vision.checkpoint import load_checkpoint
+    from gripper_force.vision.exported import read_model
 
-    return load_checkpoint(config.vision.checkpoint)
+    return read_model(settled(config)[0].vision.checkpoint)
+
+
+def settled(config: Config) -> tuple[Config, str]:
+    """The configuration with nothing of its estimator left to ``auto``, and what was taken and why, in words.
+
+    Raises:
+        ConfigError: Nothing keeps the budget.
+    """
+    if "auto" not in (config.vision.checkpoint, config.vision.engine):
+        return config, ""
+    from gripper_force.vision import choice
+
+    vision, why = choice.settled(config.vision, config.budget)
+    return config.model_copy(update={"vision": vision}), why
 
 
 def grasp_in(session: Session, config: Config, sees: bool, progress: Progress | None = None) -> str:
@@ -402,7 +419,7 @@ def _recorder(
     config: Config,
     devices: Devices,
     path: Path,
-    checkpoint: "Checkpoint | None",
+    checkpoint: "Model | None",
     correction: "Correction | None",
 ) -> Recorder:
     about = _metadata(config, devices, checkpoint)
@@ -436,7 +453,7 @@ def _perception(config: Config, devices: Devices, estimator: Estimator | None) -
     return ThreadedPerception(devices.camera, estimator, devices.clock)
 
 
-def _metadata(config: Config, devices: Devices, checkpoint: "Checkpoint | None") -> dict[str, str]:
+def _metadata(config: Config, devices: Devices, checkpoint: "Model | None") -> dict[str, str]:
     versions = {f"version {name}": metadata.version(name) for name in _PACKAGES}
     return {
         "object": config.object,

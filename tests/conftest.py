@@ -40,8 +40,9 @@ def tiny_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two small networks that have learnt nothing, claim little, and say 0 N of a scene without contact."""
     import torch
 
-    from gripper_force.vision.checkpoint import Header, Residual, save_checkpoint
-    from gripper_force.vision.network import ForceNetwork, NetworkConfig
+    from gripper_force.vision.checkpoint import save_checkpoint
+    from gripper_force.vision.header import Header, NetworkConfig, Residual
+    from gripper_force.vision.network import ForceNetwork
     from gripper_force.vision.preprocess import Preprocess
 
     torch.manual_seed(0)
@@ -61,8 +62,8 @@ def tiny_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for network in networks:
             network.out.weight *= 1000  # what a frame changes would else be lost in the noise
             for _ in range(2):
-                force_n, _ = network.step(torch.zeros(1, 1, 32, 32), None)
-                network.out.bias -= force_n.mean() / 20
+                seen, _ = network.step(torch.zeros(1, 1, 32, 32), None)
+                network.out.bias -= seen.force_n.mean() / 20
     path = tmp_path_factory.mktemp("checkpoint") / "tiny.safetensors"
     save_checkpoint(path, networks, header)
     return path

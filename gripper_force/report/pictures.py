@@ -102,16 +102,16 @@ def _estimator(run: Run) -> "tuple[ForceEstimator | None, str]":
     if "vision" not in run.forces:
         return None, ""
     # Loaded here, as a recording without estimates needs no network and its libraries are slow to import.
-    from gripper_force.vision.checkpoint import load_checkpoint
-    from gripper_force.vision.estimator import ForceEstimator
+    from gripper_force.vision.estimator import open_estimator
+    from gripper_force.vision.exported import read_model
 
     try:
-        checkpoint = load_checkpoint(run.config.vision.checkpoint)
+        checkpoint = read_model(run.config.vision.checkpoint)
     except CheckpointError as error:
         return None, f"Attention is not shown: {error}."
     if checkpoint.digest != run.metadata.get("checkpoint"):
         return None, f"Attention is not shown: {run.config.vision.checkpoint!r} is not the run's checkpoint."
-    estimator = ForceEstimator(checkpoint, run.config.vision.region, run.config.vision.threads)
+    estimator = open_estimator(checkpoint, run.config.vision)
     return estimator, "Laid over: where the network looks (spatial attention), from dark to bright."
 
 

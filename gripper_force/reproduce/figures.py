@@ -93,7 +93,7 @@ def attention(test: Test, network: ForceNetwork, preprocess: Preprocess) -> Figu
 
 
 def _look(axes: Axes, clip: Clip, index: int, network: ForceNetwork, preprocess: Preprocess) -> None:
-    gates = _gates(clip.frames[: index + 1][-network.context - 1 :], clip.frames, network, preprocess)
+    gates = _gates(clip.frames[: index + 1][-network.config.context - 1 :], clip.frames, network, preprocess)
     gray = shrink(clip.frames[index], None, _SIDE)
     axes.imshow(overlay(gray, gates))
     axes.set_axis_off()
@@ -109,10 +109,9 @@ def _gates(frames: Gray, clip: Gray, network: ForceNetwork, preprocess: Preproce
     inputs = normalise(torch.from_numpy(frames)[None], reference)  # (1, T, 1, S, S)
     state = None
     for i in range(inputs.shape[1]):
-        _, state = network.step(inputs[:, i], state)
-    assert state is not None
-    assert state.gates is not None
-    return np.asarray(state.gates[0, 0].numpy(), np.float32)
+        seen, state = network.step(inputs[:, i], state)
+    assert seen.gates is not None
+    return np.asarray(seen.gates[0, 0].numpy(), np.float32)
 
 
 def _one_of_each(test: Test) -> list[int]:

@@ -47,10 +47,12 @@ from gripper_force.types import (
     VisualForce,
 )
 from gripper_force.video_import import estimate_tare, read_forces
-from gripper_force.vision.checkpoint import FORMAT, Header, Residual, load_checkpoint
+from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.correction import Correction, HeadAndGate, load_correction, write_arrays
+from gripper_force.vision.engines.pytorch import TorchEngine
 from gripper_force.vision.estimator import ForceEstimator
-from gripper_force.vision.network import ForceNetwork, NetworkConfig
+from gripper_force.vision.header import FORMAT, Header, NetworkConfig, Residual
+from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess
 
 _SIDE: Final = 16
@@ -379,7 +381,7 @@ def _use_header(data: bytes, path: Path) -> None:
 
 def _use_checkpoint(data: bytes, path: Path) -> None:
     path.write_bytes(data)
-    estimator = ForceEstimator(load_checkpoint(path), threads=1)
+    estimator = ForceEstimator(TorchEngine(load_checkpoint(path)))
     rng = np.random.default_rng(0)
     for _ in range(5):
         estimator.update(rng.integers(0, 256, (_SIDE, _SIDE), np.uint8))

@@ -6,8 +6,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from gripper_force.errors import ConfigError
 from gripper_force.schema import NonNegative, Positive, Section, section_from
-from gripper_force.vision.attention import Pooling
-from gripper_force.vision.network import Attention, BackboneName, Count, NetworkConfig
+from gripper_force.vision.header import Attention, BackboneName, Count, NetworkConfig, Pooling
 from gripper_force.vision.preprocess import Preprocess
 
 Share = Annotated[float, Field(ge=0, le=1)]

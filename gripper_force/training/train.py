@@ -22,7 +22,8 @@ from gripper_force.training.batches import Batches
 from gripper_force.training.parallel import Ranks, joined
 from gripper_force.training.recipe import TrainConfig as TrainConfig
 from gripper_force.training.trainer import Trainer, estimates
-from gripper_force.vision.checkpoint import Checkpoint, Header, Residual, load_checkpoint, save_checkpoint
+from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from gripper_force.vision.header import Header, Residual
 
 STATE_EVERY_S: Final = 60.0
 

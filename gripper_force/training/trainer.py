@@ -87,7 +87,7 @@ class Trainer:
             group["lr"] = config.learning_rate * rate
         count, length = config.clips, config.clip_frames
         if config.windows == "separate":
-            length = self.network.context + 1
+            length = self.network.config.context + 1
         elif done < config.short_share:
             count, length = count * length // config.short_frames, config.short_frames
         first = length - 1 if config.windows == "separate" else min(window, length) - 1

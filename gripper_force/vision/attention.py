@@ -8,14 +8,11 @@ attention to the newest map alone (the paper's "traditional" attention in table 
 SE and CBAM see the newest map only. All are called alike, with the stack and the newest map.
 """
 
-from typing import Literal
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-Pooling = Literal["wap", "gap"]
-"""How SSAM squeezes channels and SCAM positions: averages with learned weights, or plain ones (table 5)."""
+from gripper_force.vision.header import Pooling
 
 
 class SpatialAttention(nn.Module):

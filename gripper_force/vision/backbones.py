@@ -1,7 +1,6 @@
 """Convolutional backbones: one gray frame in, one feature map out."""
 
 from itertools import pairwise
-from typing import ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -11,9 +10,8 @@ VGG_CHANNELS = (16, 32, 64, 128, 256)
 
 
 class Backbone(nn.Module):
-    """Maps frames (N, 1, S, S) to feature maps (N, out_channels, S/stride, S/stride), none negative."""
+    """Maps frames (N, 1, S, S) to feature maps (N, out_channels, S/s, S/s), none negative, s of `STRIDES`."""
 
-    stride: ClassVar[int]
     out_channels: int
 
 
@@ -23,8 +21,6 @@ class Vgg(Backbone):
     A 2x2 max pooling follows each of the first four pairs, and batch normalisation follows each pooling; the
     latter is in the authors' public code, not in the paper.
     """
-
-    stride = 16
 
     def __init__(self, width: float) -> None:
         super().__init__()
@@ -55,8 +51,6 @@ class ResNet18(Backbone):
     public code holds a fragment that normalises before the convolutions instead, which nothing there calls.
     """
 
-    stride = 32
-
     def __init__(self, width: float) -> None:
         super().__init__()
         channels = [_scaled(c, width) for c in (64, 128, 256, 512)]
@@ -81,8 +75,6 @@ class Mobile(Backbone):
     The original's 17 blocks take a CPU longer than `Vgg` does for a frame of 64 pixels, as the time goes into
     calls and not into arithmetic. Six blocks at Vgg's stride take about half of Vgg's.
     """
-
-    stride = 16
 
     def __init__(self, width: float) -> None:
         super().__init__()

@@ -1,60 +1,17 @@
 """One safetensors file holds a whole ensemble: weights, and in its header all that is needed to use them."""
 
-import hashlib
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
 
 import torch
-from pydantic import ValidationError, model_validator
 from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
 from gripper_force.errors import CheckpointError
-from gripper_force.schema import Finite, NonNegative, Section
-from gripper_force.vision.network import ForceNetwork, NetworkConfig
-from gripper_force.vision.preprocess import Preprocess
-
-FORMAT: Final = "gripper-force-network/1"
-"""Key of the header in the file's metadata: the only one, as safetensors keeps no order of keys."""
-
-DEFAULT_PATH: Final = Path(__file__).with_name("default.safetensors")
-
-
-class Residual(Section):
-    """How far off the ensemble was on validation data where it said about ``force_n``."""
-
-    force_n: Finite
-    std_n: NonNegative
-
-
-class Header(Section):
-    """What a checkpoint says about itself.
-
-    Attributes:
-        members: Shapes of the networks whose mean is the estimate.
-        preprocess: How frames are prepared for them.
-        residuals: Error by estimated force, measured on validation data, by rising force.
-        data_digest: SHA-256 of the training set.
-        metrics: Figures on the validation data, such as ``mae_n``.
-    """
-
-    members: tuple[NetworkConfig, ...]
-    preprocess: Preprocess
-    residuals: tuple[Residual, ...]
-    data_digest: str
-    metrics: dict[str, float]
-
-    @model_validator(mode="after")
-    def _fits(self) -> "Header":
-        if not self.members or not self.residuals:
-            raise ValueError("an ensemble has at least one member and one residual")
-        if any(member.size != self.preprocess.size for member in self.members):
-            raise ValueError("preprocess.size and the networks' size must agree")
-        return self
+from gripper_force.vision.header import FORMAT, Header, NetworkConfig, digest_of, read_checkpoint
+from gripper_force.vision.network import ForceNetwork
 
 
 @dataclass(frozen=True)
@@ -97,40 +54,18 @@ def load_checkpoint(source: str | Path = "default") -> Checkpoint:
     """Reads an ensemble.
 
     Args:
-        source: A path, or ``default`` for the checkpoint that is shipped.
+        source: A path, or ``default`` or ``small`` for one that is shipped.
 
     Raises:
         CheckpointError: The file is missing, damaged, or of another network.
     """
-    path = DEFAULT_PATH if source == "default" else Path(source)
-    if not path.is_file():
-        raise CheckpointError(f"no checkpoint at {path}; train one with `gripper-force train`")
+    path, data, header = read_checkpoint(source)
     try:
-        data = path.read_bytes()
         tensors = load(data)
-    except (OSError, SafetensorError) as error:
+    except SafetensorError as error:
         raise CheckpointError(f"{path} is damaged or no safetensors file: {error}") from error
-    metadata = _metadata(data)
-    if FORMAT not in metadata:
-        raise CheckpointError(f"{path} is not a {FORMAT} file; train one with `gripper-force train`")
-    try:
-        header = Header.model_validate_json(metadata[FORMAT])
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise CheckpointError(f"the header of {path} is wrong at {key!r}: {first['msg']}") from error
     networks = tuple(_member(path, i, config, tensors) for i, config in enumerate(header.members))
-    return Checkpoint(networks, header, hashlib.sha256(data).hexdigest())
-
-
-def _metadata(data: bytes) -> dict[str, str]:
-    """What a sound safetensors file says about itself: a length in 8 bytes, then JSON.
-
-    Its own `safe_open` tells as well, but leaks 7 kB each time (in 0.8), which a day of grasps would feel.
-    """
-    length = int.from_bytes(data[:8], "little")
-    metadata: dict[str, str] = json.loads(data[8 : 8 + length]).get("__metadata__", {})
-    return metadata
+    return Checkpoint(networks, header, digest_of(data))
 
 
 def _stored(tensor: Tensor) -> Tensor:

@@ -65,7 +65,7 @@ def features(
     """
     clip = torch.from_numpy(frames)[None].to(device)  # (1, T, S, S)
     reference = clip[:, : preprocess.reference_frames] if preprocess.reference else None
-    context = max(network.context for network in networks)
+    context = max(network.config.context for network in networks)
     forces, read = [], []
     for begin in range(0, clip.shape[1], CHUNK):
         first = max(0, begin - context)

@@ -4,14 +4,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
-import torch
 
+from gripper_force.config import VisionConfig
 from gripper_force.errors import DataError, NonFiniteError
 from gripper_force.types import Gray
-from gripper_force.vision.checkpoint import Checkpoint
 from gripper_force.vision.correction import Correction
-from gripper_force.vision.network import StreamState
+from gripper_force.vision.engines import Engine, Floats, open_engine
+from gripper_force.vision.header import Model
 from gripper_force.vision.plausible import Plausibility
 from gripper_force.vision.preprocess import Normaliser, Region, shrink
 
@@ -35,35 +34,31 @@ class ForceEstimator:
 
     def __init__(
         self,
-        checkpoint: Checkpoint,
+        engine: Engine,
         region: Region | None = None,
-        threads: int = 2,
         correction: Correction | None = None,
     ) -> None:
-        """Makes the ensemble ready; the first estimate is as fast as any.
+        """Begins a run.
 
         Args:
-            checkpoint: The ensemble.
+            engine: The ensemble.
             region: Region of interest of the camera's frame in pixels; None for the whole frame.
-            threads: CPU threads of this process that PyTorch may use.
             correction: What the object's profile makes of the estimates.
         """
-        torch.set_num_threads(threads)
         self._region = region
-        self._preprocess = checkpoint.header.preprocess
-        self._networks = checkpoint.networks
+        self._engine = engine
+        self._preprocess = engine.header.preprocess
         self._correction = correction
-        self._residual_forces = [residual.force_n for residual in checkpoint.header.residuals]
-        self._residual_stds = [residual.std_n for residual in checkpoint.header.residuals]
-        self.reset()
-        self._infer(np.zeros((self._preprocess.size, self._preprocess.size), np.float32))
+        self._residual_forces = [residual.force_n for residual in engine.header.residuals]
+        self._residual_stds = [residual.std_n for residual in engine.header.residuals]
         self.reset()
 
     def reset(self) -> None:
         """Forgets the stream: the next frames are the first of a new run, and its reference."""
         self._plausibility = Plausibility()
         self._normaliser = Normaliser(self._preprocess)
-        self._states: list[StreamState | None] = [None] * len(self._networks)
+        self._engine.reset()
+        self._attention: Floats | None = None
 
     @property
     def reference(self) -> Gray | None:
@@ -85,31 +80,29 @@ class ForceEstimator:
             ConfigError: The region of interest reaches beyond the frame.
             NonFiniteError: A network gave NaN or infinity.
         """
-        forces: list[float] = []
+        step = None
         small = shrink(gray, self._region, self._preprocess.size)
         self._plausibility.check(small)
         for frame in self._normaliser.push(small):
-            forces = self._infer(frame)
-        if not forces:
+            step = self._engine.step(frame)
+        if step is None:
             return None
+        forces: list[float] = step.forces_n.tolist()
+        self._attention = step.attention
         if not all(math.isfinite(force) for force in forces):
             raise NonFiniteError(f"the network gave {forces} N; check the checkpoint and the camera's image")
         force_n = sum(forces) / len(forces)
         if self._correction is not None:
-            return self._corrected(self._correction, force_n)
+            return self._corrected(self._correction, force_n, step.features)
         residual_n = float(np.interp(force_n, self._residual_forces, self._residual_stds))
         return Estimate(force_n, math.hypot(residual_n, (max(forces) - min(forces)) / 2))
 
-    def attention_map(self) -> npt.NDArray[np.float32] | None:
+    def attention_map(self) -> Floats | None:
         """Where SSAM looks in the newest frame, (h, w) in 0..1; None without SSAM or a frame."""
-        for network, state in zip(self._networks, self._states, strict=True):
-            if network.config.attention == "ssam" and state is not None and state.gates is not None:
-                return np.asarray(state.gates[0, 0].numpy(), np.float32)
-        return None
+        return self._attention
 
-    def _corrected(self, correction: Correction, force_n: float) -> Estimate:
-        read = [state.features[0].numpy() for state in self._states if state is not None]
-        features = np.concatenate(read)[None]  # (1, F)
+    def _corrected(self, correction: Correction, force_n: float, read: Floats) -> Estimate:
+        features = read[None]  # (1, F)
         strangeness = float(correction.strangeness(features)[0])
         if strangeness > 1:
             raise DataError(
@@ -119,11 +112,20 @@ class ForceEstimator:
         corrected_n = correction.force_n([force_n], features)
         return Estimate(float(corrected_n[0]), float(correction.std_n(corrected_n)[0]))
 
-    @torch.inference_mode()
-    def _infer(self, frame: npt.NDArray[np.float32]) -> list[float]:
-        inputs = torch.from_numpy(frame)[None, None]  # (1, 1, S, S)
-        forces = []
-        for i, network in enumerate(self._networks):
-            force, self._states[i] = network.step(inputs, self._states[i])
-            forces.append(force.item())
-        return forces
+
+def open_estimator(
+    model: Model, vision: VisionConfig, correction: Correction | None = None
+) -> ForceEstimator:
+    """The estimator of a run.
+
+    Args:
+        model: What ``vision.checkpoint`` names.
+        vision: Nothing in it is left to ``auto``; see `gripper_force.vision.choice.settled`.
+        correction: What the object's profile makes of the estimates.
+
+    Raises:
+        ConfigError: The engine is not there, or can't run this file.
+        CheckpointError: The file is damaged.
+    """
+    engine = open_engine(model, vision.engine, vision.precision, vision.threads)
+    return ForceEstimator(engine, vision.region, correction)

@@ -1,88 +1,29 @@
 """The force network of Shin et al. 2019: backbone, attention, average pooling, BLSTM, two dense layers.
 
-Three facts shape this module. Every frame passes the backbone once, also while streaming: only the maps of
-the last n frames and the pooled vectors of the last 20 are kept, and the result equals a whole window's.
-Frames before the first count as copies of the first; the paper leaves that open, and a still hand before
-contact looks just so. And the backward LSTM is read at the last step, as in the authors' public code, where
-it has seen one frame only.
+Three facts shape this module. Every frame passes the backbone once, also while streaming: the maps of the
+last n frames are kept, and of each of the next 20 windows how far the LSTM has come in it. So each frame
+takes one product of 20 rows, where a window from its beginning takes 20 products one after the other; the
+result is the same. Frames before the first count as copies of the first; the paper leaves that open, and a
+still hand before contact looks just so. And the backward LSTM is read at the last step, as in the authors'
+public code, where it has seen one frame only.
 """
 
-from dataclasses import dataclass
-from typing import Annotated, Final, Literal, Self
+from typing import Final, NamedTuple, Self
 
 import torch
-from pydantic import Field, model_validator
+import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from gripper_force.schema import Positive, Section
-from gripper_force.vision.attention import (
-    Cbam,
-    ChannelAttention,
-    Pooling,
-    SpatialAttention,
-    SqueezeExcitation,
-)
+from gripper_force.vision.attention import Cbam, ChannelAttention, SpatialAttention, SqueezeExcitation
 from gripper_force.vision.backbones import Backbone, Mobile, ResNet18, Vgg
+from gripper_force.vision.header import STRIDES, NetworkConfig
 
 BACKBONES: Final[dict[str, type[Vgg | ResNet18 | Mobile]]] = {
     "vgg": Vgg,
     "resnet18": ResNet18,
     "mobile": Mobile,
 }
-
-Attention = Literal["none", "ssam", "scam", "se", "cbam"]
-BackboneName = Literal["vgg", "resnet18", "mobile"]
-
-Count = Annotated[int, Field(ge=1, le=100_000)]
-
-
-class NetworkConfig(Section):
-    """The shape of one network.
-
-    Attributes:
-        attention: SSAM, SCAM, none (the paper's baseline), or SE or CBAM for comparison.
-        earlier_frames: n, the frames before the newest that SSAM and SCAM see; the others see none.
-        pooling: How SSAM and SCAM squeeze: weighted or global average pooling.
-        reduction: r of the perceptron; the paper gives none, this is that of SE and CBAM.
-        backbone: The paper's VGG-like network, its ResNet with 18 layers, or a small one for slow computers.
-        size: Side of the input in pixels.
-        width: Multiplier of the backbone's channels.
-        window: Frames the BLSTM sees.
-        hidden: Units of each direction of the BLSTM.
-        head: Units of the dense layer.
-        label_scale_n: The last layer's output 1 means this force.
-    """
-
-    attention: Attention = "none"
-    earlier_frames: Annotated[int, Field(ge=0, le=20)] = 1
-    pooling: Pooling = "wap"
-    reduction: Count = 16
-    backbone: BackboneName = "vgg"
-    size: Annotated[int, Field(ge=16, le=1024)] = 128
-    width: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] = 1.0
-    window: Annotated[int, Field(ge=1, le=1000)] = 20
-    hidden: Count = 256
-    head: Count = 1024
-    label_scale_n: Positive = 20.0
-
-    @model_validator(mode="after")
-    def _fits(self) -> Self:
-        stride = BACKBONES[self.backbone].stride
-        if self.size % stride:
-            raise ValueError(
-                f"size {self.size} does not suit the backbone {self.backbone}: take a multiple of {stride}"
-            )
-        if self.pooling == "gap" and not self.sequential:
-            raise ValueError(
-                f"pooling gap is a choice of ssam and scam: with the attention {self.attention} leave it out"
-            )
-        return self
-
-    @property
-    def sequential(self) -> bool:
-        """Whether attention may see earlier frames."""
-        return self.attention in ("ssam", "scam")
 
 
 class LastStepBlstm(nn.Module):
@@ -100,25 +41,60 @@ class LastStepBlstm(nn.Module):
     def forward(self, windows: Tensor) -> Tensor:
         """Maps windows (N, L, F) to the last step's two hidden states (N, 2*hidden)."""
         onward = self.onward(windows)[0][:, -1]  # (N, hidden)
-        gate_in, candidate, gate_out = self.backward_gates(windows[:, -1]).chunk(3, dim=1)
+        return torch.cat([onward, self._backward(windows[:, -1])], dim=1)
+
+    def advance(self, newest: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Takes the next vector of a stream into all windows that it lies in.
+
+        Args:
+            newest: The vector, (B, F).
+            hidden: Hidden states of the windows that have begun, (B, L, hidden): row k has seen k vectors.
+            cell: Their cell states, (B, L, hidden).
+
+        Returns:
+            What `forward` gives for the window that ends here, (B, 2*hidden), and the next states.
+        """
+        into_weight, on_weight, into_bias, on_bias = self.onward.all_weights[0]
+        into = F.linear(newest, into_weight, into_bias + on_bias)  # (B, 4*hidden)
+        gates = into[:, None] + F.linear(hidden, on_weight)  # (B, L, 4*hidden)
+        gate_in, forget, candidate, gate_out = gates.chunk(4, dim=2)
+        after = torch.sigmoid(forget) * cell + torch.sigmoid(gate_in) * torch.tanh(candidate)
+        shown = torch.sigmoid(gate_out) * torch.tanh(after)  # (B, L, hidden)
+        read = torch.cat([shown[:, -1], self._backward(newest)], dim=1)
+        # Row 0 has seen nothing: it stays as it is, zero, and each other row moves on by one.
+        return read, torch.cat([hidden[:, :1], shown[:, :-1]], 1), torch.cat([cell[:, :1], after[:, :-1]], 1)
+
+    def _backward(self, newest: Tensor) -> Tensor:
+        gate_in, candidate, gate_out = self.backward_gates(newest).chunk(3, dim=1)
         cell = torch.sigmoid(gate_in) * torch.tanh(candidate)
-        return torch.cat([onward, torch.sigmoid(gate_out) * torch.tanh(cell)], dim=1)
+        return torch.sigmoid(gate_out) * torch.tanh(cell)
 
 
-@dataclass(frozen=True, slots=True)
-class StreamState:
+class StreamState(NamedTuple):
     """What a stream remembers between frames.
 
     Attributes:
         maps: Feature maps of the last n frames, (B, n, C, H, W).
-        pooled: Pooled vectors of the last frames of the window, (B, window, C).
-        features: What the last layer makes the newest force from, (B, head).
-        gates: Attention of the newest frame: of positions (B, 1, H, W) from SSAM and CBAM, of channels
-            (B, C, 1, 1) from SCAM and SE, None without attention.
+        hidden: LSTM of the windows that have begun, (B, window, hidden); see `LastStepBlstm.advance`.
+        cell: Likewise.
     """
 
     maps: Tensor
-    pooled: Tensor
+    hidden: Tensor
+    cell: Tensor
+
+
+class Output(NamedTuple):
+    """What a stream gives for a frame.
+
+    Attributes:
+        force_n: Forces, (B,).
+        features: What the last layer makes them from, (B, head).
+        gates: Attention: of positions (B, 1, H, W) from SSAM and CBAM, of channels (B, C, 1, 1) from SCAM and
+            SE, None without attention.
+    """
+
+    force_n: Tensor
     features: Tensor
     gates: Tensor | None
 
@@ -130,9 +106,8 @@ class ForceNetwork(nn.Module):
         super().__init__()
         self.config = config
         self.backbone: Backbone = BACKBONES[config.backbone](config.width)
-        self.earlier_frames = config.earlier_frames if config.sequential else 0
         channels = self.backbone.out_channels
-        self.attention = _attention(config, channels, self.backbone.stride)
+        self.attention = _attention(config, channels)
         self.blstm = LastStepBlstm(channels, config.hidden)
         self.dense = nn.Linear(2 * config.hidden, config.head)
         self.out = nn.Linear(config.head, 1)
@@ -142,11 +117,6 @@ class ForceNetwork(nn.Module):
         """Puts the channels last in memory: faster, the same numbers."""
         moved: Self = self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         return moved
-
-    @property
-    def context(self) -> int:
-        """Earlier frames that one estimate depends on."""
-        return self.config.window - 1 + self.earlier_frames
 
     def forward(self, clips: Tensor, start: int = 0) -> Tensor:
         """Estimates the force for the frames of whole clips; one backbone pass serves all windows.
@@ -166,7 +136,7 @@ class ForceNetwork(nn.Module):
         batch, length = clips.shape[:2]
         flat = self.backbone(clips.flatten(0, 1))  # (B*T, C, H, W)
         maps = flat.view(batch, length, *flat.shape[1:])
-        earlier = maps[:, :1].expand(-1, self.earlier_frames, -1, -1, -1)
+        earlier = maps[:, :1].expand(-1, self.config.maps_kept, -1, -1, -1)
         pooled, _ = self._attend(torch.cat([earlier, maps], dim=1))  # (B, T, C)
         window = self.config.window
         padded = torch.cat([pooled[:, :1].expand(-1, window - 1, -1), pooled], dim=1)
@@ -179,7 +149,7 @@ class ForceNetwork(nn.Module):
             force: Tensor = self.out(features).squeeze(1) * self.config.label_scale_n
         return force
 
-    def step(self, frame: Tensor, state: StreamState | None) -> tuple[Tensor, StreamState]:
+    def step(self, frame: Tensor, state: StreamState | None) -> tuple[Output, StreamState]:
         """Estimates the force for the next frame of a stream, exactly as `forward` would.
 
         Args:
@@ -187,20 +157,32 @@ class ForceNetwork(nn.Module):
             state: What the last step returned; None for the first frame.
 
         Returns:
-            Forces in N, (B,), and the state for the next step.
+            The estimate, and the state for the next step.
         """
-        newest = self.backbone(frame)[:, None]  # (B, 1, C, H, W)
-        earlier = newest.expand(-1, self.earlier_frames, -1, -1, -1) if state is None else state.maps
-        maps = torch.cat([earlier, newest], dim=1)  # (B, n + 1, C, H, W)
+        if state is None:
+            state = self.blank(len(frame))
+            for _ in range(self.config.context):
+                _, state = self.step(frame, state)
+        maps = self.backbone(frame)[:, None]
+        if self.config.maps_kept:  # exported, a tensor of size zero would be refused
+            maps = torch.cat([state.maps, maps], dim=1)  # (B, n + 1, C, H, W)
         pooled, gates = self._attend(maps)  # (B, 1, C)
-        window = pooled.expand(-1, self.config.window, -1) if state is None else state.pooled
-        window = torch.cat([window[:, 1:], pooled], dim=1)
-        features = self._read(window)
-        return self.force_n(features), StreamState(maps[:, 1:], window, features, gates)
+        read, hidden, cell = self.blstm.advance(pooled[:, 0], state.hidden, state.cell)
+        features = torch.tanh(self.dense(read))
+        return Output(self.force_n(features), features, gates), StreamState(maps[:, 1:], hidden, cell)
+
+    def blank(self, batch: int = 1) -> StreamState:
+        """A state that remembers nothing: what a stream forgets after as many frames as `context` says."""
+        config = self.config
+        side = config.size // STRIDES[config.backbone]
+        like = self.out.weight
+        maps = like.new_zeros(batch, config.maps_kept, self.backbone.out_channels, side, side)
+        hidden = like.new_zeros(batch, config.window, config.hidden)
+        return StreamState(maps, hidden, torch.zeros_like(hidden))
 
     def _attend(self, maps: Tensor) -> tuple[Tensor, Tensor | None]:
         """Excites and pools the maps (B, n + T, C, H, W) that have n before them: (B, T, C), and gates."""
-        n = self.earlier_frames
+        n = self.config.maps_kept
         length = maps.shape[1] - n
         newest = maps[:, n:].flatten(0, 1)  # (B*T, C, H, W)
         gates = None
@@ -216,12 +198,12 @@ class ForceNetwork(nn.Module):
             return torch.tanh(self.dense(self.blstm(windows.to(self.dense.weight.dtype))))
 
 
-def _attention(config: NetworkConfig, channels: int, stride: int) -> nn.Module | None:
+def _attention(config: NetworkConfig, channels: int) -> nn.Module | None:
     match config.attention:
         case "ssam":
             return SpatialAttention(channels, config.earlier_frames, config.pooling)
         case "scam":
-            positions = (config.size // stride) ** 2
+            positions = (config.size // STRIDES[config.backbone]) ** 2
             return ChannelAttention(
                 channels, config.earlier_frames, positions, config.reduction, config.pooling
             )
@@ -242,8 +224,6 @@ def cost(config: NetworkConfig) -> tuple[int, int]:
     """
     network = ForceNetwork(config).eval()
     with torch.no_grad(), FlopCounterMode(display=False) as counter:
-        network.step(torch.zeros(1, 1, config.size, config.size), None)
-    # On a CPU the counter does not see into an LSTM.
-    recurrent = config.window * sum(w.numel() for w in network.blstm.onward.parameters() if w.dim() > 1)
+        network.step(torch.zeros(1, 1, config.size, config.size), network.blank())
     parameters = sum(parameter.numel() for parameter in network.parameters())
-    return parameters, recurrent + counter.get_total_flops() // 2
+    return parameters, counter.get_total_flops() // 2

@@ -7,9 +7,11 @@ import torch
 from gripper_force.dataset import Clip
 from gripper_force.errors import DataError
 from gripper_force.evaluate import evaluate, ridge_baseline
-from gripper_force.vision.checkpoint import Checkpoint, Header, Residual
+from gripper_force.vision.checkpoint import Checkpoint
+from gripper_force.vision.engines.pytorch import TorchEngine
 from gripper_force.vision.estimator import ForceEstimator
-from gripper_force.vision.network import ForceNetwork, NetworkConfig
+from gripper_force.vision.header import Header, NetworkConfig, Residual
+from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess
 
 
@@ -54,7 +56,7 @@ def test_equals_the_streaming_estimator(checkpoint: Checkpoint) -> None:
     clips[1].valid[10:20] = False
     result = evaluate(checkpoint, clips)
     errors: dict[str, list[float]] = {"cup": [], "tube": []}
-    estimator = ForceEstimator(checkpoint, threads=1)
+    estimator = ForceEstimator(TorchEngine(checkpoint))
     for one in clips:
         estimator.reset()
         for frame, force_n, valid in zip(one.frames, one.forces_n, one.valid, strict=True):

@@ -27,8 +27,9 @@ from gripper_force.types import (
     Request,
     VisualForce,
 )
-from gripper_force.vision.checkpoint import Header, Residual, load_checkpoint, save_checkpoint
-from gripper_force.vision.network import ForceNetwork, NetworkConfig
+from gripper_force.vision.checkpoint import load_checkpoint, save_checkpoint
+from gripper_force.vision.header import Header, NetworkConfig, Residual
+from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess
 
 TARGET_N = 4.0

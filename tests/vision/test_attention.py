@@ -6,13 +6,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from gripper_force.vision.attention import (
-    Cbam,
-    ChannelAttention,
-    Pooling,
-    SpatialAttention,
-    SqueezeExcitation,
-)
+from gripper_force.vision.attention import Cbam, ChannelAttention, SpatialAttention, SqueezeExcitation
+from gripper_force.vision.header import Pooling
 
 C, H, W = 4, 2, 3
 Array = npt.NDArray[np.float64]

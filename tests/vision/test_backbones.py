@@ -4,6 +4,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gripper_force.vision.backbones import Mobile, ResNet18, Vgg
+from gripper_force.vision.header import STRIDES
 
 
 def convolved(x: Tensor, pair: nn.Module, stride: int = 1) -> Tensor:
@@ -46,7 +47,7 @@ def test_width_scales_the_channels(make: type[Vgg | ResNet18 | Mobile], full: in
     assert make(width=1.0).out_channels == full
     half = make(width=0.5)
     assert half.out_channels == full // 2
-    side = make.stride
+    side = STRIDES[make.__name__.lower()]
     maps = half(torch.randn(2, 1, side, 3 * side))
     assert maps.shape == (2, full // 2, 1, 3)
     assert maps.min() >= 0

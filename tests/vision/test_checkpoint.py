@@ -10,8 +10,9 @@ from safetensors.torch import save_file
 
 from gripper_force.errors import CheckpointError
 from gripper_force.vision import checkpoint
-from gripper_force.vision.checkpoint import Header, Residual, load_checkpoint, save_checkpoint
-from gripper_force.vision.network import ForceNetwork, NetworkConfig
+from gripper_force.vision.checkpoint import load_checkpoint, save_checkpoint
+from gripper_force.vision.header import SHIPPED, Header, NetworkConfig, Residual
+from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess
 
 SSAM = NetworkConfig(attention="ssam", size=16, width=0.25, hidden=6, head=7)
@@ -101,7 +102,7 @@ def test_an_ensemble_of_full_size_fits_in_12_mb(tmp_path: Path) -> None:
 def test_a_missing_file_says_how_to_get_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(CheckpointError, match="train one"):
         load_checkpoint(tmp_path / "absent.safetensors")
-    monkeypatch.setattr(checkpoint, "DEFAULT_PATH", tmp_path / "default.safetensors")
+    monkeypatch.setitem(SHIPPED, "default", tmp_path / "default.safetensors")
     with pytest.raises(CheckpointError, match=r"default\.safetensors"):
         load_checkpoint()
 

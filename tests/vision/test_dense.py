@@ -3,7 +3,8 @@ import pytest
 import torch
 
 from gripper_force.vision import dense
-from gripper_force.vision.network import ForceNetwork, NetworkConfig
+from gripper_force.vision.header import NetworkConfig
+from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess
 
 

@@ -7,11 +7,13 @@ import torch
 
 from gripper_force.errors import ConfigError, DataError, NonFiniteError
 from gripper_force.object_profile import Interval, ObjectProfile, OutputCurve
-from gripper_force.vision.checkpoint import Checkpoint, Header, Residual
+from gripper_force.vision.checkpoint import Checkpoint
 from gripper_force.vision.correction import Correction, HeadAndGate
 from gripper_force.vision.dense import features, predict
+from gripper_force.vision.engines.pytorch import TorchEngine
 from gripper_force.vision.estimator import Estimate, ForceEstimator
-from gripper_force.vision.network import ForceNetwork, NetworkConfig
+from gripper_force.vision.header import Header, NetworkConfig, Residual
+from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess, shrink
 
 REGION = (10, 5, 40, 40)
@@ -41,7 +43,7 @@ def run(estimator: ForceEstimator, frames: np.ndarray) -> list[Estimate | None]:
 
 def test_equals_the_whole_clip_at_once(frames: np.ndarray) -> None:
     checkpoint = ensemble("ssam", "scam")
-    estimates = run(ForceEstimator(checkpoint, REGION, threads=1), frames)
+    estimates = run(ForceEstimator(TorchEngine(checkpoint), REGION), frames)
     small = np.stack([shrink(frame, REGION, 32) for frame in frames])
     members = predict(checkpoint.networks, checkpoint.header.preprocess, small)  # (2, 30)
     assert estimates[:3] == [None] * 3
@@ -54,7 +56,7 @@ def test_equals_the_whole_clip_at_once(frames: np.ndarray) -> None:
 
 
 def test_reset_starts_a_new_run(frames: np.ndarray) -> None:
-    estimator = ForceEstimator(ensemble("ssam"), threads=1)
+    estimator = ForceEstimator(TorchEngine(ensemble("ssam")))
     first = run(estimator, frames)
     assert run(estimator, frames) != first
     estimator.reset()
@@ -63,13 +65,13 @@ def test_reset_starts_a_new_run(frames: np.ndarray) -> None:
 
 
 def test_without_a_reference_every_frame_counts(frames: np.ndarray) -> None:
-    estimator = ForceEstimator(ensemble("scam", reference=False), threads=1)
+    estimator = ForceEstimator(TorchEngine(ensemble("scam", reference=False)))
     assert None not in run(estimator, frames)
     assert estimator.reference is None
 
 
 def test_the_reference_is_what_the_region_shows(frames: np.ndarray) -> None:
-    estimator = ForceEstimator(ensemble("ssam"), REGION, threads=1)
+    estimator = ForceEstimator(TorchEngine(ensemble("ssam")), REGION)
     run(estimator, frames)
     expected = np.mean([shrink(frame, REGION, 32) for frame in frames[:4]], axis=0).round()
     assert estimator.reference is not None
@@ -77,7 +79,7 @@ def test_the_reference_is_what_the_region_shows(frames: np.ndarray) -> None:
 
 
 def test_attention_is_that_of_the_newest_frame(frames: np.ndarray) -> None:
-    estimator = ForceEstimator(ensemble("scam", "ssam"), threads=1)
+    estimator = ForceEstimator(TorchEngine(ensemble("scam", "ssam")))
     assert estimator.attention_map() is None
     run(estimator, frames[:5])
     earlier = estimator.attention_map()
@@ -92,7 +94,7 @@ def test_attention_is_that_of_the_newest_frame(frames: np.ndarray) -> None:
 
 
 def test_no_map_without_spatial_attention(frames: np.ndarray) -> None:
-    estimator = ForceEstimator(ensemble("scam", "none"), threads=1)
+    estimator = ForceEstimator(TorchEngine(ensemble("scam", "none")))
     run(estimator, frames[:5])
     assert estimator.attention_map() is None
 
@@ -100,16 +102,16 @@ def test_no_map_without_spatial_attention(frames: np.ndarray) -> None:
 def test_nan_never_leaves_the_network(frames: np.ndarray) -> None:
     checkpoint = ensemble("ssam", "scam")
     checkpoint.networks[1].out.bias.fill_(torch.nan)
-    estimator = ForceEstimator(checkpoint, threads=1)
+    estimator = ForceEstimator(TorchEngine(checkpoint))
     with pytest.raises(NonFiniteError, match="nan"):
         run(estimator, frames)
 
 
 def test_bad_frames_and_regions_are_named(frames: np.ndarray) -> None:
     with pytest.raises(ConfigError, match="region"):
-        ForceEstimator(ensemble("ssam"), (0, 0, 100, 100), threads=1).update(frames[0])
+        ForceEstimator(TorchEngine(ensemble("ssam")), (0, 0, 100, 100)).update(frames[0])
     with pytest.raises(DataError, match="gray"):
-        ForceEstimator(ensemble("ssam"), threads=1).update(frames)
+        ForceEstimator(TorchEngine(ensemble("ssam"))).update(frames)
 
 
 def correction(gate: float, mean: np.ndarray) -> Correction:
@@ -143,7 +145,7 @@ def test_a_profile_corrects_each_frame_as_it_would_the_whole_clip(frames: np.nda
     small = np.stack([shrink(frame, REGION, 32) for frame in frames])
     forces, read = features(checkpoint.networks, checkpoint.header.preprocess, small)
     profile = correction(1e6, read.mean(0))
-    estimates = run(ForceEstimator(checkpoint, REGION, 1, profile), frames)
+    estimates = run(ForceEstimator(TorchEngine(checkpoint), REGION, profile), frames)
     expected = 0.5 * forces.mean(0) + 0.2 + 2.0 * read[:, 3] + 0.1
     for estimate, force_n in zip(estimates[3:], expected[3:].tolist(), strict=True):
         assert estimate is not None
@@ -154,6 +156,6 @@ def test_a_profile_corrects_each_frame_as_it_would_the_whole_clip(frames: np.nda
 
 def test_what_a_profile_does_not_know_gives_no_estimate(frames: np.ndarray) -> None:
     checkpoint = ensemble("ssam")
-    estimator = ForceEstimator(checkpoint, REGION, 1, correction(1e-6, np.zeros(7, np.float32)))
+    estimator = ForceEstimator(TorchEngine(checkpoint), REGION, correction(1e-6, np.zeros(7, np.float32)))
     with pytest.raises(DataError, match=r"profile 'mug'.*see whether it is that object"):
         run(estimator, frames)

@@ -8,13 +8,8 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from torch import Tensor, nn
 
-from gripper_force.vision.network import (
-    ForceNetwork,
-    LastStepBlstm,
-    NetworkConfig,
-    StreamState,
-    cost,
-)
+from gripper_force.vision.header import NetworkConfig
+from gripper_force.vision.network import ForceNetwork, LastStepBlstm, StreamState, cost
 
 TINY = NetworkConfig(size=16, width=0.25, window=5, hidden=6, head=7, reduction=4)
 SIZES = {"vgg": 32, "resnet18": 64, "mobile": 32}
@@ -63,14 +58,14 @@ def literal(network: ForceNetwork, frames: Tensor) -> Tensor:
 
 def history(network: ForceNetwork, clip: Tensor, t: int) -> Tensor:
     """The frames that the estimate at t depends on; copies of the first stand in for those before it."""
-    return clip[torch.arange(t - network.context, t + 1).clamp_min(0)]
+    return clip[torch.arange(t - network.config.context, t + 1).clamp_min(0)]
 
 
 def stream(network: ForceNetwork, clip: Tensor) -> Iterator[Tensor]:
     state: StreamState | None = None
     for frame in clip:
-        force, state = network.step(frame[None], state)
-        yield force[0]
+        seen, state = network.step(frame[None], state)
+        yield seen.force_n[0]
 
 
 def assert_same(actual: Tensor, expected: Tensor) -> None:
@@ -145,7 +140,7 @@ def test_the_full_size_network_fits_the_paper() -> None:
     assert network.blstm.onward.hidden_size == 256
     assert network.dense.out_features == 1024
     assert network.config.window == 20
-    assert network.context == 20
+    assert network.config.context == 20
     assert 2.4e6 < sum(parameter.numel() for parameter in network.parameters()) < 2.8e6
 
 
@@ -167,10 +162,10 @@ def test_attention_to_the_newest_map_alone_keeps_no_maps() -> None:
     frame = torch.zeros(1, 1, 16, 16)
     for attention in ("none", "se", "cbam"):
         network = build(TINY.model_copy(update={"attention": attention, "earlier_frames": 2}))
-        assert network.context == 4
+        assert network.config.context == 4
         assert network.step(frame, None)[1].maps.shape[1] == 0
     network = build(TINY.model_copy(update={"attention": "ssam", "earlier_frames": 2}))
-    assert network.context == 6
+    assert network.config.context == 6
     assert network.step(frame, None)[1].maps.shape[1] == 2
 
 
@@ -204,9 +199,7 @@ def test_cost_is_that_of_the_layers_added_up() -> None:
     blstm = 256 * 4 * (256 + 256)
     backward, dense, out = 256 * 3 * 256, 512 * 1024, 1024
     weights += blstm + 2 * 4 * 256 + backward + 3 * 256 + dense + 1024 + out + 1
-    assert cost(NetworkConfig(size=64)) == (weights, convolutions + 20 * blstm + backward + dense + out)
+    step = convolutions + 256 * 4 * 256 * (1 + 20) + backward + dense + out  # each window moves on by one
+    assert cost(NetworkConfig(size=64)) == (weights, step)
     ssam = 2 * 256
-    assert cost(NetworkConfig(attention="ssam", size=64)) == (
-        weights + ssam + 1,
-        convolutions + 16 * ssam + 20 * blstm + backward + dense + out,
-    )
+    assert cost(NetworkConfig(attention="ssam", size=64)) == (weights + ssam + 1, step + 16 * ssam)

@@ -31,7 +31,7 @@ from gripper_force.recording.lag import camera_lags_s, load_cell_lag_s
 from gripper_force.recording.record import Plan, record
 from gripper_force.recording.summary import releases_ns
 from gripper_force.rig import CameraCalibration, Estimate, read_rig, update_rig
-from gripper_force.session import checkpoint_of
+from gripper_force.session import checkpoint_of, settled
 from gripper_force.types import (
     NS_PER_MS,
     NS_PER_S,
@@ -42,7 +42,7 @@ from gripper_force.types import (
     Request,
     ServoState,
 )
-from gripper_force.vision.estimator import ForceEstimator
+from gripper_force.vision.estimator import open_estimator
 from gripper_force.vision.preprocess import Region, shrink
 
 EXPOSURES_US: Final = (500, 1000, 2000, 4000, 8000, 16000)
@@ -279,7 +279,7 @@ def compute_ms(config: Config, gray: Gray) -> float:
         return 0.0
     if config.clock == "lockstep":
         return config.vision.lockstep_compute_ms
-    estimator = ForceEstimator(checkpoint, config.vision.region, config.vision.threads)
+    estimator = open_estimator(checkpoint, settled(config)[0].vision)
     each_ms = []
     for _ in range(_TIMED_FRAMES):
         begin_ns = time.perf_counter_ns()

@@ -16,10 +16,12 @@ from gripper_force.config import Config
 from gripper_force.errors import DataError
 from gripper_force.object_profile import ObjectProfile, write_object
 from gripper_force.recording.record import Plan, Progress, record
+from gripper_force.session import settled
 from gripper_force.types import NS_PER_MS
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
 from gripper_force.vision.correction import write_arrays
-from gripper_force.vision.estimator import ForceEstimator
+from gripper_force.vision.estimator import open_estimator
+from gripper_force.vision.exported import read_model
 
 Advance = Callable[[str], None]
 """Told of each log that was read, and of each step of the fit."""
@@ -86,6 +88,7 @@ def calibrate(
         DataError: The logs can't be used, or nothing can be learnt from them.
         ConfigError: The profile can't be written.
     """
+    config, _ = settled(config)
     checkpoint = load_checkpoint(config.vision.checkpoint)
     if not paths:
         raise DataError(f"there is no log of {name!r} to calibrate from; touch it first")
@@ -145,7 +148,7 @@ def _compute_s(config: Config, checkpoint: Checkpoint) -> float:
     """How long an estimate takes: on the simulated clock what is set, else measured."""
     if config.clock == "lockstep":
         return config.vision.lockstep_compute_ms * NS_PER_MS / 1e9
-    estimator = ForceEstimator(checkpoint, threads=config.vision.threads)
+    estimator = open_estimator(read_model(config.vision.checkpoint), config.vision)
     size = checkpoint.header.preprocess.size
     rng = np.random.default_rng(0)
     taken_s = []

@@ -7,7 +7,8 @@ from matplotlib.figure import Figure
 from gripper_force.reproduce import figures
 from gripper_force.reproduce.experiment import Test as Estimates
 from gripper_force.reproduce.models import BASELINE, PROPOSED
-from gripper_force.vision.network import ForceNetwork, NetworkConfig
+from gripper_force.vision.header import NetworkConfig
+from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess
 
 

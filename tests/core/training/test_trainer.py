@@ -11,7 +11,8 @@ from gripper_force.training.recipe import TrainConfig
 from gripper_force.training.train import train
 from gripper_force.training.trainer import Trainer, one_cycle, squared_error, tenths
 from gripper_force.vision.checkpoint import load_checkpoint
-from gripper_force.vision.network import ForceNetwork, NetworkConfig
+from gripper_force.vision.header import NetworkConfig
+from gripper_force.vision.network import ForceNetwork
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -1,0 +1,197 @@
+"""From a checkpoint to the files that other engines run, each checked against PyTorch before it is kept."""
+
+import logging
+import shutil
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final
+
+import numpy as np
+import torch
+
+from gripper_force.errors import CheckpointError, ConfigError, DataError
+from gripper_force.types import Gray
+from gripper_force.vision.checkpoint import load_checkpoint
+from gripper_force.vision.engines import Engine, Floats, open_engine
+from gripper_force.vision.engines.pytorch import TorchEngine
+from gripper_force.vision.exported import KEY, described
+from gripper_force.vision.header import EXPORTED, Model
+from gripper_force.vision.preprocess import Normaliser
+from gripper_force.vision.step import FRAME, EnsembleStep, state_names
+
+TOLERANCE: Final = 1e-4
+"""How far an exported network may be off PyTorch in float32, of the label's scale."""
+
+_CHECKED: Final = 30
+"""Frames that an exported network is checked on: more than a window."""
+
+_SAMPLES: Final = 300
+"""Frames that int8 is scaled on; NNCF's own default."""
+
+
+def export(model: Model, path: Path, frames: Sequence[Gray] | None = None) -> dict[str, float]:
+    """Writes an ensemble's streaming step as an ONNX or OpenVINO file, after the ending of ``path``.
+
+    Args:
+        model: The checkpoint.
+        path: The file to write; an OpenVINO file's weights go beside it, into ``.bin``.
+        frames: Recordings, (T, S, S) uint8 each, to scale the convolutions' int8 on; None: float32. What is
+            no convolution, a twentieth of the arithmetic, stays in floating point: the recurrence in int8
+            alone costs more than a newton.
+
+    Returns:
+        ``largest_n`` and ``mean_n``: how far it is off PyTorch on frames, of the recordings or of noise.
+
+    Raises:
+        ConfigError: The ending is another, or a package is not installed.
+        CheckpointError: The checkpoint can't be read, or what came out of it computes something else.
+        DataError: The recordings are too few.
+    """
+    if path.suffix not in EXPORTED:
+        raise ConfigError(f"{path} should end in {' or '.join(EXPORTED)}: that says what to export to")
+    if frames is not None and path.suffix != ".xml":
+        raise ConfigError("int8 is exported to OpenVINO: name a file that ends in .xml")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=path.parent) as folder, _quiet():
+            made = Path(folder) / path.name
+            (_openvino if path.suffix == ".xml" else _onnx)(model, made, frames)
+            errors = _check(model, made, frames)
+            # The weights first: what finds the one finds the other.
+            for part in sorted(Path(folder).iterdir(), key=lambda part: part.suffix == path.suffix):
+                shutil.move(part, path.parent / part.name)
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"exporting to {path.suffix} needs {error.name}: pip install 'gripper-force[engines]'"
+        ) from error
+    except OSError as error:
+        raise CheckpointError(f"can't write {path}: {error.strerror}") from error
+    return errors
+
+
+def _onnx(model: Model, path: Path, _frames: Sequence[Gray] | None) -> None:
+    step, inputs = _traced(model)
+    program = torch.onnx.export(
+        step,
+        inputs,
+        dynamo=True,
+        verbose=False,
+        input_names=[FRAME, *state_names(model.header.members)],
+        output_names=step.outputs,
+    )
+    assert program is not None
+    for name, text in described(model.header, model.digest).items():
+        program.model.metadata_props[f"{KEY}.{name}"] = text
+    program.save(str(path))
+
+
+def _openvino(model: Model, path: Path, frames: Sequence[Gray] | None) -> None:
+    import openvino
+
+    step, inputs = _traced(model)
+    network = openvino.convert_model(step, example_input=inputs)
+    names = [FRAME, *state_names(model.header.members)]
+    for port, name, tensor in zip(network.inputs, names, inputs, strict=True):
+        port.get_tensor().set_names({name})
+        port.get_node().set_friendly_name(name)
+        port.get_node().set_partial_shape(openvino.PartialShape(list(tensor.shape)))
+    network.validate_nodes_and_infer_types()
+    for port, name in zip(network.outputs, step.outputs, strict=True):
+        port.get_tensor().set_names({name})
+    if frames is not None:
+        network = _quantised(network, model, frames)
+    for name, text in described(model.header, model.digest).items():
+        network.set_rt_info(text, [KEY, name])
+    openvino.save_model(network, path, compress_to_fp16=False)
+
+
+def _quantised(network: Any, model: Model, frames: Sequence[Gray]) -> Any:
+    """The convolutions in int8, each channel of their weights and their inputs scaled on frames."""
+    import nncf
+
+    engine = _Tapped(model)
+    for clip in frames:
+        engine.reset()
+        for frame in inputs_of(model, clip):
+            engine.step(frame)
+    seen = engine.seen
+    if len(seen) < _SAMPLES:
+        raise DataError(
+            f"int8 is scaled on at least {_SAMPLES} frames, and these recordings have {len(seen)}"
+        )
+    chosen = np.random.default_rng(0).choice(len(seen), _SAMPLES, replace=False)
+    kept = {"Convolution", "GroupConvolution"}
+    others = sorted({node.get_type_name() for node in network.get_ops()} - kept)
+    return nncf.quantize(
+        network,
+        nncf.Dataset([seen[i] for i in chosen]),
+        subset_size=_SAMPLES,
+        fast_bias_correction=False,
+        ignored_scope=nncf.IgnoredScope(types=others, validate=False),
+    )
+
+
+class _Tapped(TorchEngine):
+    """Keeps what goes into each step."""
+
+    def __init__(self, model: Model) -> None:
+        super().__init__(model)
+        self.seen: list[list[Floats]] = []
+
+    def _run(self, frame: Floats) -> Any:
+        self.seen.append([frame[None, None], *(np.array(tensor) for tensor in self._state)])
+        return super()._run(frame)
+
+
+def _traced(model: Model) -> tuple[EnsembleStep, tuple[torch.Tensor, ...]]:
+    step = EnsembleStep(load_checkpoint(model.path).networks).eval()
+    size = model.header.preprocess.size
+    return step, (torch.zeros(1, 1, size, size), *step.blank())
+
+
+def inputs_of(model: Model, clip: Gray) -> Iterator[Floats]:
+    """Prepares a recording, (T, S, S) uint8, as a run would."""
+    normaliser = Normaliser(model.header.preprocess)
+    for frame in clip:
+        yield from normaliser.push(frame)
+
+
+def _check(model: Model, path: Path, frames: Sequence[Gray] | None) -> dict[str, float]:
+    if frames is None:
+        size = model.header.preprocess.size
+        frames = [np.random.default_rng(0).integers(0, 256, (_CHECKED, size, size), np.uint8)]
+    made = Model(path, model.header, model.digest)
+    ours, theirs = (
+        np.concatenate([_estimates(engine, model, clip) for clip in frames])
+        for engine in (TorchEngine(model), open_engine(made, EXPORTED[path.suffix]))
+    )
+    off_n = np.abs(ours - theirs)
+    scale_n = max(member.label_scale_n for member in model.header.members)
+    quantised = len(frames) > 1 or len(frames[0]) > _CHECKED
+    if not np.isfinite(off_n).all() or (not quantised and off_n.max() > TOLERANCE * scale_n):
+        raise CheckpointError(f"what came out as {path.suffix} is off by {off_n.max():.2g} N")
+    return {"largest_n": float(off_n.max()), "mean_n": float(off_n.mean())}
+
+
+def _estimates(engine: Engine, model: Model, clip: Gray) -> Floats:
+    engine.reset()
+    return np.stack([engine.step(frame).forces_n.mean() for frame in inputs_of(model, clip)])
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """The exporters talk about their own insides."""
+    names = ("torch.onnx", "nncf", "onnxscript", "onnx_ir")
+    levels = {name: logging.getLogger(name).level for name in names}
+    for name in names:
+        logging.getLogger(name).setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        for name, level in levels.items():
+            logging.getLogger(name).setLevel(level)
