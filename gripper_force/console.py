@@ -256,11 +256,42 @@ def commands_table(r: dict[str, Any]) -> None:
 
 def startup_table(r: dict[str, Any]) -> None:
     """What scenes take to start."""
-    table = Table("scene", "time s", "memory MB", "loaded", "threads", box=None)
+    table = Table("scene", "time s", "memory MB", "libraries", "threads", box=None)
     for s in r["startup"]:
         figures = (_number(s.time_s, digits=2), _number(s.memory_mb, digits=0))
-        table.add_row(s.scene, *figures, ", ".join(s.loaded), ", ".join(s.threads))
+        libraries = ", ".join(name for name in s.loaded if "gripper_" not in name)
+        table.add_row(s.scene, *figures, libraries, ", ".join(s.threads))
     out.print(table)
+    out.print(f"[dim]load {r['load']:.1f} on {r['cores']} cores[/]")
+
+
+def loop_table(r: dict[str, Any]) -> None:
+    """What a loop in real time did."""
+    columns = ("beside it", "cycles", "missed %", "late ms", "bus ms", "cycle ms", "estimate ms", "lost")
+    table = Table(*columns, box=None)
+    for c in r["loop"]:
+        pairs = (
+            (c.late_p50_ms, c.late_p99_ms, c.late_max_ms),
+            (c.bus_p50_ms, c.bus_p99_ms),
+            (c.cycle_p50_ms, c.cycle_p99_ms),
+            (c.estimator_p50_ms, c.estimator_p99_ms),
+        )
+        figures = (" / ".join(_number(ms, digits=2) for ms in pair) for pair in pairs)
+        missed = _number(100 * c.missed / c.cycles)
+        table.add_row(c.beside, str(c.cycles), missed, *figures, str(c.lost_records))
+    out.print(table)
+    out.print(
+        "[dim]p50 / p99 (/ the latest); a servo behind a pseudo-terminal, a recorded camera, no physics[/]"
+    )
+    log = r["log"]
+    _pairs(
+        {
+            "log of the run, MB/s": log.run_mb_s,
+            "log at most, MB/s": log.write_mb_s,
+            "us a record": log.record_us,
+            "replay, times real time": log.replay_times,
+        }
+    )
     out.print(f"[dim]load {r['load']:.1f} on {r['cores']} cores[/]")
 
 

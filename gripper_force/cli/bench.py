@@ -21,13 +21,22 @@ def bench(
     startup: Annotated[
         bool, typer.Option("--startup", help="What each kind of scene takes until its first cycle.")
     ] = False,
+    loop: Annotated[
+        bool, typer.Option("--loop", help="The control loop in real time, with inference beside it.")
+    ] = False,
+    seconds: Annotated[
+        float, typer.Option(min=1.0, help="With --loop: how long with inference, and how long without.")
+    ] = 30.0,
     minutes: Annotated[float, typer.Option(min=0.01, help="With --training: for each way.")] = 30.0,
     folder: Annotated[
         Path, typer.Option("--out", help="With --training: where to keep what is measured.")
     ] = Path("runs/bench"),
     jobs: Jobs = CORES,
     set_: Annotated[
-        list[str] | None, typer.Option("--set", help="With --training: a key for all recipes. Repeatable.")
+        list[str] | None,
+        typer.Option(
+            "--set", help="With --training a key of all recipes, with --loop of the run. Repeatable."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -35,12 +44,20 @@ def bench(
     from gripper_force.bench import bus as bus_job
     from gripper_force.bench import commands as commands_job
 
-    if [bus, commands, startup, training is not None].count(True) != 1:
+    if [bus, commands, startup, loop, training is not None].count(True) != 1:
         raise ConfigError(
-            "bench measures one thing at a time: --bus, --commands, --startup or --training DATA"
+            "bench measures one thing at a time: --bus, --commands, --startup, --loop or --training DATA"
         )
     if training is not None:
         console.show(_learning(training, minutes, set_ or [], folder, jobs), as_json, console.learning_table)
+        return
+    if loop:
+        from gripper_force.bench.loop import loop as run
+
+        with console.err.status(f"running for {2 * seconds:g} s"):
+            costs_, log = run(seconds, set_ or [])
+        told = {"loop": costs_, "log": log, "load": os.getloadavg()[0], "cores": CORES}
+        console.show(told, as_json, console.loop_table)
         return
     if startup:
         console.show(_startup(), as_json, console.startup_table)
