@@ -20,6 +20,7 @@ from typing import Any, Final, cast
 import numpy as np
 
 from gripper_force.backends import SERVO, MonotonicClock, load
+from gripper_force.bench.startup import PATIENT
 from gripper_force.config import Config, config_from_text, load_config
 from gripper_force.interfaces import Devices, Servo
 from gripper_force.log import LogReader, LogWriter
@@ -34,9 +35,6 @@ _REQUEST_S: Final = 2.0
 """The jaws close and open in turn, each for so long."""
 
 _LATENCY_NS: Final = 10 * NS_PER_MS
-_PATIENT: Final = ("servo.bus_watchdog_ms=2540", "servo.reply_margin_ms=100")
-"""On a busy machine the stand-in for the servo may be late too, and that is not to end the run."""
-
 _RECORDING: Final = (
     *("object=stapler", "seed=7", "sim.detail=coarse", "target_n=4"),
     *("vision.checkpoint=none", "control.feedback=current", "load_cell.backend=none"),
@@ -194,7 +192,7 @@ def loop(seconds: float, overrides: list[str]) -> tuple[tuple[LoopCost, ...], Lo
         for turn in range(turns):
             for beside, seen in loops.items():
                 blind = () if beside == "vision" else ("vision.checkpoint=none", "control.feedback=current")
-                settings = [*_PATIENT, *overrides, "clock=realtime", f"servo.port={port}", *blind]
+                settings = [*PATIENT, *overrides, "clock=realtime", f"servo.port={port}", *blind]
                 path = folder / f"{beside}{turn}.mcap"
                 _run(load_config(None, settings), frames, seconds / turns, path, seen)
         log = _log_cost(folder / "vision0.mcap", folder / "again.mcap", seconds / turns)
