@@ -53,7 +53,7 @@ def tiny_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     header = Header(
         members=members,
         preprocess=Preprocess(size=32),
-        residuals=(Residual(force_n=0.0, std_n=1.0),),
+        residuals=(Residual(force_n=-99.0, std_n=1.0), Residual(force_n=99.0, std_n=1.0)),
         data_digest="",
         metrics={},
     )

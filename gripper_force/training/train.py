@@ -23,7 +23,7 @@ from gripper_force.training.parallel import Ranks, joined
 from gripper_force.training.recipe import TrainConfig as TrainConfig
 from gripper_force.training.trainer import Trainer, estimates
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
-from gripper_force.vision.header import Header, Residual
+from gripper_force.vision.header import RESIDUAL_HALF_N, Header, Residual
 
 STATE_EVERY_S: Final = 60.0
 
@@ -143,5 +143,5 @@ def _residuals(forces_n: npt.NDArray[np.float32], measured_n: npt.NDArray[np.flo
     for newton in np.unique(newtons):
         part = squared[newtons == newton]
         variance = (part.sum() + RESIDUAL_PRIOR * squared.mean()) / (len(part) + RESIDUAL_PRIOR)
-        residuals.append(Residual(force_n=float(newton) + 0.5, std_n=math.sqrt(variance)))
+        residuals.append(Residual(force_n=float(newton) + RESIDUAL_HALF_N, std_n=math.sqrt(variance)))
     return residuals

@@ -82,7 +82,9 @@ class Correction:
     def half_width_n(self, force_n: npt.ArrayLike) -> Floats:
         """Half-width of the interval about corrected forces, (N,); it grows beyond the forces calibrated."""
         force = np.asarray(force_n, np.float64)
-        beyond_n: Floats = np.clip(force - self.profile.force_n, 0, None)
+        least_n = -self.profile.interval.half_width_n(0.0)  # nothing pulls: that is as far as noise takes it
+        known_n = np.clip(force, least_n, self.profile.force_n)
+        beyond_n: Floats = np.abs(force - known_n)
         return self.profile.interval.half_width_n(force) + beyond_n
 
     def std_n(self, force_n: npt.ArrayLike) -> Floats:

@@ -10,7 +10,7 @@ from gripper_force.errors import DataError, NonFiniteError
 from gripper_force.types import Gray
 from gripper_force.vision.correction import Correction
 from gripper_force.vision.engines import Engine, Floats, open_engine
-from gripper_force.vision.header import Model
+from gripper_force.vision.header import RESIDUAL_HALF_N, Model
 from gripper_force.vision.plausible import Plausibility
 from gripper_force.vision.preprocess import Normaliser, Region, shrink
 
@@ -23,6 +23,7 @@ class Estimate:
         force_n: Contact force: the mean over the ensemble, corrected by the object's profile.
         std_n: Standard deviation claimed for it: as the profile's interval says, or, without a profile, the
             error measured in validation at that force, and half the spread of the members, as independent.
+            It grows by each newton beyond the forces that these know.
     """
 
     force_n: float
@@ -95,7 +96,11 @@ class ForceEstimator:
         if self._correction is not None:
             return self._corrected(self._correction, force_n, step.features)
         residual_n = float(np.interp(force_n, self._residual_forces, self._residual_stds))
-        return Estimate(force_n, math.hypot(residual_n, (max(forces) - min(forces)) / 2))
+        # Validation never saw such an estimate: all that is known is that the forces there end earlier.
+        least_n = self._residual_forces[0] - RESIDUAL_HALF_N
+        most_n = self._residual_forces[-1] + RESIDUAL_HALF_N
+        beyond_n = max(least_n - force_n, force_n - most_n, 0.0)
+        return Estimate(force_n, math.hypot(residual_n + beyond_n, (max(forces) - min(forces)) / 2))
 
     def attention_map(self) -> Floats | None:
         """Where SSAM looks in the newest frame, (h, w) in 0..1; None without SSAM or a frame."""

@@ -91,6 +91,10 @@ SHIPPED: Final = {name: Path(__file__).with_name(f"{name}.safetensors") for name
 """The checkpoints that come with the package."""
 
 
+RESIDUAL_HALF_N: Final = 0.5
+"""A residual speaks for estimates as far off as this, either way."""
+
+
 class Residual(Section):
     """How far off the ensemble was on validation data where it said about ``force_n``."""
 

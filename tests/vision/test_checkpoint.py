@@ -91,6 +91,17 @@ def test_loading_is_bit_exact_after_the_first_rounding(file: Path, tmp_path: Pat
     assert again.read_bytes() == file.read_bytes()
 
 
+@pytest.mark.parametrize("factor", [1e-30, 1e-7, 1e7])
+def test_what_half_precision_cannot_hold_is_kept_whole(factor: float, tmp_path: Path) -> None:
+    network = ForceNetwork(SSAM)
+    with torch.no_grad():
+        network.dense.weight *= factor
+    save_checkpoint(tmp_path / "one.safetensors", [network], header(SSAM))
+    (loaded,) = load_checkpoint(tmp_path / "one.safetensors").networks
+    assert torch.equal(loaded.dense.weight, network.dense.weight)
+    assert not torch.equal(loaded.blstm.onward.weight_ih_l0, network.blstm.onward.weight_ih_l0)
+
+
 def test_an_ensemble_of_full_size_fits_in_12_mb(tmp_path: Path) -> None:
     configs = [NetworkConfig(attention="ssam"), NetworkConfig(attention="scam")]
     path = tmp_path / "full.safetensors"

@@ -49,6 +49,7 @@ def test_a_curve_goes_straight_on_beyond_its_ends(at_n: float) -> None:
 def test_the_interval_grows_with_the_force_and_fast_beyond_what_was_calibrated() -> None:
     correction = Correction(profile(), arrays())
     half_n = correction.half_width_n([-1.0, 0.0, 4.0, 6.0, 8.0])
+    assert half_n[0] == pytest.approx(np.hypot(0.3, 0.1) + 0.7)
     assert half_n[1:4] == pytest.approx(np.hypot(0.3, [0.0, 0.4, 0.6]))
     assert half_n[4] == pytest.approx(np.hypot(0.3, 0.8) + 2)
     assert correction.std_n([4.0])[0] * 1.6449 == pytest.approx(half_n[2], rel=1e-4)

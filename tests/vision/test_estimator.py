@@ -107,6 +107,34 @@ def test_nan_never_leaves_the_network(frames: np.ndarray) -> None:
         run(estimator, frames)
 
 
+def test_an_input_that_is_not_finite_never_enters_the_stream(frames: np.ndarray) -> None:
+    inputs = frames[:3, :32, :32].astype(np.float32) / 255
+    spoiled = inputs[1].copy()
+    spoiled[3, 4] = np.nan
+    engine = TorchEngine(ensemble("ssam"))
+    expected = [engine.step(frame).forces_n for frame in inputs]
+    engine.reset()
+    seen = []
+    for frame in inputs:
+        with pytest.raises(NonFiniteError, match="prepared frame"):
+            engine.step(spoiled)
+        seen.append(engine.step(frame).forces_n)
+    np.testing.assert_array_equal(seen, expected)
+
+
+@pytest.mark.parametrize("force_n", [-150.0, -100.6, -100.4, 0.0, 100.4, 100.6, 1e30])
+def test_the_claimed_error_grows_beyond_the_forces_that_validation_knew(
+    frames: np.ndarray, force_n: float
+) -> None:
+    checkpoint = ensemble("ssam")
+    checkpoint.networks[0].out.weight.zero_()
+    checkpoint.networks[0].out.bias.fill_(force_n / 20)
+    estimate = run(ForceEstimator(TorchEngine(checkpoint)), frames[:4])[3]
+    assert estimate is not None
+    known_n = {-100.6: 0.0, -100.4: 0.0, -150.0: 0.0, 0.0: 1.0}.get(force_n, 2.0)
+    assert estimate.std_n == pytest.approx(known_n + max(abs(force_n) - 100.5, 0), rel=1e-5, abs=1e-4)
+
+
 def test_bad_frames_and_regions_are_named(frames: np.ndarray) -> None:
     with pytest.raises(ConfigError, match="region"):
         ForceEstimator(TorchEngine(ensemble("ssam")), (0, 0, 100, 100)).update(frames[0])
@@ -150,7 +178,7 @@ def test_a_profile_corrects_each_frame_as_it_would_the_whole_clip(frames: np.nda
     for estimate, force_n in zip(estimates[3:], expected[3:].tolist(), strict=True):
         assert estimate is not None
         assert estimate.force_n == pytest.approx(force_n, abs=1e-4)
-        half_n = math.hypot(0.3, 0.1 * force_n) + max(force_n - 5, 0)
+        half_n = math.hypot(0.3, 0.1 * force_n) + max(force_n - 5, -0.3 - force_n, 0)
         assert estimate.std_n == pytest.approx(half_n / 1.6449, abs=1e-3)
 
 

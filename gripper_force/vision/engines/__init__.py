@@ -11,7 +11,7 @@ from typing import Any, Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from gripper_force.errors import ConfigError
+from gripper_force.errors import ConfigError, NonFiniteError
 from gripper_force.vision.header import Header, Model
 
 Floats = npt.NDArray[np.float32]
@@ -53,7 +53,14 @@ class Engine(ABC):
         self._begun = False
 
     def step(self, frame: Floats) -> Step:
-        """Takes the next prepared frame of the stream, (S, S)."""
+        """Takes the next prepared frame of the stream, (S, S).
+
+        Raises:
+            NonFiniteError: It holds NaN or infinity. The stream goes on as if it had not been there.
+        """
+        # OpenVINO's rectifier makes zeros of NaN, and a force like any other comes out.
+        if not np.isfinite(frame).all():
+            raise NonFiniteError("a prepared frame holds NaN or infinity; look at the camera's image")
         if not self._begun:
             # Frames before the first count as copies of it, so the first is taken in as often as it counts.
             self._blank()
