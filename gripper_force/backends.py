@@ -52,6 +52,9 @@ KILL_TRIAL: Final = "gripper_hw.sim.killed:kill_trial"
 BUS_COST: Final = "gripper_hw.dynamixel.cost:bus_cost"
 """What a servo bus cycle costs, for `gripper_force.bench.bus`."""
 
+SCENE_COSTS: Final = "gripper_hw.sim.cost:scene_costs"
+"""What each level of detail of a simulated object costs, for `gripper_force.bench.scene`."""
+
 VIRTUAL_SERVO: Final = "gripper_hw.dynamixel.serve:serve_virtual_servo"
 """Virtual servos at a device path, for the command line and `gripper_force.bench`."""
 

@@ -149,6 +149,12 @@ class BudgetConfig(Section):
 
     latency_ms: Positive | None = Field(None, description="99th percentile of an estimate's time")
     error_n: Positive | None = Field(None, description="mean absolute error of the visual estimate")
+    sim_error_n: Positive | None = Field(
+        None, description="root mean square error of a simulated object's force, against its finest level"
+    )
+    sim_speed: Positive | None = Field(
+        None, description="least speed of the physics, in simulated seconds a second, by the shipped table"
+    )
 
 
 class ControlConfig(Section):
@@ -213,7 +219,11 @@ class ControlConfig(Section):
 class SimConfig(Section):
     """The simulated world. Only read where a backend is simulated."""
 
-    detail: Literal["coarse", "medium", "fine"] = "medium"
+    detail: Literal["coarse", "medium", "fine", "auto"] = Field(
+        "medium",
+        description="mesh and step; auto: the fastest of which `gripper-force bench --scene` found that it "
+        "keeps budget.sim_error_n and budget.sim_speed",
+    )
     lux: float | None = Field(None, description="350, 550, 750; None: drawn from the seed", gt=0)
     tool: Literal["pads", "rods"] = Field(
         "pads",

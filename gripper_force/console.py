@@ -89,6 +89,7 @@ def grasp_table(r: dict[str, Any]) -> None:
             "control loop": _number(r["loop_hz"], " Hz", 1),
             "camera": _number(r["camera_hz"], " Hz", 1),
             "samples rejected": _number(r["samples_rejected"]),
+            **{f"auto, {i}": text for i, text in enumerate(r["taken"], 1)},
             "log": r["log"],
             "report": r["report"] or "-",
         }
@@ -261,6 +262,18 @@ def startup_table(r: dict[str, Any]) -> None:
         figures = (_number(s.time_s, digits=2), _number(s.memory_mb, digits=0))
         libraries = ", ".join(name for name in s.loaded if "gripper_" not in name)
         table.add_row(s.scene, *figures, libraries, ", ".join(s.threads))
+    out.print(table)
+    out.print(f"[dim]load {r['load']:.1f} on {r['cores']} cores[/]")
+
+
+def scene_table(r: dict[str, Any]) -> None:
+    """What the levels of detail of simulated objects cost."""
+    columns = ("object", "detail", "unknowns", "step ms", "iterations", "simulated s/s", "RMSE N", "worst N")
+    table = Table(*columns, box=None)
+    for s in r["scene"]:
+        solver = (str(s.unknowns), f"{s.step_ms:g}", _number(s.iterations, digits=1))
+        figures = (_number(s.speed, digits=1), _number(s.error_n), _number(s.worst_n))
+        table.add_row(s.object, s.detail, *solver, *figures)
     out.print(table)
     out.print(f"[dim]load {r['load']:.1f} on {r['cores']} cores[/]")
 

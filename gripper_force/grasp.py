@@ -19,6 +19,7 @@ from gripper_force.replay import compare
 from gripper_force.session import run_grasp
 from gripper_force.types import (
     NS_PER_S,
+    Event,
     FusedForce,
     GraspStatus,
     LoadCellSample,
@@ -40,8 +41,9 @@ def grasp(config: Config, progress: Callable[[GraspStatus], None] | None = None)
 
     Returns:
         ``result, object, target_n, load_cell_mean_n, steady_error_n, overshoot_n, settle_s, estimator_p50_ms,
-        estimator_p99_ms, loop_hz, camera_hz, samples_rejected, log, report`` and the seed and the peak force;
-        None where a figure has no meaning, such as without a load cell.
+        estimator_p99_ms, loop_hz, camera_hz, samples_rejected, taken, log, report`` and the seed and the peak
+        force. ``taken`` says what was taken for each ``auto``, and why. None where a figure has no meaning,
+        such as without a load cell.
 
     Raises:
         GripperError: The run failed; its log holds what was seen.
@@ -92,7 +94,7 @@ def summarise(path: Path) -> Summary:
     """Reads the figures of a grasp from its log."""
     reader = LogReader(path)
     records: dict[type, list[Any]] = defaultdict(list)
-    for record in reader.records(GraspStatus, LoadCellSample, ServoState, VisualForce, FusedForce):
+    for record in reader.records(Event, GraspStatus, LoadCellSample, ServoState, VisualForce, FusedForce):
         records[type(record)].append(record)
     statuses, cells = records[GraspStatus], sorted(records[LoadCellSample], key=lambda c: c.t_ns)
     cycles_ns = [state.t_ns for state in records[ServoState]]
@@ -120,6 +122,7 @@ def summarise(path: Path) -> Summary:
             "fused": _mae_n([(f.t_ns, f.force_n) for f in records[FusedForce]], cells),
             "floor": _floor_n(reader.metadata, cells),
         },
+        "taken": [event.text for event in records[Event] if event.text.startswith("took ")],
         "log": str(path),
     }
 

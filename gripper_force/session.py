@@ -240,8 +240,9 @@ def open_session(
     estimator = make_estimator(config, checkpoint, correction)
     with ExitStack() as stack:
         recorder = _recorder(config, devices, path, checkpoint, correction)
-        if why:
-            recorder.write(Event(devices.start_ns, "vision", why))
+        for unit, text in (("vision", why), ("simulation", devices.notes.get("detail"))):
+            if text:
+                recorder.write(Event(devices.start_ns, unit, text))
         session = Session(config, devices, controller, _perception(config, devices, estimator), recorder)
         stack.callback(_discard_unused, session, path)
         stack.callback(recorder.close)

@@ -22,7 +22,6 @@ def tell(fd: int) -> None:
 
 def first_cycle(fd: int, settings: list[str]) -> None:
     """Does what a grasp does up to its first cycle, and tells ``fd`` of it."""
-    import gripper_force.grasp  # noqa: F401, the command's own way in
     from gripper_force.backends import open_devices
     from gripper_force.config import load_config
     from gripper_force.session import checkpoint_of, open_session

@@ -138,6 +138,7 @@ import gripper_force.cli
 from gripper_force.bench import inside
 fd, kind, *arguments = sys.argv[1:]
 if kind == "grasp":
+    import gripper_force.grasp
     inside.first_cycle(int(fd), arguments)
 else:
     atexit.register(inside.tell, int(fd))

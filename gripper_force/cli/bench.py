@@ -27,6 +27,15 @@ def bench(
     seconds: Annotated[
         float, typer.Option(min=1.0, help="With --loop: how long with inference, and how long without.")
     ] = 30.0,
+    scene: Annotated[
+        bool, typer.Option("--scene", help="Speed against error of each level of sim.detail.")
+    ] = False,
+    objects: Annotated[
+        list[str] | None, typer.Option("--object", help="With --scene: only this object. Repeatable.")
+    ] = None,
+    write: Annotated[
+        Path | None, typer.Option(help="With --scene: Markdown file to put the table into.")
+    ] = None,
     minutes: Annotated[float, typer.Option(min=0.01, help="With --training: for each way.")] = 30.0,
     folder: Annotated[
         Path, typer.Option("--out", help="With --training: where to keep what is measured.")
@@ -41,43 +50,52 @@ def bench(
     as_json: AsJson = False,
 ) -> None:
     """Measure what parts of a run cost on this machine, beside what others use."""
-    from gripper_force.bench import bus as bus_job
-    from gripper_force.bench import commands as commands_job
+    asked = {
+        "--bus": bus,
+        "--commands": commands,
+        "--startup": startup,
+        "--loop": loop,
+        "--scene": scene,
+        "--training DATA": training is not None,
+    }
+    if list(asked.values()).count(True) != 1:
+        raise ConfigError(f"bench measures one thing at a time, one of {', '.join(asked)}")
+    if bus:
+        result, table = _bus(cycles), console.bus_table
+    elif commands:
+        result, table = _commands(), console.commands_table
+    elif startup:
+        result, table = _startup(), console.startup_table
+    elif loop:
+        result, table = _loop(seconds, set_ or []), console.loop_table
+    elif scene:
+        result, table = _scene(objects or [], write), console.scene_table
+    else:
+        assert training is not None
+        result, table = _learning(training, minutes, set_ or [], folder, jobs), console.learning_table
+    console.show({**result, "load": os.getloadavg()[0], "cores": CORES}, as_json, table)
 
-    if [bus, commands, startup, loop, training is not None].count(True) != 1:
-        raise ConfigError(
-            "bench measures one thing at a time: --bus, --commands, --startup, --loop or --training DATA"
-        )
-    if training is not None:
-        console.show(_learning(training, minutes, set_ or [], folder, jobs), as_json, console.learning_table)
-        return
-    if loop:
-        from gripper_force.bench.loop import loop as run
 
-        with console.err.status(f"running for {2 * seconds:g} s"):
-            costs_, log = run(seconds, set_ or [])
-        told = {"loop": costs_, "log": log, "load": os.getloadavg()[0], "cores": CORES}
-        console.show(told, as_json, console.loop_table)
-        return
-    if startup:
-        console.show(_startup(), as_json, console.startup_table)
-        return
-    if commands:
-        taken = []
-        with console.bar("running", len(commands_job.COMMANDS)) as advance:
-            for cost in commands_job.commands():
-                taken.append(cost)
-                advance(cost.command)
-        console.show(
-            {"commands": taken, "load": os.getloadavg()[0], "cores": CORES}, as_json, console.commands_table
-        )
-        return
+def _bus(cycles: int) -> dict[str, Any]:
+    from gripper_force.bench import bus as job
+
     costs: list[Any] = []
-    with console.bar("measuring", len(bus_job.BUS_SETTINGS)) as advance:
-        for setting in bus_job.bus(cycles):
+    with console.bar("measuring", len(job.BUS_SETTINGS)) as advance:
+        for setting in job.bus(cycles):
             costs += setting
             advance(f"{setting[0].baud_rate} baud, {setting[0].latency_ms:g} ms")
-    console.show({"bus": costs, "load": os.getloadavg()[0], "cores": CORES}, as_json, console.bus_table)
+    return {"bus": costs}
+
+
+def _commands() -> dict[str, Any]:
+    from gripper_force.bench import commands as job
+
+    taken = []
+    with console.bar("running", len(job.COMMANDS)) as advance:
+        for cost in job.commands():
+            taken.append(cost)
+            advance(cost.command)
+    return {"commands": taken}
 
 
 def _startup() -> dict[str, Any]:
@@ -88,7 +106,32 @@ def _startup() -> dict[str, Any]:
         for row in job.startup(job.SCENES):
             rows.append(row)
             advance(row.scene)
-    return {"startup": rows, "load": os.getloadavg()[0], "cores": CORES}
+    return {"startup": rows}
+
+
+def _loop(seconds: float, overrides: list[str]) -> dict[str, Any]:
+    from gripper_force.bench import loop as job
+
+    with console.err.status(f"running for {2 * seconds:g} s"):
+        costs, log = job.loop(seconds, overrides)
+    return {"loop": costs, "log": log}
+
+
+def _scene(objects: list[str], page: Path | None) -> dict[str, Any]:
+    from gripper_force.bench import scene as job
+
+    if page is not None and objects:
+        raise ConfigError("--write needs all objects: leave out --object")
+    rows = []
+    with console.err.status("squeezing") as status:
+        for row in job.scene(objects, keep=page is not None):
+            rows.append(row)
+            status.update(f"squeezed {row.object}, {row.detail}")
+    if page is not None:
+        from gripper_force.report.markers import write_between
+
+        write_between(page, "detail", job.markdown(rows))
+    return {"scene": rows}
 
 
 def _learning(data: Path, minutes: float, overrides: list[str], out_: Path, jobs: int) -> dict[str, Any]:
@@ -101,4 +144,4 @@ def _learning(data: Path, minutes: float, overrides: list[str], out_: Path, jobs
     for point in learn(partial(load_clips, data, workers=jobs), minutes, overrides, out_):
         points.append(point)
         console.err.print(f"{point.way}, {point.minutes:.2f} min: {point.mae_n:.3f} N")
-    return {"points": points, "as_good_as_paper_min": reached(points), "cores": CORES, "folder": out_}
+    return {"points": points, "as_good_as_paper_min": reached(points), "folder": out_}

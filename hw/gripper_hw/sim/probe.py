@@ -20,10 +20,12 @@ def probe(config: Config) -> Iterator[Check]:
         return
     from gripper_hw.dynamixel.control_table import load_model
     from gripper_hw.dynamixel.firmware import VirtualServo
+    from gripper_hw.sim.detail import settled
     from gripper_hw.sim.scene import draw_scene
     from gripper_hw.sim.world import World  # where EGL is missing, this import raises
 
     model = load_model("XM430-W350")
+    config, _ = settled(config)
     scene = draw_scene(config.object, config.seed, config.sim)
     world = World(scene, config.gripper, VirtualServo(1, model), model.nm_per_a, config.seed)
     try:

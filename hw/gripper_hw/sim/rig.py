@@ -19,6 +19,7 @@ from gripper_force.interfaces import Camera, Clock, LoadCell
 from gripper_force.types import NS_PER_MS, NS_PER_S, Frame, Gray, LoadCellSample
 from gripper_hw.dynamixel.control_table import load_model
 from gripper_hw.dynamixel.virtual import VirtualBus, VirtualServo, register_bus, unregister_bus
+from gripper_hw.sim.detail import settled
 from gripper_hw.sim.scene import Scene, draw_scene
 from gripper_hw.sim.world import World
 
@@ -169,6 +170,7 @@ class SimulatedRig:
                 f"servo.port {config.servo.port!r} is no virtual port, and a simulated camera or load cell "
                 "needs the simulated rig's servo; set servo.port to virtual:rig"
             )
+        config, self._why = settled(config)
         self._config = config
         self.scene = draw_scene(config.object, config.seed, config.sim)
         model = load_model(config.servo.model)
@@ -225,7 +227,8 @@ class SimulatedRig:
 
     def notes(self) -> dict[str, str]:
         """What a log should know of the scene."""
-        return {"scene": json.dumps(asdict(self.scene)), "exposure_ms": str(self._exposure_ms)}
+        why = {"detail": self._why} if self._why else {}
+        return {"scene": json.dumps(asdict(self.scene)), "exposure_ms": str(self._exposure_ms), **why}
 
     def relight(self, lux: float) -> tuple[Camera, dict[str, str]]:
         """A further camera, which sees what a rig of its own with this ``sim.lux`` would, and its notes."""

@@ -55,6 +55,7 @@ class World:
 
     Attributes:
         t_ns: Simulated time.
+        step_ns: Time step of the physics.
         force_n: Grip force: mean of the normal forces on the two pads.
     """
 
@@ -77,7 +78,7 @@ class World:
         self._scene, self._motor = scene, motor
         self._nm_per_a = nm_per_a * scene.nm_per_a
         self._rng = np.random.default_rng([seed, 1])
-        self._step_ns = round(self._model.opt.timestep * NS_PER_S)
+        self.step_ns = round(self._model.opt.timestep * NS_PER_S)
         servo = self._model.joint("servo")
         self._qpos, self._dof = int(servo.qposadr[0]), int(servo.dofadr[0])
         self._left = int(self._model.sensor("left_force").adr[0]) + 1
@@ -90,6 +91,16 @@ class World:
         mujoco.mj_forward(self._model, self._data)
         self.every(_GUARD_PERIOD_NS, self._guard)
 
+    @property
+    def unknowns(self) -> int:
+        """Degrees of freedom of the scene."""
+        return int(self._model.nv)
+
+    @property
+    def iterations(self) -> int:
+        """The solver's, in the last step."""
+        return int(self._data.solver_niter.sum())
+
     def every(self, period_ns: int, call: Callable[[int], None]) -> None:
         """Calls ``call(t_ns)`` at each multiple of a period, to the next physics step."""
         self._taps.append(_Tap(period_ns, self.t_ns + period_ns, call))
@@ -97,7 +108,7 @@ class World:
     def advance_to(self, t_ns: int) -> None:
         """Lets the world go on. Raises `SimulationError` once it can't be trusted any more."""
         data = self._data
-        while self.t_ns + self._step_ns <= t_ns:
+        while self.t_ns + self.step_ns <= t_ns:
             noise_a = float(self._rng.normal(0.0, 0.003))
             current_a = self._motor.control(
                 self.t_ns, float(data.qpos[self._qpos]), float(data.qvel[self._dof]), noise_a
@@ -107,7 +118,7 @@ class World:
                 mujoco.mj_step(self._model, data)
             except mujoco.FatalError as error:
                 raise SimulationError(self._broken(str(error))) from error
-            self.t_ns += self._step_ns
+            self.t_ns += self.step_ns
             sensors = data.sensordata
             self.force_n = 0.5 * (abs(float(sensors[self._left])) + abs(float(sensors[self._right])))
             for tap in self._taps:
