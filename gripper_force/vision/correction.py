@@ -13,12 +13,12 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import NormalDist
 
 import numpy as np
 import numpy.typing as npt
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
-from scipy.special import ndtri
 
 from gripper_force.errors import ConfigError
 from gripper_force.object_profile import ObjectProfile, weights_path
@@ -73,7 +73,7 @@ class Correction:
         self._arrays = arrays
         self._estimate_n = np.array(profile.output.estimate_n)
         self._force_n = np.array(profile.output.force_n)
-        self._z = float(ndtri(0.5 + profile.interval.coverage / 2))
+        self._z = NormalDist().inv_cdf(0.5 + profile.interval.coverage / 2)
 
     def force_n(self, estimate_n: npt.ArrayLike, features: Features) -> Floats:
         """Corrected forces, (N,), of the members' mean (N,) and their features (N, F)."""
