@@ -1,5 +1,7 @@
 import json
 from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -8,12 +10,18 @@ from gripper_force import cli
 from gripper_force.bench import startup
 from gripper_force.bench.startup import SCENES, Scene, start
 from gripper_force.errors import GripperError
+from gripper_force.vision.engines import open_engine
+from gripper_force.vision.exported import read_model
 
 
 @pytest.fixture(scope="module")
-def places() -> Iterator[dict[str, str]]:
-    with startup.stand_ins() as places:
-        yield places
+def places(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+    with pytest.MonkeyPatch.context() as patch, startup.stand_ins() as places:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        for engine in ("openvino", "onnxruntime"):
+            if find_spec(engine) is not None:
+                open_engine(read_model(tiny_checkpoint), engine)  # exports it, which needs PyTorch
+        yield {**places, "network": str(tiny_checkpoint)}
 
 
 @pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.name)
