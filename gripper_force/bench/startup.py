@@ -112,6 +112,11 @@ SCENES: Final = (
     ),
     Scene("simulated, motor current alone", _SIMULATED, settings=(*_BLIND, *_NO_CELL)),
     Scene("simulated, load cell", _SIMULATED, settings=_BLIND),
+    Scene(
+        "simulated, a whole grasp without report",
+        _SIMULATED,
+        command=("grasp", *(f"--set={key}" for key in ("object=stapler", *_BLIND, "log.report=false"))),
+    ),
     Scene("simulated, camera, no network", _SIMULATED | {"cv2"}, settings=_NO_NETWORK),
     Scene(
         "simulated, vision (the default)",
