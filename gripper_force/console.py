@@ -322,6 +322,35 @@ def bus_table(r: dict[str, Any]) -> None:
     out.print(f"[dim]load {r['load']:.1f} on {r['cores']} cores[/]")
 
 
+def estimator_table(r: dict[str, Any]) -> None:
+    """Speed against error of the visual estimate."""
+    table = Table("network", "px", "way", "p50 ms", "p99 ms", "/ roof", "MAE N", "worst", "MB", "", box=None)
+    short = {"float32": "f32", "bfloat16": "bf16"}
+    for e in r["estimator"]:
+        share = None if e.least_ms is None else e.p50_ms / e.least_ms
+        table.add_row(
+            Path(e.checkpoint).stem,
+            str(e.size),
+            f"{e.engine} {short.get(e.precision, e.precision)} x{e.threads}",
+            *(_number(value, digits=2) for value in (e.p50_ms, e.p99_ms)),
+            _number(share, digits=1),
+            _number(e.mae_n),
+            _number(e.worst_n, digits=2),
+            _number(e.memory_mb, digits=0),
+            "front" if e.front else "",
+        )
+    out.print(table)
+    for checkpoint, told in r["ratios"].items():
+        _pairs(
+            {
+                f"{Path(checkpoint).stem}: fastest that keeps the error": told["fastest"],
+                "faster than the window in PyTorch": f"{told['times_faster_than_window']:.0f} times",
+            }
+        )
+    _pairs({"plot": str(r["plot"]), "kept in": str(r["file"])})
+    out.print(f"[dim]load {r['load']:.1f} on {r['cores']} cores[/]")
+
+
 def learning_table(r: dict[str, Any]) -> None:
     """Ways to train."""
     table = Table("way", "minutes", "steps", "MAE N", "RMSE N", box=None)

@@ -291,6 +291,31 @@ def evaluate(
 
 
 @app.command()
+def export(
+    out: Annotated[Path, typer.Option("--out", help="File to write: .onnx, or .xml for OpenVINO.")],
+    checkpoint: Annotated[str, typer.Argument(help="A path, or default or small.")] = "default",
+    int8: Annotated[
+        Path | None,
+        typer.Option(help="Compute the convolutions in int8, scaled on this folder of logs (.xml only)."),
+    ] = None,
+    jobs: Jobs = CORES,
+    as_json: AsJson = False,
+) -> None:
+    """Write a network's streaming step for another engine, checked against PyTorch."""
+    from gripper_force.dataset import load_clips
+    from gripper_force.vision.export import export as job
+    from gripper_force.vision.exported import read_model
+
+    model = read_model(checkpoint)
+    frames = None
+    if int8 is not None:
+        frames = [clip.frames for clip in load_clips(int8, model.header.preprocess, workers=jobs)]
+    with console.err.status("exporting"):
+        errors = job(model, out, frames)
+    console.show({"file": str(out), "digest": model.digest, "off_torch_n": errors}, as_json)
+
+
+@app.command()
 def reproduce(
     what: Annotated[str, typer.Argument(help="3, 4, 5, 6, 7, 8, 9, fig6, fig7, fig8, fig9, claims or all.")],
     scale: Annotated[

@@ -33,12 +33,29 @@ def bench(
     objects: Annotated[
         list[str] | None, typer.Option("--object", help="With --scene: only this object. Repeatable.")
     ] = None,
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            help="Estimator: logs that training never saw. By default some are simulated, for int8 too."
+        ),
+    ] = None,
+    scale_on: Annotated[
+        Path | None, typer.Option(help="Estimator: other logs, to scale int8 on. Goes with --data.")
+    ] = None,
+    checkpoints: Annotated[
+        list[str] | None,
+        typer.Option("--checkpoint", help="Estimator: a path or name. Repeatable. Default: all shipped."),
+    ] = None,
+    threads: Annotated[
+        list[int] | None,
+        typer.Option(min=1, help="Estimator: CPU threads. Repeatable. Default: one, and all cores."),
+    ] = None,
     write: Annotated[
-        Path | None, typer.Option(help="With --scene: Markdown file to put the table into.")
+        Path | None, typer.Option(help="Estimator, --scene: page to put the table into.")
     ] = None,
     minutes: Annotated[float, typer.Option(min=0.01, help="With --training: for each way.")] = 30.0,
     folder: Annotated[
-        Path, typer.Option("--out", help="With --training: where to keep what is measured.")
+        Path, typer.Option("--out", help="Estimator, --training: where to keep what is measured.")
     ] = Path("runs/bench"),
     jobs: Jobs = CORES,
     set_: Annotated[
@@ -49,7 +66,11 @@ def bench(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure what parts of a run cost on this machine, beside what others use."""
+    """Measure what parts of a run cost on this machine, beside what others use.
+
+    Without another choice: the visual estimate's speed against its error, by network, engine, precision and
+    threads.
+    """
     asked = {
         "--bus": bus,
         "--commands": commands,
@@ -58,8 +79,9 @@ def bench(
         "--scene": scene,
         "--training DATA": training is not None,
     }
-    if list(asked.values()).count(True) != 1:
-        raise ConfigError(f"bench measures one thing at a time, one of {', '.join(asked)}")
+    if list(asked.values()).count(True) > 1:
+        raise ConfigError(f"bench measures one thing at a time: the estimator, or one of {', '.join(asked)}")
+    result: dict[str, Any]
     if bus:
         result, table = _bus(cycles), console.bus_table
     elif commands:
@@ -70,10 +92,61 @@ def bench(
         result, table = _loop(seconds, set_ or []), console.loop_table
     elif scene:
         result, table = _scene(objects or [], write), console.scene_table
-    else:
-        assert training is not None
+    elif training is not None:
         result, table = _learning(training, minutes, set_ or [], folder, jobs), console.learning_table
+    else:
+        result = _estimator(checkpoints, threads, data, scale_on, folder, write, jobs)
+        table = console.estimator_table
     console.show({**result, "load": os.getloadavg()[0], "cores": CORES}, as_json, table)
+
+
+def _estimator(
+    checkpoints: list[str] | None,
+    threads: list[int] | None,
+    data: Path | None,
+    scale_on: Path | None,
+    out_: Path,
+    page: Path | None,
+    jobs: int,
+) -> dict[str, Any]:
+    from tempfile import TemporaryDirectory
+
+    from gripper_force.bench import estimator as job
+    from gripper_force.config import Config
+    from gripper_force.dataset import load_clips
+    from gripper_force.report.markers import write_between
+    from gripper_force.simulate import plan, simulate
+    from gripper_force.vision.header import SHIPPED
+
+    if (data is None) != (scale_on is None):
+        raise ConfigError(
+            "--data and --scale-on go together: int8 is scaled on other logs than it is judged by"
+        )
+    with TemporaryDirectory() as name, console.err.status("measuring") as status:
+        if data is None or scale_on is None:
+            data, scale_on = Path(name) / "data", Path(name) / "scale"
+            for folder, plans in ((data, plan("press", 12, 900_000)), (scale_on, plan("press", 8, 100_000))):
+                for made in simulate(plans, folder, Config(), jobs):
+                    status.update(f"simulating {made.name}")
+        status.update("measuring")
+        rows = job.bench(
+            checkpoints or list(SHIPPED),
+            lambda model: load_clips(data, model.header.preprocess, workers=jobs, quiet=True),
+            lambda model: load_clips(scale_on, model.header.preprocess, workers=jobs, quiet=True),
+            threads or sorted({1, CORES}),
+            lambda what: console.err.print(what),
+        )
+    plot = out_ / "estimator.png" if page is None else page.with_suffix(".png")
+    job.write_json(out_ / "estimator.json", rows)
+    job.draw(plot, rows)
+    if page is not None:
+        write_between(page, "estimator", job.markdown(rows))
+    return {
+        "estimator": rows,
+        "ratios": job.ratios(rows),
+        "plot": plot,
+        "file": out_ / "estimator.json",
+    }
 
 
 def _bus(cycles: int) -> dict[str, Any]:

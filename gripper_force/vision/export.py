@@ -4,7 +4,8 @@ import logging
 import shutil
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
+from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -124,13 +125,20 @@ def _quantised(network: Any, model: Model, frames: Sequence[Gray]) -> Any:
         )
     chosen = np.random.default_rng(0).choice(len(seen), _SAMPLES, replace=False)
     kept = {"Convolution", "GroupConvolution"}
-    others = sorted({node.get_type_name() for node in network.get_ops()} - kept)
+    nodes = network.get_ops()
+    others = sorted({node.get_type_name() for node in nodes} - kept)
+    # The first convolution has one channel to read: little to gain, and what it sees is faint.
+    first = [
+        n.get_friendly_name()
+        for n in nodes
+        if n.get_type_name() == "Convolution" and n.input(1).get_shape()[1] == 1
+    ]
     return nncf.quantize(
         network,
         nncf.Dataset([seen[i] for i in chosen]),
         subset_size=_SAMPLES,
         fast_bias_correction=False,
-        ignored_scope=nncf.IgnoredScope(types=others, validate=False),
+        ignored_scope=nncf.IgnoredScope(types=others, names=first, validate=False),
     )
 
 
@@ -183,13 +191,13 @@ def _estimates(engine: Engine, model: Model, clip: Gray) -> Floats:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """The exporters talk about their own insides."""
+    """The exporters talk about their own insides, on stdout too."""
     names = ("torch.onnx", "nncf", "onnxscript", "onnx_ir")
     levels = {name: logging.getLogger(name).level for name in names}
     for name in names:
         logging.getLogger(name).setLevel(logging.ERROR)
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), redirect_stdout(StringIO()):
             warnings.simplefilter("ignore")
             yield
     finally:

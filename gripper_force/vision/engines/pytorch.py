@@ -1,5 +1,7 @@
 """PyTorch, as it is and compiled."""
 
+import warnings
+
 import numpy as np
 import torch
 
@@ -40,7 +42,11 @@ class CompiledEngine(TorchEngine):
     def __init__(self, model: Model | Checkpoint, precision: Precision = "float32", threads: int = 1) -> None:
         """As `TorchEngine`."""
         super().__init__(model, precision, threads)
-        self._forward = torch.compile(self._step)
+        with warnings.catch_warnings():  # of PyTorch about its own parts, at the first step
+            warnings.simplefilter("ignore", DeprecationWarning)
+            self._forward = torch.compile(self._step)
+            self._blank()
+            self._run(np.zeros((self.header.preprocess.size,) * 2, np.float32))
 
 
 def _load(model: Model) -> Checkpoint:

@@ -1,0 +1,189 @@
+"""What every engine owes: the same newtons as the window, frame by frame, whatever computes them."""
+
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gripper_force.errors import CheckpointError, ConfigError
+from gripper_force.vision.checkpoint import load_checkpoint, save_checkpoint
+from gripper_force.vision.engines import ENGINES, Engine, open_engine
+from gripper_force.vision.exported import cache_folder, exported, read_model
+from gripper_force.vision.header import Attention, Header, NetworkConfig, Residual
+from gripper_force.vision.network import ForceNetwork
+from gripper_force.vision.preprocess import Preprocess
+
+PACKAGES = {"compiled": "torch"}
+
+
+def needs(engine: str) -> None:
+    package = PACKAGES.get(engine, engine)
+    if find_spec(package) is None:
+        pytest.skip(f"{package} is not installed: pip install 'gripper-force[engines]'")
+
+
+def write(path: Path, *shapes: tuple[Attention, int, str]) -> Path:
+    """An ensemble that has learnt nothing: attention, earlier frames and backbone of each member."""
+    torch.manual_seed(0)
+    configs = tuple(
+        NetworkConfig.model_validate(
+            {"attention": a, "earlier_frames": n, "backbone": b, "size": 32, "width": 0.25}
+            | {"window": 5, "hidden": 6, "head": 7, "reduction": 4}
+        )
+        for a, n, b in shapes
+    )
+    header = Header(
+        members=configs,
+        preprocess=Preprocess(size=32),
+        residuals=(Residual(force_n=0.0, std_n=1.0),),
+        data_digest="",
+        metrics={"mae_n": 0.5},
+    )
+    save_checkpoint(path, [ForceNetwork(config).eval() for config in configs], header)
+    return path
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+    folder = tmp_path_factory.getbasetemp() / "engines-cache"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(folder))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def ensemble(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("engines") / "both.safetensors"
+    return write(path, ("scam", 1, "vgg"), ("ssam", 2, "vgg"), ("none", 1, "mobile"))
+
+
+@pytest.fixture(params=["torch", "openvino", "onnxruntime"])
+def engine(request: pytest.FixtureRequest, ensemble: Path) -> Engine:
+    needs(request.param)
+    return open_engine(read_model(ensemble), request.param)
+
+
+def frames(count: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=(count, 32, 32)).astype(np.float32)
+
+
+def windows(ensemble: Path, clip: np.ndarray) -> np.ndarray:
+    """Each member's forces, (T, M), by the whole clip at once in float64."""
+    inputs = torch.from_numpy(clip)[None, :, None].double()
+    with torch.inference_mode():
+        members = [network.double()(inputs)[0].numpy() for network in load_checkpoint(ensemble).networks]
+    return np.stack(members, axis=1)
+
+
+def test_streams_what_whole_windows_give(engine: Engine, ensemble: Path) -> None:
+    clip = frames(17)
+    streamed = np.stack([engine.step(frame).forces_n for frame in clip])
+    np.testing.assert_allclose(streamed, windows(ensemble, clip), rtol=1e-5, atol=1e-5)
+
+
+def test_a_reset_forgets_everything(engine: Engine, ensemble: Path) -> None:
+    for frame in frames(9, seed=1):
+        engine.step(frame)
+    engine.reset()
+    clip = frames(4)
+    again = np.stack([engine.step(frame).forces_n for frame in clip])
+    np.testing.assert_allclose(again, windows(ensemble, clip), rtol=1e-5, atol=1e-5)
+
+
+def test_gives_features_and_attention_of_the_newest_frame(engine: Engine) -> None:
+    first, second = (engine.step(frame) for frame in frames(2))
+    assert first.features.shape == (21,)
+    assert first.features.dtype == first.forces_n.dtype == np.float32
+    assert first.attention is not None
+    assert second.attention is not None
+    assert first.attention.shape == (2, 2)
+    assert not np.array_equal(first.attention, second.attention)
+    assert not np.array_equal(first.features, second.features)  # what was given is not written over
+
+
+def test_two_runs_are_the_same_to_the_bit(engine: Engine) -> None:
+    clip = frames(8)
+
+    def run() -> Iterator[bytes]:
+        engine.reset()
+        for frame in clip:
+            yield engine.step(frame).forces_n.tobytes()
+
+    assert list(run()) == list(run())
+
+
+def test_the_compiled_engine_computes_the_same(ensemble: Path) -> None:
+    torch.compiler.reset()
+    clip = frames(3)
+    opened = open_engine(read_model(ensemble), "compiled")
+    streamed = np.stack([opened.step(frame).forces_n for frame in clip])
+    np.testing.assert_allclose(streamed, windows(ensemble, clip), rtol=1e-5, atol=1e-5)
+
+
+def test_bfloat16_is_near(ensemble: Path) -> None:
+    needs("openvino")
+    clip = frames(10)
+    opened = open_engine(read_model(ensemble), "openvino", "bfloat16")
+    streamed = np.stack([opened.step(frame).forces_n for frame in clip])
+    np.testing.assert_allclose(streamed, windows(ensemble, clip), atol=20 * 2**-7)
+
+
+def test_without_spatial_attention_there_is_no_map(tmp_path: Path) -> None:
+    model = read_model(write(tmp_path / "plain.safetensors", ("none", 0, "vgg")))
+    for name in ("torch", "openvino", "onnxruntime"):
+        if find_spec(PACKAGES.get(name, name)) is not None:
+            assert open_engine(model, name).step(frames(1)[0]).attention is None
+
+
+@pytest.mark.parametrize(("suffix", "name"), [(".xml", "openvino"), (".onnx", "onnxruntime")])
+def test_a_machine_exports_once(ensemble: Path, suffix: str, name: str) -> None:
+    needs(name)
+    model = read_model(ensemble)
+    path = exported(model, suffix)
+    assert path.parent == cache_folder()
+    written = path.stat().st_mtime_ns
+    assert exported(model, suffix) == path
+    assert path.stat().st_mtime_ns == written
+    again = read_model(path)
+    assert (again.header, again.digest) == (model.header, model.digest)
+
+
+def test_a_damaged_file_is_named(ensemble: Path, tmp_path: Path) -> None:
+    needs("openvino")
+    model = read_model(ensemble)
+    for suffix in (".xml", ".bin"):
+        whole = exported(model, ".xml").with_suffix(suffix)
+        (tmp_path / "cut").with_suffix(suffix).write_bytes(whole.read_bytes())
+    (tmp_path / "cut.bin").write_bytes(b"")
+    with pytest.raises(CheckpointError, match=r"cut\.xml"):
+        open_engine(read_model(tmp_path / "cut.xml"), "openvino")
+    (tmp_path / "cut.xml").write_text("<net", encoding="utf-8")
+    with pytest.raises(CheckpointError, match="damaged or no OpenVINO file"):
+        read_model(tmp_path / "cut.xml")
+    (tmp_path / "cut.xml").write_text("<net/>", encoding="utf-8")
+    with pytest.raises(CheckpointError, match="not made by `gripper-force export`"):
+        read_model(tmp_path / "cut.xml")
+    needs("onnxruntime")
+    (tmp_path / "cut.onnx").write_bytes(b"no network")
+    with pytest.raises(CheckpointError, match="damaged or no ONNX file"):
+        read_model(tmp_path / "cut.onnx")
+
+
+def test_what_does_not_go_together_is_refused(ensemble: Path) -> None:
+    model = read_model(ensemble)
+    with pytest.raises(ConfigError, match=r"no vision\.engine 'tensorrt'; there are torch"):
+        open_engine(model, "tensorrt")
+    with pytest.raises(ConfigError, match="bfloat16 needs openvino"):
+        open_engine(model, "torch", "bfloat16")
+    needs("openvino")
+    file = read_model(exported(model, ".xml"))
+    for name in ("torch", "onnxruntime"):
+        needs(name)
+        with pytest.raises(ConfigError, match=r"set vision\.engine=openvino"):
+            open_engine(file, name)
+
+
+def test_every_engine_is_covered() -> None:
+    assert set(ENGINES) == {"torch", "compiled", "openvino", "onnxruntime"}
