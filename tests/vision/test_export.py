@@ -1,0 +1,68 @@
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gripper_force.errors import CheckpointError, ConfigError, DataError
+from gripper_force.vision.engines import open_engine
+from gripper_force.vision.export import export
+from gripper_force.vision.exported import read_model
+from gripper_force.vision.header import Model
+
+
+@pytest.fixture
+def model(tiny_checkpoint: Path) -> Model:
+    return read_model(tiny_checkpoint)
+
+
+@pytest.fixture
+def recordings() -> list[np.ndarray]:
+    """A square that moves over noise."""
+    rng = np.random.default_rng(0)
+    clips = []
+    for _ in range(3):
+        clip = rng.integers(90, 110, (130, 32, 32), np.uint8)
+        for i, frame in enumerate(clip[10:]):
+            frame[8:16, i % 20 : i % 20 + 8] += 60
+        clips.append(clip)
+    return clips
+
+
+def needs(package: str) -> None:
+    if find_spec(package) is None:
+        pytest.skip(f"{package} is not installed: pip install 'gripper-force[engines]'")
+
+
+@pytest.mark.parametrize(("name", "package"), [("force.xml", "openvino"), ("force.onnx", "onnxscript")])
+def test_says_how_far_it_is_off_and_what_it_is(model: Model, tmp_path: Path, name: str, package: str) -> None:
+    needs(package)
+    errors = export(model, tmp_path / "new" / name)
+    assert 0 <= errors["mean_n"] <= errors["largest_n"] < 1e-2  # the fixture's newtons are a thousandfold
+    again = read_model(tmp_path / "new" / name)
+    assert (again.header, again.digest) == (model.header, model.digest)
+    left = {path.name for path in (tmp_path / "new").iterdir()}
+    assert left == ({"force.xml", "force.bin"} if name.endswith("xml") else {"force.onnx"})
+
+
+def test_int8_is_scaled_on_recordings(model: Model, tmp_path: Path, recordings: list[np.ndarray]) -> None:
+    needs("nncf")
+    errors = export(model, tmp_path / "int8.xml", recordings)
+    assert errors["mean_n"] > 0
+    assert b"FakeQuantize" in (tmp_path / "int8.xml").read_bytes()
+    opened = open_engine(read_model(tmp_path / "int8.xml"), "openvino", "bfloat16")
+    assert np.isfinite(opened.step(np.zeros((32, 32), np.float32)).forces_n).all()
+
+
+def test_says_what_it_can_not_do(model: Model, tmp_path: Path, recordings: list[np.ndarray]) -> None:
+    with pytest.raises(ConfigError, match=r"should end in \.xml or \.onnx"):
+        export(model, tmp_path / "force.trt")
+    with pytest.raises(ConfigError, match=r"int8 is exported to OpenVINO"):
+        export(model, tmp_path / "force.onnx", recordings)
+    needs("nncf")
+    with pytest.raises(DataError, match="at least 300 frames, and these recordings have 40"):
+        export(model, tmp_path / "force.xml", [recordings[0][:40]])
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "file").write_text("", encoding="utf-8")
+    with pytest.raises(CheckpointError, match="can't write"):
+        export(model, tmp_path / "file" / "force.xml")
