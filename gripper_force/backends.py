@@ -49,6 +49,10 @@ FUZZ_TARGETS: Final = (
 KILL_TRIAL: Final = "gripper_hw.sim.killed:kill_trial"
 """A grasp whose process is killed, for `gripper_force.stability.faults`."""
 
+PLANT_PRESS: Final = "gripper_calibration.fits.plant:Press"
+PLANT_FIT: Final = "gripper_calibration.fits.plant:fit_plant"
+"""How calibration identifies the force loop's plant, for `gripper_force.stability.margin`."""
+
 BUS_COST: Final = "gripper_hw.dynamixel.cost:bus_cost"
 """What a servo bus cycle costs, for `gripper_force.bench.bus`."""
 

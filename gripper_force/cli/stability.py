@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 def stability(
     part: Annotated[
         list[str] | None,
-        typer.Option(help="Hard cases for the numbers of this part alone: filter. Repeatable."),
+        typer.Option(
+            help="Hard cases for the numbers of one part: network, loop, filter, simulator. Repeatable."
+        ),
     ] = None,
     faults: Annotated[bool, typer.Option("--faults", help="Break each part in mid-grasp.")] = False,
     seeds: Annotated[int, typer.Option(min=1, help="With --faults: grasps of each row.")] = 20,

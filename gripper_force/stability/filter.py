@@ -22,12 +22,12 @@ from gripper_force.control.fusion import Fusion
 from gripper_force.control.grasp import GraspController
 from gripper_force.control.transmission import Transmission
 from gripper_force.stability.numerics import Row
+from gripper_force.stability.plant import CYCLE_NS, transmission_of
 from gripper_force.types import NS_PER_MS, NS_PER_S, Request, RequestKind, ServoState, VisualForce
 
 CYCLES: Final = 1_000_000
 """Of the longest case: 83 minutes at 200 Hz."""
 
-_NM_PER_A: Final = 1.78
 _ROUNDING_N: Final = 1e-9
 """A billionth of what the loop calls even; a filter that loses digits as it goes is far beyond."""
 
@@ -35,7 +35,6 @@ _LEFT: Final = 1e-15
 """Share of a huge reading that may stay in those after it: a few times the last digit of a double."""
 
 _DAY_NS: Final = 86_400 * NS_PER_S
-_CYCLE_NS: Final = 5 * NS_PER_MS
 _DIGITS: Final = 50
 
 Input = tuple[int, float, VisualForce | None]
@@ -178,7 +177,7 @@ def cases(config: Config, _maps: Path | None, cycles: int = CYCLES) -> Iterator[
     yield against(
         "prior variance without end", "10^18 N², the most that can be configured", _steady(rng, 4000), **wide
     )
-    tiny = ((t_ns, 5e-324 * (t_ns // _CYCLE_NS % 3), None) for t_ns in range(0, NS_PER_S, _CYCLE_NS))
+    tiny = ((t_ns, 5e-324 * (t_ns // CYCLE_NS % 3), None) for t_ns in range(0, NS_PER_S, CYCLE_NS))
     yield against("denormal currents", "0 to 2 of the smallest number", tiny)
     for huge_n in (1e3, 1e9):
         yield against(
@@ -209,7 +208,7 @@ def worst_n(control: ControlConfig, gripper: GripperConfig, inputs: Iterator[Inp
 
     Beyond 1 N as a share of the force.
     """
-    transmission = Transmission.from_config(gripper, _NM_PER_A)
+    transmission = transmission_of(gripper)
     tested, exact = Fusion(control, transmission), _Exact(control, transmission)
     worst = 0.0
     with localcontext(prec=_DIGITS):
@@ -245,7 +244,7 @@ def _steady(
     rng: np.random.Generator, cycles: int, begin_ns: int = NS_PER_S, std_n: float = 0.1
 ) -> Iterator[Input]:
     for cycle in range(cycles):
-        t_ns = begin_ns + cycle * _CYCLE_NS
+        t_ns = begin_ns + cycle * CYCLE_NS
         visual = _seen(rng, t_ns - 40 * NS_PER_MS, cycle, std_n) if cycle % 10 in (0, 3, 6) else None
         yield t_ns, _push_n(rng, t_ns), visual
 
@@ -286,7 +285,7 @@ def _spiked(rng: np.random.Generator, huge_n: float) -> Iterator[Input]:
 
 def _moved(control: ControlConfig, gripper: GripperConfig, by_ns: int, seed: int) -> float:
     """How many estimates differ where all times are later by the same."""
-    transmission = Transmission.from_config(gripper, _NM_PER_A)
+    transmission = transmission_of(gripper)
     here, there = Fusion(control, transmission), Fusion(control, transmission)
     different = 0
     for t_ns, push_n, visual in _ragged(np.random.default_rng([seed, 41])):
@@ -302,7 +301,7 @@ def _unheard(
     control: ControlConfig, gripper: GripperConfig, force_n: float, std_n: float, seed: int
 ) -> float:
     """Most that the estimate is off because of estimates that can't be used."""
-    transmission = Transmission.from_config(gripper, _NM_PER_A)
+    transmission = transmission_of(gripper)
     # What vision says after such an estimate counts anew: only what the filter holds is compared.
     hears, spared = Fusion(control, transmission), Fusion(control, transmission)
     worst = 0.0
@@ -319,7 +318,7 @@ def _unheard(
 
 def _wild_commands(control: ControlConfig, gripper: GripperConfig, current_limit_a: float) -> int:
     """How many commands of a grasp break a limit while the servo says things that are not finite."""
-    transmission = Transmission.from_config(gripper, _NM_PER_A)
+    transmission = transmission_of(gripper)
     broken = 0
     for name in ("position_rad", "velocity_rad_s", "current_a", "temperature_c", "voltage_v"):
         for wild in (math.nan, math.inf, -math.inf, sys.float_info.max):
@@ -327,7 +326,7 @@ def _wild_commands(control: ControlConfig, gripper: GripperConfig, current_limit
             controller = GraspController(control, transmission, current_limit_a)
             request: Request | None = Request(0, RequestKind.GRASP, 4.0)
             for cycle in range(400):
-                t_ns = cycle * _CYCLE_NS
+                t_ns = cycle * CYCLE_NS
                 servo = replace(_servo(t_ns, 0.03), position_rad=min(0.001 * cycle, 0.3))
                 if cycle % 10 == 9:
                     servo = replace(servo, **spoiled)

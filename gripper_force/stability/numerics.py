@@ -1,5 +1,6 @@
 """Numerical stability: hard cases of each part, each with a figure and the bound that it must keep."""
 
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -11,6 +12,7 @@ from gripper_force.config import Config
 from gripper_force.errors import ConfigError
 
 PARTS: Final = {
+    "loop": "gripper_force.stability.loop:cases",
     "filter": "gripper_force.stability.filter:cases",
 }
 """Parts of the suite, in the order of the page, and the `Part` of each."""
@@ -24,7 +26,7 @@ class Row:
         case: What was done.
         detail: How, and what it is measured against.
         figure: What was found. NaN breaks any bound.
-        bound: The most that the figure may be.
+        bound: The most that the figure may be; infinite where it only informs.
         unit: Of both.
         ok: Whether the figure keeps its bound.
     """
@@ -91,5 +93,5 @@ def markdown(rows: Sequence[Row]) -> str:
 
 
 def said(number: float, unit: str) -> str:
-    """A figure with its unit."""
-    return f"{number:.3g} {unit}".rstrip()
+    """A figure with its unit; a bound that is none is a dash."""
+    return "-" if number == math.inf else f"{number:.3g} {unit}".rstrip()

@@ -9,6 +9,7 @@ from gripper_force.config import Config, ControlConfig, GripperConfig
 from gripper_force.control import fusion
 from gripper_force.stability import filter as suite
 from gripper_force.stability.filter import Input, worst_n
+from gripper_force.stability.plant import transmission_of
 
 
 @pytest.fixture
@@ -52,7 +53,7 @@ def test_the_reference_takes_frames_in_and_turns_them_away(inputs: Iterator[Inpu
         (t_ns, push_n, visual and replace(visual, force_n=visual.force_n + 3 * (number % 2)))
         for number, (t_ns, push_n, visual) in enumerate(seen)
     ]
-    transmission = suite.Transmission.from_config(GripperConfig(), 1.78)
+    transmission = transmission_of(GripperConfig())
     ends = []
     for some in (seen, blind, wild):
         exact = suite._Exact(ControlConfig(), transmission)

@@ -1,0 +1,160 @@
+"""A gripper and an object as a few equations: fast enough to close the loop over it some thousand times.
+
+One jaw, driven by half of the motor: current loop, inertia, Coulomb and viscous friction and gear play, as in
+the simulated rig (docs/simulation.md), and an object that is a spring. The servo is an X-series
+one in mode 5.
+"""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import Final
+
+from gripper_force.config import GripperConfig
+from gripper_force.control.transmission import Transmission
+from gripper_force.types import NS_PER_MS, NS_PER_S, ServoCommand, ServoState, VisualForce
+
+_NM_PER_A: Final = 1.78
+CURRENT_STEP_A: Final = 0.00269
+"""Of an XM430-W350: https://emanual.robotis.com/docs/en/dxl/x/xm430-w350/"""
+
+CYCLE_NS: Final = 5 * NS_PER_MS
+_STALL_A: Final = 2.3
+_CURRENT_LOOP_S: Final = 0.002
+_TICK_RAD: Final = 2 * math.pi / 4096
+_NO_LOAD_RAD_S: Final = 4.8
+_VELOCITY_STEP_RAD_S: Final = 0.024
+_PWM_PER_TICK: Final = 800 / 128 / 885
+
+NOISE_A: Final = 0.003
+"""Of the measured current, in one reading."""
+
+
+def transmission_of(gripper: GripperConfig) -> Transmission:
+    """The gears as the configuration has them, with an XM430-W350 where it leaves the motor open."""
+    return Transmission.from_config(gripper, _NM_PER_A, gripper.current_step_a or CURRENT_STEP_A)
+
+
+@dataclass(slots=True)
+class Gripper:
+    """The truth: what one jaw and the object do.
+
+    Attributes:
+        transmission: What the controller takes the gears for.
+        stiffness_n_m: Of the object, at one jaw.
+        gain: True torque constant over the one that is taken for it.
+        friction_n: True Coulomb friction.
+        damping_n_s_m: True viscous friction.
+        play_m: Gear play either way.
+        step_a: True resolution of the goal current.
+        mass_kg: Of a jaw with its half of the rotor.
+        contact_m: Travel at which the jaw meets the object.
+        x_m: Travel of the motor, as that of a jaw.
+        v_m_s: Its speed.
+        jaw_m: Travel of the jaw itself.
+        current_a: Of the motor.
+        deepest_m: The most travel of the jaw so far.
+    """
+
+    transmission: Transmission
+    stiffness_n_m: float = 1000.0
+    gain: float = 1.0
+    friction_n: float = 0.95
+    damping_n_s_m: float = 14.5
+    play_m: float = 0.0003
+    step_a: float = CURRENT_STEP_A
+    mass_kg: float = 1.3
+    contact_m: float = 0.010
+    x_m: float = 0.0
+    v_m_s: float = 0.0
+    jaw_m: float = 0.0
+    current_a: float = 0.0
+    deepest_m: float = 0.0
+
+    @property
+    def force_n(self) -> float:
+        """What the object feels."""
+        return max(self.stiffness_n_m * (self.jaw_m - self.contact_m), 0.0)
+
+    @property
+    def peak_n(self) -> float:
+        """The most it has felt."""
+        return max(self.stiffness_n_m * (self.deepest_m - self.contact_m), 0.0)
+
+    def advance(self, command: ServoCommand, time_s: float) -> None:
+        """Lets the servo follow a command."""
+        stiffness_n_m, contact_m, play_m = self.stiffness_n_m, self.contact_m, self.play_m
+        damping_n_s_m, mass_kg, friction_n = self.damping_n_s_m, self.mass_kg, self.friction_n
+        n_per_a, radius_m = self.gain * self.transmission.n_per_a, self.transmission.pinion_radius_m
+        x_m, v_m_s, jaw_m, current_a = self.x_m, self.v_m_s, self.jaw_m, self.current_a
+        deepest_m = self.deepest_m
+        limit_a = command.goal_current_a
+        if self.step_a:
+            limit_a = round(limit_a / self.step_a) * self.step_a
+        goal_m = self.transmission.closing_m_s(command.goal_position_rad)
+        pwm_per_m = _PWM_PER_TICK / (_TICK_RAD * radius_m)
+        steps = math.ceil(time_s / self._step_s)
+        dt_s = time_s / steps
+        keep, brake_m_s = math.exp(-dt_s / _CURRENT_LOOP_S), friction_n / mass_kg * dt_s
+        for _ in range(steps):
+            pwm = min(max((goal_m - x_m) * pwm_per_m, -1.0), 1.0)
+            wanted_a = _STALL_A * (pwm - v_m_s / radius_m / _NO_LOAD_RAD_S)
+            wanted_a = min(max(wanted_a, -limit_a), limit_a)
+            current_a = wanted_a + (current_a - wanted_a) * keep
+            force_n = stiffness_n_m * (jaw_m - contact_m) if jaw_m > contact_m else 0.0
+            drive_n = n_per_a * current_a - damping_n_s_m * v_m_s - force_n
+            free_m_s = v_m_s + drive_n / mass_kg * dt_s
+            v_m_s = math.copysign(max(abs(free_m_s) - brake_m_s, 0.0), free_m_s)
+            x_m += v_m_s * dt_s
+            # The object pushes the jaw back onto the flank of the teeth that drives it.
+            jaw_m = max(x_m - play_m, min(jaw_m, contact_m, x_m + play_m))
+            deepest_m = max(deepest_m, jaw_m)
+        self.x_m, self.v_m_s, self.jaw_m, self.current_a = x_m, v_m_s, jaw_m, current_a
+        self.deepest_m = deepest_m
+
+    def read(self, t_ns: int, noise_a: float) -> ServoState:
+        """What the servo says of itself, on its own grids."""
+        radius_m = self.transmission.pinion_radius_m
+        measured_a = self.current_a + noise_a
+        return ServoState(
+            t_ns=t_ns,
+            position_rad=round(self.x_m / radius_m / _TICK_RAD) * _TICK_RAD,
+            velocity_rad_s=round(self.v_m_s / radius_m / _VELOCITY_STEP_RAD_S) * _VELOCITY_STEP_RAD_S,
+            current_a=round(measured_a / CURRENT_STEP_A) * CURRENT_STEP_A,
+            temperature_c=35.0,
+            voltage_v=12.0,
+            hardware_error=0,
+        )
+
+    @property
+    def _step_s(self) -> float:
+        """Short against the swing of jaw and object."""
+        return min(0.0005, 0.4 * math.sqrt(self.mass_kg / self.stiffness_n_m))
+
+
+class Eye:
+    """Vision: frames of the force, some time late, with white noise."""
+
+    def __init__(self, delay_s: float, noise_n: float, rate_hz: float = 60.0) -> None:
+        self._delay_ns = round(delay_s * NS_PER_S)
+        self._noise_n, self._period_ns = noise_n, NS_PER_S / rate_hz
+        self._under_way: deque[VisualForce] = deque()
+        self._seq = 0
+
+    def look(self, t_ns: int, force_n: float, noise: float) -> VisualForce | None:
+        """Takes a picture if one is due, and gives the newest estimate that is ready.
+
+        Args:
+            t_ns: Now.
+            force_n: What there is to see.
+            noise: A normal number.
+        """
+        if t_ns >= self._seq * self._period_ns:
+            self._seq += 1
+            seen_n = max(force_n + self._noise_n * noise, 0.0)
+            std_n = max(self._noise_n, 0.1)
+            self._under_way.append(VisualForce(t_ns, t_ns + self._delay_ns, self._seq, seen_n, std_n, 12.0))
+        newest = None
+        while self._under_way and self._under_way[0].ready_ns <= t_ns:
+            newest = self._under_way.popleft()
+        return newest
