@@ -16,7 +16,7 @@ from gripper_force.dataset import stiffness_floor_n, stiffness_of
 from gripper_force.errors import DataError
 from gripper_force.log import LogReader
 from gripper_force.replay import compare
-from gripper_force.session import run_grasp
+from gripper_force.session import checkpoint_of, run_grasp
 from gripper_force.types import (
     NS_PER_S,
     Event,
@@ -69,6 +69,7 @@ def trials(config: Config, count: int, jobs: int) -> Iterator[Summary]:
     Yields:
         The summary of each, in order, with its ``seed``.
     """
+    checkpoint_of(config)  # what `auto` measures is measured here and not in each process
     rng = np.random.default_rng([config.seed, 20])
     quiet = config.log.model_copy(update={"report": False})  # `replay LOG --report` draws any of them
     plan = [
