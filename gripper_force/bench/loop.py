@@ -37,7 +37,7 @@ _REQUEST_S: Final = 2.0
 _LATENCY_NS: Final = 10 * NS_PER_MS
 _RECORDING: Final = (
     *("object=stapler", "seed=7", "sim.detail=coarse", "target_n=4"),
-    *("vision.checkpoint=none", "control.feedback=current", "load_cell.backend=none"),
+    *("vision.checkpoint=none", "control.feedback=current", "load_cell.backend=none", "clock=lockstep"),
 )
 """What the camera shows."""
 
@@ -151,7 +151,7 @@ class _Camera:
     """Shows frames over and over, forth and back, at the configured rate."""
 
     def __init__(self, frames: list[Frame], rate_hz: float) -> None:
-        self._grays = [frame.gray for frame in (*frames, *reversed(frames))]
+        self._grays = [frame.gray for frame in (*frames, *reversed(frames[1:-1]))]
         self._period_ns = round(NS_PER_S / rate_hz)
         self._start_ns = self._shown = 0
 
@@ -187,7 +187,7 @@ def loop(seconds: float, overrides: list[str]) -> tuple[tuple[LoopCost, ...], Lo
     turns = max(1, round(seconds / _TURN_S))
     with TemporaryDirectory() as name, _virtual_servo() as port:
         folder = Path(name)
-        run_grasp(load_config(None, [*_RECORDING, *overrides, "clock=lockstep"]), folder / "seen.mcap")
+        run_grasp(load_config(None, [*overrides, *_RECORDING]), folder / "seen.mcap")
         frames = list(LogReader(folder / "seen.mcap").records(Frame))
         for turn in range(turns):
             for beside, seen in loops.items():

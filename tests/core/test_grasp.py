@@ -28,6 +28,17 @@ def test_a_summary_is_what_the_log_says(fused_log: Path) -> None:
     assert summary["samples_rejected"] == 0
 
 
+def test_a_summary_says_what_was_taken_for_auto(quick: list[str], tmp_path: Path) -> None:
+    overrides = [
+        "sim.detail=auto",
+        "budget.sim_error_n=0.05",
+        f"log.directory={tmp_path}",
+        "log.report=false",
+    ]
+    (taken,) = grasp_module.grasp(load_config(None, [*quick, *overrides]))["taken"]
+    assert taken.startswith("took sim.detail=medium")
+
+
 def test_what_was_not_measured_is_none(fused_log: Path, tmp_path: Path) -> None:
     reader = LogReader(fused_log)
     path = tmp_path / "run.mcap"

@@ -44,7 +44,8 @@ def test_the_shipped_table_knows_every_object(name: str) -> None:
         settled(load_config(None, [f"object={name}", "sim.detail=auto", f"budget.sim_error_n={error_n}"]))
         for error_n in (1e-6, 10)
     )
-    assert (strict[0].sim.detail, loose[0].sim.detail) == ("fine", "coarse")
+    assert strict[0].sim.detail == "fine"
+    assert loose[0].sim.detail in ("coarse", "medium")
 
 
 def test_a_level_that_is_named_stays() -> None:
