@@ -35,6 +35,6 @@ def test_what_the_loop_did_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
     assert {"log", "load", "cores"} < set(told)
 
 
-@pytest.mark.parametrize("arguments", [[], ["--loop", "--startup"]], ids=["nothing", "two things"])
-def test_bench_measures_one_thing_at_a_time(arguments: list[str]) -> None:
-    assert "one thing at a time" in str(CliRunner().invoke(cli.app, ["bench", *arguments]).exception)
+def test_bench_measures_one_thing_at_a_time() -> None:
+    done = CliRunner().invoke(cli.app, ["bench", "--loop", "--startup"])
+    assert "one thing at a time" in str(done.exception)
