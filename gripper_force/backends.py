@@ -53,6 +53,9 @@ PLANT_PRESS: Final = "gripper_calibration.fits.plant:Press"
 PLANT_FIT: Final = "gripper_calibration.fits.plant:fit_plant"
 """How calibration identifies the force loop's plant, for `gripper_force.stability.margin`."""
 
+SIMULATOR_CASES: Final = "gripper_hw.sim.steps:cases"
+"""Hard cases for the simulator's numbers, for `gripper_force.stability.numerics`."""
+
 BUS_COST: Final = "gripper_hw.dynamixel.cost:bus_cost"
 """What a servo bus cycle costs, for `gripper_force.bench.bus`."""
 

@@ -7,13 +7,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from gripper_force.backends import load
+from gripper_force.backends import SIMULATOR_CASES, load
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError
 
 PARTS: Final = {
     "loop": "gripper_force.stability.loop:cases",
     "filter": "gripper_force.stability.filter:cases",
+    "simulator": SIMULATOR_CASES,
 }
 """Parts of the suite, in the order of the page, and the `Part` of each."""
 
