@@ -280,7 +280,7 @@ def scene_table(r: dict[str, Any]) -> None:
 
 def loop_table(r: dict[str, Any]) -> None:
     """What a loop in real time did."""
-    columns = ("beside it", "cycles", "missed %", "late ms", "bus ms", "cycle ms", "estimate ms", "lost")
+    columns = ("beside", "cycles", "missed %", "late ms", "bus ms", "cycle ms", "estimate ms", "lost")
     table = Table(*columns, box=None)
     for c in r["loop"]:
         pairs = (
@@ -289,12 +289,12 @@ def loop_table(r: dict[str, Any]) -> None:
             (c.cycle_p50_ms, c.cycle_p99_ms),
             (c.estimator_p50_ms, c.estimator_p99_ms),
         )
-        figures = (" / ".join(_number(ms, digits=2) for ms in pair) for pair in pairs)
+        figures = ("/".join(_number(ms, digits=2) for ms in pair) for pair in pairs)
         missed = _number(100 * c.missed / c.cycles)
         table.add_row(c.beside, str(c.cycles), missed, *figures, str(c.lost_records))
     out.print(table)
     out.print(
-        "[dim]p50 / p99 (/ the latest); a servo behind a pseudo-terminal, a recorded camera, no physics[/]"
+        "[dim]p50/p99(/worst); a servo behind a pseudo-terminal, a recorded camera, no physics[/]"
     )
     log = r["log"]
     _pairs(
