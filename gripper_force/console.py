@@ -280,21 +280,23 @@ def scene_table(r: dict[str, Any]) -> None:
 
 def loop_table(r: dict[str, Any]) -> None:
     """What a loop in real time did."""
-    columns = ("beside", "cycles", "missed %", "late ms", "bus ms", "cycle ms", "estimate ms", "lost")
-    table = Table(*columns, box=None)
+    table = Table("beside", "missed %", "late", "worst", "bus", "cycle", "estimate", "lost", box=None)
     for c in r["loop"]:
-        pairs = (
-            (c.late_p50_ms, c.late_p99_ms, c.late_max_ms),
-            (c.bus_p50_ms, c.bus_p99_ms),
-            (c.cycle_p50_ms, c.cycle_p99_ms),
-            (c.estimator_p50_ms, c.estimator_p99_ms),
+        late, bus, cycle, estimate = (
+            "/".join(_number(ms, digits=2) for ms in pair)
+            for pair in (
+                (c.late_p50_ms, c.late_p99_ms),
+                (c.bus_p50_ms, c.bus_p99_ms),
+                (c.cycle_p50_ms, c.cycle_p99_ms),
+                (c.estimator_p50_ms, c.estimator_p99_ms),
+            )
         )
-        figures = ("/".join(_number(ms, digits=2) for ms in pair) for pair in pairs)
-        missed = _number(100 * c.missed / c.cycles)
-        table.add_row(c.beside, str(c.cycles), missed, *figures, str(c.lost_records))
+        missed, worst = _number(100 * c.missed / c.cycles), _number(c.late_max_ms, digits=2)
+        table.add_row(c.beside, missed, late, worst, bus, cycle, estimate, str(c.lost_records))
     out.print(table)
     out.print(
-        "[dim]p50/p99(/worst); a servo behind a pseudo-terminal, a recorded camera, no physics[/]"
+        f"[dim]p50/p99 in ms of {r['loop'][0].cycles} cycles; a servo behind a pseudo-terminal, a recorded "
+        "camera, no physics[/]"
     )
     log = r["log"]
     _pairs(
