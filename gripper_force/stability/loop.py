@@ -16,6 +16,8 @@ from gripper_force.config import Config, ControlConfig
 from gripper_force.control.force_loop import tolerance_n
 from gripper_force.control.grasp import GraspController
 from gripper_force.stability.margin import (
+    FRAME_S,
+    SWING_N,
     Identified,
     by_identified_plant,
     by_rule,
@@ -68,6 +70,7 @@ class Grid:
         factors: Of the loop gain, a map each.
         margin_stiffness_n_m: Of the map of margins.
         margin_delay_s: Likewise.
+        tuned_delay_s: Delays for which vision alone is tuned anew.
         sweep: Values that are all combined: ``delay_s``, and attributes of `Gripper`; friction as a share of
             what is taken for it.
     """
@@ -77,6 +80,7 @@ class Grid:
     factors: Sequence[float]
     margin_stiffness_n_m: Sequence[float]
     margin_delay_s: Sequence[float]
+    tuned_delay_s: Sequence[float]
     sweep: dict[str, Sequence[float]]
 
 
@@ -86,6 +90,7 @@ FULL: Final = Grid(
     factors=(1.0, 2.0, 4.0),
     margin_stiffness_n_m=(1e2, 3e2, 1e3, 3e3, 1e4, 3e4, 1e5, 3e5, 1e6),
     margin_delay_s=(0.0, 0.01, 0.02, 0.035, 0.05, 0.075, 0.1, 0.15),
+    tuned_delay_s=(0.02, 0.035, 0.075),
     sweep={
         "stiffness_n_m": (1e2, 1e3, 1e4, 1e5, 1e6),
         "delay_s": (0.035, 0.1),
@@ -231,6 +236,7 @@ def cases(config: Config, maps: Path | None, grid: Grid = FULL) -> Iterator[Row]
     plants = {k: identify(config, replace(truth, stiffness_n_m=k)) for k in grid.margin_stiffness_n_m}
     margins = _margins(config, truth, grid, plants)
     yield from _margin_rows(grid, margins)
+    yield _tuned_row(config, truth, grid, plants)
     if maps is not None:
         from gripper_force.stability.maps import draw_margins, draw_verdicts
 
@@ -256,7 +262,7 @@ def _map_row(config: Config, truth: Gripper, feedback: str, factor: float, trial
     bad = sum(trial.verdict not in (Verdict.HOLDS, Verdict.CURRENT) for trial in soft.values())
     return Row(
         f"{_LOOPS[feedback]}, loop gain x {factor:g}",
-        f"{_counted(trials.values())}; of those that the touch alone does not crush, share that is not held",
+        f"{_counted(trials.values())}; share that is not held of those that the touch alone does not crush",
         100 * bad / len(soft),
         0.0 if (feedback, factor) == ("fused", 1.0) else math.inf,
         "%",
@@ -278,7 +284,7 @@ def _sweep_rows(grid: Grid, swept: dict[tuple[float, ...], Trial]) -> Iterator[R
         for value in values:
             trials = [trial for key, trial in swept.items() if key[number] == value]
             yield Row(
-                f"fused, {_NAMES[name].format(value)}",
+                f"{_LOOPS['fused']}, {_NAMES[name].format(value)}",
                 f"with all else that is combined: {_counted(trials)}; share that rings",
                 100 * sum(trial.verdict == Verdict.RINGS for trial in trials) / len(trials),
                 math.inf,
@@ -324,7 +330,7 @@ def _margin_rows(grid: Grid, margins: Margins) -> Iterator[Row]:
             )
     short = 1 - margins.fused / margins.rule
     yield Row(
-        "margin of the fused loop",
+        f"margin of {_LOOPS['fused']}",
         f"least {margins.fused.min():.1f}, median {np.median(margins.fused):.1f}; most that it falls short "
         "of what its tuning promises",
         100 * max(float(short.max()), 0.0),
@@ -333,9 +339,31 @@ def _margin_rows(grid: Grid, margins: Margins) -> Iterator[Row]:
     )
 
 
+def _tuned_row(config: Config, truth: Gripper, grid: Grid, plants: dict[float, Identified]) -> Row:
+    """Vision alone with the gains that an object profile gives it."""
+    found, promised = [], []
+    for (stiffness, plant), delay_s in product(plants.items(), grid.tuned_delay_s):
+        known = {
+            "plant_gain": plant.gain,
+            "plant_lag_ms": 1e3 * plant.lag_s,
+            "plant_delay_ms": 1e3 * (delay_s + FRAME_S / 2),
+        }
+        tuned = config.model_copy(update={"control": config.control.model_copy(update=known)})
+        found.append(observed(tuned, replace(truth, stiffness_n_m=stiffness), "vision", delay_s))
+        promised.append(by_identified_plant(gains_of(tuned, "vision"), plant, delay_s))
+    return Row(
+        "margin of vision alone, tuned by what was identified",
+        f"observed {min(found):.2f} to {max(found):.2f}, predicted by gain and lag alone "
+        f"{min(promised):.2f} to {max(promised):.2f}; of {len(found)} cells those where a swing of "
+        f"{SWING_N:g} N grows",
+        float(sum(margin < 1 for margin in found)),
+        math.inf,
+    )
+
+
 def _counted(trials: Iterable[Trial]) -> str:
     counts = Counter(trial.verdict for trial in trials)
-    return ", ".join(f"{counts[verdict]} {verdict}" for verdict in Verdict if counts[verdict])
+    return ", ".join(f"{verdict} {counts[verdict]}" for verdict in Verdict if counts[verdict])
 
 
 _LOOPS: Final = {"fused": "current and vision", "vision": "vision alone"}

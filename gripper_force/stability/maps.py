@@ -19,6 +19,7 @@ _COLOURS: Final = {
     Verdict.RINGS: "#e8a33d",
     Verdict.CRUSHES: "#c1443c",
 }
+_INK: Final = "#222222"
 _TITLES: Final = {"fused": "current and vision", "vision": "vision alone"}
 
 
@@ -28,7 +29,7 @@ def draw_verdicts(
     """What became of each grasp, by loop and loop gain, with the borders that were predicted."""
     delay_ms = 1e3 * np.array(grid.delay_s)
     loops = list(dict.fromkeys(feedback for feedback, _ in verdicts))
-    with rc_context({**STYLE, "axes.grid": False}):
+    with rc_context({**STYLE, "axes.grid": False, "hatch.linewidth": 0.5, "hatch.color": _INK}):
         figure = Figure(figsize=(10, 2.9 * len(loops) + 0.6), layout="constrained")
         axes = figure.subplots(len(loops), len(grid.factors), sharex=True, sharey=True, squeeze=False)
         for (feedback, factor), trials in verdicts.items():
@@ -46,8 +47,8 @@ def draw_verdicts(
                 shading="nearest",
             )
             predicted = margins.inertia if feedback == "vision" else margins.rule
-            _border(panel, grid, predicted, factor)
-            panel.axvline(crushing_n_m, color="#222222", ls=":", lw=1.2)
+            _hatch(panel, grid, predicted, factor)
+            panel.axvline(crushing_n_m, color=_INK, ls=":", lw=1.2)
             panel.set_xscale("log")
             panel.set_title(f"{_TITLES[feedback]}, loop gain × {factor:g}")
         for panel in axes[-1]:
@@ -55,16 +56,18 @@ def draw_verdicts(
         for panel in axes[:, 0]:
             panel.set_ylabel("delay of vision, ms")
         patches = [Patch(color=colour, label=verdict.value) for verdict, colour in _COLOURS.items()]
+        patches.append(Patch(fill=False, hatch="///", lw=0, label="predicted to ring"))
         figure.legend(handles=patches, loc="outside lower center", ncols=len(patches))
     return figure
 
 
-def _border(panel: Axes, grid: Grid, predicted: Field, factor: float) -> None:
-    if min(predicted.shape) > 1 and predicted.min() < factor < predicted.max():
-        delay_ms = 1e3 * np.array(grid.margin_delay_s)
-        panel.contour(
-            grid.margin_stiffness_n_m, delay_ms, predicted, [factor], colors="#222222", linewidths=1.5
-        )
+def _hatch(panel: Axes, grid: Grid, predicted: Field, factor: float) -> None:
+    """Where less than so many times the gain is predicted to ring."""
+    if min(predicted.shape) > 1 and predicted.min() < factor:
+        where = (grid.margin_stiffness_n_m, 1e3 * np.array(grid.margin_delay_s))
+        panel.contourf(*where, predicted, [0.0, factor], hatches=["///"], colors="none")
+        if factor < predicted.max():
+            panel.contour(*where, predicted, [factor], colors=_INK, linewidths=1.2)
 
 
 def draw_margins(grid: Grid, margins: Margins) -> Figure:

@@ -16,6 +16,7 @@ SMALL = Grid(
     factors=(1.0,),
     margin_stiffness_n_m=(3e3, 3e4),
     margin_delay_s=(0.01, 0.075),
+    tuned_delay_s=(0.075,),
     sweep={
         "stiffness_n_m": (1e3,),
         "delay_s": (0.035,),
