@@ -12,6 +12,7 @@ from gripper_force.config import Config
 from gripper_force.errors import ConfigError
 
 PARTS: Final = {
+    "network": "gripper_force.stability.network:cases",
     "loop": "gripper_force.stability.loop:cases",
     "filter": "gripper_force.stability.filter:cases",
     "simulator": SIMULATOR_CASES,
