@@ -53,6 +53,9 @@ PLANT_PRESS: Final = "gripper_calibration.fits.plant:Press"
 PLANT_FIT: Final = "gripper_calibration.fits.plant:fit_plant"
 """How calibration identifies the force loop's plant, for `gripper_force.stability.margin`."""
 
+HEAD_CASES: Final = "gripper_calibration.fits.conditioning:cases"
+"""Ill-conditioned fits of the last layer, for `gripper_force.stability.network`."""
+
 SIMULATOR_CASES: Final = "gripper_hw.sim.steps:cases"
 """Hard cases for the simulator's numbers, for `gripper_force.stability.numerics`."""
 

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from gripper_force.backends import HEAD_CASES, load
 from gripper_force.config import Config, load_config
 from gripper_force.control import fusion
 from gripper_force.dataset import Clip, load_clip
@@ -81,6 +82,7 @@ def cases(
         yield from _frames(twin, grasp, config)
         yield _range(folder, grasp, config)
         yield from _streams(folder, twin, ways, press, streamed, long)
+        yield from load(HEAD_CASES)()
 
 
 # What goes in.
