@@ -46,6 +46,7 @@ _EYE_NOISE_N: Final = 0.1
 _OVER: Final = 0.05
 _LOST: Final = 0.1
 _AGREE: Final = 0.2
+_DPI: Final = 110
 _FROM_S: Final = 0.035
 _CYCLE_S: Final = CYCLE_NS / NS_PER_S
 
@@ -54,7 +55,7 @@ class Verdict(StrEnum):
     """How a grasp ended. The worse comes later."""
 
     HOLDS = "holds"
-    CURRENT = "holds, on motor current alone"
+    CURRENT = "holds on current alone"
     LOSES = "does not hold"
     RINGS = "rings"
     CRUSHES = "would crush"
@@ -242,8 +243,8 @@ def cases(config: Config, maps: Path | None, grid: Grid = FULL) -> Iterator[Row]
 
         maps.mkdir(parents=True, exist_ok=True)
         crushing = crushing_n_m(config.control, truth)
-        draw_verdicts(grid, verdicts, margins, crushing).savefig(maps / "loop-verdicts.png")
-        draw_margins(grid, margins).savefig(maps / "loop-margins.png")
+        draw_verdicts(grid, verdicts, margins, crushing).savefig(maps / "loop-verdicts.png", dpi=_DPI)
+        draw_margins(grid, margins).savefig(maps / "loop-margins.png", dpi=_DPI)
 
 
 def _try_all(config: Config, truth: Gripper, grid: Grid, feedback: str, factor: float) -> Trials:
@@ -285,7 +286,7 @@ def _sweep_rows(grid: Grid, swept: dict[tuple[float, ...], Trial]) -> Iterator[R
             trials = [trial for key, trial in swept.items() if key[number] == value]
             yield Row(
                 f"{_LOOPS['fused']}, {_NAMES[name].format(value)}",
-                f"with all else that is combined: {_counted(trials)}; share that rings",
+                f"{_counted(trials)}; share that rings, all else combined",
                 100 * sum(trial.verdict == Verdict.RINGS for trial in trials) / len(trials),
                 math.inf,
                 "%",
