@@ -23,6 +23,7 @@ from gripper_force.faults import Faults, FaultyEstimator, FaultyFile
 from gripper_force.interfaces import Devices
 from gripper_force.log import LogWriter
 from gripper_force.perception import Estimator, LockstepPerception, Perception, ThreadedPerception
+from gripper_force.priority import real_time_priority
 from gripper_force.profiles import check_target, correction_of, rig_mismatches, with_plant
 from gripper_force.recorder import Recorder
 from gripper_force.types import (
@@ -250,6 +251,8 @@ def open_session(
             # Python's default lets a thread that computes keep the control thread waiting for 5 ms.
             stack.callback(sys.setswitchinterval, sys.getswitchinterval())
             sys.setswitchinterval(_REALTIME_SWITCH_S)
+            if refusal := stack.enter_context(real_time_priority()):
+                recorder.write(Event(devices.start_ns, "session", refusal))
         stack.callback(_attach_reference, session, estimator)
         stack.enter_context(_signals_wait(session))
         stack.callback(session.close)

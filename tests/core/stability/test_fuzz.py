@@ -121,7 +121,7 @@ def test_an_input_that_is_none_is_named(planted: Path) -> None:
             fuzz(1, 0, 1, planted, only=only)
 
 
-@pytest.mark.parametrize("options", [[], ["--fuzz", "1", "--soak", "1"]])
+@pytest.mark.parametrize("options", [["--part", "loop", "--fuzz", "1"], ["--fuzz", "1", "--soak", "1"]])
 def test_stability_does_one_thing_at_a_time(options: list[str]) -> None:
     done = CliRunner().invoke(cli.app, ["stability", *options])
     assert isinstance(done.exception, ConfigError)

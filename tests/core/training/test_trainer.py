@@ -23,7 +23,8 @@ def gradients(
     """The training's loss on windows that are whole, and its gradients."""
     network.zero_grad()
     loss = (
-        squared_error(network, inputs, forces_n, valid, network.context) / valid[:, network.context :].sum()
+        squared_error(network, inputs, forces_n, valid, network.config.context)
+        / valid[:, network.config.context :].sum()
     )
     loss.backward()  # type: ignore[no-untyped-call]
     return loss.item(), [p.grad.clone() for p in network.parameters() if p.grad is not None]
@@ -47,7 +48,7 @@ def test_shared_windows_give_the_loss_and_gradients_of_separate_ones(
     for name, tensor in network.state_dict().items():
         if name.endswith("running_var"):
             tensor.uniform_(0.01, 1)
-    window = network.context + 1
+    window = network.config.context + 1
     inputs = torch.randn(2, window + 4, 1, 32, 32, dtype=torch.float64)
     forces_n, valid = torch.rand(2, window + 4, dtype=torch.float64), torch.rand(2, window + 4) < 0.7
 
