@@ -13,7 +13,8 @@ PRIORITY: Final = 10
 def real_time_priority() -> Iterator[str]:
     """Lets this thread run as soon as it wakes, before any that computes; threads that it starts do not.
 
-    Without it, a thread that wakes on a core that computes an estimate may wait for 3 ms (Linux 6.18). See sched(7), https://man7.org/linux/man-pages/man7/sched.7.html.
+    Without it, a thread that wakes on a core that computes an estimate may wait for 3 ms (Linux 6.18).
+    See sched(7), https://man7.org/linux/man-pages/man7/sched.7.html.
 
     Yields:
         Why that was not allowed, and what to do; an empty text where it was.
