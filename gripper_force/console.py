@@ -326,7 +326,8 @@ def bus_table(r: dict[str, Any]) -> None:
 
 def estimator_table(r: dict[str, Any]) -> None:
     """Speed against error of the visual estimate."""
-    table = Table("network", "px", "way", "p50 ms", "p99 ms", "/ roof", "MAE N", "worst", "MB", "", box=None)
+    columns = ("p50 ms", "p99 ms", "/roof", "MAE N", "worst", "MB", "")
+    table = Table("network", "px", Column("way", no_wrap=True), *columns, box=None)
     short = {"float32": "f32", "bfloat16": "bf16"}
     for e in r["estimator"]:
         share = None if e.least_ms is None else e.p50_ms / e.least_ms
@@ -339,7 +340,7 @@ def estimator_table(r: dict[str, Any]) -> None:
             _number(e.mae_n),
             _number(e.worst_n, digits=2),
             _number(e.memory_mb, digits=0),
-            "front" if e.front else "",
+            "*" if e.front else "",
         )
     out.print(table)
     for checkpoint, told in r["ratios"].items():
@@ -349,6 +350,7 @@ def estimator_table(r: dict[str, Any]) -> None:
                 "faster than the window in PyTorch": f"{told['times_faster_than_window']:.0f} times",
             }
         )
+    _pairs({"*": "no other way is faster and more exact"})
     _pairs({"plot": str(r["plot"]), "kept in": str(r["file"])})
     out.print(f"[dim]load {r['load']:.1f} on {r['cores']} cores[/]")
 

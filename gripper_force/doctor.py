@@ -16,6 +16,7 @@ from gripper_force.backends import PROBES, MonotonicClock
 from gripper_force.config import Config
 from gripper_force.errors import GripperError
 from gripper_force.interfaces import Devices
+from gripper_force.priority import real_time_priority
 from gripper_force.types import NS_PER_MS, NS_PER_S
 
 _FIRST_NS: Final = 5 * NS_PER_S
@@ -177,6 +178,11 @@ def _network(config: Config) -> Iterator[Check]:
 
 def _clock(config: Config) -> Iterator[Check]:
     yield Check("clock", "resolution", f"{time.get_clock_info('monotonic').resolution * 1e9:.0f} ns", True)
+    lockstep = config.clock == "lockstep"
+    with real_time_priority() as refusal:
+        advice = refusal.rpartition("; ")[2]
+        found = "refused" if refusal else "granted"
+        yield judged("clock", "priority", found, not refusal, advice, harmless=True)
     clock, late_ns = MonotonicClock(), []
     for _ in range(200):
         due_ns = clock.now_ns() + _SLEEP_MS * NS_PER_MS
@@ -186,5 +192,4 @@ def _clock(config: Config) -> Iterator[Check]:
     found = f"median {median_ms:.2f} ms, p99 {p99_ms:.2f} ms of 200 sleeps of {_SLEEP_MS} ms"
     cycle_ms = 1e3 / config.control.rate_hz
     advice = f"more than a cycle at control.rate_hz={config.control.rate_hz:g}: close what computes"
-    lockstep = config.clock == "lockstep"
     yield judged("clock", "wakes late by", found, p99_ms <= cycle_ms, advice, harmless=lockstep)

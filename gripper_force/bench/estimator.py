@@ -313,7 +313,9 @@ def draw(path: Path, rows: Sequence[EstimatorCost]) -> None:
         for name, marker in markers.items():
             axes.plot([], [], marker, color="0.4", label=Path(name).stem)
         axes.set_xscale("log")
-        axes.set_ylim(bottom=0)
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter("{x:g}")
         axes.set_xlabel("median time of a frame, ms (filled: more than one thread)")
         axes.set_ylabel("mean absolute error, N")
         axes.legend(loc="lower left", bbox_to_anchor=(1.0, 0.0), fontsize=8)

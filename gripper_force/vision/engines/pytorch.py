@@ -44,6 +44,7 @@ class CompiledEngine(TorchEngine):
         super().__init__(model, precision, threads)
         with warnings.catch_warnings():  # of PyTorch about its own parts, at the first step
             warnings.simplefilter("ignore", DeprecationWarning)
+            torch.compiler.reset()  # it compiles anew for so many networks, and then gives up in silence
             self._forward = torch.compile(self._step)
             self._blank()
             self._run(np.zeros((self.header.preprocess.size,) * 2, np.float32))
