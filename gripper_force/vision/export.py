@@ -18,8 +18,7 @@ from gripper_force.types import Gray
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.engines import Engine, Floats, open_engine
 from gripper_force.vision.engines.pytorch import TorchEngine
-from gripper_force.vision.exported import KEY, described
-from gripper_force.vision.header import EXPORTED, Model
+from gripper_force.vision.header import EXPORTED, KEY, Model, described
 from gripper_force.vision.preprocess import Normaliser
 from gripper_force.vision.step import FRAME, EnsembleStep, state_names
 
@@ -87,7 +86,7 @@ def _onnx(model: Model, path: Path, _frames: Sequence[Gray] | None) -> None:
         output_names=step.outputs,
     )
     assert program is not None
-    for name, text in described(model.header, model.digest).items():
+    for name, text in described(model).items():
         program.model.metadata_props[f"{KEY}.{name}"] = text
     program.save(str(path))
 
@@ -107,7 +106,7 @@ def _openvino(model: Model, path: Path, frames: Sequence[Gray] | None) -> None:
         port.get_tensor().set_names({name})
     if frames is not None:
         network = _quantised(network, model, frames)
-    for name, text in described(model.header, model.digest).items():
+    for name, text in described(model).items():
         network.set_rt_info(text, [KEY, name])
     openvino.save_model(network, path, compress_to_fp16=False)
 

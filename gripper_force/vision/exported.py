@@ -6,21 +6,17 @@ An ONNX file carries the header in its metadata, an OpenVINO file in its ``rt_in
 import os
 import xml.etree.ElementTree as ET
 from pathlib import Path
-from typing import Final
 
 from gripper_force.errors import CheckpointError, ConfigError
 from gripper_force.vision.header import (
     EXPORTED,
+    KEY,
     SHIPPED,
-    Header,
     Model,
     digest_of,
     header_from,
     read_checkpoint,
 )
-
-KEY: Final = "gripper_force"
-"""Where an exported file's description is: its ``header``, and the checkpoint's ``digest``."""
 
 
 def read_model(source: str | Path) -> Model:
@@ -72,11 +68,6 @@ def cache_folder() -> Path:
     """What can be made again (https://specifications.freedesktop.org/basedir-spec/latest/)."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(base) / "gripper-force"
-
-
-def described(header: Header, digest: str) -> dict[str, str]:
-    """What an exported file says about itself."""
-    return {"header": header.model_dump_json(), "digest": digest}
 
 
 def _of_openvino(path: Path) -> dict[str, str]:

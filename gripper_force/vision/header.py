@@ -84,6 +84,9 @@ class NetworkConfig(Section):
 EXPORTED: Final = {".xml": "openvino", ".onnx": "onnxruntime"}
 """What a checkpoint can be exported to, by ending, and the engine that runs it."""
 
+KEY: Final = "gripper_force"
+"""Where an exported file's description is: its ``header``, and the checkpoint's ``digest``."""
+
 FORMAT: Final = "gripper-force-network/1"
 """Key of the header in the file's metadata: the only one, as safetensors keeps no order of keys."""
 
@@ -175,6 +178,11 @@ def header_from(text: str, path: Path) -> Header:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
         raise CheckpointError(f"the header of {path} is wrong at {key!r}: {first['msg']}") from error
+
+
+def described(model: Model) -> dict[str, str]:
+    """What an exported file says about itself."""
+    return {"header": model.header.model_dump_json(), "digest": model.digest}
 
 
 def digest_of(data: bytes) -> str:
