@@ -42,8 +42,8 @@ def export(model: Model, path: Path, frames: Sequence[Gray] | None = None) -> di
         model: The checkpoint.
         path: The file to write; an OpenVINO file's weights go beside it, into ``.bin``.
         frames: Recordings, (T, S, S) uint8 each, to scale the convolutions' int8 on; None: float32. What is
-            no convolution, a twentieth of the arithmetic, stays in floating point: the recurrence in int8
-            alone costs more than a newton.
+            no convolution, a tenth of the arithmetic or less, stays in floating point: all of the network in
+            int8 was off by more than a newton.
 
     Returns:
         ``largest_n`` and ``mean_n``: how far it is off PyTorch on frames, of the recordings or of noise.

@@ -37,7 +37,7 @@ class TorchEngine(Engine):
 
 
 class CompiledEngine(TorchEngine):
-    """Runs what `torch.compile` makes of them, which takes half a minute, and a C++ compiler."""
+    """Runs what `torch.compile` makes of them, which takes some seconds, and a C++ compiler."""
 
     def __init__(self, model: Model | Checkpoint, precision: Precision = "float32", threads: int = 1) -> None:
         """As `TorchEngine`."""
