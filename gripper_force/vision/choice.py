@@ -166,7 +166,7 @@ def remember(measured: dict[str, Way]) -> None:
 
 
 def installed() -> list[str]:
-    """Engines that ``auto`` may take: what is there, but for the compiled one: it starts slowly and gains nothing."""
+    """Engines that ``auto`` may take: what is there, but for the compiled one, which gains nothing."""
     return [e for e, package in ENGINE_PACKAGES.items() if e != "compiled" and _version(package)]
 
 
