@@ -53,6 +53,11 @@ class Clip:
     set: str
     stiffness: float = float("nan")
 
+    @property
+    def nominal_n(self) -> npt.NDArray[np.float32]:
+        """Forces, (T,), had the object exactly its kind's stiffness; as measured where that is not known."""
+        return self.forces_n if math.isnan(self.stiffness) else self.forces_n / np.float32(self.stiffness)
+
 
 def load_clips(
     source: Path | Sequence[Path],

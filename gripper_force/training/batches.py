@@ -22,7 +22,9 @@ class Batches:
             if len(clip.frames) < config.preprocess.reference_frames:
                 raise DataError(f"{clip.name} has {len(clip.frames)} frames, too few for its own reference")
         lengths = [len(clip.frames) for clip in clips]
-        forces_n = np.concatenate([clip.forces_n for clip in clips])
+        forces_n = np.concatenate(
+            [clip.nominal_n if config.labels == "nominal" else clip.forces_n for clip in clips]
+        )
         valid = np.concatenate([clip.valid for clip in clips])
         self._config = config
         self._device = ranks.device

@@ -67,6 +67,8 @@ class TrainConfig(Section):
         warmup: Share of the training in which the learning rate of ``one_cycle`` rises.
         weight_decay: Of AdamW; without any it is Adam.
         gradient_limit: Norm to which a larger gradient is cut; None for none.
+        labels: ``measured``: the load cell's. ``nominal``: what it would have read, had a simulated object
+            exactly its kind's stiffness: a look tells no more, so the rest is noise to be learnt by heart.
         contact_share: Share of clips that end in contact.
         force_share: Share of clips whose last frame is drawn evenly over force, as high forces are rare.
         shift_px: Largest shift of a clip.
@@ -100,6 +102,7 @@ class TrainConfig(Section):
     warmup: Annotated[float, Field(gt=0, lt=1)] = 0.25
     weight_decay: NonNegative = 0.01
     gradient_limit: Positive | None = 1.0
+    labels: Literal["measured", "nominal"] = "measured"
     contact_share: Share = 0.3
     force_share: Share = 0.2
     shift_px: Annotated[int, Field(ge=0)] = 2

@@ -74,7 +74,7 @@ class StreamState(NamedTuple):
     """What a stream remembers between frames.
 
     Attributes:
-        maps: Feature maps of the last n frames, (B, n, C, H, W).
+        maps: Feature maps of the last n frames side by side, oldest first, (B, n*C, H, W).
         hidden: LSTM of the windows that have begun, (B, window, hidden); see `LastStepBlstm.advance`.
         cell: Likewise.
     """
@@ -136,8 +136,11 @@ class ForceNetwork(nn.Module):
         batch, length = clips.shape[:2]
         flat = self.backbone(clips.flatten(0, 1))  # (B*T, C, H, W)
         maps = flat.view(batch, length, *flat.shape[1:])
-        earlier = maps[:, :1].expand(-1, self.config.maps_kept, -1, -1, -1)
-        pooled, _ = self._attend(torch.cat([earlier, maps], dim=1))  # (B, T, C)
+        stack = flat
+        if n := self.config.maps_kept:
+            begun = torch.cat([maps[:, :1].expand(-1, n, -1, -1, -1), maps], dim=1)  # (B, n + T, C, H, W)
+            stack = torch.cat([begun[:, k : k + length] for k in range(n + 1)], dim=2).flatten(0, 1)
+        pooled = self._pool(stack, flat)[0].view(batch, length, -1)
         window = self.config.window
         padded = torch.cat([pooled[:, :1].expand(-1, window - 1, -1), pooled], dim=1)
         windows = padded.unfold(1, window, 1)[:, start:].transpose(2, 3)  # (B, T - start, window, C)
@@ -163,33 +166,35 @@ class ForceNetwork(nn.Module):
             state = self.blank(len(frame))
             for _ in range(self.config.context):
                 _, state = self.step(frame, state)
-        maps = self.backbone(frame)[:, None]
-        if self.config.maps_kept:  # exported, a tensor of size zero would be refused
-            maps = torch.cat([state.maps, maps], dim=1)  # (B, n + 1, C, H, W)
-        pooled, gates = self._attend(maps)  # (B, 1, C)
-        read, hidden, cell = self.blstm.advance(pooled[:, 0], state.hidden, state.cell)
+        return self.advance(self.backbone(frame), state)
+
+    def advance(self, newest: Tensor, state: StreamState) -> tuple[Output, StreamState]:
+        """What `step` does after the backbone, with its map (B, C, H, W)."""
+        stack, kept = newest, state.maps
+        if n := self.config.maps_kept:
+            stack = torch.cat([state.maps, newest], dim=1)  # (B, (n+1)*C, H, W)
+            # A map is not cut out of the stack without need: that takes engines as long as a layer.
+            kept = newest if n == 1 else stack[:, newest.shape[1] :]
+        pooled, gates = self._pool(stack, newest)
+        read, hidden, cell = self.blstm.advance(pooled, state.hidden, state.cell)
         features = torch.tanh(self.dense(read))
-        return Output(self.force_n(features), features, gates), StreamState(maps[:, 1:], hidden, cell)
+        return Output(self.force_n(features), features, gates), StreamState(kept, hidden, cell)
 
     def blank(self, batch: int = 1) -> StreamState:
         """A state that remembers nothing: what a stream forgets after as many frames as `context` says."""
         config = self.config
         side = config.size // STRIDES[config.backbone]
         like = self.out.weight
-        maps = like.new_zeros(batch, config.maps_kept, self.backbone.out_channels, side, side)
+        maps = like.new_zeros(batch, config.maps_kept * self.backbone.out_channels, side, side)
         hidden = like.new_zeros(batch, config.window, config.hidden)
         return StreamState(maps, hidden, torch.zeros_like(hidden))
 
-    def _attend(self, maps: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Excites and pools the maps (B, n + T, C, H, W) that have n before them: (B, T, C), and gates."""
-        n = self.config.maps_kept
-        length = maps.shape[1] - n
-        newest = maps[:, n:].flatten(0, 1)  # (B*T, C, H, W)
+    def _pool(self, stack: Tensor, newest: Tensor) -> tuple[Tensor, Tensor | None]:
+        """Excites the maps (N, C, H, W), seen with those before (N, (n+1)*C, H, W), and averages: (N, C)."""
         gates = None
         if self.attention is not None:
-            shifted = [maps[:, k : k + length] for k in range(n + 1)]
-            newest, gates = self.attention(torch.cat(shifted, dim=2).flatten(0, 1), newest)
-        return newest.mean((2, 3)).view(maps.shape[0], length, -1), gates
+            newest, gates = self.attention(stack, newest)
+        return newest.mean((2, 3)), gates
 
     def _read(self, windows: Tensor) -> Tensor:
         """Maps windows of pooled vectors (N, window, C) to features, (N, head)."""

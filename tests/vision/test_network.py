@@ -166,7 +166,7 @@ def test_attention_to_the_newest_map_alone_keeps_no_maps() -> None:
         assert network.step(frame, None)[1].maps.shape[1] == 0
     network = build(TINY.model_copy(update={"attention": "ssam", "earlier_frames": 2}))
     assert network.config.context == 6
-    assert network.step(frame, None)[1].maps.shape[1] == 2
+    assert network.step(frame, None)[1].maps.shape[1] == 2 * network.backbone.out_channels
 
 
 @pytest.mark.parametrize(

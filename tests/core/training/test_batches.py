@@ -1,3 +1,6 @@
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -32,6 +35,18 @@ def test_frames_without_label_carry_no_loss(clips: list[Clip], small_recipe: Tra
     assert valid[:, -1].all()
     assert not valid.all()
     assert (forces_n[valid] < 10).all()
+
+
+def test_nominal_labels_are_those_of_the_kinds_own_stiffness(
+    clips: list[Clip], small_recipe: TrainConfig
+) -> None:
+    known = [replace(clip, stiffness=0.5 if i else math.nan) for i, clip in enumerate(clips)]
+    nominal = small_recipe.model_copy(update={"labels": "nominal"})
+    _, measured_n, _ = Batches(known, small_recipe, Ranks("cpu")).batch(0, 60, 22)
+    _, forces_n, _ = Batches(known[1:], nominal, Ranks("cpu")).batch(0, 60, 22)
+    assert forces_n.max() == pytest.approx(2 * measured_n.max())
+    _, real_n, _ = Batches(known[:1], nominal, Ranks("cpu")).batch(0, 60, 22)
+    assert real_n.max() == measured_n.max()
 
 
 def test_rare_forces_are_drawn_more_often(clips: list[Clip], small_recipe: TrainConfig) -> None:
