@@ -233,6 +233,12 @@ def train(
     hold_out: Annotated[
         list[str] | None, typer.Option(help="Object to leave out of the training. Repeatable.")
     ] = None,
+    validation: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder with logs to measure the claimed error on; without, sets held out of DATA."
+        ),
+    ] = None,
     init: Annotated[str | None, typer.Option(help="Checkpoint to begin with.")] = None,
     resume: Annotated[bool, typer.Option(help="Go on from the states of a run that was broken off.")] = False,
     jobs: Jobs = CORES,
@@ -248,8 +254,9 @@ def train(
     quiet = os.environ.get("RANK", "0") != "0"  # of torchrun's processes the first one speaks
     clips = load_clips(data, settings.preprocess, workers=jobs, quiet=quiet)
     clips = [clip for clip in clips if clip.object not in (hold_out or [])]
+    unseen = load_clips(validation, settings.preprocess, workers=jobs, quiet=quiet) if validation else None
     start = load_checkpoint(init) if init else None
-    result = job(settings, clips, checkpoint, init=start, resume=resume)
+    result = job(settings, clips, checkpoint, validation_clips=unseen, init=start, resume=resume)
     metrics = result.header.metrics
     if not quiet:
         console.show({"checkpoint": str(checkpoint), "digest": result.digest, **metrics}, as_json)
@@ -330,7 +337,7 @@ def reproduce(
         typer.Option("--out", help="Folder for the networks; what is there is not trained again."),
     ] = None,
     write: Annotated[
-        Path | None, typer.Option(help="Markdown file to put tables and figures into, such as docs/paper.md.")
+        Path | None, typer.Option(help="Page with places for tables and figures, such as docs/paper.md.")
     ] = None,
     jobs: Jobs = CORES,
     set_: Annotated[
@@ -353,13 +360,13 @@ def reproduce(
     pictures.mkdir(parents=True, exist_ok=True)
     for name, figure in result.figures.items():
         figure.savefig(pictures / f"{name}.png")
-    text = page.markdown(what, result, scale, settings, test, pictures.name)
     if write is not None:
         from gripper_force.report.markers import write_between
 
-        write_between(write, scale, text)
+        for place, text in page.markdown(result, scale, settings, test, pictures.name).items():
+            write_between(write, place, text)
     drawn = {name: str(pictures / f"{name}.png") for name in result.figures}
-    console.show({"tables": result.tables, "figures": drawn}, as_json, console.paper_tables)
+    console.show({"tables": list(result.tables.values()), "figures": drawn}, as_json, console.paper_tables)
 
 
 @import_app.command("video")

@@ -23,9 +23,9 @@ Bar = Callable[[str, int], AbstractContextManager[Advance]]
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """Tables, and figures by name."""
+    """Tables and figures by name."""
 
-    tables: tuple[tables.Table, ...]
+    tables: dict[str, tables.Table]
     figures: dict[str, Figure]
 
 
@@ -71,18 +71,18 @@ def reproduce(
 
 
 def _make(names: Sequence[str], test: Test | None, scale: Scale, out: Path, advance: Advance) -> Result:
-    made: list[tables.Table] = []
+    made: dict[str, tables.Table] = {}
     drawn: dict[str, Figure] = {}
     for name in names:
         if name == "7":
-            made.append(tables.times(advance))
+            made[name] = tables.times(advance)
             continue
         assert test is not None
         match name:
             case "9":
-                made.append(tables.objects(test))
+                made[name] = tables.objects(test)
             case "claims":
-                made.append(tables.claims(test))
+                made[name] = tables.claims(test)
             case "fig6":
                 drawn[name] = figures.error_by_force(test)
             case "fig7":
@@ -93,30 +93,33 @@ def _make(names: Sequence[str], test: Test | None, scale: Scale, out: Path, adva
             case "fig9":
                 drawn[name] = figures.force_over_time(test, [BASELINE, PROPOSED], "Baseline and proposed")
             case _:
-                made.append(tables.comparison(test, name))
-    return Result(tuple(made), drawn)
+                made[name] = tables.comparison(test, name)
+    return Result(made, drawn)
 
 
 def markdown(
-    what: str, result: Result, scale_name: str, scale: Scale, test: Test | None, pictures: str
-) -> str:
-    """What was made, in Markdown; ``pictures`` is the folder of the figures, as the page names it."""
-    recipe = f"{scale.size}x{scale.size} pixels, width {scale.width:g}, {scale.steps} steps a network"
-    lines = [
-        f"Made by `gripper-force reproduce {what} --scale {scale_name}`:",
-        f"{recipe}, {scale.seeds} seeds.",
-    ]
+    result: Result, scale_name: str, scale: Scale, test: Test | None, pictures: str
+) -> dict[str, str]:
+    """What was made, in Markdown, by the name of its place in the page.
+
+    The scale's own name stands for what the networks of its tables are; ``pictures`` is the folder of the
+    figures, as the page names it.
+    """
+    made = {name: table.markdown() for name, table in result.tables.items()}
+    for name in result.figures:
+        made[name] = f"![{_CAPTIONS[name]}]({pictures}/{name}.png)\n*{_CAPTIONS[name]}*\n"
+    parts = {f"{scale_name} {name}": text for name, text in made.items()}
     if test is not None:
-        lines += [
+        lines = [
+            f"Made by `gripper-force reproduce all --scale {scale_name}`:",
+            f"{scale.size}x{scale.size} pixels, width {scale.width:g}, {scale.steps} steps a network,",
+            f"{scale.seeds} seeds.",
             f"Tested on {len(test.clips)} sets: {len(test.measured_n)} frames, of which",
             f"{100 * test.contact.mean():.0f} % in contact. MAE: mean ± s.d. over seeds. Ratio: that of",
             "the baseline over it. p: Wilcoxon's signed-rank test against the baseline, paired by test set.",
         ]
-    blocks = [" ".join(lines), *(table.markdown() for table in result.tables)]
-    blocks += [
-        f"![{_CAPTIONS[name]}]({pictures}/{name}.png)\n*{_CAPTIONS[name]}*\n" for name in result.figures
-    ]
-    return "\n\n".join(block.rstrip() for block in blocks) + "\n"
+        parts[scale_name] = " ".join(lines) + "\n"
+    return parts
 
 
 _CAPTIONS: Final = {

@@ -18,7 +18,8 @@ def test_all_is_everything() -> None:
 
 def test_a_figure_is_made_from_logs_and_put_into_a_page(touches: Path, tmp_path: Path) -> None:
     page = tmp_path / "paper.md"
-    page.write_text("# Paper\n<!-- small -->\n<!-- end of small -->\n")
+    places = ("small", "small fig8", "small 3")
+    page.write_text("# Paper\n" + "".join(f"<!-- {p} -->\nold {p}\n<!-- end of {p} -->\n" for p in places))
     options = ["--data", str(touches), "--out", str(tmp_path / "out"), "--write", str(page), "--jobs", "1"]
     for key in ("size=32", "width=0.25", "steps=2", "seeds=1"):
         options += ["--set", key]
@@ -29,7 +30,8 @@ def test_a_figure_is_made_from_logs_and_put_into_a_page(touches: Path, tmp_path:
     assert picture.stat().st_size > 10_000
     text = page.read_text()
     assert "(paper/fig8.png)" in text
-    assert "`gripper-force reproduce fig8 --scale small`" in text
+    assert "old small 3" in text
+    assert text.count("old") == 1
     assert "32x32 pixels, width 0.25, 2 steps a network, 1 seeds" in text
 
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from gripper_force import cli
-from gripper_force.dataset import Clip, digest
+from gripper_force import cli, metrics
+from gripper_force.dataset import Clip, digest, load_clips
 from gripper_force.errors import CheckpointError, ConfigError, DataError, NonFiniteError
 from gripper_force.training import train as train_module
 from gripper_force.training.recipe import TrainConfig
@@ -156,5 +156,15 @@ def test_the_command_takes_a_recipe(few_logs: Path, tmp_path: Path) -> None:
     header = load_checkpoint(out).header
     assert [member.attention for member in header.members] == ["cbam"]
     assert not header.preprocess.reference
+    one = min(few_logs.glob("*.mcap"))
+    (tmp_path / "unseen").mkdir()
+    (tmp_path / "unseen" / one.name).symlink_to(one)
+    call = [*call, "--validation", str(tmp_path / "unseen")]
+    told = json.loads(CliRunner().invoke(cli.app, call).stdout)
+    (clip,) = load_clips([one], header.preprocess)
+    forces_n = predict(load_checkpoint(out).networks, header.preprocess, clip.frames)[0]
+    assert told["mae_n"] == pytest.approx(
+        metrics.mae(forces_n[clip.valid], clip.forces_n[clip.valid]), rel=0.01
+    )
     refused = CliRunner().invoke(cli.app, ["train", str(few_logs), "--recipe", "shin"]).exception
     assert isinstance(refused, ConfigError)
