@@ -140,7 +140,7 @@ class VisionConfig(Section):
     )
 
 
-_CAUTIOUS: Final = (1.0, 60.0, 60.0)
+CAUTIOUS_PLANT: Final = (1.0, 60.0, 60.0)
 """Gain, lag and delay in ms of a plant that was not identified."""
 
 
@@ -195,7 +195,7 @@ class ControlConfig(Section):
     plant_delay_ms: Positive | None = Field(
         None,
         description="delay from contact force to estimate: exposure to use, and half a frame; None: the "
-        "object profile's, or 60",
+        "object profile's, or 60. With feedback=vision never less than 60, nor the lag more",
     )
 
     @model_validator(mode="after")
@@ -211,7 +211,7 @@ class ControlConfig(Section):
         """Gain, lag in s and delay in s of the force loop's plant; cautious ones where nothing is known."""
         given = (self.plant_gain, self.plant_lag_ms, self.plant_delay_ms)
         gain, lag_ms, delay_ms = (
-            known if one is None else one for one, known in zip(given, _CAUTIOUS, strict=True)
+            known if one is None else one for one, known in zip(given, CAUTIOUS_PLANT, strict=True)
         )
         return gain, lag_ms * 1e-3, delay_ms * 1e-3
 

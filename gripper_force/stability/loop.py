@@ -358,7 +358,7 @@ def _tuned_row(config: Config, truth: Gripper, grid: Grid, plants: dict[float, I
         f"{min(promised):.2f} to {max(promised):.2f}; of {len(found)} cells those where a swing of "
         f"{SWING_N:g} N grows",
         float(sum(margin < 1 for margin in found)),
-        math.inf,
+        0.0,
     )
 
 

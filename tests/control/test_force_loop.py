@@ -31,6 +31,17 @@ def test_margins_are_those_of_the_rule(loop):
     assert loop.margins["hold"].gains.proportional == 0
 
 
+def test_vision_alone_is_never_faster_than_for_a_plant_nobody_knows(transmission):
+    def gains(**plant):
+        return ForceLoop(ControlConfig(feedback="vision", **plant), transmission).margins["vision"].gains
+
+    cautious = gains()
+    assert gains(plant_lag_ms=165, plant_delay_ms=28) == cautious
+    assert gains(plant_delay_ms=90).integral_s < cautious.integral_s
+    assert gains(plant_lag_ms=25).proportional < cautious.proportional
+    assert gains(plant_gain=2.0).integral_s == cautious.integral_s / 2
+
+
 def test_the_ramp_takes_the_bias_off(loop, transmission):
     assert ramp(loop, 4.0, bias_n=0.3) == pytest.approx(4.0 + transmission.friction_n - 0.3)
 
