@@ -1,8 +1,10 @@
 """Training data: logs of randomised touches in the simulated rig.
 
 A *press* closes, ramps to one to three random forces in turn, holds each for a while, and opens, as the
-paper's collector does (section IV-A). A *grasp* is one touch that ends as `gripper-force grasp` ends it. Both
-run the controller on motor current alone, so no network is needed to make the data that one is trained on.
+paper's collector does (section IV-A). A *tap* is one fast touch, which shows a scene in half of the frames:
+to train on, another scene is worth more than another moment. A *grasp* is one touch that ends as
+`gripper-force grasp` ends it. All run the controller on motor current alone, so no network is needed to make
+the data that one is trained on.
 
 The *protocol* of Shin et al. 2019 (section IV-A): sets of four touches with random peaks to 12 N, for four
 objects, four angles, three light levels and 15 times each, seen by a camera of 149 frames a second. All light
@@ -27,10 +29,12 @@ from gripper_force.recording.touches import ramp, touch, wait
 from gripper_force.session import Session, open_session, release, run_grasp
 from gripper_force.types import Frame, Gray
 
-Kind = Literal["press", "grasp"]
+Kind = Literal["press", "tap", "grasp"]
 OBJECTS = ("sponge", "paper_cup", "tube", "stapler")
 PEAK_N = 12.5
 _MAX_TARGETS = 3
+_TAP_N: Final = 4.0
+"""A tap goes at least up to this."""
 
 PROTOCOL_RATE_HZ: Final = 149.0
 """Frame rate of the paper's camera."""
@@ -168,7 +172,7 @@ def make_log(task: Plan, out: Path, tree: dict[str, object]) -> Path:
     if task.kind == "grasp":
         run_grasp(config, unfinished)
     else:
-        _press(config, unfinished, rng)
+        (_tap if task.kind == "tap" else _press)(config, unfinished, rng)
     return unfinished.rename(path)
 
 
@@ -330,4 +334,17 @@ def _press(config: Config, path: Path, rng: np.random.Generator) -> None:
         for _ in range(int(rng.integers(_MAX_TARGETS)) + 1):
             ramp(session, _target_n(rng), config.control.timeout_s)
             wait(session, float(rng.uniform(0.05, 0.6)))
+        release(session, config)
+
+
+def _tap(config: Config, path: Path, rng: np.random.Generator) -> None:
+    fast = {"approach_speed_m_s": 0.05, "ramp_n_s": float(np.exp(rng.uniform(np.log(10.0), np.log(30.0))))}
+    config = config.model_copy(update={"control": config.control.model_copy(update=fast)})
+    with open_devices(config) as devices, open_session(config, devices, path, None) as session:
+        wait(session, 0.1)
+        peak_n = float(rng.uniform(_TAP_N, PEAK_N))
+        ramp(session, peak_n, config.control.timeout_s)
+        wait(session, float(rng.uniform(0.03, 0.2)))
+        if rng.random() < 0.5:
+            ramp(session, float(rng.uniform(0.5, peak_n)), config.control.timeout_s)
         release(session, config)

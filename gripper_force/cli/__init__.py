@@ -119,6 +119,10 @@ def simulate(
     presses: Annotated[
         int | None, typer.Option(min=0, help="Logs of random forces, one after the other.  [default: 200]")
     ] = None,
+    taps: Annotated[
+        int | None,
+        typer.Option(min=0, help="Logs of one fast touch: more scenes in less time.  [default: 0]"),
+    ] = None,
     grasps: Annotated[int | None, typer.Option(min=0, help="Logs of grasps.  [default: 20]")] = None,
     first_seed: Annotated[
         int | None,
@@ -147,11 +151,12 @@ def simulate(
         if scale is not None:
             raise ConfigError("--scale is of a protocol's sets: add --protocol shin2019, or leave it out")
         settings = load_settings(config, set_, {})
-        count, seed = 200 if presses is None else presses, 100_000 if first_seed is None else first_seed
-        plans = job.plan("press", count, seed)
-        plans += job.plan("grasp", 20 if grasps is None else grasps, seed + count)
+        seed, plans = 100_000 if first_seed is None else first_seed, []
+        plans += job.plan("press", 200 if presses is None else presses, seed)
+        plans += job.plan("tap", taps or 0, seed + len(plans))
+        plans += job.plan("grasp", 20 if grasps is None else grasps, seed + len(plans))
     elif protocol == "shin2019":
-        given = {"--presses": presses, "--grasps": grasps, "--first-seed": first_seed}
+        given = {"--presses": presses, "--taps": taps, "--grasps": grasps, "--first-seed": first_seed}
         if idle := [name for name, value in given.items() if value is not None]:
             raise ConfigError(
                 f"the sets of --protocol are fixed, so {' and '.join(idle)} can't be heeded: leave out one "

@@ -11,6 +11,7 @@ from gripper_force.log import LogReader
 from gripper_force.simulate import (
     OBJECTS,
     PEAK_N,
+    Kind,
     Plan,
     SetPlan,
     make_log,
@@ -36,9 +37,9 @@ def test_a_plan_is_always_the_same_and_takes_the_objects_in_turn() -> None:
     assert plan("grasp", 2, 7, ("tube",)) == [Plan("grasp", "tube", 7), Plan("grasp", "tube", 8)]
 
 
-@pytest.mark.parametrize("kind", ["press", "grasp"])
-def test_a_log_holds_a_touch_and_says_what_it_is(kind: str, config: Config, tmp_path: Path) -> None:
-    task = Plan("press" if kind == "press" else "grasp", "stapler", 100_003)
+@pytest.mark.parametrize("kind", ["press", "tap", "grasp"])
+def test_a_log_holds_a_touch_and_says_what_it_is(kind: Kind, config: Config, tmp_path: Path) -> None:
+    task = Plan(kind, "stapler", 100_003)
     path = make_log(task, tmp_path, config.model_dump(mode="json"))
     assert path == tmp_path / f"{kind}-stapler-100003.mcap"
     assert list(tmp_path.iterdir()) == [path]
