@@ -2,19 +2,19 @@
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from enum import StrEnum
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import numpy.typing as npt
 
 from gripper_force.config import Config, ControlConfig
 from gripper_force.control.force_loop import tolerance_n
 from gripper_force.control.grasp import GraspController
+from gripper_force.stability.grid import FULL, Field, Grid, Margins, Trial, Trials, Verdict
+from gripper_force.stability.maps import draw_margins, draw_verdicts
 from gripper_force.stability.margin import (
     FRAME_S,
     SWING_N,
@@ -28,7 +28,6 @@ from gripper_force.stability.margin import (
 )
 from gripper_force.stability.numerics import Row
 from gripper_force.stability.plant import (
-    CURRENT_STEP_A,
     CYCLE_NS,
     NOISE_A,
     Eye,
@@ -49,77 +48,6 @@ _AGREE: Final = 0.2
 _DPI: Final = 110
 _FROM_S: Final = 0.035
 _CYCLE_S: Final = CYCLE_NS / NS_PER_S
-
-
-class Verdict(StrEnum):
-    """How a grasp ended. The worse comes later."""
-
-    HOLDS = "holds"
-    CURRENT = "holds on current alone"
-    LOSES = "does not hold"
-    RINGS = "rings"
-    CRUSHES = "would crush"
-
-
-@dataclass(frozen=True, slots=True)
-class Grid:
-    """What is tried.
-
-    Attributes:
-        stiffness_n_m: Of the map of verdicts.
-        delay_s: Likewise.
-        factors: Of the loop gain, a map each.
-        margin_stiffness_n_m: Of the map of margins.
-        margin_delay_s: Likewise.
-        tuned_delay_s: Delays for which vision alone is tuned anew.
-        sweep: Values that are all combined: ``delay_s``, and attributes of `Gripper`; friction as a share of
-            what is taken for it.
-    """
-
-    stiffness_n_m: Sequence[float]
-    delay_s: Sequence[float]
-    factors: Sequence[float]
-    margin_stiffness_n_m: Sequence[float]
-    margin_delay_s: Sequence[float]
-    tuned_delay_s: Sequence[float]
-    sweep: dict[str, Sequence[float]]
-
-
-FULL: Final = Grid(
-    stiffness_n_m=tuple(float(k) for k in np.geomspace(1e2, 1e6, 13)),
-    delay_s=(0.0, 0.02, 0.04, 0.06, 0.08, 0.1, 0.125, 0.15),
-    factors=(1.0, 2.0, 4.0),
-    margin_stiffness_n_m=(1e2, 3e2, 1e3, 3e3, 1e4, 3e4, 1e5, 3e5, 1e6),
-    margin_delay_s=(0.0, 0.01, 0.02, 0.035, 0.05, 0.075, 0.1, 0.15),
-    tuned_delay_s=(0.02, 0.035, 0.075),
-    sweep={
-        "stiffness_n_m": (1e2, 1e3, 1e4, 1e5, 1e6),
-        "delay_s": (0.035, 0.1),
-        "gain": (0.9, 1.0, 1.1),
-        "friction_n": (0.0, 0.5, 1.0, 2.0),
-        "play_m": (0.0, 0.001),
-        "step_a": (CURRENT_STEP_A, 0.01),
-    },
-)
-
-
-@dataclass(frozen=True, slots=True)
-class Trial:
-    """A grasp on an analytic plant.
-
-    Attributes:
-        verdict: How it ended.
-        peak_n: The most the object felt.
-        swing_n: How far the force went up and down in the last two seconds.
-        off: How far its mean there is from the target, as a share.
-        broken: Commands beyond limits, or not finite.
-    """
-
-    verdict: Verdict
-    peak_n: float
-    swing_n: float
-    off: float
-    broken: int
 
 
 def target_n(stiffness_n_m: float) -> float:
@@ -186,32 +114,6 @@ def crushing_n_m(control: ControlConfig, truth: Gripper) -> float:
     return ((1 + _OVER) * control.force_limit_n / speed_m_s) ** 2 / truth.mass_kg
 
 
-Trials = dict[tuple[float, float], Trial]
-"""By stiffness and delay."""
-
-Field = npt.NDArray[np.float64]
-"""A number for each delay and stiffness, (D, S)."""
-
-
-@dataclass(frozen=True, eq=False)
-class Margins:
-    """Factors by which the loop gain may be raised, each (D, S).
-
-    Attributes:
-        vision: Observed, with vision alone.
-        identified: Predicted for it from gain, lag and delay.
-        inertia: Predicted for it from the same gain, with inertia and friction of the jaws.
-        fused: Observed, with motor current and vision.
-        rule: What its tuning promises.
-    """
-
-    vision: Field
-    identified: Field
-    inertia: Field
-    fused: Field
-    rule: Field
-
-
 def cases(config: Config, maps: Path | None, grid: Grid = FULL) -> Iterator[Row]:
     """Rows of the force loop; its maps go into ``maps``.
 
@@ -239,8 +141,6 @@ def cases(config: Config, maps: Path | None, grid: Grid = FULL) -> Iterator[Row]
     yield from _margin_rows(grid, margins)
     yield _tuned_row(config, truth, grid, plants)
     if maps is not None:
-        from gripper_force.stability.maps import draw_margins, draw_verdicts
-
         maps.mkdir(parents=True, exist_ok=True)
         crushing = crushing_n_m(config.control, truth)
         draw_verdicts(grid, verdicts, margins, crushing).savefig(maps / "loop-verdicts.png", dpi=_DPI)

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from gripper_force.report.figure import STYLE
-from gripper_force.stability.loop import Field, Grid, Margins, Trials, Verdict
+from gripper_force.stability.grid import Field, Grid, Margins, Trials, Verdict
 
 _COLOURS: Final = {
     Verdict.HOLDS: "#4d9a6a",

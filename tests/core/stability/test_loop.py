@@ -5,8 +5,9 @@ from pathlib import Path
 import pytest
 
 from gripper_force.config import Config
-from gripper_force.stability.loop import CURRENT_STEP_A, Grid, Verdict, _Bounds, cases, crushing_n_m, grasp
-from gripper_force.stability.plant import Gripper, transmission_of
+from gripper_force.stability.grid import Grid, Verdict
+from gripper_force.stability.loop import _Bounds, cases, crushing_n_m, grasp
+from gripper_force.stability.plant import CURRENT_STEP_A, Gripper, transmission_of
 
 CONFIG = Config()
 TRUTH = Gripper(transmission_of(CONFIG.gripper), contact_m=0.008)
