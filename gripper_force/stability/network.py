@@ -2,7 +2,7 @@
 
 import math
 import resource
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
@@ -11,7 +11,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 import torch
-from torch import nn
 
 from gripper_force.backends import HEAD_CASES, load
 from gripper_force.config import Config, load_config
@@ -21,15 +20,26 @@ from gripper_force.errors import CheckpointError, GripperError, NonFiniteError
 from gripper_force.perception import Sight
 from gripper_force.simulate import Plan, make_log
 from gripper_force.stability.exact import EPS, ROUNDING, WAYS, Exact, Twin, Way
+from gripper_force.stability.hard_frames import REFERENCE, spoiled
+from gripper_force.stability.hard_networks import (
+    HARD,
+    KNOWN_N,
+    STEEP,
+    drawn,
+    faint,
+    outlier,
+    overflow,
+    saved,
+    scaled,
+)
 from gripper_force.stability.numerics import Row
 from gripper_force.types import NS_PER_MS, Frame, Gray, VisualForce
-from gripper_force.vision.backbones import Vgg
-from gripper_force.vision.checkpoint import load_checkpoint, save_checkpoint
+from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.engines import Engine, Floats
 from gripper_force.vision.estimator import ForceEstimator
 from gripper_force.vision.export import TOLERANCE, inputs_of
 from gripper_force.vision.exported import read_model
-from gripper_force.vision.header import RESIDUAL_HALF_N, Header, Model, NetworkConfig, Residual
+from gripper_force.vision.header import RESIDUAL_HALF_N
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import DIFFERENCE_GAIN, FLAT_STD, Preprocess, shrink
 
@@ -45,13 +55,9 @@ LONG: Final = 10_000
 _COMPARED: Final = 40
 """Frames of a grasp that are run in float64, which is slow: two windows, with the first contact in them."""
 
-_REFERENCE: Final = 4
 _PREPARED: Final = 8 * EPS
 """What preparing a frame rounds away of its largest number: mean, deviation, quotient and difference of two,
 and the gain."""
-
-_KNOWN_N: Final = (0.5, 9.5)
-"""Validation of the small networks knew these forces."""
 
 
 def cases(
@@ -101,7 +107,7 @@ def _recordings(folder: Path, preprocess: Preprocess, seed: int) -> tuple[Clip, 
 def _contact(grasp: Clip, size: int) -> Gray:
     """The frames of no contact that a run begins with, and those in which contact begins."""
     first = int(np.argmax(grasp.forces_n > 2.0)) - _COMPARED // 3
-    frames = np.concatenate([grasp.frames[:_REFERENCE], grasp.frames[first : first + _COMPARED - _REFERENCE]])
+    frames = np.concatenate([grasp.frames[:REFERENCE], grasp.frames[first : first + _COMPARED - REFERENCE]])
     return np.stack([shrink(frame, None, size) for frame in frames])
 
 
@@ -147,113 +153,12 @@ def _as_said(case: str, twin: Twin, found_n: Exact, true_n: Exact) -> Row:
 # Weights.
 
 
-def _scaled(factor: float, recurrence: float = 1.0) -> Callable[[ForceNetwork], None]:
-    """Gates and tanh with so many times their weights, that of the recurrence apart."""
-
-    def change(network: ForceNetwork) -> None:
-        for part in (network.attention, network.blstm, network.dense):
-            assert part is not None
-            for name, weight in part.named_parameters():
-                weight.mul_(recurrence if "weight_hh" in name else factor)
-
-    return change
-
-
-def _variance(variance: float) -> Callable[[ForceNetwork], None]:
-    def change(network: ForceNetwork) -> None:
-        for module in network.modules():
-            if isinstance(module, nn.BatchNorm2d):
-                assert module.running_var is not None
-                module.running_var.fill_(variance)
-
-    return change
-
-
-def _denormal(network: ForceNetwork) -> None:
-    for name, weight in network.named_parameters():
-        if "second.2" in name or "dense" in name:
-            weight.mul_(1e-39)
-
-
-def _faint(network: ForceNetwork) -> None:
-    """Activations that float32 has few digits for, and the next layer makes large again."""
-    first, second = _pair(network, 2)
-    assert first.bias is not None
-    first.weight.mul_(1e-39)
-    first.bias.mul_(1e-39)
-    second.weight.mul_(1e38)
-
-
-def _outlier(network: ForceNetwork) -> None:
-    """A channel of each pair a thousand times what it was, and taken back by the next: the same forces."""
-    for i in range(5):
-        first, second = _pair(network, i)
-        assert first.bias is not None
-        first.weight[0] *= 1e3
-        first.bias[0] *= 1e3
-        second.weight[:, 0] /= 1e3
-
-
-def _overflow(network: ForceNetwork) -> None:
-    for i in range(5):
-        for convolution in _pair(network, i):
-            convolution.weight.mul_(1e15)
-
-
-def _pair(network: ForceNetwork, index: int) -> tuple[nn.Conv2d, nn.Conv2d]:
-    backbone = network.backbone
-    assert isinstance(backbone, Vgg)
-    first, second = backbone.first[index], backbone.second[index]
-    assert isinstance(first, nn.Conv2d)
-    assert isinstance(second, nn.Conv2d)
-    return first, second
-
-
-_HARD: Final[dict[str, Callable[[ForceNetwork], None]]] = {
-    "weights as drawn": lambda _network: None,
-    "one channel x 1000": _outlier,
-    "denormal weights, x 1e-39": _denormal,
-    "gates and tanh saturated, weights x 100": _scaled(1e2),
-    "gates and tanh saturated, weights x 10^4": _scaled(1e4),
-    "batch-norm variance 1e-12": _variance(1e-12),
-    "batch-norm variance 1e-38": _variance(1e-38),
-    "batch-norm variance 0": _variance(0.0),
-}
-_STEEP: Final = tuple(_HARD)[3:]
-"""So steep that of numbers with eight bits nothing is left in the end."""
-
-
-def _drawn(change: Callable[[ForceNetwork], None], attention: str = "ssam", size: int = 32) -> ForceNetwork:
-    """A small network with random weights, changed."""
-    shape = {"attention": attention, "size": size, "width": 0.25, "hidden": 16, "head": 32}
-    network = ForceNetwork(NetworkConfig.model_validate(shape))
-    with torch.no_grad():
-        for weight in network.backbone.parameters():
-            if weight.dim() == 4:
-                # PyTorch draws so small that nothing of the frame is left at the end; this is He's scale.
-                weight.mul_(math.sqrt(6))
-        change(network)
-    return network.eval().requires_grad_(False)
-
-
-def _saved(path: Path, *networks: ForceNetwork) -> Model:
-    header = Header(
-        members=tuple(network.config for network in networks),
-        preprocess=Preprocess(size=networks[0].config.size),
-        residuals=tuple(Residual(force_n=force_n, std_n=0.1) for force_n in _KNOWN_N),
-        data_digest="",
-        metrics={},
-    )
-    save_checkpoint(path, networks, header)
-    return read_model(path)
-
-
 def _weights(folder: Path, ways: Sequence[Way], grasp: Clip) -> Iterator[Row]:
     torch.manual_seed(0)
     # All in one ensemble: one export serves them all.
-    kinds = [(name, kind) for name in _HARD for kind in (("ssam", "scam") if "gates" in name else ("ssam",))]
-    networks = [_drawn(_HARD[name], kind) for name, kind in kinds]
-    twin = Twin(_saved(folder / "hard.safetensors", *networks), folder)
+    kinds = [(name, kind) for name in HARD for kind in (("ssam", "scam") if "gates" in name else ("ssam",))]
+    networks = [drawn(HARD[name], kind) for name, kind in kinds]
+    twin = Twin(saved(folder / "hard.safetensors", *networks), folder)
     inputs = _inputs(twin, grasp)
     true_n = twin.forces_n(inputs)
     found_n: dict[str, list[Exact]] = {}
@@ -263,9 +168,9 @@ def _weights(folder: Path, ways: Sequence[Way], grasp: Clip) -> Iterator[Row]:
     for precision, forces_n in found_n.items():
         off_n = np.max([np.abs(one_n - true_n).max(1) for one_n in forces_n], axis=0)
         bound_n = twin.bound_n(inputs, ROUNDING[precision])
-        for name in _HARD:
+        for name in HARD:
             own = [name == other for other, _ in kinds]
-            if precision == "float32" or name not in _STEEP:
+            if precision == "float32" or name not in STEEP:
                 yield _row(
                     f"{name}: {precision}", "a small network, the worst engine", off_n[own], bound_n[own]
                 )
@@ -285,14 +190,14 @@ def _reach_n(network: ForceNetwork) -> float:
 def _refused(folder: Path, ways: Sequence[Way], grasp: Clip) -> Iterator[Row]:
     """Networks that nobody can compute: an engine other than PyTorch refuses them, or computes them."""
     hopeless = {
-        "recurrence x 100: each rounding doubles with each frame": _scaled(1e2, 1e2),
-        "activations below 1e-38, made large again": _faint,
-        "weights that overflow": _overflow,
+        "recurrence x 100: each rounding doubles with each frame": scaled(1e2, 1e2),
+        "activations below 1e-38, made large again": faint,
+        "weights that overflow": overflow,
     }
     for number, (name, change) in enumerate(hopeless.items()):
         torch.manual_seed(0)
-        network = _drawn(change, "scam")
-        twin = Twin(_saved(folder / f"hopeless-{number}.safetensors", network), folder)
+        network = drawn(change, "scam")
+        twin = Twin(saved(folder / f"hopeless-{number}.safetensors", network), folder)
         inputs = _inputs(twin, grasp)
         true_n = twin.forces_n(inputs)
         worst_n, refusals = 0.0, 0
@@ -306,7 +211,7 @@ def _refused(folder: Path, ways: Sequence[Way], grasp: Clip) -> Iterator[Row]:
                 worst_n = max(worst_n, float(np.abs(_run(engine, inputs) - true_n).max()))
         detail = f"refused by {refusals} of {len(others)} exports; error of the others, against float64"
         yield Row(name, detail, worst_n, TOLERANCE * twin.networks[0].config.label_scale_n, "N")
-        if change is _overflow:
+        if change is overflow:
             yield Row(f"{name}: torch", "estimates that came out", float(_estimates(twin, grasp)), 0.0)
 
 
@@ -324,7 +229,7 @@ def _outlier_in_int8(folder: Path, ways: Sequence[Way], press: Clip, grasp: Clip
     for way in ways:
         if way.precision == "int8":
             torch.manual_seed(0)
-            twin = Twin(_saved(folder / "outlier.safetensors", _drawn(_outlier)), folder)
+            twin = Twin(saved(folder / "outlier.safetensors", drawn(outlier)), folder)
             inputs = _inputs(twin, grasp)
             clip = np.stack([shrink(frame, None, inputs.shape[1]) for frame in press.frames])
             found_n = _run(twin.open(way, [clip]), inputs)
@@ -335,8 +240,8 @@ def _half(folder: Path) -> Row:
     """Weights that half precision can't hold, in a checkpoint."""
     worst = 0.0
     for factor in (1e7, 1e-7, 1e-38):
-        network = _drawn(_scaled(factor))
-        _saved(folder / "half.safetensors", network)
+        network = drawn(scaled(factor))
+        saved(folder / "half.safetensors", network)
         loaded = load_checkpoint(folder / "half.safetensors").networks[0].state_dict()
         for name, tensor in network.state_dict().items():
             if tensor.is_floating_point():
@@ -351,10 +256,10 @@ def _half(folder: Path) -> Row:
 
 def _not_finite(folder: Path, ways: Sequence[Way], grasp: Clip) -> Iterator[Row]:
     torch.manual_seed(0)
-    twin = Twin(_saved(folder / "drawn.safetensors", _drawn(_HARD["weights as drawn"])), folder)
+    twin = Twin(saved(folder / "drawn.safetensors", drawn(HARD["weights as drawn"])), folder)
     inputs = _inputs(twin, grasp)
-    spoiled = [np.array(inputs[0]) for _ in range(3)]
-    for frame, wild in zip(spoiled, (math.nan, math.inf, -math.inf), strict=True):
+    wilds = [np.array(inputs[0]) for _ in range(3)]
+    for frame, wild in zip(wilds, (math.nan, math.inf, -math.inf), strict=True):
         frame[3, 4] = wild
     taken, changed, longest = 0, 0.0, 0
     for way in ways:
@@ -365,7 +270,7 @@ def _not_finite(folder: Path, ways: Sequence[Way], grasp: Clip) -> Iterator[Row]
         engine.reset()
         found_n = []
         for number, frame in enumerate(inputs):
-            taken += _takes(engine, spoiled[number % 3])
+            taken += _takes(engine, wilds[number % 3])
             found_n.append(engine.step(frame).forces_n)
         changed = max(changed, float(np.abs(np.stack(found_n, axis=1) - expected_n).max()))
         engine.reset()
@@ -398,7 +303,7 @@ def _frames(twin: Twin, grasp: Clip, config: Config) -> Iterator[Row]:
     forces_n: dict[bytes, Exact] = {}
     calm: list[_Seen] = []
     farthest, where = 0.0, ""
-    for name, frames in _spoiled(clip, config.seed).items():
+    for name, frames in spoiled(clip, config.seed).items():
         seen = _see(engine, frames, config.control.vision_std_n)
         # Most cases leave the same frames, and float64 is slow.
         taken = np.stack([frame for frame, one in zip(frames, seen, strict=True) if one.taken])
@@ -458,46 +363,6 @@ def _exactly(clip: Gray, preprocess: Preprocess) -> Exact:
     return standard
 
 
-def _spoiled(clip: Gray, seed: int) -> dict[str, list[Gray]]:
-    """The recording with something wrong after its reference frames."""
-    rng = np.random.default_rng([seed, 50])
-    start, rest = list(clip[:_REFERENCE]), list(clip[_REFERENCE:])
-
-    def some(change: Callable[[Gray], Gray], every: int = 5) -> list[Gray]:
-        return start + [change(frame) if i % every == 0 else frame for i, frame in enumerate(rest)]
-
-    def gain(factor: float) -> Callable[[Gray], Gray]:
-        return lambda frame: (frame * factor).clip(0, 255).astype(np.uint8)
-
-    def hot(frame: Gray) -> Gray:
-        seen = frame.copy()
-        seen[5, 7] = 255
-        return seen
-
-    def filled(level: int) -> Callable[[Gray], Gray]:
-        return lambda frame: np.full_like(frame, level)
-
-    turns = [gain(2.0 if i % 2 else 0.5)(frame) for i, frame in enumerate(rest)]
-    mild = [gain(1.25 if i % 2 else 0.8)(frame) for i, frame in enumerate(rest)]
-    return {
-        "a grasp": start + rest,
-        "black frames": some(filled(0)),
-        "white frames": some(filled(255)),
-        "gray frames": some(filled(128)),
-        "a pixel at 255 in a flat frame": some(lambda frame: hot(filled(100)(frame))),
-        "a pixel that stays at 255": some(hot, every=1),
-        "noise": some(lambda frame: rng.integers(0, 256, frame.shape, np.uint8)),
-        "frames of NaN": some(lambda frame: np.full(frame.shape, np.nan)),
-        "exposure x 0.5 and x 2 in turns": start + turns,
-        "exposure x 0.8 and x 1.25 in turns": start + mild,
-        "flashes of one frame, x 1.5": some(gain(1.5)),
-        "flashes of one frame, to white": some(gain(4.0)),
-        "two of three frames lost": start + rest[::3],
-        "frames lost and late at random": start + [frame for frame in rest if rng.random() < 0.5],
-        "every frame three times": start + [frame for frame in rest for _ in range(3)],
-    }
-
-
 def _range(folder: Path, grasp: Clip, config: Config) -> Row:
     """Last layers that say far too much: what may count beyond the forces that validation knew."""
     limit_n = config.control.vision_std_n
@@ -505,15 +370,15 @@ def _range(folder: Path, grasp: Clip, config: Config) -> Row:
     for factor in (1.0, 10.0, 1e3, 1e6):
         for sign in (-1.0, 1.0):
             torch.manual_seed(0)
-            network = _drawn(_HARD["weights as drawn"])
+            network = drawn(HARD["weights as drawn"])
             network.out.weight.mul_(sign * factor)
             network.out.bias.zero_()
-            twin = Twin(_saved(folder / "range.safetensors", network), folder)
+            twin = Twin(saved(folder / "range.safetensors", network), folder)
             frames = list(_contact(grasp, network.config.size))
             forces_n = [one.visual.force_n for one in _see(twin.open(WAYS[0]), frames, limit_n) if one.visual]
             total += len(frames) - twin.model.header.preprocess.lead_in
             counted += len(forces_n)
-            least_n, most_n = _KNOWN_N[0] - RESIDUAL_HALF_N, _KNOWN_N[1] + RESIDUAL_HALF_N
+            least_n, most_n = KNOWN_N[0] - RESIDUAL_HALF_N, KNOWN_N[1] + RESIDUAL_HALF_N
             beyond_n = max([beyond_n, *(max(least_n - f, f - most_n) for f in forces_n)])
     detail = f"{total - counted} of {total} estimates flagged; the others beyond what validation knew"
     return Row("last layers x 1 to 10^6", detail, beyond_n, limit_n, "N")
@@ -529,7 +394,7 @@ def _streams(
     names = {way.engine: way for way in ways if way.precision == "float32"}
     way = names.get("openvino", WAYS[0])
     torch.manual_seed(0)
-    small = Twin(_saved(folder / "small.safetensors", _drawn(_HARD["weights as drawn"], size=16)), folder)
+    small = Twin(saved(folder / "small.safetensors", drawn(HARD["weights as drawn"], size=16)), folder)
     noise = np.random.default_rng(0).standard_normal((997, 16, 16)).astype(np.float32)
     detail = f"{way.name}; off from a stream that begins a window before, ten times"
     drift_n, grown_mb, last_n, last = _stream(small, way, noise, streamed)
