@@ -55,6 +55,8 @@ _SUPPLY_SLACK_V = 0.5
 
 _REALTIME_SWITCH_S = 2e-4
 _PACKAGES = ("gripper-force", "dynamixel-sdk", "mujoco", "numpy", "torch")
+_OWN_PACKAGE = ("openvino", "onnxruntime")
+"""Engines that a package of their own name computes."""
 
 Progress = Callable[[GraspStatus], None]
 
@@ -458,7 +460,9 @@ def _perception(config: Config, devices: Devices, estimator: Estimator | None) -
 
 
 def _metadata(config: Config, devices: Devices, checkpoint: "Model | None") -> dict[str, str]:
-    versions = {f"version {name}": metadata.version(name) for name in _PACKAGES}
+    engine = config.vision.engine if checkpoint else ""
+    packages = (*_PACKAGES, engine) if engine in _OWN_PACKAGE else _PACKAGES
+    versions = {f"version {name}": metadata.version(name) for name in packages}
     return {
         "object": config.object,
         "set": f"{config.object}-{config.seed}",

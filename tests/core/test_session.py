@@ -40,6 +40,7 @@ from gripper_force.types import (
     VisualForce,
 )
 from gripper_force.vision.checkpoint import load_checkpoint
+from gripper_force.vision.exported import read_model
 from gripper_hw.dynamixel import virtual
 from gripper_hw.dynamixel.packets import Instruction, Parser
 from gripper_hw.dynamixel.virtual import VirtualBus
@@ -670,3 +671,11 @@ def test_versions_are_those_of_installed_packages() -> None:
     assert about["serial"] == "7"
     assert about["checkpoint"] == ""
     assert about["version numpy"] == np.__version__
+    assert "version openvino" not in about
+
+
+def test_the_version_of_an_engine_of_its_own_is_in_the_log() -> None:
+    openvino = pytest.importorskip("openvino")
+    config = load_config(None, ["vision.engine=openvino"])
+    about = session_module._metadata(config, SimpleNamespace(notes={}), read_model("small"))  # type: ignore[arg-type]
+    assert openvino.__version__.startswith(about["version openvino"])
