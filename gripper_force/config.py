@@ -140,7 +140,7 @@ class VisionConfig(Section):
     )
 
 
-CAUTIOUS_PLANT: Final = (1.0, 60.0, 60.0)
+_CAUTIOUS: Final = (1.0, 60.0, 60.0)
 """Gain, lag and delay in ms of a plant that was not identified."""
 
 
@@ -211,8 +211,12 @@ class ControlConfig(Section):
         """Gain, lag in s and delay in s of the force loop's plant; cautious ones where nothing is known."""
         given = (self.plant_gain, self.plant_lag_ms, self.plant_delay_ms)
         gain, lag_ms, delay_ms = (
-            known if one is None else one for one, known in zip(given, CAUTIOUS_PLANT, strict=True)
+            known if one is None else one for one, known in zip(given, _CAUTIOUS, strict=True)
         )
+        if self.feedback == "vision":
+            # No press shows how the jaws swing on the object's spring, and vision alone would feed the swing:
+            # it is never tuned to be faster than for the cautious plant, whatever was identified.
+            lag_ms, delay_ms = min(lag_ms, _CAUTIOUS[1]), max(delay_ms, _CAUTIOUS[2])
         return gain, lag_ms * 1e-3, delay_ms * 1e-3
 
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from gripper_force.config import CAUTIOUS_PLANT, ControlConfig
+from gripper_force.config import ControlConfig
 from gripper_force.control.fusion import OBSERVER_LAG_S
 from gripper_force.control.profile import Profile
 from gripper_force.control.transmission import Transmission
@@ -54,11 +54,7 @@ class ForceLoop:
         # The current follows jaws that move at once, but of stuck ones vision alone tells, through the
         # filter. To an integral the lags are more delay.
         stuck = Plant(gain, 0.0, delay_s + lag_s + OBSERVER_LAG_S)
-        # No press shows how the jaws swing on the object's spring, and vision alone would feed the swing: it
-        # is never tuned to be faster than for the cautious plant, whatever was identified.
-        _, longest_ms, shortest_ms = CAUTIOUS_PLANT
-        slow = Plant(gain, min(lag_s, 1e-3 * longest_ms), max(delay_s, 1e-3 * shortest_ms))
-        plants = {"hold": stuck, "vision": slow}
+        plants = {"hold": stuck, "vision": Plant(gain, lag_s, delay_s)}
         self.margins = {
             name: Margin(gains := simc(plant), phase_margin_deg(plant, gains))
             for name, plant in plants.items()
