@@ -166,10 +166,7 @@ class ForceNetwork(nn.Module):
             state = self.blank(len(frame))
             for _ in range(self.config.context):
                 _, state = self.step(frame, state)
-        return self.advance(self.backbone(frame), state)
-
-    def advance(self, newest: Tensor, state: StreamState) -> tuple[Output, StreamState]:
-        """What `step` does after the backbone, with its map (B, C, H, W)."""
+        newest = self.backbone(frame)  # (B, C, H, W)
         stack, kept = newest, state.maps
         if n := self.config.maps_kept:
             stack = torch.cat([state.maps, newest], dim=1)  # (B, (n+1)*C, H, W)
