@@ -198,13 +198,12 @@ def sets_table(r: dict[str, Any]) -> None:
 
 def imports_table(r: dict[str, Any]) -> None:
     """What became of recordings."""
-    table = Table("log", "object", "frames", "spikes", "tare N", "note", box=None)
+    table = Table("log", "object", "frames", "spikes", "tare N", "force late by", "note", box=None)
     for row in r["logs"]:
-        tare = _number(row["tare_n"], digits=3)
-        name = Path(row["log"]).name
-        table.add_row(
-            name, row["object"], str(row["frames"]), str(row["spikes_rejected"]), tare, row["tare_note"]
-        )
+        counts = (str(row["frames"]), str(row["spikes_rejected"]))
+        late = f"{1e3 * row['force_lag_s']:.0f} ms"
+        name, tare = Path(row["log"]).name, _number(row["tare_n"], digits=3)
+        table.add_row(name, row["object"], *counts, tare, late, row["tare_note"])
     out.print(table)
 
 

@@ -22,6 +22,7 @@ from rich.progress import track
 from gripper_force.config import Config, dump_config
 from gripper_force.errors import DataError
 from gripper_force.log import LogWriter
+from gripper_force.recording.lag import force_lag_s
 from gripper_force.spikes import find_spikes
 from gripper_force.types import NS_PER_S, Frame, Gray, LoadCellSample
 from gripper_force.vision.preprocess import Region, shrink
@@ -47,6 +48,8 @@ class ImportSummary:
         spikes_rejected: Samples marked as not valid.
         tare_n: Offset removed from every sample; 0 where none could be trusted.
         tare_note: Why no tare was removed; empty where it was.
+        force_lag_s: Time by which the forces trailed the pictures; it was taken out. 0 where none is beyond
+            doubt, see `recording.lag.force_lag_s`.
         frames_without_force: Frames that have no row in the table.
         forces_without_frame: Rows that have no frame in the video.
     """
@@ -58,6 +61,7 @@ class ImportSummary:
     spikes_rejected: int
     tare_n: float
     tare_note: str
+    force_lag_s: float
     frames_without_force: int
     forces_without_frame: int
 
@@ -77,8 +81,16 @@ class ForceTable:
     force_n: Floats
 
 
-def import_folder(folder: Path, out: Path, *, region: Region | None = None) -> list[ImportSummary]:
+def import_folder(
+    folder: Path, out: Path, *, region: Region | None = None, align: bool = True
+) -> list[ImportSummary]:
     """Imports every recording of a folder into ``out/<recording>.mcap``, with a progress bar on stderr.
+
+    Args:
+        folder: Holds recordings, see above.
+        out: Folder for the logs.
+        region: As for `import_video`.
+        align: Likewise.
 
     Raises:
         DataError: There is none, one lacks its table, or one can't be used.
@@ -90,7 +102,10 @@ def import_folder(folder: Path, out: Path, *, region: Region | None = None) -> l
             f"{folder} holds no recordings: neither X.avi with X.csv nor folders with one of each"
         )
     steps = track(pairs, "importing", console=Console(stderr=True))
-    return [import_video(v, f, out / f"{name}.mcap", name=name, region=region) for name, v, f in steps]
+    return [
+        import_video(v, f, out / f"{name}.mcap", name=name, region=region, align=align)
+        for name, v, f in steps
+    ]
 
 
 def import_video(
@@ -102,11 +117,13 @@ def import_video(
     object_name: str | None = None,
     region: Region | None = None,
     size: int = 128,
+    align: bool = True,
 ) -> ImportSummary:
     """Writes one recording as a log of gray frames and load-cell samples.
 
     Spikes and impossible values stay in the log, marked as not valid; the reading before tare is kept beside
-    the force, and the table as an attachment.
+    the force, and the table as an attachment. Forces that come late or early beyond doubt are set right, and
+    the log's metadata say by how much.
 
     Args:
         video: The video.
@@ -116,6 +133,7 @@ def import_video(
         object_name: What was grasped; by default taken from the name.
         region: Part of the frame to keep in pixels: left, top, width, height; None for the whole.
         size: Side of the logged frames in pixels.
+        align: Whether forces that come late or early beyond doubt are set right.
 
     Raises:
         DataError: The video or the table is missing or can't be used.
@@ -126,16 +144,24 @@ def import_video(
     object_name = object_name or object_of(name)
     table = read_forces(forces)
     tare_n, tare_note = estimate_tare(table.t_s, table.force_n)
-    samples = load_cell_samples([_ns(t_s) for t_s in table.t_s], table.force_n, tare_n)
     gray, rate_hz = _read_video(video, region, size)
-    times_ns = _frame_times_ns(table, len(gray), rate_hz)
-    frames = [Frame(t, t, i, image) for i, (t, image) in enumerate(zip(times_ns, gray, strict=True))]
+    frames_s = _frame_times_s(table, len(gray), rate_hz)
+    lag_s = 0.0
+    if align:
+        good = ~find_spikes(table.force_n - tare_n)
+        lag_s = force_lag_s(frames_s, np.stack(gray), table.t_s[good], table.force_n[good])
+    # What is early is moved, not what is late, so that no time is before the recording's start.
+    frames_ns = [_ns(t_s) for t_s in frames_s + max(lag_s, 0.0)]
+    frames = [Frame(t, t, i, image) for i, (t, image) in enumerate(zip(frames_ns, gray, strict=True))]
+    forces_ns = [_ns(t_s) for t_s in table.t_s + max(-lag_s, 0.0)]
+    samples = load_cell_samples(forces_ns, table.force_n, tare_n)
     metadata = {
         "object": object_name,
         "set": re.sub(r"_\d+$", "", name),
         "source": name,
         "tare_n": f"{tare_n:.5f}",
         "tare_note": tare_note,
+        "force_lag_s": f"{lag_s:.4f}",
     }
     spikes = write_recording(out, Config(object=object_name), metadata, frames, samples, forces)
     with_row = int(np.isin(np.arange(len(frames)), table.frame).sum())
@@ -147,6 +173,7 @@ def import_video(
         spikes_rejected=spikes,
         tare_n=tare_n,
         tare_note=tare_note,
+        force_lag_s=lag_s,
         frames_without_force=len(frames) - with_row,
         forces_without_frame=len(samples) - with_row,
     )
@@ -310,12 +337,12 @@ def _read_video(video: Path, region: Region | None, size: int) -> tuple[list[Gra
     return frames, rate_hz
 
 
-def _frame_times_ns(table: ForceTable, frames: int, rate_hz: float) -> list[int]:
+def _frame_times_s(table: ForceTable, frames: int, rate_hz: float) -> Floats:
     """The table's times; between its rows interpolated, outside of them by the video's rate."""
     index = np.arange(frames)
     t_s = np.interp(index, table.frame, table.t_s)
     t_s += np.minimum(index - table.frame[0], 0) / rate_hz + np.maximum(index - table.frame[-1], 0) / rate_hz
-    return [_ns(t) for t in t_s]
+    return np.asarray(t_s, np.float64)
 
 
 def _ns(t_s: float) -> int:

@@ -380,21 +380,24 @@ def import_video(
     forces: Annotated[Path | None, typer.Argument(help="Table with frame, t_s and force_n.")] = None,
     folder: Annotated[Path, typer.Option("--out", help="Folder for the logs.")] = Path("data/imported"),
     object_: Annotated[str | None, typer.Option("--object", help="What was grasped.")] = None,
+    align: Annotated[
+        bool, typer.Option(help="Set forces right that come late or early beyond doubt.")
+    ] = True,
     set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Import a video and its load-cell table, or a folder of them. Spikes and tare are counted."""
+    """Import a video and its load-cell table, or a folder of them. Spikes, tare and lag are told."""
     from gripper_force import video_import as job
 
     region = load_settings(None, set_, {}).vision.region
 
     if video.is_dir():
-        summaries = job.import_folder(video, folder, region=region)
+        summaries = job.import_folder(video, folder, region=region, align=align)
     elif forces is None:
         raise DataError(f"{video} needs its load-cell table: import video CLIP.avi FORCES.csv")
     else:
         log = folder / f"{video.stem}.mcap"
-        summaries = [job.import_video(video, forces, log, object_name=object_, region=region)]
+        summaries = [job.import_video(video, forces, log, object_name=object_, region=region, align=align)]
     rows = [console.jsonable(summary) for summary in summaries]
     console.show({"logs": rows}, as_json, console.imports_table)
 

@@ -13,6 +13,9 @@ instant; what flows only shapes how they go on. The lag is the difference of the
 
 Of a simulated set of four touches both steps together are within 5 ms of the truth, and of three sets within
 4 ms, for all four objects. A load cell with less than some 50 samples/s is too slow for the second step.
+
+*A recording without an encoder* has the picture and the force alone. Flow makes force lead; so a force that
+trails what is seen, or leads it by longer than any flow, is late or early beyond doubt: see `force_lag_s`.
 """
 
 from collections.abc import Sequence
@@ -22,6 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gripper_force.types import Gray
+from gripper_force.vision.preprocess import Normaliser, Preprocess
 
 WIDEST_S: Final = 0.15
 """No larger lag is looked for."""
@@ -51,7 +55,50 @@ _FORCE: Final = (0.020, (1.0, 1.25, 1.5, 1.75, 2.0))
 """How long a change is followed once it is clear, for so many samples at least, and the powers of time that
 it may begin with. Jaws have mass; a force may fall at once, as speed has a part in it."""
 
+_FLOW_S: Final = 0.06
+"""By so much what flows, the object or a soft pad, may make force lead the picture."""
+
+_LEAST_LAG_S: Final = 0.02
+_FEWEST_FRAMES: Final = 30
+_CLEAR_FALL: Final = 0.7
+"""A lag is believed if without it the force is followed so much less well."""
+
+_CURVE: Final = 3
+"""Degree of the polynomial by which force follows how far the picture has changed."""
+
 Floats = npt.NDArray[np.float64]
+
+
+def force_lag_s(t_s: Floats, images: Gray, force_t_s: Floats, force_n: Floats) -> float:
+    """Time by which forces trail pictures in a recording that has no encoder, where that is beyond doubt.
+
+    That is the shift at which force follows best, as one curve, how far the picture has gone from the first
+    ones, which must show no contact.
+
+    Args:
+        t_s: Times of the pictures, rising, (T,).
+        images: The pictures, small, (T, S, S) uint8.
+        force_t_s: Times of the forces, rising, (M,).
+        force_n: The forces, (M,), finite, without spikes.
+
+    Returns:
+        Lag in s; positive where the load cell's timestamps are late; 0 where the pictures tell of none, or of
+        one that the flow of what is grasped explains.
+    """
+    inside = (t_s >= t_s[0] + WIDEST_S) & (t_s <= t_s[-1] - WIDEST_S)
+    if not len(force_n) or inside.sum() < _FEWEST_FRAMES:
+        return 0.0
+    look = Normaliser(Preprocess())
+    change = np.array([np.sqrt(np.square(d).mean()) for image in images for d in look.push(image)])  # (T,)
+    if not change.max() > 0:
+        return 0.0
+    basis = np.linalg.qr(np.vander(change[inside] / change.max(), _CURVE + 1))[0]  # (frames, 4)
+    lags_s = np.arange(-WIDEST_S, WIDEST_S + _STEP_S / 2, _STEP_S)
+    forces_n = np.interp(t_s[inside] + lags_s[:, None], force_t_s, force_n)  # (lags, frames)
+    unexplained = np.sqrt(np.square(forces_n - forces_n @ basis @ basis.T).sum(axis=1))
+    lag_s = _least(lags_s, unexplained)
+    believed = unexplained.min() < _CLEAR_FALL * unexplained[len(lags_s) // 2]
+    return lag_s if believed and (lag_s > _LEAST_LAG_S or lag_s < -_FLOW_S) else 0.0
 
 
 def camera_lags_s(

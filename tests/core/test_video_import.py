@@ -207,6 +207,26 @@ def test_spikes_are_rejected_and_stay_in_the_log(folder: Path, tmp_path: Path) -
     assert samples[55].raw == -70.0
 
 
+def test_forces_that_come_late_are_set_right_unless_told_not_to(folder: Path, tmp_path: Path) -> None:
+    squeezed = cv2.VideoWriter(str(folder / "video.avi"), cv2.VideoWriter.fourcc(*"MJPG"), RATE_HZ, (64, 48))
+    for force in grip(90):
+        image = np.full((48, 64, 3), 200, np.uint8)
+        image[:, : 10 + round(force)] = 60
+        squeezed.write(image)
+    squeezed.release()
+    for frames, name in [(3, "late"), (-3, "early")]:
+        write_table(folder / "load_cell.csv", np.roll(grip(90), frames))
+        (summary,) = import_folder(tmp_path, tmp_path / name)
+        assert summary.force_lag_s == pytest.approx(frames / RATE_HZ, abs=0.01)
+        log = LogReader(summary.log)
+        assert float(log.metadata["force_lag_s"]) == pytest.approx(summary.force_lag_s, abs=1e-4)
+        frame, sample = next(log.records(Frame)), next(log.records(LoadCellSample))
+        assert frame.t_ns - sample.t_ns == pytest.approx(summary.force_lag_s * 1e9, abs=1)
+        assert min(frame.t_ns, sample.t_ns) == 0
+        (as_it_is,) = import_folder(tmp_path, tmp_path / f"{name}_as_it_is", align=False)
+        assert as_it_is.force_lag_s == 0.0
+
+
 def test_a_clock_that_started_long_ago_gives_no_tare() -> None:
     tare_n, note = estimate_tare(np.array([1e18, 2e18]), np.array([0.0, 1.0]))
     assert tare_n == 0.0
@@ -234,18 +254,21 @@ def test_real_recordings_import_with_their_known_flaws_found(real_grasps: Path, 
         "2023-12-16_blue_foam_brick_harder_0",
         "2023-12-06_foam_brick_1",
         "2023-11-11_small_rigid_sphere_1",
+        "2023-11-18_rigid_strawberry_3",
     ]
     source = tmp_path / "source"
     source.mkdir()
     for name in names:
         (source / name).symlink_to(real_grasps / name)
     by_name = {summary.log.stem: summary for summary in import_folder(source, tmp_path / "out")}
-    blue, near_contact, sphere = (by_name[name] for name in names)
+    blue, near_contact, sphere, strawberry = (by_name[name] for name in names)
     assert (sphere.spikes_rejected, sphere.tare_note) == (0, "")
     assert abs(sphere.tare_n) < 0.02
     assert near_contact.tare_n == 0.0
     assert "contact may be near" in near_contact.tare_note
     assert blue.tare_n == pytest.approx(0.55, abs=0.02)
+    assert (sphere.force_lag_s, near_contact.force_lag_s) == (0.0, 0.0)
+    assert strawberry.force_lag_s == pytest.approx(0.09, abs=0.015)  # its force rises three frames late
     samples = list(LogReader(blue.log).records(LoadCellSample))
     assert not any(s.valid for s in samples if s.raw < -1.0)
     assert all(s.valid for s in samples if s.force_n > 1.0)

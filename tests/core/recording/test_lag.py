@@ -1,7 +1,10 @@
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
-from gripper_force.recording.lag import Floats, camera_lags_s, load_cell_lag_s
+from gripper_force.recording.lag import Floats, camera_lags_s, force_lag_s, load_cell_lag_s
 from gripper_force.types import Gray
 
 SERVO_S = np.arange(0, 8, 0.005)
@@ -62,3 +65,43 @@ def test_what_does_not_move_or_is_not_there_tells_no_lag() -> None:
     assert not len(camera_lags_s(t_s, images, SERVO_S, still, []))
     assert np.isnan(load_cell_lag_s(t_s, np.zeros(len(t_s)), SERVO_S, width_m(SERVO_S), 2.0))
     assert np.isnan(load_cell_lag_s(nothing, nothing, SERVO_S, width_m(SERVO_S), 2.0))
+
+
+def force_n(t_s: Floats, viscous_s: float) -> Floats:
+    """What gives way along a curve, and flows."""
+    fine_s = np.arange(0, 8, 0.0005)
+    depth_m = 0.06 - width_m(fine_s)
+    force = 6e4 * np.clip(depth_m + viscous_s * np.gradient(depth_m, fine_s), 0, None) ** 2
+    return np.interp(t_s, fine_s, force)
+
+
+@pytest.mark.parametrize("viscous_s", [0.0, 0.03])
+@pytest.mark.parametrize("lag_s", [-0.1, 0.06, 0.1])
+def test_without_an_encoder_a_clear_lag_is_found_but_for_the_flow(lag_s: float, viscous_s: float) -> None:
+    t_s = np.arange(0.003, 7.9, 1 / 30)
+    images = pictures(t_s, np.random.default_rng(3))
+    found_s = force_lag_s(t_s, images, t_s + lag_s, force_n(t_s, viscous_s))
+    assert found_s == pytest.approx(lag_s - viscous_s / 2, abs=0.008 + viscous_s / 2)
+
+
+@pytest.mark.parametrize("viscous_s", [0.0, 0.02, 0.05])
+def test_without_an_encoder_flow_is_not_taken_for_a_lag(viscous_s: float) -> None:
+    t_s = np.arange(0.003, 7.9, 1 / 30)
+    images = pictures(t_s, np.random.default_rng(4))
+    assert force_lag_s(t_s, images, t_s, force_n(t_s, viscous_s)) == 0.0
+
+
+def test_without_an_encoder_what_tells_nothing_has_no_lag() -> None:
+    t_s = np.arange(0, 4, 1 / 30)
+    images = pictures(t_s, np.random.default_rng(5))
+    force = force_n(t_s, 0.0)
+    assert force_lag_s(t_s, np.full_like(images, 90), t_s + 0.1, force) == 0.0
+    assert force_lag_s(t_s, images, t_s, np.zeros(len(t_s))) == 0.0
+    assert force_lag_s(t_s[:35], images[:35], t_s[:35] + 0.1, force[:35]) == 0.0
+    assert force_lag_s(t_s, images, t_s[:0], force[:0]) == 0.0
+
+
+@given(arrays(np.uint8, (45, 16, 16)), arrays(np.float64, 45, elements=st.floats(-1e6, 1e6)))
+def test_without_an_encoder_any_recording_has_a_lag_within_bounds(images: Gray, force: Floats) -> None:
+    t_s = np.arange(45) / 30
+    assert abs(force_lag_s(t_s, images, t_s, force)) < 0.15
