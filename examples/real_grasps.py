@@ -2,10 +2,12 @@
 
 Imports a folder of recordings (`<date>_<object>_<trial>/video.avi` with `load_cell.csv`), splits the objects
 into folds, trains on all folds but one and evaluates on that one, with a ridge regression beside it. Each
-object that was held out is then calibrated on one of its trials and tested on its others, each trial in turn.
+object that was held out is then calibrated on one of its trials and tested on its others, each trial in turn:
+on all of them, and on those of the same day alone, as the finger's pad was another on some days.
 
     python examples/real_grasps.py FOLDER [--folds 5] [--minutes 5]             # the last rung alone
     python examples/real_grasps.py FOLDER [--folds 5] [--minutes 5] --ladder    # what each thing brings
+    python examples/real_grasps.py FOLDER --as-recorded --out data/as_recorded  # late forces left as they are
 
 Each result is kept in OUT/results.json as it comes; the same command goes on where it was broken off.
 """
@@ -87,14 +89,14 @@ def run(rung: str, fold: list[str], clips: list[Clip], minutes: float, out: Path
                 "gain": gain,
                 "correlation": float(np.corrcoef(estimated_n, measured_n)[0, 1]),
                 "one_gain_mae_n": float(np.abs(estimated_n / gain - measured_n).mean()),
-                "calibrated_mae_n": calibrated_mae_n(checkpoint, [c for c, _ in pairs]),
+                **calibrated(checkpoint, [c for c, _ in pairs]),
             }
         )
     return rows
 
 
-def calibrated_mae_n(checkpoint: Checkpoint, clips: list[Clip]) -> float:
-    """Mean error on an object's other trials after a calibration on one, over all choices of that one."""
+def calibrated(checkpoint: Checkpoint, clips: list[Clip]) -> dict[str, float]:
+    """Mean errors on an object's other trials after a calibration on one, over all choices of that one."""
     lead_in = checkpoint.header.preprocess.lead_in
     trials = []
     for number, clip in enumerate(clips):
@@ -103,11 +105,16 @@ def calibrated_mae_n(checkpoint: Checkpoint, clips: list[Clip]) -> float:
         whose = np.full(int(seen.sum()), number)
         estimate_n = forces_n.mean(0)[seen].astype(np.float64)
         trials.append(Touches(read_out[seen], estimate_n, clip.forces_n[seen].astype(np.float64), whose))
-    errors_n = []
-    for trial in trials:
+    errors_n: dict[str, list[np.ndarray]] = {"calibrated_mae_n": [], "same_day_mae_n": []}
+    for one, trial in zip(clips, trials, strict=True):
         fitted = fit_correction(trial)
-        errors_n += [np.abs(fitted.predict(t) - t.force_n) for t in trials if t is not trial]
-    return float(np.concatenate(errors_n).mean())
+        for other, t in zip(clips, trials, strict=True):
+            if other is not one:
+                error_n = np.abs(fitted.predict(t) - t.force_n)
+                errors_n["calibrated_mae_n"].append(error_n)
+                if other.set == one.set:
+                    errors_n["same_day_mae_n"].append(error_n)
+    return {name: float(np.concatenate(parts).mean()) for name, parts in errors_n.items()}
 
 
 def summary(results: dict[str, list[dict[str, Any]]], rung: str) -> str:
@@ -127,12 +134,13 @@ def main() -> None:
     parser.add_argument("--folds", type=int, default=5)
     parser.add_argument("--minutes", type=float, default=5.0, help="training time of one fold, on one thread")
     parser.add_argument("--ladder", action="store_true", help="all rungs, not only the last")
+    parser.add_argument("--as-recorded", action="store_true", help="leave forces that come late as they are")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("data/real"))
     options = parser.parse_args()
 
     if not any(options.out.glob("*.mcap")):
-        import_folder(options.recordings, options.out)
+        import_folder(options.recordings, options.out, align=not options.as_recorded)
     kept = options.out / "results.json"
     results = json.loads(kept.read_text()) if kept.exists() else {}
     clips = load_clips(options.out, TrainConfig(**BASE).preprocess, workers=options.jobs)
@@ -155,12 +163,29 @@ def main() -> None:
     mine = {key: results[key] for key in wanted}
     for rung in rungs:
         print(summary(mine, rung))
-    print("\n| held out | MAE N | after one trial | in contact | with its gain known | gain | correlation |")
-    print("|---|---|---|---|---|---|---|")
-    for key, rows in mine.items():
-        for r in rows if key.startswith(DEFAULT) else []:
-            figures = ("mae_n", "calibrated_mae_n", "contact_mae_n", "one_gain_mae_n", "gain", "correlation")
-            print(f"| {r['object']} | " + " | ".join(f"{r[name]:.2f}" for name in figures) + " |")
+    titles = (
+        "MAE N",
+        "after one trial",
+        "of the same day",
+        "in contact",
+        "its gain known",
+        "gain",
+        "correlation",
+    )
+    print("\n| held out | " + " | ".join(titles) + " |\n" + "|---" * (len(titles) + 1) + "|")
+    names = (
+        "mae_n",
+        "calibrated_mae_n",
+        "same_day_mae_n",
+        "contact_mae_n",
+        "one_gain_mae_n",
+        "gain",
+        "correlation",
+    )
+    held_out = [row for key, rows in mine.items() if key.startswith(DEFAULT) for row in rows]
+    held_out.append({"object": "mean", **{name: np.mean([row[name] for row in held_out]) for name in names}})
+    for row in held_out:
+        print(f"| {row['object']} | " + " | ".join(f"{row[name]:.2f}" for name in names) + " |")
 
 
 if __name__ == "__main__":
