@@ -62,6 +62,16 @@ RUNGS: dict[str, dict[str, Any]] = {
 DEFAULT = "spatial attention"
 RIDGE = "ridge regression"
 
+COLUMNS = {
+    "mae_n": "MAE N",
+    "calibrated_mae_n": "after one trial",
+    "same_day_mae_n": "of the same day",
+    "contact_mae_n": "in contact",
+    "one_gain_mae_n": "its gain known",
+    "gain": "gain",
+    "correlation": "correlation",
+}
+
 
 def run(rung: str, fold: list[str], clips: list[Clip], minutes: float, out: Path) -> list[dict[str, Any]]:
     """Trains without the fold's objects, and tells of each of them how well the network does there."""
@@ -163,29 +173,13 @@ def main() -> None:
     mine = {key: results[key] for key in wanted}
     for rung in rungs:
         print(summary(mine, rung))
-    titles = (
-        "MAE N",
-        "after one trial",
-        "of the same day",
-        "in contact",
-        "its gain known",
-        "gain",
-        "correlation",
-    )
-    print("\n| held out | " + " | ".join(titles) + " |\n" + "|---" * (len(titles) + 1) + "|")
-    names = (
-        "mae_n",
-        "calibrated_mae_n",
-        "same_day_mae_n",
-        "contact_mae_n",
-        "one_gain_mae_n",
-        "gain",
-        "correlation",
-    )
+    print("\n| held out | " + " | ".join(COLUMNS.values()) + " |\n" + "|---" * (len(COLUMNS) + 1) + "|")
     held_out = [row for key, rows in mine.items() if key.startswith(DEFAULT) for row in rows]
-    held_out.append({"object": "mean", **{name: np.mean([row[name] for row in held_out]) for name in names}})
+    held_out.append(
+        {"object": "mean", **{name: np.mean([row[name] for row in held_out]) for name in COLUMNS}}
+    )
     for row in held_out:
-        print(f"| {row['object']} | " + " | ".join(f"{row[name]:.2f}" for name in names) + " |")
+        print(f"| {row['object']} | " + " | ".join(f"{row[name]:.2f}" for name in COLUMNS) + " |")
 
 
 if __name__ == "__main__":
