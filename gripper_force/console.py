@@ -198,13 +198,15 @@ def sets_table(r: dict[str, Any]) -> None:
 
 def imports_table(r: dict[str, Any]) -> None:
     """What became of recordings."""
-    table = Table("log", "object", "frames", "spikes", "tare N", "force late by", "note", box=None)
+    table = Table("log", "frames", "spikes", "tare N", "force late ms", box=None)
     for row in r["logs"]:
-        counts = (str(row["frames"]), str(row["spikes_rejected"]))
-        late = f"{1e3 * row['force_lag_s']:.0f} ms"
-        name, tare = Path(row["log"]).name, _number(row["tare_n"], digits=3)
-        table.add_row(name, row["object"], *counts, tare, late, row["tare_note"])
+        figures = (_number(row["tare_n"], digits=3), f"{1e3 * row['force_lag_s']:.0f}")
+        table.add_row(Path(row["log"]).name, str(row["frames"]), str(row["spikes_rejected"]), *figures)
     out.print(table)
+    for row in r["logs"]:
+        if row["tare_note"]:
+            note = f"no tare: {row['tare_note']}"
+            out.print(f"[yellow]{escape(Path(row['log']).name)}[/] {escape(note)}", soft_wrap=True)
 
 
 def database_table(r: dict[str, Any]) -> None:
