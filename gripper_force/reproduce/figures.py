@@ -105,8 +105,8 @@ def _look(axes: Axes, clip: Clip, index: int, network: ForceNetwork, preprocess:
 @torch.inference_mode()
 def _gates(frames: Gray, clip: Gray, network: ForceNetwork, preprocess: Preprocess) -> np.ndarray:
     """Spatial attention of the last of some frames, (h, w)."""
-    reference = torch.from_numpy(clip[None, : preprocess.reference_frames]) if preprocess.reference else None
-    inputs = normalise(torch.from_numpy(frames)[None], reference)  # (1, T, 1, S, S)
+    leading = torch.from_numpy(clip[None, : preprocess.reference_frames])
+    inputs = normalise(torch.from_numpy(frames)[None], leading, preprocess)  # (1, T, 1, S, S)
     state = None
     for i in range(inputs.shape[1]):
         seen, state = network.step(inputs[:, i], state)

@@ -360,7 +360,7 @@ def _exactly(clip: Gray, preprocess: Preprocess) -> Exact:
     standard: Exact = (frames - frames.mean((1, 2), keepdims=True)) / deviation
     if preprocess.reference:
         standard = DIFFERENCE_GAIN * (standard - standard[: preprocess.reference_frames].mean(0))
-    return standard
+    return np.abs(standard) if preprocess.magnitude else standard
 
 
 def _range(folder: Path, grasp: Clip, config: Config) -> Row:

@@ -67,11 +67,11 @@ class Batches:
         begin = self._begin[ends]
         # Frames before a recording's first are copies of it, as for the estimator.
         index = np.maximum(ends[:, None] + np.arange(1 - length, 1), begin[:, None])  # (B, T)
-        # The reference goes through the same distortion as the clip: it shares the camera and the light.
+        # The leading frames go through the same distortion as the clip: they share the camera and the light.
         lead = begin[:, None] + np.arange(config.preprocess.reference_frames)  # (B, R)
         gray = self._distorted(rng, np.concatenate([lead, index], axis=1))  # (B, R + T, S, S)
-        reference, frames = gray[:, : lead.shape[1]], gray[:, lead.shape[1] :]
-        inputs = normalise(frames, reference if config.preprocess.reference else None)
+        leading, frames = gray[:, : lead.shape[1]], gray[:, lead.shape[1] :]
+        inputs = normalise(frames, leading, config.preprocess)
         where = torch.from_numpy(index[self._share]).to(self._device)
         return inputs, self._labels[where], self._valid[where]
 

@@ -15,19 +15,22 @@ CHUNK = 256
 """Frames of a clip that pass the backbone together; bounds memory."""
 
 
-def normalise(frames: Tensor, reference: Tensor | None) -> Tensor:
-    """Standardises frames and subtracts their reference; equals `preprocess.Normaliser`.
+def normalise(frames: Tensor, leading: Tensor, preprocess: Preprocess) -> Tensor:
+    """Prepares the frames of recordings; equals `preprocess.Normaliser`.
 
     Args:
         frames: Gray levels, (B, T, S, S), uint8 or float32.
-        reference: The frames that show no contact, (B, R, S, S); None where no reference is used.
+        leading: The first of each recording, which show no contact, (B, R, S, S).
+        preprocess: What to do; ``R`` is its ``reference_frames``.
 
     Returns:
         The network's input, (B, T, 1, S, S) float32.
     """
     inputs = _standardise(frames)
-    if reference is not None:
-        inputs = DIFFERENCE_GAIN * (inputs - _standardise(reference).mean(1, keepdim=True))
+    if preprocess.reference:
+        inputs = DIFFERENCE_GAIN * (inputs - _standardise(leading).mean(1, keepdim=True))
+    if preprocess.magnitude:
+        inputs = inputs.abs()
     return inputs[:, :, None]
 
 
@@ -64,12 +67,12 @@ def features(
         Each member's forces in N, (members, T), and the members' features side by side, (T, heads).
     """
     clip = torch.from_numpy(frames)[None].to(device)  # (1, T, S, S)
-    reference = clip[:, : preprocess.reference_frames] if preprocess.reference else None
+    leading = clip[:, : preprocess.reference_frames]
     context = max(network.config.context for network in networks)
     forces, read = [], []
     for begin in range(0, clip.shape[1], CHUNK):
         first = max(0, begin - context)
-        inputs = normalise(clip[:, first : begin + CHUNK], reference)
+        inputs = normalise(clip[:, first : begin + CHUNK], leading, preprocess)
         part = [network.features(inputs, begin - first)[0] for network in networks]  # (chunk, head) each
         forces.append(torch.stack([n.force_n(f) for n, f in zip(networks, part, strict=True)]))
         read.append(torch.cat(part, dim=1))

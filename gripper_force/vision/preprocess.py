@@ -4,12 +4,12 @@ The difference to a reference frame halves the error in simulation and is what l
 objects it has not seen; raw gray values did not learn at all on real finger cameras.
 """
 
-from typing import Annotated, Final
+from typing import Annotated, Final, Self
 
 import cv2
 import numpy as np
 import numpy.typing as npt
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.schema import Section
@@ -32,11 +32,20 @@ class Preprocess(Section):
         size: Side of the square input in pixels.
         reference: Whether the mean of the first frames, which must show no contact, is subtracted.
         reference_frames: How many frames that mean is taken over.
+        magnitude: Whether only the size of that difference counts. Where a soft pad that is lit from its
+            sides bulges, the sign tells where the lamps stand, and differs from pad to pad.
     """
 
     size: Annotated[int, Field(ge=16, le=1024, multiple_of=16)] = 128
     reference: bool = True
     reference_frames: Annotated[int, Field(ge=1, le=1000)] = 4
+    magnitude: bool = False
+
+    @model_validator(mode="after")
+    def _has_difference(self) -> Self:
+        if self.magnitude and not self.reference:
+            raise ValueError("magnitude is that of the difference to a reference: set reference too")
+        return self
 
     @property
     def lead_in(self) -> int:
@@ -98,7 +107,7 @@ class Normaliser:
         if not self._preprocess.reference:
             return [_standardise(small)]
         if self._reference is not None:
-            return [_difference(small, self._reference)]
+            return [self._difference(small, self._reference)]
         self._waiting.append(small)
         if len(self._waiting) < self._preprocess.reference_frames:
             return []
@@ -106,12 +115,11 @@ class Normaliser:
         reference: npt.NDArray[np.float32] = np.mean([_standardise(image) for image in waiting], axis=0)
         self._reference = reference
         self._reference_image = np.mean(waiting, axis=0).round().astype(np.uint8)
-        return [_difference(image, reference) for image in waiting]
+        return [self._difference(image, reference) for image in waiting]
 
-
-def _difference(small: Gray, reference: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
-    difference: npt.NDArray[np.float32] = np.float32(DIFFERENCE_GAIN) * (_standardise(small) - reference)
-    return difference
+    def _difference(self, small: Gray, reference: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+        difference: npt.NDArray[np.float32] = np.float32(DIFFERENCE_GAIN) * (_standardise(small) - reference)
+        return np.abs(difference) if self._preprocess.magnitude else difference
 
 
 def _standardise(small: Gray) -> npt.NDArray[np.float32]:

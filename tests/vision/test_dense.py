@@ -19,7 +19,7 @@ def test_chunks_make_no_difference(chunk: int, monkeypatch: pytest.MonkeyPatch) 
     frames = np.random.default_rng(0).integers(0, 256, (40, 16, 16), np.uint8)
     clip = torch.from_numpy(frames)[None]
     with torch.inference_mode():
-        inputs = dense.normalise(clip, clip[:, :4])
+        inputs = dense.normalise(clip, clip[:, :4], Preprocess(size=16))
         whole = torch.cat([network(inputs) for network in networks])
     monkeypatch.setattr(dense, "CHUNK", chunk)
     forces = dense.predict(networks, Preprocess(size=16), frames)

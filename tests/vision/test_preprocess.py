@@ -50,18 +50,29 @@ def test_size_must_suit_the_backbone() -> None:
 @given(images(7))
 def test_streaming_and_batches_agree(frames: np.ndarray) -> None:
     clip = torch.from_numpy(frames)[None]
-    for preprocess in (SMALL, Preprocess(size=16, reference=False)):
-        reference = clip[:, : preprocess.reference_frames] if preprocess.reference else None
-        expected = normalise(clip, reference)[0, :, 0].numpy()
+    for keys in ({}, {"reference": False}, {"magnitude": True}):
+        preprocess = Preprocess(size=16, **keys)
+        expected = normalise(clip, clip[:, : preprocess.reference_frames], preprocess)[0, :, 0].numpy()
         np.testing.assert_allclose(stream(preprocess, frames), expected, rtol=1e-4, atol=1e-4)
 
 
 @given(st.integers(0, 99), st.floats(0.5, 0.9), st.floats(0, 20))
 def test_gain_and_offset_of_the_light_make_no_difference(seed: int, gain: float, offset: float) -> None:
     gray = 255 * torch.rand(1, 2, 16, 16, generator=torch.Generator().manual_seed(seed))
-    torch.testing.assert_close(
-        normalise(gain * gray + offset, None), normalise(gray, None), rtol=1e-3, atol=1e-3
-    )
+    plain = Preprocess(size=16, reference=False)
+    lit = normalise(gain * gray + offset, gray, plain)
+    torch.testing.assert_close(lit, normalise(gray, gray, plain), rtol=1e-3, atol=1e-3)
+
+
+@given(images(7))
+def test_magnitude_is_blind_to_what_a_lamp_on_the_other_side_changes(frames: np.ndarray) -> None:
+    magnitude = Preprocess(size=16, magnitude=True)
+    np.testing.assert_allclose(stream(magnitude, frames), stream(magnitude, 255 - frames), atol=1e-4)
+
+
+def test_magnitude_needs_a_reference() -> None:
+    with pytest.raises(ValidationError, match="set reference too"):
+        Preprocess(reference=False, magnitude=True)
 
 
 def test_a_flat_frame_gives_zeros_and_faint_noise_stays_faint() -> None:

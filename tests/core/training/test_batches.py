@@ -20,7 +20,7 @@ def test_batches_hold_what_a_run_would_see(clips: list[Clip], small_recipe: Trai
     assert inputs.shape == (40, 22, 1, 16, 16)
     assert valid.all()
     frames = torch.from_numpy(np.stack([clip.frames for clip in clips]))
-    images = normalise(frames, frames[:, :4]).flatten(0, 1)  # (6 * 60, 1, 16, 16)
+    images = normalise(frames, frames[:, :4], plain.preprocess).flatten(0, 1)  # (6 * 60, 1, 16, 16)
     labels = np.concatenate([clip.forces_n for clip in clips])
     for image, force_n in zip(inputs[:, -1], forces_n[:, -1], strict=True):
         same = (images - image).abs().amax((1, 2, 3)) < 1e-4
