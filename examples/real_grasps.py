@@ -35,7 +35,7 @@ from gripper_force.vision.checkpoint import Checkpoint
 from gripper_force.vision.dense import features
 
 BASE: dict[str, Any] = {
-    "preprocess": {"size": 64},
+    "preprocess": {"size": 64, "magnitude": True},
     "attentions": ["ssam"],
     "width": 0.5,
     "clips": 20,
@@ -49,7 +49,8 @@ RUNGS: dict[str, dict[str, Any]] = {
         "preprocess": {"size": 64, "reference": False},
         **BARE,
     },
-    "+ reference frame": {"attentions": ["none"], **BARE},
+    "+ reference frame": {"attentions": ["none"], "preprocess": {"size": 64}, **BARE},
+    "+ magnitude alone": {"attentions": ["none"], **BARE},
     "+ augmentation": {"attentions": ["none"]},
     "channel attention": {"attentions": ["scam"]},
     "spatial and channel, averaged": {"attentions": ["ssam", "scam"]},
