@@ -86,7 +86,7 @@ def force_lag_s(t_s: Floats, images: Gray, force_t_s: Floats, force_n: Floats) -
         one that the flow of what is grasped explains.
     """
     inside = (t_s >= t_s[0] + WIDEST_S) & (t_s <= t_s[-1] - WIDEST_S)
-    if not len(force_n) or inside.sum() < _FEWEST_FRAMES:
+    if not np.any(force_n) or inside.sum() < _FEWEST_FRAMES:
         return 0.0
     look = Normaliser(Preprocess())
     change = np.array([np.sqrt(np.square(d).mean()) for image in images for d in look.push(image)])  # (T,)
@@ -94,8 +94,11 @@ def force_lag_s(t_s: Floats, images: Gray, force_t_s: Floats, force_n: Floats) -
         return 0.0
     basis = np.linalg.qr(np.vander(change[inside] / change.max(), _CURVE + 1))[0]  # (frames, 4)
     lags_s = np.arange(-WIDEST_S, WIDEST_S + _STEP_S / 2, _STEP_S)
-    forces_n = np.interp(t_s[inside] + lags_s[:, None], force_t_s, force_n)  # (lags, frames)
-    unexplained = np.sqrt(np.square(forces_n - forces_n @ basis @ basis.T).sum(axis=1))
+    share = force_n / np.abs(force_n).max()
+    unexplained = np.empty(len(lags_s))
+    for i, lag_s in enumerate(lags_s):  # not all at once: a recording may be long
+        forces = np.interp(t_s[inside] + lag_s, force_t_s, share)  # (frames,)
+        unexplained[i] = np.linalg.norm(forces - basis @ (basis.T @ forces))
     lag_s = _least(lags_s, unexplained)
     believed = unexplained.min() < _CLEAR_FALL * unexplained[len(lags_s) // 2]
     return lag_s if believed and (lag_s > _LEAST_LAG_S or lag_s < -_FLOW_S) else 0.0
