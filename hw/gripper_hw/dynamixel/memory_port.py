@@ -6,16 +6,15 @@ from typing import Final
 from dynamixel_sdk import PortHandler
 
 from gripper_force.errors import DeviceError, DeviceLostError, DeviceNotFoundError
-from gripper_hw.dynamixel.port import VIRTUAL_PREFIX
 from gripper_hw.dynamixel.virtual import VirtualBus, find_bus
 
 
 class MemoryPort(PortHandler):  # type: ignore[misc]
     """A line to a `VirtualBus` in this process. Never sleeps: an answer is there at once, or never."""
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, bus_name: str) -> None:
         super().__init__(name)
-        self._name = name.removeprefix(VIRTUAL_PREFIX)
+        self._name = bus_name
         self._received = bytearray()
         bus = find_bus(self._name)
         if bus is None:

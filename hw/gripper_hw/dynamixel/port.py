@@ -52,7 +52,7 @@ def open_port(name: str, baud_rate: int, reply_margin_ms: float) -> Port:
     if name.startswith(VIRTUAL_PREFIX):
         from gripper_hw.dynamixel.memory_port import MemoryPort
 
-        return MemoryPort(name)
+        return MemoryPort(name, name.removeprefix(VIRTUAL_PREFIX))
     port = SerialPort(name, reply_margin_ms)
     if not port.setBaudRate(baud_rate):
         raise ConfigError(f"servo.baud_rate {baud_rate} is none that Dynamixel adapters do; use e.g. 1000000")
