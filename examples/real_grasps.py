@@ -98,6 +98,9 @@ def run(rung: str, fold: list[str], clips: list[Clip], minutes: float, out: Path
     checkpoint = train(recipe, training, out / f"{rung}-{fold[0]}.safetensors")
     forces_n = [members_n.mean(0) for members_n in estimates(checkpoint, test)]
     per_object = compare(test, forces_n, recipe.preprocess.lead_in)["per_object"]
+    process_n = gaussian_process(training, test, recipe.preprocess)
+    means_n = [(network_n + n) / 2 for network_n, n in zip(forces_n, process_n, strict=True)]
+    together = compare(test, means_n, recipe.preprocess.lead_in)["per_object"]
     rows = []
     for name, result in per_object.items():
         pairs = [(c, f) for c, f in zip(test, forces_n, strict=True) if c.object == name]
@@ -109,6 +112,8 @@ def run(rung: str, fold: list[str], clips: list[Clip], minutes: float, out: Path
             {
                 "object": name,
                 **result,
+                "with_process_mae_n": together[name]["mae_n"],
+                "with_process_contact_mae_n": together[name]["contact_mae_n"],
                 "gain": gain,
                 "correlation": float(np.corrcoef(estimated_n, measured_n)[0, 1]),
                 "one_gain_mae_n": float(np.abs(estimated_n / gain - measured_n).mean()),
@@ -167,14 +172,18 @@ def calibrated(checkpoint: Checkpoint, clips: list[Clip]) -> dict[str, float]:
     return {name: float(np.concatenate(parts).mean()) for name, parts in errors_n.items()}
 
 
-def summary(results: dict[str, list[dict[str, Any]]], rung: str) -> str:
+def summary(results: dict[str, list[dict[str, Any]]], rung: str, estimate: str = "") -> str:
     """A row: MAE over all frames and over frames in contact, mean and s.d. over folds."""
     parts = [rows for key, rows in results.items() if key.startswith(f"{rung}: ")]
     cells = []
     for figure in ("mae_n", "contact_mae_n"):
-        folds = [np.average([r[figure] for r in rows], weights=[r["frames"] for r in rows]) for rows in parts]
+        folds = [
+            np.average([r[estimate + figure] for r in rows], weights=[r["frames"] for r in rows])
+            for rows in parts
+        ]
         cells.append(f"{np.mean(folds):.2f} ± {np.std(folds):.2f}")
-    return f"| {rung} | " + " | ".join(cells) + f" | {len(parts)} |"
+    name = f"{rung}, averaged with the process" if estimate else rung
+    return f"| {name} | " + " | ".join(cells) + f" | {len(parts)} |"
 
 
 def main() -> None:
@@ -213,6 +222,7 @@ def main() -> None:
     mine = {key: results[key] for key in wanted}
     for rung in rungs:
         print(summary(mine, rung))
+    print(summary(mine, DEFAULT, "with_process_"))
     print("\n| held out | " + " | ".join(COLUMNS.values()) + " |\n" + "|---" * (len(COLUMNS) + 1) + "|")
     held_out = [row for key, rows in mine.items() if key.startswith(DEFAULT) for row in rows]
     held_out.append(
