@@ -7,7 +7,7 @@ on all of them, and on those of the same day alone, as the finger's pad was anot
 
     python examples/real_grasps.py FOLDER [--folds 5] [--minutes 5]             # the last rung alone
     python examples/real_grasps.py FOLDER [--folds 5] [--minutes 5] --ladder    # what each thing brings
-    python examples/real_grasps.py FOLDER --as-recorded --out data/as_recorded  # late forces left as they are
+    python examples/real_grasps.py FOLDER --as-recorded                         # late forces left as they are
 
 Each result is kept in OUT/results.json as it comes; the same command goes on where it was broken off.
 """
@@ -29,7 +29,7 @@ from gripper_calibration.fits.correction import fit_correction
 from gripper_calibration.fits.touches import Touches
 from gripper_force.dataset import CONTACT_N, Clip, load_clips
 from gripper_force.errors import DataError
-from gripper_force.evaluate import compare, estimates, ridge_baseline
+from gripper_force.evaluate import Result, compare, estimates, ridge_baseline
 from gripper_force.training.recipe import TrainConfig
 from gripper_force.training.train import train
 from gripper_force.video_import import import_folder
@@ -88,13 +88,10 @@ def run(rung: str, fold: list[str], clips: list[Clip], minutes: float, out: Path
     training = [clip for clip in clips if clip.object not in fold]
     test = [clip for clip in clips if clip.object in fold]
     if rung == RIDGE:
-        per_object = ridge_baseline(training, test)["per_object"]
-        return [{"object": name, **result} for name, result in per_object.items()]
+        return _rows(ridge_baseline(training, test))
     if rung in PROCESSES:
-        recipe = TrainConfig(preprocess=Preprocess(magnitude=PROCESSES[rung]))
-        forces_n = gaussian_process(training, test, recipe.preprocess)
-        per_object = compare(test, forces_n, recipe.preprocess.lead_in)["per_object"]
-        return [{"object": name, **result} for name, result in per_object.items()]
+        preprocess = Preprocess(magnitude=PROCESSES[rung])
+        return _rows(compare(test, gaussian_process(training, test, preprocess), preprocess.lead_in))
     recipe = TrainConfig(**{**BASE, **RUNGS[rung], "minutes": minutes})
     checkpoint = train(recipe, training, out / f"{rung}-{fold[0]}.safetensors")
     forces_n = [members_n.mean(0) for members_n in estimates(checkpoint, test)]
@@ -124,6 +121,10 @@ def run(rung: str, fold: list[str], clips: list[Clip], minutes: float, out: Path
     return rows
 
 
+def _rows(result: Result) -> list[dict[str, Any]]:
+    return [{"object": name, **errors} for name, errors in result["per_object"].items()]
+
+
 def gaussian_process(training: list[Clip], test: list[Clip], preprocess: Preprocess) -> list[np.ndarray]:
     """Regression on principal components of pictures of 32x32, with a squared exponential kernel."""
 
@@ -143,9 +144,8 @@ def gaussian_process(training: list[Clip], test: list[Clip], preprocess: Preproc
     scores = (pictures - centre) / spread @ axes
     unit = scores[:, 0].std()
     touched = forces_n > CONTACT_N
-    chosen = np.concatenate(
-        [np.flatnonzero(touched)[::2], np.flatnonzero(~touched)[::8]]
-    )  # neighbours tell the same
+    # Not all frames: neighbours tell nearly the same, and the cost goes with the cube.
+    chosen = np.concatenate([np.flatnonzero(touched)[::2], np.flatnonzero(~touched)[::8]])
     known = scores[chosen] / unit
     weights = np.linalg.solve(kernel(known, known) + NOISE * np.eye(len(known)), forces_n[chosen])
     return [kernel((look(clip) - centre) / spread @ axes / unit, known) @ weights for clip in test]
@@ -203,8 +203,9 @@ def main() -> None:
     parser.add_argument("--ladder", action="store_true", help="all rungs, not only the last")
     parser.add_argument("--as-recorded", action="store_true", help="leave forces that come late as they are")
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--out", type=Path, default=Path("data/real"))
+    parser.add_argument("--out", type=Path, help="by default data/real or data/as_recorded")
     options = parser.parse_args()
+    options.out = options.out or Path("data/as_recorded" if options.as_recorded else "data/real")
 
     if not any(options.out.glob("*.mcap")):
         import_folder(options.recordings, options.out, align=not options.as_recorded)

@@ -198,7 +198,7 @@ def sets_table(r: dict[str, Any]) -> None:
 
 def imports_table(r: dict[str, Any]) -> None:
     """What became of recordings."""
-    table = Table("log", "frames", "spikes", "tare N", "force late ms", box=None)
+    table = Table("log", "frames", "spikes", "tare N", "lag ms", box=None)
     for row in r["logs"]:
         figures = (_number(row["tare_n"], digits=3), f"{1e3 * row['force_lag_s']:.0f}")
         table.add_row(Path(row["log"]).name, str(row["frames"]), str(row["spikes_rejected"]), *figures)
