@@ -61,7 +61,7 @@ _FLOW_S: Final = 0.06
 _LEAST_LAG_S: Final = 0.02
 _FEWEST_FRAMES: Final = 30
 _CLEAR_FALL: Final = 0.7
-"""A lag is believed if what the curve leaves unexplained falls below this share of what it was without one."""
+"""A lag is believed if what the curve leaves unexplained falls below this share of what it was without."""
 
 _CURVE: Final = 3
 """Degree of the polynomial by which force follows how far the picture has changed."""
