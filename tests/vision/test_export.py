@@ -6,7 +6,7 @@ import pytest
 
 from gripper_force.errors import CheckpointError, ConfigError, DataError
 from gripper_force.vision.engines import open_engine
-from gripper_force.vision.export import export
+from gripper_force.vision.export import coarser, export
 from gripper_force.vision.exported import read_model
 from gripper_force.vision.header import Model
 
@@ -48,10 +48,15 @@ def test_says_how_far_it_is_off_and_what_it_is(model: Model, tmp_path: Path, nam
 def test_int8_is_scaled_on_recordings(model: Model, tmp_path: Path, recordings: list[np.ndarray]) -> None:
     needs("nncf")
     errors = export(model, tmp_path / "int8.xml", recordings)
-    assert errors["mean_n"] > 0
+    assert 0 < errors["mean_n"] <= errors["rms_n"] <= errors["largest_n"]
     assert b"FakeQuantize" in (tmp_path / "int8.xml").read_bytes()
     opened = open_engine(read_model(tmp_path / "int8.xml"), "openvino", "bfloat16")
     assert np.isfinite(opened.step(np.zeros((32, 32), np.float32)).forces_n).all()
+    # A run must not trust it as it does the network that it was made of.
+    assert opened.header == coarser(model.header, errors)
+    for before, after in zip(model.header.residuals, opened.header.residuals, strict=True):
+        assert after.std_n**2 == pytest.approx(before.std_n**2 + errors["rms_n"] ** 2)
+        assert after.std_n > before.std_n
 
 
 def test_says_what_it_can_not_do(model: Model, tmp_path: Path, recordings: list[np.ndarray]) -> None:
