@@ -1,9 +1,9 @@
 """Which ports and servos are there, how are they set, and how long is a cycle? Also what sets a servo up."""
 
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final
 
 from serial.tools import list_ports
 
@@ -17,8 +17,9 @@ from gripper_hw.dynamixel.control_table import (
     load_model,
     model_names,
 )
-from gripper_hw.dynamixel.port import VIRTUAL_PREFIX, open_port
-from gripper_hw.dynamixel.servo import DynamixelBus, hardware_error_text
+from gripper_hw.dynamixel.line import Line
+from gripper_hw.dynamixel.port import VIRTUAL_PREFIX
+from gripper_hw.dynamixel.servo import CYCLE_BYTES, DynamixelBus, hardware_error_text
 
 _SYSFS: Final = Path("/sys/bus/usb-serial/devices")
 _CYCLES: Final = 200
@@ -53,19 +54,19 @@ def probe(config: Config, sysfs: Path = _SYSFS) -> Iterator[Check]:
     if config.clock == "lockstep" and not servo.port.startswith(VIRTUAL_PREFIX):
         advice = "a real servo can't keep simulated time: set clock=realtime"
         yield Check("servo", "clock", "lockstep", False, advice)
-    with _opened(config) as line:
+    with _opened(config) as looked:
         yield Check("servo", "port", servo.port, True)
         timer = sysfs / Path(servo.port).resolve().name / "latency_timer"
         if timer.is_file():
             latency_ms = int(timer.read_text())
             fast, advice = latency_ms < servo.reply_margin_ms, "install hw/udev's rules, which make it 1 ms"
             yield judged("servo", "latency timer", f"{latency_ms} ms", fast, advice)
-        found = line.scan()
+        found = looked.line.scan()
         for id_, (number, firmware) in sorted(found.items()):
             if id_ != servo.id:
                 yield Check(f"servo {id_}", "model", f"{_model(number)}, firmware {firmware}", None)
         if servo.id in found:
-            yield from line.checks(config, *found[servo.id])
+            yield from looked.checks(config, *found[servo.id])
             return
     answered = ", ".join(str(id_) for id_ in sorted(found)) or "none"
     what = f"no answer at {servo.baud_rate} baud (ids that answer: {answered})"
@@ -81,29 +82,19 @@ def setup(config: Config, agree: Agree) -> dict[str, Any]:
     Raises:
         GripperError: See `gripper_force.doctor.setup`.
     """
-    with _opened(config) as line:
-        return line.set_up(config.servo.id, agree)
+    with _opened(config) as looked:
+        return looked.set_up(config.servo.id, agree)
 
 
-class _Line(DynamixelBus):
-    """The bus without a start: it stays as it is."""
+class _Looked:
+    """The configured servo, looked at without a start: it stays as it is."""
 
-    def __enter__(self) -> Self:
-        margin_ms = max(_PATIENCE_MS, self._config.reply_margin_ms)
-        self._port = open_port(self._config.port, self._config.baud_rate, margin_ms)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def ping(self, id_: int) -> int:
-        """Model number. Raises `DeviceTimeoutError`."""
-        return self._transact(f"a ping of servo {id_}", lambda: self._ping_once(id_))
-
-    def scan(self) -> dict[int, tuple[int, int]]:
-        """Id to model number and firmware of all that answer."""
-        found, _ = self._packets.broadcastPing(self._port)
-        return {id_: (number, firmware) for id_, (number, firmware) in found.items()}
+    def __init__(self, config: ServoConfig) -> None:
+        bus = DynamixelBus(config, (config.id,))  # never opened: it knows what a run sets
+        self.model = bus.model
+        self.line = Line(config)
+        self._config = config
+        self._wanted = bus.settings | {"bus_watchdog": 0}  # what a start writes once torque is off
 
     def checks(self, config: Config, number: int, firmware: int) -> Iterator[Check]:
         """Looks at the configured servo."""
@@ -115,7 +106,7 @@ class _Line(DynamixelBus):
         yield judged(unit, "model", f"{self.model.name}, firmware {firmware}", able, advice)
         try:
             values = self._values(id_)
-            error, torque = self._get(id_, "hardware_error_status"), self._get(id_, "torque_enable")
+            error, torque = self.line.get(id_, "hardware_error_status"), self.line.get(id_, "torque_enable")
         except DeviceTimeoutError:
             advice = "its Status Return Level may be 0, which a run sets right; else check the cable"
             yield Check(unit, "registers", "it answers a ping, and no read", False, advice)
@@ -124,15 +115,15 @@ class _Line(DynamixelBus):
         yield judged(unit, "hardware error", text if error else "none", not error, advice)
         advice = "it holds as it was told to, and the next run lets go first"
         yield judged(unit, "torque", "on" if torque else "off", not torque, advice, harmless=True)
-        for name, new in self._wanted().items():
+        for name, new in self._wanted.items():
             if name in _SHOWN or values[name] != new:
                 same, text = values[name] == new, self._text(name, values[name])
                 advice = f"a run sets {self._text(name, new)}, and so does doctor --setup"
                 yield judged(unit, name.replace("_", " "), text, same, advice, harmless=True)
         if not able:
             return
-        self._data = REGISTERS["present_current"].address  # as many bytes as a cycle's, wherever they lie
-        median_ms, p99_ms = time_ms(lambda: self._transact("a fast sync read", self._read_once), _CYCLES)
+        start = REGISTERS["present_current"].address  # as many bytes as a cycle's, wherever they lie
+        median_ms, p99_ms = time_ms(lambda: self.line.sync_read((id_,), start, CYCLE_BYTES), _CYCLES)
         found = f"median {median_ms:.2f} ms, p99 {p99_ms:.2f} ms of {_CYCLES} reads"
         rate_hz, lockstep = config.control.rate_hz, config.clock == "lockstep"
         advice = f"longer than a cycle at control.rate_hz={rate_hz:g}: close what computes, or lower it"
@@ -140,28 +131,24 @@ class _Line(DynamixelBus):
 
     def set_up(self, id_: int, agree: Agree) -> dict[str, Any]:
         """See `setup`."""
-        check_model_number(self.model, self.ping(id_), f"the servo with id {id_} on {self._config.port}")
-        if self._get(id_, "torque_enable"):
+        check_model_number(self.model, self.line.ping(id_), f"the servo with id {id_} on {self._config.port}")
+        if self.line.get(id_, "torque_enable"):
             raise DeviceError(
                 f"servo {id_} has torque on, so nothing was changed; take the object out, then power-cycle it"
             )
         values = self._values(id_)
-        wanted = {name: new for name, new in self._wanted().items() if values[name] != new}
+        wanted = {name: new for name, new in self._wanted.items() if values[name] != new}
         text = self._text
         changes = [Change(name, text(name, values[name]), text(name, new)) for name, new in wanted.items()]
         applied = bool(changes) and agree(f"servo {id_}", changes)
         if applied:
-            self._ask_for_answers(id_)
+            self.line.ask_for_answers(id_)
             for name, new in wanted.items():
-                self._set(id_, name, new)
+                self.line.set(id_, name, new)
         return {"servo": id_, "changes": changes, "applied": applied}
 
-    def _wanted(self) -> dict[str, int]:
-        """What a start writes once torque is off."""
-        return self.settings | {"bus_watchdog": 0}
-
     def _values(self, id_: int) -> dict[str, int]:
-        return {name: self._get(id_, name) for name in self._wanted()}
+        return {name: self.line.get(id_, name) for name in self._wanted}
 
     def _text(self, name: str, value: int) -> str:
         match name:
@@ -177,11 +164,18 @@ class _Line(DynamixelBus):
 
 
 @contextmanager
-def _opened(config: Config) -> Iterator[_Line]:
+def _opened(config: Config) -> Iterator[_Looked]:
     with ExitStack() as stack:
         if config.servo.port.startswith(VIRTUAL_PREFIX):
             stack.enter_context(open_devices(only(config, "servo")))
-        yield stack.enter_context(_Line(config.servo, (config.servo.id,)))
+        looked = _Looked(config.servo)
+        stack.callback(looked.line.close)
+        _open(looked.line, config.servo)
+        yield looked
+
+
+def _open(line: Line, servo: ServoConfig) -> None:
+    line.open(max(_PATIENCE_MS, servo.reply_margin_ms))
 
 
 def _other_baud_rate(servo: ServoConfig) -> int | None:
@@ -191,7 +185,8 @@ def _other_baud_rate(servo: ServoConfig) -> int | None:
         if rate == servo.baud_rate:
             continue
         other = servo.model_copy(update={"baud_rate": rate, "retries": 0})
-        with suppress(GripperError), _Line(other, (servo.id,)) as line:
+        with suppress(GripperError), closing(Line(other)) as line:
+            _open(line, other)
             line.ping(servo.id)
             return rate
     return None

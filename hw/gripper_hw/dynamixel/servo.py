@@ -9,16 +9,7 @@ import struct
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
-from typing import Final, TypeVar
-
-from dynamixel_sdk import COMM_RX_CORRUPT, COMM_SUCCESS, PacketHandler
-from dynamixel_sdk.protocol2_packet_handler import (
-    PKT_ERROR,
-    PKT_ID,
-    PKT_INSTRUCTION,
-    PKT_LENGTH_H,
-    PKT_LENGTH_L,
-)
+from typing import Final
 
 from gripper_force.config import ServoConfig
 from gripper_force.errors import (
@@ -42,8 +33,7 @@ from gripper_hw.dynamixel.control_table import (
     rad_from_ticks,
     ticks_from_rad,
 )
-from gripper_hw.dynamixel.packets import BROADCAST_ID
-from gripper_hw.dynamixel.port import Port, open_port
+from gripper_hw.dynamixel.line import Line
 
 _READ: Final = {  # name: bytes
     "present_current": 2,
@@ -55,6 +45,9 @@ _READ: Final = {  # name: bytes
     "bus_watchdog": 1,
 }
 _READ_BLOCK: Final = struct.Struct("<hhiBBHb")
+CYCLE_BYTES: Final = _READ_BLOCK.size
+"""What a cycle reads of each servo."""
+
 _WRITE: Final = {"goal_current": 2, "goal_position": 4}
 _WRITE_BLOCK: Final = struct.Struct("<hi")
 _INDIRECT_ADDRESSES: Final = tuple(
@@ -62,22 +55,8 @@ _INDIRECT_ADDRESSES: Final = tuple(
 )
 _VOLTAGE_UNIT_V: Final = 0.1
 
-_LENGTHS: Final = 8
-"""A read asks for 0 to 7 bytes more than it needs, each time another number: an answer to one of the seven
-requests before has another length. The most fills the 20 bytes of an XL330's indirect data."""
-
 _TRAVEL_RAD: Final = 255 * 2 * math.pi  # a turn less than Goal Position takes either way
 _TORQUE_OFF_TRIES: Final = 5
-_ERROR_CRC: Final = 3
-_ERROR_MASK: Final = 0x7F  # the bit above is the alert, which the read block tells in full
-_ERRORS: Final = {
-    1: "result fail",
-    2: "instruction error",
-    4: "data range error",
-    5: "data length error",
-    6: "data limit error",
-    7: "access error",
-}
 _HARDWARE_ERRORS: Final = {
     0x01: "input voltage",
     0x04: "overheating",
@@ -86,8 +65,6 @@ _HARDWARE_ERRORS: Final = {
     0x20: "overload",
 }
 
-_T = TypeVar("_T")
-
 
 class DynamixelBus:
     """Servos of one model on one port, read and written together.
@@ -95,7 +72,6 @@ class DynamixelBus:
     Attributes:
         model: Their model.
         ids: Their ids, in the order of states and commands.
-        stats: Counters since construction.
         firmware: Their firmware versions, known after `start`.
     """
 
@@ -114,17 +90,18 @@ class DynamixelBus:
                 f"{self.model.max_current_a:g}; lower it"
             )
         self.ids = tuple(ids)
-        self.stats = BusStats()
         self.firmware: tuple[int, ...] = ()
         self._config = config
-        self._clock_ns = clock_ns
-        self._packets = PacketHandler(2.0)
+        self._line = Line(config, clock_ns)
         self._current_limit = math.floor(config.current_limit_a / self.model.current_unit_a)
         self._watchdog = math.ceil(config.bus_watchdog_ms / WATCHDOG_UNIT_MS)
         self._expected_watchdog = 0
-        self._port: Port | None = None
-        self._requests = 0
         self._data = 0  # where the cycle reads, and behind it writes
+
+    @property
+    def stats(self) -> BusStats:
+        """Counters since construction."""
+        return self._line.stats
 
     @property
     def settings(self) -> dict[str, int]:
@@ -151,7 +128,7 @@ class DynamixelBus:
             DeviceError: The port is in use, a firmware is too old, or a register does not take its value.
         """
         self._expected_watchdog = 0
-        self._port = open_port(self._config.port, self._config.baud_rate, self._config.reply_margin_ms)
+        self._line.open()
         with ExitStack() as undo:
             undo.callback(self.close)
             self.firmware = tuple(self._identify(id_) for id_ in self.ids)
@@ -176,7 +153,7 @@ class DynamixelBus:
             DeviceTimeoutError: No sound answer came, after every retry.
             DeviceLostError: The port is gone.
         """
-        t_ns, blocks = self._transact("a fast sync read", self._read_once)
+        t_ns, blocks = self._line.sync_read(self.ids, self._data, _READ_BLOCK.size)
         self.stats.cycles += 1
         return tuple(self._state(t_ns, id_, block) for id_, block in zip(self.ids, blocks, strict=True))
 
@@ -189,7 +166,7 @@ class DynamixelBus:
             DeviceLostError: The port is gone.
         """
         blocks = [self._goals(command) for command in commands]
-        self._transact("a sync write", lambda: self._write_once(blocks))
+        self._line.sync_write(self._data + _READ_BLOCK.size, dict(zip(self.ids, blocks, strict=True)))
 
     def stop(self, *, hold: bool) -> None:
         """Turns torque off and makes sure; with ``hold`` disarms the watchdogs and keeps the goals instead.
@@ -213,38 +190,30 @@ class DynamixelBus:
 
     def close(self) -> None:
         """Releases the port and leaves torque as it is. May be called twice."""
-        if self._port is not None:
-            self._port.closePort()
-            self._port = None
+        self._line.close()
 
     # Start.
 
     def _identify(self, id_: int) -> int:
         where = f"the servo with id {id_} on {self._config.port}"
         try:
-            number = self._transact(f"a ping of servo {id_}", lambda: self._ping_once(id_))
+            number = self._line.ping(id_)
         except DeviceTimeoutError as error:
             raise DeviceNotFoundError(
                 f"{where} does not answer at {self._config.baud_rate} baud; "
                 "check its power, servo.id and servo.baud_rate"
             ) from error
         if number != self.model.number:  # a late answer can pass for a ping's, and not for a read's
-            number = self._get(id_, "model_number")
+            number = self._line.get(id_, "model_number")
         check_model_number(self.model, number, where)
-        self._ask_for_answers(id_)
-        firmware = self._get(id_, "firmware_version")
+        self._line.ask_for_answers(id_)
+        firmware = self._line.get(id_, "firmware_version")
         if firmware < self.model.min_firmware:
             raise DeviceError(
                 f"{where} has firmware {firmware}, which lacks Fast Sync Read; update it to "
                 f"{self.model.min_firmware} or newer with DYNAMIXEL Wizard"
             )
         return firmware
-
-    def _ask_for_answers(self, id_: int) -> None:
-        """Another program may have left the servo mute; a sync write is a write that awaits no answer."""
-        address = REGISTERS["status_return_level"].address
-        params = bytes((id_, 2))
-        self._transact(f"a sync write to servo {id_}", lambda: (self._sync_write(address, 1, params), None))
 
     def _common_window(self) -> IndirectWindow:
         """One transaction has one address for all, so all must have their indirect data in one place."""
@@ -258,29 +227,29 @@ class DynamixelBus:
 
     def _set_up(self, id_: int, window: IndirectWindow) -> None:
         # In this order: to clear a watchdog that tripped in an earlier run would set the motor going again.
-        self._set(id_, "torque_enable", 0, tries=_TORQUE_OFF_TRIES)
-        self._set(id_, "bus_watchdog", 0)
-        hardware_error = self._get(id_, "hardware_error_status")
+        self._line.set(id_, "torque_enable", 0, tries=_TORQUE_OFF_TRIES)
+        self._line.set(id_, "bus_watchdog", 0)
+        hardware_error = self._line.get(id_, "hardware_error_status")
         if hardware_error:
             raise HardwareFaultError(
                 f"servo {id_} reports {hardware_error_text(hardware_error)}; remove the cause, then "
                 "power-cycle or reboot it"
             )
         for name, value in self.settings.items():
-            if not REGISTERS[name].eeprom or self._get(id_, name) != value:  # the EEPROM wears out
-                self._set(id_, name, value)
+            if not REGISTERS[name].eeprom or self._line.get(id_, name) != value:  # the EEPROM wears out
+                self._line.set(id_, name, value)
         pointers = struct.pack(f"<{len(_INDIRECT_ADDRESSES)}H", *_INDIRECT_ADDRESSES)
-        self._write_bytes(id_, window.address, pointers)
-        if self._read_bytes(id_, window.address, len(pointers)) != pointers:
+        self._line.write(id_, window.address, pointers)
+        if self._line.read(id_, window.address, len(pointers)) != pointers:
             raise DeviceError(
                 f"servo {id_} did not take its indirect addresses; power-cycle it and start again"
             )
 
     def _energise(self, id_: int, state: ServoState) -> None:
-        self._set(id_, "goal_current", 0)
-        self._set(id_, "goal_position", ticks_from_rad(state.position_rad))
-        self._set(id_, "bus_watchdog", self._watchdog)
-        self._set(id_, "torque_enable", 1)
+        self._line.set(id_, "goal_current", 0)
+        self._line.set(id_, "goal_position", ticks_from_rad(state.position_rad))
+        self._line.set(id_, "bus_watchdog", self._watchdog)
+        self._line.set(id_, "torque_enable", 1)
 
     def _abandon(self) -> None:
         with suppress(DeviceError):  # the error that brought us here is the one to tell
@@ -289,34 +258,19 @@ class DynamixelBus:
     # Stop.
 
     def _torque_off(self, id_: int) -> None:
-        self._set(id_, "torque_enable", 0, tries=_TORQUE_OFF_TRIES)
-        self._set(id_, "bus_watchdog", 0)
+        self._line.set(id_, "torque_enable", 0, tries=_TORQUE_OFF_TRIES)
+        self._line.set(id_, "bus_watchdog", 0)
 
     def _hold(self, id_: int) -> None:
         # Disarming a watchdog that has tripped would set the motor going again.
-        if self._get(id_, "bus_watchdog") < 0 or not self._get(id_, "torque_enable"):
+        if self._line.get(id_, "bus_watchdog") < 0 or not self._line.get(id_, "torque_enable"):
             self._torque_off(id_)
             raise HardwareFaultError(
                 f"servo {id_} can't hold: it had stopped by itself, and its torque was turned off"
             )
-        self._set(id_, "bus_watchdog", 0)
+        self._line.set(id_, "bus_watchdog", 0)
 
     # Cycle.
-
-    def _read_once(self) -> tuple[int, tuple[int, list[bytes]]]:
-        t_ns = self._clock_ns()
-        asked = self._length(_READ_BLOCK.size)
-        sent = self._packets.syncReadTx(self._port, self._data, asked, self.ids, len(self.ids), True)
-        step = asked + 4  # error number and id come before a servo's data, a CRC after
-        result, answer = self._answer(sent, BROADCAST_ID, step * len(self.ids) - 2)
-        if result == COMM_SUCCESS and answer[1::step] != bytes(self.ids):
-            result = COMM_RX_CORRUPT
-        starts = range(2, len(answer), step)
-        return result, (t_ns, [answer[start : start + _READ_BLOCK.size] for start in starts])
-
-    def _write_once(self, blocks: Sequence[bytes]) -> tuple[int, None]:
-        params = b"".join(bytes((id_,)) + block for id_, block in zip(self.ids, blocks, strict=True))
-        return self._sync_write(self._data + _READ_BLOCK.size, _WRITE_BLOCK.size, params), None
 
     def _state(self, t_ns: int, id_: int, block: bytes) -> ServoState:
         current, velocity, ticks, hardware_error, temperature, voltage, watchdog = _READ_BLOCK.unpack(block)
@@ -344,103 +298,6 @@ class DynamixelBus:
         current = max(0.0, min(self._current_limit, command.goal_current_a / self.model.current_unit_a))
         position_rad = max(-_TRAVEL_RAD, min(_TRAVEL_RAD, command.goal_position_rad))
         return _WRITE_BLOCK.pack(round(current), ticks_from_rad(position_rad))
-
-    # Registers.
-
-    def _get(self, id_: int, name: str) -> int:
-        register = REGISTERS[name]
-        return register.decode(self._read_bytes(id_, register.address, register.size))
-
-    def _set(self, id_: int, name: str, value: int, tries: int = 1) -> None:
-        """Writes a register and reads it back."""
-        register = REGISTERS[name]
-        for left in reversed(range(tries)):
-            try:
-                self._write_bytes(id_, register.address, register.encode(value))
-                if self._get(id_, name) == value:
-                    return
-            except DeviceTimeoutError:
-                if not left:
-                    raise
-        raise DeviceError(f"servo {id_} did not keep {name} = {value}; power-cycle it and start again")
-
-    def _read_bytes(self, id_: int, address: int, size: int) -> bytes:
-        what = f"a read of {size} bytes at {address} of servo {id_}"
-
-        def once() -> tuple[int, bytes]:
-            asked = self._length(size)
-            sent = self._packets.readTx(self._port, id_, address, asked)
-            result, answer = self._answer(sent, id_, 1 + asked)
-            return _checked(what, result, answer[0] if answer else 0), answer[1 : 1 + size]
-
-        return self._transact(what, once)
-
-    def _write_bytes(self, id_: int, address: int, data: bytes) -> None:
-        what = f"a write of {len(data)} bytes at {address} of servo {id_}"
-
-        def once() -> tuple[int, None]:
-            result, error = self._packets.writeTxRx(self._port, id_, address, len(data), data)
-            return _checked(what, result, error), None
-
-        self._transact(what, once)
-
-    def _sync_write(self, address: int, size: int, params: bytes) -> int:
-        result: int = self._packets.syncWriteTxOnly(self._port, address, size, params, len(params))
-        return result
-
-    def _length(self, size: int) -> int:
-        """How many bytes a read asks for to get ``size``: see `_LENGTHS`."""
-        self._requests += 1
-        return size + self._requests % _LENGTHS
-
-    def _answer(self, sent: int, id_: int, size: int) -> tuple[int, bytes]:
-        """Listens for the answer to what was ``sent``, and passes over those to requests before.
-
-        The SDK's own reads compare the id alone, and cut an answer to the length that they look for.
-
-        Returns:
-            The SDK's result code, and ``size`` bytes from the error number on; or 1, where that is no 0.
-        """
-        result = sent
-        while result == COMM_SUCCESS:
-            packet, result = self._packets.rxPacket(self._port, id_ == BROADCAST_ID)
-            if result != COMM_SUCCESS:
-                break
-            length = packet[PKT_LENGTH_L] | packet[PKT_LENGTH_H] << 8
-            answer = bytes(packet[PKT_ERROR : PKT_INSTRUCTION + length - 2])
-            whole = len(answer) == size or (len(answer) == 1 and answer[0] & _ERROR_MASK)
-            if whole and packet[PKT_ID] == id_:
-                return result, answer
-        return result, b""
-
-    def _ping_once(self, id_: int) -> tuple[int, int]:
-        number, result, error = self._packets.ping(self._port, id_)
-        return _checked(f"a ping of servo {id_}", result, error), number
-
-    def _transact(self, what: str, once: Callable[[], tuple[int, _T]]) -> _T:
-        """Tries a transaction until it succeeds; ``once`` returns the SDK's result code and a value."""
-        if self._port is None:
-            raise DeviceError(
-                f"the servo's port {self._config.port} is not open, so {what} was not sent; start first"
-            )
-        for attempt in range(self._config.retries + 1):
-            self.stats.retries += attempt > 0
-            self._port.is_using = False  # an interrupted transaction would leave it set for ever
-            try:
-                result, value = once()
-            except IndexError:  # the SDK indexes into answers that are too short
-                result = COMM_RX_CORRUPT
-            if result == COMM_SUCCESS:
-                return value
-            if result == COMM_RX_CORRUPT:
-                self.stats.corrupt += 1
-            else:
-                self.stats.timeouts += 1
-            self._port.drain()  # or the rest of a damaged answer would meet the next request on the line
-        raise DeviceTimeoutError(
-            f"no sound answer to {what} on {self._config.port} after {self._config.retries + 1} tries; check "
-            "cable, power, and that the adapter's latency timer is below servo.reply_margin_ms"
-        )
 
 
 class DynamixelServo:
@@ -495,16 +352,6 @@ class DynamixelServo:
     def close(self) -> None:
         """Releases the port and leaves torque as it is. May be called twice."""
         self._bus.close()
-
-
-def _checked(what: str, result: int, error: int) -> int:
-    """The SDK's result code, where the servo's own error number is no reason to raise `DeviceError`."""
-    number = error & _ERROR_MASK
-    if result != COMM_SUCCESS or number == 0:
-        return result
-    if number == _ERROR_CRC:
-        return int(COMM_RX_CORRUPT)  # our packet was damaged on its way: worth another try
-    raise DeviceError(f"{what} was refused: {_ERRORS.get(number, f'error {number}')}")
 
 
 def hardware_error_text(bits: int) -> str:

@@ -174,11 +174,11 @@ def test_whatever_befalls_the_bus_a_state_is_of_now_or_there_is_none(spans, retr
         for _ in range(50):
             b.go_on()
             with suppress(DeviceError):
-                b.servo.start() if b.servo._bus._port is None else b.read_fresh()
+                b.servo.start() if b.servo._bus._line._port is None else b.read_fresh()
             if b.bus.is_unplugged():
                 b.servo.close()
         b.go_on(40)
-        if b.servo._bus._port is None:
+        if b.servo._bus._line._port is None:
             b.servo.start()
         b.servo.stop(hold=False)
         assert b.firmware.get("torque_enable") == 0
@@ -203,7 +203,7 @@ def test_an_answer_up_to_seven_requests_late_is_not_believed(late, retries, seed
             with pytest.raises(DeviceTimeoutError):
                 b.servo.read()
         with pytest.raises(DeviceTimeoutError):
-            b.servo._bus._get(1, "present_position")
+            b.servo._bus._line.get(1, "present_position")
 
 
 @settings(deadline=None, max_examples=100)

@@ -420,7 +420,7 @@ def test_an_answer_that_is_too_short_is_no_value(started):
     """The SDK fills short data up with the packet's CRC."""
     line, servo = started
     line.bus.tamper = _first(1, lambda answer: status(1, 0))
-    assert servo._bus._get(1, "present_position") == 2048
+    assert servo._bus._line.get(1, "present_position") == 2048
     assert servo.stats.retries == 1
 
 
@@ -538,7 +538,7 @@ def test_a_servo_that_refuses_says_what(started):
     line, servo = started
     line.bus.servos[0].set("bus_watchdog", -1)
     with pytest.raises(DeviceError, match="data range error"):
-        servo._bus._set(1, "goal_current", 1)
+        servo._bus._line.set(1, "goal_current", 1)
 
 
 def test_registers_of_the_cycle_exist_in_every_model():
