@@ -1,7 +1,6 @@
 import itertools
 import math
 import struct
-import time
 
 import pytest
 from hypothesis import given, settings
@@ -27,8 +26,7 @@ from gripper_hw.dynamixel.control_table import (
     ticks_from_rad,
 )
 from gripper_hw.dynamixel.firmware import OVERHEATING_ERROR, OVERLOAD_ERROR, REBOOT_NS
-from gripper_hw.dynamixel.packets import BROADCAST_ID, Instruction, Packet, frame, status
-from gripper_hw.dynamixel.serve import PtyServer
+from gripper_hw.dynamixel.packets import BROADCAST_ID, Instruction, Packet
 from gripper_hw.dynamixel.servo import DynamixelBus, DynamixelServo
 from gripper_hw.dynamixel.virtual import VirtualBus, VirtualServo, register_bus, unregister_bus
 
@@ -416,14 +414,6 @@ def test_stop_sends_torque_off_even_if_no_answer_ever_comes(memory_line):
     assert memory_line.bus.servos[0].get("torque_enable") == 0
 
 
-def test_an_answer_that_is_too_short_is_no_value(started):
-    """The SDK fills short data up with the packet's CRC."""
-    line, servo = started
-    line.bus.tamper = _first(1, lambda answer: status(1, 0))
-    assert servo._bus._line.get(1, "present_position") == 2048
-    assert servo.stats.retries == 1
-
-
 def test_stop_tries_every_servo(make_memory_line):
     line = make_memory_line(VirtualServo(1, MODEL), VirtualServo(2, MODEL))
     bus = DynamixelBus(line.config(), (1, 2), lambda: line.now_ns)
@@ -434,93 +424,7 @@ def test_stop_tries_every_servo(make_memory_line):
     assert [servo.get("torque_enable") for servo in line.bus.servos] == [1, 0]
 
 
-# Faults on the wire.
-
-
-def _first(count, damage):
-    """Damages the first answers and lets the others pass."""
-    left = iter(range(count))
-    return lambda answer: answer if next(left, None) is None else damage(answer)
-
-
-DAMAGES = {
-    "silence": lambda answer: None,
-    "truncated": lambda answer: answer[:-3],
-    "corrupt": lambda answer: answer[:-1] + bytes((answer[-1] ^ 0x5A,)),
-    "short, yet sound": lambda answer: frame(BROADCAST_ID, 0x55, b"\x00"),
-    "of another size": lambda answer: frame(BROADCAST_ID, 0x55, b"\x00\x01" + bytes(4)),
-    "of nobody": lambda answer: frame(BROADCAST_ID, 0x55, b"\x00\x07" + bytes(15)),
-    "of another servo": lambda answer: status(7, 0, bytes(15)),
-    "noise": lambda answer: b"\xff\xff\xfd\x00\x01\x00\x00" + bytes(20),
-}
-
-
-@pytest.mark.parametrize("damage", DAMAGES)
-@pytest.mark.parametrize("count", [1, 2])
-def test_a_damaged_answer_is_retried_and_counted(make_line, damage, count):
-    line = make_line()
-    servo = drive(line)
-    servo.start()
-    line.bus.servos[0].control(0, 0.5, 0.0)
-    before = servo.stats.retries
-    line.bus.tamper = _first(count, DAMAGES[damage])
-    assert servo.read().position_rad == pytest.approx(0.5, abs=1e-3)
-    assert servo.stats.retries - before == count
-    assert servo.stats.timeouts + servo.stats.corrupt == servo.stats.retries
-    servo.close()
-
-
-@pytest.mark.parametrize("damage", DAMAGES)
-def test_damage_without_end_is_a_timeout(make_line, damage):
-    line = make_line()
-    servo = drive(line)
-    servo.start()
-    line.bus.tamper = DAMAGES[damage]
-    line.heard.clear()
-    with pytest.raises(DeviceTimeoutError, match="after 3 tries"):
-        servo.read()
-    assert len(line.packets()) == 3
-    line.bus.tamper = None
-    servo.read()  # it comes back by itself
-    servo.close()
-
-
-def test_noise_before_an_answer_is_skipped(started):
-    line, servo = started
-    line.bus.tamper = lambda answer: b"\x00\xff\xff\x12" + answer
-    servo.read()
-    assert servo.stats.retries == 0
-
-
-def test_an_instruction_damaged_on_its_way_is_retried(memory_line):
-    memory_line.bus.tamper = _first(1, lambda answer: status(1, 3))
-    servo = drive(memory_line)
-    servo.start()
-    assert (servo.stats.retries, servo.stats.corrupt) == (1, 1)
-    memory_line.bus.tamper = _first(1, lambda answer: status(1, 3))
-    servo.stop(hold=False)
-    assert (servo.stats.retries, servo.stats.corrupt) == (2, 2)
-
-
-def test_a_late_answer_is_not_taken_for_the_next():
-    """It comes after the time for it is over and before a retry without a pause would have had its own."""
-    firmware = VirtualServo(1, MODEL)
-    bus = VirtualBus([firmware], lambda: 0)
-    margin_s = 0.2
-    with PtyServer(bus) as server:
-        servo = DynamixelServo(ServoConfig(port=server.device_path, reply_margin_ms=margin_s * 1e3))
-        servo.start()
-
-        def delay(answer):
-            bus.tamper = None
-            firmware.control(0, 1.0, 0.0)  # the world moves on
-            time.sleep(1.5 * margin_s)
-            return answer
-
-        bus.tamper = delay
-        assert servo.read().position_rad == pytest.approx(1.0, abs=1e-3)
-        assert (servo.stats.timeouts, servo.stats.retries) == (1, 1)
-        servo.close()
+# Faults on the wire: see test_line.py and test_faults.py as well.
 
 
 def test_a_pulled_plug_is_told_at_once(started):
@@ -532,13 +436,6 @@ def test_a_pulled_plug_is_told_at_once(started):
     assert servo.stats.timeouts == 0
     servo.close()
     servo.close()
-
-
-def test_a_servo_that_refuses_says_what(started):
-    line, servo = started
-    line.bus.servos[0].set("bus_watchdog", -1)
-    with pytest.raises(DeviceError, match="data range error"):
-        servo._bus._line.set(1, "goal_current", 1)
 
 
 def test_registers_of_the_cycle_exist_in_every_model():
