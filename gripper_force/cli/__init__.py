@@ -128,6 +128,10 @@ def simulate(
         int | None,
         typer.Option(min=0, help="Seed of the first log. Training data start at 100000.  [default: 100000]"),
     ] = None,
+    object_: Annotated[
+        list[str] | None,
+        typer.Option("--object", help="Make logs of this object. Repeatable.  [default: all four, in turn]"),
+    ] = None,
     protocol: Annotated[
         str | None, typer.Option(help="shin2019: the paper's sets instead, into OUT/train and OUT/test.")
     ] = None,
@@ -152,11 +156,18 @@ def simulate(
             raise ConfigError("--scale is of a protocol's sets: add --protocol shin2019, or leave it out")
         settings = load_settings(config, set_, {})
         seed, plans = 100_000 if first_seed is None else first_seed, []
-        plans += job.plan("press", 200 if presses is None else presses, seed)
-        plans += job.plan("tap", taps or 0, seed + len(plans))
-        plans += job.plan("grasp", 20 if grasps is None else grasps, seed + len(plans))
+        objects = tuple(object_ or job.OBJECTS)
+        plans += job.plan("press", 200 if presses is None else presses, seed, objects)
+        plans += job.plan("tap", taps or 0, seed + len(plans), objects)
+        plans += job.plan("grasp", 20 if grasps is None else grasps, seed + len(plans), objects)
     elif protocol == "shin2019":
-        given = {"--presses": presses, "--taps": taps, "--grasps": grasps, "--first-seed": first_seed}
+        given = {
+            "--presses": presses,
+            "--taps": taps,
+            "--grasps": grasps,
+            "--first-seed": first_seed,
+            "--object": object_,
+        }
         if idle := [name for name, value in given.items() if value is not None]:
             raise ConfigError(
                 f"the sets of --protocol are fixed, so {' and '.join(idle)} can't be heeded: leave out one "

@@ -296,6 +296,7 @@ def test_a_protocol_and_its_scale_are_known_by_name(run: Run) -> None:
         (["--scale", "small"], "add --protocol shin2019"),
         (["--protocol", "shin2019", "--presses", "9"], "--presses can't be heeded"),
         (["--protocol", "shin2019", "--grasps", "0", "--first-seed", "7"], "--grasps and --first-seed can't"),
+        (["--protocol", "shin2019", "--object", "tube"], "--object can't be heeded"),
     ],
 )
 def test_what_a_simulation_would_not_heed_is_an_error(
@@ -304,6 +305,15 @@ def test_what_a_simulation_would_not_heed_is_an_error(
     done = run("simulate", "--out", tmp_path / "sets", *args)
     assert (done.code, sentence in done.err) == (2, True)
     assert not (tmp_path / "sets").exists()
+
+
+def test_logs_can_be_made_of_one_object(run: Run, tmp_path: Path) -> None:
+    options = ("--presses", "0", "--taps", "1", "--grasps", "0", "--jobs", "1", "--first-seed", "100007")
+    made = run("simulate", "--out", tmp_path / "hard", "--object", "stapler", *options, "--json")
+    assert made.json()["made"] == 1
+    assert [path.name for path in (tmp_path / "hard").iterdir()] == ["tap-stapler-100007.mcap"]
+    unknown = run("simulate", "--out", tmp_path / "none", "--object", "pencil", *options)
+    assert (unknown.code, "no simulated object 'pencil'" in unknown.err) == (2, True)
 
 
 def test_a_video_needs_its_table(run: Run, tmp_path: Path) -> None:
