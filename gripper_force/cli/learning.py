@@ -1,0 +1,159 @@
+"""The commands that make networks of logs, and say what they are worth."""
+
+import json
+import os
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from gripper_force import console
+from gripper_force.cli.options import CORES, AsJson, Jobs, Overrides, load_settings
+from gripper_force.errors import ConfigError, DataError
+
+
+def train(
+    data: Annotated[Path, typer.Argument(help="Folder with logs.")],
+    checkpoint: Annotated[Path, typer.Option("--out", help="Checkpoint to write.")] = Path(
+        "force.safetensors"
+    ),
+    recipe: Annotated[
+        str, typer.Option(help="short_clips, our own, or shin2019, the paper's.")
+    ] = "short_clips",
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="Set one key of the recipe: key=value. Repeatable.")
+    ] = None,
+    hold_out: Annotated[
+        list[str] | None, typer.Option(help="Object to leave out of the training. Repeatable.")
+    ] = None,
+    validation: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder with logs to measure the claimed error on; without, sets held out of DATA."
+        ),
+    ] = None,
+    init: Annotated[str | None, typer.Option(help="Checkpoint to begin with.")] = None,
+    resume: Annotated[bool, typer.Option(help="Go on from the states of a run that was broken off.")] = False,
+    jobs: Jobs = CORES,
+    as_json: AsJson = False,
+) -> None:
+    """Train the force network on logs; under `torchrun`, in several processes."""
+    from gripper_force.dataset import load_clips
+    from gripper_force.training.recipe import recipe as named
+    from gripper_force.training.train import train as job
+    from gripper_force.vision.checkpoint import load_checkpoint
+
+    settings = named(recipe, set_)
+    quiet = os.environ.get("RANK", "0") != "0"  # of torchrun's processes the first one speaks
+    clips = load_clips(data, settings.preprocess, workers=jobs, quiet=quiet)
+    clips = [clip for clip in clips if clip.object not in (hold_out or [])]
+    unseen = load_clips(validation, settings.preprocess, workers=jobs, quiet=quiet) if validation else None
+    start = load_checkpoint(init) if init else None
+    result = job(settings, clips, checkpoint, validation_clips=unseen, init=start, resume=resume)
+    metrics = result.header.metrics
+    if not quiet:
+        console.show({"checkpoint": str(checkpoint), "digest": result.digest, **metrics}, as_json)
+
+
+def evaluate(
+    data: Annotated[Path, typer.Argument(help="Folder with logs that training has not seen.")],
+    checkpoint: Annotated[str | None, typer.Option(help="Checkpoint, or `default`.")] = None,
+    profile: Annotated[
+        str | None, typer.Option(help="Object profile, by name or path; own: the one with each log's object.")
+    ] = None,
+    only: Annotated[
+        list[str] | None, typer.Option("--object", help="Only logs of this object. Repeatable.")
+    ] = None,
+    jobs: Jobs = CORES,
+    set_: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Compare a checkpoint's estimates with the load cell, over all logs of a folder."""
+    from gripper_force.dataset import load_clips
+    from gripper_force.evaluate import evaluate as job
+    from gripper_force.profiles import correction_of
+    from gripper_force.vision.checkpoint import load_checkpoint
+
+    settings = load_settings(None, set_, {"vision.checkpoint": checkpoint, "calibration.object": profile})
+    vision = settings.vision
+    loaded = load_checkpoint(vision.checkpoint)
+    clips = load_clips(data, loaded.header.preprocess, vision.region, workers=jobs)
+    clips = [clip for clip in clips if not only or clip.object in only]
+    if not clips:
+        raise DataError(f"no log in {data} is of {', '.join(only or [])}")
+
+    def correct(clip: Any) -> Any:
+        return correction_of(settings.model_copy(update={"object": clip.object}), loaded)
+
+    corrected = None if settings.calibration.object is None else correct
+    console.show(dict(job(loaded, clips, corrected)), as_json, console.errors_table)
+
+
+def export(
+    out: Annotated[Path, typer.Option("--out", help="File to write: .onnx, or .xml for OpenVINO.")],
+    checkpoint: Annotated[str, typer.Argument(help="A path, or default or small.")] = "default",
+    int8: Annotated[
+        Path | None,
+        typer.Option(help="Compute the convolutions in int8, scaled on this folder of logs (.xml only)."),
+    ] = None,
+    jobs: Jobs = CORES,
+    as_json: AsJson = False,
+) -> None:
+    """Write a network's streaming step for another engine, checked against PyTorch."""
+    from gripper_force.dataset import load_clips
+    from gripper_force.vision.export import export as job
+    from gripper_force.vision.exported import read_model
+
+    model = read_model(checkpoint)
+    frames = None
+    if int8 is not None:
+        frames = [clip.frames for clip in load_clips(int8, model.header.preprocess, workers=jobs)]
+    with console.err.status("exporting"):
+        errors = job(model, out, frames)
+    console.show({"file": str(out), "digest": model.digest, "off_torch_n": errors}, as_json)
+
+
+def reproduce(
+    what: Annotated[str, typer.Argument(help="3, 4, 5, 6, 7, 8, 9, fig6, fig7, fig8, fig9, claims or all.")],
+    scale: Annotated[
+        str, typer.Option(help="small (two CPU cores, some two hours) or full (for a GPU).")
+    ] = "small",
+    data: Annotated[
+        Path | None,
+        typer.Option(help="Folder with logs in train/ and test/. By default they are simulated first."),
+    ] = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option("--out", help="Folder for the networks; what is there is not trained again."),
+    ] = None,
+    write: Annotated[
+        Path | None, typer.Option(help="Page with places for tables and figures, such as docs/paper.md.")
+    ] = None,
+    jobs: Jobs = CORES,
+    set_: Annotated[
+        list[str] | None, typer.Option("--set", help="Set one key of the scale: key=value. Repeatable.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make the paper's tables and figures again, beside its own numbers. Goes on where it was broken off."""
+    from gripper_force.reproduce import page
+    from gripper_force.reproduce.models import SCALES, Scale
+    from gripper_force.schema import section_from
+
+    names = page.asked_for(what)
+    if scale not in SCALES:
+        raise ConfigError(f"no scale {scale!r}; there are {', '.join(SCALES)}")
+    settings = section_from(Scale, [*(f"{k}={json.dumps(v)}" for k, v in SCALES[scale]), *(set_ or [])])
+    out_ = folder or Path("runs/paper") / scale
+    result, test = page.reproduce(names, settings, data, out_, jobs, console.bar)
+    pictures = write.with_suffix("") if write else out_
+    pictures.mkdir(parents=True, exist_ok=True)
+    for name, figure in result.figures.items():
+        figure.savefig(pictures / f"{name}.png")
+    if write is not None:
+        from gripper_force.report.markers import write_between
+
+        for place, text in page.markdown(result, scale, settings, test, pictures.name).items():
+            write_between(write, place, text)
+    drawn = {name: str(pictures / f"{name}.png") for name in result.figures}
+    console.show({"tables": list(result.tables.values()), "figures": drawn}, as_json, console.paper_tables)
