@@ -152,7 +152,7 @@ def _network(config: Config) -> Iterator[Check]:
     if config.camera.backend == "none" or vision.checkpoint == "none":
         yield Check("network", "step", "not needed: no camera, or no checkpoint", None)
         return
-    from gripper_force.session import settled
+    from gripper_force.assembly import settled
     from gripper_force.vision.choice import ENGINE_PACKAGES
     from gripper_force.vision.estimator import open_estimator
     from gripper_force.vision.exported import read_model

@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from gripper_force.assembly import checkpoint_of
 from gripper_force.config import Config, config_from, config_from_text
 from gripper_force.control.score import score_grasp
 from gripper_force.dataset import stiffness_floor_n, stiffness_of
 from gripper_force.errors import DataError
 from gripper_force.log import LogReader
 from gripper_force.replay import compare
-from gripper_force.session import checkpoint_of, run_grasp
+from gripper_force.session import run_grasp
 from gripper_force.types import (
     NS_PER_S,
     Event,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gripper_force import metrics
+from gripper_force.assembly import controller_from, make_estimator
 from gripper_force.config import Config, config_from_text
 from gripper_force.control.grasp import Decision
 from gripper_force.dataset import CONTACT_N, label_frames
@@ -16,7 +17,6 @@ from gripper_force.errors import DataError
 from gripper_force.log import LogReader
 from gripper_force.perception import Sight
 from gripper_force.profiles import correction_of
-from gripper_force.session import controller_from, make_estimator
 from gripper_force.types import (
     NS_PER_S,
     Frame,

@@ -13,18 +13,18 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
+from gripper_force.assembly import checkpoint_of, make_controller, make_estimator, settled
 from gripper_force.backends import open_devices
 from gripper_force.config import Config, dump_config
 from gripper_force.control.grasp import Decision, GraspController, is_open
 from gripper_force.control.limits import largest_target_n
-from gripper_force.control.transmission import Transmission
 from gripper_force.errors import ConfigError, DeviceError, GripperError
 from gripper_force.faults import Faults, FaultyEstimator, FaultyFile
 from gripper_force.interfaces import Devices
 from gripper_force.log import LogWriter
 from gripper_force.perception import Estimator, LockstepPerception, Perception, ThreadedPerception
 from gripper_force.priority import real_time_priority
-from gripper_force.profiles import check_target, correction_of, rig_mismatches, with_plant
+from gripper_force.profiles import check_target, correction_of, rig_mismatches
 from gripper_force.recorder import Recorder
 from gripper_force.types import (
     NS_PER_S,
@@ -49,9 +49,6 @@ _REFERENCE_NS = NS_PER_S // 10
 
 _OPENING_NS = 5 * NS_PER_S
 """How long jaws may take to open."""
-
-_SUPPLY_SLACK_V = 0.5
-"""A supply that is set to the end of a servo's range reads a little beyond it."""
 
 _REALTIME_SWITCH_S = 2e-4
 _PACKAGES = ("gripper-force", "dynamixel-sdk", "mujoco", "numpy", "torch")
@@ -312,67 +309,6 @@ def _check_target(config: Config) -> None:
             f"most {largest_target_n(limit_n):g} N, or raise the limit"
         )
     check_target(config)
-
-
-def make_controller(config: Config, devices: Devices) -> tuple[Config, GraspController]:
-    """Completes the configuration with what the servo knows of itself, and builds the controller from it."""
-    servo = devices.servo
-    gripper = config.gripper
-    if gripper.nm_per_a is None:
-        gripper = gripper.model_copy(update={"nm_per_a": servo.nm_per_a})
-    if gripper.current_step_a is None:
-        gripper = gripper.model_copy(update={"current_step_a": servo.current_step_a})
-    control = config.control
-    if control.voltage_limits_v is None:
-        low_v, high_v = servo.voltage_range_v
-        slack = {"voltage_limits_v": (low_v - _SUPPLY_SLACK_V, high_v + _SUPPLY_SLACK_V)}
-        control = control.model_copy(update=slack)
-    control = with_plant(config, control)
-    config = config.model_copy(update={"gripper": gripper, "control": control})
-    return config, controller_from(config)
-
-
-def controller_from(config: Config) -> GraspController:
-    """Builds the controller of a completed configuration, such as a log holds."""
-    gripper = config.gripper
-    if gripper.nm_per_a is None:
-        raise ConfigError("this configuration was never completed by a servo: gripper.nm_per_a is not set")
-    transmission = Transmission.from_config(gripper, gripper.nm_per_a, gripper.current_step_a or 0.0)
-    return GraspController(config.control, transmission, config.servo.current_limit_a)
-
-
-def make_estimator(
-    config: Config, checkpoint: "Model | None", correction: "Correction | None"
-) -> "ForceEstimator | None":
-    """The estimator of a run, or None for a run without vision."""
-    if checkpoint is None:
-        return None
-    from gripper_force.vision.estimator import open_estimator
-
-    return open_estimator(checkpoint, config.vision, correction)
-
-
-def checkpoint_of(config: Config) -> "Model | None":
-    """The network that the configuration names, or None for a run without vision."""
-    if config.camera.backend == "none" or config.vision.checkpoint == "none":
-        return None
-    from gripper_force.vision.exported import read_model
-
-    return read_model(settled(config)[0].vision.checkpoint)
-
-
-def settled(config: Config) -> tuple[Config, str]:
-    """The configuration with nothing of its estimator left to ``auto``, and what was taken and why, in words.
-
-    Raises:
-        ConfigError: Nothing keeps the budget.
-    """
-    if "auto" not in (config.vision.checkpoint, config.vision.engine):
-        return config, ""
-    from gripper_force.vision import choice
-
-    vision, why = choice.settled(config.vision, config.budget)
-    return config.model_copy(update={"vision": vision}), why
 
 
 def grasp_in(session: Session, config: Config, sees: bool, progress: Progress | None = None) -> str:

@@ -22,9 +22,10 @@ def tell(fd: int) -> None:
 
 def first_cycle(fd: int, settings: list[str]) -> None:
     """Does what a grasp does up to its first cycle, and tells ``fd`` of it."""
+    from gripper_force.assembly import checkpoint_of
     from gripper_force.backends import open_devices
     from gripper_force.config import load_config
-    from gripper_force.session import checkpoint_of, open_session
+    from gripper_force.session import open_session
 
     config = load_config(None, settings)
     checkpoint = checkpoint_of(config)

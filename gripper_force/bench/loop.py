@@ -19,13 +19,14 @@ from typing import Any, Final, cast
 
 import numpy as np
 
+from gripper_force.assembly import checkpoint_of
 from gripper_force.backends import SERVO, MonotonicClock, load
 from gripper_force.bench.startup import PATIENT
 from gripper_force.config import Config, config_from_text, load_config
 from gripper_force.interfaces import Devices, Servo
 from gripper_force.log import LogReader, LogWriter
 from gripper_force.replay import run_again
-from gripper_force.session import checkpoint_of, open_session, run_grasp
+from gripper_force.session import open_session, run_grasp
 from gripper_force.types import NS_PER_MS, NS_PER_S, Frame, RequestKind, ServoCommand, ServoState, VisualForce
 
 _TURN_S: Final = 10.0

@@ -19,13 +19,14 @@ from typing import Any, Final
 import numpy as np
 
 from gripper_force import __version__
+from gripper_force.assembly import checkpoint_of
 from gripper_force.backends import KILL_TRIAL, load, open_devices
 from gripper_force.config import Config, config_from, dump_config
 from gripper_force.errors import DataError, GripperError, LogError
 from gripper_force.grasp import TRIAL_OBJECTS, TRIAL_TARGETS_N
 from gripper_force.interfaces import Devices
 from gripper_force.log import LogReader
-from gripper_force.session import checkpoint_of, grasp_in, open_session
+from gripper_force.session import grasp_in, open_session
 from gripper_force.stability.rows import ROWS, Row
 from gripper_force.stability.verdict import Grasp, Sound, judge
 from gripper_force.types import (

@@ -19,6 +19,7 @@ from mcap.records import Schema
 from mcap.writer import CompressionType, Writer
 from safetensors.torch import save
 
+from gripper_force.assembly import controller_from
 from gripper_force.config import (
     Config,
     GripperConfig,
@@ -35,7 +36,6 @@ from gripper_force.replay import replay
 from gripper_force.report.data import read_run
 from gripper_force.rig import Estimate, LoadCellCalibration, RigProfile, ServoCalibration
 from gripper_force.schema import dump
-from gripper_force.session import controller_from
 from gripper_force.stability.fuzz import Target
 from gripper_force.types import (
     NS_PER_MS,

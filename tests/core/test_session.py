@@ -22,7 +22,7 @@ from gripper_force.config import Config, config_from_text, load_config
 from gripper_force.errors import ConfigError, DataError, DeviceError, DeviceTimeoutError, SimulationError
 from gripper_force.interfaces import Camera, Devices
 from gripper_force.log import LogReader
-from gripper_force.session import Session, controller_from, open_session, run_grasp
+from gripper_force.session import Session, open_session, run_grasp
 from gripper_force.types import (
     NS_PER_MS,
     Event,
@@ -232,11 +232,6 @@ def test_a_target_over_the_limit_is_refused_before_anything_moves(quick: list[st
     with pytest.raises(ConfigError, match=r"target_n 13 N is too near to control\.force_limit_n 10 N"):
         run_grasp(load_config(None, [*quick, "target_n=13"]), tmp_path / "run.mcap")
     assert not list(tmp_path.iterdir())
-
-
-def test_a_configuration_that_met_no_servo_controls_nothing() -> None:
-    with pytest.raises(ConfigError, match=r"gripper\.nm_per_a is not set"):
-        controller_from(Config())
 
 
 # Every way out.

@@ -23,6 +23,7 @@ from gripper_calibration.fits.camera import (
     telling,
 )
 from gripper_calibration.reports.camera import draw
+from gripper_force.assembly import checkpoint_of, settled
 from gripper_force.backends import open_devices
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
@@ -31,7 +32,6 @@ from gripper_force.recording.lag import camera_lags_s, load_cell_lag_s
 from gripper_force.recording.record import Plan, record
 from gripper_force.recording.summary import releases_ns
 from gripper_force.rig import CameraCalibration, Estimate, read_rig, update_rig
-from gripper_force.session import checkpoint_of, settled
 from gripper_force.types import (
     NS_PER_MS,
     NS_PER_S,

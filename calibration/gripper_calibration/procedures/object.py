@@ -12,11 +12,11 @@ from gripper_calibration import logs
 from gripper_calibration.fits.correction import COVERAGE, Fitted, fit_correction, learning_curve
 from gripper_calibration.fits.plant import crushed_by, fit_plant, stiffness_n_m
 from gripper_calibration.reports.object import draw
+from gripper_force.assembly import settled
 from gripper_force.config import Config
 from gripper_force.errors import DataError
 from gripper_force.object_profile import ObjectProfile, write_object
 from gripper_force.recording.record import Plan, Progress, record
-from gripper_force.session import settled
 from gripper_force.types import NS_PER_MS
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
 from gripper_force.vision.correction import write_arrays

@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from gripper_calibration.procedures.object import calibrate, touch
+from gripper_force.assembly import make_controller
 from gripper_force.backends import open_devices
 from gripper_force.cli import app
 from gripper_force.config import Config, load_config
@@ -16,7 +17,6 @@ from gripper_force.grasp import grasp
 from gripper_force.log import LogReader
 from gripper_force.object_profile import read_object, weights_path
 from gripper_force.replay import replay
-from gripper_force.session import make_controller
 from gripper_force.types import Event
 
 QUICK = [
