@@ -161,7 +161,7 @@ class GraspController:
         if tripped:
             self._fail()
         if request is not None and (refusal := self._obey(t_ns, request)):
-            events.append(Event(t_ns, "control", f"refused {request.kind!r}: {refusal}"))
+            events.append(Event(t_ns, "control", f"refused {str(request.kind)!r}: {refusal}"))
         if self._width_m is not None:
             self._act(t_ns, dt_s, self._width_m, self._transmission.closing_m_s(servo.velocity_rad_s))
         command, is_over = self._bound(t_ns, dt_s)
@@ -189,8 +189,7 @@ class GraspController:
         self._motor_n = self._transmission.force_n(servo.current_a)
         closing_m_s = self._transmission.closing_m_s(servo.velocity_rad_s)
         free = self._cruises(closing_m_s)
-        opening = self._phase == Phase.RELEASE or self._opens_at_fault
-        self._estimate, fused = self._fusion.step(t_ns, servo, visual, free=free, opening=opening)
+        self._estimate, fused = self._fusion.step(t_ns, servo, visual, free=free, opening=self._opens)
         return [*fused, *self._ease(t_ns, servo.temperature_c)]
 
     def _ease(self, t_ns: int, temperature_c: float) -> list[Event]:
@@ -248,22 +247,27 @@ class GraspController:
 
     def _release(self, reason: str) -> None:
         self._travel.start(self._present_width_m, 2 * self._config.approach_speed_m_s)
+        self._limits.begin()
         self._enter(Phase.RELEASE, reason)
 
     def _fail(self) -> None:
         reason = self._safety.reason
         if self._config.on_fault == "open":
             self._release(reason)
-        elif self._config.on_fault == "limp":
-            self._push_n = 0.0
-        if self._phase not in (*_GRIPPING, Phase.RELEASE):
+        elif self._phase not in _GRIPPING:
             self._goal_width_m = self._present_width_m
+        if self._config.on_fault == "limp":
+            self._push_n = 0.0
         self._enter(Phase.FAULT, reason)
         self._conclude(Outcome.FAULT, reason)
 
     @property
     def _opens_at_fault(self) -> bool:
         return self._phase == Phase.FAULT and self._config.on_fault == "open"
+
+    @property
+    def _opens(self) -> bool:
+        return self._phase == Phase.RELEASE or self._opens_at_fault
 
     @property
     def _wanted_n(self) -> float:
@@ -400,7 +404,9 @@ class GraspController:
         )
         may_rise = self._phase != Phase.FAULT or self._opens_at_fault
         force_n, friction_n = self._estimate.force_n, self._estimate.friction_n
-        return self._limits.apply(wanted, force_n, friction_n, self._motor_n, dt_s, may_rise=may_rise)
+        return self._limits.apply(
+            wanted, force_n, friction_n, self._motor_n, dt_s, may_rise=may_rise, opens=self._opens
+        )
 
     def _status(self, t_ns: int) -> GraspStatus:
         return GraspStatus(

@@ -60,6 +60,7 @@ class Limits:
         dt_s: float,
         *,
         may_rise: bool,
+        opens: bool = False,
     ) -> tuple[ServoCommand, bool]:
         """Bounds a command.
 
@@ -70,6 +71,7 @@ class Limits:
             push_n: The motor's present push, by its current.
             dt_s: Time since the last command.
             may_rise: Whether the goal current may exceed the last one at all.
+            opens: Whether the jaws are to open: then a force over its limit is no reason to push less.
 
         Returns:
             The bounded command, and whether the force estimate is over its limit.
@@ -82,7 +84,7 @@ class Limits:
         if not may_rise:
             ceiling_a = min(ceiling_a, self._last_a)
         over = force_n > self._force_limit_n
-        if over:
+        if over and not opens:
             if not self._over:
                 self._lowered_a = _OVER_FORCE_CEILING * self._last_a
             # Friction may hold the force up. A push that can't give the limit any more need not fall further.
@@ -97,7 +99,7 @@ class Limits:
         return ServoCommand(command.t_ns, position_rad, self._last_a), over
 
     def begin(self) -> None:
-        """A new grasp: what was too much for the last one no longer counts."""
+        """A new grasp, or its end: what was too much for the last one no longer counts."""
         self._lowered_a = math.inf
 
     def ceiling_a(self, friction_n: float) -> float:

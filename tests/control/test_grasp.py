@@ -210,9 +210,29 @@ def test_stop_wins_in_every_phase(make_run, phase):
     assert {decision.status.outcome for decision in after} == {"fault"}
     currents = [before_a, *(decision.command.goal_current_a for decision in after)]
     assert all(b <= a for a, b in pairwise(currents))
-    assert any("release first" in text for text in run.texts)
+    assert any("refused 'grasp': " in text and "release first" in text for text in run.texts)
     run.go(4.0, "release").go(0.05)
     assert run.last.status.phase == "open"
+
+
+@pytest.mark.parametrize("on_fault", ["limp", "hold"])
+def test_a_force_that_seems_too_much_never_keeps_the_jaws_from_opening(make_run, on_fault):
+    run = make_run(eye={"noise_n": 0.7}, feedback="vision", on_fault=on_fault, force_limit_n=4.5)
+    run_to(run, "hold")
+    run.eye.gain = 1.3  # pictures that are on their way when the stop comes
+    run.go(0.02).go(0.5, "stop")
+    assert any("over the limit" in event.text for d in run.decisions[-100:] for event in d.events)
+    run.go(4.0, "release")
+    assert run.last.status.phase == "open"
+
+
+def test_a_stop_while_the_jaws_open_holds_them_where_they_are(make_run):
+    run = run_to(make_run(on_fault="hold"), "hold").go(0.15, "release")
+    run.go(0.005, "stop")
+    stopped_m = run.last.status.width_m
+    goal_m = run.transmission.width_m(run.last.command.goal_position_rad)
+    assert goal_m == pytest.approx(stopped_m, abs=1e-6)
+    assert stopped_m < run.transmission.open_width_m - 0.01
 
 
 def test_at_fault_the_jaws_go_limp(make_run):
