@@ -183,7 +183,8 @@ class LogWriter:
         through: What the bytes pass on their way to the file.
 
     Attributes:
-        waiting: Records of the open chunk; they are lost where it can't be written.
+        failed: Whether the disk failed; nothing more is written then.
+        waiting: Records of the open chunk, which are lost where the disk fails.
 
     Raises:
         LogError: The file exists already, or can't be written (every method).
@@ -199,7 +200,7 @@ class LogWriter:
     ) -> None:
         self.waiting = 0
         self._path = path
-        self._failed = False
+        self.failed = False
         self._closed = False
         self._channels: dict[type[Record], int] = {}
         self._chunk_start_ns: int | None = None
@@ -240,8 +241,10 @@ class LogWriter:
             data = _CODECS[record_type].encode(record)
             if not 0 <= log_ns < 2**64:
                 raise ValueError(f"its time is {log_ns} ns")
-            channel = self._channels.get(record_type) or self._register(record_type)
             sequence = record.seq if isinstance(record, Frame) else 0
+            if not 0 <= sequence < 2**32:  # found out later, it would spoil the chunk
+                raise ValueError(f"its sequence number is {sequence}")
+            channel = self._channels.get(record_type) or self._register(record_type)
             self._writer.add_message(channel, log_ns, data, publish_time=log_ns, sequence=sequence)
             self.waiting += 1
             if self._chunk_start_ns is None:
@@ -261,7 +264,7 @@ class LogWriter:
         if self._closed:
             return
         try:
-            if not self._failed:
+            if not self.failed:
                 with self._guard():
                     self._writer.finish()
                     self._file.flush()
@@ -281,12 +284,12 @@ class LogWriter:
 
     @contextlib.contextmanager
     def _guard(self) -> Iterator[None]:
-        if self._closed or self._failed:
+        if self._closed or self.failed:
             raise LogError(f"the log {self._path} {'is closed' if self._closed else 'failed before'}")
         try:
             yield
         except OSError as error:
-            self._failed = True
+            self.failed = True
             raise LogError(f"can't write the log {self._path}: {error.strerror}") from error
         except (ValueError, TypeError) as error:
             raise LogError(f"a record doesn't fit the log {self._path}: {error}") from error

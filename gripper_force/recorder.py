@@ -50,8 +50,11 @@ class Recorder:
     def close(self) -> None:
         """Writes what waits and completes the log. May be called twice."""
         if self._thread is not None:
-            self._queue.put(None)
-            self._thread.join(_PATIENCE_S)
+            try:
+                self._queue.put(None, timeout=_PATIENCE_S)
+                self._thread.join(_PATIENCE_S)
+            except queue.Full:
+                pass  # the thread has not moved all that time
             if self._thread.is_alive():
                 self.lost += self._queue.qsize()
                 self._error = f"the disk has not taken the last records within {_PATIENCE_S:g} s"
@@ -90,8 +93,12 @@ class Recorder:
             write()
         except LogError as error:
             self._lose(str(error))
+        except Exception as error:  # a thread that ended here would lose all that follows, in silence
+            self._lose(f"{type(error).__name__}: {error}")
 
     def _lose(self, why: str) -> None:
-        self.lost += 1 + self._log.waiting
-        self._log.waiting = 0
+        self.lost += 1
+        if self._log.failed:
+            self.lost += self._log.waiting
+            self._log.waiting = 0
         self._error = self._error or why

@@ -1,20 +1,21 @@
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from gripper_force import recorder as recorder_module
 from gripper_force.errors import LogError
 from gripper_force.log import LogReader, LogWriter
 from gripper_force.recorder import Recorder
-from gripper_force.types import Event, Record
+from gripper_force.types import Event, Frame, Record
 
 
 class Gate:
     """A log whose disk can be made to wait or to fail."""
 
     def __init__(self, log: LogWriter) -> None:
-        self.log, self.waiting = log, 0
+        self.log, self.waiting, self.failed = log, 0, False
         self.opened = threading.Event()
         self.opened.set()
         self.fails = False
@@ -91,18 +92,33 @@ def test_a_slow_disk_keeps_nobody_waiting(gate: Gate, path: Path) -> None:
     assert len(written) + recorder.lost == recorder_module.ROOM + 100
 
 
+@pytest.mark.parametrize("count", [1, recorder_module.ROOM + 100])
 def test_a_disk_that_hangs_does_not_keep_the_run_from_ending(
-    gate: Gate, monkeypatch: pytest.MonkeyPatch
+    gate: Gate, monkeypatch: pytest.MonkeyPatch, count: int
 ) -> None:
     monkeypatch.setattr(recorder_module, "_PATIENCE_S", 0.05)
     gate.opened.clear()
     recorder = Recorder(gate, lockstep=False)  # type: ignore[arg-type]
-    recorder.write(events(1)[0])
+    for event in events(count):
+        recorder.write(event)
     recorder.close()
     with pytest.raises(LogError, match="has not taken the last records"):
         recorder.raise_losses()
     gate.opened.set()
     recorder.close()
+
+
+@pytest.mark.parametrize("lockstep", [True, False])
+def test_a_record_that_does_not_fit_is_lost_alone(path: Path, lockstep: bool) -> None:
+    recorder = Recorder(LogWriter(path, config="", metadata={}), lockstep=lockstep)
+    sound = events(12)
+    for record in (*sound[:10], Event(-1, "test", "before all time"), *sound[10:]):
+        recorder.write(record)
+    recorder.write(Frame(5, 5, 2**32, np.zeros((2, 2), np.uint8)))
+    recorder.write(Event(13, "test", "after"))
+    recorder.close()
+    assert recorder.lost == 2
+    assert list(LogReader(path).records(Event)) == [*sound, Event(13, "test", "after")]
 
 
 def test_records_of_a_chunk_that_is_not_written_count_as_lost(path: Path) -> None:
