@@ -177,10 +177,7 @@ def import_environment(
             continue
         samples = load_cell_samples([t_ns[n] for n in labelled], np.array([forces_n[n] for n in labelled]))
         metadata = {**about, "set": log.stem, "split": split_of(i), "touches": str(touches)}
-        unfinished = log.with_name(f".{log.name}.part")
-        unfinished.unlink(missing_ok=True)
-        spikes += write_recording(unfinished, config, metadata, frames, samples)
-        unfinished.rename(log)
+        spikes += write_recording(log, config, metadata, frames, samples)
         frame_count += len(frames)
     return EnvironmentSummary(
         folder=folder.name,

@@ -148,6 +148,8 @@ def compare(clips: Sequence[Clip], predictions: Sequence[npt.NDArray[np.floating
     """
     measured_n, valid = _joined(clips)
     valid &= np.concatenate([np.arange(len(clip.frames)) >= lead_in for clip in clips])
+    if not valid.any():
+        raise DataError(f"no frame after a recording's first {lead_in} has a load-cell force to compare with")
     predicted_n = np.concatenate(predictions)
     floors_n = np.concatenate([stiffness_floor_n(clip.forces_n, clip.stiffness) for clip in clips])[valid]
     objects = np.concatenate([np.full(len(clip.frames), clip.object) for clip in clips])[valid]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gripper_force import metrics
-from gripper_force.assembly import controller_from, make_estimator
+from gripper_force.assembly import checkpoint_of, controller_from, make_estimator, settled
 from gripper_force.config import Config, config_from_text
 from gripper_force.control.grasp import Decision
 from gripper_force.dataset import CONTACT_N, label_frames
@@ -79,7 +79,12 @@ def replay(
     """
     reader = LogReader(path, recover=recover)
     config = config_from_text(reader.config, str(path), overrides)
-    checkpoint = _checkpoint(config, checkpoint_source)
+    if checkpoint_source is not None:
+        vision = config.vision.model_copy(update={"checkpoint": checkpoint_source})
+        config = config.model_copy(update={"vision": vision})
+    checkpoint = checkpoint_of(config)
+    if checkpoint is not None:
+        config, _ = settled(config)
     replayed = run_again(reader, config, checkpoint)
     flags = [f for f in (replayed.estimates_identical, replayed.decisions_identical) if f is not None]
     sources = _sources(replayed)
@@ -97,7 +102,11 @@ def replay(
 
 
 def run_again(reader: LogReader, config: Config, checkpoint: "Model | None") -> Replayed:
-    """Feeds estimator and controller from a log, in the order in which the run had its inputs."""
+    """Feeds estimator and controller from a log, in the order in which the run had its inputs.
+
+    Where faults were injected into the estimator, the controller has the estimates that it had then.
+    """
+    spoilt = _spoilt(config)
     sight = Sight(make_estimator(config, checkpoint, correction_of(config, checkpoint)))
     runs = config.gripper.nm_per_a is not None  # a recording that was imported never had a controller
     controller = controller_from(config) if runs else None
@@ -115,7 +124,7 @@ def run_again(reader: LogReader, config: Config, checkpoint: "Model | None") -> 
                 visual.append(seen)
                 pending[record.seq] = seen
         elif isinstance(record, VisualForce):
-            again = pending.pop(record.seq, None)
+            again = None if spoilt else pending.pop(record.seq, None)
             # The time an estimate was ready is the run's own, not this computer's.
             fresh = record if again is None else replace(again, ready_ns=record.ready_ns)
         elif isinstance(record, Request):
@@ -126,7 +135,7 @@ def run_again(reader: LogReader, config: Config, checkpoint: "Model | None") -> 
         elif isinstance(record, LoadCellSample):
             cells.append(record)
     return Replayed(
-        _same_estimates(logged[VisualForce], visual) if logged[VisualForce] else None,
+        _same_estimates(logged[VisualForce], visual) if logged[VisualForce] and not spoilt else None,
         _same_decisions(logged, decisions) if logged[ServoCommand] else None,
         visual,
         decisions,
@@ -152,11 +161,17 @@ def _same_decisions(logged: dict[type, list[Any]], again: list[Decision]) -> boo
     return all(a == b[: len(a)] and len(b) - len(a) <= 1 for a, b in pairs)
 
 
+def _spoilt(config: Config) -> bool:
+    return any(fault.unit == "estimator" for fault in config.faults)
+
+
 def _note(reader: LogReader, config: Config, checkpoint: "Model | None") -> str:
     """Why the estimates can't come out the same, or an empty text."""
     used = reader.metadata.get("checkpoint", "")
     if checkpoint is None or used == "":
         return ""
+    if _spoilt(config):
+        return "faults were injected into the run's estimator: its decisions alone are compared"
     if used != checkpoint.digest:
         return f"the run's checkpoint was {used[:12]}, this one is {checkpoint.digest[:12]}: estimates differ"
     correction = correction_of(config, checkpoint)
@@ -165,15 +180,6 @@ def _note(reader: LogReader, config: Config, checkpoint: "Model | None") -> str:
         names = [text[:12] or "none" for text in (used, profile)]
         return f"the run's object profile was {names[0]}, this one is {names[1]}: estimates differ"
     return ""
-
-
-def _checkpoint(config: Config, source: str | None) -> "Model | None":
-    name = source or config.vision.checkpoint
-    if name == "none":
-        return None
-    from gripper_force.vision.exported import read_model
-
-    return read_model(name)
 
 
 def _sources(replayed: Replayed) -> dict[str, dict[str, Any]]:

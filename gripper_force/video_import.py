@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.progress import track
 
 from gripper_force.config import Config, dump_config
-from gripper_force.errors import DataError
+from gripper_force.errors import DataError, LogError
 from gripper_force.log import LogWriter
 from gripper_force.recording.lag import force_lag_s
 from gripper_force.spikes import find_spikes
@@ -150,10 +150,12 @@ def import_video(
     if align:
         good = ~find_spikes(table.force_n - tare_n)
         lag_s = force_lag_s(frames_s, np.stack(gray), table.t_s[good], table.force_n[good])
-    # What is early is moved, not what is late, so that no time is before the recording's start.
-    frames_ns = [_ns(t_s) for t_s in frames_s + max(lag_s, 0.0)]
+    frames_s, forces_s = frames_s + max(lag_s, 0.0), table.t_s + max(-lag_s, 0.0)
+    # A table may begin after the video does; a log has no time before 0.
+    start_s = min(0.0, frames_s[0], forces_s[0])
+    frames_ns = [_ns(t_s) for t_s in frames_s - start_s]
     frames = [Frame(t, t, i, image) for i, (t, image) in enumerate(zip(frames_ns, gray, strict=True))]
-    forces_ns = [_ns(t_s) for t_s in table.t_s + max(-lag_s, 0.0)]
+    forces_ns = [_ns(t_s) for t_s in forces_s - start_s]
     samples = load_cell_samples(forces_ns, table.force_n, tare_n)
     metadata = {
         "object": object_name,
@@ -231,7 +233,9 @@ def estimate_tare(t_s: Floats, force_n: Floats) -> tuple[float, str]:
     """
     start = force_n[t_s <= t_s[0] + TARE_S]
     offset = float(np.median(start))
-    if len(start) < 3 or np.ptp(start) > TARE_SPREAD_N:
+    if len(start) < 3:
+        return 0.0, f"the first {TARE_S} s hold {len(start)} forces, too few to tell an offset from a touch"
+    if np.ptp(start) > TARE_SPREAD_N:
         return (
             0.0,
             f"the force moves by {np.ptp(start):.2f} N in the first {TARE_S} s, so contact may be near",
@@ -266,7 +270,15 @@ def write_recording(
     samples: list[LoadCellSample],
     table: Path | None = None,
 ) -> int:
-    """Writes an imported recording as a log, and the table it came from as an attachment.
+    """Writes an imported recording as a log, which appears once it is whole.
+
+    Args:
+        out: The log to write.
+        config: What is known of how it was made.
+        metadata: Likewise, for people.
+        frames: The pictures.
+        samples: The forces.
+        table: A file to attach, where the forces came from one.
 
     Returns:
         How many samples are not valid; the log's metadata say so too.
@@ -274,14 +286,19 @@ def write_recording(
     Raises:
         LogError: The log exists already or can't be written.
     """
+    if out.exists():
+        raise LogError(f"can't write the log {out}: it exists already, and a log is never overwritten")
+    unfinished = out.with_name(f".{out.name}.part")
+    unfinished.unlink(missing_ok=True)
     spikes = sum(not sample.valid for sample in samples)
     records: list[Frame | LoadCellSample] = [*frames, *samples]
     metadata = {**metadata, "spikes_rejected": str(spikes)}
-    with LogWriter(out, config=dump_config(config), metadata=metadata) as log:
+    with LogWriter(unfinished, config=dump_config(config), metadata=metadata) as log:
         if table is not None:
             log.attach(table.name, table.read_bytes(), "text/csv")
         for record in sorted(records, key=lambda record: record.t_ns):
             log.write(record)
+    unfinished.rename(out)
     return spikes
 
 

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 import torch
 
+from gripper_force.config import load_config
 from gripper_force.errors import CheckpointError, DataError, LogError
 from gripper_force.log import LogReader, LogWriter
 from gripper_force.metrics import bias, mae, rmse
 from gripper_force.replay import replay
+from gripper_force.session import run_grasp
 from gripper_force.types import (
     FusedForce,
     GraspStatus,
@@ -127,3 +129,23 @@ def test_what_can_not_be_compared_is_named(fused_log: Path, tmp_path: Path) -> N
         replay(fused_log, "gone.safetensors")
     with pytest.raises(LogError, match="No such file"):
         replay(tmp_path / "gone.mcap")
+
+
+def test_auto_is_settled_as_a_run_would(fused_log: Path, quick: list[str], tmp_path: Path) -> None:
+    taken = replay(fused_log, "auto")
+    assert "estimates differ" in taken["note"]
+    blind = tmp_path / "blind.mcap"
+    run_grasp(load_config(None, [*quick, "vision.checkpoint=auto"]), blind)
+    assert replay(blind)["identical"] is True
+
+
+@pytest.mark.parametrize("kind", ["off", "wrong"])
+def test_decisions_on_an_estimator_that_was_made_to_fail_are_still_compared(
+    quick_vision: list[str], tmp_path: Path, kind: str
+) -> None:
+    path = tmp_path / "spoilt.mcap"
+    fault = f"faults=[{{unit: estimator, kind: {kind}, at_s: 0.6}}]"
+    run_grasp(load_config(None, [*quick_vision, fault]), path)
+    result = replay(path)
+    assert result["identical"] is True
+    assert "faults were injected" in result["note"]
