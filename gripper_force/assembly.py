@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from gripper_force.config import Config
-from gripper_force.control.grasp import GraspController
+from gripper_force.control.grasp import MAX_CYCLE_S, GraspController
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import ConfigError
 from gripper_force.interfaces import Devices
@@ -16,6 +16,9 @@ if TYPE_CHECKING:  # a run without vision loads none of it
 
 _SUPPLY_SLACK_V = 0.5
 """A supply that is set to the end of a servo's range reads a little beyond it."""
+
+_CYCLES_A_WATCHDOG = 2
+"""One cycle that is lost must not make the servo stop."""
 
 
 def settled(config: Config) -> tuple[Config, str]:
@@ -53,7 +56,12 @@ def make_estimator(
 
 
 def make_controller(config: Config, devices: Devices) -> tuple[Config, GraspController]:
-    """Completes the configuration with what the servo knows of itself, and builds the controller from it."""
+    """Completes the configuration with what the servo knows of itself, and builds the controller from it.
+
+    Raises:
+        ConfigError: The loop is too slow to be one, or slower than the servo waits for it.
+    """
+    _check_rate(config)
     servo = devices.servo
     gripper = config.gripper
     if gripper.nm_per_a is None:
@@ -77,3 +85,16 @@ def controller_from(config: Config) -> GraspController:
         raise ConfigError("this configuration was never completed by a servo: gripper.nm_per_a is not set")
     transmission = Transmission.from_config(gripper, gripper.nm_per_a, gripper.current_step_a or 0.0)
     return GraspController(config.control, transmission, config.servo.current_limit_a)
+
+
+def _check_rate(config: Config) -> None:
+    rate_hz, watchdog_ms = config.control.rate_hz, config.servo.bus_watchdog_ms
+    if rate_hz < 1 / MAX_CYCLE_S:
+        raise ConfigError(
+            f"control.rate_hz is {rate_hz:g}, too slow for a force loop; set at least {1 / MAX_CYCLE_S:g}"
+        )
+    if rate_hz < (least_hz := 1e3 * _CYCLES_A_WATCHDOG / watchdog_ms):
+        raise ConfigError(
+            f"at control.rate_hz {rate_hz:g} a servo with servo.bus_watchdog_ms {watchdog_ms} would stop by "
+            f"itself; set the rate to {least_hz:.4g} or more, or make the watchdog longer"
+        )

@@ -259,7 +259,7 @@ class SimConfig(Section):
     )
     markers: bool = Field(False, description="whether each finger carries an ArUco marker beside its pad")
     camera_latency_ms: NonNegative = 15.0
-    exposure_ms: NonNegative = Field(4.0, description="at a camera.exposure_us of 4000")
+    exposure_ms: Positive = Field(4.0, description="at a camera.exposure_us of 4000")
 
 
 class CalibrationConfig(Section):

@@ -48,15 +48,15 @@ class Sight:
 
     An error on the frames before the first estimate means that the run is set up wrongly, and is raised. A
     later one costs the estimate of its frame: the controller goes on with the motor current alone. So does a
-    frame that is its forerunner to the bit: sensors have noise, and a camera that hangs has none. In a
-    recording that stands still from the start it means nothing.
+    frame that is its forerunner to the bit: sensors have noise, and a camera that hangs has none. Where all
+    frames up to the first estimate are the same, as in a recording without noise, it means nothing.
     """
 
     def __init__(self, estimator: Estimator | None) -> None:
         self._estimator = estimator
         self._works = False
         self._last: Gray | None = None
-        self._may_repeat = False
+        self._may_repeat: bool | None = None  # nothing is known yet
 
     def see(self, frame: Frame, now_ns: Callable[[], int] | None = None) -> Seen:
         """Makes an estimate of a frame.
@@ -71,9 +71,10 @@ class Sight:
         if self._estimator is None:
             return Seen(frame, None)
         repeats = self._last is not None and np.array_equal(frame.gray, self._last)
+        if self._last is not None and not self._works:
+            self._may_repeat = repeats and self._may_repeat is not False
         self._last = frame.gray
-        self._may_repeat |= repeats and not self._works
-        if repeats and not self._may_repeat:
+        if self._works and repeats and not self._may_repeat:
             return Seen(frame, None, "the camera repeats its last picture; see whether it hangs")
         begin_ns = time.perf_counter_ns()
         try:

@@ -42,9 +42,6 @@ _GATE = 3.29
 _REENTRY = 20
 """Estimates in a row that must be off to the same side before the filter gives way (1/3 s at 60 Hz)."""
 
-_HISTORY = 64
-"""Cycles of current-derived force kept: 320 ms at 200 Hz, several camera latencies."""
-
 
 class Fusion:
     """Kalman filter on the difference between vision and the current-derived force, and a share of it.
@@ -71,7 +68,8 @@ class Fusion:
         _, self._lag_s, _ = config.plant
         self._std_limit_n = config.vision_std_n
         self._transmission = transmission
-        self._history: deque[tuple[int, float]] = deque(maxlen=_HISTORY)
+        cycles = math.ceil(config.rate_hz * config.vision_age_ms / 1e3) + 2
+        self._history: deque[tuple[int, float]] = deque(maxlen=cycles)  # to compare any accepted frame with
         self._push_n = 0.0
         self._current_n = 0.0
         self._newest_seen_ns = -1

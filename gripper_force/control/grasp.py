@@ -25,7 +25,7 @@ from gripper_force.types import (
     VisualForce,
 )
 
-_MAX_CYCLE_S = 0.05
+MAX_CYCLE_S = 0.05
 """A late cycle counts for no more than this, so that it does not become a leap."""
 
 _IMPACT_M_S_PER_N = 0.010
@@ -176,7 +176,7 @@ class GraspController:
     def _elapsed_s(self, t_ns: int) -> float:
         before_ns = t_ns if self._t_ns is None else self._t_ns
         self._t_ns = t_ns
-        return min(max(t_ns - before_ns, 0) / NS_PER_S, _MAX_CYCLE_S)
+        return min(max(t_ns - before_ns, 0) / NS_PER_S, MAX_CYCLE_S)
 
     def _sense(self, t_ns: int, servo: ServoState, visual: VisualForce | None) -> list[Event]:
         if not is_sound(servo):

@@ -45,3 +45,16 @@ def test_auto_becomes_a_network_and_an_engine_with_the_reason() -> None:
     config, why = settled(load_config(None, ["vision.checkpoint=auto"]))
     assert "auto" not in (config.vision.checkpoint, config.vision.engine)
     assert config.vision.checkpoint in why
+
+
+@pytest.mark.parametrize(
+    ("slow", "sentence"),
+    [
+        (["control.rate_hz=10", "servo.bus_watchdog_ms=500"], "too slow for a force loop; set at least 20"),
+        (["control.rate_hz=40"], "servo.bus_watchdog_ms 40 would stop by itself; set the rate to 50 or more"),
+    ],
+)
+def test_a_loop_too_slow_for_itself_or_for_the_servo_is_refused(slow: list[str], sentence: str) -> None:
+    config = load_config(None, ["camera.backend=none", "load_cell.backend=none", *slow])
+    with open_devices(config) as devices, pytest.raises(ConfigError, match=sentence):
+        make_controller(config, devices)

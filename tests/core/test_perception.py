@@ -17,10 +17,11 @@ class Guess(NamedTuple):
 
 
 class Eye:
-    """Says how many frames it has seen, after one reference frame."""
+    """Says how many frames it has seen, after its reference frames."""
 
-    def __init__(self, error: Exception | None = None, at: int = 1) -> None:
+    def __init__(self, error: Exception | None = None, at: int = 1, references: int = 1) -> None:
         self.count = 0
+        self.references = references
         self.error = error
         self.at = at
 
@@ -28,7 +29,7 @@ class Eye:
         self.count += 1
         if self.error is not None and self.count == self.at:
             raise self.error
-        return Guess(float(self.count), 0.5) if self.count > 1 else None
+        return Guess(float(self.count), 0.5) if self.count > self.references else None
 
 
 class Hand:
@@ -150,6 +151,16 @@ def test_a_camera_that_hangs_gives_no_estimates() -> None:
     assert ["hangs" in s.problem for s in seen] == [False, False, False, True, True, False]
     assert [s.visual is None for s in seen] == [True, False, False, True, True, False]
     assert eye.count == 4
+
+
+def test_one_picture_that_came_twice_at_the_start_excuses_no_camera_that_hangs() -> None:
+    camera, eye = Shutter(), Eye(references=3)
+    eyes = LockstepPerception(camera, eye, Hand(), 0.0)
+    seen = []
+    for seq, level in enumerate((1, 1, 2, 3, 4, 5, 5, 5)):
+        camera.give(seq, level=level)
+        seen += eyes.poll()
+    assert ["hangs" in s.problem for s in seen] == [False] * 6 + [True] * 2
 
 
 def test_a_recording_may_stand_still() -> None:
