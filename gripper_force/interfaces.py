@@ -18,7 +18,7 @@ class BusStats:
 
 
 class Servo(Protocol):
-    """The gripper's servo. One thread alone may call it, `emergency_stop` aside.
+    """The gripper's servo. One thread alone may call it.
 
     Every method may raise `DeviceLostError`, `DeviceTimeoutError` or `HardwareFaultError`.
     """

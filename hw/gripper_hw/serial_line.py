@@ -1,7 +1,7 @@
 """Opens a serial line for one program alone, and says in a sentence why it can't."""
 
 import termios
-from errno import EACCES, EAGAIN
+from errno import EACCES, EAGAIN, EBUSY
 from pathlib import Path
 
 import serial
@@ -36,6 +36,6 @@ def _open_error(name: str, unit: str, error: Exception) -> DeviceError:
         )
     if isinstance(error, OSError) and error.errno == EACCES:
         return DeviceError(f"no permission to open {whose}; join the group dialout and log in again")
-    if isinstance(error, OSError) and error.errno == EAGAIN:
+    if isinstance(error, OSError) and error.errno in (EAGAIN, EBUSY):
         return DeviceError(f"{whose} is in use by another program; close that first")
     return DeviceError(f"can't open {whose}: {error}")

@@ -30,8 +30,10 @@ def test_each_thing_in_the_way_is_one_sentence(tmp_path: Path, monkeypatch: pyte
     file.touch()
     assert refused(str(file)).startswith(f"can't open the load cell's port {file}: ")
 
-    def forbid(*_: object, **__: object) -> None:
-        raise serial.SerialException(errno.EACCES, "Permission denied")
+    for number, advice in ((errno.EACCES, "join the group dialout"), (errno.EBUSY, "is in use by another")):
 
-    monkeypatch.setattr(serial, "Serial", forbid)  # to the administrator nothing is forbidden
-    assert "join the group dialout" in refused(str(file))
+        def forbid(*_: object, number: int = number, **__: object) -> None:
+            raise serial.SerialException(number, os.strerror(number))
+
+        monkeypatch.setattr(serial, "Serial", forbid)  # to the administrator nothing is forbidden
+        assert advice in refused(str(file))

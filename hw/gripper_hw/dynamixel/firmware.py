@@ -299,7 +299,8 @@ class VirtualServo:
             self._pwm = self._position_pid(dt_s)
             if mode == CURRENT_BASED_POSITION_MODE:
                 limit_a = min(limit_a, abs(self._goal_current_a))
-        self._pwm = max(-self._pwm_limit, min(self._pwm_limit, self._pwm))
+        bound = self._pwm_limit if mode == PWM_MODE else min(self._pwm_limit, abs(self._goal_pwm))
+        self._pwm = max(-bound, min(bound, self._pwm))
         return max(-limit_a, min(limit_a, self._stall_a * (self._pwm - back_emf)))
 
     def _position_pid(self, dt_s: float) -> float:

@@ -134,7 +134,9 @@ class SerialPort(PortHandler):  # type: ignore[misc]
     def _read(self, length: int, timeout_s: float) -> bytes:
         try:
             fd = self._fd()
-            if not select.select([fd], [], [], timeout_s)[0]:
+            waiting = select.poll()  # `select.select` fails for descriptors from 1024 on
+            waiting.register(fd, select.POLLIN)
+            if not waiting.poll(1e3 * timeout_s):
                 return b""
             data = os.read(fd, length)
         except BlockingIOError:

@@ -114,12 +114,19 @@ class DynamixelBus:
             "status_return_level": 2,
             "profile_acceleration": 0,
             "profile_velocity": 0,
+            # Another program's gains could make the position loop ring within the current it is allowed.
+            "position_p_gain": self.model.initial["position_p_gain"],
+            "position_i_gain": 0,
+            "position_d_gain": 0,
+            "feedforward_1st_gain": 0,
+            "feedforward_2nd_gain": 0,
         }
 
     def start(self) -> tuple[ServoState, ...]:
         """Opens the port, sets every servo up, and turns torque on at the present position with no current.
 
-        Where this raises, torque is off or was tried to be turned off, unless another model answered.
+        Where this raises, each servo of the right model that was reached has no torque, or turning it off
+        was tried.
 
         Raises:
             DeviceNotFoundError: The port is not there, or a servo does not answer on it.
@@ -127,12 +134,16 @@ class DynamixelBus:
             HardwareFaultError: A servo reports an error of its own.
             DeviceError: The port is in use, a firmware is too old, or a register does not take its value.
         """
-        self._expected_watchdog = 0
         self._line.open()
+        self._expected_watchdog = 0
         with ExitStack() as undo:
             undo.callback(self.close)
-            self.firmware = tuple(self._identify(id_) for id_ in self.ids)
-            undo.callback(self._abandon)
+            firmware = []
+            for id_ in self.ids:
+                self._identify(id_)
+                undo.callback(self._abandon, id_)
+                firmware.append(self._firmware(id_))
+            self.firmware = tuple(firmware)
             window = self._common_window()
             for id_ in self.ids:
                 self._set_up(id_, window)
@@ -175,7 +186,7 @@ class DynamixelBus:
 
         Raises:
             DeviceError: A servo could not be stopped. With ``hold``, also where it had already stopped by
-                itself: then its torque is turned off.
+                itself, or can't be told to hold: then its torque is turned off, or that was tried.
         """
         action = self._hold if hold else self._torque_off
         failure: DeviceError | None = None
@@ -194,8 +205,12 @@ class DynamixelBus:
 
     # Start.
 
-    def _identify(self, id_: int) -> int:
-        where = f"the servo with id {id_} on {self._config.port}"
+    def _where(self, id_: int) -> str:
+        return f"the servo with id {id_} on {self._config.port}"
+
+    def _identify(self, id_: int) -> None:
+        """Another model is left alone: what its registers mean is not known."""
+        where = self._where(id_)
         try:
             number = self._line.ping(id_)
         except DeviceTimeoutError as error:
@@ -206,11 +221,13 @@ class DynamixelBus:
         if number != self.model.number:  # a late answer can pass for a ping's, and not for a read's
             number = self._line.get(id_, "model_number")
         check_model_number(self.model, number, where)
+
+    def _firmware(self, id_: int) -> int:
         self._line.ask_for_answers(id_)
         firmware = self._line.get(id_, "firmware_version")
         if firmware < self.model.min_firmware:
             raise DeviceError(
-                f"{where} has firmware {firmware}, which lacks Fast Sync Read; update it to "
+                f"{self._where(id_)} has firmware {firmware}, which lacks Fast Sync Read; update it to "
                 f"{self.model.min_firmware} or newer with DYNAMIXEL Wizard"
             )
         return firmware
@@ -238,6 +255,7 @@ class DynamixelBus:
         for name, value in self.settings.items():
             if not REGISTERS[name].eeprom or self._line.get(id_, name) != value:  # the EEPROM wears out
                 self._line.set(id_, name, value)
+        self._line.set(id_, "goal_pwm", self._line.get(id_, "pwm_limit"))  # another program may have left 0
         pointers = struct.pack(f"<{len(_INDIRECT_ADDRESSES)}H", *_INDIRECT_ADDRESSES)
         self._line.write(id_, window.address, pointers)
         if self._line.read(id_, window.address, len(pointers)) != pointers:
@@ -251,9 +269,9 @@ class DynamixelBus:
         self._line.set(id_, "bus_watchdog", self._watchdog)
         self._line.set(id_, "torque_enable", 1)
 
-    def _abandon(self) -> None:
+    def _abandon(self, id_: int) -> None:
         with suppress(DeviceError):  # the error that brought us here is the one to tell
-            self.stop(hold=False)
+            self._torque_off(id_)
 
     # Stop.
 
@@ -262,13 +280,16 @@ class DynamixelBus:
         self._line.set(id_, "bus_watchdog", 0)
 
     def _hold(self, id_: int) -> None:
-        # Disarming a watchdog that has tripped would set the motor going again.
-        if self._line.get(id_, "bus_watchdog") < 0 or not self._line.get(id_, "torque_enable"):
-            self._torque_off(id_)
-            raise HardwareFaultError(
-                f"servo {id_} can't hold: it had stopped by itself, and its torque was turned off"
-            )
-        self._line.set(id_, "bus_watchdog", 0)
+        try:
+            # Disarming a watchdog that has tripped would set the motor going again.
+            if self._line.get(id_, "bus_watchdog") < 0 or not self._line.get(id_, "torque_enable"):
+                raise HardwareFaultError(
+                    f"servo {id_} can't hold: it had stopped by itself, and its torque was turned off"
+                )
+            self._line.set(id_, "bus_watchdog", 0)
+        except DeviceError:
+            self._abandon(id_)  # whether it holds is not known, so it must not go on by itself
+            raise
 
     # Cycle.
 

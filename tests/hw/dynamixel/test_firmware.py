@@ -366,6 +366,11 @@ def test_pwm_mode_is_a_voltage():
     assert settle(make(PWM_MODE, goal_pwm=442, pwm_limit=100)) == pytest.approx(2.3 * 100 / 885, abs=1e-3)
 
 
+def test_goal_pwm_bounds_the_other_modes():
+    servo = make(CURRENT_BASED_POSITION_MODE, goal_current=400, goal_position=10_000, goal_pwm=100)
+    assert settle(servo) == pytest.approx(2.3 * 100 / 885, abs=1e-3)
+
+
 def test_present_registers_are_quantised():
     servo = make(torque_enable=0)
     servo.control(1_234 * MS, 0.5, -1.0, current_noise_a=0.1)

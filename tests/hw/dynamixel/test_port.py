@@ -1,5 +1,7 @@
+import contextlib
 import os
 import pty
+import resource
 import threading
 import tty
 
@@ -79,6 +81,22 @@ def test_the_sdk_may_ask_for_less_than_nothing(line):
     assert port.readPort(-1) == b""
     assert port.readPort(1) == b"\xff"
     port.closePort()
+
+
+def test_a_program_with_many_files_open_reads_too(line, tmp_path):
+    with contextlib.ExitStack() as stack:
+        file = stack.enter_context((tmp_path / "file").open("w"))
+        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 2048), hard))
+        stack.callback(resource.setrlimit, resource.RLIMIT_NOFILE, (soft, hard))
+        last = 0
+        while last < 1024:
+            last = os.dup(file.fileno())
+            stack.callback(os.close, last)
+        port = open_port(line.port, 1_000_000, 250.0)
+        stack.callback(port.closePort)
+        number, result, _ = sdk.PacketHandler(2.0).ping(port, 1)
+        assert (number, result) == (1020, sdk.COMM_SUCCESS)
 
 
 def test_an_answer_may_come_in_pieces(line):

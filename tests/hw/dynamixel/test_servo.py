@@ -163,10 +163,30 @@ def test_more_current_than_the_model_allows_is_refused():
         DynamixelServo(ServoConfig(port="virtual:nobody", model="XC330-T288"))
 
 
-def test_old_firmware_is_refused(make_memory_line):
+def test_old_firmware_is_refused_and_loses_its_torque(make_memory_line):
     line = make_memory_line(VirtualServo(1, MODEL, firmware=44))
+    line.bus.servos[0].set("torque_enable", 1)
     with pytest.raises(DeviceError, match=r"firmware 44.*update it to 45"):
         drive(line).start()
+    assert line.bus.servos[0].get("torque_enable") == 0
+
+
+def test_a_start_where_one_servo_is_missing_turns_the_others_torque_off(make_memory_line):
+    line = make_memory_line(VirtualServo(1, MODEL))
+    line.bus.servos[0].set("torque_enable", 1)
+    with pytest.raises(DeviceNotFoundError, match="id 2"):
+        DynamixelBus(line.config(reply_margin_ms=2.0), (1, 2)).start()
+    assert line.bus.servos[0].get("torque_enable") == 0
+
+
+def test_gains_and_bounds_that_another_program_left_are_set_right(line):
+    firmware = line.bus.servos[0]
+    odd = ("position_p_gain", "position_i_gain", "position_d_gain", "feedforward_1st_gain", "goal_pwm")
+    usual = {name: firmware.get(name) for name in odd}
+    for name in odd:
+        firmware.set(name, 1)
+    drive(line).start()
+    assert {name: firmware.get(name) for name in odd} == usual
 
 
 def test_a_hardware_error_refuses_start_and_leaves_torque_off(memory_line):
@@ -391,6 +411,21 @@ def test_a_servo_that_restarted_can_not_hold(memory_line):
     memory_line.bus.servos[0].set("torque_enable", 0)
     with pytest.raises(HardwareFaultError, match="can't hold"):
         servo.stop(hold=True)
+
+
+def test_a_servo_that_can_not_be_told_to_hold_loses_its_torque(memory_line):
+    servo = drive(memory_line)
+    servo.start()
+    deaf = REGISTERS["bus_watchdog"].address.to_bytes(2, "little")
+
+    def lose_what_is_said_of_the_watchdog(answer):
+        packet = memory_line.packets()[-1]
+        return None if packet.params[:2] == deaf else answer
+
+    memory_line.bus.tamper = lose_what_is_said_of_the_watchdog
+    with pytest.raises(DeviceTimeoutError):
+        servo.stop(hold=True)
+    assert memory_line.bus.servos[0].get("torque_enable") == 0
 
 
 def test_stop_goes_on_through_lost_answers(memory_line):
