@@ -30,6 +30,9 @@ LOAD_CELLS: Final = {
     "serial": "gripper_hw.load_cells.serial:SerialLoadCell",
     "phidget": "gripper_hw.load_cells.phidget:PhidgetLoadCell",
 }
+_ANY_TIME: Final = (RIG, CAMERAS["playback"], LOAD_CELLS["playback"])
+"""What keeps simulated time as well as the host's."""
+
 PROBES: Final = {
     "servo": "gripper_hw.dynamixel.probe",
     "camera": "gripper_hw.cameras.probe",
@@ -109,8 +112,8 @@ def open_devices(config: Config) -> Iterator[Devices]:
                 "servo.port=virtual:rig, or faults=[]"
             )
         clock: Clock = rig.clock if rig is not None else MonotonicClock()
-        camera = _open(stack, camera_class, rig, config.camera, clock, "camera")
-        load_cell = _open(stack, load_cell_class, rig, config.load_cell, clock, "load_cell")
+        camera = _open(stack, camera_class, rig, config, clock, "camera")
+        load_cell = _open(stack, load_cell_class, rig, config, clock, "load_cell")
         servo = load(SERVO)(config.servo, clock.now_ns)
         stack.callback(servo.close)
         if rig is not None:
@@ -128,9 +131,12 @@ def open_devices(config: Config) -> Iterator[Devices]:
         )
 
 
-def _open(stack: ExitStack, backend: str | None, rig: Any, section: Any, clock: Clock, unit: str) -> Any:
+def _open(stack: ExitStack, backend: str | None, rig: Any, config: Config, clock: Clock, unit: str) -> Any:
     if backend is None:
         return None
+    section = getattr(config, unit)
+    if config.clock == "lockstep" and backend not in _ANY_TIME:
+        raise ConfigError(f"{unit}.backend={section.backend} can't keep simulated time; set clock=realtime")
     device = getattr(rig, unit) if backend == RIG else load(backend)(section, clock)
     stack.callback(device.close)
     return device

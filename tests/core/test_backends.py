@@ -53,6 +53,14 @@ def test_lockstep_needs_a_simulated_servo(config: Config) -> None:
         pass
 
 
+@pytest.mark.parametrize(("unit", "backend"), [("camera", "oak"), ("load_cell", "serial")])
+def test_a_real_sensor_keeps_no_simulated_time(config: Config, unit: str, backend: str) -> None:
+    mixed = changed(config, **{unit: {"backend": backend, "port": "/dev/nowhere"}})
+    sentence = rf"{unit}\.backend={backend} can't keep .*set clock=realtime"
+    with pytest.raises(ConfigError, match=sentence), open_devices(mixed):
+        pass
+
+
 @pytest.mark.parametrize("unit", ["camera", "load_cell"])
 def test_a_simulated_sensor_needs_the_simulated_servo(config: Config, unit: str) -> None:
     none = {"camera": {"backend": "none"}, "load_cell": {"backend": "none"}}

@@ -179,8 +179,9 @@ def _moving(config: Config, devices: Devices, progress: Progress) -> Iterator["_
     """Jaws under torque; on every way out it is off."""
     assert devices.load_cell is not None
     devices.load_cell.start()
+    state = devices.servo.start()  # turns torque off itself where it fails
     try:
-        yield _Jaws(config, devices, devices.servo.start(), progress)
+        yield _Jaws(config, devices, state, progress)
     finally:
         devices.servo.stop(hold=False)
 

@@ -83,9 +83,6 @@ class OakCamera(BackgroundCamera):
         config: Its section of the configuration.
         clock: The run's clock.
         source: What gives the pictures; a test puts a host's node here.
-
-    Raises:
-        ConfigError: The clock is a simulated one.
     """
 
     def __init__(self, config: CameraConfig, clock: Clock, source: Source = device_source) -> None:

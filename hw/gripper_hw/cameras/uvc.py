@@ -48,7 +48,7 @@ class UvcCamera(BackgroundCamera):
         open_capture: What opens a path; a test puts a video file here.
 
     Raises:
-        ConfigError: No device is named, or the clock is a simulated one.
+        ConfigError: No device is named.
     """
 
     def __init__(

@@ -30,7 +30,7 @@ class PhidgetLoadCell(LiveLoadCell):
         clock: The run's clock.
 
     Raises:
-        ConfigError: The bridge does not sample at this rate, or the clock is a simulated one.
+        ConfigError: The bridge does not sample at this rate.
     """
 
     def __init__(self, config: LoadCellConfig, clock: Clock) -> None:

@@ -7,9 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from gripper_force.backends import MonotonicClock
 from gripper_force.config import LoadCellConfig
-from gripper_force.errors import ConfigError
 from gripper_force.interfaces import Clock
 from gripper_force.spikes import HAMPEL_HALF_WINDOW, find_spikes
 from gripper_force.types import NS_PER_S, LoadCellSample
@@ -131,19 +129,12 @@ class LiveLoadCell:
 
     Args:
         config: Their section of the configuration.
-        clock: The run's clock.
+        clock: The run's clock, which must be the host's.
         unit_n: Newtons for one unit of the reading where the configuration says nothing; NaN if unknown.
         noisy: See `Screen`.
-
-    Raises:
-        ConfigError: The clock is a simulated one.
     """
 
     def __init__(self, config: LoadCellConfig, clock: Clock, *, unit_n: float, noisy: bool) -> None:
-        if not isinstance(clock, MonotonicClock):
-            raise ConfigError(
-                f"load_cell.backend={config.backend} can't keep a simulated time; set clock=realtime"
-            )
         self._config, self._clock = config, clock
         n_per_raw = unit_n if config.n_per_raw is None else config.n_per_raw
         self._screen = Screen(config.tare_raw, n_per_raw, noisy=noisy)

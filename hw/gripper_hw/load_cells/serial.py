@@ -31,7 +31,7 @@ class SerialLoadCell(LiveLoadCell):
         clock: The run's clock.
 
     Raises:
-        ConfigError: No port is configured, or the clock is a simulated one.
+        ConfigError: No port is configured.
     """
 
     def __init__(self, config: LoadCellConfig, clock: Clock) -> None:

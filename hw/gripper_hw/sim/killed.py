@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from gripper_force.config import Config
+from gripper_force.config import Config, dump_config
 from gripper_force.errors import DeviceTimeoutError, LogError
 from gripper_force.log import LogReader
 from gripper_force.types import NS_PER_MS, NS_PER_S
@@ -69,8 +69,8 @@ def kill_trial(config: Config, folder: Path, number: Signals) -> KillTrial:
         server = stack.enter_context(PtyServer(bus))
         rig.load_cell.start()
         rig.start()
-        command = _command(config, server.device_path, folder)
-        child = Popen(command, stdout=DEVNULL, stderr=DEVNULL)
+        said = stack.enter_context((folder / "said.txt").open("w+"))
+        child = Popen(_command(config, server.device_path, folder), stdout=DEVNULL, stderr=said)
         stack.callback(child.wait)
         stack.callback(child.kill)
         forces_n = [0.0]
@@ -88,8 +88,10 @@ def kill_trial(config: Config, folder: Path, number: Signals) -> KillTrial:
                 return bus.servos[0].tripped
 
         if not _wait(grips, goes_on, _CONTACT_NS):
+            said.seek(0)
+            last = (said.read().strip().splitlines() or ["it said nothing"])[-1]
             raise DeviceTimeoutError(
-                f"the process that was to grip {config.object!r} and be killed never did"
+                f"the process that was to grip {config.object!r} and be killed never did: {last}"
             )
         time.sleep(float(np.random.default_rng([config.seed, 32]).uniform(0.0, 0.5)))
         sent_ns = time.monotonic_ns()
@@ -113,22 +115,20 @@ def _wait(condition: Callable[[], bool], goes_on: Callable[[], bool], most_ns: i
 
 
 def _command(config: Config, port: str, folder: Path) -> list[str]:
-    settings = {
-        "servo.port": port,
-        "servo.reply_margin_ms": 20,  # three processes share this machine with the world
-        "clock": "realtime",
-        "camera.backend": "none",
-        "load_cell.backend": "none",
-        "control.feedback": "current",
-        "control.force_limit_n": config.control.force_limit_n,
-        "control.hold_s": 30,
-        "log.directory": folder,
-        "log.report": "false",
-        "target_n": config.target_n,
+    changes = {
+        # three processes share this machine with the world
+        "servo": {"port": port, "reply_margin_ms": 20.0},
+        "camera": {"backend": "none"},
+        "load_cell": {"backend": "none"},
+        "control": {"feedback": "current", "hold_s": 30.0},
+        "log": {"directory": folder, "report": False},
     }
+    sections = {name: getattr(config, name).model_copy(update=update) for name, update in changes.items()}
+    grasp = config.model_copy(update={"clock": "realtime", "faults": (), **sections})
+    path = folder / "grasp.yaml"
+    path.write_text(dump_config(grasp), encoding="utf-8")
     program = "from gripper_force.cli import main; main()"
-    sets = [part for key, value in settings.items() for part in ("--set", f"{key}={value}")]
-    return [sys.executable, "-c", program, "grasp", "--json", *sets]
+    return [sys.executable, "-c", program, "grasp", "--json", "--config", str(path)]
 
 
 def _lost_ms(folder: Path, sent_ns: int) -> float:

@@ -2,34 +2,33 @@
 
 from collections.abc import Iterator
 
-from gripper_force.backends import CAMERAS, LOAD_CELLS, RIG
+from gripper_force.backends import CAMERAS, RIG
 from gripper_force.config import Config
 from gripper_force.doctor import Check, time_ms
 
 
 def probe(config: Config) -> Iterator[Check]:
-    """Draws a small picture of the configured scene, if anything is simulated.
+    """Draws a small picture of the configured scene, if a camera is to see it.
 
     Raises:
         ConfigError: There is no such object.
         SimulationError: EGL is missing.
     """
-    backends = CAMERAS.get(config.camera.backend), LOAD_CELLS.get(config.load_cell.backend)
-    if not config.servo.port.startswith("virtual:") and RIG not in backends:
-        yield Check("simulation", "EGL", "not needed: nothing is simulated", None)
+    if CAMERAS.get(config.camera.backend) != RIG:
+        yield Check("simulation", "EGL", "not needed: no camera is simulated", None)
         return
     from gripper_hw.dynamixel.control_table import load_model
     from gripper_hw.dynamixel.firmware import VirtualServo
     from gripper_hw.sim.detail import settled
     from gripper_hw.sim.scene import draw_scene
-    from gripper_hw.sim.world import World  # where EGL is missing, this import raises
+    from gripper_hw.sim.world import World
 
     model = load_model("XM430-W350")
     config, _ = settled(config)
     scene = draw_scene(config.object, config.seed, config.sim)
     world = World(scene, config.gripper, VirtualServo(1, model), model.nm_per_a, config.seed)
     try:
-        world.render(16)  # the first one makes the drawing context
+        world.render(16)  # the first one makes the drawing context, and raises where EGL is missing
         median_ms, _ = time_ms(lambda: world.render(16), 5)
     finally:
         world.close()

@@ -38,6 +38,9 @@ _LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 _GAMMA = 2.2
 _READ_NOISE = 0.002
 _VIGNETTE = 0.12
+_UNREAD = 64
+"""Frames kept that have arrived and nobody took."""
+
 _REALTIME_SLICE_NS = 5 * NS_PER_MS
 _REALTIME_MAX_LAG_NS = 500 * NS_PER_MS
 
@@ -68,7 +71,7 @@ class SimulatedCamera:
         self._period_ns = round(NS_PER_S / config.camera.rate_hz)
         self._exposure = _exposure(config)
         self._rng = np.random.default_rng([config.seed, 2])
-        self._under_way: deque[Frame] = deque(maxlen=64)
+        self._under_way: deque[Frame] = deque(maxlen=_UNREAD + self._latency_ns // self._period_ns)
         self._seq = 0
         self._started = self._closed = False
 

@@ -2,24 +2,20 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import chain, repeat
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from gripper_force.backends import MonotonicClock
 from gripper_force.config import CameraConfig
-from gripper_force.errors import ConfigError, DeviceLostError
+from gripper_force.errors import ConfigError, DeviceError, DeviceLostError, DeviceNotFoundError
 from gripper_hw.cameras import reader
 from gripper_hw.cameras.reader import BackgroundCamera, Read, Shot, square
 
-
-class SimulatedClock:
-    def now_ns(self) -> int:
-        return 0
-
-    def sleep_until_ns(self, t_ns: int) -> None:
-        raise NotImplementedError
+GRAY = np.zeros((1, 1), np.uint8)
 
 
 class Camera(BackgroundCamera):
@@ -30,11 +26,6 @@ class Camera(BackgroundCamera):
     @contextmanager
     def _opened(self) -> Iterator[Read]:
         yield self.read
-
-
-def test_a_simulated_clock_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"camera\.backend=oak .*; set clock=realtime"):
-        Camera(CameraConfig(backend="oak"), SimulatedClock())
 
 
 def test_a_camera_that_gives_no_frame_at_all_can_not_be_started(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -53,6 +44,58 @@ def test_a_defect_in_the_thread_is_raised_to_who_asks(monkeypatch: pytest.Monkey
         camera.start()
     with pytest.raises(ZeroDivisionError):
         camera.newest()
+    camera.close()
+
+
+@pytest.mark.parametrize("error", [DeviceError, DeviceLostError])
+def test_whatever_goes_wrong_later_is_a_loss_and_the_camera_comes_back(
+    monkeypatch: pytest.MonkeyPatch, error: type[Exception]
+) -> None:
+    monkeypatch.setattr(reader, "_RETRY_S", 0.0)
+    camera = Camera(CameraConfig(backend="oak"), MonotonicClock())
+    shots: Iterator[Shot | None] = iter(())
+
+    def read() -> Shot | None:
+        nonlocal shots
+        try:
+            return next(shots)
+        except StopIteration:
+            shots = iter([Shot(2, 0, GRAY)] * 10_000)
+            raise error("something") from None
+
+    shots = iter([Shot(1, 0, GRAY)])
+    camera.read = read
+    camera.start()
+    while (frame := camera.newest()) is None or frame.t_ns == 1:
+        pass
+    assert frame.seq > 0
+    assert camera.counts()["losses"] >= 1
+    camera.close()
+
+
+def test_a_camera_that_comes_back_with_another_picture_is_still_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reader, "_RETRY_S", 0.0)
+    tries = iter([None, ConfigError("the region"), DeviceNotFoundError("no camera"), None])
+
+    class Changed(BackgroundCamera):
+        @contextmanager
+        def _opened(self) -> Iterator[Read]:
+            if (error := next(tries)) is not None:
+                raise error
+            shots = iter([Shot(1, 0, GRAY)])
+            yield lambda: next(shots, None) or lose()
+
+    def lose() -> Shot:
+        if next(lost):
+            raise DeviceLostError("gone")
+        return Shot(2, 5, GRAY)
+
+    lost = chain([True], repeat(False))
+    camera = Changed(CameraConfig(backend="oak"), MonotonicClock())
+    camera.start()
+    while (frame := camera.newest()) is None or frame.t_ns == 1:
+        pass
+    assert camera.counts() == {"losses": 1}
     camera.close()
 
 

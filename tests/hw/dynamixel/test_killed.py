@@ -10,6 +10,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import dynamixel_sdk as sdk
+import pytest
 
 from gripper_force.log import LogReader
 from gripper_force.types import NS_PER_MS, ServoCommand, ServoState
@@ -59,6 +60,21 @@ def grasp(port: str, folder: Path, quick: list[str]) -> list[str]:
 
 
 def test_the_servo_lets_go_by_itself_and_the_log_is_whole(quick, tmp_path):
+    for attempt in range(3):
+        try:
+            kill_both(quick, tmp_path / str(attempt))
+        except BusyError as error:
+            why = error
+        else:
+            return
+    pytest.skip(f"this machine is too busy for real time: {why}")
+
+
+class BusyError(Exception):
+    """A grasp gave up before it was killed."""
+
+
+def kill_both(quick: list[str], tmp_path: Path) -> None:
     with ExitStack() as stack:
         ports, children = [], []
         for number in SIGNALS:
@@ -67,9 +83,12 @@ def test_the_servo_lets_go_by_itself_and_the_log_is_whole(quick, tmp_path):
             folder = tmp_path / number.name
             children.append(stack.enter_context(process(*grasp(ports[-1], folder, quick))))
         for child in children:
-            assert any("approach" in line for line in child.stderr), child.stdout.read()
+            if not any("approach" in line for line in child.stderr):
+                check_busy(child)
         time.sleep(1.0)  # some way
-        assert [child.poll() for child in children] == [None, None]
+        for child in children:
+            if child.poll() is not None:
+                check_busy(child)
         sent_ns = time.monotonic_ns()
         for number, child in zip(SIGNALS, children, strict=True):
             child.send_signal(number)
@@ -78,6 +97,12 @@ def test_the_servo_lets_go_by_itself_and_the_log_is_whole(quick, tmp_path):
             check_servo(port)
     for number in SIGNALS:
         check_log(tmp_path / number.name, sent_ns)
+
+
+def check_busy(child: subprocess.Popen[str]) -> None:
+    said = child.stdout.read() + child.stderr.read()
+    assert any(sentence in said for sentence in ("no sound answer", "watchdog tripped")), said
+    raise BusyError(said)
 
 
 def check_servo(device_path: str) -> None:

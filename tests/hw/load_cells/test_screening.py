@@ -6,8 +6,6 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from gripper_force.config import LoadCellConfig
-from gripper_force.errors import ConfigError
 from gripper_force.spikes import HAMPEL_HALF_WINDOW, find_spikes
 from gripper_force.types import NS_PER_S, LoadCellSample
 from gripper_hw.load_cells.screening import (
@@ -16,7 +14,6 @@ from gripper_hw.load_cells.screening import (
     PATIENCE_NS,
     STUCK_NS,
     STUCK_SAMPLES,
-    LiveLoadCell,
     Screen,
 )
 
@@ -179,14 +176,3 @@ def test_without_a_scale_there_are_readings_and_no_forces() -> None:
     assert [s.raw for s in taken] == list(range(10))
     assert not any(s.valid for s in taken)
     assert screen.stats.not_finite == 10
-
-
-def test_a_real_cell_keeps_no_simulated_time() -> None:
-    class Simulated:
-        def now_ns(self) -> int:
-            return 0
-
-        def sleep_until_ns(self, t_ns: int) -> None: ...
-
-    with pytest.raises(ConfigError, match=r"load_cell\.backend=serial can't keep .*set clock=realtime"):
-        LiveLoadCell(LoadCellConfig(backend="serial"), Simulated(), unit_n=1.0, noisy=True)

@@ -5,12 +5,22 @@ import pytest
 
 from gripper_force.config import load_config
 from gripper_force.errors import DeviceTimeoutError, SimulationError
+from gripper_hw.sim import killed
 from gripper_hw.sim.killed import KillTrial, kill_trial
 
 
 def try_to_kill(folder: Path) -> KillTrial:
     config = load_config(None, ["object=stapler", "target_n=3", "sim.detail=coarse", "sim.randomise=false"])
     return kill_trial(config, folder, SIGKILL)
+
+
+def test_a_grasp_that_never_grips_tells_what_its_process_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = load_config(None, ["object=stapler", "camera.backend=none", "sim.detail=coarse"])
+    monkeypatch.setattr(killed, "dump_config", lambda _: "nonsense: 1")
+    with pytest.raises(DeviceTimeoutError, match=r"never did: .*nonsense"):
+        kill_trial(config, tmp_path, SIGKILL)
 
 
 def test_a_grasp_that_is_killed_is_let_go_by_its_servo(tmp_path: Path) -> None:

@@ -25,7 +25,6 @@ def test_without_egl_it_says_what_to_install() -> None:
     assert "advice='on Debian or Ubuntu: apt-get install libegl1" in done.stdout
 
 
-def test_it_is_not_asked_where_nothing_is_simulated() -> None:
-    none = {"backend": "none"}
-    config = Config.model_validate({"servo": {"port": "/dev/nowhere"}, "camera": none, "load_cell": none})
-    assert list(probe(config)) == [Check("simulation", "EGL", "not needed: nothing is simulated", None)]
+def test_it_is_not_asked_where_no_camera_is_simulated() -> None:
+    config = Config.model_validate({"camera": {"backend": "none"}})
+    assert list(probe(config)) == [Check("simulation", "EGL", "not needed: no camera is simulated", None)]
