@@ -57,7 +57,7 @@ def errors(kind: str, number: int, out: Path) -> list[dict[str, Any]]:
         return rows
     paths = list(touch(configure(kind, number, out), TOUCHES, None, out / f"{kind}-{number}"))
     checkpoint = load_checkpoint()
-    touches = logs.join([logs.read_one(path, checkpoint) for path in paths], paths).touches
+    touches = logs.join({path: logs.read_one(path, checkpoint) for path in paths}).touches
     test = touches.only(touches.numbers[-TESTED:])
     rng = np.random.default_rng(number)
     before_n = float(np.abs(test.estimate_n - test.force_n).mean())

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from gripper_force.errors import ConfigError
-from gripper_force.schema import Finite, NonNegative, Positive, Section, dump, read_section
+from gripper_force.schema import Finite, NonNegative, Positive, Section, dump, read_section, write_all
 
 FORMAT: Final = "gripper-force-object/1"
 
@@ -147,12 +147,17 @@ def read_object(path: Path) -> ObjectProfile:
     return read_section(ObjectProfile, path, FORMAT, "object profile")
 
 
-def write_object(path: Path, profile: ObjectProfile) -> None:
-    """Writes an object profile. Raises `ConfigError` where it can't."""
-    try:
-        path.write_text(dump(profile), encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"can't write the object profile {path}: {error}") from error
+def check_place(path: Path) -> None:
+    """Makes a profile's folder. Raises `ConfigError` where none can be written to that path."""
+    if path.suffix != ".yaml":
+        raise ConfigError(f"an object profile is a file that ends in .yaml, and {path} does not")
+    write_all({path.with_name(f".{path.name}.place"): b""})
+    path.with_name(f".{path.name}.place").unlink()
+
+
+def write_object(path: Path, profile: ObjectProfile, weights: bytes) -> None:
+    """Writes an object profile and the file beside it. Raises `ConfigError` where it can't."""
+    write_all({weights_path(path): weights, path: dump(profile).encode()})
 
 
 def user_folder() -> Path:

@@ -5,7 +5,6 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import AwareDatetime, Field, model_validator
 
-from gripper_force.errors import ConfigError
 from gripper_force.schema import (
     Finite,
     NonNegative,
@@ -14,6 +13,7 @@ from gripper_force.schema import (
     Tree,
     dump,
     read_section,
+    write_all,
 )
 
 FORMAT: Final = "gripper-force-rig/1"
@@ -212,11 +212,5 @@ def update_rig(path: Path, section: LoadCellCalibration | ServoCalibration | Cam
     profile = read_rig(path) if path.exists() else RigProfile()
     names = {LoadCellCalibration: "load_cell", ServoCalibration: "servo", CameraCalibration: "camera"}
     profile = profile.model_copy(update={names[type(section)]: section})
-    unfinished = path.with_name(path.name + ".part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished.write_text(dump(profile), encoding="utf-8")
-        unfinished.replace(path)
-    except OSError as error:
-        raise ConfigError(f"can't write the rig profile {path}: {error}") from error
+    write_all({path: dump(profile).encode()})
     return profile

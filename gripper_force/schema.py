@@ -126,6 +126,23 @@ def read_section(section: type[S], path: Path, format_: str, what: str) -> S:
     return validated(section, tree, str(path), what)
 
 
+def write_all(files: dict[Path, bytes]) -> None:
+    """Writes files, none of which appears under its name before all are whole.
+
+    Raises:
+        ConfigError: One can't be written.
+    """
+    parts = {path: path.with_name(f".{path.name}.part") for path in files}
+    try:
+        for path, data in files.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            parts[path].write_bytes(data)
+        for path, part in parts.items():
+            part.replace(path)
+    except OSError as error:
+        raise ConfigError(f"can't write {error.filename}: {error.strerror}") from error
+
+
 def _parse(text: str, what_fails: str) -> Any:
     try:
         return yaml.safe_load(text)

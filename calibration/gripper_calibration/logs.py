@@ -1,6 +1,5 @@
 """What the fits need of logs: touches, and what servo and load cell tell of an object and of the loop."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -35,6 +34,7 @@ class Recorded:
         presses: What servo and load cell tell of the loop.
         width_m: Distance between the jaws in each press, (N,) each.
         delay_s: From the contact force to an estimate that can be used, the network's time aside.
+        source: What the labels come from and of: the object, the load cell and its scale.
     """
 
     touches: Touches
@@ -42,22 +42,29 @@ class Recorded:
     presses: list[Press]
     width_m: list[Floats]
     delay_s: float
+    source: dict[str, Any]
+
+    @property
+    def felt(self) -> bool:
+        """Whether anything was touched."""
+        return bool((self.touches.force_n > CONTACT_N).any())
 
 
-def join(parts: Sequence[Recorded], paths: Sequence[Path]) -> Recorded:
-    """Several recordings, each of a log, as one; touches are numbered on.
+def join(recorded: dict[Path, Recorded]) -> Recorded:
+    """Recordings, each of a log, as one; touches are numbered on.
 
     Raises:
-        DataError: They are of different cameras.
+        DataError: They are of different objects, cameras or scales of the load cell.
     """
-    first = parts[0]
-    for path, part in zip(paths, parts, strict=True):
-        if part.camera != first.camera:
-            key = next(key for key, value in part.camera.items() if first.camera.get(key) != value)
-            raise DataError(
-                f"{path} was seen with {key} {part.camera[key]}, and {paths[0]} with "
-                f"{first.camera.get(key)}; calibrate each on its own"
-            )
+    (known, first), parts = next(iter(recorded.items())), list(recorded.values())
+    for path, part in recorded.items():
+        ones, others = part.source | part.camera, first.source | first.camera
+        for key, value in ones.items():
+            if value != others[key]:
+                raise DataError(
+                    f"{path} was recorded with {key} {value}, and {known} with {others[key]}; calibrate each "
+                    "on its own"
+                )
     begins = np.cumsum([0, *(len(part.touches.numbers) for part in parts[:-1])])
     touches = [part.touches for part in parts]
     return Recorded(
@@ -68,6 +75,7 @@ def join(parts: Sequence[Recorded], paths: Sequence[Path]) -> Recorded:
             np.concatenate([t.touch + begin for t, begin in zip(touches, begins, strict=True)]),
         ),
         camera=first.camera,
+        source=first.source,
         presses=[press for part in parts for press in part.presses],
         width_m=[width for part in parts for width in part.width_m],
         delay_s=float(np.median([part.delay_s for part in parts])),
@@ -85,6 +93,10 @@ def read_one(path: Path, checkpoint: Checkpoint) -> Recorded:
     clip = load_clip(path, preprocess, None)
     forces_n, read_out = features(checkpoint.networks, preprocess, clip.frames)
     labelled = clip.valid & (np.arange(len(clip.frames)) >= preprocess.lead_in)
+    if not labelled.any():
+        raise DataError(
+            f"{path} has no label behind its first {preprocess.lead_in} frames, which lead in; record longer"
+        )
     estimate_n = forces_n.mean(0).astype(np.float64)
     felt_n = clip.forces_n.astype(np.float64)
     numbers = np.unique(touch_of(felt_n)[labelled], return_inverse=True)[1]
@@ -97,11 +109,19 @@ def read_one(path: Path, checkpoint: Checkpoint) -> Recorded:
     return Recorded(
         touches=Touches(read_out[labelled], estimate_n[labelled], felt_n[labelled], numbers),
         camera=config.camera_settings(),
+        source=_source(config),
         presses=presses,
         width_m=width_m,
         # A frame is used for as long as the next one takes to come.
-        delay_s=late_ns / NS_PER_S + 0.5 / config.camera.rate_hz + max(seen_s, 0.0),
+        # A force that never changes has no lag: seen_s is NaN then.
+        delay_s=late_ns / NS_PER_S + 0.5 / config.camera.rate_hz + (seen_s if seen_s > 0 else 0.0),
     )
+
+
+def _source(config: Config) -> dict[str, Any]:
+    """A tare drifts and is taken anew; another scale would make of the same touch another force."""
+    cell = config.load_cell
+    return {"object": config.object, "load cell": cell.sensor, "load_cell.n_per_raw": cell.n_per_raw}
 
 
 def touch_of(force_n: Floats) -> npt.NDArray[np.int64]:

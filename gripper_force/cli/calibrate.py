@@ -157,10 +157,15 @@ def _touches(settings: "Config", touches: int, peak_n: float | None, folder: Pat
     from gripper_calibration.procedures import object as job
 
     paths = []
+    done: set[int] = set()
     with console.err.status("touching") as status:
 
         def ask(number: int) -> None:
             _ask(f"Put the object down for touch {number}", False, status)
+
+        def tell(number: int, _touch: int, force_n: float) -> None:
+            done.add(number)
+            status.update(f"touch {number} of {touches}: {force_n:.1f} N")
 
         try:
             for path in job.touch(
@@ -169,15 +174,15 @@ def _touches(settings: "Config", touches: int, peak_n: float | None, folder: Pat
                 peak_n,
                 folder,
                 ask=ask if pause else lambda _: None,
-                progress=lambda number, _, force_n: status.update(
-                    f"touch {number} of {touches}: {force_n:.1f} N"
-                ),
+                progress=tell,
             ):
                 paths.append(path)
         except KeyboardInterrupt:
             if not paths:
                 raise
             console.err.print(f"stopped after {len(paths)} of {touches} touches; calibrating on these")
+    if kept := len(set(range(1, len(paths) + 1)) - done):
+        console.err.print(f"{kept} of {touches} touches were there already, in {folder}")
     return paths
 
 
@@ -201,5 +206,6 @@ def _ask(what: str, yes: bool, status: Any) -> None:
         )
     status.stop()
     console.err.print(f"{what}, then press Enter ", end="", soft_wrap=True)
-    sys.stdin.readline()
+    if not sys.stdin.readline():  # the terminal was closed, or Ctrl-D
+        raise ConfigError(f"no answer came to this: {what}; run it again, where Enter can be pressed")
     status.start()

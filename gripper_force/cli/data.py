@@ -120,7 +120,8 @@ def record(
     plan = job.Plan(sets, touches, peak_n, degrees, lux)
     paths = plan.paths(settings, folder)
     with console.bar("recording", sets) as advance:
-        advance("", sum(path.exists() for path in paths))
+        if there := sum(path.exists() for path in paths):
+            console.err.print(f"{there} of {sets} sets are there already, and are kept")
 
         def tell(number: int, touch: int, force_n: float) -> None:
             what = f"touch {touch} of {touches}" if touch else "at rest"

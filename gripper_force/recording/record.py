@@ -16,14 +16,16 @@ from tempfile import TemporaryDirectory
 from typing import Final
 
 import numpy as np
+from pydantic import BaseModel
 
 from gripper_force.backends import open_devices
-from gripper_force.config import Config
+from gripper_force.config import Config, config_from_text
 from gripper_force.control.grasp import Decision
 from gripper_force.control.limits import largest_target_n
 from gripper_force.dataset import CONTACT_N
 from gripper_force.errors import ConfigError, DataError, DeviceError
 from gripper_force.interfaces import Devices
+from gripper_force.log import LogReader
 from gripper_force.recording.touches import touch
 from gripper_force.session import Session, let_open, open_session, release
 from gripper_force.types import (
@@ -54,6 +56,9 @@ _FREE_N: Final = 0.1
 _PATIENCE_S: Final = 5.0
 _SILENT_NS: Final = 2 * NS_PER_S
 """A camera or load cell that says nothing for so long has failed. The slowest samples take 1.3 s."""
+
+_SAME: Final = ("object", "seed", "target_n", "camera", "sim")
+"""What the sets of one recording share, the seed counting on; the rest may be set right meanwhile."""
 
 _SATURATED: Final = 5
 """More saturated samples than this are no glitch."""
@@ -100,25 +105,42 @@ class Plan:
         return "train" if number % self.test_every else "test"
 
 
-def record(config: Config, plan: Plan, out: Path, progress: Progress) -> Iterator[Path]:
-    """Records the sets that are not there yet, and yields each log as it is done.
+def record(
+    config: Config,
+    plan: Plan,
+    out: Path,
+    progress: Progress,
+    ask: Callable[[int], None] = lambda _set: None,
+) -> Iterator[Path]:
+    """Records the sets that are not there yet, and yields each log once it is there.
 
     A log appears under its name once it is whole. Set n has the seed ``config.seed + n - 1``, for its peaks
     and for what a simulated rig draws.
 
+    Args:
+        config: The run.
+        plan: What to record.
+        out: Where the logs are.
+        progress: Told of what is done, a few times a second.
+        ask: Told of the number of a set before it is recorded; returns once it may be.
+
     Raises:
         ConfigError: There is no camera or no load cell, the object's name is no file's name, or the peak is
             not within the force limit.
-        DataError: The load cell reads a force at rest, or a touch came to none.
+        DataError: The load cell reads a force at rest, a touch came to none, or a set that is there was
+            recorded otherwise.
         GripperError: A device failed. The servo was stopped as configured, and whole sets stay.
     """
     config, peak_n = _ready(config, plan)
     for number, path in enumerate(plan.paths(config, out), start=1):
+        one = config.model_copy(update={"seed": config.seed + number - 1, "target_n": peak_n})
         if path.exists():
+            _check_same(path, one)
+            yield path
             continue
+        ask(number)
         unfinished = path.with_name(f".{path.name}.part")
         unfinished.unlink(missing_ok=True)
-        one = config.model_copy(update={"seed": config.seed + number - 1, "target_n": peak_n})
         notes = {"set": path.stem}
         notes |= {"split": split} if (split := plan.split(number)) else {}
         notes |= {} if plan.degrees is None else {"degrees": f"{plan.degrees:g}"}
@@ -130,6 +152,21 @@ def record(config: Config, plan: Plan, out: Path, progress: Progress) -> Iterato
                 _touch_all(_Rig(session, devices, one, number, progress), plan.touches)
                 release(session, one)
         yield unfinished.rename(path)
+
+
+def _check_same(path: Path, config: Config) -> None:
+    """Raises `DataError` where the log is of another object, light, camera or peak than the run's."""
+    there = config_from_text(LogReader(path).config, str(path))
+    for key in _SAME:
+        section, run = getattr(there, key), getattr(config, key)
+        if section != run:
+            if isinstance(run, BaseModel):
+                name = next(n for n in type(run).model_fields if getattr(section, n) != getattr(run, n))
+                key, section, run = f"{key}.{name}", getattr(section, name), getattr(run, name)
+            raise DataError(
+                f"{path} is there already and was recorded with {key} {section}, not {run}; take another "
+                f"folder, set {key} as it was, or move that log away"
+            )
 
 
 def _open_jaws(config: Config, devices: Devices) -> None:

@@ -48,7 +48,7 @@ from gripper_force.types import (
 )
 from gripper_force.video_import import estimate_tare, read_forces
 from gripper_force.vision.checkpoint import load_checkpoint
-from gripper_force.vision.correction import Correction, HeadAndGate, load_correction, write_arrays
+from gripper_force.vision.correction import Correction, HeadAndGate, load_correction, pack
 from gripper_force.vision.engines.pytorch import TorchEngine
 from gripper_force.vision.estimator import ForceEstimator
 from gripper_force.vision.header import FORMAT, Header, NetworkConfig, Residual
@@ -103,10 +103,7 @@ def _read_object(data: bytes, path: Path) -> None:
 
 
 def _halves() -> list[bytes]:
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "mug.yaml"
-        write_arrays(path, _HALF)
-        return [weights_path(path).read_bytes()]
+    return [pack(_HALF)]
 
 
 def _read_half(data: bytes, path: Path) -> None:

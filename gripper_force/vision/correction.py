@@ -105,19 +105,13 @@ def curve_n(estimate_n: Floats, force_n: Floats, at_n: npt.ArrayLike) -> Floats:
     return value
 
 
-def write_arrays(path: Path, arrays: HeadAndGate) -> str:
-    """Writes the file beside a profile, in half precision where it may be. Returns its SHA-256.
-
-    Raises:
-        ConfigError: It can't be written.
-    """
+def pack(arrays: HeadAndGate) -> bytes:
+    """What goes into the file beside a profile, in half precision where it may be."""
     half = {"axes"}
-    data = save({n: getattr(arrays, n).astype(np.float16 if n in half else np.float32) for n in _NAMES})
-    try:
-        weights_path(path).write_bytes(data)
-    except OSError as error:
-        raise ConfigError(f"can't write {weights_path(path)}: {error}") from error
-    return hashlib.sha256(data).hexdigest()
+    data: bytes = save(
+        {n: getattr(arrays, n).astype(np.float16 if n in half else np.float32) for n in _NAMES}
+    )
+    return data
 
 
 def load_correction(

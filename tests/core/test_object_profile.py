@@ -1,3 +1,4 @@
+import errno
 from datetime import date
 from pathlib import Path
 
@@ -10,9 +11,11 @@ from gripper_force.object_profile import (
     LoopPlant,
     ObjectProfile,
     OutputCurve,
+    check_place,
     find_object,
     read_object,
     user_folder,
+    weights_path,
     write_object,
 )
 
@@ -40,16 +43,45 @@ def profile(**keys: object) -> ObjectProfile:
 
 
 def test_comes_back_as_it_was_written(tmp_path: Path) -> None:
-    write_object(tmp_path / "mug.yaml", profile())
+    write_object(tmp_path / "mug.yaml", profile(), b"weights")
+    assert weights_path(tmp_path / "mug.yaml").read_bytes() == b"weights"
     assert read_object(tmp_path / "mug.yaml") == profile()
+
+
+def test_a_disk_that_is_full_leaves_both_halves_of_the_old_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "mug.yaml"
+    write_object(path, profile(), b"old")
+    real = Path.write_bytes
+
+    def full(file: Path, data: bytes) -> int:
+        if file.name.startswith(".mug.yaml"):
+            raise OSError(errno.ENOSPC, "No space left on device", str(file))
+        return real(file, data)
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(ConfigError, match=r"can't write .*mug\.yaml.*: No space left"):
+        write_object(path, profile(touches=9), b"new")
+    assert weights_path(path).read_bytes() == b"old"
+    assert read_object(path).touches == 4
+
+
+def test_a_place_where_nothing_can_be_written_is_told_at_once(tmp_path: Path) -> None:
+    check_place(tmp_path / "new" / "mug.yaml")
+    assert list((tmp_path / "new").iterdir()) == []
+    with pytest.raises(ConfigError, match=r"ends in \.yaml"):
+        check_place(tmp_path / "mug")
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="can't write"):
+        check_place(tmp_path / "file" / "mug.yaml")
 
 
 def test_ones_own_come_before_those_that_are_shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     with pytest.raises(ConfigError, match="no object profile 'mug'"):
         find_object("mug")
-    user_folder().mkdir(parents=True)
-    write_object(user_folder() / "mug.yaml", profile())
+    write_object(user_folder() / "mug.yaml", profile(), b"")
     assert find_object("mug") == tmp_path / "gripper-force" / "objects" / "mug.yaml"
     with pytest.raises(ConfigError, match=r"there are .*mug"):
         find_object("cup_of_another")

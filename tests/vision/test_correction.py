@@ -1,4 +1,5 @@
 from datetime import date
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from gripper_force.vision.correction import (
     HeadAndGate,
     curve_n,
     load_correction,
-    write_arrays,
+    pack,
 )
 
 
@@ -40,6 +41,12 @@ def arrays(features: int = 5, spread: float = 2.0) -> HeadAndGate:
     return HeadAndGate(zeros, np.zeros(1, np.float32), zeros, axes, np.array([spread], np.float32))
 
 
+def written(path: Path, arrays: HeadAndGate) -> str:
+    data = pack(arrays)
+    weights_path(path).write_bytes(data)
+    return sha256(data).hexdigest()
+
+
 @given(st.floats(-20, 40))
 def test_a_curve_goes_straight_on_beyond_its_ends(at_n: float) -> None:
     value_n = float(curve_n(np.array([0.0, 2.0, 4.0]), np.array([0.5, 1.5, 4.5]), [at_n])[0])
@@ -63,7 +70,7 @@ def test_strange_is_what_lies_off_the_plane() -> None:
 
 def test_both_halves_come_back_and_belong_together(tmp_path: Path) -> None:
     path = tmp_path / "mug.yaml"
-    weights = write_arrays(path, arrays())
+    weights = written(path, arrays())
     correction = load_correction(path, profile(weights), 5)
     features = np.random.default_rng(0).normal(size=(7, 5)).astype(np.float32)
     expected = Correction(profile(), arrays())
@@ -80,6 +87,6 @@ def test_both_halves_come_back_and_belong_together(tmp_path: Path) -> None:
 @pytest.mark.parametrize("spread", [0.0, np.nan])
 def test_values_that_can_not_be_are_refused(tmp_path: Path, spread: float) -> None:
     path = tmp_path / "mug.yaml"
-    weights = write_arrays(path, arrays(spread=spread))
+    weights = written(path, arrays(spread=spread))
     with pytest.raises(ConfigError, match="not finite"):
         load_correction(path, profile(weights), 5)

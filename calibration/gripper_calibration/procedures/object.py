@@ -3,23 +3,24 @@
 import time
 from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from gripper_calibration import logs
-from gripper_calibration.fits.correction import COVERAGE, Fitted, fit_correction, learning_curve
+from gripper_calibration.fits.correction import COVERAGE, fit_correction, learning_curve
 from gripper_calibration.fits.plant import crushed_by, fit_plant, stiffness_n_m
 from gripper_calibration.reports.object import draw
 from gripper_force.assembly import settled
 from gripper_force.config import Config
 from gripper_force.errors import DataError
-from gripper_force.object_profile import ObjectProfile, write_object
+from gripper_force.object_profile import ObjectProfile, check_place, write_object
 from gripper_force.recording.record import Plan, Progress, record
 from gripper_force.types import NS_PER_MS
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
-from gripper_force.vision.correction import write_arrays
+from gripper_force.vision.correction import pack
 from gripper_force.vision.estimator import open_estimator
 from gripper_force.vision.exported import read_model
 
@@ -51,7 +52,7 @@ def touch(
         progress: Told of the touch and the force, a few times a second.
 
     Raises:
-        GripperError: As `gripper_force.recording.record` does. Touches that are done stay.
+        GripperError: As `gripper_force.recording.record.record` does. Touches that are done stay.
     """
     sim = config.sim
     same = {
@@ -59,14 +60,7 @@ def touch(
         for name in ("object_seed", "rig_seed")
     }
     config = config.model_copy(update={"sim": sim.model_copy(update=same)})
-    plan = Plan(sets=touches, touches=1, peak_n=peak_n, test_every=None)
-    paths = plan.paths(config, folder)
-    done = record(config, plan, folder, progress)
-    for number, path in enumerate(paths, start=1):
-        if not path.exists():
-            ask(number)
-            next(done)
-        yield path
+    yield from record(config, Plan(touches, 1, peak_n, test_every=None), folder, progress, ask)
 
 
 def calibrate(
@@ -88,15 +82,17 @@ def calibrate(
         DataError: The logs can't be used, or nothing can be learnt from them.
         ConfigError: The profile can't be written.
     """
+    check_place(out)
     config, _ = settled(config)
     checkpoint = load_checkpoint(config.vision.checkpoint)
     if not paths:
         raise DataError(f"there is no log of {name!r} to calibrate from; touch it first")
-    parts = []
+    parts = {}
     for path in paths:
-        parts.append(logs.read_one(path, checkpoint))
+        parts[path] = logs.read_one(path, checkpoint)
         advance(path.name)
-    recorded = logs.join(parts, paths)
+    felt = {path: part for path, part in parts.items() if part.felt}
+    recorded = logs.join(felt or parts)  # without any, the fit says what was felt
     touches = recorded.touches
     fitted = fit_correction(touches, COVERAGE)
     advance("fitted")
@@ -106,6 +102,7 @@ def calibrate(
     stiffness = stiffness_n_m(recorded.width_m, forces_n)
     peaks_n = np.array([force_n.max() for force_n in forces_n])
     crushed = crushed_by(np.array([width_m[0] for width_m in recorded.width_m]), peaks_n)
+    weights = pack(fitted.arrays)
     bore_n = float(touches.force_n.max() if crushed is None else peaks_n[:crushed].max())
     profile = ObjectProfile(
         object=name,
@@ -122,9 +119,9 @@ def calibrate(
         plant=fit_plant(recorded.presses, recorded.delay_s + _compute_s(config, checkpoint)),
         before_n=fitted.before_n,
         after_n=fitted.after_n,
-        weights=_write_arrays(out, fitted),
+        weights=sha256(weights).hexdigest(),
     )
-    write_object(out, profile)
+    write_object(out, profile, weights)
     picture = out.with_suffix(".png")
     draw(profile, fitted, touches, curve, picture)
     return {
@@ -134,14 +131,10 @@ def calibrate(
         "crushed_at_n": None if crushed is None else float(peaks_n[crushed]),
         "stiffness_std_n_m": float(stiffness.std(ddof=1)) if len(stiffness) > 1 else None,
         "touches_needed": _table(curve),
+        "without_contact": [path for path in parts if path not in felt],
         "profile": out,
         "report": picture,
     }
-
-
-def _write_arrays(out: Path, fitted: Fitted) -> str:
-    out.parent.mkdir(parents=True, exist_ok=True)
-    return write_arrays(out, fitted.arrays)
 
 
 def _compute_s(config: Config, checkpoint: Checkpoint) -> float:

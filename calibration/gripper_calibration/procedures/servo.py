@@ -86,7 +86,9 @@ def calibrate(
                 f"{1e3 * config.gripper.open_width_m:g} mm (gripper.open_width_m)"
             )
     known = read_rig(rig) if rig.exists() else RigProfile()
-    given = Nominal(config.gripper.pinion_radius_m, config.gripper.open_width_m, _scale_share(known, config))
+    given = Nominal(
+        config.gripper.pinion_radius_m, config.gripper.open_width_m, _scale_share(known, config, rig)
+    )
     config = config.model_copy(update={"camera": config.camera.model_copy(update={"backend": "none"})})
     presses: list[Press] = []
     passes: list[Pass] = []
@@ -111,11 +113,17 @@ def calibrate(
     }
 
 
-def _scale_share(known: RigProfile, config: Config) -> float:
+def _scale_share(known: RigProfile, config: Config, rig: Path) -> float:
     """Half of the interval of the load cell's scale over the scale, where the profile is of this cell."""
     cell = known.load_cell
     if cell is None or cell.sensor != config.load_cell.sensor:
         return 0.0
+    if cell.n_per_raw.value != config.load_cell.n_per_raw:
+        raise ConfigError(
+            f"{rig} has calibrated this load cell to {cell.n_per_raw.value:g} N for one unit of its reading, "
+            f"and load_cell.n_per_raw is {config.load_cell.n_per_raw}; go by the profile with --set "
+            f"calibration.rig={rig}, or write another one with --rig"
+        )
     return cell.n_per_raw.half / abs(cell.n_per_raw.value)
 
 

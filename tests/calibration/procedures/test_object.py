@@ -2,22 +2,27 @@
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from click.testing import Result
 from typer.testing import CliRunner
 
+from gripper_calibration.procedures import object as job
 from gripper_calibration.procedures.object import calibrate, touch
 from gripper_force.assembly import make_controller
 from gripper_force.backends import open_devices
 from gripper_force.cli import app
+from gripper_force.cli import calibrate as cli_calibrate
 from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.grasp import grasp
 from gripper_force.log import LogReader
 from gripper_force.object_profile import read_object, weights_path
 from gripper_force.replay import replay
-from gripper_force.types import Event
+from gripper_force.types import Event, LoadCellSample
 
 QUICK = [
     "object=stapler",
@@ -66,6 +71,10 @@ def test_a_profile_tells_of_the_object_and_halves_the_error(profile: Path) -> No
     assert found.stiffness_n_m is not None
     assert found.plant is not None
     assert 0.7 < found.plant.gain < 1.4
+    config = load_config(None, QUICK)
+    seen_ms = config.sim.camera_latency_ms + 500 / config.camera.rate_hz
+    known_ms = seen_ms + config.vision.lockstep_compute_ms
+    assert -0.01 < found.plant.delay_ms - known_ms < 60  # the rest is how late the network itself is
     assert 30 < found.plant.phase_margin_deg < 90
     assert profile.with_suffix(".png").stat().st_size > 10_000
 
@@ -132,6 +141,69 @@ def test_the_command_calibrates_from_logs(touched: list[Path], tmp_path: Path) -
     assert found["touches"] == 3
     assert found["profile"] == str(out)
     assert [row["touches"] for row in found["touches_needed"]] == [1, 2]
+
+
+def test_what_crushed_it_is_more_than_it_bears(
+    touched: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(job, "crushed_by", lambda _contact_m, _peak_n: 2)
+    found = calibrate(load_config(None, QUICK), "stapler", touched, tmp_path / "it.yaml", lambda _: None)
+    peaks_n = [max(sample.force_n for sample in LogReader(path).records(LoadCellSample)) for path in touched]
+    assert found["force_n"] == pytest.approx(max(peaks_n[:2]), abs=0.3)
+    assert found["crushed_at_n"] == pytest.approx(peaks_n[2], abs=0.3)
+    assert abs(peaks_n[2] - max(peaks_n[:2])) > 0.3
+
+
+class Terminal:
+    """Somebody who presses Enter so often, and then does something else."""
+
+    def __init__(self, often: int, then: Callable[[], str]) -> None:
+        self._left, self._then = often, then
+
+    def isatty(self) -> bool:
+        return True
+
+    def readline(self) -> str:
+        self._left -= 1
+        return "\n" if self._left >= 0 else self._then()
+
+
+def interrupt() -> str:
+    raise KeyboardInterrupt
+
+
+def by_hand(folder: Path, monkeypatch: pytest.MonkeyPatch, terminal: Terminal) -> Result:
+    monkeypatch.setattr(cli_calibrate, "sys", SimpleNamespace(stdin=terminal))
+    keys = [part for key in QUICK[1:] for part in ("--set", key)]
+    given = ["calibrate", "object", "stapler", "--touches", "3", "--peak-n", "6", "--pause", "--json", *keys]
+    return CliRunner().invoke(
+        app, [*given, "--folder", str(folder / "touches"), "--out", str(folder / "it.yaml")]
+    )
+
+
+def test_who_stops_early_gets_a_profile_of_what_there_is_and_may_go_on(
+    touched: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stopped = by_hand(tmp_path, monkeypatch, Terminal(2, interrupt))
+    assert json.loads(stopped.stdout)["touches"] == 2
+    assert "stopped after 2 of 3 touches" in stopped.stderr
+    assert "Put the object down for touch 3, then press Enter" in stopped.stderr
+    finished = by_hand(tmp_path, monkeypatch, Terminal(1, interrupt))
+    assert json.loads(finished.stdout)["touches"] == 3
+    assert "2 of 3 touches were there already" in " ".join(finished.stderr.split())
+
+
+def test_a_terminal_that_is_gone_is_no_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    result = by_hand(tmp_path, monkeypatch, Terminal(0, lambda: ""))
+    assert isinstance(result.exception, ConfigError)
+    assert "no answer came to this: Put the object down for touch 1" in str(result.exception)
+    assert not list(tmp_path.rglob("*.mcap"))
+
+
+def test_where_no_profile_can_be_written_nothing_is_fitted(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="can't write"):
+        calibrate(load_config(), "stapler", [], tmp_path / "file" / "p.yaml", lambda _: None)
 
 
 def test_no_logs_is_one_sentence(tmp_path: Path) -> None:

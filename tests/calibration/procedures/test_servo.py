@@ -1,5 +1,6 @@
 """On the simulated rig, with a gauge between the jaws whose friction and torque are known."""
 
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from gripper_force.cli import app
 from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError, DataError, DeviceError
 from gripper_force.log import LogReader
-from gripper_force.rig import Estimate, read_rig
+from gripper_force.rig import Estimate, LoadCellCalibration, read_rig, update_rig
 from gripper_force.session import run_grasp
 from gripper_force.types import Event
 from gripper_hw.dynamixel.control_table import load_model
@@ -120,6 +121,22 @@ def test_a_person_reads_values_with_their_intervals(capsys: pytest.CaptureFixtur
     printed = capsys.readouterr().out
     for told in ("1.7 (1.6 to 1.8)", "0.02 (given)", "0.3, 9.5"):
         assert told in printed
+
+
+def test_a_scale_that_the_run_does_not_go_by_is_refused(tmp_path: Path) -> None:
+    rig = tmp_path / "rig.yaml"
+    cell = LoadCellCalibration(
+        date=datetime(2026, 1, 2, tzinfo=UTC),
+        sensor="simulated",
+        tare_raw=Estimate(value=0.0),
+        n_per_raw=Estimate(value=2.0, low=1.9, high=2.1),
+        force_n=(0.0, 10.0),
+        noise_n=0.01,
+        drift_n_min=Estimate(value=0.0),
+    )
+    update_rig(rig, cell)
+    with pytest.raises(ConfigError, match=r"to 2 N for one unit .*--set calibration\.rig="):
+        calibrate(config_of(), [0.03], rig, ask=lambda _: None)
 
 
 def test_without_a_terminal_nobody_is_asked(tmp_path: Path) -> None:

@@ -72,16 +72,24 @@ def test_a_set_is_a_log_to_train_on(config: Config, tmp_path: Path) -> None:
 def test_what_is_there_is_kept_and_seeds_go_by_the_set(config: Config, tmp_path: Path) -> None:
     plan = Plan(2, 1)
     kept, missing = plan.paths(config, tmp_path)
-    kept.parent.mkdir()
-    kept.write_bytes(b"recorded before")
+    assert made(config, Plan(1, 1), tmp_path) == [kept]
+    recorded_before = kept.read_bytes()
     leftover = missing.with_name(f".{missing.name}.part")
     leftover.write_bytes(b"half a log")
-    assert made(config, plan, tmp_path) == [missing]
-    assert kept.read_bytes() == b"recorded before"
+    assert made(config, plan, tmp_path) == [kept, missing]
+    assert kept.read_bytes() == recorded_before
     assert not leftover.exists()
     peak_n = next(LogReader(missing).records(Request)).target_n
     assert peak_n == np.random.default_rng([config.seed + 1, 12]).uniform(1, 9)
-    assert made(config, plan, tmp_path) == []
+    missing_bytes = missing.read_bytes()
+    retared = config.model_copy(update={"load_cell": config.load_cell.model_copy(update={"tare_raw": 0.2})})
+    assert made(retared, plan, tmp_path) == [kept, missing]
+    assert missing.read_bytes() == missing_bytes
+    dimmed = config.model_copy(update={"sim": config.sim.model_copy(update={"lux": 100.0})})
+    with pytest.raises(DataError, match=r"stapler-01\.mcap is there already .* sim\.lux None, not 100"):
+        made(dimmed, plan, tmp_path)
+    with pytest.raises(DataError, match=r"target_n 9\.0, not 5\.0; take another folder"):
+        made(config, Plan(2, 1, peak_n=5.0), tmp_path)
 
 
 @pytest.mark.parametrize(
