@@ -1,10 +1,13 @@
 """The configuration: typed, with a default for everything, from YAML and ``--set key.path=value``."""
 
+from collections.abc import Callable
+from copy import deepcopy
 from pathlib import Path
 from typing import Annotated, Final, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
+from gripper_force.errors import ConfigError
 from gripper_force.rig import read_rig
 from gripper_force.schema import (
     Finite,
@@ -410,11 +413,14 @@ def load_config(path: Path | None = None, overrides: list[str] | None = None) ->
     Raises:
         ConfigError: A file, key or value is wrong. The sentence names it.
     """
-    tree = read_tree(path) if path is not None else {}
-    for assignment in overrides or []:
-        assign(tree, assignment)
     where = str(path) if path else "--set"
-    return config_from(merged(_rig_settings(tree, where), tree), where)
+    tree = read_tree(path) if path is not None else {}
+    if "format" in tree:
+        raise ConfigError(
+            f"{path} is no configuration but a {tree['format']}; a rig profile goes with --set "
+            f"calibration.rig={path}, and an object profile with --profile {path}"
+        )
+    return _with_overrides(lambda given: merged(_rig_settings(given, where), given), tree, where, overrides)
 
 
 def config_from(tree: Tree, where: str) -> Config:
@@ -434,9 +440,22 @@ def config_from_text(text: str, where: str, overrides: list[str] | None = None) 
     for assignment in overrides or []:
         assign(given, assignment)
     tree = merged(tree_from(text, where), _rig_settings(given, "--set"))
+    return _with_overrides(lambda tree: tree, tree, where, overrides)
+
+
+def _with_overrides(
+    complete: Callable[[Tree], Tree], tree: Tree, where: str, overrides: list[str] | None
+) -> Config:
+    """Validates a tree with overrides. The sentence blames them only where the tree is sound without."""
+    changed = deepcopy(tree)
     for assignment in overrides or []:
-        assign(tree, assignment)
-    return config_from(tree, where)
+        assign(changed, assignment)
+    try:
+        return config_from(complete(changed), where)
+    except ConfigError:
+        config_from(complete(tree), where)
+        config_from(complete(changed), "--set")
+        raise
 
 
 def dump_config(config: Config) -> str:

@@ -3,7 +3,7 @@
 import json
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -64,10 +64,17 @@ def _pairs(pairs: dict[str, Any]) -> None:
     out.print(table)
 
 
-def phase_line(status: Any) -> str:
-    """A line for each phase of a grasp."""
-    note = f" [bold]{status.outcome}[/]" if status.outcome else ""
-    return f"[dim]{status.t_ns / 1e9 % 1e4:8.2f} s[/] {status.phase}{note} [dim]{status.reason}[/]"
+def phases() -> Callable[[Any], None]:
+    """What prints a line for each phase of a grasp on stderr, with the time since the first."""
+    begin_ns: list[int] = []
+
+    def show_phase(status: Any) -> None:
+        begin_ns.append(status.t_ns)
+        after_s = (status.t_ns - begin_ns[0]) / 1e9
+        note = f" [bold]{status.outcome}[/]" if status.outcome else ""
+        err.print(f"[dim]{after_s:8.2f} s[/] {status.phase}{note} [dim]{escape(status.reason)}[/]")
+
+    return show_phase
 
 
 def grasp_table(r: dict[str, Any]) -> None:
@@ -146,7 +153,11 @@ def replay_table(r: dict[str, Any]) -> None:
     identical = {True: "yes, to the bit", False: "no", None: "nothing to compare"}[r["identical"]]
     if r["note"]:
         identical += f": {r['note']}"
-    _pairs({"identical": identical, "log": r["log"], **({"report": r["report"]} if "report" in r else {})})
+    pairs = {"identical": identical}
+    if r["changed"] and not r["identical"]:
+        pairs["commands"] = f"at most {1e3 * r['changed']['goal_current_a']:.0f} mA off the run's"
+        pairs["fused force"] = f"at most {r['changed']['fused_n']:.2f} N off the run's"
+    _pairs({**pairs, "log": r["log"], **({"report": r["report"]} if "report" in r else {})})
     table = Table("source", "MAE N", "RMSE N", "bias N", "contact MAE N", "lag ms", "samples", box=None)
     for name, s in r["sources"].items():
         figures = (s["mae_n"], s["rmse_n"], s["bias_n"], s["contact_mae_n"])
@@ -185,7 +196,7 @@ def sets_table(r: dict[str, Any]) -> None:
             _number(s["load_cell_hz"], digits=1),
             str(s["samples_rejected"]),
             _number(s["peak_n"], digits=1),
-            "-" if s["lag_ms"] is None else f"{s['lag_ms']:.1f} ± {s['lag_spread_ms']:.1f}",
+            _lag(s["lag_ms"], s["lag_spread_ms"]),
         )
     out.print(table)
     table = Table("force N", "frames", box=None)
@@ -196,12 +207,18 @@ def sets_table(r: dict[str, Any]) -> None:
         out.print(f"[yellow]{escape(warning)}[/]", soft_wrap=True)
 
 
+def _lag(lag_ms: float | None, spread_ms: float | None) -> str:
+    """Of one touch alone, nothing is known of the spread."""
+    return _number(lag_ms, digits=1) + ("" if spread_ms is None else f" ± {spread_ms:.1f}")
+
+
 def imports_table(r: dict[str, Any]) -> None:
     """What became of recordings."""
-    table = Table("log", "frames", "spikes", "tare N", "lag ms", box=None)
+    table = Table("log", "frames", "without force", "spikes", "tare N", "lag ms", box=None)
     for row in r["logs"]:
         figures = (_number(row["tare_n"], digits=3), f"{1e3 * row['force_lag_s']:.0f}")
-        table.add_row(Path(row["log"]).name, str(row["frames"]), str(row["spikes_rejected"]), *figures)
+        counts = (str(row[name]) for name in ("frames", "frames_without_force", "spikes_rejected"))
+        table.add_row(Path(row["log"]).name, *counts, *figures)
     out.print(table)
     for row in r["logs"]:
         if row["tare_note"]:

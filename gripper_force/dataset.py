@@ -4,10 +4,8 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -19,6 +17,7 @@ from rich.progress import track
 from gripper_force.config import config_from_text
 from gripper_force.errors import DataError
 from gripper_force.log import LogReader
+from gripper_force.processes import process_pool
 from gripper_force.types import NS_PER_MS, Frame, Gray, LoadCellSample
 
 if TYPE_CHECKING:  # labels need no OpenCV
@@ -90,7 +89,7 @@ def load_clips(
     console = Console(stderr=True, quiet=quiet)
     if workers == 1:  # a process takes some seconds to begin
         return list(track(map(read, paths), "reading logs", len(paths), console=console))
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+    with process_pool(workers) as pool:
         return list(track(pool.map(read, paths), "reading logs", len(paths), console=console))
 
 

@@ -1,10 +1,8 @@
 """The main job: grasp, and say how well, once or over many trials."""
 
-import multiprocessing
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +14,7 @@ from gripper_force.control.score import score_grasp
 from gripper_force.dataset import stiffness_floor_n, stiffness_of
 from gripper_force.errors import DataError
 from gripper_force.log import LogReader
+from gripper_force.processes import process_pool
 from gripper_force.replay import compare
 from gripper_force.session import run_grasp
 from gripper_force.types import (
@@ -37,8 +36,15 @@ WITHIN_SHARE, WITHIN_N = 0.08, 0.25
 Summary = dict[str, Any]
 
 
-def grasp(config: Config, progress: Callable[[GraspStatus], None] | None = None) -> Summary:
+def grasp(
+    config: Config, progress: Callable[[GraspStatus], None] | None = None, path: Path | None = None
+) -> Summary:
     """Runs one grasp, writes its log and its report, and sums it up.
+
+    Args:
+        config: The run.
+        progress: Told of each new phase.
+        path: The log to write; None for a `new_log`.
 
     Returns:
         ``result, object, target_n, load_cell_mean_n, steady_error_n, overshoot_n, settle_s, estimator_p50_ms,
@@ -49,7 +55,7 @@ def grasp(config: Config, progress: Callable[[GraspStatus], None] | None = None)
     Raises:
         GripperError: The run failed; its log holds what was seen.
     """
-    path = _new_log(config)
+    path = path or new_log(config)
     run_grasp(config, path, progress)
     result = {**summarise(path), "report": None}
     if config.log.report:
@@ -85,11 +91,8 @@ def trials(config: Config, count: int, jobs: int) -> Iterator[Summary]:
         for i in range(count)
     ]
     trees = [trial.model_dump(mode="json") for trial in plan]
-    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
-        try:
-            yield from pool.map(_trial, trees)
-        finally:
-            pool.shutdown(cancel_futures=True)
+    with process_pool(jobs) as pool:
+        yield from pool.map(_trial, trees)
 
 
 def summarise(path: Path) -> Summary:
@@ -203,7 +206,8 @@ def _percentile(values: Any, q: float) -> float | None:
     return float(np.percentile(values, q)) if len(values) else None
 
 
-def _new_log(config: Config) -> Path:
+def new_log(config: Config) -> Path:
+    """A path for the run's log that is free."""
     stamp = time.strftime("%Y%m%d-%H%M%S")
     stem = f"{stamp}-{config.object}-{config.target_n:g}N-{config.control.feedback}-seed{config.seed}"
     path = config.log.directory / f"{stem}.mcap"

@@ -208,7 +208,8 @@ class LogWriter:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = through(path.open("xb"))
         except OSError as error:
-            reason = "it exists already, and a log is never overwritten" if path.exists() else error.strerror
+            there = "it exists already, and a log is never overwritten; move it away, or name another folder"
+            reason = there if path.exists() else error.strerror
             raise LogError(f"can't write the log {path}: {reason}") from error
         self._writer = Writer(self._file)
         try:

@@ -40,6 +40,7 @@ class Replayed:
     Attributes:
         estimates_identical: Every visual estimate came out as logged, to the bit; None without any.
         decisions_identical: So did every command, status and fused force; None without any.
+        changed: How far off the log's they are at most: ``goal_current_a``, ``fused_n``; empty without any.
         visual: Visual estimates, as computed now.
         decisions: Decisions, as computed now.
         load_cell: The log's load-cell samples.
@@ -47,6 +48,7 @@ class Replayed:
 
     estimates_identical: bool | None
     decisions_identical: bool | None
+    changed: dict[str, float]
     visual: list[VisualForce]
     decisions: list[Decision]
     load_cell: list[LoadCellSample]
@@ -69,8 +71,8 @@ def replay(
 
     Returns:
         ``mae_n, rmse_n, bias_n, per_bin, frames`` of the estimate that the run acted on (or of vision, where
-        nothing acted), ``identical`` (None where the log holds no run), ``note`` (why it can't be), and the
-        same figures with ``lag_s`` by source.
+        nothing acted), ``identical`` (None where the log holds no run), ``note`` (why it can't be),
+        ``changed`` (see `Replayed`), and the same figures with ``lag_s`` by source.
 
     Raises:
         LogError: The log can't be read.
@@ -96,6 +98,7 @@ def replay(
         "per_object": {config.object: {k: best[k] for k in ("mae_n", "rmse_n", "bias_n", "frames")}},
         "identical": all(flags) if flags else None,
         "note": _note(reader, config, checkpoint),
+        "changed": replayed.changed,
         "sources": sources,
         "log": str(path),
     }
@@ -137,6 +140,7 @@ def run_again(reader: LogReader, config: Config, checkpoint: "Model | None") -> 
     return Replayed(
         _same_estimates(logged[VisualForce], visual) if logged[VisualForce] and not spoilt else None,
         _same_decisions(logged, decisions) if logged[ServoCommand] else None,
+        _changed(logged, decisions) if logged[ServoCommand] else {},
         visual,
         decisions,
         cells,
@@ -159,6 +163,15 @@ def _same_decisions(logged: dict[type, list[Any]], again: list[Decision]) -> boo
         (logged[GraspStatus], [d.status for d in again]),
     )
     return all(a == b[: len(a)] and len(b) - len(a) <= 1 for a, b in pairs)
+
+
+def _changed(logged: dict[type, list[Any]], again: list[Decision]) -> dict[str, float]:
+    commands = zip(logged[ServoCommand], again, strict=False)
+    fused = zip(logged[FusedForce], again, strict=False)
+    return {
+        "goal_current_a": max(abs(a.goal_current_a - b.command.goal_current_a) for a, b in commands),
+        "fused_n": max((abs(a.force_n - b.estimate.force_n) for a, b in fused), default=0.0),
+    }
 
 
 def _spoilt(config: Config) -> bool:

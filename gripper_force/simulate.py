@@ -11,9 +11,8 @@ objects, four angles, three light levels and 15 times each, seen by a camera of 
 levels of a set are one physics, simulated and drawn once.
 """
 
-import multiprocessing
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal
@@ -25,6 +24,7 @@ from gripper_force.config import Config, config_from, config_from_text, dump_con
 from gripper_force.errors import ConfigError, SimulationError
 from gripper_force.interfaces import Camera
 from gripper_force.log import LogReader, LogWriter
+from gripper_force.processes import process_pool
 from gripper_force.recording.touches import ramp, touch, wait
 from gripper_force.session import Session, open_session, release, run_grasp
 from gripper_force.types import Frame, Gray
@@ -150,13 +150,10 @@ def simulate(plans: Sequence[Plan | SetPlan], out: Path, config: Config, jobs: i
     """
     out.mkdir(parents=True, exist_ok=True)
     missing = [p for p in plans if not all((out / name).exists() for name in p.names)]
-    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+    with process_pool(jobs) as pool:
         futures = [pool.submit(_make, p, out, config.model_dump(mode="json")) for p in missing]
-        try:
-            for future in as_completed(futures):
-                yield from future.result()
-        finally:
-            pool.shutdown(cancel_futures=True)
+        for future in as_completed(futures):
+            yield from future.result()
 
 
 def _make(task: Plan | SetPlan, out: Path, tree: dict[str, object]) -> list[Path]:

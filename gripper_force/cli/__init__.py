@@ -81,11 +81,21 @@ def grasp(
         },
     )
     if not trials:
-        result = job.grasp(settings, progress=lambda s: console.err.print(console.phase_line(s)))
+        log = job.new_log(settings)
+        try:
+            result = job.grasp(settings, console.phases(), log)
+        except BaseException:
+            if log.exists():
+                console.err.print(f"what was seen is in {log}: gripper-force replay {log}", soft_wrap=True)
+            raise
         console.show(result, as_json, console.grasp_table)
         if result["result"] != "held":
             raise typer.Exit(1)
         return
+    if object_ is not None or target_n is not None:
+        raise ConfigError(
+            "--trials goes through all four objects with drawn targets; leave --object and --target-n out"
+        )
     results = []
     with console.bar("grasping", trials) as advance:
         for one in job.trials(settings, trials, jobs):
@@ -106,6 +116,8 @@ def replay(
     """Run estimator and controller again on a log, and compare them with its load cell."""
     from gripper_force.replay import replay as job
 
+    if report and (set_ or checkpoint):
+        raise ConfigError("--report draws the run as it was; leave --set and --checkpoint out, or --report")
     result = job(log, checkpoint, overrides=set_, recover=recover)
     if report:
         from gripper_force.report import write_report

@@ -156,7 +156,7 @@ def _lag_figures(lags: list[TouchLag]) -> dict[str, float | None]:
     low_ms, high_ms = np.percentile([lag.lag_ms for lag in found], [16, 84])
     return {
         "lag_ms": float(np.median([lag.lag_ms for lag in found])),
-        "lag_spread_ms": float(high_ms - low_ms) / 2,
+        "lag_spread_ms": float(high_ms - low_ms) / 2 if len(found) > 1 else None,
         "camera_lag_ms": float(np.median([lag.camera_ms for lag in found])),
         "load_cell_lag_ms": float(np.median([lag.load_cell_ms for lag in found])),
     }

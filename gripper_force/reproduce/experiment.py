@@ -4,9 +4,8 @@ import contextlib
 import functools
 import io
 import json
-import multiprocessing
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -20,6 +19,7 @@ from gripper_force.config import load_config
 from gripper_force.dataset import CONTACT_N, Clip, load_clips
 from gripper_force.errors import DataError
 from gripper_force.evaluate import estimates
+from gripper_force.processes import process_pool
 from gripper_force.reproduce.models import MODELS, Scale
 from gripper_force.simulate import PROTOCOL_RATE_HZ, plan_protocol, simulate
 from gripper_force.training.train import train
@@ -134,16 +134,13 @@ def run(scale: Scale, models: Iterable[str], data: Path, out: Path, jobs: int, a
     for net, seed in set(nets) - set(missing):
         advance(f"{net}, seed {seed}")
     if missing:
-        workers = min(jobs, len(missing))
-        reading = max(1, jobs // workers)
-        with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+        count = min(jobs, len(missing))
+        reading = max(1, jobs // count)
+        with process_pool(count) as pool:
             futures = {pool.submit(_train, scale, *pair, data, out, reading): pair for pair in missing}
-            try:
-                for future in as_completed(futures):
-                    future.result()
-                    advance("{}, seed {}".format(*futures[future]))
-            finally:
-                pool.shutdown(cancel_futures=True)
+            for future in as_completed(futures):
+                future.result()
+                advance("{}, seed {}".format(*futures[future]))
     clips = _clips(data, "test", scale, jobs)
     keep = [_labelled(scale, clip) for clip in clips]
     measured_n = np.concatenate([clip.forces_n[k] for clip, k in zip(clips, keep, strict=True)])

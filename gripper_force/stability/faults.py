@@ -6,12 +6,10 @@ hold. A run without the fault stands beside it. Rows that end a process are real
 
 import hashlib
 import json
-import multiprocessing
 import signal
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from statistics import median
 from typing import Any, Final
@@ -26,6 +24,7 @@ from gripper_force.errors import DataError, GripperError, LogError
 from gripper_force.grasp import TRIAL_OBJECTS, TRIAL_TARGETS_N
 from gripper_force.interfaces import Devices
 from gripper_force.log import LogReader
+from gripper_force.processes import process_pool
 from gripper_force.session import grasp_in, open_session
 from gripper_force.stability.rows import ROWS, Row
 from gripper_force.stability.verdict import Grasp, Sound, judge
@@ -112,7 +111,7 @@ def run_matrix(
     drawn = [_draw(config, i).model_dump(mode="json") for i in range(seeds)]
     simulated = [row for row in rows if row.unit != "process"]
     kept = _Kept(keep, config, resume)
-    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+    with process_pool(jobs) as pool:
 
         def begin(row: Row, index: int, clock: str) -> Callable[[], Summary]:
             """Starts a grasp, if none is kept; what is returned waits for its outcome."""
@@ -132,22 +131,19 @@ def run_matrix(
                 advance(name)
             return outcomes
 
-        try:
-            without = [pool.submit(_sound, tree) for tree in drawn] if simulated else []
-            sound = []
-            for grasp in without:
-                sound.append(grasp.result())
-                advance("without a fault")
-            begun = {row: [begin(row, i, "lockstep") for i in range(seeds)] for row in simulated}
-            done = {row: end(begun[row], row.name) for row in simulated}
-            for row in rows:  # real time wants the machine for itself, so one grasp after the other
-                if row in done:
-                    live = (begin(row, i, "realtime") for i in range(min(live_seeds, seeds)))
-                    yield _summary(row, done[row], end(live, f"{row.name}, in real time"))
-                else:
-                    yield _summary(row, [], end((begin(row, i, "realtime") for i in range(seeds)), row.name))
-        finally:
-            pool.shutdown(cancel_futures=True)
+        without = [pool.submit(_sound, tree) for tree in drawn] if simulated else []
+        sound = []
+        for grasp in without:
+            sound.append(grasp.result())
+            advance("without a fault")
+        begun = {row: [begin(row, i, "lockstep") for i in range(seeds)] for row in simulated}
+        done = {row: end(begun[row], row.name) for row in simulated}
+        for row in rows:  # real time wants the machine for itself, so one grasp after the other
+            if row in done:
+                live = (begin(row, i, "realtime") for i in range(min(live_seeds, seeds)))
+                yield _summary(row, done[row], end(live, f"{row.name}, in real time"))
+            else:
+                yield _summary(row, [], end((begin(row, i, "realtime") for i in range(seeds)), row.name))
 
 
 def count_grasps(seeds: int, live_seeds: int, rows: Sequence[Row] = ROWS) -> int:

@@ -1,7 +1,9 @@
 import json
+import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,6 +17,7 @@ from typer.testing import CliRunner
 from gripper_force import cli, console
 from gripper_force.cli.options import load_settings
 from gripper_force.errors import ConfigError
+from gripper_force.log import LogReader
 
 
 class Done(NamedTuple):
@@ -235,6 +238,7 @@ def test_a_published_database_is_imported_and_its_damage_told(run: Run, tmp_path
             "there is no port /dev/ttyUSB7",
         ),
         (["--set", "servo.model=XW999"], "XW999"),
+        (["--trials", "2", "--object", "tube"], "leave --object and --target-n out"),
         (["--config", "gone.yaml"], "can't read the configuration gone.yaml"),
         (["--set", "camera.backend=simulated", "--set", "vision.checkpoint=gone"], "no checkpoint at gone"),
     ],
@@ -282,6 +286,39 @@ def test_a_file_that_is_no_checkpoint_is_named(
         (line,) = done.err.splitlines()
         assert str(path) in line
         assert sentence in line
+
+
+def test_a_report_is_of_the_run_as_it_was(run: Run, fused_log: Path) -> None:
+    done = run("replay", fused_log, "--report", "--set", "control.ramp_n_s=4")
+    assert (done.code, "--report draws the run as it was" in done.err) == (2, True)
+
+
+def interrupt(arguments: list[str], folder: Path) -> tuple[int, str]:
+    """Runs the command in a terminal's group of its own, and sends Ctrl-C once it writes a log."""
+    command = [sys.executable, "-c", "from gripper_force.cli import main; main()", *arguments]
+    with subprocess.Popen(
+        command, cwd=folder, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as child:
+        while not any(log.stat().st_size > 100_000 for log in folder.rglob("*.mcap")):
+            assert child.poll() is None
+            time.sleep(0.01)
+        os.killpg(child.pid, signal.SIGINT)
+        _, said = child.communicate()
+    return child.returncode, said
+
+
+def test_an_interrupted_grasp_says_where_its_log_is(sets: list[str], tmp_path: Path) -> None:
+    code, said = interrupt(["grasp", *sets, "--set", "control.hold_s=600"], tmp_path)
+    assert (code, "Traceback" in said) == (130, False)
+    (log,) = tmp_path.rglob("*.mcap")
+    assert f"gripper-force replay {log}" in said
+    assert LogReader(log).duration_ns > 0
+
+
+def test_interrupted_trials_end_without_a_word_from_each_process(sets: list[str], tmp_path: Path) -> None:
+    code, said = interrupt(["grasp", "--trials", "40", "--jobs", "2", *sets], tmp_path)
+    assert (code, "Traceback" in said) == (130, False)
+    assert "interrupted" in said
 
 
 def test_a_protocol_and_its_scale_are_known_by_name(run: Run) -> None:

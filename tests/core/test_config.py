@@ -91,6 +91,27 @@ def test_a_value_out_of_range_is_refused_with_its_key_and_itself(assignment: str
     assert ", got " in str(caught.value)
 
 
+def test_who_is_wrong_is_named_the_file_or_what_is_set(tmp_path: Path) -> None:
+    path = tmp_path / "scene.yaml"
+    path.write_text("seed: 4")
+    with pytest.raises(ConfigError, match=r"'sead' \(from --set\)"):
+        load_config(path, ["sead=3"])
+    with pytest.raises(ConfigError, match=r"'sead' \(from --set\)"):
+        config_from_text("seed: 4", "run.mcap", ["sead=3"])
+    path.write_text("sead: 4")
+    with pytest.raises(ConfigError, match=r"'sead' \(from .*scene\.yaml\)"):
+        load_config(path, ["seed=3"])
+    path.write_text("seed: x")
+    assert load_config(path, ["seed=3"]).seed == 3
+
+
+def test_a_rig_profile_is_no_configuration(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    path.write_text("format: gripper-force-rig/1")
+    with pytest.raises(ConfigError, match=r"rig\.yaml is no configuration .* --set calibration\.rig="):
+        load_config(path)
+
+
 def test_overrides_are_yaml_and_the_last_one_wins(tmp_path: Path) -> None:
     path = tmp_path / "scene.yaml"
     path.write_text("object: tube\ntarget_n: 2\nvision: {threads: 3}\n")

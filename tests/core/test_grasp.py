@@ -1,4 +1,7 @@
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -116,25 +119,15 @@ def test_trials_without_any_figure_still_sum_up() -> None:
     assert summary["peak_n"] is None
 
 
-class Here:
+@contextmanager
+def here(_count: int) -> Iterator[SimpleNamespace]:
     """Stands in for a pool of processes."""
-
-    def __init__(self, *_: object, **__: object) -> None: ...
-
-    def __enter__(self) -> "Here":
-        return self
-
-    def __exit__(self, *_: object) -> None: ...
-
-    def map(self, function: Any, tasks: list[Any]) -> Any:
-        return map(function, tasks)
-
-    def shutdown(self, **_: object) -> None: ...
+    yield SimpleNamespace(map=map)
 
 
 def test_trials_are_drawn_from_the_seed(monkeypatch: pytest.MonkeyPatch) -> None:
     ran: list[Config] = []
-    monkeypatch.setattr(grasp_module, "ProcessPoolExecutor", Here)
+    monkeypatch.setattr(grasp_module, "process_pool", here)
     monkeypatch.setattr(grasp_module, "grasp", lambda config: ran.append(config) or {})
 
     def plan(seed: int) -> list[tuple[str, float, int]]:
@@ -155,7 +148,7 @@ def test_a_log_is_never_overwritten(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     config = load_config(None, [f"log.directory={tmp_path}", "object=tube", "target_n=2.5", "seed=7"])
     paths = []
     for _ in range(3):
-        paths.append(grasp_module._new_log(config))
+        paths.append(grasp_module.new_log(config))
         paths[-1].touch()
     assert paths[0].name == "20260101-120000-tube-2.5N-fused-seed7.mcap"
     assert [path.stem.removeprefix(paths[0].stem) for path in paths] == ["", "-2", "-3"]

@@ -106,8 +106,12 @@ def test_without_a_checkpoint_the_logged_estimates_are_used(fused_log: Path) -> 
 
 
 def test_an_override_changes_decisions(fused_log: Path) -> None:
-    assert replay(fused_log, overrides=["control.ramp_n_s=4"])["identical"] is False
-    assert replay(fused_log, overrides=["log.report=false"])["identical"] is True
+    changed = replay(fused_log, overrides=["control.ramp_n_s=4"])
+    assert changed["identical"] is False
+    assert changed["changed"]["goal_current_a"] > 0.01
+    same = replay(fused_log, overrides=["log.report=false"])
+    assert same["identical"] is True
+    assert same["changed"] == {"goal_current_a": 0, "fused_n": 0}
 
 
 def test_a_truncated_log_is_read_only_where_that_is_asked_for(fused_log: Path, tmp_path: Path) -> None:

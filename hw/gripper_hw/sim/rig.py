@@ -171,7 +171,8 @@ class SimulatedRig:
         if not config.servo.port.startswith("virtual:"):
             raise ConfigError(
                 f"servo.port {config.servo.port!r} is no virtual port, and a simulated camera or load cell "
-                "needs the simulated rig's servo; set servo.port to virtual:rig"
+                "sees the simulated rig's servo alone; set camera.backend and load_cell.backend to what you "
+                "have, or to none, or set servo.port to virtual:rig"
             )
         config, self._why = settled(config)
         self._config = config
