@@ -30,25 +30,27 @@ HARD_FORCE_LIMIT_N = 70.0
 class ServoConfig(Section):
     """The servo and its bus."""
 
-    model: str = "XM430-W350"
+    model: str = Field("XM430-W350", description="XM430-W350, XM430-W210, XL330-M288 or XC330-T288")
     port: str = Field(
-        "virtual:rig", description="a device path, or virtual:<name> for a bus in this process's memory"
+        "virtual:rig", description="a device path, or virtual:NAME for a bus in this process's memory"
     )
-    id: int = Field(1, ge=0, le=252)
-    baud_rate: int = Field(1_000_000, gt=0)
-    current_limit_a: Positive = 1.2
-    bus_watchdog_ms: int = Field(40, ge=20, le=2540)
-    retries: int = Field(2, ge=0, le=10)
+    id: int = Field(1, ge=0, le=252, description="the servo's number on the bus")
+    baud_rate: int = Field(1_000_000, gt=0, description="bits a second")
+    current_limit_a: Positive = Field(1.2, description="what the servo itself never goes beyond")
+    bus_watchdog_ms: int = Field(
+        40, ge=20, le=2540, description="silence on the bus after which the servo stops by itself"
+    )
+    retries: int = Field(2, ge=0, le=10, description="of a transaction without a sound answer")
     reply_margin_ms: Positive = Field(3.0, description="how long a reply may be late before a retry")
 
 
 class GripperConfig(Section):
     """How the servo moves the jaws: one pinion, two racks."""
 
-    pinion_radius_m: Positive = 0.020
-    closing_sign: Literal[-1, 1] = 1
+    pinion_radius_m: Positive = Field(0.020, description="travel of one jaw for a radian of the servo")
+    closing_sign: Literal[-1, 1] = Field(1, description="-1 where a falling position closes")
     open_position_rad: Finite = Field(0.0, description="servo angle with the jaws open")
-    open_width_m: Positive = 0.092
+    open_width_m: Positive = Field(0.092, description="distance between the open jaws")
     nm_per_a: Positive | None = Field(None, description="torque constant at the horn; None: the model's own")
     current_step_a: Positive | None = Field(
         None, description="resolution of the goal current; None: the model's own"
@@ -65,7 +67,7 @@ class CameraConfig(Section):
     """The camera."""
 
     backend: str = Field("simulated", description="simulated, oak, uvc, playback, none")
-    rate_hz: Positive = 60.0
+    rate_hz: Positive = Field(60.0, description="frames a second that are asked for")
     path: Path | None = Field(None, description="the log that backend `playback` plays")
     speed: Literal["recorded", "full"] = Field("recorded", description="how fast it is played")
     device: int | str | None = Field(
@@ -96,7 +98,7 @@ class LoadCellConfig(Section):
         200.0, description="of `simulated` and `phidget` (at most 122); a board on a serial port has its own"
     )
     port: str | None = Field(None, description="the device path that backend `serial` reads")
-    baud_rate: int = Field(115_200, gt=0)
+    baud_rate: int = Field(115_200, gt=0, description="of the serial port, in bits a second")
     format: Literal["hx711", "cas"] = Field(
         "hx711", description="what `serial` reads: counts of an HX711 board, or a weighing indicator's frames"
     )
@@ -163,15 +165,19 @@ class BudgetConfig(Section):
 class ControlConfig(Section):
     """Fusion, force loop, phases and limits."""
 
-    rate_hz: Positive = 200.0
-    feedback: Literal["fused", "current", "vision"] = "fused"
-    force_limit_n: Annotated[float, Field(gt=0, le=HARD_FORCE_LIMIT_N, allow_inf_nan=False)] = 10.0
+    rate_hz: Positive = Field(200.0, description="of the loop")
+    feedback: Literal["fused", "current", "vision"] = Field(
+        "fused", description="what the loop goes by: vision and motor current together, or one of them alone"
+    )
+    force_limit_n: float = Field(
+        10.0, gt=0, le=HARD_FORCE_LIMIT_N, allow_inf_nan=False, description="what ends a grasp as over_force"
+    )
     approach_speed_m_s: Positive = Field(0.025, description="closing speed of one jaw before contact")
     approach_force_n: Positive = Field(0.5, description="grip force allowed before contact")
-    ramp_n_s: Positive = 8.0
+    ramp_n_s: Positive = Field(8.0, description="how fast the wanted force rises after contact")
     settle_s: Positive = Field(1.0, description="time within tolerance that makes a grasp `held`")
     hold_s: NonNegative = Field(1.5, description="how long to hold after it is held, before the run ends")
-    timeout_s: Positive = 8.0
+    timeout_s: Positive = Field(8.0, description="after which a grasp that is not held is given up")
     vision_timeout_ms: Positive = Field(
         45.0, description="time without an estimate after which vision drops out: two frames at 60 a second"
     )
@@ -185,7 +191,7 @@ class ControlConfig(Section):
     warm_c: Positive = Field(
         60.0, description="servo temperature from which a hold is eased, down to 60 % at the limit"
     )
-    temperature_limit_c: Positive = 70.0
+    temperature_limit_c: Positive = Field(70.0, description="servo temperature that ends a grasp")
     voltage_limits_v: tuple[Positive, Positive] | None = Field(
         None, description="supply of the servo, least and most; None: what its model is made for"
     )
@@ -261,7 +267,7 @@ class SimConfig(Section):
         0.05, ge=0, le=0.5, description="half-width of the uniform spread of the object's stiffness"
     )
     markers: bool = Field(False, description="whether each finger carries an ArUco marker beside its pad")
-    camera_latency_ms: NonNegative = 15.0
+    camera_latency_ms: NonNegative = Field(15.0, description="from the middle of an exposure to its frame")
     exposure_ms: Positive = Field(4.0, description="at a camera.exposure_us of 4000")
 
 
@@ -284,8 +290,8 @@ class CalibrationConfig(Section):
 class LogConfig(Section):
     """Where runs are written."""
 
-    directory: Path = Path("runs")
-    report: bool = True
+    directory: Path = Field(Path("runs"), description="folder of logs and reports")
+    report: bool = Field(True, description="whether a run ends with a picture and a page")
 
 
 FAULTS: Final[dict[str, dict[str, str]]] = {
@@ -368,10 +374,14 @@ class FaultConfig(Section):
 class Config(Section):
     """A whole run."""
 
-    object: str = "sponge"
-    target_n: Positive = 4.0
-    seed: int = Field(0, ge=0)
-    clock: Literal["lockstep", "realtime"] = "lockstep"
+    object: str = Field(
+        "sponge", description="what is grasped; simulated: sponge, paper_cup, tube, stapler, ball or block"
+    )
+    target_n: Positive = Field(4.0, description="wanted force")
+    seed: int = Field(0, ge=0, description="of everything that is drawn")
+    clock: Literal["lockstep", "realtime"] = Field(
+        "lockstep", description="lockstep: the simulated world waits for the computer; devices need realtime"
+    )
     on_exit: Literal["release", "hold"] = Field(
         "release", description="release: torque off on every way out; hold: keep the last goals"
     )

@@ -1,5 +1,6 @@
 """What all that is typed and kept as YAML shares: sections, numbers, reading, and the error's sentence."""
 
+from collections.abc import Iterator
 from copy import deepcopy
 from inspect import isclass
 from pathlib import Path
@@ -7,6 +8,7 @@ from typing import Annotated, Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
 
 from gripper_force.errors import ConfigError
 
@@ -124,6 +126,16 @@ def read_section(section: type[S], path: Path, format_: str, what: str) -> S:
             "`gripper-force calibrate`"
         )
     return validated(section, tree, str(path), what)
+
+
+def keys(section: type[Section], under: str = "") -> Iterator[tuple[str, FieldInfo]]:
+    """Every key of a section and of the sections in it, by its path, with what it is."""
+    for name, field in section.model_fields.items():
+        kind = field.annotation
+        if isclass(kind) and issubclass(kind, Section):
+            yield from keys(kind, f"{under}{name}.")
+        else:
+            yield f"{under}{name}", field
 
 
 def write_all(files: dict[Path, bytes]) -> None:

@@ -91,12 +91,15 @@ def evaluate(
 
 def export(
     out: Annotated[Path, typer.Option("--out", help="File to write: .onnx, or .xml for OpenVINO.")],
-    checkpoint: Annotated[str, typer.Argument(help="A path, or default or small.")] = "default",
+    checkpoint: Annotated[
+        str | None, typer.Argument(help="A path, or default or small. Default: vision.checkpoint.")
+    ] = None,
     int8: Annotated[
         Path | None,
         typer.Option(help="Compute the convolutions in int8, scaled on this folder of logs (.xml only)."),
     ] = None,
     jobs: Jobs = CORES,
+    set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
     """Write a network's streaming step for another engine, checked against PyTorch."""
@@ -104,7 +107,7 @@ def export(
     from gripper_force.vision.export import export as job
     from gripper_force.vision.exported import read_model
 
-    model = read_model(checkpoint)
+    model = read_model(load_settings(None, set_, {"vision.checkpoint": checkpoint}).vision.checkpoint)
     frames = None
     if int8 is not None:
         frames = [clip.frames for clip in load_clips(int8, model.header.preprocess, workers=jobs)]

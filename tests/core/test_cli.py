@@ -70,6 +70,17 @@ def test_every_command_explains_itself(path: tuple[str, ...]) -> None:
     assert "Usage:" in result.output
 
 
+def test_every_command_can_be_set_and_read_by_a_script() -> None:
+    groups = list(commands(typer.main.get_command(cli.app)))
+    for path in groups:
+        command: Any = typer.main.get_command(cli.app)
+        for name in path:
+            command = command.commands[name]
+        if not hasattr(command, "commands"):
+            options = {option for parameter in command.params for option in parameter.opts}
+            assert options >= {"--set", "--json"}, path
+
+
 def test_the_command_line_answers_without_what_is_heavy() -> None:
     code = "import sys, gripper_force.cli; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
