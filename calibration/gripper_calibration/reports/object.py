@@ -36,9 +36,11 @@ def draw(
         before.plot(touches.estimate_n, touches.force_n, ".", ms=2, color=DATA)
         before.plot(line, line, color=GRAY, lw=0.8, label="equal")
         knots = np.array(profile.output.estimate_n), np.array(profile.output.force_n)
-        before.plot(line, curve_n(*knots, line), color=FIT, label=fitted.candidate)
+        alone = not fitted.arrays.head.any()
+        label = fitted.candidate if alone else "its line; the last layer, refitted, adds the rest"
+        before.plot(line, curve_n(*knots, line), color=FIT, label=label)
         name(before, "before", "the network's estimate, N", "load cell, N")
-        before.legend(loc="upper left")
+        before.legend()
         after.plot(after_n, touches.force_n, ".", ms=2, color=DATA)
         after.plot(line, line, color=GRAY, lw=0.8)
         name(after, "after", "corrected estimate, N", "load cell, N")
@@ -52,12 +54,15 @@ def draw(
         left.plot(line, half_n, color=FIT, label=label)
         left.plot(line, -half_n, color=FIT)
         name(left, "what is left, by force", "load cell, N", "error, N")
-        left.legend(loc="upper left")
-        counts = sorted({count for count, _, _ in curve})
+        left.legend()
         for count, mae_n, _ in curve:
             enough.plot(count, mae_n, ".", color=DATA)
-        means_n = [np.mean([mae_n for number, mae_n, _ in curve if number == count]) for count in counts]
-        enough.plot(counts, means_n, color=FIT, label="after, on the touches that were not drawn")
+        drawn = sorted({count for count, _, _ in curve})
+        means_n = {c: np.mean([mae_n for count, mae_n, _ in curve if count == c]) for c in drawn}
+        if left_out:  # the same experiment, with every choice of all but one
+            means_n[profile.touches - 1] = np.abs(error_n).mean()
+        counts = list(means_n)
+        enough.plot(counts, list(means_n.values()), ".-", color=FIT, label="after, on those left out")
         enough.axhline(profile.before_n, color=GRAY, lw=0.8, label="before")
         enough.set_xscale("log", base=2)
         enough.set_xticks(counts, [str(count) for count in counts])
