@@ -3,8 +3,10 @@
 *The line.* Each touch has a line of its own: how an object lies between the jaws changes what is seen by some
 percent. So a touch tells the object's line up to that scatter, however many frames it has, as studies do in a
 meta-analysis with random effects (R. DerSimonian and N. Laird, Controlled Clinical Trials 7 (1986) 177-188,
-doi:10.1016/0197-2456(86)90046-2), with a prior that the network was right. A load cell's spikes are held down
-by Huber's weights (P. J. Huber, Annals of Mathematical Statistics 35 (1964) 73, doi:10.1214/aoms/1177703732).
+doi:10.1016/0197-2456(86)90046-2), with a prior that the network was right. It has the tails of Student's t (K.
+L. Lange et al., JASA 84 (1989) 881, doi:10.1080/01621459.1989.10478852): a kind of object that the network never
+saw is not held to what holds of those it did. A load cell's spikes are held down by Huber's weights (P. J.
+Huber, Annals of Mathematical Statistics 35 (1964) 73, doi:10.1214/aoms/1177703732).
 
 *The curve.* Straight pieces with slopes that are not negative, drawn to the line by a penalty on how the
 slopes differ from its own.
@@ -23,10 +25,13 @@ GAIN_STD: Final = 0.25
 OFFSET_STD_N: Final = 0.1
 """What is thought of an object before it was touched: how far the network's gain and offset are off."""
 
+_GAIN_TAIL: Final = 2.0
+"""Degrees of freedom of the gain's prior: the fewer, the rather may an object be altogether different."""
+
 _TOUCH_GAIN_STD: Final = 0.05
 _TOUCH_OFFSET_STD_N: Final = 0.05
 _TOUCH_WEIGHT: Final = 2.0
-"""And of how far touches of one object differ, worth so many touches."""
+"""And of how far touches of one object differ, in the gain as a share of it, worth so many touches."""
 
 _TOGETHER: Final = 20
 """Frames that tell no more than one: the network's window."""
@@ -83,20 +88,22 @@ def fit_line(touches: Touches) -> Line:
     scale = 1 / (_TOGETHER * frame_std_n**2)
     grams = [scale * (x * w[:, None]).T @ x for x, w in zip(designs, weights, strict=True)]  # (2, 2) each
     pulls = [scale * (x * w[:, None]).T @ r for x, r, w in zip(designs, missing, weights, strict=True)]
-    prior = np.diag([GAIN_STD**-2, OFFSET_STD_N**-2])
+    gain_weight = 0.0  # first what the touches say by themselves
     touch_var = np.square([_TOUCH_GAIN_STD, _TOUCH_OFFSET_STD_N])
     unit = np.eye(2)
     for _ in range(_ROUNDS):
         shrunk = [np.linalg.inv(unit + gram * touch_var) for gram in grams]
+        prior = np.diag([gain_weight * GAIN_STD**-2, OFFSET_STD_N**-2])
         precision = prior + sum(s @ g for s, g in zip(shrunk, grams, strict=True))
         line = np.linalg.solve(precision, sum(s @ p for s, p in zip(shrunk, pulls, strict=True)))
+        gain_weight = (_GAIN_TAIL + 1) / (_GAIN_TAIL + (line[0] / GAIN_STD) ** 2)
         # Each touch's own departure, as far as its frames tell it: expectation-maximisation.
         own = [
             np.linalg.solve(g + np.diag(1 / touch_var), p - g @ line)
             for g, p in zip(grams, pulls, strict=True)
         ]
         left = [np.diag(np.linalg.inv(g + np.diag(1 / touch_var))) for g in grams]
-        first = np.square([_TOUCH_GAIN_STD, _TOUCH_OFFSET_STD_N])
+        first = np.square([_TOUCH_GAIN_STD * max(1.0, 1 + line[0]), _TOUCH_OFFSET_STD_N])
         total = _TOUCH_WEIGHT * first + sum(np.square(o) + v for o, v in zip(own, left, strict=True))
         touch_var = total / (_TOUCH_WEIGHT + len(parts))
     return Line(

@@ -50,6 +50,19 @@ def test_a_wrong_gain_is_put_right_by_a_few_touches(count: int, gain: float) -> 
     assert (fitted.after_n is None) == (count < 3)
 
 
+@pytest.mark.parametrize("count", [1, 2])
+@pytest.mark.parametrize("gain", [2.0, 3.5])
+def test_an_object_of_another_kind_is_not_held_to_what_was_thought_of_it(count: int, gain: float) -> None:
+    """The touches scatter, so that a prior without tails would win over them."""
+    after_n, before_n = [], []
+    for seed in range(6):
+        fitted = fit_correction(touched(count, gain=gain, scatter=0.15, peak_n=3.0, seed=seed))
+        new = touched(5, gain=gain, scatter=0.15, peak_n=3.0, seed=50 + seed)
+        after_n.append(np.abs(fitted.predict(new) - new.force_n).mean())
+        before_n.append(np.abs(new.estimate_n - new.force_n).mean())
+    assert np.mean(after_n) < 0.45 * np.mean(before_n)
+
+
 def test_what_is_right_stays_as_it_is() -> None:
     fitted = fit_correction(touched(8))
     assert fitted.candidate == "the network as it is"
