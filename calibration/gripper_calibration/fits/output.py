@@ -4,9 +4,9 @@
 percent. So a touch tells the object's line up to that scatter, however many frames it has, as studies do in a
 meta-analysis with random effects (R. DerSimonian and N. Laird, Controlled Clinical Trials 7 (1986) 177-188,
 doi:10.1016/0197-2456(86)90046-2), with a prior that the network was right. It has the tails of Student's t
-(K. L. Lange et al., JASA 84 (1989) 881, doi:10.1080/01621459.1989.10478852): a kind of object that the network
-never saw is not held to what holds of those it did. A load cell's spikes are held down by Huber's weights
-(P. J. Huber, Annals of Mathematical Statistics 35 (1964) 73, doi:10.1214/aoms/1177703732).
+(K. L. Lange et al., JASA 84 (1989) 881, doi:10.1080/01621459.1989.10478852): a kind of object that the
+network never saw is not held to what holds of those it did. A load cell's spikes are held down by Huber's
+weights (P. J. Huber, Annals of Mathematical Statistics 35 (1964) 73, doi:10.1214/aoms/1177703732).
 
 *The curve.* Straight pieces with slopes that are not negative, drawn to the line by a penalty on how the
 slopes differ from its own.
