@@ -1,4 +1,4 @@
-"""The command line: parse, call, and let `gripper_force.console` print.
+"""The command line: parse, call, and let `gripper_force.tables` print.
 
 Every command takes ``--set key.path=value`` and ``--json``. With ``--json`` one JSON object goes to stdout;
 progress and messages go to stderr always. Bad input is one sentence on stderr and exit code 2. Exit code 1
@@ -20,6 +20,8 @@ from gripper_force import console
 from gripper_force.cli import bench, calibrate, data, learning, stability
 from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, load_settings
 from gripper_force.errors import ConfigError, GripperError
+from gripper_force.tables.doctor import changes_table, checks_table, setup_line
+from gripper_force.tables.runs import grasp_table, phases, replay_table, trials_table
 
 app = typer.Typer(
     help="A robot gripper that feels with its eyes: run, calibrate, replay.",
@@ -83,12 +85,12 @@ def grasp(
     if not trials:
         log = job.new_log(settings)
         try:
-            result = job.grasp(settings, console.phases(), log)
+            result = job.grasp(settings, phases(), log)
         except BaseException:
             if log.exists():
                 console.err.print(f"what was seen is in {log}: gripper-force replay {log}", soft_wrap=True)
             raise
-        console.show(result, as_json, console.grasp_table)
+        console.show(result, as_json, grasp_table)
         if result["result"] != "held":
             raise typer.Exit(1)
         return
@@ -102,7 +104,7 @@ def grasp(
             results.append(one)
             advance(f"{one['object']} {one['target_n']:.1f} N: {one['result']}")
     summary = job.overall(results, settings.control.force_limit_n)
-    console.show({"trials": results, "summary": summary}, as_json, console.trials_table)
+    console.show({"trials": results, "summary": summary}, as_json, trials_table)
 
 
 def replay(
@@ -123,7 +125,7 @@ def replay(
         from gripper_force.report import write_report
 
         result["report"] = str(write_report(log, recover=recover).html)
-    console.show(result, as_json, console.replay_table)
+    console.show(result, as_json, replay_table)
 
 
 def virtual_servo(
@@ -161,13 +163,13 @@ def doctor(
         console.show(
             job.setup(settings, lambda servo, changes: _agreed(servo, changes, yes)),
             as_json,
-            console.setup_line,
+            setup_line,
         )
         return
     with console.err.status("looking"):
         checks = list(job.doctor(settings))
     ok = all(check.ok is not False for check in checks)
-    console.show({"checks": checks, "ok": ok}, as_json, console.checks_table)
+    console.show({"checks": checks, "ok": ok}, as_json, checks_table)
     if not ok:
         raise typer.Exit(1)
 
@@ -194,7 +196,7 @@ def _terminate(_signal: int, _frame: FrameType | None) -> None:
 
 
 def _agreed(servo: str, changes: list[Any], yes: bool) -> bool:
-    console.changes_table(servo, changes)
+    changes_table(servo, changes)
     try:
         return yes or typer.confirm(f"Write these to {servo}?", err=True)
     except typer.Abort as abort:

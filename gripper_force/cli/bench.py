@@ -9,6 +9,15 @@ import typer
 from gripper_force import console
 from gripper_force.cli.options import CORES, AsJson, Jobs
 from gripper_force.errors import ConfigError
+from gripper_force.tables.bench import (
+    bus_table,
+    commands_table,
+    estimator_table,
+    learning_table,
+    loop_table,
+    scene_table,
+    startup_table,
+)
 
 
 def bench(
@@ -83,20 +92,20 @@ def bench(
         raise ConfigError(f"bench measures one thing at a time: the estimator, or one of {', '.join(asked)}")
     result: dict[str, Any]
     if bus:
-        result, table = _bus(cycles), console.bus_table
+        result, table = _bus(cycles), bus_table
     elif commands:
-        result, table = _commands(), console.commands_table
+        result, table = _commands(), commands_table
     elif startup:
-        result, table = _startup(), console.startup_table
+        result, table = _startup(), startup_table
     elif loop:
-        result, table = _loop(seconds, set_ or []), console.loop_table
+        result, table = _loop(seconds, set_ or []), loop_table
     elif scene:
-        result, table = _scene(objects or [], write), console.scene_table
+        result, table = _scene(objects or [], write), scene_table
     elif training is not None:
-        result, table = _learning(training, minutes, set_ or [], folder, jobs), console.learning_table
+        result, table = _learning(training, minutes, set_ or [], folder, jobs), learning_table
     else:
         result = _estimator(checkpoints, threads, data, scale_on, folder, write, jobs)
-        table = console.estimator_table
+        table = estimator_table
     console.show({**result, "load": os.getloadavg()[0], "cores": CORES}, as_json, table)
 
 

@@ -9,6 +9,7 @@ import typer
 from gripper_force import console
 from gripper_force.cli.options import AsJson, ConfigPath, Overrides, load_settings
 from gripper_force.errors import ConfigError
+from gripper_force.tables.calibrate import object_table, rig_table
 
 if TYPE_CHECKING:
     from gripper_force.config import Config
@@ -49,7 +50,7 @@ def load_cell(
             seconds=seconds,
             progress=lambda step, raw: status.update(f"{step}: {raw:.6g}"),
         )
-    console.show(result, as_json, console.rig_table)
+    console.show(result, as_json, rig_table)
 
 
 @app.command("servo")
@@ -80,7 +81,7 @@ def servo(
             ask=lambda what: _ask(what, yes, status),
             progress=lambda step, force_n: status.update(f"{step}: {force_n:.1f} N"),
         )
-    console.show(result, as_json, console.rig_table)
+    console.show(result, as_json, rig_table)
 
 
 @app.command("camera")
@@ -113,7 +114,7 @@ def camera(
             touches=touches,
             progress=lambda step, force_n: status.update(f"{step}: {force_n:.1f} N"),
         )
-    console.show(result, as_json, console.rig_table)
+    console.show(result, as_json, rig_table)
 
 
 @app.command("object")
@@ -150,7 +151,7 @@ def object_(
         paths = [p for path in logs for p in (sorted(path.rglob("*.mcap")) if path.is_dir() else [path])]
     with console.bar("calibrating", len(paths) + 2) as advance:
         result = job.calibrate(settings, name, paths, out or user_folder() / f"{name}.yaml", advance)
-    console.show(result, as_json, console.object_table)
+    console.show(result, as_json, object_table)
 
 
 def _touches(settings: "Config", touches: int, peak_n: float | None, folder: Path, pause: bool) -> list[Path]:

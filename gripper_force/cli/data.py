@@ -8,6 +8,7 @@ import typer
 from gripper_force import console
 from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, load_settings
 from gripper_force.errors import ConfigError, DataError
+from gripper_force.tables.data import database_table, imports_table, sets_table
 
 import_app = typer.Typer(no_args_is_help=True, help="Turn other recordings into logs.")
 
@@ -129,7 +130,7 @@ def record(
 
         for path in job.record(settings, plan, folder, tell):
             advance(path.name)
-    console.show(summarise(paths), as_json, console.sets_table)
+    console.show(summarise(paths), as_json, sets_table)
 
 
 @import_app.command("video")
@@ -157,7 +158,7 @@ def import_video(
         log = folder / f"{video.stem}.mcap"
         summaries = [job.import_video(video, forces, log, object_name=object_, region=region, align=align)]
     rows = [console.jsonable(summary) for summary in summaries]
-    console.show({"logs": rows}, as_json, console.imports_table)
+    console.show({"logs": rows}, as_json, imports_table)
 
 
 @import_app.command("database")
@@ -187,4 +188,4 @@ def import_database(
                 )
             )
             advance(path.name)
-    console.show({"environments": rows, "ignored": ignored}, as_json, console.database_table)
+    console.show({"environments": rows, "ignored": ignored}, as_json, database_table)

@@ -10,6 +10,8 @@ import typer
 from gripper_force import console
 from gripper_force.cli.options import CORES, AsJson, Jobs, Overrides, load_settings
 from gripper_force.errors import ConfigError, DataError
+from gripper_force.tables.paper import paper_tables
+from gripper_force.tables.runs import errors_table
 
 
 def train(
@@ -86,7 +88,7 @@ def evaluate(
         return correction_of(settings.model_copy(update={"object": clip.object}), loaded)
 
     corrected = None if settings.calibration.object is None else correct
-    console.show(dict(job(loaded, clips, corrected)), as_json, console.errors_table)
+    console.show(dict(job(loaded, clips, corrected)), as_json, errors_table)
 
 
 def export(
@@ -159,4 +161,4 @@ def reproduce(
         for place, text in page.markdown(result, scale, settings, test, pictures.name).items():
             write_between(write, place, text)
     drawn = {name: str(pictures / f"{name}.png") for name in result.figures}
-    console.show({"tables": list(result.tables.values()), "figures": drawn}, as_json, console.paper_tables)
+    console.show({"tables": list(result.tables.values()), "figures": drawn}, as_json, paper_tables)

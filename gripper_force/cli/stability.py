@@ -8,6 +8,7 @@ import typer
 from gripper_force import console
 from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, load_settings
 from gripper_force.errors import ConfigError
+from gripper_force.tables.stability import faults_table, fuzz_table, numerics_tables, soak_table
 
 if TYPE_CHECKING:
     from gripper_force.config import Config
@@ -58,23 +59,23 @@ def stability(
         raise ConfigError("stability does one thing at a time: --part, --faults, --fuzz N or --soak SECONDS")
     if not modes:
         result = _numbers(load_settings(config, set_, {"seed": seed}), part or [], write)
-        console.show(result, as_json, console.numerics_tables)
+        console.show(result, as_json, numerics_tables)
     elif faults:
         result = _fault_matrix(load_settings(config, set_, {"seed": seed}), seeds, live, jobs, write, resume)
-        console.show(result, as_json, console.faults_table)
+        console.show(result, as_json, faults_table)
     elif fuzz is not None:
         from gripper_force.stability.fuzz import fuzz as feed
 
         with console.bar("fuzzing", fuzz) as advance:
             result = feed(fuzz, seed, jobs, folder, advance, only=only)
-        console.show(result, as_json, console.fuzz_table)
+        console.show(result, as_json, fuzz_table)
     else:
         from gripper_force.stability.soak import soak as grasp_on
 
         settings = load_settings(config, ["sim.detail=coarse", *(set_ or [])], {"seed": seed})
         with console.bar("soaking", round(soak or 0)) as advance:
             result = grasp_on(settings, soak or 0, advance)
-        console.show(result, as_json, console.soak_table)
+        console.show(result, as_json, soak_table)
     if not result["ok"]:
         raise typer.Exit(1)
 

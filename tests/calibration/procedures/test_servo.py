@@ -8,13 +8,13 @@ import pytest
 from typer.testing import CliRunner
 
 from gripper_calibration.procedures.servo import calibrate
-from gripper_force import console
 from gripper_force.cli import app
 from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError, DataError, DeviceError
 from gripper_force.log import LogReader
 from gripper_force.rig import Estimate, LoadCellCalibration, read_rig, update_rig
 from gripper_force.session import run_grasp
+from gripper_force.tables.calibrate import rig_table
 from gripper_force.types import Event
 from gripper_hw.dynamixel.control_table import load_model
 from gripper_hw.dynamixel.virtual import VirtualBus, find_bus
@@ -117,7 +117,7 @@ def test_what_fails_is_named_and_leaves_no_torque(
 
 def test_a_person_reads_values_with_their_intervals(capsys: pytest.CaptureFixture[str]) -> None:
     measured, given = {"value": 1.7, "low": 1.6, "high": 1.8}, {"value": 0.02, "low": None, "high": None}
-    console.rig_table({"nm_per_a": measured, "pinion_radius_m": given, "force_n": [0.3, 9.5]})
+    rig_table({"nm_per_a": measured, "pinion_radius_m": given, "force_n": [0.3, 9.5]})
     printed = capsys.readouterr().out
     for told in ("1.7 (1.6 to 1.8)", "0.02 (given)", "0.3, 9.5"):
         assert told in printed
