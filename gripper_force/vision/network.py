@@ -118,6 +118,11 @@ class ForceNetwork(nn.Module):
         moved: Self = self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         return moved
 
+    def in_plain_layout(self) -> Self:
+        """Puts the channels first, as PyTorch does by itself: to compare with."""
+        moved: Self = self.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
+        return moved
+
     def forward(self, clips: Tensor, start: int = 0) -> Tensor:
         """Estimates the force for the frames of whole clips; one backbone pass serves all windows.
 

@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 
 from gripper_force.bench import estimator
-from gripper_force.bench.estimator import WINDOW, EstimatorCost, bench, draw, markdown, ratios, write_json
+from gripper_force.bench.estimator import (
+    PLAIN_WINDOW,
+    WINDOW,
+    EstimatorCost,
+    bench,
+    draw,
+    markdown,
+    ratios,
+    write_json,
+)
 from gripper_force.dataset import Clip
 from gripper_force.vision.header import Model
 
@@ -30,6 +39,7 @@ ROW = EstimatorCost(
     frames=100,
 )
 PAPER = replace(ROW, engine=WINDOW, p50_ms=100.0, least_ms=None, memory_mb=None)
+PLAIN = replace(PAPER, engine=PLAIN_WINDOW, p50_ms=150.0)
 FAST = replace(ROW, engine="openvino", precision="bfloat16", p50_ms=1.0, mae_n=0.203)
 ROUGH = replace(ROW, engine="openvino", precision="int8", p50_ms=0.5, mae_n=0.25)
 
@@ -66,21 +76,23 @@ def test_measures_every_way(tiny_checkpoint: Path, tmp_path: Path, monkeypatch: 
     rows = bench([str(tiny_checkpoint)], lambda model: recordings(0), scaling, [1], told.append)
     assert [(row.engine, row.precision) for row in rows] == [
         (WINDOW, "float32"),
+        (PLAIN_WINDOW, "float32"),
         ("torch", "float32"),
         ("openvino", "int8"),
     ]
     assert all(row.frames == 2 * 157 for row in rows)  # three of each are reference alone
-    assert rows[0].mae_n == rows[1].mae_n != rows[2].mae_n
+    assert rows[0].mae_n == rows[1].mae_n == rows[2].mae_n != rows[3].mae_n
     assert all(row.p99_ms >= row.p50_ms > 0 for row in rows)
-    assert rows[0].memory_mb is None
-    assert all(row.memory_mb is not None and row.memory_mb > 30 for row in rows[1:])
+    assert [row.memory_mb for row in rows[:2]] == [None, None]
+    assert all(row.memory_mb is not None and row.memory_mb > 30 for row in rows[2:])
     assert any(row.front for row in rows)
     assert told
 
 
 def test_ratios_are_to_the_window_and_keep_the_error() -> None:
-    told = ratios([PAPER, ROW, FAST, ROUGH])[ROW.checkpoint]
+    told = ratios([PAPER, PLAIN, ROW, FAST, ROUGH])[ROW.checkpoint]
     assert told["times_faster_than_window"] == 100
+    assert told["times_faster_than_plain_window"] == 150
     assert told["fastest"] == "openvino, bfloat16, 1 threads"
     assert told["mae_over_float32"] == pytest.approx(1.015)
 
