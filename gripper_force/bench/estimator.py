@@ -179,8 +179,8 @@ def _timed(
             if (engine, name) not in errors:
                 errors[engine, name] = _errors(engines[engine, name], model, clips)
                 advance(f"{source}: {engine}, {name}: {errors[engine, name]['mae_n']:.3f} N")
-        for way in (WINDOW, PLAIN_WINDOW):
-            errors[way, "float32"] = errors["torch", "float32"]
+        for window in (WINDOW, PLAIN_WINDOW):
+            errors[window, "float32"] = errors["torch", "float32"]
         taken = _in_turns({way: _Timed(engine.step, []) for way, engine in engines.items()}, model, frames)
         advance(f"{source}: {count} threads")
         for (engine, name), taken_ns in taken.items():
