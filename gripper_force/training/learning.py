@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator
 
 from gripper_force import metrics
 from gripper_force.dataset import Clip, split_by
@@ -150,7 +151,8 @@ def draw(points: Sequence[Point]) -> Figure:
             axes.plot([p.minutes for p in own], [p.mae_n for p in own], "o-", markersize=3, label=way)
         axes.set(xscale="log", xlabel="minutes of training", ylabel="validation MAE, N")
         axes.set_ylim(bottom=0)
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.xaxis.set_minor_locator(NullLocator())
         axes.xaxis.set_major_formatter("{x:g}")
-        axes.xaxis.set_minor_formatter("{x:g}")
         axes.legend()
     return figure
