@@ -44,17 +44,17 @@ BASE: dict[str, Any] = {
     "clips": 20,
     "clip_frames": 26,
     "short_share": 0.0,
+    "shift_px": 0,
+    "light": 0.0,
+    "noise": 0.0,
 }
-BARE = {"shift_px": 0, "light": 0.0, "noise": 0.0}
+AUGMENTED = {"shift_px": 2, "light": 0.2, "noise": 0.02}
 RUNGS: dict[str, dict[str, Any]] = {
-    "no attention, no reference, no augmentation": {
-        "attentions": ["none"],
-        "preprocess": {"size": 64, "reference": False},
-        **BARE,
-    },
-    "+ reference frame": {"attentions": ["none"], "preprocess": {"size": 64}, **BARE},
-    "+ magnitude alone": {"attentions": ["none"], **BARE},
-    "+ augmentation": {"attentions": ["none"]},
+    "no attention, no reference": {"attentions": ["none"], "preprocess": {"size": 64, "reference": False}},
+    "+ reference frame": {"attentions": ["none"], "preprocess": {"size": 64}},
+    "+ magnitude alone": {"attentions": ["none"]},
+    "with augmentation": {"attentions": ["none"], **AUGMENTED},
+    "spatial attention, with augmentation": AUGMENTED,
     "channel attention": {"attentions": ["scam"]},
     "spatial and channel, averaged": {"attentions": ["ssam", "scam"]},
     "two plain networks, averaged": {"attentions": ["none", "none"]},
