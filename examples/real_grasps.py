@@ -56,12 +56,10 @@ RUNGS: dict[str, dict[str, Any]] = {
     "with augmentation": {"attentions": ["none"], **AUGMENTED},
     "spatial attention, with augmentation": AUGMENTED,
     "channel attention": {"attentions": ["scam"]},
-    "spatial and channel, averaged": {"attentions": ["ssam", "scam"]},
-    "two plain networks, averaged": {"attentions": ["none", "none"]},
     "deeper: ResNet-18": {"backbone": "resnet18"},
     "spatial attention": {},
 }
-"""What each changes in `BASE`. The averaged ones have the same minutes for both networks together."""
+"""What each changes in `BASE`."""
 
 DEFAULT = "spatial attention"
 RIDGE = "ridge regression"
