@@ -151,8 +151,13 @@ def check_place(path: Path) -> None:
     """Makes a profile's folder. Raises `ConfigError` where none can be written to that path."""
     if path.suffix != ".yaml":
         raise ConfigError(f"an object profile is a file that ends in .yaml, and {path} does not")
-    write_all({path.with_name(f".{path.name}.place"): b""})
-    path.with_name(f".{path.name}.place").unlink()
+    place = path.with_name(f".{path.name}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        place.touch()
+        place.unlink()
+    except OSError as error:
+        raise ConfigError(f"can't write {path}: {error.strerror}") from error
 
 
 def write_object(path: Path, profile: ObjectProfile, weights: bytes) -> None:
