@@ -157,7 +157,7 @@ def check_place(path: Path) -> None:
         place.touch()
         place.unlink()
     except OSError as error:
-        raise ConfigError(f"can't write {path}: {error.strerror}") from error
+        raise ConfigError(f"can't write {path}: {error.strerror}, {error.filename}") from error
 
 
 def write_object(path: Path, profile: ObjectProfile, weights: bytes) -> None:

@@ -152,7 +152,8 @@ def write_all(files: dict[Path, bytes]) -> None:
         for path, part in parts.items():
             part.replace(path)
     except OSError as error:
-        raise ConfigError(f"can't write {' and '.join(map(str, files))}: {error.strerror}") from error
+        names = " and ".join(map(str, files))
+        raise ConfigError(f"can't write {names}: {error.strerror}, {error.filename}") from error
 
 
 def _parse(text: str, what_fails: str) -> Any:
