@@ -231,7 +231,7 @@ def main() -> None:
         print(summary(mine, rung))
     print(summary(mine, DEFAULT, "with_process_"))
     print("\n| held out | " + " | ".join(COLUMNS.values()) + " |\n" + "|---" * (len(COLUMNS) + 1) + "|")
-    held_out = [row for key, rows in mine.items() if key.startswith(DEFAULT) for row in rows]
+    held_out = [row for key, rows in mine.items() if key.startswith(f"{DEFAULT}: ") for row in rows]
     held_out.append(
         {"object": "mean", **{name: np.mean([row[name] for row in held_out]) for name in COLUMNS}}
     )
