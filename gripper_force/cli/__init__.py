@@ -86,7 +86,7 @@ def grasp(
         log = job.new_log(settings)
         try:
             result = job.grasp(settings, phases(), log)
-        except BaseException:
+        except KeyboardInterrupt:
             if log.exists():
                 console.err.print(f"what was seen is in {log}: gripper-force replay {log}", soft_wrap=True)
             raise

@@ -55,7 +55,8 @@ class _Exact:
         self._push_n = self._force_n = self._difference_n = Decimal(0)
         self._share = Decimal(1)
         self._variance_n2 = self._prior_n2(self._force_n)
-        self._history: deque[tuple[int, Decimal]] = deque(maxlen=64)
+        cycles = math.ceil(control.rate_hz * control.vision_age_ms / 1e3) + 2
+        self._history: deque[tuple[int, Decimal]] = deque(maxlen=cycles)
         self._newest_ns = -1
         self._run = 0
 
