@@ -88,7 +88,10 @@ def test_a_slow_disk_keeps_nobody_waiting(gate: Gate, path: Path) -> None:
     with pytest.raises(LogError, match="the disk is too slow"):
         recorder.raise_losses()
     written = list(LogReader(path).records(Event))
-    assert written == events(recorder_module.ROOM + 100)[: len(written)]
+    sent = events(recorder_module.ROOM + 100)
+    # The thread holds one record beyond the queue's room, and may have taken it at any time meanwhile.
+    assert written[: recorder_module.ROOM] == sent[: recorder_module.ROOM]
+    assert all(event in sent[recorder_module.ROOM :] for event in written[recorder_module.ROOM :])
     assert len(written) + recorder.lost == recorder_module.ROOM + 100
 
 
