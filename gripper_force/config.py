@@ -267,6 +267,10 @@ class SimConfig(Section):
         0.05, ge=0, le=0.5, description="half-width of the uniform spread of the object's stiffness"
     )
     markers: bool = Field(False, description="whether each finger carries an ArUco marker beside its pad")
+    changing_light: bool = Field(
+        False, description="whether the light swells and fades during a run, by up to three tenths"
+    )
+    moving_background: bool = Field(False, description="whether things pass behind the object")
     camera_latency_ms: NonNegative = Field(15.0, description="from the middle of an exposure to its frame")
     exposure_ms: Positive = Field(4.0, description="at a camera.exposure_us of 4000")
 

@@ -21,6 +21,7 @@ from gripper_hw.dynamixel.control_table import load_model
 from gripper_hw.dynamixel.virtual import VirtualBus, VirtualServo, register_bus, unregister_bus
 from gripper_hw.sim.detail import settled
 from gripper_hw.sim.scene import Scene, draw_scene
+from gripper_hw.sim.surroundings import Surroundings
 from gripper_hw.sim.world import World
 
 if TYPE_CHECKING:
@@ -67,6 +68,7 @@ class SimulatedCamera:
 
     def __init__(self, world: World, scene: Scene, config: Config, clock: Clock, start_ns: int) -> None:
         self._world, self._scene, self._clock, self._start_ns = world, scene, clock, start_ns
+        self._surroundings = Surroundings(scene)
         self._latency_ns = round(config.sim.camera_latency_ms * NS_PER_MS)
         self._period_ns = round(NS_PER_S / config.camera.rate_hz)
         self._exposure = _exposure(config)
@@ -101,7 +103,8 @@ class SimulatedCamera:
         if self._closed:
             return
         picture = self._world.render(_OVERSAMPLED * FRAME_SIDE)
-        gray = expose(picture, self._scene.lux * self._exposure, self._scene.shot_noise, self._rng)
+        lux = self._scene.lux * self._surroundings.light(t_ns / NS_PER_S)
+        gray = expose(picture, lux * self._exposure, self._scene.shot_noise, self._rng)
         t_ns += self._start_ns
         self._under_way.append(Frame(t_ns, t_ns + self._latency_ns, self._seq, gray))
         self._seq += 1

@@ -24,6 +24,9 @@ _ROD_RADIUS_M = 0.012
 _FINGER_X_M = {"pads": 0.009, "rods": 0.022}
 """How far behind the middle of a pad its finger is."""
 
+PASSING = 4
+"""Things that pass behind the object in a scene whose background moves."""
+
 _MARKER_MATERIALS = "".join(
     f'<texture name="marker_{i}" type="2d" file="marker_{i}.png"/>'
     f'<material name="marker_{i}" texture="marker_{i}" specular="0" shininess="0"/>'
@@ -65,6 +68,8 @@ class Scene:
         backlash_m: Half of the gear play at the rack.
         rod_length_m: How far a rod, where that is the tool, stands out of its finger.
         markers: Whether each finger carries an ArUco marker.
+        changing_light: Whether the light swells and fades.
+        moving_background: Whether things pass behind the object.
     """
 
     object: str
@@ -90,6 +95,8 @@ class Scene:
     backlash_m: float = 0.0003
     rod_length_m: float = 0.020
     markers: bool = False
+    changing_light: bool = False
+    moving_background: bool = False
 
 
 def draw_scene(object_name: str, seed: int, config: SimConfig) -> Scene:
@@ -110,6 +117,8 @@ def draw_scene(object_name: str, seed: int, config: SimConfig) -> Scene:
     return replace(
         rig,
         markers=config.markers,
+        changing_light=config.changing_light,
+        moving_background=config.moving_background,
         size=1.0 if known else itself.size,
         stiffness=1.0 if known else itself.stiffness,
         texture_seed=itself.texture_seed,
@@ -187,6 +196,7 @@ def scene_mjcf(scene: Scene, gripper: GripperConfig, *, seen: bool = True) -> tu
         contact=model.contact,
         jaw_start=_text([gripper.open_width_m / 2 + _PAD_HALF_THICKNESS_M]),
         jaw_travel=_text([gripper.open_width_m / 2 - 0.001]),
+        passing=_passing(scene),
         left_tool=_tool(scene, -1),
         right_tool=_tool(scene, 1),
         left_marker=_marker(scene, -1),
@@ -227,6 +237,17 @@ def _marker(scene: Scene, side: int) -> str:
     return (
         f'<geom type="box" size=".008 .008 .0003" euler="90 0 0" pos="{place}" contype="0" conaffinity="0" '
         f'mass="0" material="marker_{(side + 1) // 2}"/>'
+    )
+
+
+def _passing(scene: Scene) -> str:
+    """Boxes and eggs, from dark to bright; `World` moves them."""
+    if not scene.moving_background:
+        return ""
+    return "".join(
+        f'<geom name="passing_{i}" type="{"ellipsoid" if i % 2 else "box"}" size="{_text(size)}" '
+        f'rgba="{_text([*(3 * [(i + 1) / PASSING]), 1])}" contype="0" conaffinity="0"/>'
+        for i, size in enumerate(np.random.default_rng(scene.table_seed).uniform(0.008, 0.025, (PASSING, 3)))
     )
 
 

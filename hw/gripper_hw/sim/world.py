@@ -13,6 +13,7 @@ from gripper_force.errors import SimulationError
 from gripper_force.types import NS_PER_S
 from gripper_hw.sim.engine import mujoco, new_renderer
 from gripper_hw.sim.scene import Scene, scene_mjcf
+from gripper_hw.sim.surroundings import Surroundings
 
 _MAX_PENETRATION_M = 0.004
 _MAX_RACK_SLIP_M = 0.005
@@ -87,7 +88,7 @@ class World:
                 f"comes of it can't be trusted; take one of at most {1e3 * _LONGEST_STEP_S:g} ms"
             )
         self._data: Any = mujoco.MjData(self._model)
-        self._scene, self._motor = scene, motor
+        self._scene, self._motor, self._surroundings = scene, motor, Surroundings(scene)
         self._nm_per_a = nm_per_a * scene.nm_per_a
         self._rng = np.random.default_rng([seed, 1])
         self.step_ns = round(self._model.opt.timestep * NS_PER_S)
@@ -143,6 +144,7 @@ class World:
         if self._renderer is None:
             self._renderer = self._new_renderer(side)
         if self._picture is None or self._picture[0] != self.t_ns:  # one drawing serves all light levels
+            self._move_background()
             self._renderer.update_scene(self._data, "camera")
             self._picture = self.t_ns, self._renderer.render()
         return self._picture[1]
@@ -158,6 +160,11 @@ class World:
         for flag in _NOT_DRAWN:
             renderer.scene.flags[flag] = 0
         return renderer
+
+    def _move_background(self) -> None:
+        """Nothing touches what passes, so it moves where it is drawn: the physics is the same without it."""
+        for i, place_m in enumerate(self._surroundings.places_m(self.t_ns / NS_PER_S)):
+            self._data.geom_xpos[self._model.geom(f"passing_{i}").id] = place_m
 
     def _guard(self, _: int) -> None:
         """`discrete` fails silently: a wrong world has to be looked for."""

@@ -68,6 +68,25 @@ def test_a_seed_gives_one_world_to_the_bit_and_another_seed_another(make_rig: Ma
     assert (first[1][0].gray != other[1][0].gray).any()
 
 
+def test_a_moving_background_is_seen_and_touches_nothing(make_rig: MakeRig) -> None:
+    still, moving = (squeeze(make_rig(f"sim.moving_background={asked}")) for asked in ("false", "true"))
+    assert moving[0] == still[0]
+    assert moving[2] == still[2]
+    differs = np.array([a.gray != b.gray for a, b in zip(moving[1], still[1], strict=True)])  # (T, H, W)
+    assert differs.any((1, 2)).mean() > 0.3  # they pass out of sight as well
+    assert (differs[0] != differs[-1]).any()
+    assert differs.mean() < 0.5
+
+
+def test_a_changing_light_is_seen_and_touches_nothing(make_rig: MakeRig) -> None:
+    steady, changing = (squeeze(make_rig(f"sim.changing_light={asked}")) for asked in ("false", "true"))
+    assert changing[2] == steady[2]
+    linear = [[(f.gray / 255.0) ** 2.2 for f in frames] for frames in (changing[1], steady[1])]
+    light = [a.mean() / b.mean() for a, b in zip(*linear, strict=True)]
+    assert 0.65 < min(light) < max(light) < 1.35
+    assert max(light) - min(light) > 0.02
+
+
 @pytest.mark.parametrize("latency_ms", [0.0, 40.0])
 def test_a_frame_comes_after_the_cameras_latency(make_rig: MakeRig, latency_ms: float) -> None:
     rig = make_rig(f"sim.camera_latency_ms={latency_ms}", "camera.rate_hz=100")

@@ -15,7 +15,15 @@ def test_a_seed_draws_one_scene_and_another_seed_another() -> None:
     assert draw_scene("tube", 3, config) == draw_scene("tube", 3, config)
     first, second = asdict(draw_scene("tube", 3, config)), asdict(draw_scene("tube", 4, config))
     same = {name for name in first if first[name] == second[name]}
-    assert same == {"object", "detail", "tool", "rod_length_m", "markers"}
+    assert same == {
+        "object",
+        "detail",
+        "tool",
+        "rod_length_m",
+        "markers",
+        "changing_light",
+        "moving_background",
+    }
 
 
 def test_what_is_asked_for_is_not_drawn() -> None:
@@ -99,8 +107,9 @@ def test_every_drawn_number_reaches_the_model() -> None:
     gripper = GripperConfig()
     plain = Scene("sponge", "coarse", "rods")
     before = scene_mjcf(plain, gripper)
-    drawn = asdict(draw_scene("sponge", 1, SimConfig(tool="rods", markers=True)))
-    for name in drawn.keys() - {"object", "detail", "tool", "lux", "shot_noise", "nm_per_a"}:
+    drawn = asdict(draw_scene("sponge", 1, SimConfig(tool="rods", markers=True, moving_background=True)))
+    not_of_the_model = {"object", "detail", "tool", "lux", "shot_noise", "nm_per_a", "changing_light"}
+    for name in drawn.keys() - not_of_the_model:
         after = scene_mjcf(replace(plain, **{name: drawn[name]}), gripper)
         if name not in ("texture_seed", "table_seed"):
             assert after[0] != before[0], name
