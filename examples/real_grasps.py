@@ -61,7 +61,7 @@ RUNGS: dict[str, dict[str, Any]] = {
 }
 """What each changes in `BASE`."""
 
-DEFAULT = "spatial attention"
+DEFAULT = "deeper: ResNet-18"
 RIDGE = "ridge regression"
 PROCESSES = {"Gaussian process, difference": False, "Gaussian process, magnitude": True}
 """See one moment and no window; take a second where a network takes minutes. Which of them see magnitudes."""
@@ -74,7 +74,8 @@ COLUMNS = {
     "calibrated_mae_n": "after one trial",
     "same_day_mae_n": "of the same day",
     "contact_mae_n": "in contact",
-    "one_gain_mae_n": "its gain known",
+    "best_line_mae_n": "its best line known",
+    "best_trial_line_mae_n": "each trial's",
     "gain": "gain",
     "correlation": "correlation",
 }
@@ -112,7 +113,6 @@ def run(rung: str, fold: list[str], clips: list[Clip], minutes: float, out: Path
                 "with_process_contact_mae_n": together[name]["contact_mae_n"],
                 "gain": gain,
                 "correlation": float(np.corrcoef(estimated_n, measured_n)[0, 1]),
-                "one_gain_mae_n": float(np.abs(estimated_n / gain - measured_n).mean()),
                 **calibrated(checkpoint, [c for c, _ in pairs]),
             }
         )
@@ -160,6 +160,8 @@ def calibrated(checkpoint: Checkpoint, clips: list[Clip]) -> dict[str, float]:
         estimate_n = forces_n.mean(0)[seen].astype(np.float64)
         trials.append(Touches(read_out[seen], estimate_n, clip.forces_n[seen].astype(np.float64), whose))
     errors_n: dict[str, list[np.ndarray]] = {"calibrated_mae_n": [], "same_day_mae_n": []}
+    errors_n["best_line_mae_n"] = [_beside_best_line(trials)]
+    errors_n["best_trial_line_mae_n"] = [_beside_best_line([trial]) for trial in trials]
     for one, trial in zip(clips, trials, strict=True):
         try:
             correct = fit_correction(trial).predict
@@ -172,6 +174,15 @@ def calibrated(checkpoint: Checkpoint, clips: list[Clip]) -> dict[str, float]:
                 if other.set == one.set:
                     errors_n["same_day_mae_n"].append(error_n)
     return {name: float(np.concatenate(parts).mean()) for name, parts in errors_n.items()}
+
+
+def _beside_best_line(trials: list[Touches]) -> np.ndarray:
+    """Absolute errors of the line that hindsight draws: no gain and offset do better."""
+    estimate_n, force_n = (
+        np.concatenate([getattr(t, of) for t in trials]) for of in ("estimate_n", "force_n")
+    )
+    sides = np.stack([estimate_n, np.ones_like(estimate_n)], 1)
+    return np.abs(sides @ np.linalg.lstsq(sides, force_n)[0] - force_n)
 
 
 def _as_it_is(touches: Touches) -> np.ndarray:
