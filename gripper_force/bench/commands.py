@@ -23,6 +23,8 @@ COMMANDS: Final = (
     "train data --out force.safetensors --set steps=20",
     "evaluate tests --checkpoint force.safetensors",
     "export --out force.xml",
+    "calibrate servo --gauge-mm 30 --yes --set object=block --rig rig.yaml",
+    "calibrate camera --object sponge --seed 3 --set sim.markers=true --rig rig.yaml",
     "calibrate object tube --touches 3 --folder touches --out tube.yaml",
     "reproduce 7",
     "stability --part filter",
