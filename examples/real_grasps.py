@@ -56,8 +56,8 @@ RUNGS: dict[str, dict[str, Any]] = {
     "with augmentation": {"attentions": ["none"], **AUGMENTED},
     "spatial attention, with augmentation": AUGMENTED,
     "channel attention": {"attentions": ["scam"]},
-    "deeper: ResNet-18": {"backbone": "resnet18"},
     "spatial attention": {},
+    "deeper: ResNet-18": {"backbone": "resnet18"},
 }
 """What each changes in `BASE`."""
 

@@ -12,7 +12,7 @@ _LIGHT_SPREAD = 0.3
 
 _PASSING_HZ = (0.1, 0.6)
 _BEHIND_M = np.array([[-0.12, 0.10, 0.0], [0.12, 0.24, 0.08]])
-"""Corners of the space where things pass: in sight, but behind every object and the rods."""
+"""Corners of the space where things pass: behind every object and the rods, in sight part of the time."""
 
 
 class Surroundings:

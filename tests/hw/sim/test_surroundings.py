@@ -24,13 +24,13 @@ def test_light_changes_by_three_tenths_at_most_and_things_pass_behind_the_object
 
 
 @given(SEEDS)
-def test_light_and_things_are_never_still_for_a_second(seed: int) -> None:
+def test_light_and_things_are_never_still_for_long(seed: int) -> None:
     surroundings = Surroundings(
         Scene("tube", "coarse", table_seed=seed, changing_light=True, moving_background=True)
     )
-    times_s = np.linspace(0, 1, 50)
+    times_s = np.linspace(0, 10, 200)  # a period of the slowest
     assert np.ptp([surroundings.light(t_s) for t_s in times_s]) > 0.01
-    assert (np.ptp([surroundings.places_m(t_s) for t_s in times_s], axis=0) > 1e-4).all()
+    assert (np.ptp([surroundings.places_m(t_s) for t_s in times_s], axis=0) > 0.01).all()
 
 
 @given(SEEDS, TIMES_S)
