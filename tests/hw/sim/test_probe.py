@@ -2,15 +2,31 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 from gripper_force.config import Config
 from gripper_force.doctor import Check
 from gripper_hw.sim.probe import probe
+from gripper_hw.sim.world import World
 
 
 def test_a_scene_is_drawn() -> None:
     (check,) = probe(Config.model_validate({"object": "stapler", "sim": {"detail": "coarse"}}))
     assert (check.unit, check.name, check.ok) == ("simulation", "EGL", True)
     assert check.found.startswith("draws 16x16 pixels of 'stapler'")
+
+
+def test_each_picture_that_is_timed_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    times_ns = []
+    render = World.render
+
+    def counted(world: World, side: int) -> object:
+        times_ns.append(world.t_ns)
+        return render(world, side)
+
+    monkeypatch.setattr(World, "render", counted)
+    list(probe(Config.model_validate({"object": "stapler", "sim": {"detail": "coarse"}})))
+    assert len(set(times_ns)) == len(times_ns) > 3
 
 
 def test_without_egl_it_says_what_to_install() -> None:
