@@ -28,8 +28,8 @@ from gripper_calibration.fits.correction import fit_correction
 from gripper_calibration.procedures.object import calibrate, touch
 from gripper_force.config import Config, load_config
 from gripper_force.errors import DataError
-from gripper_force.grasp import grasp
-from gripper_force.object_profile import read_object
+from gripper_force.jobs.grasp import grasp
+from gripper_force.profiles.object import read_object
 from gripper_force.vision.checkpoint import load_checkpoint
 
 KINDS = ("sponge", "paper_cup", "tube", "stapler", "ball")

@@ -16,8 +16,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from gripper_force.dataset import CONTACT_N, load_clip
-from gripper_force.log import LogReader
+from gripper_force.jobs.dataset import CONTACT_N, load_clip
+from gripper_force.runtime.log import LogReader
 from gripper_force.types import NS_PER_S, Frame, ServoState
 from gripper_force.vision.preprocess import Preprocess
 

@@ -27,12 +27,12 @@ from rich.progress import track
 
 from gripper_calibration.fits.correction import fit_correction
 from gripper_calibration.fits.touches import Touches
-from gripper_force.dataset import CONTACT_N, Clip, load_clips
 from gripper_force.errors import DataError
-from gripper_force.evaluate import Result, compare, estimates, ridge_baseline
-from gripper_force.training.recipe import TrainConfig
-from gripper_force.training.train import train
-from gripper_force.video_import import import_folder
+from gripper_force.jobs.dataset import CONTACT_N, Clip, load_clips
+from gripper_force.jobs.evaluate import Result, compare, estimates, ridge_baseline
+from gripper_force.jobs.imports.video import import_folder
+from gripper_force.jobs.training.recipe import TrainConfig
+from gripper_force.jobs.training.train import train
 from gripper_force.vision.checkpoint import Checkpoint
 from gripper_force.vision.dense import features, normalise
 from gripper_force.vision.preprocess import Preprocess

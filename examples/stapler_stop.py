@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from gripper_force.dataset import load_clips
-from gripper_force.evaluate import estimates
-from gripper_force.log import LogReader
+from gripper_force.jobs.dataset import load_clips
+from gripper_force.jobs.evaluate import estimates
+from gripper_force.runtime.log import LogReader
 from gripper_force.types import GraspStatus, LoadCellSample
 from gripper_force.vision.checkpoint import load_checkpoint
 

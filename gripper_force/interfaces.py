@@ -1,4 +1,4 @@
-"""What the core asks of a device; `gripper_force.backends` picks the class by name."""
+"""What the core asks of a device; `gripper_force.runtime.backends` picks the class by name."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -121,7 +121,7 @@ class Clock(Protocol):
 
 @dataclass(slots=True)
 class Devices:
-    """What a run drives, built by `gripper_force.backends.open_devices`.
+    """What a run drives, built by `gripper_force.runtime.backends.open_devices`.
 
     Attributes:
         clock: The run's time.

@@ -11,10 +11,10 @@ from gripper_calibration.fits.plant import Press
 from gripper_calibration.fits.touches import Floats, Touches
 from gripper_force.config import Config, config_from_text
 from gripper_force.control.transmission import Transmission
-from gripper_force.dataset import CONTACT_N, load_clip
 from gripper_force.errors import DataError
-from gripper_force.log import LogReader
-from gripper_force.metrics import lag_s
+from gripper_force.jobs.dataset import CONTACT_N, load_clip
+from gripper_force.jobs.metrics import lag_s
+from gripper_force.runtime.log import LogReader
 from gripper_force.types import NS_PER_S, Frame, GraspStatus, LoadCellSample, Phase, ServoState
 from gripper_force.vision.checkpoint import Checkpoint
 from gripper_force.vision.dense import features

@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from gripper_force.errors import DataError
-from gripper_force.report.figure import STYLE
-from gripper_force.rig import Estimate
+from gripper_force.jobs.report.figure import STYLE
+from gripper_force.profiles.rig import Estimate
 
 DATA: Final = "#7f9cc0"
 FIT: Final = "#c2410c"

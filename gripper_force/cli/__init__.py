@@ -1,4 +1,4 @@
-"""The command line: parse, call, and let `gripper_force.tables` print.
+"""The command line: parse, call, and let `gripper_force.cli.output` print.
 
 Every command takes ``--set key.path=value`` and ``--json``. With ``--json`` one JSON object goes to stdout;
 progress and messages go to stderr always. Bad input is one sentence on stderr and exit code 2. Exit code 1
@@ -16,12 +16,11 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from gripper_force import console
-from gripper_force.cli import bench, calibrate, data, learning, stability
+from gripper_force.cli import bench, calibrate, console, data, learning, stability
 from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, load_settings
+from gripper_force.cli.output.doctor import changes_table, checks_table, setup_line
+from gripper_force.cli.output.runs import grasp_table, phases, replay_table, trials_table
 from gripper_force.errors import ConfigError, GripperError
-from gripper_force.tables.doctor import changes_table, checks_table, setup_line
-from gripper_force.tables.runs import grasp_table, phases, replay_table, trials_table
 
 app = typer.Typer(
     help="A robot gripper that feels with its eyes: run, calibrate, replay.",
@@ -69,7 +68,7 @@ def grasp(
     jobs: Jobs = CORES,
 ) -> None:
     """Grasp with the wanted force, and report how well. Exit code 1 where nothing was held."""
-    from gripper_force import grasp as job
+    from gripper_force.jobs import grasp as job
 
     settings = load_settings(
         config,
@@ -116,13 +115,13 @@ def replay(
     report: Annotated[bool, typer.Option(help="Write the report again, beside the log.")] = False,
 ) -> None:
     """Run estimator and controller again on a log, and compare them with its load cell."""
-    from gripper_force.replay import replay as job
+    from gripper_force.jobs.replay import replay as job
 
     if report and (set_ or checkpoint):
         raise ConfigError("--report draws the run as it was; leave --set and --checkpoint out, or --report")
     result = job(log, checkpoint, overrides=set_, recover=recover)
     if report:
-        from gripper_force.report import write_report
+        from gripper_force.jobs.report import write_report
 
         result["report"] = str(write_report(log, recover=recover).html)
     console.show(result, as_json, replay_table)
@@ -135,11 +134,11 @@ def virtual_servo(
     as_json: AsJson = False,
 ) -> None:
     """Serve virtual servos at a device path that any Dynamixel client can open, until Ctrl-C."""
-    from gripper_force.backends import VIRTUAL_SERVO, load
+    from gripper_hw.dynamixel.pty_server import serve_virtual_servo
 
     servo = load_settings(None, set_, {"servo.model": model}).servo
     who = ids or [servo.id]
-    with load(VIRTUAL_SERVO)(servo.model, who) as server:
+    with serve_virtual_servo(servo.model, who) as server:
         console.show({"port": server.device_path, "model": servo.model, "ids": who}, as_json)
         sys.stdout.flush()
         console.err.print("serving until Ctrl-C")
@@ -156,7 +155,7 @@ def doctor(
     as_json: AsJson = False,
 ) -> None:
     """Look at every device and this machine, and say what to do. Exit code 1 if something is to be done."""
-    from gripper_force import doctor as job
+    from gripper_force.jobs import doctor as job
 
     settings = load_settings(config, set_, {})
     if setup:

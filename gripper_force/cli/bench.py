@@ -6,10 +6,9 @@ from typing import Annotated, Any
 
 import typer
 
-from gripper_force import console
+from gripper_force.cli import console
 from gripper_force.cli.options import CORES, AsJson, Jobs
-from gripper_force.errors import ConfigError
-from gripper_force.tables.bench import (
+from gripper_force.cli.output.bench import (
     bus_table,
     commands_table,
     estimator_table,
@@ -18,6 +17,7 @@ from gripper_force.tables.bench import (
     scene_table,
     startup_table,
 )
+from gripper_force.errors import ConfigError
 
 
 def bench(
@@ -120,11 +120,11 @@ def _estimator(
 ) -> dict[str, Any]:
     from tempfile import TemporaryDirectory
 
-    from gripper_force.bench import estimator as job
     from gripper_force.config import Config
-    from gripper_force.dataset import load_clips
-    from gripper_force.report.markers import write_between
-    from gripper_force.simulate import plan, simulate
+    from gripper_force.jobs.dataset import load_clips
+    from gripper_force.jobs.simulate import plan, simulate
+    from gripper_force.qualification.bench import estimator as job
+    from gripper_force.qualification.markdown_blocks import write_between
     from gripper_force.vision.header import SHIPPED
 
     if (data is None) != (scale_on is None):
@@ -159,7 +159,7 @@ def _estimator(
 
 
 def _bus(cycles: int) -> dict[str, Any]:
-    from gripper_force.bench import bus as job
+    from gripper_force.qualification.bench import bus as job
 
     costs: list[Any] = []
     with console.bar("measuring", len(job.BUS_SETTINGS)) as advance:
@@ -170,7 +170,7 @@ def _bus(cycles: int) -> dict[str, Any]:
 
 
 def _commands() -> dict[str, Any]:
-    from gripper_force.bench import commands as job
+    from gripper_force.qualification.bench import commands as job
 
     taken = []
     with console.bar("running", len(job.COMMANDS)) as advance:
@@ -181,7 +181,7 @@ def _commands() -> dict[str, Any]:
 
 
 def _startup() -> dict[str, Any]:
-    from gripper_force.bench import startup as job
+    from gripper_force.qualification.bench import startup as job
 
     rows = []
     with console.bar("starting", len(job.SCENES)) as advance:
@@ -192,7 +192,7 @@ def _startup() -> dict[str, Any]:
 
 
 def _loop(seconds: float, overrides: list[str]) -> dict[str, Any]:
-    from gripper_force.bench import loop as job
+    from gripper_force.qualification.bench import loop as job
 
     with console.err.status(f"running for {2 * seconds:g} s"):
         costs, log = job.loop(seconds, overrides)
@@ -200,17 +200,17 @@ def _loop(seconds: float, overrides: list[str]) -> dict[str, Any]:
 
 
 def _scene(objects: list[str], page: Path | None) -> dict[str, Any]:
-    from gripper_force.bench import scene as job
+    from gripper_force.qualification.bench import scene as job
 
     if page is not None and objects:
         raise ConfigError("--write needs all objects: leave out --object")
     rows = []
     with console.err.status("squeezing") as status:
-        for row in job.scene(objects, keep=page is not None):
+        for row in job.scene_costs(objects, keep_table=page is not None):
             rows.append(row)
             status.update(f"squeezed {row.object}, {row.detail}")
     if page is not None:
-        from gripper_force.report.markers import write_between
+        from gripper_force.qualification.markdown_blocks import write_between
 
         write_between(page, "detail", job.markdown(rows))
     return {"scene": rows}
@@ -219,8 +219,8 @@ def _scene(objects: list[str], page: Path | None) -> dict[str, Any]:
 def _learning(data: Path, minutes: float, overrides: list[str], out_: Path, jobs: int) -> dict[str, Any]:
     from functools import partial
 
-    from gripper_force.dataset import load_clips
-    from gripper_force.training.learning import learn, reached
+    from gripper_force.jobs.dataset import load_clips
+    from gripper_force.qualification.bench.training import learn, reached
 
     points = []
     for point in learn(partial(load_clips, data, workers=jobs), minutes, overrides, out_):

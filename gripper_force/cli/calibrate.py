@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gripper_force import console
+from gripper_force.cli import console
 from gripper_force.cli.options import AsJson, ConfigPath, Overrides, load_settings
+from gripper_force.cli.output.calibrate import object_table, rig_table
 from gripper_force.errors import ConfigError
-from gripper_force.tables.calibrate import object_table, rig_table
 
 if TYPE_CHECKING:
     from gripper_force.config import Config
@@ -142,7 +142,7 @@ def object_(
 ) -> None:
     """Learn an object by touching it with the load cell in place. Ctrl-C calibrates on what there is."""
     from gripper_calibration.procedures import object as job
-    from gripper_force.object_profile import user_folder
+    from gripper_force.profiles.object import user_folder
 
     settings = load_settings(config, set_, {"object": name, "seed": seed})
     if logs is None:

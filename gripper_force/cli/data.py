@@ -5,10 +5,10 @@ from typing import Annotated, Any
 
 import typer
 
-from gripper_force import console
+from gripper_force.cli import console
 from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, load_settings
+from gripper_force.cli.output.data import database_table, imports_table, sets_table
 from gripper_force.errors import ConfigError, DataError
-from gripper_force.tables.data import database_table, imports_table, sets_table
 
 import_app = typer.Typer(no_args_is_help=True, help="Turn other recordings into logs.")
 
@@ -47,7 +47,7 @@ def simulate(
     as_json: AsJson = False,
 ) -> None:
     """Write logs of randomised touches, to train and to evaluate on. Goes on where it was broken off."""
-    from gripper_force import simulate as job
+    from gripper_force.jobs import simulate as job
 
     plans: list[Any]
     if protocol is None:
@@ -113,8 +113,8 @@ def record(
     OUT/train. At the end each set is judged: frames, losses, forces, and whether camera and load cell agree
     in time. Sets that are there already are kept, so a recording that was broken off goes on.
     """
-    from gripper_force.recording import record as job
-    from gripper_force.recording.summary import summarise
+    from gripper_force.jobs.recording import record as job
+    from gripper_force.jobs.recording.summary import summarise
 
     options = {"object": object_, "seed": seed, "sim.yaw_deg": degrees, "sim.lux": lux}
     settings = load_settings(config, set_, options)
@@ -146,7 +146,7 @@ def import_video(
     as_json: AsJson = False,
 ) -> None:
     """Import a video and its load-cell table, or a folder of them. Spikes, tare and lag are told."""
-    from gripper_force import video_import as job
+    from gripper_force.jobs.imports import video as job
 
     region = load_settings(None, set_, {}).vision.region
 
@@ -175,7 +175,7 @@ def import_database(
 
     Goes on where it was broken off.
     """
-    from gripper_force.database_import import find_environments, import_environment
+    from gripper_force.jobs.imports.database import find_environments, import_environment
 
     settings = load_settings(None, set_, {"camera.rate_hz": rate_hz})
     environments, ignored = find_environments(database)

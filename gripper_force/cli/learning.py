@@ -7,11 +7,11 @@ from typing import Annotated, Any
 
 import typer
 
-from gripper_force import console
+from gripper_force.cli import console
 from gripper_force.cli.options import CORES, AsJson, Jobs, Overrides, load_settings
+from gripper_force.cli.output.paper import paper_tables
+from gripper_force.cli.output.runs import errors_table
 from gripper_force.errors import ConfigError, DataError
-from gripper_force.tables.paper import paper_tables
-from gripper_force.tables.runs import errors_table
 
 
 def train(
@@ -40,9 +40,9 @@ def train(
     as_json: AsJson = False,
 ) -> None:
     """Train the force network on logs; under `torchrun`, in several processes."""
-    from gripper_force.dataset import load_clips
-    from gripper_force.training.recipe import recipe as named
-    from gripper_force.training.train import train as job
+    from gripper_force.jobs.dataset import load_clips
+    from gripper_force.jobs.training.recipe import recipe as named
+    from gripper_force.jobs.training.train import train as job
     from gripper_force.vision.checkpoint import load_checkpoint
 
     settings = named(recipe, set_)
@@ -71,9 +71,9 @@ def evaluate(
     as_json: AsJson = False,
 ) -> None:
     """Compare a checkpoint's estimates with the load cell, over all logs of a folder."""
-    from gripper_force.dataset import load_clips
-    from gripper_force.evaluate import evaluate as job
-    from gripper_force.profiles import correction_of
+    from gripper_force.jobs.dataset import load_clips
+    from gripper_force.jobs.evaluate import evaluate as job
+    from gripper_force.profiles.apply import correction_of
     from gripper_force.vision.checkpoint import load_checkpoint
 
     settings = load_settings(None, set_, {"vision.checkpoint": checkpoint, "calibration.object": profile})
@@ -105,7 +105,7 @@ def export(
     as_json: AsJson = False,
 ) -> None:
     """Write a network's streaming step for another engine, checked against PyTorch."""
-    from gripper_force.dataset import load_clips
+    from gripper_force.jobs.dataset import load_clips
     from gripper_force.vision.export import export as job
     from gripper_force.vision.exported import read_model
 
@@ -141,8 +141,8 @@ def reproduce(
     as_json: AsJson = False,
 ) -> None:
     """Make the paper's tables and figures again, beside its own numbers. Goes on where it was broken off."""
-    from gripper_force.reproduce import page
-    from gripper_force.reproduce.models import SCALES, Scale
+    from gripper_force.qualification.paper import page
+    from gripper_force.qualification.paper.models import SCALES, Scale
     from gripper_force.schema import section_from
 
     names = page.asked_for(what)
@@ -156,7 +156,7 @@ def reproduce(
     for name, figure in result.figures.items():
         figure.savefig(pictures / f"{name}.png")
     if write is not None:
-        from gripper_force.report.markers import write_between
+        from gripper_force.qualification.markdown_blocks import write_between
 
         for place, text in page.markdown(result, scale, settings, test, pictures.name).items():
             write_between(write, place, text)

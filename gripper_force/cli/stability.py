@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from gripper_force import console
+from gripper_force.cli import console
 from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, load_settings
+from gripper_force.cli.output.stability import faults_table, fuzz_table, numerics_tables, soak_table
 from gripper_force.errors import ConfigError
-from gripper_force.tables.stability import faults_table, fuzz_table, numerics_tables, soak_table
 
 if TYPE_CHECKING:
     from gripper_force.config import Config
@@ -64,13 +64,13 @@ def stability(
         result = _fault_matrix(load_settings(config, set_, {"seed": seed}), seeds, live, jobs, write, resume)
         console.show(result, as_json, faults_table)
     elif fuzz is not None:
-        from gripper_force.stability.fuzz import fuzz as feed
+        from gripper_force.qualification.fuzz.run import fuzz as feed
 
         with console.bar("fuzzing", fuzz) as advance:
             result = feed(fuzz, seed, jobs, folder, advance, only=only)
         console.show(result, as_json, fuzz_table)
     else:
-        from gripper_force.stability.soak import soak as grasp_on
+        from gripper_force.qualification.soak import soak as grasp_on
 
         settings = load_settings(config, ["sim.detail=coarse", *(set_ or [])], {"seed": seed})
         with console.bar("soaking", round(soak or 0)) as advance:
@@ -81,8 +81,8 @@ def stability(
 
 
 def _numbers(settings: "Config", parts: list[str], page: Path | None) -> dict[str, Any]:
-    from gripper_force.report.markers import write_between
-    from gripper_force.stability.numerics import PARTS, markdown, run
+    from gripper_force.qualification.markdown_blocks import write_between
+    from gripper_force.qualification.numerics.run import PARTS, markdown, run
 
     with console.bar("hard cases", len(parts or PARTS)) as advance:
         result = run(settings, parts, page and page.with_suffix(""), advance)
@@ -95,8 +95,8 @@ def _numbers(settings: "Config", parts: list[str], page: Path | None) -> dict[st
 def _fault_matrix(
     settings: "Config", seeds: int, live: int, jobs: int, page: Path | None, resume: bool
 ) -> dict[str, Any]:
-    from gripper_force.report.markers import write_between
-    from gripper_force.stability.faults import count_grasps, markdown, run_matrix
+    from gripper_force.qualification.fault_matrix.run import count_grasps, markdown, run_matrix
+    from gripper_force.qualification.markdown_blocks import write_between
 
     with console.bar("breaking things", count_grasps(seeds, live)) as advance:
         keep = settings.log.directory / "faults.jsonl"

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from gripper_force.config import ControlConfig
 from gripper_force.control.fusion import OBSERVER_LAG_S
-from gripper_force.control.profile import Profile
+from gripper_force.control.trajectory import Profile
 from gripper_force.control.transmission import Transmission
 from gripper_force.control.tuning import Gains, Plant, phase_margin_deg, simc
 from gripper_force.types import FusedForce, Source

@@ -7,8 +7,8 @@ import numpy as np
 
 from gripper_force.config import VisionConfig
 from gripper_force.errors import DataError, NonFiniteError
+from gripper_force.profiles.correction import Correction
 from gripper_force.types import Gray
-from gripper_force.vision.correction import Correction
 from gripper_force.vision.engines import Engine, Floats, open_engine
 from gripper_force.vision.header import RESIDUAL_HALF_N, Model
 from gripper_force.vision.plausible import Plausibility

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gripper_force.config import ControlConfig, GripperConfig
-from gripper_force.control.grasp import Decision, GraspController
+from gripper_force.control.state_machine import Decision, GraspController
 from gripper_force.control.transmission import Transmission
 from gripper_force.types import (
     NS_PER_S,

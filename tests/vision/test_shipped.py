@@ -3,9 +3,9 @@ from pathlib import Path
 import pytest
 
 from gripper_force.config import load_config
-from gripper_force.dataset import load_clips
-from gripper_force.evaluate import evaluate
-from gripper_force.simulate import plan, simulate
+from gripper_force.jobs.dataset import load_clips
+from gripper_force.jobs.evaluate import evaluate
+from gripper_force.jobs.simulate import plan, simulate
 from gripper_force.vision.checkpoint import load_checkpoint
 
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy.stats import t as student
 
 from gripper_force.errors import DataError
-from gripper_force.rig import Estimate
+from gripper_force.profiles.rig import Estimate
 from gripper_force.types import Gray
 from gripper_force.vision.preprocess import Region
 

@@ -18,8 +18,8 @@ from gripper_calibration.fits.interval import FEWEST, by_conformal, by_model
 from gripper_calibration.fits.output import BENDS, fit_curve, fit_line, identity
 from gripper_calibration.fits.touches import Floats, Touches, check
 from gripper_force.errors import DataError
-from gripper_force.object_profile import Interval, OutputCurve
-from gripper_force.vision.correction import HeadAndGate, curve_n
+from gripper_force.profiles.correction import HeadAndGate, curve_n
+from gripper_force.profiles.object import Interval, OutputCurve
 
 COVERAGE: Final = 0.9
 

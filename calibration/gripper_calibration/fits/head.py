@@ -9,7 +9,7 @@ matrix are a stable factorisation, and serve all penalties and all right sides.
 import numpy as np
 
 from gripper_calibration.fits.touches import Floats
-from gripper_force.vision.correction import Features
+from gripper_force.profiles.correction import Features
 
 PENALTIES = np.geomspace(1e1, 1e-6, 8)
 """Shares of the features' whole variance, the strongest first."""

@@ -18,7 +18,7 @@ from scipy.special import ndtri
 
 from gripper_calibration.fits.output import Line
 from gripper_calibration.fits.touches import Floats
-from gripper_force.object_profile import Interval
+from gripper_force.profiles.object import Interval
 
 FEWEST: Final = 3
 _LEAST_N: Final = 0.01

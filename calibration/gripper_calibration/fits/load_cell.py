@@ -8,7 +8,7 @@ import numpy.typing as npt
 from scipy import stats
 
 from gripper_force.errors import DataError
-from gripper_force.rig import Estimate
+from gripper_force.profiles.rig import Estimate
 from gripper_force.spikes import find_spikes
 
 BATCHES: Final = 10

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from gripper_calibration.fits.touches import Floats, Touches
-from gripper_force.object_profile import OutputCurve
+from gripper_force.profiles.object import OutputCurve
 
 GAIN_STD: Final = 0.25
 OFFSET_STD_N: Final = 0.1

@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 
 from gripper_calibration.fits.touches import Floats
 from gripper_force.control.tuning import Plant, phase_margin_deg, simc
-from gripper_force.object_profile import LoopPlant
+from gripper_force.profiles.object import LoopPlant
 
 _STEP_S: Final = 0.005
 _LONGEST_LAG_S: Final = 0.3

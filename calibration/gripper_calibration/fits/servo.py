@@ -9,7 +9,7 @@ import numpy.typing as npt
 from scipy import stats
 
 from gripper_force.errors import DataError
-from gripper_force.rig import Estimate
+from gripper_force.profiles.rig import Estimate
 
 LEAST_PRESSES: Final = 5
 LEAST_PASSES: Final = 8

@@ -6,9 +6,9 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from gripper_force.dataset import CONTACT_N
 from gripper_force.errors import DataError
-from gripper_force.vision.correction import Features
+from gripper_force.jobs.dataset import CONTACT_N
+from gripper_force.profiles.correction import Features
 
 Floats = npt.NDArray[np.float64]
 

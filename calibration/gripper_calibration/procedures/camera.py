@@ -23,15 +23,15 @@ from gripper_calibration.fits.camera import (
     telling,
 )
 from gripper_calibration.reports.camera import draw
-from gripper_force.assembly import checkpoint_of, settled
-from gripper_force.backends import open_devices
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
-from gripper_force.log import LogReader
-from gripper_force.recording.lag import camera_lags_s, load_cell_lag_s
-from gripper_force.recording.record import Plan, record
-from gripper_force.recording.summary import releases_ns
-from gripper_force.rig import CameraCalibration, Estimate, read_rig, update_rig
+from gripper_force.jobs.recording.lag import camera_lags_s, load_cell_lag_s
+from gripper_force.jobs.recording.record import Plan, record
+from gripper_force.jobs.recording.summary import releases_ns
+from gripper_force.profiles.rig import CameraCalibration, Estimate, read_rig, update_rig
+from gripper_force.runtime.assembly import checkpoint_of, settled
+from gripper_force.runtime.backends import open_devices
+from gripper_force.runtime.log import LogReader
 from gripper_force.types import (
     NS_PER_MS,
     NS_PER_S,
@@ -176,7 +176,7 @@ def watch(log: Path, region: Region | None) -> Seen:
     """Looks for markers and lags in a recorded set of touches.
 
     Args:
-        log: The set, as `gripper_force.recording.record` writes it.
+        log: The set, as `gripper_force.jobs.recording.record` writes it.
         region: Region of interest, if it is known; then no markers are looked for.
     """
     records: dict[type, list[Any]] = defaultdict(list)

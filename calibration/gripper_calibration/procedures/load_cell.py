@@ -10,11 +10,11 @@ import numpy as np
 
 from gripper_calibration.fits.load_cell import Rest, Weighing, fit_load_cell, level
 from gripper_calibration.reports.load_cell import draw
-from gripper_force.backends import LOAD_CELLS, MonotonicClock, load
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
 from gripper_force.interfaces import Clock, LoadCell
-from gripper_force.rig import LoadCellCalibration, read_rig, update_rig
+from gripper_force.profiles.rig import LoadCellCalibration, read_rig, update_rig
+from gripper_force.runtime.backends import LOAD_CELLS, MonotonicClock, load
 from gripper_force.types import NS_PER_MS, NS_PER_S, LoadCellSample
 
 STANDARD_GRAVITY_M_S2: Final = 9.80665

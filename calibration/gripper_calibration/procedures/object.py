@@ -13,14 +13,14 @@ from gripper_calibration import logs
 from gripper_calibration.fits.correction import COVERAGE, fit_correction, learning_curve
 from gripper_calibration.fits.plant import crushed_by, fit_plant, stiffness_n_m
 from gripper_calibration.reports.object import draw
-from gripper_force.assembly import settled
 from gripper_force.config import Config
 from gripper_force.errors import DataError
-from gripper_force.object_profile import ObjectProfile, check_place, write_object
-from gripper_force.recording.record import Plan, Progress, record
+from gripper_force.jobs.recording.record import Plan, Progress, record
+from gripper_force.profiles.correction import pack
+from gripper_force.profiles.object import ObjectProfile, check_place, write_object
+from gripper_force.runtime.assembly import settled
 from gripper_force.types import NS_PER_MS
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
-from gripper_force.vision.correction import pack
 from gripper_force.vision.estimator import open_estimator
 from gripper_force.vision.exported import read_model
 
@@ -52,7 +52,7 @@ def touch(
         progress: Told of the touch and the force, a few times a second.
 
     Raises:
-        GripperError: As `gripper_force.recording.record.record` does. Touches that are done stay.
+        GripperError: As `gripper_force.jobs.recording.record.record` does. Touches that are done stay.
     """
     sim = config.sim
     same = {

@@ -10,14 +10,14 @@ import numpy as np
 
 from gripper_calibration.fits.servo import Nominal, Pass, Press, ServoFit, fit_servo
 from gripper_calibration.reports.servo import draw
-from gripper_force.backends import open_devices
 from gripper_force.config import Config
 from gripper_force.control.limits import largest_target_n
 from gripper_force.control.safety import Safety
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import ConfigError, DataError, DeviceError
 from gripper_force.interfaces import Devices
-from gripper_force.rig import RigProfile, ServoCalibration, read_rig, update_rig
+from gripper_force.profiles.rig import RigProfile, ServoCalibration, read_rig, update_rig
+from gripper_force.runtime.backends import open_devices
 from gripper_force.types import NS_PER_S, ServoCommand, ServoState
 
 PRESSES: Final = ((3.0, 1.0), (6.0, 1.0), (12.0, 1.0), (3.0, 0.6), (6.0, 0.8), (12.0, 0.8))

@@ -9,7 +9,7 @@ from matplotlib.patches import Polygon, Rectangle
 
 from gripper_calibration.fits.camera import Markers, Rung, Touch, telling
 from gripper_calibration.report import DATA, FIT, GRAY, OTHER, name, picture, text_of
-from gripper_force.rig import CameraCalibration
+from gripper_force.profiles.rig import CameraCalibration
 from gripper_force.types import Gray
 
 

@@ -7,8 +7,8 @@ import numpy as np
 from gripper_calibration.fits.correction import Fitted
 from gripper_calibration.fits.touches import Touches
 from gripper_calibration.report import DATA, FIT, GRAY, name, picture
-from gripper_force.object_profile import ObjectProfile
-from gripper_force.vision.correction import curve_n
+from gripper_force.profiles.correction import curve_n
+from gripper_force.profiles.object import ObjectProfile
 
 
 def draw(

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gripper_force.backends import open_devices
 from gripper_force.config import Config
-from gripper_force.doctor import Check, gather, judged, only, rate_hz, time_of
+from gripper_force.jobs.doctor import Check, gather, judged, only, rate_hz, time_of
+from gripper_force.runtime.backends import open_devices
 from gripper_force.types import NS_PER_MS, Frame
 
 _SYSFS = Path("/sys")

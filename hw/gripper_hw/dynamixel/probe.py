@@ -7,17 +7,17 @@ from typing import Any, Final
 
 from serial.tools import list_ports
 
-from gripper_force.backends import open_devices
 from gripper_force.config import Config, ServoConfig
-from gripper_force.doctor import Agree, Change, Check, judged, only, time_ms
 from gripper_force.errors import DeviceError, DeviceTimeoutError, GripperError
+from gripper_force.jobs.doctor import Agree, Change, Check, judged, only, time_ms
+from gripper_force.runtime.backends import open_devices
+from gripper_hw.dynamixel.bus import Line
 from gripper_hw.dynamixel.control_table import (
     REGISTERS,
     check_model_number,
     load_model,
     model_names,
 )
-from gripper_hw.dynamixel.line import Line
 from gripper_hw.dynamixel.port import VIRTUAL_PREFIX
 from gripper_hw.dynamixel.servo import CYCLE_BYTES, DynamixelBus, hardware_error_text
 
@@ -80,7 +80,7 @@ def setup(config: Config, agree: Agree) -> dict[str, Any]:
     """Sets the configured servo up as a run would, so that EEPROM is written now and not then.
 
     Raises:
-        GripperError: See `gripper_force.doctor.setup`.
+        GripperError: See `gripper_force.jobs.doctor.setup`.
     """
     with _opened(config) as looked:
         return looked.set_up(config.servo.id, agree)

@@ -4,9 +4,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from gripper_force.backends import open_devices
 from gripper_force.config import Config
-from gripper_force.doctor import Check, gather, judged, only, rate_hz, time_of
+from gripper_force.jobs.doctor import Check, gather, judged, only, rate_hz, time_of
+from gripper_force.runtime.backends import open_devices
 
 _LEAST_VALID = 0.9
 

@@ -10,7 +10,7 @@ from dataclasses import replace
 from gripper_force.config import CameraConfig, LoadCellConfig
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.interfaces import Clock
-from gripper_force.log import LogReader
+from gripper_force.runtime.log import LogReader
 from gripper_force.types import Frame, LoadCellSample
 
 

@@ -18,7 +18,7 @@ _HEAD: Final = (
 )
 
 Levels = dict[str, dict[str, float]]
-"""By level of detail: ``error_n`` and ``speed`` as in `gripper_force.bench.scene.SceneCost`."""
+"""By level of detail: ``error_n`` and ``speed`` as in `gripper_force.qualification.bench.scene.SceneCost`."""
 
 
 def keep(table: dict[str, Levels]) -> None:

@@ -2,9 +2,9 @@
 
 from collections.abc import Iterator
 
-from gripper_force.backends import CAMERAS, RIG
 from gripper_force.config import Config
-from gripper_force.doctor import Check, time_ms
+from gripper_force.jobs.doctor import Check, time_ms
+from gripper_force.runtime.backends import CAMERAS, RIG
 
 
 def probe(config: Config) -> Iterator[Check]:

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from gripper_force.backends import MonotonicClock
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, SimulationError
-from gripper_force.faults import Faults
+from gripper_force.fault_injection import Faults
 from gripper_force.interfaces import Camera, Clock, LoadCell
+from gripper_force.runtime.backends import MonotonicClock
 from gripper_force.types import NS_PER_MS, NS_PER_S, Frame, Gray, LoadCellSample
 from gripper_hw.dynamixel.control_table import load_model
 from gripper_hw.dynamixel.virtual import VirtualBus, VirtualServo, register_bus, unregister_bus
@@ -25,7 +25,7 @@ from gripper_hw.sim.surroundings import Surroundings
 from gripper_hw.sim.world import World
 
 if TYPE_CHECKING:
-    from gripper_hw.dynamixel.faults import WireFaults
+    from gripper_hw.dynamixel.fault_injection import WireFaults
 
 FRAME_SIDE = 128
 _OVERSAMPLED = 2
@@ -188,7 +188,7 @@ class SimulatedRig:
         faults = Faults(config.faults, start_ns)
         wire = None
         if config.faults:
-            from gripper_hw.dynamixel.faults import WireFaults
+            from gripper_hw.dynamixel.fault_injection import WireFaults
 
             wire = WireFaults(bus, faults, config.seed)
         motor = _LockedMotor(servo, bus.lock, wire)
@@ -210,7 +210,7 @@ class SimulatedRig:
         self._thread: threading.Thread | None = None
 
     def _break_devices(self, faults: Faults, seed: int) -> None:
-        from gripper_hw.sim.faults import FaultyCamera, FaultyClock, FaultyLoadCell
+        from gripper_hw.sim.fault_injection import FaultyCamera, FaultyClock, FaultyLoadCell
 
         clock = self.clock
         if faults.has("clock"):

@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 
 from gripper_calibration.fits.servo import LEAST_PASSES, LEAST_PRESSES, Nominal, Pass, Press, fit_servo
 from gripper_force.errors import DataError
-from gripper_force.rig import Estimate
+from gripper_force.profiles.rig import Estimate
 
 N_PER_A, FRICTION_N, DAMPING, RADIUS_M, OPEN_RAD = 44.0, 0.9, 14.0, 0.020, 0.03
 NOMINAL = Nominal(pinion_radius_m=RADIUS_M, open_width_m=0.09)

@@ -13,10 +13,10 @@ from gripper_calibration.procedures.camera import calibrate, compute_ms, watch
 from gripper_force.cli import app
 from gripper_force.config import load_config
 from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
-from gripper_force.log import LogReader, LogWriter
-from gripper_force.profiles import rig_mismatches
-from gripper_force.recording.record import Plan, record
-from gripper_force.rig import read_rig
+from gripper_force.jobs.recording.record import Plan, record
+from gripper_force.profiles.apply import rig_mismatches
+from gripper_force.profiles.rig import read_rig
+from gripper_force.runtime.log import LogReader, LogWriter
 from gripper_force.types import NS_PER_MS, Frame
 
 QUICK = ["object=stapler", "sim.detail=coarse", "vision.checkpoint=none", "seed=2", "camera.rate_hz=30"]

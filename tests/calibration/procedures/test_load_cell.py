@@ -16,7 +16,7 @@ from gripper_calibration.procedures.load_cell import calibrate, weigh
 from gripper_force.cli import app
 from gripper_force.config import Config, config_from, load_config
 from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
-from gripper_force.rig import read_rig
+from gripper_force.profiles.rig import read_rig
 from gripper_force.types import NS_PER_S, LoadCellSample
 
 TARE, N_PER_RAW, WEIGHT_N = -4_000, 1e-4, 5.0

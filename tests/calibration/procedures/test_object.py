@@ -12,16 +12,16 @@ from typer.testing import CliRunner
 
 from gripper_calibration.procedures import object as job
 from gripper_calibration.procedures.object import calibrate, touch
-from gripper_force.assembly import make_controller
-from gripper_force.backends import open_devices
 from gripper_force.cli import app
 from gripper_force.cli import calibrate as cli_calibrate
 from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError, DataError
-from gripper_force.grasp import grasp
-from gripper_force.log import LogReader
-from gripper_force.object_profile import read_object, weights_path
-from gripper_force.replay import replay
+from gripper_force.jobs.grasp import grasp
+from gripper_force.jobs.replay import replay
+from gripper_force.profiles.object import read_object, weights_path
+from gripper_force.runtime.assembly import make_controller
+from gripper_force.runtime.backends import open_devices
+from gripper_force.runtime.log import LogReader
 from gripper_force.types import Event, LoadCellSample
 
 QUICK = [

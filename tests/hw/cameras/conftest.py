@@ -13,9 +13,9 @@ import depthai as dai
 import numpy as np
 import pytest
 
-from gripper_force.backends import MonotonicClock
 from gripper_force.config import CameraConfig
 from gripper_force.interfaces import Camera
+from gripper_force.runtime.backends import MonotonicClock
 from gripper_force.types import Frame, Gray
 from gripper_hw.cameras.oak import PICTURE, OakCamera
 from gripper_hw.cameras.uvc import UvcCamera

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gripper_force.backends import CAMERAS, MonotonicClock
 from gripper_force.config import CameraConfig, load_config
 from gripper_force.errors import ConfigError
 from gripper_force.interfaces import Camera, Clock
-from gripper_force.log import LogWriter
+from gripper_force.runtime.backends import CAMERAS, MonotonicClock
+from gripper_force.runtime.log import LogWriter
 from gripper_force.types import NS_PER_MS, Frame
 from gripper_hw.playback import PlaybackCamera
 from gripper_hw.sim.rig import SimulatedRig

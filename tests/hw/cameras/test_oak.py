@@ -8,9 +8,9 @@ import depthai as dai
 import numpy as np
 import pytest
 
-from gripper_force.backends import MonotonicClock
 from gripper_force.config import CameraConfig
 from gripper_force.errors import ConfigError, DeviceError, DeviceLostError, DeviceNotFoundError
+from gripper_force.runtime.backends import MonotonicClock
 from gripper_force.types import NS_PER_MS, Frame, Gray
 from gripper_hw.cameras import oak
 from gripper_hw.cameras.oak import PICTURE, OakCamera, choose_sensor

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gripper_force.backends import MonotonicClock
 from gripper_force.config import CameraConfig
 from gripper_force.errors import ConfigError, DeviceError, DeviceLostError, DeviceNotFoundError
+from gripper_force.runtime.backends import MonotonicClock
 from gripper_hw.cameras import reader
 from gripper_hw.cameras.reader import BackgroundCamera, Read, Shot, square
 
@@ -102,7 +102,7 @@ def test_a_camera_that_comes_back_with_another_picture_is_still_away(monkeypatch
 def test_a_program_that_forgets_to_close_still_releases_the_device() -> None:
     program = """
 from contextlib import contextmanager
-from gripper_force.backends import MonotonicClock
+from gripper_force.runtime.backends import MonotonicClock
 from gripper_force.config import CameraConfig
 from gripper_hw.cameras.reader import BackgroundCamera, Shot
 

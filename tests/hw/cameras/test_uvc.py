@@ -5,9 +5,9 @@ from pathlib import Path
 import cv2
 import pytest
 
-from gripper_force.backends import MonotonicClock
 from gripper_force.config import CameraConfig
 from gripper_force.errors import ConfigError, DeviceError, DeviceNotFoundError
+from gripper_force.runtime.backends import MonotonicClock
 from gripper_force.types import NS_PER_MS, Frame
 from gripper_hw.cameras.uvc import UvcCamera, find_device
 

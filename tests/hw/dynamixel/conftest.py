@@ -8,7 +8,7 @@ import pytest
 from gripper_force.config import ServoConfig
 from gripper_hw.dynamixel.control_table import load_model
 from gripper_hw.dynamixel.packets import Packet, Parser
-from gripper_hw.dynamixel.serve import PtyServer
+from gripper_hw.dynamixel.pty_server import PtyServer
 from gripper_hw.dynamixel.virtual import VirtualBus, VirtualServo, register_bus, unregister_bus
 
 

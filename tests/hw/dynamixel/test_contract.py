@@ -14,7 +14,7 @@ from gripper_force.interfaces import Servo
 from gripper_force.types import NS_PER_MS, ServoCommand, ServoState
 from gripper_hw.dynamixel.control_table import load_model, model_names
 from gripper_hw.dynamixel.firmware import VirtualServo
-from gripper_hw.dynamixel.serve import BenchMotor, serve_virtual_servo
+from gripper_hw.dynamixel.pty_server import BenchMotor, serve_virtual_servo
 from gripper_hw.dynamixel.servo import DynamixelServo
 from gripper_hw.dynamixel.virtual import VirtualBus, find_bus, register_bus, unregister_bus
 from gripper_hw.sim.rig import SimulatedRig

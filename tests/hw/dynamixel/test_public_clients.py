@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from gripper_hw.dynamixel.serve import serve_virtual_servo
+from gripper_hw.dynamixel.pty_server import serve_virtual_servo
 
 WANTED = "GRIPPER_FORCE_CLIENT_PYTHON"
 HOW = (

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from gripper_force.backends import MonotonicClock
 from gripper_force.config import LoadCellConfig, load_config
 from gripper_force.errors import DeviceError
 from gripper_force.interfaces import Clock, LoadCell
-from gripper_force.log import LogWriter
+from gripper_force.runtime.backends import MonotonicClock
+from gripper_force.runtime.log import LogWriter
 from gripper_force.types import NS_PER_MS, LoadCellSample
 from gripper_hw.load_cells.serial import SerialLoadCell
 from gripper_hw.playback import PlaybackLoadCell

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from gripper_force.backends import MonotonicClock
 from gripper_force.config import LoadCellConfig
 from gripper_force.errors import ConfigError, DeviceError, DeviceNotFoundError
+from gripper_force.runtime.backends import MonotonicClock
 from gripper_hw.load_cells.phidget import PhidgetLoadCell
 
 INSTALLED = importlib.util.find_spec("Phidget22") is not None

@@ -3,9 +3,9 @@ from typing import Any
 
 import pytest
 
-from gripper_force import doctor
 from gripper_force.config import Config
-from gripper_force.doctor import Check
+from gripper_force.jobs import doctor
+from gripper_force.jobs.doctor import Check
 from gripper_hw.load_cells.probe import probe
 
 REAL = {"clock": "realtime", "servo": {"port": "/dev/nowhere"}}

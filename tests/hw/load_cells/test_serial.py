@@ -3,9 +3,9 @@ import threading
 
 import pytest
 
-from gripper_force.backends import MonotonicClock
 from gripper_force.config import LoadCellConfig
 from gripper_force.errors import ConfigError, DeviceError, DeviceNotFoundError
+from gripper_force.runtime.backends import MonotonicClock
 from gripper_hw.load_cells.screening import PATIENCE_NS
 from gripper_hw.load_cells.serial import SerialLoadCell
 

@@ -1,0 +1,33 @@
+"""What is there, what is wrong with it, and what a set-up changes."""
+
+from typing import Any
+
+from rich.markup import escape
+from rich.table import Table
+
+from gripper_force.cli.console import err, out
+
+
+def checks_table(r: dict[str, Any]) -> None:
+    """What doctor found, and what to do."""
+    marks = {True: "[green]ok[/]", False: "[bold red]problem[/]", None: "-"}
+    table = Table(box=None, show_header=False, pad_edge=False)
+    for check in r["checks"]:
+        advice = f"\n[yellow]{escape(check.advice)}[/]" if check.advice else ""
+        style = "dim" if check.ok is None else ""
+        table.add_row(marks[check.ok], check.unit, check.name, escape(check.found) + advice, style=style)
+    out.print(table)
+
+
+def changes_table(servo: str, changes: list[Any]) -> None:
+    """Registers that would change, on stderr."""
+    table = Table(servo, "is", "becomes", box=None, pad_edge=False)
+    for change in changes:
+        table.add_row(change.register, change.old, change.new)
+    err.print(table)
+
+
+def setup_line(r: dict[str, Any]) -> None:
+    """What became of a servo's set-up."""
+    done = "set up, and read back" if r["applied"] else "left as it is"
+    out.print(f"servo {r['servo']}: {done if r['changes'] else 'nothing to change'}")

@@ -1,0 +1,1 @@
+"""Jobs: grasp, replay, record, simulate, import, train, evaluate, doctor."""

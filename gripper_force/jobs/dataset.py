@@ -1,0 +1,247 @@
+"""Logs as training and test clips."""
+
+import hashlib
+import json
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+from rich.progress import track
+
+from gripper_force.config import config_from_text
+from gripper_force.errors import DataError
+from gripper_force.jobs.processes import process_pool
+from gripper_force.runtime.log import LogReader
+from gripper_force.types import NS_PER_MS, Frame, Gray, LoadCellSample
+
+if TYPE_CHECKING:  # labels need no OpenCV
+    from gripper_force.vision.preprocess import Preprocess, Region
+
+CONTACT_N: Final = 0.25
+"""Measured force over which a frame counts as contact."""
+
+NEAR_NS: Final = 50 * NS_PER_MS
+"""A frame with no valid load-cell sample within this time has no label."""
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """One recording.
+
+    Attributes:
+        frames: Cropped and resized frames, (T, S, S) uint8.
+        forces_n: Load-cell force at each frame, (T,) float32; 0 where not valid.
+        valid: Whether the frame has a label, (T,) bool.
+        name: The log's file name without its suffix.
+        object: What was grasped.
+        set: What a split must keep on one side, such as all light levels of one rendering.
+        stiffness: A simulated object's own stiffness over its kind's; NaN where it is not known.
+    """
+
+    frames: Gray
+    forces_n: npt.NDArray[np.float32]
+    valid: npt.NDArray[np.bool_]
+    name: str
+    object: str
+    set: str
+    stiffness: float = float("nan")
+
+    @property
+    def nominal_n(self) -> npt.NDArray[np.float32]:
+        """Forces, (T,), had the object exactly its kind's stiffness; as measured where that is not known."""
+        return self.forces_n if math.isnan(self.stiffness) else self.forces_n / np.float32(self.stiffness)
+
+
+def load_clips(
+    source: Path | Sequence[Path],
+    preprocess: "Preprocess",
+    region: "Region | None" = None,
+    workers: int = 1,
+    *,
+    quiet: bool = False,
+) -> list[Clip]:
+    """Reads logs in parallel processes, with a progress bar on stderr.
+
+    Args:
+        source: A folder that is searched for ``*.mcap``, or the logs themselves.
+        preprocess: Tells the size frames are reduced to.
+        region: Region of interest in pixels; None for the one in each log's own configuration.
+        workers: Processes to read with; 1 is this one.
+        quiet: Whether to show no progress.
+
+    Returns:
+        A clip for each log, sorted by path.
+
+    Raises:
+        DataError: There are no logs, or one holds no frames or no labels.
+        LogError: A log can't be read.
+    """
+    paths = sorted(source.rglob("*.mcap")) if isinstance(source, Path) else sorted(source)
+    if not paths:
+        raise DataError(f"no logs (*.mcap) in {source}; record, simulate or import some first")
+    read = partial(load_clip, preprocess=preprocess, region=region)
+    console = Console(stderr=True, quiet=quiet)
+    if workers == 1:  # a process takes some seconds to begin
+        return list(track(map(read, paths), "reading logs", len(paths), console=console))
+    with process_pool(workers) as pool:
+        return list(track(pool.map(read, paths), "reading logs", len(paths), console=console))
+
+
+def split_by(
+    clips: Sequence[Clip], key: Literal["object", "set"], fraction: float, seed: int = 0
+) -> tuple[list[Clip], list[Clip]]:
+    """Draws whole objects or sets, so that nothing of what is held out is seen in training.
+
+    Args:
+        clips: What to split.
+        key: What to keep together. Sets are drawn for each object apart, so that both sides hold all objects
+            as far as they have two sets.
+        fraction: Share of objects or sets to hold out, at least one, as long as one stays.
+        seed: Of the draw.
+
+    Returns:
+        The rest, and what is held out.
+
+    Raises:
+        DataError: There are less than two objects or sets.
+    """
+    rng = np.random.default_rng(seed)
+    pools = (
+        [clips] if key == "object" else [[c for c in clips if c.object == o] for o in _names(clips, "object")]
+    )
+    held: set[str] = set()
+    for pool in pools:
+        names = _names(pool, key)
+        count = min(max(1, round(fraction * len(names))), len(names) - 1)
+        held.update(rng.choice(names, count, replace=False))
+    if not held:
+        raise DataError(f"a split by {key} needs at least two of them, got {_names(clips, key)}")
+    return [c for c in clips if getattr(c, key) not in held], [c for c in clips if getattr(c, key) in held]
+
+
+def check_size(clips: Iterable[Clip], preprocess: "Preprocess") -> None:
+    """Raises `DataError` where a clip's frames are of another size than the networks take."""
+    for clip in clips:
+        if clip.frames.shape[1] != preprocess.size:
+            raise DataError(
+                f"{clip.name} has frames of {clip.frames.shape[1]} px, the network needs {preprocess.size}; "
+                "load the log for this network"
+            )
+
+
+def digest(clips: Iterable[Clip]) -> str:
+    """SHA-256 over all frames and labels."""
+    sha = hashlib.sha256()
+    for clip in clips:
+        for part in (clip.frames, clip.forces_n, clip.valid):
+            sha.update(np.ascontiguousarray(part).data)
+    return sha.hexdigest()
+
+
+def label_frames(
+    frame_t_ns: npt.NDArray[np.int64],
+    samples: Sequence[LoadCellSample],
+    exposure_ns: int,
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
+    """Finds the load-cell force at each frame.
+
+    That is the mean of the valid samples within the exposure where it holds two or more, and a linear
+    interpolation at its middle otherwise. One frame of shift would cost 0.06 N.
+
+    Args:
+        frame_t_ns: Middle of each exposure, (T,).
+        samples: Load-cell samples by rising time.
+        exposure_ns: Length of the exposures; 0 where it is not known.
+
+    Returns:
+        Forces in N, (T,) float32, 0 where there is none, and whether there is one, (T,) bool.
+    """
+    good = [sample for sample in samples if sample.valid and np.isfinite(sample.force_n)]
+    if not good:
+        return np.zeros(len(frame_t_ns), np.float32), np.zeros(len(frame_t_ns), np.bool_)
+    t_ns = np.array([sample.t_ns for sample in good], np.int64)
+    force_n = np.array([sample.force_n for sample in good])
+    labels = np.interp(frame_t_ns, t_ns, force_n)
+    total = np.concatenate([[0.0], np.cumsum(force_n)])
+    first = np.searchsorted(t_ns, frame_t_ns - exposure_ns // 2, "left")
+    last = np.searchsorted(t_ns, frame_t_ns + exposure_ns // 2, "right")
+    several = last - first >= 2
+    labels[several] = (total[last] - total[first])[several] / (last - first)[several]
+    after = np.searchsorted(t_ns, frame_t_ns).clip(0, len(t_ns) - 1)
+    distance = np.minimum(np.abs(t_ns[after] - frame_t_ns), np.abs(t_ns[(after - 1).clip(0)] - frame_t_ns))
+    valid = distance <= NEAR_NS
+    return np.where(valid, labels, 0.0).astype(np.float32), valid
+
+
+def load_clip(path: Path, preprocess: "Preprocess", region: "Region | None") -> Clip:
+    """Reads one log; see `load_clips`."""
+    from gripper_force.vision.preprocess import shrink
+
+    reader = LogReader(path)
+    config = config_from_text(reader.config, str(path))
+    region = region or config.vision.region
+    small: list[Gray] = []
+    t_ns: list[int] = []
+    samples: list[LoadCellSample] = []
+    for record in reader.records(Frame, LoadCellSample):
+        if isinstance(record, Frame):
+            small.append(shrink(record.gray, region, preprocess.size))
+            t_ns.append(record.t_ns)
+        elif isinstance(record, LoadCellSample):
+            samples.append(record)
+    if not small:
+        raise DataError(f"{path} holds no camera frames")
+    samples.sort(key=lambda sample: sample.t_ns)
+    exposure_ns = round(_known(reader.metadata, "exposure_ms", float, 0.0) * NS_PER_MS)
+    forces_n, valid = label_frames(np.array(t_ns, np.int64), samples, exposure_ns)
+    if not valid.any():
+        raise DataError(f"{path} holds no valid load-cell sample near any frame, so it has no labels")
+    name = path.stem
+    set_ = reader.metadata.get("set", name)
+    stiffness = stiffness_of(reader.metadata)
+    return Clip(np.stack(small), forces_n, valid, name, config.object, set_, stiffness)
+
+
+def stiffness_of(metadata: Mapping[str, str]) -> float:
+    """A simulated object's own stiffness over its kind's, from a log's metadata; NaN for real ones.
+
+    Raises:
+        DataError: The metadata tell of a scene, and not of a stiffness above 0.
+    """
+    return _known(metadata, "scene", lambda scene: float(json.loads(scene)["stiffness"]), float("nan"))
+
+
+def _known(metadata: Mapping[str, str], key: str, read: Callable[[str], float], otherwise: float) -> float:
+    if key not in metadata:
+        return otherwise
+    try:
+        value = read(metadata[key])
+    except (ValueError, LookupError, TypeError, RecursionError):
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise DataError(f"a log's metadata {key!r} hold no number above 0: {metadata[key][:80]!r}")
+    return value
+
+
+def stiffness_floor_n(forces_n: npt.NDArray[np.floating], stiffness: float) -> npt.NDArray[np.floating]:
+    """Error that no look at an object avoids: it shows travel, and of its stiffness only its kind's is known.
+
+    Args:
+        forces_n: True forces, (N,).
+        stiffness: The object's own stiffness over its kind's.
+
+    Returns:
+        Absolute errors in N, (N,).
+    """
+    floor_n: npt.NDArray[np.floating] = np.abs(forces_n) * abs(1 - 1 / stiffness)
+    return floor_n
+
+
+def _names(clips: Iterable[Clip], key: str) -> list[str]:
+    return sorted({getattr(clip, key) for clip in clips})

@@ -1,0 +1,1 @@
+"""Imports of recordings that were made elsewhere, to logs."""

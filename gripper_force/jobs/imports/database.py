@@ -1,0 +1,307 @@
+"""The published database of Shin et al. 2019, turned into logs.
+
+Its layout, by https://github.com/hyeon-jo/Interaction-force-estimation-based-on-deep-learning: a folder
+``<object>_<degrees>_<illumination>`` for each of the 48 environments, with images ``N.jpg`` and a table
+``test.txt`` of lines such as ``4,-0.00318538,0.00328883``: number of the image, force in newtons, unused.
+
+*Sets.* Nothing in a folder tells where one of the paper's sets ends. A set is four touches (its table 1), so
+a folder is cut in the rest after each fourth touch, and where numbers are missing for longer than the network
+looks back. In a split each log is a set of its own: the paper collected sets "for each environment", so none
+was seen under two lights. As in the simulated protocol, sets 13 to 15 of each folder are for test.
+
+*Forces* stay as published, so that errors compare with the paper's; only spikes are marked as not valid.
+
+*Damage* ends nothing that can go on. What is missing, doubled, out of order or no line of a table is counted,
+and the summary names the first of each.
+"""
+
+import math
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from gripper_force.config import CameraConfig, Config
+from gripper_force.errors import DataError
+from gripper_force.jobs.dataset import CONTACT_N
+from gripper_force.jobs.imports.video import load_cell_samples, write_recording
+from gripper_force.jobs.simulate import split_of
+from gripper_force.types import NS_PER_S, Frame, Gray
+from gripper_force.vision.preprocess import Region, shrink
+
+RATE_HZ: Final = 149.0
+"""Of the paper's camera; the database tells no times."""
+
+LUX: Final = {"50": 350, "70": 550, "75": 550, "100": 750}
+"""What the third part of a folder's name means. For 550 lux the database's page says 70, and the
+authors' code (https://github.com/cxz1418/SSAM_ForcePrediction) 75."""
+
+TOUCHES: Final = 4
+_SHORTEST: Final = 5
+"""Frames with contact in turn that are no noise."""
+_REST: Final = 15
+"""Frames without contact between two touches, at least; less is a bounce."""
+_HOLE: Final = 20
+"""Missing numbers that no log bridges: the network looks back over 20 frames."""
+_MOST_N: Final = 1000.0
+
+_LINE: Final = re.compile(r"\s*([0-9]{1,9})\s*,\s*([-+.0-9eE]+)\s*,[^,]*")
+_FOLDER: Final = re.compile(r"(.+)_([0-9]+)_([0-9]+)")
+_IMAGE: Final = re.compile(r"0|[1-9][0-9]{0,8}")
+
+Numbers = npt.NDArray[np.int64]
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class EnvironmentSummary:
+    """What became of the folder of one environment.
+
+    Attributes:
+        folder: Its name.
+        object: What was touched.
+        degrees: Angle of the press.
+        lux: Illumination.
+        logs: Sets that are logs now.
+        kept: How many of these were so before, and were left as they are.
+        touches: Touches in all sets.
+        frames: Frames in the logs that were written now.
+        spikes_rejected: Samples marked as not valid in the logs that were written now.
+        problems: What is wrong with the folder, a sentence each.
+    """
+
+    folder: str
+    object: str
+    degrees: int
+    lux: int
+    logs: int
+    kept: int
+    touches: int
+    frames: int
+    spikes_rejected: int
+    problems: tuple[str, ...]
+
+
+def find_environments(folder: Path) -> tuple[list[Path], list[str]]:
+    """Looks a database over before anything of it is imported.
+
+    Returns:
+        The folders of the environments, and the names of what else lies beside them.
+
+    Raises:
+        DataError: There is no environment, one has no table, or an illumination is not known.
+    """
+    if not folder.is_dir():
+        raise DataError(f"{folder} is no folder")
+    entries = sorted(folder.iterdir())
+    found = [entry for entry in entries if entry.is_dir() and _FOLDER.fullmatch(entry.name)]
+    if not found:
+        raise DataError(
+            f"{folder} holds no folder named <object>_<degrees>_<illumination>, such as sponge_0_50; "
+            "name the folder that holds these"
+        )
+    if bare := [entry.name for entry in found if not (entry / "test.txt").is_file()]:
+        raise DataError(
+            f"{len(bare)} of {len(found)} folders in {folder} have no test.txt: {', '.join(bare[:5])}; "
+            "fetch them again, or take them away"
+        )
+    for entry in found:
+        _environment(entry)
+    return found, [entry.name for entry in entries if entry not in found]
+
+
+def import_environment(
+    folder: Path, out: Path, *, rate_hz: float = RATE_HZ, region: Region | None = None, size: int = 128
+) -> EnvironmentSummary:
+    """Imports one environment into logs ``out/<folder>-<set>.mcap``.
+
+    Logs that are there already are left as they are, so an import that was broken off can go on.
+
+    Args:
+        folder: One of `find_environments`.
+        out: Where the logs go, into ``train`` and ``test`` as those of `simulate.plan_protocol`.
+        rate_hz: Frame rate that the numbers of the images are turned into times with.
+        region: Part of the images to keep in pixels: left, top, width, height; None for the whole.
+        size: Side of the logged frames in pixels.
+
+    Raises:
+        DataError: No line of its table is usable, or none of the images that it names is there.
+        ConfigError: The region reaches beyond an image.
+        LogError: A log can't be written.
+    """
+    object_name, degrees, illumination = _environment(folder)
+    forces_n, problems = read_table(folder / "test.txt")
+    images = {int(path.stem): path for path in folder.glob("*.jpg") if _IMAGE.fullmatch(path.stem)}
+    if not images.keys() & forces_n.keys():
+        raise DataError(f"{folder} holds no image that its test.txt names, such as {min(forces_n)}.jpg")
+    problems += _told("{} forces have no image", sorted(forces_n.keys() - images.keys()))
+    others = [p.name for p in folder.iterdir() if p.name != "test.txt" and p not in images.values()]
+    problems += _told("{} files are neither N.jpg nor test.txt and were left out", sorted(others))
+    problems += _told("{} images have no force", sorted(images.keys() - forces_n.keys()))
+    sets = find_sets(np.array(list(forces_n)), np.array(list(forces_n.values())))
+    about = {
+        "object": object_name,
+        "source": folder.name,
+        "degrees": str(degrees),
+        "illumination": illumination,
+        "lux": str(LUX[illumination]),
+        "rate_hz": f"{rate_hz:g}",
+    }
+    config = Config(object=object_name, camera=CameraConfig(rate_hz=rate_hz))
+    numbers = np.array(sorted(images.keys() | forces_n.keys()))
+    parts = np.split(numbers, np.searchsorted(numbers, [first for first, _ in sets[1:]]))
+    damaged: list[str] = []
+    empty: list[str] = []
+    kept = frame_count = spikes = 0
+    for i, (part, (_, touches)) in enumerate(zip(parts, sets, strict=True), start=1):
+        log = out / split_of(i) / f"{folder.name}-{i:02d}.mcap"
+        if log.exists():
+            kept += 1
+            continue
+        t_ns = {int(n): round(int(n - part[0]) * NS_PER_S / rate_hz) for n in part}
+        frames: list[Frame] = []
+        for number in sorted(t_ns.keys() & images.keys()):
+            if (gray := _read_image(images[number])) is None:
+                damaged.append(images[number].name)
+            else:
+                frames.append(Frame(t_ns[number], t_ns[number], number, shrink(gray, region, size)))
+        labelled = [n for n in t_ns if n in forces_n]
+        if not forces_n.keys() & {frame.seq for frame in frames}:
+            empty.append(log.stem)
+            continue
+        samples = load_cell_samples([t_ns[n] for n in labelled], np.array([forces_n[n] for n in labelled]))
+        metadata = {**about, "set": log.stem, "split": split_of(i), "touches": str(touches)}
+        spikes += write_recording(log, config, metadata, frames, samples)
+        frame_count += len(frames)
+    return EnvironmentSummary(
+        folder=folder.name,
+        object=object_name,
+        degrees=degrees,
+        lux=LUX[illumination],
+        logs=len(sets) - len(empty),
+        kept=kept,
+        touches=sum(touches for _, touches in sets),
+        frames=frame_count,
+        spikes_rejected=spikes,
+        problems=(
+            *problems,
+            *_told("{} images can't be decoded and were left out", damaged),
+            *_told("{} sets have no image with a force and became no log", empty),
+        ),
+    )
+
+
+def read_table(path: Path) -> tuple[dict[int, float], list[str]]:
+    """Reads a table ``test.txt``.
+
+    Returns:
+        Number of an image to force in N, by rising number, and a sentence for each kind of line that was not
+        taken as it stands.
+
+    Raises:
+        DataError: It can't be read, or no line of it is usable.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"can't read the table of forces {path}: {error}") from error
+    rows: dict[int, set[float]] = {}
+    bad: list[str] = []
+    disorder: list[str] = []
+    doubles: Counter[int] = Counter()
+    last = -1
+    for i, line in enumerate(lines, start=1):
+        if not line.strip():
+            continue
+        if (row := _row(line)) is None:
+            bad.append(f"line {i}, {line[:40]!r}")
+            continue
+        number, force_n = row
+        if number in rows:
+            doubles[number] += 1
+        elif number < last:
+            disorder.append(f"line {i}, number {number} after {last}")
+        rows.setdefault(number, set()).add(force_n)
+        last = number
+    forces_n = {number: min(rows[number]) for number in sorted(rows) if len(rows[number]) == 1}
+    if not forces_n:
+        raise DataError(f"{path} has no usable line; it needs lines such as 4,-0.0032,0.0033")
+    doubtful = [number for number in rows if number not in forces_n]
+    return forces_n, [
+        *_told("{} lines are no number,force,unused and were left out", bad),
+        *_told("{} lines were out of order and were sorted", disorder),
+        *_told("{} numbers came twice with one force and were taken once", sorted(doubles.keys() & forces_n)),
+        *_told("{} numbers came with several forces and have none now", sorted(doubtful)),
+    ]
+
+
+def _row(line: str) -> tuple[int, float] | None:
+    found = _LINE.fullmatch(line)
+    try:
+        force_n = float(found[2]) if found else math.nan
+    except ValueError:
+        return None
+    return (int(found[1]), force_n) if found and abs(force_n) <= _MOST_N else None
+
+
+def find_sets(number: Numbers, force_n: Floats) -> list[tuple[int, int]]:
+    """Cuts a folder into sets of four touches.
+
+    Args:
+        number: Numbers of the images, (N,), rising.
+        force_n: Forces in N, (N,).
+
+    Returns:
+        First number of each set, and how many touches are in it.
+    """
+    sets: list[tuple[int, int]] = []
+    holes = np.flatnonzero(np.diff(number) > _HOLE) + 1
+    for part in np.split(np.arange(len(number)), holes):
+        starts, ends = _touches(force_n[part])
+        count = max(math.ceil(len(starts) / TOUCHES), 1)
+        for i in range(count):
+            k = i * TOUCHES
+            first = (ends[k - 1] + starts[k]) // 2 if i else 0
+            sets.append((int(number[part[first]]), min(TOUCHES, len(starts) - k)))
+    return sets
+
+
+def _touches(force_n: Floats) -> tuple[Numbers, Numbers]:
+    """First index of each touch, and the index behind its last."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], force_n > CONTACT_N, [False]]).astype(np.int8)))
+    lasting = edges[1::2] - edges[::2] >= _SHORTEST
+    starts, ends = edges[::2][lasting], edges[1::2][lasting]
+    rested = starts[1:] - ends[:-1] >= _REST
+    return starts[np.append(True, rested)[: len(starts)]], ends[np.append(rested, True)[: len(ends)]]
+
+
+def _environment(folder: Path) -> tuple[str, int, str]:
+    """Object, degrees and illumination, by the folder's name."""
+    found = _FOLDER.fullmatch(folder.name)
+    if not found or found[3] not in LUX:
+        known = ", ".join(f"{name} ({lux} lux)" for name, lux in LUX.items())
+        raise DataError(f"the illumination in the name of {folder} is not known; known are {known}")
+    name = re.sub(r"[ _]+", "_", found[1].lower())
+    return {"papercup": "paper_cup"}.get(name, name), int(found[2]), found[3]
+
+
+def _read_image(path: Path) -> Gray | None:
+    """(H, W) uint8, or None for what is no whole JPEG: a decoder would fill up the rest in gray."""
+    data = path.read_bytes()
+    if not data.rstrip(b"\0").endswith(b"\xff\xd9"):
+        return None
+    try:
+        return np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE), np.uint8)
+    except (cv2.error, TypeError):
+        return None
+
+
+def _told(sentence: str, cases: Sequence[object]) -> list[str]:
+    """The sentence with how many there are and the first of them; nothing where there is none."""
+    return [f"{sentence.format(len(cases))}, the first is {cases[0]}"] if cases else []

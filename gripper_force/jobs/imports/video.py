@@ -1,0 +1,366 @@
+"""A video and a table of forces, turned into a log, so recordings made elsewhere can be replayed and learnt.
+
+A recording is a video and a CSV table with the columns ``frame`` (from 0), ``t_s`` and ``force_n``; more
+columns are allowed. It is either a folder with one video and one table, or a pair ``X.avi`` and ``X.csv``. A
+name ``<date>_<object>_<trial>`` tells what was grasped.
+"""
+
+import csv
+import math
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+from rich.progress import track
+
+from gripper_force.config import Config, dump_config
+from gripper_force.errors import DataError, LogError
+from gripper_force.jobs.recording.lag import force_lag_s
+from gripper_force.runtime.log import LogWriter
+from gripper_force.spikes import find_spikes
+from gripper_force.types import NS_PER_S, Frame, Gray, LoadCellSample
+from gripper_force.vision.preprocess import Region, shrink
+
+VIDEO_SUFFIXES: Final = frozenset({".avi", ".mp4", ".mkv", ".mov"})
+
+TARE_S: Final = 0.25
+TARE_SPREAD_N: Final = 0.05
+TARE_RISE_N: Final = 1.0
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class ImportSummary:
+    """What became of one recording.
+
+    Attributes:
+        log: The log written.
+        object: What was grasped.
+        frames: Frames in the log.
+        samples: Load-cell samples in the log, the rejected ones among them.
+        spikes_rejected: Samples marked as not valid.
+        tare_n: Offset removed from every sample; 0 where none could be trusted.
+        tare_note: Why no tare was removed; empty where it was.
+        force_lag_s: Time by which the forces trailed the pictures; it was taken out. 0 where none is beyond
+            doubt, see `recording.lag.force_lag_s`.
+        frames_without_force: Frames that have no row in the table.
+        forces_without_frame: Rows that have no frame in the video.
+    """
+
+    log: Path
+    object: str
+    frames: int
+    samples: int
+    spikes_rejected: int
+    tare_n: float
+    tare_note: str
+    force_lag_s: float
+    frames_without_force: int
+    forces_without_frame: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ForceTable:
+    """The rows of a table of forces.
+
+    Attributes:
+        frame: Frame numbers, (N,), rising.
+        t_s: Times, (N,), rising.
+        force_n: Forces as measured, (N,).
+    """
+
+    frame: npt.NDArray[np.int64]
+    t_s: Floats
+    force_n: Floats
+
+
+def import_folder(
+    folder: Path, out: Path, *, region: Region | None = None, align: bool = True
+) -> list[ImportSummary]:
+    """Imports every recording of a folder into ``out/<recording>.mcap``, with a progress bar on stderr.
+
+    Args:
+        folder: Holds recordings, see above.
+        out: Folder for the logs.
+        region: As for `import_video`.
+        align: Likewise.
+
+    Raises:
+        DataError: There is none, one lacks its table, or one can't be used.
+        LogError: A log exists already or can't be written.
+    """
+    pairs = list(_recordings(folder))
+    if not pairs:
+        raise DataError(
+            f"{folder} holds no recordings: neither X.avi with X.csv nor folders with one of each"
+        )
+    steps = track(pairs, "importing", console=Console(stderr=True))
+    return [
+        import_video(v, f, out / f"{name}.mcap", name=name, region=region, align=align)
+        for name, v, f in steps
+    ]
+
+
+def import_video(
+    video: Path,
+    forces: Path,
+    out: Path,
+    *,
+    name: str | None = None,
+    object_name: str | None = None,
+    region: Region | None = None,
+    size: int = 128,
+    align: bool = True,
+) -> ImportSummary:
+    """Writes one recording as a log of gray frames and load-cell samples.
+
+    Spikes and impossible values stay in the log, marked as not valid; the reading before tare is kept beside
+    the force, and the table as an attachment. Forces that come late or early beyond doubt are set right, and
+    the log's metadata say by how much.
+
+    Args:
+        video: The video.
+        forces: The table, see `read_forces`.
+        out: The log to write.
+        name: The recording's name, ``<date>_<object>_<trial>``; by default that of the video.
+        object_name: What was grasped; by default taken from the name.
+        region: Part of the frame to keep in pixels: left, top, width, height; None for the whole.
+        size: Side of the logged frames in pixels.
+        align: Whether forces that come late or early beyond doubt are set right.
+
+    Raises:
+        DataError: The video or the table is missing or can't be used.
+        ConfigError: The region reaches beyond the frame.
+        LogError: The log exists already or can't be written.
+    """
+    name = name or video.stem
+    object_name = object_name or object_of(name)
+    table = read_forces(forces)
+    tare_n, tare_note = estimate_tare(table.t_s, table.force_n)
+    gray, rate_hz = _read_video(video, region, size)
+    frames_s = _frame_times_s(table, len(gray), rate_hz)
+    lag_s = 0.0
+    if align:
+        good = ~find_spikes(table.force_n - tare_n)
+        lag_s = force_lag_s(frames_s, np.stack(gray), table.t_s[good], table.force_n[good])
+    frames_s, forces_s = frames_s + max(lag_s, 0.0), table.t_s + max(-lag_s, 0.0)
+    # A table may begin after the video does; a log has no time before 0.
+    start_s = min(0.0, frames_s[0], forces_s[0])
+    frames_ns = [_ns(t_s) for t_s in frames_s - start_s]
+    frames = [Frame(t, t, i, image) for i, (t, image) in enumerate(zip(frames_ns, gray, strict=True))]
+    forces_ns = [_ns(t_s) for t_s in forces_s - start_s]
+    samples = load_cell_samples(forces_ns, table.force_n, tare_n)
+    metadata = {
+        "object": object_name,
+        "set": re.sub(r"_\d+$", "", name),
+        "source": name,
+        "tare_n": f"{tare_n:.5f}",
+        "tare_note": tare_note,
+        "force_lag_s": f"{lag_s:.4f}",
+    }
+    spikes = write_recording(out, Config(object=object_name), metadata, frames, samples, forces)
+    with_row = int(np.isin(np.arange(len(frames)), table.frame).sum())
+    return ImportSummary(
+        log=out,
+        object=object_name,
+        frames=len(frames),
+        samples=len(samples),
+        spikes_rejected=spikes,
+        tare_n=tare_n,
+        tare_note=tare_note,
+        force_lag_s=lag_s,
+        frames_without_force=len(frames) - with_row,
+        forces_without_frame=len(samples) - with_row,
+    )
+
+
+def object_of(name: str) -> str:
+    """What was grasped, by a recording's name: ``2023-12-16_foam_brick_2`` is a ``foam_brick``."""
+    found = re.fullmatch(r"(?:\d{4}-\d{2}-\d{2}_)?(.+?)(?:_\d+)?", name)
+    return found[1] if found else name
+
+
+def read_forces(path: Path) -> ForceTable:
+    """Reads a table with the columns ``frame``, ``t_s`` and ``force_n``.
+
+    Raises:
+        DataError: It is missing, empty, lacks a column, or holds a value that is no finite number, a frame
+            twice, or rows that are out of order. The sentence names the line.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file)
+            columns = ("frame", "t_s", "force_n")
+            missing = [column for column in columns if column not in (reader.fieldnames or [])]
+            if missing:
+                raise DataError(f"{path} lacks the column {missing[0]!r}; it needs frame, t_s and force_n")
+            rows = [
+                [_number(path, reader.line_num, column, row[column]) for column in columns] for row in reader
+            ]
+    except OSError as error:
+        raise DataError(f"can't read the table of forces {path}: {error.strerror}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise DataError(f"{path} is no CSV table: {error}") from error
+    if not rows:
+        raise DataError(f"{path} holds no rows")
+    values = np.array(rows)  # (N, 3)
+    disorder = np.flatnonzero((np.diff(values[:, 0]) <= 0) | (np.diff(values[:, 1]) <= 0))
+    if len(disorder):
+        row = int(disorder[0])
+        raise DataError(
+            f"{path}: frame {values[row + 1, 0]:.0f} at {values[row + 1, 1]:.4f} s follows frame "
+            f"{values[row, 0]:.0f} at {values[row, 1]:.4f} s; frames and times must rise from row to row"
+        )
+    return ForceTable(values[:, 0].astype(np.int64), values[:, 1], values[:, 2])
+
+
+def estimate_tare(t_s: Floats, force_n: Floats) -> tuple[float, str]:
+    """Offset of the load cell, from the start of a recording that starts without contact.
+
+    Args:
+        t_s: Times, (N,).
+        force_n: Forces as measured, (N,).
+
+    Returns:
+        The offset in N and an empty text; or 0 and the reason why the start can't be trusted as unloaded.
+    """
+    start = force_n[t_s <= t_s[0] + TARE_S]
+    offset = float(np.median(start))
+    if len(start) < 3:
+        return 0.0, f"the first {TARE_S} s hold {len(start)} forces, too few to tell an offset from a touch"
+    if np.ptp(start) > TARE_SPREAD_N:
+        return (
+            0.0,
+            f"the force moves by {np.ptp(start):.2f} N in the first {TARE_S} s, so contact may be near",
+        )
+    if float(np.percentile(force_n, 25)) < offset - TARE_RISE_N:
+        return 0.0, "the force starts above its later level, so the gripper may start loaded"
+    if float(force_n.max()) < offset + TARE_RISE_N:
+        return 0.0, f"the force never rises by {TARE_RISE_N} N, so nothing tells that the start is unloaded"
+    return offset, ""
+
+
+def load_cell_samples(t_ns: Sequence[int], raw_n: Floats, tare_n: float = 0.0) -> list[LoadCellSample]:
+    """Samples with their tare removed and their spikes marked as not valid.
+
+    Args:
+        t_ns: Times, (N,).
+        raw_n: Forces as measured, (N,).
+        tare_n: Offset to remove.
+    """
+    force_n = raw_n - tare_n
+    return [
+        LoadCellSample(t, float(force), float(raw), not bad)
+        for t, force, raw, bad in zip(t_ns, force_n, raw_n, find_spikes(force_n), strict=True)
+    ]
+
+
+def write_recording(
+    out: Path,
+    config: Config,
+    metadata: dict[str, str],
+    frames: list[Frame],
+    samples: list[LoadCellSample],
+    table: Path | None = None,
+) -> int:
+    """Writes an imported recording as a log, which appears once it is whole.
+
+    Args:
+        out: The log to write.
+        config: What is known of how it was made.
+        metadata: Likewise, for people.
+        frames: The pictures.
+        samples: The forces.
+        table: A file to attach, where the forces came from one.
+
+    Returns:
+        How many samples are not valid; the log's metadata say so too.
+
+    Raises:
+        LogError: The log exists already or can't be written.
+    """
+    if out.exists():
+        raise LogError(f"can't write the log {out}: it exists already, and a log is never overwritten")
+    unfinished = out.with_name(f".{out.name}.part")
+    unfinished.unlink(missing_ok=True)
+    spikes = sum(not sample.valid for sample in samples)
+    records: list[Frame | LoadCellSample] = [*frames, *samples]
+    metadata = {**metadata, "spikes_rejected": str(spikes)}
+    with LogWriter(unfinished, config=dump_config(config), metadata=metadata) as log:
+        if table is not None:
+            log.attach(table.name, table.read_bytes(), "text/csv")
+        for record in sorted(records, key=lambda record: record.t_ns):
+            log.write(record)
+    unfinished.rename(out)
+    return spikes
+
+
+def _recordings(folder: Path) -> Iterator[tuple[str, Path, Path]]:
+    """Name, video and table of each recording, by name."""
+    if not folder.is_dir():
+        raise DataError(f"{folder} is no folder")
+    for entry in sorted(folder.iterdir()):
+        if entry.is_dir():
+            videos = [path for path in sorted(entry.iterdir()) if path.suffix.lower() in VIDEO_SUFFIXES]
+            tables = sorted(entry.glob("*.csv"))
+            if len(videos) == 1 and len(tables) == 1:
+                yield entry.name, videos[0], tables[0]
+            elif videos or tables:
+                raise DataError(
+                    f"{entry} holds {len(videos)} videos and {len(tables)} .csv tables; it needs one of each"
+                )
+        elif entry.suffix.lower() in VIDEO_SUFFIXES:
+            table = entry.with_suffix(".csv")
+            if not table.is_file():
+                raise DataError(f"{entry} has no table of forces; {table.name} should lie beside it")
+            yield entry.stem, entry, table
+
+
+def _number(path: Path, line: int, column: str, text: str | None) -> float:
+    try:
+        value = float(text or "")
+    except ValueError:
+        value = math.nan
+    # From 2**53 on a float does not tell two frames apart.
+    whole = value.is_integer() and abs(value) < 2**53
+    if not math.isfinite(value) or (column == "frame" and not whole):
+        kind = "frame number" if column == "frame" else "finite number"
+        raise DataError(f"{path}, line {line}: {column} is {text!r}, which is no {kind}")
+    return value
+
+
+def _read_video(video: Path, region: Region | None, size: int) -> tuple[list[Gray], float]:
+    """Every frame, (size, size) uint8, and the frame rate."""
+    if not video.is_file():
+        raise DataError(f"there is no video {video}")
+    frames: list[Gray] = []
+    capture = cv2.VideoCapture(str(video))
+    try:
+        rate_hz = float(capture.get(cv2.CAP_PROP_FPS))
+        while (read := capture.read())[0]:
+            gray = np.asarray(cv2.cvtColor(read[1], cv2.COLOR_BGR2GRAY), np.uint8)  # (H, W)
+            frames.append(shrink(gray, region, size))
+    finally:
+        capture.release()
+    if not frames or not 0 < rate_hz < math.inf:
+        raise DataError(f"no frame of {video} can be decoded, or it tells no frame rate; is it a video?")
+    return frames, rate_hz
+
+
+def _frame_times_s(table: ForceTable, frames: int, rate_hz: float) -> Floats:
+    """The table's times; between its rows interpolated, outside of them by the video's rate."""
+    index = np.arange(frames)
+    t_s = np.interp(index, table.frame, table.t_s)
+    t_s += np.minimum(index - table.frame[0], 0) / rate_hz + np.maximum(index - table.frame[-1], 0) / rate_hz
+    return np.asarray(t_s, np.float64)
+
+
+def _ns(t_s: float) -> int:
+    return round(t_s * NS_PER_S)

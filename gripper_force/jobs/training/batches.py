@@ -1,0 +1,116 @@
+"""What a training step sees: clips drawn from all recordings, shifted, relit and with noise."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from gripper_force.errors import DataError
+from gripper_force.jobs.dataset import CONTACT_N, Clip
+from gripper_force.jobs.training.parallel import Ranks
+from gripper_force.jobs.training.recipe import TrainConfig
+from gripper_force.vision.dense import normalise
+
+
+class Batches:
+    """All training frames on one device, and lists to draw clips from."""
+
+    def __init__(self, clips: Sequence[Clip], config: TrainConfig, ranks: Ranks) -> None:
+        for clip in clips:
+            if len(clip.frames) < config.preprocess.reference_frames:
+                raise DataError(f"{clip.name} has {len(clip.frames)} frames, too few for its own reference")
+        lengths = [len(clip.frames) for clip in clips]
+        forces_n = np.concatenate(
+            [clip.nominal_n if config.labels == "nominal" else clip.forces_n for clip in clips]
+        )
+        valid = np.concatenate([clip.valid for clip in clips])
+        self._config = config
+        self._device = ranks.device
+        self._share = ranks.share
+        self._begin = np.repeat(np.cumsum([0, *lengths[:-1]]), lengths)  # (N,)
+        frames = np.concatenate([clip.frames for clip in clips])  # (N, S, S)
+        self._frames = torch.from_numpy(frames).to(self._device)
+        self._labels = torch.from_numpy(forces_n).to(self._device)  # (N,)
+        self._valid = torch.from_numpy(valid).to(self._device)  # (N,)
+        self._all = np.flatnonzero(valid)
+        self._contact = np.flatnonzero(valid & (forces_n > CONTACT_N))
+        if not len(self._contact):
+            raise DataError(
+                f"no training frame shows a force over {CONTACT_N} N; record or simulate contacts"
+            )
+        newtons = np.floor(forces_n[self._contact])
+        self._levels = [self._contact[newtons == n] for n in np.unique(newtons)]
+        self._pass = -1
+        self._order = self._all
+
+    @property
+    def labels(self) -> int:
+        """Frames that have one."""
+        return len(self._all)
+
+    def batch(self, step: int, count: int, length: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Draws the clips of one step, which depend on the seed and these arguments alone.
+
+        Args:
+            step: Number of the step.
+            count: Clips, B. Where several processes train, each gets its share of them.
+            length: Frames of each clip, T.
+
+        Returns:
+            Inputs (B, T, 1, S, S), forces in N (B, T), and which of these are valid (B, T).
+        """
+        config = self._config
+        rng = np.random.default_rng((config.seed, step))
+        ends = self._ends(rng, step, count)
+        begin = self._begin[ends]
+        # Frames before a recording's first are copies of it, as for the estimator.
+        index = np.maximum(ends[:, None] + np.arange(1 - length, 1), begin[:, None])  # (B, T)
+        # The leading frames go through the same distortion as the clip: they share the camera and the light.
+        lead = begin[:, None] + np.arange(config.preprocess.reference_frames)  # (B, R)
+        gray = self._distorted(rng, np.concatenate([lead, index], axis=1))  # (B, R + T, S, S)
+        leading, frames = gray[:, : lead.shape[1]], gray[:, lead.shape[1] :]
+        inputs = normalise(frames, leading, config.preprocess)
+        where = torch.from_numpy(index[self._share]).to(self._device)
+        return inputs, self._labels[where], self._valid[where]
+
+    def _ends(self, rng: np.random.Generator, step: int, count: int) -> npt.NDArray[np.int64]:
+        draws = rng.random(count)
+        ends = np.array([self._in_turn(step * count + i) for i in range(count)])
+        by_force = draws < self._config.force_share
+        in_contact = ~by_force & (draws < self._config.force_share + self._config.contact_share)
+        ends[in_contact] = rng.choice(self._contact, int(in_contact.sum()))
+        ends[by_force] = [
+            rng.choice(self._levels[rng.integers(len(self._levels))]) for _ in range(by_force.sum())
+        ]
+        return ends
+
+    def _in_turn(self, i: int) -> int:
+        """Frame i of endless passes over all frames that have a label, each in an order of its own."""
+        number, place = divmod(i, len(self._all))
+        if number != self._pass:
+            self._order = np.random.default_rng((self._config.seed, number, 1)).permutation(self._all)
+            self._pass = number
+        return int(self._order[place])
+
+    def _distorted(self, rng: np.random.Generator, index: npt.NDArray[np.int64]) -> Tensor:
+        """This process's clips of frames (B, T) as gray (B, T, S, S), each shifted, relit and with noise."""
+        config = self._config
+        size = config.preprocess.size
+        # Everything is drawn for all clips, so that a step is the same however many processes share it.
+        shifts = rng.integers(-config.shift_px, config.shift_px, (2, len(index), 1), endpoint=True)
+        rows, columns = (np.arange(size) + shifts).clip(0, size - 1)  # (B, S) each
+        light = rng.normal(0, config.light, (2, len(index))).astype(np.float32)
+        noise = rng.uniform(0, config.noise, len(index)).astype(np.float32)
+        generator = torch.Generator(self._device).manual_seed(int(rng.integers(2**62)))
+        grain = torch.randn((*index.shape, size, size), generator=generator, device=self._device)
+
+        def move(array: npt.NDArray[np.generic]) -> Tensor:
+            return torch.from_numpy(array[self._share]).to(self._device)
+
+        where, down, right = move(index), move(rows), move(columns)
+        gray = self._frames[where[:, :, None, None], down[:, None, :, None], right[:, None, None, :]]
+        gain, gamma = (move(np.exp(part))[:, None, None, None] for part in light)  # (B, 1, 1, 1) each
+        lit: Tensor = gain * (gray / 255) ** gamma + move(noise)[:, None, None, None] * grain[self._share]
+        return lit.clamp_(0, 1) * 255

@@ -1,0 +1,147 @@
+"""Training an ensemble on logs, to a checkpoint.
+
+Diversity, not the number of labels, is what limits this task, so a step of our own recipe draws short clips
+from everywhere instead of long ones from a few recordings.
+"""
+
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from gripper_force.errors import CheckpointError, ConfigError
+from gripper_force.jobs import metrics
+from gripper_force.jobs.dataset import Clip, check_size, digest, split_by
+from gripper_force.jobs.training.batches import Batches
+from gripper_force.jobs.training.parallel import Ranks, joined
+from gripper_force.jobs.training.recipe import TrainConfig as TrainConfig
+from gripper_force.jobs.training.trainer import Trainer, estimates
+from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from gripper_force.vision.header import RESIDUAL_HALF_N, Header, Residual
+
+STATE_EVERY_S: Final = 60.0
+
+RESIDUAL_PRIOR: Final = 20
+"""Frames that count as much as the error over all forces, in the error claimed for one force."""
+
+
+def train(
+    config: TrainConfig,
+    clips: Sequence[Clip],
+    out: Path,
+    *,
+    validation_clips: Sequence[Clip] | None = None,
+    init: Checkpoint | None = None,
+    resume: bool = False,
+) -> Checkpoint:
+    """Trains an ensemble and writes its checkpoint, together with all processes that `torchrun` started.
+
+    Each member's state is kept beside ``out`` every minute, until the checkpoint is written. With ``steps``,
+    on the CPU with one thread, a seed fixes the result to the bit, broken off and resumed or not.
+
+    Args:
+        config: The recipe.
+        clips: Training data.
+        out: The checkpoint to write. All processes read it, so it lies where all machines see it.
+        validation_clips: What the error that the checkpoint claims is measured on; None: sets that are held
+            out of ``clips``.
+        init: Checkpoint whose weights to begin with, instead of random ones.
+        resume: Whether to go on from the states of a run that was broken off.
+
+    Returns:
+        The checkpoint as written.
+
+    Raises:
+        DataError: The data have no two sets of any object, hold no contact, or a recording is too short or of
+            another size.
+        NonFiniteError: The training diverged.
+        CheckpointError: A state is of another recipe or other data, or a file can't be written.
+        ConfigError: Several processes can't train together as they are.
+    """
+    training, held_out = clips, validation_clips
+    if held_out is None:
+        training, held_out = split_by(clips, "set", config.validation, config.seed)
+    check_size([*training, *held_out], config.preprocess)
+    states = [out.with_suffix(f".{i}.state") for i in range(len(config.attentions))]
+    with joined(config.device) as ranks:
+        networks = [t.network for t in _trained(config, training, states, init, resume, ranks)]
+        if ranks.first:
+            forces_n, measured_n = estimates(held_out, networks, config.preprocess, ranks.device)
+            header = Header(
+                members=tuple(network.config for network in networks),
+                preprocess=config.preprocess,
+                residuals=tuple(_residuals(forces_n, measured_n)),
+                data_digest=digest(clips),
+                metrics={
+                    "mae_n": metrics.mae(forces_n, measured_n),
+                    "rmse_n": metrics.rmse(forces_n, measured_n),
+                    "bias_n": metrics.bias(forces_n, measured_n),
+                },
+            )
+            save_checkpoint(out, networks, header)
+            for state in states:
+                state.unlink()
+        ranks.wait()
+        return load_checkpoint(out)
+
+
+def _trained(
+    config: TrainConfig,
+    clips: Sequence[Clip],
+    states: Sequence[Path],
+    init: Checkpoint | None,
+    resume: bool,
+    ranks: Ranks,
+) -> list[Trainer]:
+    if ranks.count > config.clips:
+        raise ConfigError(f"{ranks.count} processes can't share {config.clips} clips a step; set more clips")
+    if ranks.count > 1 and config.compile:
+        raise ConfigError("several processes train networks that are not compiled: leave compile out")
+    shapes = [config.network(member) for member in range(len(config.attentions))]
+    if init is not None and [network.config for network in init.networks] != shapes:
+        raise CheckpointError("the checkpoint to begin with holds other networks than this recipe trains")
+    batches = Batches(clips, config, ranks)
+    start = init.digest if init is not None else ""
+    identity = f"{config.model_dump_json(exclude={'device', 'compile'})} {digest(clips)} {start}"
+    trainers = []
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[loss]}"))
+    console = Console(stderr=True, quiet=not ranks.first)
+    with Progress(*columns, TimeRemainingColumn(), console=console) as progress:
+        for member, state in enumerate(states):
+            trainer = Trainer(config, member, batches, ranks)
+            trainers.append(trainer)
+            if init is not None:
+                trainer.begin_with(init.networks[member])
+            if resume:
+                trainer.restore(state, identity)
+            ranks.agree(f"{identity} {trainer.done}", "recipes, data or states")
+            task = progress.add_task(config.attentions[member], total=1.0, loss="")
+            saved = time.monotonic()
+            for rmse_n in trainer.steps():
+                progress.update(task, completed=min(1.0, trainer.done), loss=f"RMSE {rmse_n:.3f} N")
+                if ranks.first and time.monotonic() - saved > STATE_EVERY_S:
+                    trainer.save(state, identity)
+                    saved = time.monotonic()
+            progress.update(task, completed=1.0)
+            trainer.network.eval()
+            if ranks.first:
+                trainer.save(state, identity)
+    return trainers
+
+
+def _residuals(forces_n: npt.NDArray[np.float32], measured_n: npt.NDArray[np.float32]) -> list[Residual]:
+    """Root mean squared error by estimated force, which is what a run knows, in bins of 1 N."""
+    squared = np.square(forces_n - measured_n)
+    newtons = np.floor(forces_n)
+    residuals = []
+    for newton in np.unique(newtons):
+        part = squared[newtons == newton]
+        variance = (part.sum() + RESIDUAL_PRIOR * squared.mean()) / (len(part) + RESIDUAL_PRIOR)
+        residuals.append(Residual(force_n=float(newton) + RESIDUAL_HALF_N, std_n=math.sqrt(variance)))
+    return residuals

@@ -1,0 +1,1 @@
+"""Profiles: calibrated data of a rig and of an object, and their application to a run."""

@@ -1,0 +1,259 @@
+"""Cost of a servo bus cycle: the driver beside a plain loop of the vendor's SDK and bare bytes."""
+
+import multiprocessing
+import os
+import pty
+import select
+import signal
+import struct
+import time
+import tty
+from collections.abc import Callable, Iterator, MutableSequence, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Final
+
+import numpy as np
+from dynamixel_sdk import GroupSyncRead, GroupSyncWrite, PacketHandler, PortHandler
+
+from gripper_force.config import ServoConfig
+from gripper_force.types import NS_PER_MS, NS_PER_S, ServoCommand
+from gripper_hw.dynamixel.control_table import REGISTERS, load_model
+from gripper_hw.dynamixel.firmware import VirtualServo
+from gripper_hw.dynamixel.packets import BROADCAST_ID, Instruction, frame
+from gripper_hw.dynamixel.servo import DynamixelBus
+from gripper_hw.dynamixel.virtual import VirtualBus
+
+BUS_SETTINGS: Final = tuple(
+    (baud_rate, latency_ms) for latency_ms in (0.0, 1.0) for baud_rate in (1_000_000, 2_000_000, 4_000_000)
+)
+"""Bits a second, and how much later than on the wire an answer comes out of the adapter."""
+
+_MODEL: Final = "XM430-W350"
+_IDS: Final = (1, 2)
+_RATE_HZ: Final = 200
+_TURN: Final = 50
+"""Cycles of one client before those of the other."""
+
+_FIRMWARE: Final = 52
+_READ_SIZE, _WRITE_OFFSET, _WRITE_SIZE = 16, 13, 6
+"""As the driver's; it reads 13 to 20 bytes in turn."""
+
+_BITS_A_BYTE: Final = 10
+_OVERSLEPT_NS: Final = 150_000
+
+_PATIENCE_MS: Final = 1000.0
+"""More than a session's: on a busy machine the line itself may be late, and is to be measured anyhow."""
+
+Cycle = Callable[[], object]
+
+
+@dataclass(frozen=True, slots=True)
+class BusCost:
+    """What a cycle takes, a read of two servos and a write of their goals, by one client at one setting.
+
+    Attributes:
+        client: ``driver``; ``plain SDK``, GroupSyncRead and GroupSyncWrite over the SDK's own port, as in its
+            examples; or ``bare bytes``, packets made beforehand: what this machine takes to carry them.
+        baud_rate: Bits a second.
+        latency_ms: See `BUS_SETTINGS`.
+        line_ms: What the line alone takes: the bytes' own time, and the latency.
+        p50_ms: Median of a cycle, back to back with the next.
+        p99_ms: 99th percentile of it.
+        cpu_share: Share of one CPU that the client takes at 200 cycles a second.
+    """
+
+    client: str
+    baud_rate: int
+    latency_ms: float
+    line_ms: float
+    p50_ms: float
+    p99_ms: float
+    cpu_share: float
+
+
+def bus(cycles: int) -> Iterator[tuple[BusCost, ...]]:
+    """Measures the servo's driver, beside what `BusCost` names, setting by setting.
+
+    Args:
+        cycles: How many of each client at each setting.
+
+    Raises:
+        DeviceError: The driver gave the line up, on a machine that is far too busy.
+    """
+    for baud_rate, latency_ms in BUS_SETTINGS:
+        yield bus_cost(baud_rate, latency_ms, cycles)
+
+
+def bus_cost(baud_rate: int, latency_ms: float, cycles: int) -> tuple[BusCost, ...]:
+    """Measures the clients that `BusCost` names, in turn.
+
+    Args:
+        baud_rate: Bits a second.
+        latency_ms: How much later than on the wire an answer comes out of the adapter.
+        cycles: How many of each client.
+
+    Raises:
+        DeviceError: The driver gave the line up.
+    """
+    with _line(baud_rate, latency_ms) as (paths, sent), ExitStack() as stack:
+        clients = {
+            "driver": stack.enter_context(_driver(paths[0], baud_rate)),
+            "plain SDK": stack.enter_context(_plain_sdk(paths[1], baud_rate)),
+            "bare bytes": stack.enter_context(_bare_bytes(paths[2])),
+        }
+        turns = [(name, min(_TURN, cycles - done)) for done in range(0, cycles, _TURN) for name in clients]
+        times_ns: dict[str, list[int]] = {name: [] for name in clients}
+        shares: dict[str, list[float]] = {name: [] for name in clients}
+        begun = list(sent)
+        for name, count in turns:
+            times_ns[name] += [_time_ns(clients[name]) for _ in range(count)]
+        bytes_ = [after - before for before, after in zip(begun, sent, strict=True)]
+        for name, count in turns:
+            shares[name].append(_cpu_share(clients[name], count))
+    costs = []
+    for name, count in zip(clients, bytes_, strict=True):
+        line_ms = _wire_ns(count, baud_rate) / cycles / NS_PER_MS + latency_ms
+        p50_ms, p99_ms = (float(ms) for ms in np.percentile(times_ns[name], (50, 99)) / NS_PER_MS)
+        share = float(np.median(shares[name]))
+        costs.append(BusCost(name, baud_rate, latency_ms, line_ms, p50_ms, p99_ms, share))
+    return tuple(costs)
+
+
+@contextmanager
+def _driver(path: str, baud_rate: int) -> Iterator[Cycle]:
+    config = ServoConfig(
+        model=_MODEL, port=path, baud_rate=baud_rate, bus_watchdog_ms=2540, reply_margin_ms=_PATIENCE_MS
+    )
+    bus = DynamixelBus(config, _IDS)
+
+    def cycle() -> None:
+        bus.write([ServoCommand(state.t_ns, state.position_rad, 0.1) for state in bus.read()])
+
+    bus.start()
+    try:
+        yield cycle
+        bus.stop(hold=False)
+    finally:
+        bus.close()
+
+
+@contextmanager
+def _plain_sdk(path: str, baud_rate: int) -> Iterator[Cycle]:
+    port, packets = PortHandler(path), PacketHandler(2.0)
+    port.setBaudRate(baud_rate)
+    current, velocity, position, goal = (
+        REGISTERS[name]
+        for name in ("present_current", "present_velocity", "present_position", "goal_position")
+    )
+    reader = GroupSyncRead(port, packets, current.address, current.size + velocity.size + position.size)
+    writer = GroupSyncWrite(port, packets, goal.address, goal.size)
+    for id_ in _IDS:
+        reader.addParam(id_)
+        writer.addParam(id_, bytes(goal.size))
+
+    def cycle() -> None:
+        reader.txRxPacket()
+        for id_ in _IDS:
+            ticks = [reader.getData(id_, r.address, r.size) for r in (current, velocity, position)][-1]
+            writer.changeParam(id_, goal.encode(ticks))
+        writer.txPacket()
+
+    try:
+        yield cycle
+    finally:
+        port.closePort()
+
+
+@contextmanager
+def _bare_bytes(path: str) -> Iterator[Cycle]:
+    """The driver's packets, made beforehand: what the machine itself takes to carry them to and fro."""
+    data = load_model(_MODEL).indirect_windows(_FIRMWARE)[0].data
+    read = frame(BROADCAST_ID, Instruction.FAST_SYNC_READ, struct.pack("<HH", data, _READ_SIZE) + bytes(_IDS))
+    goals = b"".join(bytes((id_,)) + bytes(_WRITE_SIZE) for id_ in _IDS)
+    params = struct.pack("<HH", data + _WRITE_OFFSET, _WRITE_SIZE) + goals
+    write = frame(BROADCAST_ID, Instruction.SYNC_WRITE, params)
+    line = os.open(path, os.O_RDWR | os.O_NOCTTY)
+
+    def cycle() -> None:
+        os.write(line, read)
+        left = 8 + (_READ_SIZE + 4) * len(_IDS)
+        while left > 0:
+            left -= len(os.read(line, left))
+        os.write(line, write)
+
+    try:
+        yield cycle
+    finally:
+        os.close(line)
+
+
+def _time_ns(cycle: Cycle) -> int:
+    start_ns = time.perf_counter_ns()
+    cycle()
+    return time.perf_counter_ns() - start_ns
+
+
+def _cpu_share(cycle: Cycle, cycles: int) -> float:
+    """Share of a CPU that this thread takes for so many cycles at 200 Hz."""
+    start_ns, cpu_ns = time.monotonic_ns(), time.thread_time_ns()
+    for i in range(1, cycles + 1):
+        cycle()
+        time.sleep(max(0.0, (start_ns + i * NS_PER_S / _RATE_HZ - time.monotonic_ns()) / NS_PER_S))
+    return (time.thread_time_ns() - cpu_ns) / (time.monotonic_ns() - start_ns)
+
+
+def _wire_ns(count: int, baud_rate: int) -> float:
+    return count * _BITS_A_BYTE * NS_PER_S / baud_rate
+
+
+# The line: a process of its own, as it must neither share Python's lock with a client nor be late.
+
+
+@contextmanager
+def _line(baud_rate: int, latency_ms: float) -> Iterator[tuple[list[str], Sequence[int]]]:
+    """Serves a virtual bus to three clients: their paths, and how many bytes went over the wire for each."""
+    context = multiprocessing.get_context("spawn")
+    sent: MutableSequence[int] = context.RawArray("q", 3)
+    here, there = context.Pipe()
+    process = context.Process(target=_serve, args=(there, sent, baud_rate, latency_ms), daemon=True)
+    process.start()
+    there.close()
+    try:
+        yield here.recv(), sent
+    finally:
+        here.close()
+        process.join()
+
+
+def _serve(parent: Connection, sent: MutableSequence[int], baud_rate: int, latency_ms: float) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's, which lets go then
+    bus = VirtualBus(VirtualServo(id_, load_model(_MODEL)) for id_ in _IDS)
+    clients = {}
+    paths = []
+    for i in range(len(sent)):
+        master, slave = pty.openpty()
+        tty.setraw(slave)
+        clients[master] = i
+        paths.append(os.ttyname(slave))
+    parent.send(paths)
+    free_ns = 0.0  # when the wire is
+    while parent.fileno() not in (ready := select.select([parent.fileno(), *clients], [], [])[0]):
+        for master in ready:
+            request = os.read(master, 4096)
+            free_ns = max(free_ns, time.monotonic_ns()) + _wire_ns(len(request), baud_rate)
+            answer = bus.transact(request)
+            sent[clients[master]] += len(request) + len(answer)
+            if answer:
+                free_ns += _wire_ns(len(answer), baud_rate)
+                _wait_until(free_ns + latency_ms * NS_PER_MS)
+                os.write(master, answer)
+
+
+def _wait_until(t_ns: float) -> None:
+    """Sleeps, but for the last moments: a sleep ends late."""
+    if (left_ns := t_ns - _OVERSLEPT_NS - time.monotonic_ns()) > 0:
+        time.sleep(left_ns / NS_PER_S)
+    while time.monotonic_ns() < t_ns:
+        pass

@@ -1,0 +1,1 @@
+"""The fault matrix: each part fails during a grasp, and the log is judged."""

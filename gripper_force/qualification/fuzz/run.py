@@ -1,0 +1,414 @@
+"""Random and damaged input for everything that reads bytes or text from outside.
+
+An input must give a result or a `GripperError`. Any other exception is a finding, and so are a crash, a hang,
+and a wish for more memory than `MEMORY_BYTES`. Input ``i`` of a target is a function of the seed, the name of
+the target and ``i``, so a finding is seen again by its number.
+"""
+
+import random
+import re
+import resource
+import signal
+import struct
+import tempfile
+import time
+import traceback
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from multiprocessing import connection, get_context
+from pathlib import Path
+from typing import Any, Final
+
+from gripper_force.errors import ConfigError, GripperError
+from gripper_force.types import NS_PER_S
+
+FUZZ_TARGETS: Final = tuple(
+    f"gripper_force.qualification.fuzz.{name}"
+    for name in ("core_targets", "bus_targets", "load_cell_targets")
+)
+"""Modules with a list ``TARGETS``; each worker process imports them."""
+
+HANG_S: Final = 30.0
+"""Far beyond the slowest input, which takes under a second: a machine may be busy."""
+
+MEMORY_BYTES: Final = 512 * 2**20
+"""What inputs may take on top of what the readers themselves do."""
+
+_POLL_S: Final = 0.25
+_LONGEST: Final = 1 << 18
+_PACKAGES: Final = ("gripper_force", "gripper_hw", "gripper_calibration")
+_INTEGERS: Final = (
+    *(0, 1, 2, 3, 7, 16, 127, 128, 255, 256, 1023, 1024, 0x7FFF, 0x8000, 0xFFFF, 1 << 20, 1 << 28),
+    *(0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 1 << 40, (1 << 63) - 1, 1 << 63, (1 << 64) - 1),
+)
+_FLOATS: Final = (float("nan"), float("inf"), -float("inf"), -0.0, -1.0, 1e-320, 1e19, 1e300, -1e300)
+_WORDS: Final = (
+    *(
+        b"nan",
+        b".nan",
+        b"-.inf",
+        b"inf",
+        b"1e400",
+        b"-1",
+        b"0",
+        b"1e-320",
+        b"1e300",
+        b"0x_",
+        b"0b",
+        b"9" * 30,
+    ),
+    *(b"\x00", b"\xff", b"\n", b"\r\n", b" ", b",", b"[", b"]", b"{", b"}", b'"', b":", b"'", b"-", b"\t"),
+    *(b"null", b"true", b"2001-99-99", b"\xd9\xa3", b"\xf0\x9f\xa6\xbe", b"[" * 2000, b"x" * 300),
+)
+_DIGITS: Final = re.compile(rb"[+-]?\d+(?:\.\d*)?")
+
+
+@dataclass(frozen=True)
+class Target:
+    """One reader of input.
+
+    Attributes:
+        name: What it is called.
+        examples: Makes inputs to damage, the same in every process.
+        feed: Reads an input. The path is a scratch file for readers of files.
+        weight: How many inputs it gets, relative to others.
+        words: Bytes that mean something to it.
+        repair: Makes a damaged input pass its checksums; done to half of the inputs.
+    """
+
+    name: str
+    examples: Callable[[], Sequence[bytes]]
+    feed: Callable[[bytes, Path], object]
+    weight: float = 1.0
+    words: tuple[bytes, ...] = ()
+    repair: Callable[[bytes], bytes] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """An input that got neither a result nor a typed error.
+
+    Attributes:
+        target: Whose.
+        index: Its number.
+        error: What came of it, and where.
+        file: Where it was kept.
+    """
+
+    target: str
+    index: int
+    error: str
+    file: str
+
+
+Advance = Callable[[str, int], None]
+"""Told what goes on, and how many inputs more are done."""
+
+
+def load_targets(modules: Sequence[str]) -> list[Target]:
+    """The targets of modules, each of which has a list ``TARGETS``."""
+    return [target for module in modules for target in import_module(module).TARGETS]
+
+
+def fuzz(
+    count: int,
+    seed: int,
+    jobs: int,
+    out: Path,
+    advance: Advance = lambda _note, _done: None,
+    *,
+    only: str | None = None,
+) -> dict[str, Any]:
+    """Feeds ``count`` inputs to all targets, in several processes.
+
+    Args:
+        count: Inputs over all targets; each target gets one at least.
+        seed: Of all inputs.
+        jobs: Processes.
+        out: Folder for the inputs that were findings.
+        advance: Told of progress.
+        only: A target's name, which then gets all inputs; or ``<name>:<number>`` for that input alone.
+
+    Returns:
+        ``ok`` (nothing was found), ``targets`` (by name: ``inputs``, ``results``, ``typed_errors``,
+        ``findings``), ``findings`` (one of each kind), ``inputs``, ``seed`` and ``wall_s``.
+
+    Raises:
+        ConfigError: There is no such target.
+        GripperError: A process died before its first input.
+    """
+    begin_s = time.monotonic()
+    targets = load_targets(FUZZ_TARGETS)
+    plan = _plan(targets, count, only)
+    findings: dict[tuple[str, str], Finding] = {}
+    done = 0
+    with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
+        workers = [_Worker(seed, plan, k, jobs, Path(folder)) for k in range(jobs)]
+        try:
+            while any(worker.busy for worker in workers):
+                connection.wait([w.process.sentinel for w in workers if w.busy], _POLL_S)
+                for t, index, error in [found for worker in workers for found in worker.poll()]:
+                    target = targets[t]
+                    if (key := (target.name, _kind(error))) not in findings:
+                        file = _keep(out, target, seed, index)
+                        findings[key] = Finding(target.name, index, error, str(file))
+                now = sum(sum(worker.counts(t)) for worker in workers for t in range(len(targets)))
+                advance(f"{len(findings)} findings", now - done)
+                done = now
+        finally:
+            for worker in workers:
+                worker.kill()
+    counts = {
+        target.name: [sum(row) for row in zip(*(worker.counts(t) for worker in workers), strict=True)]
+        for t, target in enumerate(targets)
+        if plan[t]
+    }
+    return {
+        "ok": not findings,
+        "targets": {
+            name: {"inputs": sum(row), "results": row[0], "typed_errors": row[1], "findings": row[2]}
+            for name, row in counts.items()
+        },
+        "findings": list(findings.values()),
+        "inputs": done,
+        "seed": seed,
+        "wall_s": round(time.monotonic() - begin_s, 1),
+    }
+
+
+def input_of(target: Target, examples: Sequence[bytes], seed: int, index: int) -> bytes:
+    """Input ``index`` of a target."""
+    rng = random.Random(f"{seed}/{target.name}/{index}")
+    data = mutate(rng, examples, (*_WORDS, *target.words))
+    return target.repair(data) if target.repair is not None and rng.random() < 0.5 else data
+
+
+def mutate(rng: random.Random, examples: Sequence[bytes], words: Sequence[bytes]) -> bytes:
+    """Damages one of the examples in one to eight ways; one input in 50 is nothing but random bytes."""
+    if rng.random() < 0.02:
+        return rng.randbytes(int(rng.expovariate(1 / 100)))
+    data = bytearray(rng.choice(examples))
+    for _ in range(min(8, 1 + int(rng.expovariate(1.0)))):
+        damage = rng.choice(_DAMAGES)
+        damage(rng, data, examples, words)
+    return bytes(data[:_LONGEST])
+
+
+_Damage = Callable[[random.Random, bytearray, Sequence[bytes], Sequence[bytes]], None]
+
+
+def _flip(rng: random.Random, data: bytearray, *_: object) -> None:
+    for _bit in range(rng.randint(1, 4) if data else 0):
+        data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+
+
+def _noise(rng: random.Random, data: bytearray, *_: object) -> None:
+    at = _span(rng, data)
+    data[at] = rng.randbytes(at.stop - at.start)
+
+
+def _insert(rng: random.Random, data: bytearray, *_: object) -> None:
+    at = _span(rng, data).start
+    data[at:at] = rng.randbytes(rng.randint(1, 16))
+
+
+def _delete(rng: random.Random, data: bytearray, *_: object) -> None:
+    del data[_span(rng, data)]
+
+
+def _cut(rng: random.Random, data: bytearray, *_: object) -> None:
+    del data[rng.randint(0, len(data)) :]
+
+
+def _repeat(rng: random.Random, data: bytearray, *_: object) -> None:
+    at = _span(rng, data)
+    data[at.stop : at.stop] = data[at] * rng.choice((1, 2, 7, 60))
+
+
+def _splice(rng: random.Random, data: bytearray, examples: Sequence[bytes], _words: object) -> None:
+    other = rng.choice(examples)
+    data[rng.randint(0, len(data)) :] = other[rng.randint(0, len(other)) :]
+
+
+def _integer(rng: random.Random, data: bytearray, *_: object) -> None:
+    """A lie where a length, a count, an address or a time may be."""
+    size = rng.choice((1, 2, 4, 8))
+    number = rng.choice(_INTEGERS) % (1 << 8 * size)
+    at = rng.randint(0, len(data))
+    data[at : at + size] = number.to_bytes(size, rng.choice(("little", "big")))
+
+
+def _float(rng: random.Random, data: bytearray, *_: object) -> None:
+    at = rng.randint(0, len(data))
+    data[at : at + 8] = struct.pack("<d", rng.choice(_FLOATS))
+
+
+def _word(rng: random.Random, data: bytearray, _examples: object, words: Sequence[bytes]) -> None:
+    at = _span(rng, data)
+    data[at if rng.random() < 0.5 else slice(at.start, at.start)] = rng.choice(words)
+
+
+def _digits(rng: random.Random, data: bytearray, _examples: object, words: Sequence[bytes]) -> None:
+    """Another number, or no number, in the place of one that is written out."""
+    found = _DIGITS.search(data, rng.randint(0, len(data)))
+    if found is not None:
+        number = str(rng.choice((-1, 1)) * rng.choice(_INTEGERS)).encode()
+        data[found.start() : found.end()] = rng.choice((number, rng.choice(words)))
+
+
+_DAMAGES: Final[tuple[_Damage, ...]] = (
+    *(_flip, _noise, _insert, _delete, _cut, _repeat, _splice, _integer, _float, _word, _digits),
+)
+
+
+def _span(rng: random.Random, data: bytearray) -> slice:
+    """Some bytes in a row, mostly few."""
+    start = rng.randint(0, len(data))
+    return slice(start, min(len(data), start + int(rng.expovariate(1 / 6))))
+
+
+def _plan(targets: Sequence[Target], count: int, only: str | None) -> list[range]:
+    """The numbers of the inputs that each target gets."""
+    if only is None:
+        total = sum(target.weight for target in targets)
+        return [range(max(1, round(count * target.weight / total))) for target in targets]
+    name, colon, number = only.partition(":")
+    if name not in {target.name for target in targets} or (colon and not number.isdecimal()):
+        known = ", ".join(target.name for target in targets)
+        raise ConfigError(f"no input {only!r}; give <target> or <target>:<number>, of {known}")
+    wanted = range(int(number), int(number) + 1) if colon else range(count)
+    return [wanted if target.name == name else range(0) for target in targets]
+
+
+class _Worker:
+    """A process that feeds its share of the inputs, and the next one in its place where it dies or hangs."""
+
+    def __init__(self, seed: int, plan: Sequence[range], number: int, jobs: int, folder: Path) -> None:
+        self._context = get_context("spawn")
+        self._shares = [numbers[number::jobs] for numbers in plan]
+        # Target, place in its share, begin of the input (0: none yet); then three counts for each target.
+        self._shared = self._context.RawArray("q", 3 + 3 * len(plan))
+        self._task = (FUZZ_TARGETS, seed, self._shares, folder / str(number), self._shared)
+        self.busy = True
+        self._begin(0, 0)
+
+    def _begin(self, target: int, place: int) -> None:
+        self._shared[2] = 0
+        self._pipe, theirs = self._context.Pipe(duplex=False)
+        self.process = self._context.Process(
+            target=_work, args=(*self._task, target, place, theirs), daemon=True
+        )
+        self.process.start()
+        theirs.close()
+
+    def counts(self, target: int) -> tuple[int, int, int]:
+        """Results, typed errors and findings of a target so far."""
+        a, b, c = self._shared[3 + 3 * target : 6 + 3 * target]
+        return a, b, c
+
+    def poll(self) -> list[tuple[int, int, str]]:
+        """Findings since the last call: target, number, error."""
+        if not self.busy:
+            return []
+        ended = not self.process.is_alive()
+        found = self._received()
+        target, place, begin_ns = self._shared[:3]
+        hangs = begin_ns and time.monotonic_ns() - begin_ns > HANG_S * NS_PER_S
+        if hangs and not ended:
+            self.kill()
+        elif not ended:
+            return found
+        code = self.process.exitcode
+        if code == 0:
+            self.busy = False
+        elif not begin_ns:
+            raise GripperError(f"a fuzzing process ended with code {code} before its first input")
+        else:
+            why = (
+                f"Hang: no end after {HANG_S:.0f} s"
+                if hangs
+                else f"Crash: the process ended with code {code}"
+            )
+            found.append((target, self._shares[target][place], why))
+            self._shared[5 + 3 * target] += 1
+            self._begin(target, place + 1)
+        return found
+
+    def kill(self) -> None:
+        """Ends the process."""
+        self.process.kill()
+        self.process.join()
+
+    def _received(self) -> list[tuple[int, int, str]]:
+        found = []
+        try:
+            while self._pipe.poll():
+                found.append(self._pipe.recv())
+        except EOFError:
+            pass
+        return found
+
+
+def _work(
+    modules: Sequence[str],
+    seed: int,
+    shares: Sequence[range],
+    scratch: Path,
+    shared: Any,
+    first_target: int,
+    first_place: int,
+    pipe: connection.Connection,
+) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that reads the pipe ends this one
+    warnings.simplefilter("ignore")
+    targets = load_targets(modules)
+    examples = [target.examples() if share else () for target, share in zip(targets, shares, strict=True)]
+    limit = _address_space() + MEMORY_BYTES
+    resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    told = set()
+    for t, target in list(enumerate(targets))[first_target:]:
+        for place in range(first_place if t == first_target else 0, len(shares[t])):
+            index = shares[t][place]
+            data = input_of(target, examples[t], seed, index)
+            shared[0], shared[1], shared[2] = t, place, time.monotonic_ns()
+            error = _outcome(target, data, scratch)
+            shared[3 + 3 * t + _COLUMNS.get(error, 2)] += 1
+            if error not in _COLUMNS and (kind := (t, _kind(error))) not in told:
+                told.add(kind)
+                pipe.send((t, index, error))
+
+
+_RESULT, _TYPED = "result", "typed error"
+_COLUMNS: Final = {_RESULT: 0, _TYPED: 1}
+
+
+def _outcome(target: Target, data: bytes, scratch: Path) -> str:
+    try:
+        target.feed(data, scratch)
+    except GripperError:
+        return _TYPED
+    except BaseException as error:  # libraries in Rust panic past Exception
+        frames = traceback.extract_tb(error.__traceback__)
+        ours = [frame for frame in frames if any(package in frame.filename for package in _PACKAGES)]
+        where = f"{Path(ours[-1].filename).name}:{ours[-1].lineno}" if ours else "nowhere"
+        message = " ".join(str(error)[:200].split())
+        return f"{type(error).__name__} at {where}: {message}"
+    return _RESULT
+
+
+def _kind(error: str) -> str:
+    return error.partition(": ")[0]
+
+
+def _keep(out: Path, target: Target, seed: int, index: int) -> Path:
+    out.mkdir(parents=True, exist_ok=True)
+    path = out / f"{target.name}-{seed}-{index}.bin"
+    path.write_bytes(input_of(target, target.examples(), seed, index))
+    return path
+
+
+def _address_space() -> int:
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    return pages * resource.getpagesize()

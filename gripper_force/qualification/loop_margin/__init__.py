@@ -1,0 +1,1 @@
+"""Stability margins of the force loop over stiffness and delay."""

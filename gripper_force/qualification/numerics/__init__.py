@@ -1,0 +1,1 @@
+"""Numerically hard cases for the network, the fusion filter, the head fit and the simulator."""

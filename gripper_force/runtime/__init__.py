@@ -1,0 +1,1 @@
+"""Runtime of one gripper: devices, perception, control cycle and log."""

@@ -1,0 +1,104 @@
+"""What a run writes down, without ever waiting for the disk or ending for its sake."""
+
+import queue
+import threading
+from collections.abc import Callable
+from typing import Final
+
+from gripper_force.errors import LogError
+from gripper_force.runtime.log import LogWriter
+from gripper_force.types import Record
+
+ROOM: Final = 4096
+"""Records that may wait for the disk: some three seconds of a run."""
+
+_PATIENCE_S: Final = 10.0
+
+
+class Recorder:
+    """Hands records to a log and counts those that are lost.
+
+    In real time a thread writes, and where the disk is so slow that the queue is full, records are dropped.
+    In lockstep the caller writes, and the clock stands still meanwhile.
+
+    Args:
+        log: The log; the recorder closes it.
+        lockstep: Whether time waits.
+
+    Attributes:
+        lost: Records that are missing from the log.
+    """
+
+    def __init__(self, log: LogWriter, *, lockstep: bool) -> None:
+        self.lost = 0
+        self._log = log
+        self._error = ""
+        self._queue: queue.Queue[Callable[[], None] | None] = queue.Queue(ROOM)
+        self._thread: threading.Thread | None = None
+        if not lockstep:
+            self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+            self._thread.start()
+
+    def write(self, record: Record) -> None:
+        """Writes a record, now or soon."""
+        self._do(lambda: self._log.write(record))
+
+    def attach(self, name: str, data: bytes, media_type: str) -> None:
+        """Adds a file to the log, now or soon."""
+        self._do(lambda: self._log.attach(name, data, media_type))
+
+    def close(self) -> None:
+        """Writes what waits and completes the log. May be called twice."""
+        if self._thread is not None:
+            try:
+                self._queue.put(None, timeout=_PATIENCE_S)
+                self._thread.join(_PATIENCE_S)
+            except queue.Full:
+                pass  # the thread has not moved all that time
+            if self._thread.is_alive():
+                self.lost += self._queue.qsize()
+                self._error = f"the disk has not taken the last records within {_PATIENCE_S:g} s"
+                return  # the log is still the thread's
+            self._thread = None
+        self._count(self._log.close)
+
+    def raise_losses(self) -> None:
+        """Tells of losses, which must not end a run, once it has ended.
+
+        Raises:
+            LogError: Records are missing from the log.
+        """
+        if self._error:
+            raise LogError(
+                f"{self._error}; the run went on, and its log lacks {self.lost} records: free some space, or "
+                "set log.directory elsewhere"
+            )
+
+    def _do(self, write: Callable[[], None]) -> None:
+        if self._thread is None:
+            self._count(write)
+            return
+        try:
+            self._queue.put_nowait(write)
+        except queue.Full:
+            self.lost += 1
+            self._error = self._error or "the disk is too slow for the log"
+
+    def _run(self) -> None:
+        while (write := self._queue.get()) is not None:
+            self._count(write)
+
+    def _count(self, write: Callable[[], None]) -> None:
+        try:
+            write()
+        except LogError as error:
+            self._lose(str(error))
+        except Exception as error:  # a thread that ended here would lose all that follows, in silence
+            self._lose(f"{type(error).__name__}: {error}")
+
+    def _lose(self, why: str) -> None:
+        self.lost += 1
+        if self._log.failed:
+            self.lost += self._log.waiting
+            self._log.waiting = 0
+        self._error = self._error or why

@@ -1,1 +1,0 @@
-"""What a run must survive: hostile input, a long life, and failing parts."""

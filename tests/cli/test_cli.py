@@ -1,0 +1,402 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from gripper_force import cli
+from gripper_force.cli import console
+from gripper_force.cli.options import load_settings
+from gripper_force.errors import ConfigError
+from gripper_force.runtime.log import LogReader
+
+
+class Done(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+    def json(self) -> dict[str, Any]:
+        assert self.code == 0, self.err
+        (line,) = self.out.splitlines()
+        loaded: dict[str, Any] = json.loads(line)
+        return loaded
+
+
+Run = Callable[..., Done]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Iterator[Run]:
+    """The command itself, but for the process."""
+    monkeypatch.chdir(tmp_path)
+    handler = signal.getsignal(signal.SIGTERM)
+
+    def call(*arguments: object) -> Done:
+        monkeypatch.setattr(sys, "argv", ["gripper-force", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        said = capsys.readouterr()
+        return Done(int(end.value.code or 0), said.out, said.err)
+
+    yield call
+    signal.signal(signal.SIGTERM, handler)
+
+
+@pytest.fixture
+def sets(quick: list[str], tmp_path: Path) -> list[str]:
+    return [part for one in (*quick, f"log.directory={tmp_path}/runs") for part in ("--set", one)]
+
+
+def commands(group: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    yield path
+    for name, command in getattr(group, "commands", {}).items():
+        yield from commands(command, (*path, name))
+
+
+@pytest.mark.parametrize("path", list(commands(typer.main.get_command(cli.app))), ids=" ".join)
+def test_every_command_explains_itself(path: tuple[str, ...]) -> None:
+    result = CliRunner().invoke(cli.app, [*path, "--help"])
+    assert result.exit_code == 0
+    assert "Usage:" in result.output
+
+
+def test_every_command_can_be_set_and_read_by_a_script() -> None:
+    groups = list(commands(typer.main.get_command(cli.app)))
+    for path in groups:
+        command: Any = typer.main.get_command(cli.app)
+        for name in path:
+            command = command.commands[name]
+        if not hasattr(command, "commands"):
+            options = {option for parameter in command.params for option in parameter.opts}
+            assert options >= {"--set", "--json"}, path
+
+
+def test_the_command_line_answers_without_what_is_heavy() -> None:
+    code = "import sys, gripper_force.cli; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    heavy = {"torch", "mujoco", "cv2", "matplotlib", "scipy", "numpy", "dynamixel_sdk", "depthai", "mcap"}
+    assert not heavy & set(done.stdout.split())
+
+
+GRASP_KEYS = {"result", "object", "target_n", "load_cell_mean_n", "steady_error_n", "overshoot_n", "settle_s"}
+GRASP_KEYS |= {"estimator_p50_ms", "estimator_p99_ms", "loop_hz", "log", "report"}
+ERROR_KEYS = {"mae_n", "rmse_n", "bias_n", "per_object", "per_bin", "frames"}
+
+
+def test_grasp_prints_one_json_object(run: Run, sets: list[str]) -> None:
+    done = run("grasp", "--json", "--object", "stapler", "--target-n", 2.5, "--seed", 3, *sets)
+    result = done.json()
+    assert set(result) >= GRASP_KEYS
+    assert (result["result"], result["object"], result["target_n"]) == ("held", "stapler", 2.5)
+    assert result["estimator_p50_ms"] is None
+    assert Path(result["log"]).is_file()
+    assert Path(result["report"]).read_text().startswith("<!")
+    for phase in ("approach", "contact", "ramp", "hold"):
+        assert phase in done.err
+
+
+def test_grasp_prints_a_table_for_people(run: Run, sets: list[str]) -> None:
+    done = run("grasp", *sets, "--set", "log.report=false")
+    assert done.code == 0
+    for text in ("held", "stapler", "3.00 N", "steady error", "200.0 Hz"):
+        assert text in done.out
+
+
+def test_a_grasp_that_did_not_hold_has_an_exit_code(run: Run, sets: list[str]) -> None:
+    fault = "faults=[{unit: servo, kind: wrong, at_s: 0.4}]"
+    done = run("grasp", "--json", *sets, "--set", "log.report=false", "--set", fault)
+    assert (json.loads(done.out)["result"], done.code) == ("fault", 1)
+
+
+def test_trials_print_each_and_a_summary(run: Run, sets: list[str]) -> None:
+    result = run("grasp", "--json", "--trials", 1, "--jobs", 1, *sets).json()
+    assert set(result) == {"trials", "summary"}
+    (trial,) = result["trials"]
+    assert set(trial) >= GRASP_KEYS
+    assert trial["object"] == "sponge"
+    assert result["summary"]["trials"] == 1
+    assert result["summary"]["median_error_percent"] is not None
+
+
+def test_replay_prints_one_json_object(run: Run, fused_log: Path) -> None:
+    result = run("replay", fused_log, "--json").json()
+    assert set(result) >= ERROR_KEYS | {"identical"}
+    assert result["identical"] is True
+    table = run("replay", fused_log)
+    assert table.code == 0
+    assert "yes, to the bit" in table.out
+    changed = run("replay", fused_log, "--set", "control.ramp_n_s=4", "--json").json()
+    assert changed["identical"] is False
+
+
+def write_recording(folder: Path) -> tuple[Path, Path]:
+    """A bright bar that widens with the force, and the forces."""
+    force_n = np.interp(np.arange(60), [0, 15, 30, 45, 50, 60], [0, 0, 20, 20, 0, 0])
+    video, table = folder / "touch.avi", folder / "touch.csv"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (64, 64))
+    for force in force_n:
+        image = np.full((64, 64, 3), 60, np.uint8)
+        image[:, : 20 + int(force)] = 200
+        writer.write(image)
+    writer.release()
+    rows = [f"{i},{i / 30:.6f},{force:.5f}" for i, force in enumerate(force_n)]
+    table.write_text("\n".join(["frame,t_s,force_n", *rows, ""]))
+    return video, table
+
+
+def test_a_recording_is_imported_replayed_and_evaluated(
+    run: Run, tmp_path: Path, tiny_checkpoint: Path
+) -> None:
+    video, table = write_recording(tmp_path)
+    imported = run("import", "video", video, table, "--out", "logs", "--object", "foam", "--json").json()
+    (row,) = imported["logs"]
+    assert (row["object"], row["frames"], row["spikes_rejected"]) == ("foam", 60, 0)
+    replayed = run("replay", row["log"], "--checkpoint", tiny_checkpoint, "--json").json()
+    assert set(replayed) >= ERROR_KEYS
+    assert replayed["identical"] is None
+    assert set(replayed["sources"]) == {"visual"}
+    people = run("replay", row["log"], "--checkpoint", tiny_checkpoint)
+    assert "nothing to compare" in people.out
+    evaluated = run(
+        "evaluate", "logs", "--checkpoint", tiny_checkpoint, "--object", "foam", "--jobs", 1, "--json"
+    ).json()
+    assert set(evaluated) >= ERROR_KEYS
+    assert set(evaluated["per_object"]) == {"foam"}
+    assert evaluated["mae_n"] == pytest.approx(replayed["mae_n"], rel=0.2)
+
+
+def test_sets_are_recorded_judged_and_kept(run: Run, sets: list[str]) -> None:
+    eyes = ("--set", "camera.backend=simulated", "--set", "camera.rate_hz=20", "--set", "control.ramp_n_s=30")
+    asked = ("record", "--object", "stapler", "--sets", 1, "--touches", 1, "--out", "data", "--lux", 350)
+    result = run(*asked, *sets, *eyes, "--json").json()
+    assert set(result) == {"sets", "overall", "warnings"}
+    (one,) = result["sets"]
+    assert Path(one["log"]) == Path("data/train/stapler-350lux-01.mcap")
+    made_ns = Path(one["log"]).stat().st_mtime_ns
+    keys = {"frames", "camera_hz", "camera_hz_asked", "frames_lost", "samples_rejected", "histogram"}
+    keys |= {"lag_ms", "lag_spread_ms"}
+    assert set(one) >= keys
+    assert set(result["overall"]) >= keys
+    again = run(*asked, *sets, *eyes)
+    assert again.code == 0
+    for text in ("stapler-350lux-01", "Hz of 20", "lag ms", "0-1"):
+        assert text in again.out
+    assert Path(one["log"]).stat().st_mtime_ns == made_ns
+    replayed = run("replay", one["log"], "--json").json()
+    assert replayed["identical"] is True
+    blind = run("record", *sets, "--json")
+    assert (blind.code, "record needs a camera" in blind.err) == (2, True)
+
+
+def test_a_published_database_is_imported_and_its_damage_told(run: Run, tmp_path: Path) -> None:
+    folder = tmp_path / "db" / "sponge_30_100"
+    folder.mkdir(parents=True)
+    for number in range(1, 5):
+        cv2.imwrite(str(folder / f"{number}.jpg"), np.full((16, 16, 3), 60 + number, np.uint8))
+    (folder / "test.txt").write_text("1,0.0,0\n2,0.5\n3,1.0,0\n4,0.5,0\n")
+    (tmp_path / "db" / "notes[1].txt").touch()
+    result = run("import", "database", "db", "--out", "logs", "--rate-hz", 100, "--json").json()
+    (row,) = result["environments"]
+    assert (row["object"], row["degrees"], row["lux"], row["logs"], row["frames"]) == (
+        "sponge",
+        30,
+        750,
+        1,
+        4,
+    )
+    assert result["ignored"] == ["notes[1].txt"]
+    assert Path("logs/train/sponge_30_100-01.mcap").is_file()
+    people = run("import", "database", "db", "--out", "logs")
+    for text in ("sponge_30_100", "line 2, '2,0.5'", "the first is 2", "not imported notes[1].txt"):
+        assert text in people.out
+    assert "camera.rate_hz" in run("import", "database", "db", "--rate-hz", 0).err
+    assert "name the folder that holds these" in run("import", "database", "logs/train").err
+
+
+# Bad input.
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--set", "control.ramp=3"], "unknown configuration key 'control.ramp'"),
+        (["--set", "seed=x"], "configuration key 'seed'"),
+        (["--object", "egg"], "no simulated object 'egg'; there are sponge, paper_cup, tube, stapler"),
+        (["--feedback", "guess"], "configuration key 'control.feedback'"),
+        (["--target-n", "13"], "target_n 13 N is too near to control.force_limit_n 10 N"),
+        (["--set", "camera.backend=oak9"], "no camera backend 'oak9'; there are none, simulated"),
+        (["--set", "load_cell.backend=scale"], "no load_cell backend 'scale'"),
+        (["--set", "servo.port=/dev/ttyUSB7", "--set", "load_cell.backend=none"], "clock=lockstep needs"),
+        (
+            [
+                "--set",
+                "servo.port=/dev/ttyUSB7",
+                "--set",
+                "load_cell.backend=none",
+                "--set",
+                "clock=realtime",
+            ],
+            "there is no port /dev/ttyUSB7",
+        ),
+        (["--set", "servo.model=XW999"], "XW999"),
+        (["--trials", "2", "--object", "tube"], "leave --object and --target-n out"),
+        (["--config", "gone.yaml"], "can't read the configuration gone.yaml"),
+        (["--set", "camera.backend=simulated", "--set", "vision.checkpoint=gone"], "no checkpoint at gone"),
+    ],
+)
+def test_bad_input_to_grasp_is_one_sentence(
+    run: Run, sets: list[str], arguments: list[str], sentence: str
+) -> None:
+    done = run("grasp", *sets, *arguments)
+    assert (done.code, done.out) == (2, "")
+    (line,) = done.err.splitlines()
+    assert line.startswith("error: ")
+    assert sentence in line
+
+
+def test_with_json_the_error_is_json_too(run: Run) -> None:
+    done = run("grasp", "--json", "--set", "[bold]=3")
+    assert done.code == 2
+    assert "unknown configuration key '[bold]'" in json.loads(done.out)["error"]
+    assert "unknown configuration key '[bold]'" in done.err
+
+
+def test_a_truncated_log_is_refused_and_recovered_on_request(
+    run: Run, fused_log: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(fused_log.read_bytes()[:-1000])
+    done = run("replay", path)
+    assert done.code == 2
+    assert "can be recovered, --recover reads them" in done.err
+    assert run("replay", path, "--recover", "--json").json()["frames"] > 100
+
+
+def test_a_file_that_is_no_checkpoint_is_named(
+    run: Run, fused_log: Path, tiny_checkpoint: Path, tmp_path: Path
+) -> None:
+    from safetensors.torch import load_file, save_file
+
+    garbage, foreign, short = (tmp_path / f"{n}.safetensors" for n in ("garbage", "foreign", "short"))
+    garbage.write_bytes(b"no weights" * 100)
+    save_file(load_file(tiny_checkpoint), foreign)
+    short.write_bytes(tiny_checkpoint.read_bytes()[:-100])
+    for path, sentence in ((garbage, "damaged"), (foreign, "is not a gripper-force"), (short, "damaged")):
+        done = run("replay", fused_log, "--checkpoint", path)
+        assert done.code == 2
+        (line,) = done.err.splitlines()
+        assert str(path) in line
+        assert sentence in line
+
+
+def test_a_report_is_of_the_run_as_it_was(run: Run, fused_log: Path) -> None:
+    done = run("replay", fused_log, "--report", "--set", "control.ramp_n_s=4")
+    assert (done.code, "--report draws the run as it was" in done.err) == (2, True)
+
+
+def interrupt(arguments: list[str], folder: Path) -> tuple[int, str]:
+    """Runs the command in a terminal's group of its own, and sends Ctrl-C once it writes a log."""
+    command = [sys.executable, "-c", "from gripper_force.cli import main; main()", *arguments]
+    with subprocess.Popen(
+        command, cwd=folder, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as child:
+        while not any(log.stat().st_size > 100_000 for log in folder.rglob("*.mcap")):
+            assert child.poll() is None
+            time.sleep(0.01)
+        os.killpg(child.pid, signal.SIGINT)
+        _, said = child.communicate()
+    return child.returncode, said
+
+
+def test_an_interrupted_grasp_says_where_its_log_is(sets: list[str], tmp_path: Path) -> None:
+    code, said = interrupt(["grasp", *sets, "--set", "control.hold_s=600"], tmp_path)
+    assert (code, "Traceback" in said) == (130, False)
+    (log,) = tmp_path.rglob("*.mcap")
+    assert f"gripper-force replay {log}" in said
+    assert LogReader(log).duration_ns > 0
+
+
+def test_interrupted_trials_end_without_a_word_from_each_process(sets: list[str], tmp_path: Path) -> None:
+    code, said = interrupt(["grasp", "--trials", "40", "--jobs", "2", *sets], tmp_path)
+    assert (code, "Traceback" in said) == (130, False)
+    assert "interrupted" in said
+
+
+def test_a_protocol_and_its_scale_are_known_by_name(run: Run) -> None:
+    assert "no protocol 'shin'; there is shin2019" in run("simulate", "--protocol", "shin").err
+    unknown = run("simulate", "--protocol", "shin2019", "--scale", "huge")
+    assert (unknown.code, "there are full, small" in unknown.err) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("args", "sentence"),
+    [
+        (["--scale", "small"], "add --protocol shin2019"),
+        (["--protocol", "shin2019", "--presses", "9"], "--presses can't be heeded"),
+        (["--protocol", "shin2019", "--grasps", "0", "--first-seed", "7"], "--grasps and --first-seed can't"),
+        (["--protocol", "shin2019", "--object", "tube"], "--object can't be heeded"),
+    ],
+)
+def test_what_a_simulation_would_not_heed_is_an_error(
+    args: list[str], sentence: str, run: Run, tmp_path: Path
+) -> None:
+    done = run("simulate", "--out", tmp_path / "sets", *args)
+    assert (done.code, sentence in done.err) == (2, True)
+    assert not (tmp_path / "sets").exists()
+
+
+def test_logs_can_be_made_of_one_object(run: Run, tmp_path: Path) -> None:
+    options = ("--presses", "0", "--taps", "1", "--grasps", "0", "--jobs", "1", "--first-seed", "100007")
+    made = run("simulate", "--out", tmp_path / "hard", "--object", "stapler", *options, "--json")
+    assert made.json()["made"] == 1
+    assert [path.name for path in (tmp_path / "hard").iterdir()] == ["tap-stapler-100007.mcap"]
+    unknown = run("simulate", "--out", tmp_path / "none", "--object", "pencil", *options)
+    assert (unknown.code, "no simulated object 'pencil'" in unknown.err) == (2, True)
+
+
+def test_a_video_needs_its_table(run: Run, tmp_path: Path) -> None:
+    video, table = write_recording(tmp_path)
+    table.unlink()
+    assert "needs its load-cell table" in run("import", "video", video).err
+    done = run("import", "video", video, table)
+    assert done.code == 2
+    assert "can't read the table" in done.err
+    assert "touch.avi has no table of forces" in run("import", "video", tmp_path).err
+
+
+def test_an_empty_folder_has_nothing_to_evaluate(run: Run, tmp_path: Path, tiny_checkpoint: Path) -> None:
+    done = run("evaluate", tmp_path, "--checkpoint", tiny_checkpoint)
+    assert (done.code, done.out) == (2, "")
+    assert "no logs (*.mcap)" in done.err
+
+
+def test_wrong_usage_is_told_by_the_parser(run: Run) -> None:
+    done = run("grasp", "--jobs", "0")
+    assert done.code == 2
+    assert "Traceback" not in done.err
+
+
+# In between.
+
+
+def test_a_figure_that_is_no_number_is_null() -> None:
+    value = {"a": float("nan"), "b": [1.5, float("inf")], "c": Path("x"), 3: (None, True)}
+    assert console.jsonable(value) == {"a": None, "b": [1.5, None], "c": "x", "3": [None, True]}
+
+
+def test_options_win_over_overrides() -> None:
+    config = load_settings(None, ["seed=3", "object=tube"], {"seed": 4, "object": None})
+    assert (config.seed, config.object) == (4, "tube")
+    with pytest.raises(ConfigError, match="configuration key 'target_n'"):
+        load_settings(None, None, {"target_n": -1.0})

@@ -1,0 +1,222 @@
+import os
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gripper_force.config import Config, config_from_text, load_config
+from gripper_force.errors import ConfigError, DataError, DeviceError
+from gripper_force.interfaces import Devices, LoadCell
+from gripper_force.jobs.dataset import load_clip
+from gripper_force.jobs.recording import record as module
+from gripper_force.jobs.recording.record import Plan, record
+from gripper_force.runtime.log import LogReader
+from gripper_force.types import Frame, GraspStatus, LoadCellSample, Phase, Request, RequestKind
+from gripper_force.vision.preprocess import Preprocess
+from gripper_hw.dynamixel import virtual
+
+
+@pytest.fixture
+def config(quick: list[str]) -> Config:
+    """The cheapest rig that has all it takes."""
+    return load_config(None, [*quick, "camera.backend=simulated", "camera.rate_hz=20", "control.ramp_n_s=30"])
+
+
+def made(config: Config, plan: Plan, out: Path) -> list[Path]:
+    return list(record(config, plan, out, lambda *_: None))
+
+
+def test_sets_have_names_and_sides() -> None:
+    plan = Plan(15, degrees=10, lux=350.0)
+    paths = plan.paths(load_config(None, ["object=paper_cup"]), Path("data"))
+    assert paths[0] == Path("data/train/paper_cup-10deg-350lux-01.mcap")
+    assert [int(path.stem[-2:]) for path in paths if path.parent.name == "test"] == [5, 10, 15]
+    assert Plan(1).paths(load_config(), Path())[0] == Path("train/sponge-01.mcap")
+
+
+def test_a_set_is_a_log_to_train_on(config: Config, tmp_path: Path) -> None:
+    told: list[tuple[int, int, float]] = []
+    plan = Plan(1, 2, 5.0, degrees=10, lux=350)
+    (path,) = record(config, plan, tmp_path, lambda *now: told.append(now))
+    assert list(tmp_path.rglob("*.*")) == [path]
+    assert path == tmp_path / "train" / "stapler-10deg-350lux-01.mcap"
+    log = LogReader(path)
+    about = {key: log.metadata[key] for key in ("object", "set", "split", "degrees", "lux")}
+    assert about == {
+        "object": "stapler",
+        "set": "stapler-10deg-350lux-01",
+        "split": "train",
+        "degrees": "10",
+        "lux": "350",
+    }
+    used = config_from_text(log.config, str(path))
+    assert (used.control.feedback, used.vision.checkpoint) == ("current", "none")
+    requests = list(log.records(Request))
+    assert [r.kind for r in requests] == [RequestKind.GRASP, RequestKind.RELEASE] * 2 + [RequestKind.RELEASE]
+    assert all(1 <= r.target_n <= 5 for r in requests if r.kind == RequestKind.GRASP)
+    assert sum(frame.received_ns < requests[0].t_ns for frame in log.records(Frame)) >= 10
+    last = list(log.records(GraspStatus))[-1]
+    assert (last.phase, last.width_m) == (Phase.OPEN, pytest.approx(used.gripper.open_width_m, abs=0.004))
+    clip = load_clip(path, Preprocess(size=32), None)
+    assert clip.valid.all()
+    assert clip.forces_n[:10].max() < 0.1
+    assert 0.8 < clip.forces_n.max() < 6
+    assert {touch for _, touch, _ in told} == {0, 1, 2}
+    assert max(force_n for *_, force_n in told) > 0.5
+
+
+def test_what_is_there_is_kept_and_seeds_go_by_the_set(config: Config, tmp_path: Path) -> None:
+    plan = Plan(2, 1)
+    kept, missing = plan.paths(config, tmp_path)
+    assert made(config, Plan(1, 1), tmp_path) == [kept]
+    recorded_before = kept.read_bytes()
+    leftover = missing.with_name(f".{missing.name}.part")
+    leftover.write_bytes(b"half a log")
+    assert made(config, plan, tmp_path) == [kept, missing]
+    assert kept.read_bytes() == recorded_before
+    assert not leftover.exists()
+    peak_n = next(LogReader(missing).records(Request)).target_n
+    assert peak_n == np.random.default_rng([config.seed + 1, 12]).uniform(1, 9)
+    missing_bytes = missing.read_bytes()
+    retared = config.model_copy(update={"load_cell": config.load_cell.model_copy(update={"tare_raw": 0.2})})
+    assert made(retared, plan, tmp_path) == [kept, missing]
+    assert missing.read_bytes() == missing_bytes
+    dimmed = config.model_copy(update={"sim": config.sim.model_copy(update={"lux": 100.0})})
+    with pytest.raises(DataError, match=r"stapler-01\.mcap is there already .* sim\.lux None, not 100"):
+        made(dimmed, plan, tmp_path)
+    with pytest.raises(DataError, match=r"target_n 9\.0, not 5\.0; take another folder"):
+        made(config, Plan(2, 1, peak_n=5.0), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "plan", "sentence"),
+    [
+        (["camera.backend=none"], Plan(1), r"needs a camera, and camera\.backend is none"),
+        (["load_cell.backend=none"], Plan(1), r"needs a load cell, and load_cell\.backend is none"),
+        (["object=../egg"], Plan(1), r"object '\.\./egg' is no name for a log"),
+        ([], Plan(1, peak_n=12.0), r"up to 12 N are not within 1 to 9 N, which control\.force_limit_n 10 N"),
+        ([], Plan(1, peak_n=0.5), "up to 0.5 N are not within 1 to 9 N"),
+    ],
+)
+def test_what_can_not_be_recorded_is_refused_before_anything_moves(
+    overrides: list[str], plan: Plan, sentence: str, quick: list[str], tmp_path: Path
+) -> None:
+    config = load_config(None, [*quick, "camera.backend=simulated", *overrides])
+    with pytest.raises(ConfigError, match=sentence):
+        made(config, plan, tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("unit", "kind", "sentence"),
+    [
+        ("load_cell", "off", r"load cell has given no valid sample for 2 s in set 1"),
+        ("load_cell", "stuck", r"no valid sample for 2 s in set 1 \(rejected: [0-9]+ stuck\)"),
+        ("load_cell", "wrong", "load cell is saturated in set 1, where it last read -?0.0 N"),
+        ("camera", "off", "camera has given no frame for 2 s in set 1"),
+        ("servo", "wrong", "set 1 ended at a fault: the servo reports hardware error 0x20"),
+    ],
+)
+def test_a_part_that_fails_ends_the_recording(
+    unit: str, kind: str, sentence: str, config: Config, tmp_path: Path
+) -> None:
+    broken = load_config(None, [f"faults=[{{unit: {unit}, kind: {kind}, at_s: 0.2}}]"]).faults
+    with pytest.raises(DeviceError, match=sentence):
+        made(config.model_copy(update={"faults": broken}), Plan(1), tmp_path)
+    assert not list(tmp_path.rglob("*.mcap"))
+
+
+def test_after_a_fault_the_jaws_open_where_that_is_configured(config: Config, tmp_path: Path) -> None:
+    overrides = ["faults=[{unit: plant, kind: wrong, at_s: 1.0}]", "control.on_fault=open"]
+    faulty = load_config(None, overrides)
+    control = config.control.model_copy(update={"on_fault": faulty.control.on_fault})
+    with pytest.raises(DeviceError, match="set 1 ended at a fault"):
+        made(config.model_copy(update={"faults": faulty.faults, "control": control}), Plan(1), tmp_path)
+    (left,) = tmp_path.rglob("*.part")
+    widths_m = [status.width_m for status in LogReader(left).records(GraspStatus)]
+    assert min(widths_m) < 0.08
+    assert widths_m[-1] > 0.085
+
+
+@pytest.fixture
+def cell_feels(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[float], float]], None]:
+    """Changes what the rig's load cell says."""
+    open_devices = module.open_devices
+
+    class Changed:
+        def __init__(self, cell: LoadCell, change: Callable[[float], float]) -> None:
+            self._cell, self._change = cell, change
+
+        def __getattr__(self, name: str) -> object:
+            return getattr(self._cell, name)
+
+        def drain(self) -> list[LoadCellSample]:
+            return [replace(s, force_n=self._change(s.force_n)) for s in self._cell.drain()]
+
+    def change(to: Callable[[float], float]) -> None:
+        @contextmanager
+        def opened(config: Config) -> Iterator[Devices]:
+            with open_devices(config) as devices:
+                assert devices.load_cell is not None
+                devices.load_cell = Changed(devices.load_cell, to)  # type: ignore[assignment]
+                yield devices
+
+        monkeypatch.setattr(module, "open_devices", opened)
+
+    return change
+
+
+def test_a_load_cell_that_reads_a_force_at_rest_is_to_be_tared(
+    cell_feels: Callable[[Callable[[float], float]], None], config: Config, tmp_path: Path
+) -> None:
+    cell_feels(lambda force_n: force_n + 0.8)
+    with pytest.raises(DataError, match=r"reads 0\.[78][0-9]* N with open jaws; .* set load_cell\.tare_raw="):
+        made(config, Plan(1), tmp_path)
+
+
+def test_a_touch_that_is_not_felt_is_told(
+    cell_feels: Callable[[Callable[[float], float]], None], config: Config, tmp_path: Path
+) -> None:
+    cell_feels(lambda force_n: -force_n)
+    with pytest.raises(DataError, match=r"touch 1 of set 1 pressed with .* N .* felt 0\.[0-9]* N; see that"):
+        made(config, Plan(1), tmp_path)
+
+
+def test_a_touch_that_comes_to_no_force_ends_the_recording(config: Config, tmp_path: Path) -> None:
+    control = config.control.model_copy(update={"timeout_s": 0.3})
+    with pytest.raises(DataError, match=r"touch 1 of set 1 came to no force: .* is between the jaws"):
+        made(config.model_copy(update={"control": control}), Plan(1), tmp_path)
+    assert not list(tmp_path.rglob("*.mcap"))
+
+
+def test_an_interrupted_recording_stops_the_servo_and_keeps_whole_sets(
+    config: Config, tmp_path: Path
+) -> None:
+    torque: list[int] = []
+
+    def interrupt(one: int, touch: int, _force_n: float) -> None:
+        bus = virtual.find_bus("rig")
+        assert bus is not None
+        torque.append(bus.servos[0].get("torque_enable"))
+        if (one, touch) == (2, 1):
+            rig.append(bus)
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    rig: list[virtual.VirtualBus] = []
+    done: list[Path] = []
+    with pytest.raises(KeyboardInterrupt):
+        done.extend(record(config, Plan(3, 1), tmp_path, interrupt))
+    assert set(torque) == {1}
+    assert rig[0].servos[0].get("torque_enable") == 0
+    assert [path.name for path in tmp_path.rglob("*.mcap")] == ["stapler-01.mcap"]
+
+
+def test_peaks_leave_what_the_force_limit_needs() -> None:
+    _, peak_n = module._ready(load_config(None, ["control.force_limit_n=5"]), Plan(1))
+    assert peak_n == pytest.approx(4.5)
+    _, peak_n = module._ready(load_config(None, ["control.force_limit_n=20"]), Plan(1))
+    assert np.isclose(peak_n, 12)

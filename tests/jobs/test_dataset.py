@@ -1,0 +1,150 @@
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gripper_force.config import Config, dump_config
+from gripper_force.errors import ConfigError, DataError
+from gripper_force.jobs.dataset import NEAR_NS, Clip, digest, label_frames, load_clip, load_clips, split_by
+from gripper_force.runtime.log import LogWriter
+from gripper_force.types import NS_PER_MS, Frame, LoadCellSample
+from gripper_force.vision.preprocess import Preprocess, shrink
+
+SMALL = Preprocess(size=16)
+MS = NS_PER_MS
+
+
+def sample(t_ms: float, force_n: float, *, valid: bool = True) -> LoadCellSample:
+    return LoadCellSample(round(t_ms * MS), force_n, force_n, valid)
+
+
+def frame(t_ms: float, seq: int) -> Frame:
+    gray = np.random.default_rng(seq).integers(0, 256, (30, 40), np.uint8)
+    return Frame(round(t_ms * MS), round(t_ms * MS), seq, gray)
+
+
+def write_log(
+    path: Path, records: Iterable[Frame | LoadCellSample], metadata: dict[str, str], **config: object
+) -> None:
+    with LogWriter(path, config=dump_config(Config.model_validate(config)), metadata=metadata) as log:
+        for record in records:
+            log.write(record)
+
+
+def clip(name: str, object_name: str, set_name: str) -> Clip:
+    return Clip(
+        frames=np.zeros((2, 16, 16), np.uint8),
+        forces_n=np.zeros(2, np.float32),
+        valid=np.ones(2, np.bool_),
+        name=name,
+        object=object_name,
+        set=set_name,
+    )
+
+
+def test_a_label_is_the_mean_over_the_exposure() -> None:
+    samples = [sample(t, 0.1 * t**2) for t in range(0, 100)]
+    labels, valid = label_frames(np.array([20 * MS, 50 * MS]), samples, exposure_ns=4 * MS)
+    np.testing.assert_allclose(
+        labels, [np.mean(0.1 * np.arange(18, 23) ** 2), 0.1 * np.mean(np.arange(48, 53) ** 2)]
+    )
+    assert valid.all()
+
+
+def test_a_slow_load_cell_is_interpolated() -> None:
+    samples = [sample(0, 0.0), sample(40, 4.0), sample(80, 0.0)]
+    labels, valid = label_frames(np.array([10, 40, 60]) * MS, samples, exposure_ns=4 * MS)
+    np.testing.assert_allclose(labels, [1.0, 4.0, 2.0], rtol=1e-6)
+    assert valid.all()
+
+
+def test_rejected_samples_never_reach_a_label() -> None:
+    samples = [sample(0, 1.0), sample(10, -70.0, valid=False), sample(11, float("nan")), sample(20, 3.0)]
+    labels, valid = label_frames(np.array([10 * MS]), samples, exposure_ns=10 * MS)
+    np.testing.assert_allclose(labels, [2.0])
+    assert valid.all()
+
+
+def test_a_frame_far_from_any_sample_has_no_label() -> None:
+    near_ms = NEAR_NS / MS
+    t_ms = np.array([0, 100 - near_ms - 1, 100 - near_ms, 100 + near_ms, 100 + near_ms + 1])
+    labels, valid = label_frames((t_ms * MS).astype(np.int64), [sample(100, 2.0)], exposure_ns=0)
+    assert valid.tolist() == [False, False, True, True, False]
+    assert labels.tolist() == [0, 0, 2, 2, 0]
+    assert not label_frames(np.array([0]), [sample(0, 1.0, valid=False)], 0)[1].any()
+
+
+def test_logs_become_clips(tmp_path: Path) -> None:
+    frames = [frame(t, seq) for seq, t in enumerate((0, 20, 40, 300))]
+    samples = [sample(t, 0.1 * t) for t in range(0, 60, 5)]
+    write_log(
+        tmp_path / "deep" / "b.mcap",
+        [*frames, *samples],
+        {"exposure_ms": "10", "set": "press-7"},
+        object="stapler",
+        vision={"region": [4, 2, 32, 24]},
+    )
+    write_log(tmp_path / "a.mcap", [frames[0], samples[0]], {}, object="cup")
+    a, b = load_clips(tmp_path, SMALL, workers=2)
+    assert (a.name, a.object, a.set) == ("a", "cup", "a")
+    assert (b.name, b.object, b.set) == ("b", "stapler", "press-7")
+    np.testing.assert_array_equal(b.frames, [shrink(f.gray, (4, 2, 32, 24), 16) for f in frames])
+    assert b.valid.tolist() == [True, True, True, False]
+    np.testing.assert_allclose(b.forces_n[:3], [0.25, 2.0, 4.0], rtol=1e-6)
+    (again,) = load_clips([tmp_path / "deep" / "b.mcap"], SMALL, region=(0, 0, 30, 30))
+    np.testing.assert_array_equal(again.frames[0], shrink(frames[0].gray, (0, 0, 30, 30), 16))
+
+
+def test_what_is_missing_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no logs"):
+        load_clips(tmp_path, SMALL)
+    write_log(tmp_path / "dark.mcap", [sample(0, 1.0)], {})
+    with pytest.raises(DataError, match=r"dark\.mcap holds no camera frames"):
+        load_clips(tmp_path, SMALL)
+    write_log(tmp_path / "bare.mcap", [frame(0, 0)], {})
+    with pytest.raises(DataError, match=r"bare\.mcap holds no valid load-cell sample"):
+        load_clips([tmp_path / "bare.mcap"], SMALL)
+
+
+@pytest.mark.parametrize(
+    "metadata",
+    [{"exposure_ms": "long"}, {"exposure_ms": "1e999"}, {"scene": "{}"}, {"scene": '{"stiffness": 0}'}],
+)
+def test_metadata_without_the_number_they_should_hold_are_named(
+    tmp_path: Path, metadata: dict[str, str]
+) -> None:
+    write_log(tmp_path / "a.mcap", [frame(0, 0), sample(0, 1.0)], metadata)
+    with pytest.raises(DataError, match="hold no number above 0"):
+        load_clip(tmp_path / "a.mcap", SMALL, None)
+
+
+def test_a_log_with_a_damaged_configuration_is_named(tmp_path: Path) -> None:
+    with LogWriter(tmp_path / "a.mcap", config="camera: {rate_hz: 2001-99-99}", metadata={}):
+        pass
+    with pytest.raises(ConfigError, match=r"a\.mcap"):
+        load_clip(tmp_path / "a.mcap", SMALL, None)
+
+
+@pytest.mark.parametrize("key", ["object", "set"])
+def test_a_split_keeps_together_what_belongs_together(key: str) -> None:
+    clips = [clip(f"{o}{s}{i}", o, f"{o}{s}") for o in "abc" for s in range(4) for i in range(3)]
+    rest, held = split_by(clips, key, 0.25, seed=3)  # type: ignore[arg-type]
+    assert sorted(c.name for c in rest + held) == sorted(c.name for c in clips)
+    assert not {getattr(c, key) for c in rest} & {getattr(c, key) for c in held}
+    assert len({c.object for c in held}) == (1 if key == "object" else 3)
+    draws = {tuple(c.name for c in split_by(clips, key, 0.25, seed=s)[1]) for s in range(20)}  # type: ignore[arg-type]
+    assert len(draws) > 1
+
+
+def test_a_split_needs_two() -> None:
+    with pytest.raises(DataError, match="two"):
+        split_by([clip("a", "cup", "s"), clip("b", "cup", "s")], "set", 0.5)
+
+
+def test_the_digest_changes_with_every_part() -> None:
+    base = clip("a", "cup", "s")
+    other_label = clip("a", "cup", "s")
+    other_label.forces_n[1] = 1
+    assert digest([base]) == digest([clip("b", "cup", "s")])
+    assert len({digest([base]), digest([other_label]), digest([base, base])}) == 3

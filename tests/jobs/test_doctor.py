@@ -1,0 +1,133 @@
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import Result
+from typer.testing import CliRunner
+
+from gripper_force import cli
+from gripper_force.config import Config, load_config
+from gripper_force.errors import ConfigError
+from gripper_force.jobs import doctor
+from gripper_force.jobs.doctor import Check, judged, only, rate_hz, time_ms
+
+
+@pytest.fixture
+def sets(quick_vision: list[str]) -> list[str]:
+    """A whole simulated rig, and limits that a busy machine keeps."""
+    patient = ["control.rate_hz=0.1", "camera.rate_hz=20"]
+    return [part for one in (*quick_vision, *patient) for part in ("--set", one)]
+
+
+def run(*arguments: object, answer: str = "") -> Result:
+    return CliRunner().invoke(cli.app, ["doctor", *map(str, arguments)], input=answer)
+
+
+def test_without_any_hardware_the_rig_is_fit(sets: list[str]) -> None:
+    done = run("--json", *sets)
+    assert (done.exit_code, done.exception) == (0, None)
+    report: dict[str, Any] = json.loads(done.stdout)
+    assert report["ok"] is True
+    assert {check["unit"] for check in report["checks"]} == {
+        *("servo", "servo 1", "camera", "load cell", "simulation", "network", "clock"),
+    }
+    assert set(report["checks"][0]) == {"unit", "name", "found", "ok", "advice"}
+    assert not [check for check in report["checks"] if check["ok"] is False]
+
+
+def test_what_is_missing_is_a_problem_with_something_to_do(tmp_path: Path) -> None:
+    missing = [
+        *("clock=realtime", "servo.port=/dev/nowhere", "camera.backend=uvc", "camera.device=/dev/video99"),
+        *("load_cell.backend=serial", "load_cell.port=/dev/nowhere", f"vision.checkpoint={tmp_path}/gone"),
+    ]
+    sets = [part for one in missing for part in ("--set", one)]
+    done = run("--json", *sets)
+    assert done.exit_code == 1
+    report = json.loads(done.stdout)
+    assert report["ok"] is False
+    problems = {check["unit"]: check for check in report["checks"] if check["ok"] is False}
+    assert set(problems) >= {"servo", "camera", "load cell", "network"}
+    assert all(problem["advice"] for problem in problems.values())
+    assert problems["servo"]["found"] == "there is no port /dev/nowhere"
+    assert problems["servo"]["advice"].startswith("plug it in")
+
+
+def test_a_defect_of_one_probe_hides_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "PROBES", {"servo": "gripper_hw.nowhere"})
+    checks = list(doctor.doctor(load_config(None, ["vision.checkpoint=none"])))
+    assert checks[0].ok is False
+    assert "ModuleNotFoundError" in checks[0].found
+    assert checks[-1].unit == "clock"
+
+
+def test_the_table_is_for_people(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = [
+        Check("servo", "model", "none [bold]", False, "plug it in"),
+        Check("camera", "rate", "60.0 Hz", True),
+        Check("camera", "listed", "no OAK", None),
+    ]
+    monkeypatch.setattr(doctor, "doctor", lambda _: iter(found))
+    done = run()
+    assert done.exit_code == 1
+    lines = [line.split() for line in done.stdout.splitlines()]
+    assert lines == [
+        ["problem", "servo", "model", "none", "[bold]"],
+        ["plug", "it", "in"],
+        ["ok", "camera", "rate", "60.0", "Hz"],
+        ["-", "camera", "listed", "no", "OAK"],
+    ]
+
+
+def test_a_wrong_key_is_bad_input() -> None:
+    assert isinstance(run("--set", "servo.prot=x").exception, ConfigError)
+
+
+@pytest.mark.parametrize(
+    ("options", "answer", "applied"), [((), "n", False), ((), "y", True), (("--yes",), "", True)]
+)
+def test_setup_shows_and_asks(sets: list[str], options: tuple[str, ...], answer: str, applied: bool) -> None:
+    done = run("--setup", "--json", *options, *sets, answer=answer)
+    assert done.exit_code == 0
+    report = json.loads(done.stdout.splitlines()[-1])  # the runner echoes the answer before it
+    assert report["applied"] is applied
+    assert {"register": "return_delay_time", "old": "500 us", "new": "0 us"} in report["changes"]
+    assert "500 us" in done.stderr
+    assert ("Write these to servo 1?" in done.stderr) is not bool(options)
+
+
+def test_setup_ends_with_a_sentence(sets: list[str]) -> None:
+    assert run("--setup", *sets, answer="n").stdout.endswith("servo 1: left as it is\n")
+    assert run("--setup", "--yes", *sets).stdout == "servo 1: set up, and read back\n"
+    assert "no answer came, so nothing was written to servo 1" in str(run("--setup", *sets).exception)
+    odd = ["--set", "servo.port=/dev/nowhere"]
+    assert "no port /dev/nowhere" in str(run("--setup", *sets, *odd).exception)
+
+
+# In between.
+
+
+def test_only_one_sensor_is_kept() -> None:
+    kept = only(Config(), "camera")
+    assert (kept.camera.backend, kept.load_cell.backend) == ("simulated", "none")
+    assert only(Config(), "servo").camera.backend == "none"
+
+
+def test_a_rate_counts_what_is_between() -> None:
+    assert rate_hz([0, 10_000_000, 20_000_000]) == pytest.approx(100.0)
+    assert np.isfinite(rate_hz([5, 5]))
+
+
+def test_a_call_is_timed_as_often_as_asked() -> None:
+    calls: list[int] = []
+    median_ms, p99_ms = time_ms(lambda: calls.append(time.sleep(0.001) or 1), 7)
+    assert len(calls) == 7
+    assert p99_ms >= median_ms >= 1.0
+
+
+def test_advice_is_for_what_is_not_good() -> None:
+    assert judged("u", "n", "f", True, "do") == Check("u", "n", "f", True, "")
+    assert judged("u", "n", "f", False, "do") == Check("u", "n", "f", False, "do")
+    assert judged("u", "n", "f", False, "do", harmless=True) == Check("u", "n", "f", True, "do")

@@ -1,0 +1,102 @@
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+
+from gripper_force.errors import DataError
+from gripper_force.jobs.dataset import Clip
+from gripper_force.jobs.evaluate import evaluate, ridge_baseline
+from gripper_force.vision.checkpoint import Checkpoint
+from gripper_force.vision.engines.pytorch import TorchEngine
+from gripper_force.vision.estimator import ForceEstimator
+from gripper_force.vision.header import Header, NetworkConfig, Residual
+from gripper_force.vision.network import ForceNetwork
+from gripper_force.vision.preprocess import Preprocess
+
+
+@pytest.fixture
+def checkpoint() -> Checkpoint:
+    torch.manual_seed(0)
+    configs = tuple(
+        NetworkConfig.model_validate({"attention": a, "size": 16, "width": 0.25, "hidden": 6, "head": 7})
+        for a in ("ssam", "scam")
+    )
+    header = Header(
+        members=configs,
+        preprocess=Preprocess(size=16),
+        residuals=(Residual(force_n=0, std_n=1),),
+        data_digest="",
+        metrics={},
+    )
+    networks = tuple(ForceNetwork(config).eval().requires_grad_(False) for config in configs)
+    return Checkpoint(networks, header, digest="")
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def clip(name: str, object_name: str, seed: int, size: int = 16) -> Clip:
+    rng = np.random.default_rng(seed)
+    forces_n = np.maximum(0, np.linspace(-3, 6, 30)).astype(np.float32)
+    change = np.outer(forces_n, rng.integers(-5, 6, size * size)).reshape(30, size, size)
+    frames = rng.integers(60, 140, (size, size)) + change
+    return Clip(
+        frames.clip(0, 255).astype(np.uint8), forces_n, np.ones(30, np.bool_), name, object_name, name
+    )
+
+
+def test_equals_the_streaming_estimator(checkpoint: Checkpoint) -> None:
+    clips = [clip("a", "cup", 0), clip("b", "cup", 1), clip("c", "tube", 2)]
+    clips[1].valid[10:20] = False
+    result = evaluate(checkpoint, clips)
+    errors: dict[str, list[float]] = {"cup": [], "tube": []}
+    estimator = ForceEstimator(TorchEngine(checkpoint))
+    for one in clips:
+        estimator.reset()
+        for frame, force_n, valid in zip(one.frames, one.forces_n, one.valid, strict=True):
+            estimate = estimator.update(frame)
+            if estimate is not None and valid:
+                errors[one.object].append(estimate.force_n - float(force_n))
+    every = np.array(errors["cup"] + errors["tube"])
+    assert result["frames"] == len(every) == 27 + 17 + 27
+    assert result["mae_n"] == pytest.approx(np.abs(every).mean(), rel=1e-5)
+    assert result["rmse_n"] == pytest.approx(np.sqrt((every**2).mean()), rel=1e-5)
+    assert result["bias_n"] == pytest.approx(every.mean(), rel=1e-5)
+    assert result["per_object"]["cup"]["mae_n"] == pytest.approx(np.abs(errors["cup"]).mean(), rel=1e-5)
+    assert result["per_object"]["tube"]["frames"] == 27
+    assert sum(b["frames"] for b in result["per_bin"]) == result["frames"]
+
+
+def test_contact_is_told_apart(checkpoint: Checkpoint) -> None:
+    free = clip("a", "cup", 0)
+    free.forces_n[:] = 0
+    result = evaluate(checkpoint, [free])
+    assert np.isnan(result["per_object"]["cup"]["contact_mae_n"])
+
+
+def test_clips_must_fit(checkpoint: Checkpoint) -> None:
+    with pytest.raises(DataError, match="32 px, the network needs 16"):
+        evaluate(checkpoint, [clip("a", "cup", 0, size=32)])
+    unlabelled = clip("a", "cup", 0)
+    unlabelled.valid[:] = False
+    with pytest.raises(DataError, match="label"):
+        evaluate(checkpoint, [unlabelled])
+    with pytest.raises(DataError, match="label"):
+        ridge_baseline([], [])
+
+
+def test_the_baseline_finds_a_smooth_law() -> None:
+    clips = [clip(str(i), "cup", seed=0) for i in range(9)]
+    rng = np.random.default_rng(0)
+    for one in clips:
+        one.frames[...] = (one.frames + rng.integers(0, 3, one.frames.shape)).clip(0, 255)
+    result = ridge_baseline(clips[:8], clips[8:])
+    constant = np.abs(clips[0].forces_n - clips[0].forces_n.mean()).mean()
+    assert result["mae_n"] < 0.4 * constant
+    assert result["frames"] == 30

@@ -1,0 +1,154 @@
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gripper_force.config import Config, config_from_text, load_config
+from gripper_force.jobs import grasp as grasp_module
+from gripper_force.jobs.grasp import overall, summarise, trials
+from gripper_force.runtime.log import LogReader, LogWriter
+from gripper_force.types import LoadCellSample, VisualForce
+
+
+def test_a_summary_is_what_the_log_says(fused_log: Path) -> None:
+    summary = summarise(fused_log)
+    log = LogReader(fused_log)
+    assert summary["log"] == str(fused_log)
+    assert (summary["object"], summary["target_n"], summary["seed"]) == ("stapler", 3.0, 0)
+    assert summary["result"] in {"held", "timeout"}
+    assert summary["loop_hz"] == pytest.approx(200.0)
+    assert summary["peak_n"] == max(s.force_n for s in log.records(LoadCellSample))
+    assert summary["steady_error_n"] == summary["load_cell_mean_n"] - 3.0
+    times = [v.compute_ms for v in log.records(VisualForce)]
+    assert summary["estimator_p50_ms"] == pytest.approx(np.percentile(times, 50))
+    assert summary["estimator_p99_ms"] == pytest.approx(np.percentile(times, 99))
+    camera = config_from_text(log.config, "it").camera
+    assert summary["camera_hz"] == pytest.approx(camera.rate_hz, rel=0.02)
+    assert summary["samples_rejected"] == 0
+
+
+def test_a_summary_says_what_was_taken_for_auto(quick: list[str], tmp_path: Path) -> None:
+    overrides = [
+        "sim.detail=auto",
+        "budget.sim_error_n=0.05",
+        f"log.directory={tmp_path}",
+        "log.report=false",
+    ]
+    (taken,) = grasp_module.grasp(load_config(None, [*quick, *overrides]))["taken"]
+    assert taken.startswith("took sim.detail=medium")
+
+
+def test_what_was_not_measured_is_none(fused_log: Path, tmp_path: Path) -> None:
+    reader = LogReader(fused_log)
+    path = tmp_path / "run.mcap"
+    with LogWriter(path, config=reader.config, metadata={}) as writer:
+        for record in reader.records():
+            if not isinstance(record, LoadCellSample | VisualForce):
+                writer.write(record)
+    summary = summarise(path)
+    for name in (
+        "load_cell_mean_n",
+        "steady_error_n",
+        "overshoot_n",
+        "settle_s",
+        "peak_n",
+        "estimator_p50_ms",
+        "camera_hz",
+        "samples_rejected",
+    ):
+        assert summary[name] is None
+    assert summary["loop_hz"] == pytest.approx(200.0)
+
+
+def test_a_run_that_ended_before_anything_was_interrupted(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with LogWriter(path, config="object: tube", metadata={}):
+        pass
+    summary = summarise(path)
+    assert (summary["result"], summary["object"], summary["loop_hz"]) == ("interrupted", "tube", None)
+
+
+def result(target_n: float, error_n: float | None, **more: Any) -> dict[str, Any]:
+    some = {
+        "result": "held",
+        "object": "tube",
+        "target_n": target_n,
+        "steady_error_n": error_n,
+        "overshoot_n": 0.1 * target_n,
+        "settle_s": 1.0,
+        "peak_n": 1.1 * target_n,
+        "estimator_p50_ms": 5.0,
+        "estimate_mae_n": {"visual": None, "current": 0.3, "fused": 0.1, "floor": 0.05},
+    }
+    return some | more
+
+
+def test_trials_are_summed_up_by_their_share_of_the_target() -> None:
+    results = [
+        result(2.0, 0.2),  # 10 %, and within 0.25 N
+        result(5.0, -0.35),  # 7 %
+        result(8.0, 0.8, result="timeout", peak_n=12.5),  # 10 %: no good
+        result(4.0, None, result="no_object", settle_s=None, estimator_p50_ms=None, peak_n=None),
+    ]
+    summary = overall(results, force_limit_n=12.0)
+    assert (summary["trials"], summary["held"], summary["over_limit"]) == (4, 2, 1)
+    assert summary["good_percent"] == 50
+    assert summary["median_error_percent"] == pytest.approx(10.0)
+    assert summary["median_error_n"] == pytest.approx(0.35)
+    assert summary["max_overshoot_percent"] == pytest.approx(10.0)
+    assert summary["peak_n"] == 12.5
+
+
+def test_estimates_are_averaged_by_object() -> None:
+    errors = {"visual": None, "current": 0.5, "fused": 0.3, "floor": None}
+    results = [result(2.0, 0.1), result(3.0, 0.1, object="sponge", estimate_mae_n=errors)]
+    means = overall(results, force_limit_n=12.0)["estimate_mae_n"]
+    assert means["all"] == pytest.approx({"visual": None, "current": 0.4, "fused": 0.2, "floor": 0.05})
+    assert means["sponge"] == errors
+
+
+def test_trials_without_any_figure_still_sum_up() -> None:
+    nothing = result(4.0, None, overshoot_n=None, settle_s=None, estimator_p50_ms=None, peak_n=None)
+    summary = overall([nothing], force_limit_n=12.0)
+    assert summary["good_percent"] == 0
+    assert summary["median_error_percent"] is None
+    assert summary["peak_n"] is None
+
+
+@contextmanager
+def here(_count: int) -> Iterator[SimpleNamespace]:
+    """Stands in for a pool of processes."""
+    yield SimpleNamespace(map=map)
+
+
+def test_trials_are_drawn_from_the_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+    ran: list[Config] = []
+    monkeypatch.setattr(grasp_module, "process_pool", here)
+    monkeypatch.setattr(grasp_module, "grasp", lambda config: ran.append(config) or {})
+
+    def plan(seed: int) -> list[tuple[str, float, int]]:
+        ran.clear()
+        list(trials(load_config(None, [f"seed={seed}"]), 6, jobs=1))
+        return [(c.object, c.target_n, c.seed) for c in ran]
+
+    first = plan(40)
+    assert [name for name, _, _ in first] == ["sponge", "paper_cup", "tube", "stapler", "sponge", "paper_cup"]
+    assert [seed for _, _, seed in first] == list(range(40, 46))
+    assert all(1 <= target_n <= 8 for _, target_n, _ in first)
+    assert plan(40) == first
+    assert [t for _, t, _ in plan(41)] != [t for _, t, _ in first]
+
+
+def test_a_log_is_never_overwritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(grasp_module.time, "strftime", lambda _: "20260101-120000")
+    config = load_config(None, [f"log.directory={tmp_path}", "object=tube", "target_n=2.5", "seed=7"])
+    paths = []
+    for _ in range(3):
+        paths.append(grasp_module.new_log(config))
+        paths[-1].touch()
+    assert paths[0].name == "20260101-120000-tube-2.5N-fused-seed7.mcap"
+    assert [path.stem.removeprefix(paths[0].stem) for path in paths] == ["", "-2", "-3"]

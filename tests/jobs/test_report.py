@@ -1,0 +1,308 @@
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from gripper_force.config import config_from, dump_config
+from gripper_force.errors import LogError
+from gripper_force.jobs.report import write_report
+from gripper_force.jobs.report.data import SOURCES, bins, read_run
+from gripper_force.jobs.report.pictures import overlay, take_pictures
+from gripper_force.runtime.log import LogWriter
+from gripper_force.types import (
+    NS_PER_MS,
+    NS_PER_S,
+    Event,
+    Frame,
+    FusedForce,
+    GraspStatus,
+    Gray,
+    LoadCellSample,
+    Record,
+    Request,
+    VisualForce,
+)
+from gripper_force.vision.checkpoint import load_checkpoint, save_checkpoint
+from gripper_force.vision.header import Header, NetworkConfig, Residual
+from gripper_force.vision.network import ForceNetwork
+from gripper_force.vision.preprocess import Preprocess
+
+TARGET_N = 4.0
+START_NS = 5 * NS_PER_S
+"""When the log starts; the request comes 0.5 s later."""
+PHASES = [(0.0, "open"), (0.5, "approach"), (1.1, "contact"), (1.4, "ramp"), (2.2, "hold"), (5.0, "release")]
+
+
+def force_n(t_s: float) -> float:
+    """What the load cell reads: contact, a ramp with some overshoot, hold, release."""
+    overshoot = 0.35 * np.exp(-((t_s - 2.35) ** 2) / 0.01)
+    return float(
+        np.interp(t_s, [1.1, 1.4, 2.2, 5.0, 5.4], [0, 0.5, TARGET_N, TARGET_N + 0.05, 0]) + overshoot
+    )
+
+
+def picture(force: float) -> Gray:
+    """A blob that spreads with the force."""
+    y, x = np.mgrid[-1:1:128j, -1:1:128j]
+    return np.asarray(60 + 25 * x + 120 * np.exp(-(x**2 + y**2) / (0.05 + 0.05 * force)), np.uint8)
+
+
+def write_grasp(path: Path, *, checkpoint: Path | None = None, digest: str = "") -> Path:
+    """A plausible grasp: control at 100 Hz, camera at 30 Hz, load cell at 100 Hz."""
+    rng = np.random.default_rng(0)
+    vision = {"checkpoint": str(checkpoint or "nowhere.safetensors"), "threads": 1}
+    config = config_from({"object": "paper_cup", "target_n": TARGET_N, "vision": vision}, "the test")
+    records: list[tuple[int, Record]] = []
+    for i in range(600):
+        t_s, t_ns = i / 100, START_NS + i * 10 * NS_PER_MS
+        true_n = force_n(t_s)
+        phase = next(name for start_s, name in reversed(PHASES) if t_s >= start_s)
+        outcome = "held" if t_s > 3.4 else ""
+        reason = "steady within 0.2 N" if 3.4 < t_s <= 3.41 else ""
+        current_n = 0.85 * true_n + 0.3 * (t_s > 0.5) + rng.normal(0, 0.05)
+        fused = FusedForce(t_ns, true_n + rng.normal(0, 0.06), 0.2, current_n, 0.1, 0.9, "fused")
+        reference_n = float(np.interp(t_s, [1.4, 2.2, 5.0, 5.01], [0, TARGET_N, TARGET_N, 0]))
+        status = GraspStatus(t_ns, phase, outcome, reference_n, 0.04, reason)
+        cell = LoadCellSample(t_ns, true_n + rng.normal(0, 0.03), 0.0, valid=i % 50 != 0)
+        records += [(t_ns, record) for record in (fused, status, cell)]
+        if i % 3 == 0:
+            ready_ns = t_ns + round(rng.gamma(9, 2.0) * NS_PER_MS)
+            received_ns = t_ns + round(rng.gamma(20, 0.5) * NS_PER_MS)
+            records.append((received_ns, Frame(t_ns, received_ns, i // 3, picture(true_n))))
+            seen_n = true_n + rng.normal(0, 0.25)
+            records.append((ready_ns, VisualForce(t_ns, ready_ns, i // 3, seen_n, 0.3, rng.gamma(30, 0.15))))
+    request_ns = START_NS + NS_PER_S // 2
+    records.append((request_ns, Request(request_ns, "grasp", TARGET_N)))
+    event = Event(START_NS + 3 * NS_PER_S, "camera", "1 frame lost <after> 41 & before 43")
+    records.append((event.t_ns, event))
+    with LogWriter(path, config=dump_config(config), metadata={"checkpoint": digest, "version": "0"}) as log:
+        for _, record in sorted(records, key=lambda entry: entry[0]):
+            log.write(record)
+    return path
+
+
+def write_recording(path: Path) -> Path:
+    """An imported recording: frames and a load cell, no more."""
+    with LogWriter(path, config=dump_config(config_from({"object": "egg"}, "")), metadata={}) as log:
+        for i in range(40):
+            t_ns = i * 33 * NS_PER_MS
+            log.write(Frame(t_ns, t_ns, i, picture(0.1 * i)))
+            log.write(LoadCellSample(t_ns, 0.1 * i, 0.1 * i))
+    return path
+
+
+def write_network(path: Path) -> str:
+    """A small untrained SSAM network; returns its digest."""
+    torch.manual_seed(0)
+    shape = NetworkConfig.model_validate(
+        {"attention": "ssam", "size": 64, "width": 0.25, "hidden": 4, "head": 4}
+    )
+    residuals = (Residual(force_n=0, std_n=1),)
+    preprocess = Preprocess(size=64)
+    header = Header(members=(shape,), preprocess=preprocess, residuals=residuals, data_digest="", metrics={})
+    save_checkpoint(path, [ForceNetwork(shape).eval()], header)
+    return load_checkpoint(path).digest
+
+
+class Page(HTMLParser):
+    """Checks that elements close in order, and collects what the tests ask for."""
+
+    VOID = frozenset({"meta", "img", "br", "path", "rect"})
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.text: list[str] = []
+        self.sources: list[str] = []
+        self.classes: list[str] = []
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = dict(attrs)
+        self.sources += [values[key] or "" for key in ("src", "href") if key in values]
+        self.classes += (values.get("class") or "").split()
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag not in self.VOID:
+            assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if data.strip() and self.open and self.open[-1] not in {"style", "script"}:
+            self.text.append(data.strip())
+
+
+@pytest.fixture(scope="module")
+def grasp(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("report")
+    digest = write_network(folder / "net.safetensors")
+    return write_grasp(folder / "grasp.mcap", checkpoint=folder / "net.safetensors", digest=digest)
+
+
+@pytest.fixture(scope="module")
+def page(grasp: Path) -> str:
+    return write_report(grasp).html.read_text(encoding="utf-8")
+
+
+def test_the_report_lies_beside_the_log_or_where_it_is_asked_for(grasp: Path, page: str) -> None:
+    assert grasp.with_suffix(".html").is_file()
+    image = cv2.imread(str(grasp.with_suffix(".png")))
+    assert image is not None
+    assert image.shape[1] >= 1200
+    paths = write_report(grasp, grasp.parent / "elsewhere")
+    assert paths.png.parent == paths.html.parent == grasp.parent / "elsewhere"
+    assert paths.html.read_text(encoding="utf-8") == page, "the same log gives the same page"
+
+
+def test_the_page_is_well_formed_and_needs_nothing_from_outside(page: str) -> None:
+    parsed = Page(page)
+    assert parsed.sources
+    assert all(source.startswith("data:image/png;base64,") for source in parsed.sources)
+    assert not re.search(r"https?://|@import|url\(", page)
+
+
+def test_the_headline_tells_what_was_asked_and_what_came_of_it(page: str) -> None:
+    text = Page(page).text
+    for what, value in [("Target", "4"), ("Error, steady", "+0.04"), ("Overshoot", None)]:
+        assert what in text
+        if value is not None:
+            assert text[text.index(what) + 1] == value
+    assert "Paper cup" in text
+    assert "held" in text
+    assert any(re.fullmatch(r"1\d\.\d / [34]\d\.\d", entry) for entry in text), "latency p50 / p99"
+
+
+def test_texts_of_the_log_are_escaped(page: str) -> None:
+    assert "1 frame lost &lt;after&gt; 41 &amp; before 43" in page
+
+
+def test_every_source_has_its_curve_and_its_numbers_for_the_pointer(page: str) -> None:
+    for source in SOURCES:
+        assert f'class="curve {source}"' in page
+    tree = json.loads(re.search(r"const all = (.*);", page)[1])  # type: ignore[index]
+    assert [line["source"] for line in tree["forces"]] == ["load_cell", "fused", "vision", "current"]
+    assert [line["source"] for line in tree["errors"]] == ["fused", "vision", "current"]
+    for group in tree.values():
+        for line in group:
+            assert len(line["t"]) == len(line["v"]) > 100
+            assert line["t"] == sorted(line["t"])
+
+
+def test_time_zero_is_the_request_and_phases_follow_it(grasp: Path) -> None:
+    run = read_run(grasp)
+    assert run.target_n == TARGET_N
+    assert run.outcome == "held"
+    assert [(span.phase, round(span.start_s, 2)) for span in run.phases] == [
+        (phase, round(start_s - 0.5, 2)) for start_s, phase in PHASES[1:]
+    ]
+    assert (run.begin_s, run.end_s) == (pytest.approx(-0.5), pytest.approx(5.5, abs=0.06))
+    assert run.score is not None
+    assert run.score.overshoot_n == pytest.approx(0.4, abs=0.15)
+
+
+def test_errors_are_taken_against_the_valid_samples(grasp: Path) -> None:
+    run = read_run(grasp)
+    assert len(run.forces["load_cell"].t_s) == 600 - 12
+    assert abs(run.errors["fused"].value_n.mean()) < 0.02
+    in_hold = (run.errors["current"].t_s > 3) & (run.errors["current"].t_s < 4)
+    assert run.errors["current"].value_n[in_hold].mean() == pytest.approx(-0.15 * TARGET_N + 0.3, abs=0.05)
+
+
+def test_the_table_holds_requests_phases_outcomes_and_events_in_order(grasp: Path) -> None:
+    lines = read_run(grasp).lines
+    assert [line.t_s for line in lines] == sorted(line.t_s for line in lines)
+    texts = [(line.unit, line.text) for line in lines]
+    assert ("request", "grasp at 4 N") in texts
+    assert ("outcome", "held") in texts
+    assert ("phase", "ramp") in texts
+    assert ("control", "steady within 0.2 N") in texts
+
+
+def test_frames_span_the_grip_and_carry_attention(grasp: Path) -> None:
+    run = read_run(grasp)
+    pictures, note = take_pictures(grasp, run)
+    assert len(pictures) == 6
+    assert pictures[0].t_s == pytest.approx(0.3, abs=0.03)
+    assert pictures[-1].t_s == pytest.approx(4.8, abs=0.03)
+    assert "where the network looks" in note
+    assert np.ptp(pictures[3].image, axis=2).max() > 20, "the attention is in colour"
+    assert pictures[3].load_cell_n == pytest.approx(TARGET_N, abs=0.2)
+
+
+def test_frames_of_a_recording_span_its_touch(tmp_path: Path) -> None:
+    path = tmp_path / "egg.mcap"
+    with LogWriter(path, config="", metadata={}) as log:
+        for i in range(300):
+            t_ns = i * 20 * NS_PER_MS
+            log.write(Frame(t_ns, t_ns, i, picture(0.0)))
+            log.write(LoadCellSample(t_ns, 5.0 if 100 <= i < 200 else 0.01, 0.0))
+    pictures, note = take_pictures(path, read_run(path))
+    assert [round(p.t_s, 1) for p in pictures] == [1.7, 2.2, 2.7, 3.2, 3.8, 4.3]
+    assert note == ""
+
+
+def test_attention_of_another_checkpoint_is_not_shown(tmp_path: Path) -> None:
+    missing = write_grasp(tmp_path / "missing.mcap")
+    pictures, note = take_pictures(missing, read_run(missing))
+    assert "Attention is not shown" in note
+    assert "nowhere.safetensors" in note
+    assert all(np.ptp(picture.image, axis=2).max() == 0 for picture in pictures)
+    write_network(tmp_path / "other.safetensors")
+    other = write_grasp(tmp_path / "o.mcap", checkpoint=tmp_path / "other.safetensors", digest="of another")
+    assert "is not the run's checkpoint" in take_pictures(other, read_run(other))[1]
+
+
+def test_a_recording_without_a_run_is_reported_with_what_it_has(tmp_path: Path) -> None:
+    paths = write_report(write_recording(tmp_path / "egg.mcap"))
+    parsed = Page(paths.html.read_text(encoding="utf-8"))
+    assert "Egg" in parsed.text
+    assert "Force" in parsed.text
+    for absent in ("Target", "Latency", "Error against the load cell", "Phases and events"):
+        assert absent not in parsed.text
+    assert not any("ttention" in text for text in parsed.text)
+    assert {"curve", "load_cell", "frames"} <= set(parsed.classes)
+
+
+def test_an_empty_log_is_reported_too(tmp_path: Path) -> None:
+    path = tmp_path / "empty.mcap"
+    LogWriter(path, config="", metadata={}).close()
+    assert "Sponge" in Page(write_report(path).html.read_text(encoding="utf-8")).text
+
+
+def test_a_log_cut_short_is_reported_on_request(grasp: Path, tmp_path: Path) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(grasp.read_bytes()[: grasp.stat().st_size // 2])
+    with pytest.raises(LogError, match="--recover"):
+        write_report(cut)
+    assert write_report(cut, recover=True).html.is_file()
+
+
+def test_a_report_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    log = write_recording(tmp_path / "egg.mcap")
+    (tmp_path / "file").touch()
+    with pytest.raises(LogError, match="can't write the report"):
+        write_report(log, tmp_path / "file" / "below")
+
+
+def test_the_overlay_colours_where_attention_is_and_leaves_the_rest() -> None:
+    attention = np.zeros((8, 8), np.float32)
+    attention[1, 6] = 0.9
+    image = overlay(np.full((64, 64), 100, np.uint8), attention)
+    warmth = image[:, :, 0].astype(int) - image[:, :, 2]
+    y, x = np.unravel_index(warmth.argmax(), warmth.shape)
+    assert (y // 8, x // 8) == (1, 6)
+    assert (image[40:, :20] == 100).all()
+
+
+def test_a_histogram_loses_no_value() -> None:
+    values = np.array([*np.full(99, 5.0), 500.0])
+    counts, edges = bins(values)
+    assert counts.sum() == 100
+    assert len(edges) == len(counts) + 1

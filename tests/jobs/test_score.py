@@ -1,0 +1,68 @@
+import math
+
+import pytest
+
+from gripper_force.errors import DataError
+from gripper_force.jobs.score import score_grasp
+from gripper_force.types import GraspStatus, LoadCellSample, Phase
+
+MS = 1_000_000
+
+
+def statuses(*phases):
+    """100 cycles of 10 ms for each phase named."""
+    return [
+        GraspStatus(10 * MS * i, phase, "", 0.0, 0.05)
+        for i, phase in enumerate(p for p in phases for _ in range(100))
+    ]
+
+
+def cell(force_of_s, seconds):
+    return [LoadCellSample(10 * MS * i, force_of_s(i / 100), 0.0) for i in range(round(100 * seconds))]
+
+
+def test_scores_a_known_curve():
+    states = statuses(Phase.OPEN, Phase.RAMP, Phase.HOLD, Phase.HOLD, Phase.HOLD, Phase.RELEASE)
+    force = lambda t: 9.0 if t < 1 else 0.0 if t > 5 else 4.5 if t < 2 else 4.08  # noqa: E731
+    score = score_grasp(cell(force, 6), states, 4.0)
+    assert score.steady_n == pytest.approx(4.08)
+    assert score.steady_error_n == pytest.approx(0.08)
+    assert score.overshoot_n == pytest.approx(0.5)  # the 9 N came before the grasp
+    assert score.settle_s == pytest.approx(1.0)
+
+
+def test_the_last_grasp_counts_and_rejected_samples_do_not():
+    states = statuses(Phase.RAMP, Phase.HOLD, Phase.RELEASE, Phase.RAMP, Phase.HOLD, Phase.HOLD)
+    samples = cell(lambda t: 2.0 if t < 3 else 1.0, 6)
+    samples[450] = LoadCellSample(450 * 10 * MS, -70.0, 0.0, valid=False)
+    score = score_grasp(samples, states, 1.0)
+    assert (score.steady_error_n, score.overshoot_n, score.settle_s) == (0.0, 0.0, 0.0)
+
+
+def test_a_hard_first_touch_is_overshoot():
+    states = statuses(Phase.APPROACH, Phase.CONTACT, Phase.RAMP, Phase.HOLD)
+    score = score_grasp(cell(lambda t: 3.0 if 0.5 < t < 1.5 else 2.0, 4), states, 2.0)
+    assert score.overshoot_n == pytest.approx(1.0)
+    assert score.settle_s == 0.0  # which counts from the ramp on
+
+
+def test_never_settled_is_nan():
+    assert math.isnan(score_grasp(cell(lambda _: 2.0, 2), statuses(Phase.RAMP, Phase.HOLD), 4.0).settle_s)
+
+
+@pytest.mark.parametrize(("gap_s", "counts"), [(0.2, True), (0.3, False)])
+def test_a_load_cell_with_a_gap_in_the_hold_compares_nothing(gap_s, counts):
+    states = statuses(Phase.RAMP, Phase.HOLD, Phase.HOLD)
+    samples = [s for s in cell(lambda _: 2.0, 3) if not 2.5 <= s.t_ns / 1e9 < 2.5 + gap_s]
+    if counts:
+        assert score_grasp(samples, states, 2.0).steady_error_n == 0.0
+    else:
+        with pytest.raises(DataError, match=r"no sound sample for 0\.31 s of the hold"):
+            score_grasp(samples, states, 2.0)
+
+
+def test_nothing_to_score():
+    with pytest.raises(DataError, match="no hold"):
+        score_grasp(cell(lambda _: 1.0, 1), statuses(Phase.APPROACH), 4.0)
+    with pytest.raises(DataError, match="load cell"):
+        score_grasp(cell(lambda _: 1.0, 0.5), statuses(Phase.RAMP, Phase.HOLD), 4.0)

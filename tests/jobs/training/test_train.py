@@ -1,0 +1,171 @@
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from gripper_force import cli
+from gripper_force.errors import CheckpointError, ConfigError, DataError, NonFiniteError
+from gripper_force.jobs import metrics
+from gripper_force.jobs.dataset import Clip, digest, load_clips
+from gripper_force.jobs.training import train as train_module
+from gripper_force.jobs.training.recipe import TrainConfig
+from gripper_force.jobs.training.train import train
+from gripper_force.jobs.training.trainer import Trainer
+from gripper_force.vision.checkpoint import load_checkpoint
+from gripper_force.vision.dense import predict
+from gripper_force.vision.preprocess import Preprocess
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def test_it_learns(
+    clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig, press: Callable[..., Clip]
+) -> None:
+    config = small_recipe.model_copy(update={"steps": 120, "clips": 8})
+    checkpoint = train(config, clips, tmp_path / "out.safetensors")
+    unseen = press(99)
+    error = predict(checkpoint.networks, config.preprocess, unseen.frames)[0] - unseen.forces_n
+    constant = np.abs(unseen.forces_n - unseen.forces_n.mean()).mean()
+    assert np.abs(error).mean() < 0.4 * constant
+
+
+def test_the_checkpoint_tells_where_it_comes_from(
+    clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig
+) -> None:
+    config = small_recipe.model_copy(update={"attentions": ("ssam", "scam")})
+    out = tmp_path / "folder" / "out.safetensors"
+    header = train(config, clips, out).header
+    assert [member.attention for member in header.members] == ["ssam", "scam"]
+    assert header.preprocess == config.preprocess
+    assert header.data_digest == digest(clips)
+    assert {"mae_n", "rmse_n", "bias_n"} == header.metrics.keys()
+    assert [r.force_n for r in header.residuals] == sorted(r.force_n for r in header.residuals)
+    assert all(r.std_n > 0 for r in header.residuals)
+    assert list(out.parent.iterdir()) == [out]
+
+
+@pytest.mark.parametrize("attention", ["none", "ssam", "scam", "se", "cbam"])
+@pytest.mark.parametrize(("backbone", "pooling"), [("vgg", "gap"), ("resnet18", "wap"), ("mobile", "wap")])
+def test_every_network_can_be_trained(
+    attention: str, backbone: str, pooling: str, clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig
+) -> None:
+    recipe = {"attentions": [attention], "backbone": backbone, "pooling": pooling, "steps": 2, "clips": 2}
+    config = TrainConfig.model_validate({**small_recipe.model_dump(), **recipe, "preprocess": {"size": 32}})
+    larger = [replace(clip, frames=clip.frames.repeat(2, axis=1).repeat(2, axis=2)) for clip in clips]
+    checkpoint = train(config, larger, tmp_path / "out.safetensors")
+    (member,) = checkpoint.header.members
+    assert (member.attention, member.backbone) == (attention, backbone)
+    assert member.pooling == (pooling if attention in ("ssam", "scam") else "wap")
+
+
+def test_validation_clips_can_be_given(clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig) -> None:
+    out = tmp_path / "out.safetensors"
+    checkpoint = train(small_recipe, clips[:-1], out, validation_clips=clips[-1:])
+    forces_n = predict(checkpoint.networks, small_recipe.preprocess, clips[-1].frames)[0]
+    claimed = checkpoint.header.metrics["mae_n"]
+    assert claimed == pytest.approx(np.abs(forces_n - clips[-1].forces_n).mean(), rel=0.01)
+    with pytest.raises(DataError, match="p5 has frames of 16 px"):
+        train(
+            small_recipe.model_copy(update={"preprocess": Preprocess(size=32)}),
+            clips[-1:],
+            out,
+            validation_clips=clips[-1:],
+        )
+
+
+def test_a_seed_fixes_the_result(clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig) -> None:
+    a, b = tmp_path / "a.safetensors", tmp_path / "b.safetensors"
+    train(small_recipe, clips, a)
+    train(small_recipe, clips, b)
+    assert a.read_bytes() == b.read_bytes()
+    train(small_recipe.model_copy(update={"seed": 1}), clips, b)
+    assert a.read_bytes() != b.read_bytes()
+
+
+def test_a_broken_run_goes_on_to_the_same_result(
+    clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_recipe: TrainConfig
+) -> None:
+    config = small_recipe.model_copy(update={"attentions": ("ssam", "scam")})
+    whole, broken = tmp_path / "whole.safetensors", tmp_path / "broken.safetensors"
+    train(config, clips, whole)
+    monkeypatch.setattr(train_module, "STATE_EVERY_S", 0.0)
+    update = Trainer._update
+    steps = iter(range(100))
+
+    def failing(trainer: Trainer) -> torch.Tensor:
+        if next(steps) == 6:  # in the second member
+            raise KeyboardInterrupt
+        return update(trainer)
+
+    monkeypatch.setattr(Trainer, "_update", failing)
+    with pytest.raises(KeyboardInterrupt):
+        train(config, clips, broken)
+    assert not broken.exists()
+    train(config, clips, broken, resume=True)
+    assert next(steps) == 9  # 8 steps and the failed one, none twice
+    assert broken.read_bytes() == whole.read_bytes()
+    assert not list(tmp_path.glob("*.state"))
+
+
+def test_a_state_of_another_recipe_is_refused(
+    clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_recipe: TrainConfig
+) -> None:
+    out = tmp_path / "out.safetensors"
+    monkeypatch.setattr(train_module, "save_checkpoint", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        train(small_recipe, clips, out)
+    with pytest.raises(CheckpointError, match="another recipe"):
+        train(small_recipe.model_copy(update={"steps": 5}), clips, out, resume=True)
+    with pytest.raises(CheckpointError, match="other data"):
+        train(small_recipe, clips[:-1], out, resume=True)
+    out.with_suffix(".0.state").write_bytes(b"damaged")
+    with pytest.raises(CheckpointError, match="can't read"):
+        train(small_recipe, clips, out, resume=True)
+
+
+def test_divergence_is_named(clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig) -> None:
+    clips[0].forces_n[:] = clips[1].forces_n[:] = clips[2].forces_n[:] = np.inf
+    with pytest.raises(NonFiniteError, match="ssam diverged"):
+        train(small_recipe, clips, tmp_path / "out.safetensors")
+
+
+def test_data_without_contact_or_split_are_refused(
+    clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig, press: Callable[..., Clip]
+) -> None:
+    with pytest.raises(DataError, match="two"):
+        train(small_recipe, clips[:1], tmp_path / "out.safetensors")
+    with pytest.raises(DataError, match="too few"):
+        train(small_recipe, [*clips, press(7, frames=3), press(8, frames=3)], tmp_path / "out.safetensors")
+    for clip in clips:
+        clip.forces_n[:] = 0
+    with pytest.raises(DataError, match="contact"):
+        train(small_recipe, clips, tmp_path / "out.safetensors")
+
+
+def test_the_command_takes_a_recipe(few_logs: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.safetensors"
+    keys = ["preprocess.size=16", "attentions=[cbam]", "epochs=null", "steps=1", "clips=2", "device=cpu"]
+    sets = [part for key in keys for part in ("--set", key)]
+    call = ["train", str(few_logs), "--recipe", "shin2019", "--out", str(out), "--jobs", "1", *sets, "--json"]
+    told = json.loads(CliRunner().invoke(cli.app, call).stdout)
+    assert set(told) == {"checkpoint", "digest", "mae_n", "rmse_n", "bias_n"}
+    header = load_checkpoint(out).header
+    assert [member.attention for member in header.members] == ["cbam"]
+    assert not header.preprocess.reference
+    one = min(few_logs.glob("*.mcap"))
+    (tmp_path / "unseen").mkdir()
+    (tmp_path / "unseen" / one.name).symlink_to(one)
+    call = [*call, "--validation", str(tmp_path / "unseen")]
+    told = json.loads(CliRunner().invoke(cli.app, call).stdout)
+    (clip,) = load_clips([one], header.preprocess)
+    forces_n = predict(load_checkpoint(out).networks, header.preprocess, clip.frames)[0]
+    assert told["mae_n"] == pytest.approx(
+        metrics.mae(forces_n[clip.valid], clip.forces_n[clip.valid]), rel=0.01
+    )
+    refused = CliRunner().invoke(cli.app, ["train", str(few_logs), "--recipe", "shin"]).exception
+    assert isinstance(refused, ConfigError)

@@ -1,0 +1,142 @@
+from pathlib import Path
+
+import pytest
+import torch
+
+from gripper_force.jobs.dataset import Clip
+from gripper_force.jobs.training import trainer as trainer_module
+from gripper_force.jobs.training.batches import Batches
+from gripper_force.jobs.training.parallel import Ranks
+from gripper_force.jobs.training.recipe import TrainConfig
+from gripper_force.jobs.training.train import train
+from gripper_force.jobs.training.trainer import Trainer, one_cycle, squared_error, tenths
+from gripper_force.vision.checkpoint import load_checkpoint
+from gripper_force.vision.header import NetworkConfig
+from gripper_force.vision.network import ForceNetwork
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def gradients(
+    network: ForceNetwork, inputs: torch.Tensor, forces_n: torch.Tensor, valid: torch.Tensor
+) -> tuple[float, list[torch.Tensor]]:
+    """The training's loss on windows that are whole, and its gradients."""
+    network.zero_grad()
+    loss = (
+        squared_error(network, inputs, forces_n, valid, network.config.context)
+        / valid[:, network.config.context :].sum()
+    )
+    loss.backward()  # type: ignore[no-untyped-call]
+    return loss.item(), [p.grad.clone() for p in network.parameters() if p.grad is not None]
+
+
+@pytest.mark.parametrize("backbone", ["vgg", "resnet18", "mobile"])
+@pytest.mark.parametrize(
+    ("attention", "earlier_frames", "pooling"),
+    [("none", 0, "wap"), ("ssam", 0, "wap"), ("ssam", 2, "gap"), ("scam", 1, "wap"), ("cbam", 0, "wap")],
+)
+def test_shared_windows_give_the_loss_and_gradients_of_separate_ones(
+    backbone: str, attention: str, earlier_frames: int, pooling: str
+) -> None:
+    """For the same statistics of batch normalisation: here the running ones."""
+    torch.manual_seed(0)
+    shape = {"attention": attention, "earlier_frames": earlier_frames, "pooling": pooling}
+    config = NetworkConfig.model_validate(
+        {**shape, "backbone": backbone, "size": 32, "width": 0.25, "window": 5, "hidden": 6, "head": 7}
+    )
+    network = ForceNetwork(config).double().eval()
+    for name, tensor in network.state_dict().items():
+        if name.endswith("running_var"):
+            tensor.uniform_(0.01, 1)
+    window = network.config.context + 1
+    inputs = torch.randn(2, window + 4, 1, 32, 32, dtype=torch.float64)
+    forces_n, valid = torch.rand(2, window + 4, dtype=torch.float64), torch.rand(2, window + 4) < 0.7
+
+    def windows(whole: torch.Tensor) -> torch.Tensor:
+        return whole.unfold(1, window, 1).movedim(-1, 2).flatten(0, 1)  # (2 * 5, window, ...)
+
+    shared = gradients(network, inputs, forces_n, valid)
+    separate = gradients(network, windows(inputs), windows(forces_n), windows(valid))
+    assert shared[0] == pytest.approx(separate[0], rel=1e-10)
+    assert len(shared[1]) == len(list(network.parameters()))
+    for one, other in zip(shared[1], separate[1], strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-11)
+        assert other.abs().max() > 0
+
+
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+@pytest.mark.parametrize("windows", ["shared", "separate"])
+def test_each_precision_and_way_of_windows_trains(
+    precision: str, windows: str, clips: list[Clip], small_recipe: TrainConfig
+) -> None:
+    recipe = {"precision": precision, "windows": windows, "short_share": 0.0, "steps": 40}
+    config = small_recipe.model_copy(update=recipe)
+    trainer = Trainer(config, 0, Batches(clips, config, Ranks("cpu")), Ranks("cpu"))
+    errors_n = list(trainer.steps())
+    assert len(errors_n) == 40
+    assert errors_n[-1] < 0.95 * errors_n[0]
+    assert not trainer.network.training
+    assert all(p.dtype == torch.float32 for p in trainer.network.parameters())
+
+
+def test_a_training_may_be_taken_in_parts(clips: list[Clip], small_recipe: TrainConfig) -> None:
+    batches = Batches(clips, small_recipe, Ranks("cpu"))
+    whole, parts = (Trainer(small_recipe, 0, batches, Ranks("cpu")) for _ in range(2))
+    assert len(list(whole.steps())) == 4
+    assert [len(list(parts.steps(until))) for until in (0.5, 0.5, 1.0)] == [2, 0, 2]
+    for one, other in zip(whole.network.parameters(), parts.network.parameters(), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_epochs_count_passes(clips: list[Clip], small_recipe: TrainConfig) -> None:
+    config = small_recipe.model_copy(update={"epochs": 0.1, "clips": 9})
+    batches = Batches(clips, config, Ranks("cpu"))
+    assert batches.labels == 360
+    assert len(list(Trainer(config, 0, batches, Ranks("cpu")).steps())) == 4
+
+
+def test_a_time_budget_ends_the_training(
+    clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_recipe: TrainConfig
+) -> None:
+    seconds = iter(range(10_000))
+    monkeypatch.setattr(trainer_module.time, "monotonic", lambda: float(next(seconds)))
+    learning_rates = []
+    update = Trainer._update
+
+    def spying(trainer: Trainer) -> torch.Tensor:
+        learning_rates.append(trainer.done)
+        return update(trainer)
+
+    monkeypatch.setattr(Trainer, "_update", spying)
+    train(small_recipe.model_copy(update={"minutes": 0.5}), clips, tmp_path / "out.safetensors")
+    assert len(learning_rates) > 4
+    assert learning_rates == sorted(learning_rates)
+    assert learning_rates[0] == 0
+    assert learning_rates[-1] < 1
+
+
+def test_the_learning_rate_rises_then_falls() -> None:
+    values = [one_cycle(x / 100, 0.25) for x in range(101)]
+    assert values[0] == pytest.approx(0.04)
+    assert values[25] == pytest.approx(1)
+    assert values[100] == pytest.approx(0, abs=1e-9)
+    assert values[:26] == sorted(values[:26])
+    assert values[25:] == sorted(values[25:], reverse=True)
+
+
+def test_a_checkpoint_in_evaluation_mode_is_as_good_as_in_training(
+    clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig
+) -> None:
+    config = small_recipe.model_copy(update={"steps": 60, "clips": 8})
+    train(config, clips, tmp_path / "out.safetensors")
+    (network,) = load_checkpoint(tmp_path / "out.safetensors").networks
+    inputs, forces_n, _ = Batches(clips, config, Ranks("cpu")).batch(1000, 8, 22)
+    with torch.no_grad():
+        evaluated = (network(inputs, 19) - forces_n[:, 19:]).abs().mean()
+        trained = (network.train()(inputs, 19) - forces_n[:, 19:]).abs().mean()
+    assert evaluated < 2 * trained + 0.2
+
+
+def test_the_paper_takes_a_tenth_every_30_of_120_epochs() -> None:
+    rates = [tenths(epoch / 120) for epoch in (0, 29.9, 30, 60, 90, 119.9)]
+    assert rates == pytest.approx([1, 1, 0.1, 0.01, 0.001, 0.001])

@@ -1,0 +1,25 @@
+from importlib.util import find_spec
+
+import pytest
+
+from gripper_force.qualification.bench.roofline import Roofline, measure
+from gripper_force.vision.header import NetworkConfig
+from gripper_force.vision.network import cost
+
+SMALL = NetworkConfig(size=32, width=0.25)
+
+
+def test_the_longer_of_arithmetic_and_reading_counts() -> None:
+    parameters, multiply_adds = cost(SMALL)
+    assert Roofline("float32", 1, 1e9, 1e15).least_ms([SMALL]) == pytest.approx(2e-6 * multiply_adds)
+    assert Roofline("float32", 1, 1e15, 1e9).least_ms([SMALL, SMALL]) == pytest.approx(8e-6 * parameters)
+    assert Roofline("int8", 1, 1e15, 1e9).least_ms([SMALL]) == pytest.approx(1e-6 * parameters)
+
+
+@pytest.mark.parametrize("precision", ["float32", "bfloat16", "int8"])
+def test_this_machine_has_rates(precision: str) -> None:
+    if find_spec("nncf") is None:
+        pytest.skip("nncf is not installed: pip install 'gripper-force[engines]'")
+    roof = measure(precision, 1)
+    assert roof.flops > 1e8
+    assert roof.bytes_s > 1e8

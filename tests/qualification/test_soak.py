@@ -1,0 +1,108 @@
+import json
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from gripper_force import cli
+from gripper_force.config import Config
+from gripper_force.qualification import soak as soaking
+from gripper_force.qualification.soak import WARM_UP, Sample, judge, soak
+from gripper_force.runtime.log import LogWriter
+from gripper_force.types import NS_PER_S, Event
+
+
+def rising(mb_a_grasp: float = 0.0, handles: int = 0, threads: int = 0) -> list[Sample]:
+    """An hour of grasps after which something was left over from each, and a warm-up that takes much."""
+    cold = [Sample(6.0 * i, 300.0 + 40 * i, 9, 2) for i in range(WARM_UP)]
+    warm = range(595)
+    return cold + [
+        Sample(6.0 * (WARM_UP + i), 500 + mb_a_grasp * i, 9 + handles * i, 4 + threads * i) for i in warm
+    ]
+
+
+def test_what_stays_flat_is_good() -> None:
+    assert judge(rising()) == {"ok": True, "growth_mb": 0.0, "slope_mb_h": 0.0}
+
+
+@pytest.mark.parametrize("samples", [rising(mb_a_grasp=0.04), rising(handles=1), rising(threads=1)])
+def test_what_grows_is_told(samples: list[Sample]) -> None:
+    assert not judge(samples)["ok"]
+
+
+def test_objects_that_take_more_than_others_are_no_growth() -> None:
+    samples = [replace(s, memory_mb=s.memory_mb + 40 * (i % 4 == 1)) for i, s in enumerate(rising())]
+    for count in range(WARM_UP + 4, WARM_UP + 20):
+        assert judge(samples[:count])["growth_mb"] == 0
+
+
+def test_growth_is_counted_from_the_end_of_the_warm_up() -> None:
+    verdict = judge(rising(mb_a_grasp=0.01))
+    assert verdict["ok"]
+    assert verdict["growth_mb"] == pytest.approx(5.91)
+    assert verdict["slope_mb_h"] == pytest.approx(6.0, abs=0.05)
+
+
+def test_a_few_grasps_leave_nothing_behind(monkeypatch: pytest.MonkeyPatch, quick_vision: list[str]) -> None:
+    monkeypatch.setattr(soaking, "WARM_UP", 1)
+    sets = [part for one in quick_vision for part in ("--set", one)]
+    done = CliRunner().invoke(cli.app, ["stability", "--soak", "0", "--seed", "3", "--json", *sets])
+    assert done.exit_code == 0, done.stderr
+    report: dict[str, Any] = json.loads(done.stdout)
+    assert report["ok"] is True
+    assert report["grasps"] == 3 == sum(report["outcomes"].values())
+    assert report["simulated_s"] > 2
+    last, warm = report["samples"][-1], report["samples"][1]
+    assert (last["handles"], last["threads"]) == (warm["handles"], warm["threads"])
+
+
+@pytest.mark.parametrize("grasps", [3, 12])
+def test_ctrl_c_tells_what_was_seen_so_far(grasps: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    left = iter(range(grasps))
+
+    def broken_off(config: Config) -> dict[str, Any]:
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+        with LogWriter(config.log.directory / "run.mcap", config="", metadata={}) as log:
+            log.write(Event(0, "session", "tick"))
+            log.write(Event(NS_PER_S, "session", "tick"))
+        return {"result": "held"}
+
+    monkeypatch.setattr(soaking, "grasp", broken_off)
+    if grasps < WARM_UP:
+        with pytest.raises(KeyboardInterrupt):
+            soak(Config(), 3600)
+        return
+    report = soak(Config(), 3600)
+    assert (report["ok"], report["grasps"], report["simulated_s"]) == (False, 12, 12.0)
+
+
+def test_a_thread_and_a_file_that_are_left_open_are_found(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    left: list[Any] = []
+    end = threading.Event()
+
+    def leaky(config: Config) -> dict[str, Any]:
+        left.append((tmp_path / "left").open("wb"))
+        left.append(threading.Thread(target=end.wait, daemon=True))
+        left[-1].start()
+        with LogWriter(config.log.directory / "run.mcap", config="", metadata={}) as log:
+            for t_s in range(3):
+                log.write(Event(t_s * NS_PER_S, "session", "tick"))
+        return {"result": "held"}
+
+    monkeypatch.setattr(soaking, "grasp", leaky)
+    try:
+        report = soak(Config(), 30)
+    finally:
+        end.set()
+        for one in left:
+            one.join() if isinstance(one, threading.Thread) else one.close()
+    assert report["ok"] is False
+    last, warm = report["samples"][-1], report["samples"][WARM_UP]
+    assert (report["grasps"], report["simulated_s"]) == (15, 30.0)
+    assert (last.handles, last.threads) == (warm.handles + 10, warm.threads + 10)

@@ -1,0 +1,162 @@
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from gripper_force.config import Config, load_config
+from gripper_force.errors import ConfigError, DeviceError, DeviceNotFoundError, LogError
+from gripper_force.runtime import backends
+from gripper_force.runtime.backends import MonotonicClock, open_devices
+from gripper_hw.dynamixel.virtual import find_bus
+
+
+@pytest.fixture
+def config(quick: list[str]) -> Config:
+    return load_config(None, quick)
+
+
+def changed(config: Config, **sections: dict[str, object]) -> Config:
+    parts = {name: getattr(config, name).model_copy(update=update) for name, update in sections.items()}
+    return config.model_copy(update=parts)
+
+
+@pytest.mark.parametrize(
+    ("unit", "known"),
+    [
+        ("camera", "none, simulated, playback, oak, uvc"),
+        ("load_cell", "none, simulated, playback, serial, phidget"),
+    ],
+)
+def test_an_unknown_backend_is_named_with_the_known_ones(config: Config, unit: str, known: str) -> None:
+    with (
+        pytest.raises(ConfigError, match=f"no {unit} backend 'oak9'; there are {known}"),
+        open_devices(changed(config, **{unit: {"backend": "oak9"}})),
+    ):
+        pass
+    assert find_bus("rig") is None
+
+
+def test_only_what_is_named_is_built(config: Config) -> None:
+    with open_devices(changed(config, load_cell={"backend": "none"})) as devices:
+        assert devices.camera is None
+        assert devices.load_cell is None
+        assert devices.lockstep
+        assert "scene" in devices.notes
+        assert find_bus("rig") is not None
+        devices.check()
+    assert find_bus("rig") is None
+
+
+def test_lockstep_needs_a_simulated_servo(config: Config) -> None:
+    real = changed(config, servo={"port": "/dev/ttyUSB7"}, load_cell={"backend": "none"})
+    with pytest.raises(ConfigError, match=r"clock=lockstep .*'/dev/ttyUSB7'"), open_devices(real):
+        pass
+
+
+@pytest.mark.parametrize(("unit", "backend"), [("camera", "oak"), ("load_cell", "serial")])
+def test_a_real_sensor_keeps_no_simulated_time(config: Config, unit: str, backend: str) -> None:
+    mixed = changed(config, **{unit: {"backend": backend, "port": "/dev/nowhere"}})
+    sentence = rf"{unit}\.backend={backend} can't keep .*set clock=realtime"
+    with pytest.raises(ConfigError, match=sentence), open_devices(mixed):
+        pass
+
+
+@pytest.mark.parametrize("unit", ["camera", "load_cell"])
+def test_a_simulated_sensor_needs_the_simulated_servo(config: Config, unit: str) -> None:
+    none = {"camera": {"backend": "none"}, "load_cell": {"backend": "none"}}
+    mixed = changed(config, servo={"port": "/dev/ttyUSB7"}, **none | {unit: {"backend": "simulated"}})
+    with pytest.raises(ConfigError, match=r"set servo\.port to virtual:rig"), open_devices(mixed):
+        pass
+
+
+def test_a_port_that_is_not_there_is_one_sentence(config: Config) -> None:
+    real = changed(config, servo={"port": "/dev/ttyUSB7"}, load_cell={"backend": "none"})
+    real = real.model_copy(update={"clock": "realtime"})
+    with (
+        open_devices(real) as devices,
+        pytest.raises(DeviceNotFoundError, match="there is no port /dev/ttyUSB7; ") as caught,
+    ):
+        devices.servo.start()
+    assert isinstance(devices.clock, MonotonicClock)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("unit", ["camera", "load_cell"])
+def test_a_recording_that_is_not_there_closes_what_was_open(
+    config: Config, unit: str, tmp_path: Path
+) -> None:
+    plays = changed(config, **{unit: {"backend": "playback", "path": tmp_path / "none.mcap"}})
+    with pytest.raises(LogError, match="No such file"), open_devices(plays):
+        pass
+    assert find_bus("rig") is None
+
+
+@pytest.fixture
+def closed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Stands in for the servo and the rig and tells the order in which they are closed."""
+    calls: list[str] = []
+
+    def device(name: str) -> SimpleNamespace:
+        return SimpleNamespace(close=lambda: calls.append(name), start=lambda: calls.append(f"{name} starts"))
+
+    real = backends.load
+
+    def load(path: str) -> object:
+        if path == backends.SERVO:
+            return lambda *_: device("servo")
+        if path != backends.RIG:
+            return real(path)
+        rig = device("rig")
+        rig.clock, rig.start_ns, rig.check, rig.notes = MonotonicClock(), 0, lambda: None, dict
+        rig.camera, rig.load_cell, rig.relight = device("camera"), device("load cell"), None
+        return lambda *_: rig
+
+    monkeypatch.setattr(backends, "load", load)
+    return calls
+
+
+def test_playback_needs_the_log_to_play(config: Config) -> None:
+    plays = changed(config, camera={"backend": "playback"})
+    with pytest.raises(ConfigError, match=r"camera\.path, the log to play"), open_devices(plays):
+        pass
+
+
+def test_a_recording_plays_as_camera_and_load_cell(config: Config, fused_log: Path) -> None:
+    section = {"backend": "playback", "path": fused_log}
+    with open_devices(changed(config, camera=section, load_cell=section)) as devices:
+        assert devices.camera is not None
+        assert devices.load_cell is not None
+        devices.camera.start()
+        devices.load_cell.start()
+        devices.clock.sleep_until_ns(100_000_000)
+        assert devices.camera.newest() is not None
+        assert len(devices.load_cell.drain()) > 10
+
+
+def test_what_was_open_is_closed_where_the_next_can_not_be(config: Config, closed: list[str]) -> None:
+    no_log = changed(config, camera={"backend": "simulated"}, load_cell={"backend": "playback"})
+    with pytest.raises(ConfigError), open_devices(no_log):
+        pass
+    assert closed == ["camera", "rig"]
+
+
+@pytest.mark.parametrize("error", [DeviceError, KeyboardInterrupt, SystemExit])
+def test_everything_is_closed_on_every_way_out(
+    config: Config, closed: list[str], error: type[BaseException]
+) -> None:
+    config = changed(config, camera={"backend": "simulated"})
+    with open_devices(config):
+        assert closed == ["rig starts"]
+    assert closed[1:] == ["servo", "load cell", "camera", "rig"]
+    closed.clear()
+    with pytest.raises(error), open_devices(config):
+        raise error
+    assert closed[1:] == ["servo", "load cell", "camera", "rig"]
+
+
+def test_the_hosts_clock_sleeps_until_its_time() -> None:
+    clock = MonotonicClock()
+    begin_ns = clock.now_ns()
+    clock.sleep_until_ns(begin_ns - 1)
+    clock.sleep_until_ns(begin_ns + 2_000_000)
+    assert clock.now_ns() >= begin_ns + 2_000_000

@@ -1,0 +1,239 @@
+import threading
+import time
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from gripper_force.errors import DataError
+from gripper_force.runtime.perception import LockstepPerception, Seen, ThreadedPerception
+from gripper_force.types import NS_PER_MS, Frame, Gray
+
+
+class Guess(NamedTuple):
+    force_n: float
+    std_n: float
+
+
+class Eye:
+    """Says how many frames it has seen, after its reference frames."""
+
+    def __init__(self, error: Exception | None = None, at: int = 1, references: int = 1) -> None:
+        self.count = 0
+        self.references = references
+        self.error = error
+        self.at = at
+
+    def update(self, gray: Gray) -> Guess | None:
+        self.count += 1
+        if self.error is not None and self.count == self.at:
+            raise self.error
+        return Guess(float(self.count), 0.5) if self.count > self.references else None
+
+
+class Hand:
+    """A clock that stands still."""
+
+    now_ms = 0
+
+    def now_ns(self) -> int:
+        return self.now_ms * NS_PER_MS
+
+    def sleep_until_ns(self, t_ns: int) -> None:
+        self.now_ms = t_ns // NS_PER_MS
+
+
+class Shutter:
+    """A camera that has what it is given."""
+
+    def __init__(self) -> None:
+        self.frames: deque[Frame] = deque()
+
+    def give(self, seq: int, t_ms: int = 0, level: int | None = None) -> None:
+        t_ns = t_ms * NS_PER_MS
+        self.frames.append(Frame(t_ns, t_ns, seq, np.full((2, 2), seq if level is None else level, np.uint8)))
+
+    def newest(self) -> Frame | None:
+        return self.frames.popleft() if self.frames else None
+
+    def start(self) -> None: ...
+
+    def close(self) -> None: ...
+
+    def counts(self) -> dict[str, int]:
+        return {}
+
+
+def seqs(seen: list[Seen]) -> list[int]:
+    return [s.frame.seq for s in seen]
+
+
+def test_in_lockstep_an_estimate_is_there_after_its_time_and_not_before() -> None:
+    clock, camera = Hand(), Shutter()
+    eyes = LockstepPerception(camera, Eye(), clock, compute_ms=12.0)
+    for seq, t_ms in enumerate((0, 20)):
+        camera.give(seq, t_ms)
+        clock.now_ms = t_ms
+        assert eyes.poll() == []
+        clock.now_ms += 11
+        assert eyes.poll() == []
+        clock.now_ms += 1
+        (seen,) = eyes.poll()
+        assert seen.frame.seq == seq
+        assert eyes.poll() == []
+    assert seen.visual is not None
+    assert (seen.visual.t_ns, seen.visual.ready_ns) == (20 * NS_PER_MS, 32 * NS_PER_MS)
+    assert (seen.visual.seq, seen.visual.force_n, seen.visual.std_n) == (1, 2.0, 0.5)
+    assert seen.visual.compute_ms >= 0
+
+
+def test_the_reference_frame_is_seen_and_gives_no_estimate() -> None:
+    clock, camera = Hand(), Shutter()
+    eyes = LockstepPerception(camera, Eye(), clock, compute_ms=0.0)
+    camera.give(0)
+    (seen,) = eyes.poll()
+    assert (seen.frame.seq, seen.visual) == (0, None)
+
+
+def test_in_lockstep_no_frame_is_taken_while_the_last_is_under_way() -> None:
+    clock, camera, eye = Hand(), Shutter(), Eye()
+    eyes = LockstepPerception(camera, eye, clock, compute_ms=12.0)
+    camera.give(0)
+    eyes.poll()
+    camera.give(1)
+    clock.now_ms = 11
+    eyes.poll()
+    assert eye.count == 1
+    clock.now_ms = 12
+    assert seqs(eyes.poll()) == [0]
+    assert eye.count == 2
+
+
+def test_without_an_estimator_frames_pass_at_once() -> None:
+    clock, camera = Hand(), Shutter()
+    eyes = LockstepPerception(camera, None, clock, compute_ms=12.0)
+    camera.give(3)
+    assert [(s.frame.seq, s.visual) for s in eyes.poll()] == [(3, None)]
+    assert LockstepPerception(None, None, clock, 12.0).poll() == []
+
+
+@pytest.mark.parametrize("at", [1, 2])
+def test_in_lockstep_an_error_before_the_first_estimate_is_the_callers(at: int) -> None:
+    camera = Shutter()
+    eyes = LockstepPerception(camera, Eye(DataError("no picture"), at), Hand(), 0.0)
+    for _ in range(at - 1):
+        camera.give(0)
+        eyes.poll()
+    camera.give(1)
+    with pytest.raises(DataError, match="no picture"):
+        eyes.poll()
+
+
+def test_a_later_error_costs_one_estimate_and_is_told() -> None:
+    camera = Shutter()
+    eyes = LockstepPerception(camera, Eye(RuntimeError("no kernel"), at=4), Hand(), 0.0)
+    seen = []
+    for seq in range(6):
+        camera.give(seq)
+        seen += eyes.poll()
+    assert [s.visual is None for s in seen] == [True, False, False, True, False, False]
+    assert [s.problem for s in seen] == ["", "", "", "RuntimeError: no kernel", "", ""]
+
+
+def test_a_camera_that_hangs_gives_no_estimates() -> None:
+    camera, eye = Shutter(), Eye()
+    eyes = LockstepPerception(camera, eye, Hand(), 0.0)
+    seen = []
+    for seq, level in enumerate((1, 2, 3, 3, 3, 4)):
+        camera.give(seq, level=level)
+        seen += eyes.poll()
+    assert ["hangs" in s.problem for s in seen] == [False, False, False, True, True, False]
+    assert [s.visual is None for s in seen] == [True, False, False, True, True, False]
+    assert eye.count == 4
+
+
+def test_one_picture_that_came_twice_at_the_start_excuses_no_camera_that_hangs() -> None:
+    camera, eye = Shutter(), Eye(references=3)
+    eyes = LockstepPerception(camera, eye, Hand(), 0.0)
+    seen = []
+    for seq, level in enumerate((1, 1, 2, 3, 4, 5, 5, 5)):
+        camera.give(seq, level=level)
+        seen += eyes.poll()
+    assert ["hangs" in s.problem for s in seen] == [False] * 6 + [True] * 2
+
+
+def test_a_recording_may_stand_still() -> None:
+    camera, eye = Shutter(), Eye()
+    eyes = LockstepPerception(camera, eye, Hand(), 0.0)
+    for seq in range(5):
+        camera.give(seq, level=7)
+        (seen,) = eyes.poll()
+        assert seen.problem == ""
+    assert eye.count == 5
+
+
+def gather(eyes: ThreadedPerception, count: int) -> list[Seen]:
+    seen: list[Seen] = []
+    until_s = time.monotonic() + 20
+    while len(seen) < count and time.monotonic() < until_s:
+        seen += eyes.poll()
+        time.sleep(0.001)
+    return seen
+
+
+@pytest.mark.parametrize("eye", [Eye(), None])
+def test_a_thread_sees_every_frame_it_is_handed(eye: Eye | None) -> None:
+    clock, camera = Hand(), Shutter()
+    clock.now_ms = 30
+    for seq in range(5):
+        camera.give(seq, seq)
+    eyes = ThreadedPerception(camera, eye, clock)
+    eyes.start()
+    seen = gather(eyes, 5)
+    eyes.close()
+    eyes.close()
+    assert seqs(seen) == list(range(5))
+    if eye is None:
+        assert all(s.visual is None for s in seen)
+        return
+    assert seen[0].visual is None
+    assert [s.visual.force_n for s in seen[1:] if s.visual] == [2.0, 3.0, 4.0, 5.0]
+    assert seen[4].visual is not None
+    assert (seen[4].visual.t_ns, seen[4].visual.ready_ns) == (4 * NS_PER_MS, 30 * NS_PER_MS)
+
+
+@pytest.mark.parametrize("error", [DataError("no picture"), RuntimeError("no kernel")])
+def test_what_stops_the_thread_is_raised_by_poll(error: Exception) -> None:
+    camera = Shutter()
+    camera.give(0)
+    eyes = ThreadedPerception(camera, Eye(error), Hand())
+    eyes.start()
+    with pytest.raises(type(error), match="no "):
+        gather(eyes, 1)
+    eyes.close()
+
+
+def test_a_thread_survives_a_later_error() -> None:
+    camera = Shutter()
+    for seq in range(5):
+        camera.give(seq)
+    eyes = ThreadedPerception(camera, Eye(RuntimeError("no kernel"), at=3), Hand())
+    eyes.start()
+    seen = gather(eyes, 5)
+    eyes.close()
+    assert [s.problem for s in seen] == ["", "", "RuntimeError: no kernel", "", ""]
+
+
+def test_closing_leaves_no_thread_started_or_not() -> None:
+    unused = ThreadedPerception(Shutter(), None, Hand())
+    unused.close()
+    blind = ThreadedPerception(None, None, Hand())
+    blind.start()
+    assert blind.poll() == []
+    blind.close()
+    eyes = ThreadedPerception(Shutter(), None, Hand())
+    eyes.start()
+    assert "perception" in {thread.name for thread in threading.enumerate()}
+    eyes.close()
+    assert "perception" not in {thread.name for thread in threading.enumerate()}

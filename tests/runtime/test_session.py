@@ -1,0 +1,676 @@
+import dataclasses
+import math
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from itertools import count, pairwise
+from pathlib import Path
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from gripper_force.config import Config, config_from_text, load_config
+from gripper_force.errors import ConfigError, DataError, DeviceError, DeviceTimeoutError, SimulationError
+from gripper_force.interfaces import Camera, Devices
+from gripper_force.runtime import session as session_module
+from gripper_force.runtime.backends import open_devices
+from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.session import Session, open_session, run_grasp
+from gripper_force.types import (
+    NS_PER_MS,
+    Event,
+    Frame,
+    FusedForce,
+    GraspStatus,
+    LoadCellSample,
+    Outcome,
+    Phase,
+    Record,
+    Request,
+    RequestKind,
+    ServoCommand,
+    ServoState,
+    VisualForce,
+)
+from gripper_force.vision.checkpoint import load_checkpoint
+from gripper_force.vision.exported import read_model
+from gripper_hw.dynamixel import virtual
+from gripper_hw.dynamixel.packets import Instruction, Parser
+from gripper_hw.dynamixel.virtual import VirtualBus
+
+TORQUE_ENABLE = 64
+BUS_WATCHDOG = 98
+
+
+class Guess(NamedTuple):
+    force_n: float
+    std_n: float
+
+
+class Rig:
+    """An open session on the simulated rig, and what its servo heard."""
+
+    def __init__(self, devices: Devices, session: Session, bus: VirtualBus, heard: list[bytes]) -> None:
+        self.devices, self.session, self.bus, self.heard = devices, session, bus, heard
+
+    def register(self, name: str) -> int:
+        return self.bus.servos[0].get(name)
+
+    def grip(self, target_n: float = 3.0) -> None:
+        """Goes on until the jaws press."""
+        decision = self.session.cycle(RequestKind.GRASP, target_n)
+        while decision.status.phase != Phase.RAMP:
+            decision = self.session.cycle()
+        assert self.register("torque_enable") == 1
+
+    def go_on(self, cycles: int) -> None:
+        for _ in range(cycles):
+            self.session.cycle()
+
+    def last_write_to(self, address: int) -> bytes | None:
+        parser = Parser()
+        writes = [
+            packet.params[2:]
+            for data in self.heard
+            for packet in parser.feed(data)
+            if packet.instruction == Instruction.WRITE
+            and int.from_bytes(packet.params[:2], "little") == address
+        ]
+        return writes[-1] if writes else None
+
+    def is_off(self) -> bool:
+        """Torque is off, and because it was asked for over the wire."""
+        return self.register("torque_enable") == 0 and self.last_write_to(TORQUE_ENABLE) == b"\0"
+
+
+@pytest.fixture
+def heard(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
+    """Every byte the virtual bus is sent."""
+    data_sent: list[bytes] = []
+    transact = VirtualBus.transact
+
+    def listen(bus: VirtualBus, data: bytes) -> bytes:
+        data_sent.append(data)
+        return transact(bus, data)
+
+    monkeypatch.setattr(VirtualBus, "transact", listen)
+    return data_sent
+
+
+OpenRig = Callable[..., Rig]
+
+
+@pytest.fixture
+def open_rig(quick: list[str], tmp_path: Path, heard: list[bytes]) -> Iterator[tuple[ExitStack, OpenRig]]:
+    """A stack that stands for the run, and a way to begin it."""
+    with ExitStack() as devices_stay, ExitStack() as run:
+
+        def begin(*overrides: str, camera: Camera | None = None) -> Rig:
+            config = load_config(None, [*quick, *overrides])
+            devices = devices_stay.enter_context(open_devices(config))
+            devices.camera = camera
+            bus = virtual.find_bus("rig")
+            assert bus is not None
+            session = run.enter_context(open_session(config, devices, tmp_path / "run.mcap", None))
+            return Rig(devices, session, bus, heard)
+
+        yield run, begin
+
+
+def records(path: Path) -> list[Record]:
+    """Everything but frames and what is the host's own: how long an estimate took."""
+    return [
+        dataclasses.replace(r, compute_ms=0.0) if isinstance(r, VisualForce) else r
+        for r in LogReader(path).records()
+        if not isinstance(r, Frame)
+    ]
+
+
+def events(path: Path) -> list[str]:
+    return [event.text for event in LogReader(path).records(Event)]
+
+
+# A whole grasp.
+
+
+@pytest.fixture(scope="module")
+def current_log(quick: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("current") / "grasp.mcap"
+    run_grasp(load_config(None, quick), path)
+    return path
+
+
+def test_a_grasp_goes_through_its_phases_and_is_held(current_log: Path) -> None:
+    statuses = list(LogReader(current_log).records(GraspStatus))
+    phases = [b.phase for a, b in pairwise(statuses) if a.phase != b.phase]
+    assert phases == ["approach", "contact", "ramp", "hold", "release", "open"]
+    assert statuses[-1].outcome == Outcome.HELD
+    held_n = [s.force_n for s in LogReader(current_log).records(LoadCellSample)]
+    assert max(held_n) == pytest.approx(3.0, abs=1.0)
+
+
+def test_a_cycle_is_logged_in_its_order(current_log: Path) -> None:
+    kinds = [type(r) for r in LogReader(current_log).records() if not isinstance(r, LoadCellSample | Event)]
+    body = [kind for kind in kinds if kind is not Request]
+    cycle = [ServoState, FusedForce, ServoCommand, GraspStatus]
+    assert body == cycle * (len(body) // 4)
+    requests = [i for i, kind in enumerate(kinds) if kind is Request]
+    assert [kinds[i + 1] for i in requests] == [ServoState] * 2
+    assert [r.kind for r in LogReader(current_log).records(Request)] == ["grasp", "release"]
+    states = [s.t_ns for s in LogReader(current_log).records(ServoState)]
+    assert set(np.diff(states)) == {5 * NS_PER_MS}
+
+
+def test_frames_and_estimates_come_before_the_cycle_that_uses_them(fused_log: Path) -> None:
+    order = list(LogReader(fused_log).records())
+    frames = [i for i, r in enumerate(order) if isinstance(r, Frame)]
+    visual = [i for i, r in enumerate(order) if isinstance(r, VisualForce)]
+    assert len(visual) > 50
+    for i in visual:
+        frame, estimate = order[i - 1], order[i]
+        assert isinstance(frame, Frame)
+        assert isinstance(estimate, VisualForce)
+        assert (frame.seq, frame.t_ns) == (estimate.seq, estimate.t_ns)
+        assert estimate.ready_ns >= frame.received_ns
+    state = next(r for r in order[visual[0] :] if isinstance(r, ServoState))
+    first = order[visual[0]]
+    assert isinstance(first, VisualForce)
+    assert 0 <= state.t_ns - first.ready_ns <= 5 * NS_PER_MS
+    assert len(frames) > len(visual)  # the reference
+
+
+@pytest.mark.parametrize("vision", [False, True])
+def test_a_seed_gives_one_log(
+    vision: bool,
+    current_log: Path,
+    fused_log: Path,
+    quick: list[str],
+    quick_vision: list[str],
+    tmp_path: Path,
+) -> None:
+    again = tmp_path / "again.mcap"
+    run_grasp(load_config(None, quick_vision if vision else quick), again)
+    first = fused_log if vision else current_log
+    assert records(again) == records(first)
+    frames = zip(LogReader(again).records(Frame), LogReader(first).records(Frame), strict=True)
+    assert all((a.gray == b.gray).all() for a, b in frames)
+    if not vision:
+        other = tmp_path / "other.mcap"
+        run_grasp(load_config(None, [*quick, "seed=1"]), other)
+        assert records(other) != records(first)
+
+
+def test_the_log_says_what_ran(fused_log: Path, tiny_checkpoint: Path) -> None:
+    log = LogReader(fused_log)
+    config = config_from_text(log.config, "the log")
+    assert config.gripper.nm_per_a == pytest.approx(1.78, rel=0.05)
+    assert config.gripper.current_step_a == pytest.approx(0.00269)
+    assert log.metadata["object"] == "stapler"
+    assert log.metadata["set"] == "stapler-0"
+    assert log.metadata["clock"] == "lockstep"
+    assert log.metadata["checkpoint"] == load_checkpoint(tiny_checkpoint).digest
+    assert log.metadata["exposure_ms"] == "4.0"
+    assert '"object": "stapler"' in log.metadata["scene"]
+    assert log.metadata["version mujoco"].startswith("4.")
+    assert log.attachments["reference.png"].startswith(b"\x89PNG")
+
+
+def test_progress_tells_each_phase_once(quick: list[str], tmp_path: Path) -> None:
+    told: list[GraspStatus] = []
+    run_grasp(load_config(None, quick), tmp_path / "run.mcap", told.append)
+    assert [s.phase for s in told] == ["approach", "contact", "ramp", "hold", "open"]
+
+
+def test_a_target_over_the_limit_is_refused_before_anything_moves(quick: list[str], tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"target_n 13 N is too near to control\.force_limit_n 10 N"):
+        run_grasp(load_config(None, [*quick, "target_n=13"]), tmp_path / "run.mcap")
+    assert not list(tmp_path.iterdir())
+
+
+# Every way out.
+
+
+def test_torque_is_off_after_a_normal_end(open_rig: tuple[ExitStack, OpenRig]) -> None:
+    run, begin = open_rig
+    rig = begin()
+    rig.grip()
+    run.close()
+    assert rig.is_off()
+
+
+@pytest.mark.parametrize(
+    "error", [DataError("no picture"), KeyboardInterrupt(), RuntimeError("a bug"), SystemExit(3)]
+)
+def test_torque_is_off_after_an_error_in_the_run(
+    open_rig: tuple[ExitStack, OpenRig], tmp_path: Path, error: BaseException
+) -> None:
+    run, begin = open_rig
+    rig = begin()
+    rig.grip()
+    with pytest.raises(type(error)), run:
+        raise error
+    assert rig.is_off()
+    assert events(tmp_path / "run.mcap")[-1] == f"{type(error).__name__}: {error}"
+
+
+def test_torque_is_off_after_the_devices_report_a_failure(open_rig: tuple[ExitStack, OpenRig]) -> None:
+    run, begin = open_rig
+
+    def fail() -> None:
+        raise SimulationError("the world broke")
+
+    rig = begin()
+    rig.grip()
+    rig.devices.check = fail
+    with pytest.raises(SimulationError, match="the world broke"), run:
+        rig.session.cycle()
+    assert rig.is_off()
+
+
+class Gray:
+    """A camera that sees nothing but its own noise, once in four cycles."""
+
+    def __init__(self) -> None:
+        self.asked = 0
+
+    def start(self) -> None: ...
+
+    def close(self) -> None: ...
+
+    def counts(self) -> dict[str, int]:
+        return {}
+
+    def newest(self) -> Frame | None:
+        self.asked += 1
+        t_ns = self.asked * 5 * NS_PER_MS
+        gray = np.full((2, 2), self.asked % 251, np.uint8)
+        return None if self.asked % 4 else Frame(t_ns, t_ns, self.asked // 4, gray)
+
+
+class Failing:
+    """An estimator that says nothing of use."""
+
+    reference = None
+
+    def __init__(self, force_n: float) -> None:
+        self.force_n = force_n
+        self.fails = False
+
+    def update(self, gray: object) -> Guess:
+        if self.fails:
+            raise DataError("no picture")
+        return Guess(self.force_n, 0.1)
+
+
+def test_the_grip_is_kept_on_motor_current_where_the_estimator_fails(
+    open_rig: tuple[ExitStack, OpenRig], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    run, begin = open_rig
+    estimator = Failing(2.0)
+    monkeypatch.setattr(session_module, "make_estimator", lambda *_: estimator)
+    rig = begin(camera=Gray())
+    rig.grip()
+    estimator.fails = True
+    rig.go_on(100)
+    assert rig.register("torque_enable") == 1
+    assert rig.register("goal_current") > 0
+    run.close()
+    told = events(tmp_path / "run.mcap")
+    assert told.count("no estimate: no picture") == 1
+    assert list(LogReader(tmp_path / "run.mcap").records(FusedForce))[-1].source == "current"
+
+
+@pytest.mark.parametrize("force_n", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("feedback", ["fused", "vision"])
+def test_an_estimate_that_is_no_number_never_reaches_the_servo(
+    open_rig: tuple[ExitStack, OpenRig],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    force_n: float,
+    feedback: str,
+) -> None:
+    run, begin = open_rig
+    monkeypatch.setattr(session_module, "make_estimator", lambda *_: Failing(force_n))
+    rig = begin(f"control.feedback={feedback}", camera=Gray())
+    rig.grip()
+    rig.go_on(100)
+    run.close()
+    log = LogReader(tmp_path / "run.mcap")
+    commands = list(log.records(ServoCommand))
+    assert all(math.isfinite(c.goal_current_a) and math.isfinite(c.goal_position_rad) for c in commands)
+    assert any(not math.isfinite(v.force_n) for v in log.records(VisualForce))
+    assert {f.source for f in log.records(FusedForce)} == {"current"}
+    assert all(math.isfinite(f.force_n) for f in log.records(FusedForce))
+
+
+@pytest.mark.parametrize("how", ["end", "error"])
+def test_hold_keeps_the_grip_and_disarms_the_watchdog(open_rig: tuple[ExitStack, OpenRig], how: str) -> None:
+    run, begin = open_rig
+    rig = begin("on_exit=hold", "control.on_fault=hold")
+    rig.grip()
+    goal = rig.register("goal_current")
+    assert rig.register("bus_watchdog") > 0
+    if how == "end":
+        run.close()
+    else:
+        with pytest.raises(DataError), run:
+            raise DataError("no picture")
+    assert rig.register("torque_enable") == 1
+    assert rig.register("goal_current") == goal > 0
+    assert rig.register("bus_watchdog") == 0
+    assert rig.last_write_to(BUS_WATCHDOG) == b"\0"
+
+
+@pytest.mark.parametrize("on_fault", ["limp", "hold", "open"])
+def test_a_fault_ends_as_configured(quick: list[str], tmp_path: Path, on_fault: str) -> None:
+    path = tmp_path / "run.mcap"
+    config = load_config(None, [*quick, f"control.on_fault={on_fault}"])
+    with open_devices(config) as devices:
+        bus = virtual.find_bus("rig")
+        assert bus is not None
+        with open_session(config, devices, path, None) as session:
+
+            def stop(status: GraspStatus) -> None:
+                if status.phase == Phase.HOLD:
+                    session.stop_soon()
+
+            session_module.grasp_in(session, config, False, stop)
+        last = list(LogReader(path).records(GraspStatus))[-1]
+        assert (last.phase, last.outcome) == (Phase.FAULT, Outcome.FAULT)
+        assert bus.servos[0].get("torque_enable") == (on_fault == "hold")
+        assert (last.width_m > 0.085) == (on_fault == "open")
+
+
+def test_hold_does_not_release_at_the_end_of_a_grasp(quick: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    run_grasp(load_config(None, [*quick, "on_exit=hold"]), path)
+    assert [r.kind for r in LogReader(path).records(Request)] == ["grasp"]
+    assert list(LogReader(path).records(GraspStatus))[-1].phase == Phase.HOLD
+
+
+def test_a_servo_that_does_not_start_is_not_stopped_and_leaves_no_log(
+    open_rig: tuple[ExitStack, OpenRig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, begin = open_rig
+    calls: list[str] = []
+
+    def start(_: object) -> None:
+        raise DeviceTimeoutError("the servo is mute")
+
+    monkeypatch.setattr("gripper_hw.dynamixel.servo.DynamixelServo.start", start)
+    monkeypatch.setattr(
+        "gripper_hw.dynamixel.servo.DynamixelServo.stop", lambda *_, **__: calls.append("stop")
+    )
+    with pytest.raises(DeviceTimeoutError, match="the servo is mute"), run:
+        begin()
+    assert calls == []
+    assert not (tmp_path / "run.mcap").exists()
+
+
+def test_a_servo_that_can_not_be_stopped_is_told(open_rig: tuple[ExitStack, OpenRig]) -> None:
+    run, begin = open_rig
+    rig = begin()
+    rig.session.cycle()
+    rig.bus.tamper = lambda _: None
+    with pytest.raises(DeviceError, match="no sound answer"):
+        run.close()
+
+
+def test_bus_retries_are_logged(open_rig: tuple[ExitStack, OpenRig], tmp_path: Path) -> None:
+    run, begin = open_rig
+    rig = begin()
+    rig.session.cycle()
+    lost = iter([True])
+    rig.bus.tamper = lambda answer: None if next(lost, False) else answer
+    rig.session.cycle()
+    rig.session.cycle()
+    run.close()
+    assert events(tmp_path / "run.mcap") == ["1 bus retries"]
+
+
+def test_what_goes_wrong_again_and_again_is_told_once_a_second(
+    open_rig: tuple[ExitStack, OpenRig], tmp_path: Path
+) -> None:
+    run, begin = open_rig
+    rig = begin()
+    answers = count()
+    rig.bus.tamper = lambda answer: None if next(answers) % 2 else answer  # every read needs two tries
+    for _ in range(210):
+        rig.session.cycle()
+    rig.bus.tamper = None
+    run.close()
+    first, second, last = (int(text.removesuffix(" bus retries")) for text in events(tmp_path / "run.mcap"))
+    assert (first, second) == (1, 200)
+    assert last in (8, 9)
+
+
+def test_a_load_cell_that_falls_silent_is_told(quick: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    run_grasp(load_config(None, [*quick, "faults=[{unit: load_cell, kind: off, at_s: 1, for_s: 0.5}]"]), path)
+    told = [e for e in LogReader(path).records(Event) if e.unit == "load_cell"]
+    assert [e.text for e in told] == ["no sound sample; nothing to compare with", "sound samples again"]
+    assert 1.0e9 < told[0].t_ns < 1.1e9
+    assert told[1].t_ns < 1.6e9
+
+
+def test_samples_that_are_rejected_are_told_with_their_causes(quick: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    fault = "faults=[{unit: load_cell, kind: wrong, at_s: 1, for_s: 0.5}]"
+    run_grasp(load_config(None, [*quick, fault]), path)
+    log = LogReader(path)
+    told = " ".join(e.text for e in log.records(Event) if e.unit == "load_cell")
+    rejected = sum(not sample.valid for sample in log.records(LoadCellSample))
+    assert rejected >= 90
+    counted = [int(n) for n in re.findall(r"(\d+) (?:saturated|stuck|not finite|spikes|doubtful)", told)]
+    assert sum(counted) == rejected
+
+
+# Stop and signals.
+
+
+def test_stop_soon_leads_to_fault_within_a_cycle(open_rig: tuple[ExitStack, OpenRig]) -> None:
+    _, begin = open_rig
+    rig = begin()
+    rig.grip()
+    thread = threading.Thread(target=rig.session.stop_soon)
+    thread.start()
+    thread.join()
+    decision = rig.session.cycle(RequestKind.GRASP, 3.0)
+    assert decision.status.phase == Phase.FAULT
+    before_a = decision.command.goal_current_a
+    after = [rig.session.cycle() for _ in range(20)]
+    assert all(d.status.phase == Phase.FAULT for d in after)
+    assert all(d.command.goal_current_a <= before_a for d in after)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_waits_for_the_end_of_the_cycle(
+    open_rig: tuple[ExitStack, OpenRig], tmp_path: Path, number: signal.Signals
+) -> None:
+    run, begin = open_rig
+    handler = signal.getsignal(number)
+    rig = begin()
+    rig.grip()
+
+    def interrupt(answer: bytes) -> bytes:
+        rig.bus.tamper = None
+        signal.raise_signal(number)
+        return answer
+
+    rig.bus.tamper = interrupt
+    rig.session.cycle()
+    cycles = rig.session.cycles
+    with pytest.raises(KeyboardInterrupt), run:
+        rig.session.cycle()
+    assert rig.session.cycles == cycles
+    assert rig.is_off()
+    assert events(tmp_path / "run.mcap")[-1] == "KeyboardInterrupt: the run was interrupted"
+    assert signal.getsignal(number) == handler
+
+
+def test_a_second_signal_does_not_wait_and_torque_still_goes_off(open_rig: tuple[ExitStack, OpenRig]) -> None:
+    run, begin = open_rig
+    rig = begin()
+    rig.grip()
+
+    def hang(_: bytes) -> bytes:
+        rig.bus.tamper = None
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        raise AssertionError("it still waits")
+
+    rig.bus.tamper = hang
+    with pytest.raises(KeyboardInterrupt), run:
+        rig.session.cycle()
+    assert rig.is_off()
+
+
+def test_a_signal_while_torque_goes_off_waits_for_that(open_rig: tuple[ExitStack, OpenRig]) -> None:
+    run, begin = open_rig
+    rig = begin()
+    rig.grip()
+
+    def interrupt(answer: bytes) -> bytes:
+        rig.bus.tamper = None
+        signal.raise_signal(signal.SIGINT)
+        return answer
+
+    rig.bus.tamper = interrupt
+    with pytest.raises(KeyboardInterrupt):
+        run.close()
+    assert rig.is_off()
+
+
+def test_a_session_in_another_thread_leaves_signals_alone(quick: list[str], tmp_path: Path) -> None:
+    handler = signal.getsignal(signal.SIGINT)
+    seen: list[object] = []
+
+    def run() -> None:
+        config = load_config(None, quick)
+        with open_devices(config) as devices, open_session(config, devices, tmp_path / "run.mcap", None):
+            seen.append(signal.getsignal(signal.SIGINT))
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+    assert seen == [handler]
+
+
+GRASP = """
+import gripper_hw.dynamixel.virtual as virtual
+from gripper_force.cli import main
+
+unregister = virtual.unregister_bus
+
+def tell(name):
+    bus = virtual.find_bus(name)
+    if bus is not None:
+        print("torque", bus.servos[0].get("torque_enable"), flush=True)
+    unregister(name)
+
+import gripper_hw.sim.rig as rig
+rig.unregister_bus = tell
+main()
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_the_command_with_torque_off_and_a_whole_log(
+    quick: list[str], tmp_path: Path, number: signal.Signals
+) -> None:
+    sets = [*quick, f"log.directory={tmp_path}", "control.hold_s=100000"]
+    arguments = [part for assignment in sets for part in ("--set", assignment)]
+    said = tmp_path / "stderr"
+    with said.open("w") as err, (tmp_path / "stdout").open("w") as out:
+        process = subprocess.Popen(
+            [sys.executable, "-c", GRASP, "grasp", *arguments], stdout=out, stderr=err, text=True
+        )
+        while "hold" not in said.read_text() and process.poll() is None:
+            time.sleep(0.01)
+        process.send_signal(number)
+        assert process.wait(timeout=60) == 130, said.read_text()
+    assert said.read_text().splitlines()[-1].startswith("interrupted")
+    assert "Traceback" not in said.read_text()
+    assert (tmp_path / "stdout").read_text() == "torque 0\n"
+    (path,) = tmp_path.glob("*.mcap")
+    assert events(path)[-1] == "KeyboardInterrupt: the run was interrupted"
+    assert list(LogReader(path).records(GraspStatus))[-1].phase == Phase.HOLD
+
+
+FULL_DISK = """
+import resource, signal
+from gripper_force.cli import main
+
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
+main()
+"""
+
+
+def test_a_full_disk_does_not_end_the_grasp_and_is_told_after_it(quick: list[str], tmp_path: Path) -> None:
+    sets = [*quick, f"log.directory={tmp_path}", "control.hold_s=0.2"]
+    arguments = [part for assignment in sets for part in ("--set", assignment)]
+    ended = subprocess.run(
+        [sys.executable, "-c", FULL_DISK, "grasp", *arguments], capture_output=True, text=True, timeout=60
+    )
+    assert ended.returncode == 2, ended.stderr
+    assert "Traceback" not in ended.stderr
+    told = " ".join(ended.stderr.split())
+    assert "File too large; the run went on, and its log lacks" in told
+    assert told.index(" open held") < told.index("File too large")
+    (path,) = tmp_path.glob("*.mcap")
+    assert list(LogReader(path, recover=True).records(GraspStatus))
+
+
+# Real time.
+
+
+def test_in_real_time_the_loop_runs_and_the_grasp_ends(
+    quick: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # However busy the machine that tests it.
+    monkeypatch.setattr("gripper_hw.sim.rig._REALTIME_MAX_LAG_NS", 10**12)
+    real_time = ["clock=realtime", "servo.bus_watchdog_ms=2540", "control.timeout_s=2"]
+    path = tmp_path / "run.mcap"
+    interval = sys.getswitchinterval()
+    begin_s = time.monotonic()
+    run_grasp(load_config(None, [*quick, *real_time]), path)
+    ran_s = time.monotonic() - begin_s
+    states = list(LogReader(path).records(ServoState))
+    outcomes = {s.outcome for s in LogReader(path).records(GraspStatus)}
+    assert outcomes <= {"", Outcome.HELD, Outcome.TIMEOUT}
+    assert len(outcomes) == 2
+    assert 100 < len(states) <= ran_s * 200 + 10
+    assert sys.getswitchinterval() == pytest.approx(interval)
+    assert not {thread.name for thread in threading.enumerate()} & {"perception", "simulated-rig"}
+
+
+def test_a_session_needs_no_load_cell(open_rig: tuple[ExitStack, OpenRig], tmp_path: Path) -> None:
+    run, begin = open_rig
+    rig = begin("load_cell.backend=none")
+    rig.session.cycle()
+    run.close()
+    assert list(LogReader(tmp_path / "run.mcap").records(LoadCellSample)) == []
+
+
+def test_versions_are_those_of_installed_packages() -> None:
+    devices = SimpleNamespace(notes={"serial": "7"})
+    about = session_module._metadata(Config(), devices, None)  # type: ignore[arg-type]
+    assert about["serial"] == "7"
+    assert about["checkpoint"] == ""
+    assert about["version numpy"] == np.__version__
+    assert "version openvino" not in about
+
+
+def test_the_version_of_an_engine_of_its_own_is_in_the_log() -> None:
+    openvino = pytest.importorskip("openvino")
+    config = load_config(None, ["vision.engine=openvino"])
+    about = session_module._metadata(config, SimpleNamespace(notes={}), read_model("small"))  # type: ignore[arg-type]
+    assert openvino.__version__.startswith(about["version openvino"])
