@@ -1,8 +1,8 @@
 """Frozen records that travel through the project, in SI units, with the unit in the name.
 
 Time is the host's monotonic clock in integer nanoseconds (``t_ns``). In lockstep it is the simulated clock.
-Every record but `Frame` is written to a log field by field (see `gripper_force.runtime.log`), so a field's type is
-``int``, ``float``, ``bool`` or ``str``.
+Every record but `Frame` is written to a log field by field (see `gripper_force.runtime.log`), so a field's
+type is ``int``, ``float``, ``bool`` or ``str``.
 """
 
 from dataclasses import dataclass

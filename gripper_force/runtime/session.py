@@ -1,7 +1,7 @@
 """A run in time: devices, perception and the pure controller, cycle by cycle, into a log.
 
 This module alone owns the order of things within a cycle. It runs in lockstep with a simulated clock, or in
-real time; `gripper_force.jobs.replay` feeds the same controller from a log, in the order this one wrote it in.
+real time; `gripper_force.jobs.replay` feeds the same controller from a log, in the order it was written.
 """
 
 import signal

@@ -87,6 +87,7 @@ def identify(config: Config, truth: Gripper) -> Identified:
             gripper.advance(decision.command, _CYCLE_S)
         presses.append(Press(*(np.array(column) for column in zip(*rows, strict=True))))
     found = fit_plant(presses, 0.035)
+    assert found is not None  # the presses above cover the whole range of forces
     return Identified(found.gain, 1e-3 * found.lag_ms)
 
 
