@@ -23,13 +23,13 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from gripper_calibration import logs
-from gripper_calibration.fits.correction import fit_correction
-from gripper_calibration.procedures.object import calibrate, touch
+from gripper_calibration import touch_logs as logs
+from gripper_calibration.fits.object_fit import fit_correction
+from gripper_calibration.procedures.calibrate_object import calibrate, touch
 from gripper_force.config import Config, load_config
 from gripper_force.errors import DataError
 from gripper_force.jobs.grasp import grasp
-from gripper_force.profiles.object import read_object
+from gripper_force.profiles.object_profile import read_object
 from gripper_force.vision.checkpoint import load_checkpoint
 
 KINDS = ("sponge", "paper_cup", "tube", "stapler", "ball")

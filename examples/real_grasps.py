@@ -25,7 +25,7 @@ import torch.nn.functional as F
 from rich.console import Console
 from rich.progress import track
 
-from gripper_calibration.fits.correction import fit_correction
+from gripper_calibration.fits.object_fit import fit_correction
 from gripper_calibration.fits.touches import Touches
 from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import CONTACT_N, Clip, load_clips
@@ -33,8 +33,8 @@ from gripper_force.jobs.evaluate import Result, compare, estimates, ridge_baseli
 from gripper_force.jobs.imports.video import import_folder
 from gripper_force.jobs.training.recipe import TrainConfig
 from gripper_force.jobs.training.train import train
+from gripper_force.vision.batch_inference import features, normalise
 from gripper_force.vision.checkpoint import Checkpoint
-from gripper_force.vision.dense import features, normalise
 from gripper_force.vision.preprocess import Preprocess
 
 BASE: dict[str, Any] = {

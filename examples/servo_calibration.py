@@ -7,8 +7,8 @@ Each rig has a motor, friction and gear play of its own. 95 of 100 is what a 95 
 
 import argparse
 
-from gripper_calibration.fits.servo import Nominal, fit_servo
-from gripper_calibration.procedures.servo import measure
+from gripper_calibration.fits.servo_fit import Nominal, fit_servo
+from gripper_calibration.procedures.calibrate_servo import measure
 from gripper_force.config import load_config
 from gripper_hw.dynamixel.control_table import load_model
 from gripper_hw.sim.objects import BLOCK_WIDTH_M

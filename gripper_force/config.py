@@ -8,7 +8,7 @@ from typing import Annotated, Final, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from gripper_force.errors import ConfigError
-from gripper_force.profiles.rig import read_rig
+from gripper_force.profiles.rig_profile import read_rig
 from gripper_force.schema import (
     Finite,
     NonNegative,

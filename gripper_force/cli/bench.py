@@ -123,7 +123,7 @@ def _estimator(
     from gripper_force.config import Config
     from gripper_force.jobs.dataset import load_clips
     from gripper_force.jobs.simulate import plan, simulate
-    from gripper_force.qualification.bench import estimator as job
+    from gripper_force.qualification.bench import estimator_bench as job
     from gripper_force.qualification.markdown_blocks import write_between
     from gripper_force.vision.header import SHIPPED
 
@@ -159,7 +159,7 @@ def _estimator(
 
 
 def _bus(cycles: int) -> dict[str, Any]:
-    from gripper_force.qualification.bench import bus as job
+    from gripper_force.qualification.bench import bus_bench as job
 
     costs: list[Any] = []
     with console.bar("measuring", len(job.BUS_SETTINGS)) as advance:
@@ -170,7 +170,7 @@ def _bus(cycles: int) -> dict[str, Any]:
 
 
 def _commands() -> dict[str, Any]:
-    from gripper_force.qualification.bench import commands as job
+    from gripper_force.qualification.bench import command_bench as job
 
     taken = []
     with console.bar("running", len(job.COMMANDS)) as advance:
@@ -181,7 +181,7 @@ def _commands() -> dict[str, Any]:
 
 
 def _startup() -> dict[str, Any]:
-    from gripper_force.qualification.bench import startup as job
+    from gripper_force.qualification.bench import startup_bench as job
 
     rows = []
     with console.bar("starting", len(job.SCENES)) as advance:
@@ -192,7 +192,7 @@ def _startup() -> dict[str, Any]:
 
 
 def _loop(seconds: float, overrides: list[str]) -> dict[str, Any]:
-    from gripper_force.qualification.bench import loop as job
+    from gripper_force.qualification.bench import loop_bench as job
 
     with console.err.status(f"running for {2 * seconds:g} s"):
         costs, log = job.loop(seconds, overrides)
@@ -200,7 +200,7 @@ def _loop(seconds: float, overrides: list[str]) -> dict[str, Any]:
 
 
 def _scene(objects: list[str], page: Path | None) -> dict[str, Any]:
-    from gripper_force.qualification.bench import scene as job
+    from gripper_force.qualification.bench import scene_bench as job
 
     if page is not None and objects:
         raise ConfigError("--write needs all objects: leave out --object")
@@ -220,7 +220,7 @@ def _learning(data: Path, minutes: float, overrides: list[str], out_: Path, jobs
     from functools import partial
 
     from gripper_force.jobs.dataset import load_clips
-    from gripper_force.qualification.bench.training import learn, reached
+    from gripper_force.qualification.bench.training_bench import learn, reached
 
     points = []
     for point in learn(partial(load_clips, data, workers=jobs), minutes, overrides, out_):

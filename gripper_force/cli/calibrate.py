@@ -35,7 +35,7 @@ def load_cell(
     as_json: AsJson = False,
 ) -> None:
     """Find a load cell's tare and scale with a known mass: empty, loaded, empty again."""
-    from gripper_calibration.procedures import load_cell as job
+    from gripper_calibration.procedures import calibrate_load_cell as job
 
     if (mass_kg is None) == (force_n is None):
         raise ConfigError("say what is put on the load cell: --mass-kg or --force-n")
@@ -70,7 +70,7 @@ def servo(
     as_json: AsJson = False,
 ) -> None:
     """Find a servo's torque, friction and jaw geometry with the load cell between the jaws."""
-    from gripper_calibration.procedures import servo as job
+    from gripper_calibration.procedures import calibrate_servo as job
 
     settings = load_settings(config, set_, {})
     with console.err.status("moving") as status:
@@ -102,7 +102,7 @@ def camera(
     as_json: AsJson = False,
 ) -> None:
     """Find a camera's region of interest, exposure and lag, by touching an object that gives way."""
-    from gripper_calibration.procedures import camera as job
+    from gripper_calibration.procedures import calibrate_camera as job
 
     settings = load_settings(config, set_, {"object": object_, "seed": seed})
     with console.err.status("looking") as status:
@@ -141,8 +141,8 @@ def object_(
     as_json: AsJson = False,
 ) -> None:
     """Learn an object by touching it with the load cell in place. Ctrl-C calibrates on what there is."""
-    from gripper_calibration.procedures import object as job
-    from gripper_force.profiles.object import user_folder
+    from gripper_calibration.procedures import calibrate_object as job
+    from gripper_force.profiles.object_profile import user_folder
 
     settings = load_settings(config, set_, {"object": name, "seed": seed})
     if logs is None:
@@ -155,7 +155,7 @@ def object_(
 
 
 def _touches(settings: "Config", touches: int, peak_n: float | None, folder: Path, pause: bool) -> list[Path]:
-    from gripper_calibration.procedures import object as job
+    from gripper_calibration.procedures import calibrate_object as job
 
     paths = []
     done: set[int] = set()

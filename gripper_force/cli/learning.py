@@ -107,7 +107,7 @@ def export(
     """Write a network's streaming step for another engine, checked against PyTorch."""
     from gripper_force.jobs.dataset import load_clips
     from gripper_force.vision.export import export as job
-    from gripper_force.vision.exported import read_model
+    from gripper_force.vision.model_files import read_model
 
     model = read_model(load_settings(None, set_, {"vision.checkpoint": checkpoint}).vision.checkpoint)
     frames = None
@@ -141,7 +141,7 @@ def reproduce(
     as_json: AsJson = False,
 ) -> None:
     """Make the paper's tables and figures again, beside its own numbers. Goes on where it was broken off."""
-    from gripper_force.qualification.paper import page
+    from gripper_force.qualification.paper import paper_page as page
     from gripper_force.qualification.paper.models import SCALES, Scale
     from gripper_force.schema import section_from
 

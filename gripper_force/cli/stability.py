@@ -64,7 +64,7 @@ def stability(
         result = _fault_matrix(load_settings(config, set_, {"seed": seed}), seeds, live, jobs, write, resume)
         console.show(result, as_json, faults_table)
     elif fuzz is not None:
-        from gripper_force.qualification.fuzz.run import fuzz as feed
+        from gripper_force.qualification.fuzz.fuzzer import fuzz as feed
 
         with console.bar("fuzzing", fuzz) as advance:
             result = feed(fuzz, seed, jobs, folder, advance, only=only)
@@ -82,7 +82,7 @@ def stability(
 
 def _numbers(settings: "Config", parts: list[str], page: Path | None) -> dict[str, Any]:
     from gripper_force.qualification.markdown_blocks import write_between
-    from gripper_force.qualification.numerics.run import PARTS, markdown, run
+    from gripper_force.qualification.numerics.suite import PARTS, markdown, run
 
     with console.bar("hard cases", len(parts or PARTS)) as advance:
         result = run(settings, parts, page and page.with_suffix(""), advance)
@@ -95,7 +95,7 @@ def _numbers(settings: "Config", parts: list[str], page: Path | None) -> dict[st
 def _fault_matrix(
     settings: "Config", seeds: int, live: int, jobs: int, page: Path | None, resume: bool
 ) -> dict[str, Any]:
-    from gripper_force.qualification.fault_matrix.run import count_grasps, markdown, run_matrix
+    from gripper_force.qualification.fault_matrix.matrix import count_grasps, markdown, run_matrix
     from gripper_force.qualification.markdown_blocks import write_between
 
     with console.bar("breaking things", count_grasps(seeds, live)) as advance:

@@ -20,10 +20,10 @@ from gripper_force.runtime.priority import real_time_priority
 from gripper_force.types import NS_PER_MS, NS_PER_S
 
 PROBES: Final = {
-    "servo": "gripper_hw.dynamixel.probe",
-    "camera": "gripper_hw.cameras.probe",
-    "load cell": "gripper_hw.load_cells.probe",
-    "simulation": "gripper_hw.sim.probe",
+    "servo": "gripper_hw.dynamixel.servo_probe",
+    "camera": "gripper_hw.cameras.camera_probe",
+    "load cell": "gripper_hw.load_cells.load_cell_probe",
+    "simulation": "gripper_hw.sim.simulation_probe",
 }
 """Modules with a function ``probe``, in the order of its table."""
 
@@ -161,9 +161,9 @@ def _network(config: Config) -> Iterator[Check]:
         yield Check("network", "step", "not needed: no camera, or no checkpoint", None)
         return
     from gripper_force.runtime.assembly import settled
-    from gripper_force.vision.choice import ENGINE_PACKAGES
     from gripper_force.vision.estimator import open_estimator
-    from gripper_force.vision.exported import read_model
+    from gripper_force.vision.model_files import read_model
+    from gripper_force.vision.selection import ENGINE_PACKAGES
 
     vision = settled(config)[0].vision
     package = ENGINE_PACKAGES[vision.engine]

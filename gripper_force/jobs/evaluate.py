@@ -14,8 +14,8 @@ from gripper_force.errors import DataError
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import CONTACT_N, Clip, check_size, stiffness_floor_n
 from gripper_force.profiles.correction import Correction
+from gripper_force.vision.batch_inference import features, predict
 from gripper_force.vision.checkpoint import Checkpoint
-from gripper_force.vision.dense import features, predict
 
 RIDGE_SIZE: Final = 32
 RIDGE_COMPONENTS: Final = 20

@@ -4,8 +4,8 @@ from typing import TYPE_CHECKING
 
 from gripper_force.config import Config, ControlConfig
 from gripper_force.errors import ConfigError
-from gripper_force.profiles.object import find_object, read_object
-from gripper_force.profiles.rig import read_rig
+from gripper_force.profiles.object_profile import find_object, read_object
+from gripper_force.profiles.rig_profile import read_rig
 
 if TYPE_CHECKING:  # a run without vision loads none of it
     from gripper_force.profiles.correction import Correction

@@ -21,7 +21,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
 from gripper_force.errors import ConfigError
-from gripper_force.profiles.object import ObjectProfile, weights_path
+from gripper_force.profiles.object_profile import ObjectProfile, weights_path
 
 Floats = npt.NDArray[np.float64]
 Features = npt.NDArray[np.float32]

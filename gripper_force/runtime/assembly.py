@@ -29,7 +29,7 @@ def settled(config: Config) -> tuple[Config, str]:
     """
     if "auto" not in (config.vision.checkpoint, config.vision.engine):
         return config, ""
-    from gripper_force.vision import choice
+    from gripper_force.vision import selection as choice
 
     vision, why = choice.settled(config.vision, config.budget)
     return config.model_copy(update={"vision": vision}), why
@@ -39,7 +39,7 @@ def checkpoint_of(config: Config) -> "Model | None":
     """The network that the configuration names, or None for a run without vision."""
     if config.camera.backend == "none" or config.vision.checkpoint == "none":
         return None
-    from gripper_force.vision.exported import read_model
+    from gripper_force.vision.model_files import read_model
 
     return read_model(settled(config)[0].vision.checkpoint)
 

@@ -15,7 +15,7 @@ from gripper_force.interfaces import Clock, Devices
 from gripper_force.types import NS_PER_S
 
 SERVO: Final = "gripper_hw.dynamixel.servo:DynamixelServo"
-RIG: Final = "gripper_hw.sim.rig:SimulatedRig"
+RIG: Final = "gripper_hw.sim.simulated_rig:SimulatedRig"
 CAMERAS: Final = {
     "none": None,
     "simulated": RIG,

@@ -23,10 +23,10 @@ from gripper_force.profiles.apply import check_target, correction_of, rig_mismat
 from gripper_force.runtime.assembly import checkpoint_of, make_controller, make_estimator, settled
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log import LogWriter
+from gripper_force.runtime.log_queue import Recorder
 from gripper_force.runtime.monitors import CellWatch, Tally
 from gripper_force.runtime.perception import Estimator, LockstepPerception, Perception, ThreadedPerception
 from gripper_force.runtime.priority import real_time_priority
-from gripper_force.runtime.recorder import Recorder
 from gripper_force.types import (
     NS_PER_S,
     Event,

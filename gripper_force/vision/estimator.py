@@ -10,8 +10,8 @@ from gripper_force.errors import DataError, NonFiniteError
 from gripper_force.profiles.correction import Correction
 from gripper_force.types import Gray
 from gripper_force.vision.engines import Engine, Floats, open_engine
+from gripper_force.vision.frame_checks import Plausibility
 from gripper_force.vision.header import RESIDUAL_HALF_N, Model
-from gripper_force.vision.plausible import Plausibility
 from gripper_force.vision.preprocess import Normaliser, Region, shrink
 
 
@@ -125,7 +125,7 @@ def open_estimator(
 
     Args:
         model: What ``vision.checkpoint`` names.
-        vision: Nothing in it is left to ``auto``; see `gripper_force.vision.choice.settled`.
+        vision: Nothing in it is left to ``auto``; see `gripper_force.vision.selection.settled`.
         correction: What the object's profile makes of the estimates.
 
     Raises:

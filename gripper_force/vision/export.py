@@ -20,9 +20,9 @@ from gripper_force.types import Gray
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.engines import Engine, Floats, open_engine
 from gripper_force.vision.engines.pytorch import TorchEngine
+from gripper_force.vision.ensemble_step import FRAME, EnsembleStep, state_names
 from gripper_force.vision.header import EXPORTED, KEY, Header, Model, Residual, described
 from gripper_force.vision.preprocess import Normaliser
-from gripper_force.vision.step import FRAME, EnsembleStep, state_names
 
 TOLERANCE: Final = 1e-4
 """How far an exported network may be off PyTorch in float32, of the label's scale."""

@@ -5,7 +5,7 @@ import pytest
 from gripper_force.config import load_config
 from gripper_force.jobs.grasp import TRIAL_OBJECTS
 from gripper_force.profiles.apply import correction_of
-from gripper_force.profiles.object import find_object, read_object
+from gripper_force.profiles.object_profile import find_object, read_object
 from gripper_force.vision.checkpoint import load_checkpoint
 
 

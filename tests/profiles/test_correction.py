@@ -15,7 +15,7 @@ from gripper_force.profiles.correction import (
     load_correction,
     pack,
 )
-from gripper_force.profiles.object import Interval, ObjectProfile, OutputCurve, weights_path
+from gripper_force.profiles.object_profile import Interval, ObjectProfile, OutputCurve, weights_path
 
 
 def profile(weights: str = "") -> ObjectProfile:

@@ -40,7 +40,7 @@ from gripper_force.types import (
     VisualForce,
 )
 from gripper_force.vision.checkpoint import load_checkpoint
-from gripper_force.vision.exported import read_model
+from gripper_force.vision.model_files import read_model
 from gripper_hw.dynamixel import virtual
 from gripper_hw.dynamixel.packets import Instruction, Parser
 from gripper_hw.dynamixel.virtual import VirtualBus
@@ -575,7 +575,7 @@ def tell(name):
         print("torque", bus.servos[0].get("torque_enable"), flush=True)
     unregister(name)
 
-import gripper_hw.sim.rig as rig
+import gripper_hw.sim.simulated_rig as rig
 rig.unregister_bus = tell
 main()
 """
@@ -636,7 +636,7 @@ def test_in_real_time_the_loop_runs_and_the_grasp_ends(
     quick: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # However busy the machine that tests it.
-    monkeypatch.setattr("gripper_hw.sim.rig._REALTIME_MAX_LAG_NS", 10**12)
+    monkeypatch.setattr("gripper_hw.sim.simulated_rig._REALTIME_MAX_LAG_NS", 10**12)
     real_time = ["clock=realtime", "servo.bus_watchdog_ms=2540", "control.timeout_s=2"]
     path = tmp_path / "run.mcap"
     interval = sys.getswitchinterval()

@@ -7,9 +7,9 @@ import torch
 
 from gripper_force.errors import ConfigError, DataError, NonFiniteError
 from gripper_force.profiles.correction import Correction, HeadAndGate
-from gripper_force.profiles.object import Interval, ObjectProfile, OutputCurve
+from gripper_force.profiles.object_profile import Interval, ObjectProfile, OutputCurve
+from gripper_force.vision.batch_inference import features, predict
 from gripper_force.vision.checkpoint import Checkpoint
-from gripper_force.vision.dense import features, predict
 from gripper_force.vision.engines.pytorch import TorchEngine
 from gripper_force.vision.estimator import Estimate, ForceEstimator
 from gripper_force.vision.header import Header, NetworkConfig, Residual

@@ -7,8 +7,8 @@ import pytest
 from gripper_force.errors import CheckpointError, ConfigError, DataError
 from gripper_force.vision.engines import open_engine
 from gripper_force.vision.export import coarser, export
-from gripper_force.vision.exported import read_model
 from gripper_force.vision.header import Model
+from gripper_force.vision.model_files import read_model
 
 
 @pytest.fixture

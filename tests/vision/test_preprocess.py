@@ -8,7 +8,7 @@ from hypothesis.extra.numpy import arrays
 from pydantic import ValidationError
 
 from gripper_force.errors import ConfigError, DataError
-from gripper_force.vision.dense import normalise
+from gripper_force.vision.batch_inference import normalise
 from gripper_force.vision.preprocess import Normaliser, Preprocess, shrink
 
 SMALL = Preprocess(size=16)

@@ -9,7 +9,7 @@ from gripper_force.cli.console import out
 
 def paper_tables(r: dict[str, Any]) -> None:
     """The paper's tables, and where its figures are."""
-    from gripper_force.qualification.paper.tables import show
+    from gripper_force.qualification.paper.paper_tables import show
 
     for made in r["tables"]:
         table = Table(*made.columns, title=made.title, title_justify="left", box=None)

@@ -22,7 +22,7 @@ def fuzz_table(r: dict[str, Any]) -> None:
 
 def numerics_tables(r: dict[str, Any]) -> None:
     """Hard cases for the numbers, part by part."""
-    from gripper_force.qualification.numerics.run import said
+    from gripper_force.qualification.numerics.suite import said
 
     for name, rows in r["parts"].items():
         title = f"{name} ({r['seconds'][name]:.0f} s)"

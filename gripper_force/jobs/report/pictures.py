@@ -103,7 +103,7 @@ def _estimator(run: Run) -> "tuple[ForceEstimator | None, str]":
         return None, ""
     # Loaded here, as a recording without estimates needs no network and its libraries are slow to import.
     from gripper_force.vision.estimator import open_estimator
-    from gripper_force.vision.exported import read_model
+    from gripper_force.vision.model_files import read_model
 
     try:
         checkpoint = read_model(run.config.vision.checkpoint)

@@ -11,7 +11,7 @@ from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import CONTACT_N, Clip
 from gripper_force.jobs.training.parallel import Ranks
 from gripper_force.jobs.training.recipe import TrainConfig
-from gripper_force.vision.dense import normalise
+from gripper_force.vision.batch_inference import normalise
 
 
 class Batches:

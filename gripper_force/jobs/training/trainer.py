@@ -17,7 +17,7 @@ from gripper_force.jobs.dataset import Clip
 from gripper_force.jobs.training.batches import Batches
 from gripper_force.jobs.training.parallel import Ranks, share_statistics
 from gripper_force.jobs.training.recipe import TrainConfig
-from gripper_force.vision.dense import predict
+from gripper_force.vision.batch_inference import predict
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess
 

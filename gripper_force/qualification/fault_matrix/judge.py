@@ -6,7 +6,7 @@ from itertools import pairwise
 from typing import Any, Final
 
 from gripper_force.config import Config
-from gripper_force.qualification.fault_matrix.expected import Expected, Row
+from gripper_force.qualification.fault_matrix.cases import Expected, Row
 from gripper_force.runtime.log import LogReader
 from gripper_force.types import (
     NS_PER_MS,

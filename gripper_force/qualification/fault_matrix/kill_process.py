@@ -18,7 +18,7 @@ from gripper_force.runtime.log import LogReader
 from gripper_force.types import NS_PER_MS, NS_PER_S
 from gripper_hw.dynamixel.pty_server import PtyServer
 from gripper_hw.dynamixel.virtual import find_bus
-from gripper_hw.sim.rig import SimulatedRig
+from gripper_hw.sim.simulated_rig import SimulatedRig
 
 _BUS: Final = "killed"
 _CONTACT_NS: Final = 30 * NS_PER_S

@@ -1,4 +1,4 @@
-"""What of the core reads input from outside, for `gripper_force.qualification.fuzz.run`."""
+"""What of the core reads input from outside, for `gripper_force.qualification.fuzz.fuzzer`."""
 
 import json
 import struct
@@ -33,9 +33,15 @@ from gripper_force.jobs.imports.video import estimate_tare, read_forces
 from gripper_force.jobs.replay import replay
 from gripper_force.jobs.report.data import read_run
 from gripper_force.profiles.correction import Correction, HeadAndGate, load_correction, pack
-from gripper_force.profiles.object import Interval, ObjectProfile, OutputCurve, read_object, weights_path
-from gripper_force.profiles.rig import Estimate, LoadCellCalibration, RigProfile, ServoCalibration
-from gripper_force.qualification.fuzz.run import Target
+from gripper_force.profiles.object_profile import (
+    Interval,
+    ObjectProfile,
+    OutputCurve,
+    read_object,
+    weights_path,
+)
+from gripper_force.profiles.rig_profile import Estimate, LoadCellCalibration, RigProfile, ServoCalibration
+from gripper_force.qualification.fuzz.fuzzer import Target
 from gripper_force.runtime.assembly import controller_from
 from gripper_force.runtime.log import LogReader, LogWriter
 from gripper_force.schema import dump

@@ -1,4 +1,4 @@
-"""What of the load cells reads bytes from outside, for `gripper_force.qualification.fuzz.run`."""
+"""What of the load cells reads bytes from outside, for `gripper_force.qualification.fuzz.fuzzer`."""
 
 import struct
 from collections.abc import Callable
@@ -6,9 +6,9 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from gripper_force.qualification.fuzz.run import Target
+from gripper_force.qualification.fuzz.fuzzer import Target
 from gripper_force.types import NS_PER_MS
-from gripper_hw.load_cells.lines import LONGEST_LINE, PARSERS, LineSplitter, Reading
+from gripper_hw.load_cells.line_formats import LONGEST_LINE, PARSERS, LineSplitter, Reading
 from gripper_hw.load_cells.screening import Screen
 
 _PIECE: Final = 100

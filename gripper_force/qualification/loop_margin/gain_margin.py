@@ -16,14 +16,20 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from gripper_calibration.fits.plant import Press, fit_plant
+from gripper_calibration.fits.plant_fit import Press, fit_plant
 from gripper_force.config import Config, ControlConfig
 from gripper_force.control.force_loop import ForceLoop
 from gripper_force.control.fusion import OBSERVER_LAG_S, Fusion
 from gripper_force.control.limits import Limits
 from gripper_force.control.state_machine import GraspController
 from gripper_force.control.tuning import Gains
-from gripper_force.qualification.loop_margin.plant import CYCLE_NS, NOISE_A, Eye, Gripper, transmission_of
+from gripper_force.qualification.loop_margin.analytic_plant import (
+    CYCLE_NS,
+    NOISE_A,
+    Eye,
+    Gripper,
+    transmission_of,
+)
 from gripper_force.types import NS_PER_S, Phase, Request, RequestKind, ServoCommand, Source
 
 SWING_N: Final = 4.0
@@ -55,7 +61,7 @@ Complex = npt.NDArray[np.complexfloating[Any, Any]]
 
 @dataclass(frozen=True, slots=True)
 class Identified:
-    """What calibration finds of a plant: `gripper_calibration.fits.plant`.
+    """What calibration finds of a plant: `gripper_calibration.fits.plant_fit`.
 
     Attributes:
         gain: Contact force for one newton of push.

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from gripper_force.qualification.loop_margin.plant import CURRENT_STEP_A
+from gripper_force.qualification.loop_margin.analytic_plant import CURRENT_STEP_A
 
 
 class Verdict(StrEnum):

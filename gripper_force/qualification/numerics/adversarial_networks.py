@@ -10,8 +10,8 @@ from torch import nn
 
 from gripper_force.vision.backbones import Vgg
 from gripper_force.vision.checkpoint import save_checkpoint
-from gripper_force.vision.exported import read_model
 from gripper_force.vision.header import Header, Model, NetworkConfig, Residual
+from gripper_force.vision.model_files import read_model
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess
 

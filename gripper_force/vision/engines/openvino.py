@@ -5,8 +5,8 @@ import openvino
 
 from gripper_force.errors import CheckpointError
 from gripper_force.vision.engines import Engine, Floats, Precision, Step
-from gripper_force.vision.exported import exported
 from gripper_force.vision.header import Model
+from gripper_force.vision.model_files import exported
 
 _PRECISIONS = {"float32": "f32", "bfloat16": "bf16"}
 

@@ -8,8 +8,8 @@ import torch
 from gripper_force.errors import ConfigError
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
 from gripper_force.vision.engines import Engine, Floats, Precision, Step
+from gripper_force.vision.ensemble_step import ATTENTION, EnsembleStep
 from gripper_force.vision.header import EXPORTED, Model
-from gripper_force.vision.step import ATTENTION, EnsembleStep
 
 
 class TorchEngine(Engine):

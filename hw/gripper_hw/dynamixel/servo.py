@@ -22,7 +22,6 @@ from gripper_force.errors import (
 )
 from gripper_force.interfaces import BusStats
 from gripper_force.types import ServoCommand, ServoState
-from gripper_hw.dynamixel.bus import Line
 from gripper_hw.dynamixel.control_table import (
     CURRENT_BASED_POSITION_MODE,
     REGISTERS,
@@ -34,6 +33,7 @@ from gripper_hw.dynamixel.control_table import (
     rad_from_ticks,
     ticks_from_rad,
 )
+from gripper_hw.dynamixel.transport import Line
 
 _READ: Final = {  # name: bytes
     "present_current": 2,

@@ -11,7 +11,7 @@ import serial
 from gripper_force.config import LoadCellConfig
 from gripper_force.errors import ConfigError, DeviceError
 from gripper_force.interfaces import Clock
-from gripper_hw.load_cells.lines import PARSERS, LineSplitter
+from gripper_hw.load_cells.line_formats import PARSERS, LineSplitter
 from gripper_hw.load_cells.screening import LiveLoadCell
 from gripper_hw.serial_line import open_line
 

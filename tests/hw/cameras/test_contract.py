@@ -19,7 +19,7 @@ from gripper_force.runtime.backends import CAMERAS, MonotonicClock
 from gripper_force.runtime.log import LogWriter
 from gripper_force.types import NS_PER_MS, Frame
 from gripper_hw.playback import PlaybackCamera
-from gripper_hw.sim.rig import SimulatedRig
+from gripper_hw.sim.simulated_rig import SimulatedRig
 
 Take = Callable[..., list[Frame]]
 REAL = ("oak", "uvc")

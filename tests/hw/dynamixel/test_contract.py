@@ -17,7 +17,7 @@ from gripper_hw.dynamixel.firmware import VirtualServo
 from gripper_hw.dynamixel.pty_server import BenchMotor, serve_virtual_servo
 from gripper_hw.dynamixel.servo import DynamixelServo
 from gripper_hw.dynamixel.virtual import VirtualBus, find_bus, register_bus, unregister_bus
-from gripper_hw.sim.rig import SimulatedRig
+from gripper_hw.sim.simulated_rig import SimulatedRig
 
 STEP_NS = 5 * NS_PER_MS
 PATIENT = {"bus_watchdog_ms": 2540, "reply_margin_ms": 100.0, "current_limit_a": 0.8}

@@ -16,7 +16,7 @@ from gripper_force.runtime.log import LogWriter
 from gripper_force.types import NS_PER_MS, LoadCellSample
 from gripper_hw.load_cells.serial import SerialLoadCell
 from gripper_hw.playback import PlaybackLoadCell
-from gripper_hw.sim.rig import SimulatedRig
+from gripper_hw.sim.simulated_rig import SimulatedRig
 
 PERIOD_NS = 5 * NS_PER_MS
 

@@ -9,7 +9,7 @@ from gripper_force.jobs.dataset import Clip
 from gripper_force.jobs.training.batches import Batches
 from gripper_force.jobs.training.parallel import Ranks
 from gripper_force.jobs.training.recipe import TrainConfig
-from gripper_force.vision.dense import normalise
+from gripper_force.vision.batch_inference import normalise
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

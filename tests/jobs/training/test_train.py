@@ -16,8 +16,8 @@ from gripper_force.jobs.training import train as train_module
 from gripper_force.jobs.training.recipe import TrainConfig
 from gripper_force.jobs.training.train import train
 from gripper_force.jobs.training.trainer import Trainer
+from gripper_force.vision.batch_inference import predict
 from gripper_force.vision.checkpoint import load_checkpoint
-from gripper_force.vision.dense import predict
 from gripper_force.vision.preprocess import Preprocess
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -5,6 +5,7 @@ import pytest
 
 from gripper_force.config import Config
 from gripper_force.control.tuning import Gains
+from gripper_force.qualification.loop_margin.analytic_plant import Gripper, transmission_of
 from gripper_force.qualification.loop_margin.gain_margin import (
     FRAME_S,
     Identified,
@@ -16,7 +17,6 @@ from gripper_force.qualification.loop_margin.gain_margin import (
     observed,
     with_inertia,
 )
-from gripper_force.qualification.loop_margin.plant import Gripper, transmission_of
 
 CONFIG = Config()
 TRUTH = Gripper(transmission_of(CONFIG.gripper), contact_m=0.008)

@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from gripper_force.qualification.numerics.reference import ROUNDING, Rounding, Twin
-from gripper_force.vision.dense import predict
+from gripper_force.vision.batch_inference import predict
 from gripper_force.vision.export import inputs_of
-from gripper_force.vision.exported import read_model
+from gripper_force.vision.model_files import read_model
 
 
 @pytest.fixture

@@ -1,7 +1,7 @@
 import pytest
 
 from gripper_force.qualification.paper.models import MODELS, NETS, SCALES
-from gripper_force.qualification.paper.tables import COMPARISONS, MODELS_OF
+from gripper_force.qualification.paper.paper_tables import COMPARISONS, MODELS_OF
 
 
 @pytest.mark.parametrize("scale", SCALES.values(), ids=list(SCALES))

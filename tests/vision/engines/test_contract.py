@@ -11,8 +11,8 @@ import torch
 from gripper_force.errors import CheckpointError, ConfigError
 from gripper_force.vision.checkpoint import load_checkpoint, save_checkpoint
 from gripper_force.vision.engines import ENGINES, Engine, open_engine
-from gripper_force.vision.exported import cache_folder, exported, read_model
 from gripper_force.vision.header import Attention, Header, NetworkConfig, Residual
+from gripper_force.vision.model_files import cache_folder, exported, read_model
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess
 

@@ -1,0 +1,382 @@
+"""The visual estimate's speed against its error: every model, engine, precision and number of threads.
+
+All ways take turns, a few steps each, so that their ratios hold on a machine that does other things as well.
+The paper's way, the whole window for each frame, is measured among them.
+"""
+
+import json
+import logging
+import platform
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from copy import deepcopy
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Final, get_args
+
+import numpy as np
+import torch
+
+from gripper_force.errors import ConfigError
+from gripper_force.jobs import metrics
+from gripper_force.jobs.dataset import Clip
+from gripper_force.qualification.bench.roofline import Roofline, measure
+from gripper_force.types import NS_PER_MS
+from gripper_force.vision import selection as choice
+from gripper_force.vision.checkpoint import load_checkpoint
+from gripper_force.vision.engines import Engine, Floats, Precision, open_engine
+from gripper_force.vision.export import export, inputs_of
+from gripper_force.vision.header import Model
+from gripper_force.vision.model_files import cache_folder, read_model
+from gripper_force.vision.selection import Way, installed, key_of
+
+WINDOW: Final = "torch, window"
+"""The paper's way: each frame passes the network with the whole window before it."""
+
+PLAIN_WINDOW: Final = "torch, window, plain"
+"""The same with channels first, as PyTorch builds a network, where ours have them last."""
+
+_ROUNDS: Final = 40
+_STEPS: Final = 15
+"""Steps of each way in a round."""
+
+_WINDOWS: Final = 2
+"""Windows in a round: they take a hundred times as long."""
+
+_MEMORY: Final = """
+import sys
+import numpy as np
+from gripper_force.vision.engines import open_engine
+from gripper_force.vision.model_files import read_model
+source, engine, precision, threads = sys.argv[1:]
+opened = open_engine(read_model(source), engine, precision, int(threads))
+size = opened.header.preprocess.size
+for _ in range(30):
+    opened.step(np.zeros((size, size), np.float32))
+status = open("/proc/self/status").read()
+print(int(status.split("VmHWM:")[1].split()[0]) / 1024)
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class EstimatorCost:
+    """One way to compute an estimate.
+
+    Attributes:
+        checkpoint: Name or path.
+        members: Networks of the ensemble.
+        size: Side of the input in pixels.
+        engine: As ``vision.engine``, or `WINDOW` or `PLAIN_WINDOW`.
+        precision: float32, bfloat16, or int8: the convolutions so, and the rest in bfloat16.
+        threads: CPU threads.
+        p50_ms: Median time of a frame.
+        p99_ms: 99th percentile of it.
+        frames_s: Frames a second, one after the other.
+        least_ms: The machine's roofline for this network and precision.
+        memory_mb: Peak memory of a process that computes nothing else; None where it was not measured.
+        mae_n: Mean absolute error on the held-out frames.
+        rmse_n: Root mean squared error.
+        worst_n: Largest error.
+        frames: Held-out frames.
+        front: Whether no other way is faster and more exact.
+    """
+
+    checkpoint: str
+    members: int
+    size: int
+    engine: str
+    precision: str
+    threads: int
+    p50_ms: float
+    p99_ms: float
+    frames_s: float
+    least_ms: float | None
+    memory_mb: float | None
+    mae_n: float
+    rmse_n: float
+    worst_n: float
+    frames: int
+    front: bool = False
+
+
+@dataclass
+class _Timed:
+    """One way that takes turns with others."""
+
+    step: Callable[[Floats], object]
+    taken_ns: list[int]
+
+
+Advance = Callable[[str], None]
+
+
+def bench(
+    sources: Sequence[str],
+    held_out: Callable[[Model], Sequence[Clip]],
+    scaling: Callable[[Model], Sequence[Clip]],
+    threads: Sequence[int],
+    advance: Advance,
+) -> list[EstimatorCost]:
+    """Measures every way to run each checkpoint that this machine can.
+
+    Args:
+        sources: Checkpoints, by name or path.
+        held_out: Reads recordings that training never saw, at the model's size.
+        scaling: Reads recordings to scale int8 on: others than these.
+        threads: Numbers of CPU threads.
+        advance: Told what was done.
+
+    Raises:
+        ConfigError: A package is missing.
+        CheckpointError: A checkpoint can't be read.
+        DataError: The recordings are too few.
+    """
+    logging.getLogger("nncf").setLevel(logging.ERROR)
+    roofs = {(p, t): measure(p, t) for p in ("float32", "bfloat16", "int8") for t in threads}
+    advance("roofline")
+    rows: list[EstimatorCost] = []
+    for source in sources:
+        model = read_model(source)
+        clips = held_out(model)
+        eights = cache_folder() / f"{model.digest[:32]}-int8.xml"
+        export(model, eights, [clip.frames for clip in scaling(model)])
+        advance(f"{source}: int8")
+        ways = [(model, *way) for way in _ways()]
+        ways += [(read_model(eights), "openvino", "int8", "bfloat16")]
+        for each in _timed(source, model, ways, clips, threads, roofs, advance):
+            rows.append(each)
+    return _with_front(rows)
+
+
+def _ways() -> list[tuple[str, str, Precision]]:
+    """Engine, the precision's name and its setting."""
+    ways: list[tuple[str, str, Precision]] = []
+    for engine in [*installed(), *(["compiled"] if shutil.which("g++") else [])]:
+        for precision in get_args(Precision):
+            if precision == "float32" or engine == "openvino":
+                ways.append((engine, precision, precision))
+    return ways
+
+
+def _timed(
+    source: str,
+    model: Model,
+    ways: Sequence[tuple[Model, str, str, Precision]],
+    clips: Sequence[Clip],
+    threads: Sequence[int],
+    roofs: dict[tuple[str, int], Roofline],
+    advance: Advance,
+) -> Iterator[EstimatorCost]:
+    errors: dict[tuple[str, str], dict[str, float]] = {}
+    frames = list(inputs_of(model, clips[0].frames))
+    for count in threads:
+        engines = {}
+        for file, engine, name, precision in ways:
+            engines[engine, name] = open_engine(file, engine, precision, count)
+            if (engine, name) not in errors:
+                errors[engine, name] = _errors(engines[engine, name], model, clips)
+                advance(f"{source}: {engine}, {name}: {errors[engine, name]['mae_n']:.3f} N")
+        for window in (WINDOW, PLAIN_WINDOW):
+            errors[window, "float32"] = errors["torch", "float32"]
+        taken = _in_turns({way: _Timed(engine.step, []) for way, engine in engines.items()}, model, frames)
+        advance(f"{source}: {count} threads")
+        for (engine, name), taken_ns in taken.items():
+            p50_ms, p99_ms = np.percentile(taken_ns, [50, 99]) / NS_PER_MS
+            row = EstimatorCost(
+                checkpoint=source,
+                members=len(model.header.members),
+                size=model.header.preprocess.size,
+                engine=engine,
+                precision=name,
+                threads=count,
+                p50_ms=float(p50_ms),
+                p99_ms=float(p99_ms),
+                frames_s=1e9 / float(np.mean(taken_ns)),
+                least_ms=None
+                if engine.startswith(WINDOW)
+                else roofs[name, count].least_ms(model.header.members),
+                memory_mb=None,
+                mae_n=errors[engine, name]["mae_n"],
+                rmse_n=errors[engine, name]["rmse_n"],
+                worst_n=errors[engine, name]["worst_n"],
+                frames=int(errors[engine, name]["frames"]),
+            )
+            if not engine.startswith(WINDOW):
+                file, precision = next((f, p) for f, e, n, p in ways if (e, n) == (engine, name))
+                row = replace(row, memory_mb=_memory_mb(file, engine, precision, count))
+                way = Way(source, engine, precision, count, row.p50_ms, row.p99_ms, row.mae_n)
+                if file is model:
+                    choice.remember({key_of(model, engine, precision, count): way})
+            yield row
+
+
+def _errors(engine: Engine, model: Model, clips: Sequence[Clip]) -> dict[str, float]:
+    """Over all frames that have a label, as a run would see them."""
+    estimates, measured = [], []
+    for clip in clips:
+        engine.reset()
+        forces_n = np.array([engine.step(frame).forces_n.mean() for frame in inputs_of(model, clip.frames)])
+        use = clip.valid & (np.arange(len(forces_n)) >= model.header.preprocess.lead_in)
+        estimates.append(forces_n[use])
+        measured.append(clip.forces_n[use])
+    engine.reset()
+    estimated_n, measured_n = np.concatenate(estimates), np.concatenate(measured)
+    return {
+        "mae_n": metrics.mae(estimated_n, measured_n),
+        "rmse_n": metrics.rmse(estimated_n, measured_n),
+        "worst_n": float(np.abs(estimated_n - measured_n).max()),
+        "frames": len(measured_n),
+    }
+
+
+@torch.inference_mode()
+def _in_turns(
+    timed: dict[tuple[str, str], _Timed], model: Model, frames: Sequence[Floats]
+) -> dict[tuple[str, str], list[int]]:
+    networks = load_checkpoint(model.path).networks
+    context = max(member.context for member in model.header.members)
+    clip = torch.from_numpy(np.stack(frames[: context + 1]))[None, :, None]  # (1, T, 1, S, S)
+    plain = [deepcopy(network).in_plain_layout() for network in networks]
+    windows = {
+        WINDOW: _Timed(lambda _: [network(clip, clip.shape[1] - 1) for network in networks], []),
+        PLAIN_WINDOW: _Timed(lambda _: [network(clip, clip.shape[1] - 1) for network in plain], []),
+    }
+    for turn in range(_ROUNDS + 1):
+        for way in timed.values():
+            _take(way, frames, _STEPS, keep=turn > 0)
+        if turn % 4 == 0:
+            for window in windows.values():
+                _take(window, frames, _WINDOWS, keep=turn > 0)
+    taken_ns = {(name, "float32"): window.taken_ns for name, window in windows.items()}
+    return taken_ns | {name: way.taken_ns for name, way in timed.items()}
+
+
+def _take(way: _Timed, frames: Sequence[Floats], steps: int, *, keep: bool) -> None:
+    for i in range(steps):
+        begin_ns = time.perf_counter_ns()
+        way.step(frames[i % len(frames)])
+        taken_ns = time.perf_counter_ns() - begin_ns
+        if keep:
+            way.taken_ns.append(taken_ns)
+
+
+def _memory_mb(model: Model, engine: str, precision: str, threads: int) -> float:
+    done = subprocess.run(
+        [sys.executable, "-c", _MEMORY, str(model.path), engine, precision, str(threads)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode:
+        raise ConfigError(f"{engine} does not run in a process of its own: {done.stderr.strip()[-300:]}")
+    return float(done.stdout.split()[-1])
+
+
+def _with_front(rows: Sequence[EstimatorCost]) -> list[EstimatorCost]:
+    """Marks the ways that no other beats in both time and error."""
+
+    def beaten(row: EstimatorCost) -> bool:
+        return any(
+            other.p50_ms <= row.p50_ms
+            and other.mae_n <= row.mae_n
+            and (other.p50_ms, other.mae_n) != (row.p50_ms, row.mae_n)
+            for other in rows
+        )
+
+    return [replace(row, front=not beaten(row)) for row in rows]
+
+
+def write_json(path: Path, rows: Sequence[EstimatorCost]) -> None:
+    """Keeps what was measured, and on what."""
+    about = {"machine": platform.platform(), "python": platform.python_version(), "torch": torch.__version__}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    text = json.dumps({**about, "estimator": [asdict(row) for row in rows]}, indent=1)
+    path.write_text(text, encoding="utf-8")
+
+
+def draw(path: Path, rows: Sequence[EstimatorCost]) -> None:
+    """Plots error against time, and the front."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    from gripper_force.jobs.report.figure import STYLE
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    kinds = list(dict.fromkeys((row.engine, row.precision) for row in rows))
+    markers = dict(zip(dict.fromkeys(row.checkpoint for row in rows), "osD^vP*X", strict=False))
+    with rc_context(STYLE):
+        figure = Figure(figsize=(8.0, 4.6), layout="constrained")
+        axes = figure.subplots()
+        for i, (engine, precision) in enumerate(kinds):
+            of_kind = [row for row in rows if (row.engine, row.precision) == (engine, precision)]
+            for row in of_kind:
+                axes.plot(
+                    row.p50_ms,
+                    row.mae_n,
+                    markers[row.checkpoint],
+                    color=f"C{i}",
+                    markerfacecolor=f"C{i}" if row.threads > 1 else "white",
+                    label=f"{engine}, {precision}" if row is of_kind[0] else None,
+                )
+        front = sorted((row for row in rows if row.front), key=lambda row: row.p50_ms)
+        axes.plot([r.p50_ms for r in front], [r.mae_n for r in front], ":", color="0.4", label="front")
+        for name, marker in markers.items():
+            axes.plot([], [], marker, color="0.4", label=Path(name).stem)
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter("{x:g}")
+        axes.set_xlabel("median time of a frame, ms (filled: more than one thread)")
+        axes.set_ylabel("mean absolute error, N")
+        axes.legend(loc="lower left", bbox_to_anchor=(1.0, 0.0), fontsize=8)
+        figure.savefig(path, dpi=130)
+
+
+def markdown(rows: Sequence[EstimatorCost]) -> str:
+    """The table for a page."""
+    lines = [
+        "| checkpoint | networks, px | engine | precision | threads | p50, p99 ms | over roofline "
+        "| MAE, RMSE, worst N | MB | front |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        share = "–" if row.least_ms is None else f"{row.p50_ms / row.least_ms:.1f}"
+        memory = "–" if row.memory_mb is None else f"{row.memory_mb:.0f}"
+        errors = f"{row.mae_n:.3f}, {row.rmse_n:.3f}, {row.worst_n:.2f}"
+        lines.append(
+            f"| {Path(row.checkpoint).stem} | {row.members}, {row.size} | {row.engine} | {row.precision} "
+            f"| {row.threads} | {row.p50_ms:.2f}, {row.p99_ms:.2f} | {share} "
+            f"| {errors} | {memory} | {'x' if row.front else ''} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+Ratios = dict[str, dict[str, Any]]
+
+
+def ratios(rows: Sequence[EstimatorCost]) -> Ratios:
+    """Of each checkpoint: the fastest way that keeps the error, against the window, ours and the plain one.
+
+    Kept is an error at most 2 % over that of float32. Each has as many threads as serve it best.
+    """
+    told: Ratios = {}
+    for source in dict.fromkeys(row.checkpoint for row in rows):
+        own = [row for row in rows if row.checkpoint == source]
+        window, plain = (
+            min((row for row in own if row.engine == way), key=lambda row: row.p50_ms)
+            for way in (WINDOW, PLAIN_WINDOW)
+        )
+        exact = [row for row in own if not row.engine.startswith(WINDOW) and row.mae_n <= 1.02 * window.mae_n]
+        best = min(exact, key=lambda row: row.p50_ms)
+        told[source] = {
+            "fastest": f"{best.engine}, {best.precision}, {best.threads} threads",
+            "p50_ms": best.p50_ms,
+            "p99_ms": best.p99_ms,
+            "times_faster_than_window": window.p50_ms / best.p50_ms,
+            "times_faster_than_plain_window": plain.p50_ms / best.p50_ms,
+            "mae_over_float32": best.mae_n / window.mae_n,
+        }
+    return told

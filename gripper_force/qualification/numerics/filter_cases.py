@@ -1,0 +1,341 @@
+"""Hard cases for the fusion filter, each against the same equations in decimal numbers of 50 digits.
+
+The reference is written anew from the description of `gripper_force.control.fusion`, not taken from its code.
+Binary doubles keep 16 digits, so what differs is rounding, or a mistake. Fractions would be exact, but theirs
+grow with every step; 50 digits lose nothing that counts in a million.
+"""
+
+import math
+import sys
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import replace
+from decimal import Decimal, localcontext
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from gripper_force.config import Config, ControlConfig, GripperConfig
+from gripper_force.control import fusion
+from gripper_force.control.fusion import Fusion
+from gripper_force.control.state_machine import GraspController
+from gripper_force.control.transmission import Transmission
+from gripper_force.qualification.loop_margin.analytic_plant import CYCLE_NS, transmission_of
+from gripper_force.qualification.numerics.suite import Row
+from gripper_force.types import NS_PER_MS, NS_PER_S, Request, RequestKind, ServoState, VisualForce
+
+CYCLES: Final = 1_000_000
+"""Of the longest case: 83 minutes at 200 Hz."""
+
+_ROUNDING_N: Final = 1e-9
+"""A billionth of what the loop calls even; a filter that loses digits as it goes is far beyond."""
+
+_LEFT: Final = 1e-15
+"""Share of a huge reading that may stay in those after it: a few times the last digit of a double."""
+
+_DAY_NS: Final = 86_400 * NS_PER_S
+_DIGITS: Final = 50
+
+Input = tuple[int, float, VisualForce | None]
+"""Time of a cycle, the motor's push in it, and the newest estimate."""
+
+
+class _Exact:
+    """The filter of `Fusion` for jaws that touch something, in decimal numbers."""
+
+    def __init__(self, control: ControlConfig, transmission: Transmission) -> None:
+        _, lag_s, _ = control.plant
+        self._lag_s = Decimal(lag_s)
+        self._oldest_ns = control.vision_age_ms * NS_PER_MS
+        self._most_std_n = control.vision_std_n
+        self._friction_n = Decimal(transmission.friction_n)
+        self._friction_n2 = (Decimal(transmission.friction_std) * self._friction_n) ** 2
+        self._gain_std = Decimal(transmission.gain_std)
+        self._push_n = self._force_n = self._difference_n = Decimal(0)
+        self._share = Decimal(1)
+        self._variance_n2 = self._prior_n2(self._force_n)
+        cycles = math.ceil(control.rate_hz * control.vision_age_ms / 1e3) + 2
+        self._history: deque[tuple[int, Decimal]] = deque(maxlen=cycles)
+        self._newest_ns = -1
+        self._run = 0
+
+    def step(self, t_ns: int, push_n: float, visual: VisualForce | None) -> tuple[Decimal, Decimal]:
+        """One cycle: the force and its standard deviation."""
+        before_n = self._force_n
+        dt_s = Decimal(0)
+        if self._history:
+            dt_s = Decimal(max(t_ns - self._history[-1][0], 0)) / NS_PER_S
+            self._push_n += (Decimal(push_n) - self._push_n) * dt_s / (dt_s + self._lag_s)
+        else:
+            self._push_n = Decimal(push_n)
+        play_n = self._friction_n
+        self._force_n = min(max(before_n, self._push_n - play_n), self._push_n + play_n)
+        back = (1 + (self._force_n - self._push_n) / play_n) / 2 if play_n else Decimal(0)
+        drift_n2 = Decimal(fusion._DRIFT_N2_S) + Decimal(fusion._LOOSE_N2_S) * back
+        gearing_n2 = self._gain_std**2 * abs(self._force_n**2 - before_n**2)
+        grown_n2 = self._variance_n2 + drift_n2 * dt_s + gearing_n2
+        self._variance_n2 = min(grown_n2, self._prior_n2(self._force_n))
+        self._history.append((t_ns, self._force_n))
+        if visual is not None and visual.t_ns > self._newest_ns:
+            self._newest_ns = visual.t_ns
+            self._take(t_ns, visual)
+        prior_n2 = self._prior_n2(self._force_n)
+        force_n = max(self._force_n + self._share * self._difference_n, Decimal(0))
+        return force_n, (self._variance_n2 + (1 - self._share) * prior_n2).sqrt()
+
+    def _take(self, t_ns: int, visual: VisualForce) -> None:
+        sound = abs(visual.force_n) <= 1e9 and abs(visual.std_n) <= 1e9
+        if not (sound and 0 <= t_ns - visual.t_ns <= self._oldest_ns and visual.std_n <= self._most_std_n):
+            return
+        claimed_n2 = Decimal(max(visual.std_n, fusion._VISION_FLOOR_N)) ** 2
+        then_n = self._force_at(visual.t_ns)
+        prior_n2 = self._prior_n2(then_n)
+        difference_n = Decimal(visual.force_n) - then_n
+        surprise_n = difference_n - self._difference_n
+        if abs(difference_n) > 3 * (prior_n2 + claimed_n2).sqrt():
+            return
+        if abs(surprise_n) > Decimal(fusion._GATE) * (self._variance_n2 + claimed_n2).sqrt():
+            side = 1 if surprise_n > 0 else -1
+            self._run = self._run + side if self._run * side > 0 else side
+            if abs(self._run) < fusion._REENTRY:
+                return
+            self._variance_n2 = prior_n2
+        self._run = 0
+        # In the information form: what was known and what is new add up.
+        noise_n2 = Decimal(fusion._FRAME_NOISE_N) ** 2
+        total_n2 = self._variance_n2 + noise_n2
+        self._difference_n = (self._difference_n * noise_n2 + difference_n * self._variance_n2) / total_n2
+        self._variance_n2 = self._variance_n2 * noise_n2 / total_n2
+        self._share = prior_n2 / (prior_n2 + claimed_n2)
+
+    def _force_at(self, t_ns: int) -> Decimal:
+        later_ns, later_n = self._history[-1]
+        for earlier_ns, earlier_n in reversed(self._history):
+            if earlier_ns <= t_ns < later_ns:
+                share = Decimal(t_ns - earlier_ns) / (later_ns - earlier_ns)
+                return earlier_n + share * (later_n - earlier_n)
+            if earlier_ns <= t_ns:
+                return later_n
+            later_ns, later_n = earlier_ns, earlier_n
+        return later_n
+
+    def _prior_n2(self, force_n: Decimal) -> Decimal:
+        floor_n2 = Decimal(fusion._FREE_FLOOR_N) ** 2
+        return self._friction_n2 + floor_n2 + (self._gain_std * force_n) ** 2
+
+
+def cases(config: Config, _maps: Path | None, cycles: int = CYCLES) -> Iterator[Row]:
+    """Rows of the filter.
+
+    Args:
+        config: Whose control and gripper are tested.
+        cycles: Of the longest case.
+    """
+    control, gripper = config.control, config.gripper
+
+    def against(
+        case: str,
+        detail: str,
+        inputs: Iterator[Input],
+        bound_n: float = _ROUNDING_N,
+        **changed: float,
+    ) -> Row:
+        other = GripperConfig.model_validate({**gripper.model_dump(), **changed})
+        return Row(case, f"{detail}; against 50 digits", worst_n(control, other, inputs), bound_n, "N")
+
+    rng = np.random.default_rng([config.seed, 40])
+    yield against(f"{cycles} cycles", "4 ± 3 N, frames at 60 Hz", _steady(rng, cycles))
+    yield Row(
+        "a clock near 2^62 ns",
+        "146 years of uptime, beside the same cycles from 0; estimates that differ by a bit",
+        _moved(control, gripper, 2**62, config.seed),
+        0.0,
+    )
+    late = (one for day in range(10) for one in _steady(rng, 200, begin_ns=NS_PER_S + day * _DAY_NS))
+    yield against("ten days of uptime", "a second of cycles a day, nothing between", late)
+    yield against("repeated timestamps", "every cycle and every frame four times", _repeated(rng))
+    yield against("a clock that goes backward", "100 ms back, twice a second", _backward(rng))
+    yield against("irregular cycles", "1 to 50 ms, a pause of 2 s at times", _irregular(rng))
+    yield against(
+        "irregular and dropped frames", "two of three lost, 5 to 95 ms late, out of order", _ragged(rng)
+    )
+    for name, std_n in (("0", 0.0), ("the smallest number", 5e-324), ("negative", -1.0)):
+        yield against(
+            f"claimed error {name}", "no frame is believed without bound", _steady(rng, 4000, std_n=std_n)
+        )
+    for name, force_n, std_n in _REFUSED:
+        yield Row(
+            f"estimates of {name}",
+            "every second one; off from the filter that never sees those",
+            _unheard(control, gripper, force_n, std_n, config.seed),
+            0.0,
+            "N",
+        )
+    nothing = {"friction_n": 0.0, "friction_std": 0.0, "gain_std": 0.0}
+    yield against("prior variance 0", "nothing is unknown of the rig", _steady(rng, 4000), **nothing)
+    wide = {"friction_std": 1e9, "gain_std": 1e9}
+    yield against(
+        "prior variance without end", "10^18 N², the most that can be configured", _steady(rng, 4000), **wide
+    )
+    tiny = ((t_ns, 5e-324 * (t_ns // CYCLE_NS % 3), None) for t_ns in range(0, NS_PER_S, CYCLE_NS))
+    yield against("denormal currents", "0 to 2 of the smallest number", tiny)
+    for huge_n in (1e3, 1e9):
+        yield against(
+            f"one reading of {huge_n:g} N",
+            "then a second of ordinary ones",
+            _spiked(rng, huge_n),
+            bound_n=max(_ROUNDING_N, _LEFT * huge_n),
+        )
+    yield Row(
+        "servo readings that are not finite",
+        "every tenth, each number in turn, in a whole grasp; commands beyond limits or not finite",
+        float(_wild_commands(control, gripper, config.servo.current_limit_a)),
+        0.0,
+    )
+
+
+_REFUSED: Final = (
+    ("NaN N", math.nan, 0.1),
+    ("infinite N", math.inf, 0.1),
+    ("1e300 N", 1e300, 0.1),
+    ("4 N with error NaN", 4.0, math.nan),
+    ("4 N with infinite error", 4.0, math.inf),
+)
+
+
+def worst_n(control: ControlConfig, gripper: GripperConfig, inputs: Iterator[Input]) -> float:
+    """Most that force or standard deviation are off from the reference; infinite where one is not finite.
+
+    Beyond 1 N as a share of the force.
+    """
+    transmission = transmission_of(gripper)
+    tested, exact = Fusion(control, transmission), _Exact(control, transmission)
+    worst = 0.0
+    with localcontext(prec=_DIGITS):
+        for t_ns, push_n, visual in inputs:
+            servo = _servo(t_ns, transmission.current_a(push_n))
+            found, _ = tested.step(t_ns, servo, visual)
+            if not (math.isfinite(found.force_n) and math.isfinite(found.std_n)):
+                return math.inf
+            force_n, std_n = exact.step(t_ns, transmission.force_n(servo.current_a), visual)
+            for number, true in ((found.force_n, force_n), (found.std_n, std_n)):
+                worst = max(worst, float(abs(Decimal(number) - true) / max(true, Decimal(1))))
+    return worst
+
+
+# What goes in.
+
+
+def _servo(t_ns: int, current_a: float) -> ServoState:
+    return ServoState(t_ns, 0.0, 0.0, current_a, 35.0, 12.0, 0)
+
+
+def _push_n(rng: np.random.Generator, t_ns: int) -> float:
+    """Push of a grip that goes up and down, and turns the play over."""
+    return 5.0 + 3.0 * math.sin(t_ns / NS_PER_S) + float(rng.normal(0.0, 0.2))
+
+
+def _seen(rng: np.random.Generator, t_ns: int, seq: int, std_n: float = 0.1) -> VisualForce:
+    force_n = 4.0 + 3.0 * math.sin(t_ns / NS_PER_S) + float(rng.normal(0.0, 0.15))
+    return VisualForce(t_ns, t_ns, seq, force_n, std_n, 12.0)
+
+
+def _steady(
+    rng: np.random.Generator, cycles: int, begin_ns: int = NS_PER_S, std_n: float = 0.1
+) -> Iterator[Input]:
+    for cycle in range(cycles):
+        t_ns = begin_ns + cycle * CYCLE_NS
+        visual = _seen(rng, t_ns - 40 * NS_PER_MS, cycle, std_n) if cycle % 10 in (0, 3, 6) else None
+        yield t_ns, _push_n(rng, t_ns), visual
+
+
+def _repeated(rng: np.random.Generator) -> Iterator[Input]:
+    for one in _steady(rng, 2000):
+        yield from (one,) * 4
+
+
+def _backward(rng: np.random.Generator) -> Iterator[Input]:
+    for cycle, (t_ns, push_n, visual) in enumerate(_steady(rng, 4000)):
+        back_ns = 100 * NS_PER_MS * (cycle // 100)
+        seen = visual and replace(visual, t_ns=visual.t_ns - back_ns, ready_ns=visual.ready_ns - back_ns)
+        yield t_ns - back_ns, push_n, seen
+
+
+def _irregular(rng: np.random.Generator) -> Iterator[Input]:
+    t_ns = 0
+    for cycle in range(4000):
+        t_ns += 2 * NS_PER_S if rng.random() < 0.002 else int(rng.integers(NS_PER_MS, 50 * NS_PER_MS))
+        yield t_ns, _push_n(rng, t_ns), _seen(rng, t_ns - 40 * NS_PER_MS, cycle) if cycle % 3 == 0 else None
+
+
+def _ragged(rng: np.random.Generator) -> Iterator[Input]:
+    for cycle, (t_ns, push_n, visual) in enumerate(_steady(rng, 8000)):
+        late_ns = int(rng.integers(5 * NS_PER_MS, 95 * NS_PER_MS))
+        kept = visual is not None and rng.random() < 1 / 3
+        yield t_ns, push_n, _seen(rng, t_ns - late_ns, cycle) if kept else None
+
+
+def _spiked(rng: np.random.Generator, huge_n: float) -> Iterator[Input]:
+    for cycle, (t_ns, push_n, visual) in enumerate(_steady(rng, 600)):
+        yield t_ns, huge_n if cycle == 400 else push_n, visual
+
+
+# What is compared with the filter itself.
+
+
+def _moved(control: ControlConfig, gripper: GripperConfig, by_ns: int, seed: int) -> float:
+    """How many estimates differ where all times are later by the same."""
+    transmission = transmission_of(gripper)
+    here, there = Fusion(control, transmission), Fusion(control, transmission)
+    different = 0
+    for t_ns, push_n, visual in _ragged(np.random.default_rng([seed, 41])):
+        current_a = transmission.current_a(push_n)
+        later = visual and replace(visual, t_ns=visual.t_ns + by_ns, ready_ns=visual.ready_ns + by_ns)
+        one, _ = here.step(t_ns, _servo(t_ns, current_a), visual)
+        other, _ = there.step(t_ns + by_ns, _servo(t_ns + by_ns, current_a), later)
+        different += replace(other, t_ns=t_ns) != one
+    return float(different)
+
+
+def _unheard(
+    control: ControlConfig, gripper: GripperConfig, force_n: float, std_n: float, seed: int
+) -> float:
+    """Most that the estimate is off because of estimates that can't be used."""
+    transmission = transmission_of(gripper)
+    # What vision says after such an estimate counts anew: only what the filter holds is compared.
+    hears, spared = Fusion(control, transmission), Fusion(control, transmission)
+    worst = 0.0
+    for number, (t_ns, push_n, visual) in enumerate(_steady(np.random.default_rng([seed, 42]), 4000)):
+        servo = _servo(t_ns, transmission.current_a(push_n))
+        bad = visual is not None and number % 2 == 1
+        spoiled = replace(visual, force_n=force_n, std_n=std_n) if visual and bad else visual
+        found, _ = hears.step(t_ns, servo, spoiled)
+        expected, _ = spared.step(t_ns, servo, None if bad else visual)
+        off = max(abs(found.force_n - expected.force_n), abs(found.std_n - expected.std_n))
+        worst = max(worst, off) if math.isfinite(off) else math.inf
+    return worst
+
+
+def _wild_commands(control: ControlConfig, gripper: GripperConfig, current_limit_a: float) -> int:
+    """How many commands of a grasp break a limit while the servo says things that are not finite."""
+    transmission = transmission_of(gripper)
+    broken = 0
+    for name in ("position_rad", "velocity_rad_s", "current_a", "temperature_c", "voltage_v"):
+        for wild in (math.nan, math.inf, -math.inf, sys.float_info.max):
+            spoiled: dict[str, Any] = {name: wild}
+            controller = GraspController(control, transmission, current_limit_a)
+            request: Request | None = Request(0, RequestKind.GRASP, 4.0)
+            for cycle in range(400):
+                t_ns = cycle * CYCLE_NS
+                servo = replace(_servo(t_ns, 0.03), position_rad=min(0.001 * cycle, 0.3))
+                if cycle % 10 == 9:
+                    servo = replace(servo, **spoiled)
+                command = controller.step(t_ns, servo, None, request).command
+                request = None
+                ends = sorted((transmission.open_position_rad, transmission.closed_position_rad))
+                broken += not (
+                    0 <= command.goal_current_a <= current_limit_a
+                    and ends[0] <= command.goal_position_rad <= ends[1]
+                )
+    return broken

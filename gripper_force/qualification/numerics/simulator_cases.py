@@ -1,0 +1,152 @@
+"""What the step of the physics does to the force, and which guard catches what breaks."""
+
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from gripper_force.config import Config, GripperConfig
+from gripper_force.errors import SimulationError
+from gripper_force.qualification.numerics.suite import Row
+from gripper_force.types import NS_PER_MS, NS_PER_S
+from gripper_hw.sim.objects import OBJECTS, Detail
+from gripper_hw.sim.scene import Scene
+from gripper_hw.sim.world import World
+
+STEPS_S: Final = (0.00025, 0.0005, 0.001, 0.002, 0.0025, 0.004)
+"""The first is what the others are measured against."""
+
+TOO_LONG_S: Final = (0.005, 0.008)
+
+_ERROR_N: Final = 0.25
+"""2 % of the force that is reached."""
+
+_DETAIL: Final[Detail] = "medium"
+_NM_PER_A: Final = 1.78
+_RAMP_S: Final = 1.6
+_TIME_S: Final = 2.0
+_MOST_A: Final = 0.3
+_BRAKE_A_S: Final = 0.03
+_SAMPLE_NS: Final = 4 * NS_PER_MS
+_BREAKS_S: Final = 1.0
+_GUARDS: Final = {
+    "warns": "MuJoCo's warning",
+    "not finite": "an acceleration",
+    "deep": "depth",
+    "slipped": "rack",
+    "reads": "force",
+}
+
+Drive = Callable[[float, float], float]
+"""Motor current from time and speed of the horn."""
+
+Curve = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class _Motor:
+    drive: Drive
+
+    def control(self, t_ns: int, position_rad: float, velocity_rad_s: float, current_noise_a: float) -> float:
+        return self.drive(t_ns / NS_PER_S, velocity_rad_s)
+
+
+def _squeeze(t_s: float, velocity_rad_s: float) -> float:
+    """A current that rises to a grip of 12 N, with a brake so that the jaws close slowly."""
+    return _MOST_A * min(t_s / _RAMP_S, 1.0) - _BRAKE_A_S * velocity_rad_s
+
+
+_BREAKING: Final[dict[str, Drive]] = {
+    "a current that is not a number": lambda t_s, _: math.nan if t_s > 0.3 else 0.1,
+    "an infinite current": lambda t_s, _: math.inf if t_s > 0.3 else 0.1,
+    "a current of 1e300 A": lambda t_s, _: 1e300 if t_s > 0.3 else 0.1,
+    "a motor of 3 A without end": lambda _t, _v: 3.0,
+    "a motor of 10 A without end": lambda _t, _v: 10.0,
+    "a motor of 100 A without end": lambda _t, _v: 100.0,
+}
+
+
+def cases(
+    _config: Config,
+    _maps: Path | None,
+    objects: Sequence[str] = tuple(OBJECTS),
+    steps_s: Sequence[float] = STEPS_S,
+) -> Iterator[Row]:
+    """Rows of the simulator.
+
+    Args:
+        objects: Keys of `OBJECTS`.
+        steps_s: Steps, the finest first.
+    """
+    for name in objects:
+        _, finest_s, finest_n, _ = _run(name, steps_s[0])
+        for step_s in steps_s[1:]:
+            broken, times_s, force_n, speed = _run(name, step_s)
+            off_n = force_n - np.interp(times_s, finest_s, finest_n)
+            error_n = float(np.sqrt(np.mean(off_n**2)))
+            yield Row(
+                f"{name}, step {1e3 * step_s:g} ms",
+                broken
+                or f"{speed:.2g} times real time, worst {np.abs(off_n).max():.2f} N; RMS error against "
+                f"{1e3 * steps_s[0]:g} ms on a squeeze up to {finest_n[-1]:.0f} N",
+                math.nan if broken else error_n,
+                _ERROR_N,
+                "N",
+            )
+    yield Row(
+        "steps of " + " and ".join(f"{1e3 * step_s:g} ms" for step_s in TOO_LONG_S),
+        f"worlds of {', '.join(objects)} that are built nonetheless",
+        float(sum(_is_built(name, step_s) for name in objects for step_s in TOO_LONG_S)),
+        0.0,
+    )
+    for what, drive in _BREAKING.items():
+        caught = Counter(_guard_of(name, drive) for name in objects)
+        unseen = caught.pop("", 0)
+        said = ", ".join(f"{guard} {count}" for guard, count in caught.most_common())
+        yield Row(what, f"caught by: {said}; worlds that go on", float(unseen), 0.0)
+
+
+def _world(name: str, step_s: float | None, drive: Drive) -> World:
+    return World(
+        Scene(name, _DETAIL), GripperConfig(), _Motor(drive), _NM_PER_A, seed=0, seen=False, step_s=step_s
+    )
+
+
+def _run(name: str, step_s: float) -> tuple[str, Curve, Curve, float]:
+    """Why it broke, or an empty text; times and forces, (N,); and its speed over real time."""
+    world = _world(name, step_s, _squeeze)
+    times_s, forces_n, broken = [], [], ""
+    begin_s = time.process_time()
+    try:
+        for due_ns in range(_SAMPLE_NS, round(_TIME_S * NS_PER_S), _SAMPLE_NS):
+            world.advance_to(due_ns)
+            times_s.append(world.t_ns / NS_PER_S)
+            forces_n.append(world.force_n)
+    except SimulationError as error:
+        broken = str(error)
+    speed = world.t_ns / NS_PER_S / max(time.process_time() - begin_s, 1e-9)
+    return broken, np.array(times_s), np.array(forces_n), speed
+
+
+def _is_built(name: str, step_s: float) -> bool:
+    try:
+        _world(name, step_s, _squeeze)
+    except SimulationError:
+        return False
+    return True
+
+
+def _guard_of(name: str, drive: Drive) -> str:
+    """The guard that ended a world, or an empty text where none did."""
+    world = _world(name, None, drive)
+    try:
+        world.advance_to(round(_BREAKS_S * NS_PER_S))
+    except SimulationError as error:
+        return next((guard for word, guard in _GUARDS.items() if word in str(error)), "MuJoCo's own error")
+    return ""

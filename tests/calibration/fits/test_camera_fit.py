@@ -1,0 +1,133 @@
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gripper_calibration.fits.camera_fit import (
+    METHOD_MS,
+    Markers,
+    Rung,
+    Touch,
+    choose_exposure,
+    find_markers,
+    lag_of,
+    region_about,
+)
+from gripper_force.errors import DataError
+from gripper_force.types import Gray
+
+MODULE_PX = 3
+SIDE_PX = 6 * MODULE_PX
+
+
+def picture(*places: tuple[int, int, int]) -> Gray:
+    """A noisy picture of 128x128 with markers: number, left and top of its black square."""
+    gray = np.full((128 + 2 * SIDE_PX,) * 2, 110.0)
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    for number, left, top in places:
+        marker = np.pad(
+            cv2.aruco.generateImageMarker(dictionary, number, SIDE_PX), MODULE_PX, constant_values=255
+        )
+        y, x = top - MODULE_PX + SIDE_PX, left - MODULE_PX + SIDE_PX
+        gray[y : y + len(marker), x : x + len(marker)] = 20 + 0.7 * marker
+    gray += np.random.default_rng(0).normal(0, 3, gray.shape)
+    return gray[SIDE_PX:-SIDE_PX, SIDE_PX:-SIDE_PX].clip(0, 255).astype(np.uint8)
+
+
+def at(left: float, top: float, side: float = 12.0) -> np.ndarray:
+    return np.array([[left, top], [left + side, top], [left + side, top + side], [left, top + side]])
+
+
+def test_both_markers_are_found_where_they_are() -> None:
+    found = find_markers(picture((0, 12, 50), (1, 90, 58)))
+    for number, left, top in ((0, 12, 50), (1, 90, 58)):
+        assert found[number] == pytest.approx(at(left - 0.5, top - 0.5, SIDE_PX), abs=1.0)
+
+
+def test_the_region_is_the_square_about_both_markers() -> None:
+    seen = [find_markers(picture((0, 30, 50), (1, 80, 52))), find_markers(picture((0, 34, 50), (1, 76, 52)))]
+    left, top, width, height = region_about(seen, 128, 128)
+    assert width == height == pytest.approx(80 + SIDE_PX - 30 + SIDE_PX, abs=2)
+    assert (left, top) == pytest.approx((30 - SIDE_PX / 2, 60 - width / 2), abs=2)
+
+
+@pytest.mark.parametrize(
+    ("shown", "counts"),
+    [
+        ((), "marker 0 in 0 and marker 1 in 0"),
+        (((0, 12, 50),), "marker 0 in 1 and marker 1 in 0"),
+        (((0, -4, 50), (1, 90, 58)), "marker 0 in 0 and marker 1 in 1"),  # cut off
+        (((5, 12, 50), (7, 90, 58)), "marker 0 in 0 and marker 1 in 0"),  # of something else
+    ],
+)
+def test_a_marker_that_is_not_seen_whole_is_named(
+    shown: tuple[tuple[int, int, int], ...], counts: str
+) -> None:
+    with pytest.raises(DataError, match=rf"no picture shows both markers whole: of 1 there is {counts}"):
+        region_about([find_markers(picture(*shown))], 128, 128)
+
+
+def test_something_far_larger_that_looks_like_a_marker_is_none_of_a_pair() -> None:
+    with pytest.raises(DataError, match="no picture shows both"):
+        region_about([{0: at(10, 10), 1: at(60, 60, 40.0)}], 128, 128)
+
+
+@given(
+    st.lists(
+        st.tuples(*(st.floats(0, 100),) * 4).map(lambda p: {0: at(p[0], p[1]), 1: at(p[2], p[3])}), min_size=1
+    ),
+    st.integers(112, 160),
+    st.integers(112, 160),
+)
+def test_the_region_is_a_square_within_the_picture(seen: list[Markers], width: int, height: int) -> None:
+    left, top, side, same = region_about(seen, width, height)
+    assert side == same > 0
+    assert 0 <= left <= left + side <= width
+    assert 0 <= top <= top + side <= height
+    corners = np.concatenate([c for markers in seen for c in markers.values()])
+    if side < min(width, height):  # else there is no more to show
+        assert (corners >= (left - 1, top - 1)).all()
+        assert (corners <= (left + side + 1, top + side + 1)).all()
+
+
+def test_the_best_lit_picture_that_is_not_clipped_is_chosen() -> None:
+    ladder = [Rung(500, 35, 0.0), Rung(1000, 50, 0.0), Rung(2000, 71, 0.0), Rung(4000, 95, 0.02)]
+    assert choose_exposure(ladder).exposure_us == 2000
+
+
+@pytest.mark.parametrize("gray", [250, 255, 0, 39])
+def test_pictures_that_are_clipped_or_dark_are_refused(gray: int) -> None:
+    rung = Rung.of(4000, np.full((64, 64), gray, np.uint8))
+    with pytest.raises(
+        DataError, match=r"no exposure gives a picture .* \(4000 us: mean \d+, \d+\.\d % clip"
+    ):
+        choose_exposure([rung])
+
+
+def touches(*lags_ms: float, force_n: float = 5.0) -> list[Touch]:
+    return [Touch(force_n, lag_ms, lag_ms + 20) for lag_ms in lags_ms]
+
+
+@given(st.lists(st.floats(-150, 150), min_size=3, max_size=30))
+def test_the_interval_holds_the_lag_and_is_no_narrower_than_the_method(lags_ms: list[float]) -> None:
+    lag = lag_of(touches(*lags_ms))
+    assert lag.value == pytest.approx(np.median(lags_ms))
+    assert lag.half >= METHOD_MS - 1e-9
+
+
+def test_touches_that_contradict_each_other_widen_it() -> None:
+    assert lag_of(touches(-60, -20, 20, 60)).half > 60
+    assert lag_of(touches(18, 19, 20, 21)).half < 6
+
+
+def test_weak_touches_are_left_out() -> None:
+    assert lag_of([*touches(10, 11, 12), *touches(90, 95, 99, force_n=2.0)]).value == 11
+
+
+def test_too_few_touches_that_tell_are_refused() -> None:
+    nan = float("nan")
+    with pytest.raises(DataError, match="2 of 4 touches tell the camera's lag, and it takes 3"):
+        lag_of(touches(10, 11, nan, nan))
+    with pytest.raises(DataError, match="0 of 0 touches"):
+        lag_of([])

@@ -1,0 +1,62 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.signal import lfilter
+
+from gripper_calibration.fits.plant_fit import Press, crushed_by, fit_plant, stiffness_n_m
+
+
+def pressed(gain: float, lag_s: float, friction_n: float, seed: int = 0, noise_n: float = 0.01) -> Press:
+    """A ramp with rounded ends, and a hold, through a first-order lag."""
+    rng = np.random.default_rng(seed)
+    t_s = np.arange(0, 1.4, 0.005) + rng.uniform(0, 0.001)
+    push_n = 5 * (1 - np.cos(np.pi * (t_s / 1.0).clip(0, 1))) / 2 + 0.5
+    keep = np.exp(-0.005 / lag_s)
+    late = lfilter([1 - keep], [1, -keep], push_n, zi=[keep * push_n[0]])[0]
+    return Press(t_s, push_n, gain * late - friction_n + noise_n * rng.normal(size=len(t_s)))
+
+
+@settings(max_examples=30, deadline=None)
+@given(gain=st.floats(0.6, 1.5), lag_s=st.floats(0.01, 0.15), friction_n=st.floats(-0.4, 0.4))
+def test_gain_and_lag_come_back_whatever_the_friction(gain: float, lag_s: float, friction_n: float) -> None:
+    presses = [pressed(gain, lag_s, friction_n * s, seed) for seed, s in enumerate((1.0, 0.5, -1.0))]
+    plant = fit_plant(presses, 0.04)
+    assert plant is not None
+    assert plant.gain == pytest.approx(gain, rel=0.03)
+    assert plant.lag_ms == pytest.approx(1e3 * lag_s, abs=8)
+    assert plant.delay_ms == pytest.approx(40)
+    assert plant.phase_margin_deg == pytest.approx(61.4, abs=0.1)  # SIMC's own, by its choice of gains
+
+
+def test_what_hardly_moves_tells_no_plant() -> None:
+    still = Press(np.arange(100) * 0.005, np.full(100, 2.0), np.full(100, 1.0))
+    assert fit_plant([], 0.04) is None
+    assert fit_plant([still], 0.04) is None
+    assert fit_plant([pressed(0.01, 0.03, 0.0)], 0.04) is None
+
+
+def test_stiffness_is_the_slope_in_the_middle() -> None:
+    travel_m = np.linspace(0, 0.01, 200)
+    force_n = 300 * travel_m + 1e6 * np.clip(travel_m - 0.0095, 0, None) ** 2
+    slopes = stiffness_n_m([0.05 - travel_m, 0.05 - travel_m[:30]], [force_n, force_n[:30]])
+    assert slopes == pytest.approx([300], rel=1e-6)
+
+
+@given(st.lists(st.floats(-0.001, 0.001), min_size=8, max_size=8), st.integers(2, 5))
+def test_an_object_that_stays_narrower_was_crushed_by_the_hardest_touch_so_far(
+    lies_m: list[float], last: int
+) -> None:
+    peak_n = np.array([2.0, 5.0, 3.0, 4.0, 2.0, 3.0, 5.0, 1.0])
+    peak_n[last] = 9.0
+    contact_m = 0.05 + np.array(lies_m)
+    contact_m[last + 1 :] -= 0.012
+    assert crushed_by(contact_m, peak_n) == last
+
+
+def test_an_object_that_springs_back_was_not_crushed() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        assert crushed_by(0.05 + rng.uniform(-0.002, 0.002, 12), rng.uniform(1, 9, 12)) is None
+    assert crushed_by(np.array([0.05, 0.03]), np.array([1.0, 2.0])) is None
+    assert crushed_by(np.array([]), np.array([])) is None

@@ -1,0 +1,161 @@
+"""The simulated rig's camera, whose lag, latency and markers are known."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import pytest
+from typer.testing import CliRunner
+
+from gripper_calibration.fits.camera_fit import lag_of
+from gripper_calibration.procedures.calibrate_camera import calibrate, compute_ms, watch
+from gripper_force.cli import app
+from gripper_force.config import load_config
+from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
+from gripper_force.jobs.recording.record import Plan, record
+from gripper_force.profiles.apply import rig_mismatches
+from gripper_force.profiles.rig_profile import read_rig
+from gripper_force.runtime.log import LogReader, LogWriter
+from gripper_force.types import NS_PER_MS, Frame
+
+QUICK = ["object=stapler", "sim.detail=coarse", "vision.checkpoint=none", "seed=2", "camera.rate_hz=30"]
+WHOLE = (0, 0, 128, 128)
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A set of touches; the markers are there."""
+    config = load_config(None, [*QUICK, "sim.markers=true"])
+    (path,) = record(config, Plan(1, 5), tmp_path_factory.mktemp("touches"), lambda *_: None)
+    return path
+
+
+def shifted(log: Path, folder: Path, by_ms: float) -> Path:
+    """The same set from a camera whose timestamps are late."""
+    reader, path = LogReader(log), folder / "shifted.mcap"
+    with LogWriter(path, config=reader.config, metadata=reader.metadata) as copy:
+        for item in reader.records():
+            if isinstance(item, Frame):
+                late_ns = round(by_ms * NS_PER_MS)
+                item = replace(item, t_ns=item.t_ns + late_ns, received_ns=item.received_ns + late_ns)
+            copy.write(item)
+    return path
+
+
+@pytest.mark.parametrize("by_ms", [-25.0, 0.0, 25.0])
+def test_a_known_lag_lies_within_the_stated_interval(log: Path, tmp_path: Path, by_ms: float) -> None:
+    lag = lag_of(watch(shifted(log, tmp_path, by_ms), WHOLE).touches)
+    assert lag.low is not None
+    assert lag.high is not None
+    assert lag.low < by_ms < lag.high
+    assert lag.half < 12
+
+
+def test_the_plain_comparison_with_force_says_too_much(log: Path) -> None:
+    assert all(touch.correlation_ms > 10 for touch in watch(log, WHOLE).touches if touch.force_n > 3)
+
+
+def test_the_cameras_latency_and_the_wait_for_a_cycle_are_seen(log: Path) -> None:
+    seen = watch(log, None)
+    assert 15 <= seen.use_ms <= 20  # a latency of 15 ms, and the next cycle of 5
+    assert seen.rate_hz == pytest.approx(30, rel=0.05)  # of whole physics steps
+    assert len(seen.widest_markers) == 2
+    assert watch(log, WHOLE).markers == []
+
+
+def test_what_the_network_takes_is_measured_on_a_clock_that_is_real(log: Path, tiny_checkpoint: Path) -> None:
+    gray = watch(log, WHOLE).reference
+    assert compute_ms(load_config(None, QUICK), gray) == 0.0
+    config = load_config(None, [*QUICK, f"vision.checkpoint={tiny_checkpoint}"])
+    assert compute_ms(config, gray) == config.vision.lockstep_compute_ms
+    assert 0 < compute_ms(config.model_copy(update={"clock": "realtime"}), gray) < 1000
+
+
+def test_the_command_writes_profile_reference_and_report(tmp_path: Path) -> None:
+    rig = tmp_path / "rig.yaml"
+    asked = ["calibrate", "camera", "--rig", rig, "--exposure-us", 500, "--exposure-us", 4000, "--json"]
+    sets = [part for key in (*QUICK, "sim.markers=true", "sim.lux=550") for part in ("--set", key)]
+    done = CliRunner().invoke(app, [str(part) for part in (*asked, "--touches", 4, *sets)])
+    assert done.exit_code == 0, done.stderr
+    result = json.loads(done.stdout)
+    found = read_rig(rig).camera
+    assert found is not None
+    assert (found.exposure_us, found.backend, found.side_px, found.markers) == (4000, "simulated", 128, True)
+    assert found.lag_ms.low is not None
+    assert found.lag_ms.high is not None
+    assert found.lag_ms.low < 0 < found.lag_ms.high
+    assert found.delay_ms.value == pytest.approx(result["use_ms"] + 500 / 30 + found.lag_ms.value, abs=1.0)
+    assert result["touches"] == 4
+    assert cv2.imread(str(tmp_path / found.reference)).shape == (128, 128, 3)
+    assert cv2.imread(result["report"]) is not None
+    config = load_config(None, [f"calibration.rig={rig}"])
+    assert config.vision.region == found.region
+    assert config.camera.exposure_us == 4000
+    assert config.control.plant_delay_ms == found.delay_ms.value
+
+
+def test_another_camera_than_the_profiles_is_told(tmp_path: Path) -> None:
+    rig = tmp_path / "rig.yaml"
+    calibrate(load_config(None, QUICK), rig, region=(4, 4, 120, 120), exposures_us=[4000], touches=3)
+    found = read_rig(rig).camera
+    assert found is not None
+    assert (found.region, found.markers) == ((4, 4, 120, 120), False)
+    named = [*QUICK, f"calibration.rig={rig}"]
+    assert rig_mismatches(load_config(None, named)) == []
+    another = load_config(None, [*named, "camera.exposure_us=500", "camera.side_px=64"])
+    why = "of camera.side_px 128, not 64; camera.exposure_us 4000, not 500; calibrate again"
+    with pytest.raises(ConfigError, match=why):
+        rig_mismatches(another)
+    warned = load_config(None, [*named, "camera.exposure_us=500", "calibration.on_mismatch=warn"])
+    assert rig_mismatches(warned) == ["camera.exposure_us 4000, not 500"]
+    assert rig_mismatches(load_config(None, [*named, "camera.backend=none"])) == []
+
+
+def test_without_markers_nothing_is_written_and_the_way_out_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"no picture shows both markers whole: .* or choose with --region"):
+        calibrate(
+            load_config(None, [*QUICK, "camera.rate_hz=10"]),
+            tmp_path / "rig.yaml",
+            exposures_us=[4000],
+            touches=3,
+        )
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("sets", "exposures_us", "error", "why"),
+    [
+        (["sim.lux=90000"], [500, 4000], DataError, "no exposure gives a picture that is neither dark nor"),
+        (["sim.lux=1"], [500, 4000], DataError, r"4000 us: mean \d+, 0.0 % clipped"),
+        ([], [17_000], ConfigError, "half of a frame's period, 16667 us"),
+        (["camera.backend=none"], [4000], ConfigError, "and camera.backend is none; name yours"),
+        (
+            ["faults=[{unit: camera, kind: off}]"],
+            [4000],
+            DeviceTimeoutError,
+            "no frame for 3 s at an exposure",
+        ),
+    ],
+)
+def test_what_can_not_be_calibrated_is_refused_before_anything_moves(
+    tmp_path: Path, sets: list[str], exposures_us: list[int], error: type[Exception], why: str
+) -> None:
+    with pytest.raises(error, match=why):
+        calibrate(load_config(None, [*QUICK, *sets]), tmp_path / "rig.yaml", exposures_us=exposures_us)
+
+
+@pytest.mark.parametrize(
+    ("region", "why"),
+    [
+        ("10,10,200,100", "must lie within the camera's frame of 128x128 pixels"),
+        ("10,10,100", "--region needs left,top,width,height in pixels, got '10,10,100'"),
+    ],
+)
+def test_a_region_by_hand_is_checked(tmp_path: Path, region: str, why: str) -> None:
+    sets = [part for key in QUICK for part in ("--set", key)]
+    asked = ["calibrate", "camera", "--rig", str(tmp_path / "rig.yaml"), "--region", region, *sets]
+    done = CliRunner().invoke(app, asked)
+    assert done.exit_code != 0
+    assert isinstance(done.exception, ConfigError)
+    assert why in str(done.exception)

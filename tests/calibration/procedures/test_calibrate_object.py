@@ -1,0 +1,211 @@
+"""A profile from touches on the simulated rig, and what a grasp makes of it."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from click.testing import Result
+from typer.testing import CliRunner
+
+from gripper_calibration.procedures import calibrate_object as job
+from gripper_calibration.procedures.calibrate_object import calibrate, touch
+from gripper_force.cli import app
+from gripper_force.cli import calibrate as cli_calibrate
+from gripper_force.config import Config, load_config
+from gripper_force.errors import ConfigError, DataError
+from gripper_force.jobs.grasp import grasp
+from gripper_force.jobs.replay import replay
+from gripper_force.profiles.object_profile import read_object, weights_path
+from gripper_force.runtime.assembly import make_controller
+from gripper_force.runtime.backends import open_devices
+from gripper_force.runtime.log import LogReader
+from gripper_force.types import Event, LoadCellSample
+
+QUICK = [
+    "object=stapler",
+    "sim.detail=coarse",
+    "sim.stiffness_spread=0.5",
+    "sim.object_seed=5",
+    "sim.rig_seed=3",
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("object")
+
+
+@pytest.fixture(scope="module")
+def touched(folder: Path) -> list[Path]:
+    return list(touch(load_config(None, QUICK), 3, 6.0, folder / "touches"))
+
+
+@pytest.fixture(scope="module")
+def profile(folder: Path, touched: list[Path]) -> Path:
+    path = folder / "mine.yaml"
+    calibrate(load_config(None, QUICK), "stapler", touched, path, lambda _: None)
+    return path
+
+
+def run(folder: Path, *more: str) -> Config:
+    return load_config(None, [*QUICK, f"log.directory={folder}", "log.report=false", "target_n=2", *more])
+
+
+def test_touches_that_are_there_are_not_done_again(touched: list[Path], folder: Path) -> None:
+    asked: list[int] = []
+    config = load_config(None, QUICK)
+    touched[1].unlink()
+    again = list(touch(config, 3, 6.0, folder / "touches", ask=asked.append))
+    assert again == touched
+    assert asked == [2]
+
+
+def test_a_profile_tells_of_the_object_and_halves_the_error(profile: Path) -> None:
+    found = read_object(profile)
+    assert (found.object, found.touches) == ("stapler", 3)
+    assert found.after_n is not None
+    assert found.after_n < 0.7 * found.before_n
+    assert found.stiffness_n_m is not None
+    assert found.plant is not None
+    assert 0.7 < found.plant.gain < 1.4
+    config = load_config(None, QUICK)
+    seen_ms = config.sim.camera_latency_ms + 500 / config.camera.rate_hz
+    known_ms = seen_ms + config.vision.lockstep_compute_ms
+    assert -0.01 < found.plant.delay_ms - known_ms < 60  # the rest is how late the network itself is
+    assert 30 < found.plant.phase_margin_deg < 90
+    assert profile.with_suffix(".png").stat().st_size > 10_000
+
+
+def test_a_grasp_with_it_is_corrected_and_replays_to_the_bit(profile: Path, tmp_path: Path) -> None:
+    alone = grasp(run(tmp_path))
+    known = grasp(run(tmp_path, f"calibration.object={profile}"))
+    assert known["estimate_mae_n"]["visual"] < 0.7 * alone["estimate_mae_n"]["visual"]
+    log = Path(known["log"])
+    assert LogReader(log).metadata["profile"] == read_object(profile).weights
+    assert replay(log)["identical"]
+    other = replay(log, overrides=["calibration.object=null"])
+    assert not other["identical"]
+    assert "profile was" in other["note"]
+
+
+def test_its_plant_tunes_the_loop_and_gives_way_to_what_is_set(profile: Path) -> None:
+    plant = read_object(profile).plant
+    assert plant is not None
+    for keys, lag_ms in (([], plant.lag_ms), (["control.plant_lag_ms=77"], 77)):
+        config = load_config(None, [*QUICK, f"calibration.object={profile}", *keys])
+        with open_devices(config) as devices:
+            control = make_controller(config, devices)[0].control
+        assert control.plant == pytest.approx((plant.gain, lag_ms * 1e-3, plant.delay_ms * 1e-3))
+
+
+def test_more_than_was_pressed_with_is_refused(profile: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="more than the object profile"):
+        grasp(run(tmp_path, f"calibration.object={profile}", "target_n=8"))
+    assert not list(tmp_path.glob("*.mcap"))
+
+
+def test_another_exposure_is_refused_or_told_of(profile: Path, tmp_path: Path) -> None:
+    keys = [f"calibration.object={profile}", "camera.exposure_us=3000"]
+    with pytest.raises(ConfigError, match="exposure_us 4000, not 3000"):
+        grasp(run(tmp_path, *keys))
+    result = grasp(run(tmp_path, *keys, "calibration.on_mismatch=warn"))
+    told = [event.text for event in LogReader(Path(result["log"])).records(Event)]
+    assert any("exposure_us 4000, not 3000" in text for text in told)
+
+
+def test_half_a_profile_is_no_profile(profile: Path, tmp_path: Path) -> None:
+    copy = Path(shutil.copy(profile, tmp_path / "copy.yaml"))
+    with pytest.raises(ConfigError, match="lacks its other half"):
+        grasp(run(tmp_path, f"calibration.object={copy}"))
+    weights_path(copy).write_bytes(b"something else")
+    with pytest.raises(ConfigError, match="does not belong to"):
+        grasp(run(tmp_path, f"calibration.object={copy}"))
+
+
+def test_logs_of_two_cameras_are_refused(touched: list[Path], tmp_path: Path) -> None:
+    other = list(touch(load_config(None, [*QUICK, "camera.exposure_us=3000"]), 1, 6.0, tmp_path / "other"))
+    with pytest.raises(DataError, match="exposure_us 3000"):
+        calibrate(load_config(), "stapler", [*touched, *other], tmp_path / "p.yaml", lambda _: None)
+    assert not (tmp_path / "p.yaml").exists()
+
+
+def test_the_command_calibrates_from_logs(touched: list[Path], tmp_path: Path) -> None:
+    out = tmp_path / "new" / "it.yaml"
+    given = ["calibrate", "object", "stapler", "--from", str(touched[0].parent), "--out", str(out), "--json"]
+    result = CliRunner().invoke(app, given)
+    assert result.exit_code == 0, result.stderr
+    found = json.loads(result.stdout)
+    assert found["touches"] == 3
+    assert found["profile"] == str(out)
+    assert [row["touches"] for row in found["touches_needed"]] == [1, 2]
+
+
+def test_what_crushed_it_is_more_than_it_bears(
+    touched: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(job, "crushed_by", lambda _contact_m, _peak_n: 2)
+    found = calibrate(load_config(None, QUICK), "stapler", touched, tmp_path / "it.yaml", lambda _: None)
+    peaks_n = [max(sample.force_n for sample in LogReader(path).records(LoadCellSample)) for path in touched]
+    assert found["force_n"] == pytest.approx(max(peaks_n[:2]), abs=0.3)
+    assert found["crushed_at_n"] == pytest.approx(peaks_n[2], abs=0.3)
+    assert abs(peaks_n[2] - max(peaks_n[:2])) > 0.3
+
+
+class Terminal:
+    """Somebody who presses Enter so often, and then does something else."""
+
+    def __init__(self, often: int, then: Callable[[], str]) -> None:
+        self._left, self._then = often, then
+
+    def isatty(self) -> bool:
+        return True
+
+    def readline(self) -> str:
+        self._left -= 1
+        return "\n" if self._left >= 0 else self._then()
+
+
+def interrupt() -> str:
+    raise KeyboardInterrupt
+
+
+def by_hand(folder: Path, monkeypatch: pytest.MonkeyPatch, terminal: Terminal) -> Result:
+    monkeypatch.setattr(cli_calibrate, "sys", SimpleNamespace(stdin=terminal))
+    keys = [part for key in QUICK[1:] for part in ("--set", key)]
+    given = ["calibrate", "object", "stapler", "--touches", "3", "--peak-n", "6", "--pause", "--json", *keys]
+    return CliRunner().invoke(
+        app, [*given, "--folder", str(folder / "touches"), "--out", str(folder / "it.yaml")]
+    )
+
+
+def test_who_stops_early_gets_a_profile_of_what_there_is_and_may_go_on(
+    touched: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stopped = by_hand(tmp_path, monkeypatch, Terminal(2, interrupt))
+    assert json.loads(stopped.stdout)["touches"] == 2
+    assert "stopped after 2 of 3 touches" in stopped.stderr
+    assert "Put the object down for touch 3, then press Enter" in stopped.stderr
+    finished = by_hand(tmp_path, monkeypatch, Terminal(1, interrupt))
+    assert json.loads(finished.stdout)["touches"] == 3
+    assert "2 of 3 touches were there already" in " ".join(finished.stderr.split())
+
+
+def test_a_terminal_that_is_gone_is_no_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    result = by_hand(tmp_path, monkeypatch, Terminal(0, lambda: ""))
+    assert isinstance(result.exception, ConfigError)
+    assert "no answer came to this: Put the object down for touch 1" in str(result.exception)
+    assert not list(tmp_path.rglob("*.mcap"))
+
+
+def test_where_no_profile_can_be_written_nothing_is_fitted(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="can't write"):
+        calibrate(load_config(), "stapler", [], tmp_path / "file" / "p.yaml", lambda _: None)
+
+
+def test_no_logs_is_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="no log"):
+        calibrate(load_config(), "stapler", [], tmp_path / "p.yaml", lambda _: None)

@@ -1,0 +1,146 @@
+"""On the simulated rig, with a gauge between the jaws whose friction and torque are known."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from gripper_calibration.procedures.calibrate_servo import calibrate
+from gripper_force.cli import app
+from gripper_force.cli.output.calibrate import rig_table
+from gripper_force.config import Config, load_config
+from gripper_force.errors import ConfigError, DataError, DeviceError
+from gripper_force.profiles.rig_profile import Estimate, LoadCellCalibration, read_rig, update_rig
+from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.session import run_grasp
+from gripper_force.types import Event
+from gripper_hw.dynamixel.control_table import load_model
+from gripper_hw.dynamixel.virtual import VirtualBus, find_bus
+from gripper_hw.sim.scene import draw_scene
+
+QUICK = ["object=block", "sim.detail=coarse", "seed=7"]
+
+
+def config_of(*overrides: str) -> Config:
+    return load_config(None, [*QUICK, *overrides])
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("rig") / "rig.yaml"
+    asked: list[str] = []
+    result = calibrate(config_of(), [0.03], path, ask=asked.append)
+    assert asked == ["Put the load cell with its width of 30 mm between the open jaws"]
+    assert Path(result["report"]).stat().st_size > 20_000
+    assert (result["presses"], result["passes"]) == (6, 12)
+    return path
+
+
+def about(estimate: Estimate, truth: float, share: float) -> bool:
+    """Near the truth, and not claimed to be nearer by far than it is."""
+    return (
+        abs(estimate.value - truth) < min(share * truth, 2 * estimate.half) and estimate.half < share * truth
+    )
+
+
+def test_the_scenes_torque_and_friction_are_found(rig: Path) -> None:
+    found = read_rig(rig).servo
+    assert found is not None
+    config = config_of()
+    scene, radius_m = draw_scene("block", config.seed, config.sim), config.gripper.pinion_radius_m
+    friction_n = scene.servo_friction_nm / (2 * radius_m) + scene.jaw_friction_n
+    assert found.model == config.servo.model
+    assert about(found.nm_per_a, load_model(found.model).nm_per_a * scene.nm_per_a, 0.01)
+    assert about(found.friction_n, friction_n, 0.06)
+    assert about(found.damping_n_s_m, scene.servo_damping_nm_s / (2 * radius_m**2) + 2.0, 0.25)
+    assert found.open_position_rad.value == pytest.approx(scene.backlash_m / radius_m, abs=5e-4)
+    assert found.pinion_radius_m == Estimate(value=radius_m)
+    assert found.force_n[0] < 1
+    assert 9 < found.force_n[1] < 10
+    assert load_config(None, [f"calibration.rig={rig}"]).gripper.nm_per_a == found.nm_per_a.value
+
+
+def test_a_grasp_beyond_what_was_calibrated_is_refused(rig: Path, tmp_path: Path) -> None:
+    config = config_of(f"calibration.rig={rig}", "control.force_limit_n=20", "target_n=11")
+    with pytest.raises(ConfigError, match=r"target_n 11 N is more than the rig profile .* 9\.\d N"):
+        run_grasp(config, tmp_path / "run.mcap")
+
+
+def test_a_profile_of_another_servo_is_refused_or_told(rig: Path, tmp_path: Path) -> None:
+    another = (f"calibration.rig={rig}", "servo.model=XM430-W210", "camera.backend=none", "target_n=2")
+    path = tmp_path / "run.mcap"
+    with pytest.raises(ConfigError, match=r"is of a servo XM430-W350, and this one is XM430-W210"):
+        run_grasp(config_of(*another), path)
+    assert not path.exists()
+    run_grasp(config_of(*another, "calibration.on_mismatch=warn"), path)
+    said = [record.text for record in LogReader(path).records(Event) if "rig profile" in record.text]
+    assert len(said) == 1
+
+
+@pytest.mark.parametrize(
+    ("overrides", "gauge_m", "kind", "sentence"),
+    [
+        (["load_cell.backend=none"], 0.03, ConfigError, "calibrate servo needs a load cell"),
+        ([], 0.09, ConfigError, "a gauge of 90 mm does not fit between jaws that open to 92 mm"),
+        ([], 0.06, DataError, "a gauge of 60 mm was met where the jaws should be 30 mm apart"),
+        (["faults=[{unit: load_cell, kind: 'off'}]"], 0.03, DataError, "no valid sample at rest"),
+        (["faults=[{unit: load_cell, kind: wrong}]"], 0.03, DataError, "no valid sample at rest"),
+        (["gripper.closing_sign=-1"], 0.03, DataError, "the load cell felt nothing"),
+        (
+            ["faults=[{unit: load_cell, kind: stuck, at_s: 1}]"],
+            0.03,
+            DeviceError,
+            "no valid sample for 1 s in closing on the gauge",
+        ),
+        (["faults=[{unit: servo, kind: wrong, at_s: 3}]"], 0.03, DeviceError, "hardware error"),
+        (["servo.current_limit_a=0.15"], 0.03, DataError, "give .* N, where 9.* N were to come"),
+    ],
+)
+def test_what_fails_is_named_and_leaves_no_torque(
+    overrides: list[str], gauge_m: float, kind: type[Exception], sentence: str, tmp_path: Path
+) -> None:
+    buses: list[VirtualBus | None] = []
+
+    def progress(_step: str, _force_n: float) -> None:
+        buses.append(find_bus("rig"))
+
+    with pytest.raises(kind, match=sentence) as caught:
+        calibrate(
+            config_of(*overrides), [gauge_m], tmp_path / "rig.yaml", ask=lambda _: None, progress=progress
+        )
+    assert "\n" not in str(caught.value)
+    assert not list(tmp_path.iterdir())
+    assert all(bus is not None and bus.servos[0].get("torque_enable") == 0 for bus in buses)
+
+
+def test_a_person_reads_values_with_their_intervals(capsys: pytest.CaptureFixture[str]) -> None:
+    measured, given = {"value": 1.7, "low": 1.6, "high": 1.8}, {"value": 0.02, "low": None, "high": None}
+    rig_table({"nm_per_a": measured, "pinion_radius_m": given, "force_n": [0.3, 9.5]})
+    printed = capsys.readouterr().out
+    for told in ("1.7 (1.6 to 1.8)", "0.02 (given)", "0.3, 9.5"):
+        assert told in printed
+
+
+def test_a_scale_that_the_run_does_not_go_by_is_refused(tmp_path: Path) -> None:
+    rig = tmp_path / "rig.yaml"
+    cell = LoadCellCalibration(
+        date=datetime(2026, 1, 2, tzinfo=UTC),
+        sensor="simulated",
+        tare_raw=Estimate(value=0.0),
+        n_per_raw=Estimate(value=2.0, low=1.9, high=2.1),
+        force_n=(0.0, 10.0),
+        noise_n=0.01,
+        drift_n_min=Estimate(value=0.0),
+    )
+    update_rig(rig, cell)
+    with pytest.raises(ConfigError, match=r"to 2 N for one unit .*--set calibration\.rig="):
+        calibrate(config_of(), [0.03], rig, ask=lambda _: None)
+
+
+def test_without_a_terminal_nobody_is_asked(tmp_path: Path) -> None:
+    arguments: list[Any] = ["calibrate", "servo", "--gauge-mm", "30", "--rig", str(tmp_path / "rig.yaml")]
+    end = CliRunner().invoke(app, arguments)
+    assert isinstance(end.exception, ConfigError)
+    assert "nobody can be asked here to do this: Put the load cell" in str(end.exception)

@@ -1,0 +1,87 @@
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gripper_force.config import Config
+from gripper_force.jobs.doctor import Check
+from gripper_force.types import Frame
+from gripper_hw.cameras import camera_probe as probe
+from gripper_hw.cameras import oak, uvc
+
+QUICK = {"object": "stapler", "sim": {"detail": "coarse"}}
+REAL = {"clock": "realtime", "servo": {"port": "/dev/nowhere"}, "load_cell": {"backend": "none"}}
+
+
+def rows(config: dict[str, Any], sysfs: Path = Path("/sys")) -> dict[str, Check]:
+    checks = probe.probe(Config.model_validate(config), sysfs)
+    return {check.name: check for check in checks if check.name != "listed"}
+
+
+def test_a_simulated_camera_is_measured_in_its_own_time() -> None:
+    found = rows(QUICK | {"camera": {"rate_hz": 50.0}})
+    assert all(check.ok for check in found.values())
+    assert found["frames"].found.startswith("128x128 pixels, 0 of ")
+    assert found["rate"].found == "50.0 Hz of simulated, in simulated time; 50 Hz asked"
+    assert found["latency"].found == "median 15.0 ms from exposure to use"
+
+
+def test_frames_that_come_too_late_to_be_used_are_a_problem() -> None:
+    late = rows(QUICK | {"control": {"vision_timeout_ms": 10.0}})["latency"]
+    assert late.ok is False
+    assert "control.vision_timeout_ms=10" in late.advice
+
+
+def test_a_recording_has_the_rate_it_was_made_at(fused_log: Path) -> None:
+    found = rows(REAL | {"camera": {"backend": "playback", "path": str(fused_log), "rate_hz": 1000.0}})
+    assert found["rate"].ok is True
+    assert found["rate"].found.endswith(" Hz of playback")
+
+
+def test_a_camera_slower_than_asked_is_a_problem(
+    make_uvc: Callable[..., uvc.UvcCamera], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(uvc, "UvcCamera", lambda section, clock: make_uvc())
+    rate = rows(REAL | {"camera": {"backend": "uvc", "device": 0, "rate_hz": 1000.0}})["rate"]
+    assert rate.ok is False
+    assert "set camera.rate_hz to what it gives" in rate.advice
+
+
+def test_an_oak_tells_its_usb_speed(
+    make_oak: Callable[..., oak.OakCamera], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for name, vendor, speed in (("1-1", "03e7", 480), ("2-1", "03e7", 5000), ("3-1", "1d6b", 12)):
+        (tmp_path / "bus/usb/devices" / name).mkdir(parents=True)
+        (tmp_path / "bus/usb/devices" / name / "idVendor").write_text(f"{vendor}\n")
+        (tmp_path / "bus/usb/devices" / name / "speed").write_text(f"{speed}\n")
+    gray = np.random.default_rng(0).integers(0, 256, (800, 1280), np.uint8)
+    monkeypatch.setattr(oak, "OakCamera", lambda section, clock: make_oak(gray))
+    config = Config.model_validate(REAL | {"camera": {"backend": "oak", "rate_hz": 1.0}})
+    speeds = [check for check in probe.probe(config, tmp_path) if check.name == "USB"]
+    assert [(check.found, check.ok) for check in speeds] == [("480 Mb/s", True), ("5000 Mb/s", True)]
+    assert "USB 3 cable" in speeds[0].advice
+    assert not speeds[1].advice
+
+
+def test_a_camera_that_sees_nothing_is_a_problem() -> None:
+    frame = Frame(0, 1, 0, np.zeros((8, 8), np.uint8))
+    (check,) = probe._frame_checks(Config(), [frame])
+    assert (check.found, check.ok) == ("1 came", False)
+    assert check.advice
+
+
+def test_lost_frames_are_counted() -> None:
+    frames = [Frame(i * 10_000_000, i * 10_000_000, i, np.zeros((6, 8), np.uint8)) for i in (0, 1, 4)]
+    check = next(iter(probe._frame_checks(Config(), frames)))
+    assert check.found == "8x6 pixels, 2 of 5 lost"
+
+
+def test_what_is_there_is_listed_and_nothing_is_missed(tmp_path: Path) -> None:
+    node = tmp_path / "class/video4linux/video2"
+    node.mkdir(parents=True)
+    (node / "name").write_text("HD Webcam\n")
+    checks = list(probe.probe(Config.model_validate({"camera": {"backend": "none"}}), tmp_path))
+    assert {check.ok for check in checks} == {None}
+    assert "/dev/video2: HD Webcam" in [check.found for check in checks]

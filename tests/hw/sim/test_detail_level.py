@@ -1,0 +1,81 @@
+from typing import get_args
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gripper_force.config import BudgetConfig, load_config
+from gripper_force.errors import ConfigError
+from gripper_hw.sim import detail_level as detail
+from gripper_hw.sim.detail_level import choose, settled
+from gripper_hw.sim.objects import OBJECTS, Detail
+from gripper_hw.sim.simulated_rig import SimulatedRig
+
+figures = st.floats(0.001, 1000)
+tables = st.dictionaries(
+    st.sampled_from(get_args(Detail)),
+    st.fixed_dictionaries({"error_n": figures, "speed": figures}),
+    min_size=1,
+)
+
+
+@given(tables, st.none() | figures, st.none() | figures)
+def test_what_is_taken_keeps_the_budget_and_nothing_faster_does(
+    levels: detail.Levels, error_n: float | None, speed: float | None
+) -> None:
+    fits = [
+        level["speed"]
+        for level in levels.values()
+        if (error_n is None or level["error_n"] <= error_n) and (speed is None or level["speed"] >= speed)
+    ]
+    budget = BudgetConfig(sim_error_n=error_n, sim_speed=speed)
+    if fits and (error_n, speed) != (None, None):
+        taken, why = choose(levels, budget, "tube")
+        assert levels[taken]["speed"] == max(fits)
+        assert why.startswith(f"took sim.detail={taken} ")
+    else:
+        with pytest.raises(ConfigError):
+            choose(levels, budget, "tube")
+
+
+@pytest.mark.parametrize("name", OBJECTS)
+def test_the_shipped_table_knows_every_object(name: str) -> None:
+    strict, loose = (
+        settled(load_config(None, [f"object={name}", "sim.detail=auto", f"budget.sim_error_n={error_n}"]))
+        for error_n in (1e-6, 10)
+    )
+    assert strict[0].sim.detail == "fine"
+    assert loose[0].sim.detail in ("coarse", "medium")
+
+
+def test_a_level_that_is_named_stays() -> None:
+    config = load_config(None, ["budget.sim_speed=1e6"])
+    assert settled(config) == (config, "")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "sentence"),
+    [
+        ([], "needs to know what for: set budget.sim_error_n or budget.sim_speed"),
+        (["object=brick", "budget.sim_speed=1"], "knows nothing of 'brick', but of sponge, paper_cup"),
+        (
+            ["object=tube", "budget.sim_error_n=0.1", "budget.sim_speed=4"],
+            r"no level of detail of a simulated tube keeps budget.sim_error_n=0.1 and budget.sim_speed=4; "
+            r"there are coarse: .* N off the finest at .* simulated s/s, medium: ",
+        ),
+    ],
+)
+def test_what_cannot_be_chosen_is_one_sentence(overrides: list[str], sentence: str) -> None:
+    with pytest.raises(ConfigError, match=sentence):
+        settled(load_config(None, ["sim.detail=auto", *overrides]))
+
+
+def test_the_rig_simulates_what_was_taken_and_says_why(quick: list[str]) -> None:
+    overrides = [*quick, "sim.detail=auto", "budget.sim_error_n=0.05"]
+    rig = SimulatedRig(load_config(None, overrides))
+    try:
+        assert rig.scene.detail == "medium"
+        assert "took sim.detail=medium" in rig.notes()["detail"]
+        assert "budget.sim_error_n=0.05" in rig.notes()["detail"]
+    finally:
+        rig.close()

@@ -1,0 +1,233 @@
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+
+from gripper_force.config import Config, load_config
+from gripper_force.errors import ConfigError, SimulationError
+from gripper_force.types import NS_PER_MS, NS_PER_S, Frame, LoadCellSample, ServoCommand, ServoState
+from gripper_hw.dynamixel.servo import DynamixelServo
+from gripper_hw.dynamixel.virtual import find_bus
+from gripper_hw.sim import simulated_rig as rig_module
+from gripper_hw.sim.simulated_rig import SimulatedRig, expose
+
+MakeRig = Callable[..., SimulatedRig]
+
+
+@pytest.fixture
+def make_rig(quick: list[str]) -> Iterator[MakeRig]:
+    rigs: list[SimulatedRig] = []
+
+    def make(*overrides: str) -> SimulatedRig:
+        config = load_config(None, [*quick, "camera.backend=simulated", *overrides])
+        rigs.append(SimulatedRig(config))
+        rigs[-1].config = config  # type: ignore[attr-defined]
+        return rigs[-1]
+
+    yield make
+    for rig in rigs:
+        rig.close()
+
+
+def servo_of(rig: SimulatedRig) -> DynamixelServo:
+    config: Config = rig.config  # type: ignore[attr-defined]
+    return DynamixelServo(config.servo, rig.clock.now_ns)
+
+
+def squeeze(rig: SimulatedRig) -> tuple[list[ServoState], list[Frame], list[LoadCellSample]]:
+    """Half a second of closing with 0.15 A."""
+    servo = servo_of(rig)
+    states, frames, samples = [servo.start()], [], []
+    rig.camera.start()
+    rig.load_cell.start()
+    for i in range(1, 101):
+        rig.clock.sleep_until_ns(i * 5 * NS_PER_MS)
+        states.append(servo.read())
+        servo.write(ServoCommand(0, 1.5, 0.15))
+        frame = rig.camera.newest()
+        frames += [frame] if frame is not None else []
+        samples += rig.load_cell.drain()
+    servo.stop(hold=False)
+    servo.close()
+    rig.close()
+    return states, frames, samples
+
+
+def test_a_seed_gives_one_world_to_the_bit_and_another_seed_another(make_rig: MakeRig) -> None:
+    first, again, other = (squeeze(make_rig(f"seed={seed}")) for seed in (5, 5, 6))
+    assert first[0] == again[0]
+    assert first[2] == again[2]
+    assert all((a.gray == b.gray).all() for a, b in zip(first[1], again[1], strict=True))
+    assert max(sample.force_n for sample in first[2]) > 1.0
+    assert first[0] != other[0]
+    assert [s.force_n for s in first[2]] != [s.force_n for s in other[2]]
+    assert (first[1][0].gray != other[1][0].gray).any()
+
+
+def test_a_moving_background_is_seen_and_touches_nothing(make_rig: MakeRig) -> None:
+    still, moving = (squeeze(make_rig(f"sim.moving_background={asked}")) for asked in ("false", "true"))
+    assert moving[0] == still[0]
+    assert moving[2] == still[2]
+    differs = np.array([a.gray != b.gray for a, b in zip(moving[1], still[1], strict=True)])  # (T, H, W)
+    assert differs.any((1, 2)).mean() > 0.3  # they pass out of sight as well
+    assert (differs[0] != differs[-1]).any()
+    assert differs.mean() < 0.5
+
+
+def test_a_changing_light_is_seen_and_touches_nothing(make_rig: MakeRig) -> None:
+    steady, changing = (squeeze(make_rig(f"sim.changing_light={asked}")) for asked in ("false", "true"))
+    assert changing[2] == steady[2]
+    linear = [[(f.gray / 255.0) ** 2.2 for f in frames] for frames in (changing[1], steady[1])]
+    light = [a.mean() / b.mean() for a, b in zip(*linear, strict=True)]
+    assert 0.65 < min(light) < max(light) < 1.35
+    assert max(light) - min(light) > 0.02
+
+
+@pytest.mark.parametrize("latency_ms", [0.0, 40.0])
+def test_a_frame_comes_after_the_cameras_latency(make_rig: MakeRig, latency_ms: float) -> None:
+    rig = make_rig(f"sim.camera_latency_ms={latency_ms}", "camera.rate_hz=100")
+    rig.camera.start()
+    frames = []
+    for t_ms in range(0, 200, 2):
+        rig.clock.sleep_until_ns(t_ms * NS_PER_MS)
+        if (frame := rig.camera.newest()) is not None:
+            assert frame.received_ns <= t_ms * NS_PER_MS < frame.received_ns + 3 * NS_PER_MS
+            frames.append(frame)
+    assert {f.received_ns - f.t_ns for f in frames} == {round(latency_ms * NS_PER_MS)}
+    assert [f.seq for f in frames] == list(range(len(frames)))
+    assert [f.t_ns for f in frames] == [10 * NS_PER_MS * (i + 1) for i in range(len(frames))]
+    assert frames[0].gray.shape == (128, 128)
+    assert frames[0].gray.dtype == np.uint8
+
+
+def test_who_asks_late_gets_the_newest_frame(make_rig: MakeRig) -> None:
+    rig = make_rig("camera.rate_hz=100")
+    rig.camera.start()
+    rig.clock.sleep_until_ns(200 * NS_PER_MS)
+    frame = rig.camera.newest()
+    assert frame is not None
+    assert frame.seq == 17  # taken at 180 ms, and here at 195 ms
+    assert rig.camera.newest() is None
+
+
+@pytest.mark.parametrize("rate_hz", [80, 200])
+def test_the_load_cell_samples_at_its_rate_with_its_noise(make_rig: MakeRig, rate_hz: int) -> None:
+    rig = make_rig(f"load_cell.rate_hz={rate_hz}")
+    rig.load_cell.start()
+    rig.load_cell.start()  # a second start is none
+    rig.clock.sleep_until_ns(NS_PER_S)
+    samples = rig.load_cell.drain()
+    assert len(samples) == rate_hz
+    assert rig.load_cell.drain() == []
+    forces_n = [sample.force_n for sample in samples]
+    assert abs(np.mean(forces_n)) < 0.005
+    assert 0.007 < np.std(forces_n) < 0.013
+
+
+def test_the_notes_hold_the_scene_and_the_exposure(make_rig: MakeRig) -> None:
+    rig = make_rig("sim.exposure_ms=7")
+    notes = rig.notes()
+    assert json.loads(notes["scene"]) == json.loads(json.dumps(asdict(rig.scene)))
+    assert notes["exposure_ms"] == "7.0"
+
+
+def first_gray(rig: SimulatedRig) -> np.ndarray:
+    rig.camera.start()
+    rig.clock.sleep_until_ns(100 * NS_PER_MS)
+    frame = rig.camera.newest()
+    assert frame is not None
+    rig.close()
+    return frame.gray
+
+
+def test_a_longer_exposure_is_brighter_up_to_what_the_camera_can_say(make_rig: MakeRig) -> None:
+    grays = {us: first_gray(make_rig(f"camera.exposure_us={us}")) for us in ("null", 2000, 4000, 400_000)}
+    assert (grays["null"] == grays[4000]).all()
+    ratio = np.median(grays[4000] / np.maximum(grays[2000], 1.0))
+    assert ratio == pytest.approx(2 ** (1 / 2.2), rel=0.03)
+    assert np.mean(grays[400_000] == 255) > 0.5
+    assert make_rig("camera.exposure_us=6000").notes()["exposure_ms"] == "6.0"
+
+
+def test_the_servos_watchdog_counts_simulated_time(make_rig: MakeRig) -> None:
+    rig = make_rig()
+    servo = servo_of(rig)
+    servo.start()
+    time.sleep(0.06)
+    servo.read()
+    rig.clock.sleep_until_ns(60 * NS_PER_MS)
+    bus = find_bus("rig")
+    assert bus is not None
+    assert bus.servos[0].tripped
+    servo.close()
+
+
+def test_a_port_that_is_real_is_refused(quick: list[str]) -> None:
+    with pytest.raises(ConfigError, match=r"'/dev/ttyUSB0' is no virtual port"):
+        SimulatedRig(load_config(None, [*quick, "servo.port=/dev/ttyUSB0"]))
+
+
+def test_an_unknown_object_is_named_and_leaves_no_bus(quick: list[str]) -> None:
+    with pytest.raises(ConfigError, match="no simulated object 'egg'; there are sponge"):
+        SimulatedRig(load_config(None, [*quick, "object=egg"]))
+    assert find_bus("rig") is None
+
+
+def test_a_closed_rig_leaves_nothing_behind(make_rig: MakeRig) -> None:
+    rig = make_rig("clock=realtime")
+    rig.start()
+    rig.start()
+    assert "simulated-rig" in {thread.name for thread in threading.enumerate()}
+    rig.close()
+    rig.close()
+    assert find_bus("rig") is None
+    assert "simulated-rig" not in {thread.name for thread in threading.enumerate()}
+
+
+def broken_after(make_rig: MakeRig, patch: Callable[[SimulatedRig], None]) -> BaseException:
+    """What `check` raises of a rig in real time that was tampered with."""
+    rig = make_rig("clock=realtime")
+    patch(rig)
+    rig.start()
+    until_s = time.monotonic() + 20
+    with pytest.raises(Exception) as caught:  # noqa: PT012 - polled
+        while time.monotonic() < until_s:
+            rig.check()
+            time.sleep(0.005)
+    return caught.value
+
+
+def test_a_machine_that_is_too_slow_is_told_so(make_rig: MakeRig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rig_module, "_REALTIME_MAX_LAG_NS", -1)
+    error = broken_after(make_rig, lambda _: None)
+    assert isinstance(error, SimulationError)
+    assert "can't simulate 'stapler' (coarse) in real time" in str(error)
+
+
+def test_whatever_breaks_the_worlds_thread_is_told_by_check(
+    make_rig: MakeRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise MemoryError("no more")
+
+    error = broken_after(make_rig, lambda rig: monkeypatch.setattr(rig.load_cell._world, "advance_to", fail))
+    assert isinstance(error, MemoryError)
+
+
+def test_more_light_is_brighter_and_more_noise_rougher() -> None:
+    picture = np.full((64, 64, 3), 128, np.uint8)
+
+    def grays(lux: float, noise: float) -> np.ndarray:
+        return expose(picture, lux, noise, np.random.default_rng(0)).astype(float)
+
+    assert grays(550, 0.0).shape == (32, 32)
+    means = [grays(lux, 0.0).mean() for lux in (350, 550, 750)]
+    assert means == sorted(means)
+    assert means[2] / means[0] == pytest.approx((750 / 350) ** (1 / 2.2), rel=0.02)
+    assert np.diff(grays(550, 0.03)).std() > 2 * np.diff(grays(550, 0.0)).std()
+    assert grays(550, 0.0)[16, 16] > 1.02 * grays(550, 0.0)[0, 0]  # the lens darkens the corners
+    assert grays(1e6, 0.0).max() == 255

@@ -1,0 +1,46 @@
+import os
+import subprocess
+import sys
+
+import pytest
+
+from gripper_force.config import Config
+from gripper_force.jobs.doctor import Check
+from gripper_hw.sim.simulation_probe import probe
+from gripper_hw.sim.world import World
+
+
+def test_a_scene_is_drawn() -> None:
+    (check,) = probe(Config.model_validate({"object": "stapler", "sim": {"detail": "coarse"}}))
+    assert (check.unit, check.name, check.ok) == ("simulation", "EGL", True)
+    assert check.found.startswith("draws 16x16 pixels of 'stapler'")
+
+
+def test_each_picture_that_is_timed_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    times_ns = []
+    render = World.render
+
+    def counted(world: World, side: int) -> object:
+        times_ns.append(world.t_ns)
+        return render(world, side)
+
+    monkeypatch.setattr(World, "render", counted)
+    list(probe(Config.model_validate({"object": "stapler", "sim": {"detail": "coarse"}})))
+    assert len(set(times_ns)) == len(times_ns) > 3
+
+
+def test_without_egl_it_says_what_to_install() -> None:
+    code = (
+        "from gripper_force import config, doctor\n"
+        "doctor.PROBES = {'simulation': 'gripper_hw.sim.simulation_probe'}\n"
+        "print(next(doctor.doctor(config.Config())))"
+    )
+    env = {**os.environ, "__EGL_VENDOR_LIBRARY_FILENAMES": "/nonexistent"}
+    done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True)
+    assert "ok=False" in done.stdout
+    assert "advice='on Debian or Ubuntu: apt-get install libegl1" in done.stdout
+
+
+def test_it_is_not_asked_where_no_camera_is_simulated() -> None:
+    config = Config.model_validate({"camera": {"backend": "none"}})
+    assert list(probe(config)) == [Check("simulation", "EGL", "not needed: no camera is simulated", None)]

@@ -1,0 +1,126 @@
+import errno
+from datetime import date
+from pathlib import Path
+
+import pytest
+
+from gripper_force.config import load_config
+from gripper_force.errors import ConfigError
+from gripper_force.profiles.object_profile import (
+    Interval,
+    LoopPlant,
+    ObjectProfile,
+    OutputCurve,
+    check_place,
+    find_object,
+    read_object,
+    user_folder,
+    weights_path,
+    write_object,
+)
+
+
+def profile(**keys: object) -> ObjectProfile:
+    found = ObjectProfile(
+        object="mug",
+        date=date(2026, 1, 2),
+        checkpoint="a" * 64,
+        camera=load_config().camera_settings(),
+        touches=4,
+        frames=400,
+        force_n=7.5,
+        output=OutputCurve(kind="affine", estimate_n=(0.0, 8.0), force_n=(0.1, 6.5)),
+        interval=Interval(coverage=0.9, base_n=0.1, share=0.03),
+        gate=0.02,
+        plant=LoopPlant(
+            gain=0.9, lag_ms=30, delay_ms=40, proportional=0.4, integral_s=14, phase_margin_deg=61
+        ),
+        before_n=0.5,
+        after_n=0.06,
+        weights="b" * 64,
+    )
+    return found.model_copy(update=keys)
+
+
+def test_comes_back_as_it_was_written(tmp_path: Path) -> None:
+    write_object(tmp_path / "mug.yaml", profile(), b"weights")
+    assert weights_path(tmp_path / "mug.yaml").read_bytes() == b"weights"
+    assert read_object(tmp_path / "mug.yaml") == profile()
+
+
+def test_a_disk_that_is_full_leaves_both_halves_of_the_old_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "mug.yaml"
+    write_object(path, profile(), b"old")
+    real = Path.write_bytes
+
+    def full(file: Path, data: bytes) -> int:
+        if file.name.startswith(".mug.yaml"):
+            raise OSError(errno.ENOSPC, "No space left on device", str(file))
+        return real(file, data)
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(ConfigError, match=r"can't write .*mug\.yaml.*: No space left"):
+        write_object(path, profile(touches=9), b"new")
+    assert weights_path(path).read_bytes() == b"old"
+    assert read_object(path).touches == 4
+
+
+def test_a_place_where_nothing_can_be_written_is_told_at_once(tmp_path: Path) -> None:
+    check_place(tmp_path / "new" / "mug.yaml")
+    assert list((tmp_path / "new").iterdir()) == []
+    with pytest.raises(ConfigError, match=r"ends in \.yaml"):
+        check_place(tmp_path / "mug")
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="can't write"):
+        check_place(tmp_path / "file" / "mug.yaml")
+
+
+def test_ones_own_come_before_those_that_are_shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    with pytest.raises(ConfigError, match="no object profile 'mug'"):
+        find_object("mug")
+    write_object(user_folder() / "mug.yaml", profile(), b"")
+    assert find_object("mug") == tmp_path / "gripper-force" / "objects" / "mug.yaml"
+    with pytest.raises(ConfigError, match=r"there are .*mug"):
+        find_object("cup_of_another")
+    assert find_object("some/where.yaml") == Path("some/where.yaml")
+
+
+def test_names_what_differs() -> None:
+    settings = load_config(None, ["camera.rate_hz=30"]).camera_settings()
+    assert profile().mismatches("a" * 64, load_config().camera_settings()) == []
+    assert profile().mismatches("c" * 64, settings) == [
+        "network aaaaaaaaaaaa, not cccccccccccc",
+        "camera.rate_hz 60.0, not 30.0",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("format: gripper-force-rig/1", "no object profile of format"),
+        ("[1, 2]", "mapping"),
+        ("format: gripper-force-object/1", "Field required"),
+    ],
+)
+def test_what_is_no_profile_is_named(tmp_path: Path, text: str, sentence: str) -> None:
+    (tmp_path / "x.yaml").write_text(text)
+    with pytest.raises(ConfigError, match=sentence):
+        read_object(tmp_path / "x.yaml")
+
+
+@pytest.mark.parametrize(
+    ("estimate_n", "force_n", "sentence"),
+    [
+        ((0.0, 1.0), (0.0, 1.0, 2.0), "one length"),
+        ((0.0, 0.0), (0.0, 1.0), "must rise"),
+        ((0.0, 1.0), (1.0, 0.0), "must not fall"),
+    ],
+)
+def test_a_curve_that_falls_is_refused(
+    estimate_n: tuple[float, ...], force_n: tuple[float, ...], sentence: str
+) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        OutputCurve(kind="monotone", estimate_n=estimate_n, force_n=force_n)

@@ -1,0 +1,98 @@
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from gripper_force.config import load_config
+from gripper_force.errors import ConfigError
+from gripper_force.profiles.rig_profile import (
+    Estimate,
+    LoadCellCalibration,
+    RigProfile,
+    ServoCalibration,
+    read_rig,
+    update_rig,
+)
+
+NOW = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
+CELL = LoadCellCalibration(
+    date=NOW,
+    sensor="serial hx711",
+    tare_raw=Estimate(value=8000, low=7990, high=8010),
+    n_per_raw=Estimate(value=1e-4, low=0.99e-4, high=1.01e-4),
+    force_n=(0, 19.6),
+    noise_n=0.01,
+    drift_n_min=Estimate(value=0.0, low=-0.01, high=0.01),
+)
+SERVO = ServoCalibration(
+    date=NOW,
+    model="XM430-W350",
+    nm_per_a=Estimate(value=1.7, low=1.69, high=1.71),
+    friction_n=Estimate(value=0.9, low=0.8, high=1.0),
+    damping_n_s_m=Estimate(value=14, low=13, high=15),
+    pinion_radius_m=Estimate(value=0.02),
+    open_position_rad=Estimate(value=0.01, low=0.0, high=0.02),
+    open_width_m=0.09,
+    force_n=(1, 9),
+    speed_m_s=(0.01, 0.05),
+    residual_n=0.03,
+)
+
+
+def test_only_the_section_that_was_calibrated_is_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "rigs" / "rig.yaml"
+    update_rig(path, CELL)
+    update_rig(path, SERVO)
+    newer = SERVO.model_copy(update={"force_n": (2, 8)})
+    assert update_rig(path, newer) == RigProfile(load_cell=CELL, servo=newer) == read_rig(path)
+    assert [file.name for file in path.parent.iterdir()] == ["rig.yaml"]
+
+
+def test_what_it_sets_are_keys_of_the_configuration(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    update_rig(path, CELL)
+    update_rig(path, SERVO)
+    config = load_config(None, [f"calibration.rig={path}"])
+    assert (config.gripper.nm_per_a, config.gripper.open_width_m) == (1.7, 0.09)
+    assert config.load_cell.tare_raw == 8000
+    assert config.gripper.friction_std == pytest.approx(0.1, abs=0.05)
+    assert config.gripper.gain_std == 0.02
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("{}", "is no rig profile of format gripper-force-rig/1, it says None"),
+        ("format: gripper-force-rig/2", "it says 'gripper-force-rig/2'"),
+        (
+            "format: gripper-force-rig/1\nsevro: {}",
+            "unknown rig profile key 'sevro'.*load_cell, servo, camera",
+        ),
+        (
+            "format: gripper-force-rig/1\nservo: {}",
+            r"rig profile key 'servo.date' \(from .*\): Field required",
+        ),
+        ("format: [", "can't read the rig profile"),
+    ],
+)
+def test_a_file_that_is_none_is_refused_with_a_sentence(tmp_path: Path, text: str, sentence: str) -> None:
+    path = tmp_path / "rig.yaml"
+    path.write_text(text)
+    for use in (lambda: read_rig(path), lambda: update_rig(path, CELL)):
+        with pytest.raises(ConfigError, match=sentence) as caught:
+            use()
+        assert str(path) in str(caught.value)
+        assert "\n" not in str(caught.value)
+    assert path.read_text() == text
+
+
+def test_a_folder_that_can_not_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match=r"can't write .*rig\.yaml: File exists, .*file"):
+        update_rig(tmp_path / "file" / "rig.yaml", CELL)
+
+
+@pytest.mark.parametrize("bounds", [{"low": 2.0, "high": 3.0}, {"low": 0.0}, {"low": 0.0, "high": 0.5}])
+def test_an_interval_holds_its_value(bounds: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=r"low and high|must lie between"):
+        Estimate(value=1.0, **bounds)

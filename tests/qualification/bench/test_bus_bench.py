@@ -1,0 +1,33 @@
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+from gripper_force import cli
+from gripper_force.qualification.bench import bus_bench as bus
+from gripper_force.qualification.bench.bus_bench import bus_cost
+
+
+def test_the_bus_is_measured_and_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bus, "BUS_SETTINGS", ((4_000_000, 1.0),))
+    call = ["bench", "--bus", "--cycles", "2"]
+    assert "plain SDK" in CliRunner().invoke(cli.app, call).stdout
+    told = json.loads(CliRunner().invoke(cli.app, [*call, "--json"]).stdout)
+    assert [cost["client"] for cost in told["bus"]] == ["driver", "plain SDK", "bare bytes"]
+    assert {"load", "cores"} < set(told)
+
+
+def test_no_answer_comes_before_its_bytes_were_on_the_wire() -> None:
+    cycles, baud_rate, latency_ms = 4, 57_600, 5.0
+    ours, theirs, bare = bus_cost(baud_rate, latency_ms, cycles)
+    assert [c.client for c in (ours, theirs, bare)] == ["driver", "plain SDK", "bare bytes"]
+    for cost in (ours, theirs, bare):
+        assert (cost.baud_rate, cost.latency_ms) == (baud_rate, latency_ms)
+        assert latency_ms < cost.line_ms
+        assert cost.line_ms / 2 < cost.p50_ms <= cost.p99_ms  # the first cycle finds a free line
+        assert cost.cpu_share > 0
+    # A sync read of ten bytes and a sync write of four, for two servos: 16, 42 and 24 bytes. The last write
+    # may still be on its way when the bytes are counted.
+    a_byte_ms = 10_000 / baud_rate
+    assert (82 - 24 / cycles) * a_byte_ms <= theirs.line_ms - latency_ms + 1e-9
+    assert theirs.line_ms - latency_ms <= 82 * a_byte_ms + 1e-9

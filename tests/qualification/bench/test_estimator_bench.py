@@ -1,0 +1,110 @@
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gripper_force.jobs.dataset import Clip
+from gripper_force.qualification.bench import estimator_bench as estimator
+from gripper_force.qualification.bench.estimator_bench import (
+    PLAIN_WINDOW,
+    WINDOW,
+    EstimatorCost,
+    bench,
+    draw,
+    markdown,
+    ratios,
+    write_json,
+)
+from gripper_force.vision.header import Model
+
+ROW = EstimatorCost(
+    checkpoint="folder/force.safetensors",
+    members=2,
+    size=64,
+    engine="torch",
+    precision="float32",
+    threads=1,
+    p50_ms=4.0,
+    p99_ms=5.0,
+    frames_s=250.0,
+    least_ms=2.0,
+    memory_mb=300.0,
+    mae_n=0.2,
+    rmse_n=0.3,
+    worst_n=1.0,
+    frames=100,
+)
+PAPER = replace(ROW, engine=WINDOW, p50_ms=100.0, least_ms=None, memory_mb=None)
+PLAIN = replace(PAPER, engine=PLAIN_WINDOW, p50_ms=150.0)
+FAST = replace(ROW, engine="openvino", precision="bfloat16", p50_ms=1.0, mae_n=0.203)
+ROUGH = replace(ROW, engine="openvino", precision="int8", p50_ms=0.5, mae_n=0.25)
+
+
+def recordings(seed: int) -> list[Clip]:
+    rng = np.random.default_rng(seed)
+    return [
+        Clip(
+            name=f"{i}",
+            object="tube",
+            set=f"{i}",
+            frames=rng.integers(0, 256, (160, 32, 32), np.uint8),
+            forces_n=rng.uniform(0, 3, 160).astype(np.float32),
+            valid=np.ones(160, bool),
+            stiffness=1.0,
+        )
+        for i in range(2)
+    ]
+
+
+def test_measures_every_way(tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for package in ("openvino", "nncf"):
+        if find_spec(package) is None:
+            pytest.skip(f"{package} is not installed: pip install 'gripper-force[engines]'")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(estimator, "_ROUNDS", 4)
+    monkeypatch.setattr(estimator, "_STEPS", 2)
+    monkeypatch.setattr(estimator, "_ways", lambda: [("torch", "float32", "float32")])
+    told: list[str] = []
+
+    def scaling(model: Model) -> Sequence[Clip]:
+        return recordings(1)
+
+    rows = bench([str(tiny_checkpoint)], lambda model: recordings(0), scaling, [1], told.append)
+    assert [(row.engine, row.precision) for row in rows] == [
+        (WINDOW, "float32"),
+        (PLAIN_WINDOW, "float32"),
+        ("torch", "float32"),
+        ("openvino", "int8"),
+    ]
+    assert all(row.frames == 2 * 157 for row in rows)  # three of each are reference alone
+    assert rows[0].mae_n == rows[1].mae_n == rows[2].mae_n != rows[3].mae_n
+    assert all(row.p99_ms >= row.p50_ms > 0 for row in rows)
+    assert [row.memory_mb for row in rows[:2]] == [None, None]
+    assert all(row.memory_mb is not None and row.memory_mb > 30 for row in rows[2:])
+    assert any(row.front for row in rows)
+    assert told
+
+
+def test_ratios_are_to_the_window_and_keep_the_error() -> None:
+    told = ratios([PAPER, PLAIN, ROW, FAST, ROUGH])[ROW.checkpoint]
+    assert told["times_faster_than_window"] == 100
+    assert told["times_faster_than_plain_window"] == 150
+    assert told["fastest"] == "openvino, bfloat16, 1 threads"
+    assert told["mae_over_float32"] == pytest.approx(1.015)
+
+
+def test_the_page_the_file_and_the_plot_hold_every_row(tmp_path: Path) -> None:
+    rows = estimator._with_front([PAPER, ROW, FAST, ROUGH])
+    assert [row.front for row in rows] == [False, True, True, True]
+    lines = markdown(rows).splitlines()
+    assert len(lines) == 2 + 4
+    assert lines[-1].startswith("| force | 2, 64 | openvino | int8 | 1 | 0.50, 5.00 |")
+    write_json(tmp_path / "new" / "estimator.json", rows)
+    kept = json.loads((tmp_path / "new" / "estimator.json").read_text(encoding="utf-8"))
+    assert [row["p50_ms"] for row in kept["estimator"]] == [100.0, 4.0, 1.0, 0.5]
+    draw(tmp_path / "plot.png", rows)
+    assert (tmp_path / "plot.png").read_bytes().startswith(b"\x89PNG")

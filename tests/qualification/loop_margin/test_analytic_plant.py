@@ -1,0 +1,90 @@
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gripper_force.config import GripperConfig
+from gripper_force.qualification.loop_margin.analytic_plant import (
+    CURRENT_STEP_A,
+    Eye,
+    Gripper,
+    transmission_of,
+)
+from gripper_force.types import NS_PER_MS, NS_PER_S, ServoCommand
+
+RIG = transmission_of(GripperConfig())
+
+
+def press(gripper: Gripper, push_n: float, time_s: float = 3.0) -> Gripper:
+    """Lets the motor push with a constant force, far from its goal position."""
+    goal_rad = RIG.position_rad(0.0)
+    for _ in range(round(time_s / 0.005)):
+        gripper.advance(ServoCommand(0, goal_rad, RIG.current_a(push_n)), 0.005)
+    return gripper
+
+
+@given(
+    stiffness_n_m=st.floats(3e2, 1e6),
+    push_n=st.floats(3.0, 8.0),
+    gain=st.floats(0.8, 1.2),
+    play_m=st.floats(0, 1e-3),
+)
+@settings(max_examples=15, deadline=None)
+def test_it_rests_where_push_spring_and_friction_balance(
+    stiffness_n_m: float, push_n: float, gain: float, play_m: float
+) -> None:
+    gripper = press(
+        Gripper(RIG, stiffness_n_m=stiffness_n_m, gain=gain, play_m=play_m, contact_m=0.005, step_a=0.0),
+        push_n,
+    )
+    assert abs(gripper.v_m_s) < 1e-6
+    assert abs(gripper.force_n - gain * push_n) <= gripper.friction_n + 1e-6
+    assert gripper.peak_n >= gripper.force_n
+
+
+def test_the_impact_is_that_of_a_mass_on_a_spring() -> None:
+    gripper = Gripper(RIG, stiffness_n_m=1e5, friction_n=0.0, damping_n_s_m=0.0, play_m=0.0, contact_m=0.001)
+    gripper.v_m_s = 0.025
+    press(gripper, 0.0, 0.2)
+    assert gripper.peak_n == pytest.approx(0.025 * math.sqrt(1.3e5), rel=0.02)
+
+
+def test_play_moves_the_jaw_late_and_the_object_holds_the_teeth_together() -> None:
+    gripper = press(Gripper(RIG, play_m=0.001, contact_m=0.005), 3.0)
+    assert gripper.jaw_m == pytest.approx(gripper.x_m - 0.001)
+    pressed_m = gripper.jaw_m
+    press(gripper, 0.8)
+    assert gripper.jaw_m == pytest.approx(gripper.x_m - 0.001)
+    assert gripper.jaw_m < pressed_m
+
+
+def test_the_goal_current_goes_in_steps() -> None:
+    coarse, fine = (Gripper(RIG, step_a=step_a, friction_n=0.0, contact_m=0.0) for step_a in (0.01, 0.0))
+    asked_a = 0.104
+    for gripper in (coarse, fine):
+        press(gripper, RIG.force_n(asked_a))
+    assert coarse.current_a == pytest.approx(0.10)
+    assert fine.current_a == pytest.approx(asked_a)
+
+
+def test_the_servo_speaks_in_its_own_steps() -> None:
+    gripper = Gripper(RIG, x_m=0.0123456, v_m_s=0.00777, current_a=0.0501)
+    servo = gripper.read(7, 0.0)
+    assert servo.t_ns == 7
+    assert servo.current_a / CURRENT_STEP_A == pytest.approx(round(0.0501 / CURRENT_STEP_A))
+    assert servo.position_rad == pytest.approx(0.0123456 / 0.02, abs=2 * math.pi / 4096)
+    assert servo.velocity_rad_s == pytest.approx(0.00777 / 0.02, abs=0.012)
+
+
+def test_vision_is_late_by_its_delay_and_keeps_the_newest() -> None:
+    eye = Eye(0.035, 0.0)
+    seen = {t_ms: eye.look(t_ms * NS_PER_MS, float(t_ms), 0.0) for t_ms in range(0, 200, 5)}
+    first = next(visual for visual in seen.values() if visual is not None)
+    assert (first.t_ns, first.ready_ns, first.force_n) == (0, 35 * NS_PER_MS, 0.0)
+    frames = [visual for visual in seen.values() if visual is not None]
+    assert len(frames) == pytest.approx(0.165 * 60, abs=1)
+    assert all(visual.force_n == visual.t_ns / NS_PER_MS for visual in frames)
+    late = eye.look(NS_PER_S, 0.0, 0.0)
+    assert late is not None
+    assert late.seq == frames[-1].seq + 2

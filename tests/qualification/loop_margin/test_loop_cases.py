@@ -1,0 +1,73 @@
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from gripper_force.config import Config
+from gripper_force.qualification.loop_margin.analytic_plant import CURRENT_STEP_A, Gripper, transmission_of
+from gripper_force.qualification.loop_margin.grid import Grid, Verdict
+from gripper_force.qualification.loop_margin.loop_cases import _Bounds, cases, crushing_n_m, grasp
+
+CONFIG = Config()
+TRUTH = Gripper(transmission_of(CONFIG.gripper), contact_m=0.008)
+SMALL = Grid(
+    stiffness_n_m=(1e3, 1e6),
+    delay_s=(0.05, 0.15),
+    factors=(1.0,),
+    margin_stiffness_n_m=(3e3, 3e4),
+    margin_delay_s=(0.01, 0.075),
+    tuned_delay_s=(0.075,),
+    sweep={
+        "stiffness_n_m": (1e3,),
+        "delay_s": (0.035,),
+        "gain": (0.9, 1.1),
+        "friction_n": (0.5, 1.0),
+        "play_m": (0.0,),
+        "step_a": (CURRENT_STEP_A,),
+    },
+)
+
+
+def verdict(truth: Gripper, delay_s: float = 0.035, **control: object) -> Verdict:
+    changed = CONFIG.model_copy(update={"control": CONFIG.control.model_copy(update=control)})
+    return grasp(changed, truth, delay_s, 0).verdict
+
+
+def test_every_case_of_a_small_grid_keeps_its_bound_and_maps_are_drawn(tmp_path: Path) -> None:
+    rows = list(cases(CONFIG, tmp_path / "maps", SMALL))
+    assert [row.case for row in rows if not row.ok] == []
+    assert len({row.case for row in rows}) == len(rows)
+    assert sorted(path.name for path in (tmp_path / "maps").iterdir()) == [
+        "loop-margins.png",
+        "loop-verdicts.png",
+    ]
+
+
+def test_a_grasp_holds_and_one_whose_frames_are_too_old_holds_on_current() -> None:
+    assert verdict(TRUTH) == Verdict.HOLDS
+    assert verdict(TRUTH, 0.15) == Verdict.CURRENT
+
+
+def test_eight_times_the_gain_rings_with_vision_late() -> None:
+    assert verdict(replace(TRUTH, stiffness_n_m=100.0), 0.08, plant_gain=1 / 8) == Verdict.RINGS
+
+
+def test_an_object_that_is_too_far_away_is_not_held() -> None:
+    assert verdict(replace(TRUTH, contact_m=0.2)) == Verdict.LOSES
+
+
+@pytest.mark.parametrize(("share", "crushed"), [(0.7, False), (1.4, True)])
+def test_the_first_touch_crushes_what_is_too_stiff(share: float, crushed: bool) -> None:
+    stiff = replace(TRUTH, stiffness_n_m=share * crushing_n_m(CONFIG.control, TRUTH))
+    assert (verdict(stiff) == Verdict.CRUSHES) is crushed
+
+
+@pytest.mark.parametrize(
+    ("current_a", "position_rad"),
+    [(-0.01, 0.1), (0.5, 0.1), (math.nan, 0.1), (0.1, math.inf), (0.1, -0.1), (0.1, 3.0)],
+)
+def test_commands_beyond_limits_are_seen(current_a: float, position_rad: float) -> None:
+    bounds = _Bounds(CONFIG, TRUTH)
+    assert bounds.keep(0.1, 0.1)
+    assert not bounds.keep(current_a, position_rad)

@@ -1,0 +1,120 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gripper_force.config import Config
+from gripper_force.jobs.dataset import Clip
+from gripper_force.qualification.numerics import network_cases as suite
+from gripper_force.qualification.numerics.reference import ROUNDING, WAYS, Exact, Twin, Way
+from gripper_force.qualification.numerics.suite import Row
+from gripper_force.vision import estimator
+from gripper_force.vision.engines import Engine, Floats, Step
+from gripper_force.vision.frame_checks import Plausibility
+from gripper_force.vision.model_files import read_model
+
+TORCH = WAYS[:1]
+OPENVINO = Way("openvino", "float32", ".xml")
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> None:
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="module")
+def grasp() -> Clip:
+    """A dark disc that grows on a background."""
+    rng = np.random.default_rng(0)
+    forces_n = np.linspace(-2, 6, 80).clip(0).astype(np.float32)
+    y, x = np.mgrid[:32, :32]
+    edge = 1 + 2 * forces_n[:, None, None] - np.hypot(y - 15.5, x - 15.5)
+    frames = np.where(edge > 0, 60, rng.integers(90, 160, (32, 32))) + rng.integers(0, 9, (80, 32, 32))
+    valid = np.ones(80, np.bool_)
+    return Clip(frames.astype(np.uint8), forces_n, valid, "grasp", "disc", "")
+
+
+@pytest.fixture
+def twin(tiny_checkpoint: Path, tmp_path: Path) -> Twin:
+    return Twin(read_model(tiny_checkpoint), tmp_path)
+
+
+def broken(rows: list[Row]) -> list[str]:
+    return [row.case for row in rows if not row.ok]
+
+
+def test_every_case_keeps_its_bound(tiny_checkpoint: Path) -> None:
+    """Of those that need no export."""
+    config = Config.model_validate({"vision": {"checkpoint": str(tiny_checkpoint)}})
+    rows = list(suite.cases(config, None, streamed=300, long=300, ways=TORCH))
+    assert broken(rows) == []
+    assert len({row.case for row in rows}) == len(rows)
+
+
+def test_an_engine_is_compared_with_float64(twin: Twin, grasp: Clip) -> None:
+    pytest.importorskip("openvino")
+    (row,) = suite._engines(twin, [OPENVINO], grasp, grasp)
+    assert row.ok
+    assert row.figure > 0
+    twin.networks[0].out.weight.mul_(1.0001)
+    (row,) = suite._engines(twin, [OPENVINO], grasp, grasp)
+    assert not row.ok
+
+
+def test_what_prepares_frames_is_compared_too(
+    twin: Twin, grasp: Clip, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(suite, "DIFFERENCE_GAIN", 2.01)
+    assert "a grasp" in broken(list(suite._frames(twin, grasp, Config())))
+
+
+def test_frames_that_nobody_refuses_are_found(
+    twin: Twin, grasp: Clip, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Plausibility, "check", lambda _self, _small: None)
+    assert "black, gray or white from the first" in broken(list(suite._frames(twin, grasp, Config())))
+
+
+def test_a_claim_that_does_not_grow_is_found(
+    grasp: Clip, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert suite._range(tmp_path, grasp, Config()).ok
+    monkeypatch.setattr(estimator, "RESIDUAL_HALF_N", 1e9)
+    assert not suite._range(tmp_path, grasp, Config()).ok
+
+
+def test_an_engine_that_takes_nan_in_is_found(
+    grasp: Clip, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert broken(list(suite._not_finite(tmp_path, TORCH, grasp))) == []
+
+    def step(self: Engine, frame: Floats) -> Step:
+        self._blank()
+        return self._run(frame)
+
+    monkeypatch.setattr(Engine, "step", step)
+    assert "frames of NaN and infinity" in broken(list(suite._not_finite(tmp_path, TORCH, grasp)))
+
+
+def test_a_stream_that_drifts_is_found(twin: Twin, grasp: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
+    pool = suite._inputs(twin, grasp)
+    drift_n, _, _, last = suite._stream(twin, WAYS[0], pool, 300)
+    bound_n = twin.bound_n(last, ROUNDING["float32"]).max()
+    assert drift_n <= bound_n
+    right = Engine.step
+    seen: dict[int, int] = {}
+
+    def step(self: Engine, frame: Floats) -> Step:
+        seen[id(self)] = seen.get(id(self), 0) + 1
+        made = right(self, frame)
+        return Step(made.forces_n * np.float32(1 + 1e-3 * seen[id(self)]), made.features, made.attention)
+
+    monkeypatch.setattr(Engine, "step", step)
+    assert suite._stream(twin, WAYS[0], pool, 300)[0] > bound_n
+
+
+def test_a_row_is_that_of_the_worst_member() -> None:
+    off_n: Exact = np.array([0.1, np.nan, 0.3])
+    assert not suite._row("case", "detail", off_n, np.ones(3)).ok
+    assert suite._row("case", "detail", off_n[[0, 2]], np.array([0.05, 1.0])).figure == 0.1

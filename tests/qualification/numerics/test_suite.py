@@ -1,0 +1,95 @@
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from gripper_force import cli
+from gripper_force.config import Config
+from gripper_force.errors import ConfigError
+from gripper_force.qualification.numerics import suite as numerics
+from gripper_force.qualification.numerics.suite import Row, markdown, run
+from gripper_force.runtime.backends import load
+
+PAGE = Path(__file__).parents[3] / "docs/stability.md"
+
+
+def good(_config: Config, _maps: Path | None) -> Iterator[Row]:
+    yield Row("even", "by hand", 1.25, 2.0, "N")
+
+
+def bad(_config: Config, maps: Path | None) -> Iterator[Row]:
+    if maps is not None:
+        maps.mkdir()
+        (maps / "bad.png").touch()
+    yield Row("odd", "by [hand]", math.nan, 2.0)
+
+
+@pytest.fixture(autouse=True)
+def parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(numerics, "PARTS", {name: f"{__name__}:{name}" for name in ("good", "bad")})
+    monkeypatch.setattr(numerics, "load", lambda path: globals()[path.partition(":")[2]])
+
+
+@pytest.mark.parametrize(("figure", "ok"), [(1.0, True), (1.1, False), (math.nan, False), (math.inf, False)])
+def test_a_figure_keeps_its_bound_or_breaks_it(figure: float, ok: bool) -> None:
+    assert Row("case", "detail", figure, 1.0).ok is ok
+
+
+def test_parts_come_in_the_order_of_the_page() -> None:
+    said: list[tuple[str, int]] = []
+    result = run(Config(), ["bad", "good"], advance=lambda note, done: said.append((note, done)))
+    assert list(result["parts"]) == ["good", "bad"]
+    assert said == [("good: even", 0), ("good", 1), ("bad: odd", 0), ("bad", 1)]
+    assert result["ok"] is False
+    assert run(Config(), ["good"])["ok"] is True
+
+
+def test_an_unknown_part_is_named() -> None:
+    with pytest.raises(ConfigError, match="no part 'goood'; there are good, bad"):
+        run(Config(), ["goood"])
+
+
+def test_the_table_says_which_case_is_broken() -> None:
+    table = markdown(run(Config(), [])["parts"]["good"])
+    assert table.splitlines()[-1] == "| even | by hand | 1.25 N | 2 N | ok |"
+    assert "| nan | 2 | **broken** |" in markdown(run(Config(), [])["parts"]["bad"])
+
+
+def test_the_command_writes_tables_and_maps_into_the_page(tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("# A\n<!-- good -->\n<!-- end of good -->\nB\n<!-- bad -->\n<!-- end of bad -->\n")
+    done = CliRunner().invoke(cli.app, ["stability", "--json", "--write", str(page)])
+    assert done.exit_code == 1
+    result = json.loads(done.stdout)
+    assert result["parts"]["good"][0]["figure"] == 1.25
+    assert result["parts"]["bad"][0]["figure"] is None
+    assert (tmp_path / "page/bad.png").exists()
+    text = page.read_text()
+    assert text.startswith("# A\n<!-- good -->\n\n| case |")
+    assert "| even | by hand |" in text
+
+
+def test_the_command_shows_a_person_each_case() -> None:
+    done = CliRunner().invoke(cli.app, ["stability", "--part", "good"])
+    assert done.exit_code == 0
+    assert "1.25 N" in done.stdout
+    shown = CliRunner().invoke(cli.app, ["stability", "--part", "bad"])
+    assert shown.exit_code == 1
+    assert "by [hand]" in shown.stdout
+
+
+def test_one_thing_at_a_time() -> None:
+    done = CliRunner().invoke(cli.app, ["stability", "--part", "good", "--fuzz", "3"])
+    assert isinstance(done.exception, ConfigError)
+
+
+def test_each_part_can_be_loaded_and_has_a_place_on_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    text = PAGE.read_text(encoding="utf-8")
+    for name, path in numerics.PARTS.items():
+        assert callable(load(path))
+        assert f"<!-- {name} -->" in text
+        assert f"<!-- end of {name} -->" in text

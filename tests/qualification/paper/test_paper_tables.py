@@ -1,0 +1,56 @@
+import pytest
+
+from gripper_force.qualification.paper import paper_tables as tables
+from gripper_force.qualification.paper.experiment import Test as Estimates
+from gripper_force.qualification.paper.paper_tables import COMPARISONS, Table
+
+
+@pytest.mark.parametrize("name", COMPARISONS)
+def test_a_comparison_has_the_papers_numbers_and_ours(name: str, estimates: Estimates) -> None:
+    table = tables.comparison(estimates, name)
+    first, *others = table.rows
+    assert first[:4] == ("baseline", "0.10313", "0.04051", "100 %")
+    assert first[5:] == ("0.400 ± 0.000", "100 %", None)
+    for row in others:
+        assert len(row) == len(table.columns)
+        if row[0] not in ("two plain networks", "ResNet, baseline"):
+            assert row[5].startswith("0.200")  # type: ignore[union-attr]
+            assert row[6:] == ("200 %", "0.008")
+
+
+def test_objects_have_a_row_for_each_model(estimates: Estimates) -> None:
+    table = tables.objects(estimates)
+    assert [row[:2] for row in table.rows[:3]] == [
+        ("sponge", "baseline"),
+        ("sponge", "single frame, ensemble"),
+        ("sponge", "proposed, ensemble"),
+    ]
+    assert table.rows[2][2:4] == ("0.01734", "122 %")
+    assert table.rows[2][4] == pytest.approx(0.2, abs=0.02)
+
+
+def test_claims_are_tested_by_set_and_by_seed(estimates: Estimates) -> None:
+    rows = {row[0]: row[1:] for row in tables.claims(estimates).rows}
+    less, sets, seeds, p = rows["the ensemble beats the baseline"]
+    assert (sets, seeds, p) == ("8 of 8", "3 of 3", "0.008")
+    assert less == "+50.0 %"
+
+
+def test_times_are_taken_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tables, "_RUNS", 1)
+    turns: list[str] = []
+    table = tables.times(turns.append)
+    assert [row[:3] for row in table.rows] == [
+        ("plain", "308", "1.00"),
+        ("ssam-1", "342", "1.11"),
+        ("scam-1", "338", "1.10"),
+    ]
+    assert table.rows[0][4] == table.rows[0][6] == "1.00"
+    assert len(turns) == 9
+
+
+def test_a_table_in_markdown() -> None:
+    table = Table("T", ("a", "b"), (("x", 0.12345), ("y", None), ("z", float("nan"))), "A note.")
+    assert (
+        table.markdown() == "**T**\n\n| a | b |\n|---|---|\n| x | 0.123 |\n| y | – |\n| z | – |\n\nA note.\n"
+    )
