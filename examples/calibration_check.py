@@ -80,7 +80,7 @@ def errors(kind: str, number: int, out: Path) -> list[dict[str, Any]]:
                     "after_n": float(error_n.mean()),
                     "within": float(within.mean()),
                     "half_width_n": float(fitted.interval.half_width_n(5.0)),
-                    "gated": float((fitted.arrays.strangeness(test.features) > fitted.gate).mean()),
+                    "gated": float((fitted.arrays.ood_score(test.features) > fitted.gate).mean()),
                 }
             )
     kept.write_text(json.dumps(rows))

@@ -126,7 +126,7 @@ class VisionConfig(Section):
         description="a path; default or small, which are shipped; or auto: the cheapest of these that keeps "
         "`budget`. What `gripper-force export` wrote is one too",
     )
-    engine: Literal["torch", "compiled", "openvino", "onnxruntime", "auto"] = Field(
+    engine: Literal["torch", "openvino", "onnxruntime", "auto"] = Field(
         "torch",
         description="what computes the network; auto: the fastest that is installed, with as many threads as "
         "serve it, measured once on each machine",

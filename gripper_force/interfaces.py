@@ -132,8 +132,8 @@ class Devices:
         start_ns: The run's start on its clock.
         check: Raises what broke in a thread of the devices' own, if anything did.
         notes: Facts about the devices that the log should hold (a scene's drawn parameters, a serial number).
-        relight: Makes a further camera that sees the same world under another light, given in lux, and that
-            camera's notes; None where no world is simulated.
+        render_under_light: Returns another camera of the same simulated world under another light, given in
+            lux, and that camera's notes; None without a simulated world.
     """
 
     clock: Clock
@@ -144,4 +144,4 @@ class Devices:
     start_ns: int
     check: Callable[[], None]
     notes: dict[str, str] = field(default_factory=dict)
-    relight: Callable[[float], tuple[Camera, dict[str, str]]] | None = None
+    render_under_light: Callable[[float], tuple[Camera, dict[str, str]]] | None = None

@@ -50,7 +50,7 @@ class RequestKind(StrEnum):
     STOP = "stop"
 
 
-class Source(StrEnum):
+class EstimateSource(StrEnum):
     """Which sensors a force estimate rests on."""
 
     FUSED = "fused"
@@ -162,7 +162,7 @@ class FusedForce:
         current_n: What the motor current alone says.
         bias_n: Correction of the current-derived force, held by the filter.
         friction_n: Coulomb friction of one jaw, as free travel told it.
-        source: Which sensors the estimate rests on (a `Source` value).
+        source: Which sensors the estimate rests on (a `EstimateSource` value).
     """
 
     t_ns: int

@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from gripper_calibration.fits.plant_fit import Press
+from gripper_calibration.fits.plant_fit import PressSeries
 from gripper_calibration.fits.touches import Floats, Touches
 from gripper_force.config import Config, config_from_text
 from gripper_force.control.transmission import Transmission
@@ -39,13 +39,13 @@ class Recorded:
 
     touches: Touches
     camera: dict[str, Any]
-    presses: list[Press]
+    presses: list[PressSeries]
     width_m: list[Floats]
     delay_s: float
     source: dict[str, Any]
 
     @property
-    def felt(self) -> bool:
+    def has_contact(self) -> bool:
         """Whether anything was touched."""
         return bool((self.touches.force_n > CONTACT_N).any())
 
@@ -143,7 +143,7 @@ def _frame_times(reader: LogReader) -> tuple[npt.NDArray[np.int64], float]:
     return table[:, 0], float(np.median(table[:, 1]))
 
 
-def _mechanics(reader: LogReader, config: Config) -> tuple[list[Press], list[Floats]]:
+def _mechanics(reader: LogReader, config: Config) -> tuple[list[PressSeries], list[Floats]]:
     """Ramps with their holds, and the distance between the jaws in each."""
     gripper = config.gripper
     if gripper.nm_per_a is None:
@@ -171,7 +171,9 @@ def _mechanics(reader: LogReader, config: Config) -> tuple[list[Press], list[Flo
     for begin, end in zip(edges[::2], edges[1::2], strict=True):
         part = states[begin:end]
         t_s = np.array([state.t_ns for state in part]) / NS_PER_S
-        push_n = np.array([transmission.force_n(state.current_a) for state in part])
+        motor_force_n = np.array([transmission.force_n(state.current_a) for state in part])
         widths_m.append(np.array([transmission.width_m(state.position_rad) for state in part]))
-        presses.append(Press(t_s, push_n - transmission.friction_n, np.interp(t_s, cell_s, cell_n)))
+        presses.append(
+            PressSeries(t_s, motor_force_n - transmission.friction_n, np.interp(t_s, cell_s, cell_n))
+        )
     return presses, widths_m

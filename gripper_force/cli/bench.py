@@ -184,8 +184,8 @@ def _startup() -> dict[str, Any]:
     from gripper_force.qualification.bench import startup_bench as job
 
     rows = []
-    with console.bar("starting", len(job.SCENES)) as advance:
-        for row in job.startup(job.SCENES):
+    with console.bar("starting", len(job.STARTUP_CASES)) as advance:
+        for row in job.startup(job.STARTUP_CASES):
             rows.append(row)
             advance(row.scene)
     return {"startup": rows}

@@ -118,7 +118,7 @@ def record(
 
     options = {"object": object_, "seed": seed, "sim.yaw_deg": degrees, "sim.lux": lux}
     settings = load_settings(config, set_, options)
-    plan = job.Plan(sets, touches, peak_n, degrees, lux)
+    plan = job.RecordingPlan(sets, touches, peak_n, degrees, lux)
     paths = plan.paths(settings, folder)
     with console.bar("recording", sets) as advance:
         if there := sum(path.exists() for path in paths):

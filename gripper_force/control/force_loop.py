@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 from gripper_force.config import ControlConfig
 from gripper_force.control.fusion import OBSERVER_LAG_S
-from gripper_force.control.trajectory import Profile
+from gripper_force.control.trajectory import TrapezoidalProfile
 from gripper_force.control.transmission import Transmission
 from gripper_force.control.tuning import Gains, Plant, phase_margin_deg, simc
-from gripper_force.types import FusedForce, Source
+from gripper_force.types import EstimateSource, FusedForce
 
 _RAMP_S = 0.4
 """Time in which the ramp gathers and loses its speed: longer than a quarter swing of the softest object."""
@@ -63,7 +63,7 @@ class ForceLoop:
         self._gains = self.margins["vision" if self._vision_alone else "hold"].gains
         self._transmission = transmission
         self._ramp_n_s = config.ramp_n_s
-        self._profile = Profile(_RAMP_S)
+        self._profile = TrapezoidalProfile(_RAMP_S)
         self._trim_n = 0.0
         self._rising = True
 
@@ -89,7 +89,7 @@ class ForceLoop:
         reference_n = self._profile.step(target_n, dt_s)
         error_n = 0.0
         # A push that rests keeps a force that rests; the current alone has no news of friction to act on.
-        if not ramping and estimate.source != Source.CURRENT:
+        if not ramping and estimate.source != EstimateSource.CURRENT:
             error_n = self._beyond_deadband(reference_n - estimate.force_n, tolerance_n(target_n))
             self._trim_n += self._gains.integral_s * error_n * dt_s
         elif ramping and not self._vision_alone:
@@ -99,8 +99,8 @@ class ForceLoop:
         room_n = 3 * self._transmission.bias_std_n(reference_n) + friction_n
         low_n, high_n = max(reference_n - room_n, 0.0), reference_n + room_n
         self._trim_n = min(max(self._trim_n, low_n - ahead_n), high_n - ahead_n)
-        push_n = ahead_n + self._trim_n + self._gains.proportional * error_n
-        return min(max(push_n, low_n), high_n)
+        motor_force_n = ahead_n + self._trim_n + self._gains.proportional * error_n
+        return min(max(motor_force_n, low_n), high_n)
 
     def _beyond_deadband(self, error_n: float, tolerance: float) -> float:
         onward_n = error_n if self._rising else -error_n

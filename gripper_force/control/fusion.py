@@ -10,7 +10,15 @@ from collections import deque
 
 from gripper_force.config import ControlConfig
 from gripper_force.control.transmission import Transmission
-from gripper_force.types import NS_PER_MS, NS_PER_S, Event, FusedForce, ServoState, Source, VisualForce
+from gripper_force.types import (
+    NS_PER_MS,
+    NS_PER_S,
+    EstimateSource,
+    Event,
+    FusedForce,
+    ServoState,
+    VisualForce,
+)
 
 _DRIFT_N2_S = 0.03**2
 """Growth of the bias' variance a second: friction wanders."""
@@ -70,26 +78,26 @@ class Fusion:
         self._transmission = transmission
         cycles = math.ceil(config.rate_hz * config.vision_age_ms / 1e3) + 2
         self._history: deque[tuple[int, float]] = deque(maxlen=cycles)  # to compare any accepted frame with
-        self._push_n = 0.0
+        self._motor_force_n = 0.0
         self._current_n = 0.0
         self._newest_seen_ns = -1
         self._used_ns: int | None = None
         self._visual_n = 0.0
         self._visual_std_n = 0.0
-        self._source = Source.CURRENT
+        self._source = EstimateSource.CURRENT
         self._refusal = "no estimate"
         self.restart()
 
     def restart(self) -> None:
         """Forgets the bias: a new grasp has its own."""
         self._difference_n = 0.0
-        self._odds = 0.0
+        self._variance_ratio = 0.0
         self._friction_n = self._transmission.friction_n
         self._friction_n2 = (self._transmission.friction_std * self._friction_n) ** 2
-        self._hidden_n2 = 0.0
-        self.loosen()
+        self._opening_variance_n2 = 0.0
+        self.reset_variance()
 
-    def loosen(self) -> None:
+    def reset_variance(self) -> None:
         """Doubts the bias: contact has stopped the jaws anywhere within the play of friction."""
         self._variance_n2 = self._prior_n2(self._current_n)
         self._rejected = 0
@@ -115,9 +123,9 @@ class Fusion:
         Returns:
             The estimate, and an event where vision drops out or comes back.
         """
-        self._hidden_n2 = self._friction_n**2 if opening else 0.0
+        self._opening_variance_n2 = self._friction_n**2 if opening else 0.0
         self._predict(servo, free)
-        self._variance_n2 = max(self._variance_n2, self._hidden_n2)
+        self._variance_n2 = max(self._variance_n2, self._opening_variance_n2)
         if visual is not None and visual.t_ns > self._newest_seen_ns and self._feedback != "current":
             self._newest_seen_ns = visual.t_ns
             self._refusal = self._update(t_ns, visual)
@@ -130,22 +138,28 @@ class Fusion:
     def _predict(self, servo: ServoState, free: bool) -> None:
         before_n = self._current_n
         moving_n = self._transmission.damping_n_s_m * self._transmission.closing_m_s(servo.velocity_rad_s)
-        push_n = self._transmission.force_n(servo.current_a) - moving_n
+        motor_force_n = self._transmission.force_n(servo.current_a) - moving_n
         dt_s = 0.0
         if self._history:
             dt_s = max(servo.t_ns - self._history[-1][0], 0) / NS_PER_S
-            self._push_n += (push_n - self._push_n) * dt_s / (dt_s + self._lag_s)
+            self._motor_force_n += (motor_force_n - self._motor_force_n) * dt_s / (dt_s + self._lag_s)
         else:
-            self._push_n = push_n
+            self._motor_force_n = motor_force_n
         if free:
             self._learn_friction()
         # Coulomb friction is a play: the contact force stays until the push leaves it by the friction.
         friction_n = self._friction_n
-        self._current_n = min(max(before_n, self._push_n - friction_n), self._push_n + friction_n)
+        self._current_n = min(
+            max(before_n, self._motor_force_n - friction_n), self._motor_force_n + friction_n
+        )
         if free:
             self._current_n = self._difference_n = 0.0
         # The further the push has gone back through the play, the less is known of when the jaws let go.
-        back = 0.0 if friction_n == 0 or free else 0.5 + (self._current_n - self._push_n) / (2 * friction_n)
+        back = (
+            0.0
+            if friction_n == 0 or free
+            else 0.5 + (self._current_n - self._motor_force_n) / (2 * friction_n)
+        )
         drift_n2 = (_DRIFT_N2_S + _LOOSE_N2_S * back) * dt_s
         # An unknown gain error g makes the bias g * force, so its variance follows the square of the force.
         gain_n2 = self._transmission.gain_std**2 * abs(self._current_n**2 - before_n**2)
@@ -154,8 +168,8 @@ class Fusion:
 
     def _learn_friction(self) -> None:
         gain = self._friction_n2 / (self._friction_n2 + _FREE_NOISE_N**2)
-        self._friction_n = max(self._friction_n + gain * (self._push_n - self._friction_n), 0.0)
-        self._friction_n2 = _both_n2(self._friction_n2, _FREE_NOISE_N**2)
+        self._friction_n = max(self._friction_n + gain * (self._motor_force_n - self._friction_n), 0.0)
+        self._friction_n2 = _combined_variance_n2(self._friction_n2, _FREE_NOISE_N**2)
 
     def _update(self, t_ns: int, visual: VisualForce) -> str:
         """Takes one estimate in. Returns why it was refused, or an empty text."""
@@ -180,13 +194,13 @@ class Fusion:
             self._variance_n2 = self._prior_n2(current_n)
         self._rejected = 0
         self._correct(innovation_n, _FRAME_NOISE_N**2)
-        self._odds = claimed_n2 / self._prior_n2(current_n)
+        self._variance_ratio = claimed_n2 / self._prior_n2(current_n)
         return ""
 
     def _correct(self, innovation_n: float, noise_n2: float) -> None:
         gain = self._variance_n2 / (self._variance_n2 + noise_n2)
         self._difference_n += gain * innovation_n
-        self._variance_n2 = _both_n2(self._variance_n2, noise_n2)
+        self._variance_n2 = _combined_variance_n2(self._variance_n2, noise_n2)
 
     def _current_at(self, t_ns: int) -> float:
         """Current-derived force at a past time, linear between cycles, held beyond both ends."""
@@ -202,25 +216,25 @@ class Fusion:
 
     def _prior_n2(self, force_n: float) -> float:
         gain_n2 = (self._transmission.gain_std * force_n) ** 2
-        return self._friction_n2 + _FREE_FLOOR_N**2 + gain_n2 + self._hidden_n2
+        return self._friction_n2 + _FREE_FLOOR_N**2 + gain_n2 + self._opening_variance_n2
 
     def _switch(self, t_ns: int) -> tuple[Event, ...]:
         fresh = self._used_ns is not None and t_ns - self._used_ns <= self._timeout_ns
-        source = Source(self._feedback) if fresh else Source.CURRENT
+        source = EstimateSource(self._feedback) if fresh else EstimateSource.CURRENT
         if source == self._source:
             return ()
         self._source = source
-        if source != Source.CURRENT:
+        if source != EstimateSource.CURRENT:
             return (Event(t_ns, "vision", f"vision counts; the force estimate is {source}"),)
         reason = f": {self._refusal}" if self._refusal else ": no new estimate"
         return (Event(t_ns, "vision", f"vision dropped out{reason}; on motor current alone"),)
 
     def _estimate(self, t_ns: int) -> FusedForce:
-        share = 1 / (1 + self._odds)
+        share = 1 / (1 + self._variance_ratio)
         bias_n = share * self._difference_n
         force_n = self._current_n + bias_n
-        std_n = math.sqrt(self._variance_n2 + self._odds * share * self._prior_n2(self._current_n))
-        if self._source == Source.VISION:
+        std_n = math.sqrt(self._variance_n2 + self._variance_ratio * share * self._prior_n2(self._current_n))
+        if self._source == EstimateSource.VISION:
             force_n, std_n = self._visual_n, max(self._visual_std_n, _VISION_FLOOR_N)
         force_n = max(force_n, 0.0)
         return FusedForce(
@@ -234,7 +248,7 @@ class Fusion:
         )
 
 
-def _both_n2(one_n2: float, other_n2: float) -> float:
+def _combined_variance_n2(one_n2: float, other_n2: float) -> float:
     """Variance of what two sources say together. One less the gain would lose it where one is far larger."""
     return one_n2 * other_n2 / (one_n2 + other_n2)
 

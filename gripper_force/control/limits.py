@@ -56,7 +56,7 @@ class Limits:
         command: ServoCommand,
         force_n: float,
         friction_n: float,
-        push_n: float,
+        motor_force_n: float,
         dt_s: float,
         *,
         may_rise: bool,
@@ -68,7 +68,7 @@ class Limits:
             command: What the controller wants.
             force_n: The estimated contact force.
             friction_n: What friction is known to take of the push.
-            push_n: The motor's present push, by its current.
+            motor_force_n: The motor's present push, by its current.
             dt_s: Time since the last command.
             may_rise: Whether the goal current may exceed the last one at all.
             opens: Whether the jaws are to open: then a force over its limit is no reason to push less.
@@ -79,7 +79,7 @@ class Limits:
         Raises:
             NonFiniteError: A number of the command, or the estimate, is not finite.
         """
-        self._refuse_non_finite(command, force_n, friction_n, push_n)
+        self._refuse_non_finite(command, force_n, friction_n, motor_force_n)
         ceiling_a = min(self.ceiling_a(friction_n), self._lowered_a)
         if not may_rise:
             ceiling_a = min(ceiling_a, self._last_a)
@@ -88,7 +88,7 @@ class Limits:
             if not self._over:
                 self._lowered_a = _OVER_FORCE_CEILING * self._last_a
             # Friction may hold the force up. A push that can't give the limit any more need not fall further.
-            eases = push_n > self._force_limit_n - friction_n
+            eases = motor_force_n > self._force_limit_n - friction_n
             ceiling_a = min(ceiling_a, (_OVER_FORCE_FACTOR if eases else 1.0) * self._last_a)
         self._over = over
         rise_a_s = self._rise_a_s / (1.0 if self._lowered_a == math.inf else _RISE_FACTOR)
@@ -120,13 +120,15 @@ class Limits:
         return given_a
 
     @staticmethod
-    def _refuse_non_finite(command: ServoCommand, force_n: float, friction_n: float, push_n: float) -> None:
+    def _refuse_non_finite(
+        command: ServoCommand, force_n: float, friction_n: float, motor_force_n: float
+    ) -> None:
         numbers = {
             "goal position": command.goal_position_rad,
             "goal current": command.goal_current_a,
             "force estimate": force_n,
             "friction estimate": friction_n,
-            "motor's push": push_n,
+            "motor's push": motor_force_n,
         }
         for name, number in numbers.items():
             if not math.isfinite(number):

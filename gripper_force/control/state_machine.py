@@ -8,10 +8,11 @@ from gripper_force.control.force_loop import ForceLoop, Margin, tolerance_n
 from gripper_force.control.fusion import Fusion
 from gripper_force.control.limits import Limits, largest_target_n
 from gripper_force.control.safety import Safety, is_sound
-from gripper_force.control.trajectory import Profile
+from gripper_force.control.trajectory import TrapezoidalProfile
 from gripper_force.control.transmission import Transmission
 from gripper_force.types import (
     NS_PER_S,
+    EstimateSource,
     Event,
     FusedForce,
     GraspStatus,
@@ -21,7 +22,6 @@ from gripper_force.types import (
     RequestKind,
     ServoCommand,
     ServoState,
-    Source,
     VisualForce,
 )
 
@@ -31,21 +31,21 @@ MAX_CYCLE_S = 0.05
 _IMPACT_M_S_PER_N = 0.010
 """Approach speed of one jaw for each newton wanted: on the stiffest object, impact stays below the target."""
 
-_TOUCH = 0.25
+_CONTACT_SHARE = 0.25
 """Share of the target that the jaws may press with before contact is known."""
 
 _SPEED_UP_S = 0.1
 """Time in which the jaws gather speed."""
 
-_CRUISE_N_S_M = 10.0
-_CRUISE_N_M = 40.0
+_SPEED_GAIN_N_S_M = 10.0
+_SPEED_INTEGRAL_N_M = 40.0
 """Speed loop of the approach: push for a speed that is missing, and for a way that is missing. With 1.3 kg of
 motor and jaw, half of the missing speed is there after 40 ms; and stalled jaws press 1 N/s more."""
 
 _LEAD_M = 0.004
 """In free travel one jaw's goal is no further ahead than this, so held jaws do not leap when let go."""
 
-_SQUEEZE_M = 0.010
+_GOAL_OFFSET_M = 0.010
 """How far inside the object each jaw's goal lies, so that the current limit alone sets the force."""
 
 _STALLED = 0.1
@@ -116,23 +116,23 @@ class GraspController:
         self._loop = ForceLoop(config, transmission)
         self._limits = Limits(config, transmission, current_limit_a)
         self._safety = Safety(config)
-        self._travel = Profile(_SPEED_UP_S)
+        self._travel = TrapezoidalProfile(_SPEED_UP_S)
         self._largest_target_n = largest_target_n(config.force_limit_n)
-        self._free_push_n = config.approach_force_n + transmission.friction_n
+        self._free_motor_force_n = config.approach_force_n + transmission.friction_n
         self._phase, self._outcome, self._reason = Phase.OPEN, Outcome.NONE, ""
         self._estimate = FusedForce(
-            0, 0.0, transmission.bias_std_n(0.0), 0.0, 0.0, transmission.friction_n, Source.CURRENT
+            0, 0.0, transmission.bias_std_n(0.0), 0.0, 0.0, transmission.friction_n, EstimateSource.CURRENT
         )
         self._t_ns: int | None = None
         self._width_m: float | None = None
         self._goal_width_m = transmission.open_width_m
-        self._push_n = self._free_push_n
+        self._motor_force_n = self._free_motor_force_n
         self._target_n = self._speed_m_s = self._held_width_m = 0.0
         self._grasp_ns = 0
         self._phase_s = self._sign_s = self._settled_s = 0.0
-        self._error_n = self._cruise_n = 0.0
+        self._error_n = self._speed_integral_n = 0.0
         self._has_moved = self._was_over = False
-        self._goal_current_a = self._motor_n = 0.0
+        self._goal_current_a = self._measured_motor_force_n = 0.0
         self._easing = 1.0
 
     @property
@@ -157,13 +157,13 @@ class GraspController:
         dt_s = self._elapsed_s(t_ns)
         self._reason = ""
         tripped = self._safety.check(servo, self._goal_current_a, dt_s, over_force=self._was_over)
-        events = self._sense(t_ns, servo, visual)
+        events = self._read_sensors(t_ns, servo, visual)
         if tripped:
             self._fail()
-        if request is not None and (refusal := self._obey(t_ns, request)):
+        if request is not None and (refusal := self._handle_request(t_ns, request)):
             events.append(Event(t_ns, "control", f"refused {str(request.kind)!r}: {refusal}"))
         if self._width_m is not None:
-            self._act(t_ns, dt_s, self._width_m, self._transmission.closing_m_s(servo.velocity_rad_s))
+            self._run_phase(t_ns, dt_s, self._width_m, self._transmission.closing_m_s(servo.velocity_rad_s))
         command, is_over = self._bound(t_ns, dt_s)
         self._goal_current_a = command.goal_current_a
         if is_over and not self._was_over:
@@ -178,7 +178,7 @@ class GraspController:
         self._t_ns = t_ns
         return min(max(t_ns - before_ns, 0) / NS_PER_S, MAX_CYCLE_S)
 
-    def _sense(self, t_ns: int, servo: ServoState, visual: VisualForce | None) -> list[Event]:
+    def _read_sensors(self, t_ns: int, servo: ServoState, visual: VisualForce | None) -> list[Event]:
         if not is_sound(servo):
             self._estimate = dataclasses.replace(self._estimate, t_ns=t_ns)
             return []
@@ -186,10 +186,10 @@ class GraspController:
         if self._width_m is None:  # nothing moves before the first request
             self._goal_width_m = width_m
         self._width_m = width_m
-        self._motor_n = self._transmission.force_n(servo.current_a)
+        self._measured_motor_force_n = self._transmission.force_n(servo.current_a)
         closing_m_s = self._transmission.closing_m_s(servo.velocity_rad_s)
-        free = self._cruises(closing_m_s)
-        self._estimate, fused = self._fusion.step(t_ns, servo, visual, free=free, opening=self._opens)
+        free = self._moves_freely(closing_m_s)
+        self._estimate, fused = self._fusion.step(t_ns, servo, visual, free=free, opening=self._is_opening)
         return [*fused, *self._ease(t_ns, servo.temperature_c)]
 
     def _ease(self, t_ns: int, temperature_c: float) -> list[Event]:
@@ -202,7 +202,7 @@ class GraspController:
             Event(t_ns, "control", f"the servo is at {temperature_c:.0f} C; holding {self._wanted_n:.2f} N")
         ]
 
-    def _obey(self, t_ns: int, request: Request) -> str:
+    def _handle_request(self, t_ns: int, request: Request) -> str:
         """Takes a request. Returns why it is refused, or an empty text."""
         if request.kind == RequestKind.STOP:
             if self._safety.trip("stop requested"):
@@ -227,7 +227,7 @@ class GraspController:
         self._phase, self._reason = phase, reason
         self._phase_s = self._sign_s = self._settled_s = 0.0
 
-    def _conclude(self, outcome: Outcome, reason: str) -> None:
+    def _set_outcome(self, outcome: Outcome, reason: str) -> None:
         self._outcome, self._reason = outcome, reason
 
     def _grasp(self, t_ns: int, target_n: float) -> None:
@@ -242,7 +242,7 @@ class GraspController:
         self._limits.begin()
         self._speed_m_s = min(self._config.approach_speed_m_s, _IMPACT_M_S_PER_N * target_n)
         self._has_moved = False
-        self._cruise_n = 0.0
+        self._speed_integral_n = 0.0
         self._enter(Phase.APPROACH, f"grasp with {target_n:g} N requested")
 
     def _release(self, reason: str) -> None:
@@ -257,16 +257,16 @@ class GraspController:
         elif self._phase not in _GRIPPING:
             self._goal_width_m = self._present_width_m
         if self._config.on_fault == "limp":
-            self._push_n = 0.0
+            self._motor_force_n = 0.0
         self._enter(Phase.FAULT, reason)
-        self._conclude(Outcome.FAULT, reason)
+        self._set_outcome(Outcome.FAULT, reason)
 
     @property
     def _opens_at_fault(self) -> bool:
         return self._phase == Phase.FAULT and self._config.on_fault == "open"
 
     @property
-    def _opens(self) -> bool:
+    def _is_opening(self) -> bool:
         return self._phase == Phase.RELEASE or self._opens_at_fault
 
     @property
@@ -274,8 +274,8 @@ class GraspController:
         return self._target_n * self._easing
 
     @property
-    def _touch_n(self) -> float:
-        return min(self._config.approach_force_n, _TOUCH * self._target_n)
+    def _contact_limit_n(self) -> float:
+        return min(self._config.approach_force_n, _CONTACT_SHARE * self._target_n)
 
     @property
     def _present_width_m(self) -> float:
@@ -283,7 +283,7 @@ class GraspController:
 
     # What goes on in a phase.
 
-    def _act(self, t_ns: int, dt_s: float, width_m: float, closing_m_s: float) -> None:
+    def _run_phase(self, t_ns: int, dt_s: float, width_m: float, closing_m_s: float) -> None:
         self._phase_s += dt_s
         match self._phase:
             case Phase.APPROACH:
@@ -300,7 +300,7 @@ class GraspController:
             case Phase.FAULT if self._opens_at_fault:
                 self._open(dt_s, width_m)
         if self._phase in _GRIPPING:
-            self._goal_width_m = max(width_m - 2 * _SQUEEZE_M, 0.0)
+            self._goal_width_m = max(width_m - 2 * _GOAL_OFFSET_M, 0.0)
         if self._phase in (Phase.APPROACH, *_GRIPPING) and self._outcome == Outcome.NONE:
             self._watch_time(t_ns)
 
@@ -308,29 +308,29 @@ class GraspController:
         # The goal position leads by so much that the goal current alone drives: a goal that stepped along
         # with the jaws would make the current ripple, and it is read at one phase of that ripple.
         self._goal_width_m = max(width_m - 2 * _LEAD_M, 0.0)
-        self._push_n = self._cruise_push_n(dt_s, closing_m_s)
+        self._motor_force_n = self._approach_motor_force_n(dt_s, closing_m_s)
         self._has_moved |= closing_m_s > _SLOWED * self._speed_m_s or self._phase_s > _START_UP_S
         if width_m < _CLOSED_M:
-            self._conclude(Outcome.NO_OBJECT, "closed without contact")
+            self._set_outcome(Outcome.NO_OBJECT, "closed without contact")
             self._release(self._reason)
-        elif self._lasts(self._touches(closing_m_s), _DEBOUNCE_S, dt_s):
-            self._fusion.loosen()
+        elif self._persists(self._touches(closing_m_s), _DEBOUNCE_S, dt_s):
+            self._fusion.reset_variance()
             self._enter(Phase.CONTACT, f"contact at {width_m * 1e3:.1f} mm")
 
-    def _cruise_push_n(self, dt_s: float, closing_m_s: float) -> float:
+    def _approach_motor_force_n(self, dt_s: float, closing_m_s: float) -> float:
         """A speed loop that presses on what it meets no harder than a touch."""
         wanted_m_s = self._speed_m_s * min(self._phase_s / _SPEED_UP_S, 1.0)
         missing_m_s = wanted_m_s - closing_m_s
         damping_n_s_m = self._transmission.damping_n_s_m
-        known_n = self._transmission.friction_n + damping_n_s_m * wanted_m_s + _CRUISE_N_S_M * missing_m_s
+        known_n = self._transmission.friction_n + damping_n_s_m * wanted_m_s + _SPEED_GAIN_N_S_M * missing_m_s
         # What the current takes for contact and vision does not is friction, too.
         friction_n = self._estimate.friction_n - self._estimate.bias_n + 2 * self._estimate.std_n
-        most_n = friction_n + self._touch_n + damping_n_s_m * max(closing_m_s, 0.0)
-        self._cruise_n += _CRUISE_N_M * missing_m_s * dt_s
-        self._cruise_n = min(max(self._cruise_n, -known_n), most_n - known_n)
-        return known_n + self._cruise_n
+        most_n = friction_n + self._contact_limit_n + damping_n_s_m * max(closing_m_s, 0.0)
+        self._speed_integral_n += _SPEED_INTEGRAL_N_M * missing_m_s * dt_s
+        self._speed_integral_n = min(max(self._speed_integral_n, -known_n), most_n - known_n)
+        return known_n + self._speed_integral_n
 
-    def _cruises(self, closing_m_s: float) -> bool:
+    def _moves_freely(self, closing_m_s: float) -> bool:
         """The jaws move freely at an even speed: all of the push is friction."""
         if self._phase != Phase.APPROACH or self._phase_s < _SPEED_UP_S + _EVEN_S:
             return False
@@ -339,32 +339,32 @@ class GraspController:
     def _touches(self, closing_m_s: float) -> bool:
         if not self._has_moved:
             return False
-        pressing = self._estimate.current_n + self._estimate.bias_n > 0.5 * self._touch_n
+        pressing = self._estimate.current_n + self._estimate.bias_n > 0.5 * self._contact_limit_n
         stalled = closing_m_s < _STALLED * self._speed_m_s
-        seen = self._estimate.source != Source.CURRENT and self._estimate.force_n > _SEEN_FORCE_N
+        seen = self._estimate.source != EstimateSource.CURRENT and self._estimate.force_n > _SEEN_FORCE_N
         return (stalled and pressing) or (seen and closing_m_s < _SLOWED * self._speed_m_s)
 
     def _ramp(self, dt_s: float, width_m: float) -> None:
-        self._push_n = self._loop.step(dt_s, self._wanted_n, self._estimate)
+        self._motor_force_n = self._loop.step(dt_s, self._wanted_n, self._estimate)
         if width_m < _CLOSED_M:
-            self._conclude(Outcome.NO_OBJECT, "closed while the force was to rise")
+            self._set_outcome(Outcome.NO_OBJECT, "closed while the force was to rise")
             self._release(self._reason)
         elif self._loop.reference_n == self._wanted_n:
             self._error_n = self._estimate.force_n - self._wanted_n
             self._enter(Phase.HOLD, f"at {self._wanted_n:g} N")
 
     def _hold(self, dt_s: float, width_m: float) -> None:
-        self._push_n = self._loop.step(dt_s, self._wanted_n, self._estimate)
+        self._motor_force_n = self._loop.step(dt_s, self._wanted_n, self._estimate)
         error_n = self._estimate.force_n - self._wanted_n
         self._error_n += (error_n - self._error_n) * dt_s / (dt_s + _SETTLE_FILTER_S)
         is_near = abs(self._error_n) <= tolerance_n(self._wanted_n)
         self._settled_s = self._settled_s + dt_s if is_near else 0.0
         if self._outcome == Outcome.NONE and self._settled_s >= self._config.settle_s:
             self._held_width_m = width_m
-            self._conclude(Outcome.HELD, f"{self._estimate.force_n:.2f} N for {self._settled_s:.2f} s")
-        collapsed = self._lasts(self._estimate.force_n < _COLLAPSED * self._wanted_n, _COLLAPSE_S, dt_s)
+            self._set_outcome(Outcome.HELD, f"{self._estimate.force_n:.2f} N for {self._settled_s:.2f} s")
+        collapsed = self._persists(self._estimate.force_n < _COLLAPSED * self._wanted_n, _COLLAPSE_S, dt_s)
         if self._outcome in (Outcome.NONE, Outcome.HELD) and (slip := self._slip(width_m, collapsed)):
-            self._conclude(Outcome.SLIP, slip)
+            self._set_outcome(Outcome.SLIP, slip)
 
     def _slip(self, width_m: float, collapsed: bool) -> str:
         if collapsed:
@@ -377,7 +377,7 @@ class GraspController:
         return ""
 
     def _open(self, dt_s: float, width_m: float) -> None:
-        self._push_n = self._free_push_n
+        self._motor_force_n = self._free_motor_force_n
         open_width_m = self._transmission.open_width_m
         self._goal_width_m = self._travel.step(open_width_m, dt_s)
         self._goal_width_m = self._travel.value = min(self._goal_width_m, width_m + 2 * _LEAD_M)
@@ -388,9 +388,9 @@ class GraspController:
 
     def _watch_time(self, t_ns: int) -> None:
         if t_ns - self._grasp_ns > self._config.timeout_s * NS_PER_S:
-            self._conclude(Outcome.TIMEOUT, f"not held within {self._config.timeout_s:g} s")
+            self._set_outcome(Outcome.TIMEOUT, f"not held within {self._config.timeout_s:g} s")
 
-    def _lasts(self, sign: bool, time_s: float, dt_s: float) -> bool:
+    def _persists(self, sign: bool, time_s: float, dt_s: float) -> bool:
         self._sign_s = self._sign_s + dt_s if sign else 0.0
         return self._sign_s >= time_s
 
@@ -400,12 +400,18 @@ class GraspController:
         wanted = ServoCommand(
             t_ns,
             self._transmission.position_rad(self._goal_width_m),
-            abs(self._transmission.current_a(self._push_n)),
+            abs(self._transmission.current_a(self._motor_force_n)),
         )
         may_rise = self._phase != Phase.FAULT or self._opens_at_fault
         force_n, friction_n = self._estimate.force_n, self._estimate.friction_n
         return self._limits.apply(
-            wanted, force_n, friction_n, self._motor_n, dt_s, may_rise=may_rise, opens=self._opens
+            wanted,
+            force_n,
+            friction_n,
+            self._measured_motor_force_n,
+            dt_s,
+            may_rise=may_rise,
+            opens=self._is_opening,
         )
 
     def _status(self, t_ns: int) -> GraspStatus:

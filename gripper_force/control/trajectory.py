@@ -3,7 +3,7 @@
 import math
 
 
-class Profile:
+class TrapezoidalProfile:
     """Moves a value to a target with bounded speed and acceleration, and arrives without overshoot.
 
     Jaws, rack and object are a mass on a spring: a step in the speed of what they follow makes them ring.

@@ -181,7 +181,7 @@ def label_frames(
 
 def load_clip(path: Path, preprocess: "Preprocess", region: "Region | None") -> Clip:
     """Reads one log; see `load_clips`."""
-    from gripper_force.vision.preprocess import shrink
+    from gripper_force.vision.preprocess import downscale
 
     reader = LogReader(path)
     config = config_from_text(reader.config, str(path))
@@ -191,7 +191,7 @@ def load_clip(path: Path, preprocess: "Preprocess", region: "Region | None") -> 
     samples: list[LoadCellSample] = []
     for record in reader.records(Frame, LoadCellSample):
         if isinstance(record, Frame):
-            small.append(shrink(record.gray, region, preprocess.size))
+            small.append(downscale(record.gray, region, preprocess.size))
             t_ns.append(record.t_ns)
         elif isinstance(record, LoadCellSample):
             samples.append(record)

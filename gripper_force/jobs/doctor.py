@@ -56,7 +56,7 @@ class Check:
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class RegisterChange:
     """A servo's register that `setup` would change, with units."""
 
     register: str
@@ -64,7 +64,7 @@ class Change:
     new: str
 
 
-Agree = Callable[[str, list[Change]], bool]
+Agree = Callable[[str, list[RegisterChange]], bool]
 """Asked with a servo's name and what would change; True lets it happen."""
 
 

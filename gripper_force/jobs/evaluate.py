@@ -33,7 +33,7 @@ class ObjectResult(TypedDict):
     frames: int
 
 
-class Result(TypedDict):
+class EvaluationResult(TypedDict):
     """Errors over all frames, by object and by measured force.
 
     ``floor_n`` is the MAE that the spread of stiffness alone costs; NaN for recordings of real objects.
@@ -50,7 +50,7 @@ class Result(TypedDict):
 
 def evaluate(
     checkpoint: Checkpoint, clips: Sequence[Clip], correct: Callable[[Clip], Correction] | None = None
-) -> Result:
+) -> EvaluationResult:
     """Estimates the force at each frame as a run would, and compares it with the load cell.
 
     Args:
@@ -102,7 +102,7 @@ def _shown(clips: Sequence[Clip]) -> Iterable[Clip]:
     return track(clips, "evaluating", console=Console(stderr=True))
 
 
-def ridge_baseline(train_clips: Sequence[Clip], test_clips: Sequence[Clip]) -> Result:
+def ridge_baseline(train_clips: Sequence[Clip], test_clips: Sequence[Clip]) -> EvaluationResult:
     """What a linear method gets: ridge regression on products of 20 principal components.
 
     The components are of 32x32 frames minus each recording's first frame.
@@ -134,7 +134,9 @@ def ridge_baseline(train_clips: Sequence[Clip], test_clips: Sequence[Clip]) -> R
     return compare(test_clips, predictions, lead_in=0)
 
 
-def compare(clips: Sequence[Clip], predictions: Sequence[npt.NDArray[np.floating]], lead_in: int) -> Result:
+def compare(
+    clips: Sequence[Clip], predictions: Sequence[npt.NDArray[np.floating]], lead_in: int
+) -> EvaluationResult:
     """Compares estimates with the load cell, over all frames that have a label.
 
     Args:
@@ -154,7 +156,7 @@ def compare(clips: Sequence[Clip], predictions: Sequence[npt.NDArray[np.floating
     floors_n = np.concatenate([stiffness_floor_n(clip.forces_n, clip.stiffness) for clip in clips])[valid]
     objects = np.concatenate([np.full(len(clip.frames), clip.object) for clip in clips])[valid]
     predicted_n, measured_n = predicted_n[valid], measured_n[valid]
-    return Result(
+    return EvaluationResult(
         mae_n=metrics.mae(predicted_n, measured_n),
         rmse_n=metrics.rmse(predicted_n, measured_n),
         bias_n=metrics.bias(predicted_n, measured_n),

@@ -16,7 +16,7 @@ from gripper_force.jobs.dataset import CONTACT_N, label_frames
 from gripper_force.profiles.apply import correction_of
 from gripper_force.runtime.assembly import checkpoint_of, controller_from, make_estimator, settled
 from gripper_force.runtime.log import LogReader
-from gripper_force.runtime.perception import Sight
+from gripper_force.runtime.perception import FrameProcessor
 from gripper_force.types import (
     NS_PER_S,
     Frame,
@@ -110,7 +110,7 @@ def run_again(reader: LogReader, config: Config, checkpoint: "Model | None") -> 
     Where faults were injected into the estimator, the controller has the estimates that it had then.
     """
     spoilt = _spoilt(config)
-    sight = Sight(make_estimator(config, checkpoint, correction_of(config, checkpoint)))
+    processor = FrameProcessor(make_estimator(config, checkpoint, correction_of(config, checkpoint)))
     runs = config.gripper.nm_per_a is not None  # a recording that was imported never had a controller
     controller = controller_from(config) if runs else None
     visual: list[VisualForce] = []
@@ -123,7 +123,7 @@ def run_again(reader: LogReader, config: Config, checkpoint: "Model | None") -> 
     for record in reader.records():
         logged[type(record)].append(record)
         if isinstance(record, Frame):
-            if (seen := sight.see(record).visual) is not None:
+            if (seen := processor.process(record).visual) is not None:
                 visual.append(seen)
                 pending[record.seq] = seen
         elif isinstance(record, VisualForce):

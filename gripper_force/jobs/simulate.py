@@ -60,7 +60,7 @@ _NEXT_DRAW: Final = 1000
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class SimulationPlan:
     """One log to make."""
 
     kind: Kind
@@ -113,9 +113,9 @@ def split_of(number: int) -> str:
     return "test" if number in TEST_SETS else "train"
 
 
-def plan(kind: Kind, count: int, first_seed: int, objects: tuple[str, ...] = OBJECTS) -> list[Plan]:
+def plan(kind: Kind, count: int, first_seed: int, objects: tuple[str, ...] = OBJECTS) -> list[SimulationPlan]:
     """``count`` logs, the objects in turn, each with a seed of its own."""
-    return [Plan(kind, objects[i % len(objects)], first_seed + i) for i in range(count)]
+    return [SimulationPlan(kind, objects[i % len(objects)], first_seed + i) for i in range(count)]
 
 
 def plan_protocol(scale: str) -> list[SetPlan]:
@@ -142,7 +142,9 @@ def plan_protocol(scale: str) -> list[SetPlan]:
     ]
 
 
-def simulate(plans: Sequence[Plan | SetPlan], out: Path, config: Config, jobs: int) -> Iterator[Path]:
+def simulate(
+    plans: Sequence[SimulationPlan | SetPlan], out: Path, config: Config, jobs: int
+) -> Iterator[Path]:
     """Makes the logs that are not there yet, in several processes, and yields each as it is done.
 
     Raises:
@@ -156,11 +158,11 @@ def simulate(plans: Sequence[Plan | SetPlan], out: Path, config: Config, jobs: i
             yield from future.result()
 
 
-def _make(task: Plan | SetPlan, out: Path, tree: dict[str, object]) -> list[Path]:
-    return [make_log(task, out, tree)] if isinstance(task, Plan) else make_set(task, out, tree)
+def _make(task: SimulationPlan | SetPlan, out: Path, tree: dict[str, object]) -> list[Path]:
+    return [make_log(task, out, tree)] if isinstance(task, SimulationPlan) else make_set(task, out, tree)
 
 
-def make_log(task: Plan, out: Path, tree: dict[str, object]) -> Path:
+def make_log(task: SimulationPlan, out: Path, tree: dict[str, object]) -> Path:
     """Makes one log. It appears under its name only once it is whole, so an interrupted run can go on."""
     rng = np.random.default_rng([task.seed, 10])
     config = _randomised(config_from(tree, "simulate"), task, rng)
@@ -207,13 +209,13 @@ def _run_set(config: Config, task: SetPlan, seed: int, logs: dict[int, Path]) ->
             (config.camera.backend, config.load_cell.backend) != ("simulated", "simulated")
             or devices.camera is None
             or devices.load_cell is None
-            or devices.relight is None
+            or devices.render_under_light is None
         ):
             raise ConfigError(
                 f"the protocol needs camera.backend and load_cell.backend simulated, got "
                 f"{config.camera.backend!r} and {config.load_cell.backend!r}"
             )
-        relit = [devices.relight(lux) for lux in others]
+        relit = [devices.render_under_light(lux) for lux in others]
         devices.camera = lit = _LitCamera(devices.camera, [camera for camera, _ in relit])
         devices.notes.update(protocol="shin2019", degrees=str(task.degrees), split=task.split, lux=str(first))
         with open_session(config, devices, logs[first], None) as session:
@@ -300,7 +302,7 @@ def _touch_four_times(session: Session, task: SetPlan, rng: np.random.Generator,
             )
 
 
-def _randomised(config: Config, task: Plan, rng: np.random.Generator) -> Config:
+def _randomised(config: Config, task: SimulationPlan, rng: np.random.Generator) -> Config:
     control = config.control.model_copy(
         update={
             "feedback": "current",

@@ -31,7 +31,7 @@ _NAMES = ("head", "offset", "mean", "axes", "spread")
 
 
 @dataclass(frozen=True, eq=False)
-class HeadAndGate:
+class ProfileArrays:
     """The part of a profile that is too long for a text.
 
     Attributes:
@@ -52,7 +52,7 @@ class HeadAndGate:
         """What the corrected last layer adds, (N,)."""
         return features.astype(np.float64) @ self.head.astype(np.float64) + float(self.offset[0])
 
-    def strangeness(self, features: Features) -> Floats:
+    def ood_score(self, features: Features) -> Floats:
         """Share of the deviation that the calibration does not know, (N,)."""
         deviation = (features - self.mean).astype(np.float64)
         off = deviation - (deviation @ self.axes) @ self.axes.T
@@ -68,7 +68,7 @@ class Correction:
         differs: What of the run's network and camera it was not calibrated with, in words.
     """
 
-    def __init__(self, profile: ObjectProfile, arrays: HeadAndGate, differs: Sequence[str] = ()) -> None:
+    def __init__(self, profile: ObjectProfile, arrays: ProfileArrays, differs: Sequence[str] = ()) -> None:
         self.profile, self.differs = profile, tuple(differs)
         self._arrays = arrays
         self._estimate_n = np.array(profile.output.estimate_n)
@@ -91,9 +91,9 @@ class Correction:
         """The standard deviation of an error that is normal with that interval, (N,)."""
         return self.half_width_n(force_n) / self._z
 
-    def strangeness(self, features: Features) -> Floats:
+    def ood_score(self, features: Features) -> Floats:
         """How unlike the calibration's frames are, (N,); over 1 is too unlike."""
-        return self._arrays.strangeness(features) / self.profile.gate
+        return self._arrays.ood_score(features) / self.profile.ood_limit
 
 
 def curve_n(estimate_n: Floats, force_n: Floats, at_n: npt.ArrayLike) -> Floats:
@@ -105,7 +105,7 @@ def curve_n(estimate_n: Floats, force_n: Floats, at_n: npt.ArrayLike) -> Floats:
     return value
 
 
-def pack(arrays: HeadAndGate) -> bytes:
+def pack(arrays: ProfileArrays) -> bytes:
     """What goes into the file beside a profile, in half precision where it may be."""
     half = {"axes"}
     data: bytes = save(
@@ -137,7 +137,7 @@ def load_correction(
         raise ConfigError(f"{beside} does not belong to {path}; calibrate again, or copy both together")
     try:
         tensors = load(data)
-        arrays = HeadAndGate(**{name: tensors[name].astype(np.float32) for name in _NAMES})
+        arrays = ProfileArrays(**{name: tensors[name].astype(np.float32) for name in _NAMES})
     except (SafetensorError, KeyError, ValueError, TypeError) as error:
         raise ConfigError(f"{beside} is no half of an object profile: {error}") from error
     shapes = {name: getattr(arrays, name).shape for name in _NAMES}

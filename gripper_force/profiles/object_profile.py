@@ -101,7 +101,8 @@ class ObjectProfile(Section):
         force_n: Largest force that the object was pressed with and sprang back from. It holds up to there.
         output: Correction of the network's output.
         interval: How far off it is at most.
-        gate: How unlike the calibration's frames a frame may be (see `vision.correction`), 0 to 1.
+        ood_limit: Highest out-of-distribution score at which an estimate is used, 0 to 1 (see
+            `gripper_force.profiles.correction`). Version 0.1 called it ``gate``.
         stiffness_n_m: Force over travel of both jaws, at half of the largest force.
         plant: The force loop's plant; None where the logs hold no servo.
         before_n: MAE of the network alone on these touches.
@@ -119,12 +120,19 @@ class ObjectProfile(Section):
     force_n: Positive
     output: OutputCurve
     interval: Interval
-    gate: Positive
+    ood_limit: Positive
     stiffness_n_m: Positive | None = None
     plant: LoopPlant | None = None
     before_n: NonNegative
     after_n: NonNegative | None = None
     weights: str
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read_version_0_1(cls, tree: Any) -> Any:
+        if isinstance(tree, dict) and "gate" in tree and "ood_limit" not in tree:
+            return {("ood_limit" if key == "gate" else key): value for key, value in tree.items()}
+        return tree
 
     def mismatches(self, checkpoint: str, camera: dict[str, Any]) -> list[str]:
         """What differs between the calibration and a run, in words."""

@@ -30,7 +30,7 @@ _NORMAL: Final = 1.96
 Range = Annotated[tuple[NonNegative, NonNegative], Field(description="least and most")]
 
 
-class Estimate(Section):
+class CalibratedValue(Section):
     """A calibrated value and its 95 % confidence interval; without one, the value was given, not measured."""
 
     value: Finite
@@ -66,11 +66,11 @@ class LoadCellCalibration(Section):
 
     date: AwareDatetime
     sensor: str
-    tare_raw: Estimate
-    n_per_raw: Estimate
+    tare_raw: CalibratedValue
+    n_per_raw: CalibratedValue
     force_n: Range
     noise_n: NonNegative
-    drift_n_min: Estimate
+    drift_n_min: CalibratedValue
 
 
 class ServoCalibration(Section):
@@ -92,11 +92,11 @@ class ServoCalibration(Section):
 
     date: AwareDatetime
     model: str
-    nm_per_a: Estimate
-    friction_n: Estimate
-    damping_n_s_m: Estimate
-    pinion_radius_m: Estimate
-    open_position_rad: Estimate
+    nm_per_a: CalibratedValue
+    friction_n: CalibratedValue
+    damping_n_s_m: CalibratedValue
+    pinion_radius_m: CalibratedValue
+    open_position_rad: CalibratedValue
     open_width_m: Positive
     force_n: Range
     speed_m_s: Range
@@ -132,8 +132,8 @@ class CameraCalibration(Section):
     clipped: NonNegative
     region: tuple[int, int, int, int]
     markers: bool
-    lag_ms: Estimate
-    delay_ms: Estimate
+    lag_ms: CalibratedValue
+    delay_ms: CalibratedValue
     reference: str
 
     def mismatches(self, camera: Tree) -> list[str]:
@@ -192,7 +192,7 @@ class RigProfile(Section):
         return differ
 
 
-def _std(estimate: Estimate, drift: float) -> float:
+def _std(estimate: CalibratedValue, drift: float) -> float:
     """Standard deviation in use, as a share of the value: the interval's, and at least what it drifts by."""
     share = estimate.half / (_NORMAL * abs(estimate.value)) if estimate.value else 0.0
     return min(max(share, drift), 1.0)

@@ -29,9 +29,9 @@ def settled(config: Config) -> tuple[Config, str]:
     """
     if "auto" not in (config.vision.checkpoint, config.vision.engine):
         return config, ""
-    from gripper_force.vision import selection as choice
+    from gripper_force.vision import selection
 
-    vision, why = choice.settled(config.vision, config.budget)
+    vision, why = selection.resolve_auto(config.vision, config.budget)
     return config.model_copy(update={"vision": vision}), why
 
 

@@ -89,7 +89,7 @@ def open_devices(config: Config) -> Iterator[Devices]:
             start_ns=rig.start_ns if rig is not None else clock.now_ns(),
             check=rig.check if rig is not None else lambda: None,
             notes=rig.notes() if rig is not None else {},
-            relight=rig.relight if rig is not None else None,
+            render_under_light=rig.render_under_light if rig is not None else None,
         )
 
 

@@ -180,7 +180,7 @@ class LogWriter:
         path: A new file; its folder is made if need be.
         config: The run's configuration as YAML.
         metadata: Versions, digests and other facts.
-        through: What the bytes pass on their way to the file.
+        wrap_file: What the bytes pass on their way to the file.
 
     Attributes:
         failed: Whether the disk failed; nothing more is written then.
@@ -196,7 +196,7 @@ class LogWriter:
         *,
         config: str,
         metadata: Mapping[str, str],
-        through: Callable[[BinaryIO], BinaryIO] = lambda file: file,
+        wrap_file: Callable[[BinaryIO], BinaryIO] = lambda file: file,
     ) -> None:
         self.waiting = 0
         self._path = path
@@ -206,7 +206,7 @@ class LogWriter:
         self._chunk_start_ns: int | None = None
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = through(path.open("xb"))
+            self._file = wrap_file(path.open("xb"))
         except OSError as error:
             there = "it exists already, and a log is never overwritten; move it away, or name another folder"
             reason = there if path.exists() else error.strerror

@@ -15,14 +15,14 @@ ROOM: Final = 4096
 _PATIENCE_S: Final = 10.0
 
 
-class Recorder:
+class LogQueue:
     """Hands records to a log and counts those that are lost.
 
     In real time a thread writes, and where the disk is so slow that the queue is full, records are dropped.
     In lockstep the caller writes, and the clock stands still meanwhile.
 
     Args:
-        log: The log; the recorder closes it.
+        log: The log; the log_queue closes it.
         lockstep: Whether time waits.
 
     Attributes:
@@ -36,7 +36,7 @@ class Recorder:
         self._queue: queue.Queue[Callable[[], None] | None] = queue.Queue(ROOM)
         self._thread: threading.Thread | None = None
         if not lockstep:
-            self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+            self._thread = threading.Thread(target=self._run, name="log_queue", daemon=True)
             self._thread.start()
 
     def write(self, record: Record) -> None:

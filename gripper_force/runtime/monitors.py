@@ -7,14 +7,14 @@ _CELL_PERIODS = 8
 """A load cell without a sound sample for so long, and for so many of its periods, says nothing any more."""
 
 
-class Tally:
+class CounterMonitor:
     """Says by how much a device's counts of what went wrong have risen, once a second at most."""
 
     def __init__(self) -> None:
         self._told: dict[str, int] = {}
         self._next_ns = 0
 
-    def look(self, t_ns: int, counts: dict[str, int], *, at_end: bool) -> str:
+    def update(self, t_ns: int, counts: dict[str, int], *, at_end: bool) -> str:
         """Takes the counts of a cycle. Returns the news, or an empty text."""
         if counts == self._told or (t_ns < self._next_ns and not at_end):
             return ""
@@ -26,7 +26,7 @@ class Tally:
         return ", ".join(news)
 
 
-class CellWatch:
+class LoadCellMonitor:
     """Says when the load cell stops giving sound samples to compare with, and when it gives them again."""
 
     def __init__(self) -> None:
@@ -34,7 +34,7 @@ class CellWatch:
         self._period_ns = NS_PER_S / _CELL_PERIODS  # until it shows
         self._silent = False
 
-    def look(self, t_ns: int, samples: list[LoadCellSample]) -> str:
+    def update(self, t_ns: int, samples: list[LoadCellSample]) -> str:
         """Takes what came in a cycle. Returns the news, or an empty text."""
         last_ns = t_ns if self._last_ns is None else self._last_ns
         sound_ns = [sample.t_ns for sample in samples if sample.valid]

@@ -16,12 +16,12 @@ from gripper_force.types import NS_PER_MS, Frame, Gray, VisualForce
 class Estimator(Protocol):
     """What perception needs of `gripper_force.vision.estimator.ForceEstimator`."""
 
-    def update(self, gray: Gray) -> "Estimate | None":
+    def update(self, gray: Gray) -> "ForceEstimate | None":
         """Takes the next frame; None while the reference is being collected."""
         ...
 
 
-class Estimate(Protocol):
+class ForceEstimate(Protocol):
     """A force with its claimed error."""
 
     @property
@@ -35,7 +35,7 @@ class Estimate(Protocol):
         ...
 
 
-class Seen(NamedTuple):
+class ProcessedFrame(NamedTuple):
     """A frame, what the estimator made of it, and what went wrong, if anything did."""
 
     frame: Frame
@@ -43,7 +43,7 @@ class Seen(NamedTuple):
     problem: str = ""
 
 
-class Sight:
+class FrameProcessor:
     """Runs the estimator on frames, and survives what it raises.
 
     An error on the frames before the first estimate means that the run is set up wrongly, and is raised. A
@@ -58,7 +58,7 @@ class Sight:
         self._last: Gray | None = None
         self._may_repeat: bool | None = None  # nothing is known yet
 
-    def see(self, frame: Frame, now_ns: Callable[[], int] | None = None) -> Seen:
+    def process(self, frame: Frame, now_ns: Callable[[], int] | None = None) -> ProcessedFrame:
         """Makes an estimate of a frame.
 
         Args:
@@ -69,13 +69,13 @@ class Sight:
             Exception: What the estimator raised before its first estimate.
         """
         if self._estimator is None:
-            return Seen(frame, None)
+            return ProcessedFrame(frame, None)
         repeats = self._last is not None and np.array_equal(frame.gray, self._last)
         if self._last is not None and not self._works:
             self._may_repeat = repeats and self._may_repeat is not False
         self._last = frame.gray
         if self._works and repeats and not self._may_repeat:
-            return Seen(frame, None, "the camera repeats its last picture; see whether it hangs")
+            return ProcessedFrame(frame, None, "the camera repeats its last picture; see whether it hangs")
         begin_ns = time.perf_counter_ns()
         try:
             result = self._estimator.update(frame.gray)
@@ -83,14 +83,14 @@ class Sight:
             if not self._works:
                 raise
             own = isinstance(error, GripperError)
-            return Seen(frame, None, str(error) if own else f"{type(error).__name__}: {error}")
+            return ProcessedFrame(frame, None, str(error) if own else f"{type(error).__name__}: {error}")
         compute_ms = (time.perf_counter_ns() - begin_ns) / NS_PER_MS
         if result is None:
-            return Seen(frame, None)
+            return ProcessedFrame(frame, None)
         self._works = True
         ready_ns = frame.received_ns if now_ns is None else now_ns()
         visual = VisualForce(frame.t_ns, ready_ns, frame.seq, result.force_n, result.std_n, compute_ms)
-        return Seen(frame, visual)
+        return ProcessedFrame(frame, visual)
 
 
 class Perception(Protocol):
@@ -100,7 +100,7 @@ class Perception(Protocol):
         """Begins to look."""
         ...
 
-    def poll(self) -> list[Seen]:
+    def poll(self) -> list[ProcessedFrame]:
         """What has become ready since the last call, oldest first."""
         ...
 
@@ -115,20 +115,20 @@ class LockstepPerception:
     def __init__(
         self, camera: Camera | None, estimator: Estimator | None, clock: Clock, compute_ms: float
     ) -> None:
-        self._camera, self._sight, self._clock = camera, Sight(estimator), clock
+        self._camera, self._processor, self._clock = camera, FrameProcessor(estimator), clock
         self._compute_ns = round(compute_ms * NS_PER_MS) if estimator is not None else 0
-        self._under_way: deque[tuple[int, Seen]] = deque()
+        self._under_way: deque[tuple[int, ProcessedFrame]] = deque()
 
     def start(self) -> None:
         """Nothing to start."""
 
-    def poll(self) -> list[Seen]:
+    def poll(self) -> list[ProcessedFrame]:
         """What has become ready since the last call, oldest first."""
         now_ns = self._clock.now_ns()
         busy = self._under_way and self._under_way[-1][0] > now_ns
         if not busy and self._camera is not None and (frame := self._camera.newest()) is not None:
             ready_ns = now_ns + self._compute_ns
-            self._under_way.append((ready_ns, self._sight.see(frame, lambda: ready_ns)))
+            self._under_way.append((ready_ns, self._processor.process(frame, lambda: ready_ns)))
         ready = []
         while self._under_way and self._under_way[0][0] <= now_ns:
             ready.append(self._under_way.popleft()[1])
@@ -145,8 +145,8 @@ class ThreadedPerception:
     _PATIENCE_S = 1.0
 
     def __init__(self, camera: Camera | None, estimator: Estimator | None, clock: Clock) -> None:
-        self._camera, self._sight, self._clock = camera, Sight(estimator), clock
-        self._done: deque[Seen] = deque()
+        self._camera, self._processor, self._clock = camera, FrameProcessor(estimator), clock
+        self._done: deque[ProcessedFrame] = deque()
         self._failure: Exception | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="perception", daemon=True)
@@ -156,7 +156,7 @@ class ThreadedPerception:
         if self._camera is not None:
             self._thread.start()
 
-    def poll(self) -> list[Seen]:
+    def poll(self) -> list[ProcessedFrame]:
         """What has become ready since the last call, oldest first. Raises what stopped the thread."""
         if self._failure is not None:
             raise self._failure
@@ -176,6 +176,6 @@ class ThreadedPerception:
                 if frame is None:
                     self._stop.wait(self._IDLE_S)
                     continue
-                self._done.append(self._sight.see(frame, self._clock.now_ns))
+                self._done.append(self._processor.process(frame, self._clock.now_ns))
         except Exception as error:  # it is the control thread's to raise
             self._failure = error

@@ -23,8 +23,8 @@ from gripper_force.profiles.apply import check_target, correction_of, rig_mismat
 from gripper_force.runtime.assembly import checkpoint_of, make_controller, make_estimator, settled
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log import LogWriter
-from gripper_force.runtime.log_queue import Recorder
-from gripper_force.runtime.monitors import CellWatch, Tally
+from gripper_force.runtime.log_queue import LogQueue
+from gripper_force.runtime.monitors import CounterMonitor, LoadCellMonitor
 from gripper_force.runtime.perception import Estimator, LockstepPerception, Perception, ThreadedPerception
 from gripper_force.runtime.priority import real_time_priority
 from gripper_force.types import (
@@ -62,11 +62,11 @@ class Session:
     """One controller on one set of devices.
 
     Attributes:
-        sees: Whether there was a visual estimate yet.
+        has_vision: Whether there was a visual estimate yet.
         failed: Whether the run is at fault, so that it is to end as ``control.on_fault`` says.
         cycles: Cycles run.
         frames: Frames logged.
-        felt: The newest valid sample of the load cell, or None.
+        last_load_cell_sample: The newest valid sample of the load cell, or None.
     """
 
     def __init__(
@@ -75,28 +75,28 @@ class Session:
         devices: Devices,
         controller: GraspController,
         perception: Perception,
-        recorder: Recorder,
+        log_queue: LogQueue,
     ) -> None:
         self._config, self._devices = config, devices
-        self._controller, self._perception, self._recorder = controller, perception, recorder
+        self._controller, self._perception, self._log_queue = controller, perception, log_queue
         self._period_ns = round(NS_PER_S / config.control.rate_hz)
         self._due_ns = 0
         self._stop = threading.Event()
         self._interrupted = False
-        self._tallies = {unit: Tally() for unit in ("servo", "camera", "load_cell")}
+        self._counter_monitors = {unit: CounterMonitor() for unit in ("servo", "camera", "load_cell")}
         self._problem = ""
-        self._cell = CellWatch()
+        self._load_cell_monitor = LoadCellMonitor()
         self._error: BaseException | None = None
         self._armed = False
         self.failed = False
-        self.sees = False
+        self.has_vision = False
         self.cycles = self.frames = 0
-        self.felt: LoadCellSample | None = None
+        self.last_load_cell_sample: LoadCellSample | None = None
 
     @property
     def lost_records(self) -> int:
         """Records that the log lacks, because the disk failed or was too slow."""
-        return self._recorder.lost
+        return self._log_queue.lost
 
     def start(self) -> None:
         """Arms the servo and starts the sensors."""
@@ -140,7 +140,7 @@ class Session:
             KeyboardInterrupt: See `interrupt`.
             GripperError: A sensor or the simulated world failed, or the first frames gave no estimate.
         """
-        devices, log = self._devices, self._recorder.write
+        devices, log = self._devices, self._log_queue.write
         devices.clock.sleep_until_ns(self._due_ns)
         self._due_ns = max(self._due_ns + self._period_ns, devices.clock.now_ns() - self._period_ns)
         self.end_if_interrupted()
@@ -152,7 +152,7 @@ class Session:
             if seen.visual is not None:
                 visual = seen.visual
                 log(visual)
-                self.sees = True
+                self.has_vision = True
             if seen.problem not in ("", self._problem):
                 log(Event(seen.frame.received_ns, "vision", f"no estimate: {seen.problem}"))
             self._problem = seen.problem
@@ -177,7 +177,7 @@ class Session:
         """Takes note of what ends the run; Ctrl-C is no fault."""
         self._error = error
         self.failed |= isinstance(error, Exception)
-        self._recorder.write(
+        self._log_queue.write(
             Event(self._devices.clock.now_ns(), "session", f"{type(error).__name__}: {error}")
         )
 
@@ -198,7 +198,7 @@ class Session:
 
     def attach(self, name: str, data: bytes, media_type: str) -> None:
         """Adds a file to the log."""
-        self._recorder.attach(name, data, media_type)
+        self._log_queue.attach(name, data, media_type)
 
     def _request(self, t_ns: int, kind: RequestKind | None, target_n: float) -> Request | None:
         if self._stop.is_set():
@@ -211,19 +211,19 @@ class Session:
         if devices.load_cell is not None:
             samples = devices.load_cell.drain()
             for sample in samples:
-                self._recorder.write(sample)
+                self._log_queue.write(sample)
                 if sample.valid:
-                    self.felt = sample
-            if text := self._cell.look(t_ns, samples):
-                self._recorder.write(Event(t_ns, "load_cell", text))
+                    self.last_load_cell_sample = sample
+            if text := self._load_cell_monitor.update(t_ns, samples):
+                self._log_queue.write(Event(t_ns, "load_cell", text))
         counts = {"servo": {"bus retries": devices.servo.stats.retries}}
         if devices.camera is not None:
             counts["camera"] = devices.camera.counts()
         if devices.load_cell is not None:
             counts["load_cell"] = devices.load_cell.counts()
         for unit, count in counts.items():
-            if text := self._tallies[unit].look(t_ns, count, at_end=at_end):
-                self._recorder.write(Event(t_ns, unit, text))
+            if text := self._counter_monitors[unit].update(t_ns, count, at_end=at_end):
+                self._log_queue.write(Event(t_ns, unit, text))
 
 
 @contextmanager
@@ -239,19 +239,19 @@ def open_session(
     correction = correction_of(config, checkpoint)
     estimator = make_estimator(config, checkpoint, correction)
     with ExitStack() as stack:
-        recorder = _recorder(config, devices, path, checkpoint, correction)
+        log_queue = _recorder(config, devices, path, checkpoint, correction)
         for unit, text in (("vision", why), ("simulation", devices.notes.get("detail"))):
             if text:
-                recorder.write(Event(devices.start_ns, unit, text))
-        session = Session(config, devices, controller, _perception(config, devices, estimator), recorder)
+                log_queue.write(Event(devices.start_ns, unit, text))
+        session = Session(config, devices, controller, _perception(config, devices, estimator), log_queue)
         stack.callback(_discard_unused, session, path)
-        stack.callback(recorder.close)
+        stack.callback(log_queue.close)
         if not devices.lockstep:
             # Python's default lets a thread that computes keep the control thread waiting for 5 ms.
             stack.callback(sys.setswitchinterval, sys.getswitchinterval())
             sys.setswitchinterval(_REALTIME_SWITCH_S)
             if refusal := stack.enter_context(real_time_priority()):
-                recorder.write(Event(devices.start_ns, "session", refusal))
+                log_queue.write(Event(devices.start_ns, "session", refusal))
         stack.callback(_attach_reference, session, estimator)
         stack.enter_context(_signals_wait(session))
         stack.callback(session.close)
@@ -261,7 +261,7 @@ def open_session(
         except BaseException as error:
             session.fail(error)
             raise
-    recorder.raise_losses()
+    log_queue.raise_losses()
 
 
 @contextmanager
@@ -311,11 +311,13 @@ def _check_target(config: Config) -> None:
     check_target(config)
 
 
-def grasp_in(session: Session, config: Config, sees: bool, progress: Progress | None = None) -> str:
+def grasp_in(session: Session, config: Config, has_vision: bool, progress: Progress | None = None) -> str:
     """Grasps, holds and releases in a session that is open; see `run_grasp`. Returns the outcome."""
     decision = session.cycle()
     start_ns = last_ns = decision.status.t_ns
-    while last_ns - start_ns < (_VISION_PATIENCE_NS if sees and not session.sees else _REFERENCE_NS):
+    while last_ns - start_ns < (
+        _VISION_PATIENCE_NS if has_vision and not session.has_vision else _REFERENCE_NS
+    ):
         last_ns = session.cycle().status.t_ns
     decision = session.cycle(RequestKind.GRASP, config.target_n)
     phase = ""
@@ -363,13 +365,13 @@ def _recorder(
     path: Path,
     checkpoint: "Model | None",
     correction: "Correction | None",
-) -> Recorder:
+) -> LogQueue:
     about = _metadata(config, devices, checkpoint)
     if correction is not None:
         about["profile"] = correction.profile.weights
     faults, clock, lockstep = Faults(config.faults, devices.start_ns), devices.clock, devices.lockstep
 
-    def through(file: BinaryIO) -> BinaryIO:
+    def wrap_file(file: BinaryIO) -> BinaryIO:
         return (
             cast(BinaryIO, FaultyFile(file, faults, clock, lockstep=lockstep)) if faults.has("disk") else file
         )
@@ -378,12 +380,12 @@ def _recorder(
         "object profile": () if correction is None else correction.differs,
         "rig profile": rig_mismatches(config),
     }
-    log = LogWriter(path, config=dump_config(config), metadata=about, through=through)
-    recorder = Recorder(log, lockstep=lockstep)
+    log = LogWriter(path, config=dump_config(config), metadata=about, wrap_file=wrap_file)
+    log_queue = LogQueue(log, lockstep=lockstep)
     for profile, found in differ.items():
         if found:
-            recorder.write(Event(devices.start_ns, "session", f"the {profile} is of {'; '.join(found)}"))
-    return recorder
+            log_queue.write(Event(devices.start_ns, "session", f"the {profile} is of {'; '.join(found)}"))
+    return log_queue
 
 
 def _perception(config: Config, devices: Devices, estimator: Estimator | None) -> Perception:

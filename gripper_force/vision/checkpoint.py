@@ -13,6 +13,9 @@ from gripper_force.errors import CheckpointError
 from gripper_force.vision.header import FORMAT, Header, NetworkConfig, digest_of, read_checkpoint
 from gripper_force.vision.network import ForceNetwork
 
+_RENAMED = {"blstm.onward.": "blstm.forward_lstm.", "blstm.backward_gates.": "blstm.backward_linear."}
+"""Weights by their names in checkpoints of version 0.1, and by their names now."""
+
 
 @dataclass(frozen=True)
 class Checkpoint:
@@ -68,6 +71,12 @@ def load_checkpoint(source: str | Path = "default") -> Checkpoint:
     return Checkpoint(networks, header, digest_of(data))
 
 
+def _current_name(name: str) -> str:
+    for old, new in _RENAMED.items():
+        name = name.replace(old, new)
+    return name
+
+
 def _stored(tensor: Tensor) -> Tensor:
     kept = tensor.detach().cpu().contiguous()
     # Biases and running variances are few, and the latter can lie below the smallest float16.
@@ -84,7 +93,9 @@ def _member(path: Path, index: int, config: NetworkConfig, tensors: dict[str, Te
     with torch.device("meta"):  # a header may claim any size: only what the weights confirm takes memory
         network = ForceNetwork(config)
     dtypes = {name: tensor.dtype for name, tensor in network.state_dict().items()}
-    own = {name.removeprefix(prefix): t for name, t in tensors.items() if name.startswith(prefix)}
+    own = {
+        _current_name(name.removeprefix(prefix)): t for name, t in tensors.items() if name.startswith(prefix)
+    }
     # A copy, as what was read lies in the bytes of the file, which can't be written to.
     state = {name: t.to(dtypes.get(name, t.dtype), copy=True) for name, t in own.items()}
     try:

@@ -10,13 +10,13 @@ from gripper_force.errors import DataError, NonFiniteError
 from gripper_force.profiles.correction import Correction
 from gripper_force.types import Gray
 from gripper_force.vision.engines import Engine, Floats, open_engine
-from gripper_force.vision.frame_checks import Plausibility
+from gripper_force.vision.frame_checks import FrameChecks
 from gripper_force.vision.header import RESIDUAL_HALF_N, Model
-from gripper_force.vision.preprocess import Normaliser, Region, shrink
+from gripper_force.vision.preprocess import Normaliser, Region, downscale
 
 
 @dataclass(frozen=True, slots=True)
-class Estimate:
+class ForceEstimate:
     """One estimate.
 
     Attributes:
@@ -56,7 +56,7 @@ class ForceEstimator:
 
     def reset(self) -> None:
         """Forgets the stream: the next frames are the first of a new run, and its reference."""
-        self._plausibility = Plausibility()
+        self._frame_checks = FrameChecks()
         self._normaliser = Normaliser(self._preprocess)
         self._engine.reset()
         self._attention: Floats | None = None
@@ -66,7 +66,7 @@ class ForceEstimator:
         """Mean of the no-contact reference frames, (S, S) uint8; None until they are there, or if unused."""
         return self._normaliser.reference_image
 
-    def update(self, gray: Gray) -> Estimate | None:
+    def update(self, gray: Gray) -> ForceEstimate | None:
         """Takes the next frame.
 
         Args:
@@ -82,8 +82,8 @@ class ForceEstimator:
             NonFiniteError: A network gave NaN or infinity.
         """
         step = None
-        small = shrink(gray, self._region, self._preprocess.size)
-        self._plausibility.check(small)
+        small = downscale(gray, self._region, self._preprocess.size)
+        self._frame_checks.check(small)
         for frame in self._normaliser.push(small):
             step = self._engine.step(frame)
         if step is None:
@@ -100,22 +100,22 @@ class ForceEstimator:
         least_n = self._residual_forces[0] - RESIDUAL_HALF_N
         most_n = self._residual_forces[-1] + RESIDUAL_HALF_N
         beyond_n = max(least_n - force_n, force_n - most_n, 0.0)
-        return Estimate(force_n, math.hypot(residual_n + beyond_n, (max(forces) - min(forces)) / 2))
+        return ForceEstimate(force_n, math.hypot(residual_n + beyond_n, (max(forces) - min(forces)) / 2))
 
     def attention_map(self) -> Floats | None:
         """Where SSAM looks in the newest frame, (h, w) in 0..1; None without SSAM or a frame."""
         return self._attention
 
-    def _corrected(self, correction: Correction, force_n: float, read: Floats) -> Estimate:
+    def _corrected(self, correction: Correction, force_n: float, read: Floats) -> ForceEstimate:
         features = read[None]  # (1, F)
-        strangeness = float(correction.strangeness(features)[0])
-        if strangeness > 1:
+        ood_score = float(correction.ood_score(features)[0])
+        if ood_score > 1:
             raise DataError(
-                f"what is seen is {strangeness:.1f} times as unlike the touches of the profile "
+                f"what is seen is {ood_score:.1f} times as unlike the touches of the profile "
                 f"{correction.profile.object!r} as these are among each other; see whether it is that object"
             )
         corrected_n = correction.force_n([force_n], features)
-        return Estimate(float(corrected_n[0]), float(correction.std_n(corrected_n)[0]))
+        return ForceEstimate(float(corrected_n[0]), float(correction.std_n(corrected_n)[0]))
 
 
 def open_estimator(
@@ -125,7 +125,7 @@ def open_estimator(
 
     Args:
         model: What ``vision.checkpoint`` names.
-        vision: Nothing in it is left to ``auto``; see `gripper_force.vision.selection.settled`.
+        vision: Nothing in it is left to ``auto``; see `gripper_force.vision.selection.resolve_auto`.
         correction: What the object's profile makes of the estimates.
 
     Raises:

@@ -15,7 +15,7 @@ ROUGHNESS: Final = 2.5
 1.15, 1.33 and 1.2 in simulation, and 1.06, 1.04 and 1.1 with a finger camera."""
 
 
-class Plausibility:
+class FrameChecks:
     """Compares each frame of a run with the first."""
 
     def __init__(self) -> None:

@@ -35,13 +35,13 @@ class LastStepBlstm(nn.Module):
 
     def __init__(self, inputs: int, hidden: int) -> None:
         super().__init__()
-        self.onward = nn.LSTM(inputs, hidden, batch_first=True)
-        self.backward_gates = nn.Linear(inputs, 3 * hidden)
+        self.forward_lstm = nn.LSTM(inputs, hidden, batch_first=True)
+        self.backward_linear = nn.Linear(inputs, 3 * hidden)
 
     def forward(self, windows: Tensor) -> Tensor:
         """Maps windows (N, L, F) to the last step's two hidden states (N, 2*hidden)."""
-        onward = self.onward(windows)[0][:, -1]  # (N, hidden)
-        return torch.cat([onward, self._backward(windows[:, -1])], dim=1)
+        forward_lstm = self.forward_lstm(windows)[0][:, -1]  # (N, hidden)
+        return torch.cat([forward_lstm, self._backward(windows[:, -1])], dim=1)
 
     def advance(self, newest: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Takes the next vector of a stream into all windows that it lies in.
@@ -54,7 +54,7 @@ class LastStepBlstm(nn.Module):
         Returns:
             What `forward` gives for the window that ends here, (B, 2*hidden), and the next states.
         """
-        into_weight, on_weight, into_bias, on_bias = self.onward.all_weights[0]
+        into_weight, on_weight, into_bias, on_bias = self.forward_lstm.all_weights[0]
         into = F.linear(newest, into_weight, into_bias + on_bias)  # (B, 4*hidden)
         gates = into[:, None] + F.linear(hidden, on_weight)  # (B, L, 4*hidden)
         gate_in, forget, candidate, gate_out = gates.chunk(4, dim=2)
@@ -65,7 +65,7 @@ class LastStepBlstm(nn.Module):
         return read, torch.cat([hidden[:, :1], shown[:, :-1]], 1), torch.cat([cell[:, :1], after[:, :-1]], 1)
 
     def _backward(self, newest: Tensor) -> Tensor:
-        gate_in, candidate, gate_out = self.backward_gates(newest).chunk(3, dim=1)
+        gate_in, candidate, gate_out = self.backward_linear(newest).chunk(3, dim=1)
         cell = torch.sigmoid(gate_in) * torch.tanh(candidate)
         return torch.sigmoid(gate_out) * torch.tanh(cell)
 

@@ -1,4 +1,4 @@
-"""From a camera frame to the network's input: crop, shrink, standardise, subtract the no-contact reference.
+"""Prepares a camera frame for the network: crop, downscale, standardise, subtract the reference frame.
 
 The difference to a reference frame halves the error in simulation and is what lets the network transfer to
 objects it has not seen; raw gray values did not learn at all on real finger cameras.
@@ -53,7 +53,7 @@ class Preprocess(Section):
         return self.reference_frames - 1 if self.reference else 0
 
 
-def shrink(gray: Gray, region: Region | None, size: int) -> Gray:
+def downscale(gray: Gray, region: Region | None, size: int) -> Gray:
     """Cuts the region of interest out of a frame and resizes it.
 
     Args:

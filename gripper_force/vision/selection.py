@@ -22,7 +22,6 @@ from gripper_force.vision.model_files import cache_folder, read_model
 
 ENGINE_PACKAGES: Final = {
     "torch": "torch",
-    "compiled": "torch",
     "openvino": "openvino",
     "onnxruntime": "onnxruntime",
 }
@@ -33,8 +32,8 @@ _WARM: Final = 20
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
-    """One way to compute an estimate, and what it takes on this machine.
+class Candidate:
+    """One candidate to compute an estimate, and what it takes on this machine.
 
     Attributes:
         checkpoint: Name or path.
@@ -69,7 +68,7 @@ class Way:
 
 
 @lru_cache
-def settled(vision: VisionConfig, budget: BudgetConfig) -> tuple[VisionConfig, str]:
+def resolve_auto(vision: VisionConfig, budget: BudgetConfig) -> tuple[VisionConfig, str]:
     """Puts names in place of ``auto``, and says why.
 
     Args:
@@ -77,49 +76,54 @@ def settled(vision: VisionConfig, budget: BudgetConfig) -> tuple[VisionConfig, s
         budget: What the choice has to keep.
 
     Returns:
-        The section with nothing left to choose, and a sentence; empty where there was nothing to choose.
+        The section with nothing left to select, and a sentence; empty where there was nothing to select.
 
     Raises:
-        ConfigError: No way keeps the budget.
+        ConfigError: No candidate keeps the budget.
     """
     if vision.checkpoint == "none" or "auto" not in (vision.checkpoint, vision.engine):
         return vision, ""
-    return choose(ways(vision), vision, budget)
+    return select(candidates(vision), vision, budget)
 
 
-def choose(tried: Sequence[Way], vision: VisionConfig, budget: BudgetConfig) -> tuple[VisionConfig, str]:
-    """The cheapest way within the budget; without one, of the most exact checkpoint the fastest way."""
+def select(
+    tested: Sequence[Candidate], vision: VisionConfig, budget: BudgetConfig
+) -> tuple[VisionConfig, str]:
+    """Selects the cheapest candidate within the budget; without a budget, the fastest of the most accurate."""
     named = f"budget.latency_ms={budget.latency_ms}, budget.error_n={budget.error_n}"
     fits = [
-        way
-        for way in tried
-        if (budget.latency_ms is None or way.p99_ms <= budget.latency_ms)
-        and (budget.error_n is None or way.error_n <= budget.error_n)
+        candidate
+        for candidate in tested
+        if (budget.latency_ms is None or candidate.p99_ms <= budget.latency_ms)
+        and (budget.error_n is None or candidate.error_n <= budget.error_n)
     ]
     if not fits:
-        nearest = "; ".join(str(way) for way in pareto(tried))
-        raise ConfigError(f"no way to compute the force keeps {named}; there are {nearest}")
+        nearest = "; ".join(str(candidate) for candidate in pareto(tested))
+        raise ConfigError(f"no candidate to compute the force keeps {named}; there are {nearest}")
     if budget.latency_ms is None and budget.error_n is None:
-        least_n = min(way.error_n for way in fits)
-        taken = min((way for way in fits if way.error_n == least_n), key=lambda way: way.p50_ms)
+        least_n = min(candidate.error_n for candidate in fits)
+        chosen = min(
+            (candidate for candidate in fits if candidate.error_n == least_n),
+            key=lambda candidate: candidate.p50_ms,
+        )
         why = "the fastest of the most exact"
     else:
-        taken, why = min(fits, key=lambda way: way.cost_ms), f"the cheapest that keeps {named}"
-    update = {name: getattr(taken, name) for name in ("checkpoint", "engine", "precision", "threads")}
-    return vision.model_copy(update=update), f"took {taken} ({why} of {len(tried)} ways)"
+        chosen, why = min(fits, key=lambda candidate: candidate.cost_ms), f"the cheapest that keeps {named}"
+    update = {name: getattr(chosen, name) for name in ("checkpoint", "engine", "precision", "threads")}
+    return vision.model_copy(update=update), f"took {chosen} ({why} of {len(tested)} candidates)"
 
 
-def pareto(tried: Sequence[Way]) -> list[Way]:
-    """The ways that no other beats in both time and error, by rising time."""
-    front: list[Way] = []
-    for way in sorted(tried, key=lambda way: (way.p50_ms, way.error_n)):
-        if not front or way.error_n < front[-1].error_n:
-            front.append(way)
+def pareto(tested: Sequence[Candidate]) -> list[Candidate]:
+    """The candidates that no other beats in both time and error, by rising time."""
+    front: list[Candidate] = []
+    for candidate in sorted(tested, key=lambda candidate: (candidate.p50_ms, candidate.error_n)):
+        if not front or candidate.error_n < front[-1].error_n:
+            front.append(candidate)
     return front
 
 
-def ways(vision: VisionConfig) -> list[Way]:
-    """What there is to choose from, measured now where this machine has not measured it before."""
+def candidates(vision: VisionConfig) -> list[Candidate]:
+    """What there is to select from, measured now where this machine has not measured it before."""
     known = _remembered()
     found = []
     for key, (model, engine, precision, threads) in _candidates(vision):
@@ -127,7 +131,7 @@ def ways(vision: VisionConfig) -> list[Way]:
             opened = open_engine(model, engine, precision, threads)
             p50_ms, p99_ms = timed_ms(opened)
             mae_n = model.header.metrics.get("mae_n", float("inf"))
-            known[key] = Way(_name(model), engine, precision, threads, p50_ms, p99_ms, mae_n)
+            known[key] = Candidate(_name(model), engine, precision, threads, p50_ms, p99_ms, mae_n)
             remember({key: known[key]})
         found.append(known[key])
     return found
@@ -152,10 +156,10 @@ def key_of(model: Model, engine: str, precision: str, threads: int) -> str:
     return " ".join((*parts, precision, str(threads), _machine()))
 
 
-def remember(measured: dict[str, Way]) -> None:
+def remember(measured: dict[str, Candidate]) -> None:
     """Keeps measurements for the next time; where the folder can't be written, nothing is kept."""
     path = _memory()
-    known = {key: asdict(way) for key, way in (_remembered() | measured).items()}
+    known = {key: asdict(candidate) for key, candidate in (_remembered() | measured).items()}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         partial = path.with_suffix(f".{os.getpid()}")
@@ -166,8 +170,8 @@ def remember(measured: dict[str, Way]) -> None:
 
 
 def installed() -> list[str]:
-    """Engines that ``auto`` may take: what is there, but for the compiled one, which gains nothing."""
-    return [e for e, package in ENGINE_PACKAGES.items() if e != "compiled" and _version(package)]
+    """Returns the engines whose packages are installed."""
+    return [engine for engine, package in ENGINE_PACKAGES.items() if _version(package)]
 
 
 def _candidates(vision: VisionConfig) -> Iterator[tuple[str, tuple[Model, str, Precision, int]]]:
@@ -195,9 +199,12 @@ def _memory() -> Path:
     return cache_folder() / "engines.json"
 
 
-def _remembered() -> dict[str, Way]:
+def _remembered() -> dict[str, Candidate]:
     try:
-        return {key: Way(**way) for key, way in json.loads(_memory().read_text(encoding="utf-8")).items()}
+        return {
+            key: Candidate(**candidate)
+            for key, candidate in json.loads(_memory().read_text(encoding="utf-8")).items()
+        }
     except (OSError, ValueError, TypeError, AttributeError):
         return {}  # nothing there yet, or of another version: it is measured again
 

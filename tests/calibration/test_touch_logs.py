@@ -58,7 +58,7 @@ def test_logs_that_do_not_belong_together_are_refused(tmp_path: Path, tiny_check
 
 def test_a_log_without_contact_is_no_touch_and_has_no_lag(tmp_path: Path, tiny_checkpoint: Path) -> None:
     recorded = read_one(recording(tmp_path / "a.mcap", [0.0] * 30), load_checkpoint(tiny_checkpoint))
-    assert not recorded.felt
+    assert not recorded.has_contact
     assert recorded.delay_s == pytest.approx(0.02 + 1 / 60)
 
 

@@ -1,4 +1,4 @@
-"""A small gripper: inertia, spring, Coulomb and viscous friction, a mode-5 servo, a late and noisy eye."""
+"""A small gripper: inertia, spring, Coulomb and viscous friction, a mode-5 servo, a late and noisy vision."""
 
 import math
 from collections.abc import Callable
@@ -79,7 +79,7 @@ class Plant:
 
 
 @dataclass
-class Eye:
+class SimulatedVision:
     """Vision: 60 frames a second, late, with white noise and an error that stays over a grasp."""
 
     noise_n: float = 0.1
@@ -89,7 +89,7 @@ class Eye:
     seq: int = 0
     due: list[VisualForce] = field(default_factory=list)
 
-    def look(self, t_ns: int, force_n: float, rng: np.random.Generator) -> VisualForce | None:
+    def sample(self, t_ns: int, force_n: float, rng: np.random.Generator) -> VisualForce | None:
         if t_ns * 60 >= self.seq * NS_PER_S and t_ns < self.off_after_s * NS_PER_S:
             self.seq += 1
             ready_ns = t_ns + round(float(rng.uniform(*self.latency_s)) * NS_PER_S)
@@ -106,7 +106,7 @@ class Run:
 
     config: ControlConfig
     plant: Plant
-    eye: Eye
+    vision: SimulatedVision
     seed: int = 0
     transmission: Transmission = TRANSMISSION
     inputs: list[tuple[int, ServoState, VisualForce | None, Request | None]] = field(default_factory=list)
@@ -123,7 +123,7 @@ class Run:
         request = Request(self.t_ns, kind, target_n) if kind else None
         for _ in range(round(time_s * NS_PER_S / CYCLE_NS)):
             servo = self.spoil(self.t_ns, self.plant.read(self.t_ns, self.rng))
-            visual = self.eye.look(self.t_ns, self.plant.force_n(), self.rng)
+            visual = self.vision.sample(self.t_ns, self.plant.force_n(), self.rng)
             self.inputs.append((self.t_ns, servo, visual, request))
             self.decisions.append(self.controller.step(*self.inputs[-1]))
             self.cell.append(LoadCellSample(self.t_ns, self.plant.force_n(), 0.0))
@@ -145,7 +145,7 @@ class Run:
 
 
 def draw_run(seed: int, **control: object) -> Run:
-    """A gripper, an object and an eye drawn from the seed."""
+    """A gripper, an object and an vision drawn from the seed."""
     rng = np.random.default_rng([seed, 1])
     stiffness_n_m = float(rng.choice([300.0, 1000.0, 3000.0]))
     plant = Plant(
@@ -157,8 +157,8 @@ def draw_run(seed: int, **control: object) -> Run:
         gain=float(rng.uniform(0.9, 1.1)),
         contact_m=float(rng.uniform(0.008, 0.014)),
     )
-    eye = Eye(noise_n=float(rng.uniform(0.05, 0.15)), gain=float(rng.uniform(0.95, 1.05)))
-    return Run(ControlConfig(**control), plant, eye, seed)  # type: ignore[arg-type]
+    vision = SimulatedVision(noise_n=float(rng.uniform(0.05, 0.15)), gain=float(rng.uniform(0.95, 1.05)))
+    return Run(ControlConfig(**control), plant, vision, seed)  # type: ignore[arg-type]
 
 
 @pytest.fixture(scope="session")
@@ -168,13 +168,13 @@ def transmission() -> Transmission:
 
 @pytest.fixture
 def make_run() -> Callable[..., Run]:
-    """Builds a closed loop: ``make_run(plant={...}, eye={...}, **control)``."""
+    """Builds a closed loop: ``make_run(plant={...}, vision={...}, **control)``."""
 
     def make(
-        plant: dict[str, float] | None = None, eye: dict[str, float] | None = None, **control: object
+        plant: dict[str, float] | None = None, vision: dict[str, float] | None = None, **control: object
     ) -> Run:
         run = draw_run(0, **control)
-        return replace(run, plant=Plant(**(plant or {})), eye=Eye(**(eye or {})))  # type: ignore[arg-type]
+        return replace(run, plant=Plant(**(plant or {})), vision=SimulatedVision(**(vision or {})))  # type: ignore[arg-type]
 
     return make
 

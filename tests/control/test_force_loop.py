@@ -13,8 +13,8 @@ def estimate(force_n, bias_n=0.0, source="fused"):
 
 def ramp(loop, target_n, bias_n=0.0):
     while loop.reference_n != target_n:
-        push_n = loop.step(0.005, target_n, estimate(loop.reference_n, bias_n))
-    return push_n
+        motor_force_n = loop.step(0.005, target_n, estimate(loop.reference_n, bias_n))
+    return motor_force_n
 
 
 @pytest.fixture
@@ -47,27 +47,27 @@ def test_the_ramp_takes_the_bias_off(loop, transmission):
 
 
 def test_hold_leaves_a_small_error_alone(loop):
-    push_n = ramp(loop, 4.0)
+    motor_force_n = ramp(loop, 4.0)
     for error_n in (0.2, -0.4):
         for _ in range(50):
             held_n = loop.step(0.005, 4.0, estimate(4.0 - error_n * tolerance_n(4.0)))
-        assert held_n == pytest.approx(push_n)
+        assert held_n == pytest.approx(motor_force_n)
 
 
 def test_hold_integrates_what_is_missing(loop):
-    push_n = ramp(loop, 4.0)
+    motor_force_n = ramp(loop, 4.0)
     for _ in range(100):
         raised_n = loop.step(0.005, 4.0, estimate(3.8))
     gain = loop.margins["hold"].gains.integral_s
-    assert raised_n - push_n == pytest.approx(0.5 * 0.2 * gain)
+    assert raised_n - motor_force_n == pytest.approx(0.5 * 0.2 * gain)
 
 
 def test_too_much_turns_the_push_back_into_the_play(loop, transmission):
-    push_n = ramp(loop, 4.0)
+    motor_force_n = ramp(loop, 4.0)
     turned_n = loop.step(0.005, 4.0, estimate(4.1))
-    assert turned_n == pytest.approx(push_n - 0.75 * transmission.friction_n, abs=0.01)
+    assert turned_n == pytest.approx(motor_force_n - 0.75 * transmission.friction_n, abs=0.01)
     assert loop.step(0.005, 4.0, estimate(4.03)) == turned_n
-    assert loop.step(0.005, 4.0, estimate(3.9)) == pytest.approx(push_n, abs=0.02)
+    assert loop.step(0.005, 4.0, estimate(3.9)) == pytest.approx(motor_force_n, abs=0.02)
 
 
 @pytest.mark.parametrize("feedback", ["fused", "current", "vision"])
@@ -78,11 +78,11 @@ def test_no_estimate_drives_the_push_beyond_what_is_plausible(transmission, feed
     loop.start(0.0, target_n)
     for lie_n in lies:
         for _ in range(200):
-            push_n = loop.step(0.05, target_n, estimate(lie_n, bias_n=lie_n))
+            motor_force_n = loop.step(0.05, target_n, estimate(lie_n, bias_n=lie_n))
             room_n = 3 * transmission.bias_std_n(loop.reference_n) + transmission.friction_n
-            assert abs(push_n - loop.reference_n) <= room_n * (1 + 1e-9)
+            assert abs(motor_force_n - loop.reference_n) <= room_n * (1 + 1e-9)
     # Nothing is wound up: a second of the opposite error is felt at once.
-    assert loop.step(0.05, target_n, estimate(100.0)) < push_n + 1e-9
+    assert loop.step(0.05, target_n, estimate(100.0)) < motor_force_n + 1e-9
 
 
 def test_retarget_starts_where_the_ramp_is(loop, transmission):
@@ -96,8 +96,8 @@ def test_vision_alone_waits_for_the_ramp(transmission):
     loop = ForceLoop(ControlConfig(feedback="vision"), transmission)
     loop.start(0.5, 4.0)
     assert ramp(loop, 4.0, bias_n=0.5) == pytest.approx(4.0 + transmission.friction_n)
-    push_n = loop.step(0.005, 4.0, estimate(3.8, source="vision"))
+    motor_force_n = loop.step(0.005, 4.0, estimate(3.8, source="vision"))
     gains = loop.margins["vision"].gains
-    assert push_n == pytest.approx(
+    assert motor_force_n == pytest.approx(
         4.0 + transmission.friction_n + 0.2 * (gains.proportional + 0.005 * gains.integral_s)
     )

@@ -14,7 +14,7 @@ MS = 1_000_000
 
 
 class Bench:
-    """A motor that pushes with a known force, and an eye that is 40 ms late."""
+    """A motor that pushes with a known force, and an vision that is 40 ms late."""
 
     def __init__(self, transmission, **control):
         self.transmission = transmission
@@ -24,12 +24,22 @@ class Bench:
         self.estimate = None
 
     def run(
-        self, time_s, push_n, seen_n=None, std_n=0.1, latency_ms=40, noise=None, free=False, opening=False
+        self,
+        time_s,
+        motor_force_n,
+        seen_n=None,
+        std_n=0.1,
+        latency_ms=40,
+        noise=None,
+        free=False,
+        opening=False,
     ):
-        """`push_n` is a function of the time in seconds; `seen_n` is what vision says of a capture time."""
+        """`motor_force_n` and `seen_n` are functions of the time in seconds; `seen_n` is what vision estimates."""
         for _ in range(round(time_s * 200)):
             t_s = self.t_ns / 1e9
-            servo = ServoState(self.t_ns, 0.0, 0.0, self.transmission.current_a(push_n(t_s)), 30.0, 12.0, 0)
+            servo = ServoState(
+                self.t_ns, 0.0, 0.0, self.transmission.current_a(motor_force_n(t_s)), 30.0, 12.0, 0
+            )
             visual = None
             if seen_n is not None and self.t_ns // (5 * MS) % 3 == 0:
                 capture_ns = self.t_ns - latency_ms * MS
@@ -109,8 +119,8 @@ def test_jaws_that_open_are_believed_to_the_eye(bench, transmission):
 @given(st.lists(st.floats(-50, 50), min_size=1, max_size=30))
 def test_whatever_the_push_friction_is_never_negative(transmission, pushes_n):
     b = Bench(transmission, feedback="current")
-    for push_n in pushes_n:
-        assert b.run(0.005, lambda _, n=push_n: n, free=True).friction_n >= 0
+    for motor_force_n in pushes_n:
+        assert b.run(0.005, lambda _, n=motor_force_n: n, free=True).friction_n >= 0
 
 
 @pytest.mark.parametrize(

@@ -37,9 +37,11 @@ cycles = st.lists(
 def test_no_output_ever_leaves_the_limits(cycles, transmission, limit_a):
     limits = Limits(CONFIG, transmission, limit_a)
     last_a = 0.0
-    for position_rad, current_a, force_n, friction_n, push_n, dt_s, may_rise, opens in cycles:
+    for position_rad, current_a, force_n, friction_n, motor_force_n, dt_s, may_rise, opens in cycles:
         wanted = ServoCommand(0, position_rad, current_a)
-        out, over = limits.apply(wanted, force_n, friction_n, push_n, dt_s, may_rise=may_rise, opens=opens)
+        out, over = limits.apply(
+            wanted, force_n, friction_n, motor_force_n, dt_s, may_rise=may_rise, opens=opens
+        )
         believed_n = min(max(friction_n, 0.0), 2 * transmission.friction_n)
         cap_a = min(limit_a, (CONFIG.force_limit_n + believed_n) / transmission.n_per_a)
         assert 0.0 <= out.goal_current_a <= cap_a
@@ -48,7 +50,7 @@ def test_no_output_ever_leaves_the_limits(cycles, transmission, limit_a):
         assert over == (force_n > CONFIG.force_limit_n)
         if (over and not opens) or not may_rise:
             assert out.goal_current_a <= last_a
-        if over and not opens and push_n > CONFIG.force_limit_n - friction_n:
+        if over and not opens and motor_force_n > CONFIG.force_limit_n - friction_n:
             assert out.goal_current_a <= 0.85 * last_a
         rise_a = 4 * CONFIG.ramp_n_s / transmission.n_per_a * dt_s + 1.5 * transmission.current_step_a
         assert out.goal_current_a <= last_a + rise_a + 1e-12

@@ -47,8 +47,8 @@ def test_fused_holds_what_was_asked(drawn_run, target_n):
         assert phases(run) == ["approach", "contact", "ramp", "hold"]
         outcomes.append(run.last.status.outcome)
         score = score_grasp(run.cell, statuses(run), target_n)
-        # What the eye is off by over the whole grasp is no fault of the loop.
-        seen.append(abs(score.steady_n * run.eye.gain - target_n) / target_n)
+        # What the vision is off by over the whole grasp is no fault of the loop.
+        seen.append(abs(score.steady_n * run.vision.gain - target_n) / target_n)
         overshoot.append(score.overshoot_n)
     # Where friction is heaviest, a force a shade too high takes longer than this to come down.
     assert outcomes.count("held") >= 7
@@ -87,12 +87,12 @@ def test_vision_alone_holds(drawn_run):
     for seed in range(4):
         run = drawn_run(seed, feedback="vision").grasp(4.0, 8.0)
         score = score_grasp(run.cell, statuses(run), 4.0)
-        assert abs(score.steady_n * run.eye.gain - 4.0) < 0.15
+        assert abs(score.steady_n * run.vision.gain - 4.0) < 0.15
         assert run.last.status.outcome == "held"
 
 
 def test_fused_goes_on_when_vision_drops_out(make_run):
-    run = make_run(plant={"gain": 1.08}, eye={"off_after_s": 3.0}).grasp(4.0)
+    run = make_run(plant={"gain": 1.08}, vision={"off_after_s": 3.0}).grasp(4.0)
     assert run.last.estimate.source == "current"
     assert [text for text in run.texts if "vision dropped out" in text]
     assert run.last.status.outcome == "held"
@@ -158,7 +158,7 @@ def test_jaws_that_meet_before_it_is_held_are_a_slip(make_run):
 
 def test_collapse_of_the_force_is_a_slip(make_run):
     run = make_run(feedback="vision").grasp(4.0, 5.0)
-    run.eye.gain = 0.0
+    run.vision.gain = 0.0
     run.spoil = lambda _, servo: replace(servo, current_a=0.0)  # the motor gives way too
     run.go(1.5)
     assert run.last.status.outcome == "slip"
@@ -217,9 +217,9 @@ def test_stop_wins_in_every_phase(make_run, phase):
 
 @pytest.mark.parametrize("on_fault", ["limp", "hold"])
 def test_a_force_that_seems_too_much_never_keeps_the_jaws_from_opening(make_run, on_fault):
-    run = make_run(eye={"noise_n": 0.7}, feedback="vision", on_fault=on_fault, force_limit_n=4.5)
+    run = make_run(vision={"noise_n": 0.7}, feedback="vision", on_fault=on_fault, force_limit_n=4.5)
     run_to(run, "hold")
-    run.eye.gain = 1.3  # pictures that are on their way when the stop comes
+    run.vision.gain = 1.3  # pictures that are on their way when the stop comes
     run.go(0.02).go(0.5, "stop")
     assert any("over the limit" in event.text for d in run.decisions[-100:] for event in d.events)
     run.go(4.0, "release")
@@ -276,7 +276,7 @@ def test_a_servo_that_grows_hot_holds_less_and_says_so(make_run):
 
 @pytest.mark.parametrize("gain", [0.92, 1.08])
 def test_an_eye_that_sees_too_little_can_not_force_the_limit(make_run, gain):
-    run = make_run(force_limit_n=5.0, plant={"gain": gain}, eye={"gain": 0.6}).grasp(4.4, 6.0)
+    run = make_run(force_limit_n=5.0, plant={"gain": gain}, vision={"gain": 0.6}).grasp(4.4, 6.0)
     assert max(sample.force_n for sample in run.cell) <= 1.05 * 5.0
 
 

@@ -2,12 +2,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gripper_force.control.trajectory import Profile
+from gripper_force.control.trajectory import TrapezoidalProfile
 
 
 @given(st.floats(-10, 10), st.floats(-10, 10), st.floats(0.5, 10), st.floats(0.001, 0.05))
 def test_arrives_without_overshoot_within_rate(start, target, rate, dt_s):
-    profile = Profile(0.4)
+    profile = TrapezoidalProfile(0.4)
     profile.start(start, rate)
     low, high = min(start, target), max(start, target)
     for _ in range(round((abs(target - start) / rate + 2.0) / dt_s) + 2):
@@ -20,7 +20,7 @@ def test_arrives_without_overshoot_within_rate(start, target, rate, dt_s):
 
 
 def test_gathers_speed():
-    profile = Profile(0.4)
+    profile = TrapezoidalProfile(0.4)
     profile.start(0.0, 8.0)
     first = profile.step(8.0, 0.005)
     assert first == pytest.approx(8.0 / 0.4 * 0.005 * 0.005)

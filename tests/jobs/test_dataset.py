@@ -9,7 +9,7 @@ from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs.dataset import NEAR_NS, Clip, digest, label_frames, load_clip, load_clips, split_by
 from gripper_force.runtime.log import LogWriter
 from gripper_force.types import NS_PER_MS, Frame, LoadCellSample
-from gripper_force.vision.preprocess import Preprocess, shrink
+from gripper_force.vision.preprocess import Preprocess, downscale
 
 SMALL = Preprocess(size=16)
 MS = NS_PER_MS
@@ -89,11 +89,11 @@ def test_logs_become_clips(tmp_path: Path) -> None:
     a, b = load_clips(tmp_path, SMALL, workers=2)
     assert (a.name, a.object, a.set) == ("a", "cup", "a")
     assert (b.name, b.object, b.set) == ("b", "stapler", "press-7")
-    np.testing.assert_array_equal(b.frames, [shrink(f.gray, (4, 2, 32, 24), 16) for f in frames])
+    np.testing.assert_array_equal(b.frames, [downscale(f.gray, (4, 2, 32, 24), 16) for f in frames])
     assert b.valid.tolist() == [True, True, True, False]
     np.testing.assert_allclose(b.forces_n[:3], [0.25, 2.0, 4.0], rtol=1e-6)
     (again,) = load_clips([tmp_path / "deep" / "b.mcap"], SMALL, region=(0, 0, 30, 30))
-    np.testing.assert_array_equal(again.frames[0], shrink(frames[0].gray, (0, 0, 30, 30), 16))
+    np.testing.assert_array_equal(again.frames[0], downscale(frames[0].gray, (0, 0, 30, 30), 16))
 
 
 def test_what_is_missing_is_named(tmp_path: Path) -> None:

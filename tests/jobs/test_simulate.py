@@ -11,8 +11,8 @@ from gripper_force.jobs.simulate import (
     OBJECTS,
     PEAK_N,
     Kind,
-    Plan,
     SetPlan,
+    SimulationPlan,
     make_log,
     make_set,
     plan,
@@ -34,12 +34,15 @@ def test_a_plan_is_always_the_same_and_takes_the_objects_in_turn() -> None:
     assert [p.object for p in plans] == [*OBJECTS, *OBJECTS[:2]]
     assert [p.seed for p in plans] == list(range(100, 106))
     assert len({p.name for p in plans + plan("grasp", 6, 100)}) == 12
-    assert plan("grasp", 2, 7, ("tube",)) == [Plan("grasp", "tube", 7), Plan("grasp", "tube", 8)]
+    assert plan("grasp", 2, 7, ("tube",)) == [
+        SimulationPlan("grasp", "tube", 7),
+        SimulationPlan("grasp", "tube", 8),
+    ]
 
 
 @pytest.mark.parametrize("kind", ["press", "tap", "grasp"])
 def test_a_log_holds_a_touch_and_says_what_it_is(kind: Kind, config: Config, tmp_path: Path) -> None:
-    task = Plan(kind, "stapler", 100_003)
+    task = SimulationPlan(kind, "stapler", 100_003)
     path = make_log(task, tmp_path, config.model_dump(mode="json"))
     assert path == tmp_path / f"{kind}-stapler-100003.mcap"
     assert list(tmp_path.iterdir()) == [path]
@@ -58,7 +61,9 @@ def test_a_log_holds_a_touch_and_says_what_it_is(kind: Kind, config: Config, tmp
 def test_a_seed_makes_one_log_and_another_seed_another(config: Config, tmp_path: Path) -> None:
     def forces(seed: int, folder: str) -> list[float]:
         (tmp_path / folder).mkdir()
-        path = make_log(Plan("press", "stapler", seed), tmp_path / folder, config.model_dump(mode="json"))
+        path = make_log(
+            SimulationPlan("press", "stapler", seed), tmp_path / folder, config.model_dump(mode="json")
+        )
         return [s.force_n for s in LogReader(path).records(LoadCellSample)]
 
     first = forces(1, "a")
@@ -69,7 +74,7 @@ def test_a_seed_makes_one_log_and_another_seed_another(config: Config, tmp_path:
 def test_frames_are_in_the_log(config: Config, tmp_path: Path) -> None:
     camera = config.camera.model_copy(update={"backend": "simulated", "rate_hz": 10.0})
     seen = config.model_copy(update={"camera": camera})
-    path = make_log(Plan("press", "stapler", 3), tmp_path, seen.model_dump(mode="json"))
+    path = make_log(SimulationPlan("press", "stapler", 3), tmp_path, seen.model_dump(mode="json"))
     frames = list(LogReader(path).records(Frame))
     assert len(frames) > 5
     assert frames[0].gray.shape == (128, 128)
@@ -90,7 +95,7 @@ def test_what_was_broken_off_goes_on(config: Config, tmp_path: Path) -> None:
 
 def test_a_scene_that_fails_leaves_no_log_under_its_name(config: Config, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no simulated object 'egg'"):
-        make_log(Plan("press", "egg", 5), tmp_path, config.model_dump(mode="json"))
+        make_log(SimulationPlan("press", "egg", 5), tmp_path, config.model_dump(mode="json"))
     assert not list(tmp_path.glob("*.mcap"))
 
 
@@ -191,7 +196,7 @@ def test_the_protocol_needs_its_camera(config: Config, tmp_path: Path) -> None:
 
 def test_what_is_drawn_for_a_press_stays_to_the_bit() -> None:
     rng = np.random.default_rng([100_000, 10])
-    made = module._randomised(Config(), Plan("press", "tube", 100_000), rng)
+    made = module._randomised(Config(), SimulationPlan("press", "tube", 100_000), rng)
     assert (made.control.ramp_n_s, made.target_n, rng.uniform()) == (
         22.15120772485808,
         1.799035382848817,

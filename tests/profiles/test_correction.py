@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from gripper_force.errors import ConfigError
 from gripper_force.profiles.correction import (
     Correction,
-    HeadAndGate,
+    ProfileArrays,
     curve_n,
     load_correction,
     pack,
@@ -29,19 +29,19 @@ def profile(weights: str = "") -> ObjectProfile:
         force_n=6.0,
         output=OutputCurve(kind="monotone", estimate_n=(0.0, 2.0, 4.0), force_n=(0.5, 1.5, 4.5)),
         interval=Interval(coverage=0.9, base_n=0.3, share=0.1),
-        gate=0.5,
+        ood_limit=0.5,
         before_n=0.5,
         weights=weights,
     )
 
 
-def arrays(features: int = 5, spread: float = 2.0) -> HeadAndGate:
+def arrays(features: int = 5, spread: float = 2.0) -> ProfileArrays:
     axes = np.eye(features, 2, dtype=np.float32)
     zeros = np.zeros(features, np.float32)
-    return HeadAndGate(zeros, np.zeros(1, np.float32), zeros, axes, np.array([spread], np.float32))
+    return ProfileArrays(zeros, np.zeros(1, np.float32), zeros, axes, np.array([spread], np.float32))
 
 
-def written(path: Path, arrays: HeadAndGate) -> str:
+def written(path: Path, arrays: ProfileArrays) -> str:
     data = pack(arrays)
     weights_path(path).write_bytes(data)
     return sha256(data).hexdigest()
@@ -65,7 +65,7 @@ def test_the_interval_grows_with_the_force_and_fast_beyond_what_was_calibrated()
 def test_strange_is_what_lies_off_the_plane() -> None:
     correction = Correction(profile(), arrays())
     on, off = np.array([[9, 9, 0, 0, 0], [9, 9, 0, 1, 1]], np.float32)
-    assert correction.strangeness(np.stack([on, off])) == pytest.approx([0, 1 / 0.5])
+    assert correction.ood_score(np.stack([on, off])) == pytest.approx([0, 1 / 0.5])
 
 
 def test_both_halves_come_back_and_belong_together(tmp_path: Path) -> None:
@@ -74,7 +74,7 @@ def test_both_halves_come_back_and_belong_together(tmp_path: Path) -> None:
     correction = load_correction(path, profile(weights), 5)
     features = np.random.default_rng(0).normal(size=(7, 5)).astype(np.float32)
     expected = Correction(profile(), arrays())
-    np.testing.assert_array_equal(correction.strangeness(features), expected.strangeness(features))
+    np.testing.assert_array_equal(correction.ood_score(features), expected.ood_score(features))
     with pytest.raises(ConfigError, match="for another network: this one has 6"):
         load_correction(path, profile(weights), 6)
     with pytest.raises(ConfigError, match="does not belong to"):

@@ -31,7 +31,7 @@ def profile(**keys: object) -> ObjectProfile:
         force_n=7.5,
         output=OutputCurve(kind="affine", estimate_n=(0.0, 8.0), force_n=(0.1, 6.5)),
         interval=Interval(coverage=0.9, base_n=0.1, share=0.03),
-        gate=0.02,
+        ood_limit=0.02,
         plant=LoopPlant(
             gain=0.9, lag_ms=30, delay_ms=40, proportional=0.4, integral_s=14, phase_margin_deg=61
         ),

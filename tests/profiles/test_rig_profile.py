@@ -6,7 +6,7 @@ import pytest
 from gripper_force.config import load_config
 from gripper_force.errors import ConfigError
 from gripper_force.profiles.rig_profile import (
-    Estimate,
+    CalibratedValue,
     LoadCellCalibration,
     RigProfile,
     ServoCalibration,
@@ -18,20 +18,20 @@ NOW = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
 CELL = LoadCellCalibration(
     date=NOW,
     sensor="serial hx711",
-    tare_raw=Estimate(value=8000, low=7990, high=8010),
-    n_per_raw=Estimate(value=1e-4, low=0.99e-4, high=1.01e-4),
+    tare_raw=CalibratedValue(value=8000, low=7990, high=8010),
+    n_per_raw=CalibratedValue(value=1e-4, low=0.99e-4, high=1.01e-4),
     force_n=(0, 19.6),
     noise_n=0.01,
-    drift_n_min=Estimate(value=0.0, low=-0.01, high=0.01),
+    drift_n_min=CalibratedValue(value=0.0, low=-0.01, high=0.01),
 )
 SERVO = ServoCalibration(
     date=NOW,
     model="XM430-W350",
-    nm_per_a=Estimate(value=1.7, low=1.69, high=1.71),
-    friction_n=Estimate(value=0.9, low=0.8, high=1.0),
-    damping_n_s_m=Estimate(value=14, low=13, high=15),
-    pinion_radius_m=Estimate(value=0.02),
-    open_position_rad=Estimate(value=0.01, low=0.0, high=0.02),
+    nm_per_a=CalibratedValue(value=1.7, low=1.69, high=1.71),
+    friction_n=CalibratedValue(value=0.9, low=0.8, high=1.0),
+    damping_n_s_m=CalibratedValue(value=14, low=13, high=15),
+    pinion_radius_m=CalibratedValue(value=0.02),
+    open_position_rad=CalibratedValue(value=0.01, low=0.0, high=0.02),
     open_width_m=0.09,
     force_n=(1, 9),
     speed_m_s=(0.01, 0.05),
@@ -95,4 +95,4 @@ def test_a_folder_that_can_not_be_written_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize("bounds", [{"low": 2.0, "high": 3.0}, {"low": 0.0}, {"low": 0.0, "high": 0.5}])
 def test_an_interval_holds_its_value(bounds: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=r"low and high|must lie between"):
-        Estimate(value=1.0, **bounds)
+        CalibratedValue(value=1.0, **bounds)

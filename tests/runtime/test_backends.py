@@ -108,7 +108,7 @@ def closed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
             return real(path)
         rig = device("rig")
         rig.clock, rig.start_ns, rig.check, rig.notes = MonotonicClock(), 0, lambda: None, dict
-        rig.camera, rig.load_cell, rig.relight = device("camera"), device("load cell"), None
+        rig.camera, rig.load_cell, rig.render_under_light = device("camera"), device("load cell"), None
         return lambda *_: rig
 
     monkeypatch.setattr(backends, "load", load)

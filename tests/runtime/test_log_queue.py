@@ -7,7 +7,7 @@ import pytest
 from gripper_force.errors import LogError
 from gripper_force.runtime import log_queue as recorder_module
 from gripper_force.runtime.log import LogReader, LogWriter
-from gripper_force.runtime.log_queue import Recorder
+from gripper_force.runtime.log_queue import LogQueue
 from gripper_force.types import Event, Frame, Record
 
 
@@ -49,13 +49,13 @@ def events(count: int) -> list[Event]:
 
 @pytest.mark.parametrize("lockstep", [True, False])
 def test_all_is_written_in_order(gate: Gate, path: Path, lockstep: bool) -> None:
-    recorder = Recorder(gate, lockstep=lockstep)  # type: ignore[arg-type]
+    log_queue = LogQueue(gate, lockstep=lockstep)  # type: ignore[arg-type]
     for event in events(1000):
-        recorder.write(event)
-    recorder.attach("note.txt", b"well", "text/plain")
-    recorder.close()
-    recorder.close()
-    recorder.raise_losses()
+        log_queue.write(event)
+    log_queue.attach("note.txt", b"well", "text/plain")
+    log_queue.close()
+    log_queue.close()
+    log_queue.raise_losses()
     reader = LogReader(path)
     assert list(reader.records(Event)) == events(1000)
     assert reader.attachments["note.txt"] == b"well"
@@ -63,64 +63,64 @@ def test_all_is_written_in_order(gate: Gate, path: Path, lockstep: bool) -> None
 
 @pytest.mark.parametrize("lockstep", [True, False])
 def test_a_disk_that_fails_is_told_at_the_end(gate: Gate, path: Path, lockstep: bool) -> None:
-    recorder = Recorder(gate, lockstep=lockstep)  # type: ignore[arg-type]
-    recorder.write(events(1)[0])
+    log_queue = LogQueue(gate, lockstep=lockstep)  # type: ignore[arg-type]
+    log_queue.write(events(1)[0])
     if not lockstep:
-        while recorder._queue.qsize():
+        while log_queue._queue.qsize():
             pass
     gate.fails = True
     for event in events(5):
-        recorder.write(event)
-    recorder.close()
-    assert recorder.lost == 5
+        log_queue.write(event)
+    log_queue.close()
+    assert log_queue.lost == 5
     with pytest.raises(LogError, match="no space; the run went on, and its log lacks 5 records"):
-        recorder.raise_losses()
+        log_queue.raise_losses()
 
 
 def test_a_slow_disk_keeps_nobody_waiting(gate: Gate, path: Path) -> None:
     gate.opened.clear()
-    recorder = Recorder(gate, lockstep=False)  # type: ignore[arg-type]
+    log_queue = LogQueue(gate, lockstep=False)  # type: ignore[arg-type]
     for event in events(recorder_module.ROOM + 100):
-        recorder.write(event)  # returns, though the disk does not
-    assert 99 <= recorder.lost <= 100
+        log_queue.write(event)  # returns, though the disk does not
+    assert 99 <= log_queue.lost <= 100
     gate.opened.set()
-    recorder.close()
+    log_queue.close()
     with pytest.raises(LogError, match="the disk is too slow"):
-        recorder.raise_losses()
+        log_queue.raise_losses()
     written = list(LogReader(path).records(Event))
     sent = events(recorder_module.ROOM + 100)
     # The thread holds one record beyond the queue's room, and may have taken it at any time meanwhile.
     assert written[: recorder_module.ROOM] == sent[: recorder_module.ROOM]
     assert all(event in sent[recorder_module.ROOM :] for event in written[recorder_module.ROOM :])
-    assert len(written) + recorder.lost == recorder_module.ROOM + 100
+    assert len(written) + log_queue.lost == recorder_module.ROOM + 100
 
 
 @pytest.mark.parametrize("count", [1, recorder_module.ROOM + 100])
 def test_a_disk_that_hangs_does_not_keep_the_run_from_ending(
-    gate: Gate, monkeypatch: pytest.MonkeyPatch, count: int
+    ood_limit: Gate, monkeypatch: pytest.MonkeyPatch, count: int
 ) -> None:
     monkeypatch.setattr(recorder_module, "_PATIENCE_S", 0.05)
     gate.opened.clear()
-    recorder = Recorder(gate, lockstep=False)  # type: ignore[arg-type]
+    log_queue = LogQueue(gate, lockstep=False)  # type: ignore[arg-type]
     for event in events(count):
-        recorder.write(event)
-    recorder.close()
+        log_queue.write(event)
+    log_queue.close()
     with pytest.raises(LogError, match="has not taken the last records"):
-        recorder.raise_losses()
+        log_queue.raise_losses()
     gate.opened.set()
-    recorder.close()
+    log_queue.close()
 
 
 @pytest.mark.parametrize("lockstep", [True, False])
 def test_a_record_that_does_not_fit_is_lost_alone(path: Path, lockstep: bool) -> None:
-    recorder = Recorder(LogWriter(path, config="", metadata={}), lockstep=lockstep)
+    log_queue = LogQueue(LogWriter(path, config="", metadata={}), lockstep=lockstep)
     sound = events(12)
     for record in (*sound[:10], Event(-1, "test", "before all time"), *sound[10:]):
-        recorder.write(record)
-    recorder.write(Frame(5, 5, 2**32, np.zeros((2, 2), np.uint8)))
-    recorder.write(Event(13, "test", "after"))
-    recorder.close()
-    assert recorder.lost == 2
+        log_queue.write(record)
+    log_queue.write(Frame(5, 5, 2**32, np.zeros((2, 2), np.uint8)))
+    log_queue.write(Event(13, "test", "after"))
+    log_queue.close()
+    assert log_queue.lost == 2
     assert list(LogReader(path).records(Event)) == [*sound, Event(13, "test", "after")]
 
 
@@ -139,16 +139,16 @@ def test_records_of_a_chunk_that_is_not_written_count_as_lost(path: Path) -> Non
 
     files: list[Full] = []
     log = LogWriter(path, config="", metadata={}, through=lambda f: files.append(Full(f)) or files[0])  # type: ignore[arg-type, func-returns-value]
-    recorder = Recorder(log, lockstep=True)
+    log_queue = LogQueue(log, lockstep=True)
     for i in range(10):
-        recorder.write(Event(i, "test", "kept"))
-    recorder.write(Event(200_000_000, "test", "closes the chunk"))
+        log_queue.write(Event(i, "test", "kept"))
+    log_queue.write(Event(200_000_000, "test", "closes the chunk"))
     files[0].is_full = True
     for i in range(7):
-        recorder.write(Event(300_000_000 + i, "test", "lost"))
-    recorder.write(Event(500_000_000, "test", "would close the chunk"))
-    recorder.write(Event(500_000_001, "test", "too late"))
-    recorder.close()
+        log_queue.write(Event(300_000_000 + i, "test", "lost"))
+    log_queue.write(Event(500_000_000, "test", "would close the chunk"))
+    log_queue.write(Event(500_000_001, "test", "too late"))
+    log_queue.close()
     kept = list(LogReader(path, recover=True).records(Event))
     assert len(kept) == 11
-    assert recorder.lost >= 9
+    assert log_queue.lost >= 9

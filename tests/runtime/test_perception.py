@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gripper_force.errors import DataError
-from gripper_force.runtime.perception import LockstepPerception, Seen, ThreadedPerception
+from gripper_force.runtime.perception import LockstepPerception, ProcessedFrame, ThreadedPerception
 from gripper_force.types import NS_PER_MS, Frame, Gray
 
 
@@ -16,7 +16,7 @@ class Guess(NamedTuple):
     std_n: float
 
 
-class Eye:
+class FakeEstimator:
     """Says how many frames it has seen, after its reference frames."""
 
     def __init__(self, error: Exception | None = None, at: int = 1, references: int = 1) -> None:
@@ -65,23 +65,23 @@ class Shutter:
         return {}
 
 
-def seqs(seen: list[Seen]) -> list[int]:
+def seqs(seen: list[ProcessedFrame]) -> list[int]:
     return [s.frame.seq for s in seen]
 
 
 def test_in_lockstep_an_estimate_is_there_after_its_time_and_not_before() -> None:
     clock, camera = Hand(), Shutter()
-    eyes = LockstepPerception(camera, Eye(), clock, compute_ms=12.0)
+    perception = LockstepPerception(camera, FakeEstimator(), clock, compute_ms=12.0)
     for seq, t_ms in enumerate((0, 20)):
         camera.give(seq, t_ms)
         clock.now_ms = t_ms
-        assert eyes.poll() == []
+        assert perception.poll() == []
         clock.now_ms += 11
-        assert eyes.poll() == []
+        assert perception.poll() == []
         clock.now_ms += 1
-        (seen,) = eyes.poll()
+        (seen,) = perception.poll()
         assert seen.frame.seq == seq
-        assert eyes.poll() == []
+        assert perception.poll() == []
     assert seen.visual is not None
     assert (seen.visual.t_ns, seen.visual.ready_ns) == (20 * NS_PER_MS, 32 * NS_PER_MS)
     assert (seen.visual.seq, seen.visual.force_n, seen.visual.std_n) == (1, 2.0, 0.5)
@@ -90,111 +90,111 @@ def test_in_lockstep_an_estimate_is_there_after_its_time_and_not_before() -> Non
 
 def test_the_reference_frame_is_seen_and_gives_no_estimate() -> None:
     clock, camera = Hand(), Shutter()
-    eyes = LockstepPerception(camera, Eye(), clock, compute_ms=0.0)
+    perception = LockstepPerception(camera, FakeEstimator(), clock, compute_ms=0.0)
     camera.give(0)
-    (seen,) = eyes.poll()
+    (seen,) = perception.poll()
     assert (seen.frame.seq, seen.visual) == (0, None)
 
 
 def test_in_lockstep_no_frame_is_taken_while_the_last_is_under_way() -> None:
-    clock, camera, eye = Hand(), Shutter(), Eye()
-    eyes = LockstepPerception(camera, eye, clock, compute_ms=12.0)
+    clock, camera, estimator = Hand(), Shutter(), FakeEstimator()
+    perception = LockstepPerception(camera, estimator, clock, compute_ms=12.0)
     camera.give(0)
-    eyes.poll()
+    perception.poll()
     camera.give(1)
     clock.now_ms = 11
-    eyes.poll()
-    assert eye.count == 1
+    perception.poll()
+    assert estimator.count == 1
     clock.now_ms = 12
-    assert seqs(eyes.poll()) == [0]
-    assert eye.count == 2
+    assert seqs(perception.poll()) == [0]
+    assert estimator.count == 2
 
 
 def test_without_an_estimator_frames_pass_at_once() -> None:
     clock, camera = Hand(), Shutter()
-    eyes = LockstepPerception(camera, None, clock, compute_ms=12.0)
+    perception = LockstepPerception(camera, None, clock, compute_ms=12.0)
     camera.give(3)
-    assert [(s.frame.seq, s.visual) for s in eyes.poll()] == [(3, None)]
+    assert [(s.frame.seq, s.visual) for s in perception.poll()] == [(3, None)]
     assert LockstepPerception(None, None, clock, 12.0).poll() == []
 
 
 @pytest.mark.parametrize("at", [1, 2])
 def test_in_lockstep_an_error_before_the_first_estimate_is_the_callers(at: int) -> None:
     camera = Shutter()
-    eyes = LockstepPerception(camera, Eye(DataError("no picture"), at), Hand(), 0.0)
+    perception = LockstepPerception(camera, FakeEstimator(DataError("no picture"), at), Hand(), 0.0)
     for _ in range(at - 1):
         camera.give(0)
-        eyes.poll()
+        perception.poll()
     camera.give(1)
     with pytest.raises(DataError, match="no picture"):
-        eyes.poll()
+        perception.poll()
 
 
 def test_a_later_error_costs_one_estimate_and_is_told() -> None:
     camera = Shutter()
-    eyes = LockstepPerception(camera, Eye(RuntimeError("no kernel"), at=4), Hand(), 0.0)
+    perception = LockstepPerception(camera, FakeEstimator(RuntimeError("no kernel"), at=4), Hand(), 0.0)
     seen = []
     for seq in range(6):
         camera.give(seq)
-        seen += eyes.poll()
+        seen += perception.poll()
     assert [s.visual is None for s in seen] == [True, False, False, True, False, False]
     assert [s.problem for s in seen] == ["", "", "", "RuntimeError: no kernel", "", ""]
 
 
 def test_a_camera_that_hangs_gives_no_estimates() -> None:
-    camera, eye = Shutter(), Eye()
-    eyes = LockstepPerception(camera, eye, Hand(), 0.0)
+    camera, estimator = Shutter(), FakeEstimator()
+    perception = LockstepPerception(camera, estimator, Hand(), 0.0)
     seen = []
     for seq, level in enumerate((1, 2, 3, 3, 3, 4)):
         camera.give(seq, level=level)
-        seen += eyes.poll()
+        seen += perception.poll()
     assert ["hangs" in s.problem for s in seen] == [False, False, False, True, True, False]
     assert [s.visual is None for s in seen] == [True, False, False, True, True, False]
-    assert eye.count == 4
+    assert estimator.count == 4
 
 
 def test_one_picture_that_came_twice_at_the_start_excuses_no_camera_that_hangs() -> None:
-    camera, eye = Shutter(), Eye(references=3)
-    eyes = LockstepPerception(camera, eye, Hand(), 0.0)
+    camera, estimator = Shutter(), FakeEstimator(references=3)
+    perception = LockstepPerception(camera, estimator, Hand(), 0.0)
     seen = []
     for seq, level in enumerate((1, 1, 2, 3, 4, 5, 5, 5)):
         camera.give(seq, level=level)
-        seen += eyes.poll()
+        seen += perception.poll()
     assert ["hangs" in s.problem for s in seen] == [False] * 6 + [True] * 2
 
 
 def test_a_recording_may_stand_still() -> None:
-    camera, eye = Shutter(), Eye()
-    eyes = LockstepPerception(camera, eye, Hand(), 0.0)
+    camera, estimator = Shutter(), FakeEstimator()
+    perception = LockstepPerception(camera, estimator, Hand(), 0.0)
     for seq in range(5):
         camera.give(seq, level=7)
-        (seen,) = eyes.poll()
+        (seen,) = perception.poll()
         assert seen.problem == ""
-    assert eye.count == 5
+    assert estimator.count == 5
 
 
-def gather(eyes: ThreadedPerception, count: int) -> list[Seen]:
-    seen: list[Seen] = []
+def gather(perception: ThreadedPerception, count: int) -> list[ProcessedFrame]:
+    seen: list[ProcessedFrame] = []
     until_s = time.monotonic() + 20
     while len(seen) < count and time.monotonic() < until_s:
-        seen += eyes.poll()
+        seen += perception.poll()
         time.sleep(0.001)
     return seen
 
 
-@pytest.mark.parametrize("eye", [Eye(), None])
-def test_a_thread_sees_every_frame_it_is_handed(eye: Eye | None) -> None:
+@pytest.mark.parametrize("estimator", [FakeEstimator(), None])
+def test_a_thread_sees_every_frame_it_is_handed(estimator: FakeEstimator | None) -> None:
     clock, camera = Hand(), Shutter()
     clock.now_ms = 30
     for seq in range(5):
         camera.give(seq, seq)
-    eyes = ThreadedPerception(camera, eye, clock)
-    eyes.start()
-    seen = gather(eyes, 5)
-    eyes.close()
-    eyes.close()
+    perception = ThreadedPerception(camera, estimator, clock)
+    perception.start()
+    seen = gather(perception, 5)
+    perception.close()
+    perception.close()
     assert seqs(seen) == list(range(5))
-    if eye is None:
+    if estimator is None:
         assert all(s.visual is None for s in seen)
         return
     assert seen[0].visual is None
@@ -207,21 +207,21 @@ def test_a_thread_sees_every_frame_it_is_handed(eye: Eye | None) -> None:
 def test_what_stops_the_thread_is_raised_by_poll(error: Exception) -> None:
     camera = Shutter()
     camera.give(0)
-    eyes = ThreadedPerception(camera, Eye(error), Hand())
-    eyes.start()
+    perception = ThreadedPerception(camera, FakeEstimator(error), Hand())
+    perception.start()
     with pytest.raises(type(error), match="no "):
-        gather(eyes, 1)
-    eyes.close()
+        gather(perception, 1)
+    perception.close()
 
 
 def test_a_thread_survives_a_later_error() -> None:
     camera = Shutter()
     for seq in range(5):
         camera.give(seq)
-    eyes = ThreadedPerception(camera, Eye(RuntimeError("no kernel"), at=3), Hand())
-    eyes.start()
-    seen = gather(eyes, 5)
-    eyes.close()
+    perception = ThreadedPerception(camera, FakeEstimator(RuntimeError("no kernel"), at=3), Hand())
+    perception.start()
+    seen = gather(perception, 5)
+    perception.close()
     assert [s.problem for s in seen] == ["", "", "RuntimeError: no kernel", "", ""]
 
 
@@ -232,8 +232,8 @@ def test_closing_leaves_no_thread_started_or_not() -> None:
     blind.start()
     assert blind.poll() == []
     blind.close()
-    eyes = ThreadedPerception(Shutter(), None, Hand())
-    eyes.start()
+    perception = ThreadedPerception(Shutter(), None, Hand())
+    perception.start()
     assert "perception" in {thread.name for thread in threading.enumerate()}
-    eyes.close()
+    perception.close()
     assert "perception" not in {thread.name for thread in threading.enumerate()}

@@ -99,7 +99,7 @@ def test_what_half_precision_cannot_hold_is_kept_whole(factor: float, tmp_path: 
     save_checkpoint(tmp_path / "one.safetensors", [network], header(SSAM))
     (loaded,) = load_checkpoint(tmp_path / "one.safetensors").networks
     assert torch.equal(loaded.dense.weight, network.dense.weight)
-    assert not torch.equal(loaded.blstm.onward.weight_ih_l0, network.blstm.onward.weight_ih_l0)
+    assert not torch.equal(loaded.blstm.forward_lstm.weight_ih_l0, network.blstm.forward_lstm.weight_ih_l0)
 
 
 def test_an_ensemble_of_full_size_fits_in_12_mb(tmp_path: Path) -> None:

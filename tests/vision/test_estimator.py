@@ -6,15 +6,15 @@ import pytest
 import torch
 
 from gripper_force.errors import ConfigError, DataError, NonFiniteError
-from gripper_force.profiles.correction import Correction, HeadAndGate
+from gripper_force.profiles.correction import Correction, ProfileArrays
 from gripper_force.profiles.object_profile import Interval, ObjectProfile, OutputCurve
 from gripper_force.vision.batch_inference import features, predict
 from gripper_force.vision.checkpoint import Checkpoint
 from gripper_force.vision.engines.pytorch import TorchEngine
-from gripper_force.vision.estimator import Estimate, ForceEstimator
+from gripper_force.vision.estimator import ForceEstimate, ForceEstimator
 from gripper_force.vision.header import Header, NetworkConfig, Residual
 from gripper_force.vision.network import ForceNetwork
-from gripper_force.vision.preprocess import Preprocess, shrink
+from gripper_force.vision.preprocess import Preprocess, downscale
 
 REGION = (10, 5, 40, 40)
 RESIDUALS = (Residual(force_n=-100, std_n=0), Residual(force_n=100, std_n=2))
@@ -37,14 +37,14 @@ def frames() -> np.ndarray:
     return np.random.default_rng(0).integers(0, 256, (30, 50, 60), np.uint8)
 
 
-def run(estimator: ForceEstimator, frames: np.ndarray) -> list[Estimate | None]:
+def run(estimator: ForceEstimator, frames: np.ndarray) -> list[ForceEstimate | None]:
     return [estimator.update(frame) for frame in frames]
 
 
 def test_equals_the_whole_clip_at_once(frames: np.ndarray) -> None:
     checkpoint = ensemble("ssam", "scam")
     estimates = run(ForceEstimator(TorchEngine(checkpoint), REGION), frames)
-    small = np.stack([shrink(frame, REGION, 32) for frame in frames])
+    small = np.stack([downscale(frame, REGION, 32) for frame in frames])
     members = predict(checkpoint.networks, checkpoint.header.preprocess, small)  # (2, 30)
     assert estimates[:3] == [None] * 3
     for estimate, (ssam, scam) in zip(estimates[3:], members.T[3:].tolist(), strict=True):
@@ -73,7 +73,7 @@ def test_without_a_reference_every_frame_counts(frames: np.ndarray) -> None:
 def test_the_reference_is_what_the_region_shows(frames: np.ndarray) -> None:
     estimator = ForceEstimator(TorchEngine(ensemble("ssam")), REGION)
     run(estimator, frames)
-    expected = np.mean([shrink(frame, REGION, 32) for frame in frames[:4]], axis=0).round()
+    expected = np.mean([downscale(frame, REGION, 32) for frame in frames[:4]], axis=0).round()
     assert estimator.reference is not None
     np.testing.assert_array_equal(estimator.reference, expected)
 
@@ -156,13 +156,13 @@ def correction(gate: float, mean: np.ndarray) -> Correction:
         force_n=5.0,
         output=OutputCurve(kind="affine", estimate_n=(0.0, 2.0), force_n=(0.2, 1.2)),
         interval=Interval(coverage=0.9, base_n=0.3, share=0.1),
-        gate=gate,
+        ood_limit=gate,
         before_n=0.5,
         weights="",
     )
     head = np.zeros(len(mean), np.float32)
     head[3] = 2.0
-    arrays = HeadAndGate(
+    arrays = ProfileArrays(
         head, np.array([0.1], np.float32), mean, unit / np.linalg.norm(unit), np.array([1.0], np.float32)
     )
     return Correction(profile, arrays)
@@ -170,7 +170,7 @@ def correction(gate: float, mean: np.ndarray) -> Correction:
 
 def test_a_profile_corrects_each_frame_as_it_would_the_whole_clip(frames: np.ndarray) -> None:
     checkpoint = ensemble("ssam", "scam")
-    small = np.stack([shrink(frame, REGION, 32) for frame in frames])
+    small = np.stack([downscale(frame, REGION, 32) for frame in frames])
     forces, read = features(checkpoint.networks, checkpoint.header.preprocess, small)
     profile = correction(1e6, read.mean(0))
     estimates = run(ForceEstimator(TorchEngine(checkpoint), REGION, profile), frames)

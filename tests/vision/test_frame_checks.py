@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from gripper_force.errors import DataError
 from gripper_force.runtime.log import LogReader
 from gripper_force.types import Frame, Gray
-from gripper_force.vision.frame_checks import Plausibility
-from gripper_force.vision.preprocess import shrink
+from gripper_force.vision.frame_checks import FrameChecks
+from gripper_force.vision.preprocess import downscale
 
 RNG = np.random.default_rng(0)
 
@@ -22,14 +22,14 @@ def scene(seed: int) -> Gray:
     return picture.round().astype(np.uint8)
 
 
-def look(plausibility: Plausibility, gray: Gray) -> None:
-    plausibility.check(shrink(gray, None, 64))
+def look(plausibility: FrameChecks, gray: Gray) -> None:
+    plausibility.check(downscale(gray, None, 64))
 
 
 def test_whole_runs_pass(fused_log: Path) -> None:
     frames = [frame.gray for frame in LogReader(fused_log).records(Frame)]
     assert len(frames) > 50
-    plausibility = Plausibility()
+    plausibility = FrameChecks()
     for gray in frames:
         look(plausibility, gray)
 
@@ -45,7 +45,7 @@ FAULTS: dict[str, Callable[[Gray], Gray]] = {
 
 @pytest.mark.parametrize("what", FAULTS)
 def test_a_broken_picture_is_named_and_the_next_good_one_passes(what: str) -> None:
-    plausibility = Plausibility()
+    plausibility = FrameChecks()
     for seed in range(5):
         look(plausibility, scene(seed))
     with pytest.raises(DataError, match=what.strip()):
@@ -55,11 +55,11 @@ def test_a_broken_picture_is_named_and_the_next_good_one_passes(what: str) -> No
 
 def test_a_covered_lens_is_told_from_the_first_frame_on() -> None:
     with pytest.raises(DataError, match="lens"):
-        look(Plausibility(), np.full((128, 128), 3, np.uint8))
+        look(FrameChecks(), np.full((128, 128), 3, np.uint8))
 
 
 @given(st.floats(0.75, 1.3), st.integers(-6, 6))
 def test_light_and_shift_of_a_grasp_pass(gain: float, shift: int) -> None:
-    plausibility = Plausibility()
+    plausibility = FrameChecks()
     look(plausibility, scene(0))
     look(plausibility, np.clip(np.roll(scene(1), shift, 1) * gain, 0, 255).astype(np.uint8))

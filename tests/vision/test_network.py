@@ -30,13 +30,13 @@ def build(config: NetworkConfig, seed: int = 0) -> ForceNetwork:
 
 def as_torch_blstm(blstm: LastStepBlstm) -> nn.LSTM:
     """The same weights in PyTorch's own bidirectional LSTM, with noise where no weight may matter."""
-    hidden = blstm.onward.hidden_size
-    full = nn.LSTM(blstm.onward.input_size, hidden, batch_first=True, bidirectional=True)
-    for name, weight in blstm.onward.named_parameters():
+    hidden = blstm.forward_lstm.hidden_size
+    full = nn.LSTM(blstm.forward_lstm.input_size, hidden, batch_first=True, bidirectional=True)
+    for name, weight in blstm.forward_lstm.named_parameters():
         getattr(full, name).data.copy_(weight)
     keep = torch.cat([torch.arange(hidden), torch.arange(2 * hidden, 4 * hidden)])  # in, (forget,) cell, out
-    full.weight_ih_l0_reverse.data[keep] = blstm.backward_gates.weight
-    full.bias_ih_l0_reverse.data[keep] = blstm.backward_gates.bias
+    full.weight_ih_l0_reverse.data[keep] = blstm.backward_linear.weight
+    full.bias_ih_l0_reverse.data[keep] = blstm.backward_linear.bias
     full.bias_hh_l0_reverse.data.zero_()
     return full
 
@@ -137,7 +137,7 @@ def test_batches_are_independent() -> None:
 
 def test_the_full_size_network_fits_the_paper() -> None:
     network = ForceNetwork(NetworkConfig(attention="ssam"))
-    assert network.blstm.onward.hidden_size == 256
+    assert network.blstm.forward_lstm.hidden_size == 256
     assert network.dense.out_features == 1024
     assert network.config.window == 20
     assert network.config.context == 20

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.vision.batch_inference import normalise
-from gripper_force.vision.preprocess import Normaliser, Preprocess, shrink
+from gripper_force.vision.preprocess import Normaliser, Preprocess, downscale
 
 SMALL = Preprocess(size=16)
 
@@ -26,20 +26,20 @@ def stream(preprocess: Preprocess, frames: np.ndarray) -> list[np.ndarray]:
 def test_shrink_cuts_the_region_then_resizes() -> None:
     gray = np.arange(40 * 60, dtype=np.uint16).reshape(40, 60).astype(np.uint8)
     expected = cv2.resize(gray[4:36, 8:40], (16, 16), interpolation=cv2.INTER_AREA)
-    np.testing.assert_array_equal(shrink(gray, (8, 4, 32, 32), 16), expected)
-    assert shrink(gray, None, 16).shape == (16, 16)
+    np.testing.assert_array_equal(downscale(gray, (8, 4, 32, 32), 16), expected)
+    assert downscale(gray, None, 16).shape == (16, 16)
 
 
 @pytest.mark.parametrize("region", [(-1, 0, 8, 8), (0, 0, 61, 8), (0, 33, 8, 8), (0, 0, 0, 8)])
 def test_a_region_beyond_the_frame_is_named(region: tuple[int, int, int, int]) -> None:
     with pytest.raises(ConfigError, match=r"vision\.region.*60x40"):
-        shrink(np.zeros((40, 60), np.uint8), region, 16)
+        downscale(np.zeros((40, 60), np.uint8), region, 16)
 
 
 @pytest.mark.parametrize("frame", [np.zeros((8, 8, 3), np.uint8), np.zeros((8, 8), np.float32)])
 def test_a_frame_that_is_no_gray_image_is_refused(frame: np.ndarray) -> None:
     with pytest.raises(DataError, match="uint8"):
-        shrink(frame, None, 16)
+        downscale(frame, None, 16)
 
 
 def test_size_must_suit_the_backbone() -> None:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy.stats import t as student
 
 from gripper_force.errors import DataError
-from gripper_force.profiles.rig_profile import Estimate
+from gripper_force.profiles.rig_profile import CalibratedValue
 from gripper_force.types import Gray
 from gripper_force.vision.preprocess import Region
 
@@ -45,7 +45,7 @@ METHOD_MS: Final = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Rung:
+class ExposureStep:
     """One exposure of the ladder.
 
     Attributes:
@@ -59,7 +59,7 @@ class Rung:
     clipped: float
 
     @classmethod
-    def of(cls, exposure_us: int, gray: Gray) -> "Rung":
+    def of(cls, exposure_us: int, gray: Gray) -> "ExposureStep":
         """Judges a picture."""
         return cls(exposure_us, float(gray.mean()), float(np.mean(gray >= _CLIPPED)))
 
@@ -85,7 +85,7 @@ class Touch:
     correlation_ms: float
 
 
-def choose_exposure(ladder: Sequence[Rung]) -> Rung:
+def choose_exposure(ladder: Sequence[ExposureStep]) -> ExposureStep:
     """The usable rung whose picture is best lit. Raises `DataError` where none is usable."""
     usable = [rung for rung in ladder if rung.usable]
     if not usable:
@@ -142,7 +142,7 @@ def region_about(seen: Sequence[Markers], width: int, height: int) -> Region:
     return left, top, side, side
 
 
-def lag_of(touches: Sequence[Touch]) -> Estimate:
+def lag_of(touches: Sequence[Touch]) -> CalibratedValue:
     """The lag over touches in ms, with a 95 % interval: their scatter, and what the method may be off by.
 
     Raises:
@@ -158,7 +158,7 @@ def lag_of(touches: Sequence[Touch]) -> Estimate:
     value = float(np.median(lags_ms))
     scatter_ms = float(student.ppf(0.975, count - 1) * lags_ms.std(ddof=1) / np.sqrt(count))
     half_ms = float(np.hypot(scatter_ms, METHOD_MS))
-    return Estimate(value=value, low=value - half_ms, high=value + half_ms)
+    return CalibratedValue(value=value, low=value - half_ms, high=value + half_ms)
 
 
 def telling(touches: Sequence[Touch]) -> list[Touch]:

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.special import ndtri
 
-from gripper_calibration.fits.output_curve import Line
+from gripper_calibration.fits.output_curve import LinearFit
 from gripper_calibration.fits.touches import Floats
 from gripper_force.profiles.object_profile import Interval
 
@@ -24,7 +24,7 @@ FEWEST: Final = 3
 _LEAST_N: Final = 0.01
 
 
-def by_model(line: Line, coverage: float) -> Interval:
+def by_model(line: LinearFit, coverage: float) -> Interval:
     """The interval of a line: scatter of frames and of touches, and what is not known of the line."""
     z = float(ndtri(0.5 + coverage / 2))
     gain_std, offset_std_n = np.sqrt(np.diag(line.covariance) + np.square(line.touch_std))

@@ -8,7 +8,7 @@ import numpy.typing as npt
 from scipy import stats
 
 from gripper_force.errors import DataError
-from gripper_force.profiles.rig_profile import Estimate
+from gripper_force.profiles.rig_profile import CalibratedValue
 from gripper_force.spikes import find_spikes
 
 BATCHES: Final = 10
@@ -83,10 +83,10 @@ class Weighing:
     """
 
     rests: tuple[Rest, Rest, Rest]
-    tare_raw: Estimate
-    n_per_raw: Estimate
+    tare_raw: CalibratedValue
+    n_per_raw: CalibratedValue
     noise_n: float
-    drift_n_min: Estimate
+    drift_n_min: CalibratedValue
     return_n: float
     rejected: int
     levels: tuple[Level, Level, Level]
@@ -197,10 +197,10 @@ def fit_load_cell(empty: Rest, loaded: Rest, again: Rest, force_n: float) -> Wei
     levels = (first, under, last)
     return Weighing(
         rests=(empty, loaded, again),
-        tare_raw=Estimate(value=tare, low=tare - tare_half, high=tare + tare_half),
-        n_per_raw=Estimate(value=n_per_raw, low=ends[0], high=ends[1]),
+        tare_raw=CalibratedValue(value=tare, low=tare - tare_half, high=tare + tare_half),
+        n_per_raw=CalibratedValue(value=n_per_raw, low=ends[0], high=ends[1]),
         noise_n=max(one.noise_raw for one in levels) * abs(n_per_raw),
-        drift_n_min=Estimate(value=drift, low=drift - drift_half, high=drift + drift_half),
+        drift_n_min=CalibratedValue(value=drift, low=drift - drift_half, high=drift + drift_half),
         return_n=came_back * n_per_raw,
         rejected=sum(int((~one.kept).sum()) for one in levels),
         levels=levels,

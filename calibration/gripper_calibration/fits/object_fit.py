@@ -12,13 +12,13 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from gripper_calibration.fits import ood_fit as gate
+from gripper_calibration.fits import ood_fit
 from gripper_calibration.fits.interval_fit import FEWEST, by_conformal, by_model
 from gripper_calibration.fits.output_curve import BENDS, fit_curve, fit_line, identity
 from gripper_calibration.fits.ridge import PENALTIES, Ridge
 from gripper_calibration.fits.touches import Floats, Touches, check
 from gripper_force.errors import DataError
-from gripper_force.profiles.correction import HeadAndGate, curve_n
+from gripper_force.profiles.correction import ProfileArrays, curve_n
 from gripper_force.profiles.object_profile import Interval, OutputCurve
 
 COVERAGE: Final = 0.9
@@ -52,7 +52,7 @@ class Fitted:
     Attributes:
         output: Correction of the output.
         arrays: Correction of the last layer, and the gate's plane.
-        gate: The gate's limit.
+        ood_limit: The gate's limit.
         interval: How far off it is at most.
         candidate: Which one was taken, in words.
         left_out_n: What each touch was estimated at from all others, (N,); NaN with less than 3 touches.
@@ -62,8 +62,8 @@ class Fitted:
     """
 
     output: OutputCurve
-    arrays: HeadAndGate
-    gate: float
+    arrays: ProfileArrays
+    ood_limit: float
     interval: Interval
     candidate: str
     left_out_n: Floats
@@ -99,7 +99,7 @@ def fit_correction(touches: Touches, coverage: float = COVERAGE, advance: Advanc
     ridge = Ridge(thin.features)
     numbers = touches.numbers
     if len(numbers) < FEWEST:
-        chosen, left_out_n, errors_n, strangeness = _AFFINE, np.full(len(touches.touch), np.nan), {}, []
+        chosen, left_out_n, errors_n, ood_score = _AFFINE, np.full(len(touches.touch), np.nan), {}, []
     else:
         left_out = []
         for number in numbers:
@@ -111,7 +111,7 @@ def fit_correction(touches: Touches, coverage: float = COVERAGE, advance: Advanc
         left_out_n = np.empty(len(touches.touch))
         for number, out in zip(numbers, left_out, strict=True):
             left_out_n[touches.touch == number] = out.forces_n[_CANDIDATES.index(chosen)]
-        strangeness = [out.strangeness for out in left_out]
+        ood_score = [out.ood_score for out in left_out]
     ((output, head, offset),) = _fits(touches, thin, ridge, [chosen])
     if errors_n:
         interval = by_conformal(left_out_n, touches.force_n, touches.touch, coverage)
@@ -120,7 +120,7 @@ def fit_correction(touches: Touches, coverage: float = COVERAGE, advance: Advanc
     return Fitted(
         output=output,
         arrays=_arrays(ridge, head, offset),
-        gate=gate.limit(strangeness),
+        ood_limit=ood_fit.limit(ood_score),
         interval=interval,
         candidate=chosen.name,
         left_out_n=left_out_n,
@@ -158,7 +158,7 @@ def learning_curve(
 class _LeftOut(NamedTuple):
     forces_n: Floats  # (candidates, N)
     felt_n: Floats  # (N,)
-    strangeness: Floats  # (N,)
+    ood_score: Floats  # (N,)
 
 
 def _candidates() -> list[Candidate]:
@@ -190,7 +190,7 @@ def _estimate(others: Touches, left: Touches) -> _LeftOut:
         base_n = curve_n(np.array(output.estimate_n), np.array(output.force_n), left.estimate_n)
         forces_n.append(base_n + (0.0 if head is None else left.features @ head + offset))
     plane = _arrays(ridge, None, 0.0)
-    return _LeftOut(np.stack(forces_n), left.force_n, plane.strangeness(left.features))
+    return _LeftOut(np.stack(forces_n), left.force_n, plane.ood_score(left.features))
 
 
 def _fits(
@@ -212,11 +212,11 @@ def _fits(
             yield output, *ridge.solve(missing_n, candidate.penalty)
 
 
-def _arrays(ridge: Ridge, head: Floats | None, offset: float) -> HeadAndGate:
-    return HeadAndGate(
+def _arrays(ridge: Ridge, head: Floats | None, offset: float) -> ProfileArrays:
+    return ProfileArrays(
         head=(np.zeros_like(ridge.mean) if head is None else head).astype(np.float32),
         offset=np.array([offset], np.float32),
         mean=ridge.mean.astype(np.float32),
-        axes=ridge.axes(gate.AXES).astype(np.float32),
+        axes=ridge.axes(ood_fit.AXES).astype(np.float32),
         spread=np.array([ridge.spread], np.float32),
     )

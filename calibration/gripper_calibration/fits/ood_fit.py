@@ -18,8 +18,8 @@ _FEWEST: Final = 3
 
 
 def limit(left_out: Iterable[Floats]) -> float:
-    """The gate's limit from the strangeness of each touch's frames to all other touches, (N,) each."""
-    worst = [float(np.quantile(strangeness, _QUANTILE)) for strangeness in left_out]
+    """The gate's limit from the ood_score of each touch's frames to all other touches, (N,) each."""
+    worst = [float(np.quantile(ood_score, _QUANTILE)) for ood_score in left_out]
     if len(worst) < _FEWEST:
         return UNKNOWN
     return 1.5 * (1 + 2 / len(worst)) * max(worst)

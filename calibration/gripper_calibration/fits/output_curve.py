@@ -49,7 +49,7 @@ _SMALLEST_SLOPE: Final = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
+class LinearFit:
     """``force = gain * estimate + offset_n`` for an object, and how its touches scatter about it.
 
     Attributes:
@@ -78,7 +78,7 @@ class Line:
         )
 
 
-def fit_line(touches: Touches) -> Line:
+def fit_line(touches: Touches) -> LinearFit:
     """Fits the line. One touch is enough, and then counts for as much as it can tell."""
     parts = [touches.only([number]) for number in touches.numbers]
     designs = [np.column_stack([part.estimate_n, np.ones(len(part.estimate_n))]) for part in parts]
@@ -106,7 +106,7 @@ def fit_line(touches: Touches) -> Line:
         first = np.square([_TOUCH_GAIN_STD * max(1.0, 1 + line[0]), _TOUCH_OFFSET_STD_N])
         total = _TOUCH_WEIGHT * first + sum(np.square(o) + v for o, v in zip(own, left, strict=True))
         touch_var = total / (_TOUCH_WEIGHT + len(parts))
-    return Line(
+    return LinearFit(
         gain=float(1 + line[0]),
         offset_n=float(line[1]),
         covariance=np.asarray(np.linalg.inv(precision), np.float64),
@@ -115,7 +115,7 @@ def fit_line(touches: Touches) -> Line:
     )
 
 
-def fit_curve(touches: Touches, line: Line, bend: float) -> OutputCurve:
+def fit_curve(touches: Touches, line: LinearFit, bend: float) -> OutputCurve:
     """Fits the curve about its line; ``bend`` is of `BENDS`."""
     estimate_n = touches.estimate_n
     reach_n = max(float(estimate_n.max()), 1.0)

@@ -23,21 +23,21 @@ _AFTERWARDS: Final = 2
 
 
 @dataclass(frozen=True, eq=False)
-class Press:
+class PressSeries:
     """One ramp and the hold after it: the force rises, so that friction keeps its sign, and then rests.
 
     Attributes:
         t_s: Times of the control cycles, (N,).
-        push_n: Push at each jaw by motor current, less the nominal friction, (N,).
+        motor_force_n: Push at each jaw by motor current, less the nominal friction, (N,).
         force_n: What the load cell felt, (N,).
     """
 
     t_s: Floats
-    push_n: Floats
+    motor_force_n: Floats
     force_n: Floats
 
 
-def fit_plant(presses: list[Press], delay_s: float) -> LoopPlant | None:
+def fit_plant(presses: list[PressSeries], delay_s: float) -> LoopPlant | None:
     """Fits gain and lag to presses by least squares, and tunes the loop for them and a measured delay.
 
     Friction differs from press to press and from what is nominal, so each press has an offset of its own: the
@@ -111,22 +111,22 @@ def crushed_by(contact_m: Floats, peak_n: Floats) -> int | None:
     return found
 
 
-def _evenly(press: Press) -> tuple[Floats, Floats] | None:
+def _evenly(press: PressSeries) -> tuple[Floats, Floats] | None:
     """Push and force at even times, or None where the press is too small to tell anything."""
     if len(press.t_s) < _FEWEST or np.ptp(press.force_n) < _LEAST_RISE_N:
         return None
     t_s = np.arange(press.t_s[0], press.t_s[-1], _STEP_S)
     if len(t_s) < _FEWEST:
         return None
-    return np.interp(t_s, press.t_s, press.push_n), np.interp(t_s, press.t_s, press.force_n)
+    return np.interp(t_s, press.t_s, press.motor_force_n), np.interp(t_s, press.t_s, press.force_n)
 
 
 def _gain(presses: list[tuple[Floats, Floats]], lag_s: float) -> tuple[float, float]:
     """What a lag leaves of the forces, as a sum of squares, and the gain that goes with it."""
     keep = float(np.exp(-_STEP_S / lag_s)) if lag_s > 0 else 0.0
     along = across = total = 0.0
-    for push_n, force_n in presses:
-        late = lfilter([1 - keep], [1, -keep], push_n, zi=[keep * push_n[0]])[0]
+    for motor_force_n, force_n in presses:
+        late = lfilter([1 - keep], [1, -keep], motor_force_n, zi=[keep * motor_force_n[0]])[0]
         late, force = late - late.mean(), force_n - force_n.mean()
         along, across, total = along + late @ force, across + late @ late, total + force @ force
     gain = along / max(across, 1e-12)

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from scipy import stats
 
 from gripper_force.errors import DataError
-from gripper_force.profiles.rig_profile import Estimate
+from gripper_force.profiles.rig_profile import CalibratedValue
 
 LEAST_PRESSES: Final = 5
 LEAST_PASSES: Final = 8
@@ -33,7 +33,7 @@ Bools = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
-class Press:
+class ServoPress:
     """The jaws press a gauge with a current that rises steadily and falls steadily. Positive closes.
 
     Attributes:
@@ -54,7 +54,7 @@ class Press:
 
 
 @dataclass(frozen=True, slots=True)
-class Pass:
+class FreePass:
     """Free travel under a constant current. Positive closes.
 
     Attributes:
@@ -123,16 +123,16 @@ class ServoFit:
         travelled: Speed in m/s, push in newtons without inertia's part, of each part of a pass: (M, 2).
     """
 
-    n_per_a: Estimate
-    nm_per_a: Estimate
-    friction_n: Estimate
-    friction_share: Estimate
-    offset_a: Estimate
-    lag_s: Estimate
-    free_friction_n: Estimate
-    damping_n_s_m: Estimate
-    pinion_radius_m: Estimate
-    open_position_rad: Estimate
+    n_per_a: CalibratedValue
+    nm_per_a: CalibratedValue
+    friction_n: CalibratedValue
+    friction_share: CalibratedValue
+    offset_a: CalibratedValue
+    lag_s: CalibratedValue
+    free_friction_n: CalibratedValue
+    damping_n_s_m: CalibratedValue
+    pinion_radius_m: CalibratedValue
+    open_position_rad: CalibratedValue
     force_n: tuple[float, float]
     speed_m_s: tuple[float, float]
     residual_n: float
@@ -141,7 +141,7 @@ class ServoFit:
     travelled: Floats
 
 
-def fit_servo(presses: Sequence[Press], passes: Sequence[Pass], nominal: Nominal) -> ServoFit:
+def fit_servo(presses: Sequence[ServoPress], passes: Sequence[FreePass], nominal: Nominal) -> ServoFit:
     """Fits statics to presses, viscous friction to passes, geometry to where presses begin.
 
     While the jaws slide, the motor's push is the force and what friction takes, up or down::
@@ -205,7 +205,7 @@ def fit_servo(presses: Sequence[Press], passes: Sequence[Pass], nominal: Nominal
         lag_s=_estimate(lag_s, half[4]),
         free_friction_n=_estimate(free[0], free_half[0]),
         damping_n_s_m=_estimate(damping, damping_half),
-        pinion_radius_m=Estimate(value=radius[0]) if given else _estimate(*radius),
+        pinion_radius_m=CalibratedValue(value=radius[0]) if given else _estimate(*radius),
         open_position_rad=_estimate(*opening),
         force_n=(float(force_n.min()), float(force_n.max())),
         speed_m_s=(
@@ -219,7 +219,7 @@ def fit_servo(presses: Sequence[Press], passes: Sequence[Pass], nominal: Nominal
     )
 
 
-def _press_rows(presses: Sequence[Press]) -> Floats:
+def _press_rows(presses: Sequence[ServoPress]) -> Floats:
     """The readings in which the jaws slide, (N, 7): force, current, angle, side, rate, gauge, number."""
     rows = []
     for number, press in enumerate(presses):
@@ -252,7 +252,7 @@ def _slides(force_n: Floats, side: float) -> Bools:
 
 
 def _travel(
-    passes: Sequence[Pass], n_per_a: float, half_n_per_a: float, radius_m: float
+    passes: Sequence[FreePass], n_per_a: float, half_n_per_a: float, radius_m: float
 ) -> tuple[Floats, Floats, Floats]:
     """Free friction and damping with half intervals; speed and push of each part."""
     if len(passes) < LEAST_PASSES:
@@ -276,8 +276,8 @@ def _travel(
     beta, table, kept = _robust(table, "free travel")
     values, half = _jackknife(table, lambda b: np.asarray(b[1:3] * n_per_a, np.float64), between=3)
     half = np.hypot(half, values * half_n_per_a / n_per_a)
-    push_n = (data[kept, 0] - beta[0] - beta[3] * data[kept, 2]) * n_per_a
-    return values, half, np.column_stack([data[kept, 1], push_n])
+    motor_force_n = (data[kept, 0] - beta[0] - beta[3] * data[kept, 2]) * n_per_a
+    return values, half, np.column_stack([data[kept, 1], motor_force_n])
 
 
 def _geometry(rows: Floats, nominal: Nominal) -> tuple[tuple[float, float], tuple[float, float], bool]:
@@ -371,11 +371,11 @@ def _slope(x: Floats, y: Floats) -> float:
     return float(x @ y) / square if square else 0.0
 
 
-def _estimate(value: float, half: float) -> Estimate:
+def _estimate(value: float, half: float) -> CalibratedValue:
     _require(
         abs(value) + half < _LARGEST, "the readings contradict each other, and nothing follows from them"
     )
-    return Estimate(value=float(value), low=float(value - half), high=float(value + half))
+    return CalibratedValue(value=float(value), low=float(value - half), high=float(value + half))
 
 
 def _require(holds: bool | np.bool_, sentence: str) -> None:

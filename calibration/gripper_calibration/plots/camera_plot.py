@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Polygon, Rectangle
 
-from gripper_calibration.fits.camera_fit import Markers, Rung, Touch, telling
+from gripper_calibration.fits.camera_fit import ExposureStep, Markers, Touch, telling
 from gripper_calibration.plots.style import DATA, FIT, GRAY, OTHER, name, picture, text_of
 from gripper_force.profiles.rig_profile import CameraCalibration
 from gripper_force.types import Gray
@@ -17,7 +17,7 @@ def draw(
     found: CameraCalibration,
     frame: Gray,
     markers: Markers,
-    ladder: Sequence[Rung],
+    ladder: Sequence[ExposureStep],
     pictures: Sequence[Gray],
     touches: Sequence[Touch],
     path: Path,

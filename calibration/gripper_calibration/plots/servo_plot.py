@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from gripper_calibration.fits.servo_fit import Floats, Press, ServoFit
+from gripper_calibration.fits.servo_fit import Floats, ServoFit, ServoPress
 from gripper_calibration.plots.style import DATA, FIT, GRAY, OTHER, name, picture, text_of
 
 
-def draw(fit: ServoFit, presses: Sequence[Press], path: Path) -> None:
+def draw(fit: ServoFit, presses: Sequence[ServoPress], path: Path) -> None:
     """All presses with the sliding branches of the fit, residuals by force, and free travel."""
     with picture(path, f"Servo: {text_of(fit.nm_per_a, 'N m for 1 A at the horn')}", 7.5) as figure:
         axes = figure.subplots(2, 2)

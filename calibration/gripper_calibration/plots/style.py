@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from gripper_force.errors import DataError
 from gripper_force.jobs.report.figure import STYLE
-from gripper_force.profiles.rig_profile import Estimate
+from gripper_force.profiles.rig_profile import CalibratedValue
 
 DATA: Final = "#7f9cc0"
 FIT: Final = "#c2410c"
@@ -43,7 +43,7 @@ def name(axes: Axes, title: str, x: str, y: str) -> None:
     axes.set_ylabel(y)
 
 
-def text_of(estimate: Estimate, unit: str) -> str:
+def text_of(estimate: CalibratedValue, unit: str) -> str:
     """A value and its interval."""
     if estimate.low is None or estimate.high is None:
         return f"{estimate.value:.5g} {unit} (given)"

@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 
 from gripper_calibration.fits.camera_fit import (
+    ExposureStep,
     Markers,
-    Rung,
     Touch,
     choose_exposure,
     find_markers,
@@ -26,9 +26,9 @@ from gripper_calibration.plots.camera_plot import draw
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
 from gripper_force.jobs.recording.lag import camera_lags_s, load_cell_lag_s
-from gripper_force.jobs.recording.record import Plan, record
+from gripper_force.jobs.recording.record import RecordingPlan, record
 from gripper_force.jobs.recording.summary import releases_ns
-from gripper_force.profiles.rig_profile import CameraCalibration, Estimate, read_rig, update_rig
+from gripper_force.profiles.rig_profile import CalibratedValue, CameraCalibration, read_rig, update_rig
 from gripper_force.runtime.assembly import checkpoint_of, settled
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log import LogReader
@@ -43,7 +43,7 @@ from gripper_force.types import (
     ServoState,
 )
 from gripper_force.vision.estimator import open_estimator
-from gripper_force.vision.preprocess import Region, shrink
+from gripper_force.vision.preprocess import Region, downscale
 
 EXPOSURES_US: Final = (500, 1000, 2000, 4000, 8000, 16000)
 """The ladder, as far as half of a frame's period: what is exposed for longer is late and blurred."""
@@ -65,7 +65,7 @@ Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class CameraObservation:
     """What one recording of touches shows.
 
     Attributes:
@@ -132,7 +132,7 @@ def calibrate(
         def tell(_set: int, touch: int, force_n: float) -> None:
             progress(f"touch {touch} of {touches}", force_n)
 
-        (log,) = record(config, Plan(1, touches), Path(aside), tell)
+        (log,) = record(config, RecordingPlan(1, touches), Path(aside), tell)
         seen = watch(log, region)
     height, width = seen.reference.shape
     found_region = region_about(seen.markers, width, height) if region is None else region
@@ -172,7 +172,7 @@ def calibrate(
     }
 
 
-def watch(log: Path, region: Region | None) -> Seen:
+def watch(log: Path, region: Region | None) -> CameraObservation:
     """Looks for markers and lags in a recorded set of touches.
 
     Args:
@@ -200,7 +200,7 @@ def watch(log: Path, region: Region | None) -> Seen:
     reference = np.mean([frame.gray for frame in frames[:_REFERENCE_FRAMES]], axis=0)
     as_gray: Gray = np.rint(reference).astype(np.uint8)
     frame_s = np.array([frame.t_ns for frame in frames]) / NS_PER_S
-    return Seen(
+    return CameraObservation(
         reference=as_gray,
         markers=markers,
         widest=as_gray if widest is None else looked_at[widest].gray,
@@ -213,7 +213,7 @@ def watch(log: Path, region: Region | None) -> Seen:
 
 def _touches(frames: list[Frame], region: Region | None, records: dict[type, list[Any]]) -> list[Touch]:
     frame_s = np.array([frame.t_ns for frame in frames]) / NS_PER_S
-    images = np.stack([shrink(frame.gray, region, _SMALL_PX) for frame in frames])
+    images = np.stack([downscale(frame.gray, region, _SMALL_PX) for frame in frames])
     cells = sorted((s for s in records[LoadCellSample] if s.valid), key=lambda sample: sample.t_ns)
     cell_s = np.array([sample.t_ns for sample in cells]) / NS_PER_S
     force_n = np.array([sample.force_n for sample in cells])
@@ -230,7 +230,9 @@ def _touches(frames: list[Frame], region: Region | None, records: dict[type, lis
     return touches
 
 
-def _climb(config: Config, exposures_us: Sequence[int], progress: Progress) -> tuple[list[Rung], list[Gray]]:
+def _climb(
+    config: Config, exposures_us: Sequence[int], progress: Progress
+) -> tuple[list[ExposureStep], list[Gray]]:
     longest_us = 0.5e6 / config.camera.rate_hz
     ladder, pictures = [], []
     for exposure_us in exposures_us:
@@ -239,8 +241,8 @@ def _climb(config: Config, exposures_us: Sequence[int], progress: Progress) -> t
         progress(f"exposure of {exposure_us} us", 0.0)
         gray = _picture(_with(config, "camera", exposure_us=exposure_us))
         region = config.vision.region
-        part = gray if region is None else shrink(gray, region, min(region[2:]))
-        ladder.append(Rung.of(exposure_us, part))
+        part = gray if region is None else downscale(gray, region, min(region[2:]))
+        ladder.append(ExposureStep.of(exposure_us, part))
         pictures.append(gray)
     if not ladder:
         raise ConfigError(
@@ -292,9 +294,9 @@ def _with(config: Config, section: str, **values: object) -> Config:
     return config.model_copy(update={section: getattr(config, section).model_copy(update=values)})
 
 
-def _shifted(estimate: Estimate, by: float) -> Estimate:
+def _shifted(estimate: CalibratedValue, by: float) -> CalibratedValue:
     low, high = (None if end is None else end + by for end in (estimate.low, estimate.high))
-    return Estimate(value=estimate.value + by, low=low, high=high)
+    return CalibratedValue(value=estimate.value + by, low=low, high=high)
 
 
 def _apart_px(markers: Markers) -> float:

@@ -9,13 +9,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from gripper_calibration import touch_logs as logs
+from gripper_calibration import touch_logs
 from gripper_calibration.fits.object_fit import COVERAGE, fit_correction, learning_curve
 from gripper_calibration.fits.plant_fit import crushed_by, fit_plant, stiffness_n_m
 from gripper_calibration.plots.object_plot import draw
 from gripper_force.config import Config
 from gripper_force.errors import DataError
-from gripper_force.jobs.recording.record import Plan, Progress, record
+from gripper_force.jobs.recording.record import Progress, RecordingPlan, record
 from gripper_force.profiles.correction import pack
 from gripper_force.profiles.object_profile import ObjectProfile, check_place, write_object
 from gripper_force.runtime.assembly import settled
@@ -60,7 +60,7 @@ def touch(
         for name in ("object_seed", "rig_seed")
     }
     config = config.model_copy(update={"sim": sim.model_copy(update=same)})
-    yield from record(config, Plan(touches, 1, peak_n, test_every=None), folder, progress, ask)
+    yield from record(config, RecordingPlan(touches, 1, peak_n, test_every=None), folder, progress, ask)
 
 
 def calibrate(
@@ -89,10 +89,10 @@ def calibrate(
         raise DataError(f"there is no log of {name!r} to calibrate from; touch it first")
     parts = {}
     for path in paths:
-        parts[path] = logs.read_one(path, checkpoint)
+        parts[path] = touch_logs.read_one(path, checkpoint)
         advance(path.name)
-    felt = {path: part for path, part in parts.items() if part.felt}
-    recorded = logs.join(felt or parts)  # without any, the fit says what was felt
+    felt = {path: part for path, part in parts.items() if part.has_contact}
+    recorded = touch_logs.join(felt or parts)  # without any, the fit says what was felt
     touches = recorded.touches
     fitted = fit_correction(touches, COVERAGE)
     advance("fitted")
@@ -114,7 +114,7 @@ def calibrate(
         force_n=bore_n,
         output=fitted.output,
         interval=fitted.interval,
-        gate=fitted.gate,
+        ood_limit=fitted.ood_limit,
         stiffness_n_m=float(np.median(stiffness)) if len(stiffness) else None,
         plant=fit_plant(recorded.presses, recorded.delay_s + _compute_s(config, checkpoint)),
         before_n=fitted.before_n,

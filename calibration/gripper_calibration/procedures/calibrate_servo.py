@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from gripper_calibration.fits.servo_fit import Nominal, Pass, Press, ServoFit, fit_servo
+from gripper_calibration.fits.servo_fit import FreePass, Nominal, ServoFit, ServoPress, fit_servo
 from gripper_calibration.plots.servo_plot import draw
 from gripper_force.config import Config
 from gripper_force.control.limits import largest_target_n
@@ -90,8 +90,8 @@ def calibrate(
         config.gripper.pinion_radius_m, config.gripper.open_width_m, _scale_share(known, config, rig)
     )
     config = config.model_copy(update={"camera": config.camera.model_copy(update={"backend": "none"})})
-    presses: list[Press] = []
-    passes: list[Pass] = []
+    presses: list[ServoPress] = []
+    passes: list[FreePass] = []
     for width_m in gauges_m:
         ask(f"Put the load cell with its width of {1e3 * width_m:g} mm between the open jaws")
         more = measure(config, width_m, progress)
@@ -147,7 +147,7 @@ def _section(fit: ServoFit, config: Config) -> ServoCalibration:
     )
 
 
-def measure(config: Config, gauge_m: float, progress: Progress) -> tuple[list[Press], list[Pass]]:
+def measure(config: Config, gauge_m: float, progress: Progress) -> tuple[list[ServoPress], list[FreePass]]:
     """Presses a gauge that is between the jaws, and travels where it is not.
 
     Raises:
@@ -173,7 +173,7 @@ def measure(config: Config, gauge_m: float, progress: Progress) -> tuple[list[Pr
     return presses, passes
 
 
-def _friction_a(press: Press) -> float:
+def _friction_a(press: ServoPress) -> float:
     """Half of what the current differs by, up and down, at about half of the force."""
     middle_n = press.force_n[press.turn - 1] / 2
     near = np.abs(press.force_n - middle_n) < middle_n / 4
@@ -295,7 +295,7 @@ class _Jaws:
             )
         return self.closing_rad
 
-    def press(self, gauge_m: float, rate_n_s: float, peak_n: float) -> Press:
+    def press(self, gauge_m: float, rate_n_s: float, peak_n: float) -> ServoPress:
         """Lets the current rise until the peak is felt, and fall until nothing is."""
         step_a = abs(self._nominal.current_a(rate_n_s)) / _RATE_HZ
         most_a = 1.5 * abs(self._nominal.current_a(peak_n + self._nominal.friction_n))
@@ -324,7 +324,7 @@ class _Jaws:
                 "the load cell gave hardly a valid sample while the jaws pressed; see what doctor says"
             )
         felt_ns, felt_n = np.array(felt).T
-        return Press(
+        return ServoPress(
             gauge_m=gauge_m,
             t_s=(t_ns - t_ns[0]) / NS_PER_S,
             current_a=self._sign * np.array([state.current_a for state in states]),
@@ -337,7 +337,7 @@ class _Jaws:
         """Leaves the gauge."""
         self._go(touch_rad - 2 * _CLEAR_M / self._nominal.pinion_radius_m)
 
-    def travel(self, friction_a: float, speed_m_s: float, touch_rad: float) -> list[Pass]:
+    def travel(self, friction_a: float, speed_m_s: float, touch_rad: float) -> list[FreePass]:
         """Opens and closes under a constant current; a pass that sticks is left out."""
         nominal = self._nominal
         grid_a = nominal.current_step_a
@@ -351,7 +351,7 @@ class _Jaws:
             passes += [] if one is None else [one]
         return passes
 
-    def _pass(self, side: int, end_rad: float, current_a: float) -> Pass | None:
+    def _pass(self, side: int, end_rad: float, current_a: float) -> FreePass | None:
         for _ in range(round(_LONGEST_S * _RATE_HZ)):
             if side * self._sign * self.state.velocity_rad_s > _MOVES_RAD_S:
                 break
@@ -365,7 +365,7 @@ class _Jaws:
         self._go(end_rad)
         if len(states) < _RATE_HZ / 10 or abs(states[-1].velocity_rad_s) < _MOVES_RAD_S:
             return None
-        return Pass(
+        return FreePass(
             t_s=np.array([state.t_ns / NS_PER_S for state in states]),
             current_a=self._sign * np.array([state.current_a for state in states]),
             closing_rad=self._sign * np.array([state.position_rad for state in states]),

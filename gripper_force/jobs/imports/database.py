@@ -33,7 +33,7 @@ from gripper_force.jobs.dataset import CONTACT_N
 from gripper_force.jobs.imports.video import load_cell_samples, write_recording
 from gripper_force.jobs.simulate import split_of
 from gripper_force.types import NS_PER_S, Frame, Gray
-from gripper_force.vision.preprocess import Region, shrink
+from gripper_force.vision.preprocess import Region, downscale
 
 RATE_HZ: Final = 149.0
 """Of the paper's camera; the database tells no times."""
@@ -170,7 +170,7 @@ def import_environment(
             if (gray := _read_image(images[number])) is None:
                 damaged.append(images[number].name)
             else:
-                frames.append(Frame(t_ns[number], t_ns[number], number, shrink(gray, region, size)))
+                frames.append(Frame(t_ns[number], t_ns[number], number, downscale(gray, region, size)))
         labelled = [n for n in t_ns if n in forces_n]
         if not forces_n.keys() & {frame.seq for frame in frames}:
             empty.append(log.stem)

@@ -25,7 +25,7 @@ from gripper_force.jobs.recording.lag import force_lag_s
 from gripper_force.runtime.log import LogWriter
 from gripper_force.spikes import find_spikes
 from gripper_force.types import NS_PER_S, Frame, Gray, LoadCellSample
-from gripper_force.vision.preprocess import Region, shrink
+from gripper_force.vision.preprocess import Region, downscale
 
 VIDEO_SUFFIXES: Final = frozenset({".avi", ".mp4", ".mkv", ".mov"})
 
@@ -346,7 +346,7 @@ def _read_video(video: Path, region: Region | None, size: int) -> tuple[list[Gra
         rate_hz = float(capture.get(cv2.CAP_PROP_FPS))
         while (read := capture.read())[0]:
             gray = np.asarray(cv2.cvtColor(read[1], cv2.COLOR_BGR2GRAY), np.uint8)  # (H, W)
-            frames.append(shrink(gray, region, size))
+            frames.append(downscale(gray, region, size))
     finally:
         capture.release()
     if not frames or not 0 < rate_hz < math.inf:

@@ -71,7 +71,7 @@ Progress = Callable[[int, int, float], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class RecordingPlan:
     """What to record.
 
     Attributes:
@@ -107,7 +107,7 @@ class Plan:
 
 def record(
     config: Config,
-    plan: Plan,
+    plan: RecordingPlan,
     out: Path,
     progress: Progress,
     ask: Callable[[int], None] = lambda _set: None,
@@ -176,7 +176,7 @@ def _open_jaws(config: Config, devices: Devices) -> None:
     devices.servo.close()  # the set's own session opens it again
 
 
-def _ready(config: Config, plan: Plan) -> tuple[Config, float]:
+def _ready(config: Config, plan: RecordingPlan) -> tuple[Config, float]:
     for unit, backend in (("camera", config.camera.backend), ("load_cell", config.load_cell.backend)):
         if backend == "none":
             name = unit.replace("_", " ")
@@ -213,8 +213,8 @@ class _Rig:
         self._saturated = self._saturations()
 
     @property
-    def felt(self) -> LoadCellSample | None:
-        return self._session.felt
+    def last_load_cell_sample(self) -> LoadCellSample | None:
+        return self._session.last_load_cell_sample
 
     @property
     def frames(self) -> int:
@@ -226,12 +226,16 @@ class _Rig:
         t_ns = decision.status.t_ns
         if self.frames > frames:
             self._seen_ns = t_ns
-        if self.felt is not None:
-            self.most_n = max(self.most_n, self.felt.force_n)
+        if self.last_load_cell_sample is not None:
+            self.most_n = max(self.most_n, self.last_load_cell_sample.force_n)
         self._check(decision.status)
         if t_ns - self._told_ns >= _TELL_NS:
             self._told_ns = t_ns
-            self._progress(self.number, self.touch, 0.0 if self.felt is None else self.felt.force_n)
+            self._progress(
+                self.number,
+                self.touch,
+                0.0 if self.last_load_cell_sample is None else self.last_load_cell_sample.force_n,
+            )
         return decision
 
     def _check(self, status: GraspStatus) -> None:
@@ -240,7 +244,11 @@ class _Rig:
                 let_open(self._session, self.config, status)
             raise DeviceError(f"set {self.number} ended at a fault: {status.reason}; see what caused it")
         if self._saturations() - self._saturated > _SATURATED:
-            felt_n = f"{self.felt.force_n:.1f} N" if self.felt is not None else "no force"
+            felt_n = (
+                f"{self.last_load_cell_sample.force_n:.1f} N"
+                if self.last_load_cell_sample is not None
+                else "no force"
+            )
             raise DeviceError(
                 f"the load cell is saturated in set {self.number}, where it last read {felt_n}; ask for a "
                 "smaller --peak-n, or see to its range and wiring"
@@ -250,7 +258,11 @@ class _Rig:
                 f"the camera has given no frame for {_SILENT_NS / NS_PER_S:g} s in set {self.number}; check "
                 "its cable, and see what doctor says"
             )
-        heard_ns = self._begin_ns if self.felt is None else max(self.felt.t_ns, self._begin_ns)
+        heard_ns = (
+            self._begin_ns
+            if self.last_load_cell_sample is None
+            else max(self.last_load_cell_sample.t_ns, self._begin_ns)
+        )
         if status.t_ns - heard_ns > _SILENT_NS:
             counts = ", ".join(f"{n} {name}" for name, n in self._cell.counts().items() if n)
             raise DeviceError(
@@ -294,8 +306,8 @@ def _rest(rig: _Rig) -> tuple[float, float]:
     begin_ns = t_ns = rig.cycle().status.t_ns
     while t_ns - begin_ns < _REST_NS or rig.frames < _REST_FRAMES or len(felt) < _REST_SAMPLES:
         t_ns = rig.cycle().status.t_ns
-        if rig.felt is not None:
-            felt[rig.felt.t_ns] = rig.felt
+        if rig.last_load_cell_sample is not None:
+            felt[rig.last_load_cell_sample.t_ns] = rig.last_load_cell_sample
     forces_n = [sample.force_n for sample in felt.values()]
     rest_n = float(np.median(forces_n))
     if abs(rest_n) >= CONTACT_N:

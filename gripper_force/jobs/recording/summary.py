@@ -15,7 +15,7 @@ from gripper_force.jobs.dataset import label_frames
 from gripper_force.jobs.recording.lag import camera_lags_s, load_cell_lag_s
 from gripper_force.runtime.log import LogReader
 from gripper_force.types import NS_PER_S, Frame, GraspStatus, LoadCellSample, Request, RequestKind
-from gripper_force.vision.preprocess import shrink
+from gripper_force.vision.preprocess import downscale
 
 _SMALL_PX: Final = 48
 """Side of the pictures that the lag is found from."""
@@ -83,7 +83,7 @@ def _summary(path: Path) -> Summary:
     images = []
     for record in reader.records(Frame, LoadCellSample, GraspStatus, Request):
         if isinstance(record, Frame):
-            images.append(shrink(record.gray, config.vision.region, _SMALL_PX))
+            images.append(downscale(record.gray, config.vision.region, _SMALL_PX))
             records[Frame].append((record.t_ns, record.seq))
         else:
             records[type(record)].append(record)

@@ -14,7 +14,7 @@ class Toucher(Protocol):
     """What touches need of a `gripper_force.runtime.session.Session`."""
 
     @property
-    def felt(self) -> LoadCellSample | None:
+    def last_load_cell_sample(self) -> LoadCellSample | None:
         """The newest valid sample of the load cell."""
         ...
 
@@ -76,4 +76,4 @@ def wait(rig: Toucher, duration_s: float) -> None:
 
 
 def _felt_n(rig: Toucher) -> float:
-    return 0.0 if rig.felt is None else rig.felt.force_n
+    return 0.0 if rig.last_load_cell_sample is None else rig.last_load_cell_sample.force_n

@@ -65,7 +65,7 @@ class Span:
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class EventRow:
     """A line of the table of events."""
 
     t_s: float
@@ -112,7 +112,7 @@ class Run:
     errors: dict[str, Series]
     reference: Series
     phases: list[Span]
-    lines: list[Line]
+    event_rows: list[EventRow]
     compute_ms: Floats
     camera_age_ms: Floats
     latency_ms: Floats
@@ -174,7 +174,7 @@ def read_run(path: Path, *, recover: bool = False) -> Run:
         errors=_errors(forces),
         reference=_series(zero_ns, ((s.t_ns, s.reference_n) for s in status)),
         phases=_phases(zero_ns, end_s, status),
-        lines=_lines(zero_ns, requests, status, log.records(Event)),
+        event_rows=_lines(zero_ns, requests, status, log.records(Event)),
         compute_ms=np.array([v.compute_ms for v in vision]),
         camera_age_ms=np.array(ages) / NS_PER_MS,
         latency_ms=np.array([v.ready_ns - v.t_ns for v in vision]) / NS_PER_MS,
@@ -228,7 +228,7 @@ def _phases(zero_ns: int, end_s: float, status: list[GraspStatus]) -> list[Span]
 
 def _lines(
     zero_ns: int, requests: list[Request], status: list[GraspStatus], events: Iterable[Event]
-) -> list[Line]:
+) -> list[EventRow]:
     entries = [(r.t_ns, "request", _request_text(r)) for r in requests]
     before: GraspStatus | None = None
     for s in status:
@@ -242,7 +242,7 @@ def _lines(
         before = s
     entries += [(e.t_ns, e.unit, e.text) for e in events]
     entries.sort(key=lambda entry: entry[0])
-    return [Line((t_ns - zero_ns) / NS_PER_S, unit, text) for t_ns, unit, text in entries]
+    return [EventRow((t_ns - zero_ns) / NS_PER_S, unit, text) for t_ns, unit, text in entries]
 
 
 def _request_text(request: Request) -> str:

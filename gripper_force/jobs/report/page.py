@@ -161,13 +161,13 @@ def _frames(pictures: list[Picture], note: str) -> str:
 
 
 def _events(run: Run) -> str:
-    if not run.lines:
+    if not run.event_rows:
         return ""
     rows = "".join(
         f"<tr><td>{line.t_s:.3f}</td><td>{escape(line.unit)}</td><td>{escape(line.text)}</td></tr>"
-        for line in run.lines[:_LINES]
+        for line in run.event_rows[:_LINES]
     )
-    more = len(run.lines) - _LINES
+    more = len(run.event_rows) - _LINES
     rest = f'<p class="note">{more} more are in the log.</p>' if more > 0 else ""
     head = "<thead><tr><th>s</th><th>unit</th><th>what</th></tr></thead>"
     return f"<section><h2>Phases and events</h2><table>{head}<tbody>{rows}</tbody></table>{rest}</section>"

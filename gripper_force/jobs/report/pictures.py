@@ -14,7 +14,7 @@ from gripper_force.errors import CheckpointError, DataError
 from gripper_force.jobs.report.data import Run
 from gripper_force.runtime.log import LogReader
 from gripper_force.types import NS_PER_S, Frame, Gray, Phase
-from gripper_force.vision.preprocess import shrink
+from gripper_force.vision.preprocess import downscale
 
 if TYPE_CHECKING:
     from gripper_force.vision.estimator import ForceEstimator
@@ -116,7 +116,7 @@ def _estimator(run: Run) -> "tuple[ForceEstimator | None, str]":
 
 
 def _picture(frame: Frame, run: Run, attention: npt.NDArray[np.float32] | None) -> Picture:
-    gray = shrink(frame.gray, run.config.vision.region, _SIDE)
+    gray = downscale(frame.gray, run.config.vision.region, _SIDE)
     t_s = (frame.t_ns - run.zero_ns) / NS_PER_S
     image = np.repeat(gray[:, :, None], 3, axis=2) if attention is None else overlay(gray, attention)
     return Picture(t_s, image, _at(run, "vision", t_s), _at(run, "load_cell", t_s))

@@ -82,7 +82,7 @@ class Trainer:
 
     def _update(self) -> Tensor:
         config, window, done = self._config, self.network.config.window, self.done
-        rate = one_cycle(done, config.warmup) if config.schedule == "one_cycle" else tenths(done)
+        rate = one_cycle(done, config.warmup) if config.schedule == "one_cycle" else step_decay(done)
         for group in self._optimizer.param_groups:
             group["lr"] = config.learning_rate * rate
         count, length = config.clips, config.clip_frames
@@ -181,7 +181,7 @@ def one_cycle(done: float, warmup: float) -> float:
     return (1 + math.cos(math.pi * min(1.0, (done - warmup) / (1 - warmup)))) / 2
 
 
-def tenths(done: float) -> float:
+def step_decay(done: float) -> float:
     """The learning rate's share of its peak: a tenth after each quarter, 30 epochs of the paper's 120."""
     return float(0.1 ** math.floor(4 * done))
 

@@ -7,7 +7,6 @@ The paper's way, the whole window for each frame, is measured among them.
 import json
 import logging
 import platform
-import shutil
 import subprocess
 import sys
 import time
@@ -25,13 +24,13 @@ from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import Clip
 from gripper_force.qualification.bench.roofline import Roofline, measure
 from gripper_force.types import NS_PER_MS
-from gripper_force.vision import selection as choice
+from gripper_force.vision import selection
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.engines import Engine, Floats, Precision, open_engine
 from gripper_force.vision.export import export, inputs_of
 from gripper_force.vision.header import Model
 from gripper_force.vision.model_files import cache_folder, read_model
-from gripper_force.vision.selection import Way, installed, key_of
+from gripper_force.vision.selection import Candidate, installed, key_of
 
 WINDOW: Final = "torch, window"
 """The paper's way: each frame passes the network with the whole window before it."""
@@ -154,7 +153,7 @@ def bench(
 def _ways() -> list[tuple[str, str, Precision]]:
     """Engine, the precision's name and its setting."""
     ways: list[tuple[str, str, Precision]] = []
-    for engine in [*installed(), *(["compiled"] if shutil.which("g++") else [])]:
+    for engine in installed():
         for precision in get_args(Precision):
             if precision == "float32" or engine == "openvino":
                 ways.append((engine, precision, precision))
@@ -207,9 +206,9 @@ def _timed(
             if not engine.startswith(WINDOW):
                 file, precision = next((f, p) for f, e, n, p in ways if (e, n) == (engine, name))
                 row = replace(row, memory_mb=_memory_mb(file, engine, precision, count))
-                way = Way(source, engine, precision, count, row.p50_ms, row.p99_ms, row.mae_n)
+                way = Candidate(source, engine, precision, count, row.p50_ms, row.p99_ms, row.mae_n)
                 if file is model:
-                    choice.remember({key_of(model, engine, precision, count): way})
+                    selection.remember({key_of(model, engine, precision, count): way})
             yield row
 
 

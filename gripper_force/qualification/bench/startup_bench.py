@@ -52,7 +52,7 @@ _EYES: Final = frozenset({"gripper_force.vision", "cv2", "safetensors"})
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
+class StartupCase:
     """What is started.
 
     Attributes:
@@ -80,28 +80,28 @@ _BLIND: Final = ("camera.backend=none", "control.feedback=current")
 _RECORDED: Final = ("camera.backend=playback", "camera.path={log}")
 _NO_NETWORK: Final = ("vision.checkpoint=none", "control.feedback=current")
 
-SCENES: Final = (
-    Scene("--help", command=("--help",)),
-    Scene(
+STARTUP_CASES: Final = (
+    StartupCase("--help", command=("--help",)),
+    StartupCase(
         "doctor, a real servo alone",  # it lists all devices there are, and asks each room
         _SERVO | {"depthai", "gripper_hw.cameras", "gripper_hw.load_cells", "gripper_hw.sim"},
         command=("doctor", *(f"--set={key}" for key in (*_REAL, *_NO_CELL, *_BLIND))),
     ),
-    Scene("real servo", _SERVO, frozenset({"recorder"}), (*_REAL, *_NO_CELL, *_BLIND)),
-    Scene(
+    StartupCase("real servo", _SERVO, frozenset({"recorder"}), (*_REAL, *_NO_CELL, *_BLIND)),
+    StartupCase(
         "real servo, serial load cell",
         _SERVO | {"gripper_hw.load_cells"},
         frozenset({"recorder", "load-cell"}),
         (*_REAL, *_BLIND, "load_cell.backend=serial", "load_cell.port={load_cell}"),
     ),
-    Scene(
+    StartupCase(
         "real servo, recorded camera",
         _SERVO | {"gripper_hw.playback"},
         frozenset({"recorder", "perception"}),
         (*_REAL, *_NO_CELL, *_RECORDED, *_NO_NETWORK),
     ),
     *(
-        Scene(
+        StartupCase(
             f"real servo, recorded camera, {engine}",
             _SERVO | {"gripper_hw.playback", engine} | _EYES,
             frozenset({"recorder", "perception"}),
@@ -110,15 +110,15 @@ SCENES: Final = (
         for engine in ("torch", "openvino", "onnxruntime")
         if find_spec(engine) is not None
     ),
-    Scene("simulated, motor current alone", _SIMULATED, settings=(*_BLIND, *_NO_CELL)),
-    Scene("simulated, load cell", _SIMULATED, settings=_BLIND),
-    Scene(
+    StartupCase("simulated, motor current alone", _SIMULATED, settings=(*_BLIND, *_NO_CELL)),
+    StartupCase("simulated, load cell", _SIMULATED, settings=_BLIND),
+    StartupCase(
         "simulated, a whole grasp without report",
         _SIMULATED,
         command=("grasp", *(f"--set={key}" for key in ("object=stapler", *_BLIND, "log.report=false"))),
     ),
-    Scene("simulated, camera, no network", _SIMULATED | {"cv2"}, settings=_NO_NETWORK),
-    Scene(
+    StartupCase("simulated, camera, no network", _SIMULATED | {"cv2"}, settings=_NO_NETWORK),
+    StartupCase(
         "simulated, vision (the default)",
         _SIMULATED | _EYES | {"torch"},
         settings=("vision.checkpoint={network}",),
@@ -149,20 +149,20 @@ class Start:
 _PROGRAM: Final = """
 import atexit, sys
 import gripper_force.cli
-from gripper_force.qualification.bench import startup_child as inside
+from gripper_force.qualification.bench import startup_child
 fd, kind, *arguments = sys.argv[1:]
 if kind == "grasp":
     import gripper_force.jobs.grasp
-    inside.first_cycle(int(fd), arguments)
+    startup_child.first_cycle(int(fd), arguments)
 else:
-    atexit.register(inside.tell, int(fd))
+    atexit.register(startup_child.tell, int(fd))
     sys.argv[1:] = arguments
     gripper_force.cli.main()
 """
 """The process of a scene: what the command line does, and a word to this process at the first cycle."""
 
 
-def startup(scenes: Sequence[Scene], times: int = 3) -> Iterator[Start]:
+def startup(scenes: Sequence[StartupCase], times: int = 3) -> Iterator[Start]:
     """Starts each scene in a process of its own, so many times after a first; gives the medians of each.
 
     At the first, files come into memory, and a network is exported for an engine that needs it so.
@@ -178,7 +178,7 @@ def startup(scenes: Sequence[Scene], times: int = 3) -> Iterator[Start]:
             yield replace(starts[0], time_s=time_s, memory_mb=memory_mb)
 
 
-def start(scene: Scene, places: dict[str, str]) -> Start:
+def start(scene: StartupCase, places: dict[str, str]) -> Start:
     """Starts a scene once.
 
     Args:

@@ -6,18 +6,18 @@ from itertools import pairwise
 from typing import Any, Final
 
 from gripper_force.config import Config
-from gripper_force.qualification.fault_matrix.cases import Expected, Row
+from gripper_force.qualification.fault_matrix.cases import Expected, FaultCase
 from gripper_force.runtime.log import LogReader
 from gripper_force.types import (
     NS_PER_MS,
     NS_PER_S,
+    EstimateSource,
     Event,
     FusedForce,
     GraspStatus,
     LoadCellSample,
     Phase,
     ServoCommand,
-    Source,
     VisualForce,
 )
 
@@ -51,7 +51,7 @@ class Sound:
     commands: tuple[ServoCommand, ...]
 
 
-def judge(row: Row, run: Grasp, sound: Sound, config: Config, at_ns: int) -> tuple[float | None, str]:
+def judge(row: FaultCase, run: Grasp, sound: Sound, config: Config, at_ns: int) -> tuple[float | None, str]:
     """When the safe state was there, in ms after the fault, and what is wrong with it, if anything is."""
     live = config.clock == "realtime"  # no two such runs are the same
     match row.expected:
@@ -102,9 +102,11 @@ def _let_go_ns(run: Grasp, at_ns: int) -> int | None:
     return next((t_ns for t_ns, force_n in cells if force_n < _LET_GO * cells[0][1]), None)
 
 
-def _judge_vision(row: Row, run: Grasp, config: Config, at_ns: int) -> tuple[float | None, str]:
+def _judge_vision(row: FaultCase, run: Grasp, config: Config, at_ns: int) -> tuple[float | None, str]:
     """The time from when the first estimate that the fault took away was due."""
-    alone = [f.t_ns for f in run.records(FusedForce) if f.t_ns >= at_ns and f.source == Source.CURRENT]
+    alone = [
+        f.t_ns for f in run.records(FusedForce) if f.t_ns >= at_ns and f.source == EstimateSource.CURRENT
+    ]
     if not alone:
         return None, "vision never dropped out"
     compute_ns = round(config.vision.lockstep_compute_ms * NS_PER_MS)

@@ -22,7 +22,7 @@ from gripper_force.errors import DataError, GripperError, LogError
 from gripper_force.interfaces import Devices
 from gripper_force.jobs.grasp import TRIAL_OBJECTS, TRIAL_TARGETS_N
 from gripper_force.jobs.processes import process_pool
-from gripper_force.qualification.fault_matrix.cases import ROWS, Row
+from gripper_force.qualification.fault_matrix.cases import ROWS, FaultCase
 from gripper_force.qualification.fault_matrix.judge import Grasp, Sound, judge
 from gripper_force.qualification.fault_matrix.kill_process import kill_trial
 from gripper_force.runtime.assembly import checkpoint_of
@@ -86,7 +86,7 @@ def run_matrix(
     keep: Path,
     *,
     resume: bool = False,
-    rows: Sequence[Row] = ROWS,
+    rows: Sequence[FaultCase] = ROWS,
     advance: Callable[[str], None] = lambda _: None,
 ) -> Iterator[Summary]:
     """Runs every row with every seed.
@@ -114,7 +114,7 @@ def run_matrix(
     kept = _Kept(keep, config, resume)
     with process_pool(jobs) as pool:
 
-        def begin(row: Row, index: int, clock: str) -> Callable[[], Summary]:
+        def begin(row: FaultCase, index: int, clock: str) -> Callable[[], Summary]:
             """Starts a grasp, if none is kept; what is returned waits for its outcome."""
             key = f"{row.name}, {clock}, {index}"
             if key in kept.outcomes:
@@ -147,7 +147,7 @@ def run_matrix(
                 yield _summary(row, [], end((begin(row, i, "realtime") for i in range(seeds)), row.name))
 
 
-def count_grasps(seeds: int, live_seeds: int, rows: Sequence[Row] = ROWS) -> int:
+def count_grasps(seeds: int, live_seeds: int, rows: Sequence[FaultCase] = ROWS) -> int:
     """How many grasps `run_matrix` does."""
     simulated = sum(row.unit != "process" for row in rows)
     return seeds * (len(rows) + bool(simulated)) + min(live_seeds, seeds) * simulated
@@ -178,7 +178,7 @@ def _sound(tree: dict[str, Any]) -> Sound:
         return Sound(gripping[0], gripping[-1], run.cycles, run.peak_n, tuple(run.records(ServoCommand)))
 
 
-def _broken(tree: dict[str, Any], sound: Sound, row: Row, clock: str = "lockstep") -> Summary:
+def _broken(tree: dict[str, Any], sound: Sound, row: FaultCase, clock: str = "lockstep") -> Summary:
     config = config_from(tree, "stability")
     rng = np.random.default_rng([config.seed, 31])
     at_s = float(rng.uniform(sound.begin_s + 0.05, max(sound.end_s - 0.5, sound.begin_s + 0.06)))
@@ -237,7 +237,7 @@ def _watch(devices: Devices) -> float:
     return max((sample.force_n for sample in samples if sample.valid), default=0.0)
 
 
-def _kill(tree: dict[str, Any], row: Row) -> Summary:
+def _kill(tree: dict[str, Any], row: FaultCase) -> Summary:
     config = config_from(tree, "stability")
     with tempfile.TemporaryDirectory() as folder:
         try:
@@ -266,7 +266,7 @@ def _kill(tree: dict[str, Any], row: Row) -> Summary:
     }
 
 
-def _summary(row: Row, outcomes: list[Summary], live: list[Summary]) -> Summary:
+def _summary(row: FaultCase, outcomes: list[Summary], live: list[Summary]) -> Summary:
     both = outcomes or live
     return {
         "row": row.name,

@@ -32,7 +32,7 @@ from gripper_force.jobs.grasp import summarise
 from gripper_force.jobs.imports.video import estimate_tare, read_forces
 from gripper_force.jobs.replay import replay
 from gripper_force.jobs.report.data import read_run
-from gripper_force.profiles.correction import Correction, HeadAndGate, load_correction, pack
+from gripper_force.profiles.correction import Correction, ProfileArrays, load_correction, pack
 from gripper_force.profiles.object_profile import (
     Interval,
     ObjectProfile,
@@ -40,7 +40,12 @@ from gripper_force.profiles.object_profile import (
     read_object,
     weights_path,
 )
-from gripper_force.profiles.rig_profile import Estimate, LoadCellCalibration, RigProfile, ServoCalibration
+from gripper_force.profiles.rig_profile import (
+    CalibratedValue,
+    LoadCellCalibration,
+    RigProfile,
+    ServoCalibration,
+)
 from gripper_force.qualification.fuzz.fuzzer import Target
 from gripper_force.runtime.assembly import controller_from
 from gripper_force.runtime.log import LogReader, LogWriter
@@ -83,14 +88,14 @@ def _object(weights: str = "") -> ObjectProfile:
         force_n=8.0,
         output=OutputCurve(kind="monotone", estimate_n=(0.0, 4.0, 9.0), force_n=(0.1, 3.5, 8.0)),
         interval=Interval(coverage=0.9, base_n=0.1, share=0.03),
-        gate=0.02,
+        ood_limit=0.02,
         before_n=0.4,
         weights=weights,
     )
 
 
 _SOME_FEATURES: Final = np.linspace(-1, 1, 8, dtype=np.float32)[None]
-_HALF: Final = HeadAndGate(
+_HALF: Final = ProfileArrays(
     head=np.ones(8, np.float32),
     offset=np.ones(1, np.float32),
     mean=np.ones(8, np.float32),
@@ -122,7 +127,7 @@ def _correct(correction: Correction) -> None:
     force_n = correction.force_n([-1.0, 0.0, 5.0, 30.0], np.repeat(_SOME_FEATURES, 4, 0))
     assert not np.isnan(force_n).any()
     assert (correction.half_width_n(force_n) > 0).all()
-    assert correction.strangeness(_SOME_FEATURES) >= 0
+    assert correction.ood_score(_SOME_FEATURES) >= 0
 
 
 def _configs() -> list[bytes]:
@@ -137,14 +142,14 @@ def _read_config(data: bytes, path: Path) -> None:
 
 
 def _rigs() -> list[bytes]:
-    at, found = datetime(2026, 1, 2, tzinfo=UTC), Estimate(value=1.7, low=1.69, high=1.72)
+    at, found = datetime(2026, 1, 2, tzinfo=UTC), CalibratedValue(value=1.7, low=1.69, high=1.72)
     servo = ServoCalibration(
         date=at,
         model="XM430-W350",
         nm_per_a=found,
         friction_n=found,
         damping_n_s_m=found,
-        pinion_radius_m=Estimate(value=0.02),
+        pinion_radius_m=CalibratedValue(value=0.02),
         open_position_rad=found,
         open_width_m=0.09,
         force_n=(0.3, 9.5),

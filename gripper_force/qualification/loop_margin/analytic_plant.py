@@ -132,7 +132,7 @@ class Gripper:
         return min(0.0005, 0.4 * math.sqrt(self.mass_kg / self.stiffness_n_m))
 
 
-class Eye:
+class SimulatedVision:
     """Vision: frames of the force, some time late, with white noise."""
 
     def __init__(self, delay_s: float, noise_n: float, rate_hz: float = 60.0) -> None:
@@ -141,7 +141,7 @@ class Eye:
         self._under_way: deque[VisualForce] = deque()
         self._seq = 0
 
-    def look(self, t_ns: int, force_n: float, noise: float) -> VisualForce | None:
+    def sample(self, t_ns: int, force_n: float, noise: float) -> VisualForce | None:
         """Takes a picture if one is due, and gives the newest estimate that is ready.
 
         Args:

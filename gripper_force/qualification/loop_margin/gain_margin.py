@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from gripper_calibration.fits.plant_fit import Press, fit_plant
+from gripper_calibration.fits.plant_fit import PressSeries, fit_plant
 from gripper_force.config import Config, ControlConfig
 from gripper_force.control.force_loop import ForceLoop
 from gripper_force.control.fusion import OBSERVER_LAG_S, Fusion
@@ -26,11 +26,11 @@ from gripper_force.control.tuning import Gains
 from gripper_force.qualification.loop_margin.analytic_plant import (
     CYCLE_NS,
     NOISE_A,
-    Eye,
     Gripper,
+    SimulatedVision,
     transmission_of,
 )
-from gripper_force.types import NS_PER_S, Phase, Request, RequestKind, ServoCommand, Source
+from gripper_force.types import NS_PER_S, EstimateSource, Phase, Request, RequestKind, ServoCommand
 
 SWING_N: Final = 4.0
 """From where the swing is released, with vision alone: four times what friction takes."""
@@ -88,10 +88,10 @@ def identify(config: Config, truth: Gripper) -> Identified:
             decision = controller.step(t_ns, servo, None, request)
             request = None
             if decision.status.phase in (Phase.RAMP, Phase.HOLD):
-                push_n = truth.transmission.force_n(servo.current_a) - truth.transmission.friction_n
-                rows.append((t_ns / NS_PER_S, push_n, gripper.force_n))
+                motor_force_n = truth.transmission.force_n(servo.current_a) - truth.transmission.friction_n
+                rows.append((t_ns / NS_PER_S, motor_force_n, gripper.force_n))
             gripper.advance(decision.command, _CYCLE_S)
-        presses.append(Press(*(np.array(column) for column in zip(*rows, strict=True))))
+        presses.append(PressSeries(*(np.array(column) for column in zip(*rows, strict=True))))
     found = fit_plant(presses, 0.035)
     assert found is not None  # the presses above cover the whole range of forces
     return Identified(found.gain, 1e-3 * found.lag_ms)
@@ -186,18 +186,18 @@ def dies_out(config: Config, truth: Gripper, feedback: str, delay_s: float, fact
     )
     loop, fusion, limits = ForceLoop(control, rig), Fusion(control, rig), Limits(control, rig, 3.0)
     loop.start(_TARGET_N, _TARGET_N)
-    eye = Eye(delay_s, _NOISE_N)
+    vision = SimulatedVision(delay_s, _NOISE_N)
     rng = np.random.default_rng([config.seed, 44])
     cycles, forces_n = round(_TIME_S / _CYCLE_S), []
     source = ""
-    for cycle, (servo_noise, eye_noise) in enumerate(rng.standard_normal((cycles, 2)).tolist()):
+    for cycle, (servo_noise, vision_noise) in enumerate(rng.standard_normal((cycles, 2)).tolist()):
         t_ns = cycle * CYCLE_NS
         servo = gripper.read(t_ns, NOISE_A * servo_noise)
-        estimate, _ = fusion.step(t_ns, servo, eye.look(t_ns, gripper.force_n, eye_noise))
+        estimate, _ = fusion.step(t_ns, servo, vision.sample(t_ns, gripper.force_n, vision_noise))
         source = estimate.source
-        push_n = loop.step(_CYCLE_S, _TARGET_N, estimate)
+        motor_force_n = loop.step(_CYCLE_S, _TARGET_N, estimate)
         goal_rad = rig.position_rad(max(rig.width_m(servo.position_rad) - 0.02, 0.0))
-        wanted = ServoCommand(t_ns, goal_rad, abs(rig.current_a(push_n)))
+        wanted = ServoCommand(t_ns, goal_rad, abs(rig.current_a(motor_force_n)))
         motor_n = rig.force_n(servo.current_a)
         command, _ = limits.apply(
             wanted, estimate.force_n, estimate.friction_n, motor_n, _CYCLE_S, may_rise=True
@@ -205,7 +205,7 @@ def dies_out(config: Config, truth: Gripper, feedback: str, delay_s: float, fact
         forces_n.append(gripper.force_n)
         gripper.advance(command, _CYCLE_S)
     last = forces_n[-round(_LAST_S / _CYCLE_S) :]
-    return max(last) - min(last) < swing_n / 2 and source != Source.CURRENT
+    return max(last) - min(last) < swing_n / 2 and source != EstimateSource.CURRENT
 
 
 def gains_of(config: Config, feedback: str) -> Gains:

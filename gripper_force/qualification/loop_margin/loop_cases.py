@@ -16,8 +16,8 @@ from gripper_force.control.state_machine import GraspController
 from gripper_force.qualification.loop_margin.analytic_plant import (
     CYCLE_NS,
     NOISE_A,
-    Eye,
     Gripper,
+    SimulatedVision,
     transmission_of,
 )
 from gripper_force.qualification.loop_margin.gain_margin import (
@@ -33,15 +33,15 @@ from gripper_force.qualification.loop_margin.gain_margin import (
 )
 from gripper_force.qualification.loop_margin.grid import FULL, Field, Grid, Margins, Trial, Trials, Verdict
 from gripper_force.qualification.loop_margin.maps import draw_margins, draw_verdicts
-from gripper_force.qualification.numerics.suite import Row
-from gripper_force.types import NS_PER_S, Outcome, Request, RequestKind, Source
+from gripper_force.qualification.numerics.suite import NumericalCase
+from gripper_force.types import NS_PER_S, EstimateSource, Outcome, Request, RequestKind
 
 _TARGET_N: Final = 4.0
 _TRAVEL_M: Final = 0.02  # what a soft object leaves of the stroke
 _CONTACT_M: Final = 0.008
 _TIME_S: Final = 7.0
 _LAST_S: Final = 2.0
-_EYE_NOISE_N: Final = 0.1
+_VISION_NOISE_N: Final = 0.1
 _OVER: Final = 0.05
 _LOST: Final = 0.1
 _AGREE: Final = 0.2
@@ -61,16 +61,16 @@ def grasp(config: Config, truth: Gripper, delay_s: float, seed: int) -> Trial:
     wanted_n, gripper = target_n(truth.stiffness_n_m), replace(truth)
     controller = GraspController(control, rig, config.servo.current_limit_a)
     request: Request | None = Request(0, RequestKind.GRASP, wanted_n)
-    eye = Eye(delay_s, _EYE_NOISE_N)
+    vision = SimulatedVision(delay_s, _VISION_NOISE_N)
     rng = np.random.default_rng([config.seed, 45, seed])
     bounds = _Bounds(config, truth)
     forces_n, broken = [], 0
-    for cycle, (servo_noise, eye_noise) in enumerate(
+    for cycle, (servo_noise, vision_noise) in enumerate(
         rng.standard_normal((round(_TIME_S / _CYCLE_S), 2)).tolist()
     ):
         t_ns = cycle * CYCLE_NS
         servo = gripper.read(t_ns, NOISE_A * servo_noise)
-        visual = eye.look(t_ns, gripper.force_n, eye_noise)
+        visual = vision.sample(t_ns, gripper.force_n, vision_noise)
         decision = controller.step(t_ns, servo, visual, request)
         request = None
         command = decision.command
@@ -85,7 +85,7 @@ def grasp(config: Config, truth: Gripper, delay_s: float, seed: int) -> Trial:
         verdict = Verdict.RINGS
     elif decision.status.outcome in (Outcome.NO_OBJECT, Outcome.SLIP, Outcome.FAULT) or off > _LOST:
         verdict = Verdict.LOSES
-    elif decision.estimate.source == Source.CURRENT:
+    elif decision.estimate.source == EstimateSource.CURRENT:
         verdict = Verdict.CURRENT
     else:
         verdict = Verdict.HOLDS
@@ -114,7 +114,7 @@ def crushing_n_m(control: ControlConfig, truth: Gripper) -> float:
     return ((1 + _OVER) * control.force_limit_n / speed_m_s) ** 2 / truth.mass_kg
 
 
-def cases(config: Config, maps: Path | None, grid: Grid = FULL) -> Iterator[Row]:
+def cases(config: Config, maps: Path | None, grid: Grid = FULL) -> Iterator[NumericalCase]:
     """Rows of the force loop; its maps go into ``maps``.
 
     Args:
@@ -130,7 +130,7 @@ def cases(config: Config, maps: Path | None, grid: Grid = FULL) -> Iterator[Row]
     swept = _sweep(config, truth, grid)
     yield from _sweep_rows(grid, swept)
     everything = [*swept.values(), *(trial for trials in verdicts.values() for trial in trials.values())]
-    yield Row(
+    yield NumericalCase(
         "commands beyond limits, or not finite",
         f"goal current and goal position of every cycle of these {len(everything)} grasps",
         float(sum(trial.broken for trial in everything)),
@@ -157,11 +157,11 @@ def _try_all(config: Config, truth: Gripper, grid: Grid, feedback: str, factor: 
     }
 
 
-def _map_row(config: Config, truth: Gripper, feedback: str, factor: float, trials: Trials) -> Row:
+def _map_row(config: Config, truth: Gripper, feedback: str, factor: float, trials: Trials) -> NumericalCase:
     """The fused loop is to hold with the gain that it has; of anything else the map tells."""
     soft = {key: t for key, t in trials.items() if key[0] < crushing_n_m(config.control, truth)}
     bad = sum(trial.verdict not in (Verdict.HOLDS, Verdict.CURRENT) for trial in soft.values())
-    return Row(
+    return NumericalCase(
         f"{_LOOPS[feedback]}, loop gain x {factor:g}",
         f"{_counted(trials.values())}; share that is not held of those that the touch alone does not crush",
         100 * bad / len(soft),
@@ -180,11 +180,11 @@ def _sweep(config: Config, truth: Gripper, grid: Grid) -> dict[tuple[float, ...]
     return trials
 
 
-def _sweep_rows(grid: Grid, swept: dict[tuple[float, ...], Trial]) -> Iterator[Row]:
+def _sweep_rows(grid: Grid, swept: dict[tuple[float, ...], Trial]) -> Iterator[NumericalCase]:
     for number, (name, values) in enumerate(grid.sweep.items()):
         for value in values:
             trials = [trial for key, trial in swept.items() if key[number] == value]
-            yield Row(
+            yield NumericalCase(
                 f"{_LOOPS['fused']}, {_NAMES[name].format(value)}",
                 f"{_counted(trials)}; share that rings, all else combined",
                 100 * sum(trial.verdict == Verdict.RINGS for trial in trials) / len(trials),
@@ -213,7 +213,7 @@ def _margins(config: Config, truth: Gripper, grid: Grid, plants: dict[float, Ide
     )
 
 
-def _margin_rows(grid: Grid, margins: Margins) -> Iterator[Row]:
+def _margin_rows(grid: Grid, margins: Margins) -> Iterator[NumericalCase]:
     late = np.array(grid.margin_delay_s) >= _FROM_S
     for cells, name, bound in ((late, "from", 100 * _AGREE), (~late, "below", math.inf)):
         for how, predicted, least in (
@@ -221,7 +221,7 @@ def _margin_rows(grid: Grid, margins: Margins) -> Iterator[Row]:
             ("gain and lag alone", margins.identified, math.inf),
         ):
             ratio = (margins.vision / predicted)[cells]
-            yield Row(
+            yield NumericalCase(
                 f"margin of vision alone, delay {name} {1e3 * _FROM_S:.0f} ms, by {how}",
                 f"observed over predicted on {ratio.size} cells: {ratio.min():.2f} to {ratio.max():.2f}, "
                 f"median {np.median(ratio):.2f}; nine cells of ten agree within",
@@ -230,7 +230,7 @@ def _margin_rows(grid: Grid, margins: Margins) -> Iterator[Row]:
                 "%",
             )
     short = 1 - margins.fused / margins.rule
-    yield Row(
+    yield NumericalCase(
         f"margin of {_LOOPS['fused']}",
         f"least {margins.fused.min():.1f}, median {np.median(margins.fused):.1f}; most that it falls short "
         "of what its tuning promises",
@@ -240,7 +240,7 @@ def _margin_rows(grid: Grid, margins: Margins) -> Iterator[Row]:
     )
 
 
-def _tuned_row(config: Config, truth: Gripper, grid: Grid, plants: dict[float, Identified]) -> Row:
+def _tuned_row(config: Config, truth: Gripper, grid: Grid, plants: dict[float, Identified]) -> NumericalCase:
     """Vision alone with the gains that an object profile gives it."""
     found, promised = [], []
     for (stiffness, plant), delay_s in product(plants.items(), grid.tuned_delay_s):
@@ -252,7 +252,7 @@ def _tuned_row(config: Config, truth: Gripper, grid: Grid, plants: dict[float, I
         tuned = config.model_copy(update={"control": config.control.model_copy(update=known)})
         found.append(observed(tuned, replace(truth, stiffness_n_m=stiffness), "vision", delay_s))
         promised.append(by_identified_plant(gains_of(tuned, "vision"), plant, delay_s))
-    return Row(
+    return NumericalCase(
         "margin of vision alone, tuned by what was identified",
         f"observed {min(found):.2f} to {max(found):.2f}, predicted by gain and lag alone "
         f"{min(promised):.2f} to {max(promised):.2f}; of {len(found)} cells those where a swing of "

@@ -22,7 +22,7 @@ from gripper_force.control.fusion import Fusion
 from gripper_force.control.state_machine import GraspController
 from gripper_force.control.transmission import Transmission
 from gripper_force.qualification.loop_margin.analytic_plant import CYCLE_NS, transmission_of
-from gripper_force.qualification.numerics.suite import Row
+from gripper_force.qualification.numerics.suite import NumericalCase
 from gripper_force.types import NS_PER_MS, NS_PER_S, Request, RequestKind, ServoState, VisualForce
 
 CYCLES: Final = 1_000_000
@@ -52,7 +52,7 @@ class _Exact:
         self._friction_n = Decimal(transmission.friction_n)
         self._friction_n2 = (Decimal(transmission.friction_std) * self._friction_n) ** 2
         self._gain_std = Decimal(transmission.gain_std)
-        self._push_n = self._force_n = self._difference_n = Decimal(0)
+        self._motor_force_n = self._force_n = self._difference_n = Decimal(0)
         self._share = Decimal(1)
         self._variance_n2 = self._prior_n2(self._force_n)
         cycles = math.ceil(control.rate_hz * control.vision_age_ms / 1e3) + 2
@@ -60,18 +60,20 @@ class _Exact:
         self._newest_ns = -1
         self._run = 0
 
-    def step(self, t_ns: int, push_n: float, visual: VisualForce | None) -> tuple[Decimal, Decimal]:
+    def step(self, t_ns: int, motor_force_n: float, visual: VisualForce | None) -> tuple[Decimal, Decimal]:
         """One cycle: the force and its standard deviation."""
         before_n = self._force_n
         dt_s = Decimal(0)
         if self._history:
             dt_s = Decimal(max(t_ns - self._history[-1][0], 0)) / NS_PER_S
-            self._push_n += (Decimal(push_n) - self._push_n) * dt_s / (dt_s + self._lag_s)
+            self._motor_force_n += (
+                (Decimal(motor_force_n) - self._motor_force_n) * dt_s / (dt_s + self._lag_s)
+            )
         else:
-            self._push_n = Decimal(push_n)
+            self._motor_force_n = Decimal(motor_force_n)
         play_n = self._friction_n
-        self._force_n = min(max(before_n, self._push_n - play_n), self._push_n + play_n)
-        back = (1 + (self._force_n - self._push_n) / play_n) / 2 if play_n else Decimal(0)
+        self._force_n = min(max(before_n, self._motor_force_n - play_n), self._motor_force_n + play_n)
+        back = (1 + (self._force_n - self._motor_force_n) / play_n) / 2 if play_n else Decimal(0)
         drift_n2 = Decimal(fusion._DRIFT_N2_S) + Decimal(fusion._LOOSE_N2_S) * back
         gearing_n2 = self._gain_std**2 * abs(self._force_n**2 - before_n**2)
         grown_n2 = self._variance_n2 + drift_n2 * dt_s + gearing_n2
@@ -125,7 +127,7 @@ class _Exact:
         return self._friction_n2 + floor_n2 + (self._gain_std * force_n) ** 2
 
 
-def cases(config: Config, _maps: Path | None, cycles: int = CYCLES) -> Iterator[Row]:
+def cases(config: Config, _maps: Path | None, cycles: int = CYCLES) -> Iterator[NumericalCase]:
     """Rows of the filter.
 
     Args:
@@ -140,13 +142,15 @@ def cases(config: Config, _maps: Path | None, cycles: int = CYCLES) -> Iterator[
         inputs: Iterator[Input],
         bound_n: float = _ROUNDING_N,
         **changed: float,
-    ) -> Row:
+    ) -> NumericalCase:
         other = GripperConfig.model_validate({**gripper.model_dump(), **changed})
-        return Row(case, f"{detail}; against 50 digits", worst_n(control, other, inputs), bound_n, "N")
+        return NumericalCase(
+            case, f"{detail}; against 50 digits", worst_n(control, other, inputs), bound_n, "N"
+        )
 
     rng = np.random.default_rng([config.seed, 40])
     yield against(f"{cycles} cycles", "4 ± 3 N, frames at 60 Hz", _steady(rng, cycles))
-    yield Row(
+    yield NumericalCase(
         "a clock near 2^62 ns",
         "146 years of uptime, beside the same cycles from 0; estimates that differ by a bit",
         _moved(control, gripper, 2**62, config.seed),
@@ -165,7 +169,7 @@ def cases(config: Config, _maps: Path | None, cycles: int = CYCLES) -> Iterator[
             f"claimed error {name}", "no frame is believed without bound", _steady(rng, 4000, std_n=std_n)
         )
     for name, force_n, std_n in _REFUSED:
-        yield Row(
+        yield NumericalCase(
             f"estimates of {name}",
             "every second one; off from the filter that never sees those",
             _unheard(control, gripper, force_n, std_n, config.seed),
@@ -187,7 +191,7 @@ def cases(config: Config, _maps: Path | None, cycles: int = CYCLES) -> Iterator[
             _spiked(rng, huge_n),
             bound_n=max(_ROUNDING_N, _LEFT * huge_n),
         )
-    yield Row(
+    yield NumericalCase(
         "servo readings that are not finite",
         "every tenth, each number in turn, in a whole grasp; commands beyond limits or not finite",
         float(_wild_commands(control, gripper, config.servo.current_limit_a)),
@@ -213,8 +217,8 @@ def worst_n(control: ControlConfig, gripper: GripperConfig, inputs: Iterator[Inp
     tested, exact = Fusion(control, transmission), _Exact(control, transmission)
     worst = 0.0
     with localcontext(prec=_DIGITS):
-        for t_ns, push_n, visual in inputs:
-            servo = _servo(t_ns, transmission.current_a(push_n))
+        for t_ns, motor_force_n, visual in inputs:
+            servo = _servo(t_ns, transmission.current_a(motor_force_n))
             found, _ = tested.step(t_ns, servo, visual)
             if not (math.isfinite(found.force_n) and math.isfinite(found.std_n)):
                 return math.inf
@@ -231,7 +235,7 @@ def _servo(t_ns: int, current_a: float) -> ServoState:
     return ServoState(t_ns, 0.0, 0.0, current_a, 35.0, 12.0, 0)
 
 
-def _push_n(rng: np.random.Generator, t_ns: int) -> float:
+def _motor_force_n(rng: np.random.Generator, t_ns: int) -> float:
     """Push of a grip that goes up and down, and turns the play over."""
     return 5.0 + 3.0 * math.sin(t_ns / NS_PER_S) + float(rng.normal(0.0, 0.2))
 
@@ -247,7 +251,7 @@ def _steady(
     for cycle in range(cycles):
         t_ns = begin_ns + cycle * CYCLE_NS
         visual = _seen(rng, t_ns - 40 * NS_PER_MS, cycle, std_n) if cycle % 10 in (0, 3, 6) else None
-        yield t_ns, _push_n(rng, t_ns), visual
+        yield t_ns, _motor_force_n(rng, t_ns), visual
 
 
 def _repeated(rng: np.random.Generator) -> Iterator[Input]:
@@ -256,29 +260,33 @@ def _repeated(rng: np.random.Generator) -> Iterator[Input]:
 
 
 def _backward(rng: np.random.Generator) -> Iterator[Input]:
-    for cycle, (t_ns, push_n, visual) in enumerate(_steady(rng, 4000)):
+    for cycle, (t_ns, motor_force_n, visual) in enumerate(_steady(rng, 4000)):
         back_ns = 100 * NS_PER_MS * (cycle // 100)
         seen = visual and replace(visual, t_ns=visual.t_ns - back_ns, ready_ns=visual.ready_ns - back_ns)
-        yield t_ns - back_ns, push_n, seen
+        yield t_ns - back_ns, motor_force_n, seen
 
 
 def _irregular(rng: np.random.Generator) -> Iterator[Input]:
     t_ns = 0
     for cycle in range(4000):
         t_ns += 2 * NS_PER_S if rng.random() < 0.002 else int(rng.integers(NS_PER_MS, 50 * NS_PER_MS))
-        yield t_ns, _push_n(rng, t_ns), _seen(rng, t_ns - 40 * NS_PER_MS, cycle) if cycle % 3 == 0 else None
+        yield (
+            t_ns,
+            _motor_force_n(rng, t_ns),
+            _seen(rng, t_ns - 40 * NS_PER_MS, cycle) if cycle % 3 == 0 else None,
+        )
 
 
 def _ragged(rng: np.random.Generator) -> Iterator[Input]:
-    for cycle, (t_ns, push_n, visual) in enumerate(_steady(rng, 8000)):
+    for cycle, (t_ns, motor_force_n, visual) in enumerate(_steady(rng, 8000)):
         late_ns = int(rng.integers(5 * NS_PER_MS, 95 * NS_PER_MS))
         kept = visual is not None and rng.random() < 1 / 3
-        yield t_ns, push_n, _seen(rng, t_ns - late_ns, cycle) if kept else None
+        yield t_ns, motor_force_n, _seen(rng, t_ns - late_ns, cycle) if kept else None
 
 
 def _spiked(rng: np.random.Generator, huge_n: float) -> Iterator[Input]:
-    for cycle, (t_ns, push_n, visual) in enumerate(_steady(rng, 600)):
-        yield t_ns, huge_n if cycle == 400 else push_n, visual
+    for cycle, (t_ns, motor_force_n, visual) in enumerate(_steady(rng, 600)):
+        yield t_ns, huge_n if cycle == 400 else motor_force_n, visual
 
 
 # What is compared with the filter itself.
@@ -289,8 +297,8 @@ def _moved(control: ControlConfig, gripper: GripperConfig, by_ns: int, seed: int
     transmission = transmission_of(gripper)
     here, there = Fusion(control, transmission), Fusion(control, transmission)
     different = 0
-    for t_ns, push_n, visual in _ragged(np.random.default_rng([seed, 41])):
-        current_a = transmission.current_a(push_n)
+    for t_ns, motor_force_n, visual in _ragged(np.random.default_rng([seed, 41])):
+        current_a = transmission.current_a(motor_force_n)
         later = visual and replace(visual, t_ns=visual.t_ns + by_ns, ready_ns=visual.ready_ns + by_ns)
         one, _ = here.step(t_ns, _servo(t_ns, current_a), visual)
         other, _ = there.step(t_ns + by_ns, _servo(t_ns + by_ns, current_a), later)
@@ -306,8 +314,8 @@ def _unheard(
     # What vision says after such an estimate counts anew: only what the filter holds is compared.
     hears, spared = Fusion(control, transmission), Fusion(control, transmission)
     worst = 0.0
-    for number, (t_ns, push_n, visual) in enumerate(_steady(np.random.default_rng([seed, 42]), 4000)):
-        servo = _servo(t_ns, transmission.current_a(push_n))
+    for number, (t_ns, motor_force_n, visual) in enumerate(_steady(np.random.default_rng([seed, 42]), 4000)):
+        servo = _servo(t_ns, transmission.current_a(motor_force_n))
         bad = visual is not None and number % 2 == 1
         spoiled = replace(visual, force_n=force_n, std_n=std_n) if visual and bad else visual
         found, _ = hears.step(t_ns, servo, spoiled)

@@ -10,7 +10,7 @@ from gripper_calibration.fits.object_fit import fit_correction
 from gripper_calibration.fits.ridge import PENALTIES, Ridge
 from gripper_calibration.fits.touches import Floats, Touches
 from gripper_force.profiles.correction import Features
-from gripper_force.qualification.numerics.suite import Row
+from gripper_force.qualification.numerics.suite import NumericalCase
 
 _FRAMES: Final = 20
 _FEATURES: Final = 30
@@ -24,7 +24,7 @@ _NOTICED_N: Final = 0.005
 """A tenth of the error that is allowed to any estimate at best."""
 
 
-def cases() -> Iterator[Row]:
+def cases() -> Iterator[NumericalCase]:
     """Rows of the last layer's fit."""
     for name, features in _hard().items():
         worst, error_n, bound_n = 0.0, 0.0, 0.0
@@ -34,10 +34,12 @@ def cases() -> Iterator[Row]:
             off_n = _off_n(features, missing_n, penalty)
             if not off_n / allowed_n < worst:  # NaN is the worst
                 worst, error_n, bound_n = off_n / allowed_n, off_n, allowed_n
-        yield Row(f"last layer fitted to {name}", "all penalties; against 50 digits", error_n, bound_n, "N")
+        yield NumericalCase(
+            f"last layer fitted to {name}", "all penalties; against 50 digits", error_n, bound_n, "N"
+        )
     moved_n = max(_moved_n(steps) for steps in _STEPS)
     detail = "what float32 rounds away of it and of its features, where these move by 1 to 0.001"
-    yield Row("last layer of a profile", detail, moved_n, _NOTICED_N, "N")
+    yield NumericalCase("last layer of a profile", detail, moved_n, _NOTICED_N, "N")
 
 
 def _hard() -> dict[str, Features]:

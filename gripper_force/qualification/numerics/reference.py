@@ -36,7 +36,7 @@ weights and what goes into convolutions."""
 EPS: Final = 2.0**-24
 """What float32 rounds away, as a share."""
 
-Exact = npt.NDArray[np.float64]
+Float64Result = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +63,8 @@ ROUNDING: Final = {
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
-    """A way to compute.
+class EngineVariant:
+    """A variant to compute.
 
     Attributes:
         engine: One of `gripper_force.vision.engines.ENGINES`.
@@ -82,16 +82,16 @@ class Way:
         return f"{self.engine}, {self.precision}"
 
 
-WAYS: Final = (
-    Way("torch", "float32", ".safetensors"),
-    Way("openvino", "float32", ".xml"),
-    Way("openvino", "bfloat16", ".xml"),
-    Way("openvino", "int8", "-int8.xml"),
-    Way("onnxruntime", "float32", ".onnx"),
+ENGINE_VARIANTS: Final = (
+    EngineVariant("torch", "float32", ".safetensors"),
+    EngineVariant("openvino", "float32", ".xml"),
+    EngineVariant("openvino", "bfloat16", ".xml"),
+    EngineVariant("openvino", "int8", "-int8.xml"),
+    EngineVariant("onnxruntime", "float32", ".onnx"),
 )
 
 
-class Twin:
+class ReferenceEnsemble:
     """An ensemble in float64, and beside it the engines that run it.
 
     Attributes:
@@ -106,31 +106,31 @@ class Twin:
         self.said_n = math.nan
         self._folder = folder
 
-    def open(self, way: Way, clips: Sequence[Gray] = ()) -> Engine:
+    def open(self, variant: EngineVariant, clips: Sequence[Gray] = ()) -> Engine:
         """An engine, its file made at the first use.
 
         Args:
-            way: Which.
+            variant: Which.
             clips: Recordings to scale int8 on.
 
         Raises:
             CheckpointError: What the export made computes something else.
         """
         model = self.model
-        if way.engine != "torch":
-            path = self._folder / f"{model.path.stem}{way.file}"
+        if variant.engine != "torch":
+            path = self._folder / f"{model.path.stem}{variant.file}"
             if not path.exists():
-                said = export(model, path, clips if way.precision == "int8" else None)
+                said = export(model, path, clips if variant.precision == "int8" else None)
                 self.said_n = said["largest_n"]
             model = read_model(path)
-        precision: Precision = "bfloat16" if way.precision == "bfloat16" else "float32"
-        return open_engine(model, way.engine, precision)
+        precision: Precision = "bfloat16" if variant.precision == "bfloat16" else "float32"
+        return open_engine(model, variant.engine, precision)
 
-    def forces_n(self, inputs: Floats | Exact) -> Exact:
+    def forces_n(self, inputs: Floats | Float64Result) -> Float64Result:
         """Each member's forces for prepared frames (T, S, S), (M, T)."""
         return _forces_n(self.networks, inputs)
 
-    def bound_n(self, inputs: Floats | Exact, rounding: Rounding, off: float = 0.0) -> Exact:
+    def bound_n(self, inputs: Floats | Float64Result, rounding: Rounding, off: float = 0.0) -> Float64Result:
         """How far off each member may be, (M,); see the module.
 
         Args:
@@ -148,12 +148,12 @@ class Twin:
             farthest_n = np.maximum(farthest_n, np.abs(moved_n - true_n).max(1))
         # The last digit of the label's scale is lost in any case.
         scale_n = np.array([network.config.label_scale_n for network in self.networks])
-        bound_n: Exact = _MARGIN * (farthest_n + EPS * scale_n)
+        bound_n: Float64Result = _MARGIN * (farthest_n + EPS * scale_n)
         return bound_n
 
 
 @torch.inference_mode()
-def _forces_n(networks: Sequence[ForceNetwork], inputs: Floats | Exact) -> Exact:
+def _forces_n(networks: Sequence[ForceNetwork], inputs: Floats | Float64Result) -> Float64Result:
     clip = torch.from_numpy(inputs.astype(np.float64))[None, :, None]  # (1, T, 1, S, S)
     return np.stack([network(clip)[0].numpy() for network in networks])
 

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from gripper_force.config import Config, GripperConfig
 from gripper_force.errors import SimulationError
-from gripper_force.qualification.numerics.suite import Row
+from gripper_force.qualification.numerics.suite import NumericalCase
 from gripper_force.types import NS_PER_MS, NS_PER_S
 from gripper_hw.sim.objects import OBJECTS, Detail
 from gripper_hw.sim.scene import Scene
@@ -77,7 +77,7 @@ def cases(
     _maps: Path | None,
     objects: Sequence[str] = tuple(OBJECTS),
     steps_s: Sequence[float] = STEPS_S,
-) -> Iterator[Row]:
+) -> Iterator[NumericalCase]:
     """Rows of the simulator.
 
     Args:
@@ -90,7 +90,7 @@ def cases(
             broken, times_s, force_n, speed = _run(name, step_s)
             off_n = force_n - np.interp(times_s, finest_s, finest_n)
             error_n = float(np.sqrt(np.mean(off_n**2)))
-            yield Row(
+            yield NumericalCase(
                 f"{name}, step {1e3 * step_s:g} ms",
                 broken
                 or f"{speed:.2g} times real time, worst {np.abs(off_n).max():.2f} N; RMS error against "
@@ -99,7 +99,7 @@ def cases(
                 _ERROR_N,
                 "N",
             )
-    yield Row(
+    yield NumericalCase(
         "steps of " + " and ".join(f"{1e3 * step_s:g} ms" for step_s in TOO_LONG_S),
         f"worlds of {', '.join(objects)} that are built nonetheless",
         float(sum(_is_built(name, step_s) for name in objects for step_s in TOO_LONG_S)),
@@ -109,7 +109,7 @@ def cases(
         caught = Counter(_guard_of(name, drive) for name in objects)
         unseen = caught.pop("", 0)
         said = ", ".join(f"{guard} {count}" for guard, count in caught.most_common())
-        yield Row(what, f"caught by: {said}; worlds that go on", float(unseen), 0.0)
+        yield NumericalCase(what, f"caught by: {said}; worlds that go on", float(unseen), 0.0)
 
 
 def _world(name: str, step_s: float | None, drive: Drive) -> World:

@@ -21,7 +21,7 @@ PARTS: Final = {
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class NumericalCase:
     """One hard case.
 
     Attributes:
@@ -44,7 +44,7 @@ class Row:
         object.__setattr__(self, "ok", bool(self.figure <= self.bound))
 
 
-Part = Callable[[Config, Path | None], Iterator[Row]]
+Part = Callable[[Config, Path | None], Iterator[NumericalCase]]
 """Yields its rows, and draws its maps into a folder if it is given one."""
 
 
@@ -63,14 +63,14 @@ def run(
         advance: Told of each case, and how many more parts are done.
 
     Returns:
-        ``parts`` (name to a list of `Row`), ``seconds`` of each, and ``ok``.
+        ``parts`` (name to a list of `NumericalCase`), ``seconds`` of each, and ``ok``.
 
     Raises:
         ConfigError: There is no such part.
     """
     if unknown := [name for name in parts if name not in PARTS]:
         raise ConfigError(f"stability has no part {unknown[0]!r}; there are {', '.join(PARTS)}")
-    rows: dict[str, list[Row]] = {}
+    rows: dict[str, list[NumericalCase]] = {}
     seconds: dict[str, float] = {}
     for name in [part for part in PARTS if part in parts or not parts]:
         cases: Part = load(PARTS[name])
@@ -84,7 +84,7 @@ def run(
     return {"parts": rows, "seconds": seconds, "ok": all(row.ok for part in rows.values() for row in part)}
 
 
-def markdown(rows: Sequence[Row]) -> str:
+def markdown(rows: Sequence[NumericalCase]) -> str:
     """The cases of a part as a table in Markdown."""
     head = "| case | how | found | bound | |\n|---|---|---|---|---|\n"
     return head + "".join(

@@ -17,7 +17,7 @@ from gripper_force.qualification.paper.models import BASELINE, PROPOSED, SINGLE_
 from gripper_force.types import Gray
 from gripper_force.vision.batch_inference import normalise
 from gripper_force.vision.network import ForceNetwork
-from gripper_force.vision.preprocess import Preprocess, shrink
+from gripper_force.vision.preprocess import Preprocess, downscale
 
 _BINS: Final = 11
 """Of 1 N each."""
@@ -94,7 +94,7 @@ def attention(test: Test, network: ForceNetwork, preprocess: Preprocess) -> Figu
 
 def _look(axes: Axes, clip: Clip, index: int, network: ForceNetwork, preprocess: Preprocess) -> None:
     gates = _gates(clip.frames[: index + 1][-network.config.context - 1 :], clip.frames, network, preprocess)
-    gray = shrink(clip.frames[index], None, _SIDE)
+    gray = downscale(clip.frames[index], None, _SIDE)
     axes.imshow(overlay(gray, gates))
     axes.set_axis_off()
     axes.set_title(

@@ -9,14 +9,12 @@ from typing import Final
 from matplotlib.figure import Figure
 
 from gripper_force.errors import ConfigError
-from gripper_force.qualification.paper import experiment
-from gripper_force.qualification.paper import paper_figures as figures
-from gripper_force.qualification.paper import paper_tables as tables
+from gripper_force.qualification.paper import experiment, paper_figures, paper_tables
 from gripper_force.qualification.paper.experiment import Advance, Test, checkpoint_path
 from gripper_force.qualification.paper.models import BASELINE, PROPOSED, SINGLE_FRAME, Scale
 from gripper_force.vision.checkpoint import load_checkpoint
 
-WHAT: Final = (*sorted(tables.MODELS_OF), "all")
+WHAT: Final = (*sorted(paper_tables.MODELS_OF), "all")
 """What `gripper-force reproduce` can be asked for."""
 
 
@@ -24,10 +22,10 @@ Bar = Callable[[str, int], AbstractContextManager[Advance]]
 
 
 @dataclass(frozen=True, slots=True)
-class Result:
+class PaperResult:
     """Tables and figures by name."""
 
-    tables: dict[str, tables.Table]
+    tables: dict[str, paper_tables.Table]
     figures: dict[str, Figure]
 
 
@@ -35,16 +33,16 @@ def asked_for(what: str) -> tuple[str, ...]:
     """The tables and figures that ``what`` stands for. Raises `ConfigError` if it stands for none."""
     if what not in WHAT:
         raise ConfigError(f"nothing to reproduce is named {what!r}; there are {', '.join(WHAT)}")
-    return tuple(tables.MODELS_OF) if what == "all" else (what,)
+    return tuple(paper_tables.MODELS_OF) if what == "all" else (what,)
 
 
 def reproduce(
     names: Sequence[str], scale: Scale, data: Path | None, out: Path, jobs: int, bar: Bar
-) -> tuple[Result, Test | None]:
+) -> tuple[PaperResult, Test | None]:
     """Makes tables and figures, and first of all the logs and networks they need that are not there yet.
 
     Args:
-        names: Of `tables.MODELS_OF`.
+        names: Of `paper_tables.MODELS_OF`.
         scale: How much of everything.
         data: Folder with logs in ``train`` and ``test``; None for simulated ones.
         out: Folder for the networks.
@@ -58,7 +56,7 @@ def reproduce(
         DataError: See `experiment.run`.
         CheckpointError: See `experiment.run`.
     """
-    models = list(dict.fromkeys(model for name in names for model in tables.MODELS_OF[name]))
+    models = list(dict.fromkeys(model for name in names for model in paper_tables.MODELS_OF[name]))
     test = None
     if models:
         if data is None:
@@ -68,39 +66,41 @@ def reproduce(
                 experiment.simulate_missing(scale, data, jobs, advance)
         with bar("training", scale.seeds * len(experiment.networks(models))) as advance:
             test = experiment.run(scale, models, data, out, jobs, advance)
-    with bar("timing", tables.TIMED * ("7" in names)) as advance:
+    with bar("timing", paper_tables.TIMED * ("7" in names)) as advance:
         return _make(names, test, scale, out, advance), test
 
 
-def _make(names: Sequence[str], test: Test | None, scale: Scale, out: Path, advance: Advance) -> Result:
-    made: dict[str, tables.Table] = {}
+def _make(names: Sequence[str], test: Test | None, scale: Scale, out: Path, advance: Advance) -> PaperResult:
+    made: dict[str, paper_tables.Table] = {}
     drawn: dict[str, Figure] = {}
     for name in names:
         if name == "7":
-            made[name] = tables.times(advance)
+            made[name] = paper_tables.times(advance)
             continue
         assert test is not None
         match name:
             case "9":
-                made[name] = tables.objects(test)
+                made[name] = paper_tables.objects(test)
             case "claims":
-                made[name] = tables.claims(test)
+                made[name] = paper_tables.claims(test)
             case "fig6":
-                drawn[name] = figures.error_by_force(test)
+                drawn[name] = paper_figures.error_by_force(test)
             case "fig7":
-                drawn[name] = figures.force_over_time(test, [PROPOSED], "The proposed ensemble")
+                drawn[name] = paper_figures.force_over_time(test, [PROPOSED], "The proposed ensemble")
             case "fig8":
                 network = load_checkpoint(str(checkpoint_path(out, "ssam-1", 0))).networks[0]
-                drawn[name] = figures.attention(test, network, scale.recipe("ssam-1", 0).preprocess)
+                drawn[name] = paper_figures.attention(test, network, scale.recipe("ssam-1", 0).preprocess)
             case "fig9":
-                drawn[name] = figures.force_over_time(test, [BASELINE, PROPOSED], "Baseline and proposed")
+                drawn[name] = paper_figures.force_over_time(
+                    test, [BASELINE, PROPOSED], "Baseline and proposed"
+                )
             case _:
-                made[name] = tables.comparison(test, name)
-    return Result(made, drawn)
+                made[name] = paper_tables.comparison(test, name)
+    return PaperResult(made, drawn)
 
 
 def markdown(
-    result: Result, scale_name: str, scale: Scale, test: Test | None, pictures: str
+    result: PaperResult, scale_name: str, scale: Scale, test: Test | None, pictures: str
 ) -> dict[str, str]:
     """What was made, in Markdown, by the name of its place in the page.
 

@@ -19,7 +19,6 @@ Precision = Literal["float32", "bfloat16"]
 
 ENGINES: Final = {
     "torch": "pytorch:TorchEngine",
-    "compiled": "pytorch:CompiledEngine",
     "openvino": "openvino:OpenVinoEngine",
     "onnxruntime": "onnxruntime:OnnxEngine",
 }

@@ -1,6 +1,4 @@
-"""PyTorch, as it is and compiled."""
-
-import warnings
+"""PyTorch on the CPU (https://pytorch.org)."""
 
 import numpy as np
 import torch
@@ -34,20 +32,6 @@ class TorchEngine(Engine):
         self._state = list(out[first:])
         forces_n, features, *looks = (np.asarray(tensor.numpy(), np.float32) for tensor in out[:first])
         return Step(forces_n, features, looks[0] if ATTENTION in self._outputs else None)
-
-
-class CompiledEngine(TorchEngine):
-    """Runs what `torch.compile` makes of them, which takes some seconds, and a C++ compiler."""
-
-    def __init__(self, model: Model | Checkpoint, precision: Precision = "float32", threads: int = 1) -> None:
-        """As `TorchEngine`."""
-        super().__init__(model, precision, threads)
-        with warnings.catch_warnings():  # of PyTorch about its own parts, at the first step
-            warnings.simplefilter("ignore", DeprecationWarning)
-            torch.compiler.reset()  # it compiles anew for so many networks, and then gives up in silence
-            self._forward = torch.compile(self._step)
-            self._blank()
-            self._run(np.zeros((self.header.preprocess.size,) * 2, np.float32))
 
 
 def _load(model: Model) -> Checkpoint:

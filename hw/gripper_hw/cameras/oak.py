@@ -24,7 +24,7 @@ _DEFAULT_ISO = 100
 _WAIT = timedelta(milliseconds=50)
 _US = timedelta(microseconds=1)
 
-Source = Callable[[CameraConfig, ExitStack], tuple[Any, Any]]
+FrameSource = Callable[[CameraConfig, ExitStack], tuple[Any, Any]]
 """Makes a ``depthai.Pipeline`` with an output that gives pictures of size `PICTURE`; the stack closes it."""
 
 
@@ -85,7 +85,7 @@ class OakCamera(BackgroundCamera):
         source: What gives the pictures; a test puts a host's node here.
     """
 
-    def __init__(self, config: CameraConfig, clock: Clock, source: Source = device_source) -> None:
+    def __init__(self, config: CameraConfig, clock: Clock, source: FrameSource = device_source) -> None:
         super().__init__(config, clock)
         self._source = source
 

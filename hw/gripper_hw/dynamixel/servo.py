@@ -33,7 +33,7 @@ from gripper_hw.dynamixel.control_table import (
     rad_from_ticks,
     ticks_from_rad,
 )
-from gripper_hw.dynamixel.transport import Line
+from gripper_hw.dynamixel.transport import Transport
 
 _READ: Final = {  # name: bytes
     "present_current": 2,
@@ -92,7 +92,7 @@ class DynamixelBus:
         self.ids = tuple(ids)
         self.firmware: tuple[int, ...] = ()
         self._config = config
-        self._line = Line(config, clock_ns)
+        self._line = Transport(config, clock_ns)
         self._current_limit = math.floor(config.current_limit_a / self.model.current_unit_a)
         self._watchdog = math.ceil(config.bus_watchdog_ms / WATCHDOG_UNIT_MS)
         self._expected_watchdog = 0

@@ -9,7 +9,7 @@ from serial.tools import list_ports
 
 from gripper_force.config import Config, ServoConfig
 from gripper_force.errors import DeviceError, DeviceTimeoutError, GripperError
-from gripper_force.jobs.doctor import Agree, Change, Check, judged, only, time_ms
+from gripper_force.jobs.doctor import Agree, Check, RegisterChange, judged, only, time_ms
 from gripper_force.runtime.backends import open_devices
 from gripper_hw.dynamixel.control_table import (
     REGISTERS,
@@ -19,7 +19,7 @@ from gripper_hw.dynamixel.control_table import (
 )
 from gripper_hw.dynamixel.port import VIRTUAL_PREFIX
 from gripper_hw.dynamixel.servo import CYCLE_BYTES, DynamixelBus, hardware_error_text
-from gripper_hw.dynamixel.transport import Line
+from gripper_hw.dynamixel.transport import Transport
 
 _SYSFS: Final = Path("/sys/bus/usb-serial/devices")
 _CYCLES: Final = 200
@@ -92,7 +92,7 @@ class _Looked:
     def __init__(self, config: ServoConfig) -> None:
         bus = DynamixelBus(config, (config.id,))  # never opened: it knows what a run sets
         self.model = bus.model
-        self.line = Line(config)
+        self.line = Transport(config)
         self._config = config
         self._wanted = bus.settings | {"bus_watchdog": 0}  # what a start writes once torque is off
 
@@ -139,7 +139,9 @@ class _Looked:
         values = self._values(id_)
         wanted = {name: new for name, new in self._wanted.items() if values[name] != new}
         text = self._text
-        changes = [Change(name, text(name, values[name]), text(name, new)) for name, new in wanted.items()]
+        changes = [
+            RegisterChange(name, text(name, values[name]), text(name, new)) for name, new in wanted.items()
+        ]
         applied = bool(changes) and agree(f"servo {id_}", changes)
         if applied:
             self.line.ask_for_answers(id_)
@@ -174,7 +176,7 @@ def _opened(config: Config) -> Iterator[_Looked]:
         yield looked
 
 
-def _open(line: Line, servo: ServoConfig) -> None:
+def _open(line: Transport, servo: ServoConfig) -> None:
     line.open(max(_PATIENCE_MS, servo.reply_margin_ms))
 
 
@@ -185,7 +187,7 @@ def _other_baud_rate(servo: ServoConfig) -> int | None:
         if rate == servo.baud_rate:
             continue
         other = servo.model_copy(update={"baud_rate": rate, "retries": 0})
-        with suppress(GripperError), closing(Line(other)) as line:
+        with suppress(GripperError), closing(Transport(other)) as line:
             _open(line, other)
             line.ping(servo.id)
             return rate

@@ -44,7 +44,7 @@ _ERRORS: Final = {
 _T = TypeVar("_T")
 
 
-class Line:
+class Transport:
     """A port, and whole transactions with the servos on it.
 
     Where nothing else is said, each method tries as often as the configuration says and raises

@@ -26,7 +26,7 @@ def keep(table: dict[str, Levels]) -> None:
     _TABLE.write_text(_HEAD + yaml.safe_dump(table, sort_keys=False), encoding="utf-8")
 
 
-def settled(config: Config) -> tuple[Config, str]:
+def resolve_detail(config: Config) -> tuple[Config, str]:
     """Puts a level in place of ``auto``, and says why.
 
     Returns:

@@ -19,7 +19,7 @@ from gripper_force.runtime.backends import MonotonicClock
 from gripper_force.types import NS_PER_MS, NS_PER_S, Frame, Gray, LoadCellSample
 from gripper_hw.dynamixel.control_table import load_model
 from gripper_hw.dynamixel.virtual import VirtualBus, VirtualServo, register_bus, unregister_bus
-from gripper_hw.sim.detail_level import settled
+from gripper_hw.sim.detail_level import resolve_detail
 from gripper_hw.sim.scene import Scene, draw_scene
 from gripper_hw.sim.surroundings import Surroundings
 from gripper_hw.sim.world import World
@@ -177,7 +177,7 @@ class SimulatedRig:
                 "sees the simulated rig's servo alone; set camera.backend and load_cell.backend to what you "
                 "have, or to none, or set servo.port to virtual:rig"
             )
-        config, self._why = settled(config)
+        config, self._why = resolve_detail(config)
         self._config = config
         self.scene = draw_scene(config.object, config.seed, config.sim)
         model = load_model(config.servo.model)
@@ -237,7 +237,7 @@ class SimulatedRig:
         why = {"detail": self._why} if self._why else {}
         return {"scene": json.dumps(asdict(self.scene)), "exposure_ms": str(self._exposure_ms), **why}
 
-    def relight(self, lux: float) -> tuple[Camera, dict[str, str]]:
+    def render_under_light(self, lux: float) -> tuple[Camera, dict[str, str]]:
         """A further camera, which sees what a rig of its own with this ``sim.lux`` would, and its notes."""
         config = self._config.model_copy(update={"sim": self._config.sim.model_copy(update={"lux": lux})})
         scene = draw_scene(config.object, config.seed, config.sim)

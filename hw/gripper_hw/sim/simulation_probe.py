@@ -19,12 +19,12 @@ def probe(config: Config) -> Iterator[Check]:
         return
     from gripper_hw.dynamixel.control_table import load_model
     from gripper_hw.dynamixel.firmware import VirtualServo
-    from gripper_hw.sim.detail_level import settled
+    from gripper_hw.sim.detail_level import resolve_detail
     from gripper_hw.sim.scene import draw_scene
     from gripper_hw.sim.world import World
 
     model = load_model("XM430-W350")
-    config, _ = settled(config)
+    config, _ = resolve_detail(config)
     scene = draw_scene(config.object, config.seed, config.sim)
     world = World(scene, config.gripper, VirtualServo(1, model), model.nm_per_a, config.seed)
 

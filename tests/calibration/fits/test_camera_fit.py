@@ -6,8 +6,8 @@ from hypothesis import strategies as st
 
 from gripper_calibration.fits.camera_fit import (
     METHOD_MS,
+    ExposureStep,
     Markers,
-    Rung,
     Touch,
     choose_exposure,
     find_markers,
@@ -92,13 +92,18 @@ def test_the_region_is_a_square_within_the_picture(seen: list[Markers], width: i
 
 
 def test_the_best_lit_picture_that_is_not_clipped_is_chosen() -> None:
-    ladder = [Rung(500, 35, 0.0), Rung(1000, 50, 0.0), Rung(2000, 71, 0.0), Rung(4000, 95, 0.02)]
+    ladder = [
+        ExposureStep(500, 35, 0.0),
+        ExposureStep(1000, 50, 0.0),
+        ExposureStep(2000, 71, 0.0),
+        ExposureStep(4000, 95, 0.02),
+    ]
     assert choose_exposure(ladder).exposure_us == 2000
 
 
 @pytest.mark.parametrize("gray", [250, 255, 0, 39])
 def test_pictures_that_are_clipped_or_dark_are_refused(gray: int) -> None:
-    rung = Rung.of(4000, np.full((64, 64), gray, np.uint8))
+    rung = ExposureStep.of(4000, np.full((64, 64), gray, np.uint8))
     with pytest.raises(
         DataError, match=r"no exposure gives a picture .* \(4000 us: mean \d+, \d+\.\d % clip"
     ):

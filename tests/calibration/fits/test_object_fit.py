@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gripper_calibration.fits import ood_fit as gate
+from gripper_calibration.fits import ood_fit
 from gripper_calibration.fits.interval_fit import by_conformal
 from gripper_calibration.fits.object_fit import _simplest, fit_correction, learning_curve
 from gripper_calibration.fits.touches import Floats, Touches
@@ -128,11 +128,11 @@ def test_the_interval_grows_with_the_force_as_the_errors_do(share: float) -> Non
 
 
 def test_the_gate_is_as_wide_as_new_touches_are_strange() -> None:
-    strangeness = [np.linspace(0, top, 2001) for top in (0.1, 0.3, 0.2)]
-    assert gate.limit(strangeness) == pytest.approx(1.5 * (1 + 2 / 3) * 0.3 * 0.995, rel=1e-3)
-    assert gate.limit([*strangeness] * 100) == pytest.approx(1.5 * 0.3 * 0.995, rel=0.01)
-    assert gate.limit(strangeness[:2]) == gate.UNKNOWN
-    assert gate.limit([]) == gate.UNKNOWN
+    ood_score = [np.linspace(0, top, 2001) for top in (0.1, 0.3, 0.2)]
+    assert ood_fit.limit(ood_score) == pytest.approx(1.5 * (1 + 2 / 3) * 0.3 * 0.995, rel=1e-3)
+    assert ood_fit.limit([*ood_score] * 100) == pytest.approx(1.5 * 0.3 * 0.995, rel=0.01)
+    assert ood_fit.limit(ood_score[:2]) == ood_fit.UNKNOWN
+    assert ood_fit.limit([]) == ood_fit.UNKNOWN
 
 
 def test_the_simplest_that_is_no_worse_by_a_standard_error_is_taken() -> None:
@@ -148,8 +148,8 @@ def test_frames_of_another_object_are_stranger_than_those_of_new_touches() -> No
     fitted = fit_correction(touched(8))
     new, other = touched(5, seed=1), touched(5, seed=1)
     other.features[:, ::2] *= -1
-    assert (fitted.arrays.strangeness(new.features) > fitted.gate).mean() < 0.02
-    assert (fitted.arrays.strangeness(other.features) > fitted.gate).mean() > 0.5
+    assert (fitted.arrays.ood_score(new.features) > fitted.ood_limit).mean() < 0.02
+    assert (fitted.arrays.ood_score(other.features) > fitted.ood_limit).mean() > 0.5
 
 
 def test_how_many_touches_are_enough_goes_down_and_tests_on_others() -> None:

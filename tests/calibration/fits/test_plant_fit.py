@@ -4,17 +4,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from gripper_calibration.fits.plant_fit import Press, crushed_by, fit_plant, stiffness_n_m
+from gripper_calibration.fits.plant_fit import PressSeries, crushed_by, fit_plant, stiffness_n_m
 
 
-def pressed(gain: float, lag_s: float, friction_n: float, seed: int = 0, noise_n: float = 0.01) -> Press:
+def pressed(
+    gain: float, lag_s: float, friction_n: float, seed: int = 0, noise_n: float = 0.01
+) -> PressSeries:
     """A ramp with rounded ends, and a hold, through a first-order lag."""
     rng = np.random.default_rng(seed)
     t_s = np.arange(0, 1.4, 0.005) + rng.uniform(0, 0.001)
-    push_n = 5 * (1 - np.cos(np.pi * (t_s / 1.0).clip(0, 1))) / 2 + 0.5
+    motor_force_n = 5 * (1 - np.cos(np.pi * (t_s / 1.0).clip(0, 1))) / 2 + 0.5
     keep = np.exp(-0.005 / lag_s)
-    late = lfilter([1 - keep], [1, -keep], push_n, zi=[keep * push_n[0]])[0]
-    return Press(t_s, push_n, gain * late - friction_n + noise_n * rng.normal(size=len(t_s)))
+    late = lfilter([1 - keep], [1, -keep], motor_force_n, zi=[keep * motor_force_n[0]])[0]
+    return PressSeries(t_s, motor_force_n, gain * late - friction_n + noise_n * rng.normal(size=len(t_s)))
 
 
 @settings(max_examples=30, deadline=None)
@@ -30,7 +32,7 @@ def test_gain_and_lag_come_back_whatever_the_friction(gain: float, lag_s: float,
 
 
 def test_what_hardly_moves_tells_no_plant() -> None:
-    still = Press(np.arange(100) * 0.005, np.full(100, 2.0), np.full(100, 1.0))
+    still = PressSeries(np.arange(100) * 0.005, np.full(100, 2.0), np.full(100, 1.0))
     assert fit_plant([], 0.04) is None
     assert fit_plant([still], 0.04) is None
     assert fit_plant([pressed(0.01, 0.03, 0.0)], 0.04) is None

@@ -8,9 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from gripper_calibration.fits.servo_fit import LEAST_PASSES, LEAST_PRESSES, Nominal, Pass, Press, fit_servo
+from gripper_calibration.fits.servo_fit import (
+    LEAST_PASSES,
+    LEAST_PRESSES,
+    FreePass,
+    Nominal,
+    ServoPress,
+    fit_servo,
+)
 from gripper_force.errors import DataError
-from gripper_force.profiles.rig_profile import Estimate
+from gripper_force.profiles.rig_profile import CalibratedValue
 
 N_PER_A, FRICTION_N, DAMPING, RADIUS_M, OPEN_RAD = 44.0, 0.9, 14.0, 0.020, 0.03
 NOMINAL = Nominal(pinion_radius_m=RADIUS_M, open_width_m=0.09)
@@ -20,45 +27,49 @@ STEP_A = 2.69e-3
 Floats = npt.NDArray[np.float64]
 
 
-def press(rng: np.random.Generator, rate_n_s: float, gauge_m: float = 0.03, growth: float = 0.0) -> Press:
+def press(
+    rng: np.random.Generator, rate_n_s: float, gauge_m: float = 0.03, growth: float = 0.0
+) -> ServoPress:
     """A motor against a play of friction and a spring; what is read of its current is rounded."""
     rise_s, fall_s = 9.0 / rate_n_s, (9.0 + 2 * FRICTION_N + 1.0) / rate_n_s
     t_s = np.arange(0, rise_s + fall_s, 0.005)
-    push_n = FRICTION_N + rate_n_s * np.minimum(t_s, 2 * rise_s - t_s)
+    motor_force_n = FRICTION_N + rate_n_s * np.minimum(t_s, 2 * rise_s - t_s)
     force_n = np.zeros(len(t_s))
     for i in range(1, len(t_s)):
         friction_n = FRICTION_N + growth * force_n[i - 1]
-        force_n[i] = max(min(max(force_n[i - 1], push_n[i] - friction_n), push_n[i] + friction_n), 0.0)
-    measured_a = push_n / N_PER_A + rng.normal(0, 3e-3, len(t_s))
+        force_n[i] = max(
+            min(max(force_n[i - 1], motor_force_n[i] - friction_n), motor_force_n[i] + friction_n), 0.0
+        )
+    measured_a = motor_force_n / N_PER_A + rng.normal(0, 3e-3, len(t_s))
     touch_rad = OPEN_RAD + (NOMINAL.open_width_m - gauge_m) / (2 * RADIUS_M)
     closing_rad = touch_rad + 5e-3 * force_n - 1e-4 * force_n**2
-    return Press(
+    return ServoPress(
         gauge_m=gauge_m,
         t_s=t_s,
         current_a=np.round(measured_a / STEP_A) * STEP_A,
         force_n=force_n + rng.normal(0, 0.01, len(t_s)),
         closing_rad=np.round(closing_rad * 652) / 652,
-        turn=int(np.argmax(push_n)),
+        turn=int(np.argmax(motor_force_n)),
     )
 
 
-def free(rng: np.random.Generator, speed_m_s: float, side: int) -> Pass:
+def free(rng: np.random.Generator, speed_m_s: float, side: int) -> FreePass:
     t_s = np.arange(0, 0.6, 0.005)
     rad_s = side * speed_m_s / RADIUS_M * (1 - 0.3 * np.exp(-t_s / 0.1))
-    push_n = side * FRICTION_N + DAMPING * RADIUS_M * rad_s + 1.2 * RADIUS_M * np.gradient(rad_s, t_s)
-    current_a = push_n / N_PER_A + rng.normal(0, 3e-3, len(t_s))
-    return Pass(t_s, current_a, np.cumsum(rad_s) * 0.005, rad_s)
+    motor_force_n = side * FRICTION_N + DAMPING * RADIUS_M * rad_s + 1.2 * RADIUS_M * np.gradient(rad_s, t_s)
+    current_a = motor_force_n / N_PER_A + rng.normal(0, 3e-3, len(t_s))
+    return FreePass(t_s, current_a, np.cumsum(rad_s) * 0.005, rad_s)
 
 
-def passes(rng: np.random.Generator) -> list[Pass]:
+def passes(rng: np.random.Generator) -> list[FreePass]:
     return [free(rng, speed, side) for speed in np.linspace(0.012, 0.052, 6) for side in (-1, 1)]
 
 
-def presses(rng: np.random.Generator, gauge_m: float = 0.03, growth: float = 0.0) -> list[Press]:
+def presses(rng: np.random.Generator, gauge_m: float = 0.03, growth: float = 0.0) -> list[ServoPress]:
     return [press(rng, rate, gauge_m, growth) for rate in RATES]
 
 
-def holds(estimate: Estimate, truth: float) -> bool:
+def holds(estimate: CalibratedValue, truth: float) -> bool:
     return estimate.low is not None and estimate.high is not None and estimate.low <= truth <= estimate.high
 
 
@@ -76,7 +87,7 @@ def test_the_intervals_hold_the_truth_in_95_of_100() -> None:
         held += [holds(estimate, truth) for estimate, truth in truths]
         assert fit.nm_per_a.half < 0.01 * fit.nm_per_a.value
         assert fit.open_position_rad.value == pytest.approx(OPEN_RAD, abs=3e-4)
-        assert fit.pinion_radius_m == Estimate(value=RADIUS_M)
+        assert fit.pinion_radius_m == CalibratedValue(value=RADIUS_M)
     assert (held >= 35).all()
 
 
@@ -117,7 +128,7 @@ def test_spikes_do_not_count() -> None:
     assert fit.nm_per_a.value == pytest.approx(plain.nm_per_a.value, rel=5e-3)
 
 
-Spoil = Callable[[list[Press], list[Pass]], tuple[list[Press], list[Pass]]]
+Spoil = Callable[[list[ServoPress], list[FreePass]], tuple[list[ServoPress], list[FreePass]]]
 
 
 @pytest.mark.parametrize(
@@ -145,19 +156,19 @@ numbers = st.floats(-1e3, 1e3) | st.sampled_from([np.nan, np.inf, -np.inf, 0.0, 
 
 
 @st.composite
-def odd_presses(draw: st.DrawFn) -> Press:
+def odd_presses(draw: st.DrawFn) -> ServoPress:
     count = draw(st.sampled_from([0, 1, 30, 60]))
     columns = [draw(arrays(np.float64, count, elements=numbers)) for _ in range(3)]
     if draw(st.booleans()):
         ramp = np.concatenate([np.linspace(0, 9, count // 2), np.linspace(9, 0, count - count // 2)])
         columns[1] = ramp
-    return Press(draw(st.sampled_from([0.03, 0.06])), np.arange(count) / 100, *columns, turn=count // 2)
+    return ServoPress(draw(st.sampled_from([0.03, 0.06])), np.arange(count) / 100, *columns, turn=count // 2)
 
 
 @st.composite
-def odd_passes(draw: st.DrawFn) -> Pass:
+def odd_passes(draw: st.DrawFn) -> FreePass:
     count = draw(st.sampled_from([0, 1, 9, 40]))
-    return Pass(
+    return FreePass(
         np.arange(count) / 100, *(draw(arrays(np.float64, count, elements=numbers)) for _ in range(3))
     )
 
@@ -165,7 +176,7 @@ def odd_passes(draw: st.DrawFn) -> Pass:
 @settings(max_examples=40, deadline=None)
 @given(st.lists(odd_presses(), max_size=7), st.lists(odd_passes(), max_size=9), st.booleans())
 def test_odd_data_are_refused_or_known_to_within_what_is_said(
-    some: list[Press], others: list[Pass], good: bool
+    some: list[ServoPress], others: list[FreePass], good: bool
 ) -> None:
     rng = np.random.default_rng(3)
     try:

@@ -13,7 +13,7 @@ from gripper_calibration.procedures.calibrate_camera import calibrate, compute_m
 from gripper_force.cli import app
 from gripper_force.config import load_config
 from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
-from gripper_force.jobs.recording.record import Plan, record
+from gripper_force.jobs.recording.record import RecordingPlan, record
 from gripper_force.profiles.apply import rig_mismatches
 from gripper_force.profiles.rig_profile import read_rig
 from gripper_force.runtime.log import LogReader, LogWriter
@@ -27,7 +27,7 @@ WHOLE = (0, 0, 128, 128)
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A set of touches; the markers are there."""
     config = load_config(None, [*QUICK, "sim.markers=true"])
-    (path,) = record(config, Plan(1, 5), tmp_path_factory.mktemp("touches"), lambda *_: None)
+    (path,) = record(config, RecordingPlan(1, 5), tmp_path_factory.mktemp("touches"), lambda *_: None)
     return path
 
 

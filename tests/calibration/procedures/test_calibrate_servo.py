@@ -12,7 +12,7 @@ from gripper_force.cli import app
 from gripper_force.cli.output.calibrate import rig_table
 from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError, DataError, DeviceError
-from gripper_force.profiles.rig_profile import Estimate, LoadCellCalibration, read_rig, update_rig
+from gripper_force.profiles.rig_profile import CalibratedValue, LoadCellCalibration, read_rig, update_rig
 from gripper_force.runtime.log import LogReader
 from gripper_force.runtime.session import run_grasp
 from gripper_force.types import Event
@@ -38,7 +38,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def about(estimate: Estimate, truth: float, share: float) -> bool:
+def about(estimate: CalibratedValue, truth: float, share: float) -> bool:
     """Near the truth, and not claimed to be nearer by far than it is."""
     return (
         abs(estimate.value - truth) < min(share * truth, 2 * estimate.half) and estimate.half < share * truth
@@ -56,7 +56,7 @@ def test_the_scenes_torque_and_friction_are_found(rig: Path) -> None:
     assert about(found.friction_n, friction_n, 0.06)
     assert about(found.damping_n_s_m, scene.servo_damping_nm_s / (2 * radius_m**2) + 2.0, 0.25)
     assert found.open_position_rad.value == pytest.approx(scene.backlash_m / radius_m, abs=5e-4)
-    assert found.pinion_radius_m == Estimate(value=radius_m)
+    assert found.pinion_radius_m == CalibratedValue(value=radius_m)
     assert found.force_n[0] < 1
     assert 9 < found.force_n[1] < 10
     assert load_config(None, [f"calibration.rig={rig}"]).gripper.nm_per_a == found.nm_per_a.value
@@ -128,11 +128,11 @@ def test_a_scale_that_the_run_does_not_go_by_is_refused(tmp_path: Path) -> None:
     cell = LoadCellCalibration(
         date=datetime(2026, 1, 2, tzinfo=UTC),
         sensor="simulated",
-        tare_raw=Estimate(value=0.0),
-        n_per_raw=Estimate(value=2.0, low=1.9, high=2.1),
+        tare_raw=CalibratedValue(value=0.0),
+        n_per_raw=CalibratedValue(value=2.0, low=1.9, high=2.1),
         force_n=(0.0, 10.0),
         noise_n=0.01,
-        drift_n_min=Estimate(value=0.0),
+        drift_n_min=CalibratedValue(value=0.0),
     )
     update_rig(rig, cell)
     with pytest.raises(ConfigError, match=r"to 2 N for one unit .*--set calibration\.rig="):

@@ -7,7 +7,7 @@ from gripper_force.errors import DeviceError, DeviceLostError, DeviceTimeoutErro
 from gripper_hw.dynamixel.control_table import REGISTERS, load_model
 from gripper_hw.dynamixel.packets import BROADCAST_ID, frame, status
 from gripper_hw.dynamixel.pty_server import PtyServer
-from gripper_hw.dynamixel.transport import Line
+from gripper_hw.dynamixel.transport import Transport
 from gripper_hw.dynamixel.virtual import VirtualBus, VirtualServo
 
 MODEL = load_model("XM430-W350")
@@ -20,7 +20,7 @@ TICKS = slice(6, 10)
 @pytest.fixture
 def opened(line):
     """A virtual bus, and an open line to it."""
-    client = Line(line.config(), lambda: line.now_ns)
+    client = Transport(line.config(), lambda: line.now_ns)
     client.open()
     yield line, client
     client.close()
@@ -97,7 +97,7 @@ def test_a_late_answer_is_not_taken_for_the_next():
     bus = VirtualBus([firmware], lambda: 0)
     margin_s = 0.2
     with PtyServer(bus) as server:
-        client = Line(ServoConfig(port=server.device_path, reply_margin_ms=margin_s * 1e3))
+        client = Transport(ServoConfig(port=server.device_path, reply_margin_ms=margin_s * 1e3))
         client.open()
 
         def delay(answer):
@@ -122,7 +122,7 @@ def test_a_servo_that_refuses_says_what(opened):
 
 def test_blocks_go_to_the_servo_that_they_are_for(make_line):
     line = make_line(VirtualServo(1, MODEL), VirtualServo(2, MODEL))
-    client = Line(line.config(), lambda: line.now_ns)
+    client = Transport(line.config(), lambda: line.now_ns)
     client.open()
     goal = REGISTERS["goal_current"]
     client.sync_write(goal.address, {2: goal.encode(20), 1: goal.encode(10)})
@@ -134,7 +134,7 @@ def test_blocks_go_to_the_servo_that_they_are_for(make_line):
 
 
 def test_nothing_is_sent_without_a_port(line):
-    client = Line(line.config())
+    client = Transport(line.config())
     with pytest.raises(DeviceError, match="not open, so a ping of servo 1 was not sent"):
         client.ping(1)
     client.open()

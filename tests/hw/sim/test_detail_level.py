@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from gripper_force.config import BudgetConfig, load_config
 from gripper_force.errors import ConfigError
 from gripper_hw.sim import detail_level as detail
-from gripper_hw.sim.detail_level import choose, settled
+from gripper_hw.sim.detail_level import choose, resolve_detail
 from gripper_hw.sim.objects import OBJECTS, Detail
 from gripper_hw.sim.simulated_rig import SimulatedRig
 
@@ -41,7 +41,9 @@ def test_what_is_taken_keeps_the_budget_and_nothing_faster_does(
 @pytest.mark.parametrize("name", OBJECTS)
 def test_the_shipped_table_knows_every_object(name: str) -> None:
     strict, loose = (
-        settled(load_config(None, [f"object={name}", "sim.detail=auto", f"budget.sim_error_n={error_n}"]))
+        resolve_detail(
+            load_config(None, [f"object={name}", "sim.detail=auto", f"budget.sim_error_n={error_n}"])
+        )
         for error_n in (1e-6, 10)
     )
     assert strict[0].sim.detail == "fine"
@@ -50,7 +52,7 @@ def test_the_shipped_table_knows_every_object(name: str) -> None:
 
 def test_a_level_that_is_named_stays() -> None:
     config = load_config(None, ["budget.sim_speed=1e6"])
-    assert settled(config) == (config, "")
+    assert resolve_detail(config) == (config, "")
 
 
 @pytest.mark.parametrize(
@@ -67,7 +69,7 @@ def test_a_level_that_is_named_stays() -> None:
 )
 def test_what_cannot_be_chosen_is_one_sentence(overrides: list[str], sentence: str) -> None:
     with pytest.raises(ConfigError, match=sentence):
-        settled(load_config(None, ["sim.detail=auto", *overrides]))
+        resolve_detail(load_config(None, ["sim.detail=auto", *overrides]))
 
 
 def test_the_rig_simulates_what_was_taken_and_says_why(quick: list[str]) -> None:

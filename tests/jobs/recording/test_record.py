@@ -13,7 +13,7 @@ from gripper_force.errors import ConfigError, DataError, DeviceError
 from gripper_force.interfaces import Devices, LoadCell
 from gripper_force.jobs.dataset import load_clip
 from gripper_force.jobs.recording import record as module
-from gripper_force.jobs.recording.record import Plan, record
+from gripper_force.jobs.recording.record import RecordingPlan, record
 from gripper_force.runtime.log import LogReader
 from gripper_force.types import Frame, GraspStatus, LoadCellSample, Phase, Request, RequestKind
 from gripper_force.vision.preprocess import Preprocess
@@ -26,21 +26,21 @@ def config(quick: list[str]) -> Config:
     return load_config(None, [*quick, "camera.backend=simulated", "camera.rate_hz=20", "control.ramp_n_s=30"])
 
 
-def made(config: Config, plan: Plan, out: Path) -> list[Path]:
+def made(config: Config, plan: RecordingPlan, out: Path) -> list[Path]:
     return list(record(config, plan, out, lambda *_: None))
 
 
 def test_sets_have_names_and_sides() -> None:
-    plan = Plan(15, degrees=10, lux=350.0)
+    plan = RecordingPlan(15, degrees=10, lux=350.0)
     paths = plan.paths(load_config(None, ["object=paper_cup"]), Path("data"))
     assert paths[0] == Path("data/train/paper_cup-10deg-350lux-01.mcap")
     assert [int(path.stem[-2:]) for path in paths if path.parent.name == "test"] == [5, 10, 15]
-    assert Plan(1).paths(load_config(), Path())[0] == Path("train/sponge-01.mcap")
+    assert RecordingPlan(1).paths(load_config(), Path())[0] == Path("train/sponge-01.mcap")
 
 
 def test_a_set_is_a_log_to_train_on(config: Config, tmp_path: Path) -> None:
     told: list[tuple[int, int, float]] = []
-    plan = Plan(1, 2, 5.0, degrees=10, lux=350)
+    plan = RecordingPlan(1, 2, 5.0, degrees=10, lux=350)
     (path,) = record(config, plan, tmp_path, lambda *now: told.append(now))
     assert list(tmp_path.rglob("*.*")) == [path]
     assert path == tmp_path / "train" / "stapler-10deg-350lux-01.mcap"
@@ -70,9 +70,9 @@ def test_a_set_is_a_log_to_train_on(config: Config, tmp_path: Path) -> None:
 
 
 def test_what_is_there_is_kept_and_seeds_go_by_the_set(config: Config, tmp_path: Path) -> None:
-    plan = Plan(2, 1)
+    plan = RecordingPlan(2, 1)
     kept, missing = plan.paths(config, tmp_path)
-    assert made(config, Plan(1, 1), tmp_path) == [kept]
+    assert made(config, RecordingPlan(1, 1), tmp_path) == [kept]
     recorded_before = kept.read_bytes()
     leftover = missing.with_name(f".{missing.name}.part")
     leftover.write_bytes(b"half a log")
@@ -89,21 +89,25 @@ def test_what_is_there_is_kept_and_seeds_go_by_the_set(config: Config, tmp_path:
     with pytest.raises(DataError, match=r"stapler-01\.mcap is there already .* sim\.lux None, not 100"):
         made(dimmed, plan, tmp_path)
     with pytest.raises(DataError, match=r"target_n 9\.0, not 5\.0; take another folder"):
-        made(config, Plan(2, 1, peak_n=5.0), tmp_path)
+        made(config, RecordingPlan(2, 1, peak_n=5.0), tmp_path)
 
 
 @pytest.mark.parametrize(
     ("overrides", "plan", "sentence"),
     [
-        (["camera.backend=none"], Plan(1), r"needs a camera, and camera\.backend is none"),
-        (["load_cell.backend=none"], Plan(1), r"needs a load cell, and load_cell\.backend is none"),
-        (["object=../egg"], Plan(1), r"object '\.\./egg' is no name for a log"),
-        ([], Plan(1, peak_n=12.0), r"up to 12 N are not within 1 to 9 N, which control\.force_limit_n 10 N"),
-        ([], Plan(1, peak_n=0.5), "up to 0.5 N are not within 1 to 9 N"),
+        (["camera.backend=none"], RecordingPlan(1), r"needs a camera, and camera\.backend is none"),
+        (["load_cell.backend=none"], RecordingPlan(1), r"needs a load cell, and load_cell\.backend is none"),
+        (["object=../egg"], RecordingPlan(1), r"object '\.\./egg' is no name for a log"),
+        (
+            [],
+            RecordingPlan(1, peak_n=12.0),
+            r"up to 12 N are not within 1 to 9 N, which control\.force_limit_n 10 N",
+        ),
+        ([], RecordingPlan(1, peak_n=0.5), "up to 0.5 N are not within 1 to 9 N"),
     ],
 )
 def test_what_can_not_be_recorded_is_refused_before_anything_moves(
-    overrides: list[str], plan: Plan, sentence: str, quick: list[str], tmp_path: Path
+    overrides: list[str], plan: RecordingPlan, sentence: str, quick: list[str], tmp_path: Path
 ) -> None:
     config = load_config(None, [*quick, "camera.backend=simulated", *overrides])
     with pytest.raises(ConfigError, match=sentence):
@@ -126,7 +130,7 @@ def test_a_part_that_fails_ends_the_recording(
 ) -> None:
     broken = load_config(None, [f"faults=[{{unit: {unit}, kind: {kind}, at_s: 0.2}}]"]).faults
     with pytest.raises(DeviceError, match=sentence):
-        made(config.model_copy(update={"faults": broken}), Plan(1), tmp_path)
+        made(config.model_copy(update={"faults": broken}), RecordingPlan(1), tmp_path)
     assert not list(tmp_path.rglob("*.mcap"))
 
 
@@ -135,7 +139,11 @@ def test_after_a_fault_the_jaws_open_where_that_is_configured(config: Config, tm
     faulty = load_config(None, overrides)
     control = config.control.model_copy(update={"on_fault": faulty.control.on_fault})
     with pytest.raises(DeviceError, match="set 1 ended at a fault"):
-        made(config.model_copy(update={"faults": faulty.faults, "control": control}), Plan(1), tmp_path)
+        made(
+            config.model_copy(update={"faults": faulty.faults, "control": control}),
+            RecordingPlan(1),
+            tmp_path,
+        )
     (left,) = tmp_path.rglob("*.part")
     widths_m = [status.width_m for status in LogReader(left).records(GraspStatus)]
     assert min(widths_m) < 0.08
@@ -175,7 +183,7 @@ def test_a_load_cell_that_reads_a_force_at_rest_is_to_be_tared(
 ) -> None:
     cell_feels(lambda force_n: force_n + 0.8)
     with pytest.raises(DataError, match=r"reads 0\.[78][0-9]* N with open jaws; .* set load_cell\.tare_raw="):
-        made(config, Plan(1), tmp_path)
+        made(config, RecordingPlan(1), tmp_path)
 
 
 def test_a_touch_that_is_not_felt_is_told(
@@ -183,13 +191,13 @@ def test_a_touch_that_is_not_felt_is_told(
 ) -> None:
     cell_feels(lambda force_n: -force_n)
     with pytest.raises(DataError, match=r"touch 1 of set 1 pressed with .* N .* felt 0\.[0-9]* N; see that"):
-        made(config, Plan(1), tmp_path)
+        made(config, RecordingPlan(1), tmp_path)
 
 
 def test_a_touch_that_comes_to_no_force_ends_the_recording(config: Config, tmp_path: Path) -> None:
     control = config.control.model_copy(update={"timeout_s": 0.3})
     with pytest.raises(DataError, match=r"touch 1 of set 1 came to no force: .* is between the jaws"):
-        made(config.model_copy(update={"control": control}), Plan(1), tmp_path)
+        made(config.model_copy(update={"control": control}), RecordingPlan(1), tmp_path)
     assert not list(tmp_path.rglob("*.mcap"))
 
 
@@ -209,14 +217,14 @@ def test_an_interrupted_recording_stops_the_servo_and_keeps_whole_sets(
     rig: list[virtual.VirtualBus] = []
     done: list[Path] = []
     with pytest.raises(KeyboardInterrupt):
-        done.extend(record(config, Plan(3, 1), tmp_path, interrupt))
+        done.extend(record(config, RecordingPlan(3, 1), tmp_path, interrupt))
     assert set(torque) == {1}
     assert rig[0].servos[0].get("torque_enable") == 0
     assert [path.name for path in tmp_path.rglob("*.mcap")] == ["stapler-01.mcap"]
 
 
 def test_peaks_leave_what_the_force_limit_needs() -> None:
-    _, peak_n = module._ready(load_config(None, ["control.force_limit_n=5"]), Plan(1))
+    _, peak_n = module._ready(load_config(None, ["control.force_limit_n=5"]), RecordingPlan(1))
     assert peak_n == pytest.approx(4.5)
-    _, peak_n = module._ready(load_config(None, ["control.force_limit_n=20"]), Plan(1))
+    _, peak_n = module._ready(load_config(None, ["control.force_limit_n=20"]), RecordingPlan(1))
     assert np.isclose(peak_n, 12)

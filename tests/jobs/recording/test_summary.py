@@ -8,7 +8,7 @@ import pytest
 from gripper_force.config import load_config
 from gripper_force.errors import DataError
 from gripper_force.jobs.recording import summary as module
-from gripper_force.jobs.recording.record import Plan, record
+from gripper_force.jobs.recording.record import RecordingPlan, record
 from gripper_force.jobs.recording.summary import summarise
 from gripper_force.runtime.log import LogReader, LogWriter
 from gripper_force.types import NS_PER_MS, Frame, LoadCellSample, Record
@@ -21,7 +21,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A set of an object that flows: force leads what is seen of it by more than 20 ms."""
     overrides = ["object=stapler", "seed=31", "sim.detail=coarse", "camera.rate_hz=30", "control.ramp_n_s=30"]
     folder = tmp_path_factory.mktemp("recorded")
-    (path,) = record(load_config(None, overrides), Plan(1, 3), folder, lambda *_: None)
+    (path,) = record(load_config(None, overrides), RecordingPlan(1, 3), folder, lambda *_: None)
     return path
 
 

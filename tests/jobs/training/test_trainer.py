@@ -9,7 +9,7 @@ from gripper_force.jobs.training.batches import Batches
 from gripper_force.jobs.training.parallel import Ranks
 from gripper_force.jobs.training.recipe import TrainConfig
 from gripper_force.jobs.training.train import train
-from gripper_force.jobs.training.trainer import Trainer, one_cycle, squared_error, tenths
+from gripper_force.jobs.training.trainer import Trainer, one_cycle, squared_error, step_decay
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.header import NetworkConfig
 from gripper_force.vision.network import ForceNetwork
@@ -138,5 +138,5 @@ def test_a_checkpoint_in_evaluation_mode_is_as_good_as_in_training(
 
 
 def test_the_paper_takes_a_tenth_every_30_of_120_epochs() -> None:
-    rates = [tenths(epoch / 120) for epoch in (0, 29.9, 30, 60, 90, 119.9)]
+    rates = [step_decay(epoch / 120) for epoch in (0, 29.9, 30, 60, 90, 119.9)]
     assert rates == pytest.approx([1, 1, 0.1, 0.01, 0.001, 0.001])

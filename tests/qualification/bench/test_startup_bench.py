@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from gripper_force import cli
 from gripper_force.errors import GripperError
 from gripper_force.qualification.bench import startup_bench as startup
-from gripper_force.qualification.bench.startup_bench import SCENES, Scene, start
+from gripper_force.qualification.bench.startup_bench import STARTUP_CASES, StartupCase, start
 from gripper_force.vision.engines import open_engine
 from gripper_force.vision.model_files import read_model
 
@@ -24,8 +24,8 @@ def places(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> I
         yield {**places, "network": str(tiny_checkpoint)}
 
 
-@pytest.mark.parametrize("scene", SCENES, ids=lambda scene: scene.name)
-def test_a_scene_loads_and_runs_only_what_it_asks_for(scene: Scene, places: dict[str, str]) -> None:
+@pytest.mark.parametrize("scene", STARTUP_CASES, ids=lambda scene: scene.name)
+def test_a_scene_loads_and_runs_only_what_it_asks_for(scene: StartupCase, places: dict[str, str]) -> None:
     started = start(scene, places)
     assert set(started.loaded) <= scene.asks_for
     assert set(started.threads) == scene.threads
@@ -35,11 +35,11 @@ def test_a_scene_loads_and_runs_only_what_it_asks_for(scene: Scene, places: dict
 
 def test_a_scene_that_does_not_start_is_told(places: dict[str, str]) -> None:
     with pytest.raises(GripperError, match=r"(?s)the scene 'broken' did not start: .*no_such_key"):
-        start(Scene("broken", settings=("no_such_key=1",)), places)
+        start(StartupCase("broken", settings=("no_such_key=1",)), places)
 
 
 def test_what_starting_takes_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(startup, "SCENES", SCENES[:1])
+    monkeypatch.setattr(startup, "STARTUP_CASES", STARTUP_CASES[:1])
     assert "--help" in CliRunner().invoke(cli.app, ["bench", "--startup"]).stdout
     told = json.loads(CliRunner().invoke(cli.app, ["bench", "--startup", "--json"]).stdout)
     (row,) = told["startup"]

@@ -5,7 +5,7 @@ import pytest
 from gripper_force.config import FAULTS, load_config
 from gripper_force.errors import DataError
 from gripper_force.qualification.fault_matrix import matrix as faults
-from gripper_force.qualification.fault_matrix.cases import ROWS, Expected, Row
+from gripper_force.qualification.fault_matrix.cases import ROWS, Expected, FaultCase
 from gripper_force.qualification.fault_matrix.judge import Sound
 from gripper_force.qualification.fault_matrix.matrix import count_grasps, markdown, run_matrix
 from gripper_force.qualification.markdown_blocks import write_between
@@ -17,7 +17,7 @@ FAST = load_config(None, [*SHORT, *BLIND])
 TWO_ROWS = [row for row in ROWS if (row.unit, row.kind) in (("bus", "off"), ("disk", "off"))]
 
 
-def needs_eyes(row: Row) -> bool:
+def needs_eyes(row: FaultCase) -> bool:
     return row.unit in ("camera", "estimator")
 
 
@@ -39,7 +39,9 @@ def test_every_fault_that_can_be_injected_has_a_row() -> None:
 
 
 @pytest.mark.parametrize("row", SIMULATED, ids=lambda row: f"{row.unit}-{row.kind}")
-def test_a_row_ends_as_expected(row: Row, without_fault: dict[bool, tuple[dict[str, object], Sound]]) -> None:
+def test_a_row_ends_as_expected(
+    row: FaultCase, without_fault: dict[bool, tuple[dict[str, object], Sound]]
+) -> None:
     tree, sound = without_fault[needs_eyes(row)]
     outcome = faults._broken(tree, sound, row)
     assert outcome["why_not"] == ""
@@ -50,7 +52,7 @@ def test_a_row_ends_as_expected(row: Row, without_fault: dict[bool, tuple[dict[s
 def test_what_is_merely_a_nuisance_is_lived_with(
     unit: str, kind: str, without_fault: dict[bool, tuple[dict[str, object], Sound]]
 ) -> None:
-    row = Row("nuisance", unit, kind, Expected.CAP, None)
+    row = FaultCase("nuisance", unit, kind, Expected.CAP, None)
     tree, sound = without_fault[needs_eyes(row)]
     outcome = faults._broken(tree, sound, row)
     assert outcome["why_not"] == ""
@@ -60,9 +62,9 @@ def test_a_row_that_does_not_end_as_expected_is_told(
     without_fault: dict[bool, tuple[dict[str, object], Sound]],
 ) -> None:
     tree, sound = without_fault[False]
-    harmless = Row("harmless", "clock", "wrong", Expected.STOP, 20.0)
+    harmless = FaultCase("harmless", "clock", "wrong", Expected.STOP, 20.0)
     assert faults._broken(tree, sound, harmless)["why_not"] == "it went on: held"
-    too_slow = Row("too slow", "bus", "off", Expected.STOP, -1.0)
+    too_slow = FaultCase("too slow", "bus", "off", Expected.STOP, -1.0)
     assert faults._broken(tree, sound, too_slow)["why_not"].startswith("it took")
 
 

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from gripper_force.config import GripperConfig
 from gripper_force.qualification.loop_margin.analytic_plant import (
     CURRENT_STEP_A,
-    Eye,
     Gripper,
+    SimulatedVision,
     transmission_of,
 )
 from gripper_force.types import NS_PER_MS, NS_PER_S, ServoCommand
@@ -16,30 +16,30 @@ from gripper_force.types import NS_PER_MS, NS_PER_S, ServoCommand
 RIG = transmission_of(GripperConfig())
 
 
-def press(gripper: Gripper, push_n: float, time_s: float = 3.0) -> Gripper:
+def press(gripper: Gripper, motor_force_n: float, time_s: float = 3.0) -> Gripper:
     """Lets the motor push with a constant force, far from its goal position."""
     goal_rad = RIG.position_rad(0.0)
     for _ in range(round(time_s / 0.005)):
-        gripper.advance(ServoCommand(0, goal_rad, RIG.current_a(push_n)), 0.005)
+        gripper.advance(ServoCommand(0, goal_rad, RIG.current_a(motor_force_n)), 0.005)
     return gripper
 
 
 @given(
     stiffness_n_m=st.floats(3e2, 1e6),
-    push_n=st.floats(3.0, 8.0),
+    motor_force_n=st.floats(3.0, 8.0),
     gain=st.floats(0.8, 1.2),
     play_m=st.floats(0, 1e-3),
 )
 @settings(max_examples=15, deadline=None)
 def test_it_rests_where_push_spring_and_friction_balance(
-    stiffness_n_m: float, push_n: float, gain: float, play_m: float
+    stiffness_n_m: float, motor_force_n: float, gain: float, play_m: float
 ) -> None:
     gripper = press(
         Gripper(RIG, stiffness_n_m=stiffness_n_m, gain=gain, play_m=play_m, contact_m=0.005, step_a=0.0),
-        push_n,
+        motor_force_n,
     )
     assert abs(gripper.v_m_s) < 1e-6
-    assert abs(gripper.force_n - gain * push_n) <= gripper.friction_n + 1e-6
+    assert abs(gripper.force_n - gain * motor_force_n) <= gripper.friction_n + 1e-6
     assert gripper.peak_n >= gripper.force_n
 
 
@@ -78,13 +78,13 @@ def test_the_servo_speaks_in_its_own_steps() -> None:
 
 
 def test_vision_is_late_by_its_delay_and_keeps_the_newest() -> None:
-    eye = Eye(0.035, 0.0)
-    seen = {t_ms: eye.look(t_ms * NS_PER_MS, float(t_ms), 0.0) for t_ms in range(0, 200, 5)}
+    vision = SimulatedVision(0.035, 0.0)
+    seen = {t_ms: vision.sample(t_ms * NS_PER_MS, float(t_ms), 0.0) for t_ms in range(0, 200, 5)}
     first = next(visual for visual in seen.values() if visual is not None)
     assert (first.t_ns, first.ready_ns, first.force_n) == (0, 35 * NS_PER_MS, 0.0)
     frames = [visual for visual in seen.values() if visual is not None]
     assert len(frames) == pytest.approx(0.165 * 60, abs=1)
     assert all(visual.force_n == visual.t_ns / NS_PER_MS for visual in frames)
-    late = eye.look(NS_PER_S, 0.0, 0.0)
+    late = vision.sample(NS_PER_S, 0.0, 0.0)
     assert late is not None
     assert late.seq == frames[-1].seq + 2

@@ -47,11 +47,11 @@ def test_an_estimate_that_is_not_finite_is_beyond_any_bound(
 
 def test_the_reference_takes_frames_in_and_turns_them_away(inputs: Iterator[Input]) -> None:
     """Else it would agree with a filter that never saw one."""
-    seen = [(t_ns, push_n, visual) for t_ns, push_n, visual in inputs]
-    blind = [(t_ns, push_n, None) for t_ns, push_n, _ in seen]
+    seen = [(t_ns, motor_force_n, visual) for t_ns, motor_force_n, visual in inputs]
+    blind = [(t_ns, motor_force_n, None) for t_ns, motor_force_n, _ in seen]
     wild = [
-        (t_ns, push_n, visual and replace(visual, force_n=visual.force_n + 3 * (number % 2)))
-        for number, (t_ns, push_n, visual) in enumerate(seen)
+        (t_ns, motor_force_n, visual and replace(visual, force_n=visual.force_n + 3 * (number % 2)))
+        for number, (t_ns, motor_force_n, visual) in enumerate(seen)
     ]
     transmission = transmission_of(GripperConfig())
     ends = []

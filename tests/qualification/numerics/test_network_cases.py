@@ -7,15 +7,21 @@ import torch
 from gripper_force.config import Config
 from gripper_force.jobs.dataset import Clip
 from gripper_force.qualification.numerics import network_cases as suite
-from gripper_force.qualification.numerics.reference import ROUNDING, WAYS, Exact, Twin, Way
-from gripper_force.qualification.numerics.suite import Row
+from gripper_force.qualification.numerics.reference import (
+    ENGINE_VARIANTS,
+    ROUNDING,
+    EngineVariant,
+    Float64Result,
+    ReferenceEnsemble,
+)
+from gripper_force.qualification.numerics.suite import NumericalCase
 from gripper_force.vision import estimator
 from gripper_force.vision.engines import Engine, Floats, Step
-from gripper_force.vision.frame_checks import Plausibility
+from gripper_force.vision.frame_checks import FrameChecks
 from gripper_force.vision.model_files import read_model
 
-TORCH = WAYS[:1]
-OPENVINO = Way("openvino", "float32", ".xml")
+TORCH = ENGINE_VARIANTS[:1]
+OPENVINO = EngineVariant("openvino", "float32", ".xml")
 
 
 @pytest.fixture(autouse=True)
@@ -36,44 +42,44 @@ def grasp() -> Clip:
 
 
 @pytest.fixture
-def twin(tiny_checkpoint: Path, tmp_path: Path) -> Twin:
-    return Twin(read_model(tiny_checkpoint), tmp_path)
+def reference(tiny_checkpoint: Path, tmp_path: Path) -> ReferenceEnsemble:
+    return ReferenceEnsemble(read_model(tiny_checkpoint), tmp_path)
 
 
-def broken(rows: list[Row]) -> list[str]:
+def broken(rows: list[NumericalCase]) -> list[str]:
     return [row.case for row in rows if not row.ok]
 
 
 def test_every_case_keeps_its_bound(tiny_checkpoint: Path) -> None:
     """Of those that need no export."""
     config = Config.model_validate({"vision": {"checkpoint": str(tiny_checkpoint)}})
-    rows = list(suite.cases(config, None, streamed=300, long=300, ways=TORCH))
+    rows = list(suite.cases(config, None, streamed=300, long=300, variants=TORCH))
     assert broken(rows) == []
     assert len({row.case for row in rows}) == len(rows)
 
 
-def test_an_engine_is_compared_with_float64(twin: Twin, grasp: Clip) -> None:
+def test_an_engine_is_compared_with_float64(reference: ReferenceEnsemble, grasp: Clip) -> None:
     pytest.importorskip("openvino")
-    (row,) = suite._engines(twin, [OPENVINO], grasp, grasp)
+    (row,) = suite._engines(reference, [OPENVINO], grasp, grasp)
     assert row.ok
     assert row.figure > 0
-    twin.networks[0].out.weight.mul_(1.0001)
-    (row,) = suite._engines(twin, [OPENVINO], grasp, grasp)
+    reference.networks[0].out.weight.mul_(1.0001)
+    (row,) = suite._engines(reference, [OPENVINO], grasp, grasp)
     assert not row.ok
 
 
 def test_what_prepares_frames_is_compared_too(
-    twin: Twin, grasp: Clip, monkeypatch: pytest.MonkeyPatch
+    reference: ReferenceEnsemble, grasp: Clip, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(suite, "DIFFERENCE_GAIN", 2.01)
-    assert "a grasp" in broken(list(suite._frames(twin, grasp, Config())))
+    assert "a grasp" in broken(list(suite._frames(reference, grasp, Config())))
 
 
 def test_frames_that_nobody_refuses_are_found(
-    twin: Twin, grasp: Clip, monkeypatch: pytest.MonkeyPatch
+    reference: ReferenceEnsemble, grasp: Clip, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Plausibility, "check", lambda _self, _small: None)
-    assert "black, gray or white from the first" in broken(list(suite._frames(twin, grasp, Config())))
+    monkeypatch.setattr(FrameChecks, "check", lambda _self, _small: None)
+    assert "black, gray or white from the first" in broken(list(suite._frames(reference, grasp, Config())))
 
 
 def test_a_claim_that_does_not_grow_is_found(
@@ -97,10 +103,12 @@ def test_an_engine_that_takes_nan_in_is_found(
     assert "frames of NaN and infinity" in broken(list(suite._not_finite(tmp_path, TORCH, grasp)))
 
 
-def test_a_stream_that_drifts_is_found(twin: Twin, grasp: Clip, monkeypatch: pytest.MonkeyPatch) -> None:
-    pool = suite._inputs(twin, grasp)
-    drift_n, _, _, last = suite._stream(twin, WAYS[0], pool, 300)
-    bound_n = twin.bound_n(last, ROUNDING["float32"]).max()
+def test_a_stream_that_drifts_is_found(
+    reference: ReferenceEnsemble, grasp: Clip, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pool = suite._inputs(reference, grasp)
+    drift_n, _, _, last = suite._stream(reference, ENGINE_VARIANTS[0], pool, 300)
+    bound_n = reference.bound_n(last, ROUNDING["float32"]).max()
     assert drift_n <= bound_n
     right = Engine.step
     seen: dict[int, int] = {}
@@ -111,10 +119,10 @@ def test_a_stream_that_drifts_is_found(twin: Twin, grasp: Clip, monkeypatch: pyt
         return Step(made.forces_n * np.float32(1 + 1e-3 * seen[id(self)]), made.features, made.attention)
 
     monkeypatch.setattr(Engine, "step", step)
-    assert suite._stream(twin, WAYS[0], pool, 300)[0] > bound_n
+    assert suite._stream(reference, ENGINE_VARIANTS[0], pool, 300)[0] > bound_n
 
 
 def test_a_row_is_that_of_the_worst_member() -> None:
-    off_n: Exact = np.array([0.1, np.nan, 0.3])
+    off_n: Float64Result = np.array([0.1, np.nan, 0.3])
     assert not suite._row("case", "detail", off_n, np.ones(3)).ok
     assert suite._row("case", "detail", off_n[[0, 2]], np.array([0.05, 1.0])).figure == 0.1

@@ -10,21 +10,21 @@ from gripper_force import cli
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError
 from gripper_force.qualification.numerics import suite as numerics
-from gripper_force.qualification.numerics.suite import Row, markdown, run
+from gripper_force.qualification.numerics.suite import NumericalCase, markdown, run
 from gripper_force.runtime.backends import load
 
 PAGE = Path(__file__).parents[3] / "docs/stability.md"
 
 
-def good(_config: Config, _maps: Path | None) -> Iterator[Row]:
-    yield Row("even", "by hand", 1.25, 2.0, "N")
+def good(_config: Config, _maps: Path | None) -> Iterator[NumericalCase]:
+    yield NumericalCase("even", "by hand", 1.25, 2.0, "N")
 
 
-def bad(_config: Config, maps: Path | None) -> Iterator[Row]:
+def bad(_config: Config, maps: Path | None) -> Iterator[NumericalCase]:
     if maps is not None:
         maps.mkdir()
         (maps / "bad.png").touch()
-    yield Row("odd", "by [hand]", math.nan, 2.0)
+    yield NumericalCase("odd", "by [hand]", math.nan, 2.0)
 
 
 @pytest.fixture(autouse=True)
@@ -35,7 +35,7 @@ def parts(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize(("figure", "ok"), [(1.0, True), (1.1, False), (math.nan, False), (math.inf, False)])
 def test_a_figure_keeps_its_bound_or_breaks_it(figure: float, ok: bool) -> None:
-    assert Row("case", "detail", figure, 1.0).ok is ok
+    assert NumericalCase("case", "detail", figure, 1.0).ok is ok
 
 
 def test_parts_come_in_the_order_of_the_page() -> None:
