@@ -17,6 +17,46 @@ class BusStats:
     corrupt: int = 0
 
 
+class Progress(Protocol):
+    """Callback that long work calls to report what it does."""
+
+    def __call__(self, text: str, steps: int = 1) -> None:
+        """Reports progress.
+
+        Args:
+            text: What is being done, for a person.
+            steps: Steps of the announced total that were finished since the last call; 0 for none.
+        """
+        ...
+
+
+class Prompt(Protocol):
+    """Callback that asks a person to do something."""
+
+    def __call__(self, text: str) -> None:
+        """Shows an instruction and returns once the person has confirmed it."""
+        ...
+
+
+def no_progress(text: str, steps: int = 1) -> None:
+    """Ignores progress reports."""
+
+
+@dataclass(frozen=True, slots=True)
+class ServoSpec:
+    """Data of a servo model, known without a connection.
+
+    Attributes:
+        nm_per_a: Torque constant at the horn by the vendor's table: a prior, to be calibrated.
+        current_step_a: Resolution of the goal current.
+        voltage_range_v: Least and greatest supply voltage.
+    """
+
+    nm_per_a: float
+    current_step_a: float
+    voltage_range_v: tuple[float, float]
+
+
 class Servo(Protocol):
     """The gripper's servo. One thread alone may call it.
 

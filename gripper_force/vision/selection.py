@@ -89,7 +89,7 @@ def resolve_auto(vision: VisionConfig, budget: BudgetConfig) -> tuple[VisionConf
 def select(
     tested: Sequence[Candidate], vision: VisionConfig, budget: BudgetConfig
 ) -> tuple[VisionConfig, str]:
-    """Selects the cheapest candidate within the budget; without a budget, the fastest of the most accurate."""
+    """Selects the cheapest candidate within the budget; without one, the fastest of the most accurate."""
     named = f"budget.latency_ms={budget.latency_ms}, budget.error_n={budget.error_n}"
     fits = [
         candidate

@@ -34,7 +34,7 @@ class Bench:
         free=False,
         opening=False,
     ):
-        """`motor_force_n` and `seen_n` are functions of the time in seconds; `seen_n` is what vision estimates."""
+        """`motor_force_n` and `seen_n` are functions of the time in seconds; `seen_n` is the visual force."""
         for _ in range(round(time_s * 200)):
             t_s = self.t_ns / 1e9
             servo = ServoState(
