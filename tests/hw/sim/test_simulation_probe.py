@@ -31,7 +31,7 @@ def test_each_picture_that_is_timed_is_drawn(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_without_egl_it_says_what_to_install() -> None:
     code = (
-        "from gripper_force import config, doctor\n"
+        "from gripper_force import config\nfrom gripper_force.jobs import doctor\n"
         "doctor.PROBES = {'simulation': 'gripper_hw.sim.simulation_probe'}\n"
         "print(next(doctor.doctor(config.Config())))"
     )
