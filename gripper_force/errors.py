@@ -13,6 +13,7 @@
     ├── LogError                a log can't be read or written
     ├── DataError               a recording or a data set is unusable
     ├── CheckpointError         a network's file is of another network, or damaged
+    ├── RequestError            a request was refused: a target out of range, or nothing to hold
     └── NonFiniteError          NaN or infinity where a number is needed
 """
 
@@ -59,6 +60,10 @@ class DataError(GripperError):
 
 class CheckpointError(GripperError):
     """A checkpoint is missing, damaged, or belongs to another network."""
+
+
+class RequestError(GripperError, ValueError):
+    """A request was refused: a target out of range, or nothing to hold."""
 
 
 class NonFiniteError(GripperError, ValueError):

@@ -28,6 +28,7 @@ class Phase(StrEnum):
     RAMP = "ramp"
     HOLD = "hold"
     RELEASE = "release"
+    MOVE = "move"
     FAULT = "fault"
 
 
@@ -47,6 +48,7 @@ class RequestKind(StrEnum):
 
     GRASP = "grasp"
     RELEASE = "release"
+    MOVE = "move"
     STOP = "stop"
 
 
@@ -182,11 +184,13 @@ class Request:
         t_ns: Host time of the request.
         kind: A `RequestKind` value.
         target_n: Wanted grip force (grasp only).
+        width_m: Wanted distance between the jaws (move only).
     """
 
     t_ns: int
     kind: str
     target_n: float = 0.0
+    width_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

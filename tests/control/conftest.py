@@ -119,8 +119,8 @@ class Run:
         self.controller = GraspController(self.config, self.transmission, current_limit_a=1.2)
         self.t_ns = 0
 
-    def go(self, time_s: float, kind: str = "", target_n: float = 0.0) -> "Run":
-        request = Request(self.t_ns, kind, target_n) if kind else None
+    def go(self, time_s: float, kind: str = "", target_n: float = 0.0, width_m: float = 0.0) -> "Run":
+        request = Request(self.t_ns, kind, target_n, width_m) if kind else None
         for _ in range(round(time_s * NS_PER_S / CYCLE_NS)):
             servo = self.spoil(self.t_ns, self.plant.read(self.t_ns, self.rng))
             visual = self.vision.sample(self.t_ns, self.plant.force_n(), self.rng)
@@ -134,6 +134,9 @@ class Run:
 
     def grasp(self, target_n: float, time_s: float = 6.0) -> "Run":
         return self.go(time_s, RequestKind.GRASP, target_n)
+
+    def move(self, width_m: float, time_s: float = 4.0) -> "Run":
+        return self.go(time_s, RequestKind.MOVE, width_m=width_m)
 
     @property
     def last(self) -> Decision:
@@ -166,7 +169,7 @@ def transmission() -> Transmission:
     return TRANSMISSION
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_run() -> Callable[..., Run]:
     """Builds a closed loop: ``make_run(plant={...}, vision={...}, **control)``."""
 
@@ -179,6 +182,6 @@ def make_run() -> Callable[..., Run]:
     return make
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def drawn_run() -> Callable[..., Run]:
     return draw_run

@@ -13,7 +13,7 @@ from gripper_force.jobs.score import score_grasp
 from gripper_force.types import Request, ServoState, VisualForce
 
 TARGETS_N = (1.0, 2.0, 4.0, 8.0)
-PHASES = ("open", "approach", "contact", "ramp", "hold", "release")
+PHASES = ("open", "approach", "contact", "ramp", "hold", "release", "move")
 
 
 def statuses(run):
@@ -30,6 +30,8 @@ def run_to(run, phase):
     """Goes on until a phase, from the request that leads there."""
     if phase == "open":
         return run.go(0.05)
+    if phase == "move":
+        return run.move(0.06, 0.5)
     run.go(0.005, "grasp", 4.0)
     if phase == "release":
         run.go(0.5).go(0.005, "release")
@@ -193,7 +195,7 @@ def test_release_pre_empts(make_run, phase):
     assert run.plant.x_m < 0.003
 
 
-@pytest.mark.parametrize("phase", ["open", "approach", "release"])
+@pytest.mark.parametrize("phase", ["open", "approach", "release", "move"])
 def test_grasp_pre_empts(make_run, phase):
     run = run_to(make_run(), phase).grasp(2.0)
     assert run.last.status.outcome == "held"
@@ -375,7 +377,13 @@ visuals = st.one_of(
 )
 requests = st.one_of(
     st.none(),
-    st.builds(Request, st.just(0), st.sampled_from(["grasp", "release", "stop", "dance"]), wild),
+    st.builds(
+        Request,
+        st.just(0),
+        st.sampled_from(["grasp", "release", "move", "stop", "dance"]),
+        wild,
+        wild | st.floats(0, 0.092),
+    ),
 )
 
 
