@@ -1,7 +1,6 @@
 """Faults on purpose: which is on when, and the two that the core itself suffers, estimator and disk.
 
-What a kind means for each unit stands in `gripper_force.config.FAULTS`; the stand-ins of devices carry the
-other faults out.
+`gripper_force.fault_config.FAULTS` lists the kinds of each unit; the simulated devices carry out the others.
 """
 
 import errno
@@ -11,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, BinaryIO
 
-from gripper_force.config import FaultConfig
+from gripper_force.fault_config import FaultConfig
 from gripper_force.interfaces import Clock
 from gripper_force.types import NS_PER_MS, NS_PER_S, Gray
 

@@ -25,7 +25,7 @@ class FaultCase:
 
     Attributes:
         name: What breaks.
-        unit: Of `gripper_force.config.FAULTS`; ``process`` for a signal.
+        unit: Of `gripper_force.fault_config.FAULTS`; ``process`` for a signal.
         kind: Likewise; or the signal's name.
         expected: What is to follow.
         within_ms: In which time; None where only what follows counts.

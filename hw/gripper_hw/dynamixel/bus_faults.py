@@ -1,4 +1,4 @@
-"""The faults of servo, bus and plant, carried out on a virtual bus (see `gripper_force.config.FAULTS`)."""
+"""Faults of servo, bus and plant on a virtual bus (see `gripper_force.fault_config.FAULTS`)."""
 
 import random
 from collections import deque

@@ -1,4 +1,4 @@
-"""The simulated camera, load cell and clock with their faults (see `gripper_force.config.FAULTS`)."""
+"""The simulated camera, load cell and clock with their faults (see `gripper_force.fault_config.FAULTS`)."""
 
 import math
 import time

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gripper_force.config import FAULTS, Config, FaultConfig, ServoConfig
+from gripper_force.config import Config, ServoConfig
 from gripper_force.errors import (
     DeviceError,
     DeviceLostError,
@@ -15,6 +15,7 @@ from gripper_force.errors import (
     DeviceTimeoutError,
     HardwareFaultError,
 )
+from gripper_force.fault_config import FAULTS, FaultConfig
 from gripper_force.fault_injection import Faults
 from gripper_force.runtime.backends import open_devices
 from gripper_force.types import NS_PER_MS, ServoCommand
