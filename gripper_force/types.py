@@ -33,7 +33,7 @@ class Phase(StrEnum):
 
 
 class Outcome(StrEnum):
-    """How a grasp ended; ``NONE`` while it is under way."""
+    """Result of a grasp or a move; ``NONE`` while it is under way."""
 
     NONE = ""
     HELD = "held"
@@ -41,6 +41,8 @@ class Outcome(StrEnum):
     SLIP = "slip"
     TIMEOUT = "timeout"
     FAULT = "fault"
+    MOVED = "moved"
+    BLOCKED = "blocked"
 
 
 class RequestKind(StrEnum):
