@@ -123,7 +123,7 @@ def test_force_on_an_obstacle_is_bounded(make_run, stiffness_n_m, gain, friction
 
 def test_steady_force_on_a_soft_obstacle_is_the_approach_force(make_run):
     run = make_run(plant={"stiffness_n_m": 300.0, "contact_m": 0.02}).move(0.02, 5.0)
-    assert run.plant.force_n() == pytest.approx(run.config.approach_force_n, abs=0.3)
+    assert run.plant.force_n == pytest.approx(run.config.approach_force_n, abs=0.3)
 
 
 def test_obstacle_is_reported_one_second_after_the_profile_ends(make_run):
@@ -156,7 +156,7 @@ def test_widths_out_of_range_are_refused(make_run, width_m):
 def test_refused_move_does_not_end_a_hold(make_run):
     run = make_run().grasp(4.0, 5.0).move(0.2, 0.5)
     assert (run.last.status.phase, run.last.status.outcome) == ("hold", "held")
-    assert run.plant.force_n() == pytest.approx(4.0, abs=0.2)
+    assert run.plant.force_n == pytest.approx(4.0, abs=0.2)
 
 
 @pytest.mark.parametrize("phase", PHASES)
@@ -164,7 +164,7 @@ def test_move_pre_empts_every_phase(make_run, phase):
     run = run_to(make_run(), phase).move(0.08, 4.0)
     assert (run.last.status.phase, run.last.status.outcome) == ("move", "")
     assert run.last.status.width_m == pytest.approx(0.08, abs=0.0005)
-    assert run.plant.force_n() == 0.0
+    assert run.plant.force_n == 0.0
 
 
 def test_move_resets_the_outcome_and_lets_go(make_run):
@@ -173,7 +173,7 @@ def test_move_resets_the_outcome_and_lets_go(make_run):
     run.go(0.005, "move", width_m=0.08)
     assert run.last.status.outcome == ""
     run.go(1.0)
-    assert run.plant.force_n() == 0.0
+    assert run.plant.force_n == 0.0
     assert run.last.status.reference_n == 0.0
 
 
@@ -181,7 +181,7 @@ def test_move_from_a_hold_to_a_narrower_width_relaxes_the_grip(make_run):
     run = make_run().grasp(8.0, 5.0).move(0.02, 4.0)
     assert run.last.status.phase == "move"
     # Friction may hold the object compressed above what the motor gives.
-    assert run.plant.force_n() <= run.config.approach_force_n + 2 * run.plant.friction_n + 0.1
+    assert run.plant.force_n <= run.config.approach_force_n + 2 * run.plant.friction_n + 0.1
     assert max(d.command.goal_current_a for d in run.decisions[-700:]) <= motor_limit_a(run)
 
 
@@ -190,7 +190,7 @@ def test_grasp_after_a_move_holds(make_run, from_m):
     """From free travel, from beside the object, and from jaws that press on it."""
     run = make_run().move(from_m, 4.0).grasp(4.0, 7.0)
     assert run.last.status.outcome == "held"
-    assert run.plant.force_n() == pytest.approx(4.0, abs=0.2)
+    assert run.plant.force_n == pytest.approx(4.0, abs=0.2)
 
 
 def test_release_after_a_move_opens(make_run):
@@ -237,7 +237,7 @@ def test_goal_positions_follow_the_closing_direction(make_run, transmission, clo
     rig = replace(transmission, closing_sign=closing_sign)
     run = make_run(plant=FAR)
     controller = GraspController(run.config, rig, 1.2)
-    servo = replace(run.plant.read(0, run.rng), position_rad=rig.position_rad(0.08))
+    servo = replace(run.plant.read(0, 0.0), position_rad=rig.position_rad(0.08))
     controller.step(0, servo, None, Request(0, "move", width_m=0.04))
     for cycle in range(1, 40):
         decision = controller.step(cycle * 5_000_000, replace(servo, t_ns=cycle * 5_000_000), None, None)

@@ -94,14 +94,14 @@ def test_vision_alone_holds(drawn_run):
 
 
 def test_fused_goes_on_when_vision_drops_out(make_run):
-    run = make_run(plant={"gain": 1.08}, vision={"off_after_s": 3.0}).grasp(4.0)
+    run = make_run(plant={"gain": 1.08}, vision_off_s=3.0).grasp(4.0)
     assert run.last.estimate.source == "current"
     assert [text for text in run.texts if "vision dropped out" in text]
     assert run.last.status.outcome == "held"
     assert run.last.estimate.std_n > next(
         d.estimate.std_n for d in run.decisions if d.estimate.t_ns == 2_950_000_000
     )
-    assert run.plant.force_n() == pytest.approx(4.0, rel=0.04)  # what vision taught is kept
+    assert run.plant.force_n == pytest.approx(4.0, rel=0.04)  # what vision taught is kept
 
 
 def test_holds_still_against_friction(make_run):
@@ -120,7 +120,7 @@ def test_stalled_start_up_is_not_contact(make_run):
 def test_jaws_already_in_contact_grip(make_run):
     run = make_run(plant={"contact_m": 0.0}).grasp(2.0)
     assert run.last.status.outcome == "held"
-    assert run.plant.force_n() == pytest.approx(2.0, abs=0.1)
+    assert run.plant.force_n == pytest.approx(2.0, abs=0.1)
 
 
 def test_no_object(make_run):
@@ -176,16 +176,16 @@ def test_timeout(make_run):
 def test_retarget_without_letting_go(make_run):
     run = make_run().grasp(2.0, 4.0).grasp(5.0, 4.0)
     assert phases(run) == ["approach", "contact", "ramp", "hold", "ramp", "hold"]
-    assert run.plant.force_n() == pytest.approx(5.0, rel=0.03)
+    assert run.plant.force_n == pytest.approx(5.0, rel=0.03)
     run.grasp(3.0, 6.0)
-    assert run.plant.force_n() == pytest.approx(3.0, rel=0.05)
+    assert run.plant.force_n == pytest.approx(3.0, rel=0.05)
     assert min(sample.force_n for sample in run.cell[-1100:]) > 2.7
     assert run.last.status.outcome == "held"
 
 
 def test_a_new_target_in_contact_counts(make_run):
     run = run_to(make_run(), "contact").grasp(2.0, 4.0)
-    assert run.plant.force_n() == pytest.approx(2.0, abs=0.1)
+    assert run.plant.force_n == pytest.approx(2.0, abs=0.1)
 
 
 @pytest.mark.parametrize("phase", PHASES)
@@ -242,14 +242,14 @@ def test_at_fault_the_jaws_go_limp(make_run):
     run.go(0.005, "stop")
     assert run.last.command.goal_current_a == 0.0
     run.go(1.0)
-    assert run.plant.force_n() <= run.plant.friction_n + 0.01
+    assert run.plant.force_n <= run.plant.friction_n + 0.01
 
 
 def test_at_fault_the_hold_is_kept(make_run):
-    run = run_to(make_run(on_fault="hold"), "hold")
-    before_n = run.plant.force_n()
+    run = run_to(make_run(on_fault="hold"), "hold").go(1.0)
+    before_n = run.plant.force_n
     run.go(1.0, "stop")
-    assert run.plant.force_n() == pytest.approx(before_n, abs=0.1)
+    assert run.plant.force_n == pytest.approx(before_n, abs=0.1)
 
 
 @pytest.mark.parametrize("phase", ["approach", "ramp", "hold"])
@@ -263,13 +263,13 @@ def test_at_fault_the_jaws_open(make_run, phase):
 
 def test_a_servo_that_grows_hot_holds_less_and_says_so(make_run):
     run = run_to(make_run(), "hold").go(1.0)
-    before_n, before_a = run.plant.force_n(), run.last.command.goal_current_a
+    before_n, before_a = run.plant.force_n, run.last.command.goal_current_a
     run.spoil = lambda _, servo: replace(servo, temperature_c=65.0)
     run.go(3.0)
     assert run.last.status.outcome == "held"
     assert run.last.status.reference_n == pytest.approx(0.8 * 4.0)
     assert run.last.command.goal_current_a < before_a
-    assert run.plant.force_n() < before_n
+    assert run.plant.force_n < before_n
     assert any("at 65 C; holding 3.20 N" in text for text in run.texts)
     run.spoil = lambda _, servo: servo
     run.go(3.0)
