@@ -20,7 +20,9 @@ from gripper_force.qualification.loop_margin.analytic_plant import (
 )
 from gripper_force.types import (
     NS_PER_S,
+    GraspStatus,
     LoadCellSample,
+    Phase,
     Request,
     RequestKind,
     ServoState,
@@ -83,9 +85,31 @@ class Run:
     def move(self, width_m: float, time_s: float = 4.0) -> "Run":
         return self.go(time_s, RequestKind.MOVE, width_m=width_m)
 
+    def to_phase(self, phase: str) -> "Run":
+        """Steps until a phase, from the request that leads there."""
+        if phase == Phase.OPEN:
+            return self.go(0.05)
+        if phase == Phase.MOVE:
+            return self.move(0.06, 0.5)
+        self.go(0.005, RequestKind.GRASP, 4.0)
+        if phase == Phase.RELEASE:
+            self.go(0.5).go(0.005, RequestKind.RELEASE)
+        while self.last.status.phase != phase:
+            self.go(0.005)
+            assert self.t_ns < 5e9
+        return self
+
     @property
     def last(self) -> Decision:
         return self.decisions[-1]
+
+    @property
+    def statuses(self) -> list[GraspStatus]:
+        return [decision.status for decision in self.decisions]
+
+    @property
+    def reasons(self) -> list[str]:
+        return [status.reason for status in self.statuses if status.reason]
 
     @property
     def texts(self) -> list[str]:
