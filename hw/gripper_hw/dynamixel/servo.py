@@ -20,7 +20,7 @@ from gripper_force.errors import (
     HardwareFaultError,
     NonFiniteError,
 )
-from gripper_force.interfaces import BusStats
+from gripper_force.interfaces import BusStats, ServoSpec
 from gripper_force.types import ServoCommand, ServoState
 from gripper_hw.dynamixel.control_table import (
     CURRENT_BASED_POSITION_MODE,
@@ -328,6 +328,20 @@ class DynamixelServo:
         """Takes note of what to drive; `start` opens the port. Raises as `DynamixelBus`."""
         self._bus = DynamixelBus(config, (config.id,), clock_ns)
         self.model = self._bus.model
+
+    @staticmethod
+    def spec(config: ServoConfig) -> ServoSpec:
+        """Returns the data of the configured model, without opening the port.
+
+        Raises:
+            ConfigError: The model is unknown, or has no current control.
+        """
+        model = load_model(config.model)
+        return ServoSpec(
+            nm_per_a=model.nm_per_a,
+            current_step_a=model.current_unit_a,
+            voltage_range_v=model.voltage_range_v,
+        )
 
     @property
     def stats(self) -> BusStats:

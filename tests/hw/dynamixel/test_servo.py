@@ -15,7 +15,7 @@ from gripper_force.errors import (
     DeviceTimeoutError,
     HardwareFaultError,
 )
-from gripper_force.interfaces import Servo
+from gripper_force.interfaces import Servo, ServoSpec
 from gripper_force.types import ServoCommand
 from gripper_hw.dynamixel import control_table
 from gripper_hw.dynamixel.control_table import (
@@ -161,6 +161,15 @@ def test_a_model_that_will_not_do_is_refused_before_any_port_is_opened(model):
 def test_more_current_than_the_model_allows_is_refused():
     with pytest.raises(ConfigError, match=r"current_limit_a is 1.2.*0.91"):
         DynamixelServo(ServoConfig(port="virtual:nobody", model="XC330-T288"))
+
+
+def test_spec_is_the_models_data_and_needs_no_port():
+    config = ServoConfig(port="virtual:nobody", model="XC330-T288")
+    assert DynamixelServo.spec(config) == ServoSpec(
+        nm_per_a=pytest.approx(0.92 / 0.80), current_step_a=0.001, voltage_range_v=(6.5, 12.0)
+    )
+    with pytest.raises(ConfigError, match="unknown servo model 'AX-12'"):
+        DynamixelServo.spec(ServoConfig(model="AX-12"))
 
 
 def test_old_firmware_is_refused_and_loses_its_torque(make_memory_line):
