@@ -17,29 +17,6 @@ FAR = {"contact_m": 1.0}
 PHASES = ("open", "approach", "contact", "ramp", "hold", "release", "move")
 
 
-def statuses(run):
-    return [decision.status for decision in run.decisions]
-
-
-def reasons(run):
-    return [status.reason for status in statuses(run) if status.reason]
-
-
-def run_to(run, phase):
-    """Steps until a phase, from the request that leads there."""
-    if phase == "open":
-        return run.go(0.05)
-    if phase == "move":
-        return run.move(0.07, 0.3)
-    run.go(0.005, "grasp", 4.0)
-    if phase == "release":
-        run.go(0.5).go(0.005, "release")
-    while run.last.status.phase != phase:
-        run.go(0.005)
-        assert run.t_ns < 5e9
-    return run
-
-
 def motor_limit_a(run):
     """Goal current of the approach force plus friction, on the servo's grid."""
     rig = run.transmission
@@ -51,7 +28,7 @@ def test_move_closes_to_a_width(make_run, width_m):
     run = make_run(plant=FAR).move(width_m)
     assert run.last.status.phase == "move"
     assert run.last.status.width_m == pytest.approx(width_m, abs=0.0005)
-    assert reasons(run) == [
+    assert run.reasons == [
         f"move to {1e3 * width_m:.1f} mm requested",
         f"moved to {1e3 * width_m:.1f} mm",
     ]
@@ -63,12 +40,12 @@ def test_move_opens_to_a_width_and_holds_it(make_run):
     arrived_m = run.last.status.width_m
     run.go(2.0)
     assert run.last.status.width_m == pytest.approx(arrived_m, abs=1e-4)
-    assert sum(reason.startswith("moved") for reason in reasons(run)) == 1
+    assert sum(reason.startswith("moved") for reason in run.reasons) == 1
 
 
 def test_move_to_the_present_width_ends_at_once(make_run):
     run = make_run(plant={**FAR, "x_m": 0.02}).move(OPEN_M - 0.04, 0.1)
-    assert any(reason.startswith("moved to 52.0 mm") for reason in reasons(run))
+    assert any(reason.startswith("moved to 52.0 mm") for reason in run.reasons)
 
 
 @settings(deadline=None, max_examples=25)
@@ -92,7 +69,7 @@ def test_speed_and_lead_are_bounded_and_the_width_is_reached(
     # The servo's position loop passes the speed of its goal by no more than this while it settles.
     assert max(speeds_m_s) <= 1.2 * speed_m_s + 0.001
     assert run.last.status.width_m == pytest.approx(width_m, abs=0.0005)
-    assert not any("obstacle" in reason for reason in reasons(run))
+    assert not any("obstacle" in reason for reason in run.reasons)
     goals_m = [run.transmission.width_m(d.command.goal_position_rad) for d in run.decisions]
     for decision, goal_m in zip(run.decisions, goals_m, strict=True):
         assert abs(goal_m - decision.status.width_m) <= LEAD_M + 1e-9
@@ -116,19 +93,19 @@ def test_force_on_an_obstacle_is_bounded(make_run, stiffness_n_m, gain, friction
     assert max(forces_n) <= impact_n + motor_n
     assert forces_n[-1] <= motor_n + friction_n
     assert max(d.command.goal_current_a for d in run.decisions) <= motor_limit_a(run)
-    stopped = [reason for reason in reasons(run) if reason.startswith("stopped at")]
+    stopped = [reason for reason in run.reasons if reason.startswith("stopped at")]
     assert stopped == [f"stopped at {1e3 * run.last.status.width_m:.1f} mm by an obstacle"]
     assert run.last.status.phase == "move"
 
 
 def test_steady_force_on_a_soft_obstacle_is_the_approach_force(make_run):
     run = make_run(plant={"stiffness_n_m": 300.0, "contact_m": 0.02}).move(0.02, 5.0)
-    assert run.plant.force_n() == pytest.approx(run.config.approach_force_n, abs=0.3)
+    assert run.plant.force_n == pytest.approx(run.config.approach_force_n, abs=0.3)
 
 
 def test_obstacle_is_reported_one_second_after_the_profile_ends(make_run):
     run = make_run(plant={"contact_m": 0.01}).move(0.042, 5.0)
-    stopped = next(s for s in statuses(run) if s.reason.startswith("stopped"))
+    stopped = next(s for s in run.statuses if s.reason.startswith("stopped"))
     assert stopped.t_ns == pytest.approx((0.05 / 0.05 + 0.1 + 1.0) * 1e9, abs=10e6)
 
 
@@ -140,7 +117,7 @@ def test_jaws_go_on_slowly_when_the_obstacle_is_gone(make_run):
     assert run.last.status.width_m == pytest.approx(0.03, abs=0.0005)
     widths_m = [decision.status.width_m for decision in run.decisions[before:]]
     assert max(a - b for a, b in pairwise(widths_m)) <= 2 * 0.1 * 0.005
-    assert sum(reason.startswith(("moved", "stopped")) for reason in reasons(run)) == 1
+    assert sum(reason.startswith(("moved", "stopped")) for reason in run.reasons) == 1
 
 
 @pytest.mark.parametrize("width_m", [-0.001, OPEN_M + 0.001, math.nan, math.inf, -math.inf])
@@ -156,15 +133,15 @@ def test_widths_out_of_range_are_refused(make_run, width_m):
 def test_refused_move_does_not_end_a_hold(make_run):
     run = make_run().grasp(4.0, 5.0).move(0.2, 0.5)
     assert (run.last.status.phase, run.last.status.outcome) == ("hold", "held")
-    assert run.plant.force_n() == pytest.approx(4.0, abs=0.2)
+    assert run.plant.force_n == pytest.approx(4.0, abs=0.2)
 
 
 @pytest.mark.parametrize("phase", PHASES)
 def test_move_pre_empts_every_phase(make_run, phase):
-    run = run_to(make_run(), phase).move(0.08, 4.0)
+    run = make_run().to_phase(phase).move(0.08, 4.0)
     assert (run.last.status.phase, run.last.status.outcome) == ("move", "")
     assert run.last.status.width_m == pytest.approx(0.08, abs=0.0005)
-    assert run.plant.force_n() == 0.0
+    assert run.plant.force_n == 0.0
 
 
 def test_move_resets_the_outcome_and_lets_go(make_run):
@@ -173,7 +150,7 @@ def test_move_resets_the_outcome_and_lets_go(make_run):
     run.go(0.005, "move", width_m=0.08)
     assert run.last.status.outcome == ""
     run.go(1.0)
-    assert run.plant.force_n() == 0.0
+    assert run.plant.force_n == 0.0
     assert run.last.status.reference_n == 0.0
 
 
@@ -181,7 +158,7 @@ def test_move_from_a_hold_to_a_narrower_width_relaxes_the_grip(make_run):
     run = make_run().grasp(8.0, 5.0).move(0.02, 4.0)
     assert run.last.status.phase == "move"
     # Friction may hold the object compressed above what the motor gives.
-    assert run.plant.force_n() <= run.config.approach_force_n + 2 * run.plant.friction_n + 0.1
+    assert run.plant.force_n <= run.config.approach_force_n + 2 * run.plant.friction_n + 0.1
     assert max(d.command.goal_current_a for d in run.decisions[-700:]) <= motor_limit_a(run)
 
 
@@ -190,7 +167,7 @@ def test_grasp_after_a_move_holds(make_run, from_m):
     """From free travel, from beside the object, and from jaws that press on it."""
     run = make_run().move(from_m, 4.0).grasp(4.0, 7.0)
     assert run.last.status.outcome == "held"
-    assert run.plant.force_n() == pytest.approx(4.0, abs=0.2)
+    assert run.plant.force_n == pytest.approx(4.0, abs=0.2)
 
 
 def test_release_after_a_move_opens(make_run):
@@ -220,7 +197,7 @@ def test_stop_during_a_move(make_run, on_fault):
 def test_newer_move_pre_empts_an_older_one(make_run):
     run = make_run(plant=FAR).move(0.02, 0.8).move(0.08, 3.0)
     assert run.last.status.width_m == pytest.approx(0.08, abs=0.0005)
-    assert sum(reason.startswith("moved") for reason in reasons(run)) == 1
+    assert sum(reason.startswith("moved") for reason in run.reasons) == 1
 
 
 def test_late_cycles_do_not_make_the_goal_leap(make_run):
@@ -237,7 +214,7 @@ def test_goal_positions_follow_the_closing_direction(make_run, transmission, clo
     rig = replace(transmission, closing_sign=closing_sign)
     run = make_run(plant=FAR)
     controller = GraspController(run.config, rig, 1.2)
-    servo = replace(run.plant.read(0, run.rng), position_rad=rig.position_rad(0.08))
+    servo = replace(run.plant.read(0, 0.0), position_rad=rig.position_rad(0.08))
     controller.step(0, servo, None, Request(0, "move", width_m=0.04))
     for cycle in range(1, 40):
         decision = controller.step(cycle * 5_000_000, replace(servo, t_ns=cycle * 5_000_000), None, None)
