@@ -135,6 +135,19 @@ class LoadCellSample:
 
 
 @dataclass(frozen=True, slots=True)
+class ForceEstimate:
+    """Estimate of the contact force from one frame.
+
+    Attributes:
+        force_n: Contact force.
+        std_n: Standard deviation of its error, as the estimator claims it.
+    """
+
+    force_n: float
+    std_n: float
+
+
+@dataclass(frozen=True, slots=True)
 class VisualForce:
     """The network's estimate for one frame.
 
