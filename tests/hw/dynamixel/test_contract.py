@@ -224,7 +224,7 @@ def test_a_bus_that_falls_silent_is_told_and_comes_back(fitted):
     fitted.go_on(5)
     fitted.bus.tamper = lambda answer: None
     for _ in range(2):
-        with pytest.raises(DeviceTimeoutError, match="no sound answer"):
+        with pytest.raises(DeviceTimeoutError, match="no valid reply"):
             fitted.servo.read()
     with pytest.raises(DeviceTimeoutError):
         fitted.servo.stop(hold=False)
