@@ -168,7 +168,7 @@ def test_spec_is_the_models_data_and_needs_no_port():
     assert DynamixelServo.spec(config) == ServoSpec(
         nm_per_a=pytest.approx(0.92 / 0.80), current_step_a=0.001, voltage_range_v=(6.5, 12.0)
     )
-    with pytest.raises(ConfigError, match="unknown servo.model 'AX-12'"):
+    with pytest.raises(ConfigError, match=r"unknown servo\.model 'AX-12'"):
         DynamixelServo.spec(ServoConfig(model="AX-12"))
 
 
