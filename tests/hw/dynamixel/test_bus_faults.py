@@ -89,7 +89,7 @@ def test_an_unsound_or_late_answer_is_an_error_at_once_and_never_believed(kind):
     with bench(fault("bus", kind)) as b:
         read_until_the_fault(b)
         for _ in range(19):
-            with pytest.raises(DeviceTimeoutError, match="no sound answer"):
+            with pytest.raises(DeviceTimeoutError, match="no valid reply"):
                 b.servo.read()
             b.go_on()
         b.go_on()
@@ -175,11 +175,11 @@ def test_whatever_befalls_the_bus_a_state_is_of_now_or_there_is_none(spans, retr
         for _ in range(50):
             b.go_on()
             with suppress(DeviceError):
-                b.servo.start() if b.servo._bus._line._port is None else b.read_fresh()
+                b.servo.start() if b.servo._bus._transport._port is None else b.read_fresh()
             if b.bus.is_unplugged():
                 b.servo.close()
         b.go_on(40)
-        if b.servo._bus._line._port is None:
+        if b.servo._bus._transport._port is None:
             b.servo.start()
         b.servo.stop(hold=False)
         assert b.firmware.get("torque_enable") == 0
@@ -204,7 +204,7 @@ def test_an_answer_up_to_seven_requests_late_is_not_believed(late, retries, seed
             with pytest.raises(DeviceTimeoutError):
                 b.servo.read()
         with pytest.raises(DeviceTimeoutError):
-            b.servo._bus._line.get(1, "present_position")
+            b.servo._bus._transport.get(1, "present_position")
 
 
 @settings(deadline=None, max_examples=100)
@@ -236,7 +236,7 @@ def test_a_servo_without_power_falls_silent_and_comes_back_with_its_ram_reset():
         with pytest.raises(DeviceTimeoutError):
             b.servo.read()
         b.go_on(REBOOT_NS // CYCLE_NS + 1)
-        with pytest.raises(HardwareFaultError, match="restarted and forgot"):
+        with pytest.raises(HardwareFaultError, match="restarted and lost"):
             b.servo.read()
         assert (b.firmware.get("torque_enable"), b.firmware.get("bus_watchdog")) == (0, 0)
         assert b.firmware.get("goal_current") == b.firmware.get("current_limit")
@@ -253,7 +253,7 @@ def test_a_servo_whose_power_is_cut_now_and_then_is_told():
             b.servo.read()
         assert b.firmware.get("torque_enable") == 0
         b.go_on(50)
-        with pytest.raises(HardwareFaultError, match="restarted and forgot"):
+        with pytest.raises(HardwareFaultError, match="restarted and lost"):
             b.servo.read()
         b.go_on(10)  # 0.3 s after the first time
         with pytest.raises(DeviceTimeoutError):
@@ -345,5 +345,5 @@ def test_a_cut_between_two_cycles_counts():
         with pytest.raises(DeviceTimeoutError):
             read_on(devices)
         devices.clock.sleep_until_ns(REBOOT_NS + 20 * NS_PER_MS)
-        with pytest.raises(HardwareFaultError, match="restarted and forgot"):
+        with pytest.raises(HardwareFaultError, match="restarted and lost"):
             devices.servo.read()

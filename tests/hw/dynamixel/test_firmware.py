@@ -253,11 +253,11 @@ def test_a_hardware_error_outside_shutdown_leaves_torque():
 
 def test_heat_and_supply_raise_their_errors():
     servo = make()
-    servo.sense(temperature_c=80.0, voltage_v=12.0)
+    servo.set_conditions(temperature_c=80.0, voltage_v=12.0)
     assert not servo.alert
-    servo.sense(temperature_c=80.5)
+    servo.set_conditions(temperature_c=80.5)
     assert read(servo, "hardware_error_status") == OVERHEATING_ERROR
-    servo.sense(voltage_v=9.0)
+    servo.set_conditions(voltage_v=9.0)
     assert read(servo, "hardware_error_status") == OVERHEATING_ERROR | 1
     assert (read(servo, "present_temperature"), read(servo, "present_input_voltage")) == (80, 90)
 

@@ -101,7 +101,7 @@ def kill_both(quick: list[str], tmp_path: Path) -> None:
 
 def check_busy(child: subprocess.Popen[str]) -> None:
     said = child.stdout.read() + child.stderr.read()
-    assert any(sentence in said for sentence in ("no sound answer", "watchdog tripped")), said
+    assert any(sentence in said for sentence in ("no valid reply", "watchdog tripped")), said
     raise BusyError(said)
 
 

@@ -36,19 +36,19 @@ def test_an_odd_baud_rate_is_refused(tmp_path):
         open_port(str(tmp_path), 12_345, 4.0)
 
 
-def test_a_port_is_exclusive_until_closed(line):
-    port = open_port(line.port, 1_000_000, 250.0)
+def test_a_port_is_exclusive_until_closed(endpoint):
+    port = open_port(endpoint.port, 1_000_000, 250.0)
     with pytest.raises(DeviceError, match="in use"):
-        open_port(line.port, 1_000_000, 250.0)
+        open_port(endpoint.port, 1_000_000, 250.0)
     port.closePort()
     port.closePort()
-    open_port(line.port, 1_000_000, 250.0).closePort()
+    open_port(endpoint.port, 1_000_000, 250.0).closePort()
 
 
-def test_a_pulled_plug_is_told_each_time_and_leaves_no_port_busy(line):
-    port = open_port(line.port, 1_000_000, 250.0)
+def test_a_pulled_plug_is_told_each_time_and_leaves_no_port_busy(endpoint):
+    port = open_port(endpoint.port, 1_000_000, 250.0)
     assert PACKETS.ping(port, 1)[1] == sdk.COMM_SUCCESS
-    line.unplug()
+    endpoint.unplug()
     for _ in range(2):
         with pytest.raises(DeviceLostError, match="gone"):
             PACKETS.ping(port, 1)
@@ -56,15 +56,15 @@ def test_a_pulled_plug_is_told_each_time_and_leaves_no_port_busy(line):
     port.closePort()
 
 
-def test_a_closed_port_is_lost(line):
-    port = open_port(line.port, 1_000_000, 250.0)
+def test_a_closed_port_is_lost(endpoint):
+    port = open_port(endpoint.port, 1_000_000, 250.0)
     port.closePort()
     with pytest.raises(DeviceLostError):
         PACKETS.ping(port, 1)
 
 
-def test_what_was_received_before_is_not_the_next_answer(line):
-    port = open_port(line.port, 1_000_000, 250.0)
+def test_what_was_received_before_is_not_the_next_answer(endpoint):
+    port = open_port(endpoint.port, 1_000_000, 250.0)
     port.writePort(PING)
     port.setPacketTimeoutMillis(100.0)
     port.drain()
@@ -73,8 +73,8 @@ def test_what_was_received_before_is_not_the_next_answer(line):
     port.closePort()
 
 
-def test_the_sdk_may_ask_for_less_than_nothing(line):
-    port = open_port(line.port, 1_000_000, 250.0)
+def test_the_sdk_may_ask_for_less_than_nothing(endpoint):
+    port = open_port(endpoint.port, 1_000_000, 250.0)
     port.writePort(PING)
     port.setPacketTimeoutMillis(1000.0)
     assert port.readPort(1) == b"\xff"
@@ -83,7 +83,7 @@ def test_the_sdk_may_ask_for_less_than_nothing(line):
     port.closePort()
 
 
-def test_a_program_with_many_files_open_reads_too(line, tmp_path):
+def test_a_program_with_many_files_open_reads_too(endpoint, tmp_path):
     with contextlib.ExitStack() as stack:
         file = stack.enter_context((tmp_path / "file").open("w"))
         soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -93,14 +93,14 @@ def test_a_program_with_many_files_open_reads_too(line, tmp_path):
         while last < 1024:
             last = os.dup(file.fileno())
             stack.callback(os.close, last)
-        port = open_port(line.port, 1_000_000, 250.0)
+        port = open_port(endpoint.port, 1_000_000, 250.0)
         stack.callback(port.closePort)
         number, result, _ = sdk.PacketHandler(2.0).ping(port, 1)
         assert (number, result) == (1020, sdk.COMM_SUCCESS)
 
 
-def test_an_answer_may_come_in_pieces(line):
-    port = open_port(line.port, 1_000_000, 100.0)
+def test_an_answer_may_come_in_pieces(endpoint):
+    port = open_port(endpoint.port, 1_000_000, 100.0)
     port.writePort(PING)
     port.setPacketTimeout(14)
     found = b""
@@ -112,7 +112,7 @@ def test_an_answer_may_come_in_pieces(line):
 
 
 @pytest.fixture
-def deaf_line():
+def deaf_port():
     """A port whose other end reads nothing."""
     master, slave = pty.openpty()
     tty.setraw(slave)
@@ -123,10 +123,10 @@ def deaf_line():
     os.close(slave)
 
 
-def test_the_time_for_an_answer_counts_both_packets_and_the_margin(deaf_line):
-    deaf_line.writePort(PING)
-    deaf_line.setPacketTimeout(100)
-    assert deaf_line.packet_timeout == pytest.approx(110 * 10_000 / 57_600 + 4.0)
+def test_the_time_for_an_answer_counts_both_packets_and_the_margin(deaf_port):
+    deaf_port.writePort(PING)
+    deaf_port.setPacketTimeout(100)
+    assert deaf_port.packet_timeout == pytest.approx(110 * 10_000 / 57_600 + 4.0)
 
 
 def test_a_line_that_never_falls_silent_is_given_up():
@@ -152,8 +152,8 @@ def test_a_line_that_never_falls_silent_is_given_up():
     os.close(slave)
 
 
-def test_a_line_that_takes_no_more_is_not_lost(deaf_line):
-    while deaf_line.writePort(bytes(1000)):
+def test_a_line_that_takes_no_more_is_not_lost(deaf_port):
+    while deaf_port.writePort(bytes(1000)):
         pass
-    assert PACKETS.ping(deaf_line, 1)[1] == sdk.COMM_TX_FAIL
-    assert not deaf_line.is_using
+    assert PACKETS.ping(deaf_port, 1)[1] == sdk.COMM_TX_FAIL
+    assert not deaf_port.is_using

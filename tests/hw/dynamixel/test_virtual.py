@@ -21,11 +21,11 @@ CURRENT, POSITION, LED = 126, 132, 65
 
 
 @pytest.fixture
-def pair(make_line):
+def pair(make_endpoint):
     """An XM430 with id 1 and an XL330 with id 2."""
-    line = make_line(VirtualServo(1, MODEL), VirtualServo(2, load_model("XL330-M288")))
-    port = open_port(line.port, 1_000_000, 30.0)
-    yield line, port
+    endpoint = make_endpoint(VirtualServo(1, MODEL), VirtualServo(2, load_model("XL330-M288")))
+    port = open_port(endpoint.port, 1_000_000, 30.0)
+    yield endpoint, port
     port.closePort()
 
 
@@ -36,9 +36,9 @@ def test_ping(pair):
     assert PACKETS.ping(port, 3)[1] == sdk.COMM_RX_TIMEOUT
 
 
-def test_broadcast_ping_finds_all(make_memory_line):
-    line = make_memory_line(VirtualServo(4, MODEL, firmware=46), VirtualServo(2, MODEL))
-    port = open_port(line.port, 1_000_000, 1.0)
+def test_broadcast_ping_finds_all(make_memory_endpoint):
+    endpoint = make_memory_endpoint(VirtualServo(4, MODEL, firmware=46), VirtualServo(2, MODEL))
+    port = open_port(endpoint.port, 1_000_000, 1.0)
     assert PACKETS.broadcastPing(port) == ({2: [1020, 52], 4: [1020, 46]}, OK)
     port.closePort()
 
@@ -57,45 +57,45 @@ def test_read_and_write(pair):
 
 
 def test_registered_writes_act_together(pair):
-    line, port = pair
+    endpoint, port = pair
     for id_ in (1, 2):
         assert PACKETS.regWriteTxRx(port, id_, LED, 1, [1]) == (OK, 0)
-    assert [servo.get("led") for servo in line.bus.servos] == [0, 0]
+    assert [servo.get("led") for servo in endpoint.bus.servos] == [0, 0]
     assert PACKETS.action(port, BROADCAST_ID) == OK
     assert PACKETS.read1ByteTxRx(port, 2, LED) == (1, OK, 0)
-    assert [servo.get("led") for servo in line.bus.servos] == [1, 1]
+    assert [servo.get("led") for servo in endpoint.bus.servos] == [1, 1]
 
 
 def test_reboot_is_silent_for_a_while_and_resets_ram(pair):
-    line, port = pair
+    endpoint, port = pair
     PACKETS.write1ByteTxRx(port, 1, LED, 1)
     assert PACKETS.reboot(port, 1) == (OK, 0)
     assert PACKETS.ping(port, 1)[1] == sdk.COMM_RX_TIMEOUT
     assert PACKETS.ping(port, 2)[1] == OK
-    line.now_ns += REBOOT_NS
+    endpoint.now_ns += REBOOT_NS
     assert PACKETS.read1ByteTxRx(port, 1, LED) == (0, OK, 0)
 
 
 def test_factory_reset(pair):
-    line, port = pair
+    endpoint, port = pair
     PACKETS.write1ByteTxRx(port, 2, 11, 5)
     assert PACKETS.factoryReset(port, 2, 0x02) == (OK, 0)
-    line.now_ns += REBOOT_NS
+    endpoint.now_ns += REBOOT_NS
     assert PACKETS.read1ByteTxRx(port, 2, 11) == (3, OK, 0)
     assert PACKETS.factoryReset(port, 2, 0x77) == (OK, Error.DATA_RANGE)
 
 
 def test_clear_brings_the_position_within_one_turn(pair):
-    line, port = pair
-    line.bus.servos[0].control(0, 10.0, 0.0)
+    endpoint, port = pair
+    endpoint.bus.servos[0].control(0, 10.0, 0.0)
     before = PACKETS.read4ByteTxRx(port, 1, POSITION)[0]
     assert PACKETS.clearMultiTurn(port, 1) == (OK, 0)
     assert PACKETS.read4ByteTxRx(port, 1, POSITION)[0] == before % 4096 != before
 
 
 def test_status_return_level_decides_who_is_answered(pair):
-    line, port = pair
-    servo = line.bus.servos[0]
+    endpoint, port = pair
+    servo = endpoint.bus.servos[0]
     servo.set("status_return_level", 1)
     assert PACKETS.write1ByteTxRx(port, 1, LED, 1)[0] == sdk.COMM_RX_TIMEOUT
     assert servo.get("led") == 1
@@ -109,8 +109,8 @@ def test_status_return_level_decides_who_is_answered(pair):
 
 
 def test_a_hardware_error_sets_the_alert_bit_of_every_answer(pair):
-    line, port = pair
-    line.bus.servos[0].raise_hardware_error(OVERLOAD_ERROR)
+    endpoint, port = pair
+    endpoint.bus.servos[0].raise_hardware_error(OVERLOAD_ERROR)
     assert PACKETS.read1ByteTxRx(port, 1, 70) == (OVERLOAD_ERROR, OK, 0x80)
     assert PACKETS.write1ByteTxRx(port, 1, LED, 2) == (OK, 0x80 | Error.DATA_RANGE)
     assert PACKETS.ping(port, 1) == (1020, OK, 0x80)
@@ -119,8 +119,8 @@ def test_a_hardware_error_sets_the_alert_bit_of_every_answer(pair):
 
 @pytest.mark.parametrize("fast", [False, True])
 def test_sync_read(pair, fast):
-    line, port = pair
-    for servo, position_rad in zip(line.bus.servos, (0.1, -0.1), strict=True):
+    endpoint, port = pair
+    for servo, position_rad in zip(endpoint.bus.servos, (0.1, -0.1), strict=True):
         servo.control(0, position_rad, 0.0)
     group = sdk.GroupSyncRead(port, PACKETS, CURRENT, 10)
     group.addParam(1)
@@ -133,8 +133,8 @@ def test_sync_read(pair, fast):
 
 @pytest.mark.parametrize("fast", [False, True])
 def test_bulk_read(pair, fast):
-    line, port = pair
-    line.bus.servos[1].set("led", 1)
+    endpoint, port = pair
+    endpoint.bus.servos[1].set("led", 1)
     group = sdk.GroupBulkRead(port, PACKETS)
     group.addParam(1, POSITION, 4)
     group.addParam(2, LED, 1)
@@ -143,7 +143,7 @@ def test_bulk_read(pair, fast):
 
 
 def test_sync_and_bulk_write(pair):
-    line, port = pair
+    endpoint, port = pair
     sync = sdk.GroupSyncWrite(port, PACKETS, 102, 2)
     sync.addParam(1, [10, 0])
     sync.addParam(2, [20, 0])
@@ -153,7 +153,7 @@ def test_sync_and_bulk_write(pair):
     bulk.addParam(2, 104, 4, [30, 0, 0, 0])
     assert bulk.txPacket() == OK
     assert PACKETS.ping(port, 1)[1] == OK  # now both writes have been carried out
-    first, second = line.bus.servos
+    first, second = endpoint.bus.servos
     assert (first.get("goal_current"), second.get("goal_current")) == (10, 20)
     assert (first.get("led"), second.get("goal_velocity")) == (1, 30)
 
@@ -164,9 +164,9 @@ STUFFY = bytes.fromhex("fffffd00aafffdfd0102")
 @pytest.mark.parametrize("how", ["read", "fast sync read"])
 def test_the_sdk_misreads_stuffed_data_but_for_fast_sync_read(pair, how):
     """If the first case fails, the SDK has been mended; the driver needs no change."""
-    line, port = pair
+    endpoint, port = pair
     current, velocity, ticks = struct.unpack("<hii", STUFFY)
-    _sense_raw(line.bus.servos[0], current, velocity, ticks)
+    _sense_raw(endpoint.bus.servos[0], current, velocity, ticks)
     if how == "read":
         assert bytes(PACKETS.readTxRx(port, 1, CURRENT, 10)[0]) != STUFFY
     else:
