@@ -30,6 +30,8 @@ app = typer.Typer(
 )
 app.add_typer(data.import_app, name="import")
 app.add_typer(calibrate.app, name="calibrate")
+app.add_typer(bench.app, name="bench")
+app.add_typer(stability.app, name="stability")
 
 _INTERRUPTED = 130
 
@@ -182,8 +184,6 @@ for _command in (  # in the order of --help
     learning.evaluate,
     learning.reproduce,
     learning.export,
-    bench.bench,
-    stability.stability,
     doctor,
     virtual_servo,
 ):

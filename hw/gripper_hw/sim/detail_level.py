@@ -1,6 +1,6 @@
 """``sim.detail: auto``: the cheapest level of detail that keeps the budget, by a table that is shipped.
 
-The table is `gripper-force bench --scene`'s. It is not measured anew on each machine, as the same
+The table is `gripper-force bench scene`'s. It is not measured anew on each machine, as the same
 configuration has to give the same log everywhere.
 """
 
@@ -13,9 +13,7 @@ from gripper_force.config import BudgetConfig, Config
 from gripper_force.errors import ConfigError
 
 _TABLE: Final = Path(__file__).with_name("detail_level.yaml")
-_HEAD: Final = (
-    "# Made by `gripper-force bench --scene --write docs/simulation.md`. Not to be edited by hand.\n"
-)
+_HEAD: Final = "# Made by `gripper-force bench scene --write docs/simulation.md`. Not to be edited by hand.\n"
 
 Levels = dict[str, dict[str, float]]
 """By level of detail: ``error_n`` and ``speed``, as measured by ``gripper-force bench scene``."""
