@@ -174,30 +174,33 @@ class _Camera:
         pass
 
 
-def loop(seconds: float, overrides: list[str]) -> tuple[tuple[LoopCost, ...], LogCost]:
-    """Runs the loop with and without vision beside it, in turns.
+def loop(
+    seconds: float, overrides: list[str], path: Path | None = None
+) -> tuple[tuple[LoopCost, ...], LogCost]:
+    """Runs the loop with and without vision in parallel, in turns.
 
     Args:
-        seconds: How long each of the two.
-        overrides: Keys of the configuration, such as ``vision.threads=2``.
+        seconds: Duration of each of the two.
+        overrides: Configuration keys, such as ``vision.threads=2``.
+        path: Configuration file, or None.
 
     Raises:
-        GripperError: The servo's stand-in did not answer, or the configuration is wrong.
+        GripperError: The virtual servo did not answer, or the configuration is wrong.
     """
     loops = {"vision": _Seen(), "nothing": _Seen()}
     turns = max(1, round(seconds / _TURN_S))
     with TemporaryDirectory() as name, _virtual_servo() as port:
         folder = Path(name)
-        run_grasp(load_config(None, [*overrides, *_RECORDING]), folder / "seen.mcap")
+        run_grasp(load_config(path, [*overrides, *_RECORDING]), folder / "seen.mcap")
         frames = list(LogReader(folder / "seen.mcap").records(Frame))
         for turn in range(turns):
             for beside, seen in loops.items():
                 blind = () if beside == "vision" else ("vision.checkpoint=none", "control.feedback=current")
                 settings = [*PATIENT, *overrides, "clock=realtime", f"servo.port={port}", *blind]
-                path = folder / f"{beside}{turn}.mcap"
-                _run(load_config(None, settings), frames, seconds / turns, path, seen)
+                log_path = folder / f"{beside}{turn}.mcap"
+                _run(load_config(path, settings), frames, seconds / turns, log_path, seen)
         log = _log_cost(folder / "vision0.mcap", folder / "again.mcap", seconds / turns)
-    period_ns = round(NS_PER_S / load_config(None, overrides).control.rate_hz)
+    period_ns = round(NS_PER_S / load_config(path, overrides).control.rate_hz)
     return tuple(_cost(beside, seconds, period_ns, seen) for beside, seen in loops.items()), log
 
 
