@@ -158,8 +158,9 @@ def _open_estimator(config: "Config", digest: str) -> "tuple[ForceEstimator | No
 
 
 def _picture(frame: _Candidate, t_s: float, run: Run) -> Picture:
-    shown = "vision" in run.forces and frame.attention is not None
-    image = overlay(frame.gray, frame.attention) if shown else np.repeat(frame.gray[:, :, None], 3, axis=2)
+    attention = frame.attention if "vision" in run.forces else None
+    gray = frame.gray
+    image = np.repeat(gray[:, :, None], 3, axis=2) if attention is None else overlay(gray, attention)
     return Picture(t_s, image, _at(run, "vision", t_s), _at(run, "load_cell", t_s))
 
 
