@@ -20,6 +20,7 @@ from gripper_force.jobs.simulate import OBJECTS, PEAK_N
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log import LogReader, LogWriter
 from gripper_force.runtime.session import Session, open_session
+from gripper_force.schema import Tree
 from gripper_force.types import Frame, Gray
 
 RATE_HZ: Final = 149.0
@@ -94,7 +95,7 @@ class SetPlan:
         stem = f"{self.split}/{self.object}-{self.degrees:02d}-{self.number:02d}"
         return tuple(f"{stem}-{lux}.mcap" for lux in self.lux)
 
-    def make(self, out: Path, config: dict[str, object]) -> list[Path]:
+    def make(self, out: Path, config: Tree) -> list[Path]:
         """Makes the logs that do not exist yet; see `make_set`."""
         return make_set(self, out, config)
 
@@ -134,7 +135,7 @@ def plan_protocol(scale: str) -> list[SetPlan]:
     ]
 
 
-def make_set(task: SetPlan, out: Path, config: dict[str, object]) -> list[Path]:
+def make_set(task: SetPlan, out: Path, config: Tree) -> list[Path]:
     """Makes the logs of a set that do not exist yet. Each log gets its name once it is complete.
 
     Args:

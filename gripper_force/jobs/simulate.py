@@ -22,6 +22,7 @@ from gripper_force.jobs.processes import process_pool
 from gripper_force.jobs.recording.touches import ramp, wait
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.session import open_session, release, run_grasp
+from gripper_force.schema import Tree
 
 Kind = Literal["press", "tap", "grasp"]
 
@@ -45,7 +46,7 @@ class Plan(Protocol):
         """File names of the logs, relative to the output folder."""
         ...
 
-    def make(self, out: Path, config: dict[str, object]) -> list[Path]:
+    def make(self, out: Path, config: Tree) -> list[Path]:
         """Makes the logs that do not exist yet.
 
         Args:
@@ -79,7 +80,7 @@ class SimulationPlan:
         """The file name, as the only one."""
         return (self.name,)
 
-    def make(self, out: Path, config: dict[str, object]) -> list[Path]:
+    def make(self, out: Path, config: Tree) -> list[Path]:
         """Makes the log; see `make_log`."""
         return [make_log(self, out, config)]
 
@@ -109,7 +110,7 @@ def simulate(plans: Sequence[Plan], out: Path, config: Config, jobs: int) -> Ite
             yield from future.result()
 
 
-def make_log(task: SimulationPlan, out: Path, config: dict[str, object]) -> Path:
+def make_log(task: SimulationPlan, out: Path, config: Tree) -> Path:
     """Makes one log.
 
     The log gets its name once it is complete, so an interrupted simulation can be continued.

@@ -1,12 +1,16 @@
 """How a grasp, several, or a replay went, and how far off estimates are."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.markup import escape
 from rich.table import Table
 
 from gripper_force.cli.console import err, number, out, pairs
+
+if TYPE_CHECKING:  # --help loads no PyTorch
+    from gripper_force.jobs.evaluate import Evaluation
+    from gripper_force.jobs.metrics import ForceBin
 
 
 def phases() -> Callable[[Any], None]:
@@ -74,22 +78,22 @@ def trials_table(r: dict[str, Any]) -> None:
     out.print(table)
 
 
-def errors_table(r: dict[str, Any]) -> None:
-    """Errors of estimates: over all, by object and by force."""
-    pairs({key: r[key] for key in ("mae_n", "rmse_n", "bias_n", "floor_n", "frames")})
+def errors_table(r: "Evaluation") -> None:
+    """Prints errors of estimates: over all frames, by object and by force."""
+    pairs({key: getattr(r, key) for key in ("mae_n", "rmse_n", "bias_n", "floor_n", "frames")})
     table = Table("object", "MAE N", "RMSE N", "contact MAE N", "floor N", "frames", box=None)
-    for name, o in r["per_object"].items():
-        figures = (o["mae_n"], o["rmse_n"], o["contact_mae_n"], o["floor_n"])
-        table.add_row(name, *(number(value) for value in figures), str(o["frames"]))
+    for name, o in r.per_object.items():
+        figures = (o.mae_n, o.rmse_n, o.contact_mae_n, o.floor_n)
+        table.add_row(name, *(number(value) for value in figures), str(o.frames))
     out.print(table)
-    _bins_table(r["per_bin"])
+    _bins_table(r.per_bin)
 
 
-def _bins_table(bins: list[dict[str, Any]]) -> None:
+def _bins_table(bins: "list[ForceBin]") -> None:
     table = Table("force N", "MAE N", "bias N", "frames", box=None)
     for b in bins:
-        span = f"{b['from_n']:.0f}-{b['to_n']:.0f}"
-        table.add_row(span, number(b["mae_n"]), number(b["bias_n"]), str(b["frames"]))
+        span = f"{b.from_n:.0f}-{b.to_n:.0f}"
+        table.add_row(span, number(b.mae_n), number(b.bias_n), str(b.frames))
     out.print(table)
 
 
