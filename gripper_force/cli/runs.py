@@ -83,12 +83,15 @@ def replay(
 
     if report and (set_ or checkpoint):
         raise ConfigError("--report shows the run as it was; leave out --set and --checkpoint, or --report")
-    result = dict(job(log, checkpoint, overrides=set_, recover=recover))
-    if report:
-        from gripper_force.jobs.report import write_report
+    result = job(log, checkpoint, overrides=set_, recover=recover)
+    if not report:
+        console.show(result, as_json, replay_table)
+        return
+    from gripper_force.jobs.report import write_report
 
-        result["report"] = str(write_report(log, recover=recover).html)
-    console.show(result, as_json, replay_table)
+    page = str(write_report(log, recover=recover).html)
+    shown = {**console.jsonable(result), "report": page}
+    console.show(shown, as_json, lambda _: replay_table(result, page))
 
 
 def doctor(

@@ -296,7 +296,7 @@ def _trial(tree: dict[str, Any]) -> Summary:
 def _mae_n(estimates: list[tuple[int, float]], cells: list[LoadCellSample]) -> float | None:
     """Mean absolute error of an estimate over the whole run."""
     figures = compare([t for t, _ in estimates], [f for _, f in estimates], cells)
-    return None if figures is None else float(figures["mae_n"])
+    return None if figures is None else figures.mae_n
 
 
 def _floor_n(metadata: Mapping[str, str], cells: list[LoadCellSample]) -> float | None:

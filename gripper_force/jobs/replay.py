@@ -4,7 +4,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from gripper_force.control.state_machine import Decision
 from gripper_force.errors import DataError
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import CONTACT_N, label_frames
+from gripper_force.jobs.metrics import ForceBin
 from gripper_force.profiles.apply import read_correction, read_profiles
 from gripper_force.runtime.log import LogReader
 from gripper_force.runtime.perception import FrameProcessor
@@ -30,7 +31,8 @@ from gripper_force.types import (
 )
 
 
-class Comparison(TypedDict):
+@dataclass(frozen=True, slots=True)
+class Comparison:
     """Errors of an estimate against the load cell, in newtons.
 
     Attributes:
@@ -49,10 +51,11 @@ class Comparison(TypedDict):
     contact_mae_n: float | None
     lag_s: float
     frames: int
-    per_bin: list[metrics.Bin]
+    per_bin: list[ForceBin]
 
 
-class ReplayResult(TypedDict):
+@dataclass(frozen=True, slots=True)
+class ReplayResult:
     """Result of `replay`.
 
     Attributes:
@@ -72,9 +75,9 @@ class ReplayResult(TypedDict):
     mae_n: float
     rmse_n: float
     bias_n: float
-    per_bin: list[metrics.Bin]
+    per_bin: list[ForceBin]
     frames: int
-    per_object: dict[str, dict[str, Any]]
+    per_object: dict[str, dict[str, float]]
     identical: bool | None
     note: str
     changed: dict[str, float]
@@ -141,21 +144,20 @@ def replay(
         raise DataError(
             f"{path} holds no estimate to compare with a load cell; replay a log of a run with a load cell"
         )
-    return {
-        "mae_n": best["mae_n"],
-        "rmse_n": best["rmse_n"],
-        "bias_n": best["bias_n"],
-        "per_bin": best["per_bin"],
-        "frames": best["frames"],
-        "per_object": {
-            config.object: {key: best[key] for key in ("mae_n", "rmse_n", "bias_n", "frames")},
-        },
-        "identical": all(flags) if flags else None,
-        "note": _note(reader, run),
-        "changed": replayed.changed,
-        "sources": sources,
-        "log": str(path),
-    }
+    overall = {"mae_n": best.mae_n, "rmse_n": best.rmse_n, "bias_n": best.bias_n, "frames": best.frames}
+    return ReplayResult(
+        mae_n=best.mae_n,
+        rmse_n=best.rmse_n,
+        bias_n=best.bias_n,
+        per_bin=best.per_bin,
+        frames=best.frames,
+        per_object={config.object: overall},
+        identical=all(flags) if flags else None,
+        note=_note(reader, run),
+        changed=replayed.changed,
+        sources=sources,
+        log=str(path),
+    )
 
 
 def resolve_replay(config: Config) -> ResolvedConfig:
@@ -298,12 +300,12 @@ def compare(
         return None
     t_s, predicted_n, measured_n = times_ns[valid] / NS_PER_S, estimates_n[valid], measured_n[valid]
     contact = measured_n > CONTACT_N
-    return {
-        "mae_n": metrics.mae(predicted_n, measured_n),
-        "rmse_n": metrics.rmse(predicted_n, measured_n),
-        "bias_n": metrics.bias(predicted_n, measured_n),
-        "contact_mae_n": metrics.mae(predicted_n[contact], measured_n[contact]) if contact.any() else None,
-        "lag_s": metrics.lag_s(t_s, predicted_n, t_s, measured_n),
-        "frames": len(predicted_n),
-        "per_bin": metrics.per_bin(predicted_n, measured_n),
-    }
+    return Comparison(
+        mae_n=metrics.mae(predicted_n, measured_n),
+        rmse_n=metrics.rmse(predicted_n, measured_n),
+        bias_n=metrics.bias(predicted_n, measured_n),
+        contact_mae_n=metrics.mae(predicted_n[contact], measured_n[contact]) if contact.any() else None,
+        lag_s=metrics.lag_s(t_s, predicted_n, t_s, measured_n),
+        frames=len(predicted_n),
+        per_bin=metrics.per_bin(predicted_n, measured_n),
+    )

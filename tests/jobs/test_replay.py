@@ -54,7 +54,7 @@ def test_its_figures_agree_with_the_logs_load_cell(fused_log: Path) -> None:
     assert result["mae_n"] == pytest.approx(mae(said, measured), abs=0.02)
     assert result["rmse_n"] == pytest.approx(rmse(said, measured), abs=0.02)
     assert result["bias_n"] == pytest.approx(bias(said, measured), abs=0.02)
-    assert sum(b["frames"] for b in result["per_bin"]) == result["frames"]
+    assert sum(b.frames for b in result["per_bin"]) == result["frames"]
     assert result["per_object"]["stapler"]["mae_n"] == result["mae_n"]
 
 

@@ -6,8 +6,11 @@ from rich.table import Table
 
 from gripper_force.cli.console import number, out, pairs
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # --help loads neither NumPy nor PyTorch
+    from gripper_force.jobs.evaluate import Evaluation
     from gripper_force.jobs.grasp import Summary
+    from gripper_force.jobs.metrics import ForceBin
+    from gripper_force.jobs.replay import ReplayResult
 
 
 def grasp_table(r: "Summary") -> None:
@@ -62,39 +65,39 @@ def trials_table(r: dict[str, Any]) -> None:
     out.print(table)
 
 
-def errors_table(r: dict[str, Any]) -> None:
-    """Prints errors of estimates: overall, by object and by force."""
-    pairs({key: r[key] for key in ("mae_n", "rmse_n", "bias_n", "floor_n", "frames")})
+def errors_table(r: "Evaluation") -> None:
+    """Prints errors of estimates: over all frames, by object and by force."""
+    pairs({key: getattr(r, key) for key in ("mae_n", "rmse_n", "bias_n", "floor_n", "frames")})
     table = Table("object", "MAE N", "RMSE N", "contact MAE N", "floor N", "frames", box=None)
-    for name, o in r["per_object"].items():
-        figures = (o["mae_n"], o["rmse_n"], o["contact_mae_n"], o["floor_n"])
-        table.add_row(name, *(number(value) for value in figures), str(o["frames"]))
+    for name, o in r.per_object.items():
+        figures = (o.mae_n, o.rmse_n, o.contact_mae_n, o.floor_n)
+        table.add_row(name, *(number(value) for value in figures), str(o.frames))
     out.print(table)
-    _bins_table(r["per_bin"])
+    _bins_table(r.per_bin)
 
 
-def _bins_table(bins: list[dict[str, Any]]) -> None:
+def _bins_table(bins: "list[ForceBin]") -> None:
     table = Table("force N", "MAE N", "bias N", "frames", box=None)
     for b in bins:
-        span = f"{b['from_n']:.0f}-{b['to_n']:.0f}"
-        table.add_row(span, number(b["mae_n"]), number(b["bias_n"]), str(b["frames"]))
+        span = f"{b.from_n:.0f}-{b.to_n:.0f}"
+        table.add_row(span, number(b.mae_n), number(b.bias_n), str(b.frames))
     out.print(table)
 
 
-def replay_table(r: dict[str, Any]) -> None:
+def replay_table(r: "ReplayResult", report: str | None = None) -> None:
     """Prints the result of a replay."""
-    identical = {True: "yes, bit for bit", False: "no", None: "nothing to compare"}[r["identical"]]
-    if r["note"]:
-        identical += f": {r['note']}"
+    identical = {True: "yes, bit for bit", False: "no", None: "nothing to compare"}[r.identical]
+    if r.note:
+        identical += f": {r.note}"
     found = {"identical": identical}
-    if r["changed"] and not r["identical"]:
-        found["commands"] = f"at most {1e3 * r['changed']['goal_current_a']:.0f} mA from the run's"
-        found["fused force"] = f"at most {r['changed']['fused_n']:.2f} N from the run's"
-    pairs({**found, "log": r["log"], **({"report": r["report"]} if "report" in r else {})})
+    if r.changed and not r.identical:
+        found["commands"] = f"at most {1e3 * r.changed['goal_current_a']:.0f} mA from the run's"
+        found["fused force"] = f"at most {r.changed['fused_n']:.2f} N from the run's"
+    pairs({**found, "log": r.log, **({} if report is None else {"report": report})})
     table = Table("source", "MAE N", "RMSE N", "bias N", "contact MAE N", "lag ms", "samples", box=None)
-    for name, s in r["sources"].items():
-        figures = (s["mae_n"], s["rmse_n"], s["bias_n"], s["contact_mae_n"])
-        lag = number(1e3 * s["lag_s"], digits=0)
-        table.add_row(name, *(number(value) for value in figures), lag, str(s["frames"]))
+    for name, s in r.sources.items():
+        figures = (s.mae_n, s.rmse_n, s.bias_n, s.contact_mae_n)
+        lag = number(1e3 * s.lag_s, digits=0)
+        table.add_row(name, *(number(value) for value in figures), lag, str(s.frames))
     out.print(table)
-    _bins_table(r["per_bin"])
+    _bins_table(r.per_bin)

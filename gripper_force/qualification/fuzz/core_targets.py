@@ -328,7 +328,7 @@ def _learn_log(data: bytes, path: Path) -> None:
 
 def _report_log(data: bytes, path: Path) -> None:
     path.write_bytes(data)
-    read_run(path, recover=True)
+    read_run(LogReader(path, recover=True))
 
 
 def _summarise_log(data: bytes, path: Path) -> None:
