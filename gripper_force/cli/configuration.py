@@ -22,7 +22,7 @@ def show(config: ConfigPath = None, set_: Overrides = None, as_json: AsJson = Fa
 
 @app.command()
 def check(config: ConfigPath = None, set_: Overrides = None, as_json: AsJson = False) -> None:
-    """Check keys, values, profiles, backends and budgets without opening a device. Exit code 2 if one is wrong."""
+    """Check keys, values, profiles, backends and budgets without opening a device."""
     from gripper_force.runtime.resolve import resolve
 
     run = resolve(load_settings(config, set_, {}))

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -15,14 +15,16 @@ from rich.progress import Progress as ProgressBar
 from rich.table import Table
 
 from gripper_force.errors import GripperError
-from gripper_force.interfaces import Progress
+
+if TYPE_CHECKING:  # --help loads no NumPy
+    from gripper_force.interfaces import Progress
 
 err = Console(stderr=True, highlight=False)
 out = Console(highlight=False)
 
 
 @contextmanager
-def bar(label: str, total: int) -> Iterator[Progress]:
+def bar(label: str, total: int) -> "Iterator[Progress]":
     """Shows a progress bar on stderr and gives its `Progress` callback."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with ProgressBar(*columns, TextColumn("{task.fields[note]}"), console=err) as shown:

@@ -53,14 +53,18 @@ def grasp(
             result = job.grasp(settings, console.line, log)
         except KeyboardInterrupt:
             if log.exists():
-                console.err.print(f"the run until then is in {log}: gripper-force replay {log}", soft_wrap=True)
+                console.err.print(
+                    f"the run until then is in {log}: gripper-force replay {log}", soft_wrap=True
+                )
             raise
         console.show(result, as_json, grasp_table)
         if result["result"] != "held":
             raise typer.Exit(1)
         return
     if object_ is not None or target_n is not None:
-        raise ConfigError("--trials uses all four objects with drawn targets; leave out --object and --target-n")
+        raise ConfigError(
+            "--trials uses all four objects with drawn targets; leave out --object and --target-n"
+        )
     results = []
     with console.bar("grasping", trials) as progress:
         for one in job.trials(settings, trials, jobs):

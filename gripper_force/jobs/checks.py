@@ -52,12 +52,12 @@ class SetupResult:
     """Result of a servo's setup.
 
     Attributes:
-        servo: Name of the servo.
-        changes: Registers that differed.
+        servo: Id of the servo.
+        changes: Registers that differed from what a run needs.
         applied: True if they were written and read back.
     """
 
-    servo: str
+    servo: int
     changes: list[RegisterChange]
     applied: bool
 

@@ -66,7 +66,9 @@ def _guarded(unit: str, checks: Iterable[Check]) -> Iterator[Check]:
         found, _, advice = str(error).partition("; ")
         yield Check(unit, "usable", found, False, advice)
     except Exception as error:  # a defect of one probe must not hide the results of the others
-        yield Check(unit, "usable", f"{type(error).__name__}: {error}", False, "a defect of gripper-force: report it")
+        yield Check(
+            unit, "usable", f"{type(error).__name__}: {error}", False, "a defect of gripper-force: report it"
+        )
 
 
 def _network(config: Config) -> Iterator[Check]:

@@ -16,7 +16,7 @@ from gripper_force.config import Config
 from gripper_force.errors import DataError
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import CONTACT_N, Clip, check_size, load_clips, stiffness_floor_n
-from gripper_force.profiles.apply import correction_of
+from gripper_force.profiles.apply import read_correction, read_profiles
 from gripper_force.profiles.correction import Correction
 from gripper_force.vision.batch_inference import features, predict
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
@@ -119,8 +119,8 @@ def evaluate(
         calibration = calibration.model_copy(update={"object": profile})
 
     def correction(clip: Clip) -> Correction | None:
-        settings = {"object": clip.object, "calibration": calibration}
-        return correction_of(config.model_copy(update=settings), loaded)
+        own = config.model_copy(update={"object": clip.object, "calibration": calibration})
+        return read_correction(own, read_profiles(own), loaded)
 
     return evaluate_clips(loaded, clips, None if calibration.object is None else correction)
 

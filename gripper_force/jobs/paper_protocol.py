@@ -19,6 +19,7 @@ from gripper_force.jobs.recording.touches import touch, wait
 from gripper_force.jobs.simulate import OBJECTS, PEAK_N
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log import LogReader, LogWriter
+from gripper_force.runtime.resolve import resolve
 from gripper_force.runtime.session import Session, open_session
 from gripper_force.schema import Tree
 from gripper_force.types import Frame, Gray
@@ -171,7 +172,8 @@ def make_set(task: SetPlan, out: Path, config: Tree) -> list[Path]:
 def _run_set(config: Config, task: SetPlan, seed: int, logs: dict[int, Path]) -> None:
     first, *others = logs
     rng = np.random.default_rng([seed, 11])
-    config = _set_config(config, task, seed, first, rng)
+    run = resolve(_set_config(config, task, seed, first, rng), vision=False)
+    config = run.config
     with open_devices(config) as devices:
         if (
             (config.camera.backend, config.load_cell.backend) != ("simulated", "simulated")
@@ -187,7 +189,7 @@ def _run_set(config: Config, task: SetPlan, seed: int, logs: dict[int, Path]) ->
         rendered = [devices.render_under_light(lux) for lux in others]
         devices.camera = cameras = _MultiLightCamera(devices.camera, [camera for camera, _ in rendered])
         devices.notes.update(protocol="shin2019", degrees=str(task.degrees), split=task.split, lux=str(first))
-        with open_session(config, devices, logs[first], None) as session:
+        with open_session(run, devices, logs[first]) as session:
             _touch_all(session, task, rng, config.control.timeout_s)
     for lux, (_, notes), grays in zip(others, rendered, cameras.grays, strict=True):
         _copy_under_light(logs[first], logs[lux], lux, {**notes, "lux": str(lux)}, grays)

@@ -18,10 +18,10 @@ from typing import Final, Literal, Protocol
 import numpy as np
 
 from gripper_force.config import Config, config_from
+from gripper_force.jobs.grasp import run_grasp
 from gripper_force.jobs.processes import process_pool
 from gripper_force.jobs.recording.touches import ramp, wait
-from gripper_force.runtime.backends import open_devices
-from gripper_force.runtime.session import open_session, release, run_grasp
+from gripper_force.runtime.session import open_run
 from gripper_force.schema import Tree
 
 Kind = Literal["press", "tap", "grasp"]
@@ -157,22 +157,22 @@ def _draw_target_n(rng: np.random.Generator) -> float:
 
 
 def _press(config: Config, path: Path, rng: np.random.Generator) -> None:
-    with open_devices(config) as devices, open_session(config, devices, path, None) as session:
+    with open_run(config, path, vision=False) as session:
         wait(session, 0.2)
         for _ in range(int(rng.integers(_MAX_TARGETS)) + 1):
             ramp(session, _draw_target_n(rng), config.control.timeout_s)
             wait(session, float(rng.uniform(0.05, 0.6)))
-        release(session, config)
+        session.release()
 
 
 def _tap(config: Config, path: Path, rng: np.random.Generator) -> None:
     fast = {"approach_speed_m_s": 0.05, "ramp_n_s": float(np.exp(rng.uniform(np.log(10.0), np.log(30.0))))}
     config = config.model_copy(update={"control": config.control.model_copy(update=fast)})
-    with open_devices(config) as devices, open_session(config, devices, path, None) as session:
+    with open_run(config, path, vision=False) as session:
         wait(session, 0.1)
         peak_n = float(rng.uniform(_MIN_TAP_N, PEAK_N))
         ramp(session, peak_n, config.control.timeout_s)
         wait(session, float(rng.uniform(0.03, 0.2)))
         if rng.random() < 0.5:
             ramp(session, float(rng.uniform(_MIN_TARGET_N, peak_n)), config.control.timeout_s)
-        release(session, config)
+        session.release()

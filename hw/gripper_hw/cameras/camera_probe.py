@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from gripper_force.config import Config
-from gripper_force.jobs.doctor import Check, gather, judged, only, rate_hz, time_of
+from gripper_force.jobs.checks import Check, clock_name, gather, judged, keep_only, rate_hz
 from gripper_force.runtime.backends import open_devices
 from gripper_force.types import NS_PER_MS, Frame
 
@@ -34,7 +34,7 @@ def probe(config: Config, sysfs: Path = _SYSFS) -> Iterator[Check]:
     if config.camera.backend == "none":
         yield Check("camera", "backend", "none", None)
         return
-    with open_devices(only(config, "camera")) as devices:
+    with open_devices(keep_only(config, "camera")) as devices:
         camera = devices.camera
         assert camera is not None
         camera.start()
@@ -60,9 +60,8 @@ def _frame_checks(config: Config, frames: list[Frame]) -> Iterator[Check]:
     if config.camera.backend == "playback":
         yield Check("camera", "rate", f"{rate:.1f} Hz of playback", True)
     else:
-        found = (
-            f"{rate:.1f} Hz of {config.camera.backend}, in {time_of(config)}; {configured_hz:g} Hz configured"
-        )
+        measured = f"{rate:.1f} Hz of {config.camera.backend}, in {clock_name(config)}"
+        found = f"{measured}; {configured_hz:g} Hz configured"
         fast_enough = rate >= _MIN_RATE_SHARE * configured_hz
         advice = "set camera.rate_hz to the measured rate, shorten camera.exposure_us, or add light"
         yield judged("camera", "rate", found, fast_enough, advice)

@@ -3,13 +3,13 @@
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
-from typing import Final, TypedDict
+from typing import Final
 
 from serial.tools import list_ports
 
 from gripper_force.config import Config, ServoConfig
 from gripper_force.errors import DeviceError, DeviceTimeoutError, GripperError
-from gripper_force.jobs.doctor import Agree, Check, RegisterChange, judged, only, time_ms
+from gripper_force.jobs.checks import Check, Confirm, RegisterChange, SetupResult, judged, keep_only, time_ms
 from gripper_force.runtime.backends import open_devices
 from gripper_hw.dynamixel.control_table import (
     REGISTERS,
@@ -77,28 +77,14 @@ def probe(config: Config, sysfs: Path = _SYSFS) -> Iterator[Check]:
     yield Check(f"servo {servo.id}", "model", found_text, False, advice)
 
 
-class SetupResult(TypedDict):
-    """Result of `setup`.
-
-    Attributes:
-        servo: Id of the servo.
-        changes: Registers that differ from what a run needs.
-        applied: True if they were written.
-    """
-
-    servo: int
-    changes: list[RegisterChange]
-    applied: bool
-
-
-def setup(config: Config, agree: Agree) -> SetupResult:
-    """Writes the registers that a run would write, if ``agree`` returns True. Saves a run the EEPROM writes.
+def setup(config: Config, confirm: Confirm) -> SetupResult:
+    """Writes the registers that a run would write, if ``confirm`` returns True. A run then writes no EEPROM.
 
     Raises:
         GripperError: See `gripper_force.jobs.doctor.setup`.
     """
     with _opened(config) as inspection:
-        return inspection.set_up(config.servo.id, agree)
+        return inspection.set_up(config.servo.id, confirm)
 
 
 class _Inspection:
@@ -145,7 +131,7 @@ class _Inspection:
         advice = f"longer than a cycle at control.rate_hz={rate_hz:g}: close other programs, or lower it"
         yield judged(unit, "bus cycle", found, p99_ms <= 1e3 / rate_hz, advice, harmless=lockstep)
 
-    def set_up(self, id_: int, agree: Agree) -> SetupResult:
+    def set_up(self, id_: int, confirm: Confirm) -> SetupResult:
         """Implements `setup`."""
         number = self.transport.ping(id_)
         check_model_number(self.model, number, f"the servo with id {id_} on {self._config.port}")
@@ -159,12 +145,12 @@ class _Inspection:
         changes = [
             RegisterChange(name, text(name, values[name]), text(name, new)) for name, new in differing.items()
         ]
-        applied = bool(changes) and agree(f"servo {id_}", changes)
+        applied = bool(changes) and confirm(f"servo {id_}", changes)
         if applied:
             self.transport.enable_replies(id_)
             for name, new in differing.items():
                 self.transport.set(id_, name, new)
-        return {"servo": id_, "changes": changes, "applied": applied}
+        return SetupResult(id_, changes, applied)
 
     def _values(self, id_: int) -> dict[str, int]:
         return {name: self.transport.get(id_, name) for name in self._expected}
@@ -186,7 +172,7 @@ class _Inspection:
 def _opened(config: Config) -> Iterator[_Inspection]:
     with ExitStack() as stack:
         if config.servo.port.startswith(VIRTUAL_PREFIX):
-            stack.enter_context(open_devices(only(config, "servo")))
+            stack.enter_context(open_devices(keep_only(config, "servo")))
         inspection = _Inspection(config.servo)
         stack.callback(inspection.transport.close)
         _open(inspection.transport, config.servo)

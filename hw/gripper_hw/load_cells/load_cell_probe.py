@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from gripper_force.config import Config
-from gripper_force.jobs.doctor import Check, gather, judged, only, rate_hz, time_of
+from gripper_force.jobs.checks import Check, clock_name, gather, judged, keep_only, rate_hz
 from gripper_force.runtime.backends import open_devices
 
 _MIN_VALID_SHARE = 0.9
@@ -21,7 +21,7 @@ def probe(config: Config) -> Iterator[Check]:
     if config.load_cell.backend == "none":
         yield Check("load cell", "backend", "none", None)
         return
-    with open_devices(only(config, "load_cell")) as devices:
+    with open_devices(keep_only(config, "load_cell")) as devices:
         cell = devices.load_cell
         assert cell is not None
         cell.start()
@@ -34,7 +34,7 @@ def probe(config: Config) -> Iterator[Check]:
         return
     rate = rate_hz([sample.t_ns for sample in samples])
     yield Check(
-        "load cell", "rate", f"{rate:.1f} Hz of {config.load_cell.backend}, in {time_of(config)}", True
+        "load cell", "rate", f"{rate:.1f} Hz of {config.load_cell.backend}, in {clock_name(config)}", True
     )
     forces_n = [sample.force_n for sample in samples if sample.valid]
     if forces_n:

@@ -22,6 +22,8 @@ class _PlaybackDevice:
         LogError: The log cannot be read.
     """
 
+    supports_lockstep = True
+
     def __init__(self, config: CameraConfig | LoadCellConfig, clock: Clock, unit: str) -> None:
         if config.path is None:
             raise ConfigError(f"{unit}.backend=playback needs {unit}.path; set it to the log to play")

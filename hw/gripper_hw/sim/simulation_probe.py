@@ -3,8 +3,7 @@
 from collections.abc import Iterator
 
 from gripper_force.config import Config
-from gripper_force.jobs.doctor import Check, time_ms
-from gripper_force.runtime.backends import CAMERAS, RIG
+from gripper_force.jobs.checks import Check, time_ms
 
 _SIDE_PX = 16
 
@@ -16,7 +15,7 @@ def probe(config: Config) -> Iterator[Check]:
         ConfigError: The object does not exist.
         SimulationError: EGL is missing.
     """
-    if CAMERAS.get(config.camera.backend) != RIG:
+    if config.camera.backend != "simulated":
         yield Check("simulation", "EGL", "not needed: the camera is not simulated", None)
         return
     from gripper_hw.dynamixel.control_table import load_model
