@@ -17,7 +17,10 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from gripper_calibration.procedures.calibrate_object import calibrate_object as calibrate_object
+    from gripper_force.config import CameraConfig as CameraConfig
     from gripper_force.config import Config as Config
+    from gripper_force.config import LoadCellConfig as LoadCellConfig
+    from gripper_force.config import ServoConfig as ServoConfig
     from gripper_force.config import load_config as load_config
     from gripper_force.errors import CheckpointError as CheckpointError
     from gripper_force.errors import ConfigError as ConfigError
@@ -68,7 +71,7 @@ __version__ = "0.2.0.dev0"
 
 _MODULES = {
     "gripper_calibration.procedures.calibrate_object": ("calibrate_object",),
-    "gripper_force.config": ("Config", "load_config"),
+    "gripper_force.config": ("CameraConfig", "Config", "LoadCellConfig", "ServoConfig", "load_config"),
     "gripper_force.errors": (
         "CheckpointError",
         "ConfigError",
