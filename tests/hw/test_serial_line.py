@@ -28,7 +28,7 @@ def test_open_errors_have_remedies(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     with pytest.raises(DeviceNotFoundError, match=r"set servo\.port to one of /dev/serial/by-id"):
         open_line(str(missing), 57_600, unit="servo", timeout_s=0)
     file.touch()
-    assert refused(str(file)).startswith(f"can't open the load cell's port {file}: ")
+    assert refused(str(file)).startswith(f"can't open the load cell's port {file} (")
 
     for number, advice in ((errno.EACCES, "join the group dialout"), (errno.EBUSY, "is in use by another")):
 
