@@ -55,7 +55,7 @@ class ServoContract:
 
     @pytest.fixture
     def spec(self, config: ServoConfig) -> ServoSpec:
-        """What the static method ``spec`` of the servo's class returns."""
+        """Result of the static method ``spec`` of the servo's class."""
         raise NotImplementedError("override the fixture spec")
 
     @pytest.fixture

@@ -38,4 +38,4 @@ def _open_error(name: str, unit: str, error: Exception) -> DeviceError:
         return DeviceError(f"no permission to open {port}; join the group dialout and log in again")
     if isinstance(error, OSError) and error.errno in (EAGAIN, EBUSY):
         return DeviceError(f"{port} is in use by another program; close that first")
-    return DeviceError(f"can't open {port}: {error}")
+    return DeviceError(f"can't open {port} ({error}); set {unit}.port to a serial port")

@@ -59,7 +59,7 @@ def started(endpoint):
 # Start.
 
 
-def test_start_sets_the_servo_up(endpoint):
+def test_start_configures_the_servo(endpoint):
     servo: Servo = drive(endpoint, current_limit_a=1.0, bus_watchdog_ms=41)
     firmware = endpoint.bus.servos[0]
     firmware.control(0, 1.0, 0.0)
@@ -95,7 +95,7 @@ def test_start_writes_the_present_position_as_goal_before_torque_comes_on(endpoi
     assert torque_off < mode < goal < watchdog < torque_on == len(writes) - 1
 
 
-def test_start_reads_back_all_it_writes(memory_endpoint):
+def test_start_reads_back_every_write(memory_endpoint):
     drive(memory_endpoint).start()
     packets = memory_endpoint.packets()
     for write, read in itertools.pairwise(packets):
@@ -104,7 +104,7 @@ def test_start_reads_back_all_it_writes(memory_endpoint):
             assert 0 <= int.from_bytes(read.params[2:], "little") - (len(write.params) - 2) < 8
 
 
-def test_a_second_start_leaves_the_eeprom_alone(started):
+def test_second_start_does_not_write_the_eeprom(started):
     endpoint, servo = started
     servo.stop(hold=False)
     servo.close()
@@ -114,7 +114,7 @@ def test_a_second_start_leaves_the_eeprom_alone(started):
     assert all(int.from_bytes(packet.params[:2], "little") >= 64 for packet in writes)
 
 
-def test_a_tripped_watchdog_is_cleared_only_once_torque_is_off(memory_endpoint):
+def test_start_clears_a_tripped_watchdog_after_torque_off(memory_endpoint):
     firmware = memory_endpoint.bus.servos[0]
     firmware.set("torque_enable", 1)
     firmware.set("bus_watchdog", -1)
@@ -124,7 +124,7 @@ def test_a_tripped_watchdog_is_cleared_only_once_torque_is_off(memory_endpoint):
 
 
 @pytest.mark.parametrize("level", [0, 1])
-def test_a_servo_that_was_left_mute_is_started(endpoint, level):
+def test_start_enables_replies(endpoint, level):
     endpoint.bus.servos[0].set("status_return_level", level)
     servo = drive(endpoint)
     servo.start()
@@ -133,37 +133,37 @@ def test_a_servo_that_was_left_mute_is_started(endpoint, level):
     servo.close()
 
 
-def test_nobody_at_that_id(endpoint):
+def test_missing_id_is_reported_and_releases_the_port(endpoint):
     with pytest.raises(DeviceNotFoundError, match=r"id 9 .*does not answer"):
         drive(endpoint, id=9, reply_margin_ms=2.0).start()
     drive(endpoint).start()  # the port was released
 
 
-def test_another_model_is_left_alone(make_memory_endpoint):
+def test_another_model_is_refused_and_not_written(make_memory_endpoint):
     endpoint = make_memory_endpoint(VirtualServo(1, load_model("XM430-W210")))
     with pytest.raises(ConfigError, match="XM430-W210"):
         drive(endpoint).start()
     assert all(packet.instruction != Instruction.WRITE for packet in endpoint.packets())
 
 
-def test_a_servo_without_current_control_is_refused_when_found(memory_endpoint):
+def test_connected_servo_without_current_control_is_refused(memory_endpoint):
     memory_endpoint.bus.servos[0].set("model_number", 1060)
     with pytest.raises(ConfigError, match=r"XL430-W250.*Present Load"):
         drive(memory_endpoint).start()
 
 
 @pytest.mark.parametrize("model", ["XL430-W250", "AX-12"])
-def test_a_model_that_will_not_do_is_refused_before_any_port_is_opened(model):
+def test_unsuitable_model_is_refused_before_the_port_is_opened(model):
     with pytest.raises(ConfigError, match=model):
         DynamixelServo(ServoConfig(port="virtual:nobody", model=model))
 
 
-def test_more_current_than_the_model_allows_is_refused():
+def test_current_limit_above_the_models_is_refused():
     with pytest.raises(ConfigError, match=r"current_limit_a is 1.2.*0.91"):
         DynamixelServo(ServoConfig(port="virtual:nobody", model="XC330-T288"))
 
 
-def test_spec_is_the_models_data_and_needs_no_port():
+def test_spec_contains_the_models_data_and_needs_no_port():
     config = ServoConfig(port="virtual:nobody", model="XC330-T288")
     assert DynamixelServo.spec(config) == ServoSpec(
         nm_per_a=pytest.approx(0.92 / 0.80), current_step_a=0.001, voltage_range_v=(6.5, 12.0)
@@ -172,7 +172,7 @@ def test_spec_is_the_models_data_and_needs_no_port():
         DynamixelServo.spec(ServoConfig(model="AX-12"))
 
 
-def test_old_firmware_is_refused_and_loses_its_torque(make_memory_endpoint):
+def test_old_firmware_is_refused_with_torque_off(make_memory_endpoint):
     endpoint = make_memory_endpoint(VirtualServo(1, MODEL, firmware=44))
     endpoint.bus.servos[0].set("torque_enable", 1)
     with pytest.raises(DeviceError, match=r"firmware 44.*update it to 45"):
@@ -180,7 +180,7 @@ def test_old_firmware_is_refused_and_loses_its_torque(make_memory_endpoint):
     assert endpoint.bus.servos[0].get("torque_enable") == 0
 
 
-def test_a_start_where_one_servo_is_missing_turns_the_others_torque_off(make_memory_endpoint):
+def test_missing_servo_fails_start_and_turns_the_others_off(make_memory_endpoint):
     endpoint = make_memory_endpoint(VirtualServo(1, MODEL))
     endpoint.bus.servos[0].set("torque_enable", 1)
     with pytest.raises(DeviceNotFoundError, match="id 2"):
@@ -188,7 +188,7 @@ def test_a_start_where_one_servo_is_missing_turns_the_others_torque_off(make_mem
     assert endpoint.bus.servos[0].get("torque_enable") == 0
 
 
-def test_gains_and_bounds_that_another_program_left_are_set_right(endpoint):
+def test_start_overwrites_gains_of_another_program(endpoint):
     firmware = endpoint.bus.servos[0]
     odd = ("position_p_gain", "position_i_gain", "position_d_gain", "feedforward_1st_gain", "goal_pwm")
     usual = {name: firmware.get(name) for name in odd}
@@ -198,7 +198,7 @@ def test_gains_and_bounds_that_another_program_left_are_set_right(endpoint):
     assert {name: firmware.get(name) for name in odd} == usual
 
 
-def test_a_hardware_error_refuses_start_and_leaves_torque_off(memory_endpoint):
+def test_hardware_error_prevents_start_with_torque_off(memory_endpoint):
     firmware = memory_endpoint.bus.servos[0]
     firmware.set("shutdown", 0)
     firmware.set("torque_enable", 1)
@@ -208,7 +208,7 @@ def test_a_hardware_error_refuses_start_and_leaves_torque_off(memory_endpoint):
     assert firmware.get("torque_enable") == 0
 
 
-def test_a_start_that_fails_late_turns_torque_off(memory_endpoint):
+def test_late_failure_of_start_turns_torque_off(memory_endpoint):
     firmware = memory_endpoint.bus.servos[0]
 
     def lose_the_last_read(answer):
@@ -220,7 +220,7 @@ def test_a_start_that_fails_late_turns_torque_off(memory_endpoint):
     assert firmware.get("torque_enable") == 0
 
 
-def test_a_register_that_does_not_keep_its_value_is_told(memory_endpoint):
+def test_register_that_does_not_keep_its_value_is_reported(memory_endpoint):
     firmware = memory_endpoint.bus.servos[0]
     real = firmware.write
 
@@ -238,7 +238,7 @@ def test_a_register_that_does_not_keep_its_value_is_told(memory_endpoint):
     ("model", "firmware", "data"),
     [("XM430-W350", 52, 224), ("XL330-M288", 51, 224), ("XL330-M288", 52, 208), ("XC330-T288", 52, 208)],
 )
-def test_the_cycle_uses_the_models_indirect_data(make_memory_endpoint, model, firmware, data):
+def test_cycle_uses_the_models_indirect_data(make_memory_endpoint, model, firmware, data):
     endpoint = make_memory_endpoint(VirtualServo(1, load_model(model), firmware))
     servo = drive(endpoint, model=model, current_limit_a=0.9)
     assert servo.firmware is None
@@ -257,7 +257,7 @@ def test_the_cycle_uses_the_models_indirect_data(make_memory_endpoint, model, fi
 # The cycle.
 
 
-def test_read_gives_signed_si_units(started):
+def test_read_returns_signed_si_units(started):
     endpoint, servo = started
     firmware = endpoint.bus.servos[0]
     firmware.set_conditions(temperature_c=41.0, voltage_v=11.3)
@@ -271,7 +271,7 @@ def test_read_gives_signed_si_units(started):
     assert (state.temperature_c, state.voltage_v, state.hardware_error) == (41.0, pytest.approx(11.3), 0)
 
 
-def test_data_that_looks_like_a_header_is_read_right(started):
+def test_data_that_contains_a_header_pattern_is_read_correctly(started):
     """The SDK's removeStuffing misreads such data; fast sync read is not stuffed."""
     endpoint, servo = started
     current, velocity, ticks = struct.unpack("<hhi", bytes.fromhex("fffffd00aafffdfd"))
@@ -288,7 +288,7 @@ def test_write_sets_both_goals_in_one_packet(started):
     endpoint, servo = started
     endpoint.received.clear()
     servo.write(command(0.5, 0.269))
-    servo.read()  # so that the write has been carried out
+    servo.read()  # so that the write was executed
     assert [packet.instruction for packet in endpoint.packets()] == [
         Instruction.SYNC_WRITE,
         Instruction.FAST_SYNC_READ,
@@ -299,7 +299,7 @@ def test_write_sets_both_goals_in_one_packet(started):
 
 @settings(deadline=None, max_examples=50)
 @given(st.floats(allow_nan=False, allow_infinity=False), st.floats(allow_nan=False, allow_infinity=False))
-def test_goals_stay_within_current_limit_and_travel(position_rad, current_a):
+def test_goals_are_clamped_to_current_limit_and_travel(position_rad, current_a):
     bus = VirtualBus([VirtualServo(1, MODEL)], lambda: 0)
     register_bus("goals", bus)
     servo = DynamixelServo(ServoConfig(port="virtual:goals", current_limit_a=0.5), lambda: 0)
@@ -316,7 +316,7 @@ def test_goals_stay_within_current_limit_and_travel(position_rad, current_a):
     unregister_bus("goals")
 
 
-def test_two_servos_are_read_and_written_together(make_endpoint):
+def test_two_servos_share_one_read_and_one_write(make_endpoint):
     endpoint = make_endpoint(VirtualServo(1, MODEL), VirtualServo(2, MODEL))
     bus = DynamixelBus(endpoint.config(), (2, 1), lambda: endpoint.now_ns)
     bus.start()
@@ -336,20 +336,20 @@ def test_two_servos_are_read_and_written_together(make_endpoint):
     bus.close()
 
 
-def test_servos_whose_firmware_differs_in_indirect_data_are_refused(make_memory_endpoint):
+def test_firmware_versions_with_different_indirect_data_are_refused(make_memory_endpoint):
     model = load_model("XL330-M288")
     endpoint = make_memory_endpoint(VirtualServo(1, model, 51), VirtualServo(2, model, 52))
     with pytest.raises(DeviceError, match=r"\(51, 52\).*same version"):
         DynamixelBus(endpoint.config(model="XL330-M288"), (1, 2)).start()
 
 
-def test_a_hardware_error_travels_in_the_state(started):
+def test_hardware_error_is_in_the_state(started):
     endpoint, servo = started
     endpoint.bus.servos[0].raise_hardware_error(OVERLOAD_ERROR)
     assert servo.read().hardware_error == OVERLOAD_ERROR
 
 
-def test_a_tripped_watchdog_is_told_and_not_cleared(started):
+def test_tripped_watchdog_raises_and_is_not_cleared(started):
     endpoint, servo = started
     endpoint.now_ns += 41 * MS
     for _ in range(2):
@@ -358,7 +358,7 @@ def test_a_tripped_watchdog_is_told_and_not_cleared(started):
     assert endpoint.bus.servos[0].get("bus_watchdog") == -1
 
 
-def test_reading_in_time_keeps_the_watchdog_quiet(started):
+def test_reading_in_time_feeds_the_watchdog(started):
     endpoint, servo = started
     for _ in range(10):
         endpoint.now_ns += 40 * MS
@@ -366,7 +366,7 @@ def test_reading_in_time_keeps_the_watchdog_quiet(started):
     assert servo.stats.cycles == 12  # two of them in start
 
 
-def test_a_servo_that_restarted_is_told(started):
+def test_restarted_servo_raises(started):
     endpoint, servo = started
     endpoint.bus.servos[0].reboot(endpoint.now_ns)
     endpoint.now_ns += REBOOT_NS
@@ -377,7 +377,7 @@ def test_a_servo_that_restarted_is_told(started):
 # Stop.
 
 
-def test_stop_turns_torque_off_on_the_wire(started):
+def test_stop_sends_torque_off_and_reads_it_back(started):
     endpoint, servo = started
     endpoint.received.clear()
     servo.stop(hold=False)
@@ -399,7 +399,7 @@ def test_stop_with_hold_keeps_the_goals_and_disarms_the_watchdog(started):
     assert write_packet("torque_enable", 0) not in endpoint.packets()
 
 
-def test_hold_after_a_trip_does_not_set_the_motor_going_again(started):
+def test_hold_after_a_watchdog_trip_does_not_restart_the_motor(started):
     endpoint, servo = started
     servo.write(command(0.5, 0.3))
     servo.read()
@@ -414,7 +414,7 @@ def test_hold_after_a_trip_does_not_set_the_motor_going_again(started):
     assert torque < watchdog
 
 
-def test_a_servo_that_restarted_can_not_hold(memory_endpoint):
+def test_restarted_servo_can_not_hold(memory_endpoint):
     servo = drive(memory_endpoint)
     servo.start()
     memory_endpoint.bus.servos[0].set("torque_enable", 0)
@@ -422,7 +422,7 @@ def test_a_servo_that_restarted_can_not_hold(memory_endpoint):
         servo.stop(hold=True)
 
 
-def test_a_servo_that_can_not_be_told_to_hold_loses_its_torque(memory_endpoint):
+def test_failed_hold_turns_torque_off(memory_endpoint):
     servo = drive(memory_endpoint)
     servo.start()
     deaf = REGISTERS["bus_watchdog"].address.to_bytes(2, "little")
@@ -437,7 +437,7 @@ def test_a_servo_that_can_not_be_told_to_hold_loses_its_torque(memory_endpoint):
     assert memory_endpoint.bus.servos[0].get("torque_enable") == 0
 
 
-def test_stop_goes_on_through_lost_answers(memory_endpoint):
+def test_stop_retries_after_lost_replies(memory_endpoint):
     servo = drive(memory_endpoint, retries=0)
     servo.start()
     lost = iter(range(4))
@@ -447,7 +447,7 @@ def test_stop_goes_on_through_lost_answers(memory_endpoint):
     assert memory_endpoint.bus.servos[0].get("torque_enable") == 0
 
 
-def test_stop_sends_torque_off_even_if_no_answer_ever_comes(memory_endpoint):
+def test_stop_turns_torque_off_without_any_reply(memory_endpoint):
     servo = drive(memory_endpoint)
     servo.start()
     memory_endpoint.bus.tamper = lambda answer: None
@@ -468,10 +468,10 @@ def test_stop_tries_every_servo(make_memory_endpoint):
     assert [servo.get("torque_enable") for servo in endpoint.bus.servos] == [1, 0]
 
 
-# Faults on the wire: see test_transport.py and test_bus_faults.py as well.
+# Faults on the bus: see test_transport.py and test_bus_faults.py as well.
 
 
-def test_a_pulled_plug_is_told_at_once(started):
+def test_unplugged_bus_raises_at_once(started):
     endpoint, servo = started
     endpoint.unplug()
     for call in (servo.read, lambda: servo.write(command()), lambda: servo.stop(hold=False), servo.read):
@@ -482,7 +482,7 @@ def test_a_pulled_plug_is_told_at_once(started):
     servo.close()
 
 
-def test_registers_of_the_cycle_exist_in_every_model():
+def test_cycle_fits_the_indirect_data_of_every_model():
     for name in control_table.model_names():
         model = load_model(name)
         assert model.indirect_windows(model.min_firmware)[0].length >= 20

@@ -21,7 +21,7 @@ MODEL = load_model("XM430-W350")
 
 
 def config_of(endpoint, **servo) -> Config:
-    # A cycle of a second, as nothing is said here about how fast a busy machine is.
+    # A cycle of one second, so that a busy machine passes.
     return Config.model_validate(
         {"clock": "realtime", "servo": endpoint.config(**servo), "control": {"rate_hz": 1.0}}
     )
@@ -32,7 +32,7 @@ def rows(endpoint, **servo):
 
 
 def written(endpoint) -> dict[str, int]:
-    """Every register that was written, one by one."""
+    """Every register that was written."""
     names = {register.address: name for name, register in REGISTERS.items()}
     values = {}
     for packet in endpoint.packets():
@@ -42,7 +42,7 @@ def written(endpoint) -> dict[str, int]:
     return values
 
 
-def test_a_servo_as_it_comes_is_fit_and_is_only_read(endpoint):
+def test_factory_settings_pass_and_nothing_is_written(endpoint):
     found = rows(endpoint)
     assert not [check for check in found.values() if check.ok is False]
     texts = {name: check.found for (unit, name), check in found.items() if unit == "servo 1"}
@@ -60,7 +60,7 @@ def test_a_servo_as_it_comes_is_fit_and_is_only_read(endpoint):
     assert {packet.instruction for packet in endpoint.packets()} == READS
 
 
-def test_a_servo_that_runs_is_left_running(endpoint):
+def test_running_servo_is_not_changed(endpoint):
     servo = DynamixelServo(endpoint.config(), lambda: endpoint.now_ns)
     servo.start()
     servo.close()
@@ -71,7 +71,7 @@ def test_a_servo_that_runs_is_left_running(endpoint):
     assert {packet.instruction for packet in endpoint.packets()} == READS
 
 
-def test_a_fault_of_the_servo_is_a_problem(endpoint):
+def test_hardware_error_is_a_problem(endpoint):
     endpoint.bus.servos[0].raise_hardware_error(OVERLOAD_ERROR)
     check = rows(endpoint)["servo 1", "hardware error"]
     assert (check.found, check.ok) == ("overload", False)
@@ -85,14 +85,14 @@ def test_old_firmware_is_a_problem_and_its_cycle_is_not_measured(make_endpoint):
     assert ("servo 1", "bus cycle") not in found
 
 
-def test_a_mute_servo_is_told_from_a_missing_one(endpoint):
+def test_servo_without_replies_is_distinguished_from_a_missing_one(endpoint):
     endpoint.bus.servos[0].set("status_return_level", 0)
     check = rows(endpoint, retries=0)["servo 1", "registers"]
     assert check.ok is False
     assert "Status Return Level" in check.advice
 
 
-def test_answers_too_late_for_a_run_are_measured_all_the_same(endpoint):
+def test_replies_too_late_for_a_run_are_still_measured(endpoint):
     def late(answer):
         time.sleep(0.01)
         return answer
@@ -108,14 +108,14 @@ def test_other_servos_are_listed(make_endpoint):
     assert (check.found, check.ok) == ("XL330-M288, firmware 52", None)
 
 
-def test_a_missing_servo_is_a_problem_that_names_who_is_there(make_endpoint):
+def test_missing_servo_check_lists_the_ids_that_answer(make_endpoint):
     endpoint = make_endpoint(VirtualServo(7, MODEL))
     check = rows(endpoint, reply_margin_ms=20.0)["servo 1", "model"]
     assert (check.found, check.ok) == ("no answer at 1000000 baud (ids that answer: 7)", False)
     assert check.advice == "check power, cable and servo.id"
 
 
-def test_a_servo_at_another_baud_rate_is_found(endpoint):
+def test_servo_at_another_baud_rate_is_found(endpoint):
     fd = os.open(endpoint.port, os.O_RDWR | os.O_NOCTTY)
     endpoint.bus.tamper = lambda answer: answer if termios.tcgetattr(fd)[4] == termios.B57600 else None
     check = rows(endpoint)["servo 1", "model"]
@@ -125,7 +125,7 @@ def test_a_servo_at_another_baud_rate_is_found(endpoint):
 
 
 @pytest.mark.parametrize(("latency_ms", "ok"), [(16, False), (1, True)])
-def test_a_slow_adapter_is_a_problem(endpoint, tmp_path, latency_ms, ok):
+def test_adapter_latency_is_checked(endpoint, tmp_path, latency_ms, ok):
     adapter = tmp_path / Path(endpoint.port).name
     adapter.mkdir()
     (adapter / "latency_timer").write_text(f"{latency_ms}\n")
@@ -135,14 +135,14 @@ def test_a_slow_adapter_is_a_problem(endpoint, tmp_path, latency_ms, ok):
     assert ("hw/udev" in check.advice) is not ok
 
 
-def test_what_hides_the_servo_is_raised(endpoint):
+def test_wrong_model_and_missing_port_raise(endpoint):
     with pytest.raises(ConfigError, match=r"XM430-W350 .*, not the configured XL330-M288"):
         rows(endpoint, model="XL330-M288")
     with pytest.raises(DeviceNotFoundError, match="there is no port /dev/nowhere"):
         rows(endpoint, port="/dev/nowhere")
 
 
-def test_a_real_servo_needs_real_time(endpoint):
+def test_lockstep_clock_with_a_real_servo_is_a_problem(endpoint):
     config = config_of(endpoint).model_copy(update={"clock": "lockstep"})
     check = next(check for check in probe(config) if check.name == "clock")
     assert (check.ok, check.advice) == (
@@ -154,7 +154,7 @@ def test_a_real_servo_needs_real_time(endpoint):
 # Setup.
 
 
-def test_setup_asks_and_writes_nothing_if_told_not_to(endpoint):
+def test_setup_writes_nothing_if_declined(endpoint):
     asked = []
     result = setup(config_of(endpoint), lambda *question: bool(asked.append(question)))
     ((servo, changes),) = asked
@@ -168,7 +168,7 @@ def test_setup_asks_and_writes_nothing_if_told_not_to(endpoint):
     assert {packet.instruction for packet in endpoint.packets()} <= READS
 
 
-def test_setup_writes_what_it_showed_and_a_start_need_not(endpoint):
+def test_setup_writes_the_listed_changes_so_that_start_does_not(endpoint):
     assert setup(config_of(endpoint), lambda *_: True)["applied"]
     assert written(endpoint) == {
         "return_delay_time": 0,
@@ -186,7 +186,7 @@ def test_setup_writes_what_it_showed_and_a_start_need_not(endpoint):
     assert setup(config_of(endpoint), pytest.fail) == {"servo": 1, "changes": [], "applied": False}
 
 
-def test_setup_undoes_what_another_program_left(endpoint):
+def test_setup_overwrites_registers_of_another_program(endpoint):
     firmware = endpoint.bus.servos[0]
     odd = {"drive_mode": 4, "status_return_level": 1, "profile_velocity": 50, "profile_acceleration": 5}
     for name, value in odd.items():

@@ -14,7 +14,7 @@ MODEL = load_model("XM430-W350")
 START = REGISTERS["present_current"].address
 SIZE = 13
 TICKS = slice(6, 10)
-"""Where Present Position lies in what is read from there."""
+"""Present Position within the bytes read from there."""
 
 
 @pytest.fixture
@@ -36,9 +36,9 @@ DAMAGES = {
     "silence": lambda answer: None,
     "truncated": lambda answer: answer[:-3],
     "corrupt": lambda answer: answer[:-1] + bytes((answer[-1] ^ 0x5A,)),
-    "short, yet sound": lambda answer: frame(BROADCAST_ID, 0x55, b"\x00"),
+    "short, with valid CRC": lambda answer: frame(BROADCAST_ID, 0x55, b"\x00"),
     "of another size": lambda answer: frame(BROADCAST_ID, 0x55, b"\x00\x01" + bytes(4)),
-    "of nobody": lambda answer: frame(BROADCAST_ID, 0x55, b"\x00\x07" + bytes(15)),
+    "of a missing id": lambda answer: frame(BROADCAST_ID, 0x55, b"\x00\x07" + bytes(15)),
     "of another servo": lambda answer: status(7, 0, bytes(15)),
     "noise": lambda answer: b"\xff\xff\xfd\x00\x01\x00\x00" + bytes(20),
 }
@@ -46,7 +46,7 @@ DAMAGES = {
 
 @pytest.mark.parametrize("damage", DAMAGES)
 @pytest.mark.parametrize("count", [1, 2])
-def test_a_damaged_answer_is_retried_and_counted(opened, damage, count):
+def test_damaged_reply_is_retried_and_counted(opened, damage, count):
     endpoint, transport = opened
     endpoint.bus.tamper = first(count, DAMAGES[damage])
     _, (block,) = transport.sync_read((1,), START, SIZE)
@@ -56,25 +56,25 @@ def test_a_damaged_answer_is_retried_and_counted(opened, damage, count):
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_damage_without_end_is_a_timeout(opened, damage):
+def test_persistent_damage_is_a_timeout(opened, damage):
     endpoint, transport = opened
     endpoint.bus.tamper = DAMAGES[damage]
     with pytest.raises(DeviceTimeoutError, match="after 3 tries"):
         transport.sync_read((1,), START, SIZE)
     assert len(endpoint.packets()) == 3
     endpoint.bus.tamper = None
-    transport.sync_read((1,), START, SIZE)  # it comes back by itself
+    transport.sync_read((1,), START, SIZE)  # works again without a restart
 
 
-def test_an_answer_that_is_too_short_is_no_value(opened):
-    """The SDK fills short data up with the packet's CRC."""
+def test_short_reply_is_rejected(opened):
+    """The SDK pads short data with the packet's CRC."""
     endpoint, transport = opened
     endpoint.bus.tamper = first(1, lambda answer: status(1, 0))
     assert transport.get(1, "present_position") == 2048
     assert transport.stats.retries == 1
 
 
-def test_noise_before_an_answer_is_skipped(opened):
+def test_noise_before_a_reply_is_skipped(opened):
     endpoint, transport = opened
     endpoint.bus.tamper = lambda answer: b"\x00\xff\xff\x12" + answer
     transport.sync_read((1,), START, SIZE)
@@ -82,7 +82,7 @@ def test_noise_before_an_answer_is_skipped(opened):
     assert transport.stats.retries == 0
 
 
-def test_an_instruction_damaged_on_its_way_is_retried(opened):
+def test_corrupt_instruction_is_retried(opened):
     endpoint, transport = opened
     for number, call in enumerate(
         (lambda: transport.ping(1), lambda: transport.set(1, "goal_current", 7)), 1
@@ -93,8 +93,8 @@ def test_an_instruction_damaged_on_its_way_is_retried(opened):
     assert endpoint.bus.servos[0].get("goal_current") == 7
 
 
-def test_a_late_answer_is_not_taken_for_the_next():
-    """It comes after the time for it is over and before a retry without a pause would have had its own."""
+def test_late_reply_is_not_used_for_the_next_request():
+    """The reply arrives after its timeout, when a retry without a pause would still be waiting."""
     firmware = VirtualServo(1, MODEL)
     bus = VirtualBus([firmware], lambda: 0)
     margin_s = 0.2
@@ -104,7 +104,7 @@ def test_a_late_answer_is_not_taken_for_the_next():
 
         def delay(answer):
             bus.tamper = None
-            firmware.control(0, 1.0, 0.0)  # the world moves on
+            firmware.control(0, 1.0, 0.0)  # the horn moves meanwhile
             time.sleep(1.5 * margin_s)
             return answer
 
@@ -115,14 +115,14 @@ def test_a_late_answer_is_not_taken_for_the_next():
         transport.close()
 
 
-def test_a_servo_that_refuses_says_what(opened):
+def test_refusal_names_the_error(opened):
     endpoint, transport = opened
     endpoint.bus.servos[0].set("bus_watchdog", -1)
     with pytest.raises(DeviceError, match="data range error"):
         transport.set(1, "goal_current", 1)
 
 
-def test_blocks_go_to_the_servo_that_they_are_for(make_endpoint):
+def test_sync_write_and_read_map_blocks_to_ids(make_endpoint):
     endpoint = make_endpoint(VirtualServo(1, MODEL), VirtualServo(2, MODEL))
     transport = Transport(endpoint.config(), lambda: endpoint.now_ns)
     transport.open()
@@ -135,7 +135,7 @@ def test_blocks_go_to_the_servo_that_they_are_for(make_endpoint):
     transport.close()
 
 
-def test_nothing_is_sent_without_a_port(endpoint):
+def test_closed_or_unplugged_port_raises(endpoint):
     transport = Transport(endpoint.config())
     with pytest.raises(DeviceError, match="not open, so a ping of servo 1 was not sent"):
         transport.ping(1)
