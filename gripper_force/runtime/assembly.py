@@ -31,8 +31,8 @@ def settled(config: Config) -> tuple[Config, str]:
         return config, ""
     from gripper_force.vision import selection
 
-    vision, why = selection.resolve_auto(config.vision, config.budget)
-    return config.model_copy(update={"vision": vision}), why
+    vision, choice = selection.resolve_auto(config.vision, config.budget)
+    return config.model_copy(update={"vision": vision}), "" if choice is None else str(choice)
 
 
 def checkpoint_of(config: Config) -> "Model | None":
