@@ -17,7 +17,7 @@ from gripper_force.config import CameraConfig
 from gripper_force.interfaces import Camera
 from gripper_force.runtime.backends import MonotonicClock
 from gripper_force.types import Frame, Gray
-from gripper_hw.cameras.oak import PICTURE, OakCamera
+from gripper_hw.cameras.oak import SENSOR_SIZE_PX, OakCamera
 from gripper_hw.cameras.uvc import UvcCamera
 
 PATIENCE_S = 30.0
@@ -136,7 +136,7 @@ def make_oak(plugged: threading.Event) -> Callable[..., OakCamera]:
     """An `OakCamera` whose pipeline runs on the host."""
 
     def make(gray: Gray | None = None, colour: bool = False, **config: Any) -> OakCamera:
-        width, height = PICTURE
+        width, height = SENSOR_SIZE_PX
         shown = np.zeros((height, width), np.uint8) if gray is None else gray
 
         def source(config: CameraConfig, stack: ExitStack) -> tuple[Any, Any]:

@@ -24,7 +24,7 @@ def test_a_simulated_camera_is_measured_in_its_own_time() -> None:
     found = rows(QUICK | {"camera": {"rate_hz": 50.0}})
     assert all(check.ok for check in found.values())
     assert found["frames"].found.startswith("128x128 pixels, 0 of ")
-    assert found["rate"].found == "50.0 Hz of simulated, in simulated time; 50 Hz asked"
+    assert found["rate"].found == "50.0 Hz of simulated, in simulated time; 50 Hz configured"
     assert found["latency"].found == "median 15.0 ms from exposure to use"
 
 
@@ -68,7 +68,7 @@ def test_an_oak_tells_its_usb_speed(
 def test_a_camera_that_sees_nothing_is_a_problem() -> None:
     frame = Frame(0, 1, 0, np.zeros((8, 8), np.uint8))
     (check,) = probe._frame_checks(Config(), [frame])
-    assert (check.found, check.ok) == ("1 came", False)
+    assert (check.found, check.ok) == ("1 received", False)
     assert check.advice
 
 

@@ -13,7 +13,7 @@ from gripper_force.config import CameraConfig
 from gripper_force.errors import ConfigError, DeviceError, DeviceLostError, DeviceNotFoundError
 from gripper_force.runtime.backends import MonotonicClock
 from gripper_hw.cameras import reader
-from gripper_hw.cameras.reader import BackgroundCamera, Read, Shot, square
+from gripper_hw.cameras.reader import BackgroundCamera, RawFrame, ReadFrame, crop_square
 
 GRAY = np.zeros((1, 1), np.uint8)
 
@@ -21,15 +21,15 @@ GRAY = np.zeros((1, 1), np.uint8)
 class Camera(BackgroundCamera):
     """Reads what it is given."""
 
-    read: Callable[[], Shot | None]
+    read: Callable[[], RawFrame | None]
 
     @contextmanager
-    def _opened(self) -> Iterator[Read]:
+    def _open(self) -> Iterator[ReadFrame]:
         yield self.read
 
 
 def test_a_camera_that_gives_no_frame_at_all_can_not_be_started(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reader, "_FIRST_FRAME_NS", 1_000_000)
+    monkeypatch.setattr(reader, "_FIRST_FRAME_TIMEOUT_NS", 1_000_000)
     camera = Camera(CameraConfig(backend="oak"), MonotonicClock())
     camera.read = lambda: None
     with pytest.raises(DeviceLostError, match="the oak camera gave no frame for 1 ms; "):
@@ -51,19 +51,19 @@ def test_a_defect_in_the_thread_is_raised_to_who_asks(monkeypatch: pytest.Monkey
 def test_whatever_goes_wrong_later_is_a_loss_and_the_camera_comes_back(
     monkeypatch: pytest.MonkeyPatch, error: type[Exception]
 ) -> None:
-    monkeypatch.setattr(reader, "_RETRY_S", 0.0)
+    monkeypatch.setattr(reader, "_REOPEN_PERIOD_S", 0.0)
     camera = Camera(CameraConfig(backend="oak"), MonotonicClock())
-    shots: Iterator[Shot | None] = iter(())
+    shots: Iterator[RawFrame | None] = iter(())
 
-    def read() -> Shot | None:
+    def read() -> RawFrame | None:
         nonlocal shots
         try:
             return next(shots)
         except StopIteration:
-            shots = iter([Shot(2, 0, GRAY)] * 10_000)
+            shots = iter([RawFrame(2, 0, GRAY)] * 10_000)
             raise error("something") from None
 
-    shots = iter([Shot(1, 0, GRAY)])
+    shots = iter([RawFrame(1, 0, GRAY)])
     camera.read = read
     camera.start()
     while (frame := camera.newest()) is None or frame.t_ns == 1:
@@ -74,21 +74,21 @@ def test_whatever_goes_wrong_later_is_a_loss_and_the_camera_comes_back(
 
 
 def test_a_camera_that_comes_back_with_another_picture_is_still_away(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reader, "_RETRY_S", 0.0)
+    monkeypatch.setattr(reader, "_REOPEN_PERIOD_S", 0.0)
     tries = iter([None, ConfigError("the region"), DeviceNotFoundError("no camera"), None])
 
     class Changed(BackgroundCamera):
         @contextmanager
-        def _opened(self) -> Iterator[Read]:
+        def _open(self) -> Iterator[ReadFrame]:
             if (error := next(tries)) is not None:
                 raise error
-            shots = iter([Shot(1, 0, GRAY)])
+            shots = iter([RawFrame(1, 0, GRAY)])
             yield lambda: next(shots, None) or lose()
 
-    def lose() -> Shot:
+    def lose() -> RawFrame:
         if next(lost):
             raise DeviceLostError("gone")
-        return Shot(2, 5, GRAY)
+        return RawFrame(2, 5, GRAY)
 
     lost = chain([True], repeat(False))
     camera = Changed(CameraConfig(backend="oak"), MonotonicClock())
@@ -104,12 +104,12 @@ def test_a_program_that_forgets_to_close_still_releases_the_device() -> None:
 from contextlib import contextmanager
 from gripper_force.runtime.backends import MonotonicClock
 from gripper_force.config import CameraConfig
-from gripper_hw.cameras.reader import BackgroundCamera, Shot
+from gripper_hw.cameras.reader import BackgroundCamera, RawFrame
 
 class Camera(BackgroundCamera):
     @contextmanager
-    def _opened(self):
-        yield lambda: Shot(0, 0, None)
+    def _open(self):
+        yield lambda: RawFrame(0, 0, None)
         print("released")
 
 Camera(CameraConfig(backend="oak"), MonotonicClock()).start()
@@ -130,9 +130,9 @@ def test_the_square_lies_in_the_middle_of_a_region_that_lies_in_the_picture(
     config = CameraConfig(region=region)
     if not inside:
         with pytest.raises(ConfigError, match=r"camera\.region"):
-            square(config, width, height)
+            crop_square(config, width, height)
         return
-    x, y, side = square(config, width, height)
+    x, y, side = crop_square(config, width, height)
     assert side == min(columns, rows)
     for start, low, size in ((x, left, columns), (y, top, rows)):
         assert low <= start
@@ -141,4 +141,4 @@ def test_the_square_lies_in_the_middle_of_a_region_that_lies_in_the_picture(
 
 
 def test_without_a_region_the_whole_picture_counts() -> None:
-    assert square(CameraConfig(), 1280, 800) == (240, 0, 800)
+    assert crop_square(CameraConfig(), 1280, 800) == (240, 0, 800)

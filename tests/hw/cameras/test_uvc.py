@@ -16,7 +16,7 @@ MakeUvc = Callable[..., UvcCamera]
 
 
 def test_a_device_must_be_named() -> None:
-    with pytest.raises(ConfigError, match=r"camera\.backend=uvc needs camera\.device: an index"):
+    with pytest.raises(ConfigError, match=r"camera\.backend=uvc needs camera\.device"):
         UvcCamera(CameraConfig(backend="uvc"), MonotonicClock())
 
 
@@ -90,11 +90,11 @@ def test_what_is_no_free_camera_is_one_sentence(
     make_uvc: MakeUvc, plugged: threading.Event, tmp_path: Path
 ) -> None:
     plugged.clear()
-    with pytest.raises(DeviceError, match="can't be opened as a camera; "):
+    with pytest.raises(DeviceError, match=r"cannot open .* as a camera"):
         make_uvc().start()
     text = tmp_path / "no_camera"
     text.write_text("nothing to see")
-    with pytest.raises(DeviceError, match="can't be opened as a camera; "):
+    with pytest.raises(DeviceError, match=r"cannot open .* as a camera"):
         UvcCamera(CameraConfig(backend="uvc", device=str(text)), MonotonicClock()).start()
 
 
@@ -112,7 +112,7 @@ def test_a_device_is_found_by_number_path_and_name(tmp_path: Path, video: Path) 
         DeviceNotFoundError, match=r"0 cameras have the name 'Nose'; .*'Webcam' at /dev/video0"
     ):
         find_device("Nose", tmp_path)
-    with pytest.raises(DeviceNotFoundError, match="there are: none"):
+    with pytest.raises(DeviceNotFoundError, match="0 cameras have the name 'Eye'"):
         find_device("Eye", tmp_path / "video0")
     with pytest.raises(DeviceNotFoundError, match="there is no camera /dev/video777; "):
         find_device(777)

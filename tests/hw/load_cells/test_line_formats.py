@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from gripper_hw.load_cells.line_formats import (
     HX711_MAX,
     HX711_MIN,
-    LONGEST_LINE,
+    MAX_LINE_BYTES,
     PARSERS,
     LineSplitter,
     Reading,
@@ -101,5 +101,5 @@ def test_lines_are_the_same_however_they_arrive(data: bytes, cuts: list[int]) ->
 
 def test_a_flood_without_a_line_feed_is_thrown_away() -> None:
     splitter = LineSplitter()
-    splitter.feed(b"torn\n" + bytes(LONGEST_LINE + 1))
+    splitter.feed(b"torn\n" + bytes(MAX_LINE_BYTES + 1))
     assert splitter.feed(b"end of it\n12\n") == [b"12"]

@@ -4,7 +4,7 @@ from typing import Any
 import pytest
 
 from gripper_force.config import Config
-from gripper_force.jobs import doctor
+from gripper_force.jobs import checks
 from gripper_force.jobs.checks import Check
 from gripper_hw.load_cells.load_cell_probe import probe
 
@@ -41,7 +41,7 @@ def test_a_cell_without_a_scale_is_a_problem(board) -> None:
 
 
 def test_a_silent_cell_is_a_problem(board, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "_FIRST_NS", 0)
+    monkeypatch.setattr(checks, "_FIRST_NS", 0)
     section = board.config().model_dump(mode="json")
     check = rows(REAL | {"load_cell": section})["rate"]
     assert check.ok is False

@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from gripper_force.spikes import HAMPEL_HALF_WINDOW, find_spikes
 from gripper_force.types import NS_PER_S, LoadCellSample
 from gripper_hw.load_cells.screening import (
-    DOUBT_SAMPLES,
-    DOUBT_SHARE,
-    PATIENCE_NS,
+    DOUBT_WINDOW_SAMPLES,
+    MAX_REJECTED_SHARE,
+    MAX_WAIT_NS,
     STUCK_NS,
     STUCK_SAMPLES,
-    Screen,
+    SampleValidator,
 )
 
 RATE_HZ = 80
@@ -25,7 +25,7 @@ Floats = npt.NDArray[np.float64]
 
 
 def screened(
-    screen: Screen, raws: npt.ArrayLike, every: int = 1, period_ns: int = PERIOD_NS
+    screen: SampleValidator, raws: npt.ArrayLike, every: int = 1, period_ns: int = PERIOD_NS
 ) -> list[LoadCellSample]:
     """Adds readings, takes samples after every few of them, and at last what is left."""
     t_ns, taken = START_NS, []
@@ -34,11 +34,11 @@ def screened(
         screen.add(t_ns, float(raw))
         if i % every == 0:
             taken += screen.take(t_ns)
-    return taken + screen.take(t_ns + PATIENCE_NS + 1)
+    return taken + screen.take(t_ns + MAX_WAIT_NS + 1)
 
 
-def calibrated(*, noisy: bool = True) -> Screen:
-    return Screen(0.0, 1.0, noisy=noisy)
+def calibrated(*, noisy: bool = True) -> SampleValidator:
+    return SampleValidator(0.0, 1.0, noisy=noisy)
 
 
 raw_readings = st.floats(-1e9, 1e9) | st.sampled_from([math.nan, math.inf, -math.inf])
@@ -50,12 +50,12 @@ batches = st.integers(1, 9)
 def test_every_reading_is_handed_out_once_in_order_and_unchanged(
     readings: list[tuple[float, bool]], every: int, tare_raw: float, n_per_raw: float
 ) -> None:
-    screen, taken = Screen(tare_raw, n_per_raw, noisy=True), []
+    screen, taken = SampleValidator(tare_raw, n_per_raw, noisy=True), []
     for i, (raw, saturated) in enumerate(readings):
         screen.add(i * PERIOD_NS, raw, saturated=saturated)
         if i % every == 0:
             taken += screen.take(i * PERIOD_NS)
-    taken += screen.take(len(readings) * PERIOD_NS + PATIENCE_NS + 1)
+    taken += screen.take(len(readings) * PERIOD_NS + MAX_WAIT_NS + 1)
     assert [s.t_ns for s in taken] == [i * PERIOD_NS for i in range(len(readings))]
     assert np.array_equal([s.raw for s in taken], [raw for raw, _ in readings], equal_nan=True)
     assert all(math.isfinite(s.force_n) for s in taken if s.valid)
@@ -68,7 +68,7 @@ def test_every_reading_is_handed_out_once_in_order_and_unchanged(
 def test_live_samples_are_judged_as_those_of_a_recording(forces_n: list[float], every: int) -> None:
     taken = screened(calibrated(noisy=False), forces_n, every)
     expected = ~find_spikes(np.array(forces_n)) if forces_n else np.array([])
-    assume((~expected.astype(bool)).sum() <= DOUBT_SHARE * DOUBT_SAMPLES)
+    assume((~expected.astype(bool)).sum() <= MAX_REJECTED_SHARE * DOUBT_WINDOW_SAMPLES)
     assert [s.valid for s in taken] == list(expected)
 
 
@@ -93,7 +93,7 @@ def wave(period: float, top_n: float) -> Floats:
 def test_smooth_forces_are_never_rejected(
     force_n: Floats, every: int, n_per_raw: float, tare_raw: float
 ) -> None:
-    taken = screened(Screen(tare_raw, n_per_raw, noisy=False), force_n / n_per_raw + tare_raw, every)
+    taken = screened(SampleValidator(tare_raw, n_per_raw, noisy=False), force_n / n_per_raw + tare_raw, every)
     assert all(s.valid for s in taken)
     assert [s.force_n for s in taken] == pytest.approx(list(force_n), abs=1e-5)
 
@@ -123,9 +123,9 @@ def test_a_sample_waits_for_those_after_it_but_not_for_ever() -> None:
         assert screen.take(START_NS + i) == []
     screen.add(START_NS + 3, 3.0)
     assert [s.raw for s in screen.take(START_NS + 3)] == [0.0]
-    assert screen.take(START_NS + PATIENCE_NS) == []
-    assert [s.raw for s in screen.take(START_NS + 3 + PATIENCE_NS)] == [1.0, 2.0]
-    assert [s.raw for s in screen.take(START_NS + 4 + PATIENCE_NS)] == [3.0]
+    assert screen.take(START_NS + MAX_WAIT_NS) == []
+    assert [s.raw for s in screen.take(START_NS + 3 + MAX_WAIT_NS)] == [1.0, 2.0]
+    assert [s.raw for s in screen.take(START_NS + 4 + MAX_WAIT_NS)] == [3.0]
 
 
 def test_a_converter_that_says_the_same_for_too_long_is_stuck() -> None:
@@ -145,7 +145,7 @@ def test_among_garbage_little_is_believed() -> None:
     )
     screen = calibrated()
     taken = screened(screen, raws)
-    believed = [i for i, s in enumerate(taken) if s.valid and 30 + DOUBT_SAMPLES <= i < 225]
+    believed = [i for i, s in enumerate(taken) if s.valid and 30 + DOUBT_WINDOW_SAMPLES <= i < 225]
     assert len(believed) < 175 / 3
     assert screen.stats.doubtful > 50
     assert all(s.valid for s in taken[260:])
@@ -156,7 +156,7 @@ def test_an_indicator_may_rest_on_one_value() -> None:
 
 
 def test_the_same_reading_after_a_gap_is_not_stuck() -> None:
-    assert all(s.valid for s in screened(calibrated(), np.full(50, 7.0), period_ns=PATIENCE_NS + 1))
+    assert all(s.valid for s in screened(calibrated(), np.full(50, 7.0), period_ns=MAX_WAIT_NS + 1))
 
 
 def test_a_saturated_reading_is_kept_and_hides_no_spike_beside_it() -> None:
@@ -171,7 +171,7 @@ def test_a_saturated_reading_is_kept_and_hides_no_spike_beside_it() -> None:
 
 
 def test_without_a_scale_there_are_readings_and_no_forces() -> None:
-    screen = Screen(0.0, math.nan, noisy=True)
+    screen = SampleValidator(0.0, math.nan, noisy=True)
     taken = screened(screen, np.arange(10))
     assert [s.raw for s in taken] == list(range(10))
     assert not any(s.valid for s in taken)

@@ -6,7 +6,7 @@ import pytest
 from gripper_force.config import LoadCellConfig
 from gripper_force.errors import ConfigError, DeviceError, DeviceNotFoundError
 from gripper_force.runtime.backends import MonotonicClock
-from gripper_hw.load_cells.screening import PATIENCE_NS
+from gripper_hw.load_cells.screening import MAX_WAIT_NS
 from gripper_hw.load_cells.serial import SerialLoadCell
 
 
@@ -69,7 +69,7 @@ def test_a_cell_that_is_away_can_be_drained_and_closed(board, cell, collect, wai
     board.unplug()
     wait_until(lambda: cell.stats.losses == 1)
     lost_ns = MonotonicClock().now_ns()
-    wait_until(lambda: MonotonicClock().now_ns() > lost_ns + PATIENCE_NS)
+    wait_until(lambda: MonotonicClock().now_ns() > lost_ns + MAX_WAIT_NS)
     assert cell.drain()
     assert cell.drain() == []
     cell.close()

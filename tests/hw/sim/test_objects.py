@@ -7,7 +7,7 @@ import pytest
 from gripper_force.config import GripperConfig
 from gripper_force.errors import ConfigError
 from gripper_hw.sim.engine import mujoco
-from gripper_hw.sim.objects import BLOCK_WIDTH_M, FOR_PADS_ALONE, GAUGES, OBJECTS, Detail, build_object
+from gripper_hw.sim.objects import BLOCK_WIDTH_M, GAUGES, OBJECTS, PADS_ONLY, Detail, build_object
 from gripper_hw.sim.scene import Scene, scene_mjcf
 
 DETAILS = get_args(Detail)
@@ -33,7 +33,7 @@ def press(model: mujoco.MjModel, force_n: float, time_s: float) -> tuple[float, 
     return float(data.joint("right").qpos[0]), float(np.mean(np.abs(data.sensordata[[1, 5]])))
 
 
-@pytest.mark.parametrize("name", sorted(OBJECTS.keys() - FOR_PADS_ALONE))
+@pytest.mark.parametrize("name", sorted(OBJECTS.keys() - PADS_ONLY))
 def test_rods_press_a_turned_object_and_let_go_of_it(name: str) -> None:
     scene = Scene(name, "coarse", "rods", yaw_deg=34, offset_m=(0.0015, 0.003))
     model = mujoco.MjModel.from_xml_string(*scene_mjcf(scene, GripperConfig()))
@@ -49,7 +49,7 @@ def test_rods_press_a_turned_object_and_let_go_of_it(name: str) -> None:
     assert forces_n[1] == 0
 
 
-@pytest.mark.parametrize("name", FOR_PADS_ALONE)
+@pytest.mark.parametrize("name", PADS_ONLY)
 def test_what_rods_would_dent_is_refused_to_them(name: str) -> None:
     with pytest.raises(ConfigError, match="rods would dent the simulated ball beyond its model"):
         scene_mjcf(Scene(name, "coarse", "rods"), GripperConfig())

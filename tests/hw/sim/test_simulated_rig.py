@@ -167,7 +167,10 @@ def test_the_servos_watchdog_counts_simulated_time(make_rig: MakeRig) -> None:
 
 
 def test_a_port_that_is_real_is_refused(quick: list[str]) -> None:
-    with pytest.raises(ConfigError, match=r"'/dev/ttyUSB0' is no virtual port"):
+    with pytest.raises(
+        ConfigError,
+        match=r"servo\.port '/dev/ttyUSB0' is not virtual, but a simulated camera or load cell needs the s",
+    ):
         SimulatedRig(load_config(None, [*quick, "servo.port=/dev/ttyUSB0"]))
 
 
@@ -205,7 +208,7 @@ def test_a_machine_that_is_too_slow_is_told_so(make_rig: MakeRig, monkeypatch: p
     monkeypatch.setattr(rig_module, "_REALTIME_MAX_LAG_NS", -1)
     error = broken_after(make_rig, lambda _: None)
     assert isinstance(error, SimulationError)
-    assert "can't simulate 'stapler' (coarse) in real time" in str(error)
+    assert "too slow to simulate 'stapler' (coarse) in real time" in str(error)
 
 
 def test_whatever_breaks_the_worlds_thread_is_told_by_check(

@@ -13,7 +13,7 @@ from gripper_hw.sim.world import World
 def test_a_scene_is_drawn() -> None:
     (check,) = probe(Config.model_validate({"object": "stapler", "sim": {"detail": "coarse"}}))
     assert (check.unit, check.name, check.ok) == ("simulation", "EGL", True)
-    assert check.found.startswith("draws 16x16 pixels of 'stapler'")
+    assert check.found.startswith("renders 16x16 pixels of 'stapler'")
 
 
 def test_each_picture_that_is_timed_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -43,4 +43,6 @@ def test_without_egl_it_says_what_to_install() -> None:
 
 def test_it_is_not_asked_where_no_camera_is_simulated() -> None:
     config = Config.model_validate({"camera": {"backend": "none"}})
-    assert list(probe(config)) == [Check("simulation", "EGL", "not needed: no camera is simulated", None)]
+    assert list(probe(config)) == [
+        Check("simulation", "EGL", "not needed: the camera is not simulated", None)
+    ]

@@ -74,7 +74,7 @@ def test_the_motor_is_stepped_with_the_physics(make_world: Callable[..., World])
 def test_a_tap_is_called_at_each_multiple_of_its_period(make_world: Callable[..., World]) -> None:
     world = make_world(Current(0.0))
     calls: list[int] = []
-    world.every(16_666_667, calls.append)
+    world.call_every(16_666_667, calls.append)
     world.advance_to(1000 * NS_PER_MS)
     assert len(calls) == 59
     late_ns = np.array(calls) - 16_666_667 * np.arange(1, 60)
