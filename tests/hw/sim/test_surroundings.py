@@ -10,7 +10,7 @@ TIMES_S = st.floats(0, 1e4)
 
 
 @given(SEEDS, TIMES_S)
-def test_light_changes_by_three_tenths_at_most_and_things_pass_behind_the_object(
+def test_light_varies_by_30_percent_at_most_and_background_stays_behind_the_object(
     seed: int, t_s: float
 ) -> None:
     scene = Scene("tube", "coarse", table_seed=seed, changing_light=True, moving_background=True)
@@ -24,7 +24,7 @@ def test_light_changes_by_three_tenths_at_most_and_things_pass_behind_the_object
 
 
 @given(SEEDS)
-def test_light_and_things_are_never_still_for_long(seed: int) -> None:
+def test_light_and_background_keep_changing(seed: int) -> None:
     surroundings = Surroundings(
         Scene("tube", "coarse", table_seed=seed, changing_light=True, moving_background=True)
     )
@@ -34,7 +34,7 @@ def test_light_and_things_are_never_still_for_long(seed: int) -> None:
 
 
 @given(SEEDS, TIMES_S)
-def test_without_being_asked_for_nothing_happens(seed: int, t_s: float) -> None:
+def test_surroundings_are_constant_by_default(seed: int, t_s: float) -> None:
     surroundings = Surroundings(Scene("tube", "coarse", table_seed=seed))
     assert surroundings.light_factor(t_s) == 1.0
     assert len(surroundings.positions_m(t_s)) == 0

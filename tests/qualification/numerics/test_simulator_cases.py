@@ -37,13 +37,13 @@ def test_what_no_guard_catches_is_counted(monkeypatch: pytest.MonkeyPatch) -> No
 
 @pytest.mark.parametrize("step_s", [0.008, 0.0, math.nan])
 def test_a_step_that_can_not_be_trusted_is_refused(step_s: float) -> None:
-    with pytest.raises(SimulationError, match="is no step for 'stapler'"):
+    with pytest.raises(SimulationError, match="gives wrong forces for 'stapler'"):
         World(
             Scene("stapler", "coarse"),
             GripperConfig(),
             steps._Motor(steps._squeeze),
             1.78,
             0,
-            seen=False,
+            textured=False,
             step_s=step_s,
         )
