@@ -14,11 +14,11 @@ import numpy.typing as npt
 from rich.console import Console
 from rich.progress import track
 
-from gripper_force.config import config_from_text
+from gripper_force.config import Config, config_from_text
 from gripper_force.errors import DataError
 from gripper_force.jobs.processes import process_pool
 from gripper_force.runtime.log import LogReader
-from gripper_force.types import NS_PER_MS, Frame, Gray, LoadCellSample
+from gripper_force.types import NS_PER_MS, Frame, Gray, LoadCellSample, Record
 
 if TYPE_CHECKING:  # labels need no OpenCV
     from gripper_force.vision.preprocess import Preprocess, Region
@@ -181,15 +181,39 @@ def label_frames(
 
 def load_clip(path: Path, preprocess: "Preprocess", region: "Region | None") -> Clip:
     """Reads one log; see `load_clips`."""
-    from gripper_force.vision.preprocess import downscale
-
     reader = LogReader(path)
     config = config_from_text(reader.config, str(path))
+    return read_clip(reader, config, reader.records(Frame, LoadCellSample), preprocess, region)
+
+
+def read_clip(
+    reader: LogReader,
+    config: Config,
+    records: Iterable[Record],
+    preprocess: "Preprocess",
+    region: "Region | None" = None,
+) -> Clip:
+    """Makes a clip from a log's records, for callers that also use records of other types.
+
+    Args:
+        reader: The log.
+        config: Its configuration.
+        records: Its records. All but frames and load-cell samples are ignored.
+        preprocess: Determines the size that frames are downscaled to.
+        region: Region of interest in pixels; None for the one in the configuration.
+
+    Raises:
+        DataError: There are no frames or no labels.
+        LogError: The log can't be read.
+    """
+    from gripper_force.vision.preprocess import downscale
+
+    path = reader.path
     region = region or config.vision.region
     small: list[Gray] = []
     t_ns: list[int] = []
     samples: list[LoadCellSample] = []
-    for record in reader.records(Frame, LoadCellSample):
+    for record in records:
         if isinstance(record, Frame):
             small.append(downscale(record.gray, region, preprocess.size))
             t_ns.append(record.t_ns)

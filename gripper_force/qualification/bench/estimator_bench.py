@@ -25,13 +25,13 @@ from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import Clip
 from gripper_force.qualification.bench.roofline import Roofline, measure
 from gripper_force.types import NS_PER_MS
-from gripper_force.vision import selection
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.engines import Engine, Floats, Precision, open_engine
 from gripper_force.vision.export import export, inputs_of
 from gripper_force.vision.header import Model
 from gripper_force.vision.model_files import cache_folder, read_model
-from gripper_force.vision.selection import Candidate, installed, key_of
+from gripper_force.vision.selection import installed
+from gripper_force.vision.step_benchmark import Candidate, cache_key, update_cache
 
 WINDOW: Final = "torch, window"
 """The paper's way: each frame passes the network with the whole window before it."""
@@ -206,7 +206,7 @@ def _timed(
                 row = replace(row, memory_mb=_memory_mb(file, engine, precision, count))
                 way = Candidate(source, engine, precision, count, row.p50_ms, row.p99_ms, row.mae_n)
                 if file is model:
-                    selection.remember({key_of(model, engine, precision, count): way})
+                    update_cache({cache_key(model, engine, precision, count): way})
             yield row
 
 

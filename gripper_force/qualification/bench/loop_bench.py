@@ -21,12 +21,13 @@ import numpy as np
 
 from gripper_force.config import Config, config_from_text, load_config
 from gripper_force.interfaces import Devices, Servo
-from gripper_force.jobs.replay import run_again
+from gripper_force.jobs.grasp import run_grasp
+from gripper_force.jobs.replay import resolve_replay, run_again
 from gripper_force.qualification.bench.startup_bench import PATIENT
-from gripper_force.runtime.assembly import checkpoint_of
-from gripper_force.runtime.backends import SERVO, MonotonicClock, load
+from gripper_force.runtime.backends import MonotonicClock, load_servo_class
 from gripper_force.runtime.log import LogReader, LogWriter
-from gripper_force.runtime.session import open_session, run_grasp
+from gripper_force.runtime.resolve import resolve
+from gripper_force.runtime.session import open_session
 from gripper_force.types import NS_PER_MS, NS_PER_S, Frame, RequestKind, ServoCommand, ServoState, VisualForce
 
 _TURN_S: Final = 10.0
@@ -206,10 +207,11 @@ def loop(
 
 def _run(config: Config, frames: list[Frame], seconds: float, path: Path, seen: _Seen) -> None:
     """One turn: the jaws close and open."""
-    checkpoint = checkpoint_of(config)
+    run = resolve(config)
+    config = run.config
     clock = _Clock(round(NS_PER_S / config.control.rate_hz), seen)
     with ExitStack() as stack:
-        servo = load(SERVO)(config.servo, clock.now_ns)
+        servo = load_servo_class(config)(config.servo, clock.now_ns)
         stack.callback(servo.close)
         devices = Devices(
             clock=clock,
@@ -220,7 +222,7 @@ def _run(config: Config, frames: list[Frame], seconds: float, path: Path, seen: 
             start_ns=clock.now_ns(),
             check=lambda: None,
         )
-        session = stack.enter_context(open_session(config, devices, path, checkpoint))
+        session = stack.enter_context(open_session(run, devices, path))
         end_ns = clock.now_ns() + round(seconds * NS_PER_S)
         next_ns, kind = 0, RequestKind.RELEASE
         while (now_ns := clock.now_ns()) < end_ns:
@@ -267,9 +269,9 @@ def _log_cost(path: Path, again: Path, seconds: float) -> LogCost:
             log.write(record)
     wrote_s = time.monotonic() - begin_s
     config = config_from_text(reader.config, str(path))
-    checkpoint = checkpoint_of(config)
+    run = resolve_replay(config)
     begin_s = time.monotonic()
-    run_again(reader, config, checkpoint)
+    run_again(reader, run)
     replayed_s = time.monotonic() - begin_s
     return LogCost(
         run_mb_s=path.stat().st_size / 2**20 / seconds,

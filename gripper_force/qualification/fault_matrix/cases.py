@@ -25,7 +25,7 @@ class FaultCase:
 
     Attributes:
         name: Name of the fault.
-        unit: Failing unit, a key of `gripper_force.config.FAULTS`; ``process`` for a signal.
+        unit: Failing unit, a key of `gripper_force.fault_config.FAULTS`; ``process`` for a signal.
         kind: Kind of failure in `FAULTS`; for ``process`` the signal's name.
         expected: Expected reaction.
         within_ms: Time limit of the reaction; None if only the reaction counts.

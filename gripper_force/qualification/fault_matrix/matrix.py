@@ -21,15 +21,15 @@ from gripper_force import __version__
 from gripper_force.config import Config, config_from, dump_config
 from gripper_force.errors import DataError, GripperError, LogError
 from gripper_force.interfaces import Devices, Progress, no_progress
-from gripper_force.jobs.grasp import TRIAL_OBJECTS, TRIAL_TARGETS_N
+from gripper_force.jobs.grasp import TRIAL_OBJECTS, TRIAL_TARGETS_N, grasp_and_release
 from gripper_force.jobs.processes import process_pool
 from gripper_force.qualification.fault_matrix.cases import ROWS, FaultCase
 from gripper_force.qualification.fault_matrix.judge import FaultFreeGrasp, Grasp, judge
 from gripper_force.qualification.fault_matrix.kill_process import kill_trial
-from gripper_force.runtime.assembly import checkpoint_of
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log import LogReader
-from gripper_force.runtime.session import grasp_in, open_session
+from gripper_force.runtime.resolve import resolve
+from gripper_force.runtime.session import open_session
 from gripper_force.types import (
     NS_PER_MS,
     NS_PER_S,
@@ -282,11 +282,11 @@ def _run_with_fault(
 
 def _grasp(config: Config, folder: Path) -> Grasp:
     """Runs a grasp, and observes the force for a while afterwards."""
-    path, checkpoint, result, session = folder / "run.mcap", checkpoint_of(config), "", None
-    with open_devices(config) as devices:
+    path, run, result, session = folder / "run.mcap", resolve(config), "", None
+    with open_devices(run.config) as devices:
         try:
-            with open_session(config, devices, path, checkpoint) as session:
-                result = grasp_in(session, config, checkpoint is not None)
+            with open_session(run, devices, path) as session:
+                result = grasp_and_release(session, config.target_n)
         except LogError:
             pass  # reports lost records, which are counted below
         except GripperError as error:

@@ -117,7 +117,7 @@ def cases(
 
 def _world(name: str, step_s: float | None, drive: Drive) -> World:
     return World(
-        Scene(name, _DETAIL), GripperConfig(), _Motor(drive), _NM_PER_A, seed=0, seen=False, step_s=step_s
+        Scene(name, _DETAIL), GripperConfig(), _Motor(drive), _NM_PER_A, seed=0, textured=False, step_s=step_s
     )
 
 

@@ -2,8 +2,9 @@ from pathlib import Path
 
 import pytest
 
-from gripper_force.config import FAULTS, load_config
+from gripper_force.config import load_config
 from gripper_force.errors import DataError
+from gripper_force.fault_config import FAULTS
 from gripper_force.qualification.fault_matrix import matrix as faults
 from gripper_force.qualification.fault_matrix.cases import ROWS, Expected, FaultCase
 from gripper_force.qualification.fault_matrix.judge import FaultFreeGrasp
