@@ -193,7 +193,7 @@ def cases(config: Config, _maps: Path | None, cycles: int = CYCLES) -> Iterator[
         )
     yield NumericalCase(
         "non-finite servo readings",
-        "every tenth, each quantity in turn, in a whole grasp; number of commands beyond limits or not finite",
+        "every tenth, each quantity in turn, in a whole grasp; number of commands outside limits",
         float(_count_bad_commands(control, gripper, config.servo.current_limit_a)),
         0.0,
     )
