@@ -238,7 +238,9 @@ def _rough_scale(empty: Rest, loaded: Rest, force_n: float) -> float:
         medians.append(float(np.median(usable)) if len(usable) else 0.0)
         spreads.append(float(np.median(np.abs(usable - medians[-1]))) if len(usable) else 0.0)
     change = medians[1] - medians[0]
-    return force_n / change if abs(change) > max(_CHANGE_TO_SPREAD * max(spreads), force_n / _MAX_RAW) else 0.0
+    return (
+        force_n / change if abs(change) > max(_CHANGE_TO_SPREAD * max(spreads), force_n / _MAX_RAW) else 0.0
+    )
 
 
 def _trend(raw: Floats) -> Floats:

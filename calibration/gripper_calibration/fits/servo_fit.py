@@ -230,7 +230,12 @@ def _sliding_rows(presses: Sequence[ServoPress]) -> Floats:
     """Samples in which the jaws slide, (N, 7): force, current, angle, side, rate, gauge, number of the press."""
     rows = []
     for number, press in enumerate(presses):
-        plausible = _plausible(press.current_a) & _plausible(press.force_n) & _plausible(press.closing_rad) & _plausible(press.t_s)
+        plausible = (
+            _plausible(press.current_a)
+            & _plausible(press.force_n)
+            & _plausible(press.closing_rad)
+            & _plausible(press.t_s)
+        )
         for side, part in ((1.0, slice(0, press.turn)), (-1.0, slice(press.turn, None))):
             slid = plausible[part] & _slides(press.force_n[part], side)
             if slid.sum() < _MIN_ROWS:
@@ -241,7 +246,9 @@ def _sliding_rows(presses: Sequence[ServoPress]) -> Floats:
             force, t_s = press.force_n[part][slid], press.t_s[part][slid]
             rate, one = _slope(t_s, force), np.ones(len(force))
             measured = (force, press.current_a[part][slid], press.closing_rad[part][slid])
-            rows.append(np.column_stack([*measured, side * one, rate * one, press.gauge_m * one, number * one]))
+            rows.append(
+                np.column_stack([*measured, side * one, rate * one, press.gauge_m * one, number * one])
+            )
     return np.concatenate(rows)
 
 
@@ -269,7 +276,12 @@ def _fit_travel(
         )
     rows, clusters = [], []
     for number, one in enumerate(passes):
-        plausible = _plausible(one.t_s) & _plausible(one.current_a) & _plausible(one.closing_rad) & _plausible(one.closing_rad_s)
+        plausible = (
+            _plausible(one.t_s)
+            & _plausible(one.current_a)
+            & _plausible(one.closing_rad)
+            & _plausible(one.closing_rad_s)
+        )
         for part in np.array_split(np.flatnonzero(plausible), _WINDOWS):
             if len(part) < 2 or not (span_s := one.t_s[part[-1]] - one.t_s[part[0]]) > 0:
                 continue

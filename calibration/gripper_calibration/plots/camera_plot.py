@@ -36,7 +36,9 @@ def draw(
     Raises:
         DataError: The file can't be written.
     """
-    title = f"Camera: {calibration.exposure_us} us, {value_text(calibration.delay_ms, 'ms from contact to use')}"
+    title = (
+        f"Camera: {calibration.exposure_us} us, {value_text(calibration.delay_ms, 'ms from contact to use')}"
+    )
     with saved_figure(path, title, 6.4) as figure:
         upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(1, 1.5))[:, 0]
         for axes, candidate, gray in zip(
@@ -48,7 +50,11 @@ def draw(
             for spine in axes.spines.values():
                 spine.set(visible=True, color=FIT if selected else GRAY, linewidth=2.5 if selected else 0.5)
         left, right = lower.subplots(1, 2, width_ratios=(1, 1.7))
-        _show(left, frame, f"region {list(calibration.region)}, {'from markers' if calibration.markers else 'given'}")
+        _show(
+            left,
+            frame,
+            f"region {list(calibration.region)}, {'from markers' if calibration.markers else 'given'}",
+        )
         x, y, width, height = calibration.region
         left.add_patch(Rectangle((x - 0.5, y - 0.5), width, height, fill=False, color=FIT, lw=1.5))
         for number, corners in markers.items():
@@ -70,7 +76,9 @@ def _plot_lags(axes: Axes, calibration: CameraCalibration, touches: Sequence[Tou
         (used, "o", DATA, "through the encoder"),
         (unused, "x", GRAY, "not used: weak or undetermined"),
     ):
-        axes.plot([t.force_n for t in subset], [t.lag_ms for t in subset], mark, color=colour, ms=5, label=label)
+        axes.plot(
+            [t.force_n for t in subset], [t.lag_ms for t in subset], mark, color=colour, ms=5, label=label
+        )
     axes.plot(
         [t.force_n for t in touches],
         [t.correlation_ms for t in touches],

@@ -61,9 +61,7 @@ def draw(
         before_error_n = touches.estimate_n - touches.force_n
         residual_plot.plot(touches.force_n, before_error_n, ".", ms=2, color=GRAY, label="before")
         residual_plot.plot(touches.force_n, error_n, ".", ms=2, color=DATA, label="after")
-        label = (
-            f"{100 * profile.interval.coverage:.0f} % interval, contains {100 * covered.mean():.0f} %"
-        )
+        label = f"{100 * profile.interval.coverage:.0f} % interval, contains {100 * covered.mean():.0f} %"
         residual_plot.plot(line_n, half_n, color=FIT, label=label)
         residual_plot.plot(line_n, -half_n, color=FIT)
         label_axes(residual_plot, "errors", "load cell, N", "error, N")

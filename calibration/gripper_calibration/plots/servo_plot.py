@@ -34,7 +34,9 @@ def draw(fit: ServoFit, presses: Sequence[ServoPress], path: Path) -> None:
             line_a = fit.offset_a.value + (ends + sign * friction_n) / fit.n_per_a.value
             force_plot.plot(line_a, ends, color=colour, label=f"{label}, fit")
             centres, means, spreads = _binned(force[rows], residual[rows])
-            residual_plot.errorbar(centres, means, spreads, fmt="o", ms=4, capsize=2, color=colour, label=label)
+            residual_plot.errorbar(
+                centres, means, spreads, fmt="o", ms=4, capsize=2, color=colour, label=label
+            )
             ahead = sign * fit.travelled[:, 0] > 0
             speed, motor_force_n = fit.travelled[ahead].T
             travel_plot.plot(
@@ -51,7 +53,12 @@ def draw(fit: ServoFit, presses: Sequence[ServoPress], path: Path) -> None:
         friction_n = fit.free_friction_n.value + fit.damping_n_s_m.value * speeds
         travel_plot.plot(100 * speeds, friction_n, color=GRAY, label="fit")
         travel_plot.set_ylim(bottom=0)
-        label_axes(travel_plot, "free travel: friction against speed", "speed of a jaw, cm/s", "motor force at a jaw, N")
+        label_axes(
+            travel_plot,
+            "free travel: friction against speed",
+            "speed of a jaw, cm/s",
+            "motor force at a jaw, N",
+        )
         residual_plot.margins(y=0.25)
         for one in (force_plot, residual_plot, travel_plot):
             one.legend(ncols=2, loc="upper left")
@@ -76,5 +83,7 @@ def _binned(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
     edges = np.linspace(x.min(), x.max() + 1e-9, 11)
     index = np.digitize(x, edges)
     filled = [index == i for i in range(1, 11) if (index == i).any()]
-    centres, means, stds = zip(*((x[bin_].mean(), y[bin_].mean(), y[bin_].std()) for bin_ in filled), strict=True)
+    centres, means, stds = zip(
+        *((x[bin_].mean(), y[bin_].mean(), y[bin_].std()) for bin_ in filled), strict=True
+    )
     return np.array(centres), np.array(means), np.array(stds)

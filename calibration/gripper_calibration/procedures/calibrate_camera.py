@@ -1,8 +1,7 @@
-"""What a camera sees of the jaws, how long to expose, and how late its pictures come, from some touches."""
+"""Calibration of a camera: region of interest, exposure and lag, from touches of a soft object."""
 
 import time
-from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,18 +12,19 @@ import cv2
 import numpy as np
 
 from gripper_calibration.fits.camera_fit import (
-    ExposureStep,
+    ExposureCandidate,
     Markers,
-    Touch,
-    choose_exposure,
+    TouchLag,
+    estimate_lag,
     find_markers,
-    lag_of,
-    region_about,
-    telling,
+    region_around,
+    select_exposure,
+    usable_touches,
 )
 from gripper_calibration.plots.camera_plot import draw
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
+from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.recording.lag import camera_lags_s, load_cell_lag_s
 from gripper_force.jobs.recording.record import RecordingPlan, record
 from gripper_force.jobs.recording.summary import releases_ns
@@ -46,214 +46,262 @@ from gripper_force.vision.estimator import open_estimator
 from gripper_force.vision.preprocess import Region, downscale
 
 EXPOSURES_US: Final = (500, 1000, 2000, 4000, 8000, 16000)
-"""The ladder, as far as half of a frame's period: what is exposed for longer is late and blurred."""
+"""Default candidates. Those longer than half a frame period are skipped: their images are late and blurred."""
 
 TOUCHES: Final = 10
+"""Default number of touches."""
 
 _SETTLE_NS: Final = 300 * NS_PER_MS
 _PATIENCE_NS: Final = 3 * NS_PER_S
 _POLL_NS: Final = 5 * NS_PER_MS
 _SMALL_PX: Final = 48
-_LOOKED_AT: Final = 200
-"""Pictures of the touches that are searched for markers."""
+_SEARCHED_FRAMES: Final = 200
+"""Frames of the touches that are searched for markers."""
 
 _REFERENCE_FRAMES: Final = 10
 _TIMED_FRAMES: Final = 60
 
-Progress = Callable[[str, float], None]
-"""Told of the step and the force in newtons, some times a second."""
-
 
 @dataclass(frozen=True, slots=True)
 class CameraObservation:
-    """What one recording of touches shows.
+    """Images, markers and lags in a recorded set of touches.
 
     Attributes:
-        reference: Mean of the first pictures, with open jaws.
-        markers: Markers of pictures that were searched.
-        widest: Of those that show both, the picture where they are furthest apart; else the reference.
-        widest_markers: The markers in it.
-        touches: What each touch says of the lag.
-        use_ms: From the camera's timestamp to the cycle that has the picture, median over all.
-        rate_hz: Rate of the pictures.
+        reference: Mean of the first images, with open jaws, (H, W).
+        markers: Markers in the searched images.
+        widest: Image that shows both markers furthest apart, (H, W); the reference if none shows both.
+        widest_markers: Markers in it.
+        touches: Lag of each touch.
+        use_ms: Median time from the camera's timestamp to the control cycle that has the image.
+        rate_hz: Frame rate.
     """
 
     reference: Gray
     markers: list[Markers]
     widest: Gray
     widest_markers: Markers
-    touches: list[Touch]
+    touches: list[TouchLag]
     use_ms: float
     rate_hz: float
 
 
-def calibrate(
+@dataclass(frozen=True, slots=True)
+class CameraResult:
+    """Result of `calibrate_camera`.
+
+    Attributes:
+        calibration: The section of the rig profile.
+        correlation_lag_ms: Time shift with the highest correlation of image and force, for comparison.
+        use_ms: Median time from the camera's timestamp to the control cycle that has the image.
+        compute_ms: Computing time of the network.
+        touches: Number of touches.
+        usable_touches: Number of touches that the lag was estimated from.
+        rig: The rig profile.
+        report: The figure, PNG.
+    """
+
+    calibration: CameraCalibration
+    correlation_lag_ms: float
+    use_ms: float
+    compute_ms: float
+    touches: int
+    usable_touches: int
+    rig: Path
+    report: Path
+
+    def as_dict(self) -> dict[str, Any]:
+        """Returns the result as the command prints it."""
+        return {
+            **self.calibration.model_dump(mode="json"),
+            "correlation_lag_ms": self.correlation_lag_ms,
+            "use_ms": self.use_ms,
+            "compute_ms": self.compute_ms,
+            "touches": self.touches,
+            "touches_that_tell": self.usable_touches,
+            "rig": self.rig,
+            "report": self.report,
+        }
+
+
+def calibrate_camera(
     config: Config,
     rig: Path,
     *,
     region: Region | None = None,
     exposures_us: Sequence[int] = EXPOSURES_US,
     touches: int = TOUCHES,
-    progress: Progress = lambda _step, _force_n: None,
-) -> dict[str, Any]:
-    """Tries exposures, touches the object, writes the rig profile's section and pictures beside it.
+    progress: Progress = no_progress,
+) -> CameraResult:
+    """Tries exposures, touches the object, and writes the rig profile's section, a reference image and a figure.
 
     Args:
-        config: The run, with an object between the jaws that gives way, and is not wider than the picture.
-        rig: The rig profile to write, or to replace the section of.
-        region: Region of interest of the frame, chosen by hand; None: from the markers on the jaws.
-        exposures_us: The ladder.
-        touches: How often to touch.
-        progress: Told of the step and the force.
-
-    Returns:
-        The section, what each touch says, and the paths.
+        config: The configuration, with a soft object between the jaws that is not wider than the image.
+        rig: Rig profile to write; an existing one keeps its other sections.
+        region: Region of interest of the frame; None: determined from the markers on the jaws.
+        exposures_us: Candidate exposures.
+        touches: Number of touches.
+        progress: Called with the step and the force a few times per second, with 0 steps.
 
     Raises:
         ConfigError: There is no camera or load cell, the region is not within the frame, or the profile can't
             be read or written.
         DeviceError: A device failed. The servo was stopped as configured.
-        DataError: No exposure is usable, the markers are not seen, or the touches tell no lag.
+        DataError: No exposure is usable, the markers are not visible, or the touches do not determine the lag.
     """
     if config.camera.backend in ("none", "playback"):
         raise ConfigError(
-            f"calibrate camera needs one that can be set, and camera.backend is {config.camera.backend}; "
-            "name yours"
+            f"calibrate camera needs a camera with an adjustable exposure, and camera.backend is "
+            f"{config.camera.backend}; set it to your camera"
         )
     if rig.exists():
-        read_rig(rig)  # before anything has moved
-    config = _with(config, "calibration", rig=None, object=None)  # what they say of the camera is found anew
-    config = _with(config, "vision", region=region)
-    ladder, pictures = _climb(config, exposures_us, progress)
-    rung = choose_exposure(ladder)
-    config = _with(config, "camera", exposure_us=rung.exposure_us)
-    with TemporaryDirectory() as aside:
+        read_rig(rig)  # fails before anything has moved
+    # Existing profiles contain camera settings, which are determined anew.
+    config = _replace(config, "calibration", rig=None, object=None)
+    config = _replace(config, "vision", region=region)
+    candidates, images = _try_exposures(config, exposures_us, progress)
+    exposure = select_exposure(candidates)
+    config = _replace(config, "camera", exposure_us=exposure.exposure_us)
+    with TemporaryDirectory() as folder:
 
-        def tell(_set: int, touch: int, force_n: float) -> None:
-            progress(f"touch {touch} of {touches}", force_n)
+        def report_touch(_set: int, touch: int, force_n: float) -> None:
+            progress(f"touch {touch} of {touches}: {force_n:.1f} N", 0)
 
-        (log,) = record(config, RecordingPlan(1, touches), Path(aside), tell)
-        seen = watch(log, region)
-    height, width = seen.reference.shape
-    found_region = region_about(seen.markers, width, height) if region is None else region
-    lag = lag_of(seen.touches)
-    taken_ms = compute_ms(_with(config, "vision", region=found_region), seen.reference)
-    wait_ms = seen.use_ms + taken_ms + 500 / seen.rate_hz
+        (log,) = record(config, RecordingPlan(1, touches), Path(folder), report_touch)
+        observed = observe(log, region)
+    height, width = observed.reference.shape
+    selected_region = region_around(observed.markers, width, height) if region is None else region
+    lag = estimate_lag(observed.touches)
+    network_ms = compute_ms(_replace(config, "vision", region=selected_region), observed.reference)
+    # Until the next frame comes, an image ages by half a frame period on average.
+    wait_ms = observed.use_ms + network_ms + 500 / observed.rate_hz
     camera = config.camera
-    found = CameraCalibration(
+    calibration = CameraCalibration(
         date=datetime.now(UTC).replace(microsecond=0),
         backend=camera.backend,
         side_px=camera.side_px,
         rate_hz=camera.rate_hz,
         gain=camera.gain,
-        exposure_us=rung.exposure_us,
-        mean=rung.mean,
-        clipped=rung.clipped,
-        region=found_region,
+        exposure_us=exposure.exposure_us,
+        mean=exposure.mean,
+        clipped=exposure.clipped,
+        region=selected_region,
         markers=region is None,
         lag_ms=lag,
         delay_ms=_shifted(lag, wait_ms),
         reference=f"{rig.stem}-reference.png",
     )
-    update_rig(rig, found)
-    _write(rig.with_name(found.reference), seen.reference)
+    update_rig(rig, calibration)
+    _write_image(rig.with_name(calibration.reference), observed.reference)
     report = rig.with_name(f"{rig.stem}-camera.png")
-    draw(found, seen.widest, seen.widest_markers, ladder, pictures, seen.touches, report)
-    telling_ms = [touch.correlation_ms for touch in telling(seen.touches)]
-    return {
-        **found.model_dump(mode="json"),
-        "correlation_lag_ms": float(np.nanmedian(telling_ms)),
-        "use_ms": seen.use_ms,
-        "compute_ms": taken_ms,
-        "touches": len(seen.touches),
-        "touches_that_tell": len(telling_ms),
-        "rig": rig,
-        "report": report,
-    }
+    draw(calibration, observed.widest, observed.widest_markers, candidates, images, observed.touches, report)
+    correlations_ms = [touch.correlation_ms for touch in usable_touches(observed.touches)]
+    return CameraResult(
+        calibration=calibration,
+        correlation_lag_ms=float(np.nanmedian(correlations_ms)),
+        use_ms=observed.use_ms,
+        compute_ms=network_ms,
+        touches=len(observed.touches),
+        usable_touches=len(correlations_ms),
+        rig=rig,
+        report=report,
+    )
 
 
-def watch(log: Path, region: Region | None) -> CameraObservation:
-    """Looks for markers and lags in a recorded set of touches.
+def observe(log: Path, region: Region | None) -> CameraObservation:
+    """Finds markers and lags in a recorded set of touches.
 
     Args:
-        log: The set, as `gripper_force.jobs.recording.record` writes it.
-        region: Region of interest, if it is known; then no markers are looked for.
+        log: The set, as `gripper_force.jobs.recording.record.record` writes it.
+        region: Region of interest if it is known; then no markers are searched.
     """
-    records: dict[type, list[Any]] = defaultdict(list)
     frames: list[Frame] = []
+    samples: list[LoadCellSample] = []
+    statuses: list[GraspStatus] = []
+    requests: list[Request] = []
     used_ms: list[float] = []
     waiting: list[Frame] = []
     for item in LogReader(log).records(Frame, ServoState, LoadCellSample, GraspStatus, Request):
         if isinstance(item, Frame):
             frames.append(item)
             waiting.append(item)
-        elif isinstance(item, ServoState):  # of the cycle that had the frames before it
+        elif isinstance(item, ServoState):  # of the cycle that has the frames logged before it
             used_ms += [(item.t_ns - frame.t_ns) / NS_PER_MS for frame in waiting]
             waiting = []
-        else:
-            records[type(item)].append(item)
-    step = -(-len(frames) // _LOOKED_AT)
-    looked_at = frames[::step] if region is None else []
-    markers = [find_markers(frame.gray) for frame in looked_at]
-    apart = [_apart_px(one) for one in markers]
-    widest = int(np.argmax(apart)) if apart and max(apart) > 0 else None
-    reference = np.mean([frame.gray for frame in frames[:_REFERENCE_FRAMES]], axis=0)
-    as_gray: Gray = np.rint(reference).astype(np.uint8)
+        elif isinstance(item, LoadCellSample):
+            samples.append(item)
+        elif isinstance(item, GraspStatus):
+            statuses.append(item)
+        elif isinstance(item, Request):
+            requests.append(item)
+    step = -(-len(frames) // _SEARCHED_FRAMES)
+    searched = frames[::step] if region is None else []
+    markers = [find_markers(frame.gray) for frame in searched]
+    distances_px = [_distance_px(found) for found in markers]
+    widest = int(np.argmax(distances_px)) if distances_px and max(distances_px) > 0 else None
+    mean = np.mean([frame.gray for frame in frames[:_REFERENCE_FRAMES]], axis=0)
+    reference: Gray = np.rint(mean).astype(np.uint8)
     frame_s = np.array([frame.t_ns for frame in frames]) / NS_PER_S
     return CameraObservation(
-        reference=as_gray,
+        reference=reference,
         markers=markers,
-        widest=as_gray if widest is None else looked_at[widest].gray,
+        widest=reference if widest is None else searched[widest].gray,
         widest_markers={} if widest is None else markers[widest],
-        touches=_touches(frames, region, records),
+        touches=_touch_lags(frames, region, samples, statuses, releases_ns(requests)),
         use_ms=float(np.median(used_ms)),
         rate_hz=float(1 / np.median(np.diff(frame_s))),
     )
 
 
-def _touches(frames: list[Frame], region: Region | None, records: dict[type, list[Any]]) -> list[Touch]:
+def _touch_lags(
+    frames: list[Frame],
+    region: Region | None,
+    samples: list[LoadCellSample],
+    statuses: list[GraspStatus],
+    release_times_ns: list[int],
+) -> list[TouchLag]:
     frame_s = np.array([frame.t_ns for frame in frames]) / NS_PER_S
     images = np.stack([downscale(frame.gray, region, _SMALL_PX) for frame in frames])
-    cells = sorted((s for s in records[LoadCellSample] if s.valid), key=lambda sample: sample.t_ns)
-    cell_s = np.array([sample.t_ns for sample in cells]) / NS_PER_S
-    force_n = np.array([sample.force_n for sample in cells])
-    servo_s = np.array([status.t_ns for status in records[GraspStatus]]) / NS_PER_S
-    width_m = np.array([status.width_m for status in records[GraspStatus]])
-    releases_s = [t_ns / NS_PER_S for t_ns in releases_ns(records[Request])]
+    samples = sorted((s for s in samples if s.valid), key=lambda sample: sample.t_ns)
+    cell_s = np.array([sample.t_ns for sample in samples]) / NS_PER_S
+    force_n = np.array([sample.force_n for sample in samples])
+    servo_s = np.array([status.t_ns for status in statuses]) / NS_PER_S
+    width_m = np.array([status.width_m for status in statuses])
+    releases_s = [t_ns / NS_PER_S for t_ns in release_times_ns]
     by_servo_s = camera_lags_s(frame_s, images, servo_s, width_m, releases_s)
     by_force_s = camera_lags_s(frame_s, images, cell_s, force_n, releases_s)
     touches = []
-    for at_s, camera_s, correlation_s in zip(releases_s, by_servo_s, by_force_s, strict=True):
-        cell_lag_s = load_cell_lag_s(cell_s, force_n, servo_s, width_m, at_s)
-        at_n = float(np.interp(at_s, cell_s, force_n))
-        touches.append(Touch(at_n, 1e3 * (float(camera_s) - cell_lag_s), 1e3 * float(correlation_s)))
+    for release_s, camera_s, correlation_s in zip(releases_s, by_servo_s, by_force_s, strict=True):
+        cell_lag_s = load_cell_lag_s(cell_s, force_n, servo_s, width_m, release_s)
+        release_n = float(np.interp(release_s, cell_s, force_n))
+        touches.append(TouchLag(release_n, 1e3 * (float(camera_s) - cell_lag_s), 1e3 * float(correlation_s)))
     return touches
 
 
-def _climb(
+def _try_exposures(
     config: Config, exposures_us: Sequence[int], progress: Progress
-) -> tuple[list[ExposureStep], list[Gray]]:
-    longest_us = 0.5e6 / config.camera.rate_hz
-    ladder, pictures = [], []
+) -> tuple[list[ExposureCandidate], list[Gray]]:
+    """Candidates not longer than half a frame period, and an image at each."""
+    max_us = 0.5e6 / config.camera.rate_hz
+    candidates, images = [], []
     for exposure_us in exposures_us:
-        if exposure_us > longest_us:
+        if exposure_us > max_us:
             continue
-        progress(f"exposure of {exposure_us} us", 0.0)
-        gray = _picture(_with(config, "camera", exposure_us=exposure_us))
+        progress(f"exposure of {exposure_us} us", 0)
+        gray = _take_image(_replace(config, "camera", exposure_us=exposure_us))
         region = config.vision.region
         part = gray if region is None else downscale(gray, region, min(region[2:]))
-        ladder.append(ExposureStep.of(exposure_us, part))
-        pictures.append(gray)
-    if not ladder:
+        candidates.append(ExposureCandidate.measure(exposure_us, part))
+        images.append(gray)
+    if not candidates:
         raise ConfigError(
-            f"no exposure of the ladder is as short as half of a frame's period, {longest_us:.0f} us at "
-            f"camera.rate_hz {config.camera.rate_hz:g}; name shorter ones with --exposure-us"
+            f"every candidate exposure is longer than half a frame period ({max_us:.0f} us at camera.rate_hz "
+            f"{config.camera.rate_hz:g}); pass shorter ones with --exposure-us"
         )
-    return ladder, pictures
+    return candidates, images
 
 
-def _picture(config: Config) -> Gray:
-    """The newest picture of a camera that has run for a while."""
+def _take_image(config: Config) -> Gray:
+    """An image (H, W) of the camera after its exposure has settled."""
     with open_devices(config) as devices:
         camera, clock = devices.camera, devices.clock
         assert camera is not None
@@ -269,43 +317,43 @@ def _picture(config: Config) -> Gray:
             if gray is None and now_ns - begin_ns > _PATIENCE_NS:
                 raise DeviceTimeoutError(
                     f"the camera gave no frame for {_PATIENCE_NS / NS_PER_S:g} s at an exposure of "
-                    f"{config.camera.exposure_us} us; check its cable, and see what doctor says"
+                    f"{config.camera.exposure_us} us; check its cable, and run `gripper-force doctor`"
                 )
         return gray
 
 
 def compute_ms(config: Config, gray: Gray) -> float:
-    """What the network takes for a picture: on a simulated clock what it is said to, else as measured."""
+    """Returns the network's computing time for an image (H, W): configured on the simulated clock, else measured."""
     checkpoint = checkpoint_of(config)
     if checkpoint is None:
         return 0.0
     if config.clock == "lockstep":
         return config.vision.lockstep_compute_ms
     estimator = open_estimator(checkpoint, settled(config)[0].vision)
-    each_ms = []
+    times_ms = []
     for _ in range(_TIMED_FRAMES):
         begin_ns = time.perf_counter_ns()
         estimator.update(gray)
-        each_ms.append((time.perf_counter_ns() - begin_ns) / NS_PER_MS)
-    return float(np.median(each_ms))
+        times_ms.append((time.perf_counter_ns() - begin_ns) / NS_PER_MS)
+    return float(np.median(times_ms))
 
 
-def _with(config: Config, section: str, **values: object) -> Config:
+def _replace(config: Config, section: str, **values: object) -> Config:
     return config.model_copy(update={section: getattr(config, section).model_copy(update=values)})
 
 
-def _shifted(estimate: CalibratedValue, by: float) -> CalibratedValue:
-    low, high = (None if end is None else end + by for end in (estimate.low, estimate.high))
-    return CalibratedValue(value=estimate.value + by, low=low, high=high)
+def _shifted(value: CalibratedValue, by: float) -> CalibratedValue:
+    low, high = (None if end is None else end + by for end in (value.low, value.high))
+    return CalibratedValue(value=value.value + by, low=low, high=high)
 
 
-def _apart_px(markers: Markers) -> float:
+def _distance_px(markers: Markers) -> float:
     if len(markers) < 2:
         return 0.0
     first, second = (corners.mean(axis=0) for corners in markers.values())
     return float(np.linalg.norm(first - second))
 
 
-def _write(path: Path, gray: Gray) -> None:
+def _write_image(path: Path, gray: Gray) -> None:
     if not cv2.imwrite(str(path), gray):
-        raise DataError(f"can't write the picture {path}; check its folder")
+        raise DataError(f"can't write the image {path}; check its folder")

@@ -1,159 +1,186 @@
-"""Tare and scale of a load cell with a known mass: empty, loaded, empty again."""
+"""Calibration of a load cell with a known mass: empty, loaded, empty again."""
 
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from gripper_calibration.fits.load_cell_fit import Rest, Weighing, fit_load_cell, level
+from gripper_calibration.fits.load_cell_fit import LoadCellFit, Rest, fit_load_cell, rest_statistics
 from gripper_calibration.plots.load_cell_plot import draw
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
-from gripper_force.interfaces import Clock, LoadCell
+from gripper_force.interfaces import Clock, LoadCell, Progress, Prompt, no_progress
 from gripper_force.profiles.rig_profile import LoadCellCalibration, read_rig, update_rig
 from gripper_force.runtime.backends import LOAD_CELLS, MonotonicClock, load
 from gripper_force.types import NS_PER_MS, NS_PER_S, LoadCellSample
 
 STANDARD_GRAVITY_M_S2: Final = 9.80665
-NEUTRAL: Final = 1e-9
-"""Newtons for a unit of the reading, so few that no threshold in newtons acts: what the driver then rejects
-is what the reading itself says, saturation and standstill. The fit tells spikes, once it knows the scale."""
+NEUTRAL_N_PER_RAW: Final = 1e-9
+"""Scale so small that the driver's thresholds in newtons have no effect: it then rejects only saturated and
+stuck readings. The fit detects spikes, once it knows the scale."""
 
 _PERIOD_NS: Final = 50 * NS_PER_MS
-_SHAKEN_NS: Final = NS_PER_S
-"""A hand has just let go."""
+_SETTLE_NS: Final = NS_PER_S
+"""Waiting time after a person has touched the load cell."""
 _SILENT_NS: Final = 3 * NS_PER_S
-_MOST_N: Final = 1000.0
-_AWAY: Final = 10
-_STEADY: Final = 0.01
-_WEIGHING: Final = {n: path for n, path in LOAD_CELLS.items() if path is not None and n != "simulated"}
-_NAMES: Final = ("empty", "loaded", "empty again")
-
-Ask = Callable[[str], None]
-"""Says what is to be done, and returns once it may have been."""
-
-Progress = Callable[[str, float], None]
-"""Told of the step and the newest reading, a few times a second."""
+_MAX_FORCE_N: Final = 1000.0
+_CHANGE_TO_UNCERTAINTY: Final = 10
+_STEADY_SHARE: Final = 0.01
+_BACKENDS: Final = {n: path for n, path in LOAD_CELLS.items() if path is not None and n != "simulated"}
 
 
-def calibrate(
-    config: Config, force_n: float, rig: Path, *, ask: Ask, seconds: float, progress: Progress
-) -> dict[str, Any]:
-    """Weighs a known mass, writes the rig profile's section and a picture beside it.
+@dataclass(frozen=True, slots=True)
+class LoadCellResult:
+    """Result of `calibrate_load_cell`.
+
+    Attributes:
+        calibration: The section of the rig profile.
+        return_n: Difference of the empty readings after and before the load.
+        rejected: Number of rejected readings.
+        rig: The rig profile.
+        report: The figure, PNG.
+    """
+
+    calibration: LoadCellCalibration
+    return_n: float
+    rejected: int
+    rig: Path
+    report: Path
+
+    def as_dict(self) -> dict[str, Any]:
+        """Returns the result as the command prints it."""
+        return {
+            **self.calibration.model_dump(mode="json"),
+            "return_n": self.return_n,
+            "rejected": self.rejected,
+            "rig": self.rig,
+            "report": self.report,
+        }
+
+
+def calibrate_load_cell(
+    config: Config,
+    force_n: float,
+    rig: Path,
+    *,
+    prompt: Prompt,
+    seconds: float = 10.0,
+    progress: Progress = no_progress,
+) -> LoadCellResult:
+    """Measures tare and scale with a known mass, and writes the rig profile's section and a figure.
 
     Args:
-        config: The run; of its section ``load_cell``, tare and scale do not count.
+        config: The configuration. Tare and scale in its section ``load_cell`` are ignored.
         force_n: Weight of the mass.
-        rig: The rig profile to write, or to replace the section of.
-        ask: Says what is to be done.
-        seconds: How long each load is to rest.
-        progress: Told of the step and the newest reading.
-
-    Returns:
-        The section, what was left out, and the paths.
+        rig: Rig profile to write; an existing one keeps its other sections.
+        prompt: Asks a person to change the load.
+        seconds: Duration of each rest.
+        progress: Called with the step and the newest reading a few times per second, with 0 steps.
 
     Raises:
-        ConfigError: There is no load cell to calibrate, or the profile can't be read or written.
+        ConfigError: The backend has no raw readings, the weight is out of range, or the profile can't be read or
+            written.
         DeviceError: The load cell can't be opened, or gives no reading.
-        DataError: The readings give no calibration.
+        DataError: The readings are not sufficient for a calibration.
     """
     section = config.load_cell
-    if section.backend not in _WEIGHING:
+    if section.backend not in _BACKENDS:
         raise ConfigError(
-            f"load_cell.backend={section.backend} has no raw readings that a mass could change; name the "
-            "load cell that you have: serial or phidget, or playback for a log of one"
+            f"load_cell.backend {section.backend} has no raw readings to calibrate; set it to serial or phidget, "
+            "or to playback for a recorded log"
         )
-    if not 0 < force_n <= _MOST_N:
-        raise ConfigError(f"a mass of {force_n:g} N can't be weighed; take one of up to {_MOST_N:g} N")
+    if not 0 < force_n <= _MAX_FORCE_N:
+        raise ConfigError(
+            f"a weight of {force_n:g} N is not within the supported range; use one above 0 and up to "
+            f"{_MAX_FORCE_N:g} N"
+        )
     if rig.exists():
-        read_rig(rig)  # before anybody has carried masses
+        read_rig(rig)  # fails before a person has moved masses
     clock = MonotonicClock()
-    neutral = section.model_copy(update={"tare_raw": 0.0, "n_per_raw": NEUTRAL})
-    cell: LoadCell = load(_WEIGHING[section.backend])(neutral, clock)
+    neutral = section.model_copy(update={"tare_raw": 0.0, "n_per_raw": NEUTRAL_N_PER_RAW})
+    cell: LoadCell = load(_BACKENDS[section.backend])(neutral, clock)
     with closing(cell):
         cell.start()
-        weighing = weigh(cell, clock, force_n, ask=ask, seconds=seconds, progress=progress)
-    found = LoadCellCalibration(
+        fit = measure(cell, clock, force_n, prompt=prompt, seconds=seconds, progress=progress)
+    calibration = LoadCellCalibration(
         date=datetime.now(UTC).replace(microsecond=0),
         sensor=section.sensor,
-        tare_raw=weighing.tare_raw,
-        n_per_raw=weighing.n_per_raw,
+        tare_raw=fit.tare_raw,
+        n_per_raw=fit.n_per_raw,
         force_n=(0.0, force_n),
-        noise_n=weighing.noise_n,
-        drift_n_min=weighing.drift_n_min,
+        noise_n=fit.noise_n,
+        drift_n_min=fit.drift_n_min,
     )
-    update_rig(rig, found)
+    update_rig(rig, calibration)
     report = rig.with_name(f"{rig.stem}-load-cell.png")
-    draw(weighing, report)
-    return {
-        **found.model_dump(mode="json"),
-        "return_n": weighing.return_n,
-        "rejected": weighing.rejected,
-        "rig": rig,
-        "report": report,
-    }
+    draw(fit, report)
+    return LoadCellResult(calibration, fit.return_n, fit.rejected, rig, report)
 
 
-def weigh(
+def measure(
     cell: LoadCell,
     clock: Clock,
     force_n: float,
     *,
-    ask: Ask,
+    prompt: Prompt,
     seconds: float = 10.0,
     patience_s: float = 60.0,
-    progress: Progress = lambda _step, _raw: None,
-) -> Weighing:
-    """Asks for the three loads in turn, and reads each until it has rested for some time.
+    progress: Progress = no_progress,
+) -> LoadCellFit:
+    """Asks for the three loads in turn, reads each one at rest, and fits tare and scale.
 
     Args:
-        cell: A load cell that was started; with a scale of `NEUTRAL`, no threshold in newtons acts.
-        clock: Its time.
+        cell: A started load cell with the scale `NEUTRAL_N_PER_RAW`.
+        clock: Its clock.
         force_n: Weight of the known mass.
-        ask: Says what is to be done.
-        seconds: How long each load is to rest.
-        patience_s: How long to wait for that, beyond `seconds`.
-        progress: Told of the newest reading.
+        prompt: Asks a person to change the load.
+        seconds: Duration of each rest.
+        patience_s: Longest waiting time for a rest, beyond `seconds`.
+        progress: Called with the step and the newest reading, with 0 steps.
 
     Raises:
-        DeviceTimeoutError: The cell gives no reading.
-        DataError: A reading does not rest, hardly changes with the load, or does not come back.
+        DeviceTimeoutError: The load cell gives no reading.
+        DataError: A reading does not settle, hardly changes with the load, or does not return.
     """
-    scale = _Scale(cell, clock, round(seconds * NS_PER_S), round(patience_s * NS_PER_S), progress)
-    ask("Take everything off the load cell")
-    empty = scale.read(_NAMES[0], lambda _: True)
-    tare = level(empty, 0.0, "without load")
-    ask(f"Put the mass of {force_n / STANDARD_GRAVITY_M_S2:.4g} kg ({force_n:.4g} N) on it and let it rest")
+    reader = _RestReader(cell, clock, round(seconds * NS_PER_S), round(patience_s * NS_PER_S), progress)
+    prompt("Take everything off the load cell")
+    empty = reader.read("empty", lambda _: True)
+    tare = rest_statistics(empty, 0.0, "without load")
+    prompt(
+        f"Put the mass of {force_n / STANDARD_GRAVITY_M_S2:.4g} kg ({force_n:.4g} N) on it and let it rest"
+    )
 
-    def rests(rest: Rest) -> bool:
+    def is_loaded(rest: Rest) -> bool:
         try:
-            now = level(rest, 0.0, "under load")
+            now = rest_statistics(rest, 0.0, "under load")
         except DataError:
             return False
         change = abs(now.raw - tare.raw)
-        return change > _AWAY * (now.half_raw + tare.half_raw) and now.moved_raw < _STEADY * change
+        known = change > _CHANGE_TO_UNCERTAINTY * (now.half_raw + tare.half_raw)
+        return known and now.range_raw < _STEADY_SHARE * change
 
-    loaded = scale.read(_NAMES[1], rests)
-    under = level(loaded, 0.0, "under load")
+    loaded = reader.read("loaded", is_loaded)
+    load_level = rest_statistics(loaded, 0.0, "under load")
 
-    def is_back(rest: Rest) -> bool:
+    def is_unloaded(rest: Rest) -> bool:
         try:
-            now = level(rest, 0.0, "after the load was taken off")
+            now = rest_statistics(rest, 0.0, "after unloading")
         except DataError:
             return False
-        change = abs(under.raw - tare.raw)
-        return abs(now.raw - tare.raw) < _STEADY * change and now.moved_raw < _STEADY * change
+        limit = _STEADY_SHARE * abs(load_level.raw - tare.raw)
+        return abs(now.raw - tare.raw) < limit and now.range_raw < limit
 
-    ask("Take the mass off again")
-    again = scale.read(_NAMES[2], is_back)
+    prompt("Take the mass off again")
+    again = reader.read("empty again", is_unloaded)
     return fit_load_cell(empty, loaded, again, force_n)
 
 
-class _Scale:
-    """Reads a load cell until a span of readings is as it should be, or patience ends."""
+class _RestReader:
+    """Reads a load cell until its readings are at rest, or for the longest waiting time."""
 
     def __init__(
         self, cell: LoadCell, clock: Clock, span_ns: int, patience_ns: int, progress: Progress
@@ -161,32 +188,32 @@ class _Scale:
         self._cell, self._clock, self._progress = cell, clock, progress
         self._span_ns, self._patience_ns = span_ns, patience_ns
 
-    def read(self, step: str, is_good: Callable[[Rest], bool]) -> Rest:
-        """The last span of readings; where patience ends, as it is."""
-        begin_ns = heard_ns = self._clock.now_ns() + _SHAKEN_NS
+    def read(self, step: str, is_accepted: Callable[[Rest], bool]) -> Rest:
+        """Returns the newest span of readings once it is accepted, or at the end of the waiting time."""
+        begin_ns = newest_ns = self._clock.now_ns() + _SETTLE_NS
         end_ns = begin_ns + self._span_ns + self._patience_ns
         self._cell.drain()
         samples: list[LoadCellSample] = []
-        judge_ns = begin_ns + self._span_ns
+        check_ns = begin_ns + self._span_ns
         while True:
             now_ns = self._clock.now_ns() + _PERIOD_NS
             self._clock.sleep_until_ns(now_ns)
             samples += [sample for sample in self._cell.drain() if sample.t_ns >= begin_ns]
             if samples:
-                heard_ns = max(heard_ns, samples[-1].t_ns)
-                self._progress(step, samples[-1].raw)
-            if now_ns - heard_ns > _SILENT_NS:
+                newest_ns = max(newest_ns, samples[-1].t_ns)
+                self._progress(f"{step}: {samples[-1].raw:.6g}", 0)
+            if now_ns - newest_ns > _SILENT_NS:
                 counts = ", ".join(f"{n} {name}" for name, n in self._cell.counts().items() if n)
                 raise DeviceTimeoutError(
-                    f"the load cell gives no reading (counted: {counts or 'nothing'}); check its cable and "
-                    "its section of the configuration, and see what doctor says"
+                    f"the load cell gives no reading (counted: {counts or 'nothing'}); check its cable, the "
+                    "section load_cell of the configuration, and `gripper-force doctor`"
                 )
-            if heard_ns < judge_ns:
+            if newest_ns < check_ns:
                 continue
-            judge_ns = heard_ns + self._span_ns // 10
-            samples = [sample for sample in samples if sample.t_ns > heard_ns - self._span_ns]
+            check_ns = newest_ns + self._span_ns // 10
+            samples = [sample for sample in samples if sample.t_ns > newest_ns - self._span_ns]
             rest = _rest(samples)
-            if is_good(rest) or now_ns > end_ns:
+            if is_accepted(rest) or now_ns > end_ns:
                 return rest
 
 
