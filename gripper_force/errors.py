@@ -1,28 +1,29 @@
-"""The error tree. Every error says what is wrong, where, and what to do.
+"""Exceptions. Every message states the problem, the key or device, and the remedy.
 
 ::
 
     GripperError
-    ├── ConfigError             a key, a value, an object's or a backend's name
-    ├── DeviceError             a device is missing, in use, lost or refuses
+    ├── ConfigError             a configuration key, value, object or backend is unknown or not allowed
+    ├── DeviceError             a device is missing, in use, lost, or refuses a request
     │   ├── DeviceNotFoundError
     │   ├── DeviceLostError
     │   ├── DeviceTimeoutError
-    │   └── HardwareFaultError  the device itself reports a fault
-    ├── SimulationError         a simulated scene can't be built, drawn or trusted
+    │   └── HardwareFaultError  the device reports a fault
+    ├── SimulationError         a simulated scene can't be built or rendered, or failed while running
     ├── LogError                a log can't be read or written
-    ├── DataError               a recording or a data set is unusable
-    ├── CheckpointError         a network's file is of another network, or damaged
-    └── NonFiniteError          NaN or infinity where a number is needed
+    ├── DataError               a recording or data set is incomplete or unusable
+    ├── CheckpointError         a checkpoint is missing, damaged, or of another network
+    ├── RequestError            a request was refused: a target out of range, or nothing to hold
+    └── NonFiniteError          NaN or infinity where a finite number is required
 """
 
 
 class GripperError(Exception):
-    """Base of every error this project raises on purpose; the command line turns it into exit code 2."""
+    """Base class of all errors that this project raises; the command line exits with code 2."""
 
 
 class ConfigError(GripperError):
-    """A configuration key, value, object or backend is not known or not allowed."""
+    """A configuration key, value, object or backend is unknown or not allowed."""
 
 
 class DeviceError(GripperError):
@@ -30,11 +31,11 @@ class DeviceError(GripperError):
 
 
 class DeviceNotFoundError(DeviceError):
-    """No such device."""
+    """The device does not exist."""
 
 
 class DeviceLostError(DeviceError, ConnectionError):
-    """The device was there and is gone (unplugged, powered off)."""
+    """The device was connected and no longer is (unplugged, powered off)."""
 
 
 class DeviceTimeoutError(DeviceError, TimeoutError):
@@ -42,11 +43,11 @@ class DeviceTimeoutError(DeviceError, TimeoutError):
 
 
 class HardwareFaultError(DeviceError):
-    """The device reports a fault of its own (overload, overheating, supply voltage)."""
+    """The device reports a fault (overload, overheating, supply voltage)."""
 
 
 class SimulationError(GripperError):
-    """A simulated scene can't be built, can't be drawn, or broke while running."""
+    """A simulated scene can't be built or rendered, or failed while running."""
 
 
 class LogError(GripperError):
@@ -54,12 +55,16 @@ class LogError(GripperError):
 
 
 class DataError(GripperError):
-    """A recording or data set is missing a part or can't be used."""
+    """A recording or data set is incomplete or unusable."""
 
 
 class CheckpointError(GripperError):
     """A checkpoint is missing, damaged, or belongs to another network."""
 
 
+class RequestError(GripperError, ValueError):
+    """A request was refused: a target out of range, or nothing to hold."""
+
+
 class NonFiniteError(GripperError, ValueError):
-    """NaN or infinity reached a place that must only see finite numbers."""
+    """NaN or infinity where a finite number is required."""

@@ -1,19 +1,17 @@
 """Faults on purpose: which is on when, and the two that the core itself suffers, estimator and disk.
 
-What a kind means for each unit stands in `gripper_force.config.FAULTS`; the stand-ins of devices carry the
-other faults out.
+`gripper_force.fault_config.FAULTS` lists the kinds of each unit; the simulated devices carry out the others.
 """
 
 import errno
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, BinaryIO
 
-from gripper_force.config import FaultConfig
+from gripper_force.fault_config import FaultConfig
 from gripper_force.interfaces import Clock
-from gripper_force.types import NS_PER_MS, NS_PER_S, Gray
+from gripper_force.types import NS_PER_MS, NS_PER_S, ForceEstimate, Gray
 
 _SEEN_SHARE = 2 / 3
 _SLOW_WRITE_NS = 50 * NS_PER_MS
@@ -50,12 +48,6 @@ class Faults:
         return max(ends, default=t_ns)
 
 
-@dataclass(frozen=True, slots=True)
-class _Estimate:
-    force_n: float
-    std_n: float
-
-
 class FaultyEstimator:
     """An estimator that fails as configured."""
 
@@ -69,7 +61,7 @@ class FaultyEstimator:
         reference: Gray | None = self._estimator.reference
         return reference
 
-    def update(self, gray: Gray) -> Any:
+    def update(self, gray: Gray) -> ForceEstimate | None:
         """Takes the next frame, and gives what is left of the estimate."""
         now_ns = self._clock.now_ns()
         kind = self._faults.active("estimator", now_ns)
@@ -80,13 +72,13 @@ class FaultyEstimator:
             if not self._lockstep:  # there time would stand still with it
                 self._clock.sleep_until_ns(self._faults.end_ns("estimator", now_ns))
             return None
-        estimate = self._estimator.update(gray)
+        estimate: ForceEstimate | None = self._estimator.update(gray)
         if estimate is None or kind == "ok":
             return estimate
         force_n = _SEEN_SHARE * estimate.force_n
         if kind == "garbage":
             force_n = (math.nan, math.inf, -math.inf)[self._calls % 3]
-        return _Estimate(force_n, estimate.std_n)
+        return ForceEstimate(force_n, estimate.std_n)
 
 
 class FaultyFile:

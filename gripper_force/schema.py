@@ -1,7 +1,8 @@
-"""What all that is typed and kept as YAML shares: sections, numbers, reading, and the error's sentence."""
+"""Shared base of YAML-backed models: base class, number types, loading, and error messages."""
 
 from collections.abc import Iterator
 from copy import deepcopy
+from difflib import get_close_matches
 from inspect import isclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args
@@ -12,17 +13,17 @@ from pydantic.fields import FieldInfo
 
 from gripper_force.errors import ConfigError
 
-# No quantity of a gripper is beyond these, and what is computed from it stays finite.
+# No quantity of a gripper is beyond these bounds, and values computed from it stay finite.
 Positive = Annotated[float, Field(ge=1e-9, le=1e9, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
 Finite = Annotated[float, Field(ge=-1e9, le=1e9, allow_inf_nan=False)]
 
 Tree = dict[str, Any]
-"""Keys to values and to trees."""
+"""A mapping of keys to values and subtrees, as read from YAML."""
 
 
 class Section(BaseModel):
-    """Base of every section: immutable, and an unknown key is an error."""
+    """Base class of every section: immutable; an unknown key is an error."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -30,11 +31,11 @@ class Section(BaseModel):
 S = TypeVar("S", bound=Section)
 
 _NO_YAML = (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, RecursionError)
-"""What the parser lets out: of a date such as 2001-99-99, a number such as 0b, a tag such as !!bool x."""
+"""Exceptions of the YAML parser, among others for a date 2001-99-99, a number 0b, and a tag !!bool x."""
 
 
 def read_tree(path: Path, what: str = "configuration") -> Tree:
-    """The keys of a YAML file. Raises `ConfigError` that names it."""
+    """Reads the keys of a YAML file. Raises `ConfigError` that names the file."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, ValueError) as error:
@@ -43,34 +44,38 @@ def read_tree(path: Path, what: str = "configuration") -> Tree:
 
 
 def tree_from(text: str, where: str, what: str = "configuration") -> Tree:
-    """The keys of a YAML text. Raises `ConfigError` that names ``where``."""
+    """Parses the keys of a YAML text. Raises `ConfigError` that names ``where``."""
     loaded = _parse(text, f"can't read the {what} {where}")
     if not isinstance(loaded, dict | None):
-        raise ConfigError(f"{where} holds no mapping of keys to values at its top level")
+        raise ConfigError(f"{where} must hold a mapping at its top level, with lines such as `key: value`")
     return loaded or {}
 
 
 def dump(section: Section) -> str:
-    """A whole section as YAML."""
+    """A complete section as YAML."""
     return yaml.safe_dump(section.model_dump(mode="json"), sort_keys=False)
 
 
 def assign(tree: Tree, assignment: str) -> None:
-    """Puts ``key.path=value`` into a tree; the value is read as YAML. Raises `ConfigError`."""
+    """Assigns ``key.path=value`` in a tree; the value is read as YAML. Raises `ConfigError`."""
     key, equals, text = assignment.partition("=")
     if not equals or not key:
         raise ConfigError(f"--set needs key.path=value, got {assignment!r}")
-    value = _parse(text, f"--set {key}: {text!r} is no value")
+    assign_value(tree, key, _parse(text, f"--set {key}: {text!r} is not a YAML value"))
+
+
+def assign_value(tree: Tree, key: str, value: Any) -> None:
+    """Assigns a value to a key path in a tree. Raises `ConfigError`."""
     *parents, leaf = key.split(".")
     for parent in parents:
         tree = tree.setdefault(parent, {})
         if not isinstance(tree, dict):
-            raise ConfigError(f"--set {key}: {parent!r} is a value, not a section")
+            raise ConfigError(f"--set {key}: {parent!r} is a value, not a section; name a key of a section")
     tree[leaf] = value
 
 
 def merged(under: Tree, over: Tree) -> Tree:
-    """A tree with the keys of both; where both have one, it is the second's."""
+    """Merges two trees; where both have a key, the value of ``over`` counts."""
     both = dict(under)
     for key, value in over.items():
         below = both.get(key)
@@ -79,11 +84,11 @@ def merged(under: Tree, over: Tree) -> Tree:
 
 
 def section_from(section: type[S], overrides: list[str] | None, tree: Tree | None = None) -> S:
-    """Builds a section on its own, such as a recipe, from its defaults and assignments ``key=value``.
+    """Builds a section that is not part of a configuration, such as a training recipe.
 
     Args:
         section: What to build.
-        overrides: Assignments, which have the last word.
+        overrides: Assignments ``key=value``, applied last.
         tree: Keys that differ from the defaults.
 
     Raises:
@@ -101,8 +106,8 @@ def validated(section: type[S], tree: Tree, where: str, what: str = "configurati
     Args:
         section: What to build.
         tree: Keys that differ from the defaults.
-        where: Where they come from, for the error.
-        what: What the section is, for the error.
+        where: Origin of the keys, for the error.
+        what: Name of the kind of section, for the error.
 
     Raises:
         ConfigError: A key or value is wrong.
@@ -114,7 +119,7 @@ def validated(section: type[S], tree: Tree, where: str, what: str = "configurati
 
 
 def read_section(section: type[S], path: Path, format_: str, what: str) -> S:
-    """Reads a YAML file that says its own format under the key ``format``.
+    """Reads a YAML file that states its format under the key ``format``.
 
     Raises:
         ConfigError: It can't be read, is of another format, or a key or value is wrong.
@@ -122,14 +127,14 @@ def read_section(section: type[S], path: Path, format_: str, what: str) -> S:
     tree = read_tree(path, what)
     if tree.get("format") != format_:
         raise ConfigError(
-            f"{path} is no {what} of format {format_}, it says {tree.get('format')!r}; make one with "
+            f"{path} is not a {what} of format {format_} (it is {tree.get('format')!r}); make one with "
             "`gripper-force calibrate`"
         )
     return validated(section, tree, str(path), what)
 
 
 def keys(section: type[Section], under: str = "") -> Iterator[tuple[str, FieldInfo]]:
-    """Every key of a section and of the sections in it, by its path, with what it is."""
+    """Yields the path and the field of every key of a section and its subsections."""
     for name, field in section.model_fields.items():
         kind = field.annotation
         if isclass(kind) and issubclass(kind, Section):
@@ -139,7 +144,7 @@ def keys(section: type[Section], under: str = "") -> Iterator[tuple[str, FieldIn
 
 
 def write_all(files: dict[Path, bytes]) -> None:
-    """Writes files, none of which appears under its name before all are whole.
+    """Writes several files; none appears under its name before all are complete.
 
     Raises:
         ConfigError: One can't be written.
@@ -168,16 +173,31 @@ def _sentence(root: type[Section], error: ValidationError, where: str, what: str
     parts = [str(part) for part in first["loc"]]
     key = ".".join(parts)
     if first["type"] == "extra_forbidden":
-        known = ", ".join(_section_at(root, parts[:-1]).model_fields)
-        return f"unknown {what} key {key!r} (from {where}); known here: {known}"
+        known = list(_section_at(root, parts[:-1]).model_fields)
+        hint = _suggestion(root, parts)
+        return f"unknown {what} key {key!r} (from {where}){hint}; known here: {', '.join(known)}"
     reason = first["msg"].removeprefix("Value error, ")
     if not parts:
-        return f"the {what} (from {where}) does not fit together: {reason}"
+        return f"the {what} (from {where}) is inconsistent: {reason}"
     return f"{what} key {key!r} (from {where}): {reason}, got {first['input']!r}"
 
 
+def _suggestion(root: type[Section], parts: list[str]) -> str:
+    """Names the most similar known key path: first in the same section, then in all sections."""
+    prefix = "".join(f"{part}." for part in parts[:-1])
+    here = [f"{prefix}{name}" for name in _section_at(root, parts[:-1]).model_fields]
+    paths = [path for path, _ in keys(root)]
+    same_leaf = [path for path in paths if path.rpartition(".")[2] == parts[-1]]
+    close = (
+        get_close_matches(".".join(parts), here, 1)
+        or same_leaf
+        or get_close_matches(".".join(parts), paths, 1)
+    )
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
 def _section_at(root: type[Section], parts: list[str]) -> type[Section]:
-    """The section that a path leads to, through optional sections and tuples of sections."""
+    """Returns the section at a path, through optional sections and tuples of sections."""
     section = root
     for part in parts:
         if part in section.model_fields:

@@ -1,6 +1,6 @@
-"""Frozen records that travel through the project, in SI units, with the unit in the name.
+"""Frozen records exchanged between the parts of the project, in SI units, with the unit in the name.
 
-Time is the host's monotonic clock in integer nanoseconds (``t_ns``). In lockstep it is the simulated clock.
+Time is the host's monotonic clock in integer nanoseconds (``t_ns``); in lockstep it is the simulated clock.
 Every record but `Frame` is written to a log field by field (see `gripper_force.runtime.log`), so a field's
 type is ``int``, ``float``, ``bool`` or ``str``.
 """
@@ -20,7 +20,7 @@ Gray = npt.NDArray[np.uint8]
 
 
 class Phase(StrEnum):
-    """What the grasp controller is doing."""
+    """State of the grasp controller."""
 
     OPEN = "open"
     APPROACH = "approach"
@@ -28,11 +28,12 @@ class Phase(StrEnum):
     RAMP = "ramp"
     HOLD = "hold"
     RELEASE = "release"
+    MOVE = "move"
     FAULT = "fault"
 
 
 class Outcome(StrEnum):
-    """How a grasp ended; ``NONE`` while it is under way."""
+    """Result of a grasp or a move; ``NONE`` while it is under way."""
 
     NONE = ""
     HELD = "held"
@@ -40,18 +41,21 @@ class Outcome(StrEnum):
     SLIP = "slip"
     TIMEOUT = "timeout"
     FAULT = "fault"
+    MOVED = "moved"
+    BLOCKED = "blocked"
 
 
 class RequestKind(StrEnum):
-    """What a caller asks of the controller. A newer request pre-empts an older one; stop always wins."""
+    """Kind of a request. A newer request pre-empts an older one; stop has priority over all others."""
 
     GRASP = "grasp"
     RELEASE = "release"
+    MOVE = "move"
     STOP = "stop"
 
 
 class EstimateSource(StrEnum):
-    """Which sensors a force estimate rests on."""
+    """Sensors that a force estimate is computed from."""
 
     FUSED = "fused"
     CURRENT = "current"
@@ -60,7 +64,7 @@ class EstimateSource(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class ServoState:
-    """What one bus cycle read from the servo.
+    """Servo state read in one bus cycle.
 
     Attributes:
         t_ns: Host time of the reading.
@@ -68,7 +72,7 @@ class ServoState:
         velocity_rad_s: Angular velocity of the horn.
         current_a: Motor current, signed.
         temperature_c: Temperature of the servo.
-        voltage_v: Supply at the servo.
+        voltage_v: Supply voltage at the servo.
         hardware_error: The Hardware Error Status byte (0: none).
     """
 
@@ -83,12 +87,12 @@ class ServoState:
 
 @dataclass(frozen=True, slots=True)
 class ServoCommand:
-    """What one bus cycle writes to the servo, in current-based position mode (5).
+    """Goals written to the servo in one bus cycle, in current-based position mode (5).
 
     Attributes:
         t_ns: Host time of the decision.
-        goal_position_rad: Bounds the travel.
-        goal_current_a: Magnitude that bounds the current, and with it the force. Never negative.
+        goal_position_rad: Goal position, which limits the travel.
+        goal_current_a: Limit on the magnitude of the current, and with it on the force. Never negative.
     """
 
     t_ns: int
@@ -102,8 +106,8 @@ class Frame:
 
     Attributes:
         t_ns: Host time at the middle of the exposure.
-        received_ns: Host time at which the frame could first be used.
-        seq: The camera's frame number; a gap is a lost frame.
+        received_ns: Host time at which the frame became available.
+        seq: Frame number of the camera; a gap is a lost frame.
         gray: Image, (H, W) uint8.
     """
 
@@ -115,13 +119,13 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class LoadCellSample:
-    """One load-cell reading.
+    """One load-cell sample.
 
     Attributes:
         t_ns: Host time of the sample.
         force_n: Force after tare and scale.
-        raw: The reading before tare and scale, in the sensor's own unit.
-        valid: False where the sample was rejected (spike, saturation, stuck value).
+        raw: Value before tare and scale, in the unit of the sensor.
+        valid: False if the sample was rejected (spike, saturation, stuck value).
     """
 
     t_ns: int
@@ -131,16 +135,29 @@ class LoadCellSample:
 
 
 @dataclass(frozen=True, slots=True)
+class ForceEstimate:
+    """Estimate of the contact force from one frame.
+
+    Attributes:
+        force_n: Contact force.
+        std_n: Standard deviation of its error, as the estimator claims it.
+    """
+
+    force_n: float
+    std_n: float
+
+
+@dataclass(frozen=True, slots=True)
 class VisualForce:
-    """The network's estimate for one frame.
+    """Visual estimate for one frame.
 
     Attributes:
         t_ns: Capture time of the frame.
-        ready_ns: Host time at which the estimate was there.
-        seq: The frame's number.
+        ready_ns: Host time at which the estimate became available.
+        seq: Number of the frame.
         force_n: Estimated contact force.
-        std_n: Standard deviation the estimator claims for it.
-        compute_ms: Time the estimator took.
+        std_n: Standard deviation claimed by the estimator.
+        compute_ms: Computing time of the estimator.
     """
 
     t_ns: int
@@ -153,16 +170,16 @@ class VisualForce:
 
 @dataclass(frozen=True, slots=True)
 class FusedForce:
-    """The estimate the force loop acts on.
+    """Fused estimate: the force that the force loop controls.
 
     Attributes:
-        t_ns: Time it holds for.
+        t_ns: Time of the estimate.
         force_n: Estimated contact force.
-        std_n: Its standard deviation.
-        current_n: What the motor current alone says.
-        bias_n: Correction of the current-derived force, held by the filter.
-        friction_n: Coulomb friction of one jaw, as free travel told it.
-        source: Which sensors the estimate rests on (a `EstimateSource` value).
+        std_n: Standard deviation of `force_n`.
+        current_n: Current estimate: the force by the motor current alone.
+        bias_n: Correction that the filter adds to `current_n`.
+        friction_n: Coulomb friction of one jaw, estimated during free travel.
+        source: Sensors used (an `EstimateSource` value).
     """
 
     t_ns: int
@@ -176,30 +193,32 @@ class FusedForce:
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """What a caller asks for.
+    """Request to the controller.
 
     Attributes:
         t_ns: Host time of the request.
         kind: A `RequestKind` value.
         target_n: Wanted grip force (grasp only).
+        width_m: Wanted distance between the jaws (move only).
     """
 
     t_ns: int
     kind: str
     target_n: float = 0.0
+    width_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class GraspStatus:
-    """Where the grasp stands after one control cycle.
+    """State of the grasp after one control cycle.
 
     Attributes:
         t_ns: Time of the cycle.
         phase: A `Phase` value.
         outcome: An `Outcome` value.
-        reference_n: Force the loop steers to in this cycle (the target, shaped by the ramp).
+        reference_n: Reference of the force loop in this cycle (the target, shaped by the ramp).
         width_m: Distance between the jaws.
-        reason: Why the phase or the outcome changed in this cycle; empty otherwise.
+        reason: Reason for the change of phase or outcome in this cycle, or the end of a move; otherwise empty.
     """
 
     t_ns: int
@@ -212,11 +231,11 @@ class GraspStatus:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something worth a line: a retry on the bus, a dropped frame, a limit that acted.
+    """Message in the log: a retry on the bus, a dropped frame, an active limit.
 
     Attributes:
-        t_ns: When.
-        unit: Which part says so (``servo``, ``camera``, ``vision``, ``control``, ``session``...).
+        t_ns: Time of the event.
+        unit: Part that reports it (``servo``, ``camera``, ``vision``, ``control``, ``session``...).
         text: One sentence.
     """
 

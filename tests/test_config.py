@@ -108,7 +108,9 @@ def test_who_is_wrong_is_named_the_file_or_what_is_set(tmp_path: Path) -> None:
 def test_a_rig_profile_is_no_configuration(tmp_path: Path) -> None:
     path = tmp_path / "rig.yaml"
     path.write_text("format: gripper-force-rig/1")
-    with pytest.raises(ConfigError, match=r"rig\.yaml is no configuration .* --set calibration\.rig="):
+    with pytest.raises(
+        ConfigError, match=r"rig\.yaml is a gripper-force-rig.* not a configuration.* --set calibration\.rig="
+    ):
         load_config(path)
 
 
@@ -127,11 +129,11 @@ def test_overrides_are_yaml_and_the_last_one_wins(tmp_path: Path) -> None:
     [
         ("target_n", r"--set needs key\.path=value, got 'target_n'"),
         ("=3", r"--set needs key\.path=value, got '=3'"),
-        ("target_n=[1", r"--set target_n: '\[1' is no value"),
-        ("target_n=0b_", "--set target_n: '0b_' is no value"),
-        ("target_n=!!bool x", "--set target_n: '!!bool x' is no value"),
-        ("target_n=!!timestamp x", "is no value"),
-        ("target_n=!!int", "is no value"),
+        ("target_n=[1", r"--set target_n: '\[1' is not a YAML value"),
+        ("target_n=0b_", "--set target_n: '0b_' is not a YAML value"),
+        ("target_n=!!bool x", "--set target_n: '!!bool x' is not a YAML value"),
+        ("target_n=!!timestamp x", "is not a YAML value"),
+        ("target_n=!!int", "is not a YAML value"),
         ("seed.a.b=3", "'seed' is a value, not a section"),
     ],
 )
@@ -145,7 +147,7 @@ def test_an_assignment_that_is_none_is_refused(tmp_path: Path, assignment: str, 
 @pytest.mark.parametrize(
     ("data", "sentence"),
     [
-        (b"- a\n- b\n", "holds no mapping of keys to values"),
+        (b"- a\n- b\n", "must hold a mapping at its top level"),
         (b"a: [1\n", "can't read the configuration"),
         (b"a: 2001-99-99", "month must be"),
         (b"a: " + b"[" * 2000, "can't read the configuration .*recursion"),
@@ -214,3 +216,22 @@ def test_a_configuration_can_not_be_changed() -> None:
     config: Any = Config()
     with pytest.raises(ValueError, match="frozen"):
         config.seed = 3
+
+
+@pytest.mark.parametrize(
+    ("key", "suggestion"),
+    [("control.rate_h", "control.rate_hz"), ("rate_hz", "camera.rate_hz"), ("contol.rate_hz", "control")],
+)
+def test_an_unknown_key_gets_a_suggestion(key: str, suggestion: str) -> None:
+    with pytest.raises(ConfigError, match=f"did you mean '{suggestion}'"):
+        load_config(None, {key: 1.0})
+
+
+def test_overrides_may_be_a_mapping() -> None:
+    assert load_config(None, {"control.rate_hz": 100.0, "object": "tube"}) == load_config(
+        None, ["control.rate_hz=100", "object=tube"]
+    )
+
+
+def test_a_configuration_of_version_0_1_with_the_compiled_engine_is_read() -> None:
+    assert config_from_text("vision: {engine: compiled}", "a log").vision.engine == "torch"

@@ -1,33 +1,36 @@
-"""docs/configuration.md lists every key; ``python tests/core/test_configuration_page.py`` writes it anew."""
+"""docs/configuration.md lists every key; ``python tests/test_configuration_page.py`` writes it."""
 
 from pathlib import Path
 from typing import Any
 
-from gripper_force.config import FAULTS, Config
+from gripper_force.config import Config
+from gripper_force.fault_config import FAULTS
 from gripper_force.schema import keys
 
 PAGE = Path(__file__).parents[1] / "docs" / "configuration.md"
 HEAD = """# Configuration
 
-Every key, with what it is where nothing is said; `-` is none, `null` in YAML. A file for `--config` is YAML
-(`control: {force_limit_n: 8}`), and `--set control.force_limit_n=8` wins over it. Units stand in the names.
-An unknown key is refused, with those that are known.
+All keys and their defaults; `-` is none (`null` in YAML). A `--config` file is YAML
+(`control: {force_limit_n: 8}`); `--set control.force_limit_n=8` overrides it. Units are part of the names.
+An unknown key is an error. `gripper-force config schema` prints the JSON schema for editors.
 
-| key | default | what it is |
+| key | default | meaning |
 |---|---|---|
 """
 FAULTS_HEAD = """
 ## Faults
-`faults` takes a list: `--set "faults=[{unit: camera, kind: stuck, at_s: 2, for_s: 1}]"`. What became of each
-is in [Reliability](reliability.md).
+`faults` is a list: `--set "faults=[{unit: camera, kind: stuck, at_s: 2, for_s: 1}]"`.
+[Reliability](reliability.md) shows the result of each.
 
-| unit | kind | what it means |
+| unit | kind | meaning |
 |---|---|---|
 """
 
 
 def shown(value: Any) -> str:
     if value is None:
+        return "-"
+    if value == {}:
         return "-"
     if isinstance(value, bool):
         return str(value).lower()
@@ -45,11 +48,11 @@ def page() -> str:
     return HEAD + "\n".join(rows) + "\n" + FAULTS_HEAD + "\n".join(faults) + "\n"
 
 
-def test_the_page_is_of_today() -> None:
+def test_the_page_is_up_to_date() -> None:
     assert PAGE.read_text() == page()
 
 
-def test_every_key_is_told() -> None:
+def test_every_key_has_a_description() -> None:
     assert [key for key, field in keys(Config) if not field.description] == []
 
 

@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gripper_force.config import FAULTS, FaultConfig, config_from, load_config
+from gripper_force.config import config_from, load_config
 from gripper_force.errors import ConfigError
+from gripper_force.fault_config import FAULTS, FaultConfig
 from gripper_force.fault_injection import Faults, FaultyEstimator, FaultyFile
 
 KINDS = ("off", "stuck", "garbage", "wrong", "slow", "delayed", "intermittent")
@@ -48,7 +49,7 @@ def test_pairs_that_are_not_supported_are_refused(unit: str, kind: str) -> None:
     if kind in FAULTS[unit]:
         assert config_from(tree, "test").faults[0].kind == kind
     else:
-        with pytest.raises(ConfigError, match=f"a {unit} can't be made {kind}; known here: ok, "):
+        with pytest.raises(ConfigError, match=f"unit {unit} has no fault kind {kind}; choose one of ok, "):
             config_from(tree, "test")
 
 

@@ -47,6 +47,7 @@ def simulate(
     as_json: AsJson = False,
 ) -> None:
     """Write logs of randomised touches, to train and to evaluate on. Goes on where it was broken off."""
+    from gripper_force.jobs import paper_protocol
     from gripper_force.jobs import simulate as job
 
     plans: list[Any]
@@ -72,8 +73,8 @@ def simulate(
                 f"the sets of --protocol are fixed, so {' and '.join(idle)} can't be heeded: leave out one "
                 "or the other"
             )
-        settings = load_settings(config, [f"camera.rate_hz={job.PROTOCOL_RATE_HZ}", *(set_ or [])], {})
-        plans = list(job.plan_protocol(scale or "full"))
+        settings = load_settings(config, [f"camera.rate_hz={paper_protocol.RATE_HZ}", *(set_ or [])], {})
+        plans = list(paper_protocol.plan_protocol(scale or "full"))
     else:
         raise ConfigError(f"no protocol {protocol!r}; there is shin2019")
     names = [name for p in plans for name in p.names]

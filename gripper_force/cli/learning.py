@@ -11,7 +11,7 @@ from gripper_force.cli import console
 from gripper_force.cli.options import CORES, AsJson, Jobs, Overrides, load_settings
 from gripper_force.cli.output.paper import paper_tables
 from gripper_force.cli.output.runs import errors_table
-from gripper_force.errors import ConfigError, DataError
+from gripper_force.errors import ConfigError
 
 
 def train(
@@ -71,24 +71,11 @@ def evaluate(
     as_json: AsJson = False,
 ) -> None:
     """Compare a checkpoint's estimates with the load cell, over all logs of a folder."""
-    from gripper_force.jobs.dataset import load_clips
     from gripper_force.jobs.evaluate import evaluate as job
-    from gripper_force.profiles.apply import correction_of
-    from gripper_force.vision.checkpoint import load_checkpoint
 
     settings = load_settings(None, set_, {"vision.checkpoint": checkpoint, "calibration.object": profile})
-    vision = settings.vision
-    loaded = load_checkpoint(vision.checkpoint)
-    clips = load_clips(data, loaded.header.preprocess, vision.region, workers=jobs)
-    clips = [clip for clip in clips if not only or clip.object in only]
-    if not clips:
-        raise DataError(f"no log in {data} is of {', '.join(only or [])}")
-
-    def correct(clip: Any) -> Any:
-        return correction_of(settings.model_copy(update={"object": clip.object}), loaded)
-
-    corrected = None if settings.calibration.object is None else correct
-    console.show(dict(job(loaded, clips, corrected)), as_json, errors_table)
+    result: Any = job(data, settings.vision.checkpoint, objects=only or (), config=settings, workers=jobs)
+    console.show(result, as_json, errors_table)
 
 
 def export(

@@ -75,6 +75,13 @@ _CLOSED_M = 0.002
 _OPEN_M = 0.003
 """Distance from the open width at which the jaws count as open."""
 
+_AT_WIDTH_M = 0.0005
+"""Distance from the requested width at which a move has arrived: six times what Coulomb friction and the
+servo's proportional gain leave (80 um)."""
+
+_MOVE_SPARE_S = 1.0
+"""Time a move may take beyond its speed profile before an obstacle is reported."""
+
 _COLLAPSED = 0.5
 _COLLAPSE_S = 0.1
 """A force under this share of the target, for this time, is a lost object."""
@@ -84,12 +91,21 @@ _GRIPPING = (Phase.CONTACT, Phase.RAMP, Phase.HOLD)
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What one control cycle decided, and on what grounds."""
+    """Result of one control cycle.
+
+    Attributes:
+        command: The bounded command for the servo.
+        status: State of the grasp.
+        estimate: The force estimate.
+        events: Sentences for the log.
+        refusal: Reason why this cycle's request was refused; empty otherwise.
+    """
 
     command: ServoCommand
     status: GraspStatus
     estimate: FusedForce
     events: tuple[Event, ...]
+    refusal: str = ""
 
 
 class GraspController:
@@ -97,6 +113,8 @@ class GraspController:
 
     ``open -> approach -> contact -> ramp -> hold -> release -> open``, and ``fault`` from anywhere. A request
     pre-empts what goes on: a grasp while gripping ramps to the new target without letting go.
+
+    *A move* positions the jaws at a width with the motor force of a release. It also lets go of an object.
 
     *Fault is latched.* A stop request leads there, and whatever trips `Safety`. The jaws then go limp, hold
     where they are with a current that can only fall, or open, as ``on_fault`` says. Only a release request
@@ -128,6 +146,9 @@ class GraspController:
         self._goal_width_m = transmission.open_width_m
         self._motor_force_n = self._free_motor_force_n
         self._target_n = self._speed_m_s = self._held_width_m = 0.0
+        self._move_width_m = transmission.open_width_m
+        self._move_time_s = 0.0
+        self._move_opens = False
         self._grasp_ns = 0
         self._phase_s = self._sign_s = self._settled_s = 0.0
         self._error_n = self._speed_integral_n = 0.0
@@ -160,7 +181,8 @@ class GraspController:
         events = self._read_sensors(t_ns, servo, visual)
         if tripped:
             self._fail()
-        if request is not None and (refusal := self._handle_request(t_ns, request)):
+        refusal = "" if request is None else self._handle_request(t_ns, request)
+        if request is not None and refusal:
             events.append(Event(t_ns, "control", f"refused {str(request.kind)!r}: {refusal}"))
         if self._width_m is not None:
             self._run_phase(t_ns, dt_s, self._width_m, self._transmission.closing_m_s(servo.velocity_rad_s))
@@ -169,7 +191,7 @@ class GraspController:
         if is_over and not self._was_over:
             events.append(Event(t_ns, "control", f"{self._estimate.force_n:.2f} N is over the limit; eased"))
         self._was_over = is_over
-        return Decision(command, self._status(t_ns), self._estimate, tuple(events))
+        return Decision(command, self._status(t_ns), self._estimate, tuple(events), refusal)
 
     # What comes in.
 
@@ -213,6 +235,11 @@ class GraspController:
             if cause := self._safety.reset():
                 return cause
             self._release("release requested")
+        elif request.kind == RequestKind.MOVE:
+            open_width_m = self._transmission.open_width_m
+            if not 0 <= request.width_m <= open_width_m:
+                return f"a width of {1e3 * request.width_m:g} mm is not within 0 to {1e3 * open_width_m:g} mm"
+            self._move(request.width_m)
         elif request.kind != RequestKind.GRASP:
             return "there is no such request"
         elif not 0 < request.target_n <= self._largest_target_n:
@@ -246,9 +273,21 @@ class GraspController:
         self._enter(Phase.APPROACH, f"grasp with {target_n:g} N requested")
 
     def _release(self, reason: str) -> None:
+        self._start_travel()
+        self._enter(Phase.RELEASE, reason)
+
+    def _move(self, width_m: float) -> None:
+        self._outcome = Outcome.NONE
+        self._start_travel()
+        distance_m = width_m - self._present_width_m
+        self._move_width_m, self._move_opens = width_m, distance_m > 0
+        rate_m_s = 2 * self._config.approach_speed_m_s
+        self._move_time_s = abs(distance_m) / rate_m_s + _SPEED_UP_S + _MOVE_SPARE_S
+        self._enter(Phase.MOVE, f"move to {1e3 * width_m:.1f} mm requested")
+
+    def _start_travel(self) -> None:
         self._travel.start(self._present_width_m, 2 * self._config.approach_speed_m_s)
         self._limits.begin()
-        self._enter(Phase.RELEASE, reason)
 
     def _fail(self) -> None:
         reason = self._safety.reason
@@ -267,7 +306,11 @@ class GraspController:
 
     @property
     def _is_opening(self) -> bool:
-        return self._phase == Phase.RELEASE or self._opens_at_fault
+        return (
+            self._phase == Phase.RELEASE
+            or (self._phase == Phase.MOVE and self._move_opens)
+            or self._opens_at_fault
+        )
 
     @property
     def _wanted_n(self) -> float:
@@ -297,6 +340,8 @@ class GraspController:
                 self._hold(dt_s, width_m)
             case Phase.RELEASE:
                 self._open(dt_s, width_m)
+            case Phase.MOVE:
+                self._run_move(dt_s, width_m)
             case Phase.FAULT if self._opens_at_fault:
                 self._open(dt_s, width_m)
         if self._phase in _GRIPPING:
@@ -385,6 +430,19 @@ class GraspController:
             self._goal_width_m = open_width_m
             if self._phase == Phase.RELEASE:
                 self._enter(Phase.OPEN, "open")
+
+    def _run_move(self, dt_s: float, width_m: float) -> None:
+        self._motor_force_n = self._free_motor_force_n
+        goal_width_m = self._travel.step(self._move_width_m, dt_s)
+        self._goal_width_m = min(max(goal_width_m, width_m - 2 * _LEAD_M), width_m + 2 * _LEAD_M)
+        self._travel.value = self._goal_width_m
+        if self._outcome != Outcome.NONE:
+            return
+        is_there = abs(width_m - self._move_width_m) <= _AT_WIDTH_M
+        if is_there and self._goal_width_m == self._move_width_m:
+            self._set_outcome(Outcome.MOVED, f"moved to {self._move_width_m * 1e3:.1f} mm")
+        elif self._phase_s >= self._move_time_s:
+            self._set_outcome(Outcome.BLOCKED, f"stopped at {width_m * 1e3:.1f} mm by an obstacle")
 
     def _watch_time(self, t_ns: int) -> None:
         if t_ns - self._grasp_ns > self._config.timeout_s * NS_PER_S:

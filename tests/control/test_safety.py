@@ -130,5 +130,5 @@ def test_it_is_never_open_in_a_cycle_that_has_a_cause(cycles):
 
 @pytest.mark.parametrize("control", [{"warm_c": 70.0}, {"voltage_limits_v": [14.8, 10.0]}])
 def test_limits_out_of_order_are_refused(control):
-    with pytest.raises(ConfigError, match="must lie below"):
+    with pytest.raises(ConfigError, match="must be below"):
         config_from({"control": control}, "test")

@@ -5,7 +5,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -15,10 +15,11 @@ from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
 from gripper_force.interfaces import Clock, LoadCell, Progress, Prompt, no_progress
 from gripper_force.profiles.rig_profile import LoadCellCalibration, read_rig, update_rig
-from gripper_force.runtime.backends import LOAD_CELLS, MonotonicClock, load
+from gripper_force.runtime.backends import MonotonicClock, open_load_cell
 from gripper_force.types import NS_PER_MS, NS_PER_S, LoadCellSample
 
 STANDARD_GRAVITY_M_S2: Final = 9.80665
+<<<<<<< HEAD
 NEUTRAL_N_PER_RAW: Final = 1e-9
 """Scale so small that the driver's thresholds in newtons have no effect: it then rejects only saturated and
 stuck readings. The fit detects spikes, once it knows the scale."""
@@ -62,6 +63,41 @@ class LoadCellResult:
         }
 
 
+=======
+NEUTRAL: Final = 1e-9
+"""Newtons per raw unit, so small that no threshold in newtons acts: the driver then only rejects saturated and
+stuck readings. The fit rejects spikes, because it knows the scale."""
+
+_PERIOD_NS: Final = 50 * NS_PER_MS
+_SETTLE_NS: Final = NS_PER_S
+"""Time for the load to settle after a person has let go."""
+_SILENT_NS: Final = 3 * NS_PER_S
+_MAX_FORCE_N: Final = 1000.0
+_MIN_CHANGE: Final = 10
+_MAX_RANGE: Final = 0.01
+_NAMES: Final = ("empty", "loaded", "empty again")
+
+
+@dataclass(frozen=True, slots=True)
+class LoadCellResult:
+    """Result of `calibrate_load_cell`.
+
+    Attributes:
+        calibration: The section of the rig profile.
+        return_n: Difference of the two empty readings.
+        rejected: Number of readings that were not used.
+        rig: The rig profile.
+        report: The figure, PNG.
+    """
+
+    calibration: LoadCellCalibration
+    return_n: float
+    rejected: int
+    rig: Path
+    report: Path
+
+
+>>>>>>> main
 def calibrate_load_cell(
     config: Config,
     force_n: float,
@@ -71,6 +107,7 @@ def calibrate_load_cell(
     seconds: float = 10.0,
     progress: Progress = no_progress,
 ) -> LoadCellResult:
+<<<<<<< HEAD
     """Measures tare and scale with a known mass, and writes the rig profile's section and a figure.
 
     Args:
@@ -107,6 +144,40 @@ def calibrate_load_cell(
         cell.start()
         fit = measure(cell, clock, force_n, prompt=prompt, seconds=seconds, progress=progress)
     calibration = LoadCellCalibration(
+=======
+    """Weighs a known mass, and writes the rig profile's section and a figure beside it.
+
+    Args:
+        config: The configuration. Tare and scale in its section ``load_cell`` are not used.
+        force_n: Weight of the mass, in newtons.
+        rig: Rig profile to write; an existing one keeps its other sections.
+        prompt: Called when a person has to change the load.
+        seconds: Duration of the readings of each load.
+        progress: Called with the newest reading a few times per second.
+
+    Raises:
+        ConfigError: There is no load cell to calibrate, or the profile can't be read or written.
+        DeviceError: The load cell can't be opened, or gives no readings.
+        DataError: The readings are not sufficient for a calibration.
+    """
+    section = config.load_cell
+    if section.backend in ("none", "simulated"):
+        raise ConfigError(
+            f"load_cell.backend={section.backend} has no raw readings that a mass could change; set the "
+            "backend of your load cell: serial or phidget, or playback for a log of one"
+        )
+    if not 0 < force_n <= _MAX_FORCE_N:
+        raise ConfigError(f"a mass of {force_n:g} N can't be weighed; use one of up to {_MAX_FORCE_N:g} N")
+    if rig.exists():
+        read_rig(rig)  # a damaged profile is reported before anyone carries masses
+    clock = MonotonicClock()
+    neutral = section.model_copy(update={"tare_raw": 0.0, "n_per_raw": NEUTRAL})
+    cell: LoadCell = open_load_cell(config.model_copy(update={"load_cell": neutral}), clock)
+    with closing(cell):
+        cell.start()
+        fit = weigh(cell, clock, force_n, prompt=prompt, seconds=seconds, progress=progress)
+    found = LoadCellCalibration(
+>>>>>>> main
         date=datetime.now(UTC).replace(microsecond=0),
         sensor=section.sensor,
         tare_raw=fit.tare_raw,
@@ -118,7 +189,11 @@ def calibrate_load_cell(
     update_rig(rig, calibration)
     report = rig.with_name(f"{rig.stem}-load-cell.png")
     draw(fit, report)
+<<<<<<< HEAD
     return LoadCellResult(calibration, fit.return_n, fit.rejected, rig, report)
+=======
+    return LoadCellResult(found, fit.return_n, fit.rejected, rig, report)
+>>>>>>> main
 
 
 def measure(
@@ -128,6 +203,7 @@ def measure(
     *,
     prompt: Prompt,
     seconds: float = 10.0,
+<<<<<<< HEAD
     patience_s: float = 60.0,
     progress: Progress = no_progress,
 ) -> LoadCellFit:
@@ -149,6 +225,29 @@ def measure(
     reader = _RestReader(cell, clock, round(seconds * NS_PER_S), round(patience_s * NS_PER_S), progress)
     prompt("Take everything off the load cell")
     empty = reader.read("empty", lambda _: True)
+=======
+    timeout_s: float = 60.0,
+    progress: Progress = no_progress,
+) -> LoadCellFit:
+    """Prompts for the three loads in turn, and reads each until it is at rest.
+
+    Args:
+        cell: A started load cell with the scale `NEUTRAL`.
+        clock: Its clock.
+        force_n: Weight of the known mass, in newtons.
+        prompt: Called when a person has to change the load.
+        seconds: Duration of the readings of each load.
+        timeout_s: Longest wait for a rest, beyond `seconds`.
+        progress: Called with the newest reading a few times per second.
+
+    Raises:
+        DeviceTimeoutError: The cell gives no readings.
+        DataError: A reading does not rest, hardly changes with the load, or does not return.
+    """
+    scale = _Scale(cell, clock, round(seconds * NS_PER_S), round(timeout_s * NS_PER_S), progress)
+    prompt("Take everything off the load cell")
+    empty = scale.read(_NAMES[0], lambda _: True)
+>>>>>>> main
     tare = rest_statistics(empty, 0.0, "without load")
     prompt(
         f"Put the mass of {force_n / STANDARD_GRAVITY_M_S2:.4g} kg ({force_n:.4g} N) on it and let it rest"
@@ -160,14 +259,24 @@ def measure(
         except DataError:
             return False
         change = abs(now.raw - tare.raw)
+<<<<<<< HEAD
         known = change > _CHANGE_TO_UNCERTAINTY * (now.half_raw + tare.half_raw)
         return known and now.range_raw < _STEADY_SHARE * change
 
     loaded = reader.read("loaded", is_loaded)
     load_level = rest_statistics(loaded, 0.0, "under load")
+=======
+        return bool(
+            change > _MIN_CHANGE * (now.half_raw + tare.half_raw) and now.range_raw < _MAX_RANGE * change
+        )
+
+    loaded = scale.read(_NAMES[1], rests)
+    under = rest_statistics(loaded, 0.0, "under load")
+>>>>>>> main
 
     def is_unloaded(rest: Rest) -> bool:
         try:
+<<<<<<< HEAD
             now = rest_statistics(rest, 0.0, "after unloading")
         except DataError:
             return False
@@ -181,17 +290,39 @@ def measure(
 
 class _RestReader:
     """Reads a load cell until its readings are at rest, or for the longest waiting time."""
+=======
+            now = rest_statistics(rest, 0.0, "after the load was taken off")
+        except DataError:
+            return False
+        change = abs(under.raw - tare.raw)
+        return bool(abs(now.raw - tare.raw) < _MAX_RANGE * change and now.range_raw < _MAX_RANGE * change)
+
+    prompt("Take the mass off again")
+    again = scale.read(_NAMES[2], is_back)
+    return fit_load_cell(empty, loaded, again, force_n)
+
+
+class _Scale:
+    """Reads a load cell until a span of readings is good, or a time has passed."""
+>>>>>>> main
 
     def __init__(
-        self, cell: LoadCell, clock: Clock, span_ns: int, patience_ns: int, progress: Progress
+        self, cell: LoadCell, clock: Clock, span_ns: int, timeout_ns: int, progress: Progress
     ) -> None:
         self._cell, self._clock, self._progress = cell, clock, progress
-        self._span_ns, self._patience_ns = span_ns, patience_ns
+        self._span_ns, self._timeout_ns = span_ns, timeout_ns
 
+<<<<<<< HEAD
     def read(self, step: str, is_accepted: Callable[[Rest], bool]) -> Rest:
         """Returns the newest span of readings once it is accepted, or at the end of the waiting time."""
         begin_ns = newest_ns = self._clock.now_ns() + _SETTLE_NS
         end_ns = begin_ns + self._span_ns + self._patience_ns
+=======
+    def read(self, step: str, is_good: Callable[[Rest], bool]) -> Rest:
+        """Returns the first good span of readings, or after the timeout the last one."""
+        begin_ns = newest_ns = self._clock.now_ns() + _SETTLE_NS
+        end_ns = begin_ns + self._span_ns + self._timeout_ns
+>>>>>>> main
         self._cell.drain()
         samples: list[LoadCellSample] = []
         check_ns = begin_ns + self._span_ns
@@ -205,8 +336,13 @@ class _RestReader:
             if now_ns - newest_ns > _SILENT_NS:
                 counts = ", ".join(f"{n} {name}" for name, n in self._cell.counts().items() if n)
                 raise DeviceTimeoutError(
+<<<<<<< HEAD
                     f"the load cell gives no reading (counted: {counts or 'nothing'}); check its cable, the "
                     "section load_cell of the configuration, and `gripper-force doctor`"
+=======
+                    f"the load cell gives no readings (counted: {counts or 'nothing'}); check its cable and "
+                    "the load_cell keys, and run `gripper-force doctor`"
+>>>>>>> main
                 )
             if newest_ns < check_ns:
                 continue

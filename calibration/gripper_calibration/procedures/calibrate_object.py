@@ -25,11 +25,9 @@ from gripper_force.interfaces import Progress, Prompt, no_progress
 from gripper_force.jobs.recording.record import RecordingPlan, record
 from gripper_force.profiles.correction import pack
 from gripper_force.profiles.object_profile import ObjectProfile, check_place, user_folder, write_object
-from gripper_force.runtime.assembly import settled
+from gripper_force.runtime.resolve import ResolvedConfig, make_estimator, resolve_vision
 from gripper_force.types import NS_PER_MS
-from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
-from gripper_force.vision.estimator import open_estimator
-from gripper_force.vision.model_files import read_model
+from gripper_force.vision.checkpoint import load_checkpoint
 
 TOUCHES: Final = 8
 """Default number of touches: enough for an object of a kind that the network was not trained on."""
@@ -220,7 +218,7 @@ def _plan(touches: int, peak_n: float | None) -> RecordingPlan:
 def _fit_and_write(
     config: Config, name: str, paths: Sequence[Path], out: Path, progress: Progress
 ) -> ObjectCalibration:
-    config, _ = settled(config)
+    config, model, _ = resolve_vision(config)
     checkpoint = load_checkpoint(config.vision.checkpoint)
     recordings = {}
     for path in paths:
@@ -250,7 +248,7 @@ def _fit_and_write(
         interval=fit.interval,
         ood_limit=fit.ood_limit,
         stiffness_n_m=float(np.median(stiffness)) if len(stiffness) else None,
-        plant=fit_plant(recorded.presses, recorded.delay_s + _compute_s(config, checkpoint)),
+        plant=fit_plant(recorded.presses, recorded.delay_s + _compute_s(ResolvedConfig(config, model))),
         before_n=fit.before_n,
         after_n=fit.after_n,
         weights=sha256(weights).hexdigest(),
@@ -271,12 +269,14 @@ def _fit_and_write(
     )
 
 
-def _compute_s(config: Config, checkpoint: Checkpoint) -> float:
+def _compute_s(run: ResolvedConfig) -> float:
     """Computing time of an estimate: configured on the simulated clock, otherwise measured."""
-    if config.clock == "lockstep":
-        return config.vision.lockstep_compute_ms * NS_PER_MS / 1e9
-    estimator = open_estimator(read_model(config.vision.checkpoint), config.vision)
-    size = checkpoint.header.preprocess.size
+    if run.config.clock == "lockstep":
+        return run.config.vision.lockstep_compute_ms * NS_PER_MS / 1e9
+    estimator = make_estimator(run)
+    if run.model is None or estimator is None:
+        return 0.0
+    size = run.model.header.preprocess.size
     rng = np.random.default_rng(0)
     times_s = []
     for frame in rng.integers(60, 180, (_TIMED_FRAMES, size, size), np.uint8):

@@ -31,18 +31,14 @@ from gripper_force.config import CameraConfig, Config
 from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import CONTACT_N
 from gripper_force.jobs.imports.video import load_cell_samples, write_recording
-from gripper_force.jobs.simulate import split_of
+from gripper_force.jobs.paper_protocol import RATE_HZ, TOUCHES, split_of
 from gripper_force.types import NS_PER_S, Frame, Gray
 from gripper_force.vision.preprocess import Region, downscale
-
-RATE_HZ: Final = 149.0
-"""Of the paper's camera; the database tells no times."""
 
 LUX: Final = {"50": 350, "70": 550, "75": 550, "100": 750}
 """What the third part of a folder's name means. For 550 lux the database's page says 70, and the
 authors' code (https://github.com/cxz1418/SSAM_ForcePrediction) 75."""
 
-TOUCHES: Final = 4
 _SHORTEST: Final = 5
 """Frames with contact in turn that are no noise."""
 _REST: Final = 15
@@ -125,7 +121,7 @@ def import_environment(
 
     Args:
         folder: One of `find_environments`.
-        out: Where the logs go, into ``train`` and ``test`` as those of `simulate.plan_protocol`.
+        out: Where the logs go, into ``train`` and ``test`` as those of `paper_protocol.plan_protocol`.
         rate_hz: Frame rate that the numbers of the images are turned into times with.
         region: Part of the images to keep in pixels: left, top, width, height; None for the whole.
         size: Side of the logged frames in pixels.

@@ -12,7 +12,6 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Final
 
 import numpy as np
@@ -27,7 +26,8 @@ from gripper_force.jobs.dataset import CONTACT_N
 from gripper_force.jobs.recording.touches import touch
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log import LogReader
-from gripper_force.runtime.session import Session, let_open, open_session, release
+from gripper_force.runtime.resolve import ResolvedConfig, resolve
+from gripper_force.runtime.session import Session, open_session
 from gripper_force.types import (
     NS_PER_MS,
     NS_PER_S,
@@ -145,12 +145,13 @@ def record(
         notes |= {"split": split} if (split := plan.split(number)) else {}
         notes |= {} if plan.degrees is None else {"degrees": f"{plan.degrees:g}"}
         notes |= {} if plan.lux is None else {"lux": f"{plan.lux:g}"}
-        with open_devices(one) as devices:
+        run = resolve(one, vision=False)
+        with open_devices(run.config) as devices:
             devices.notes.update(notes)
-            _open_jaws(one, devices)
-            with open_session(one, devices, unfinished, None) as session:
+            _open_jaws(run, devices)
+            with open_session(run, devices, unfinished) as session:
                 _touch_all(_Rig(session, devices, one, number, progress), plan.touches)
-                release(session, one)
+                session.release()
         yield unfinished.rename(path)
 
 
@@ -169,10 +170,10 @@ def _check_same(path: Path, config: Config) -> None:
             )
 
 
-def _open_jaws(config: Config, devices: Devices) -> None:
-    """In a run of its own, whose log is not kept, as a set's has to begin with open jaws."""
-    with TemporaryDirectory() as aside, open_session(config, devices, Path(aside) / "log", None) as session:
-        release(session, config)
+def _open_jaws(run: ResolvedConfig, devices: Devices) -> None:
+    """Opens the jaws in a session without a log, because the log of a set must begin with open jaws."""
+    with open_session(run, devices, None) as session:
+        session.release()
     devices.servo.close()  # the set's own session opens it again
 
 
@@ -241,7 +242,7 @@ class _Rig:
     def _check(self, status: GraspStatus) -> None:
         if status.phase == Phase.FAULT:
             if self.config.control.on_fault == "open":
-                let_open(self._session, self.config, status)
+                self._session.wait_until_open(status)
             raise DeviceError(f"set {self.number} ended at a fault: {status.reason}; see what caused it")
         if self._saturations() - self._saturated > _SATURATED:
             felt_n = (

@@ -27,10 +27,10 @@ COMMANDS: Final = (
     "calibrate camera --object sponge --seed 3 --set sim.markers=true --rig rig.yaml",
     "calibrate object tube --touches 3 --folder touches --out tube.yaml",
     "reproduce 7",
-    "stability --part filter",
-    "stability --fuzz 10000",
-    "stability --soak 60",
-    "bench --bus --cycles 100",
+    "stability numerics --part filter",
+    "stability fuzz --cases 10000",
+    "stability soak --seconds 60",
+    "bench bus --cycles 100",
     "doctor",
 )
 """What `commands` measures, in this order, in one folder: some need what others made."""

@@ -20,17 +20,18 @@ import numpy as np
 import torch
 
 from gripper_force.errors import ConfigError
+from gripper_force.interfaces import Progress
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import Clip
 from gripper_force.qualification.bench.roofline import Roofline, measure
 from gripper_force.types import NS_PER_MS
-from gripper_force.vision import selection
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.engines import Engine, Floats, Precision, open_engine
 from gripper_force.vision.export import export, inputs_of
 from gripper_force.vision.header import Model
 from gripper_force.vision.model_files import cache_folder, read_model
-from gripper_force.vision.selection import Candidate, installed, key_of
+from gripper_force.vision.selection import installed
+from gripper_force.vision.step_benchmark import Candidate, cache_key, update_cache
 
 WINDOW: Final = "torch, window"
 """The paper's way: each frame passes the network with the whole window before it."""
@@ -109,15 +110,12 @@ class _Timed:
     taken_ns: list[int]
 
 
-Advance = Callable[[str], None]
-
-
 def bench(
     sources: Sequence[str],
     held_out: Callable[[Model], Sequence[Clip]],
     scaling: Callable[[Model], Sequence[Clip]],
     threads: Sequence[int],
-    advance: Advance,
+    progress: Progress,
 ) -> list[EstimatorCost]:
     """Measures every way to run each checkpoint that this machine can.
 
@@ -126,7 +124,7 @@ def bench(
         held_out: Reads recordings that training never saw, at the model's size.
         scaling: Reads recordings to scale int8 on: others than these.
         threads: Numbers of CPU threads.
-        advance: Told what was done.
+        progress: Called after each measurement.
 
     Raises:
         ConfigError: A package is missing.
@@ -135,17 +133,17 @@ def bench(
     """
     logging.getLogger("nncf").setLevel(logging.ERROR)
     roofs = {(p, t): measure(p, t) for p in ("float32", "bfloat16", "int8") for t in threads}
-    advance("roofline")
+    progress("roofline")
     rows: list[EstimatorCost] = []
     for source in sources:
         model = read_model(source)
         clips = held_out(model)
         eights = cache_folder() / f"{model.digest[:32]}-int8.xml"
         export(model, eights, [clip.frames for clip in scaling(model)])
-        advance(f"{source}: int8")
+        progress(f"{source}: int8")
         ways = [(model, *way) for way in _ways()]
         ways += [(read_model(eights), "openvino", "int8", "bfloat16")]
-        for each in _timed(source, model, ways, clips, threads, roofs, advance):
+        for each in _timed(source, model, ways, clips, threads, roofs, progress):
             rows.append(each)
     return _with_front(rows)
 
@@ -167,7 +165,7 @@ def _timed(
     clips: Sequence[Clip],
     threads: Sequence[int],
     roofs: dict[tuple[str, int], Roofline],
-    advance: Advance,
+    progress: Progress,
 ) -> Iterator[EstimatorCost]:
     errors: dict[tuple[str, str], dict[str, float]] = {}
     frames = list(inputs_of(model, clips[0].frames))
@@ -177,11 +175,11 @@ def _timed(
             engines[engine, name] = open_engine(file, engine, precision, count)
             if (engine, name) not in errors:
                 errors[engine, name] = _errors(engines[engine, name], model, clips)
-                advance(f"{source}: {engine}, {name}: {errors[engine, name]['mae_n']:.3f} N")
+                progress(f"{source}: {engine}, {name}: {errors[engine, name]['mae_n']:.3f} N")
         for window in (WINDOW, PLAIN_WINDOW):
             errors[window, "float32"] = errors["torch", "float32"]
         taken = _in_turns({way: _Timed(engine.step, []) for way, engine in engines.items()}, model, frames)
-        advance(f"{source}: {count} threads")
+        progress(f"{source}: {count} threads")
         for (engine, name), taken_ns in taken.items():
             p50_ms, p99_ms = np.percentile(taken_ns, [50, 99]) / NS_PER_MS
             row = EstimatorCost(
@@ -208,7 +206,7 @@ def _timed(
                 row = replace(row, memory_mb=_memory_mb(file, engine, precision, count))
                 way = Candidate(source, engine, precision, count, row.p50_ms, row.p99_ms, row.mae_n)
                 if file is model:
-                    selection.remember({key_of(model, engine, precision, count): way})
+                    update_cache({cache_key(model, engine, precision, count): way})
             yield row
 
 

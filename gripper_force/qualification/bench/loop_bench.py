@@ -21,12 +21,13 @@ import numpy as np
 
 from gripper_force.config import Config, config_from_text, load_config
 from gripper_force.interfaces import Devices, Servo
-from gripper_force.jobs.replay import run_again
+from gripper_force.jobs.grasp import run_grasp
+from gripper_force.jobs.replay import resolve_replay, run_again
 from gripper_force.qualification.bench.startup_bench import PATIENT
-from gripper_force.runtime.assembly import checkpoint_of
-from gripper_force.runtime.backends import SERVO, MonotonicClock, load
+from gripper_force.runtime.backends import MonotonicClock, load_servo_class
 from gripper_force.runtime.log import LogReader, LogWriter
-from gripper_force.runtime.session import open_session, run_grasp
+from gripper_force.runtime.resolve import resolve
+from gripper_force.runtime.session import open_session
 from gripper_force.types import NS_PER_MS, NS_PER_S, Frame, RequestKind, ServoCommand, ServoState, VisualForce
 
 _TURN_S: Final = 10.0
@@ -174,39 +175,43 @@ class _Camera:
         pass
 
 
-def loop(seconds: float, overrides: list[str]) -> tuple[tuple[LoopCost, ...], LogCost]:
-    """Runs the loop with and without vision beside it, in turns.
+def loop(
+    seconds: float, overrides: list[str], path: Path | None = None
+) -> tuple[tuple[LoopCost, ...], LogCost]:
+    """Runs the loop with and without vision in parallel, in turns.
 
     Args:
-        seconds: How long each of the two.
-        overrides: Keys of the configuration, such as ``vision.threads=2``.
+        seconds: Duration of each of the two.
+        overrides: Configuration keys, such as ``vision.threads=2``.
+        path: Configuration file, or None.
 
     Raises:
-        GripperError: The servo's stand-in did not answer, or the configuration is wrong.
+        GripperError: The virtual servo did not answer, or the configuration is wrong.
     """
     loops = {"vision": _Seen(), "nothing": _Seen()}
     turns = max(1, round(seconds / _TURN_S))
     with TemporaryDirectory() as name, _virtual_servo() as port:
         folder = Path(name)
-        run_grasp(load_config(None, [*overrides, *_RECORDING]), folder / "seen.mcap")
+        run_grasp(load_config(path, [*overrides, *_RECORDING]), folder / "seen.mcap")
         frames = list(LogReader(folder / "seen.mcap").records(Frame))
         for turn in range(turns):
             for beside, seen in loops.items():
                 blind = () if beside == "vision" else ("vision.checkpoint=none", "control.feedback=current")
                 settings = [*PATIENT, *overrides, "clock=realtime", f"servo.port={port}", *blind]
-                path = folder / f"{beside}{turn}.mcap"
-                _run(load_config(None, settings), frames, seconds / turns, path, seen)
+                log_path = folder / f"{beside}{turn}.mcap"
+                _run(load_config(path, settings), frames, seconds / turns, log_path, seen)
         log = _log_cost(folder / "vision0.mcap", folder / "again.mcap", seconds / turns)
-    period_ns = round(NS_PER_S / load_config(None, overrides).control.rate_hz)
+    period_ns = round(NS_PER_S / load_config(path, overrides).control.rate_hz)
     return tuple(_cost(beside, seconds, period_ns, seen) for beside, seen in loops.items()), log
 
 
 def _run(config: Config, frames: list[Frame], seconds: float, path: Path, seen: _Seen) -> None:
     """One turn: the jaws close and open."""
-    checkpoint = checkpoint_of(config)
+    run = resolve(config)
+    config = run.config
     clock = _Clock(round(NS_PER_S / config.control.rate_hz), seen)
     with ExitStack() as stack:
-        servo = load(SERVO)(config.servo, clock.now_ns)
+        servo = load_servo_class(config)(config.servo, clock.now_ns)
         stack.callback(servo.close)
         devices = Devices(
             clock=clock,
@@ -217,7 +222,7 @@ def _run(config: Config, frames: list[Frame], seconds: float, path: Path, seen: 
             start_ns=clock.now_ns(),
             check=lambda: None,
         )
-        session = stack.enter_context(open_session(config, devices, path, checkpoint))
+        session = stack.enter_context(open_session(run, devices, path))
         end_ns = clock.now_ns() + round(seconds * NS_PER_S)
         next_ns, kind = 0, RequestKind.RELEASE
         while (now_ns := clock.now_ns()) < end_ns:
@@ -264,9 +269,9 @@ def _log_cost(path: Path, again: Path, seconds: float) -> LogCost:
             log.write(record)
     wrote_s = time.monotonic() - begin_s
     config = config_from_text(reader.config, str(path))
-    checkpoint = checkpoint_of(config)
+    run = resolve_replay(config)
     begin_s = time.monotonic()
-    run_again(reader, config, checkpoint)
+    run_again(reader, run)
     replayed_s = time.monotonic() - begin_s
     return LogCost(
         run_mb_s=path.stat().st_size / 2**20 / seconds,

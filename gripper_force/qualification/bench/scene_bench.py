@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from gripper_force.config import GripperConfig
 from gripper_force.types import NS_PER_MS, NS_PER_S
-from gripper_hw.sim.detail_level import keep
+from gripper_hw.sim.detail_level import write_table
 from gripper_hw.sim.objects import OBJECTS, Detail
 from gripper_hw.sim.scene import Scene
 from gripper_hw.sim.world import World
@@ -102,7 +102,7 @@ def scene_costs(names: list[str], keep_table: bool) -> Iterator[SceneCost]:
             }
             yield row
     if keep_table:
-        keep(table)
+        write_table(table)
 
 
 def _squeeze(name: str, detail: Detail) -> _Squeeze:
@@ -110,7 +110,7 @@ def _squeeze(name: str, detail: Detail) -> _Squeeze:
     scene = Scene(name, detail)
     cost_s = []
     for _ in range(_TIMES):
-        world = World(scene, GripperConfig(), _FollowPath(), nm_per_a=1.78, seed=0, seen=False)
+        world = World(scene, GripperConfig(), _FollowPath(), nm_per_a=1.78, seed=0, textured=False)
         force_n, iterations = [], []
         begin_s = time.process_time()
         while world.force_n < _MOST_N and world.t_ns < _LONGEST_NS:

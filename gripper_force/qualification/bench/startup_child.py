@@ -23,15 +23,8 @@ def tell(fd: int) -> None:
 def first_cycle(fd: int, settings: list[str]) -> None:
     """Does what a grasp does up to its first cycle, and tells ``fd`` of it."""
     from gripper_force.config import load_config
-    from gripper_force.runtime.assembly import checkpoint_of
-    from gripper_force.runtime.backends import open_devices
-    from gripper_force.runtime.session import open_session
+    from gripper_force.runtime.session import open_run
 
-    config = load_config(None, settings)
-    checkpoint = checkpoint_of(config)
-    with (
-        open_devices(config) as devices,
-        open_session(config, devices, Path("grasp.mcap"), checkpoint) as session,
-    ):
+    with open_run(load_config(None, settings), Path("grasp.mcap")) as session:
         session.cycle()
         tell(fd)

@@ -47,8 +47,8 @@ from gripper_force.profiles.rig_profile import (
     ServoCalibration,
 )
 from gripper_force.qualification.fuzz.fuzzer import Target
-from gripper_force.runtime.assembly import controller_from
 from gripper_force.runtime.log import LogReader, LogWriter
+from gripper_force.runtime.resolve import make_controller
 from gripper_force.schema import dump
 from gripper_force.types import (
     NS_PER_MS,
@@ -189,7 +189,7 @@ def _assign(data: bytes, _path: Path) -> None:
 def _use_config(config: Config) -> None:
     completed = config.model_copy(update={"gripper": _completed(config.gripper)})
     config_from_text(dump_config(completed), "its own dump")
-    controller_from(completed).step(0, _state(0), None, Request(0, RequestKind.GRASP, config.target_n))
+    make_controller(completed).step(0, _state(0), None, Request(0, RequestKind.GRASP, config.target_n))
 
 
 def _completed(gripper: GripperConfig) -> GripperConfig:
@@ -211,7 +211,7 @@ def _log() -> bytes:
 def _grasp_into(log: LogWriter) -> None:
     """A short grasp, with every kind of record a run has."""
     rng = np.random.default_rng(0)
-    controller = controller_from(_CONFIG)
+    controller = make_controller(_CONFIG)
     position_rad = 0.0
     for cycle in range(14):
         t_ns = cycle * 20 * NS_PER_MS
@@ -328,7 +328,7 @@ def _learn_log(data: bytes, path: Path) -> None:
 
 def _report_log(data: bytes, path: Path) -> None:
     path.write_bytes(data)
-    read_run(path, recover=True)
+    read_run(LogReader(path, recover=True))
 
 
 def _summarise_log(data: bytes, path: Path) -> None:

@@ -8,8 +8,8 @@ from typing import Final
 
 from gripper_force.qualification.fuzz.fuzzer import Target
 from gripper_force.types import NS_PER_MS
-from gripper_hw.load_cells.line_formats import LONGEST_LINE, PARSERS, LineSplitter, Reading
-from gripper_hw.load_cells.screening import Screen
+from gripper_hw.load_cells.line_formats import MAX_LINE_BYTES, PARSERS, LineSplitter, Reading
+from gripper_hw.load_cells.screening import SampleValidator
 
 _PIECE: Final = 100
 _SAMPLE: Final = struct.Struct("<dq")
@@ -29,13 +29,13 @@ def _frames() -> list[bytes]:
 
 
 def _read_lines(parse: Callable[[bytes], Reading | None], data: bytes, _path: Path) -> None:
-    splitter, screen = LineSplitter(), Screen(100.0, -1e-3, noisy=True)
+    splitter, screen = LineSplitter(), SampleValidator(100.0, -1e-3, noisy=True)
     for t_ns, at in enumerate(range(0, len(data), _PIECE)):
         for line in splitter.feed(data[at : at + _PIECE]):
             if (reading := parse(line)) is not None:
                 screen.add(t_ns * NS_PER_MS, reading.raw, saturated=reading.saturated)
         screen.take(t_ns * NS_PER_MS)
-    assert len(splitter._begun) <= LONGEST_LINE + _PIECE
+    assert len(splitter._partial) <= MAX_LINE_BYTES + _PIECE
 
 
 def _readings() -> list[bytes]:
@@ -43,7 +43,7 @@ def _readings() -> list[bytes]:
 
 
 def _screen(data: bytes, _path: Path) -> None:
-    screen = Screen(0.5, 2.0, noisy=True)
+    screen = SampleValidator(0.5, 2.0, noisy=True)
     taken = 0
     whole = data[: len(data) // _SAMPLE.size * _SAMPLE.size]
     for raw, t_ns in _SAMPLE.iter_unpack(whole):

@@ -1,8 +1,8 @@
-"""A gripper and an object as a few equations: fast enough to close the loop over it some thousand times.
+"""Analytic model of a gripper and an object, fast enough for thousands of closed-loop runs.
 
 One jaw, driven by half of the motor: current loop, inertia, Coulomb and viscous friction and gear play, as in
 the simulated rig (docs/simulation.md), and an object that is a spring. The servo is an X-series
-one in mode 5.
+one in mode 5 (current-based position control).
 """
 
 import math
@@ -16,7 +16,7 @@ from gripper_force.types import NS_PER_MS, NS_PER_S, ServoCommand, ServoState, V
 
 _NM_PER_A: Final = 1.78
 CURRENT_STEP_A: Final = 0.00269
-"""Of an XM430-W350: https://emanual.robotis.com/docs/en/dxl/x/xm430-w350/"""
+"""Current resolution of an XM430-W350: https://emanual.robotis.com/docs/en/dxl/x/xm430-w350/"""
 
 CYCLE_NS: Final = 5 * NS_PER_MS
 _STALL_A: Final = 2.3
@@ -27,37 +27,40 @@ _VELOCITY_STEP_RAD_S: Final = 0.024
 _PWM_PER_TICK: Final = 800 / 128 / 885
 
 NOISE_A: Final = 0.003
-"""Of the measured current, in one reading."""
+"""Standard deviation of the measured current in one reading."""
 
 
 def transmission_of(gripper: GripperConfig) -> Transmission:
-    """The gears as the configuration has them, with an XM430-W350 where it leaves the motor open."""
+    """Returns the configured transmission; motor data that are not configured are an XM430-W350's."""
     return Transmission.from_config(gripper, _NM_PER_A, gripper.current_step_a or CURRENT_STEP_A)
 
 
 @dataclass(slots=True)
 class Gripper:
-    """The truth: what one jaw and the object do.
+    """The true state and parameters of one jaw and the object. Travel is zero with the jaws open.
 
     Attributes:
-        transmission: What the controller takes the gears for.
-        stiffness_n_m: Of the object, at one jaw.
-        gain: True torque constant over the one that is taken for it.
+        transmission: The transmission that the controller assumes.
+        stiffness_n_m: Stiffness of the object at one jaw.
+        stiffening_n_m2: Force per compression squared that adds to it.
+        gain: True torque constant over the assumed one.
         friction_n: True Coulomb friction.
         damping_n_s_m: True viscous friction.
-        play_m: Gear play either way.
+        play_m: Gear play in each direction.
         step_a: True resolution of the goal current.
-        mass_kg: Of a jaw with its half of the rotor.
+        mass_kg: Mass of a jaw with its half of the rotor.
         contact_m: Travel at which the jaw meets the object.
-        x_m: Travel of the motor, as that of a jaw.
-        v_m_s: Its speed.
-        jaw_m: Travel of the jaw itself.
-        current_a: Of the motor.
-        deepest_m: The most travel of the jaw so far.
+        stops_m: Travel of the motor at its two end stops, at which it comes to rest.
+        x_m: Travel of the motor, as travel of a jaw.
+        v_m_s: Speed of the motor, as speed of a jaw.
+        jaw_m: Travel of the jaw.
+        current_a: Motor current.
+        deepest_m: Largest travel of the jaw so far.
     """
 
     transmission: Transmission
     stiffness_n_m: float = 1000.0
+    stiffening_n_m2: float = 0.0
     gain: float = 1.0
     friction_n: float = 0.95
     damping_n_s_m: float = 14.5
@@ -65,6 +68,7 @@ class Gripper:
     step_a: float = CURRENT_STEP_A
     mass_kg: float = 1.3
     contact_m: float = 0.010
+    stops_m: tuple[float, float] = (-math.inf, math.inf)
     x_m: float = 0.0
     v_m_s: float = 0.0
     jaw_m: float = 0.0
@@ -73,17 +77,22 @@ class Gripper:
 
     @property
     def force_n(self) -> float:
-        """What the object feels."""
-        return max(self.stiffness_n_m * (self.jaw_m - self.contact_m), 0.0)
+        """Contact force at one jaw."""
+        return self._contact_force_n(self.jaw_m)
 
     @property
     def peak_n(self) -> float:
-        """The most it has felt."""
-        return max(self.stiffness_n_m * (self.deepest_m - self.contact_m), 0.0)
+        """Largest contact force so far."""
+        return self._contact_force_n(self.deepest_m)
+
+    def _contact_force_n(self, jaw_m: float) -> float:
+        depth_m = max(jaw_m - self.contact_m, 0.0)
+        return self.stiffness_n_m * depth_m + self.stiffening_n_m2 * depth_m**2
 
     def advance(self, command: ServoCommand, time_s: float) -> None:
-        """Lets the servo follow a command."""
-        stiffness_n_m, contact_m, play_m = self.stiffness_n_m, self.contact_m, self.play_m
+        """Integrates the motion for ``time_s`` while the servo follows ``command``."""
+        stiffness_n_m, stiffening_n_m2 = self.stiffness_n_m, self.stiffening_n_m2
+        contact_m, play_m, (low_m, high_m) = self.contact_m, self.play_m, self.stops_m
         damping_n_s_m, mass_kg, friction_n = self.damping_n_s_m, self.mass_kg, self.friction_n
         n_per_a, radius_m = self.gain * self.transmission.n_per_a, self.transmission.pinion_radius_m
         x_m, v_m_s, jaw_m, current_a = self.x_m, self.v_m_s, self.jaw_m, self.current_a
@@ -101,19 +110,22 @@ class Gripper:
             wanted_a = _STALL_A * (pwm - v_m_s / radius_m / _NO_LOAD_RAD_S)
             wanted_a = min(max(wanted_a, -limit_a), limit_a)
             current_a = wanted_a + (current_a - wanted_a) * keep
-            force_n = stiffness_n_m * (jaw_m - contact_m) if jaw_m > contact_m else 0.0
+            depth_m = jaw_m - contact_m if jaw_m > contact_m else 0.0
+            force_n = stiffness_n_m * depth_m + stiffening_n_m2 * depth_m * depth_m
             drive_n = n_per_a * current_a - damping_n_s_m * v_m_s - force_n
             free_m_s = v_m_s + drive_n / mass_kg * dt_s
             v_m_s = math.copysign(max(abs(free_m_s) - brake_m_s, 0.0), free_m_s)
             x_m += v_m_s * dt_s
-            # The object pushes the jaw back onto the flank of the teeth that drives it.
+            if not low_m <= x_m <= high_m:
+                x_m, v_m_s = min(max(x_m, low_m), high_m), 0.0
+            # The object pushes the jaw back onto the driving flank of the teeth.
             jaw_m = max(x_m - play_m, min(jaw_m, contact_m, x_m + play_m))
             deepest_m = max(deepest_m, jaw_m)
         self.x_m, self.v_m_s, self.jaw_m, self.current_a = x_m, v_m_s, jaw_m, current_a
         self.deepest_m = deepest_m
 
     def read(self, t_ns: int, noise_a: float) -> ServoState:
-        """What the servo says of itself, on its own grids."""
+        """Returns the servo's reading in the servo's own steps; ``noise_a`` is added to the current."""
         radius_m = self.transmission.pinion_radius_m
         measured_a = self.current_a + noise_a
         return ServoState(
@@ -128,33 +140,39 @@ class Gripper:
 
     @property
     def _step_s(self) -> float:
-        """Short against the swing of jaw and object."""
+        """Integration step, short against the oscillation of jaw and object."""
         return min(0.0005, 0.4 * math.sqrt(self.mass_kg / self.stiffness_n_m))
 
 
 class SimulatedVision:
-    """Vision: frames of the force, some time late, with white noise."""
+    """Visual estimates of the force: delayed, with white noise.
 
-    def __init__(self, delay_s: float, noise_n: float, rate_hz: float = 60.0) -> None:
-        self._delay_ns = round(delay_s * NS_PER_S)
+    Attributes:
+        delay_s: Time from a frame to its estimate; may be changed between frames.
+        gain: Estimate over true force.
+    """
+
+    def __init__(self, delay_s: float, noise_n: float, rate_hz: float = 60.0, gain: float = 1.0) -> None:
+        self.delay_s, self.gain = delay_s, gain
         self._noise_n, self._period_ns = noise_n, NS_PER_S / rate_hz
-        self._under_way: deque[VisualForce] = deque()
+        self._pending: deque[VisualForce] = deque()
         self._seq = 0
 
     def sample(self, t_ns: int, force_n: float, noise: float) -> VisualForce | None:
-        """Takes a picture if one is due, and gives the newest estimate that is ready.
+        """Takes a frame if one is due and returns the newest estimate that is ready, or None.
 
         Args:
             t_ns: Now.
-            force_n: What there is to see.
-            noise: A normal number.
+            force_n: True force.
+            noise: A sample of the standard normal distribution.
         """
         if t_ns >= self._seq * self._period_ns:
             self._seq += 1
-            seen_n = max(force_n + self._noise_n * noise, 0.0)
+            estimate_n = max(self.gain * force_n + self._noise_n * noise, 0.0)
             std_n = max(self._noise_n, 0.1)
-            self._under_way.append(VisualForce(t_ns, t_ns + self._delay_ns, self._seq, seen_n, std_n, 12.0))
+            ready_ns = t_ns + round(self.delay_s * NS_PER_S)
+            self._pending.append(VisualForce(t_ns, ready_ns, self._seq, estimate_n, std_n, 12.0))
         newest = None
-        while self._under_way and self._under_way[0].ready_ns <= t_ns:
-            newest = self._under_way.popleft()
+        while self._pending and self._pending[0].ready_ns <= t_ns:
+            newest = self._pending.popleft()
         return newest

@@ -19,8 +19,9 @@ from gripper_force.config import load_config
 from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import CONTACT_N, Clip, load_clips
 from gripper_force.jobs.evaluate import estimates
+from gripper_force.jobs.paper_protocol import RATE_HZ, plan_protocol
 from gripper_force.jobs.processes import process_pool
-from gripper_force.jobs.simulate import PROTOCOL_RATE_HZ, plan_protocol, simulate
+from gripper_force.jobs.simulate import simulate
 from gripper_force.jobs.training.train import train
 from gripper_force.qualification.paper.models import MODELS, Scale
 from gripper_force.vision.checkpoint import load_checkpoint
@@ -106,7 +107,7 @@ def missing_logs(scale: Scale, data: Path) -> int:
 
 def simulate_missing(scale: Scale, data: Path, jobs: int, advance: Advance) -> None:
     """Makes the logs of the protocol that are not there yet. Raises as `simulate.simulate` does."""
-    config = load_config(None, [f"camera.rate_hz={PROTOCOL_RATE_HZ}"])
+    config = load_config(None, [f"camera.rate_hz={RATE_HZ}"])
     for path in simulate(plan_protocol(scale.protocol), data, config, jobs):
         advance(path.name)
 

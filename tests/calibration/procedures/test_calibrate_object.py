@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 from click.testing import Result
+from gripper_force.runtime.assembly import make_controller
 from typer.testing import CliRunner
 
 from gripper_calibration.procedures import calibrate_object as job
@@ -19,7 +20,6 @@ from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs.grasp import grasp
 from gripper_force.jobs.replay import replay
 from gripper_force.profiles.object_profile import read_object, weights_path
-from gripper_force.runtime.assembly import make_controller
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log import LogReader
 from gripper_force.types import Event, LoadCellSample

@@ -12,9 +12,9 @@ from gripper_force.cli import app
 from gripper_force.cli.output.calibrate import rig_table
 from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError, DataError, DeviceError
+from gripper_force.jobs.grasp import run_grasp
 from gripper_force.profiles.rig_profile import CalibratedValue, LoadCellCalibration, read_rig, update_rig
 from gripper_force.runtime.log import LogReader
-from gripper_force.runtime.session import run_grasp
 from gripper_force.types import Event
 from gripper_hw.dynamixel.control_table import load_model
 from gripper_hw.dynamixel.virtual import VirtualBus, find_bus

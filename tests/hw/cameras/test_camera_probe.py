@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gripper_force.config import Config
-from gripper_force.jobs.doctor import Check
+from gripper_force.jobs.checks import Check
 from gripper_force.types import Frame
 from gripper_hw.cameras import camera_probe as probe
 from gripper_hw.cameras import oak, uvc

@@ -5,7 +5,7 @@ import pytest
 
 from gripper_force.config import Config
 from gripper_force.jobs import doctor
-from gripper_force.jobs.doctor import Check
+from gripper_force.jobs.checks import Check
 from gripper_hw.load_cells.load_cell_probe import probe
 
 REAL = {"clock": "realtime", "servo": {"port": "/dev/nowhere"}}

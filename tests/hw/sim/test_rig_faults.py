@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from gripper_force.config import FAULTS, FaultConfig
+from gripper_force.fault_config import FAULTS, FaultConfig
 from gripper_force.fault_injection import Faults
 from gripper_force.types import NS_PER_MS, NS_PER_S, Frame, LoadCellSample
 from gripper_hw.sim.rig_faults import FaultyCamera, FaultyClock, FaultyLoadCell

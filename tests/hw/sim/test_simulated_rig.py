@@ -194,7 +194,7 @@ def broken_after(make_rig: MakeRig, patch: Callable[[SimulatedRig], None]) -> Ba
     patch(rig)
     rig.start()
     until_s = time.monotonic() + 20
-    with pytest.raises(Exception) as caught:  # noqa: PT012 - polled
+    with pytest.raises(Exception) as caught:
         while time.monotonic() < until_s:
             rig.check()
             time.sleep(0.005)

@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from gripper_force.config import Config
-from gripper_force.jobs.doctor import Check
+from gripper_force.jobs.checks import Check
 from gripper_hw.sim.simulation_probe import probe
 from gripper_hw.sim.world import World
 

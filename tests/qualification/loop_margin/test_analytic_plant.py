@@ -88,3 +88,34 @@ def test_vision_is_late_by_its_delay_and_keeps_the_newest() -> None:
     late = vision.sample(NS_PER_S, 0.0, 0.0)
     assert late is not None
     assert late.seq == frames[-1].seq + 2
+
+
+def test_stiffening_adds_a_quadratic_force() -> None:
+    gripper = Gripper(RIG, stiffening_n_m2=1e5, contact_m=0.005, jaw_m=0.007, deepest_m=0.009)
+    assert gripper.force_n == pytest.approx(1000.0 * 0.002 + 1e5 * 0.002**2)
+    assert gripper.peak_n == pytest.approx(1000.0 * 0.004 + 1e5 * 0.004**2)
+    linear, stiffening = (
+        press(Gripper(RIG, stiffening_n_m2=quadratic, friction_n=0.0, contact_m=0.005), 4.0)
+        for quadratic in (0.0, 1e5)
+    )
+    assert stiffening.jaw_m < linear.jaw_m
+    assert stiffening.force_n == pytest.approx(linear.force_n, abs=0.05)
+
+
+def test_motor_comes_to_rest_at_its_end_stops() -> None:
+    gripper = press(Gripper(RIG, contact_m=1.0, stops_m=(0.0, 0.02)), 5.0)
+    assert (gripper.x_m, gripper.v_m_s) == (0.02, 0.0)
+    gripper = press(Gripper(RIG, contact_m=-0.01, stiffness_n_m=1e3, stops_m=(0.0, 0.02)), 0.0)
+    assert (gripper.x_m, gripper.v_m_s) == (0.0, 0.0)
+
+
+def test_visual_gain_and_a_new_delay_apply_to_the_next_frame() -> None:
+    vision = SimulatedVision(0.0, 0.0, gain=1.5)
+    first = vision.sample(0, 2.0, 0.0)
+    assert first is not None
+    assert first.force_n == 3.0
+    vision.delay_s = 0.03
+    assert vision.sample(20 * NS_PER_MS, 2.0, 0.0) is None
+    late = vision.sample(50 * NS_PER_MS, 2.0, 0.0)
+    assert late is not None
+    assert late.t_ns == 20 * NS_PER_MS

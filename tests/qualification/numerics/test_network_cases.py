@@ -96,8 +96,8 @@ def test_an_engine_that_takes_nan_in_is_found(
     assert broken(list(suite._not_finite(tmp_path, TORCH, grasp))) == []
 
     def step(self: Engine, frame: Floats) -> Step:
-        self._blank()
-        return self._run(frame)
+        self._zero_states()
+        return self._infer(frame)
 
     monkeypatch.setattr(Engine, "step", step)
     assert "frames of NaN and infinity" in broken(list(suite._not_finite(tmp_path, TORCH, grasp)))
