@@ -1,13 +1,7 @@
-<<<<<<< HEAD
-"""Calibration of a camera: region of interest, exposure and lag, from touches of a soft object."""
-
-import time
-=======
 """Calibration of a camera: exposure, region of interest and lag, from touches of a compliant object."""
 
 import time
 from collections import defaultdict
->>>>>>> main
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -52,26 +46,16 @@ from gripper_force.types import (
 from gripper_force.vision.preprocess import Region, downscale
 
 EXPOSURES_US: Final = (500, 1000, 2000, 4000, 8000, 16000)
-<<<<<<< HEAD
-"""Default candidates. Those longer than half a frame period are skipped: their images are late and blurred."""
-=======
 """Candidate exposures. Those above half a frame's period are skipped: their images are late and blurred."""
->>>>>>> main
 
 TOUCHES: Final = 10
-"""Default number of touches."""
 
 _SETTLE_NS: Final = 300 * NS_PER_MS
 _TIMEOUT_NS: Final = 3 * NS_PER_S
 _POLL_NS: Final = 5 * NS_PER_MS
 _SMALL_PX: Final = 48
-<<<<<<< HEAD
-_SEARCHED_FRAMES: Final = 200
-"""Frames of the touches that are searched for markers."""
-=======
 _MAX_SEARCHED: Final = 200
 """Images of the touches that are searched for markers."""
->>>>>>> main
 
 _REFERENCE_FRAMES: Final = 10
 _TIMED_FRAMES: Final = 60
@@ -79,17 +63,6 @@ _TIMED_FRAMES: Final = 60
 
 @dataclass(frozen=True, slots=True)
 class CameraObservation:
-<<<<<<< HEAD
-    """Images, markers and lags in a recorded set of touches.
-
-    Attributes:
-        reference: Mean of the first images, with open jaws, (H, W).
-        markers: Markers in the searched images.
-        widest: Image that shows both markers furthest apart, (H, W); the reference if none shows both.
-        widest_markers: Markers in it.
-        touches: Lag of each touch.
-        use_ms: Median time from the camera's timestamp to the control cycle that has the image.
-=======
     """Evaluation of one recording of touches.
 
     Attributes:
@@ -99,7 +72,6 @@ class CameraObservation:
         widest_markers: The markers in it.
         touches: Lag of each touch.
         use_ms: Median time from the camera's timestamp to the control cycle that gets the frame.
->>>>>>> main
         rate_hz: Frame rate.
     """
 
@@ -118,19 +90,11 @@ class CameraResult:
 
     Attributes:
         calibration: The section of the rig profile.
-<<<<<<< HEAD
-        correlation_lag_ms: Time shift with the highest correlation of image and force, for comparison.
-        use_ms: Median time from the camera's timestamp to the control cycle that has the image.
-        compute_ms: Computing time of the network.
-        touches: Number of touches.
-        usable_touches: Number of touches that the lag was estimated from.
-=======
         correlation_lag_ms: Median time shift with the highest correlation of image and force.
         use_ms: Median time from the camera's timestamp to the control cycle that gets the frame.
         compute_ms: Time of one estimate.
         touches: Number of touches.
         touches_that_tell: Number of touches that determine the lag.
->>>>>>> main
         rig: The rig profile.
         report: The figure, PNG.
     """
@@ -140,30 +104,10 @@ class CameraResult:
     use_ms: float
     compute_ms: float
     touches: int
-<<<<<<< HEAD
-    usable_touches: int
-    rig: Path
-    report: Path
-
-    def as_dict(self) -> dict[str, Any]:
-        """Returns the result as the command prints it."""
-        return {
-            **self.calibration.model_dump(mode="json"),
-            "correlation_lag_ms": self.correlation_lag_ms,
-            "use_ms": self.use_ms,
-            "compute_ms": self.compute_ms,
-            "touches": self.touches,
-            "touches_that_tell": self.usable_touches,
-            "rig": self.rig,
-            "report": self.report,
-        }
-
-=======
     touches_that_tell: int
     rig: Path
     report: Path
 
->>>>>>> main
 
 def calibrate_camera(
     config: Config,
@@ -174,17 +118,6 @@ def calibrate_camera(
     touches: int = TOUCHES,
     progress: Progress = no_progress,
 ) -> CameraResult:
-<<<<<<< HEAD
-    """Tries exposures, touches the object, and writes the rig profile's section, a reference image and a figure.
-
-    Args:
-        config: The configuration, with a soft object between the jaws that is not wider than the image.
-        rig: Rig profile to write; an existing one keeps its other sections.
-        region: Region of interest of the frame; None: determined from the markers on the jaws.
-        exposures_us: Candidate exposures.
-        touches: Number of touches.
-        progress: Called with the step and the force a few times per second, with 0 steps.
-=======
     """Selects an exposure, touches the object, and writes the rig profile's section and figures beside it.
 
     Args:
@@ -194,30 +127,11 @@ def calibrate_camera(
         exposures_us: Candidate exposures.
         touches: Number of touches.
         progress: Called with the step and the force a few times per second.
->>>>>>> main
 
     Raises:
         ConfigError: There is no camera or load cell, the region is not within the frame, or the profile can't
             be read or written.
         DeviceError: A device failed. The servo was stopped as configured.
-<<<<<<< HEAD
-        DataError: No exposure is usable, the markers are not visible, or the touches do not determine the lag.
-    """
-    if config.camera.backend in ("none", "playback"):
-        raise ConfigError(
-            f"calibrate camera needs a camera with an adjustable exposure, and camera.backend is "
-            f"{config.camera.backend}; set it to your camera"
-        )
-    if rig.exists():
-        read_rig(rig)  # fails before anything has moved
-    # Existing profiles contain camera settings, which are determined anew.
-    config = _replace(config, "calibration", rig=None, object=None)
-    config = _replace(config, "vision", region=region)
-    candidates, images = _try_exposures(config, exposures_us, progress)
-    exposure = select_exposure(candidates)
-    config = _replace(config, "camera", exposure_us=exposure.exposure_us)
-    with TemporaryDirectory() as folder:
-=======
         DataError: No exposure is usable, the markers are not visible, or the lag is undetermined.
     """
     if config.camera.backend in ("none", "playback"):
@@ -233,21 +147,10 @@ def calibrate_camera(
     selected = select_exposure(candidates)
     config = _with(config, "camera", exposure_us=selected.exposure_us)
     with TemporaryDirectory() as aside:
->>>>>>> main
 
         def report_touch(_set: int, touch: int, force_n: float) -> None:
             progress(f"touch {touch} of {touches}: {force_n:.1f} N", 0)
 
-<<<<<<< HEAD
-        (log,) = record(config, RecordingPlan(1, touches), Path(folder), report_touch)
-        observed = observe(log, region)
-    height, width = observed.reference.shape
-    selected_region = region_around(observed.markers, width, height) if region is None else region
-    lag = estimate_lag(observed.touches)
-    network_ms = compute_ms(_replace(config, "vision", region=selected_region), observed.reference)
-    # Until the next frame comes, an image ages by half a frame period on average.
-    wait_ms = observed.use_ms + network_ms + 500 / observed.rate_hz
-=======
         (log,) = record(config, RecordingPlan(1, touches), Path(aside), report_touch)
         observed = observe(log, region)
     height, width = observed.reference.shape
@@ -255,44 +158,22 @@ def calibrate_camera(
     lag = estimate_lag(observed.touches)
     estimate_ms = compute_ms(_with(config, "vision", region=found_region), observed.reference)
     wait_ms = observed.use_ms + estimate_ms + 500 / observed.rate_hz
->>>>>>> main
     camera = config.camera
-    calibration = CameraCalibration(
+    found = CameraCalibration(
         date=datetime.now(UTC).replace(microsecond=0),
         backend=camera.backend,
         side_px=camera.side_px,
         rate_hz=camera.rate_hz,
         gain=camera.gain,
-<<<<<<< HEAD
-        exposure_us=exposure.exposure_us,
-        mean=exposure.mean,
-        clipped=exposure.clipped,
-        region=selected_region,
-=======
         exposure_us=selected.exposure_us,
         mean=selected.mean,
         clipped=selected.clipped,
         region=found_region,
->>>>>>> main
         markers=region is None,
         lag_ms=lag,
         delay_ms=_shifted(lag, wait_ms),
         reference=f"{rig.stem}-reference.png",
     )
-<<<<<<< HEAD
-    update_rig(rig, calibration)
-    _write_image(rig.with_name(calibration.reference), observed.reference)
-    report = rig.with_name(f"{rig.stem}-camera.png")
-    draw(calibration, observed.widest, observed.widest_markers, candidates, images, observed.touches, report)
-    correlations_ms = [touch.correlation_ms for touch in usable_touches(observed.touches)]
-    return CameraResult(
-        calibration=calibration,
-        correlation_lag_ms=float(np.nanmedian(correlations_ms)),
-        use_ms=observed.use_ms,
-        compute_ms=network_ms,
-        touches=len(observed.touches),
-        usable_touches=len(correlations_ms),
-=======
     update_rig(rig, found)
     _write(rig.with_name(found.reference), observed.reference)
     report = rig.with_name(f"{rig.stem}-camera.png")
@@ -305,7 +186,6 @@ def calibrate_camera(
         compute_ms=estimate_ms,
         touches=len(observed.touches),
         touches_that_tell=len(correlations_ms),
->>>>>>> main
         rig=rig,
         report=report,
     )
@@ -315,42 +195,17 @@ def observe(log: Path, region: Region | None) -> CameraObservation:
     """Finds markers and lags in a recorded set of touches.
 
     Args:
-<<<<<<< HEAD
-        log: The set, as `gripper_force.jobs.recording.record.record` writes it.
-        region: Region of interest if it is known; then no markers are searched.
-=======
         log: The set, as `gripper_force.jobs.recording.record` writes it.
         region: Region of interest, if it is known; markers are then not searched.
->>>>>>> main
     """
+    records: dict[type, list[Any]] = defaultdict(list)
     frames: list[Frame] = []
-    samples: list[LoadCellSample] = []
-    statuses: list[GraspStatus] = []
-    requests: list[Request] = []
     used_ms: list[float] = []
     waiting: list[Frame] = []
     for item in LogReader(log).records(Frame, ServoState, LoadCellSample, GraspStatus, Request):
         if isinstance(item, Frame):
             frames.append(item)
             waiting.append(item)
-<<<<<<< HEAD
-        elif isinstance(item, ServoState):  # of the cycle that has the frames logged before it
-            used_ms += [(item.t_ns - frame.t_ns) / NS_PER_MS for frame in waiting]
-            waiting = []
-        elif isinstance(item, LoadCellSample):
-            samples.append(item)
-        elif isinstance(item, GraspStatus):
-            statuses.append(item)
-        elif isinstance(item, Request):
-            requests.append(item)
-    step = -(-len(frames) // _SEARCHED_FRAMES)
-    searched = frames[::step] if region is None else []
-    markers = [find_markers(frame.gray) for frame in searched]
-    distances_px = [_distance_px(found) for found in markers]
-    widest = int(np.argmax(distances_px)) if distances_px and max(distances_px) > 0 else None
-    mean = np.mean([frame.gray for frame in frames[:_REFERENCE_FRAMES]], axis=0)
-    reference: Gray = np.rint(mean).astype(np.uint8)
-=======
         elif isinstance(item, ServoState):  # of the cycle that got the frames before it
             used_ms += [(item.t_ns - frame.t_ns) / NS_PER_MS for frame in waiting]
             waiting = []
@@ -363,103 +218,62 @@ def observe(log: Path, region: Region | None) -> CameraObservation:
     widest = int(np.argmax(distances)) if distances and max(distances) > 0 else None
     reference = np.mean([frame.gray for frame in frames[:_REFERENCE_FRAMES]], axis=0)
     as_gray: Gray = np.rint(reference).astype(np.uint8)
->>>>>>> main
     frame_s = np.array([frame.t_ns for frame in frames]) / NS_PER_S
     return CameraObservation(
-        reference=reference,
+        reference=as_gray,
         markers=markers,
-<<<<<<< HEAD
-        widest=reference if widest is None else searched[widest].gray,
-=======
         widest=as_gray if widest is None else searched[widest].gray,
->>>>>>> main
         widest_markers={} if widest is None else markers[widest],
-        touches=_touch_lags(frames, region, samples, statuses, releases_ns(requests)),
+        touches=_touches(frames, region, records),
         use_ms=float(np.median(used_ms)),
         rate_hz=float(1 / np.median(np.diff(frame_s))),
     )
 
 
-<<<<<<< HEAD
-def _touch_lags(
-    frames: list[Frame],
-    region: Region | None,
-    samples: list[LoadCellSample],
-    statuses: list[GraspStatus],
-    release_times_ns: list[int],
-) -> list[TouchLag]:
-=======
 def _touches(frames: list[Frame], region: Region | None, records: dict[type, list[Any]]) -> list[TouchLag]:
->>>>>>> main
     frame_s = np.array([frame.t_ns for frame in frames]) / NS_PER_S
     images = np.stack([downscale(frame.gray, region, _SMALL_PX) for frame in frames])
-    samples = sorted((s for s in samples if s.valid), key=lambda sample: sample.t_ns)
-    cell_s = np.array([sample.t_ns for sample in samples]) / NS_PER_S
-    force_n = np.array([sample.force_n for sample in samples])
-    servo_s = np.array([status.t_ns for status in statuses]) / NS_PER_S
-    width_m = np.array([status.width_m for status in statuses])
-    releases_s = [t_ns / NS_PER_S for t_ns in release_times_ns]
+    cells = sorted((s for s in records[LoadCellSample] if s.valid), key=lambda sample: sample.t_ns)
+    cell_s = np.array([sample.t_ns for sample in cells]) / NS_PER_S
+    force_n = np.array([sample.force_n for sample in cells])
+    servo_s = np.array([status.t_ns for status in records[GraspStatus]]) / NS_PER_S
+    width_m = np.array([status.width_m for status in records[GraspStatus]])
+    releases_s = [t_ns / NS_PER_S for t_ns in releases_ns(records[Request])]
     by_servo_s = camera_lags_s(frame_s, images, servo_s, width_m, releases_s)
     by_force_s = camera_lags_s(frame_s, images, cell_s, force_n, releases_s)
     touches = []
-<<<<<<< HEAD
-    for release_s, camera_s, correlation_s in zip(releases_s, by_servo_s, by_force_s, strict=True):
-        cell_lag_s = load_cell_lag_s(cell_s, force_n, servo_s, width_m, release_s)
-        release_n = float(np.interp(release_s, cell_s, force_n))
-        touches.append(TouchLag(release_n, 1e3 * (float(camera_s) - cell_lag_s), 1e3 * float(correlation_s)))
-=======
     for at_s, camera_s, correlation_s in zip(releases_s, by_servo_s, by_force_s, strict=True):
         cell_lag_s = load_cell_lag_s(cell_s, force_n, servo_s, width_m, at_s)
         at_n = float(np.interp(at_s, cell_s, force_n))
         touches.append(TouchLag(at_n, 1e3 * (float(camera_s) - cell_lag_s), 1e3 * float(correlation_s)))
->>>>>>> main
     return touches
 
 
 def _try_exposures(
     config: Config, exposures_us: Sequence[int], progress: Progress
 ) -> tuple[list[ExposureCandidate], list[Gray]]:
-<<<<<<< HEAD
-    """Candidates not longer than half a frame period, and an image at each."""
-    max_us = 0.5e6 / config.camera.rate_hz
-=======
     longest_us = 0.5e6 / config.camera.rate_hz
->>>>>>> main
     candidates, images = [], []
     for exposure_us in exposures_us:
-        if exposure_us > max_us:
+        if exposure_us > longest_us:
             continue
         progress(f"exposure of {exposure_us} us", 0)
-<<<<<<< HEAD
-        gray = _take_image(_replace(config, "camera", exposure_us=exposure_us))
-=======
         gray = _capture(_with(config, "camera", exposure_us=exposure_us))
->>>>>>> main
         region = config.vision.region
         part = gray if region is None else downscale(gray, region, min(region[2:]))
         candidates.append(ExposureCandidate.measure(exposure_us, part))
         images.append(gray)
     if not candidates:
         raise ConfigError(
-<<<<<<< HEAD
-            f"every candidate exposure is longer than half a frame period ({max_us:.0f} us at camera.rate_hz "
-=======
             f"every candidate exposure is longer than half a frame ({longest_us:.0f} us at camera.rate_hz "
->>>>>>> main
             f"{config.camera.rate_hz:g}); pass shorter ones with --exposure-us"
         )
     return candidates, images
 
 
-<<<<<<< HEAD
-def _take_image(config: Config) -> Gray:
-    """An image (H, W) of the camera after its exposure has settled."""
-    with open_devices(config) as devices:
-=======
 def _capture(config: Config) -> Gray:
     """Returns the newest image of a camera that has run for 0.3 s."""
     with open_devices(resolve(config, vision=False).config) as devices:
->>>>>>> main
         camera, clock = devices.camera, devices.clock
         assert camera is not None
         camera.start()
@@ -473,27 +287,13 @@ def _capture(config: Config) -> Gray:
                 gray = frame.gray
             if gray is None and now_ns - begin_ns > _TIMEOUT_NS:
                 raise DeviceTimeoutError(
-<<<<<<< HEAD
-                    f"the camera gave no frame for {_PATIENCE_NS / NS_PER_S:g} s at an exposure of "
-=======
                     f"the camera gave no frame for {_TIMEOUT_NS / NS_PER_S:g} s at an exposure of "
->>>>>>> main
                     f"{config.camera.exposure_us} us; check its cable, and run `gripper-force doctor`"
                 )
         return gray
 
 
 def compute_ms(config: Config, gray: Gray) -> float:
-<<<<<<< HEAD
-    """Returns the network's computing time for an image (H, W): configured on the simulated clock, else measured."""
-    checkpoint = checkpoint_of(config)
-    if checkpoint is None:
-        return 0.0
-    if config.clock == "lockstep":
-        return config.vision.lockstep_compute_ms
-    estimator = open_estimator(checkpoint, settled(config)[0].vision)
-    times_ms = []
-=======
     """Time of one estimate: configured on the simulated clock, otherwise measured; 0 without vision."""
     config, model, _ = resolve_vision(config)
     if config.clock == "lockstep" and model is not None:
@@ -502,21 +302,20 @@ def compute_ms(config: Config, gray: Gray) -> float:
     if estimator is None:
         return 0.0
     each_ms = []
->>>>>>> main
     for _ in range(_TIMED_FRAMES):
         begin_ns = time.perf_counter_ns()
         estimator.update(gray)
-        times_ms.append((time.perf_counter_ns() - begin_ns) / NS_PER_MS)
-    return float(np.median(times_ms))
+        each_ms.append((time.perf_counter_ns() - begin_ns) / NS_PER_MS)
+    return float(np.median(each_ms))
 
 
-def _replace(config: Config, section: str, **values: object) -> Config:
+def _with(config: Config, section: str, **values: object) -> Config:
     return config.model_copy(update={section: getattr(config, section).model_copy(update=values)})
 
 
-def _shifted(value: CalibratedValue, by: float) -> CalibratedValue:
-    low, high = (None if end is None else end + by for end in (value.low, value.high))
-    return CalibratedValue(value=value.value + by, low=low, high=high)
+def _shifted(estimate: CalibratedValue, by: float) -> CalibratedValue:
+    low, high = (None if end is None else end + by for end in (estimate.low, estimate.high))
+    return CalibratedValue(value=estimate.value + by, low=low, high=high)
 
 
 def _distance_px(markers: Markers) -> float:
@@ -526,6 +325,6 @@ def _distance_px(markers: Markers) -> float:
     return float(np.linalg.norm(first - second))
 
 
-def _write_image(path: Path, gray: Gray) -> None:
+def _write(path: Path, gray: Gray) -> None:
     if not cv2.imwrite(str(path), gray):
         raise DataError(f"can't write the image {path}; check its folder")

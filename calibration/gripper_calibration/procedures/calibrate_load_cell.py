@@ -19,51 +19,6 @@ from gripper_force.runtime.backends import MonotonicClock, open_load_cell
 from gripper_force.types import NS_PER_MS, NS_PER_S, LoadCellSample
 
 STANDARD_GRAVITY_M_S2: Final = 9.80665
-<<<<<<< HEAD
-NEUTRAL_N_PER_RAW: Final = 1e-9
-"""Scale so small that the driver's thresholds in newtons have no effect: it then rejects only saturated and
-stuck readings. The fit detects spikes, once it knows the scale."""
-
-_PERIOD_NS: Final = 50 * NS_PER_MS
-_SETTLE_NS: Final = NS_PER_S
-"""Waiting time after a person has touched the load cell."""
-_SILENT_NS: Final = 3 * NS_PER_S
-_MAX_FORCE_N: Final = 1000.0
-_CHANGE_TO_UNCERTAINTY: Final = 10
-_STEADY_SHARE: Final = 0.01
-_BACKENDS: Final = {n: path for n, path in LOAD_CELLS.items() if path is not None and n != "simulated"}
-
-
-@dataclass(frozen=True, slots=True)
-class LoadCellResult:
-    """Result of `calibrate_load_cell`.
-
-    Attributes:
-        calibration: The section of the rig profile.
-        return_n: Difference of the empty readings after and before the load.
-        rejected: Number of rejected readings.
-        rig: The rig profile.
-        report: The figure, PNG.
-    """
-
-    calibration: LoadCellCalibration
-    return_n: float
-    rejected: int
-    rig: Path
-    report: Path
-
-    def as_dict(self) -> dict[str, Any]:
-        """Returns the result as the command prints it."""
-        return {
-            **self.calibration.model_dump(mode="json"),
-            "return_n": self.return_n,
-            "rejected": self.rejected,
-            "rig": self.rig,
-            "report": self.report,
-        }
-
-
-=======
 NEUTRAL: Final = 1e-9
 """Newtons per raw unit, so small that no threshold in newtons acts: the driver then only rejects saturated and
 stuck readings. The fit rejects spikes, because it knows the scale."""
@@ -97,7 +52,6 @@ class LoadCellResult:
     report: Path
 
 
->>>>>>> main
 def calibrate_load_cell(
     config: Config,
     force_n: float,
@@ -107,44 +61,6 @@ def calibrate_load_cell(
     seconds: float = 10.0,
     progress: Progress = no_progress,
 ) -> LoadCellResult:
-<<<<<<< HEAD
-    """Measures tare and scale with a known mass, and writes the rig profile's section and a figure.
-
-    Args:
-        config: The configuration. Tare and scale in its section ``load_cell`` are ignored.
-        force_n: Weight of the mass.
-        rig: Rig profile to write; an existing one keeps its other sections.
-        prompt: Asks a person to change the load.
-        seconds: Duration of each rest.
-        progress: Called with the step and the newest reading a few times per second, with 0 steps.
-
-    Raises:
-        ConfigError: The backend has no raw readings, the weight is out of range, or the profile can't be read or
-            written.
-        DeviceError: The load cell can't be opened, or gives no reading.
-        DataError: The readings are not sufficient for a calibration.
-    """
-    section = config.load_cell
-    if section.backend not in _BACKENDS:
-        raise ConfigError(
-            f"load_cell.backend {section.backend} has no raw readings to calibrate; set it to serial or phidget, "
-            "or to playback for a recorded log"
-        )
-    if not 0 < force_n <= _MAX_FORCE_N:
-        raise ConfigError(
-            f"a weight of {force_n:g} N is not within the supported range; use one above 0 and up to "
-            f"{_MAX_FORCE_N:g} N"
-        )
-    if rig.exists():
-        read_rig(rig)  # fails before a person has moved masses
-    clock = MonotonicClock()
-    neutral = section.model_copy(update={"tare_raw": 0.0, "n_per_raw": NEUTRAL_N_PER_RAW})
-    cell: LoadCell = load(_BACKENDS[section.backend])(neutral, clock)
-    with closing(cell):
-        cell.start()
-        fit = measure(cell, clock, force_n, prompt=prompt, seconds=seconds, progress=progress)
-    calibration = LoadCellCalibration(
-=======
     """Weighs a known mass, and writes the rig profile's section and a figure beside it.
 
     Args:
@@ -177,7 +93,6 @@ def calibrate_load_cell(
         cell.start()
         fit = weigh(cell, clock, force_n, prompt=prompt, seconds=seconds, progress=progress)
     found = LoadCellCalibration(
->>>>>>> main
         date=datetime.now(UTC).replace(microsecond=0),
         sensor=section.sensor,
         tare_raw=fit.tare_raw,
@@ -186,46 +101,19 @@ def calibrate_load_cell(
         noise_n=fit.noise_n,
         drift_n_min=fit.drift_n_min,
     )
-    update_rig(rig, calibration)
+    update_rig(rig, found)
     report = rig.with_name(f"{rig.stem}-load-cell.png")
     draw(fit, report)
-<<<<<<< HEAD
-    return LoadCellResult(calibration, fit.return_n, fit.rejected, rig, report)
-=======
     return LoadCellResult(found, fit.return_n, fit.rejected, rig, report)
->>>>>>> main
 
 
-def measure(
+def weigh(
     cell: LoadCell,
     clock: Clock,
     force_n: float,
     *,
     prompt: Prompt,
     seconds: float = 10.0,
-<<<<<<< HEAD
-    patience_s: float = 60.0,
-    progress: Progress = no_progress,
-) -> LoadCellFit:
-    """Asks for the three loads in turn, reads each one at rest, and fits tare and scale.
-
-    Args:
-        cell: A started load cell with the scale `NEUTRAL_N_PER_RAW`.
-        clock: Its clock.
-        force_n: Weight of the known mass.
-        prompt: Asks a person to change the load.
-        seconds: Duration of each rest.
-        patience_s: Longest waiting time for a rest, beyond `seconds`.
-        progress: Called with the step and the newest reading, with 0 steps.
-
-    Raises:
-        DeviceTimeoutError: The load cell gives no reading.
-        DataError: A reading does not settle, hardly changes with the load, or does not return.
-    """
-    reader = _RestReader(cell, clock, round(seconds * NS_PER_S), round(patience_s * NS_PER_S), progress)
-    prompt("Take everything off the load cell")
-    empty = reader.read("empty", lambda _: True)
-=======
     timeout_s: float = 60.0,
     progress: Progress = no_progress,
 ) -> LoadCellFit:
@@ -247,50 +135,26 @@ def measure(
     scale = _Scale(cell, clock, round(seconds * NS_PER_S), round(timeout_s * NS_PER_S), progress)
     prompt("Take everything off the load cell")
     empty = scale.read(_NAMES[0], lambda _: True)
->>>>>>> main
     tare = rest_statistics(empty, 0.0, "without load")
     prompt(
         f"Put the mass of {force_n / STANDARD_GRAVITY_M_S2:.4g} kg ({force_n:.4g} N) on it and let it rest"
     )
 
-    def is_loaded(rest: Rest) -> bool:
+    def rests(rest: Rest) -> bool:
         try:
             now = rest_statistics(rest, 0.0, "under load")
         except DataError:
             return False
         change = abs(now.raw - tare.raw)
-<<<<<<< HEAD
-        known = change > _CHANGE_TO_UNCERTAINTY * (now.half_raw + tare.half_raw)
-        return known and now.range_raw < _STEADY_SHARE * change
-
-    loaded = reader.read("loaded", is_loaded)
-    load_level = rest_statistics(loaded, 0.0, "under load")
-=======
         return bool(
             change > _MIN_CHANGE * (now.half_raw + tare.half_raw) and now.range_raw < _MAX_RANGE * change
         )
 
     loaded = scale.read(_NAMES[1], rests)
     under = rest_statistics(loaded, 0.0, "under load")
->>>>>>> main
 
-    def is_unloaded(rest: Rest) -> bool:
+    def is_back(rest: Rest) -> bool:
         try:
-<<<<<<< HEAD
-            now = rest_statistics(rest, 0.0, "after unloading")
-        except DataError:
-            return False
-        limit = _STEADY_SHARE * abs(load_level.raw - tare.raw)
-        return abs(now.raw - tare.raw) < limit and now.range_raw < limit
-
-    prompt("Take the mass off again")
-    again = reader.read("empty again", is_unloaded)
-    return fit_load_cell(empty, loaded, again, force_n)
-
-
-class _RestReader:
-    """Reads a load cell until its readings are at rest, or for the longest waiting time."""
-=======
             now = rest_statistics(rest, 0.0, "after the load was taken off")
         except DataError:
             return False
@@ -304,7 +168,6 @@ class _RestReader:
 
 class _Scale:
     """Reads a load cell until a span of readings is good, or a time has passed."""
->>>>>>> main
 
     def __init__(
         self, cell: LoadCell, clock: Clock, span_ns: int, timeout_ns: int, progress: Progress
@@ -312,17 +175,10 @@ class _Scale:
         self._cell, self._clock, self._progress = cell, clock, progress
         self._span_ns, self._timeout_ns = span_ns, timeout_ns
 
-<<<<<<< HEAD
-    def read(self, step: str, is_accepted: Callable[[Rest], bool]) -> Rest:
-        """Returns the newest span of readings once it is accepted, or at the end of the waiting time."""
-        begin_ns = newest_ns = self._clock.now_ns() + _SETTLE_NS
-        end_ns = begin_ns + self._span_ns + self._patience_ns
-=======
     def read(self, step: str, is_good: Callable[[Rest], bool]) -> Rest:
         """Returns the first good span of readings, or after the timeout the last one."""
         begin_ns = newest_ns = self._clock.now_ns() + _SETTLE_NS
         end_ns = begin_ns + self._span_ns + self._timeout_ns
->>>>>>> main
         self._cell.drain()
         samples: list[LoadCellSample] = []
         check_ns = begin_ns + self._span_ns
@@ -336,20 +192,15 @@ class _Scale:
             if now_ns - newest_ns > _SILENT_NS:
                 counts = ", ".join(f"{n} {name}" for name, n in self._cell.counts().items() if n)
                 raise DeviceTimeoutError(
-<<<<<<< HEAD
-                    f"the load cell gives no reading (counted: {counts or 'nothing'}); check its cable, the "
-                    "section load_cell of the configuration, and `gripper-force doctor`"
-=======
                     f"the load cell gives no readings (counted: {counts or 'nothing'}); check its cable and "
                     "the load_cell keys, and run `gripper-force doctor`"
->>>>>>> main
                 )
             if newest_ns < check_ns:
                 continue
             check_ns = newest_ns + self._span_ns // 10
             samples = [sample for sample in samples if sample.t_ns > newest_ns - self._span_ns]
             rest = _rest(samples)
-            if is_accepted(rest) or now_ns > end_ns:
+            if is_good(rest) or now_ns > end_ns:
                 return rest
 
 

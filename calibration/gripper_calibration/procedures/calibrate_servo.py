@@ -1,8 +1,4 @@
-<<<<<<< HEAD
-"""Calibration of a servo: torque, friction and jaw geometry, with the load cell's body between the jaws."""
-=======
 """Calibration of a servo: torque, friction and jaw geometry, with the load cell's body as a gauge."""
->>>>>>> main
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -21,9 +17,6 @@ from gripper_force.control.safety import Safety
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import ConfigError, DataError, DeviceError
 from gripper_force.interfaces import Devices, Progress, Prompt, no_progress
-<<<<<<< HEAD
-from gripper_force.profiles.rig_profile import RigProfile, ServoCalibration, read_rig, update_rig
-=======
 from gripper_force.profiles.rig_profile import (
     CalibratedValue,
     RigProfile,
@@ -31,22 +24,11 @@ from gripper_force.profiles.rig_profile import (
     read_rig,
     update_rig,
 )
->>>>>>> main
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.resolve import resolve
 from gripper_force.types import NS_PER_S, ServoCommand, ServoState
 
 PRESSES: Final = ((3.0, 1.0), (6.0, 1.0), (12.0, 1.0), (3.0, 0.6), (6.0, 0.8), (12.0, 0.8))
-<<<<<<< HEAD
-"""Rate in N/s and share of the peak force of each press. Several rates separate lag from friction."""
-
-SPEEDS_M_S: Final = (0.012, 0.020, 0.028, 0.036, 0.044, 0.052)
-"""Nominal speeds of a jaw in free travel; the currents are computed from them."""
-
-_RATE_HZ: Final = 200.0
-_PEAK_SHARE: Final = 1.05
-"""Peak force as a share of the largest target, so that every target is within the calibrated range."""
-=======
 """Rate in N/s and share of the largest force of each press. Several rates separate lag from friction."""
 
 SPEEDS_M_S: Final = (0.012, 0.020, 0.028, 0.036, 0.044, 0.052)
@@ -55,36 +37,21 @@ SPEEDS_M_S: Final = (0.012, 0.020, 0.028, 0.036, 0.044, 0.052)
 _RATE_HZ: Final = 200.0
 _PEAK_SHARE: Final = 1.05
 """Peak force as a share of the largest target, so that every target lies within the calibrated range."""
->>>>>>> main
 _APPROACH_M_S: Final = 0.008
-_CONTACT_N: Final = 0.5
-_NO_CONTACT_N: Final = 0.2
+_TOUCH_N: Final = 0.5
+_FREE_N: Final = 0.2
 _REST_S: Final = 0.5
 _MAX_TARE_N: Final = 1.0
-<<<<<<< HEAD
-_CLEARANCE_M: Final = 0.005
-_BRAKE_RAD: Final = 0.3
-"""At this distance from the goal, the servo's position control takes over."""
-_ACCELERATION_S: Final = 0.1
-_START_CURRENT_FACTOR: Final = 1.6
-_MOVING_RAD_S: Final = 0.15
-=======
 _CLEAR_M: Final = 0.005
 _BRAKE_RAD: Final = 0.3
 """Distance from the goal at which the servo's own position control takes over."""
 _SPEED_UP_S: Final = 0.1
 _START_FACTOR: Final = 1.6
 _MIN_SPEED_RAD_S: Final = 0.15
->>>>>>> main
 _MAX_PASS_S: Final = 4.0
 _SILENT_NS: Final = NS_PER_S
-_PROGRESS_NS: Final = NS_PER_S // 5
 _BEYOND_RAD: Final = 1.0
-<<<<<<< HEAD
-"""With a goal this far away, only the current limit determines the force."""
-=======
 """Distance of the goal beyond the contact, so that only the current limits the force."""
->>>>>>> main
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,11 +60,6 @@ class ServoResult:
 
     Attributes:
         calibration: The section of the rig profile.
-<<<<<<< HEAD
-        fit: The fit with all its parameters.
-        presses: Number of presses.
-        passes: Number of free passes.
-=======
         n_per_a: Jaw force per ampere.
         friction_share: Growth of friction with the force, as a share of it.
         free_friction_n: Friction in free travel.
@@ -105,41 +67,21 @@ class ServoResult:
         offset_a: Offset of the measured current.
         presses: Number of presses.
         passes: Number of passes of free travel.
->>>>>>> main
         rig: The rig profile.
         report: The figure, PNG.
     """
 
     calibration: ServoCalibration
-<<<<<<< HEAD
-    fit: ServoFit
-=======
     n_per_a: CalibratedValue
     friction_share: CalibratedValue
     free_friction_n: CalibratedValue
     lag_s: CalibratedValue
     offset_a: CalibratedValue
->>>>>>> main
     presses: int
     passes: int
     rig: Path
     report: Path
 
-<<<<<<< HEAD
-    def as_dict(self) -> dict[str, Any]:
-        """Returns the result as the command prints it."""
-        names = ("n_per_a", "friction_share", "free_friction_n", "lag_s", "offset_a")
-        return {
-            **self.calibration.model_dump(mode="json"),
-            **{name: getattr(self.fit, name).model_dump() for name in names},
-            "presses": self.presses,
-            "passes": self.passes,
-            "rig": self.rig,
-            "report": self.report,
-        }
-
-=======
->>>>>>> main
 
 def calibrate_servo(
     config: Config,
@@ -149,26 +91,6 @@ def calibrate_servo(
     prompt: Prompt,
     progress: Progress = no_progress,
 ) -> ServoResult:
-<<<<<<< HEAD
-    """Presses each gauge, moves the jaws freely, and writes the rig profile's section and a figure.
-
-    Args:
-        config: The configuration.
-        gauges_m: Width of each gauge, in the order in which they are placed between the jaws.
-        rig: Rig profile to write; an existing one keeps its other sections.
-        prompt: Asks a person to place a gauge between the jaws.
-        progress: Called with the step and the force a few times per second, with 0 steps.
-
-    Raises:
-        ConfigError: There is no load cell, a gauge does not fit, the profile has another scale of the load cell
-            than the configuration, or the profile can't be read or written.
-        DeviceError: A device failed. The servo's torque is off.
-        DataError: The jaws did not meet the gauge, or the samples are not sufficient for a calibration.
-    """
-    if config.load_cell.backend == "none":
-        raise ConfigError(
-            "calibrate servo needs a load cell, and load_cell.backend is none; set it to your load cell"
-=======
     """Presses each gauge, moves freely, and writes the rig profile's section and a figure beside it.
 
     Args:
@@ -186,17 +108,16 @@ def calibrate_servo(
     if config.load_cell.backend == "none":
         raise ConfigError(
             "calibrate servo needs a load cell, but load_cell.backend is none; set the backend of yours"
->>>>>>> main
         )
     for width_m in gauges_m:
-        if not 0 < width_m < config.gripper.open_width_m - 2 * _CLEARANCE_M:
+        if not 0 < width_m < config.gripper.open_width_m - 2 * _CLEAR_M:
             raise ConfigError(
                 f"a gauge of {1e3 * width_m:g} mm does not fit between jaws that open to "
-                f"{1e3 * config.gripper.open_width_m:g} mm (gripper.open_width_m); use a narrower gauge"
+                f"{1e3 * config.gripper.open_width_m:g} mm (gripper.open_width_m)"
             )
-    profile = read_rig(rig) if rig.exists() else RigProfile()
-    nominal = Nominal(
-        config.gripper.pinion_radius_m, config.gripper.open_width_m, _scale_share(profile, config, rig)
+    known = read_rig(rig) if rig.exists() else RigProfile()
+    given = Nominal(
+        config.gripper.pinion_radius_m, config.gripper.open_width_m, _scale_share(known, config, rig)
     )
     config = config.model_copy(update={"camera": config.camera.model_copy(update={"backend": "none"})})
     config = resolve(config, vision=False).config
@@ -204,22 +125,6 @@ def calibrate_servo(
     passes: list[FreePass] = []
     for width_m in gauges_m:
         prompt(f"Put the load cell with its width of {1e3 * width_m:g} mm between the open jaws")
-<<<<<<< HEAD
-        new_presses, new_passes = measure(config, width_m, progress)
-        presses += new_presses
-        passes += new_passes
-    fit = fit_servo(presses, passes, nominal)
-    calibration = _section(fit, config)
-    update_rig(rig, calibration)
-    report = rig.with_name(f"{rig.stem}-servo.png")
-    draw(fit, presses, report)
-    return ServoResult(calibration, fit, len(presses), len(passes), rig, report)
-
-
-def _scale_share(profile: RigProfile, config: Config, rig: Path) -> float:
-    """Relative uncertainty of the load cell's scale; 0 if the profile is not of this load cell."""
-    cell = profile.load_cell
-=======
         more = measure(config, width_m, progress)
         presses += more[0]
         passes += more[1]
@@ -245,20 +150,13 @@ def _scale_share(profile: RigProfile, config: Config, rig: Path) -> float:
 def _scale_share(known: RigProfile, config: Config, rig: Path) -> float:
     """Relative half-width of the interval of the load cell's scale; 0 if the profile has none of this load cell."""
     cell = known.load_cell
->>>>>>> main
     if cell is None or cell.sensor != config.load_cell.sensor:
         return 0.0
     if cell.n_per_raw.value != config.load_cell.n_per_raw:
         raise ConfigError(
-<<<<<<< HEAD
-            f"in {rig} this load cell has n_per_raw {cell.n_per_raw.value:g}, and the configuration has "
-            f"load_cell.n_per_raw {config.load_cell.n_per_raw}; use the profile with --set "
-            f"calibration.rig={rig}, or write another one with --rig"
-=======
             f"{rig} has {cell.n_per_raw.value:g} N per raw unit for this load cell, but load_cell.n_per_raw is "
             f"{config.load_cell.n_per_raw}; use the profile with --set calibration.rig={rig}, or write another "
             "one with --rig"
->>>>>>> main
         )
     return cell.n_per_raw.half / abs(cell.n_per_raw.value)
 
@@ -283,17 +181,6 @@ def _section(fit: ServoFit, config: Config) -> ServoCalibration:
     )
 
 
-<<<<<<< HEAD
-def measure(
-    config: Config, gauge_m: float, progress: Progress = no_progress
-) -> tuple[list[ServoPress], list[FreePass]]:
-    """Presses the gauge between the jaws, and moves them freely where there is space.
-
-    Args:
-        config: The configuration.
-        gauge_m: Width of the gauge.
-        progress: Called with the step and the force a few times per second, with 0 steps.
-=======
 def measure(config: Config, gauge_m: float, progress: Progress) -> tuple[list[ServoPress], list[FreePass]]:
     """Presses the gauge between the jaws, and moves freely beside it.
 
@@ -301,64 +188,45 @@ def measure(config: Config, gauge_m: float, progress: Progress) -> tuple[list[Se
         config: A resolved configuration.
         gauge_m: Width of the gauge in metres.
         progress: Called with the step and the force.
->>>>>>> main
 
     Raises:
-        DeviceError: A device failed. The servo's torque is off.
-        DataError: The load cell reads a force without contact, or the jaws did not meet the gauge.
+        DeviceError: A device failed. The servo has no torque.
+        DataError: The load cell reads a force without contact, or the jaws met nothing.
     """
-    with open_devices(config) as devices, _torque_on(config, devices, progress) as jaws:
+    with open_devices(config) as devices, _moving(config, devices, progress) as jaws:
         jaws.open()
         jaws.tare()
         jaws.step_name = "closing on the gauge"
-<<<<<<< HEAD
-        contact_rad = jaws.close_on_gauge(gauge_m)
-=======
         touch_rad = jaws.touch(gauge_m)
->>>>>>> main
         peak_n = _PEAK_SHARE * largest_target_n(config.control.force_limit_n)
         presses = []
         for number, (rate_n_s, share) in enumerate(PRESSES, start=1):
             jaws.step_name = f"{1e3 * gauge_m:g} mm, press {number} of {len(PRESSES)}"
             if number > 1:
-                jaws.close_on_gauge(gauge_m)
+                jaws.touch(gauge_m)
             presses.append(jaws.press(gauge_m, rate_n_s, share * peak_n))
-            jaws.back_off(contact_rad)
+            jaws.back_off(touch_rad)
         jaws.step_name = f"{1e3 * gauge_m:g} mm, free travel"
         friction_a = float(np.median([_friction_a(press) for press in presses]))
-        passes = [one for speed in SPEEDS_M_S for one in jaws.travel(friction_a, speed, contact_rad)]
+        passes = [one for speed in SPEEDS_M_S for one in jaws.travel(friction_a, speed, touch_rad)]
     return presses, passes
 
 
 def _friction_a(press: ServoPress) -> float:
-<<<<<<< HEAD
-    """Half of the difference of the rising and falling current, at about half of the peak force."""
-=======
     """Half the difference of the currents while the force rises and falls, near half of the largest force."""
->>>>>>> main
     middle_n = press.force_n[press.turn - 1] / 2
     near = np.abs(press.force_n - middle_n) < middle_n / 4
     rising = np.arange(len(press.force_n)) < press.turn
-    rising_a, falling_a = press.current_a[near & rising], press.current_a[near & ~rising]
-    if not (len(rising_a) and len(falling_a)):
-        return 0.0
-    return float(rising_a.mean() - falling_a.mean()) / 2
+    up_a, down_a = press.current_a[near & rising], press.current_a[near & ~rising]
+    return float(up_a.mean() - down_a.mean()) / 2 if len(up_a) and len(down_a) else 0.0
 
 
 @contextmanager
-<<<<<<< HEAD
-def _torque_on(config: Config, devices: Devices, progress: Progress) -> Iterator["_Jaws"]:
-    """Jaws under torque. The torque is off afterwards, also after an error."""
-    assert devices.load_cell is not None
-    devices.load_cell.start()
-    state = devices.servo.start()  # turns the torque off itself if it fails
-=======
 def _moving(config: Config, devices: Devices, progress: Progress) -> Iterator["_Jaws"]:
     """Gives jaws under torque, and turns torque off at every end."""
     assert devices.load_cell is not None
     devices.load_cell.start()
     state = devices.servo.start()  # if this raises, it has turned torque off itself
->>>>>>> main
     try:
         yield _Jaws(config, devices, state, progress)
     finally:
@@ -366,11 +234,7 @@ def _moving(config: Config, devices: Devices, progress: Progress) -> Iterator["_
 
 
 class _Jaws:
-<<<<<<< HEAD
-    """Moves the jaws cycle by cycle and keeps the samples of servo and load cell. Positive angles close."""
-=======
     """Moves the jaws cycle by cycle, and records servo and load cell. Positive angles close the jaws."""
->>>>>>> main
 
     def __init__(self, config: Config, devices: Devices, state: ServoState, progress: Progress) -> None:
         assert devices.load_cell is not None
@@ -384,21 +248,12 @@ class _Jaws:
         self._safety = Safety(config.control)
         self._period_ns = round(NS_PER_S / _RATE_HZ)
         self._due_ns = devices.clock.now_ns()
-<<<<<<< HEAD
-        self._last_sample_ns = self._due_ns
-        self._goal_a = 0.0
-        self._progress_ns = 0
-        self._tare_n = 0.0
-        self._states: list[ServoState] = []
-        self._samples: list[tuple[int, float]] = []
-=======
         self._sample_ns = self._due_ns
         self._goal_a = 0.0
         self._reported_ns = 0
         self._tare_n = 0.0
         self._states: list[ServoState] = []
         self._forces: list[tuple[int, float]] = []
->>>>>>> main
         self.force_n = 0.0
         self.state = state
         self.step_name = "opening"
@@ -408,11 +263,7 @@ class _Jaws:
         return self._sign * self.state.position_rad
 
     def cycle(self, goal_rad: float, current_a: float) -> None:
-<<<<<<< HEAD
-        """Runs one bus cycle with a goal position and a current limit."""
-=======
         """Runs one bus cycle with a goal angle and a current limit."""
->>>>>>> main
         devices = self._devices
         self._due_ns = max(self._due_ns + self._period_ns, devices.clock.now_ns())
         devices.clock.sleep_until_ns(self._due_ns)
@@ -420,48 +271,14 @@ class _Jaws:
         self.state = state = devices.servo.read()
         for sample in self._cell.drain():
             if sample.valid:
-<<<<<<< HEAD
-                self._last_sample_ns = max(self._last_sample_ns, sample.t_ns)
-                self.force_n = sample.force_n - self._tare_n
-                self._samples.append((sample.t_ns, self.force_n))
-=======
                 self._sample_ns = max(self._sample_ns, sample.t_ns)
                 self.force_n = sample.force_n - self._tare_n
                 self._forces.append((sample.t_ns, self.force_n))
->>>>>>> main
         self._states.append(state)
         limit_n = self._config.control.force_limit_n
         over = self.force_n > limit_n
         if self._safety.check(state, self._goal_a, 1 / _RATE_HZ, over_force=over):
             raise DeviceError(
-<<<<<<< HEAD
-                f"stopped during {self.step_name}: {self._safety.reason}; remove the cause and repeat"
-            )
-        if state.t_ns - self._last_sample_ns > _SILENT_NS:
-            counts = ", ".join(f"{n} {name}" for name, n in self._cell.counts().items() if n)
-            raise DeviceError(
-                f"the load cell has given no valid sample for {_SILENT_NS / NS_PER_S:g} s during "
-                f"{self.step_name} (rejected: {counts or 'none'}); check its wiring, calibrate it first, and run "
-                "`gripper-force doctor`"
-            )
-        self._goal_a = min(max(current_a, 0.0), self._config.servo.current_limit_a)
-        devices.servo.write(ServoCommand(self._due_ns, self._sign * goal_rad, self._goal_a))
-        if state.t_ns - self._progress_ns > _PROGRESS_NS:
-            self._progress_ns = state.t_ns
-            self._progress(f"{self.step_name}: {self.force_n:.1f} N", 0)
-
-    def open(self) -> None:
-        """Opens the jaws, as far as they go."""
-        self._move_to(self._sign * self._nominal.open_position_rad)
-
-    def tare(self) -> None:
-        """Makes the load cell's reading at rest the zero force."""
-        goal_rad = self.closing_rad
-        begin = len(self._samples)
-        for _ in range(round(_REST_S * _RATE_HZ)):
-            self.cycle(goal_rad, self._moving_current_a())
-        rest_n = np.array([force for _, force in self._samples[begin:]])
-=======
                 f"stopped in {self.step_name}: {self._safety.reason}; remove the cause and start again"
             )
         if state.t_ns - self._sample_ns > _SILENT_NS:
@@ -488,7 +305,6 @@ class _Jaws:
         for _ in range(round(_REST_S * _RATE_HZ)):
             self.cycle(goal_rad, self._moving_current_a())
         rest_n = np.array([force for _, force in self._forces[mark:]])
->>>>>>> main
         if len(rest_n) < 3:
             raise DataError(
                 "the load cell gives no valid sample at rest; calibrate it first with `calibrate load-cell`"
@@ -501,86 +317,48 @@ class _Jaws:
             )
         self.force_n -= self._tare_n
 
-<<<<<<< HEAD
-    def close_on_gauge(self, gauge_m: float) -> float:
-        """Closes slowly until contact with the gauge. Returns the angle there."""
-=======
     def touch(self, gauge_m: float) -> float:
         """Closes slowly until the load cell measures contact. Returns the angle."""
->>>>>>> main
         speed_rad = _APPROACH_M_S / self._nominal.pinion_radius_m / _RATE_HZ
         goal_rad = self.closing_rad
         end_rad = self._sign * self._nominal.closed_position_rad
-        while self.force_n < _CONTACT_N:
+        while self.force_n < _TOUCH_N:
             goal_rad += speed_rad
             if goal_rad > end_rad + _BEYOND_RAD / 4:
                 raise DataError(
-<<<<<<< HEAD
-                    "the jaws closed and the load cell measured no force; check that it is between the jaws and "
-                    "carries the force, and check load_cell.n_per_raw and its sign"
-=======
                     "the jaws closed without a force on the load cell; check that it lies between them, in the "
                     "path of the force, and check load_cell.n_per_raw and its sign"
->>>>>>> main
                 )
             self.cycle(goal_rad, self._moving_current_a())
         width_m = self._nominal.width_m(self.state.position_rad)
         if abs(width_m - gauge_m) > 0.25 * self._nominal.open_width_m:
             raise DataError(
-<<<<<<< HEAD
-                f"the jaws met the gauge of {1e3 * gauge_m:g} mm at a computed width of {1e3 * width_m:.0f} mm; "
-                "check --gauge-mm and the section gripper of the configuration"
-=======
                 f"the jaws met the gauge of {1e3 * gauge_m:g} mm at a width of {1e3 * width_m:.0f} mm; check "
                 "--gauge-mm and the gripper keys of the configuration"
->>>>>>> main
             )
         return self.closing_rad
 
     def press(self, gauge_m: float, rate_n_s: float, peak_n: float) -> ServoPress:
-<<<<<<< HEAD
-        """Raises the current until the load cell reads the peak, and lowers it until the force is gone."""
-=======
         """Raises the current until the peak force is measured, then lowers it until the force is gone."""
->>>>>>> main
         step_a = abs(self._nominal.current_a(rate_n_s)) / _RATE_HZ
-        max_a = 1.5 * abs(self._nominal.current_a(peak_n + self._nominal.friction_n))
+        most_a = 1.5 * abs(self._nominal.current_a(peak_n + self._nominal.friction_n))
         current_a = abs(self.state.current_a)
-<<<<<<< HEAD
-        for _ in range(round(_REST_S * _RATE_HZ)):  # until the impact on the gauge has decayed
-            self.cycle(self.closing_rad + _BEYOND_RAD, current_a)
-        first, first_sample = len(self._states), len(self._samples)
-=======
         for _ in range(round(_REST_S * _RATE_HZ)):  # lets the force of the impact fade
             self.cycle(self.closing_rad + _BEYOND_RAD, current_a)
         first, mark = len(self._states), len(self._forces)
->>>>>>> main
         while self.force_n < peak_n:
-            if current_a > min(max_a, self._config.servo.current_limit_a):
+            if current_a > min(most_a, self._config.servo.current_limit_a):
                 raise DataError(
-<<<<<<< HEAD
-                    f"{current_a:.2f} A give only {self.force_n:.1f} N of {peak_n:.1f} N; check that the load cell "
-                    "carries the force, its scale, and servo.current_limit_a"
-=======
                     f"{current_a:.2f} A give {self.force_n:.1f} N instead of {peak_n:.1f} N; check that the load "
                     "cell lies in the path of the force, its scale, and servo.current_limit_a"
->>>>>>> main
                 )
             current_a += step_a
             self.cycle(self.closing_rad + _BEYOND_RAD, current_a)
         turn = len(self._states) - first
-        while self.force_n > _NO_CONTACT_N and current_a > -max_a:
+        least_a = -most_a
+        while self.force_n > _FREE_N and current_a > least_a:
             current_a -= step_a
             self.cycle(self.closing_rad + np.sign(current_a) * _BEYOND_RAD, abs(current_a))
-<<<<<<< HEAD
-        states, samples = self._states[first:], self._samples[first_sample:]
-        t_ns = np.array([state.t_ns for state in states])
-        if len(samples) < 2:
-            raise DataError(
-                "the load cell gave fewer than two valid samples during a press; run `gripper-force doctor`"
-            )
-        sample_ns, sample_n = np.array(samples).T
-=======
         states, forces = self._states[first:], self._forces[mark:]
         t_ns = np.array([state.t_ns for state in states])
         if len(forces) < 2:
@@ -588,74 +366,46 @@ class _Jaws:
                 "the load cell gave fewer than two valid samples during a press; run `gripper-force doctor`"
             )
         force_ns, force_n = np.array(forces).T
->>>>>>> main
         return ServoPress(
             gauge_m=gauge_m,
             t_s=(t_ns - t_ns[0]) / NS_PER_S,
             current_a=self._sign * np.array([state.current_a for state in states]),
-<<<<<<< HEAD
-            force_n=np.interp(t_ns, sample_ns, sample_n),
-=======
             force_n=np.interp(t_ns, force_ns, force_n),
->>>>>>> main
             closing_rad=self._sign * np.array([state.position_rad for state in states]),
             turn=turn,
         )
 
-<<<<<<< HEAD
-    def back_off(self, contact_rad: float) -> None:
-        """Opens the jaws to a clear distance from the gauge."""
-        self._move_to(contact_rad - 2 * _CLEARANCE_M / self._nominal.pinion_radius_m)
-
-    def travel(self, friction_a: float, speed_m_s: float, contact_rad: float) -> list[FreePass]:
-        """Opens and closes under a constant current. Passes in which the jaws stick are left out."""
-=======
     def back_off(self, touch_rad: float) -> None:
         """Moves away from the gauge."""
         self._go(touch_rad - 2 * _CLEAR_M / self._nominal.pinion_radius_m)
 
     def travel(self, friction_a: float, speed_m_s: float, touch_rad: float) -> list[FreePass]:
         """Opens and closes under a constant current. A pass in which the jaws stick is left out."""
->>>>>>> main
         nominal = self._nominal
-        step_a = nominal.current_step_a
+        grid_a = nominal.current_step_a
         wanted_a = friction_a + abs(nominal.current_a(nominal.damping_n_s_m * speed_m_s))
-        current_a = round(wanted_a / step_a) * step_a
-        clear_rad = _CLEARANCE_M / nominal.pinion_radius_m
-        ends = (self._sign * nominal.open_position_rad + clear_rad, contact_rad - clear_rad)
+        current_a = round(wanted_a / grid_a) * grid_a
+        clear_rad = _CLEAR_M / nominal.pinion_radius_m
+        ends = (self._sign * nominal.open_position_rad + clear_rad, touch_rad - clear_rad)
         passes = []
         for side, end_rad in ((-1, ends[0]), (1, ends[1])):
-            if (one := self._pass(side, end_rad, current_a)) is not None:
-                passes.append(one)
+            one = self._pass(side, end_rad, current_a)
+            passes += [] if one is None else [one]
         return passes
 
     def _pass(self, side: int, end_rad: float, current_a: float) -> FreePass | None:
-<<<<<<< HEAD
-        """One pass, after a short time of acceleration; None if the jaws stuck."""
-        for _ in range(round(_MAX_PASS_S * _RATE_HZ)):
-            if side * self._sign * self.state.velocity_rad_s > _MOVING_RAD_S:
-                break
-            self.cycle(end_rad, _START_CURRENT_FACTOR * current_a)
-        first = len(self._states) + round(_ACCELERATION_S * _RATE_HZ)
-=======
         for _ in range(round(_MAX_PASS_S * _RATE_HZ)):
             if side * self._sign * self.state.velocity_rad_s > _MIN_SPEED_RAD_S:
                 break
             self.cycle(end_rad, _START_FACTOR * current_a)
         first = len(self._states) + round(_SPEED_UP_S * _RATE_HZ)
->>>>>>> main
         for _ in range(round(_MAX_PASS_S * _RATE_HZ)):
             self.cycle(end_rad, current_a)
             if side * (end_rad - self.closing_rad) < _BRAKE_RAD:
                 break
         states = self._states[first:]
-<<<<<<< HEAD
-        self._move_to(end_rad)
-        if len(states) < _RATE_HZ / 10 or abs(states[-1].velocity_rad_s) < _MOVING_RAD_S:
-=======
         self._go(end_rad)
         if len(states) < _RATE_HZ / 10 or abs(states[-1].velocity_rad_s) < _MIN_SPEED_RAD_S:
->>>>>>> main
             return None
         return FreePass(
             t_s=np.array([state.t_ns / NS_PER_S for state in states]),
@@ -664,15 +414,6 @@ class _Jaws:
             closing_rad_s=self._sign * np.array([state.velocity_rad_s for state in states]),
         )
 
-<<<<<<< HEAD
-    def _move_to(self, goal_rad: float) -> None:
-        """Moves to an angle at constant speed, and rests there."""
-        speed_rad = 4 * _APPROACH_M_S / self._nominal.pinion_radius_m / _RATE_HZ
-        next_rad = self.closing_rad
-        while abs(goal_rad - next_rad) > speed_rad:
-            next_rad += float(np.copysign(speed_rad, goal_rad - next_rad))
-            self.cycle(next_rad, self._moving_current_a())
-=======
     def _go(self, goal_rad: float) -> None:
         """Moves at a constant low speed, and rests at the goal."""
         speed_rad = 4 * _APPROACH_M_S / self._nominal.pinion_radius_m / _RATE_HZ
@@ -680,15 +421,9 @@ class _Jaws:
         while abs(goal_rad - at_rad) > speed_rad:
             at_rad += float(np.copysign(speed_rad, goal_rad - at_rad))
             self.cycle(at_rad, self._moving_current_a())
->>>>>>> main
         for _ in range(round(_REST_S * _RATE_HZ)):
             self.cycle(goal_rad, self._moving_current_a())
 
     def _moving_current_a(self) -> float:
-<<<<<<< HEAD
-        """Current that overcomes twice the nominal friction and presses with little more."""
-        return abs(self._nominal.current_a(2 * self._nominal.friction_n + _CONTACT_N))
-=======
         """Current that moves the jaws against twice the nominal friction, and presses with little more."""
         return abs(self._nominal.current_a(2 * self._nominal.friction_n + _TOUCH_N))
->>>>>>> main
