@@ -93,7 +93,15 @@ _GRIPPING = (Phase.CONTACT, Phase.RAMP, Phase.HOLD)
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """Result of one control cycle: command, state, force estimate and events."""
+    """Result of one control cycle.
+
+    Attributes:
+        command: The limited command for the servo.
+        status: State of the grasp.
+        estimate: The force estimate.
+        events: Sentences for the log.
+        refusal: Reason why this cycle's request was refused; empty otherwise.
+    """
 
     command: ServoCommand
     status: GraspStatus
@@ -176,7 +184,8 @@ class GraspController:
         events = self._read_sensors(t_ns, servo, visual)
         if has_tripped:
             self._enter_fault()
-        if request is not None and (refusal := self._handle_request(t_ns, request)):
+        refusal = "" if request is None else self._handle_request(t_ns, request)
+        if request is not None and refusal:
             events.append(Event(t_ns, "control", f"refused {str(request.kind)!r}: {refusal}"))
         if self._width_m is not None:
             self._run_phase(t_ns, dt_s, self._width_m, self._transmission.closing_m_s(servo.velocity_rad_s))
@@ -191,7 +200,7 @@ class GraspController:
                 )
             )
         self._was_over_force = is_over
-        return Decision(command, self._status(t_ns), self._estimate, tuple(events))
+        return Decision(command, self._status(t_ns), self._estimate, tuple(events), refusal)
 
     # Inputs.
 

@@ -41,7 +41,7 @@ def test_load_cell_without_scale_is_a_problem(board) -> None:
 
 
 def test_load_cell_without_samples_is_a_problem(board, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "_FIRST_NS", 0)
+    monkeypatch.setattr(checks, "_FIRST_NS", 0)
     section = board.config().model_dump(mode="json")
     check = rows(REAL | {"load_cell": section})["rate"]
     assert check.ok is False
