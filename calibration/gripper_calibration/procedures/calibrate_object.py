@@ -131,6 +131,7 @@ def calibrate_object(
         DataError: The load cell reads a force at rest, a touch failed, or the touches are not sufficient for a
             calibration.
         LogError: A log can't be read.
+        CheckpointError: The network can't be read.
         DeviceError: A device failed. The servo was stopped as configured, and completed touches are kept.
 
     Example:
