@@ -46,6 +46,6 @@ def test_an_invalid_time_step_raises(step_s: float) -> None:
             steps._Motor(steps._squeeze),
             1.78,
             0,
-            seen=False,
+            textured=False,
             step_s=step_s,
         )
