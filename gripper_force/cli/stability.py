@@ -25,7 +25,9 @@ def numerics(
     ] = None,
     write: Annotated[
         Path | None,
-        typer.Option(help="Markdown page to write the tables into; maps go into a folder beside it."),
+        typer.Option(
+            help="Markdown page to write the tables into; maps go into a folder of the page's name."
+        ),
     ] = None,
     seed: Seed = None,
     config: ConfigPath = None,

@@ -19,5 +19,5 @@ def test_a_page_without_the_lines_raises(text: str | None, tmp_path: Path) -> No
     page = tmp_path / "page.md"
     if text is not None:
         page.write_text(text)
-    with pytest.raises(DataError, match="can.t write into"):
+    with pytest.raises(DataError, match="it needs one line"):
         write_between(page, "here", "new")

@@ -16,9 +16,17 @@ from gripper_hw.sim.scene import Scene
 from gripper_hw.sim.world import World
 
 _CLOSING_M_S: Final = 0.016
+"""Closing speed of the jaws on the path."""
+
 _MAX_FORCE_N: Final = 10.0
+"""Force at which a squeeze ends."""
+
 _MAX_NS: Final = 4 * NS_PER_S
+"""Longest squeeze, in simulated time."""
+
 _SAMPLE_NS: Final = 5 * NS_PER_MS
+"""Interval of the compared forces."""
+
 _REPEATS: Final = 2
 """Runs of each scene; the faster one counts."""
 
