@@ -480,7 +480,9 @@ def _is_readable(fields: list[tuple[str, int, int]], record_type: type[Record]) 
     known = _fields(_CODECS[record_type].schema)
     missing = known[len(fields) :]
     defaults = {field.name: field.default for field in dataclasses.fields(record_type)}
-    return fields == known[: len(fields)] and all(defaults[name] in (0.0, "", False) for name, _, _ in missing)
+    return fields == known[: len(fields)] and all(
+        defaults[name] in (0.0, "", False) for name, _, _ in missing
+    )
 
 
 def _version(metadata: Mapping[str, str]) -> str:
