@@ -1,3 +1,4 @@
+from contextlib import closing
 from typing import get_args
 
 import pytest
