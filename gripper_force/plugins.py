@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from difflib import get_close_matches
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
-from inspect import isclass
 from operator import attrgetter
 from typing import Any
 
@@ -43,7 +42,7 @@ def load_class(
         raise ConfigError(
             f"{key}={name}: the module {module_name} has no attribute {attribute!r}; name one of its classes"
         ) from error
-    if not isclass(found):
+    if not callable(found):
         raise ConfigError(f"{key}={name}: {target} is not a class; name a class")
     return found
 

@@ -218,7 +218,7 @@ class GraspStatus:
         outcome: An `Outcome` value.
         reference_n: Reference of the force loop in this cycle (the target, shaped by the ramp).
         width_m: Distance between the jaws.
-        reason: Reason for the change of phase or outcome in this cycle, or the end of a move; otherwise empty.
+        reason: Reason for a change of phase or outcome, or the end of a move, in this cycle; otherwise empty.
     """
 
     t_ns: int

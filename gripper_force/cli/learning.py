@@ -1,9 +1,9 @@
-"""The commands that make networks of logs, and say what they are worth."""
+"""Commands for networks: `train`, `evaluate`, `export` and `reproduce`."""
 
 import json
 import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -20,22 +20,20 @@ def train(
         "force.safetensors"
     ),
     recipe: Annotated[
-        str, typer.Option(help="short_clips, our own, or shin2019, the paper's.")
+        str, typer.Option(help="short_clips (this project's) or shin2019 (the paper's).")
     ] = "short_clips",
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Set one key of the recipe: key=value. Repeatable.")
     ] = None,
     hold_out: Annotated[
-        list[str] | None, typer.Option(help="Object to leave out of the training. Repeatable.")
+        list[str] | None, typer.Option(help="Object to exclude from training. Repeatable.")
     ] = None,
     validation: Annotated[
         Path | None,
-        typer.Option(
-            help="Folder with logs to measure the claimed error on; without, sets held out of DATA."
-        ),
+        typer.Option(help="Logs to measure the checkpoint's error on. Default: sets held out of DATA."),
     ] = None,
-    init: Annotated[str | None, typer.Option(help="Checkpoint to begin with.")] = None,
-    resume: Annotated[bool, typer.Option(help="Go on from the states of a run that was broken off.")] = False,
+    init: Annotated[str | None, typer.Option(help="Checkpoint with the initial weights.")] = None,
+    resume: Annotated[bool, typer.Option(help="Continue an interrupted training.")] = False,
     jobs: Jobs = CORES,
     as_json: AsJson = False,
 ) -> None:
@@ -46,7 +44,7 @@ def train(
     from gripper_force.vision.checkpoint import load_checkpoint
 
     settings = named(recipe, set_)
-    quiet = os.environ.get("RANK", "0") != "0"  # of torchrun's processes the first one speaks
+    quiet = os.environ.get("RANK", "0") != "0"  # only the first process of torchrun prints
     clips = load_clips(data, settings.preprocess, workers=jobs, quiet=quiet)
     clips = [clip for clip in clips if clip.object not in (hold_out or [])]
     unseen = load_clips(validation, settings.preprocess, workers=jobs, quiet=quiet) if validation else None
@@ -58,13 +56,14 @@ def train(
 
 
 def evaluate(
-    data: Annotated[Path, typer.Argument(help="Folder with logs that training has not seen.")],
-    checkpoint: Annotated[str | None, typer.Option(help="Checkpoint, or `default`.")] = None,
+    data: Annotated[Path, typer.Argument(help="Folder with logs that were not used for training.")],
+    checkpoint: Annotated[str | None, typer.Option(help="Path of a checkpoint, or default or small.")] = None,
     profile: Annotated[
-        str | None, typer.Option(help="Object profile, by name or path; own: the one with each log's object.")
+        str | None,
+        typer.Option(help="Object profile, by name or path; own: the profile of each log's object."),
     ] = None,
     only: Annotated[
-        list[str] | None, typer.Option("--object", help="Only logs of this object. Repeatable.")
+        list[str] | None, typer.Option("--object", help="Use only logs of this object. Repeatable.")
     ] = None,
     jobs: Jobs = CORES,
     set_: Overrides = None,
@@ -74,24 +73,27 @@ def evaluate(
     from gripper_force.jobs.evaluate import evaluate as job
 
     settings = load_settings(None, set_, {"vision.checkpoint": checkpoint, "calibration.object": profile})
-    result: Any = job(data, settings.vision.checkpoint, objects=only or (), config=settings, workers=jobs)
+    result = job(data, settings.vision.checkpoint, objects=only or (), config=settings, workers=jobs)
     console.show(result, as_json, errors_table)
 
 
 def export(
     out: Annotated[Path, typer.Option("--out", help="File to write: .onnx, or .xml for OpenVINO.")],
     checkpoint: Annotated[
-        str | None, typer.Argument(help="A path, or default or small. Default: vision.checkpoint.")
+        str | None,
+        typer.Argument(help="Path of a checkpoint, or default or small. Default: vision.checkpoint."),
     ] = None,
     int8: Annotated[
         Path | None,
-        typer.Option(help="Compute the convolutions in int8, scaled on this folder of logs (.xml only)."),
+        typer.Option(
+            help="Quantise the convolutions to int8, calibrated on this folder of logs (.xml only)."
+        ),
     ] = None,
     jobs: Jobs = CORES,
     set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write a network's streaming step for another engine, checked against PyTorch."""
+    """Export a network for another engine, and compare it with PyTorch."""
     from gripper_force.jobs.dataset import load_clips
     from gripper_force.vision.export import export as job
     from gripper_force.vision.model_files import read_model

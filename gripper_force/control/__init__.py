@@ -1,1 +1,1 @@
-"""Pure control: fusion, force loop, phases and limits. No I/O, and time is an argument."""
+"""Control without I/O: fusion, force loop, phases and limits. Time is an argument."""

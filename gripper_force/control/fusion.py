@@ -1,8 +1,8 @@
-"""One force estimate from motor current and vision.
+"""Force estimate from motor current and vision.
 
-The motor current gives force at bus rate and without delay, but off by what is not known of friction and
-gearing; vision gives force late and noisy, but at the object. A Kalman filter of one state holds the
-difference.
+The motor current gives the force at bus rate without delay, but with the unknown part of friction and gearing
+as an error. Vision gives the force at the object, but late and noisy. A Kalman filter with one state
+estimates the difference.
 """
 
 import math
@@ -21,75 +21,77 @@ from gripper_force.types import (
 )
 
 _DRIFT_N2_S = 0.03**2
-"""Growth of the bias' variance a second: friction wanders."""
+"""Growth of the bias variance per second: friction drifts."""
 
-_LOOSE_N2_S = 0.15**2
-"""The same for jaws that are about to open."""
+_OPENING_DRIFT_N2_S = 0.15**2
+"""Additional growth for jaws that are about to open."""
 
 _FREE_NOISE_N = 0.5
-"""How far the push is from friction in one cycle of free travel; inertia makes the cycles alike."""
+"""Standard deviation of motor force about friction in one cycle of free travel. Inertia correlates the
+cycles."""
 
 _FREE_FLOOR_N = 0.08
-"""What free travel leaves unknown of friction under load: viscous friction, and what differs with place."""
+"""Standard deviation of friction under load after free travel: viscous friction, variation with position."""
 
 _VISION_FLOOR_N = 0.05
-"""No estimate is believed more than this, whatever it claims."""
+"""Lower limit of the standard deviation of a visual estimate, whatever it claims."""
 
 _FRAME_NOISE_N = 0.15
-"""What differs from frame to frame of a picture that rests. The rest of the claimed error stays as it is."""
+"""Standard deviation from frame to frame of a still scene. The rest of the claimed error is constant."""
 
 _FRAME_HZ = 60.0
+"""Assumed frame rate."""
 
-OBSERVER_LAG_S = math.sqrt(_FRAME_NOISE_N**2 / (_FRAME_HZ * _LOOSE_N2_S))
-"""Lag of the bias while the jaws are stuck and about to open: the steady filter's square root of noise over
-drift, 0.13 s."""
+OBSERVER_LAG_S = math.sqrt(_FRAME_NOISE_N**2 / (_FRAME_HZ * _OPENING_DRIFT_N2_S))
+"""Lag of the bias while the jaws are stuck and about to open: the square root of noise over drift of the
+steady-state filter, 0.13 s."""
 
 _GATE = 3.29
-"""Standard deviations of the innovation: 0.1 % of good estimates are turned away (chi-square, 10.8)."""
+"""Innovation gate in standard deviations: 0.1 % of good estimates are rejected (chi-square, 10.8)."""
 
 _REENTRY = 20
-"""Estimates in a row that must be off to the same side before the filter gives way (1/3 s at 60 Hz)."""
+"""Consecutive rejected estimates on the same side after which the filter accepts them (1/3 s at 60 Hz)."""
 
 
 class Fusion:
-    """Kalman filter on the difference between vision and the current-derived force, and a share of it.
+    """Kalman filter on the difference between the visual and the current estimate, of which a share is used.
 
-    Neither side's error averages out, however many frames there are: friction and gearing are what they are,
-    and one object in one pose is one picture. The filter therefore tracks only their *difference*, and the
-    estimate takes that share of it to which the two claimed variances entitle vision.
+    Neither error averages out over frames: friction and gearing are constant, and so is the visual error of
+    one object in one pose. The filter therefore tracks only the *difference*, and the estimate adds the share
+    of it that follows from the two claimed variances.
 
-    Friction is what the push is in free travel. Known from there, it leaves the gearing as the current's
-    error.
+    Friction is the motor force in free travel. With friction known, the error of the current estimate is that
+    of the gearing.
 
-    The measured current is noisy and quantised (0.1 N a step), and the contact force follows it with the
-    plant's lag: a low-pass of that lag serves both. Vision is compared with the same signal, at its capture
-    time.
+    The measured current is noisy and quantised (0.1 N per step), and the contact force follows it with the
+    plant's lag: one low-pass with that lag serves both. Vision is compared with the filtered current at its
+    capture time.
 
-    Without vision for `ControlConfig.vision_timeout_ms` the source is the current alone, with the bias as it
-    stands and a variance that grows.
+    Without vision for `ControlConfig.vision_timeout_ms` the source is the current alone, with the last bias
+    and a growing variance.
     """
 
     def __init__(self, config: ControlConfig, transmission: Transmission) -> None:
         self._feedback = config.feedback
         self._timeout_ns = round(config.vision_timeout_ms * NS_PER_MS)
-        self._most_age_ns = round(config.vision_age_ms * NS_PER_MS)
+        self._max_age_ns = round(config.vision_age_ms * NS_PER_MS)
         _, self._lag_s, _ = config.plant
         self._std_limit_n = config.vision_std_n
         self._transmission = transmission
         cycles = math.ceil(config.rate_hz * config.vision_age_ms / 1e3) + 2
-        self._history: deque[tuple[int, float]] = deque(maxlen=cycles)  # to compare any accepted frame with
+        self._history: deque[tuple[int, float]] = deque(maxlen=cycles)  # covers the age of any accepted frame
         self._motor_force_n = 0.0
         self._current_n = 0.0
-        self._newest_seen_ns = -1
+        self._newest_visual_ns = -1
         self._used_ns: int | None = None
         self._visual_n = 0.0
         self._visual_std_n = 0.0
         self._source = EstimateSource.CURRENT
-        self._refusal = "no estimate"
+        self._rejection = "no estimate"
         self.restart()
 
     def restart(self) -> None:
-        """Forgets the bias: a new grasp has its own."""
+        """Resets bias and friction at the start of a grasp."""
         self._difference_n = 0.0
         self._variance_ratio = 0.0
         self._friction_n = self._transmission.friction_n
@@ -98,7 +100,10 @@ class Fusion:
         self.reset_variance()
 
     def reset_variance(self) -> None:
-        """Doubts the bias: contact has stopped the jaws anywhere within the play of friction."""
+        """Resets the bias variance to its prior.
+
+        At contact the friction force can be anywhere within +- Coulomb friction.
+        """
         self._variance_n2 = self._prior_n2(self._current_n)
         self._rejected = 0
 
@@ -111,25 +116,26 @@ class Fusion:
         free: bool = False,
         opening: bool = False,
     ) -> tuple[FusedForce, tuple[Event, ...]]:
-        """One cycle.
+        """Runs one cycle.
 
         Args:
-            t_ns: Now.
-            servo: This cycle's reading; its numbers are finite.
-            visual: The newest estimate, or None. The same one may be given again; it counts once.
-            free: The jaws travel and touch nothing, so the force is zero and the push tells the friction.
-            opening: The jaws let go, and friction hides from the current how far they have.
+            t_ns: Present time.
+            servo: This cycle's reading, with finite numbers.
+            visual: Newest visual estimate, or None. A repeated one is used once.
+            free: True if the jaws move without contact: the force is zero and the motor force is friction.
+            opening: True if the jaws are opening. Until friction reverses, motor current says little about
+                the contact force.
 
         Returns:
-            The estimate, and an event where vision drops out or comes back.
+            The estimate, and an event if vision drops out or returns.
         """
         self._opening_variance_n2 = self._friction_n**2 if opening else 0.0
         self._predict(servo, free)
         self._variance_n2 = max(self._variance_n2, self._opening_variance_n2)
-        if visual is not None and visual.t_ns > self._newest_seen_ns and self._feedback != "current":
-            self._newest_seen_ns = visual.t_ns
-            self._refusal = self._update(t_ns, visual)
-            if not self._refusal:
+        if visual is not None and visual.t_ns > self._newest_visual_ns and self._feedback != "current":
+            self._newest_visual_ns = visual.t_ns
+            self._rejection = self._update(t_ns, visual)
+            if not self._rejection:
                 self._used_ns = t_ns
                 self._visual_n, self._visual_std_n = visual.force_n, visual.std_n
         events = self._switch(t_ns)
@@ -137,8 +143,8 @@ class Fusion:
 
     def _predict(self, servo: ServoState, free: bool) -> None:
         before_n = self._current_n
-        moving_n = self._transmission.damping_n_s_m * self._transmission.closing_m_s(servo.velocity_rad_s)
-        motor_force_n = self._transmission.force_n(servo.current_a) - moving_n
+        damping_n = self._transmission.damping_n_s_m * self._transmission.closing_m_s(servo.velocity_rad_s)
+        motor_force_n = self._transmission.force_n(servo.current_a) - damping_n
         dt_s = 0.0
         if self._history:
             dt_s = max(servo.t_ns - self._history[-1][0], 0) / NS_PER_S
@@ -147,21 +153,21 @@ class Fusion:
             self._motor_force_n = motor_force_n
         if free:
             self._learn_friction()
-        # Coulomb friction is a play: the contact force stays until the push leaves it by the friction.
+        # Coulomb friction acts as play: the contact force stays until the motor force differs by friction.
         friction_n = self._friction_n
         self._current_n = min(
             max(before_n, self._motor_force_n - friction_n), self._motor_force_n + friction_n
         )
         if free:
             self._current_n = self._difference_n = 0.0
-        # The further the push has gone back through the play, the less is known of when the jaws let go.
-        back = (
+        # The further the motor force has reversed within that play, the less certain the contact force is.
+        reversal = (
             0.0
             if friction_n == 0 or free
             else 0.5 + (self._current_n - self._motor_force_n) / (2 * friction_n)
         )
-        drift_n2 = (_DRIFT_N2_S + _LOOSE_N2_S * back) * dt_s
-        # An unknown gain error g makes the bias g * force, so its variance follows the square of the force.
+        drift_n2 = (_DRIFT_N2_S + _OPENING_DRIFT_N2_S * reversal) * dt_s
+        # An unknown gain error g gives a bias of g * force: its variance grows with the square of the force.
         gain_n2 = self._transmission.gain_std**2 * abs(self._current_n**2 - before_n**2)
         self._variance_n2 = min(self._variance_n2 + drift_n2 + gain_n2, self._prior_n2(self._current_n))
         self._history.append((servo.t_ns, self._current_n))
@@ -172,23 +178,23 @@ class Fusion:
         self._friction_n2 = _combined_variance_n2(self._friction_n2, _FREE_NOISE_N**2)
 
     def _update(self, t_ns: int, visual: VisualForce) -> str:
-        """Takes one estimate in. Returns why it was refused, or an empty text."""
+        """Updates the filter with one estimate. Returns the reason of a rejection, or an empty text."""
         age_ns = t_ns - visual.t_ns
         if not (abs(visual.force_n) <= 1e9 and abs(visual.std_n) <= 1e9):
-            self._used_ns = None  # a network that says this is not to be trusted with what it said before
+            self._used_ns = None  # the earlier estimates of such a network are not trusted either
             return "it is not finite"
-        if not 0 <= age_ns <= self._most_age_ns:
+        if not 0 <= age_ns <= self._max_age_ns:
             return f"it is {age_ns / NS_PER_MS:.0f} ms old"
         if visual.std_n > self._std_limit_n:
-            return f"it is uncertain by {visual.std_n:.2f} N"
+            return f"its standard deviation is {visual.std_n:.2f} N"
         claimed_n2 = max(visual.std_n, _VISION_FLOOR_N) ** 2
         current_n = self._current_at(visual.t_ns)
         difference_n = visual.force_n - current_n
         innovation_n = difference_n - self._difference_n
         if abs(difference_n) > 3 * math.sqrt(self._prior_n2(current_n) + claimed_n2):
-            return f"it is off from the motor current by {difference_n:.2f} N"
+            return f"it differs from the motor current by {difference_n:.2f} N"
         if abs(innovation_n) > _GATE * math.sqrt(self._variance_n2 + claimed_n2):
-            self._rejected = _count(self._rejected, innovation_n)
+            self._rejected = _count_rejections(self._rejected, innovation_n)
             if abs(self._rejected) < _REENTRY:
                 return f"it jumps by {innovation_n:.2f} N"
             self._variance_n2 = self._prior_n2(current_n)
@@ -203,7 +209,7 @@ class Fusion:
         self._variance_n2 = _combined_variance_n2(self._variance_n2, noise_n2)
 
     def _current_at(self, t_ns: int) -> float:
-        """Current-derived force at a past time, linear between cycles, held beyond both ends."""
+        """Returns the current estimate at a past time, interpolated linearly and held beyond both ends."""
         later_ns, later_n = self._history[-1]
         for earlier_ns, earlier_n in reversed(self._history):
             if earlier_ns <= t_ns:
@@ -225,9 +231,9 @@ class Fusion:
             return ()
         self._source = source
         if source != EstimateSource.CURRENT:
-            return (Event(t_ns, "vision", f"vision counts; the force estimate is {source}"),)
-        reason = f": {self._refusal}" if self._refusal else ": no new estimate"
-        return (Event(t_ns, "vision", f"vision dropped out{reason}; on motor current alone"),)
+            return (Event(t_ns, "vision", f"vision in use; the force estimate is {source}"),)
+        reason = f": {self._rejection}" if self._rejection else ": no new estimate"
+        return (Event(t_ns, "vision", f"vision dropped out{reason}; using motor current alone"),)
 
     def _estimate(self, t_ns: int) -> FusedForce:
         share = 1 / (1 + self._variance_ratio)
@@ -249,11 +255,11 @@ class Fusion:
 
 
 def _combined_variance_n2(one_n2: float, other_n2: float) -> float:
-    """Variance of what two sources say together. One less the gain would lose it where one is far larger."""
+    """Returns the variance of two combined estimates. `1 - gain` would cancel if one is much larger."""
     return one_n2 * other_n2 / (one_n2 + other_n2)
 
 
-def _count(rejected: int, innovation_n: float) -> int:
-    """Adds one to a run of refusals on one side (its sign); the other side starts a new run."""
+def _count_rejections(rejected: int, innovation_n: float) -> int:
+    """Counts consecutive rejections on one side (the sign); the other side starts a new count."""
     side = 1 if innovation_n > 0 else -1
     return rejected + side if rejected * side > 0 else side

@@ -1,4 +1,4 @@
-"""The last word on every command."""
+"""Final limits on position and current, applied to every command."""
 
 import math
 
@@ -8,34 +8,33 @@ from gripper_force.errors import NonFiniteError
 from gripper_force.types import ServoCommand
 
 _RISE_FACTOR = 4.0
-"""The push may rise this many times as fast as the force ramp, unless the force was over its limit."""
+"""The motor force may rise this many times as fast as the force ramp, unless the force was over its limit."""
 
 _OVER_FORCE_CEILING = 0.95
-"""A current that proved too much is not reached again in the same grasp."""
+"""Until the grasp ends, the current stays below this share of a current that caused an over-force."""
 
-_CERTAIN_SHARE = 0.95
-"""Share of the force limit to which the current is held: the torque constant is known to 10 %, and a force
-5 % beyond the limit is the most that may happen, whatever vision says."""
+_CEILING_SHARE = 0.95
+"""Share of the force limit that sets the current ceiling. The torque constant is known to 10 %, so that the
+force exceeds its limit by 5 % at most, whatever vision estimates."""
 
 _OVER_FORCE_FACTOR = 0.85
-"""What is left of the goal current after each cycle that sees too much force: half within 25 ms at 200 Hz."""
-
+"""Factor on the goal current in each cycle with too much force: half within 25 ms at 200 Hz."""
 
 _TARGET_SHARE = 0.9
-"""Most of the force limit that can be asked for: a tenth is left to overshoot."""
+"""Largest target as a share of the force limit: a tenth is left for overshoot."""
 
 
 def largest_target_n(force_limit_n: float) -> float:
-    """The largest force that may be asked for under a force limit."""
+    """Returns the largest target force that is allowed with a force limit."""
     return _TARGET_SHARE * force_limit_n
 
 
 class Limits:
-    """Bounds goal position and goal current, and puts the current on the servo's own grid.
+    """Limits goal position and goal current, and quantises the current to the servo's steps.
 
-    One step of an XM430's goal current is 2.69 mA, some 0.1 N at the jaws, which is coarser than the force
-    that is asked for. The rounding error is therefore carried into the next cycle (first-order noise
-    shaping): the mean is exact, and the jaws' inertia smooths the rest.
+    One step of an XM430's goal current is 2.69 mA, about 0.1 N at the jaws, which is coarser than the force
+    resolution needed. The rounding error is therefore carried into the next cycle (first-order noise
+    shaping): the mean is exact, and the inertia of the jaws smooths the rest.
     """
 
     def __init__(self, config: ControlConfig, transmission: Transmission, current_limit_a: float) -> None:
@@ -45,8 +44,8 @@ class Limits:
         self._step_a = transmission.current_step_a
         ends = (transmission.open_position_rad, transmission.closed_position_rad)
         self._low_rad, self._high_rad = min(ends), max(ends)
-        self._lowered_a = math.inf
-        self._level_a = 0.0
+        self._over_force_ceiling_a = math.inf
+        self._unrounded_a = 0.0
         self._rounding_a = 0.0
         self._last_a = 0.0
         self._over = False
@@ -60,61 +59,61 @@ class Limits:
         dt_s: float,
         *,
         may_rise: bool,
-        opens: bool = False,
+        opening: bool = False,
     ) -> tuple[ServoCommand, bool]:
-        """Bounds a command.
+        """Limits a command.
 
         Args:
-            command: What the controller wants.
-            force_n: The estimated contact force.
-            friction_n: What friction is known to take of the push.
-            motor_force_n: The motor's present push, by its current.
+            command: The controller's command.
+            force_n: Estimated contact force.
+            friction_n: Friction force known to reduce the motor force.
+            motor_force_n: Present motor force, by the motor current.
             dt_s: Time since the last command.
-            may_rise: Whether the goal current may exceed the last one at all.
-            opens: Whether the jaws are to open: then a force over its limit is no reason to push less.
+            may_rise: True if the goal current may exceed the last one.
+            opening: True if the jaws are to open; the current is then not lowered for a force over its limit.
 
         Returns:
-            The bounded command, and whether the force estimate is over its limit.
+            The limited command, and True if the force estimate is over its limit.
 
         Raises:
-            NonFiniteError: A number of the command, or the estimate, is not finite.
+            NonFiniteError: A number of the command or of the estimate is not finite.
         """
         self._refuse_non_finite(command, force_n, friction_n, motor_force_n)
-        ceiling_a = min(self.ceiling_a(friction_n), self._lowered_a)
+        ceiling_a = min(self.ceiling_a(friction_n), self._over_force_ceiling_a)
         if not may_rise:
             ceiling_a = min(ceiling_a, self._last_a)
         over = force_n > self._force_limit_n
-        if over and not opens:
+        if over and not opening:
             if not self._over:
-                self._lowered_a = _OVER_FORCE_CEILING * self._last_a
-            # Friction may hold the force up. A push that can't give the limit any more need not fall further.
-            eases = motor_force_n > self._force_limit_n - friction_n
-            ceiling_a = min(ceiling_a, (_OVER_FORCE_FACTOR if eases else 1.0) * self._last_a)
+                self._over_force_ceiling_a = _OVER_FORCE_CEILING * self._last_a
+            # Friction may keep the force up. A motor force too small to reach the limit need not fall.
+            lowers = motor_force_n > self._force_limit_n - friction_n
+            ceiling_a = min(ceiling_a, (_OVER_FORCE_FACTOR if lowers else 1.0) * self._last_a)
         self._over = over
-        rise_a_s = self._rise_a_s / (1.0 if self._lowered_a == math.inf else _RISE_FACTOR)
-        wanted_a = min(max(command.goal_current_a, 0.0), self._level_a + rise_a_s * dt_s, ceiling_a)
-        self._level_a = wanted_a
-        self._last_a = self._on_grid(wanted_a, ceiling_a)
+        rise_a_s = self._rise_a_s / (1.0 if self._over_force_ceiling_a == math.inf else _RISE_FACTOR)
+        wanted_a = min(max(command.goal_current_a, 0.0), self._unrounded_a + rise_a_s * dt_s, ceiling_a)
+        self._unrounded_a = wanted_a
+        self._last_a = self._quantise(wanted_a, ceiling_a)
         position_rad = min(max(command.goal_position_rad, self._low_rad), self._high_rad)
         return ServoCommand(command.t_ns, position_rad, self._last_a), over
 
-    def begin(self) -> None:
-        """A new grasp, or its end: what was too much for the last one no longer counts."""
-        self._lowered_a = math.inf
+    def reset(self) -> None:
+        """Removes the ceiling that an over-force set. Called at the start and the end of a grasp."""
+        self._over_force_ceiling_a = math.inf
 
     def ceiling_a(self, friction_n: float) -> float:
-        """The most current that the force limit and the servo's own limit leave."""
-        most_friction_n = (1 + 3 * self._transmission.friction_std) * self._transmission.friction_n
-        most_n = _CERTAIN_SHARE * self._force_limit_n + min(max(friction_n, 0.0), most_friction_n)
-        return min(self._current_limit_a, abs(self._transmission.current_a(most_n)))
+        """Returns the largest current that the force limit and the servo's current limit allow."""
+        max_friction_n = (1 + 3 * self._transmission.friction_std) * self._transmission.friction_n
+        max_n = _CEILING_SHARE * self._force_limit_n + min(max(friction_n, 0.0), max_friction_n)
+        return min(self._current_limit_a, abs(self._transmission.current_a(max_n)))
 
-    def _on_grid(self, wanted_a: float, ceiling_a: float) -> float:
+    def _quantise(self, wanted_a: float, ceiling_a: float) -> float:
         if self._step_a == 0:
             return wanted_a
         steps = round((wanted_a + self._rounding_a) / self._step_a)
         steps = max(0, min(steps, math.floor(ceiling_a / self._step_a + 1e-9)))
         given_a = min(steps * self._step_a, ceiling_a)
-        # Bounded, so that a limit that holds the current down leaves no debt.
+        # Limited, so that no error accumulates while a limit holds the current down.
         error_a = self._rounding_a + wanted_a - given_a
         self._rounding_a = min(max(error_a, -0.5 * self._step_a), 0.5 * self._step_a)
         return given_a
@@ -128,8 +127,10 @@ class Limits:
             "goal current": command.goal_current_a,
             "force estimate": force_n,
             "friction estimate": friction_n,
-            "motor's push": motor_force_n,
+            "motor force": motor_force_n,
         }
         for name, number in numbers.items():
             if not math.isfinite(number):
-                raise NonFiniteError(f"control: the {name} is {number}; stop, and see the log of this cycle")
+                raise NonFiniteError(
+                    f"control: the {name} is {number}, not a finite number; check this cycle in the log"
+                )

@@ -1,33 +1,34 @@
-"""Whether the gripper may go on, and how hard it may still press when it grows hot."""
+"""Safety checks of each cycle, and the derating of a hot servo."""
 
 import math
 
 from gripper_force.config import ControlConfig
 from gripper_force.types import NS_PER_S, ServoState
 
-_LEAP_RAD = 0.05
-_LEAP_RAD_S = 20.0
-"""Most a horn can turn between two readings. The fastest of the servos does 11 rad/s without load."""
+_JUMP_RAD = 0.05
+_JUMP_RAD_S = 20.0
+"""Largest plausible rotation of the horn between two readings: an offset plus a speed. The fastest of the
+servos does 11 rad/s without load."""
 
 _OVER_FORCE_S = 0.25
-"""The limits ease within 10 ms what is too much. A force that stays too high for so long does not obey."""
+"""Time after which a force over its limit is a fault. `Limits` lowers the current within 10 ms."""
 
 _EXCESS_A = 0.03
 _EXCESS_SHARE = 0.15
 _EXCESS_S = 0.02
-"""A motor that takes more than its goal allows, by so much and for so long, does not obey."""
+"""A motor current above its goal by more than this share and offset, for longer than this, is a fault."""
 
-_EASED = 0.6
-"""What is left of the wanted force at the temperature limit: a third of the heat."""
+_MIN_DERATING = 0.6
+"""Share of the target force at the temperature limit: a third of the heat."""
 
 
 class Safety:
-    """A latch: what forbids to go on trips it, and only a reset opens it, once the cause is gone.
+    """Fault latch: tripped by a failed check, and cleared only by a reset once the cause is gone.
 
-    Pure: the same readings give the same verdicts.
+    Deterministic: the same readings give the same results.
 
     Attributes:
-        reason: Why it tripped; empty while it has not.
+        reason: Reason of the trip; empty while not tripped.
     """
 
     def __init__(self, config: ControlConfig) -> None:
@@ -38,46 +39,46 @@ class Safety:
         self._over_s = self._excess_s = 0.0
 
     def check(self, servo: ServoState, goal_current_a: float, dt_s: float, *, over_force: bool) -> bool:
-        """Takes a cycle's reading.
+        """Checks a cycle's reading.
 
         Args:
-            servo: What the servo says of itself.
-            goal_current_a: What the last cycle allowed it.
+            servo: This cycle's reading.
+            goal_current_a: Goal current of the last cycle.
             dt_s: Time since the last cycle.
-            over_force: The last cycle's force estimate was over its limit.
+            over_force: True if the last cycle's force estimate was over its limit.
 
         Returns:
-            Whether the latch has tripped in this cycle.
+            True if the latch tripped in this cycle.
         """
         self._over_s = self._over_s + dt_s if over_force else 0.0
         excess = abs(servo.current_a) > (1 + _EXCESS_SHARE) * goal_current_a + _EXCESS_A
         self._excess_s = self._excess_s + dt_s if excess else 0.0
-        self._cause = self._why_not(servo)
+        self._cause = self._find_fault(servo)
         if is_sound(servo):
             self._last = servo
         return self.trip(self._cause) if self._cause else False
 
     def trip(self, reason: str) -> bool:
-        """Trips the latch, from outside or within. Returns whether it was open; the first reason stays."""
+        """Trips the latch. Returns False if it was tripped before; the first reason is kept."""
         if self.reason:
             return False
         self.reason = reason
         return True
 
     def reset(self) -> str:
-        """Opens the latch. Returns what forbids it, or an empty text."""
+        """Clears the latch. Returns the cause that prevents it, or an empty text."""
         if not self._cause:
             self.reason = ""
         return self._cause
 
-    def easing(self, temperature_c: float) -> float:
-        """The share of the wanted force that a servo this hot is to hold, so that it need not shut down."""
-        warm_c, most_c = self._config.warm_c, self._config.temperature_limit_c
+    def derating(self, temperature_c: float) -> float:
+        """Returns the share of the target force to hold, which keeps a hot servo from shutting down."""
+        warm_c, limit_c = self._config.warm_c, self._config.temperature_limit_c
         if temperature_c <= warm_c:
             return 1.0
-        return max(1.0 - (1.0 - _EASED) * (temperature_c - warm_c) / (most_c - warm_c), _EASED)
+        return max(1.0 - (1.0 - _MIN_DERATING) * (temperature_c - warm_c) / (limit_c - warm_c), _MIN_DERATING)
 
-    def _why_not(self, servo: ServoState) -> str:
+    def _find_fault(self, servo: ServoState) -> str:
         if not is_sound(servo):
             return "the servo's reading is not finite"
         if servo.hardware_error:
@@ -87,7 +88,7 @@ class Safety:
         low_v, high_v = self._config.voltage_limits_v or (-math.inf, math.inf)
         if not low_v <= servo.voltage_v <= high_v:
             return f"the servo's supply is at {servo.voltage_v:.1f} V, outside {low_v:g} to {high_v:g} V"
-        if self._last is not None and self._leaps(self._last, servo):
+        if self._last is not None and self._jumps(self._last, servo):
             return f"the servo's position leapt to {servo.position_rad:.3f} rad"
         if self._excess_s > _EXCESS_S:
             return f"the motor takes {abs(servo.current_a):.3f} A, more than its goal allows"
@@ -96,13 +97,13 @@ class Safety:
         return ""
 
     @staticmethod
-    def _leaps(before: ServoState, now: ServoState) -> bool:
+    def _jumps(before: ServoState, now: ServoState) -> bool:
         time_s = max(now.t_ns - before.t_ns, 0) / NS_PER_S
-        return abs(now.position_rad - before.position_rad) > _LEAP_RAD + _LEAP_RAD_S * time_s
+        return abs(now.position_rad - before.position_rad) > _JUMP_RAD + _JUMP_RAD_S * time_s
 
 
 def is_sound(servo: ServoState) -> bool:
-    """Whether every number of a reading is finite, and small enough to be reckoned with."""
+    """Returns True if every number of a reading is finite and of a plausible magnitude."""
     numbers = (
         servo.position_rad,
         servo.velocity_rad_s,

@@ -1,4 +1,4 @@
-"""The grasp: phases, outcomes, and what is commanded in each."""
+"""State machine of the grasp: phases, outcomes, and the command of each phase."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -26,51 +26,53 @@ from gripper_force.types import (
 )
 
 MAX_CYCLE_S = 0.05
-"""A late cycle counts for no more than this, so that it does not become a leap."""
+"""Longest cycle time that is used, so that a late cycle does not cause a jump of the command."""
 
 _IMPACT_M_S_PER_N = 0.010
-"""Approach speed of one jaw for each newton wanted: on the stiffest object, impact stays below the target."""
+"""Approach speed of one jaw per newton of target: on the stiffest object, impact stays below the target."""
 
 _CONTACT_SHARE = 0.25
-"""Share of the target that the jaws may press with before contact is known."""
+"""Largest contact force before contact is detected, as a share of the target."""
 
-_SPEED_UP_S = 0.1
-"""Time in which the jaws gather speed."""
+_ACCELERATION_S = 0.1
+"""Time in which the jaws reach full speed."""
 
 _SPEED_GAIN_N_S_M = 10.0
 _SPEED_INTEGRAL_N_M = 40.0
-"""Speed loop of the approach: push for a speed that is missing, and for a way that is missing. With 1.3 kg of
-motor and jaw, half of the missing speed is there after 40 ms; and stalled jaws press 1 N/s more."""
+"""Proportional and integral gain of the approach speed loop. With 1.3 kg of motor and jaw, half of a speed
+error is corrected after 40 ms; on stalled jaws the motor force rises by 1 N/s."""
 
 _LEAD_M = 0.004
-"""In free travel one jaw's goal is no further ahead than this, so held jaws do not leap when let go."""
+"""Largest lead of the goal over one jaw in free travel, so that jaws that were held back do not jump."""
 
 _GOAL_OFFSET_M = 0.010
-"""How far inside the object each jaw's goal lies, so that the current limit alone sets the force."""
+"""Distance of each jaw's goal inside the object, so that the current limit alone sets the force."""
 
-_STALLED = 0.1
-_SLOWED = 0.6
-"""Shares of the approach speed below which the jaws have stalled, or have been slowed."""
+_STALLED_SHARE = 0.1
+_SLOWED_SHARE = 0.6
+"""Shares of the approach speed below which the jaws count as stalled, or as slowed."""
 
-_SEEN_FORCE_N = 0.4
-"""Force that is seen, and taken for contact."""
+_VISUAL_CONTACT_N = 0.4
+"""Visual or fused estimate above which slowed jaws count as in contact."""
 
-_EVEN = 0.2
-_EVEN_S = 0.1
-"""A speed within this share of the wanted one is even, once it has had this time to become so."""
+_STEADY_SHARE = 0.2
+_STEADY_S = 0.1
+"""The speed counts as steady within this share of the wanted speed, from this time after the acceleration."""
 
 _START_UP_S = 0.6
-"""Jaws that have not moved by then are in contact already, and not just starting."""
+"""If the jaws have not moved within this time, they already touch the object."""
 
 _DEBOUNCE_S = 0.05
+"""Time for which the signs of contact must persist."""
+
 _DWELL_S = 0.12
-"""Time in contact before the ramp: the impact dies away and vision catches up."""
+"""Time in contact before the ramp: the impact decays and vision catches up."""
 
 _SETTLE_FILTER_S = 0.25
-"""Vision alone is noisy; whether the force has settled is judged by its mean over this time."""
+"""Time constant of the filter on the force error that decides on `held`: vision alone is noisy."""
 
 _CLOSED_M = 0.002
-"""Width under which the jaws hold nothing."""
+"""Width below which the jaws hold nothing."""
 
 _OPEN_M = 0.003
 """Distance from the open width at which the jaws count as open."""
@@ -82,9 +84,9 @@ servo's proportional gain leave (80 um)."""
 _MOVE_SPARE_S = 1.0
 """Time a move may take beyond its speed profile before an obstacle is reported."""
 
-_COLLAPSED = 0.5
+_COLLAPSE_SHARE = 0.5
 _COLLAPSE_S = 0.1
-"""A force under this share of the target, for this time, is a lost object."""
+"""A force below this share of the target, for this time, is a slip."""
 
 _GRIPPING = (Phase.CONTACT, Phase.RAMP, Phase.HOLD)
 
@@ -94,7 +96,7 @@ class Decision:
     """Result of one control cycle.
 
     Attributes:
-        command: The bounded command for the servo.
+        command: The limited command for the servo.
         status: State of the grasp.
         estimate: The force estimate.
         events: Sentences for the log.
@@ -109,22 +111,23 @@ class Decision:
 
 
 class GraspController:
-    """The grasp as a pure state machine: the same inputs give the same decisions, to the bit.
+    """Deterministic state machine of the grasp: the same inputs give bit-for-bit the same decisions.
 
-    ``open -> approach -> contact -> ramp -> hold -> release -> open``, and ``fault`` from anywhere. A request
-    pre-empts what goes on: a grasp while gripping ramps to the new target without letting go.
+    ``open -> approach -> contact -> ramp -> hold -> release -> open``, with ``move`` and ``fault`` from any
+    phase. A request pre-empts the present phase: a grasp while gripping ramps to the new target without
+    letting go.
 
     *A move* positions the jaws at a width with the motor force of a release. It also lets go of an object.
 
-    *Fault is latched.* A stop request leads there, and whatever trips `Safety`. The jaws then go limp, hold
-    where they are with a current that can only fall, or open, as ``on_fault`` says. Only a release request
-    leads out, and only once the cause is gone.
+    *Fault* is latched. A stop request or a trip of `Safety` leads to it. The jaws then go limp, hold their
+    position with a current that can only fall, or open, as ``on_fault`` says. Only a release request ends it,
+    and only once the cause is gone.
 
-    *A servo that grows hot* holds less, and says so.
+    *A hot servo* holds less force, and an event reports it.
 
-    *The outcome* stays until the next grasp. After ``held`` it may still become ``slip``. The controller lets
-    go by itself only of nothing: after ``no_object`` it opens. After ``slip`` or ``timeout`` it goes on as it
-    was. It never lets go because of a width.
+    *The outcome* stays until the next grasp or move. After ``held`` it may become ``slip``. The controller
+    opens the jaws without a request only after ``no_object``. After ``slip`` or ``timeout`` it continues. It
+    never releases because of a width.
     """
 
     def __init__(self, config: ControlConfig, transmission: Transmission, current_limit_a: float) -> None:
@@ -134,7 +137,7 @@ class GraspController:
         self._loop = ForceLoop(config, transmission)
         self._limits = Limits(config, transmission, current_limit_a)
         self._safety = Safety(config)
-        self._travel = TrapezoidalProfile(_SPEED_UP_S)
+        self._travel = TrapezoidalProfile(_ACCELERATION_S)
         self._largest_target_n = largest_target_n(config.force_limit_n)
         self._free_motor_force_n = config.approach_force_n + transmission.friction_n
         self._phase, self._outcome, self._reason = Phase.OPEN, Outcome.NONE, ""
@@ -150,50 +153,56 @@ class GraspController:
         self._move_time_s = 0.0
         self._move_opens = False
         self._grasp_ns = 0
-        self._phase_s = self._sign_s = self._settled_s = 0.0
+        self._phase_s = self._condition_s = self._settled_s = 0.0
         self._error_n = self._speed_integral_n = 0.0
-        self._has_moved = self._was_over = False
+        self._has_moved = self._was_over_force = False
         self._goal_current_a = self._measured_motor_force_n = 0.0
-        self._easing = 1.0
+        self._derating = 1.0
 
     @property
     def margins(self) -> dict[str, Margin]:
-        """Gains and phase margin of each loop."""
+        """Gains and phase margin of each control loop."""
         return self._loop.margins
 
     def step(
         self, t_ns: int, servo: ServoState, visual: VisualForce | None, request: Request | None
     ) -> Decision:
-        """One control cycle.
+        """Runs one control cycle.
 
         Args:
-            t_ns: Now.
+            t_ns: Present time.
             servo: This cycle's reading.
-            visual: The newest visual estimate, or None. The same one may be given again; it counts once.
-            request: What the caller asks for in this cycle, or None.
+            visual: Newest visual estimate, or None. A repeated one is used once.
+            request: New request in this cycle, or None.
 
         Returns:
-            The bounded command, the state of the grasp, the force estimate, and what is worth a line.
+            The limited command, the state of the grasp, the force estimate, and events.
         """
         dt_s = self._elapsed_s(t_ns)
         self._reason = ""
-        tripped = self._safety.check(servo, self._goal_current_a, dt_s, over_force=self._was_over)
+        has_tripped = self._safety.check(servo, self._goal_current_a, dt_s, over_force=self._was_over_force)
         events = self._read_sensors(t_ns, servo, visual)
-        if tripped:
-            self._fail()
+        if has_tripped:
+            self._enter_fault()
         refusal = "" if request is None else self._handle_request(t_ns, request)
         if request is not None and refusal:
             events.append(Event(t_ns, "control", f"refused {str(request.kind)!r}: {refusal}"))
         if self._width_m is not None:
             self._run_phase(t_ns, dt_s, self._width_m, self._transmission.closing_m_s(servo.velocity_rad_s))
-        command, is_over = self._bound(t_ns, dt_s)
+        command, is_over = self._limit_command(t_ns, dt_s)
         self._goal_current_a = command.goal_current_a
-        if is_over and not self._was_over:
-            events.append(Event(t_ns, "control", f"{self._estimate.force_n:.2f} N is over the limit; eased"))
-        self._was_over = is_over
+        if is_over and not self._was_over_force:
+            events.append(
+                Event(
+                    t_ns,
+                    "control",
+                    f"{self._estimate.force_n:.2f} N is over the limit; goal current lowered",
+                )
+            )
+        self._was_over_force = is_over
         return Decision(command, self._status(t_ns), self._estimate, tuple(events), refusal)
 
-    # What comes in.
+    # Inputs.
 
     def _elapsed_s(self, t_ns: int) -> float:
         before_ns = t_ns if self._t_ns is None else self._t_ns
@@ -210,89 +219,95 @@ class GraspController:
         self._width_m = width_m
         self._measured_motor_force_n = self._transmission.force_n(servo.current_a)
         closing_m_s = self._transmission.closing_m_s(servo.velocity_rad_s)
-        free = self._moves_freely(closing_m_s)
-        self._estimate, fused = self._fusion.step(t_ns, servo, visual, free=free, opening=self._is_opening)
-        return [*fused, *self._ease(t_ns, servo.temperature_c)]
+        is_free = self._moves_freely(closing_m_s)
+        self._estimate, fusion_events = self._fusion.step(
+            t_ns, servo, visual, free=is_free, opening=self._is_opening
+        )
+        return [*fusion_events, *self._derate(t_ns, servo.temperature_c)]
 
-    def _ease(self, t_ns: int, temperature_c: float) -> list[Event]:
-        """Lowers the hold of a servo that grows hot, before the servo itself drops it."""
-        before, self._easing = self._easing, self._safety.easing(temperature_c)
-        if self._easing == before or self._phase not in (Phase.RAMP, Phase.HOLD):
+    def _derate(self, t_ns: int, temperature_c: float) -> list[Event]:
+        """Lowers the target force of a hot servo, before the servo shuts down."""
+        before, self._derating = self._derating, self._safety.derating(temperature_c)
+        if self._derating == before or self._phase not in (Phase.RAMP, Phase.HOLD):
             return []
-        self._loop.retarget(self._wanted_n)
+        self._loop.retarget(self._derated_target_n)
         return [
-            Event(t_ns, "control", f"the servo is at {temperature_c:.0f} C; holding {self._wanted_n:.2f} N")
+            Event(
+                t_ns,
+                "control",
+                f"the servo is at {temperature_c:.0f} C; holding {self._derated_target_n:.2f} N",
+            )
         ]
 
     def _handle_request(self, t_ns: int, request: Request) -> str:
-        """Takes a request. Returns why it is refused, or an empty text."""
+        """Handles a request. Returns the reason of a refusal, or an empty text."""
         if request.kind == RequestKind.STOP:
             if self._safety.trip("stop requested"):
-                self._fail()
+                self._enter_fault()
         elif self._phase == Phase.FAULT and request.kind != RequestKind.RELEASE:
-            return "stopped or at fault; request a release first"
+            return "stopped or in fault; request a release first"
         elif request.kind == RequestKind.RELEASE:
             if cause := self._safety.reset():
                 return cause
-            self._release("release requested")
+            self._start_release("release requested")
         elif request.kind == RequestKind.MOVE:
             open_width_m = self._transmission.open_width_m
             if not 0 <= request.width_m <= open_width_m:
-                return f"a width of {1e3 * request.width_m:g} mm is not within 0 to {1e3 * open_width_m:g} mm"
-            self._move(request.width_m)
+                return f"the width {1e3 * request.width_m:g} mm is outside 0 to {1e3 * open_width_m:g} mm"
+            self._start_move(request.width_m)
         elif request.kind != RequestKind.GRASP:
-            return "there is no such request"
+            return "unknown kind of request; use grasp, release, move or stop"
         elif not 0 < request.target_n <= self._largest_target_n:
-            return f"a target of {request.target_n} N is not within 0 to {self._largest_target_n:g} N"
+            return f"the target {request.target_n} N is outside 0 to {self._largest_target_n:g} N"
         else:
-            self._grasp(t_ns, request.target_n)
+            self._start_grasp(t_ns, request.target_n)
         return ""
 
-    # Changes of phase.
+    # Phase changes.
 
     def _enter(self, phase: Phase, reason: str) -> None:
         self._phase, self._reason = phase, reason
-        self._phase_s = self._sign_s = self._settled_s = 0.0
+        self._phase_s = self._condition_s = self._settled_s = 0.0
 
     def _set_outcome(self, outcome: Outcome, reason: str) -> None:
         self._outcome, self._reason = outcome, reason
 
-    def _grasp(self, t_ns: int, target_n: float) -> None:
+    def _start_grasp(self, t_ns: int, target_n: float) -> None:
         self._grasp_ns, self._target_n, self._outcome = t_ns, target_n, Outcome.NONE
         if self._phase == Phase.CONTACT:
             return
         if self._phase in (Phase.RAMP, Phase.HOLD):
-            self._loop.retarget(self._wanted_n)
+            self._loop.retarget(self._derated_target_n)
             self._enter(Phase.RAMP, f"new target {target_n:g} N")
             return
         self._fusion.restart()
-        self._limits.begin()
+        self._limits.reset()
         self._speed_m_s = min(self._config.approach_speed_m_s, _IMPACT_M_S_PER_N * target_n)
         self._has_moved = False
         self._speed_integral_n = 0.0
         self._enter(Phase.APPROACH, f"grasp with {target_n:g} N requested")
 
-    def _release(self, reason: str) -> None:
+    def _start_release(self, reason: str) -> None:
         self._start_travel()
         self._enter(Phase.RELEASE, reason)
 
-    def _move(self, width_m: float) -> None:
+    def _start_move(self, width_m: float) -> None:
         self._outcome = Outcome.NONE
         self._start_travel()
         distance_m = width_m - self._present_width_m
         self._move_width_m, self._move_opens = width_m, distance_m > 0
         rate_m_s = 2 * self._config.approach_speed_m_s
-        self._move_time_s = abs(distance_m) / rate_m_s + _SPEED_UP_S + _MOVE_SPARE_S
+        self._move_time_s = abs(distance_m) / rate_m_s + _ACCELERATION_S + _MOVE_SPARE_S
         self._enter(Phase.MOVE, f"move to {1e3 * width_m:.1f} mm requested")
 
     def _start_travel(self) -> None:
         self._travel.start(self._present_width_m, 2 * self._config.approach_speed_m_s)
-        self._limits.begin()
+        self._limits.reset()
 
-    def _fail(self) -> None:
+    def _enter_fault(self) -> None:
         reason = self._safety.reason
         if self._config.on_fault == "open":
-            self._release(reason)
+            self._start_release(reason)
         elif self._phase not in _GRIPPING:
             self._goal_width_m = self._present_width_m
         if self._config.on_fault == "limp":
@@ -313,8 +328,8 @@ class GraspController:
         )
 
     @property
-    def _wanted_n(self) -> float:
-        return self._target_n * self._easing
+    def _derated_target_n(self) -> float:
+        return self._target_n * self._derating
 
     @property
     def _contact_limit_n(self) -> float:
@@ -324,94 +339,100 @@ class GraspController:
     def _present_width_m(self) -> float:
         return self._goal_width_m if self._width_m is None else self._width_m
 
-    # What goes on in a phase.
+    # Phases.
 
     def _run_phase(self, t_ns: int, dt_s: float, width_m: float, closing_m_s: float) -> None:
         self._phase_s += dt_s
         match self._phase:
             case Phase.APPROACH:
-                self._approach(dt_s, width_m, closing_m_s)
+                self._run_approach(dt_s, width_m, closing_m_s)
             case Phase.CONTACT if self._phase_s >= _DWELL_S:
-                self._loop.start(self._estimate.force_n, self._wanted_n)
+                self._loop.start(self._estimate.force_n, self._derated_target_n)
                 self._enter(Phase.RAMP, "contact has settled")
             case Phase.RAMP:
-                self._ramp(dt_s, width_m)
+                self._run_ramp(dt_s, width_m)
             case Phase.HOLD:
-                self._hold(dt_s, width_m)
+                self._run_hold(dt_s, width_m)
             case Phase.RELEASE:
-                self._open(dt_s, width_m)
+                self._run_release(dt_s, width_m)
             case Phase.MOVE:
                 self._run_move(dt_s, width_m)
             case Phase.FAULT if self._opens_at_fault:
-                self._open(dt_s, width_m)
+                self._run_release(dt_s, width_m)
         if self._phase in _GRIPPING:
             self._goal_width_m = max(width_m - 2 * _GOAL_OFFSET_M, 0.0)
         if self._phase in (Phase.APPROACH, *_GRIPPING) and self._outcome == Outcome.NONE:
-            self._watch_time(t_ns)
+            self._check_timeout(t_ns)
 
-    def _approach(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
-        # The goal position leads by so much that the goal current alone drives: a goal that stepped along
-        # with the jaws would make the current ripple, and it is read at one phase of that ripple.
+    def _run_approach(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
+        # The goal position leads far enough that the goal current alone drives the jaws. A goal that moved in
+        # steps with the jaws would cause a current ripple, and the current is sampled at one phase of it.
         self._goal_width_m = max(width_m - 2 * _LEAD_M, 0.0)
         self._motor_force_n = self._approach_motor_force_n(dt_s, closing_m_s)
-        self._has_moved |= closing_m_s > _SLOWED * self._speed_m_s or self._phase_s > _START_UP_S
+        self._has_moved |= closing_m_s > _SLOWED_SHARE * self._speed_m_s or self._phase_s > _START_UP_S
         if width_m < _CLOSED_M:
             self._set_outcome(Outcome.NO_OBJECT, "closed without contact")
-            self._release(self._reason)
-        elif self._persists(self._touches(closing_m_s), _DEBOUNCE_S, dt_s):
+            self._start_release(self._reason)
+        elif self._persists(self._detects_contact(closing_m_s), _DEBOUNCE_S, dt_s):
             self._fusion.reset_variance()
             self._enter(Phase.CONTACT, f"contact at {width_m * 1e3:.1f} mm")
 
     def _approach_motor_force_n(self, dt_s: float, closing_m_s: float) -> float:
-        """A speed loop that presses on what it meets no harder than a touch."""
-        wanted_m_s = self._speed_m_s * min(self._phase_s / _SPEED_UP_S, 1.0)
-        missing_m_s = wanted_m_s - closing_m_s
+        """Speed loop whose motor force is limited to friction, damping and the contact limit."""
+        wanted_m_s = self._speed_m_s * min(self._phase_s / _ACCELERATION_S, 1.0)
+        speed_error_m_s = wanted_m_s - closing_m_s
         damping_n_s_m = self._transmission.damping_n_s_m
-        known_n = self._transmission.friction_n + damping_n_s_m * wanted_m_s + _SPEED_GAIN_N_S_M * missing_m_s
-        # What the current takes for contact and vision does not is friction, too.
+        unlimited_n = (
+            self._transmission.friction_n + damping_n_s_m * wanted_m_s + _SPEED_GAIN_N_S_M * speed_error_m_s
+        )
+        # Force that the current estimate counts as contact and vision does not is friction, too.
         friction_n = self._estimate.friction_n - self._estimate.bias_n + 2 * self._estimate.std_n
-        most_n = friction_n + self._contact_limit_n + damping_n_s_m * max(closing_m_s, 0.0)
-        self._speed_integral_n += _SPEED_INTEGRAL_N_M * missing_m_s * dt_s
-        self._speed_integral_n = min(max(self._speed_integral_n, -known_n), most_n - known_n)
-        return known_n + self._speed_integral_n
+        max_n = friction_n + self._contact_limit_n + damping_n_s_m * max(closing_m_s, 0.0)
+        self._speed_integral_n += _SPEED_INTEGRAL_N_M * speed_error_m_s * dt_s
+        self._speed_integral_n = min(max(self._speed_integral_n, -unlimited_n), max_n - unlimited_n)
+        return unlimited_n + self._speed_integral_n
 
     def _moves_freely(self, closing_m_s: float) -> bool:
-        """The jaws move freely at an even speed: all of the push is friction."""
-        if self._phase != Phase.APPROACH or self._phase_s < _SPEED_UP_S + _EVEN_S:
+        """Returns True if the jaws move freely at a steady speed: the motor force is then friction."""
+        if self._phase != Phase.APPROACH or self._phase_s < _ACCELERATION_S + _STEADY_S:
             return False
-        return abs(closing_m_s - self._speed_m_s) < _EVEN * self._speed_m_s
+        return abs(closing_m_s - self._speed_m_s) < _STEADY_SHARE * self._speed_m_s
 
-    def _touches(self, closing_m_s: float) -> bool:
+    def _detects_contact(self, closing_m_s: float) -> bool:
         if not self._has_moved:
             return False
         pressing = self._estimate.current_n + self._estimate.bias_n > 0.5 * self._contact_limit_n
-        stalled = closing_m_s < _STALLED * self._speed_m_s
-        seen = self._estimate.source != EstimateSource.CURRENT and self._estimate.force_n > _SEEN_FORCE_N
-        return (stalled and pressing) or (seen and closing_m_s < _SLOWED * self._speed_m_s)
+        stalled = closing_m_s < _STALLED_SHARE * self._speed_m_s
+        visual = (
+            self._estimate.source != EstimateSource.CURRENT and self._estimate.force_n > _VISUAL_CONTACT_N
+        )
+        return (stalled and pressing) or (visual and closing_m_s < _SLOWED_SHARE * self._speed_m_s)
 
-    def _ramp(self, dt_s: float, width_m: float) -> None:
-        self._motor_force_n = self._loop.step(dt_s, self._wanted_n, self._estimate)
+    def _run_ramp(self, dt_s: float, width_m: float) -> None:
+        self._motor_force_n = self._loop.step(dt_s, self._derated_target_n, self._estimate)
         if width_m < _CLOSED_M:
             self._set_outcome(Outcome.NO_OBJECT, "closed while the force was to rise")
-            self._release(self._reason)
-        elif self._loop.reference_n == self._wanted_n:
-            self._error_n = self._estimate.force_n - self._wanted_n
-            self._enter(Phase.HOLD, f"at {self._wanted_n:g} N")
+            self._start_release(self._reason)
+        elif self._loop.reference_n == self._derated_target_n:
+            self._error_n = self._estimate.force_n - self._derated_target_n
+            self._enter(Phase.HOLD, f"at {self._derated_target_n:g} N")
 
-    def _hold(self, dt_s: float, width_m: float) -> None:
-        self._motor_force_n = self._loop.step(dt_s, self._wanted_n, self._estimate)
-        error_n = self._estimate.force_n - self._wanted_n
+    def _run_hold(self, dt_s: float, width_m: float) -> None:
+        self._motor_force_n = self._loop.step(dt_s, self._derated_target_n, self._estimate)
+        error_n = self._estimate.force_n - self._derated_target_n
         self._error_n += (error_n - self._error_n) * dt_s / (dt_s + _SETTLE_FILTER_S)
-        is_near = abs(self._error_n) <= tolerance_n(self._wanted_n)
+        is_near = abs(self._error_n) <= tolerance_n(self._derated_target_n)
         self._settled_s = self._settled_s + dt_s if is_near else 0.0
         if self._outcome == Outcome.NONE and self._settled_s >= self._config.settle_s:
             self._held_width_m = width_m
             self._set_outcome(Outcome.HELD, f"{self._estimate.force_n:.2f} N for {self._settled_s:.2f} s")
-        collapsed = self._persists(self._estimate.force_n < _COLLAPSED * self._wanted_n, _COLLAPSE_S, dt_s)
-        if self._outcome in (Outcome.NONE, Outcome.HELD) and (slip := self._slip(width_m, collapsed)):
+        collapsed = self._persists(
+            self._estimate.force_n < _COLLAPSE_SHARE * self._derated_target_n, _COLLAPSE_S, dt_s
+        )
+        if self._outcome in (Outcome.NONE, Outcome.HELD) and (slip := self._slip_reason(width_m, collapsed)):
             self._set_outcome(Outcome.SLIP, slip)
 
-    def _slip(self, width_m: float, collapsed: bool) -> str:
+    def _slip_reason(self, width_m: float, collapsed: bool) -> str:
         if collapsed:
             return f"the force fell to {self._estimate.force_n:.2f} N"
         if width_m < _CLOSED_M:
@@ -421,7 +442,7 @@ class GraspController:
             return f"the jaws closed by {closed_m * 1e3:.1f} mm"
         return ""
 
-    def _open(self, dt_s: float, width_m: float) -> None:
+    def _run_release(self, dt_s: float, width_m: float) -> None:
         self._motor_force_n = self._free_motor_force_n
         open_width_m = self._transmission.open_width_m
         self._goal_width_m = self._travel.step(open_width_m, dt_s)
@@ -444,17 +465,17 @@ class GraspController:
         elif self._phase_s >= self._move_time_s:
             self._set_outcome(Outcome.BLOCKED, f"stopped at {width_m * 1e3:.1f} mm by an obstacle")
 
-    def _watch_time(self, t_ns: int) -> None:
+    def _check_timeout(self, t_ns: int) -> None:
         if t_ns - self._grasp_ns > self._config.timeout_s * NS_PER_S:
             self._set_outcome(Outcome.TIMEOUT, f"not held within {self._config.timeout_s:g} s")
 
-    def _persists(self, sign: bool, time_s: float, dt_s: float) -> bool:
-        self._sign_s = self._sign_s + dt_s if sign else 0.0
-        return self._sign_s >= time_s
+    def _persists(self, condition: bool, time_s: float, dt_s: float) -> bool:
+        self._condition_s = self._condition_s + dt_s if condition else 0.0
+        return self._condition_s >= time_s
 
-    # What goes out.
+    # Outputs.
 
-    def _bound(self, t_ns: int, dt_s: float) -> tuple[ServoCommand, bool]:
+    def _limit_command(self, t_ns: int, dt_s: float) -> tuple[ServoCommand, bool]:
         wanted = ServoCommand(
             t_ns,
             self._transmission.position_rad(self._goal_width_m),
@@ -469,7 +490,7 @@ class GraspController:
             self._measured_motor_force_n,
             dt_s,
             may_rise=may_rise,
-            opens=self._is_opening,
+            opening=self._is_opening,
         )
 
     def _status(self, t_ns: int) -> GraspStatus:
@@ -484,5 +505,5 @@ class GraspController:
 
 
 def is_open(open_width_m: float, width_m: float) -> bool:
-    """Whether jaws of an open width count as open."""
+    """Returns True if jaws at ``width_m`` count as open."""
     return width_m > open_width_m - _OPEN_M

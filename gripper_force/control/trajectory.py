@@ -1,30 +1,30 @@
-"""A trapezoidal speed profile: how the force reference and the jaws' goal move."""
+"""Trapezoidal speed profile of the force reference and of the jaws' goal position."""
 
 import math
 
 
 class TrapezoidalProfile:
-    """Moves a value to a target with bounded speed and acceleration, and arrives without overshoot.
+    """Moves a value to a target with limited speed and acceleration, without overshoot.
 
-    Jaws, rack and object are a mass on a spring: a step in the speed of what they follow makes them ring.
+    Jaws, rack and object are a mass on a spring: a step in the speed of their goal makes them oscillate.
 
     Attributes:
-        value: Where the profile is.
+        value: Present value.
     """
 
     def __init__(self, ramp_s: float) -> None:
-        """``ramp_s`` is the time from rest to full speed."""
+        """Creates a profile; ``ramp_s`` is the time from rest to full speed."""
         self._ramp_s = ramp_s
         self.start(0.0, 1.0)
 
     def start(self, value: float, rate: float) -> None:
-        """Begins at rest at ``value``; ``rate`` is the full speed, a second."""
+        """Starts at rest at ``value``; ``rate`` is the full speed per second."""
         self.value = value
         self._rate = rate
         self._speed = 0.0
 
     def step(self, target: float, dt_s: float) -> float:
-        """Moves for ``dt_s`` towards ``target`` and gives the new value."""
+        """Moves towards ``target`` for ``dt_s`` and returns the new value."""
         remaining = abs(target - self.value)
         acceleration = self._rate / self._ramp_s
         braking = math.sqrt(2 * acceleration * remaining)

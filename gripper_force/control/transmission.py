@@ -1,4 +1,4 @@
-"""Servo angle and motor current to jaw width and jaw force: one pinion drives two racks."""
+"""Conversion of servo angle and motor current to jaw width and jaw force: one pinion drives two racks."""
 
 import math
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from gripper_force.config import GripperConfig
 class Transmission:
     """Nominal kinematics and statics of the gripper.
 
-    Forces here are the motor's push at each jaw, *before* friction: while closing, the contact sees
+    Forces are motor forces at each jaw, *before* friction: while closing, the contact force is
     ``force_n - friction_n``. Positive closes.
 
     Attributes:
@@ -18,10 +18,10 @@ class Transmission:
         closing_sign: Sign of the servo's rotation that closes the jaws.
         open_position_rad: Servo angle with the jaws open.
         open_width_m: Distance between the open jaws.
-        n_per_a: Push at each jaw per ampere.
+        n_per_a: Motor force at each jaw per ampere.
         friction_n: Coulomb friction at each jaw.
         damping_n_s_m: Viscous friction at each jaw.
-        current_step_a: Resolution of the servo's goal current; 0 where it is not known.
+        current_step_a: Resolution of the servo's goal current; 0 if unknown.
         friction_std: Standard deviation of true friction, as a share of `friction_n`.
         gain_std: Standard deviation of the true torque constant, as a share of the nominal.
     """
@@ -41,7 +41,7 @@ class Transmission:
     def from_config(
         cls, gripper: GripperConfig, servo_nm_per_a: float, current_step_a: float = 0.0
     ) -> "Transmission":
-        """Builds it from the gripper's section; without a torque constant, by the servo's."""
+        """Returns the transmission of a configured gripper; its torque constant defaults to the servo's."""
         nm_per_a = servo_nm_per_a if gripper.nm_per_a is None else gripper.nm_per_a
         return cls(
             pinion_radius_m=gripper.pinion_radius_m,
@@ -58,31 +58,31 @@ class Transmission:
 
     @property
     def closed_position_rad(self) -> float:
-        """Servo angle at which the jaws meet."""
+        """Servo angle with the jaws closed."""
         return self.position_rad(0.0)
 
     def width_m(self, position_rad: float) -> float:
-        """Distance between the jaws at a servo angle."""
+        """Returns the distance between the jaws at a servo angle."""
         closing_rad = self.closing_sign * (position_rad - self.open_position_rad)
         return self.open_width_m - 2 * self.pinion_radius_m * closing_rad
 
     def position_rad(self, width_m: float) -> float:
-        """Servo angle at a distance between the jaws."""
+        """Returns the servo angle at a distance between the jaws."""
         closing_rad = (self.open_width_m - width_m) / (2 * self.pinion_radius_m)
         return self.open_position_rad + self.closing_sign * closing_rad
 
     def closing_m_s(self, velocity_rad_s: float) -> float:
-        """Closing speed of one jaw."""
+        """Returns the closing speed of one jaw."""
         return self.closing_sign * self.pinion_radius_m * velocity_rad_s
 
     def force_n(self, current_a: float) -> float:
-        """Push at each jaw for a signed motor current."""
+        """Returns the motor force at each jaw for a signed motor current."""
         return self.closing_sign * self.n_per_a * current_a
 
     def current_a(self, force_n: float) -> float:
-        """Signed motor current for a push at each jaw."""
+        """Returns the signed motor current for a motor force at each jaw."""
         return self.closing_sign * force_n / self.n_per_a
 
     def bias_std_n(self, force_n: float) -> float:
-        """Standard deviation of the contact force about what the motor current says of it."""
+        """Returns the standard deviation of the contact force about the current estimate."""
         return math.hypot(self.friction_std * self.friction_n, self.gain_std * force_n)

@@ -1,4 +1,4 @@
-"""Gains from an identified plant by a published rule, and the phase margin they leave.
+"""Controller gains of an identified plant by a published rule, and their phase margin.
 
 The rule is SIMC: S. Skogestad, "Simple analytic rules for model reduction and PID controller tuning", Journal
 of Process Control 13 (2003) 291-309, doi:10.1016/S0959-1524(02)00062-8, equations 23 and 24.
@@ -11,34 +11,34 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Plant:
-    """First order plus delay: ``gain * exp(-delay_s * s) / (lag_s * s + 1)``."""
+    """First-order plant with delay: ``gain * exp(-delay_s * s) / (lag_s * s + 1)``."""
 
     gain: float
     lag_s: float
     delay_s: float
 
     def response(self, omega: float) -> complex:
-        """Frequency response at ``omega`` in rad/s."""
+        """Returns the frequency response at ``omega`` in rad/s."""
         s = 1j * omega
         return self.gain * cmath.exp(-self.delay_s * s) / (self.lag_s * s + 1)
 
 
 @dataclass(frozen=True, slots=True)
 class Gains:
-    """A PI controller: ``proportional + integral_s / s``."""
+    """Gains of a PI controller: ``proportional + integral_s / s``."""
 
     proportional: float
     integral_s: float
 
     def response(self, omega: float) -> complex:
-        """Frequency response at ``omega`` in rad/s."""
+        """Returns the frequency response at ``omega`` in rad/s."""
         return self.proportional + self.integral_s / (1j * omega)
 
 
 def simc(plant: Plant) -> Gains:
-    """SIMC gains with the rule's own choice of closed-loop time constant, the delay itself.
+    """Returns the SIMC gains with the rule's recommended closed-loop time constant, the delay.
 
-    A plant without lag gets the pure integral controller that is the rule's limit.
+    For a plant without lag they are those of an integral controller, the limit of the rule.
     """
     window_s = 2 * plant.delay_s
     proportional = plant.lag_s / (plant.gain * window_s)
@@ -48,9 +48,9 @@ def simc(plant: Plant) -> Gains:
 
 
 def phase_margin_deg(plant: Plant, gains: Gains) -> float:
-    """Phase left at the frequency where the open loop's magnitude falls through one."""
-    # There lag^2 w^4 + (1 - (gain P)^2) w^2 = (gain I)^2. Of the root's two forms, take the one in which
-    # nothing cancels.
+    """Returns the phase margin at the frequency where the open loop's magnitude falls below one."""
+    # There lag^2 w^4 + (1 - (gain P)^2) w^2 = (gain I)^2. Of the two forms of the root, the one without
+    # cancellation is used.
     fall = 1 - (plant.gain * gains.proportional) ** 2
     integral = plant.gain * gains.integral_s
     root = math.hypot(fall, 2 * plant.lag_s * integral)

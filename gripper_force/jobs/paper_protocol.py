@@ -271,7 +271,7 @@ def _touch_all(session: Session, task: SetPlan, rng: np.random.Generator, timeou
             float(rng.uniform(0.02, 0.1)),
             free_n=_FREE_N,
             timeout_s=timeout_s,
-            patience_s=1.0,
+            release_timeout_s=1.0,
         )
         if problem:
             raise SimulationError(

@@ -76,7 +76,7 @@ def test_vision_finds_the_bias(bench):
     assert estimate.force_n == pytest.approx(3.4, abs=0.05)
     assert estimate.source == "fused"
     assert estimate.std_n < 0.2
-    assert b.events == ["vision counts; the force estimate is fused"]
+    assert b.events == ["vision in use; the force estimate is fused"]
 
 
 def test_latency_leaves_no_error_on_a_ramp(bench, transmission):
@@ -131,8 +131,8 @@ def test_whatever_the_push_friction_is_never_negative(transmission, pushes_n):
         (1e300, 0.3, 40, "finite"),
         (3.0, 0.1, 61, "61 ms old"),
         (3.0, 0.1, -10, "-10 ms old"),
-        (3.0, 1.6, 40, "uncertain by 1.60 N"),
-        (9.0, 0.1, 40, "off from the motor current by"),
+        (3.0, 1.6, 40, "standard deviation is 1.60 N"),
+        (9.0, 0.1, 40, "differs from the motor current by"),
     ],
 )
 def test_bad_vision_drops_out_and_is_named(bench, seen_n, std_n, latency_ms, reason):
@@ -145,7 +145,7 @@ def test_bad_vision_drops_out_and_is_named(bench, seen_n, std_n, latency_ms, rea
     assert len(b.events) == 2
     assert reason in b.events[-1]
     b.run(0.2, lambda _: 4.0, lambda _: 3.2)
-    assert b.events[-1] == "vision counts; the force estimate is fused"
+    assert b.events[-1] == "vision in use; the force estimate is fused"
 
 
 def test_not_finite_drops_out_in_the_same_cycle(bench):

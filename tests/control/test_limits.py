@@ -40,7 +40,7 @@ def test_no_output_ever_leaves_the_limits(cycles, transmission, limit_a):
     for position_rad, current_a, force_n, friction_n, motor_force_n, dt_s, may_rise, opens in cycles:
         wanted = ServoCommand(0, position_rad, current_a)
         out, over = limits.apply(
-            wanted, force_n, friction_n, motor_force_n, dt_s, may_rise=may_rise, opens=opens
+            wanted, force_n, friction_n, motor_force_n, dt_s, may_rise=may_rise, opening=opens
         )
         believed_n = min(max(friction_n, 0.0), 2 * transmission.friction_n)
         cap_a = min(limit_a, (CONFIG.force_limit_n + believed_n) / transmission.n_per_a)
@@ -62,7 +62,7 @@ def test_no_output_ever_leaves_the_limits(cycles, transmission, limit_a):
 def test_non_finite_is_refused(bad, where):
     values = [0.0, 0.0, 0.0, 0.0, 0.0]
     values[where] = bad
-    name = ("goal position", "goal current", "force estimate", "friction estimate", "motor's push")[where]
+    name = ("goal position", "goal current", "force estimate", "friction estimate", "motor force")[where]
     with pytest.raises(NonFiniteError, match=name):
         Limits(CONFIG, FINE, 1.0).apply(
             ServoCommand(0, values[0], values[1]), *values[2:], 0.005, may_rise=True
@@ -114,7 +114,7 @@ def test_a_current_that_was_too_much_is_not_reached_again():
     assert run(5.0)[-1] == pytest.approx(0.2)
     assert run(13.0, 3)[-1] < 0.15
     assert run(5.0)[-1] == pytest.approx(0.95 * 0.2)
-    limits.begin()
+    limits.reset()
     assert run(5.0)[-1] == pytest.approx(0.2)
 
 

@@ -127,7 +127,7 @@ def test_widths_out_of_range_are_refused(make_run, width_m):
     run.move(width_m, 0.5)
     assert run.last.status.phase == "open"
     assert run.plant.x_m == pytest.approx(before_m, abs=1e-4)
-    assert any("refused 'move': a width of" in text and "within 0 to 92 mm" in text for text in run.texts)
+    assert any("refused 'move': the width" in text and "outside 0 to 92 mm" in text for text in run.texts)
 
 
 def test_refused_move_does_not_end_a_hold(make_run):
@@ -139,7 +139,7 @@ def test_refused_move_does_not_end_a_hold(make_run):
 @pytest.mark.parametrize("phase", PHASES)
 def test_move_pre_empts_every_phase(make_run, phase):
     run = make_run().to_phase(phase).move(0.08, 4.0)
-    assert (run.last.status.phase, run.last.status.outcome) == ("move", "")
+    assert (run.last.status.phase, run.last.status.outcome) == ("move", "moved")
     assert run.last.status.width_m == pytest.approx(0.08, abs=0.0005)
     assert run.plant.force_n == 0.0
 
@@ -189,7 +189,7 @@ def test_stop_during_a_move(make_run, on_fault):
         if on_fault == "limp":
             assert run.last.command.goal_current_a == 0.0
     run.move(0.05, 0.1)
-    assert "refused 'move': stopped or at fault; request a release first" in run.texts
+    assert "refused 'move': stopped or in fault; request a release first" in run.texts
     assert run.go(4.0, "release").last.status.phase == "open"
     assert run.move(0.05).last.status.width_m == pytest.approx(0.05, abs=0.0005)
 

@@ -101,7 +101,7 @@ def test_a_motor_that_takes_more_than_its_goal_trips_it():
 @given(st.floats(-40, 120), st.floats(0, 20))
 def test_a_hotter_servo_never_holds_more(temperature_c, hotter_c):
     safety = Safety(CONFIG)
-    cooler, hotter = safety.easing(temperature_c), safety.easing(temperature_c + hotter_c)
+    cooler, hotter = safety.derating(temperature_c), safety.derating(temperature_c + hotter_c)
     assert 0.6 <= hotter <= cooler <= 1.0
     assert cooler == 1.0 or temperature_c > CONFIG.warm_c
 

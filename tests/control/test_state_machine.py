@@ -317,7 +317,7 @@ def test_impossible_targets_are_refused(make_run, target_n):
 
 def test_unknown_requests_are_refused(make_run):
     run = make_run().go(0.1, "dance")
-    assert "refused 'dance': there is no such request" in run.texts
+    assert "refused 'dance': unknown kind of request; use grasp, release, move or stop" in run.texts
 
 
 def test_too_much_force_is_eased(make_run):

@@ -147,11 +147,7 @@ def calibrate_camera(
     selected = select_exposure(candidates)
     config = _with(config, "camera", exposure_us=selected.exposure_us)
     with TemporaryDirectory() as aside:
-
-        def report_touch(_set: int, touch: int, force_n: float) -> None:
-            progress(f"touch {touch} of {touches}: {force_n:.1f} N", 0)
-
-        (log,) = record(config, RecordingPlan(1, touches), Path(aside), report_touch)
+        (log,) = record(config, RecordingPlan(1, touches), Path(aside), progress)
         observed = observe(log, region)
     height, width = observed.reference.shape
     found_region = region_around(observed.markers, width, height) if region is None else region

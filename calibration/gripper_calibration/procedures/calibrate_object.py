@@ -190,16 +190,8 @@ def record_touches(
         for key in ("object_seed", "rig_seed")
     }
     config = config.model_copy(update={"sim": sim.model_copy(update=seeds)})
-
-    def report(number: int, _touch: int, force_n: float) -> None:
-        progress(f"touch {number} of {touches}: {force_n:.1f} N", 0)
-
-    def ask(number: int) -> None:
-        if prompt is not None:
-            prompt(f"Put the object down for touch {number}")
-
     folder = folder or default_folder(config.object)
-    yield from record(config, _plan(touches, peak_n), folder, report, ask)
+    yield from record(config, _plan(touches, peak_n), folder, progress, prompt)
 
 
 def touch_paths(config: Config, touches: int, folder: Path | None = None) -> list[Path]:

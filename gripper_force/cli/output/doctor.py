@@ -1,11 +1,14 @@
 """Tables of `doctor`: checks, and register changes."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.markup import escape
 from rich.table import Table
 
 from gripper_force.cli.console import err, out
+
+if TYPE_CHECKING:  # --help loads no NumPy
+    from gripper_force.jobs.checks import RegisterChange, SetupResult
 
 
 def checks_table(r: dict[str, Any]) -> None:
@@ -19,7 +22,7 @@ def checks_table(r: dict[str, Any]) -> None:
     out.print(table)
 
 
-def changes_table(servo: str, changes: list[Any]) -> None:
+def changes_table(servo: str, changes: "list[RegisterChange]") -> None:
     """Prints the registers that would change, on stderr."""
     table = Table(servo, "is", "becomes", box=None, pad_edge=False)
     for change in changes:
@@ -27,7 +30,7 @@ def changes_table(servo: str, changes: list[Any]) -> None:
     err.print(table)
 
 
-def setup_line(r: dict[str, Any]) -> None:
+def setup_line(r: "SetupResult") -> None:
     """Prints the result of a servo's setup."""
-    done = "written and read back" if r["applied"] else "unchanged"
-    out.print(f"servo {r['servo']}: {done if r['changes'] else 'nothing to change'}")
+    done = "written and read back" if r.applied else "unchanged"
+    out.print(f"servo {r.servo}: {done if r.changes else 'nothing to change'}")

@@ -87,24 +87,24 @@ STARTUP_CASES: Final = (
         _SERVO | {"depthai", "gripper_hw.cameras", "gripper_hw.load_cells", "gripper_hw.sim"},
         command=("doctor", *(f"--set={key}" for key in (*_REAL, *_NO_CELL, *_BLIND))),
     ),
-    StartupCase("real servo", _SERVO, frozenset({"recorder"}), (*_REAL, *_NO_CELL, *_BLIND)),
+    StartupCase("real servo", _SERVO, frozenset({"log_queue"}), (*_REAL, *_NO_CELL, *_BLIND)),
     StartupCase(
         "real servo, serial load cell",
         _SERVO | {"gripper_hw.load_cells"},
-        frozenset({"recorder", "load-cell"}),
+        frozenset({"log_queue", "load-cell"}),
         (*_REAL, *_BLIND, "load_cell.backend=serial", "load_cell.port={load_cell}"),
     ),
     StartupCase(
         "real servo, recorded camera",
         _SERVO | {"gripper_hw.playback"},
-        frozenset({"recorder", "perception"}),
+        frozenset({"log_queue", "perception"}),
         (*_REAL, *_NO_CELL, *_RECORDED, *_NO_NETWORK),
     ),
     *(
         StartupCase(
             f"real servo, recorded camera, {engine}",
             _SERVO | {"gripper_hw.playback", engine} | _EYES,
-            frozenset({"recorder", "perception"}),
+            frozenset({"log_queue", "perception"}),
             (*_REAL, *_NO_CELL, *_RECORDED, "vision.checkpoint={network}", f"vision.engine={engine}"),
         )
         for engine in ("torch", "openvino", "onnxruntime")

@@ -59,7 +59,7 @@ def faint(network: ForceNetwork) -> None:
 
 
 def outlier(network: ForceNetwork) -> None:
-    """Scales a channel of each pair of layers by 1000 and back in the next layer; the forces stay the same."""
+    """Scales a channel of each pair of layers by 1000 and back in the next layer; forces do not change."""
     for i in range(5):
         first, second = _pair(network, i)
         assert first.bias is not None

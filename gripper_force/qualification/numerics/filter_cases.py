@@ -74,7 +74,7 @@ class _DecimalFusion:
         play_n = self._friction_n
         self._force_n = min(max(before_n, self._motor_force_n - play_n), self._motor_force_n + play_n)
         back = (1 + (self._force_n - self._motor_force_n) / play_n) / 2 if play_n else Decimal(0)
-        drift_n2 = Decimal(fusion._DRIFT_N2_S) + Decimal(fusion._LOOSE_N2_S) * back
+        drift_n2 = Decimal(fusion._DRIFT_N2_S) + Decimal(fusion._OPENING_DRIFT_N2_S) * back
         gearing_n2 = self._gain_std**2 * abs(self._force_n**2 - before_n**2)
         grown_n2 = self._variance_n2 + drift_n2 * dt_s + gearing_n2
         self._variance_n2 = min(grown_n2, self._prior_n2(self._force_n))
@@ -193,7 +193,7 @@ def cases(config: Config, _maps: Path | None, cycles: int = CYCLES) -> Iterator[
         )
     yield NumericalCase(
         "non-finite servo readings",
-        "every tenth, each quantity in turn, in a whole grasp; number of commands beyond limits or not finite",
+        "every tenth, each quantity in turn, in a whole grasp; number of commands outside limits",
         float(_count_bad_commands(control, gripper, config.servo.current_limit_a)),
         0.0,
     )

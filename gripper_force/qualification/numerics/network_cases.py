@@ -324,7 +324,7 @@ def _accepts(engine: Engine, frame: Floats) -> bool:
 
 
 def _frames(reference: ReferenceEnsemble, grasp: Clip, config: Config) -> Iterator[NumericalCase]:
-    """Cases of disturbed frames: the estimator must flag them, or be as close to float64 as rounding allows."""
+    """Cases of disturbed frames: the estimator flags them, or is as close to float64 as rounding allows."""
     preprocess = reference.model.header.preprocess
     clip = _contact(grasp, preprocess.size)
     inputs = _prepare_float64(clip, preprocess)

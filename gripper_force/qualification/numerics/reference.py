@@ -31,7 +31,7 @@ _DRAWS: Final = 4
 """Random perturbations for a bound."""
 
 _MARGIN: Final = 4.0
-"""Bound over the largest deviation: the draws are few, and perturb only weights and inputs of convolutions."""
+"""Bound over the largest deviation: draws are few, and perturb only weights and inputs of convolutions."""
 
 EPS: Final = 2.0**-24
 """Relative rounding error of float32."""
@@ -44,8 +44,8 @@ class Rounding:
     """Relative rounding errors of a precision.
 
     Attributes:
-        sums: Of a sum of one product; it grows with the square root of their number (N. J. Higham and T. Mary,
-            "A new approach to probabilistic rounding error analysis", 2019, doi:10.1137/18M1226312).
+        sums: Of a sum; it grows with the square root of the number of products (N. J. Higham and T. Mary, "A
+            new approach to probabilistic rounding error analysis", 2019, doi:10.1137/18M1226312).
         numbers: Of each weight, and of each input of a convolution.
         steps: Quantisation step over the largest weight of a channel, and over the range of the inputs of a
             convolution.

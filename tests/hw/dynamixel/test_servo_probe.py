@@ -7,6 +7,7 @@ import pytest
 
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DeviceError, DeviceNotFoundError
+from gripper_force.jobs.checks import SetupResult
 from gripper_hw.dynamixel.control_table import REGISTERS, load_model
 from gripper_hw.dynamixel.firmware import OVERLOAD_ERROR
 from gripper_hw.dynamixel.packets import Instruction
@@ -164,12 +165,12 @@ def test_setup_writes_nothing_if_declined(endpoint):
         ("current_limit", "3.209 A", "1.200 A"),
         ("operating_mode", "3 (position)", "5 (current-based position)"),
     ]
-    assert result == {"servo": 1, "changes": changes, "applied": False}
+    assert result == SetupResult(1, changes, applied=False)
     assert {packet.instruction for packet in endpoint.packets()} <= READS
 
 
 def test_setup_writes_the_listed_changes_so_that_start_does_not(endpoint):
-    assert setup(config_of(endpoint), lambda *_: True)["applied"]
+    assert setup(config_of(endpoint), lambda *_: True).applied
     assert written(endpoint) == {
         "return_delay_time": 0,
         "current_limit": int(1.2 / MODEL.current_unit_a),
@@ -183,7 +184,7 @@ def test_setup_writes_the_listed_changes_so_that_start_does_not(endpoint):
     writes = [packet for packet in endpoint.packets() if packet.instruction == Instruction.WRITE]
     assert writes
     assert all(int.from_bytes(packet.params[:2], "little") >= 64 for packet in writes)
-    assert setup(config_of(endpoint), pytest.fail) == {"servo": 1, "changes": [], "applied": False}
+    assert setup(config_of(endpoint), pytest.fail) == SetupResult(1, [], applied=False)
 
 
 def test_setup_overwrites_registers_of_another_program(endpoint):
