@@ -84,7 +84,7 @@ def estimator(
             lambda model: load_clips(data, model.header.preprocess, workers=jobs, quiet=True),
             lambda model: load_clips(scale_on, model.header.preprocess, workers=jobs, quiet=True),
             threads or sorted({1, CORES}),
-            lambda text, steps=1: console.err.print(text),
+            console.line,
         )
     plot = folder / "estimator.png" if write is None else write.with_suffix(".png")
     file = folder / "estimator.json"

@@ -110,18 +110,19 @@ def export(
 def reproduce(
     what: Annotated[str, typer.Argument(help="3, 4, 5, 6, 7, 8, 9, fig6, fig7, fig8, fig9, claims or all.")],
     scale: Annotated[
-        str, typer.Option(help="small (two CPU cores, some two hours) or full (for a GPU).")
+        str, typer.Option(help="small (about two hours on two CPU cores) or full (for a GPU).")
     ] = "small",
     data: Annotated[
         Path | None,
-        typer.Option(help="Folder with logs in train/ and test/. By default they are simulated first."),
+        typer.Option(help="Folder with logs in train/ and test/. Default: simulated."),
     ] = None,
     folder: Annotated[
         Path | None,
-        typer.Option("--out", help="Folder for the networks; what is there is not trained again."),
+        typer.Option("--out", help="Folder for the networks; existing ones are not trained again."),
     ] = None,
     write: Annotated[
-        Path | None, typer.Option(help="Page with places for tables and figures, such as docs/paper.md.")
+        Path | None,
+        typer.Option(help="Markdown page to write tables and figures into, such as docs/paper.md."),
     ] = None,
     jobs: Jobs = CORES,
     set_: Annotated[
@@ -129,25 +130,26 @@ def reproduce(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make the paper's tables and figures again, beside its own numbers. Goes on where it was broken off."""
+    """Reproduce the paper's tables and figures, with its numbers. Continues an interrupted run."""
+    from gripper_force.qualification.markdown_blocks import write_between
     from gripper_force.qualification.paper import paper_page as page
     from gripper_force.qualification.paper.models import SCALES, Scale
     from gripper_force.schema import section_from
 
-    names = page.asked_for(what)
+    names = page.expand_name(what)
     if scale not in SCALES:
-        raise ConfigError(f"no scale {scale!r}; there are {', '.join(SCALES)}")
+        raise ConfigError(f"no scale {scale!r}; choose from {', '.join(SCALES)}")
     settings = section_from(Scale, [*(f"{k}={json.dumps(v)}" for k, v in SCALES[scale]), *(set_ or [])])
-    out_ = folder or Path("runs/paper") / scale
-    result, test = page.reproduce(names, settings, data, out_, jobs, console.bar)
-    pictures = write.with_suffix("") if write else out_
+    folder = folder or Path("runs/paper") / scale
+    result, test = page.reproduce(names, settings, data, folder, jobs, console.bar)
+    pictures = write.with_suffix("") if write else folder
     pictures.mkdir(parents=True, exist_ok=True)
     for name, figure in result.figures.items():
         figure.savefig(pictures / f"{name}.png")
     if write is not None:
-        from gripper_force.qualification.markdown_blocks import write_between
-
         for place, text in page.markdown(result, scale, settings, test, pictures.name).items():
             write_between(write, place, text)
-    drawn = {name: str(pictures / f"{name}.png") for name in result.figures}
-    console.show({"tables": list(result.tables.values()), "figures": drawn}, as_json, paper_tables)
+    tables = list(result.tables.values())
+    figures = {name: str(pictures / f"{name}.png") for name in result.figures}
+    printed = {"tables": tables, "figures": figures}
+    console.show(printed, as_json, lambda _: paper_tables(tables, figures))

@@ -25,7 +25,9 @@ def numerics(
     ] = None,
     write: Annotated[
         Path | None,
-        typer.Option(help="Markdown page to write the tables into; maps go into a folder beside it."),
+        typer.Option(
+            help="Markdown page to write the tables into; maps go into a folder of the page's name."
+        ),
     ] = None,
     seed: Seed = None,
     config: ConfigPath = None,
@@ -42,7 +44,7 @@ def numerics(
     if write is not None:
         for name, rows in report["parts"].items():
             write_between(write, name, markdown(rows))
-    console.show(dict(report), as_json, numerics_tables)
+    console.show(report, as_json, numerics_tables)
     _exit(report["ok"])
 
 
@@ -94,7 +96,7 @@ def fuzz(
     settings = load_settings(config, set_, {"seed": seed})
     with console.bar("fuzzing", cases) as progress:
         report = fuzzer.fuzz(cases, settings.seed, jobs, folder, progress, only=only)
-    console.show(dict(report), as_json, fuzz_table)
+    console.show(report, as_json, fuzz_table)
     _exit(report["ok"])
 
 
@@ -112,7 +114,7 @@ def soak(
     settings = load_settings(config, ["sim.detail=coarse", *(set_ or [])], {"seed": seed})
     with console.bar("soaking", round(seconds)) as progress:
         report = soak_test.soak(settings, seconds, progress)
-    console.show(dict(report), as_json, soak_table)
+    console.show(report, as_json, soak_table)
     _exit(report["ok"])
 
 

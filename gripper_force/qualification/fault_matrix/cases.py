@@ -86,3 +86,4 @@ ROWS: Final = (
     FaultCase("disk: I/O errors", "disk", "intermittent", Expected.CARRY_ON, None),
     FaultCase("disk slow", "disk", "slow", Expected.CARRY_ON, None),
 )
+"""Rows of the matrix, in the order of docs/reliability.md."""

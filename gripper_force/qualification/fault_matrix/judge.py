@@ -120,6 +120,7 @@ def judge(
 
 
 _FINISHED: Final = ("held", "timeout", "slip")
+"""Results of a grasp that was not stopped."""
 
 
 def _ms(time_ns: float) -> float:

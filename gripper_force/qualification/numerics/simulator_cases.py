@@ -30,12 +30,24 @@ _ERROR_N: Final = 0.25
 
 _DETAIL: Final[Detail] = "medium"
 _NM_PER_A: Final = 1.78
-_RAMP_S: Final = 1.6
-_TIME_S: Final = 2.0
 _CURRENT_A: Final = 0.3
+"""Highest motor current of a squeeze, which gives a grip of 12 N."""
+
+_RAMP_S: Final = 1.6
+"""Time in which the current rises to it."""
+
+_TIME_S: Final = 2.0
+"""Duration of a squeeze."""
+
 _BRAKE_A_S: Final = 0.03
+"""Damping of a squeeze, in A per rad/s."""
+
 _SAMPLE_NS: Final = 4 * NS_PER_MS
+"""Interval of the compared forces; no shorter than the longest step."""
+
 _UNTIL_S: Final = 1.0
+"""Simulated time within which an unstable simulation must be detected."""
+
 _CHECKS: Final = {
     "warns": "MuJoCo's warning",
     "not finite": "acceleration",

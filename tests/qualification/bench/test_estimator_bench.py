@@ -69,7 +69,7 @@ def test_bench_measures_every_variant(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(estimator, "_ROUNDS", 4)
     monkeypatch.setattr(estimator, "_STEPS", 2)
-    monkeypatch.setattr(estimator, "_ways", lambda: [("torch", "float32", "float32")])
+    monkeypatch.setattr(estimator, "_variants", lambda: [("torch", "float32", "float32")])
     reports: list[str] = []
 
     def scaling(model: Model) -> Sequence[Clip]:

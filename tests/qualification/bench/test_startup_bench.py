@@ -16,7 +16,7 @@ from gripper_force.vision.model_files import read_model
 
 @pytest.fixture(scope="module")
 def places(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
-    with pytest.MonkeyPatch.context() as patch, startup.stand_ins() as places:
+    with pytest.MonkeyPatch.context() as patch, startup.simulated_devices() as places:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         for engine in ("openvino", "onnxruntime"):
             if find_spec(engine) is not None:
@@ -27,7 +27,7 @@ def places(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> I
 @pytest.mark.parametrize("scene", STARTUP_CASES, ids=lambda scene: scene.name)
 def test_a_scene_loads_and_runs_only_what_it_needs(scene: StartupCase, places: dict[str, str]) -> None:
     started = start(scene, places)
-    assert set(started.loaded) <= scene.asks_for
+    assert set(started.loaded) <= scene.needs
     assert set(started.threads) == scene.threads
     assert started.time_s > 0
     assert 10 < started.memory_mb < 2000

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 from gripper_force import cli
 from gripper_force.errors import ConfigError
 from gripper_force.jobs.dataset import Clip
-from gripper_force.qualification.bench.training_bench import WAYS, Point, learn, reached
+from gripper_force.qualification.bench.training_bench import COMPARED, Point, learn, reached
 from gripper_force.vision.preprocess import Preprocess
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -26,8 +26,8 @@ def test_every_recipe_is_trained_for_its_time_and_saved(clips: list[Clip], tmp_p
     points = list(learn(load, 0.004, KEYS, tmp_path))
     assert sizes == [16]
     ends = {point.way: point for point in points}
-    assert set(ends) == set(WAYS)
-    first, *others = WAYS
+    assert set(ends) == set(COMPARED)
+    first, *others = COMPARED
     assert all(ends[way].minutes >= 0.004 and ends[way].steps > 0 for way in others)
     assert ends[first].minutes >= 0.0004
     kept = json.loads((tmp_path / "learning.json").read_text())
@@ -54,10 +54,10 @@ def test_reached_gives_the_time_to_the_error_of_the_paper() -> None:
 
 
 def test_several_networks_or_a_bad_folder_raise(clips: list[Clip], tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="set attentions to one"):
+    with pytest.raises(ConfigError, match="set attentions to one module"):
         next(learn(lambda _: clips, 1.0, ["attentions=[ssam, scam]"], tmp_path))
     (tmp_path / "file").touch()
-    with pytest.raises(ConfigError, match="name another folder"):
+    with pytest.raises(ConfigError, match="give another folder"):
         next(learn(lambda _: clips, 1.0, KEYS, tmp_path / "file"))
 
 
