@@ -105,7 +105,7 @@ def find_environments(folder: Path) -> tuple[list[Path], list[str]]:
     if not found:
         raise DataError(
             f"{folder} holds no folder named <object>_<degrees>_<illumination>, such as sponge_0_50; "
-            "give the folder that holds these"
+            "name the folder that holds these"
         )
     if bare := [entry.name for entry in found if not (entry / "test.txt").is_file()]:
         raise DataError(

@@ -305,7 +305,7 @@ def test_database_is_checked_before_import(environment: Path, tmp_path: Path) ->
     database = environment.parent
     with pytest.raises(DataError, match="gone is not a folder"):
         find_environments(tmp_path / "gone")
-    with pytest.raises(DataError, match=r"holds no folder named <object>.*; give the folder that holds"):
+    with pytest.raises(DataError, match=r"holds no folder named <object>.*; name the folder that holds"):
         find_environments(environment)
     (database / "sponge_0_50").mkdir()
     with pytest.raises(DataError, match=r"1 of 2 folders in .* have no test\.txt: sponge_0_50; download"):
