@@ -98,12 +98,17 @@ def fused_log(quick_vision: list[str], tmp_path_factory: pytest.TempPathFactory)
     return path
 
 
-@pytest.fixture
-def own_process() -> Iterator[None]:
-    """Allows the library to change process-wide settings, as the command line does."""
-    process.own_process()
+@pytest.fixture(autouse=True)
+def library_process() -> Iterator[None]:
+    """Takes back the permission to change process-wide settings, which the command line gives."""
     yield
     process.own_process(signals=False, switch_interval=False, real_time_priority=False, torch_threads=False)
+
+
+@pytest.fixture
+def own_process() -> None:
+    """Allows the library to change process-wide settings, as the command line does."""
+    process.own_process()
 
 
 @pytest.fixture

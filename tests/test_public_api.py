@@ -116,7 +116,7 @@ import gripper_force as gf
 from gripper_hw.dynamixel.pty_server import serve_virtual_servo
 with serve_virtual_servo("XM430-W350") as server:
     o = {"clock": "realtime", "servo.port": server.device_path, "camera.backend": "none"}
-    o |= {"load_cell.backend": "none", "control.feedback": "current"}
+    o |= {"load_cell.backend": "none", "control.feedback": "current", "servo.bus_watchdog_ms": 2540}
     with gf.open_gripper(overrides=o) as gripper:
         gripper.move(0.08)
 """

@@ -337,7 +337,7 @@ def test_interrupted_trials_end_without_a_word_from_each_process(sets: list[str]
 
 
 def test_a_protocol_and_its_scale_are_known_by_name(run: Run) -> None:
-    assert "no protocol 'shin'; there is shin2019" in run("simulate", "--protocol", "shin").err
+    assert "no protocol 'shin'; use shin2019" in run("simulate", "--protocol", "shin").err
     unknown = run("simulate", "--protocol", "shin2019", "--scale", "huge")
     assert (unknown.code, "use one of full, small" in unknown.err) == (2, True)
 
@@ -346,9 +346,9 @@ def test_a_protocol_and_its_scale_are_known_by_name(run: Run) -> None:
     ("args", "sentence"),
     [
         (["--scale", "small"], "add --protocol shin2019"),
-        (["--protocol", "shin2019", "--presses", "9"], "--presses can't be heeded"),
+        (["--protocol", "shin2019", "--presses", "9"], "--presses can't be combined"),
         (["--protocol", "shin2019", "--grasps", "0", "--first-seed", "7"], "--grasps and --first-seed can't"),
-        (["--protocol", "shin2019", "--object", "tube"], "--object can't be heeded"),
+        (["--protocol", "shin2019", "--object", "tube"], "--object can't be combined"),
     ],
 )
 def test_what_a_simulation_would_not_heed_is_an_error(

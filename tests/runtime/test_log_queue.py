@@ -108,6 +108,7 @@ def test_a_disk_that_hangs_does_not_keep_the_run_from_ending(
     with pytest.raises(LogError, match="has not taken the last records"):
         log_queue.raise_losses()
     gate.opened.set()
+    monkeypatch.undo()
     log_queue.close()
 
 

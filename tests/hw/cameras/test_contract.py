@@ -138,5 +138,5 @@ class TestUvcCamera(RealCameraContract):
 
 def test_contract_runs_on_every_built_in_camera() -> None:
     assert set(CAMERAS) == {"none", "simulated", "playback", "oak", "uvc"}
-    for module, _, name in (path.partition(":") for path in CAMERAS.values() if path is not None):
+    for module, _, name in (path.partition(":") for path in CAMERAS.values() if path):
         assert callable(getattr(import_module(module), name))

@@ -13,7 +13,7 @@ def test_commands_are_run_and_measured() -> None:
         ["--help", "grasp --set camera.backend=none --set clock=lockstep --help"]
     )
     assert (first.command, first.wall_s > 0, first.cpu_s > 0) == ("--help", True, True)
-    assert 10 < first.memory_mb < 1000
+    assert 10 < first.memory_mb < 8000  # between fork and exec a process has the memory of its parent
     assert second.memory_mb > 10
 
 
