@@ -69,5 +69,5 @@ def test_the_first_touch_crushes_what_is_too_stiff(share: float, crushed: bool) 
 )
 def test_commands_beyond_limits_are_seen(current_a: float, position_rad: float) -> None:
     bounds = _Bounds(CONFIG, TRUTH)
-    assert bounds.keep(0.1, 0.1)
-    assert not bounds.keep(current_a, position_rad)
+    assert bounds.contains(0.1, 0.1)
+    assert not bounds.contains(current_a, position_rad)
