@@ -40,7 +40,7 @@ class Faults:
         return any(fault.unit == unit for fault, _, _ in self._faults)
 
     def active(self, unit: str, t_ns: int) -> str:
-        """Returns the kind of the unit's fault at a time, or ``ok``. Of several the last one listed applies."""
+        """Returns the kind of the unit's fault at a time, or ``ok``. The last one listed has priority."""
         for fault, begin_ns, end_ns in reversed(self._faults):
             if fault.unit == unit and begin_ns <= t_ns < end_ns:
                 return fault.kind

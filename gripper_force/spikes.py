@@ -8,10 +8,10 @@ import numpy.typing as npt
 HAMPEL_HALF_WINDOW: Final = 3
 HAMPEL_SIGMAS: Final = 4.0
 HAMPEL_FLOOR_N: Final = 0.5
-"""Largest deviation from the local median that is never a spike: with equal values the local spread is zero."""
+"""Deviation from the local median that is never a spike: the spread of equal values is zero."""
 
 IMPOSSIBLE_N: Final = -0.3
-"""Force after tare below which a sample can't be a grip force. Beyond the drift of an unloaded cell (0.1 N)."""
+"""A sample below this force, after tare, is no grip force. Beyond the drift of an unloaded cell (0.1 N)."""
 
 FLANK_N: Final = -0.1
 """A dip that reaches `IMPOSSIBLE_N` is rejected from this force on, where it leaves the cell's drift."""
