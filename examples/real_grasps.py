@@ -16,6 +16,7 @@ import argparse
 import json
 import multiprocessing
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from gripper_calibration.fits.object_fit import fit_correction
 from gripper_calibration.fits.touches import Touches
 from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import CONTACT_N, Clip, load_clips
-from gripper_force.jobs.evaluate import Result, compare, estimates, ridge_baseline
+from gripper_force.jobs.evaluate import Evaluation, compare, estimates, ridge_baseline
 from gripper_force.jobs.imports.video import import_folder
 from gripper_force.jobs.training.recipe import TrainConfig
 from gripper_force.jobs.training.train import train
@@ -94,10 +95,10 @@ def run(rung: str, fold: list[str], clips: list[Clip], minutes: float, out: Path
     recipe = TrainConfig(**{**BASE, **RUNGS[rung], "minutes": minutes})
     checkpoint = train(recipe, training, out / f"{rung}-{fold[0]}.safetensors")
     forces_n = [members_n.mean(0) for members_n in estimates(checkpoint, test)]
-    per_object = compare(test, forces_n, recipe.preprocess.lead_in)["per_object"]
+    per_object = compare(test, forces_n, recipe.preprocess.lead_in).per_object
     process_n = gaussian_process(training, test, recipe.preprocess)
     means_n = [(network_n + n) / 2 for network_n, n in zip(forces_n, process_n, strict=True)]
-    together = compare(test, means_n, recipe.preprocess.lead_in)["per_object"]
+    together = compare(test, means_n, recipe.preprocess.lead_in).per_object
     rows = []
     for name, result in per_object.items():
         pairs = [(c, f) for c, f in zip(test, forces_n, strict=True) if c.object == name]
@@ -108,9 +109,9 @@ def run(rung: str, fold: list[str], clips: list[Clip], minutes: float, out: Path
         rows.append(
             {
                 "object": name,
-                **result,
-                "with_process_mae_n": together[name]["mae_n"],
-                "with_process_contact_mae_n": together[name]["contact_mae_n"],
+                **asdict(result),
+                "with_process_mae_n": together[name].mae_n,
+                "with_process_contact_mae_n": together[name].contact_mae_n,
                 "gain": gain,
                 "correlation": float(np.corrcoef(estimated_n, measured_n)[0, 1]),
                 **calibrated(checkpoint, [c for c, _ in pairs]),
@@ -119,8 +120,8 @@ def run(rung: str, fold: list[str], clips: list[Clip], minutes: float, out: Path
     return rows
 
 
-def _rows(result: Result) -> list[dict[str, Any]]:
-    return [{"object": name, **errors} for name, errors in result["per_object"].items()]
+def _rows(result: Evaluation) -> list[dict[str, Any]]:
+    return [{"object": name, **asdict(errors)} for name, errors in result.per_object.items()]
 
 
 def gaussian_process(training: list[Clip], test: list[Clip], preprocess: Preprocess) -> list[np.ndarray]:

@@ -372,8 +372,8 @@ class Config(Section):
         return {**settings, "vision.region": self.vision.region and list(self.vision.region)}
 
 
-Overrides = Sequence[str] | Mapping[str, Any]
-"""Assignments ``key.path=value`` whose values are read as YAML, or a mapping of key paths to values."""
+Overrides = Sequence[str | tuple[str, Any]] | Mapping[str, Any]
+"""Assignments ``key.path=value`` with YAML values, or pairs or a mapping of key paths and values."""
 
 
 def load_config(path: str | Path | None = None, overrides: Overrides | None = None) -> Config:
@@ -430,12 +430,11 @@ def _upgraded(tree: Tree) -> Tree:
 
 
 def _assign_all(tree: Tree, overrides: Overrides | None) -> None:
-    if isinstance(overrides, Mapping):
-        for key, value in overrides.items():
-            assign_value(tree, key, value)
-    else:
-        for assignment in overrides or ():
-            assign(tree, assignment)
+    for item in overrides.items() if isinstance(overrides, Mapping) else overrides or ():
+        if isinstance(item, str):
+            assign(tree, item)
+        else:
+            assign_value(tree, *item)
 
 
 def _with_overrides(

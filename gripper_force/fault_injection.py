@@ -7,12 +7,11 @@ import errno
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, BinaryIO
 
 from gripper_force.fault_config import FaultConfig
 from gripper_force.interfaces import Clock
-from gripper_force.types import NS_PER_MS, NS_PER_S, Gray
+from gripper_force.types import NS_PER_MS, NS_PER_S, ForceEstimate, Gray
 
 _WRONG_GAIN = 2 / 3
 """Gain of a wrong estimator."""
@@ -52,12 +51,6 @@ class Faults:
         return max(ends, default=t_ns)
 
 
-@dataclass(frozen=True, slots=True)
-class _Estimate:
-    force_n: float
-    std_n: float
-
-
 class FaultyEstimator:
     """Wrapper that makes an estimator fail as configured."""
 
@@ -71,7 +64,7 @@ class FaultyEstimator:
         reference: Gray | None = self._estimator.reference
         return reference
 
-    def update(self, gray: Gray) -> Any:
+    def update(self, gray: Gray) -> ForceEstimate | None:
         """Passes the next frame to the estimator and returns its estimate with the active fault applied."""
         now_ns = self._clock.now_ns()
         kind = self._faults.active("estimator", now_ns)
@@ -82,13 +75,13 @@ class FaultyEstimator:
             if not self._lockstep:  # lockstep time would not advance
                 self._clock.sleep_until_ns(self._faults.end_ns("estimator", now_ns))
             return None
-        estimate = self._estimator.update(gray)
+        estimate: ForceEstimate | None = self._estimator.update(gray)
         if estimate is None or kind == "ok":
             return estimate
         force_n = _WRONG_GAIN * estimate.force_n
         if kind == "garbage":
             force_n = (math.nan, math.inf, -math.inf)[self._calls % 3]
-        return _Estimate(force_n, estimate.std_n)
+        return ForceEstimate(force_n, estimate.std_n)
 
 
 class FaultyFile:

@@ -127,7 +127,7 @@ def read_section(section: type[S], path: Path, format_: str, what: str) -> S:
     tree = read_tree(path, what)
     if tree.get("format") != format_:
         raise ConfigError(
-            f"{path} is not a {what} of format {format_} (it is {tree.get('format')!r}); make one with "
+            f"{path} does not have the {what} format {format_} (it is {tree.get('format')!r}); make one with "
             "`gripper-force calibrate`"
         )
     return validated(section, tree, str(path), what)

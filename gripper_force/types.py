@@ -33,7 +33,7 @@ class Phase(StrEnum):
 
 
 class Outcome(StrEnum):
-    """Result of a grasp; ``NONE`` until it is known, and after a move request."""
+    """Result of a grasp or a move; ``NONE`` while it is under way."""
 
     NONE = ""
     HELD = "held"
@@ -41,6 +41,8 @@ class Outcome(StrEnum):
     SLIP = "slip"
     TIMEOUT = "timeout"
     FAULT = "fault"
+    MOVED = "moved"
+    BLOCKED = "blocked"
 
 
 class RequestKind(StrEnum):
@@ -130,6 +132,19 @@ class LoadCellSample:
     force_n: float
     raw: float
     valid: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class ForceEstimate:
+    """Estimate of the contact force from one frame.
+
+    Attributes:
+        force_n: Contact force.
+        std_n: Standard deviation of its error, as the estimator claims it.
+    """
+
+    force_n: float
+    std_n: float
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ from hypothesis import settings
 from gripper_force.config import dump_config, load_config
 from gripper_force.jobs.dataset import Clip
 from gripper_force.jobs.training.recipe import TrainConfig
+from gripper_force.runtime import process
 from gripper_force.runtime.log import LogWriter
 from gripper_force.types import NS_PER_MS, Frame, LoadCellSample
 from gripper_force.vision.preprocess import Preprocess
@@ -90,11 +91,19 @@ def quick_vision(quick: list[str], tiny_checkpoint: Path) -> list[str]:
 def fused_log(quick_vision: list[str], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A whole lockstep grasp with vision. Not to be written to."""
     from gripper_force.config import load_config
-    from gripper_force.runtime.session import run_grasp
+    from gripper_force.jobs.grasp import run_grasp
 
     path = tmp_path_factory.mktemp("fused") / "grasp.mcap"
     run_grasp(load_config(None, quick_vision), path)
     return path
+
+
+@pytest.fixture
+def own_process() -> Iterator[None]:
+    """Allows the library to change process-wide settings, as the command line does."""
+    process.own_process()
+    yield
+    process.own_process(signals=False, switch_interval=False, real_time_priority=False, torch_threads=False)
 
 
 @pytest.fixture

@@ -53,7 +53,7 @@ def test_what_is_dumped_is_read_back(tmp_path: Path) -> None:
 def test_an_unknown_key_is_named_with_those_of_its_section(tree: Tree) -> None:
     with pytest.raises(
         ConfigError,
-        match=r"unknown profile key 'part.*sise' \(from there\); did you mean 'part.*size'\?; known here: size$",
+        match=r"unknown profile key 'part.*sise' .*; did you mean 'part.*size'\?; known here: size$",
     ):
         validated(Whole, tree, "there", "profile")
 

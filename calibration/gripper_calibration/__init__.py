@@ -1,1 +1,1 @@
-"""Fits and procedures that let a gripper know an object without a load cell."""
+"""Calibration of the load cell, servo, camera and objects of a gripper."""

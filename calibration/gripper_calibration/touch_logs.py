@@ -1,6 +1,7 @@
-"""What the fits need of logs: touches, and what servo and load cell tell of an object and of the loop."""
+"""Data of the fits from logs: touches, presses for the loop's plant, and the settings they belong to."""
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,29 +13,29 @@ from gripper_calibration.fits.touches import Floats, Touches
 from gripper_force.config import Config, config_from_text
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import DataError
-from gripper_force.jobs.dataset import CONTACT_N, load_clip
+from gripper_force.jobs.dataset import CONTACT_N, read_clip
 from gripper_force.jobs.metrics import lag_s
 from gripper_force.runtime.log import LogReader
-from gripper_force.types import NS_PER_S, Frame, GraspStatus, LoadCellSample, Phase, ServoState
+from gripper_force.types import NS_PER_S, Frame, GraspStatus, LoadCellSample, Phase, Record, ServoState
 from gripper_force.vision.batch_inference import features
 from gripper_force.vision.checkpoint import Checkpoint
 
 _CONTACT_SHARE: Final = 0.05
 _FREE_FRAMES: Final = 5
-"""So many frames without contact end a touch."""
+"""This many frames without contact end a touch."""
 
 
 @dataclass(frozen=True, eq=False)
-class Recorded:
-    """Some logs of one object.
+class TouchRecording:
+    """Data of one or more logs of one object.
 
     Attributes:
-        touches: What camera and load cell tell.
-        camera: The camera's settings, by key of the configuration.
-        presses: What servo and load cell tell of the loop.
+        touches: Labelled frames.
+        camera: Camera settings, by key of the configuration.
+        presses: Motor and contact force of each press.
         width_m: Distance between the jaws in each press, (N,) each.
-        delay_s: From the contact force to an estimate that can be used, the network's time aside.
-        source: What the labels come from and of: the object, the load cell and its scale.
+        delay_s: Delay from the contact force to a usable estimate, without the network's computing time.
+        source: Origin of the labels: the object, the load cell and its scale.
     """
 
     touches: Touches
@@ -46,28 +47,31 @@ class Recorded:
 
     @property
     def has_contact(self) -> bool:
-        """Whether anything was touched."""
+        """True if a frame shows contact."""
         return bool((self.touches.force_n > CONTACT_N).any())
 
 
-def join(recorded: dict[Path, Recorded]) -> Recorded:
-    """Recordings, each of a log, as one; touches are numbered on.
+def join(recordings: dict[Path, TouchRecording]) -> TouchRecording:
+    """Joins the recordings of several logs and renumbers their touches.
+
+    Args:
+        recordings: One or more recordings, by the path of their log.
 
     Raises:
-        DataError: They are of different objects, cameras or scales of the load cell.
+        DataError: They are of different objects, cameras, or scales of the load cell.
     """
-    (known, first), parts = next(iter(recorded.items())), list(recorded.values())
-    for path, part in recorded.items():
-        ones, others = part.source | part.camera, first.source | first.camera
-        for key, value in ones.items():
-            if value != others[key]:
+    (first_path, first), parts = next(iter(recordings.items())), list(recordings.values())
+    expected = first.source | first.camera
+    for path, part in recordings.items():
+        for key, value in (part.source | part.camera).items():
+            if value != expected[key]:
                 raise DataError(
-                    f"{path} was recorded with {key} {value}, and {known} with {others[key]}; calibrate each "
-                    "on its own"
+                    f"{path} was recorded with {key} {value}, and {first_path} with {expected[key]}; calibrate "
+                    "them separately"
                 )
     begins = np.cumsum([0, *(len(part.touches.numbers) for part in parts[:-1])])
     touches = [part.touches for part in parts]
-    return Recorded(
+    return TouchRecording(
         touches=Touches(
             np.concatenate([t.features for t in touches]),
             np.concatenate([t.estimate_n for t in touches]),
@@ -82,50 +86,51 @@ def join(recorded: dict[Path, Recorded]) -> Recorded:
     )
 
 
-def read_one(path: Path, checkpoint: Checkpoint) -> Recorded:
-    """Reads a log. A recording that was imported tells of touches alone.
+def read_log(path: Path, checkpoint: Checkpoint) -> TouchRecording:
+    """Reads a log, once, and runs the network on its frames. An imported recording has no presses.
 
     Raises:
-        DataError: It holds no frames or no labels.
-        LogError: It can't be read.
+        DataError: The log contains no frames or no labels.
+        LogError: The log can't be read.
     """
+    reader = LogReader(path)
+    config = config_from_text(reader.config, str(path))
+    records = _RecordCollector()
     preprocess = checkpoint.header.preprocess
-    clip = load_clip(path, preprocess, None)
+    clip = read_clip(reader, config, records.tee(reader.records(*_record_types(config))), preprocess)
     forces_n, read_out = features(checkpoint.networks, preprocess, clip.frames)
     labelled = clip.valid & (np.arange(len(clip.frames)) >= preprocess.lead_in)
     if not labelled.any():
         raise DataError(
-            f"{path} has no label behind its first {preprocess.lead_in} frames, which lead in; record longer"
+            f"{path} has no label after its first {preprocess.lead_in} frames, which the network needs as "
+            "lead-in; record longer"
         )
     estimate_n = forces_n.mean(0).astype(np.float64)
-    felt_n = clip.forces_n.astype(np.float64)
-    numbers = np.unique(touch_of(felt_n)[labelled], return_inverse=True)[1]
-    reader = LogReader(path)
-    config = config_from_text(reader.config, str(path))
-    presses, width_m = _mechanics(reader, config)
-    t_ns, late_ns = _frame_times(reader)
-    t_s = t_ns[labelled] / NS_PER_S
-    seen_s = lag_s(t_s, estimate_n[labelled], t_s, felt_n[labelled])
-    return Recorded(
-        touches=Touches(read_out[labelled], estimate_n[labelled], felt_n[labelled], numbers),
+    force_n = clip.forces_n.astype(np.float64)
+    numbers = np.unique(touch_numbers(force_n)[labelled], return_inverse=True)[1]
+    presses, width_m = _presses(records, config)
+    t_s = np.array(records.frame_t_ns, np.int64)[labelled] / NS_PER_S
+    transport_ns = float(np.median(np.array(records.transport_ns, np.int64)))
+    estimate_lag_s = lag_s(t_s, estimate_n[labelled], t_s, force_n[labelled])
+    return TouchRecording(
+        touches=Touches(read_out[labelled], estimate_n[labelled], force_n[labelled], numbers),
         camera=config.camera_settings(),
-        source=_source(config),
+        source=_label_source(config),
         presses=presses,
         width_m=width_m,
-        # A frame is used for as long as the next one takes to come.
-        # A force that never changes has no lag: seen_s is NaN then.
-        delay_s=late_ns / NS_PER_S + 0.5 / config.camera.rate_hz + (seen_s if seen_s > 0 else 0.0),
+        # A frame is used until the next one comes. The lag is NaN if the force never changes.
+        delay_s=transport_ns / NS_PER_S
+        + 0.5 / config.camera.rate_hz
+        + (estimate_lag_s if estimate_lag_s > 0 else 0.0),
     )
 
 
-def _source(config: Config) -> dict[str, Any]:
-    """A tare drifts and is taken anew; another scale would make of the same touch another force."""
-    cell = config.load_cell
-    return {"object": config.object, "load cell": cell.sensor, "load_cell.n_per_raw": cell.n_per_raw}
+def touch_numbers(force_n: Floats) -> npt.NDArray[np.int64]:
+    """Returns the number of the touch of each frame, (T,). Touches are divided in the middle of the rests.
 
-
-def touch_of(force_n: Floats) -> npt.NDArray[np.int64]:
-    """Number of each frame's touch, (T,), which goes from the middle of one rest to that of the next."""
+    Args:
+        force_n: Load-cell force at each frame, (T,).
+    """
     contact = force_n > max(CONTACT_N, _CONTACT_SHARE * float(force_n.max(initial=0.0)))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], contact, [False]]).astype(np.int8)))
     begins, ends = edges[::2], edges[1::2]
@@ -136,44 +141,62 @@ def touch_of(force_n: Floats) -> npt.NDArray[np.int64]:
     return number
 
 
-def _frame_times(reader: LogReader) -> tuple[npt.NDArray[np.int64], float]:
-    """When each frame was taken, (T,), and how late it came, in the median."""
-    times = [(frame.t_ns, frame.received_ns - frame.t_ns) for frame in reader.records(Frame)]
-    table = np.array(times, np.int64)
-    return table[:, 0], float(np.median(table[:, 1]))
+@dataclass(slots=True)
+class _RecordCollector:
+    """What a log's records contain beside images: times of the frames, and records of the press."""
+
+    frame_t_ns: list[int] = field(default_factory=list)
+    transport_ns: list[int] = field(default_factory=list)
+    states: list[ServoState] = field(default_factory=list)
+    phases: list[str] = field(default_factory=list)
+    samples: list[LoadCellSample] = field(default_factory=list)
+
+    def tee(self, records: Iterable[Record]) -> Iterator[Record]:
+        """Collects each record and passes it on."""
+        for record in records:
+            if isinstance(record, Frame):
+                self.frame_t_ns.append(record.t_ns)
+                self.transport_ns.append(record.received_ns - record.t_ns)
+            elif isinstance(record, ServoState):
+                self.states.append(record)
+            elif isinstance(record, GraspStatus):
+                self.phases.append(record.phase)
+            elif isinstance(record, LoadCellSample) and record.valid:
+                self.samples.append(record)
+            yield record
 
 
-def _mechanics(reader: LogReader, config: Config) -> tuple[list[PressSeries], list[Floats]]:
-    """Ramps with their holds, and the distance between the jaws in each."""
+def _record_types(config: Config) -> list[type[Record]]:
+    """Types of records to read. Without a torque constant the servo's records are not used."""
+    types: list[type[Record]] = [Frame, LoadCellSample]
+    return types if config.gripper.nm_per_a is None else [*types, ServoState, GraspStatus]
+
+
+def _label_source(config: Config) -> dict[str, Any]:
+    """Settings that the forces depend on. The tare is not among them: it drifts and is renewed."""
+    cell = config.load_cell
+    return {"object": config.object, "load cell": cell.sensor, "load_cell.n_per_raw": cell.n_per_raw}
+
+
+def _presses(records: _RecordCollector, config: Config) -> tuple[list[PressSeries], list[Floats]]:
+    """Ramps with their holds, and the distance between the jaws in each, (N,)."""
     gripper = config.gripper
-    if gripper.nm_per_a is None:
+    if gripper.nm_per_a is None or not records.samples:
         return [], []
     transmission = Transmission.from_config(gripper, gripper.nm_per_a)
-    states: list[ServoState] = []
-    phases: list[str] = []
-    cells: list[LoadCellSample] = []
-    for record in reader.records(ServoState, GraspStatus, LoadCellSample):
-        if isinstance(record, ServoState):
-            states.append(record)
-        elif isinstance(record, GraspStatus):
-            phases.append(record.phase)
-        elif isinstance(record, LoadCellSample) and record.valid:
-            cells.append(record)
-    if not cells:
-        return [], []
-    cells.sort(key=lambda cell: cell.t_ns)
-    count = min(len(states), len(phases))
-    pressing = np.isin(phases[:count], (Phase.RAMP, Phase.HOLD))
+    samples = sorted(records.samples, key=lambda sample: sample.t_ns)
+    count = min(len(records.states), len(records.phases))
+    pressing = np.isin(records.phases[:count], (Phase.RAMP, Phase.HOLD))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], pressing, [False]]).astype(np.int8)))
-    cell_s = np.array([cell.t_ns for cell in cells]) / NS_PER_S
-    cell_n = np.array([cell.force_n for cell in cells])
+    sample_s = np.array([sample.t_ns for sample in samples]) / NS_PER_S
+    sample_n = np.array([sample.force_n for sample in samples])
     presses, widths_m = [], []
     for begin, end in zip(edges[::2], edges[1::2], strict=True):
-        part = states[begin:end]
-        t_s = np.array([state.t_ns for state in part]) / NS_PER_S
-        motor_force_n = np.array([transmission.force_n(state.current_a) for state in part])
-        widths_m.append(np.array([transmission.width_m(state.position_rad) for state in part]))
+        states = records.states[begin:end]
+        t_s = np.array([state.t_ns for state in states]) / NS_PER_S
+        motor_force_n = np.array([transmission.force_n(state.current_a) for state in states])
+        widths_m.append(np.array([transmission.width_m(state.position_rad) for state in states]))
         presses.append(
-            PressSeries(t_s, motor_force_n - transmission.friction_n, np.interp(t_s, cell_s, cell_n))
+            PressSeries(t_s, motor_force_n - transmission.friction_n, np.interp(t_s, sample_s, sample_n))
         )
     return presses, widths_m

@@ -1,229 +1,229 @@
-"""The command that measures."""
+"""The `bench` commands: speed, memory and error of parts of the product on this machine."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from gripper_force.cli import console
-from gripper_force.cli.options import CORES, AsJson, Jobs
+from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, load_settings
 from gripper_force.cli.output.bench import (
     bus_table,
     commands_table,
     estimator_table,
-    learning_table,
     loop_table,
     scene_table,
     startup_table,
+    training_table,
 )
 from gripper_force.errors import ConfigError
 
+app = typer.Typer(no_args_is_help=True, help="Measure speed, memory and error on this machine.")
 
-def bench(
-    bus: Annotated[bool, typer.Option("--bus", help="A cycle of the servo's bus, by the driver.")] = False,
-    cycles: Annotated[int, typer.Option(min=1, help="With --bus: how many of each.")] = 1000,
-    commands: Annotated[bool, typer.Option("--commands", help="Time and memory of most commands.")] = False,
-    training: Annotated[
-        Path | None, typer.Option(help="Ways to train on this folder of logs: error against minutes.")
-    ] = None,
-    startup: Annotated[
-        bool, typer.Option("--startup", help="What each kind of scene takes until its first cycle.")
-    ] = False,
-    loop: Annotated[
-        bool, typer.Option("--loop", help="The control loop in real time, with inference beside it.")
-    ] = False,
-    seconds: Annotated[
-        float, typer.Option(min=1.0, help="With --loop: how long with inference, and how long without.")
-    ] = 30.0,
-    scene: Annotated[
-        bool, typer.Option("--scene", help="Speed against error of each level of sim.detail.")
-    ] = False,
-    objects: Annotated[
-        list[str] | None, typer.Option("--object", help="With --scene: only this object. Repeatable.")
-    ] = None,
+NoOverrides = Annotated[
+    list[str] | None, typer.Option("--set", help="Not allowed: this command uses no configuration.")
+]
+Page = Annotated[Path | None, typer.Option("--write", help="Markdown page to write the table into.")]
+Folder = Annotated[Path, typer.Option("--out", help="Folder for the results.")]
+
+
+@app.command("estimator")
+def estimator(
     data: Annotated[
         Path | None,
-        typer.Option(
-            help="Estimator: logs that training never saw. By default some are simulated, for int8 too."
-        ),
+        typer.Option(help="Held-out logs to measure the error on, with --scale-on. Default: simulated."),
     ] = None,
     scale_on: Annotated[
-        Path | None, typer.Option(help="Estimator: other logs, to scale int8 on. Goes with --data.")
+        Path | None, typer.Option(help="Other logs to calibrate int8 on, with --data. Default: simulated.")
     ] = None,
     checkpoints: Annotated[
         list[str] | None,
-        typer.Option("--checkpoint", help="Estimator: a path or name. Repeatable. Default: all shipped."),
+        typer.Option("--checkpoint", help="Checkpoint, by path or name. Repeatable. Default: all shipped."),
     ] = None,
     threads: Annotated[
-        list[int] | None,
-        typer.Option(min=1, help="Estimator: CPU threads. Repeatable. Default: one, and all cores."),
+        list[int] | None, typer.Option(min=1, help="CPU threads. Repeatable. Default: one, and all cores.")
     ] = None,
-    write: Annotated[
-        Path | None, typer.Option(help="Estimator, --scene: page to put the table into.")
-    ] = None,
-    minutes: Annotated[float, typer.Option(min=0.01, help="With --training: for each way.")] = 30.0,
-    folder: Annotated[
-        Path, typer.Option("--out", help="Estimator, --training: where to keep what is measured.")
-    ] = Path("runs/bench"),
+    write: Page = None,
+    folder: Folder = Path("runs/bench"),
     jobs: Jobs = CORES,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", help="With --training a key of all recipes, with --loop of the run. Repeatable."
-        ),
-    ] = None,
+    config: ConfigPath = None,
+    set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure what parts of a run cost on this machine, beside what others use.
+    """Measure speed and error of the visual estimate by network, engine, precision and threads.
 
-    Without another choice: the visual estimate's speed against its error, by network, engine, precision and
-    threads.
+    The configuration applies to the logs that are simulated without --data.
     """
-    asked = {
-        "--bus": bus,
-        "--commands": commands,
-        "--startup": startup,
-        "--loop": loop,
-        "--scene": scene,
-        "--training DATA": training is not None,
-    }
-    if list(asked.values()).count(True) > 1:
-        raise ConfigError(f"bench measures one thing at a time: the estimator, or one of {', '.join(asked)}")
-    result: dict[str, Any]
-    if bus:
-        result, table = _bus(cycles), bus_table
-    elif commands:
-        result, table = _commands(), commands_table
-    elif startup:
-        result, table = _startup(), startup_table
-    elif loop:
-        result, table = _loop(seconds, set_ or []), loop_table
-    elif scene:
-        result, table = _scene(objects or [], write), scene_table
-    elif training is not None:
-        result, table = _learning(training, minutes, set_ or [], folder, jobs), learning_table
-    else:
-        result = _estimator(checkpoints, threads, data, scale_on, folder, write, jobs)
-        table = estimator_table
-    console.show({**result, "load": os.getloadavg()[0], "cores": CORES}, as_json, table)
-
-
-def _estimator(
-    checkpoints: list[str] | None,
-    threads: list[int] | None,
-    data: Path | None,
-    scale_on: Path | None,
-    out_: Path,
-    page: Path | None,
-    jobs: int,
-) -> dict[str, Any]:
     from tempfile import TemporaryDirectory
 
-    from gripper_force.config import Config
     from gripper_force.jobs.dataset import load_clips
     from gripper_force.jobs.simulate import plan, simulate
-    from gripper_force.qualification.bench import estimator_bench as job
+    from gripper_force.qualification.bench import estimator_bench
     from gripper_force.qualification.markdown_blocks import write_between
     from gripper_force.vision.header import SHIPPED
 
     if (data is None) != (scale_on is None):
         raise ConfigError(
-            "--data and --scale-on go together: int8 is scaled on other logs than it is judged by"
+            "--data and --scale-on go together, as int8 is calibrated on other logs than it is tested on; "
+            "give both or neither"
         )
+    if data is not None and (config is not None or set_):
+        raise ConfigError("--config and --set apply to simulated logs only; leave them out with --data")
+    settings = load_settings(config, set_, {})
     with TemporaryDirectory() as name, console.err.status("measuring") as status:
         if data is None or scale_on is None:
             data, scale_on = Path(name) / "data", Path(name) / "scale"
-            for folder, plans in ((data, plan("press", 12, 900_000)), (scale_on, plan("press", 8, 100_000))):
-                for made in simulate(plans, folder, Config(), jobs):
+            for logs, plans in ((data, plan("press", 12, 900_000)), (scale_on, plan("press", 8, 100_000))):
+                for made in simulate(plans, logs, settings, jobs):
                     status.update(f"simulating {made.name}")
         status.update("measuring")
-        rows = job.bench(
+        rows = estimator_bench.bench(
             checkpoints or list(SHIPPED),
             lambda model: load_clips(data, model.header.preprocess, workers=jobs, quiet=True),
             lambda model: load_clips(scale_on, model.header.preprocess, workers=jobs, quiet=True),
             threads or sorted({1, CORES}),
-            lambda what: console.err.print(what),
+            console.line,
         )
-    plot = out_ / "estimator.png" if page is None else page.with_suffix(".png")
-    job.write_json(out_ / "estimator.json", rows)
-    job.draw(plot, rows)
-    if page is not None:
-        write_between(page, "estimator", job.markdown(rows))
-    return {
-        "estimator": rows,
-        "ratios": job.ratios(rows),
-        "plot": plot,
-        "file": out_ / "estimator.json",
-    }
+    plot = folder / "estimator.png" if write is None else write.with_suffix(".png")
+    file = folder / "estimator.json"
+    estimator_bench.write_json(file, rows)
+    estimator_bench.draw(plot, rows)
+    if write is not None:
+        write_between(write, "estimator", estimator_bench.markdown(rows))
+    ratios = estimator_bench.ratios(rows)
+    result = {"estimator": rows, "ratios": ratios, "plot": plot, "file": file}
+    _show(result, as_json, lambda: estimator_table(rows, ratios, plot, file))
 
 
-def _bus(cycles: int) -> dict[str, Any]:
-    from gripper_force.qualification.bench import bus_bench as job
+@app.command("bus")
+def bus(
+    cycles: Annotated[int, typer.Option(min=1, help="Cycles of each client at each setting.")] = 1000,
+    set_: NoOverrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure a cycle of the servo bus: the driver, a plain SDK loop, and bare bytes."""
+    from gripper_force.qualification.bench import bus_bench
 
-    costs: list[Any] = []
-    with console.bar("measuring", len(job.BUS_SETTINGS)) as advance:
-        for setting in job.bus(cycles):
+    _reject_overrides("bus", set_)
+    costs: list[bus_bench.BusCost] = []
+    with console.bar("measuring", len(bus_bench.BUS_SETTINGS)) as progress:
+        for setting in bus_bench.bus(cycles):
             costs += setting
-            advance(f"{setting[0].baud_rate} baud, {setting[0].latency_ms:g} ms")
-    return {"bus": costs}
+            progress(f"{setting[0].baud_rate} baud, {setting[0].latency_ms:g} ms")
+    _show({"bus": costs}, as_json, lambda: bus_table(costs))
 
 
-def _commands() -> dict[str, Any]:
-    from gripper_force.qualification.bench import command_bench as job
-
-    taken = []
-    with console.bar("running", len(job.COMMANDS)) as advance:
-        for cost in job.commands():
-            taken.append(cost)
-            advance(cost.command)
-    return {"commands": taken}
-
-
-def _startup() -> dict[str, Any]:
-    from gripper_force.qualification.bench import startup_bench as job
-
-    rows = []
-    with console.bar("starting", len(job.STARTUP_CASES)) as advance:
-        for row in job.startup(job.STARTUP_CASES):
-            rows.append(row)
-            advance(row.scene)
-    return {"startup": rows}
-
-
-def _loop(seconds: float, overrides: list[str]) -> dict[str, Any]:
-    from gripper_force.qualification.bench import loop_bench as job
+@app.command("loop")
+def loop(
+    seconds: Annotated[
+        float, typer.Option(min=1.0, help="Duration with inference, and again without it.")
+    ] = 30.0,
+    config: ConfigPath = None,
+    set_: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure the control loop in real time, with and without inference in parallel."""
+    from gripper_force.qualification.bench import loop_bench
 
     with console.err.status(f"running for {2 * seconds:g} s"):
-        costs, log = job.loop(seconds, overrides)
-    return {"loop": costs, "log": log}
+        costs, log = loop_bench.loop(seconds, set_ or [], config)
+    _show({"loop": costs, "log": log}, as_json, lambda: loop_table(costs, log))
 
 
-def _scene(objects: list[str], page: Path | None) -> dict[str, Any]:
-    from gripper_force.qualification.bench import scene_bench as job
+@app.command("startup")
+def startup(set_: NoOverrides = None, as_json: AsJson = False) -> None:
+    """Measure the time and memory of each kind of scene up to its first control cycle."""
+    from gripper_force.qualification.bench import startup_bench
 
-    if page is not None and objects:
-        raise ConfigError("--write needs all objects: leave out --object")
-    rows = []
+    _reject_overrides("startup", set_)
+    rows: list[startup_bench.Start] = []
+    with console.bar("starting", len(startup_bench.STARTUP_CASES)) as progress:
+        for row in startup_bench.startup(startup_bench.STARTUP_CASES):
+            rows.append(row)
+            progress(row.scene)
+    _show({"startup": rows}, as_json, lambda: startup_table(rows))
+
+
+@app.command("scene")
+def scene(
+    objects: Annotated[
+        list[str] | None, typer.Option("--object", help="Only this object. Repeatable. Default: all.")
+    ] = None,
+    write: Page = None,
+    set_: NoOverrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure speed and error of each sim.detail level; with --write also update the table of auto."""
+    from gripper_force.qualification.bench import scene_bench
+    from gripper_force.qualification.markdown_blocks import write_between
+
+    _reject_overrides("scene", set_)
+    if write is not None and objects:
+        raise ConfigError("--write needs all objects; leave out --object")
+    rows: list[scene_bench.SceneCost] = []
     with console.err.status("squeezing") as status:
-        for row in job.scene_costs(objects, keep_table=page is not None):
+        for row in scene_bench.scene_costs(objects or [], keep_table=write is not None):
             rows.append(row)
             status.update(f"squeezed {row.object}, {row.detail}")
-    if page is not None:
-        from gripper_force.qualification.markdown_blocks import write_between
-
-        write_between(page, "detail", job.markdown(rows))
-    return {"scene": rows}
+    if write is not None:
+        write_between(write, "detail", scene_bench.markdown(rows))
+    _show({"scene": rows}, as_json, lambda: scene_table(rows))
 
 
-def _learning(data: Path, minutes: float, overrides: list[str], out_: Path, jobs: int) -> dict[str, Any]:
+@app.command("commands")
+def commands(set_: NoOverrides = None, as_json: AsJson = False) -> None:
+    """Measure the time and memory of most commands."""
+    from gripper_force.qualification.bench import command_bench
+
+    _reject_overrides("commands", set_)
+    costs: list[command_bench.CommandCost] = []
+    with console.bar("running", len(command_bench.COMMANDS)) as progress:
+        for cost in command_bench.commands():
+            costs.append(cost)
+            progress(cost.command)
+    _show({"commands": costs}, as_json, lambda: commands_table(costs))
+
+
+@app.command("training")
+def training(
+    data: Annotated[Path, typer.Argument(help="Folder with logs to train on.")],
+    minutes: Annotated[float, typer.Option(min=0.01, help="Training time of each recipe.")] = 30.0,
+    folder: Folder = Path("runs/bench"),
+    jobs: Jobs = CORES,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Set one key of all recipes: key=value. Repeatable."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure the validation error of several training recipes against training time."""
     from functools import partial
 
     from gripper_force.jobs.dataset import load_clips
-    from gripper_force.qualification.bench.training_bench import learn, reached
+    from gripper_force.qualification.bench import training_bench
 
-    points = []
-    for point in learn(partial(load_clips, data, workers=jobs), minutes, overrides, out_):
+    points: list[training_bench.Point] = []
+    for point in training_bench.learn(partial(load_clips, data, workers=jobs), minutes, set_ or [], folder):
         points.append(point)
         console.err.print(f"{point.way}, {point.minutes:.2f} min: {point.mae_n:.3f} N")
-    return {"points": points, "as_good_as_paper_min": reached(points), "folder": out_}
+    reached = training_bench.reached(points)
+    result = {"points": points, "as_good_as_paper_min": reached, "folder": folder}
+    _show(result, as_json, lambda: training_table(points, reached, folder))
+
+
+def _reject_overrides(command: str, overrides: list[str] | None) -> None:
+    if overrides:
+        raise ConfigError(f"bench {command} uses no configuration; leave out --set {overrides[0]}")
+
+
+def _show(result: dict[str, Any], as_json: bool, table: Callable[[], None]) -> None:
+    """Prints a result with the load of this machine."""
+    load = os.getloadavg()[0]
+
+    def render(_: object) -> None:
+        table()
+        console.out.print(f"[dim]load {load:.1f} on {CORES} cores[/]")
+
+    console.show({**result, "load": load, "cores": CORES}, as_json, render)

@@ -1,4 +1,4 @@
-"""The commands that calibrate."""
+"""The commands that calibrate a rig and objects."""
 
 import sys
 from pathlib import Path
@@ -12,45 +12,43 @@ from gripper_force.cli.output.calibrate import object_table, rig_table
 from gripper_force.errors import ConfigError
 
 if TYPE_CHECKING:
-    from gripper_force.config import Config
+    from rich.status import Status
 
-app = typer.Typer(no_args_is_help=True, help="Find out what this rig and its objects are like.")
+    from gripper_force.config import Config
+    from gripper_force.interfaces import Progress, Prompt
+
+app = typer.Typer(no_args_is_help=True, help="Calibrate the load cell, the servo, the camera, or an object.")
 
 RigPath = Annotated[
-    Path, typer.Option("--rig", help="Rig profile to write; only what is calibrated is replaced in it.")
+    Path, typer.Option("--rig", help="Rig profile to write; only the calibrated section is replaced.")
 ]
 
 
 @app.command("load-cell")
 def load_cell(
     mass_kg: Annotated[float | None, typer.Option(help="Known mass to put on the load cell.")] = None,
-    force_n: Annotated[float | None, typer.Option(help="Its weight, instead.")] = None,
+    force_n: Annotated[float | None, typer.Option(help="Its weight in newtons, instead of the mass.")] = None,
     rig: RigPath = Path("rig.yaml"),
-    seconds: Annotated[float, typer.Option(min=1, help="How long to read each load.")] = 10.0,
+    seconds: Annotated[float, typer.Option(min=1, help="Duration of the readings of each load.")] = 10.0,
     yes: Annotated[
-        bool, typer.Option("--yes", help="Do not wait for Enter: go on once the reading says so.")
+        bool, typer.Option("--yes", help="Do not wait for Enter: continue when the reading is at rest.")
     ] = False,
     config: ConfigPath = None,
     set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Find a load cell's tare and scale with a known mass: empty, loaded, empty again."""
+    """Calibrate a load cell's tare and scale with a known mass: empty, loaded, empty again."""
     from gripper_calibration.procedures import calibrate_load_cell as job
 
     if (mass_kg is None) == (force_n is None):
-        raise ConfigError("say what is put on the load cell: --mass-kg or --force-n")
+        raise ConfigError("pass the load that is put on the load cell: either --mass-kg or --force-n")
     weight_n = force_n if force_n is not None else (mass_kg or 0.0) * job.STANDARD_GRAVITY_M_S2
     settings = load_settings(config, set_, {})
     with console.err.status("reading") as status:
-        result = job.calibrate(
-            settings,
-            weight_n,
-            rig,
-            ask=lambda what: _ask(what, yes, status),
-            seconds=seconds,
-            progress=lambda step, raw: status.update(f"{step}: {raw:.6g}"),
+        result = job.calibrate_load_cell(
+            settings, weight_n, rig, prompt=_prompt(yes, status), seconds=seconds, progress=_progress(status)
         )
-    console.show(result, as_json, rig_table)
+    _show_rig(result, as_json)
 
 
 @app.command("servo")
@@ -58,30 +56,30 @@ def servo(
     gauge_mm: Annotated[
         list[float],
         typer.Option(
-            help="Width of the load cell between the jaws. Another width tells the pinion's radius."
+            help="Width of the load cell between the jaws. A second width also gives the pinion's radius."
         ),
     ],
     rig: RigPath = Path("rig.yaml"),
     yes: Annotated[
-        bool, typer.Option("--yes", help="Do not wait for Enter: the load cell is there.")
+        bool, typer.Option("--yes", help="Do not wait for Enter: the load cell is in place.")
     ] = False,
     config: ConfigPath = None,
     set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Find a servo's torque, friction and jaw geometry with the load cell between the jaws."""
+    """Calibrate a servo's torque, friction and jaw geometry by pressing the load cell."""
     from gripper_calibration.procedures import calibrate_servo as job
 
     settings = load_settings(config, set_, {})
     with console.err.status("moving") as status:
-        result = job.calibrate(
+        result = job.calibrate_servo(
             settings,
             [width / 1e3 for width in gauge_mm],
             rig,
-            ask=lambda what: _ask(what, yes, status),
-            progress=lambda step, force_n: status.update(f"{step}: {force_n:.1f} N"),
+            prompt=_prompt(yes, status),
+            progress=_progress(status),
         )
-    console.show(result, as_json, rig_table)
+    _show_rig(result, as_json)
 
 
 @app.command("camera")
@@ -92,99 +90,95 @@ def camera(
         typer.Option(help="Region of interest of the frame: left,top,width,height. Default: by markers."),
     ] = None,
     exposure_us: Annotated[
-        list[int] | None, typer.Option(min=1, help="An exposure to try. Repeatable. Default: a ladder.")
+        list[int] | None,
+        typer.Option(min=1, help="Candidate exposure. Repeatable. Default: 500 to 16000."),
     ] = None,
-    touches: Annotated[int, typer.Option(min=3, help="How often to touch the object.")] = 10,
-    object_: Annotated[str | None, typer.Option("--object", help="What is between the jaws.")] = None,
+    touches: Annotated[int, typer.Option(min=3, help="Number of touches.")] = 10,
+    object_: Annotated[str | None, typer.Option("--object", help="Object between the jaws.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the touches, and of a simulated scene.")] = None,
     config: ConfigPath = None,
     set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Find a camera's region of interest, exposure and lag, by touching an object that gives way."""
+    """Calibrate a camera's region of interest, exposure and lag by touching a compliant object."""
     from gripper_calibration.procedures import calibrate_camera as job
 
     settings = load_settings(config, set_, {"object": object_, "seed": seed})
-    with console.err.status("looking") as status:
-        result = job.calibrate(
+    with console.err.status("capturing") as status:
+        result = job.calibrate_camera(
             settings,
             rig,
             region=None if region is None else _region(region),
             exposures_us=exposure_us or job.EXPOSURES_US,
             touches=touches,
-            progress=lambda step, force_n: status.update(f"{step}: {force_n:.1f} N"),
+            progress=_progress(status),
         )
-    console.show(result, as_json, rig_table)
+    _show_rig(result, as_json)
 
 
 @app.command("object")
 def object_(
-    name: Annotated[str, typer.Argument(help="The object; of a simulated rig one that it knows.")],
-    touches: Annotated[int, typer.Option(min=1, help="How many touches there are to be.")] = 8,
-    peak_n: Annotated[float | None, typer.Option(help="The most to press with.")] = None,
+    name: Annotated[str, typer.Argument(help="Name of the object; in simulation one of the known objects.")],
+    touches: Annotated[int, typer.Option(min=1, help="Number of touches.")] = 8,
+    peak_n: Annotated[float | None, typer.Option(help="Largest force of a touch in newtons.")] = None,
     logs: Annotated[
         list[Path] | None,
-        typer.Option("--from", help="Calibrate on these logs, or folders of them, and touch nothing."),
+        typer.Option("--from", help="Calibrate with these logs, or folders of them, without the devices."),
     ] = None,
     folder: Annotated[
-        Path | None, typer.Option(help="Where the touches are kept; those that are there are not done again.")
+        Path | None, typer.Option(help="Folder of the touches' logs; existing ones are not repeated.")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Profile to write. Default: NAME.yaml in your own folder of profiles.")
+        Path | None, typer.Option(help="Profile to write. Default: NAME.yaml in your folder of profiles.")
     ] = None,
     pause: Annotated[
-        bool, typer.Option("--pause", help="Wait for Enter before each touch, to put the object down anew.")
+        bool, typer.Option("--pause", help="Wait for Enter before each touch, to place the object anew.")
     ] = False,
     config: ConfigPath = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the touches, and of a simulated scene.")] = None,
     set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Learn an object by touching it with the load cell in place. Ctrl-C calibrates on what there is."""
+    """Calibrate an object by touching it with the load cell in place. Ctrl-C uses the touches so far."""
     from gripper_calibration.procedures import calibrate_object as job
-    from gripper_force.profiles.object_profile import user_folder
 
     settings = load_settings(config, set_, {"object": name, "seed": seed})
     if logs is None:
-        paths = _touches(settings, touches, peak_n, folder or Path("data/touches") / name, pause)
-    else:
-        paths = [p for path in logs for p in (sorted(path.rglob("*.mcap")) if path.is_dir() else [path])]
-    with console.bar("calibrating", len(paths) + 2) as advance:
-        result = job.calibrate(settings, name, paths, out or user_folder() / f"{name}.yaml", advance)
-    console.show(result, as_json, object_table)
+        logs = _touches(settings, touches, peak_n, folder, pause)
+    with console.bar("calibrating", len(logs) + 2) as progress:
+        result = job.calibrate_object(settings, name, logs=logs, out=out, progress=progress)
+    console.show(result.as_dict(), as_json, object_table)
 
 
-def _touches(settings: "Config", touches: int, peak_n: float | None, folder: Path, pause: bool) -> list[Path]:
+def _touches(
+    settings: "Config", touches: int, peak_n: float | None, folder: Path | None, pause: bool
+) -> list[Path]:
     from gripper_calibration.procedures import calibrate_object as job
 
-    paths = []
-    done: set[int] = set()
+    existing = sum(path.exists() for path in job.touch_paths(settings, touches, folder))
+    if existing:
+        where = folder or job.default_folder(settings.object)
+        console.err.print(f"{existing} of {touches} touches exist already in {where} and are used")
+    paths: list[Path] = []
     with console.err.status("touching") as status:
-
-        def ask(number: int) -> None:
-            _ask(f"Put the object down for touch {number}", False, status)
-
-        def tell(number: int, _touch: int, force_n: float) -> None:
-            done.add(number)
-            status.update(f"touch {number} of {touches}: {force_n:.1f} N")
-
+        prompt = _prompt(False, status) if pause else None
         try:
-            for path in job.touch(
-                settings,
-                touches,
-                peak_n,
-                folder,
-                ask=ask if pause else lambda _: None,
-                progress=tell,
+            for path in job.record_touches(
+                settings, touches, peak_n, folder, prompt=prompt, progress=_progress(status)
             ):
                 paths.append(path)
         except KeyboardInterrupt:
             if not paths:
                 raise
-            console.err.print(f"stopped after {len(paths)} of {touches} touches; calibrating on these")
-    if kept := len(set(range(1, len(paths) + 1)) - done):
-        console.err.print(f"{kept} of {touches} touches were there already, in {folder}")
+            console.err.print(f"stopped after {len(paths)} of {touches} touches; calibrating with these")
     return paths
+
+
+def _show_rig(result: Any, as_json: bool) -> None:
+    """Shows the calibrated section of the rig profile and what else was measured, as one level of keys."""
+    values = console.jsonable(result)
+    section = result.calibration.model_dump(mode="json")
+    console.show({**section, **{k: v for k, v in values.items() if k != "calibration"}}, as_json, rig_table)
 
 
 def _region(text: str) -> tuple[int, int, int, int]:
@@ -195,18 +189,25 @@ def _region(text: str) -> tuple[int, int, int, int]:
     return left, top, width, height
 
 
-def _ask(what: str, yes: bool, status: Any) -> None:
-    """Says what a person is to do, and waits for Enter."""
-    if yes:
-        console.err.print(what, soft_wrap=True)
-        return
-    if not sys.stdin.isatty():
-        raise ConfigError(
-            f"nobody can be asked here to do this: {what}; run it in a terminal, or say --yes where it is "
-            "done without being asked"
-        )
-    status.stop()
-    console.err.print(f"{what}, then press Enter ", end="", soft_wrap=True)
-    if not sys.stdin.readline():  # the terminal was closed, or Ctrl-D
-        raise ConfigError(f"no answer came to this: {what}; run it again, where Enter can be pressed")
-    status.start()
+def _progress(status: "Status") -> "Progress":
+    return lambda text, steps=1: status.update(text)
+
+
+def _prompt(yes: bool, status: "Status") -> "Prompt":
+    """Returns a prompt that waits for Enter, or with ``yes`` only prints."""
+
+    def prompt(text: str) -> None:
+        if yes:
+            console.err.print(text, soft_wrap=True)
+            return
+        if not sys.stdin.isatty():
+            raise ConfigError(
+                f"this needs a person at a terminal: {text}; run it in a terminal, or pass --yes if it is done"
+            )
+        status.stop()
+        console.err.print(f"{text}, then press Enter ", end="", soft_wrap=True)
+        if not sys.stdin.readline():  # the terminal was closed, or Ctrl-D
+            raise ConfigError(f"no answer to this: {text}; run it again and press Enter")
+        status.start()
+
+    return prompt

@@ -1,34 +1,50 @@
-"""What a person sees in a terminal, or a script on stdout: progress, names and values, one JSON object."""
+"""Output for people (tables and progress) and for scripts (one JSON object on stdout)."""
 
 import json
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as ProgressBar
 from rich.table import Table
 
 from gripper_force.errors import GripperError
+
+if TYPE_CHECKING:  # --help loads no NumPy
+    from gripper_force.interfaces import Progress
 
 err = Console(stderr=True, highlight=False)
 out = Console(highlight=False)
 
 
 @contextmanager
-def bar(label: str, total: int) -> Iterator[Any]:
-    """A progress bar on stderr; gives a function to call with a note, and with steps if not one."""
+def bar(label: str, total: int) -> "Iterator[Progress]":
+    """Shows a progress bar on stderr and gives its `Progress` callback."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, TextColumn("{task.fields[note]}"), console=err) as progress:
-        task = progress.add_task(label, total=total, note="")
-        yield lambda note, steps=1: progress.update(task, advance=steps, note=note)
+    with ProgressBar(*columns, TextColumn("{task.fields[note]}"), console=err) as shown:
+        task = shown.add_task(label, total=total, note="")
+        yield lambda text, steps=1: shown.update(task, advance=steps, note=text)
 
 
-def show(result: dict[str, Any], as_json: bool, render: Any = None) -> None:
-    """Prints a result: as one JSON object, or for a person, by ``render`` or as names and values."""
+def line(text: str, steps: int = 1) -> None:
+    """Prints a line on stderr for each report of progress."""
+    err.print(f"[dim]{escape(text)}[/]", soft_wrap=True)
+
+
+def show(result: Any, as_json: bool, render: Callable[[Any], object] | None = None) -> None:
+    """Prints a result as one JSON object, or for a person: with ``render``, or as names and values.
+
+    Args:
+        result: A dictionary or a dataclass.
+        as_json: True for JSON.
+        render: Prints the result for a person.
+    """
     if as_json:
         sys.stdout.write(json.dumps(jsonable(result), allow_nan=False) + "\n")
     elif render is None:
@@ -38,11 +54,13 @@ def show(result: dict[str, Any], as_json: bool, render: Any = None) -> None:
 
 
 def jsonable(value: Any) -> Any:
-    """NaN has no place in JSON; a figure without a meaning is null."""
+    """Converts a value for JSON; NaN and infinity become null."""
     if isinstance(value, dict):
         return {str(key): jsonable(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [jsonable(item) for item in value]
+    if hasattr(value, "model_dump"):
+        return jsonable(value.model_dump(mode="json"))
     if hasattr(value, "__dataclass_fields__"):
         return {name: jsonable(getattr(value, name)) for name in value.__dataclass_fields__}
     if isinstance(value, float):
@@ -51,7 +69,7 @@ def jsonable(value: Any) -> Any:
 
 
 def number(value: Any, unit: str = "", digits: int = 3) -> str:
-    """A figure with its unit, or a dash where it has no meaning."""
+    """Formats a figure with its unit; a dash for a missing value."""
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return "-"
     return f"{value:.{digits}f}{unit}" if isinstance(value, float) else f"{value}{unit}"
@@ -66,5 +84,5 @@ def pairs(values: dict[str, Any]) -> None:
 
 
 def plain(error: GripperError) -> str:
-    """An error's sentence, whose brackets are no markup."""
+    """An error's message with its brackets escaped, so that they are not markup."""
     return str(error).replace("[", r"\[")

@@ -1,9 +1,9 @@
-"""The commands that make networks of logs, and say what they are worth."""
+"""Commands for networks: `train`, `evaluate`, `export` and `reproduce`."""
 
 import json
 import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -11,7 +11,7 @@ from gripper_force.cli import console
 from gripper_force.cli.options import CORES, AsJson, Jobs, Overrides, load_settings
 from gripper_force.cli.output.paper import paper_tables
 from gripper_force.cli.output.runs import errors_table
-from gripper_force.errors import ConfigError, DataError
+from gripper_force.errors import ConfigError
 
 
 def train(
@@ -20,22 +20,20 @@ def train(
         "force.safetensors"
     ),
     recipe: Annotated[
-        str, typer.Option(help="short_clips, our own, or shin2019, the paper's.")
+        str, typer.Option(help="short_clips (this project's) or shin2019 (the paper's).")
     ] = "short_clips",
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Set one key of the recipe: key=value. Repeatable.")
     ] = None,
     hold_out: Annotated[
-        list[str] | None, typer.Option(help="Object to leave out of the training. Repeatable.")
+        list[str] | None, typer.Option(help="Object to exclude from training. Repeatable.")
     ] = None,
     validation: Annotated[
         Path | None,
-        typer.Option(
-            help="Folder with logs to measure the claimed error on; without, sets held out of DATA."
-        ),
+        typer.Option(help="Logs to measure the checkpoint's error on. Default: sets held out of DATA."),
     ] = None,
-    init: Annotated[str | None, typer.Option(help="Checkpoint to begin with.")] = None,
-    resume: Annotated[bool, typer.Option(help="Go on from the states of a run that was broken off.")] = False,
+    init: Annotated[str | None, typer.Option(help="Checkpoint with the initial weights.")] = None,
+    resume: Annotated[bool, typer.Option(help="Continue an interrupted training.")] = False,
     jobs: Jobs = CORES,
     as_json: AsJson = False,
 ) -> None:
@@ -46,7 +44,7 @@ def train(
     from gripper_force.vision.checkpoint import load_checkpoint
 
     settings = named(recipe, set_)
-    quiet = os.environ.get("RANK", "0") != "0"  # of torchrun's processes the first one speaks
+    quiet = os.environ.get("RANK", "0") != "0"  # only the first process of torchrun prints
     clips = load_clips(data, settings.preprocess, workers=jobs, quiet=quiet)
     clips = [clip for clip in clips if clip.object not in (hold_out or [])]
     unseen = load_clips(validation, settings.preprocess, workers=jobs, quiet=quiet) if validation else None
@@ -58,53 +56,44 @@ def train(
 
 
 def evaluate(
-    data: Annotated[Path, typer.Argument(help="Folder with logs that training has not seen.")],
-    checkpoint: Annotated[str | None, typer.Option(help="Checkpoint, or `default`.")] = None,
+    data: Annotated[Path, typer.Argument(help="Folder with logs that were not used for training.")],
+    checkpoint: Annotated[str | None, typer.Option(help="Path of a checkpoint, or default or small.")] = None,
     profile: Annotated[
-        str | None, typer.Option(help="Object profile, by name or path; own: the one with each log's object.")
+        str | None,
+        typer.Option(help="Object profile, by name or path; own: the profile of each log's object."),
     ] = None,
     only: Annotated[
-        list[str] | None, typer.Option("--object", help="Only logs of this object. Repeatable.")
+        list[str] | None, typer.Option("--object", help="Use only logs of this object. Repeatable.")
     ] = None,
     jobs: Jobs = CORES,
     set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
     """Compare a checkpoint's estimates with the load cell, over all logs of a folder."""
-    from gripper_force.jobs.dataset import load_clips
     from gripper_force.jobs.evaluate import evaluate as job
-    from gripper_force.profiles.apply import correction_of
-    from gripper_force.vision.checkpoint import load_checkpoint
 
     settings = load_settings(None, set_, {"vision.checkpoint": checkpoint, "calibration.object": profile})
-    vision = settings.vision
-    loaded = load_checkpoint(vision.checkpoint)
-    clips = load_clips(data, loaded.header.preprocess, vision.region, workers=jobs)
-    clips = [clip for clip in clips if not only or clip.object in only]
-    if not clips:
-        raise DataError(f"no log in {data} is of {', '.join(only or [])}")
-
-    def correct(clip: Any) -> Any:
-        return correction_of(settings.model_copy(update={"object": clip.object}), loaded)
-
-    corrected = None if settings.calibration.object is None else correct
-    console.show(dict(job(loaded, clips, corrected)), as_json, errors_table)
+    result = job(data, settings.vision.checkpoint, objects=only or (), config=settings, workers=jobs)
+    console.show(result, as_json, errors_table)
 
 
 def export(
     out: Annotated[Path, typer.Option("--out", help="File to write: .onnx, or .xml for OpenVINO.")],
     checkpoint: Annotated[
-        str | None, typer.Argument(help="A path, or default or small. Default: vision.checkpoint.")
+        str | None,
+        typer.Argument(help="Path of a checkpoint, or default or small. Default: vision.checkpoint."),
     ] = None,
     int8: Annotated[
         Path | None,
-        typer.Option(help="Compute the convolutions in int8, scaled on this folder of logs (.xml only)."),
+        typer.Option(
+            help="Quantise the convolutions to int8, calibrated on this folder of logs (.xml only)."
+        ),
     ] = None,
     jobs: Jobs = CORES,
     set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write a network's streaming step for another engine, checked against PyTorch."""
+    """Export a network for another engine, and compare it with PyTorch."""
     from gripper_force.jobs.dataset import load_clips
     from gripper_force.vision.export import export as job
     from gripper_force.vision.model_files import read_model
@@ -121,18 +110,19 @@ def export(
 def reproduce(
     what: Annotated[str, typer.Argument(help="3, 4, 5, 6, 7, 8, 9, fig6, fig7, fig8, fig9, claims or all.")],
     scale: Annotated[
-        str, typer.Option(help="small (two CPU cores, some two hours) or full (for a GPU).")
+        str, typer.Option(help="small (about two hours on two CPU cores) or full (for a GPU).")
     ] = "small",
     data: Annotated[
         Path | None,
-        typer.Option(help="Folder with logs in train/ and test/. By default they are simulated first."),
+        typer.Option(help="Folder with logs in train/ and test/. Default: simulated."),
     ] = None,
     folder: Annotated[
         Path | None,
-        typer.Option("--out", help="Folder for the networks; what is there is not trained again."),
+        typer.Option("--out", help="Folder for the networks; existing ones are not trained again."),
     ] = None,
     write: Annotated[
-        Path | None, typer.Option(help="Page with places for tables and figures, such as docs/paper.md.")
+        Path | None,
+        typer.Option(help="Markdown page to write tables and figures into, such as docs/paper.md."),
     ] = None,
     jobs: Jobs = CORES,
     set_: Annotated[
@@ -140,25 +130,26 @@ def reproduce(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make the paper's tables and figures again, beside its own numbers. Goes on where it was broken off."""
+    """Reproduce the paper's tables and figures, with its numbers. Continues an interrupted run."""
+    from gripper_force.qualification.markdown_blocks import write_between
     from gripper_force.qualification.paper import paper_page as page
     from gripper_force.qualification.paper.models import SCALES, Scale
     from gripper_force.schema import section_from
 
-    names = page.asked_for(what)
+    names = page.expand_name(what)
     if scale not in SCALES:
-        raise ConfigError(f"no scale {scale!r}; there are {', '.join(SCALES)}")
+        raise ConfigError(f"no scale {scale!r}; choose from {', '.join(SCALES)}")
     settings = section_from(Scale, [*(f"{k}={json.dumps(v)}" for k, v in SCALES[scale]), *(set_ or [])])
-    out_ = folder or Path("runs/paper") / scale
-    result, test = page.reproduce(names, settings, data, out_, jobs, console.bar)
-    pictures = write.with_suffix("") if write else out_
+    folder = folder or Path("runs/paper") / scale
+    result, test = page.reproduce(names, settings, data, folder, jobs, console.bar)
+    pictures = write.with_suffix("") if write else folder
     pictures.mkdir(parents=True, exist_ok=True)
     for name, figure in result.figures.items():
         figure.savefig(pictures / f"{name}.png")
     if write is not None:
-        from gripper_force.qualification.markdown_blocks import write_between
-
         for place, text in page.markdown(result, scale, settings, test, pictures.name).items():
             write_between(write, place, text)
-    drawn = {name: str(pictures / f"{name}.png") for name in result.figures}
-    console.show({"tables": list(result.tables.values()), "figures": drawn}, as_json, paper_tables)
+    tables = list(result.tables.values())
+    figures = {name: str(pictures / f"{name}.png") for name in result.figures}
+    printed = {"tables": tables, "figures": figures}
+    console.show(printed, as_json, lambda _: paper_tables(tables, figures))

@@ -1,6 +1,5 @@
-"""Options that commands share, and the configuration that they make."""
+"""Options that commands share, and the configuration they give."""
 
-import json
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,12 +20,12 @@ Jobs = Annotated[int, typer.Option(min=1, help="Processes to use.")]
 
 
 def load_settings(path: Path | None, overrides: list[str] | None, options: dict[str, Any]) -> "Config":
-    """The configuration of a command; an option that was given wins over ``--set``.
+    """Loads the configuration of a command; its own options override ``--set``.
 
     Raises:
         ConfigError: A file, key or value is wrong. The sentence names it.
     """
     from gripper_force.config import load_config
 
-    given = [f"{key}={json.dumps(value)}" for key, value in options.items() if value is not None]
+    given = [(key, value) for key, value in options.items() if value is not None]
     return load_config(path, [*(overrides or []), *given])

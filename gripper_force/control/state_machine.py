@@ -93,12 +93,21 @@ _GRIPPING = (Phase.CONTACT, Phase.RAMP, Phase.HOLD)
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """Result of one control cycle: command, state, force estimate and events."""
+    """Result of one control cycle.
+
+    Attributes:
+        command: The limited command for the servo.
+        status: State of the grasp.
+        estimate: The force estimate.
+        events: Sentences for the log.
+        refusal: Reason why this cycle's request was refused; empty otherwise.
+    """
 
     command: ServoCommand
     status: GraspStatus
     estimate: FusedForce
     events: tuple[Event, ...]
+    refusal: str = ""
 
 
 class GraspController:
@@ -142,7 +151,7 @@ class GraspController:
         self._target_n = self._speed_m_s = self._held_width_m = 0.0
         self._move_width_m = transmission.open_width_m
         self._move_time_s = 0.0
-        self._move_opens = self._move_ended = False
+        self._move_opens = False
         self._grasp_ns = 0
         self._phase_s = self._condition_s = self._settled_s = 0.0
         self._error_n = self._speed_integral_n = 0.0
@@ -175,7 +184,8 @@ class GraspController:
         events = self._read_sensors(t_ns, servo, visual)
         if has_tripped:
             self._enter_fault()
-        if request is not None and (refusal := self._handle_request(t_ns, request)):
+        refusal = "" if request is None else self._handle_request(t_ns, request)
+        if request is not None and refusal:
             events.append(Event(t_ns, "control", f"refused {str(request.kind)!r}: {refusal}"))
         if self._width_m is not None:
             self._run_phase(t_ns, dt_s, self._width_m, self._transmission.closing_m_s(servo.velocity_rad_s))
@@ -190,7 +200,7 @@ class GraspController:
                 )
             )
         self._was_over_force = is_over
-        return Decision(command, self._status(t_ns), self._estimate, tuple(events))
+        return Decision(command, self._status(t_ns), self._estimate, tuple(events), refusal)
 
     # Inputs.
 
@@ -285,7 +295,7 @@ class GraspController:
         self._outcome = Outcome.NONE
         self._start_travel()
         distance_m = width_m - self._present_width_m
-        self._move_width_m, self._move_opens, self._move_ended = width_m, distance_m > 0, False
+        self._move_width_m, self._move_opens = width_m, distance_m > 0
         rate_m_s = 2 * self._config.approach_speed_m_s
         self._move_time_s = abs(distance_m) / rate_m_s + _ACCELERATION_S + _MOVE_SPARE_S
         self._enter(Phase.MOVE, f"move to {1e3 * width_m:.1f} mm requested")
@@ -447,13 +457,13 @@ class GraspController:
         goal_width_m = self._travel.step(self._move_width_m, dt_s)
         self._goal_width_m = min(max(goal_width_m, width_m - 2 * _LEAD_M), width_m + 2 * _LEAD_M)
         self._travel.value = self._goal_width_m
-        if self._move_ended:
+        if self._outcome != Outcome.NONE:
             return
         is_there = abs(width_m - self._move_width_m) <= _AT_WIDTH_M
         if is_there and self._goal_width_m == self._move_width_m:
-            self._move_ended, self._reason = True, f"moved to {self._move_width_m * 1e3:.1f} mm"
+            self._set_outcome(Outcome.MOVED, f"moved to {self._move_width_m * 1e3:.1f} mm")
         elif self._phase_s >= self._move_time_s:
-            self._move_ended, self._reason = True, f"stopped at {width_m * 1e3:.1f} mm by an obstacle"
+            self._set_outcome(Outcome.BLOCKED, f"stopped at {width_m * 1e3:.1f} mm by an obstacle")
 
     def _check_timeout(self, t_ns: int) -> None:
         if t_ns - self._grasp_ns > self._config.timeout_s * NS_PER_S:

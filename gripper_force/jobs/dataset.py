@@ -1,4 +1,4 @@
-"""Logs as training and test clips."""
+"""Training and test clips from logs."""
 
 import hashlib
 import json
@@ -14,20 +14,20 @@ import numpy.typing as npt
 from rich.console import Console
 from rich.progress import track
 
-from gripper_force.config import config_from_text
+from gripper_force.config import Config, config_from_text
 from gripper_force.errors import DataError
 from gripper_force.jobs.processes import process_pool
 from gripper_force.runtime.log import LogReader
-from gripper_force.types import NS_PER_MS, Frame, Gray, LoadCellSample
+from gripper_force.types import NS_PER_MS, Frame, Gray, LoadCellSample, Record
 
 if TYPE_CHECKING:  # labels need no OpenCV
     from gripper_force.vision.preprocess import Preprocess, Region
 
 CONTACT_N: Final = 0.25
-"""Measured force over which a frame counts as contact."""
+"""Measured force above which a frame counts as in contact."""
 
 NEAR_NS: Final = 50 * NS_PER_MS
-"""A frame with no valid load-cell sample within this time has no label."""
+"""Largest time from a frame to a valid load-cell sample; other frames have no label."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,13 +35,13 @@ class Clip:
     """One recording.
 
     Attributes:
-        frames: Cropped and resized frames, (T, S, S) uint8.
-        forces_n: Load-cell force at each frame, (T,) float32; 0 where not valid.
-        valid: Whether the frame has a label, (T,) bool.
-        name: The log's file name without its suffix.
-        object: What was grasped.
-        set: What a split must keep on one side, such as all light levels of one rendering.
-        stiffness: A simulated object's own stiffness over its kind's; NaN where it is not known.
+        frames: Cropped and downscaled frames, (T, S, S) uint8.
+        forces_n: Load-cell force at each frame, (T,) float32; 0 if not valid.
+        valid: Mask of the frames with a label, (T,) bool.
+        name: File name of the log without its suffix.
+        object: The object.
+        set: Name of the set. A split keeps a set on one side, such as all light levels of one simulation.
+        stiffness: Stiffness of a simulated object over the nominal one of its kind; NaN if unknown.
     """
 
     frames: Gray
@@ -54,7 +54,7 @@ class Clip:
 
     @property
     def nominal_n(self) -> npt.NDArray[np.float32]:
-        """Forces, (T,), had the object exactly its kind's stiffness; as measured where that is not known."""
+        """Forces with the nominal stiffness of the object's kind, (T,); as measured if stiffness is unknown."""
         return self.forces_n if math.isnan(self.stiffness) else self.forces_n / np.float32(self.stiffness)
 
 
@@ -69,25 +69,25 @@ def load_clips(
     """Reads logs in parallel processes, with a progress bar on stderr.
 
     Args:
-        source: A folder that is searched for ``*.mcap``, or the logs themselves.
-        preprocess: Tells the size frames are reduced to.
-        region: Region of interest in pixels; None for the one in each log's own configuration.
-        workers: Processes to read with; 1 is this one.
-        quiet: Whether to show no progress.
+        source: A folder, searched for ``*.mcap``, or the logs themselves.
+        preprocess: Determines the size that frames are downscaled to.
+        region: Region of interest in pixels; None for the one in each log's configuration.
+        workers: Number of processes; 1 reads in this process.
+        quiet: Show no progress bar.
 
     Returns:
-        A clip for each log, sorted by path.
+        One clip per log, sorted by path.
 
     Raises:
-        DataError: There are no logs, or one holds no frames or no labels.
+        DataError: There are no logs, or a log has no frames or no labels.
         LogError: A log can't be read.
     """
     paths = sorted(source.rglob("*.mcap")) if isinstance(source, Path) else sorted(source)
     if not paths:
-        raise DataError(f"no logs (*.mcap) in {source}; record, simulate or import some first")
+        raise DataError(f"no logs (*.mcap) in {source}; record, simulate or import some")
     read = partial(load_clip, preprocess=preprocess, region=region)
     console = Console(stderr=True, quiet=quiet)
-    if workers == 1:  # a process takes some seconds to begin
+    if workers == 1:  # starting a process takes seconds
         return list(track(map(read, paths), "reading logs", len(paths), console=console))
     with process_pool(workers) as pool:
         return list(track(pool.map(read, paths), "reading logs", len(paths), console=console))
@@ -96,20 +96,20 @@ def load_clips(
 def split_by(
     clips: Sequence[Clip], key: Literal["object", "set"], fraction: float, seed: int = 0
 ) -> tuple[list[Clip], list[Clip]]:
-    """Draws whole objects or sets, so that nothing of what is held out is seen in training.
+    """Splits clips at random by whole objects or sets, so that training and held-out clips share none.
 
     Args:
-        clips: What to split.
-        key: What to keep together. Sets are drawn for each object apart, so that both sides hold all objects
-            as far as they have two sets.
-        fraction: Share of objects or sets to hold out, at least one, as long as one stays.
-        seed: Of the draw.
+        clips: Clips to split.
+        key: Unit that is kept together. Sets are drawn per object, so that both sides hold every object with
+            at least two sets.
+        fraction: Share of objects or sets to hold out: at least one, and never all.
+        seed: Seed of the draw.
 
     Returns:
-        The rest, and what is held out.
+        The training clips and the held-out clips.
 
     Raises:
-        DataError: There are less than two objects or sets.
+        DataError: There are fewer than two objects or sets.
     """
     rng = np.random.default_rng(seed)
     pools = (
@@ -121,22 +121,22 @@ def split_by(
         count = min(max(1, round(fraction * len(names))), len(names) - 1)
         held.update(rng.choice(names, count, replace=False))
     if not held:
-        raise DataError(f"a split by {key} needs at least two of them, got {_names(clips, key)}")
+        raise DataError(f"a split by {key} needs at least two, got {_names(clips, key)}; add logs")
     return [c for c in clips if getattr(c, key) not in held], [c for c in clips if getattr(c, key) in held]
 
 
 def check_size(clips: Iterable[Clip], preprocess: "Preprocess") -> None:
-    """Raises `DataError` where a clip's frames are of another size than the networks take."""
+    """Raises `DataError` if a clip's frames do not have the size of the networks' input."""
     for clip in clips:
         if clip.frames.shape[1] != preprocess.size:
             raise DataError(
                 f"{clip.name} has frames of {clip.frames.shape[1]} px, the network needs {preprocess.size}; "
-                "load the log for this network"
+                "load the clips with this network's preprocess"
             )
 
 
 def digest(clips: Iterable[Clip]) -> str:
-    """SHA-256 over all frames and labels."""
+    """Returns the SHA-256 of all frames and labels."""
     sha = hashlib.sha256()
     for clip in clips:
         for part in (clip.frames, clip.forces_n, clip.valid):
@@ -149,30 +149,30 @@ def label_frames(
     samples: Sequence[LoadCellSample],
     exposure_ns: int,
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
-    """Finds the load-cell force at each frame.
+    """Returns the load-cell force at each frame.
 
-    That is the mean of the valid samples within the exposure where it holds two or more, and a linear
-    interpolation at its middle otherwise. One frame of shift would cost 0.06 N.
+    It is the mean of the valid samples within the exposure if there are two or more, else the linear
+    interpolation at its middle. A shift by one frame would add an error of 0.06 N.
 
     Args:
         frame_t_ns: Middle of each exposure, (T,).
         samples: Load-cell samples by rising time.
-        exposure_ns: Length of the exposures; 0 where it is not known.
+        exposure_ns: Exposure time; 0 if unknown.
 
     Returns:
-        Forces in N, (T,) float32, 0 where there is none, and whether there is one, (T,) bool.
+        Forces in N, (T,) float32, 0 without a label, and the mask of frames with a label, (T,) bool.
     """
-    good = [sample for sample in samples if sample.valid and np.isfinite(sample.force_n)]
-    if not good:
+    valid_samples = [sample for sample in samples if sample.valid and np.isfinite(sample.force_n)]
+    if not valid_samples:
         return np.zeros(len(frame_t_ns), np.float32), np.zeros(len(frame_t_ns), np.bool_)
-    t_ns = np.array([sample.t_ns for sample in good], np.int64)
-    force_n = np.array([sample.force_n for sample in good])
+    t_ns = np.array([sample.t_ns for sample in valid_samples], np.int64)
+    force_n = np.array([sample.force_n for sample in valid_samples])
     labels = np.interp(frame_t_ns, t_ns, force_n)
-    total = np.concatenate([[0.0], np.cumsum(force_n)])
+    cumulative = np.concatenate([[0.0], np.cumsum(force_n)])
     first = np.searchsorted(t_ns, frame_t_ns - exposure_ns // 2, "left")
     last = np.searchsorted(t_ns, frame_t_ns + exposure_ns // 2, "right")
     several = last - first >= 2
-    labels[several] = (total[last] - total[first])[several] / (last - first)[several]
+    labels[several] = (cumulative[last] - cumulative[first])[several] / (last - first)[several]
     after = np.searchsorted(t_ns, frame_t_ns).clip(0, len(t_ns) - 1)
     distance = np.minimum(np.abs(t_ns[after] - frame_t_ns), np.abs(t_ns[(after - 1).clip(0)] - frame_t_ns))
     valid = distance <= NEAR_NS
@@ -181,27 +181,51 @@ def label_frames(
 
 def load_clip(path: Path, preprocess: "Preprocess", region: "Region | None") -> Clip:
     """Reads one log; see `load_clips`."""
-    from gripper_force.vision.preprocess import downscale
-
     reader = LogReader(path)
     config = config_from_text(reader.config, str(path))
+    return read_clip(reader, config, reader.records(Frame, LoadCellSample), preprocess, region)
+
+
+def read_clip(
+    reader: LogReader,
+    config: Config,
+    records: Iterable[Record],
+    preprocess: "Preprocess",
+    region: "Region | None" = None,
+) -> Clip:
+    """Makes a clip from a log's records, for callers that also use records of other types.
+
+    Args:
+        reader: The log.
+        config: Its configuration.
+        records: Its records. All but frames and load-cell samples are ignored.
+        preprocess: Determines the size that frames are downscaled to.
+        region: Region of interest in pixels; None for the one in the configuration.
+
+    Raises:
+        DataError: There are no frames or no labels.
+        LogError: The log can't be read.
+    """
+    from gripper_force.vision.preprocess import downscale
+
+    path = reader.path
     region = region or config.vision.region
     small: list[Gray] = []
     t_ns: list[int] = []
     samples: list[LoadCellSample] = []
-    for record in reader.records(Frame, LoadCellSample):
+    for record in records:
         if isinstance(record, Frame):
             small.append(downscale(record.gray, region, preprocess.size))
             t_ns.append(record.t_ns)
         elif isinstance(record, LoadCellSample):
             samples.append(record)
     if not small:
-        raise DataError(f"{path} holds no camera frames")
+        raise DataError(f"{path} holds no camera frames; remove it from the logs")
     samples.sort(key=lambda sample: sample.t_ns)
-    exposure_ns = round(_known(reader.metadata, "exposure_ms", float, 0.0) * NS_PER_MS)
+    exposure_ns = round(_positive(reader.metadata, "exposure_ms", float, 0.0) * NS_PER_MS)
     forces_n, valid = label_frames(np.array(t_ns, np.int64), samples, exposure_ns)
     if not valid.any():
-        raise DataError(f"{path} holds no valid load-cell sample near any frame, so it has no labels")
+        raise DataError(f"{path} holds no valid load-cell sample near any frame; remove it from the logs")
     name = path.stem
     set_ = reader.metadata.get("set", name)
     stiffness = stiffness_of(reader.metadata)
@@ -209,32 +233,37 @@ def load_clip(path: Path, preprocess: "Preprocess", region: "Region | None") -> 
 
 
 def stiffness_of(metadata: Mapping[str, str]) -> float:
-    """A simulated object's own stiffness over its kind's, from a log's metadata; NaN for real ones.
+    """Returns a simulated object's stiffness over its kind's nominal one; NaN for real objects.
+
+    Args:
+        metadata: Metadata of the log.
 
     Raises:
-        DataError: The metadata tell of a scene, and not of a stiffness above 0.
+        DataError: The metadata hold a scene without a stiffness above 0.
     """
-    return _known(metadata, "scene", lambda scene: float(json.loads(scene)["stiffness"]), float("nan"))
+    return _positive(metadata, "scene", lambda scene: float(json.loads(scene)["stiffness"]), float("nan"))
 
 
-def _known(metadata: Mapping[str, str], key: str, read: Callable[[str], float], otherwise: float) -> float:
+def _positive(metadata: Mapping[str, str], key: str, read: Callable[[str], float], default: float) -> float:
     if key not in metadata:
-        return otherwise
+        return default
     try:
         value = read(metadata[key])
     except (ValueError, LookupError, TypeError, RecursionError):
         value = math.nan
     if not 0 < value < math.inf:
-        raise DataError(f"a log's metadata {key!r} hold no number above 0: {metadata[key][:80]!r}")
+        raise DataError(
+            f"metadata {key!r} of a log hold no number above 0: {metadata[key][:80]!r}; record or simulate it again"
+        )
     return value
 
 
 def stiffness_floor_n(forces_n: npt.NDArray[np.floating], stiffness: float) -> npt.NDArray[np.floating]:
-    """Error that no look at an object avoids: it shows travel, and of its stiffness only its kind's is known.
+    """Returns the error floor: images show travel, but only the nominal stiffness of the object's kind is known.
 
     Args:
         forces_n: True forces, (N,).
-        stiffness: The object's own stiffness over its kind's.
+        stiffness: The object's stiffness over the nominal one of its kind.
 
     Returns:
         Absolute errors in N, (N,).

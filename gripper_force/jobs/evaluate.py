@@ -1,7 +1,9 @@
-"""How well a checkpoint does on recordings it has not seen."""
+"""Evaluation of a checkpoint on recordings that training has not seen."""
 
-from collections.abc import Callable, Iterable, Sequence
-from typing import Final, TypedDict
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
 
 import cv2
 import numpy as np
@@ -10,21 +12,33 @@ import torch
 from rich.console import Console
 from rich.progress import track
 
+from gripper_force.config import Config
 from gripper_force.errors import DataError
 from gripper_force.jobs import metrics
-from gripper_force.jobs.dataset import CONTACT_N, Clip, check_size, stiffness_floor_n
+from gripper_force.jobs.dataset import CONTACT_N, Clip, check_size, load_clips, stiffness_floor_n
+from gripper_force.profiles.apply import read_correction, read_profiles
 from gripper_force.profiles.correction import Correction
 from gripper_force.vision.batch_inference import features, predict
-from gripper_force.vision.checkpoint import Checkpoint
+from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
 
-RIDGE_SIZE: Final = 32
+RIDGE_SIZE_PX: Final = 32
 RIDGE_COMPONENTS: Final = 20
 RIDGE_PENALTY: Final = 0.2
-"""For each frame; objects transfer best between 0.02 and 0.2."""
+"""Penalty per frame; values from 0.02 to 0.2 transfer best between objects."""
 
 
-class ObjectResult(TypedDict):
-    """Errors on one object; ``contact_mae_n`` is NaN where it was never touched."""
+@dataclass(frozen=True, slots=True)
+class ObjectErrors:
+    """Errors on one object.
+
+    Attributes:
+        mae_n: Mean absolute error.
+        rmse_n: Root mean squared error.
+        contact_mae_n: Mean absolute error over frames in contact; NaN without any.
+        floor_n: Error floor: the MAE of a perfect estimator, because stiffness varies and cannot be seen; NaN
+            for recordings of real objects.
+        frames: Frames with a label.
+    """
 
     mae_n: float
     rmse_n: float
@@ -33,10 +47,19 @@ class ObjectResult(TypedDict):
     frames: int
 
 
-class EvaluationResult(TypedDict):
-    """Errors over all frames, by object and by measured force.
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """Errors of estimates against the load cell.
 
-    ``floor_n`` is the MAE that the spread of stiffness alone costs; NaN for recordings of real objects.
+    Attributes:
+        mae_n: Mean absolute error over all frames.
+        rmse_n: Root mean squared error.
+        bias_n: Mean error; positive if estimates are too high.
+        floor_n: Error floor: the MAE of a perfect estimator, because stiffness varies and cannot be seen; NaN
+            for recordings of real objects.
+        frames: Frames with a label.
+        per_object: Errors by object.
+        per_bin: Errors by measured force, in bins of 1 N.
     """
 
     mae_n: float
@@ -44,36 +67,92 @@ class EvaluationResult(TypedDict):
     bias_n: float
     floor_n: float
     frames: int
-    per_object: dict[str, ObjectResult]
-    per_bin: list[metrics.Bin]
+    per_object: dict[str, ObjectErrors]
+    per_bin: list[metrics.ForceBin]
 
 
 def evaluate(
-    checkpoint: Checkpoint, clips: Sequence[Clip], correct: Callable[[Clip], Correction] | None = None
-) -> EvaluationResult:
-    """Estimates the force at each frame as a run would, and compares it with the load cell.
+    logs: Path | Sequence[Path],
+    checkpoint: str | Path = "default",
+    *,
+    profile: str | None = None,
+    objects: Collection[str] = (),
+    config: Config | None = None,
+    workers: int = 1,
+) -> Evaluation:
+    """Compares a checkpoint's estimates with the load cell, over logs that training has not seen.
+
+    Every frame gets the estimate that a run would give. Progress is shown on stderr.
+
+    Example:
+        >>> result = evaluate(Path("data/test"), "small")  # doctest: +SKIP
+        >>> result.mae_n, result.per_object["sponge"].contact_mae_n  # doctest: +SKIP
 
     Args:
-        checkpoint: The ensemble; computed on a GPU where there is one, or, with profiles, on the CPU.
-        clips: Recordings, reduced to the checkpoint's size.
-        correct: What the profile of a recording's object makes of the estimates.
+        logs: A folder, searched for ``*.mcap``, or the logs themselves. They need frames and load-cell
+            samples: runs, recorded sets and imported recordings.
+        checkpoint: Path of a checkpoint, or ``default`` or ``small`` for a shipped one.
+        profile: Object profile that corrects the estimates, by name or path; ``own`` for the profile with
+            the name of each log's object; None for the configuration's, by default none.
+        objects: Only logs of these objects are used; empty for all.
+        config: Its ``vision.region`` replaces the region in each log's own configuration, and its camera and
+            ``calibration.on_mismatch`` apply to profiles. Default: the defaults.
+        workers: Processes that read the logs.
+
+    Returns:
+        The errors over all frames with a load-cell force, by object, and by measured force.
+
+    Raises:
+        DataError: There are no logs, none of these objects, or a log has no frames or no labels.
+        LogError: A log can't be read.
+        CheckpointError: The checkpoint can't be read.
+        ConfigError: The profile can't be read, or belongs to another checkpoint or camera.
+    """
+    config = Config() if config is None else config
+    loaded = load_checkpoint(checkpoint)
+    clips = load_clips(logs, loaded.header.preprocess, config.vision.region, workers=workers)
+    clips = [clip for clip in clips if not objects or clip.object in objects]
+    if not clips:
+        raise DataError(f"no log in {logs} is of {', '.join(objects)}; choose among the logs' own objects")
+    calibration = config.calibration
+    if profile is not None:
+        calibration = calibration.model_copy(update={"object": profile})
+
+    def correction(clip: Clip) -> Correction | None:
+        own = config.model_copy(update={"object": clip.object, "calibration": calibration})
+        return read_correction(own, read_profiles(own), loaded)
+
+    return evaluate_clips(loaded, clips, None if calibration.object is None else correction)
+
+
+def evaluate_clips(
+    checkpoint: Checkpoint,
+    clips: Sequence[Clip],
+    correction: Callable[[Clip], Correction | None] | None = None,
+) -> Evaluation:
+    """Compares a checkpoint's estimates with the load cell, over clips.
+
+    Args:
+        checkpoint: The ensemble, computed on a GPU if there is one; with corrections, on the CPU.
+        clips: Recordings, downscaled to the checkpoint's size.
+        correction: Returns the correction for a clip's object.
 
     Raises:
         DataError: There are no clips, no labels, or frames of another size.
     """
-    if correct is None:
+    if correction is None:
         means_n = [members_n.mean(0) for members_n in estimates(checkpoint, clips)]
     else:
-        means_n = [_corrected_n(checkpoint, clip, correct(clip)) for clip in _shown(clips)]
+        means_n = [_corrected_n(checkpoint, clip, correction(clip)) for clip in _with_progress(clips)]
     return compare(clips, means_n, checkpoint.header.preprocess.lead_in)
 
 
 def estimates(checkpoint: Checkpoint, clips: Sequence[Clip]) -> list[npt.NDArray[np.float32]]:
-    """Each member's estimate for each frame, so that ensembles can be put together afterwards.
+    """Returns each member's estimate for each frame, from which any ensemble of members can be formed.
 
     Args:
-        checkpoint: The networks; computed on a GPU where there is one.
-        clips: Recordings, reduced to the checkpoint's size.
+        checkpoint: The networks, computed on a GPU if there is one.
+        clips: Recordings, downscaled to the checkpoint's size.
 
     Returns:
         Forces in N of each clip, (members, T).
@@ -85,25 +164,28 @@ def estimates(checkpoint: Checkpoint, clips: Sequence[Clip]) -> list[npt.NDArray
     preprocess = checkpoint.header.preprocess
     check_size(clips, preprocess)
     networks = [network.to(device) for network in checkpoint.networks]
-    forces_n = [predict(networks, preprocess, clip.frames, device) for clip in _shown(clips)]
+    forces_n = [predict(networks, preprocess, clip.frames, device) for clip in _with_progress(clips)]
     for network in networks:
         network.cpu()
     return forces_n
 
 
-def _corrected_n(checkpoint: Checkpoint, clip: Clip, correction: Correction) -> npt.NDArray[np.float32]:
+def _corrected_n(
+    checkpoint: Checkpoint, clip: Clip, correction: Correction | None
+) -> npt.NDArray[np.float32]:
     preprocess = checkpoint.header.preprocess
     check_size([clip], preprocess)
     forces_n, read_out = features(checkpoint.networks, preprocess, clip.frames)
-    return correction.force_n(forces_n.mean(0), read_out).astype(np.float32)
+    mean_n = forces_n.mean(0)
+    return mean_n if correction is None else correction.force_n(mean_n, read_out).astype(np.float32)
 
 
-def _shown(clips: Sequence[Clip]) -> Iterable[Clip]:
+def _with_progress(clips: Sequence[Clip]) -> Iterable[Clip]:
     return track(clips, "evaluating", console=Console(stderr=True))
 
 
-def ridge_baseline(train_clips: Sequence[Clip], test_clips: Sequence[Clip]) -> EvaluationResult:
-    """What a linear method gets: ridge regression on products of 20 principal components.
+def ridge_baseline(train_clips: Sequence[Clip], test_clips: Sequence[Clip]) -> Evaluation:
+    """Evaluates a linear baseline: ridge regression on products of 20 principal components.
 
     The components are of 32x32 frames minus each recording's first frame.
 
@@ -136,13 +218,13 @@ def ridge_baseline(train_clips: Sequence[Clip], test_clips: Sequence[Clip]) -> E
 
 def compare(
     clips: Sequence[Clip], predictions: Sequence[npt.NDArray[np.floating]], lead_in: int
-) -> EvaluationResult:
-    """Compares estimates with the load cell, over all frames that have a label.
+) -> Evaluation:
+    """Compares estimates with the load cell, over all frames with a label.
 
     Args:
         clips: Recordings.
         predictions: Estimates for each clip's frames in N, (T,).
-        lead_in: First frames of each clip to leave out: where they only serve as reference, a run gives no
+        lead_in: First frames of each clip to leave out. They only serve as reference, and a run gives no
             estimate for them.
 
     Raises:
@@ -151,19 +233,21 @@ def compare(
     measured_n, valid = _joined(clips)
     valid &= np.concatenate([np.arange(len(clip.frames)) >= lead_in for clip in clips])
     if not valid.any():
-        raise DataError(f"no frame after a recording's first {lead_in} has a load-cell force to compare with")
+        raise DataError(
+            f"no frame after a recording's first {lead_in} has a load-cell force; use longer recordings"
+        )
     predicted_n = np.concatenate(predictions)
     floors_n = np.concatenate([stiffness_floor_n(clip.forces_n, clip.stiffness) for clip in clips])[valid]
     objects = np.concatenate([np.full(len(clip.frames), clip.object) for clip in clips])[valid]
     predicted_n, measured_n = predicted_n[valid], measured_n[valid]
-    return EvaluationResult(
+    return Evaluation(
         mae_n=metrics.mae(predicted_n, measured_n),
         rmse_n=metrics.rmse(predicted_n, measured_n),
         bias_n=metrics.bias(predicted_n, measured_n),
         floor_n=float(floors_n.mean()),
         frames=len(measured_n),
         per_object={
-            str(name): _object_result(
+            str(name): _object_errors(
                 *(part[objects == name] for part in (predicted_n, measured_n, floors_n))
             )
             for name in np.unique(objects)
@@ -172,13 +256,13 @@ def compare(
     )
 
 
-def _object_result(
+def _object_errors(
     predicted_n: npt.NDArray[np.floating],
     measured_n: npt.NDArray[np.float32],
     floors_n: npt.NDArray[np.floating],
-) -> ObjectResult:
+) -> ObjectErrors:
     contact = measured_n > CONTACT_N
-    return ObjectResult(
+    return ObjectErrors(
         mae_n=metrics.mae(predicted_n, measured_n),
         rmse_n=metrics.rmse(predicted_n, measured_n),
         contact_mae_n=metrics.mae(predicted_n[contact], measured_n[contact])
@@ -190,14 +274,15 @@ def _object_result(
 
 
 def _joined(clips: Sequence[Clip]) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
+    """Returns all forces in N, (N,), and the mask of frames with a label, (N,)."""
     if not any(clip.valid.any() for clip in clips):
-        raise DataError("there is no frame with a label to compare with")
+        raise DataError("no frame has a label; use recordings with a load cell")
     return np.concatenate([clip.forces_n for clip in clips]), np.concatenate([clip.valid for clip in clips])
 
 
 def _first_frame_difference(clip: Clip) -> npt.NDArray[np.float32]:
-    """Frames minus the first, (T, 32 * 32), in 0..1."""
-    size = (RIDGE_SIZE, RIDGE_SIZE)
+    """Returns frames minus the first one, (T, 32 * 32), as fractions of full scale."""
+    size = (RIDGE_SIZE_PX, RIDGE_SIZE_PX)
     small = [cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in clip.frames]
     pixels = np.asarray(small, np.float32).reshape(len(small), -1) / 255
     difference: npt.NDArray[np.float32] = pixels - pixels[0]

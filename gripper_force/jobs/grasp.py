@@ -1,22 +1,23 @@
-"""The main job: grasp, and say how well, once or over many trials."""
+"""The main job: one grasp with its summary, or many trials with their statistics."""
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final, TypedDict
 
 import numpy as np
 
 from gripper_force.config import Config, config_from, config_from_text
 from gripper_force.errors import DataError
+from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.dataset import stiffness_floor_n, stiffness_of
 from gripper_force.jobs.processes import process_pool
 from gripper_force.jobs.replay import compare
 from gripper_force.jobs.score import score_grasp
-from gripper_force.runtime.assembly import checkpoint_of
 from gripper_force.runtime.log import LogReader
-from gripper_force.runtime.session import run_grasp
+from gripper_force.runtime.resolve import resolve
+from gripper_force.runtime.session import Session, open_run
 from gripper_force.types import (
     NS_PER_S,
     Event,
@@ -24,40 +25,99 @@ from gripper_force.types import (
     GraspStatus,
     LoadCellSample,
     Outcome,
+    RequestKind,
     ServoState,
     VisualForce,
 )
 
-TRIAL_OBJECTS = ("sponge", "paper_cup", "tube", "stapler")
-TRIAL_TARGETS_N = (1.0, 8.0)
+TRIAL_OBJECTS: Final = ("sponge", "paper_cup", "tube", "stapler")
+TRIAL_TARGETS_N: Final = (1.0, 8.0)
 WITHIN_SHARE, WITHIN_N = 0.08, 0.25
-"""A trial counts as good within this share of its target, or within this force."""
+"""A trial counts as good if its error is within this share of its target, or within this force."""
 
-Summary = dict[str, Any]
+_CHOICE_EVENT: Final = "took "
+"""Start of the event in which logs of version 0.1 name the network that ``auto`` chose."""
 
 
-def grasp(
-    config: Config, progress: Callable[[GraspStatus], None] | None = None, path: Path | None = None
-) -> Summary:
-    """Runs one grasp, writes its log and its report, and sums it up.
+class _Score(TypedDict):
+    load_cell_mean_n: float | None
+    steady_error_n: float | None
+    overshoot_n: float | None
+    settle_s: float | None
+
+
+class Summary(_Score):
+    """Figures of one grasp; None for a figure without a value, such as without a load cell.
+
+    Attributes:
+        result: Outcome of the grasp, or ``interrupted``.
+        object: Name of the object.
+        target_n: Target force.
+        seed: Seed of the run.
+        load_cell_mean_n: Mean of the load cell during the hold.
+        steady_error_n: That mean, less the target.
+        overshoot_n: Highest force above the target.
+        settle_s: Time from contact until the force stays within tolerance.
+        peak_n: Highest force.
+        estimator_p50_ms: Median time of an estimate.
+        estimator_p99_ms: 99th percentile of it.
+        loop_hz: Rate of the control loop.
+        camera_hz: Rate of the camera.
+        samples_rejected: Load cell samples that were rejected.
+        estimate_mae_n: MAE over the run by source: ``visual``, ``current``, ``fused``, and the ``floor``.
+        taken: What was chosen for each ``auto``, and why.
+        log: Path of the log.
+        report: Path of the report, or None.
+    """
+
+    result: str
+    object: str
+    target_n: float
+    seed: int
+    peak_n: float | None
+    estimator_p50_ms: float | None
+    estimator_p99_ms: float | None
+    loop_hz: float | None
+    camera_hz: float | None
+    samples_rejected: int | None
+    estimate_mae_n: dict[str, float | None]
+    taken: list[str]
+    log: str
+    report: str | None
+
+
+class Overall(TypedDict):
+    """Figures over all trials."""
+
+    trials: int
+    held: int
+    median_error_percent: float | None
+    p90_error_percent: float | None
+    median_error_n: float | None
+    good_percent: float
+    median_overshoot_percent: float | None
+    max_overshoot_percent: float | None
+    median_settle_s: float | None
+    peak_n: float | None
+    over_limit: int
+    estimator_p50_ms: float | None
+    estimate_mae_n: dict[str, dict[str, float | None]]
+
+
+def grasp(config: Config, progress: Progress = no_progress, path: Path | None = None) -> Summary:
+    """Runs one grasp, writes its log and its report, and summarises it.
 
     Args:
         config: The run.
-        progress: Told of each new phase.
-        path: The log to write; None for a `new_log`.
-
-    Returns:
-        ``result, object, target_n, load_cell_mean_n, steady_error_n, overshoot_n, settle_s, estimator_p50_ms,
-        estimator_p99_ms, loop_hz, camera_hz, samples_rejected, taken, log, report`` and the seed and the peak
-        force. ``taken`` says what was taken for each ``auto``, and why. None where a figure has no meaning,
-        such as without a load cell.
+        progress: Called at each change of phase.
+        path: Log to write; None: `new_log`.
 
     Raises:
-        GripperError: The run failed; its log holds what was seen.
+        GripperError: The run failed. Its log holds what was recorded until then.
     """
     path = path or new_log(config)
     run_grasp(config, path, progress)
-    result = {**summarise(path), "report": None}
+    result = summarise(path)
     if config.log.report:
         from gripper_force.jobs.report import write_report
 
@@ -65,20 +125,79 @@ def grasp(
     return result
 
 
+def run_grasp(config: Config, path: Path, progress: Progress = no_progress) -> None:
+    """Grasps, holds and releases as configured, and writes the log.
+
+    Args:
+        config: The run.
+        path: Log to write.
+        progress: Called at each change of phase.
+
+    Raises:
+        RequestError: The target is above the force limit or a profile's calibrated range.
+        GripperError: Something failed. The servo was stopped as configured, and the log holds the run until
+            then.
+    """
+    run = resolve(config)
+    run.check_target(config.target_n)
+    with open_run(run, path) as session:
+        grasp_and_release(session, config.target_n, progress)
+
+
+def grasp_and_release(session: Session, target_n: float, progress: Progress = no_progress) -> str:
+    """Grasps, holds for ``control.hold_s`` and releases as configured. Returns the outcome.
+
+    Args:
+        session: An open session.
+        target_n: Target force.
+        progress: Called at each change of phase.
+    """
+    config = session.run.config
+    session.wait_for_reference()
+    status = session.cycle(RequestKind.GRASP, target_n).status
+    begin_ns, phase = status.t_ns, ""
+    ended_ns: int | None = None
+    while True:
+        if status.phase != phase:
+            _report_phase(progress, status, begin_ns)
+        phase = status.phase
+        if status.outcome != Outcome.NONE and ended_ns is None:
+            ended_ns = status.t_ns
+        if ended_ns is not None:
+            hold_s = config.control.hold_s if status.outcome == Outcome.HELD else 0.0
+            if status.t_ns - ended_ns >= hold_s * NS_PER_S:
+                break
+        status = session.cycle().status
+    if status.outcome == Outcome.FAULT:
+        if config.control.on_fault == "open":
+            session.wait_until_open(status)
+        return status.outcome  # otherwise nothing moves until a person has looked
+    if config.on_exit == "hold":
+        return status.outcome
+    status = session.release()
+    _report_phase(progress, status, begin_ns)
+    return status.outcome
+
+
+def _report_phase(progress: Progress, status: GraspStatus, begin_ns: int) -> None:
+    parts = (f"{(status.t_ns - begin_ns) / NS_PER_S:8.2f} s", status.phase, status.outcome, status.reason)
+    progress(" ".join(part for part in parts if part))
+
+
 def trials(config: Config, count: int, jobs: int) -> Iterator[Summary]:
-    """Runs ``count`` grasps, each of the objects in turn, with targets and seeds drawn from ``config.seed``.
+    """Runs grasps of all four paper objects in turn, with targets and seeds drawn from ``config.seed``.
 
     Args:
         config: Everything else.
         count: Number of grasps.
-        jobs: Processes. A lockstep run comes out the same in any number of them.
+        jobs: Processes. The results of lockstep runs do not depend on it.
 
     Yields:
-        The summary of each, in order, with its ``seed``.
+        The summary of each grasp, in order.
     """
-    checkpoint_of(config)  # what `auto` measures is measured here and not in each process
+    resolve(config)  # measures what `auto` needs once, and not in each process
     rng = np.random.default_rng([config.seed, 20])
-    quiet = config.log.model_copy(update={"report": False})  # `replay LOG --report` draws any of them
+    quiet = config.log.model_copy(update={"report": False})  # `replay LOG --report` draws any of them later
     plan = [
         config.model_copy(
             update={
@@ -96,7 +215,7 @@ def trials(config: Config, count: int, jobs: int) -> Iterator[Summary]:
 
 
 def summarise(path: Path) -> Summary:
-    """Reads the figures of a grasp from its log."""
+    """Computes the figures of a grasp from its log."""
     reader = LogReader(path)
     records: dict[type, list[Any]] = defaultdict(list)
     for record in reader.records(Event, GraspStatus, LoadCellSample, ServoState, VisualForce, FusedForce):
@@ -105,7 +224,7 @@ def summarise(path: Path) -> Summary:
     cycles_ns = [state.t_ns for state in records[ServoState]]
     visuals = records[VisualForce]
     compute_ms = [visual.compute_ms for visual in visuals]
-    seen_s = (visuals[-1].t_ns - visuals[0].t_ns) / NS_PER_S if len(visuals) > 1 else 0.0
+    vision_s = (visuals[-1].t_ns - visuals[0].t_ns) / NS_PER_S if len(visuals) > 1 else 0.0
     config = config_from_text(reader.config, str(path))
     outcomes = [s.outcome for s in statuses if s.outcome != Outcome.NONE]
     span_s = (cycles_ns[-1] - cycles_ns[0]) / NS_PER_S if len(cycles_ns) > 1 else 0.0
@@ -119,7 +238,7 @@ def summarise(path: Path) -> Summary:
         "estimator_p50_ms": _percentile(compute_ms, 50),
         "estimator_p99_ms": _percentile(compute_ms, 99),
         "loop_hz": (len(cycles_ns) - 1) / span_s if span_s else None,
-        "camera_hz": (visuals[-1].seq - visuals[0].seq) / seen_s if seen_s else None,
+        "camera_hz": (visuals[-1].seq - visuals[0].seq) / vision_s if vision_s else None,
         "samples_rejected": sum(not cell.valid for cell in cells) if cells else None,
         "estimate_mae_n": {
             "visual": _mae_n([(v.t_ns, v.force_n) for v in visuals], cells),
@@ -127,15 +246,22 @@ def summarise(path: Path) -> Summary:
             "fused": _mae_n([(f.t_ns, f.force_n) for f in records[FusedForce]], cells),
             "floor": _floor_n(reader.metadata, cells),
         },
-        "taken": [event.text for event in records[Event] if event.text.startswith("took ")],
+        "taken": _choices(reader.metadata, records[Event]),
         "log": str(path),
+        "report": None,
     }
 
 
-def overall(results: list[Summary], force_limit_n: float) -> Summary:
-    """The figures over all trials."""
+def _choices(metadata: Mapping[str, str], events: list[Event]) -> list[str]:
+    if choice := metadata.get("choice"):
+        return [choice]
+    return [event.text for event in events if event.text.startswith(_CHOICE_EVENT)]
+
+
+def overall(results: list[Summary], force_limit_n: float) -> Overall:
+    """Computes the figures over all trials."""
     scored = [r for r in results if r["steady_error_n"] is not None]
-    error_n = np.array([abs(r["steady_error_n"]) for r in scored])
+    error_n = np.array([abs(r["steady_error_n"] or 0.0) for r in scored])
     target_n = np.array([r["target_n"] for r in scored])
     share = error_n / target_n
     good = (share <= WITHIN_SHARE) | (error_n <= WITHIN_N)
@@ -168,13 +294,13 @@ def _trial(tree: dict[str, Any]) -> Summary:
 
 
 def _mae_n(estimates: list[tuple[int, float]], cells: list[LoadCellSample]) -> float | None:
-    """Mean error of an estimate over the whole run."""
+    """Mean absolute error of an estimate over the whole run."""
     figures = compare([t for t, _ in estimates], [f for _, f in estimates], cells)
-    return None if figures is None else float(figures["mae_n"])
+    return None if figures is None else figures.mae_n
 
 
 def _floor_n(metadata: Mapping[str, str], cells: list[LoadCellSample]) -> float | None:
-    """What the spread of stiffness alone costs; None for a real object."""
+    """Mean error floor from the spread of stiffness; None for a real object."""
     if "scene" not in metadata or not cells:
         return None
     forces_n = np.array([c.force_n for c in cells])
@@ -189,11 +315,11 @@ def _mean_mae_n(results: list[Summary]) -> dict[str, float | None]:
     return means
 
 
-def _score(cells: list[LoadCellSample], statuses: list[GraspStatus], target_n: float) -> Summary:
+def _score(cells: list[LoadCellSample], statuses: list[GraspStatus], target_n: float) -> _Score:
     try:
         score = score_grasp(cells, statuses, target_n)
     except DataError:
-        return dict.fromkeys(("load_cell_mean_n", "steady_error_n", "overshoot_n", "settle_s"))
+        return {"load_cell_mean_n": None, "steady_error_n": None, "overshoot_n": None, "settle_s": None}
     return {
         "load_cell_mean_n": score.steady_n,
         "steady_error_n": score.steady_error_n,
@@ -207,7 +333,7 @@ def _percentile(values: Any, q: float) -> float | None:
 
 
 def new_log(config: Config) -> Path:
-    """A path for the run's log that is free."""
+    """Returns a path for the run's log that does not exist yet."""
     stamp = time.strftime("%Y%m%d-%H%M%S")
     stem = f"{stamp}-{config.object}-{config.target_n:g}N-{config.control.feedback}-seed{config.seed}"
     path = config.log.directory / f"{stem}.mcap"

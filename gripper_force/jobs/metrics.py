@@ -1,20 +1,30 @@
-"""Figures of merit for a predicted against a measured signal."""
+"""Errors and lag of a predicted signal against a measured one."""
 
-from typing import Final, TypedDict
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 Signal = npt.ArrayLike
-"""A one-dimensional series of numbers."""
+"""A one-dimensional series of numbers, (N,)."""
 
 
-LONGEST_S: Final = 7200.0
-"""No run is longer; a damaged time would ask for any amount of memory."""
+MAX_SPAN_S: Final = 7200.0
+"""Longest span that `lag_s` accepts. No run is longer, and a damaged time would need unlimited memory."""
 
 
-class Bin(TypedDict):
-    """Error where the measured force lies in ``from_n`` to ``to_n``."""
+@dataclass(frozen=True, slots=True)
+class ForceBin:
+    """Errors over the frames whose measured force is within ``from_n`` to ``to_n``.
+
+    Attributes:
+        from_n: Lower end of the bin, inclusive.
+        to_n: Upper end, exclusive.
+        frames: Number of frames.
+        mae_n: Mean absolute error.
+        bias_n: Mean error.
+    """
 
     from_n: float
     to_n: float
@@ -34,19 +44,19 @@ def rmse(predicted: Signal, measured: Signal) -> float:
 
 
 def bias(predicted: Signal, measured: Signal) -> float:
-    """Mean error; positive where too much is predicted."""
+    """Mean error; positive if predictions are too high."""
     return float(_error(predicted, measured).mean())
 
 
-def per_bin(predicted_n: Signal, measured_n: Signal, width_n: float = 1.0) -> list[Bin]:
-    """Errors by measured force, in bins of ``width_n`` that hold any frame, by rising force."""
+def per_bin(predicted_n: Signal, measured_n: Signal, width_n: float = 1.0) -> list[ForceBin]:
+    """Errors by measured force, in bins of ``width_n``, by rising force and without empty bins."""
     error = _error(predicted_n, measured_n)
     index = np.floor(np.asarray(measured_n, np.float64) / width_n).astype(int)
     bins = []
     for i in np.unique(index):
         part = error[index == i]
         bins.append(
-            Bin(
+            ForceBin(
                 from_n=float(i * width_n),
                 to_n=float((i + 1) * width_n),
                 frames=len(part),
@@ -60,29 +70,29 @@ def per_bin(predicted_n: Signal, measured_n: Signal, width_n: float = 1.0) -> li
 def lag_s(
     t_s: Signal, values: Signal, reference_t_s: Signal, reference: Signal, *, step_s: float = 0.001
 ) -> float:
-    """Time by which a signal trails a reference, by the peak of their cross-correlation.
+    """Lag of a signal behind a reference: the peak of their cross-correlation.
 
     Args:
-        t_s: Sample times of the signal, rising.
-        values: The signal.
-        reference_t_s: Sample times of the reference, rising.
-        reference: The reference.
-        step_s: Resolution. Both are interpolated to it over the span they share.
+        t_s: Sample times of the signal, rising, (N,).
+        values: The signal, (N,).
+        reference_t_s: Sample times of the reference, rising, (M,).
+        reference: The reference, (M,).
+        step_s: Resolution. Both signals are interpolated to it over the span they share.
 
     Returns:
-        Lag in s; positive where the signal comes later; NaN where either does not move, or they share no span
-        or one of more than `LONGEST_S`.
+        Lag in s, positive if the signal is later. NaN if either is constant, or if their shared span is
+        shorter than two steps or longer than `MAX_SPAN_S`.
     """
     t, t_ref = np.asarray(t_s, np.float64), np.asarray(reference_t_s, np.float64)
     begin, end = max(t[0], t_ref[0]), min(t[-1], t_ref[-1])
-    if not 2 * step_s <= end - begin <= LONGEST_S:
+    if not 2 * step_s <= end - begin <= MAX_SPAN_S:
         return float("nan")
     grid = np.arange(begin, end, step_s)
     a = np.interp(grid, t, np.asarray(values, np.float64))
     b = np.interp(grid, t_ref, np.asarray(reference, np.float64))
     if np.ptp(a) == 0 or np.ptp(b) == 0:
         return float("nan")
-    size = 1 << (2 * len(grid)).bit_length()  # both fit in beside each other, so that nothing wraps round
+    size = 1 << (2 * len(grid)).bit_length()  # zero padding for both, against circular wrap-around
     spectrum = np.fft.rfft(a - a.mean(), size) * np.fft.rfft(b - b.mean(), size).conj()
     shift = int(np.fft.irfft(spectrum, size).argmax())
     return float((shift if shift < size // 2 else shift - size) * step_s)

@@ -1,17 +1,23 @@
-"""Processes for independent jobs, which end at once and quietly when the program is interrupted."""
+"""Process pools for independent jobs, which end at once and quietly on an interrupt."""
 
 import signal
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
+from dataclasses import asdict
 from multiprocessing import active_children, get_context
+
+from gripper_force.runtime.process import ProcessOptions, allowed, own_process
 
 
 @contextmanager
 def process_pool(count: int) -> Iterator[ProcessPoolExecutor]:
-    """A pool of so many processes. Where the block is left by an exception, what they do is broken off."""
+    """Opens a pool of processes. If the block ends with an exception, running jobs are terminated.
+
+    The processes may change the same process-wide settings as this one (see `own_process`).
+    """
     others = set(active_children())
-    pool = ProcessPoolExecutor(count, get_context("spawn"), _leave_interrupts_to_the_parent)
+    pool = ProcessPoolExecutor(count, get_context("spawn"), _start_process, (allowed(),))
     try:
         yield pool
     except BaseException:
@@ -22,6 +28,7 @@ def process_pool(count: int) -> Iterator[ProcessPoolExecutor]:
         pool.shutdown(cancel_futures=True)
 
 
-def _leave_interrupts_to_the_parent() -> None:
-    """The terminal sends Ctrl-C to each process; a traceback from each would bury what the parent says."""
+def _start_process(options: ProcessOptions) -> None:
+    own_process(**{**asdict(options), "signals": False})
+    # A terminal sends Ctrl-C to every process; tracebacks of all would hide the parent's message.
     signal.signal(signal.SIGINT, signal.SIG_IGN)

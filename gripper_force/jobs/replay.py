@@ -1,22 +1,23 @@
-"""A log once more: the same functions over the same inputs, and every estimate against the load cell."""
+"""Replay of a log: the same functions over the same inputs, and every estimate against the load cell."""
 
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from gripper_force.config import Config, config_from_text
+from gripper_force.config import Config, Overrides, config_from_text
 from gripper_force.control.state_machine import Decision
 from gripper_force.errors import DataError
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import CONTACT_N, label_frames
-from gripper_force.profiles.apply import correction_of
-from gripper_force.runtime.assembly import checkpoint_of, controller_from, make_estimator, settled
+from gripper_force.jobs.metrics import ForceBin
+from gripper_force.profiles.apply import read_correction, read_profiles
 from gripper_force.runtime.log import LogReader
 from gripper_force.runtime.perception import FrameProcessor
+from gripper_force.runtime.resolve import ResolvedConfig, make_controller, make_estimator, resolve_vision
 from gripper_force.types import (
     NS_PER_S,
     Frame,
@@ -29,21 +30,72 @@ from gripper_force.types import (
     VisualForce,
 )
 
-if TYPE_CHECKING:
-    from gripper_force.vision.header import Model
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """Errors of an estimate against the load cell, in newtons.
+
+    Attributes:
+        mae_n: Mean absolute error.
+        rmse_n: Root mean square error.
+        bias_n: Mean error.
+        contact_mae_n: Mean absolute error in contact; None without contact.
+        lag_s: Lag of the estimate, in seconds.
+        frames: Number of estimates compared.
+        per_bin: Errors by force: ``from_n``, ``to_n``, ``mae_n``, ``bias_n``, ``frames``.
+    """
+
+    mae_n: float
+    rmse_n: float
+    bias_n: float
+    contact_mae_n: float | None
+    lag_s: float
+    frames: int
+    per_bin: list[ForceBin]
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayResult:
+    """Result of `replay`.
+
+    Attributes:
+        mae_n: Mean absolute error of the estimate that the run acted on (of vision where there was no loop).
+        rmse_n: Its root mean square error.
+        bias_n: Its mean error.
+        per_bin: Its errors by force.
+        frames: Number of estimates compared.
+        per_object: The same figures by object.
+        identical: True if the replay gave the log's estimates and decisions; None if the log holds no run.
+        note: Reason why it cannot be identical; empty without one.
+        changed: Largest differences from the log: ``goal_current_a``, ``fused_n``; empty without any.
+        sources: `Comparison` by source: ``visual``, ``current``, ``fused``.
+        log: Path of the log.
+    """
+
+    mae_n: float
+    rmse_n: float
+    bias_n: float
+    per_bin: list[ForceBin]
+    frames: int
+    per_object: dict[str, dict[str, float]]
+    identical: bool | None
+    note: str
+    changed: dict[str, float]
+    sources: dict[str, Comparison]
+    log: str
 
 
 @dataclass(frozen=True)
 class Replayed:
-    """What a replay computed, and whether it is what the log holds.
+    """Estimates and decisions that a replay computed, and their agreement with the log.
 
     Attributes:
-        estimates_identical: Every visual estimate came out as logged, to the bit; None without any.
-        decisions_identical: So did every command, status and fused force; None without any.
-        changed: How far off the log's they are at most: ``goal_current_a``, ``fused_n``; empty without any.
+        estimates_identical: True if every visual estimate equals the logged one; None without any.
+        decisions_identical: True if every command, status and fused force does; None without any.
+        changed: Largest differences from the log: ``goal_current_a``, ``fused_n``; empty without any.
         visual: Visual estimates, as computed now.
         decisions: Decisions, as computed now.
-        load_cell: The log's load-cell samples.
+        load_cell: Load cell samples of the log.
     """
 
     estimates_identical: bool | None
@@ -55,90 +107,107 @@ class Replayed:
 
 
 def replay(
-    path: Path,
-    checkpoint_source: str | None = None,
+    path: str | Path,
+    checkpoint: str | Path | None = None,
     *,
-    overrides: list[str] | None = None,
+    overrides: Overrides | None = None,
     recover: bool = False,
-) -> dict[str, Any]:
-    """Replays a log and reports it against its load cell.
+) -> ReplayResult:
+    """Runs estimator and controller again on a log, and compares the estimates with its load cell.
+
+    The replay is open loop: a changed setting changes the decisions, but not what the log's servo, camera and
+    load cell measured.
 
     Args:
         path: Log of a run or of an imported recording.
-        checkpoint_source: Another checkpoint to estimate with, instead of the log's own.
-        overrides: Assignments ``key.path=value`` that change the log's own configuration, such as a gain.
-        recover: Whether to read what is whole of a truncated log.
-
-    Returns:
-        ``mae_n, rmse_n, bias_n, per_bin, frames`` of the estimate that the run acted on (or of vision, where
-        nothing acted), ``identical`` (None where the log holds no run), ``note`` (why it can't be),
-        ``changed`` (see `Replayed`), and the same figures with ``lag_s`` by source.
+        checkpoint: Another network to estimate with; None: the log's own.
+        overrides: Changes of the log's configuration: ``{"control.ramp_n_s": 4}`` or
+            ``["control.ramp_n_s=4"]``.
+        recover: Read the intact part of a truncated log.
 
     Raises:
-        LogError: The log can't be read.
-        CheckpointError: The checkpoint can't be read.
+        LogError: The log cannot be read.
+        CheckpointError: The network's file cannot be read.
         DataError: The log holds nothing to replay, or no load cell to compare with.
     """
-    reader = LogReader(path, recover=recover)
+    reader = LogReader(Path(path), recover=recover)
     config = config_from_text(reader.config, str(path), overrides)
-    if checkpoint_source is not None:
-        vision = config.vision.model_copy(update={"checkpoint": checkpoint_source})
-        config = config.model_copy(update={"vision": vision})
-    checkpoint = checkpoint_of(config)
     if checkpoint is not None:
-        config, _ = settled(config)
-    replayed = run_again(reader, config, checkpoint)
+        vision = config.vision.model_copy(update={"checkpoint": str(checkpoint)})
+        config = config.model_copy(update={"vision": vision})
+    run = resolve_replay(config)
+    replayed = run_again(reader, run)
     flags = [f for f in (replayed.estimates_identical, replayed.decisions_identical) if f is not None]
     sources = _sources(replayed)
     best = next((sources[name] for name in ("fused", "visual") if name in sources), None)
     if best is None:
-        raise DataError(f"{path} holds no estimate that could be compared with a load cell")
-    return {
-        **{key: best[key] for key in ("mae_n", "rmse_n", "bias_n", "per_bin", "frames")},
-        "per_object": {config.object: {k: best[k] for k in ("mae_n", "rmse_n", "bias_n", "frames")}},
-        "identical": all(flags) if flags else None,
-        "note": _note(reader, config, checkpoint),
-        "changed": replayed.changed,
-        "sources": sources,
-        "log": str(path),
-    }
+        raise DataError(
+            f"{path} holds no estimate to compare with a load cell; replay a log of a run with a load cell"
+        )
+    overall = {"mae_n": best.mae_n, "rmse_n": best.rmse_n, "bias_n": best.bias_n, "frames": best.frames}
+    return ReplayResult(
+        mae_n=best.mae_n,
+        rmse_n=best.rmse_n,
+        bias_n=best.bias_n,
+        per_bin=best.per_bin,
+        frames=best.frames,
+        per_object={config.object: overall},
+        identical=all(flags) if flags else None,
+        note=_note(reader, run),
+        changed=replayed.changed,
+        sources=sources,
+        log=str(path),
+    )
 
 
-def run_again(reader: LogReader, config: Config, checkpoint: "Model | None") -> Replayed:
+def resolve_replay(config: Config) -> ResolvedConfig:
+    """Resolves the configuration of a log: network and object profile; the rest of it is complete.
+
+    Raises:
+        ConfigError: The profile does not belong to the network, or nothing fits the budget.
+        CheckpointError: The network's file cannot be read.
+    """
+    config, model, choice = resolve_vision(config)
+    return ResolvedConfig(config, model, read_correction(config, read_profiles(config), model), choice=choice)
+
+
+def run_again(reader: LogReader, run: ResolvedConfig) -> Replayed:
     """Feeds estimator and controller from a log, in the order in which the run had its inputs.
 
-    Where faults were injected into the estimator, the controller has the estimates that it had then.
+    If faults were injected into the run's estimator, the controller gets the logged estimates.
     """
-    spoilt = _spoilt(config)
-    processor = FrameProcessor(make_estimator(config, checkpoint, correction_of(config, checkpoint)))
-    runs = config.gripper.nm_per_a is not None  # a recording that was imported never had a controller
-    controller = controller_from(config) if runs else None
+    config = run.config
+    has_faulty_estimates = _has_faulty_estimates(config)
+    processor = FrameProcessor(make_estimator(run))
+    had_controller = config.gripper.nm_per_a is not None  # an imported recording had none
+    controller = make_controller(config) if had_controller else None
     visual: list[VisualForce] = []
     decisions: list[Decision] = []
     cells: list[LoadCellSample] = []
     logged: dict[type, list[Any]] = defaultdict(list)
-    fresh: VisualForce | None = None
+    newest: VisualForce | None = None
     request: Request | None = None
     pending: dict[int, VisualForce] = {}
     for record in reader.records():
         logged[type(record)].append(record)
         if isinstance(record, Frame):
-            if (seen := processor.process(record).visual) is not None:
-                visual.append(seen)
-                pending[record.seq] = seen
+            if (estimate := processor.process(record).visual) is not None:
+                visual.append(estimate)
+                pending[record.seq] = estimate
         elif isinstance(record, VisualForce):
-            again = None if spoilt else pending.pop(record.seq, None)
-            # The time an estimate was ready is the run's own, not this computer's.
-            fresh = record if again is None else replace(again, ready_ns=record.ready_ns)
+            again = None if has_faulty_estimates else pending.pop(record.seq, None)
+            # The time at which an estimate was ready is the run's, not this computer's.
+            newest = record if again is None else replace(again, ready_ns=record.ready_ns)
         elif isinstance(record, Request):
             request = record
         elif isinstance(record, ServoState) and controller is not None:
-            decisions.append(controller.step(record.t_ns, record, fresh, request))
-            fresh = request = None
+            decisions.append(controller.step(record.t_ns, record, newest, request))
+            newest = request = None
         elif isinstance(record, LoadCellSample):
             cells.append(record)
+    compares_estimates = bool(logged[VisualForce]) and not has_faulty_estimates
     return Replayed(
-        _same_estimates(logged[VisualForce], visual) if logged[VisualForce] and not spoilt else None,
+        _same_estimates(logged[VisualForce], visual) if compares_estimates else None,
         _same_decisions(logged, decisions) if logged[ServoCommand] else None,
         _changed(logged, decisions) if logged[ServoCommand] else {},
         visual,
@@ -151,12 +220,12 @@ def _same_estimates(logged: list[VisualForce], again: list[VisualForce]) -> bool
     def key(v: VisualForce) -> tuple[int, float, float]:
         return v.seq, v.force_n, v.std_n
 
-    # The last frames may have been seen and not been used any more.
+    # The run may have ended before it used the estimates of its last frames.
     return [key(v) for v in logged] == [key(v) for v in again[: len(logged)]]
 
 
 def _same_decisions(logged: dict[type, list[Any]], again: list[Decision]) -> bool:
-    # Of a log that was cut, the last cycle may lack its end.
+    # The last cycle of a truncated log may be incomplete.
     pairs = (
         (logged[ServoCommand], [d.command for d in again]),
         (logged[FusedForce], [d.estimate for d in again]),
@@ -174,28 +243,28 @@ def _changed(logged: dict[type, list[Any]], again: list[Decision]) -> dict[str, 
     }
 
 
-def _spoilt(config: Config) -> bool:
+def _has_faulty_estimates(config: Config) -> bool:
     return any(fault.unit == "estimator" for fault in config.faults)
 
 
-def _note(reader: LogReader, config: Config, checkpoint: "Model | None") -> str:
-    """Why the estimates can't come out the same, or an empty text."""
+def _note(reader: LogReader, run: ResolvedConfig) -> str:
+    """Returns the reason why the estimates cannot equal the logged ones, or an empty text."""
     used = reader.metadata.get("checkpoint", "")
-    if checkpoint is None or used == "":
+    if run.model is None or used == "":
         return ""
-    if _spoilt(config):
-        return "faults were injected into the run's estimator: its decisions alone are compared"
-    if used != checkpoint.digest:
-        return f"the run's checkpoint was {used[:12]}, this one is {checkpoint.digest[:12]}: estimates differ"
-    correction = correction_of(config, checkpoint)
-    profile, used = (correction.profile.weights if correction else ""), reader.metadata.get("profile", "")
+    if _has_faulty_estimates(run.config):
+        return "faults were injected into the run's estimator, so only decisions are compared"
+    if used != run.model.digest:
+        return f"the run's checkpoint was {used[:12]}, this one is {run.model.digest[:12]}: estimates differ"
+    profile = run.correction.profile.weights if run.correction else ""
+    used = reader.metadata.get("profile", "")
     if used != profile:
         names = [text[:12] or "none" for text in (used, profile)]
         return f"the run's object profile was {names[0]}, this one is {names[1]}: estimates differ"
     return ""
 
 
-def _sources(replayed: Replayed) -> dict[str, dict[str, Any]]:
+def _sources(replayed: Replayed) -> dict[str, Comparison]:
     series: dict[str, tuple[list[int], list[float]]] = {}
     if replayed.visual:
         series["visual"] = [v.t_ns for v in replayed.visual], [v.force_n for v in replayed.visual]
@@ -214,16 +283,16 @@ def _sources(replayed: Replayed) -> dict[str, dict[str, Any]]:
 
 def compare(
     t_ns: Sequence[int], force_n: Sequence[float], cells: Sequence[LoadCellSample]
-) -> dict[str, Any] | None:
-    """An estimate against the load cell: ``mae_n, rmse_n, bias_n, contact_mae_n, lag_s, frames, per_bin``.
+) -> Comparison | None:
+    """Compares an estimate with the load cell.
 
     Args:
-        t_ns: Times of the estimates, rising.
-        force_n: The estimates.
-        cells: Load-cell samples by rising time.
+        t_ns: Times of the estimates in nanoseconds, rising, (N,).
+        force_n: The estimates in newtons, (N,).
+        cells: Load cell samples by rising time.
 
     Returns:
-        The figures, or None where the load cell has no valid sample near any estimate.
+        The errors, or None if the load cell has no valid sample near any estimate.
     """
     times_ns, estimates_n = np.array(t_ns, np.int64), np.array(force_n)
     measured_n, valid = label_frames(times_ns, cells, 0)
@@ -231,12 +300,12 @@ def compare(
         return None
     t_s, predicted_n, measured_n = times_ns[valid] / NS_PER_S, estimates_n[valid], measured_n[valid]
     contact = measured_n > CONTACT_N
-    return {
-        "mae_n": metrics.mae(predicted_n, measured_n),
-        "rmse_n": metrics.rmse(predicted_n, measured_n),
-        "bias_n": metrics.bias(predicted_n, measured_n),
-        "contact_mae_n": metrics.mae(predicted_n[contact], measured_n[contact]) if contact.any() else None,
-        "lag_s": metrics.lag_s(t_s, predicted_n, t_s, measured_n),
-        "frames": len(predicted_n),
-        "per_bin": metrics.per_bin(predicted_n, measured_n),
-    }
+    return Comparison(
+        mae_n=metrics.mae(predicted_n, measured_n),
+        rmse_n=metrics.rmse(predicted_n, measured_n),
+        bias_n=metrics.bias(predicted_n, measured_n),
+        contact_mae_n=metrics.mae(predicted_n[contact], measured_n[contact]) if contact.any() else None,
+        lag_s=metrics.lag_s(t_s, predicted_n, t_s, measured_n),
+        frames=len(predicted_n),
+        per_bin=metrics.per_bin(predicted_n, measured_n),
+    )

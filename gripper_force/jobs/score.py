@@ -1,4 +1,4 @@
-"""How well a grasp was done, by the load cell."""
+"""Score of a grasp, measured by the load cell."""
 
 import math
 from collections.abc import Sequence
@@ -10,25 +10,25 @@ from gripper_force.errors import DataError
 from gripper_force.types import NS_PER_S, GraspStatus, LoadCellSample, Phase
 
 STEADY_S = 1.0
-"""The last part of the hold whose mean counts."""
+"""Last part of the hold, over which the force is averaged."""
 
-LONGEST_GAP_S = 0.25
-"""Without a sound sample for longer in that part, there is nothing to compare with."""
+MAX_GAP_S = 0.25
+"""Longest gap between valid samples in that part; a grasp with a longer one has no score."""
 
-_RAMPING = (Phase.RAMP, Phase.HOLD)
-_GRASPING = (Phase.APPROACH, Phase.CONTACT, *_RAMPING)
+_RAMP_PHASES = (Phase.RAMP, Phase.HOLD)
+_GRASP_PHASES = (Phase.APPROACH, Phase.CONTACT, *_RAMP_PHASES)
 
 
 @dataclass(frozen=True, slots=True)
 class GraspScore:
-    """One grasp against the load cell.
+    """One grasp compared with the load cell.
 
     Attributes:
-        target_n: What was asked.
-        steady_n: Mean over the last `STEADY_S` of the hold.
+        target_n: Target force.
+        steady_n: Mean force over the last `STEADY_S` of the hold.
         steady_error_n: ``steady_n - target_n``.
-        overshoot_n: Most the load cell read above the target, the first touch included; 0 where it never did.
-        settle_s: Time from the start of the ramp until the force stays within 5 % or 0.1 N; NaN: never.
+        overshoot_n: Largest force above the target, from the approach on; 0 if it never was above.
+        settle_s: Time from the start of the ramp until the force stays within 5 % or 0.1 N; NaN if never.
     """
 
     target_n: float
@@ -44,19 +44,21 @@ def score_grasp(
     """Scores the last grasp of a run.
 
     Args:
-        samples: Load cell readings in order of time; rejected ones are left out.
-        statuses: The controller's states in order of time.
-        target_n: What was asked.
+        samples: Load-cell samples in order of time; rejected ones are ignored.
+        statuses: States of the controller in order of time.
+        target_n: Target force.
 
     Raises:
-        DataError: The force was never held, or the load cell said nothing meanwhile, or too little.
+        DataError: The target was never held, or the load cell has no or too few valid samples in the hold.
     """
     held_ns = [s.t_ns for s in statuses if s.phase == Phase.HOLD]
     if not held_ns:
-        raise DataError("there is no hold to score in this run; the grasp ended before it reached its target")
+        raise DataError(
+            "this run has no hold to score: the grasp ended before it reached its target; see its log"
+        )
     end_ns = held_ns[-1]
-    ramp_ns = _start_of(_RAMPING, statuses, end_ns)
-    touch_ns = _start_of(_GRASPING, statuses, end_ns)
+    ramp_ns = _start_ns(_RAMP_PHASES, statuses, end_ns)
+    touch_ns = _start_ns(_GRASP_PHASES, statuses, end_ns)
     peak_n = max((s.force_n for s in samples if s.valid and touch_ns <= s.t_ns <= end_ns), default=0.0)
     cell = [(s.t_ns, s.force_n) for s in samples if s.valid and ramp_ns <= s.t_ns <= end_ns]
     if not cell or cell[-1][0] < held_ns[0]:
@@ -67,8 +69,10 @@ def score_grasp(
     begin_s = max(end_s - STEADY_S, held_s)
     last = t_s >= begin_s
     gap_s = float(np.diff([begin_s, *t_s[last], end_s]).max())
-    if gap_s > LONGEST_GAP_S or not last.any():
-        raise DataError(f"the load cell gave no sound sample for {gap_s:.2f} s of the hold; see the log")
+    if gap_s > MAX_GAP_S or not last.any():
+        raise DataError(
+            f"the load cell has no valid sample for {gap_s:.2f} s of the hold; check it in the log"
+        )
     steady_n = float(force_n[last].mean())
     outside = np.flatnonzero(np.abs(force_n - target_n) > max(0.05 * target_n, 0.1))
     first_inside = int(outside[-1]) + 1 if outside.size else 0
@@ -81,8 +85,8 @@ def score_grasp(
     )
 
 
-def _start_of(phases: tuple[Phase, ...], statuses: Sequence[GraspStatus], end_ns: int) -> int:
-    """When the unbroken run of these phases began that lasted to ``end_ns``."""
+def _start_ns(phases: tuple[Phase, ...], statuses: Sequence[GraspStatus], end_ns: int) -> int:
+    """Returns the start of the continuous run of these phases that lasts to ``end_ns``."""
     start_ns = end_ns
     for status in reversed([s for s in statuses if s.t_ns <= end_ns]):
         if status.phase not in phases:

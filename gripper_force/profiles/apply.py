@@ -1,79 +1,106 @@
-"""What the rig profile and the object profile that a configuration names mean for its run."""
+"""Application of the configured rig profile and object profile to a run."""
 
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gripper_force.config import Config, ControlConfig
 from gripper_force.errors import ConfigError
-from gripper_force.profiles.object_profile import find_object, read_object
-from gripper_force.profiles.rig_profile import read_rig
+from gripper_force.profiles.object_profile import ObjectProfile, find_object, read_object
+from gripper_force.profiles.rig_profile import RigProfile, read_rig
 
-if TYPE_CHECKING:  # a run without vision loads none of it
+if TYPE_CHECKING:  # a run without vision imports none of these
     from gripper_force.profiles.correction import Correction
     from gripper_force.vision.checkpoint import Checkpoint
     from gripper_force.vision.header import Model
 
 
-def check_target(config: Config) -> None:
-    """Raises `ConfigError` where the target is more than a profile was calibrated with."""
-    reaches = {}
-    if config.calibration.rig is not None and (servo := read_rig(config.calibration.rig).servo) is not None:
-        reaches[f"rig profile {config.calibration.rig}"] = servo.force_n[1]
-    if config.profile is not None:
-        path = find_object(config.profile)
-        reaches[f"object profile {path}"] = read_object(path).force_n
-    for name, most_n in reaches.items():
-        if config.target_n > most_n:
-            raise ConfigError(
-                f"target_n {config.target_n:g} N is more than the {name} was calibrated with, "
-                f"{most_n:.1f} N; ask for less, or calibrate up to more"
-            )
+@dataclass(frozen=True, slots=True)
+class Profiles:
+    """The profiles of a run, each read once.
+
+    Attributes:
+        rig: Rig profile, or None.
+        rig_path: Its file, or None.
+        object: Object profile, or None.
+        object_path: Its file, or None.
+    """
+
+    rig: RigProfile | None = None
+    rig_path: Path | None = None
+    object: ObjectProfile | None = None
+    object_path: Path | None = None
+
+    @property
+    def target_limits_n(self) -> dict[str, float]:
+        """Largest force that each profile was calibrated with, by the profile's description."""
+        limits_n = {}
+        if self.rig is not None and self.rig.servo is not None:
+            limits_n[f"rig profile {self.rig_path}"] = self.rig.servo.force_n[1]
+        if self.object is not None:
+            limits_n[f"object profile {self.object_path}"] = self.object.force_n
+        return limits_n
 
 
-def with_plant(config: Config, control: ControlConfig) -> ControlConfig:
-    """Completes the force loop's plant with what the object's profile knows of it."""
-    if config.profile is None or (plant := read_object(find_object(config.profile)).plant) is None:
+def read_profiles(config: Config) -> Profiles:
+    """Reads the profiles that the configuration names. Raises `ConfigError` that names the file."""
+    rig_path = config.calibration.rig
+    object_path = None if config.profile is None else find_object(config.profile)
+    return Profiles(
+        rig=None if rig_path is None else read_rig(rig_path),
+        rig_path=rig_path,
+        object=None if object_path is None else read_object(object_path),
+        object_path=object_path,
+    )
+
+
+def with_plant(control: ControlConfig, profiles: Profiles) -> ControlConfig:
+    """Fills in the force loop's plant from the object profile, where the configuration leaves it open."""
+    if profiles.object is None or (plant := profiles.object.plant) is None:
         return control
     known = {"plant_gain": plant.gain, "plant_lag_ms": plant.lag_ms, "plant_delay_ms": plant.delay_ms}
     return control.model_copy(update={k: v for k, v in known.items() if getattr(control, k) is None})
 
 
-def correction_of(config: Config, checkpoint: "Model | Checkpoint | None") -> "Correction | None":
-    """What the object's profile makes of estimates, or None without a profile or without vision.
+def read_correction(
+    config: Config, profiles: Profiles, model: Model | Checkpoint | None
+) -> Correction | None:
+    """Reads the object profile's correction of estimates; None without a profile or without vision.
 
     Raises:
-        ConfigError: The profile can't be read, or is of another network or camera, and that is refused.
+        ConfigError: The profile's second file cannot be read, or the profile belongs to another network or
+            camera and ``calibration.on_mismatch`` is ``refuse``.
     """
-    if config.profile is None or checkpoint is None:
+    if profiles.object is None or profiles.object_path is None or model is None:
         return None
-    path = find_object(config.profile)
-    profile = read_object(path)
-    differ = profile.mismatches(checkpoint.digest, config.camera_settings())
-    if differ and config.calibration.on_mismatch == "refuse":
-        raise ConfigError(
-            f"the object profile {path} is of {'; '.join(differ)}; calibrate again, or set "
-            "calibration.on_mismatch=warn"
-        )
+    mismatches = profiles.object.mismatches(model.digest, config.camera_settings())
+    _refuse(config, f"object profile {profiles.object_path}", mismatches)
     from gripper_force.profiles.correction import load_correction
 
-    features = sum(member.head for member in checkpoint.header.members)
-    return load_correction(path, profile, features, differ)
+    features = sum(member.head for member in model.header.members)
+    return load_correction(profiles.object_path, profiles.object, features, mismatches)
 
 
-def rig_mismatches(config: Config) -> list[str]:
-    """What differs between the rig profile's devices and the run's, in words.
+def rig_mismatches(config: Config, profiles: Profiles) -> list[str]:
+    """Describes the differences between the rig profile's devices and the run's.
 
     Raises:
-        ConfigError: The profile can't be read, or something differs, and that is refused.
+        ConfigError: There are some, and ``calibration.on_mismatch`` is ``refuse``.
     """
-    path = config.calibration.rig
-    if path is None:
+    if profiles.rig is None:
         return []
-    differ = read_rig(path).mismatches(
+    mismatches = profiles.rig.mismatches(
         config.servo.model, config.load_cell.sensor, config.camera.model_dump(mode="json")
     )
-    if differ and config.calibration.on_mismatch == "refuse":
+    _refuse(config, f"rig profile {profiles.rig_path}", mismatches)
+    return mismatches
+
+
+def _refuse(config: Config, profile: str, mismatches: list[str]) -> None:
+    if mismatches and config.calibration.on_mismatch == "refuse":
         raise ConfigError(
-            f"the rig profile {path} is of {'; '.join(differ)}; calibrate again, or set "
+            f"the {profile} was made with {'; '.join(mismatches)}; calibrate again, or set "
             "calibration.on_mismatch=warn"
         )
-    return differ

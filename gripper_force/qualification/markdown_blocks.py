@@ -1,4 +1,4 @@
-"""What a command measures, put into a page that is written by hand."""
+"""Writes generated tables into a Markdown page that is otherwise written by hand."""
 
 from pathlib import Path
 
@@ -6,10 +6,10 @@ from gripper_force.errors import DataError
 
 
 def write_between(page: Path, name: str, text: str) -> None:
-    """Puts text into a page between its lines ``<!-- NAME -->`` and ``<!-- end of NAME -->``.
+    """Replaces the text between the lines ``<!-- NAME -->`` and ``<!-- end of NAME -->`` of a page.
 
     Raises:
-        DataError: The page is not there, or has no such lines.
+        DataError: The page does not exist, or does not have these lines once each.
     """
     begin, end = f"<!-- {name} -->", f"<!-- end of {name} -->"
     try:
@@ -17,4 +17,6 @@ def write_between(page: Path, name: str, text: str) -> None:
         _, after = rest.split(end)
         page.write_text(f"{before}{begin}\n\n{text}\n{end}{after}", encoding="utf-8")
     except (OSError, ValueError) as error:
-        raise DataError(f"{page} has no lines {begin!r} and {end!r} to write between") from error
+        raise DataError(
+            f"can't write into {page}: it needs one line {begin!r} and after it one line {end!r}"
+        ) from error

@@ -1,41 +1,39 @@
-"""Grasp after grasp in one process, to see whether anything grows: memory, open files, threads."""
+"""Soak test: many grasps in one process, to find growth of memory, open files or threads."""
 
 import ctypes
 import gc
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final, TypedDict
 
 import numpy as np
 
 from gripper_force.config import Config
+from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.grasp import TRIAL_OBJECTS, TRIAL_TARGETS_N, grasp
 from gripper_force.runtime.log import LogReader
 from gripper_force.types import NS_PER_S
 
 WARM_UP: Final = 5
-"""Grasps until each kind of object has been held, and all that is made once has been made."""
+"""Grasps before growth counts: each kind of object was held, and everything made only once exists."""
 
 GROWTH_MB: Final = 20.0
-"""Memory that may come on top after the warm-up."""
-
-Advance = Callable[[str, int], None]
-"""Told what goes on, and how many simulated seconds more are done."""
+"""Allowed growth of memory after the warm-up."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """The process after a grasp.
+    """State of the process after a grasp.
 
     Attributes:
         simulated_s: Simulated time so far.
-        memory_mb: Memory of its own (RssAnon); pages of files come and go as the machine needs them.
+        memory_mb: Anonymous resident memory (RssAnon). It excludes file pages, which the kernel loads and
+            drops as it needs.
         handles: Open files, sockets and devices.
-        threads: Threads, those of libraries among them.
+        threads: Threads, including those of libraries.
     """
 
     simulated_s: float
@@ -44,24 +42,58 @@ class Sample:
     threads: int
 
 
-def soak(config: Config, simulated_s: float, advance: Advance = lambda _note, _done: None) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True)
+class Growth:
+    """Growth after the warm-up.
+
+    Attributes:
+        ok: True if neither files nor threads grew, and memory by less than `GROWTH_MB`.
+        growth_mb: Memory at the end minus memory after the warm-up.
+        slope_mb_h: Slope of a line through all samples, per simulated hour.
+    """
+
+    ok: bool
+    growth_mb: float
+    slope_mb_h: float
+
+
+class SoakReport(TypedDict):
+    """Result of `soak`.
+
+    Attributes:
+        ok: True if nothing grew and the simulated time was reached.
+        growth_mb: See `Growth`.
+        slope_mb_h: See `Growth`.
+        grasps: Grasps run.
+        outcomes: Count by result of a grasp.
+        simulated_s: Simulated time.
+        wall_s: Real time.
+        samples: State of the process before the first grasp and after each.
+    """
+
+    ok: bool
+    growth_mb: float
+    slope_mb_h: float
+    grasps: int
+    outcomes: dict[str, int]
+    simulated_s: float
+    wall_s: float
+    samples: list[Sample]
+
+
+def soak(config: Config, simulated_s: float, progress: Progress = no_progress) -> SoakReport:
     """Grasps the four objects in turn, with rising seeds and drawn targets, for a simulated time.
 
-    Broken off by Ctrl-C, it returns what was seen so far, with ``ok`` False.
+    Interrupted by Ctrl-C after the warm-up, it returns the results so far, with ``ok`` False.
 
     Args:
-        config: Everything but object, target, seed and the folder of logs, which are deleted as it goes.
-        simulated_s: How long; the warm-up and two more grasps are run in any case.
-        advance: Told of progress.
-
-    Returns:
-        ``ok``, ``grasps``, ``outcomes``, ``simulated_s``, ``wall_s``, ``growth_mb`` (since the warm-up),
-        ``slope_mb_h`` (of a line through all since then, a simulated hour), and ``samples``, the first of
-        them from before the first grasp. A grasp that fails counts as the outcome ``error: ...``.
+        config: Configuration; object, target, seed and log folder are replaced, and the logs deleted.
+        simulated_s: Simulated duration; at least the warm-up and two more grasps are run.
+        progress: Called after each grasp; a step is a simulated second.
     """
     begin_s = time.monotonic()
     rng = np.random.default_rng([config.seed, 30])
-    samples = [_look(0.0)]
+    samples = [_sample(0.0)]
     outcomes: Counter[str] = Counter()
     done_s, fewest = 0.0, WARM_UP + 3
     with tempfile.TemporaryDirectory(prefix="soak-") as folder:
@@ -78,19 +110,20 @@ def soak(config: Config, simulated_s: float, advance: Advance = lambda _note, _d
             except KeyboardInterrupt:
                 if len(samples) < fewest:
                     raise
-                break  # what was seen so far is worth telling
+                break
             outcomes[outcome] += 1
             before_s = done_s
             for path in Path(folder).iterdir():
                 done_s += LogReader(path).duration_ns / NS_PER_S
                 path.unlink()
-            samples.append(_look(done_s))
-            note = f"{drawn['object']}: {outcome}, {samples[-1].memory_mb:.0f} MB"
-            advance(note, int(done_s) - int(before_s))
-    flat = judge(samples)
+            samples.append(_sample(done_s))
+            text = f"{drawn['object']}: {outcome}, {samples[-1].memory_mb:.0f} MB"
+            progress(text, int(done_s) - int(before_s))
+    growth = measure_growth(samples)
     return {
-        **flat,
-        "ok": flat["ok"] and done_s >= simulated_s,
+        "ok": growth.ok and done_s >= simulated_s,
+        "growth_mb": growth.growth_mb,
+        "slope_mb_h": growth.slope_mb_h,
         "grasps": len(samples) - 1,
         "outcomes": dict(outcomes),
         "simulated_s": round(done_s, 1),
@@ -99,30 +132,30 @@ def soak(config: Config, simulated_s: float, advance: Advance = lambda _note, _d
     }
 
 
-def judge(samples: list[Sample]) -> dict[str, Any]:
-    """Whether anything grew after the warm-up: ``ok``, ``growth_mb`` and ``slope_mb_h``."""
+def measure_growth(samples: list[Sample]) -> Growth:
+    """Growth of memory, files and threads after the warm-up."""
     warm = samples[WARM_UP:]
     memory_mb = [sample.memory_mb for sample in warm]
-    each = len(TRIAL_OBJECTS)  # one object takes more than another
+    each = len(TRIAL_OBJECTS)  # objects take different amounts, so compare medians over one round of all
     growth_mb = float(np.median(memory_mb[-each:]) - np.median(memory_mb[:each]))
     hours = [sample.simulated_s / 3600 for sample in warm]
     slope_mb_h = np.polyfit(hours, memory_mb, 1)[0]
     flat = all(s.handles <= warm[0].handles and s.threads <= warm[0].threads for s in warm)
-    return {
-        "ok": flat and growth_mb < GROWTH_MB,
-        "growth_mb": round(growth_mb, 2),
-        "slope_mb_h": round(float(slope_mb_h), 2),
-    }
+    return Growth(
+        ok=flat and growth_mb < GROWTH_MB,
+        growth_mb=round(growth_mb, 2),
+        slope_mb_h=round(float(slope_mb_h), 2),
+    )
 
 
-def _look(simulated_s: float) -> Sample:
+def _sample(simulated_s: float) -> Sample:
     gc.collect()
-    ctypes.CDLL(None).malloc_trim(0)  # what was freed, and is kept to be used again, is no leak
+    ctypes.CDLL(None).malloc_trim(0)  # memory that was freed but kept for reuse is not a leak
     status = Path("/proc/self/status").read_text(encoding="ascii")
     facts = dict(line.split(":", 1) for line in status.splitlines())
     handles = sum(1 for _ in Path("/proc/self/fd").iterdir())
-    return Sample(simulated_s, _mb(facts["RssAnon"]), handles, int(facts["Threads"]))
+    return Sample(simulated_s, _kilobytes_to_mb(facts["RssAnon"]), handles, int(facts["Threads"]))
 
 
-def _mb(kilobytes: str) -> float:
+def _kilobytes_to_mb(kilobytes: str) -> float:
     return int(kilobytes.split()[0]) / 1024

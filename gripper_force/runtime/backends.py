@@ -1,7 +1,11 @@
-"""Names to classes. The core imports no device: a backend is a string here, imported when a run names it.
+"""Opens the devices that a configuration names.
 
-Nothing falls back silently: what the configuration names is opened, or an error says why not.
+A backend is a built-in name, ``package.module:Class``, or a name that an installed package registers as an
+entry point. It is imported when a run names it. There is no silent fallback: what the configuration names is
+opened, or an error says why not.
 """
+
+from __future__ import annotations
 
 import time
 from collections.abc import Iterator
@@ -9,74 +13,102 @@ from contextlib import ExitStack, contextmanager
 from importlib import import_module
 from typing import Any, Final
 
-from gripper_force.config import Config
+from gripper_force.config import CameraConfig, Config, LoadCellConfig
 from gripper_force.errors import ConfigError
 from gripper_force.interfaces import Clock, Devices
+from gripper_force.plugins import load_class
 from gripper_force.types import NS_PER_S
 
-SERVO: Final = "gripper_hw.dynamixel.servo:DynamixelServo"
 RIG: Final = "gripper_hw.sim.simulated_rig:SimulatedRig"
+SERVOS: Final = {"dynamixel": "gripper_hw.dynamixel.servo:DynamixelServo"}
 CAMERAS: Final = {
-    "none": None,
+    "none": "",
     "simulated": RIG,
     "playback": "gripper_hw.playback:PlaybackCamera",
     "oak": "gripper_hw.cameras.oak:OakCamera",
     "uvc": "gripper_hw.cameras.uvc:UvcCamera",
 }
 LOAD_CELLS: Final = {
-    "none": None,
+    "none": "",
     "simulated": RIG,
     "playback": "gripper_hw.playback:PlaybackLoadCell",
     "serial": "gripper_hw.load_cells.serial:SerialLoadCell",
     "phidget": "gripper_hw.load_cells.phidget:PhidgetLoadCell",
 }
-_ANY_TIME: Final = (RIG, CAMERAS["playback"], LOAD_CELLS["playback"])
-"""What keeps simulated time as well as the host's."""
 
 
 class MonotonicClock:
     """The host's monotonic time."""
 
     def now_ns(self) -> int:
-        """Time since some start."""
+        """Returns the current time."""
         return time.monotonic_ns()
 
     def sleep_until_ns(self, t_ns: int) -> None:
-        """Sleeps until then; returns at once if it is past."""
+        """Sleeps until a time; returns at once if it has passed."""
         if (left_ns := t_ns - time.monotonic_ns()) > 0:
             time.sleep(left_ns / NS_PER_S)
 
 
-@contextmanager
-def open_devices(config: Config) -> Iterator[Devices]:
-    """Opens what the configuration names, and closes all of it on the way out, whatever happens.
+def load_servo_class(config: Config) -> Any:
+    """Imports the class of ``servo.backend``. Raises `ConfigError` if there is no such class."""
+    return load_class("servos", SERVOS, config.servo.backend, "servo.backend")
+
+
+def is_simulated(config: Config) -> bool:
+    """Returns True if the run has a simulated world."""
+    devices = (config.camera.backend, config.load_cell.backend)
+    return "simulated" in devices or (
+        config.servo.backend == "dynamixel" and config.servo.port.startswith("virtual:")
+    )
+
+
+def resolve_simulation(config: Config) -> tuple[Config, str]:
+    """Chooses the simulated world's level of detail where the configuration says ``auto``.
+
+    Returns:
+        The configuration without ``auto``, and the reason for the choice (empty if there was none).
 
     Raises:
-        ConfigError: A backend is unknown, or two do not go together.
-        DeviceNotFoundError: A device is not there.
-        SimulationError: The simulated scene can't be built.
+        ConfigError: No level of detail keeps the budget.
     """
-    camera_class = _known(CAMERAS, "camera", config.camera.backend)
-    load_cell_class = _known(LOAD_CELLS, "load_cell", config.load_cell.backend)
+    if config.sim.detail != "auto" or not is_simulated(config):
+        return config, ""
+    resolved: tuple[Config, str] = _rig_class().resolve(config)
+    return resolved
+
+
+@contextmanager
+def open_devices(config: Config) -> Iterator[Devices]:
+    """Opens the configured devices and closes all of them at the end, whatever happens.
+
+    Args:
+        config: A resolved configuration (see `gripper_force.runtime.resolve`).
+
+    Raises:
+        ConfigError: A backend is unknown, or two cannot be combined.
+        DeviceNotFoundError: A device is missing.
+        SimulationError: The simulated scene cannot be built.
+    """
     with ExitStack() as stack:
         rig: Any = None
-        if config.servo.port.startswith("virtual:") or RIG in (camera_class, load_cell_class):
-            rig = load(RIG)(config)
+        if is_simulated(config):
+            rig = _rig_class()(config)
             stack.callback(rig.close)
         elif config.clock == "lockstep":
             raise ConfigError(
-                f"clock=lockstep needs a simulated servo, and servo.port is {config.servo.port!r}; "
-                "set clock=realtime, or servo.port=virtual:rig"
+                f"clock=lockstep needs a simulated servo, but servo.port is {config.servo.port!r}; set "
+                "clock=realtime, or servo.port=virtual:rig"
             )
         if config.faults and rig is None:
             raise ConfigError(
-                f"faults are only injected into stand-ins, and servo.port is {config.servo.port!r}; set "
-                "servo.port=virtual:rig, or faults=[]"
+                f"faults are injected into simulated devices only, but servo.port is {config.servo.port!r}; "
+                "set servo.port=virtual:rig, or faults=[]"
             )
         clock: Clock = rig.clock if rig is not None else MonotonicClock()
-        camera = _open(stack, camera_class, rig, config, clock, "camera")
-        load_cell = _open(stack, load_cell_class, rig, config, clock, "load_cell")
-        servo = load(SERVO)(config.servo, clock.now_ns)
+        camera = _open_sensor(stack, "camera", CAMERAS, config.camera, rig, config, clock)
+        load_cell = _open_sensor(stack, "load_cell", LOAD_CELLS, config.load_cell, rig, config, clock)
+        servo = load_servo_class(config)(config.servo, clock.now_ns)
         stack.callback(servo.close)
         if rig is not None:
             rig.start()
@@ -93,25 +125,42 @@ def open_devices(config: Config) -> Iterator[Devices]:
         )
 
 
-def _open(stack: ExitStack, backend: str | None, rig: Any, config: Config, clock: Clock, unit: str) -> Any:
-    if backend is None:
+def open_load_cell(config: Config, clock: Clock) -> Any:
+    """Opens the configured load cell alone, without a simulated world.
+
+    Raises:
+        ConfigError: The backend is unknown, simulated, or ``none``.
+    """
+    name = config.load_cell.backend
+    if name in ("none", "simulated"):
+        raise ConfigError(f"this needs a real load cell, but load_cell.backend is {name!r}; name yours")
+    return load_class("load_cells", LOAD_CELLS, name, "load_cell.backend")(config.load_cell, clock)
+
+
+def _rig_class() -> Any:
+    module, _, name = RIG.partition(":")
+    return getattr(import_module(module), name)
+
+
+def _open_sensor(
+    stack: ExitStack,
+    unit: str,
+    builtin: dict[str, str],
+    section: CameraConfig | LoadCellConfig,
+    rig: Any,
+    config: Config,
+    clock: Clock,
+) -> Any:
+    if section.backend == "none":
         return None
-    section = getattr(config, unit)
-    if config.clock == "lockstep" and backend not in _ANY_TIME:
-        raise ConfigError(f"{unit}.backend={section.backend} can't keep simulated time; set clock=realtime")
-    device = getattr(rig, unit) if backend == RIG else load(backend)(section, clock)
+    if section.backend == "simulated":
+        device = getattr(rig, unit)
+    else:
+        backend = load_class(f"{unit}s", builtin, section.backend, f"{unit}.backend")
+        if config.clock == "lockstep" and not getattr(backend, "supports_lockstep", False):
+            raise ConfigError(
+                f"{unit}.backend={section.backend} cannot follow simulated time; set clock=realtime"
+            )
+        device = backend(section, clock)
     stack.callback(device.close)
     return device
-
-
-def _known(backends: dict[str, str | None], unit: str, name: str) -> str | None:
-    try:
-        return backends[name]
-    except KeyError:
-        raise ConfigError(f"no {unit} backend {name!r}; there are {', '.join(backends)}") from None
-
-
-def load(path: str) -> Any:
-    """Imports what a string names: ``module:name``."""
-    module, _, name = path.partition(":")
-    return getattr(import_module(module), name)

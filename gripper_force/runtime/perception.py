@@ -1,4 +1,4 @@
-"""Frames to visual estimates, in step with a simulated clock or in a thread beside a real one."""
+"""Perception: camera frames to visual estimates, in lockstep or in a thread of its own."""
 
 import threading
 import time
@@ -10,33 +10,19 @@ import numpy as np
 
 from gripper_force.errors import GripperError
 from gripper_force.interfaces import Camera, Clock
-from gripper_force.types import NS_PER_MS, Frame, Gray, VisualForce
+from gripper_force.types import NS_PER_MS, ForceEstimate, Frame, Gray, VisualForce
 
 
 class Estimator(Protocol):
-    """What perception needs of `gripper_force.vision.estimator.ForceEstimator`."""
+    """Part of `gripper_force.vision.estimator.ForceEstimator` that perception uses."""
 
-    def update(self, gray: Gray) -> "ForceEstimate | None":
-        """Takes the next frame; None while the reference is being collected."""
-        ...
-
-
-class ForceEstimate(Protocol):
-    """A force with its claimed error."""
-
-    @property
-    def force_n(self) -> float:
-        """Contact force."""
-        ...
-
-    @property
-    def std_n(self) -> float:
-        """Its standard deviation."""
+    def update(self, gray: Gray) -> ForceEstimate | None:
+        """Takes the next frame; returns None while the reference is being collected."""
         ...
 
 
 class ProcessedFrame(NamedTuple):
-    """A frame, what the estimator made of it, and what went wrong, if anything did."""
+    """A frame, its estimate (None without one), and the problem (empty without one)."""
 
     frame: Frame
     visual: VisualForce | None
@@ -44,29 +30,29 @@ class ProcessedFrame(NamedTuple):
 
 
 class FrameProcessor:
-    """Runs the estimator on frames, and survives what it raises.
+    """Runs the estimator on frames, and contains its errors.
 
-    An error on the frames before the first estimate means that the run is set up wrongly, and is raised. A
-    later one costs the estimate of its frame: the controller goes on with the motor current alone. So does a
-    frame that is its forerunner to the bit: sensors have noise, and a camera that hangs has none. Where all
-    frames up to the first estimate are the same, as in a recording without noise, it means nothing.
+    An error before the first estimate means that the run is set up wrongly; it is raised. A later error only
+    costs the estimate of its frame: the controller continues on motor current. The same holds for a frame
+    that equals the previous one bit for bit, because sensors have noise and a camera that hangs has none. If
+    all frames up to the first estimate are equal, as in a recording without noise, repeats are accepted.
     """
 
     def __init__(self, estimator: Estimator | None) -> None:
         self._estimator = estimator
         self._works = False
         self._last: Gray | None = None
-        self._may_repeat: bool | None = None  # nothing is known yet
+        self._may_repeat: bool | None = None  # unknown
 
     def process(self, frame: Frame, now_ns: Callable[[], int] | None = None) -> ProcessedFrame:
-        """Makes an estimate of a frame.
+        """Estimates the force in a frame.
 
         Args:
             frame: The next frame.
-            now_ns: Tells, once it is made, when it was ready; None: when the frame came.
+            now_ns: Returns the time at which the estimate is ready; None: the time the frame was received.
 
         Raises:
-            Exception: What the estimator raised before its first estimate.
+            Exception: The estimator failed before its first estimate.
         """
         if self._estimator is None:
             return ProcessedFrame(frame, None)
@@ -75,7 +61,7 @@ class FrameProcessor:
             self._may_repeat = repeats and self._may_repeat is not False
         self._last = frame.gray
         if self._works and repeats and not self._may_repeat:
-            return ProcessedFrame(frame, None, "the camera repeats its last picture; see whether it hangs")
+            return ProcessedFrame(frame, None, "the camera repeats its last image; check whether it hangs")
         begin_ns = time.perf_counter_ns()
         try:
             result = self._estimator.update(frame.gray)
@@ -94,23 +80,23 @@ class FrameProcessor:
 
 
 class Perception(Protocol):
-    """Eyes of a session."""
+    """Source of processed frames for a session."""
 
     def start(self) -> None:
-        """Begins to look."""
+        """Starts the processing."""
         ...
 
     def poll(self) -> list[ProcessedFrame]:
-        """What has become ready since the last call, oldest first."""
+        """Returns the frames that became ready since the last call, oldest first."""
         ...
 
     def close(self) -> None:
-        """Stops looking. May be called twice."""
+        """Stops the processing. May be called twice."""
         ...
 
 
 class LockstepPerception:
-    """Estimates in the caller's thread; an estimate is there a fixed simulated time after its frame."""
+    """Processes frames in the caller's thread; estimates are ready after a fixed simulated time."""
 
     def __init__(
         self, camera: Camera | None, estimator: Estimator | None, clock: Clock, compute_ms: float
@@ -120,10 +106,10 @@ class LockstepPerception:
         self._under_way: deque[tuple[int, ProcessedFrame]] = deque()
 
     def start(self) -> None:
-        """Nothing to start."""
+        """Does nothing: there is no thread."""
 
     def poll(self) -> list[ProcessedFrame]:
-        """What has become ready since the last call, oldest first."""
+        """Returns the frames that became ready since the last call, oldest first."""
         now_ns = self._clock.now_ns()
         busy = self._under_way and self._under_way[-1][0] > now_ns
         if not busy and self._camera is not None and (frame := self._camera.newest()) is not None:
@@ -135,11 +121,11 @@ class LockstepPerception:
         return ready
 
     def close(self) -> None:
-        """Nothing to stop."""
+        """Does nothing: there is no thread."""
 
 
 class ThreadedPerception:
-    """Estimates in a thread of its own, always on the newest frame."""
+    """Processes the newest frame in a background thread."""
 
     _IDLE_S = 0.001
     _PATIENCE_S = 1.0
@@ -157,13 +143,13 @@ class ThreadedPerception:
             self._thread.start()
 
     def poll(self) -> list[ProcessedFrame]:
-        """What has become ready since the last call, oldest first. Raises what stopped the thread."""
+        """Returns the frames that became ready since the last call; re-raises an exception of the thread."""
         if self._failure is not None:
             raise self._failure
         return [self._done.popleft() for _ in range(len(self._done))]
 
     def close(self) -> None:
-        """Stops the thread, or leaves it behind where a model hangs. May be called twice."""
+        """Stops the thread; gives up after 1 s if the estimator hangs. May be called twice."""
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join(self._PATIENCE_S)
@@ -177,5 +163,5 @@ class ThreadedPerception:
                     self._stop.wait(self._IDLE_S)
                     continue
                 self._done.append(self._processor.process(frame, self._clock.now_ns))
-        except Exception as error:  # it is the control thread's to raise
+        except Exception as error:  # re-raised in the control thread
             self._failure = error

@@ -1,163 +1,180 @@
-"""A run in time: devices, perception and the pure controller, cycle by cycle, into a log.
+"""The control cycle of a run: devices, perception, the pure controller, and the log.
 
-This module alone owns the order of things within a cycle. It runs in lockstep with a simulated clock, or in
-real time; `gripper_force.jobs.replay` feeds the same controller from a log, in the order it was written.
+This module alone defines the order within a cycle. It runs in lockstep with a simulated clock, or in real
+time; `gripper_force.jobs.replay` feeds the same controller from a log, in the order in which it was written.
 """
 
-import signal
+from __future__ import annotations
+
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, cast
+from typing import TYPE_CHECKING, Any, BinaryIO, Final, cast
 
 from gripper_force.config import Config, dump_config
-from gripper_force.control.limits import largest_target_n
 from gripper_force.control.state_machine import Decision, GraspController, is_open
-from gripper_force.errors import ConfigError, DeviceError, GripperError
+from gripper_force.errors import DeviceError, GripperError
 from gripper_force.fault_injection import Faults, FaultyEstimator, FaultyFile
 from gripper_force.interfaces import Devices
-from gripper_force.profiles.apply import check_target, correction_of, rig_mismatches
-from gripper_force.runtime.assembly import checkpoint_of, make_controller, make_estimator, settled
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log import LogWriter
 from gripper_force.runtime.log_queue import LogQueue
 from gripper_force.runtime.monitors import CounterMonitor, LoadCellMonitor
 from gripper_force.runtime.perception import Estimator, LockstepPerception, Perception, ThreadedPerception
-from gripper_force.runtime.priority import real_time_priority
+from gripper_force.runtime.process import deferred_signals, real_time_settings
+from gripper_force.runtime.resolve import ResolvedConfig, make_controller, make_estimator, resolve
 from gripper_force.types import (
     NS_PER_S,
     Event,
+    Frame,
     GraspStatus,
     LoadCellSample,
-    Outcome,
     Phase,
+    Record,
     Request,
     RequestKind,
+    ServoState,
 )
 
-if TYPE_CHECKING:  # a run without vision loads none of it
-    from gripper_force.profiles.correction import Correction
+if TYPE_CHECKING:  # a run without vision imports none of it
     from gripper_force.vision.estimator import ForceEstimator
-    from gripper_force.vision.header import Model
 
-_VISION_PATIENCE_NS = 2 * NS_PER_S
-_REFERENCE_NS = NS_PER_S // 10
-"""Every run begins with frames that show no contact, so that its log can be replayed with vision."""
+_VISION_WAIT_NS: Final = 2 * NS_PER_S
+"""Longest wait for the first visual estimate."""
 
-_OPENING_NS = 5 * NS_PER_S
-"""How long jaws may take to open."""
+_REFERENCE_NS: Final = NS_PER_S // 10
+"""Every run starts with frames without contact, so that its log can be replayed with vision."""
 
-_REALTIME_SWITCH_S = 2e-4
-_PACKAGES = ("gripper-force", "dynamixel-sdk", "mujoco", "numpy", "torch")
-_OWN_PACKAGE = ("openvino", "onnxruntime")
-"""Engines that a package of their own name computes."""
+_OPENING_NS: Final = 5 * NS_PER_S
+"""Longest time in which the jaws open."""
 
-Progress = Callable[[GraspStatus], None]
+_PACKAGES: Final = ("gripper-force", "dynamixel-sdk", "mujoco", "numpy", "torch")
+_ENGINE_PACKAGES: Final = ("openvino", "onnxruntime")
+"""Engines whose package has the engine's name."""
 
 
 class Session:
     """One controller on one set of devices.
 
     Attributes:
-        has_vision: Whether there was a visual estimate yet.
-        failed: Whether the run is at fault, so that it is to end as ``control.on_fault`` says.
-        cycles: Cycles run.
-        frames: Frames logged.
+        run: The resolved configuration.
+        has_vision: True once there was a visual estimate.
+        failed: True if the run is at fault, so that it ends as ``control.on_fault`` says.
+        cycles: Number of cycles so far.
+        frames: Number of frames so far.
+        newest_frame: The newest frame, or None.
+        servo_state: The newest reading of the servo, or None.
         last_load_cell_sample: The newest valid sample of the load cell, or None.
     """
 
     def __init__(
         self,
-        config: Config,
+        run: ResolvedConfig,
         devices: Devices,
         controller: GraspController,
         perception: Perception,
-        log_queue: LogQueue,
+        log_queue: LogQueue | None,
     ) -> None:
-        self._config, self._devices = config, devices
+        self.run, self._devices = run, devices
         self._controller, self._perception, self._log_queue = controller, perception, log_queue
-        self._period_ns = round(NS_PER_S / config.control.rate_hz)
+        self._period_ns = round(NS_PER_S / run.config.control.rate_hz)
         self._due_ns = 0
         self._stop = threading.Event()
         self._interrupted = False
         self._counter_monitors = {unit: CounterMonitor() for unit in ("servo", "camera", "load_cell")}
-        self._problem = ""
         self._load_cell_monitor = LoadCellMonitor()
+        self._problem = ""
         self._error: BaseException | None = None
         self._armed = False
         self.failed = False
         self.has_vision = False
         self.cycles = self.frames = 0
+        self.newest_frame: Frame | None = None
+        self.servo_state: ServoState | None = None
         self.last_load_cell_sample: LoadCellSample | None = None
 
     @property
     def lost_records(self) -> int:
-        """Records that the log lacks, because the disk failed or was too slow."""
-        return self._log_queue.lost
+        """Number of records missing from the log because the disk failed or was too slow."""
+        return 0 if self._log_queue is None else self._log_queue.lost
 
     def start(self) -> None:
-        """Arms the servo and starts the sensors."""
+        """Starts the sensors and arms the servo."""
         for sensor in (self._devices.camera, self._devices.load_cell):
             if sensor is not None:
                 sensor.start()
-        self._devices.servo.start()  # where this raises, it has turned torque off itself
+        self._devices.servo.start()  # if this raises, it has turned torque off itself
         self._armed = True
         self._perception.start()
         self._due_ns = self._devices.clock.now_ns()
 
+    def wait_for_reference(self) -> Decision:
+        """Runs cycles until the reference frames are taken and, with vision, an estimate exists."""
+        decision = self.cycle()
+        start_ns = last_ns = decision.status.t_ns
+        with_vision = self.run.model is not None
+        while last_ns - start_ns < (
+            _VISION_WAIT_NS if with_vision and not self.has_vision else _REFERENCE_NS
+        ):
+            decision = self.cycle()
+            last_ns = decision.status.t_ns
+        return decision
+
     def stop_soon(self) -> None:
-        """Makes the next cycle a stop, whatever else was asked. Any thread or signal handler may call it."""
+        """Makes the next cycle a stop, before any other request. Any thread or signal handler may call it."""
         self._stop.set()
 
     def interrupt(self) -> None:
-        """Makes the next cycle raise `KeyboardInterrupt` before it talks to the servo.
+        """Makes the next cycle raise `KeyboardInterrupt` before it accesses the servo.
 
         Raises:
-            KeyboardInterrupt: The one asked for before has not come yet.
+            KeyboardInterrupt: An earlier interrupt is still pending.
         """
         if self._interrupted:
             raise KeyboardInterrupt
         self._interrupted = True
 
-    def end_if_interrupted(self) -> None:
-        """Raises the `KeyboardInterrupt` that is due, if one is."""
+    def raise_if_interrupted(self) -> None:
+        """Raises the pending `KeyboardInterrupt`, if there is one."""
         if self._interrupted:
             self._interrupted = False
             raise KeyboardInterrupt("the run was interrupted")
 
-    def cycle(self, kind: RequestKind | None = None, target_n: float = 0.0) -> Decision:
-        """Waits for the next cycle and runs it: read, see, decide, write, log.
+    def cycle(self, kind: RequestKind | None = None, target_n: float = 0.0, width_m: float = 0.0) -> Decision:
+        """Waits for the next cycle and runs it: read, estimate, decide, write, log.
 
         Args:
             kind: A new request, or None to go on as before.
-            target_n: Wanted force of a grasp.
+            target_n: Target force of a grasp request.
+            width_m: Width of a move request.
 
         Raises:
-            DeviceError: The servo was lost or does not answer.
+            DeviceError: The servo is lost or does not answer.
             KeyboardInterrupt: See `interrupt`.
             GripperError: A sensor or the simulated world failed, or the first frames gave no estimate.
         """
-        devices, log = self._devices, self._log_queue.write
+        devices, log = self._devices, self._log
         devices.clock.sleep_until_ns(self._due_ns)
         self._due_ns = max(self._due_ns + self._period_ns, devices.clock.now_ns() - self._period_ns)
-        self.end_if_interrupted()
+        self.raise_if_interrupted()
         devices.check()
         visual = None
-        for seen in self._perception.poll():
-            log(seen.frame)
+        for processed in self._perception.poll():
+            log(processed.frame)
             self.frames += 1
-            if seen.visual is not None:
-                visual = seen.visual
+            self.newest_frame = processed.frame
+            if processed.visual is not None:
+                visual = processed.visual
                 log(visual)
                 self.has_vision = True
-            if seen.problem not in ("", self._problem):
-                log(Event(seen.frame.received_ns, "vision", f"no estimate: {seen.problem}"))
-            self._problem = seen.problem
-        state = devices.servo.read()
-        request = self._request(state.t_ns, kind, target_n)
+            if processed.problem not in ("", self._problem):
+                log(Event(processed.frame.received_ns, "vision", f"no estimate: {processed.problem}"))
+            self._problem = processed.problem
+        state = self.servo_state = devices.servo.read()
+        request = self._request(state.t_ns, kind, target_n, width_m)
         decision = self._controller.step(state.t_ns, state, visual, request)
         devices.servo.write(decision.command)
         self.cycles += 1
@@ -173,17 +190,27 @@ class Session:
         self._log_sensors(state.t_ns)
         return decision
 
+    def release(self) -> GraspStatus:
+        """Opens the jaws and returns the last status. An object that catches on them can keep them closed."""
+        return self.wait_until_open(self.cycle(RequestKind.RELEASE).status)
+
+    def wait_until_open(self, status: GraspStatus) -> GraspStatus:
+        """Runs cycles until opening jaws are open, or for at most 5 s. Returns the last status."""
+        end_ns = status.t_ns + _OPENING_NS
+        while status.t_ns < end_ns and not is_open(self.run.config.gripper.open_width_m, status.width_m):
+            status = self.cycle().status
+        return status
+
     def fail(self, error: BaseException) -> None:
-        """Takes note of what ends the run; Ctrl-C is no fault."""
+        """Logs the exception that ended the run. Only an `Exception` marks the run as failed."""
         self._error = error
         self.failed |= isinstance(error, Exception)
-        self._log_queue.write(
-            Event(self._devices.clock.now_ns(), "session", f"{type(error).__name__}: {error}")
-        )
+        self._log(Event(self._devices.clock.now_ns(), "session", f"{type(error).__name__}: {error}"))
 
     def close(self) -> None:
-        """Torque off, or hold, as configured; the log keeps what the load cell still had to say."""
-        hold = self._config.control.on_fault if self.failed else self._config.on_exit
+        """Turns torque off, or holds, as configured, and logs the load cell's last samples."""
+        config = self.run.config
+        hold = config.control.on_fault if self.failed else config.on_exit
         try:
             if self._armed:
                 self._devices.servo.stop(hold=hold == "hold")
@@ -191,31 +218,38 @@ class Session:
             first = self._error
             if not isinstance(first, GripperError):
                 raise
-            raise type(first)(f"{first}; nor could it be stopped: {second}") from first
+            raise type(first)(f"{first}; and the servo could not be stopped: {second}") from first
         finally:
             self._perception.close()
         self._log_sensors(self._devices.clock.now_ns(), at_end=True)
 
     def attach(self, name: str, data: bytes, media_type: str) -> None:
         """Adds a file to the log."""
-        self._log_queue.attach(name, data, media_type)
+        if self._log_queue is not None:
+            self._log_queue.attach(name, data, media_type)
 
-    def _request(self, t_ns: int, kind: RequestKind | None, target_n: float) -> Request | None:
+    def _log(self, record: Record) -> None:
+        if self._log_queue is not None:
+            self._log_queue.write(record)
+
+    def _request(
+        self, t_ns: int, kind: RequestKind | None, target_n: float, width_m: float
+    ) -> Request | None:
         if self._stop.is_set():
             self._stop.clear()
             return Request(t_ns, RequestKind.STOP)
-        return None if kind is None else Request(t_ns, kind, target_n)
+        return None if kind is None else Request(t_ns, kind, target_n, width_m)
 
     def _log_sensors(self, t_ns: int, *, at_end: bool = False) -> None:
         devices = self._devices
         if devices.load_cell is not None:
             samples = devices.load_cell.drain()
             for sample in samples:
-                self._log_queue.write(sample)
+                self._log(sample)
                 if sample.valid:
                     self.last_load_cell_sample = sample
             if text := self._load_cell_monitor.update(t_ns, samples):
-                self._log_queue.write(Event(t_ns, "load_cell", text))
+                self._log(Event(t_ns, "load_cell", text))
         counts = {"servo": {"bus retries": devices.servo.stats.retries}}
         if devices.camera is not None:
             counts["camera"] = devices.camera.counts()
@@ -223,37 +257,55 @@ class Session:
             counts["load_cell"] = devices.load_cell.counts()
         for unit, count in counts.items():
             if text := self._counter_monitors[unit].update(t_ns, count, at_end=at_end):
-                self._log_queue.write(Event(t_ns, unit, text))
+                self._log(Event(t_ns, unit, text))
 
 
 @contextmanager
-def open_session(
-    config: Config, devices: Devices, path: Path, checkpoint: "Model | None"
-) -> Iterator[Session]:
-    """A session that runs, and on every way out stops the servo as configured and closes its log.
+def open_run(config: Config | ResolvedConfig, path: Path | None, *, vision: bool = True) -> Iterator[Session]:
+    """Resolves a configuration, opens its devices and opens a session on them.
 
-    A session that never came to a cycle leaves no log.
+    Args:
+        config: The run, resolved or not.
+        path: Log to write; None: no log.
+        vision: False for a run that only records frames.
+
+    Raises:
+        GripperError: Something is missing or inconsistent, or a device failed.
     """
-    config, why = settled(config) if checkpoint is not None else (config, "")
-    config, controller = make_controller(config, devices)
-    correction = correction_of(config, checkpoint)
-    estimator = make_estimator(config, checkpoint, correction)
+    run = config if isinstance(config, ResolvedConfig) else resolve(config, vision=vision)
+    with open_devices(run.config) as devices, open_session(run, devices, path) as session:
+        yield session
+
+
+@contextmanager
+def open_session(run: ResolvedConfig, devices: Devices, path: Path | None) -> Iterator[Session]:
+    """Opens a session, and at the end stops the servo as configured and closes the log.
+
+    A session without a single cycle leaves no log.
+
+    Args:
+        run: The resolved configuration.
+        devices: Its devices.
+        path: Log to write; None: no log.
+
+    Raises:
+        GripperError: A device failed.
+        LogError: After the run: records are missing from the log.
+    """
+    controller = make_controller(run.config)
+    estimator = make_estimator(run)
     with ExitStack() as stack:
-        log_queue = _recorder(config, devices, path, checkpoint, correction)
-        for unit, text in (("vision", why), ("simulation", devices.notes.get("detail"))):
-            if text:
+        log_queue = None if path is None else _open_log(run, devices, path)
+        session = Session(run, devices, controller, _perception(run.config, devices, estimator), log_queue)
+        if path is not None and log_queue is not None:
+            stack.callback(_discard_unused, session, path)
+            stack.callback(log_queue.close)
+            for unit, text in run.notes:
                 log_queue.write(Event(devices.start_ns, unit, text))
-        session = Session(config, devices, controller, _perception(config, devices, estimator), log_queue)
-        stack.callback(_discard_unused, session, path)
-        stack.callback(log_queue.close)
-        if not devices.lockstep:
-            # Python's default lets a thread that computes keep the control thread waiting for 5 ms.
-            stack.callback(sys.setswitchinterval, sys.getswitchinterval())
-            sys.setswitchinterval(_REALTIME_SWITCH_S)
-            if refusal := stack.enter_context(real_time_priority()):
-                log_queue.write(Event(devices.start_ns, "session", refusal))
+        if not devices.lockstep and (refusal := stack.enter_context(real_time_settings())):
+            session._log(Event(devices.start_ns, "session", refusal))
         stack.callback(_attach_reference, session, estimator)
-        stack.enter_context(_signals_wait(session))
+        stack.enter_context(_interruptible(session))
         stack.callback(session.close)
         try:
             session.start()
@@ -261,131 +313,29 @@ def open_session(
         except BaseException as error:
             session.fail(error)
             raise
-    log_queue.raise_losses()
+    if log_queue is not None:
+        log_queue.raise_losses()
 
 
 @contextmanager
-def _signals_wait(session: Session) -> Iterator[None]:
-    """Ctrl-C and SIGTERM end the run between two cycles, as one within a bus transaction would leave it torn.
-
-    A second one, while the first still waits, ends it at once.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield  # only the main thread may set handlers, and only there do they raise
-        return
-    signals = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, lambda *_: session.interrupt()) for number in signals]
-    try:
+def _interruptible(session: Session) -> Iterator[None]:
+    with deferred_signals(session.interrupt):
         yield
-    finally:
-        for number, handler in zip(signals, before, strict=True):
-            signal.signal(number, handler)
-    session.end_if_interrupted()
+    session.raise_if_interrupted()
 
 
-def run_grasp(config: Config, path: Path, progress: Progress | None = None) -> None:
-    """Grasps, holds, releases and writes the log.
-
-    Args:
-        config: The run.
-        path: Log to write.
-        progress: Called after each change of phase.
-
-    Raises:
-        ConfigError: The target is over the force limit, or more than a profile was calibrated with.
-        GripperError: Something failed. The servo was stopped as configured, and the log holds what was seen.
-    """
-    _check_target(config)
-    checkpoint = checkpoint_of(config)
-    with open_devices(config) as devices, open_session(config, devices, path, checkpoint) as session:
-        grasp_in(session, config, checkpoint is not None, progress)
-
-
-def _check_target(config: Config) -> None:
-    limit_n = config.control.force_limit_n
-    if config.target_n > largest_target_n(limit_n):
-        raise ConfigError(
-            f"target_n {config.target_n:g} N is too near to control.force_limit_n {limit_n:g} N; ask for at "
-            f"most {largest_target_n(limit_n):g} N, or raise the limit"
-        )
-    check_target(config)
-
-
-def grasp_in(session: Session, config: Config, has_vision: bool, progress: Progress | None = None) -> str:
-    """Grasps, holds and releases in a session that is open; see `run_grasp`. Returns the outcome."""
-    decision = session.cycle()
-    start_ns = last_ns = decision.status.t_ns
-    while last_ns - start_ns < (
-        _VISION_PATIENCE_NS if has_vision and not session.has_vision else _REFERENCE_NS
-    ):
-        last_ns = session.cycle().status.t_ns
-    decision = session.cycle(RequestKind.GRASP, config.target_n)
-    phase = ""
-    ended_ns: int | None = None
-    while True:
-        status = decision.status
-        if progress is not None and status.phase != phase:
-            progress(status)
-        phase = status.phase
-        if status.outcome != Outcome.NONE and ended_ns is None:
-            ended_ns = status.t_ns
-        if ended_ns is not None:
-            keep_s = config.control.hold_s if status.outcome == Outcome.HELD else 0.0
-            if status.t_ns - ended_ns >= keep_s * NS_PER_S:
-                break
-        decision = session.cycle()
-    if status.outcome == Outcome.FAULT:
-        if config.control.on_fault == "open":
-            let_open(session, config, status)
-        return status.outcome  # otherwise nothing moves until somebody has looked
-    if config.on_exit == "hold":
-        return status.outcome
-    status = release(session, config)
-    if progress is not None:
-        progress(status)
-    return status.outcome
-
-
-def release(session: Session, config: Config) -> GraspStatus:
-    """Opens the jaws and returns how far that came: an object that catches on them can keep them closed."""
-    return let_open(session, config, session.cycle(RequestKind.RELEASE).status)
-
-
-def let_open(session: Session, config: Config, status: GraspStatus) -> GraspStatus:
-    """Goes on until jaws that are opening are open, or have had their time. Returns how far that came."""
-    end_ns = status.t_ns + _OPENING_NS
-    while status.t_ns < end_ns and not is_open(config.gripper.open_width_m, status.width_m):
-        status = session.cycle().status
-    return status
-
-
-def _recorder(
-    config: Config,
-    devices: Devices,
-    path: Path,
-    checkpoint: "Model | None",
-    correction: "Correction | None",
-) -> LogQueue:
-    about = _metadata(config, devices, checkpoint)
-    if correction is not None:
-        about["profile"] = correction.profile.weights
-    faults, clock, lockstep = Faults(config.faults, devices.start_ns), devices.clock, devices.lockstep
+def _open_log(run: ResolvedConfig, devices: Devices, path: Path) -> LogQueue:
+    faults, clock, lockstep = Faults(run.config.faults, devices.start_ns), devices.clock, devices.lockstep
 
     def wrap_file(file: BinaryIO) -> BinaryIO:
         return (
             cast(BinaryIO, FaultyFile(file, faults, clock, lockstep=lockstep)) if faults.has("disk") else file
         )
 
-    differ = {
-        "object profile": () if correction is None else correction.differs,
-        "rig profile": rig_mismatches(config),
-    }
-    log = LogWriter(path, config=dump_config(config), metadata=about, wrap_file=wrap_file)
-    log_queue = LogQueue(log, lockstep=lockstep)
-    for profile, found in differ.items():
-        if found:
-            log_queue.write(Event(devices.start_ns, "session", f"the {profile} is of {'; '.join(found)}"))
-    return log_queue
+    log = LogWriter(
+        path, config=dump_config(run.config), metadata=_metadata(run, devices), wrap_file=wrap_file
+    )
+    return LogQueue(log, lockstep=lockstep)
 
 
 def _perception(config: Config, devices: Devices, estimator: Estimator | None) -> Perception:
@@ -397,18 +347,21 @@ def _perception(config: Config, devices: Devices, estimator: Estimator | None) -
     return ThreadedPerception(devices.camera, estimator, devices.clock)
 
 
-def _metadata(config: Config, devices: Devices, checkpoint: "Model | None") -> dict[str, str]:
-    engine = config.vision.engine if checkpoint else ""
-    packages = (*_PACKAGES, engine) if engine in _OWN_PACKAGE else _PACKAGES
-    versions = {f"version {name}": metadata.version(name) for name in packages}
+def _metadata(run: ResolvedConfig, devices: Devices) -> dict[str, str]:
+    config = run.config
+    engine = config.vision.engine if run.model else ""
+    packages = (*_PACKAGES, engine) if engine in _ENGINE_PACKAGES else _PACKAGES
+    profile = {} if run.correction is None else {"profile": run.correction.profile.weights}
     return {
         "object": config.object,
         "set": f"{config.object}-{config.seed}",
         "clock": config.clock,
-        "checkpoint": checkpoint.digest if checkpoint else "",
+        "checkpoint": run.model.digest if run.model else "",
+        "choice": run.choice,
         "python": sys.version.split()[0],
-        **versions,
+        **{f"version {name}": metadata.version(name) for name in packages},
         **devices.notes,
+        **profile,
     }
 
 
@@ -417,7 +370,7 @@ def _discard_unused(session: Session, path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def _attach_reference(session: Session, estimator: "ForceEstimator | None") -> None:
+def _attach_reference(session: Session, estimator: ForceEstimator | None) -> None:
     if estimator is not None and (reference := estimator.reference) is not None:
         import cv2
 

@@ -1,1 +1,11 @@
-"""Contract suites for devices and engines, to run on a class of one's own with pytest."""
+"""Contract suites for devices and engines, to be run with pytest on your own classes."""
+
+import pytest
+
+# Gives failures of the suites the same detailed messages as failures in a test module.
+pytest.register_assert_rewrite(
+    f"{__name__}.camera_contract",
+    f"{__name__}.engine_contract",
+    f"{__name__}.load_cell_contract",
+    f"{__name__}.servo_contract",
+)

@@ -1,4 +1,4 @@
-"""What an engine runs for each frame: one streaming step of a whole ensemble, as one function of tensors."""
+"""One streaming step of an ensemble as one function of tensors, which every engine can run."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -16,10 +16,10 @@ ATTENTION: Final = "attention"
 
 
 class EnsembleStep(nn.Module):
-    """One step of all members: their states go in and come out, so that any engine can run it.
+    """One step of all members. The states are inputs and outputs.
 
-    Inputs are ``frame`` (1, 1, S, S) and `state_names`. Outputs are ``force_n`` (M,), ``features`` (F,) of
-    all members side by side, ``attention`` (h, w) of the first SSAM member if there is one, and the next
+    Inputs are ``frame`` (1, 1, S, S) and `state_names`. Outputs are ``force_n`` (M,), the members'
+    concatenated ``features`` (F,), ``attention`` (h, w) of the first SSAM member if one exists, and the next
     states.
     """
 
@@ -28,43 +28,43 @@ class EnsembleStep(nn.Module):
         self.members = nn.ModuleList(networks)
         self._configs = [network.config for network in networks]
         attentions = [config.attention for config in self._configs]
-        self._looks = attentions.index("ssam") if "ssam" in attentions else None
+        self._ssam_member = attentions.index("ssam") if "ssam" in attentions else None
 
     @property
     def outputs(self) -> list[str]:
-        """Names of what `forward` returns, in order."""
-        attention = [] if self._looks is None else [ATTENTION]
+        """Names of the outputs of `forward`, in order."""
+        attention = [] if self._ssam_member is None else [ATTENTION]
         return [FORCE, FEATURES, *attention, *(f"next_{name}" for name in state_names(self._configs))]
 
     def forward(self, frame: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
-        """Takes the next frame; see the class."""
+        """Runs all members on the next frame; shapes as in the class."""
         forces, features, gates = [], [], []
-        states: list[Tensor] = []
-        left = list(state)
+        next_states: list[Tensor] = []
+        inputs = list(state)
         for config, member in zip(self._configs, self.members, strict=True):
             assert isinstance(member, ForceNetwork)
-            # Without earlier frames there are no maps: engines know no tensors of size zero.
-            maps = left.pop(0) if config.maps_kept else member.blank().maps
-            seen, after = member.step(frame, StreamState(maps, left.pop(0), left.pop(0)))
-            forces.append(seen.force_n)
-            features.append(seen.features[0])
-            gates.append(seen.gates)
-            states += after if config.maps_kept else after[1:]
-        looks = [] if self._looks is None else [_of(gates[self._looks])]
-        return torch.cat(forces), torch.cat(features), *looks, *states
+            # Without earlier frames there is no maps input: engines do not take tensors of size zero.
+            maps = inputs.pop(0) if config.maps_kept else member.zero_state().maps
+            output, state_after = member.step(frame, StreamState(maps, inputs.pop(0), inputs.pop(0)))
+            forces.append(output.force_n)
+            features.append(output.features[0])
+            gates.append(output.gates)
+            next_states += state_after if config.maps_kept else state_after[1:]
+        attention = [] if self._ssam_member is None else [_map(gates[self._ssam_member])]
+        return torch.cat(forces), torch.cat(features), *attention, *next_states
 
-    def blank(self) -> list[Tensor]:
-        """States that remember nothing, as `forward` takes them."""
+    def zero_states(self) -> list[Tensor]:
+        """Returns states of zeros, in the order in which `forward` takes them."""
         states: list[Tensor] = []
         for config, member in zip(self._configs, self.members, strict=True):
             assert isinstance(member, ForceNetwork)
-            blank = member.blank()
-            states += blank if config.maps_kept else blank[1:]
+            state = member.zero_state()
+            states += state if config.maps_kept else state[1:]
         return states
 
 
 def state_names(members: Sequence[NetworkConfig]) -> list[str]:
-    """Names of an ensemble's states, in the order that `EnsembleStep` takes them in."""
+    """Returns the names of an ensemble's states, in the order in which `EnsembleStep` takes them."""
     names = []
     for i, config in enumerate(members):
         names += [f"maps_{i}"] if config.maps_kept else []
@@ -72,6 +72,6 @@ def state_names(members: Sequence[NetworkConfig]) -> list[str]:
     return names
 
 
-def _of(gates: Tensor | None) -> Tensor:
+def _map(gates: Tensor | None) -> Tensor:
     assert gates is not None
     return gates[0, 0]  # (h, w)

@@ -1,37 +1,35 @@
-"""The force estimator of a run: camera frames in, newtons with a claimed error out."""
+"""Force estimator: camera frames in, contact force and its claimed error out."""
 
 import math
-from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
 
 import numpy as np
 
 from gripper_force.config import VisionConfig
-from gripper_force.errors import DataError, NonFiniteError
-from gripper_force.profiles.correction import Correction
-from gripper_force.types import Gray
-from gripper_force.vision.engines import Engine, Floats, open_engine
+from gripper_force.errors import ConfigError, DataError, NonFiniteError
+from gripper_force.profiles.correction import Correction, load_correction
+from gripper_force.profiles.object_profile import find_object, read_object
+from gripper_force.types import ForceEstimate, Gray
+from gripper_force.vision.engines import Engine, Floats, Precision, open_engine
 from gripper_force.vision.frame_checks import FrameChecks
 from gripper_force.vision.header import RESIDUAL_HALF_N, Model
+from gripper_force.vision.model_files import read_model
 from gripper_force.vision.preprocess import Normaliser, Region, downscale
 
 
-@dataclass(frozen=True, slots=True)
-class ForceEstimate:
-    """One estimate.
-
-    Attributes:
-        force_n: Contact force: the mean over the ensemble, corrected by the object's profile.
-        std_n: Standard deviation claimed for it: as the profile's interval says, or, without a profile, the
-            error measured in validation at that force, and half the spread of the members, as independent.
-            It grows by each newton beyond the forces that these know.
-    """
-
-    force_n: float
-    std_n: float
-
-
 class ForceEstimator:
-    """Runs an ensemble over a stream of frames. Deterministic; one thread alone may call it."""
+    """Estimates the contact force from a stream of camera frames. Deterministic; not thread-safe.
+
+    The first frames of a stream must show no contact: their mean is the reference that later frames are
+    compared with. There is no estimate until the reference is complete. Each frame passes through crop and
+    downscale, plausibility checks, subtraction of the reference, the networks, and the object profile.
+
+    The estimate is the mean over the members of the ensemble, corrected by the object profile if there is
+    one. Its standard deviation is that of the profile's interval. Without a profile, it combines the error
+    measured in validation at that force with half of the members' spread, as independent errors. It
+    grows with the distance to the forces seen in validation or calibration.
+    """
 
     def __init__(
         self,
@@ -39,12 +37,13 @@ class ForceEstimator:
         region: Region | None = None,
         correction: Correction | None = None,
     ) -> None:
-        """Begins a run.
+        """Starts a stream on an engine that is open; `load` opens one.
 
         Args:
             engine: The ensemble.
-            region: Region of interest of the camera's frame in pixels; None for the whole frame.
-            correction: What the object's profile makes of the estimates.
+            region: Region of interest of the frames in pixels: left, top, width, height. None: the whole
+                frame.
+            correction: Correction by an object profile.
         """
         self._region = region
         self._engine = engine
@@ -54,8 +53,53 @@ class ForceEstimator:
         self._residual_stds = [residual.std_n for residual in engine.header.residuals]
         self.reset()
 
+    @classmethod
+    def load(
+        cls,
+        checkpoint: str | Path = "default",
+        *,
+        region: Region | None = None,
+        profile: str | Path | None = None,
+        engine: str = "torch",
+        precision: Precision = "float32",
+        threads: int | None = None,
+    ) -> Self:
+        """Loads a network and returns an estimator for one camera.
+
+        It needs no other device and no configuration, so it also works with other grippers. For accurate
+        forces there, pass a checkpoint that was trained with that gripper (`gripper-force train`)::
+
+            estimator = ForceEstimator.load("default", region=(40, 40, 400, 400))
+            for frame in frames:  # (H, W) uint8; no contact in the first ones
+                estimate = estimator.update(frame)
+                if estimate is None:
+                    continue  # the reference is being collected
+                print(f"{estimate.force_n:.2f} N +- {estimate.std_n:.2f} N")
+
+        Args:
+            checkpoint: ``default`` or ``small`` for a shipped network, the path of a checkpoint, or the path
+                of a file that `gripper-force export` wrote.
+            region: Region of interest of the frames in pixels: left, top, width, height. None: the whole
+                frame.
+            profile: Object profile: a name such as ``sponge``, or the path of a YAML file. Its network must
+                be this one; its camera settings are not checked.
+            engine: ``torch``, ``openvino``, ``onnxruntime``, or an engine of another package: the name of an
+                entry point in the group ``gripper_force.engines``, or ``package.module:Class``.
+            precision: Precision of the arithmetic. Of the built-in engines only OpenVINO has ``bfloat16``.
+            threads: CPU threads. With PyTorch this sets the threads of the whole process. None leaves that
+                setting as it is, and gives OpenVINO and ONNX Runtime their own default, all cores.
+
+        Raises:
+            CheckpointError: The network's file is missing or damaged.
+            ConfigError: The engine is unknown, not installed, or can't run this file or precision; or the
+                profile does not exist, is damaged, or belongs to another network.
+        """
+        model = read_model(checkpoint)
+        correction = None if profile is None else _profile_correction(model, str(profile))
+        return cls(open_engine(model, engine, precision, threads), region, correction)
+
     def reset(self) -> None:
-        """Forgets the stream: the next frames are the first of a new run, and its reference."""
+        """Starts a new stream: the next frames must show no contact and become its reference."""
         self._frame_checks = FrameChecks()
         self._normaliser = Normaliser(self._preprocess)
         self._engine.reset()
@@ -63,23 +107,23 @@ class ForceEstimator:
 
     @property
     def reference(self) -> Gray | None:
-        """Mean of the no-contact reference frames, (S, S) uint8; None until they are there, or if unused."""
+        """Mean of the reference frames, (S, S) uint8; None until it is complete or if none is used."""
         return self._normaliser.reference_image
 
     def update(self, gray: Gray) -> ForceEstimate | None:
-        """Takes the next frame.
+        """Processes the next frame.
 
         Args:
-            gray: Camera frame, (H, W) uint8. The first of a run must show no contact.
+            gray: Camera frame, (H, W) uint8. The first frames of a stream must show no contact.
 
         Returns:
-            The estimate for this frame, or None while the reference frames are being collected.
+            The estimate for this frame, or None while the reference is being collected.
 
         Raises:
-            DataError: The frame is not a gray image of bytes, not what a working camera would see, or too
-                unlike all that the object's profile was calibrated with.
+            DataError: The frame is not a gray image of bytes, is implausible (see `FrameChecks`), or its
+                out-of-distribution score exceeds the limit of the object profile.
             ConfigError: The region of interest reaches beyond the frame.
-            NonFiniteError: A network gave NaN or infinity.
+            NonFiniteError: A network returned NaN or infinity.
         """
         step = None
         small = downscale(gray, self._region, self._preprocess.size)
@@ -91,46 +135,64 @@ class ForceEstimator:
         forces: list[float] = step.forces_n.tolist()
         self._attention = step.attention
         if not all(math.isfinite(force) for force in forces):
-            raise NonFiniteError(f"the network gave {forces} N; check the checkpoint and the camera's image")
+            raise NonFiniteError(
+                f"the network returned {forces} N; check the checkpoint and the camera's image"
+            )
         force_n = sum(forces) / len(forces)
         if self._correction is not None:
-            return self._corrected(self._correction, force_n, step.features)
+            return _corrected(self._correction, force_n, step.features)
         residual_n = float(np.interp(force_n, self._residual_forces, self._residual_stds))
-        # Validation never saw such an estimate: all that is known is that the forces there end earlier.
+        # No error was measured at these forces.
         least_n = self._residual_forces[0] - RESIDUAL_HALF_N
         most_n = self._residual_forces[-1] + RESIDUAL_HALF_N
         beyond_n = max(least_n - force_n, force_n - most_n, 0.0)
         return ForceEstimate(force_n, math.hypot(residual_n + beyond_n, (max(forces) - min(forces)) / 2))
 
     def attention_map(self) -> Floats | None:
-        """Where SSAM looks in the newest frame, (h, w) in 0..1; None without SSAM or a frame."""
+        """Returns SSAM's attention map of the newest frame, (h, w) in 0..1; None without SSAM or a frame."""
         return self._attention
-
-    def _corrected(self, correction: Correction, force_n: float, read: Floats) -> ForceEstimate:
-        features = read[None]  # (1, F)
-        ood_score = float(correction.ood_score(features)[0])
-        if ood_score > 1:
-            raise DataError(
-                f"what is seen is {ood_score:.1f} times as unlike the touches of the profile "
-                f"{correction.profile.object!r} as these are among each other; see whether it is that object"
-            )
-        corrected_n = correction.force_n([force_n], features)
-        return ForceEstimate(float(corrected_n[0]), float(correction.std_n(corrected_n)[0]))
 
 
 def open_estimator(
-    model: Model, vision: VisionConfig, correction: Correction | None = None
+    model: Model, vision: VisionConfig, correction: Correction | None = None, *, set_threads: bool = True
 ) -> ForceEstimator:
-    """The estimator of a run.
+    """Returns the estimator that a configuration describes.
 
     Args:
-        model: What ``vision.checkpoint`` names.
-        vision: Nothing in it is left to ``auto``; see `gripper_force.vision.selection.resolve_auto`.
-        correction: What the object's profile makes of the estimates.
+        model: The network that ``vision.checkpoint`` names.
+        vision: Configuration without ``auto``; see `gripper_force.vision.selection.resolve_auto`.
+        correction: Correction by an object profile.
+        set_threads: Sets PyTorch's threads, one setting of the whole process, to ``vision.threads``. OpenVINO
+            and ONNX Runtime have their own threads and use that number in any case.
 
     Raises:
-        ConfigError: The engine is not there, or can't run this file.
+        ConfigError: The engine is unknown, not installed, or can't run this file or precision.
         CheckpointError: The file is damaged.
     """
-    engine = open_engine(model, vision.engine, vision.precision, vision.threads)
-    return ForceEstimator(engine, vision.region, correction)
+    threads = None if vision.engine == "torch" and not set_threads else vision.threads
+    return ForceEstimator(
+        open_engine(model, vision.engine, vision.precision, threads), vision.region, correction
+    )
+
+
+def _profile_correction(model: Model, name: str) -> Correction:
+    path = find_object(name)
+    profile = read_object(path)
+    if mismatches := profile.mismatches(model.digest, camera={}):
+        raise ConfigError(
+            f"the object profile {path} is of {'; '.join(mismatches)}; calibrate the object with this "
+            "network, or use the network of the profile"
+        )
+    return load_correction(path, profile, sum(member.head for member in model.header.members))
+
+
+def _corrected(correction: Correction, force_n: float, step_features: Floats) -> ForceEstimate:
+    features = step_features[None]  # (1, F)
+    ood_score = float(correction.ood_score(features)[0])
+    if ood_score > 1:
+        raise DataError(
+            f"the frame's out-of-distribution score is {ood_score:.1f} times the limit of the object profile "
+            f"{correction.profile.object!r}; check that the object is the profile's, or calibrate again"
+        )
+    corrected_n = correction.force_n([force_n], features)
+    return ForceEstimate(float(corrected_n[0]), float(correction.std_n(corrected_n)[0]))

@@ -1,16 +1,16 @@
-"""From a checkpoint to the files that other engines run, each checked against PyTorch before it is kept."""
+"""Export of a checkpoint to ONNX or OpenVINO. Each file is checked against PyTorch before it is kept."""
 
 import logging
 import math
 import shutil
 import warnings
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import Any, Final, TypedDict
 
 import numpy as np
 import torch
@@ -18,65 +18,82 @@ import torch
 from gripper_force.errors import CheckpointError, ConfigError, DataError
 from gripper_force.types import Gray
 from gripper_force.vision.checkpoint import load_checkpoint
-from gripper_force.vision.engines import Engine, Floats, open_engine
+from gripper_force.vision.engines import Engine, Floats, Step, open_engine
 from gripper_force.vision.engines.pytorch import TorchEngine
 from gripper_force.vision.ensemble_step import FRAME, EnsembleStep, state_names
-from gripper_force.vision.header import EXPORTED, KEY, Header, Model, Residual, described
+from gripper_force.vision.header import EXPORTED, KEY, Header, Model, Residual, exported_metadata
 from gripper_force.vision.preprocess import Normaliser
 
 TOLERANCE: Final = 1e-4
-"""How far an exported network may be off PyTorch in float32, of the label's scale."""
+"""Largest difference of an exported network from PyTorch in float32, as a share of the label scale."""
 
 _CHECKED: Final = 30
-"""Frames that an exported network is checked on: more than a window."""
+"""Frames of noise that an exported network is checked on: more than a window."""
 
 _CLIPS: Final = 4
-"""Recordings that a quantised network is compared on."""
+"""Recordings that a quantised network is checked on."""
 
 _SAMPLES: Final = 300
-"""Frames that int8 is scaled on; NNCF's own default."""
+"""Frames that int8 ranges are calibrated on; NNCF's default."""
 
 
-def export(model: Model, path: Path, frames: Sequence[Gray] | None = None) -> dict[str, float]:
-    """Writes an ensemble's streaming step as an ONNX or OpenVINO file, after the ending of ``path``.
+class ExportErrors(TypedDict):
+    """Difference of an exported network's estimates from PyTorch's.
+
+    Attributes:
+        largest_n: Largest absolute difference.
+        mean_n: Mean absolute difference.
+        rms_n: Root mean square difference.
+    """
+
+    largest_n: float
+    mean_n: float
+    rms_n: float
+
+
+def export(model: Model, path: Path, frames: Sequence[Gray] | None = None) -> ExportErrors:
+    """Writes an ensemble's streaming step as an ONNX or OpenVINO file.
+
+    With ``frames`` the convolutions are quantised to int8. Other layers, a tenth of the arithmetic or less,
+    stay in floating point: with the whole network in int8, errors exceeded 1 N.
 
     Args:
         model: The checkpoint.
-        path: The file to write; an OpenVINO file's weights go beside it, into ``.bin``.
-        frames: Recordings, (T, S, S) uint8 each, to scale the convolutions' int8 on; None: float32. What is
-            no convolution, a tenth of the arithmetic or less, stays in floating point: all of the network in
-            int8 was off by more than a newton.
+        path: File to write; its suffix selects the format. An OpenVINO file's weights go beside it, into
+            ``.bin``.
+        frames: Recordings, (T, S, S) uint8 each, to calibrate the ranges of int8 on; None for float32.
 
     Returns:
-        ``largest_n``, ``mean_n`` and ``rms_n``: how far it is off PyTorch on frames, of the recordings or of
-        noise. What int8 is off by, the errors that the file claims hold as well.
+        The difference from PyTorch, on the recordings or on noise. The header of an int8 file claims errors
+        that include it.
 
     Raises:
-        ConfigError: The ending is another, or a package is not installed.
-        CheckpointError: The checkpoint can't be read, or what came out of it computes something else.
-        DataError: The recordings are too few.
+        ConfigError: The suffix is unknown, or a package is not installed.
+        CheckpointError: The checkpoint can't be read, or the exported network computes something else.
+        DataError: The recordings hold too few frames.
     """
     if path.suffix not in EXPORTED:
-        raise ConfigError(f"{path} should end in {' or '.join(EXPORTED)}: that says what to export to")
+        raise ConfigError(f"can't export to {path}; name a file that ends in {' or '.join(EXPORTED)}")
     if frames is not None and path.suffix != ".xml":
-        raise ConfigError("int8 is exported to OpenVINO: name a file that ends in .xml")
+        raise ConfigError(f"int8 is exported to OpenVINO only, not to {path}; name a file that ends in .xml")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(dir=path.parent) as folder, _quiet():
+        with TemporaryDirectory(dir=path.parent) as folder, _quiet(), _one_thread():
             made = Path(folder) / path.name
             (_openvino if path.suffix == ".xml" else _onnx)(model, made, frames)
             errors = _check(model, made, frames)
             if frames is not None:
-                _claim(coarser(model.header, errors), made)
-            # The weights first: what finds the one finds the other.
+                _replace_header(with_added_error(model.header, errors), made)
+            # The weights first: a process that finds the .xml must find its .bin too.
             for part in sorted(Path(folder).iterdir(), key=lambda part: part.suffix == path.suffix):
                 shutil.move(part, path.parent / part.name)
     except ModuleNotFoundError as error:
         raise ConfigError(
-            f"exporting to {path.suffix} needs {error.name}: pip install 'gripper-force[engines]'"
+            f"exporting to {path.suffix} needs {error.name}, which is not installed; "
+            "pip install 'gripper-force[engines]'"
         ) from error
     except OSError as error:
-        raise CheckpointError(f"can't write {path}: {error.strerror}") from error
+        raise CheckpointError(f"can't write {path}: {error.strerror}; name another file") from error
     return errors
 
 
@@ -91,7 +108,7 @@ def _onnx(model: Model, path: Path, _frames: Sequence[Gray] | None) -> None:
         output_names=step.outputs,
     )
     assert program is not None
-    for name, text in described(model).items():
+    for name, text in exported_metadata(model).items():
         program.model.metadata_props[f"{KEY}.{name}"] = text
     program.save(str(path))
 
@@ -111,19 +128,21 @@ def _openvino(model: Model, path: Path, frames: Sequence[Gray] | None) -> None:
         port.get_tensor().set_names({name})
     if frames is not None:
         network = _quantised(network, model, frames)
-    for name, text in described(model).items():
+    for name, text in exported_metadata(model).items():
         network.set_rt_info(text, [KEY, name])
     openvino.save_model(network, path, compress_to_fp16=False)
 
 
 def _quantised(network: Any, model: Model, frames: Sequence[Gray]) -> Any:
-    """The convolutions in int8, each channel of their weights and their inputs scaled on frames."""
+    """Quantises the convolutions to int8: weights with a scale per channel, inputs calibrated on frames."""
     import nncf
 
     total = sum(len(clip) for clip in frames)
     if total < _SAMPLES:
-        raise DataError(f"int8 is scaled on at least {_SAMPLES} frames, and these recordings have {total}")
-    engine = _Tapped(model, total // _SAMPLES)
+        raise DataError(
+            f"int8 needs at least {_SAMPLES} frames, and the recordings hold {total}; record more"
+        )
+    engine = _InputRecorder(model, total // _SAMPLES)
     for clip in frames:
         engine.reset()
         for frame in inputs_of(model, clip):
@@ -131,7 +150,7 @@ def _quantised(network: Any, model: Model, frames: Sequence[Gray]) -> Any:
     kept = {"Convolution", "GroupConvolution"}
     nodes = network.get_ops()
     others = sorted({node.get_type_name() for node in nodes} - kept)
-    # The first convolution has one channel to read: little to gain, and what it sees is faint.
+    # The first convolution stays too: one input channel, so little to gain, and small input values.
     first = [
         n.get_friendly_name()
         for n in nodes
@@ -139,69 +158,72 @@ def _quantised(network: Any, model: Model, frames: Sequence[Gray]) -> Any:
     ]
     return nncf.quantize(
         network,
-        nncf.Dataset(engine.seen),
-        subset_size=len(engine.seen),
+        nncf.Dataset(engine.recorded),
+        subset_size=len(engine.recorded),
         fast_bias_correction=False,
         ignored_scope=nncf.IgnoredScope(types=others, names=first, validate=False),
     )
 
 
-class _Tapped(TorchEngine):
-    """Keeps what goes into a step, evenly over all of them."""
+class _InputRecorder(TorchEngine):
+    """Records the inputs of every n-th step."""
 
     def __init__(self, model: Model, every: int) -> None:
         super().__init__(model)
-        self.seen: list[list[Floats]] = []
+        self.recorded: list[list[Floats]] = []
         self._every, self._count = every, 0
 
-    def _run(self, frame: Floats) -> Any:
+    def _infer(self, frame: Floats) -> Step:
         self._count += self._begun
         if self._begun and self._count % self._every == 0:
-            self.seen.append([frame[None, None], *(np.array(tensor) for tensor in self._state)])
-        return super()._run(frame)
+            self.recorded.append([frame[None, None], *(np.array(tensor) for tensor in self._states)])
+        return super()._infer(frame)
 
 
 def _traced(model: Model) -> tuple[EnsembleStep, tuple[torch.Tensor, ...]]:
     step = EnsembleStep(load_checkpoint(model.path).networks).eval()
     size = model.header.preprocess.size
-    return step, (torch.zeros(1, 1, size, size), *step.blank())
+    return step, (torch.zeros(1, 1, size, size), *step.zero_states())
 
 
 def inputs_of(model: Model, clip: Gray) -> Iterator[Floats]:
-    """Prepares a recording, (T, S, S) uint8, as a run would."""
+    """Yields the network's inputs, (S, S) float32, for a recording (T, S, S) uint8, as in a run."""
     normaliser = Normaliser(model.header.preprocess)
     for frame in clip:
         yield from normaliser.push(frame)
 
 
-def _check(model: Model, path: Path, frames: Sequence[Gray] | None) -> dict[str, float]:
+def _check(model: Model, path: Path, frames: Sequence[Gray] | None) -> ExportErrors:
     exact = frames is None
     if frames is None:
         size = model.header.preprocess.size
         frames = [np.random.default_rng(0).integers(0, 256, (_CHECKED, size, size), np.uint8)]
     made = Model(path, model.header, model.digest)
     frames = frames[:_CLIPS]
-    ours, theirs = (
+    expected_n, exported_n = (
         np.concatenate([_estimates(engine, model, clip) for clip in frames])
         for engine in (TorchEngine(model), open_engine(made, EXPORTED[path.suffix]))
     )
-    off_n = np.abs(ours - theirs)
+    error_n = np.abs(expected_n - exported_n)
     scale_n = max(member.label_scale_n for member in model.header.members)
-    if not np.isfinite(off_n).all() or (exact and off_n.max() > TOLERANCE * scale_n):
-        raise CheckpointError(f"what came out as {path.suffix} is off by {off_n.max():.2g} N")
+    if not np.isfinite(error_n).all() or (exact and error_n.max() > TOLERANCE * scale_n):
+        raise CheckpointError(
+            f"the exported {path.suffix} file differs from PyTorch by {error_n.max():.2g} N; "
+            "install other versions of the packages of gripper-force[engines], or use vision.engine=torch"
+        )
     return {
-        "largest_n": float(off_n.max()),
-        "mean_n": float(off_n.mean()),
-        "rms_n": float(np.sqrt(np.square(off_n).mean())),
+        "largest_n": float(error_n.max()),
+        "mean_n": float(error_n.mean()),
+        "rms_n": float(np.sqrt(np.square(error_n).mean())),
     }
 
 
-def coarser(header: Header, errors: Mapping[str, float]) -> Header:
-    """What a network says about itself that is off by so much more, in an independent way.
+def with_added_error(header: Header, errors: ExportErrors) -> Header:
+    """Returns the header with larger claimed errors.
 
     Args:
-        header: What it said before.
-        errors: ``mean_n`` and ``rms_n`` of what came on top.
+        header: Header of the checkpoint.
+        errors: Additional errors, taken as independent of the ones claimed so far.
     """
     added_n = {"mae_n": errors["mean_n"], "rmse_n": errors["rms_n"]}
     residuals = tuple(
@@ -215,9 +237,9 @@ def coarser(header: Header, errors: Mapping[str, float]) -> Header:
     return header.model_copy(update={"residuals": residuals, "metrics": metrics})
 
 
-def _claim(header: Header, path: Path) -> None:
-    """Puts another header into an OpenVINO file."""
-    tree = ET.parse(path)  # noqa: S314 - it was written a moment ago
+def _replace_header(header: Header, path: Path) -> None:
+    """Replaces the header in an OpenVINO file."""
+    tree = ET.parse(path)  # noqa: S314 - written just before
     entry = tree.find(f"rt_info/{KEY}/header")
     assert entry is not None
     entry.set("value", header.model_dump_json())
@@ -231,7 +253,7 @@ def _estimates(engine: Engine, model: Model, clip: Gray) -> Floats:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """The exporters talk about their own insides, on stdout too."""
+    """Silences the exporters, which log and print their internal steps."""
     names = ("torch.onnx", "nncf", "onnxscript", "onnx_ir")
     levels = {name: logging.getLogger(name).level for name in names}
     for name in names:
@@ -243,3 +265,14 @@ def _quiet() -> Iterator[None]:
     finally:
         for name, level in levels.items():
             logging.getLogger(name).setLevel(level)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Runs PyTorch on one thread: the rounding of sums depends on the number of threads."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

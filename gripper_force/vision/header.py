@@ -180,8 +180,8 @@ def header_from(text: str, path: Path) -> Header:
         raise CheckpointError(f"the header of {path} is wrong at {key!r}: {first['msg']}") from error
 
 
-def described(model: Model) -> dict[str, str]:
-    """What an exported file says about itself."""
+def exported_metadata(model: Model) -> dict[str, str]:
+    """Returns the metadata of a file exported from a model."""
     return {"header": model.header.model_dump_json(), "digest": model.digest}
 
 

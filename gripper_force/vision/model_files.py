@@ -1,6 +1,6 @@
-"""Files for other engines: what they say about themselves, and where this machine keeps its own.
+"""Reading of checkpoints and of files exported from them, and the cache of exported files of this machine.
 
-An ONNX file carries the header in its metadata, an OpenVINO file in its ``rt_info``.
+An ONNX file holds the header in its metadata, an OpenVINO file in its ``rt_info``.
 """
 
 import os
@@ -20,14 +20,14 @@ from gripper_force.vision.header import (
 
 
 def read_model(source: str | Path) -> Model:
-    """Reads what a checkpoint, or a file that was exported from one, says about itself.
+    """Reads the header of a checkpoint, or of a file exported from one.
 
     Args:
-        source: A path, or ``default`` or ``small`` for a checkpoint that is shipped.
+        source: A path, or ``default`` or ``small`` for a shipped checkpoint.
 
     Raises:
-        CheckpointError: The file is missing, damaged, or nothing of ours.
-        ConfigError: What reads its format is not installed.
+        CheckpointError: The file is missing, damaged, or not of this project.
+        ConfigError: The package that reads the file's format is not installed.
     """
     if str(source) in SHIPPED or Path(source).suffix not in EXPORTED:
         path, data, header = read_checkpoint(source)
@@ -35,27 +35,29 @@ def read_model(source: str | Path) -> Model:
     path = Path(source)
     if not path.is_file():
         raise CheckpointError(f"no network at {path}; make one with `gripper-force export`")
-    about = _of_openvino(path) if path.suffix == ".xml" else _of_onnx(path)
-    if not {"header", "digest"} <= about.keys():
-        raise CheckpointError(f"{path} was not made by `gripper-force export`")
-    return Model(path, header_from(about["header"], path), about["digest"])
+    metadata = _openvino_metadata(path) if path.suffix == ".xml" else _onnx_metadata(path)
+    if not {"header", "digest"} <= metadata.keys():
+        raise CheckpointError(
+            f"{path} was not made by `gripper-force export`; make one with it from a checkpoint"
+        )
+    return Model(path, header_from(metadata["header"], path), metadata["digest"])
 
 
-def exported(model: Model, suffix: str) -> Path:
-    """The model's file for an engine: its own, or, of a checkpoint, one that this machine keeps.
+def exported_file(model: Model, suffix: str) -> Path:
+    """Returns the file of a model that an engine runs.
 
-    It is made at the first use.
+    This is the model's own file, or, for a checkpoint, an export in the cache folder, made at the first use.
+
+    Args:
+        model: The model.
+        suffix: Suffix of the engine's files, a key of `EXPORTED`.
 
     Raises:
-        ConfigError: It is a file for another engine, or a package for the export is not installed.
+        ConfigError: The file was exported for another engine, or a package for the export is not installed.
     """
     if model.path.suffix == suffix:
         return model.path
-    if model.path.suffix in EXPORTED:
-        raise ConfigError(
-            f"{model.path} was exported for another engine: set vision.engine={EXPORTED[model.path.suffix]}, "
-            "or name the checkpoint that it was made of"
-        )
+    check_not_exported(model)
     path = cache_folder() / f"{model.digest[:32]}{suffix}"
     if not path.exists():
         from gripper_force.vision.export import export
@@ -64,32 +66,46 @@ def exported(model: Model, suffix: str) -> Path:
     return path
 
 
+def check_not_exported(model: Model) -> None:
+    """Raises `ConfigError` if the model's file was exported, and so only runs in another engine."""
+    if model.path.suffix in EXPORTED:
+        raise ConfigError(
+            f"{model.path} was exported for another engine; set vision.engine={EXPORTED[model.path.suffix]}, "
+            "or set vision.checkpoint to the checkpoint that it was exported from"
+        )
+
+
 def cache_folder() -> Path:
-    """What can be made again (https://specifications.freedesktop.org/basedir-spec/latest/)."""
+    """Returns the folder of cached files (https://specifications.freedesktop.org/basedir-spec/latest/)."""
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     return Path(base) / "gripper-force"
 
 
-def _of_openvino(path: Path) -> dict[str, str]:
+def _openvino_metadata(path: Path) -> dict[str, str]:
     try:
-        root = ET.parse(path).getroot()  # noqa: S314 - a network that one has chosen to run
+        root = ET.parse(path).getroot()  # noqa: S314 - a network that the user has chosen to run
     except (OSError, ET.ParseError) as error:
-        raise CheckpointError(f"{path} is damaged or no OpenVINO file: {error}") from error
-    ours = root.find(f"rt_info/{KEY}")
-    return {} if ours is None else {part.tag: part.get("value", "") for part in ours}
+        raise CheckpointError(
+            f"{path} is damaged or not an OpenVINO file: {error}; export it again"
+        ) from error
+    section = root.find(f"rt_info/{KEY}")
+    return {} if section is None else {entry.tag: entry.get("value", "") for entry in section}
 
 
-def _of_onnx(path: Path) -> dict[str, str]:
+def _onnx_metadata(path: Path) -> dict[str, str]:
     try:
         import onnxruntime
     except ModuleNotFoundError as error:
-        raise ConfigError("an ONNX file needs ONNX Runtime: pip install 'gripper-force[engines]'") from error
+        raise ConfigError(
+            f"{path} needs ONNX Runtime, which is not installed; pip install 'gripper-force[engines]'"
+        ) from error
     try:
         session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
-    except Exception as error:  # its own classes derive from Exception alone
-        raise CheckpointError(f"{path} is damaged or no ONNX file: {error}") from error
+    except Exception as error:  # ONNX Runtime's classes have no common base but Exception
+        raise CheckpointError(f"{path} is damaged or not an ONNX file: {error}; export it again") from error
+    prefix = f"{KEY}."
     return {
-        name.removeprefix(f"{KEY}."): value
+        name.removeprefix(prefix): value
         for name, value in session.get_modelmeta().custom_metadata_map.items()
-        if name.startswith(f"{KEY}.")
+        if name.startswith(prefix)
     }

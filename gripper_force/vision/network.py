@@ -168,7 +168,7 @@ class ForceNetwork(nn.Module):
             The estimate, and the state for the next step.
         """
         if state is None:
-            state = self.blank(len(frame))
+            state = self.zero_state(len(frame))
             for _ in range(self.config.context):
                 _, state = self.step(frame, state)
         newest = self.backbone(frame)  # (B, C, H, W)
@@ -182,7 +182,7 @@ class ForceNetwork(nn.Module):
         features = torch.tanh(self.dense(read))
         return Output(self.force_n(features), features, gates), StreamState(kept, hidden, cell)
 
-    def blank(self, batch: int = 1) -> StreamState:
+    def zero_state(self, batch: int = 1) -> StreamState:
         """A state that remembers nothing: what a stream forgets after as many frames as `context` says."""
         config = self.config
         side = config.size // STRIDES[config.backbone]
@@ -231,6 +231,6 @@ def cost(config: NetworkConfig) -> tuple[int, int]:
     """
     network = ForceNetwork(config).eval()
     with torch.no_grad(), FlopCounterMode(display=False) as counter:
-        network.step(torch.zeros(1, 1, config.size, config.size), network.blank())
+        network.step(torch.zeros(1, 1, config.size, config.size), network.zero_state())
     parameters = sum(parameter.numel() for parameter in network.parameters())
     return parameters, counter.get_total_flops() // 2

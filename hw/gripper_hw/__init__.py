@@ -1,1 +1,1 @@
-"""Devices and their stand-ins."""
+"""Device drivers, simulated devices and playback of logs."""

@@ -4,7 +4,7 @@ import pytest
 
 from gripper_force.config import load_config
 from gripper_force.jobs.grasp import TRIAL_OBJECTS
-from gripper_force.profiles.apply import correction_of
+from gripper_force.profiles.apply import read_correction, read_profiles
 from gripper_force.profiles.object_profile import find_object, read_object
 from gripper_force.vision.checkpoint import load_checkpoint
 
@@ -16,7 +16,7 @@ def test_a_shipped_profile_is_of_the_shipped_network_and_the_usual_camera(
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     assert read_object(find_object(name)).object == name
     config = load_config(None, [f"object={name}", "calibration.object=own"])
-    correction = correction_of(config, load_checkpoint())
+    correction = read_correction(config, read_profiles(config), load_checkpoint())
     assert correction is not None
     assert correction.differs == ()
     assert correction.profile.force_n > 8

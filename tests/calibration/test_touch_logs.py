@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gripper_calibration.touch_logs import join, read_one, touch_of
+from gripper_calibration.touch_logs import join, read_log, touch_numbers
 from gripper_force.errors import DataError
 from gripper_force.runtime.log import LogWriter
 from gripper_force.types import NS_PER_S, Frame, LoadCellSample
@@ -15,7 +15,7 @@ from gripper_force.vision.checkpoint import load_checkpoint
 @given(st.lists(st.tuples(st.integers(5, 40), st.integers(3, 40), st.floats(1, 12)), min_size=1, max_size=6))
 def test_each_contact_is_a_touch_with_the_rests_about_it(parts: list[tuple[int, int, float]]) -> None:
     rests = [np.concatenate([np.zeros(rest), np.full(press, force_n)]) for rest, press, force_n in parts]
-    number = touch_of(np.concatenate([*rests, np.zeros(5)]))
+    number = touch_numbers(np.concatenate([*rests, np.zeros(5)]))
     assert (np.diff(number) >= 0).all()
     begins = np.cumsum([0, *(len(rest) for rest in rests[:-1])])
     for i, (begin, (rest, press, _)) in enumerate(zip(begins, parts, strict=True)):
@@ -24,8 +24,8 @@ def test_each_contact_is_a_touch_with_the_rests_about_it(parts: list[tuple[int, 
 
 def test_a_flicker_of_the_force_does_not_end_a_touch() -> None:
     force_n = np.concatenate([np.zeros(10), np.full(20, 3.0), np.zeros(2), np.full(20, 3.0), np.zeros(10)])
-    assert touch_of(force_n).max() == 0
-    assert touch_of(np.zeros(30)).max() == 0
+    assert touch_numbers(force_n).max() == 0
+    assert touch_numbers(np.zeros(30)).max() == 0
 
 
 def recording(path: Path, forces_n: list[float], *, keys: str = "object: mug") -> Path:
@@ -42,35 +42,37 @@ def recording(path: Path, forces_n: list[float], *, keys: str = "object: mug") -
 def test_logs_that_do_not_belong_together_are_refused(tmp_path: Path, tiny_checkpoint: Path) -> None:
     checkpoint = load_checkpoint(tiny_checkpoint)
     forces_n = [0.0] * 10 + [2.0] * 20
-    mug = read_one(recording(tmp_path / "a.mcap", forces_n), checkpoint)
+    mug = read_log(recording(tmp_path / "a.mcap", forces_n), checkpoint)
     for keys, sentence in (
         ("object: cup", "object cup, and .*a.mcap with mug"),
         ("object: mug\nload_cell: {n_per_raw: 2.0}", r"load_cell\.n_per_raw 2.0"),
         ("object: mug\nload_cell: {backend: phidget}", "load cell phidget"),
     ):
-        other = read_one(recording(tmp_path / "b.mcap", forces_n, keys=keys), checkpoint)
+        other = read_log(recording(tmp_path / "b.mcap", forces_n, keys=keys), checkpoint)
         with pytest.raises(DataError, match=sentence):
             join({tmp_path / "a.mcap": mug, tmp_path / "b.mcap": other})
     retared = recording(tmp_path / "b.mcap", forces_n, keys="object: mug\nload_cell: {tare_raw: 2.0}")
-    both = join({tmp_path / "a.mcap": mug, retared: read_one(retared, checkpoint)})
+    both = join({tmp_path / "a.mcap": mug, retared: read_log(retared, checkpoint)})
     assert both.touches.numbers == [0, 1]
 
 
 def test_a_log_without_contact_is_no_touch_and_has_no_lag(tmp_path: Path, tiny_checkpoint: Path) -> None:
-    recorded = read_one(recording(tmp_path / "a.mcap", [0.0] * 30), load_checkpoint(tiny_checkpoint))
+    recorded = read_log(recording(tmp_path / "a.mcap", [0.0] * 30), load_checkpoint(tiny_checkpoint))
     assert not recorded.has_contact
     assert recorded.delay_s == pytest.approx(0.02 + 1 / 60)
 
 
 def test_a_log_whose_labels_end_too_soon_is_refused(tmp_path: Path, tiny_checkpoint: Path) -> None:
     path = recording(tmp_path / "a.mcap", [0.0, 0.0] + [float("nan")] * 30)
-    with pytest.raises(DataError, match=r"a\.mcap has no label behind its first 3 frames"):
-        read_one(path, load_checkpoint(tiny_checkpoint))
+    with pytest.raises(
+        DataError, match=r".* has no label after its first 3 frames, which the network needs as lead-in"
+    ):
+        read_log(path, load_checkpoint(tiny_checkpoint))
 
 
 def test_a_recording_without_a_servo_tells_of_touches_alone(tmp_path: Path, tiny_checkpoint: Path) -> None:
     path = recording(tmp_path / "clip.mcap", [max(0.0, 0.2 * (i - 10)) for i in range(40)])
-    recorded = read_one(path, load_checkpoint(tiny_checkpoint))
+    recorded = read_log(path, load_checkpoint(tiny_checkpoint))
     assert recorded.presses == []
     assert recorded.camera["camera.rate_hz"] == 30
     assert recorded.touches.numbers == [0]

@@ -135,7 +135,7 @@ def test_replay_prints_one_json_object(run: Run, fused_log: Path) -> None:
     assert result["identical"] is True
     table = run("replay", fused_log)
     assert table.code == 0
-    assert "yes, to the bit" in table.out
+    assert "yes, bit for bit" in table.out
     changed = run("replay", fused_log, "--set", "control.ramp_n_s=4", "--json").json()
     assert changed["identical"] is False
 
@@ -234,9 +234,12 @@ def test_a_published_database_is_imported_and_its_damage_told(run: Run, tmp_path
         (["--set", "seed=x"], "configuration key 'seed'"),
         (["--object", "egg"], "no simulated object 'egg'; there are sponge, paper_cup, tube, stapler"),
         (["--feedback", "guess"], "configuration key 'control.feedback'"),
-        (["--target-n", "13"], "target_n 13 N is too near to control.force_limit_n 10 N"),
-        (["--set", "camera.backend=oak9"], "no camera backend 'oak9'; there are none, simulated"),
-        (["--set", "load_cell.backend=scale"], "no load_cell backend 'scale'"),
+        (["--target-n", "13"], "a target of 13 N is too close to control.force_limit_n 10 N"),
+        (
+            ["--set", "camera.backend=oak9"],
+            "unknown camera.backend 'oak9' (did you mean 'oak'?); use none, simulated",
+        ),
+        (["--set", "load_cell.backend=scale"], "unknown load_cell.backend 'scale'"),
         (["--set", "servo.port=/dev/ttyUSB7", "--set", "load_cell.backend=none"], "clock=lockstep needs"),
         (
             [
@@ -250,7 +253,7 @@ def test_a_published_database_is_imported_and_its_damage_told(run: Run, tmp_path
             "there is no port /dev/ttyUSB7",
         ),
         (["--set", "servo.model=XW999"], "XW999"),
-        (["--trials", "2", "--object", "tube"], "leave --object and --target-n out"),
+        (["--trials", "2", "--object", "tube"], "leave out --object and --target-n"),
         (["--config", "gone.yaml"], "can't read the configuration gone.yaml"),
         (["--set", "camera.backend=simulated", "--set", "vision.checkpoint=gone"], "no checkpoint at gone"),
     ],
@@ -302,7 +305,7 @@ def test_a_file_that_is_no_checkpoint_is_named(
 
 def test_a_report_is_of_the_run_as_it_was(run: Run, fused_log: Path) -> None:
     done = run("replay", fused_log, "--report", "--set", "control.ramp_n_s=4")
-    assert (done.code, "--report draws the run as it was" in done.err) == (2, True)
+    assert (done.code, "--report shows the run as it was" in done.err) == (2, True)
 
 
 def interrupt(arguments: list[str], folder: Path) -> tuple[int, str]:
@@ -336,7 +339,7 @@ def test_interrupted_trials_end_without_a_word_from_each_process(sets: list[str]
 def test_a_protocol_and_its_scale_are_known_by_name(run: Run) -> None:
     assert "no protocol 'shin'; there is shin2019" in run("simulate", "--protocol", "shin").err
     unknown = run("simulate", "--protocol", "shin2019", "--scale", "huge")
-    assert (unknown.code, "there are full, small" in unknown.err) == (2, True)
+    assert (unknown.code, "use one of full, small" in unknown.err) == (2, True)
 
 
 @pytest.mark.parametrize(

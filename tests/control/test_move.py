@@ -139,7 +139,7 @@ def test_refused_move_does_not_end_a_hold(make_run):
 @pytest.mark.parametrize("phase", PHASES)
 def test_move_pre_empts_every_phase(make_run, phase):
     run = make_run().to_phase(phase).move(0.08, 4.0)
-    assert (run.last.status.phase, run.last.status.outcome) == ("move", "")
+    assert (run.last.status.phase, run.last.status.outcome) == ("move", "moved")
     assert run.last.status.width_m == pytest.approx(0.08, abs=0.0005)
     assert run.plant.force_n == 0.0
 

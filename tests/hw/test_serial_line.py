@@ -10,7 +10,7 @@ from gripper_force.errors import DeviceError, DeviceNotFoundError
 from gripper_hw.serial_line import open_line
 
 
-def test_each_thing_in_the_way_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_open_errors_have_remedies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(name: str) -> str:
         with pytest.raises(DeviceError) as caught:
             open_line(name, 57_600, unit="load_cell", timeout_s=0)
@@ -28,12 +28,12 @@ def test_each_thing_in_the_way_is_one_sentence(tmp_path: Path, monkeypatch: pyte
     with pytest.raises(DeviceNotFoundError, match=r"set servo\.port to one of /dev/serial/by-id"):
         open_line(str(missing), 57_600, unit="servo", timeout_s=0)
     file.touch()
-    assert refused(str(file)).startswith(f"can't open the load cell's port {file}: ")
+    assert refused(str(file)).startswith(f"can't open the load cell's port {file} (")
 
     for number, advice in ((errno.EACCES, "join the group dialout"), (errno.EBUSY, "is in use by another")):
 
         def forbid(*_: object, number: int = number, **__: object) -> None:
             raise serial.SerialException(number, os.strerror(number))
 
-        monkeypatch.setattr(serial, "Serial", forbid)  # to the administrator nothing is forbidden
+        monkeypatch.setattr(serial, "Serial", forbid)  # root may open any file
         assert advice in refused(str(file))

@@ -43,7 +43,7 @@ def clip(name: str, object_name: str, set_name: str) -> Clip:
     )
 
 
-def test_a_label_is_the_mean_over_the_exposure() -> None:
+def test_label_is_mean_over_exposure() -> None:
     samples = [sample(t, 0.1 * t**2) for t in range(0, 100)]
     labels, valid = label_frames(np.array([20 * MS, 50 * MS]), samples, exposure_ns=4 * MS)
     np.testing.assert_allclose(
@@ -52,21 +52,21 @@ def test_a_label_is_the_mean_over_the_exposure() -> None:
     assert valid.all()
 
 
-def test_a_slow_load_cell_is_interpolated() -> None:
+def test_label_of_slow_load_cell_is_interpolated() -> None:
     samples = [sample(0, 0.0), sample(40, 4.0), sample(80, 0.0)]
     labels, valid = label_frames(np.array([10, 40, 60]) * MS, samples, exposure_ns=4 * MS)
     np.testing.assert_allclose(labels, [1.0, 4.0, 2.0], rtol=1e-6)
     assert valid.all()
 
 
-def test_rejected_samples_never_reach_a_label() -> None:
+def test_labels_ignore_rejected_samples() -> None:
     samples = [sample(0, 1.0), sample(10, -70.0, valid=False), sample(11, float("nan")), sample(20, 3.0)]
     labels, valid = label_frames(np.array([10 * MS]), samples, exposure_ns=10 * MS)
     np.testing.assert_allclose(labels, [2.0])
     assert valid.all()
 
 
-def test_a_frame_far_from_any_sample_has_no_label() -> None:
+def test_frame_far_from_samples_has_no_label() -> None:
     near_ms = NEAR_NS / MS
     t_ms = np.array([0, 100 - near_ms - 1, 100 - near_ms, 100 + near_ms, 100 + near_ms + 1])
     labels, valid = label_frames((t_ms * MS).astype(np.int64), [sample(100, 2.0)], exposure_ns=0)
@@ -96,7 +96,7 @@ def test_logs_become_clips(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.frames[0], downscale(frames[0].gray, (0, 0, 30, 30), 16))
 
 
-def test_what_is_missing_is_named(tmp_path: Path) -> None:
+def test_missing_logs_frames_or_labels_raise(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no logs"):
         load_clips(tmp_path, SMALL)
     write_log(tmp_path / "dark.mcap", [sample(0, 1.0)], {})
@@ -111,15 +111,13 @@ def test_what_is_missing_is_named(tmp_path: Path) -> None:
     "metadata",
     [{"exposure_ms": "long"}, {"exposure_ms": "1e999"}, {"scene": "{}"}, {"scene": '{"stiffness": 0}'}],
 )
-def test_metadata_without_the_number_they_should_hold_are_named(
-    tmp_path: Path, metadata: dict[str, str]
-) -> None:
+def test_metadata_without_number_raise(tmp_path: Path, metadata: dict[str, str]) -> None:
     write_log(tmp_path / "a.mcap", [frame(0, 0), sample(0, 1.0)], metadata)
     with pytest.raises(DataError, match="hold no number above 0"):
         load_clip(tmp_path / "a.mcap", SMALL, None)
 
 
-def test_a_log_with_a_damaged_configuration_is_named(tmp_path: Path) -> None:
+def test_damaged_configuration_raises(tmp_path: Path) -> None:
     with LogWriter(tmp_path / "a.mcap", config="camera: {rate_hz: 2001-99-99}", metadata={}):
         pass
     with pytest.raises(ConfigError, match=r"a\.mcap"):
@@ -127,7 +125,7 @@ def test_a_log_with_a_damaged_configuration_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("key", ["object", "set"])
-def test_a_split_keeps_together_what_belongs_together(key: str) -> None:
+def test_split_keeps_objects_or_sets_together(key: str) -> None:
     clips = [clip(f"{o}{s}{i}", o, f"{o}{s}") for o in "abc" for s in range(4) for i in range(3)]
     rest, held = split_by(clips, key, 0.25, seed=3)  # type: ignore[arg-type]
     assert sorted(c.name for c in rest + held) == sorted(c.name for c in clips)
@@ -137,12 +135,12 @@ def test_a_split_keeps_together_what_belongs_together(key: str) -> None:
     assert len(draws) > 1
 
 
-def test_a_split_needs_two() -> None:
+def test_split_needs_two() -> None:
     with pytest.raises(DataError, match="two"):
         split_by([clip("a", "cup", "s"), clip("b", "cup", "s")], "set", 0.5)
 
 
-def test_the_digest_changes_with_every_part() -> None:
+def test_digest_changes_with_every_part() -> None:
     base = clip("a", "cup", "s")
     other_label = clip("a", "cup", "s")
     other_label.forces_n[1] = 1

@@ -12,7 +12,7 @@ from gripper_force import cli
 from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError
 from gripper_force.jobs import doctor
-from gripper_force.jobs.doctor import Check, judged, only, rate_hz, time_ms
+from gripper_force.jobs.checks import Check, judged, keep_only, rate_hz, time_ms
 
 
 @pytest.fixture
@@ -110,9 +110,9 @@ def test_setup_ends_with_a_sentence(sets: list[str]) -> None:
 
 
 def test_only_one_sensor_is_kept() -> None:
-    kept = only(Config(), "camera")
+    kept = keep_only(Config(), "camera")
     assert (kept.camera.backend, kept.load_cell.backend) == ("simulated", "none")
-    assert only(Config(), "servo").camera.backend == "none"
+    assert keep_only(Config(), "servo").camera.backend == "none"
 
 
 def test_a_rate_counts_what_is_between() -> None:

@@ -1,13 +1,15 @@
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from gripper_force.errors import DataError
-from gripper_force.jobs.dataset import Clip
-from gripper_force.jobs.evaluate import evaluate, ridge_baseline
-from gripper_force.vision.checkpoint import Checkpoint
+from gripper_force.config import load_config
+from gripper_force.errors import ConfigError, DataError
+from gripper_force.jobs.dataset import Clip, load_clips
+from gripper_force.jobs.evaluate import evaluate, evaluate_clips, ridge_baseline
+from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
 from gripper_force.vision.engines.pytorch import TorchEngine
 from gripper_force.vision.estimator import ForceEstimator
 from gripper_force.vision.header import Header, NetworkConfig, Residual
@@ -51,10 +53,10 @@ def clip(name: str, object_name: str, seed: int, size: int = 16) -> Clip:
     )
 
 
-def test_equals_the_streaming_estimator(checkpoint: Checkpoint) -> None:
+def test_estimates_equal_the_streaming_estimators(checkpoint: Checkpoint) -> None:
     clips = [clip("a", "cup", 0), clip("b", "cup", 1), clip("c", "tube", 2)]
     clips[1].valid[10:20] = False
-    result = evaluate(checkpoint, clips)
+    result = evaluate_clips(checkpoint, clips)
     errors: dict[str, list[float]] = {"cup": [], "tube": []}
     estimator = ForceEstimator(TorchEngine(checkpoint))
     for one in clips:
@@ -64,39 +66,58 @@ def test_equals_the_streaming_estimator(checkpoint: Checkpoint) -> None:
             if estimate is not None and valid:
                 errors[one.object].append(estimate.force_n - float(force_n))
     every = np.array(errors["cup"] + errors["tube"])
-    assert result["frames"] == len(every) == 27 + 17 + 27
-    assert result["mae_n"] == pytest.approx(np.abs(every).mean(), rel=1e-5)
-    assert result["rmse_n"] == pytest.approx(np.sqrt((every**2).mean()), rel=1e-5)
-    assert result["bias_n"] == pytest.approx(every.mean(), rel=1e-5)
-    assert result["per_object"]["cup"]["mae_n"] == pytest.approx(np.abs(errors["cup"]).mean(), rel=1e-5)
-    assert result["per_object"]["tube"]["frames"] == 27
-    assert sum(b["frames"] for b in result["per_bin"]) == result["frames"]
+    assert result.frames == len(every) == 27 + 17 + 27
+    assert result.mae_n == pytest.approx(np.abs(every).mean(), rel=1e-5)
+    assert result.rmse_n == pytest.approx(np.sqrt((every**2).mean()), rel=1e-5)
+    assert result.bias_n == pytest.approx(every.mean(), rel=1e-5)
+    assert result.per_object["cup"].mae_n == pytest.approx(np.abs(errors["cup"]).mean(), rel=1e-5)
+    assert result.per_object["tube"].frames == 27
+    assert sum(b.frames for b in result.per_bin) == result.frames
 
 
-def test_contact_is_told_apart(checkpoint: Checkpoint) -> None:
+def test_logs_are_evaluated_like_their_clips(few_logs: Path, tiny_checkpoint: Path) -> None:
+    checkpoint = load_checkpoint(tiny_checkpoint)
+    expected = evaluate_clips(checkpoint, load_clips(few_logs, checkpoint.header.preprocess))
+    assert expected.frames == 3 * 57
+    for logs in (few_logs, sorted(few_logs.iterdir())):
+        result = evaluate(logs, tiny_checkpoint, objects=["disc"])
+        assert (result.mae_n, result.per_bin) == (expected.mae_n, expected.per_bin)
+    with pytest.raises(DataError, match="is of cup"):
+        evaluate(few_logs, tiny_checkpoint, objects=["cup"])
+
+
+def test_profile_of_another_checkpoint_raises(few_logs: Path, tiny_checkpoint: Path) -> None:
+    with pytest.raises(ConfigError, match="object profile"):
+        evaluate(few_logs, tiny_checkpoint, profile="sponge")
+    config = load_config(None, ["calibration.object=sponge"])
+    with pytest.raises(ConfigError, match="object profile"):
+        evaluate(few_logs, tiny_checkpoint, config=config)
+
+
+def test_contact_error_without_contact_is_nan(checkpoint: Checkpoint) -> None:
     free = clip("a", "cup", 0)
     free.forces_n[:] = 0
-    result = evaluate(checkpoint, [free])
-    assert np.isnan(result["per_object"]["cup"]["contact_mae_n"])
+    result = evaluate_clips(checkpoint, [free])
+    assert np.isnan(result.per_object["cup"].contact_mae_n)
 
 
-def test_clips_must_fit(checkpoint: Checkpoint) -> None:
+def test_clips_without_labels_or_of_another_size_raise(checkpoint: Checkpoint) -> None:
     with pytest.raises(DataError, match="32 px, the network needs 16"):
-        evaluate(checkpoint, [clip("a", "cup", 0, size=32)])
+        evaluate_clips(checkpoint, [clip("a", "cup", 0, size=32)])
     unlabelled = clip("a", "cup", 0)
     unlabelled.valid[:] = False
     with pytest.raises(DataError, match="label"):
-        evaluate(checkpoint, [unlabelled])
+        evaluate_clips(checkpoint, [unlabelled])
     with pytest.raises(DataError, match="label"):
         ridge_baseline([], [])
 
 
-def test_the_baseline_finds_a_smooth_law() -> None:
+def test_baseline_fits_a_smooth_function() -> None:
     clips = [clip(str(i), "cup", seed=0) for i in range(9)]
     rng = np.random.default_rng(0)
     for one in clips:
         one.frames[...] = (one.frames + rng.integers(0, 3, one.frames.shape)).clip(0, 255)
     result = ridge_baseline(clips[:8], clips[8:])
     constant = np.abs(clips[0].forces_n - clips[0].forces_n.mean()).mean()
-    assert result["mae_n"] < 0.4 * constant
-    assert result["frames"] == 30
+    assert result.mae_n < 0.4 * constant
+    assert result.frames == 30

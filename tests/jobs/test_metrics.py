@@ -8,19 +8,19 @@ from gripper_force.jobs import metrics
 PREDICTED, MEASURED = [1.0, 2.0, 4.0, 9.0], [0.0, 2.5, 4.5, 4.9]
 
 
-def test_figures() -> None:
+def test_mae_rmse_and_bias() -> None:
     assert metrics.mae(PREDICTED, MEASURED) == pytest.approx((1 + 0.5 + 0.5 + 4.1) / 4)
     assert metrics.rmse(PREDICTED, MEASURED) == pytest.approx(np.sqrt((1 + 0.25 + 0.25 + 16.81) / 4))
     assert metrics.bias(PREDICTED, MEASURED) == pytest.approx((1 - 0.5 - 0.5 + 4.1) / 4)
 
 
-def test_bins_are_by_measured_force() -> None:
+def test_bins_use_measured_force() -> None:
     bins = metrics.per_bin(PREDICTED, MEASURED)
-    assert [(b["from_n"], b["to_n"], b["frames"]) for b in bins] == [(0, 1, 1), (2, 3, 1), (4, 5, 2)]
-    assert bins[2]["mae_n"] == pytest.approx((0.5 + 4.1) / 2)
-    assert bins[2]["bias_n"] == pytest.approx((-0.5 + 4.1) / 2)
+    assert [(b.from_n, b.to_n, b.frames) for b in bins] == [(0, 1, 1), (2, 3, 1), (4, 5, 2)]
+    assert bins[2].mae_n == pytest.approx((0.5 + 4.1) / 2)
+    assert bins[2].bias_n == pytest.approx((-0.5 + 4.1) / 2)
     (wide,) = metrics.per_bin(PREDICTED, MEASURED, width_n=5.0)
-    assert wide["frames"] == 4
+    assert wide.frames == 4
 
 
 @pytest.mark.parametrize(("predicted", "measured"), [([], []), ([1.0], [1.0, 2.0]), ([[1.0]], [[1.0]])])
@@ -45,6 +45,6 @@ def test_no_lag_without_movement_or_overlap() -> None:
     assert np.isnan(metrics.lag_s(t_s, np.sin(t_s), t_s + 5, np.sin(t_s)))
 
 
-def test_a_damaged_time_takes_no_memory() -> None:
+def test_lag_with_damaged_time_is_nan() -> None:
     t_s = np.array([0.0, 1.0, 1e9])
     assert np.isnan(metrics.lag_s(t_s, t_s, t_s, t_s))

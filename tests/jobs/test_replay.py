@@ -8,10 +8,10 @@ import torch
 
 from gripper_force.config import load_config
 from gripper_force.errors import CheckpointError, DataError, LogError
+from gripper_force.jobs.grasp import run_grasp
 from gripper_force.jobs.metrics import bias, mae, rmse
 from gripper_force.jobs.replay import replay
 from gripper_force.runtime.log import LogReader, LogWriter
-from gripper_force.runtime.session import run_grasp
 from gripper_force.types import (
     FusedForce,
     GraspStatus,
@@ -36,11 +36,10 @@ def tampered(log: Path, path: Path, change: Callable[[Record], Record | None]) -
 
 def test_a_lockstep_run_comes_out_the_same(fused_log: Path) -> None:
     result = replay(fused_log)
-    assert result["identical"] is True
-    assert result["note"] == ""
-    assert set(result) >= {"mae_n", "rmse_n", "bias_n", "per_object", "per_bin", "frames", "log"}
-    assert set(result["sources"]) == {"visual", "current", "fused"}
-    assert result["mae_n"] == result["sources"]["fused"]["mae_n"]
+    assert result.identical is True
+    assert result.note == ""
+    assert set(result.sources) == {"visual", "current", "fused"}
+    assert result.mae_n == result.sources["fused"].mae_n
 
 
 def test_its_figures_agree_with_the_logs_load_cell(fused_log: Path) -> None:
@@ -50,12 +49,12 @@ def test_its_figures_agree_with_the_logs_load_cell(fused_log: Path) -> None:
     fused = list(log.records(FusedForce))
     measured = np.interp([f.t_ns for f in fused], [c.t_ns for c in cell], [c.force_n for c in cell])
     said = [f.force_n for f in fused]
-    assert result["frames"] == pytest.approx(len(fused), abs=5)
-    assert result["mae_n"] == pytest.approx(mae(said, measured), abs=0.02)
-    assert result["rmse_n"] == pytest.approx(rmse(said, measured), abs=0.02)
-    assert result["bias_n"] == pytest.approx(bias(said, measured), abs=0.02)
-    assert sum(b["frames"] for b in result["per_bin"]) == result["frames"]
-    assert result["per_object"]["stapler"]["mae_n"] == result["mae_n"]
+    assert result.frames == pytest.approx(len(fused), abs=5)
+    assert result.mae_n == pytest.approx(mae(said, measured), abs=0.02)
+    assert result.rmse_n == pytest.approx(rmse(said, measured), abs=0.02)
+    assert result.bias_n == pytest.approx(bias(said, measured), abs=0.02)
+    assert sum(b.frames for b in result.per_bin) == result.frames
+    assert result.per_object["stapler"]["mae_n"] == result.mae_n
 
 
 NUDGED = [(ServoCommand, "goal_current_a"), (FusedForce, "bias_n"), (GraspStatus, "width_m")]
@@ -74,13 +73,13 @@ def test_the_slightest_change_is_found(fused_log: Path, tmp_path: Path, kind: ty
         return dataclasses.replace(record, **{field: np.nextafter(getattr(record, field), 99).item()})
 
     path = tampered(fused_log, tmp_path / "run.mcap", nudge)
-    assert replay(path)["identical"] is False
+    assert replay(path).identical is False
     assert count >= 100
 
 
 def test_a_missing_request_is_found(fused_log: Path, tmp_path: Path) -> None:
     path = tampered(fused_log, tmp_path / "run.mcap", lambda r: None if isinstance(r, Request) else r)
-    assert replay(path)["identical"] is False
+    assert replay(path).identical is False
 
 
 def test_another_checkpoint_estimates_otherwise(
@@ -93,25 +92,25 @@ def test_another_checkpoint_estimates_otherwise(
     other = tmp_path / "other.safetensors"
     save_checkpoint(other, tiny.networks, tiny.header)
     first, second = replay(fused_log), replay(fused_log, str(other))
-    assert second["identical"] is False
-    assert load_checkpoint(other).digest[:12] in second["note"]
-    moved = second["sources"]["visual"]["bias_n"] - first["sources"]["visual"]["bias_n"]
+    assert second.identical is False
+    assert load_checkpoint(other).digest[:12] in second.note
+    moved = second.sources["visual"].bias_n - first.sources["visual"].bias_n
     assert moved == pytest.approx(1.0, abs=0.05)
 
 
 def test_without_a_checkpoint_the_logged_estimates_are_used(fused_log: Path) -> None:
     result = replay(fused_log, "none")
-    assert set(result["sources"]) == {"current", "fused"}
-    assert result["sources"]["fused"] == replay(fused_log)["sources"]["fused"]
+    assert set(result.sources) == {"current", "fused"}
+    assert result.sources["fused"] == replay(fused_log).sources["fused"]
 
 
 def test_an_override_changes_decisions(fused_log: Path) -> None:
     changed = replay(fused_log, overrides=["control.ramp_n_s=4"])
-    assert changed["identical"] is False
-    assert changed["changed"]["goal_current_a"] > 0.01
+    assert changed.identical is False
+    assert changed.changed["goal_current_a"] > 0.01
     same = replay(fused_log, overrides=["log.report=false"])
-    assert same["identical"] is True
-    assert same["changed"] == {"goal_current_a": 0, "fused_n": 0}
+    assert same.identical is True
+    assert same.changed == {"goal_current_a": 0, "fused_n": 0}
 
 
 def test_a_truncated_log_is_read_only_where_that_is_asked_for(fused_log: Path, tmp_path: Path) -> None:
@@ -121,13 +120,13 @@ def test_a_truncated_log_is_read_only_where_that_is_asked_for(fused_log: Path, t
     with pytest.raises(LogError, match=r"is cut short or damaged: .* can be recovered, --recover"):
         replay(path)
     result = replay(path, recover=True)
-    assert result["identical"] is True
-    assert 100 < result["frames"] < replay(fused_log)["frames"]
+    assert result.identical is True
+    assert 100 < result.frames < replay(fused_log).frames
 
 
 def test_what_can_not_be_compared_is_named(fused_log: Path, tmp_path: Path) -> None:
     blind = tampered(fused_log, tmp_path / "run.mcap", lambda r: None if isinstance(r, LoadCellSample) else r)
-    with pytest.raises(DataError, match="no estimate that could be compared with a load cell"):
+    with pytest.raises(DataError, match="no estimate to compare with a load cell"):
         replay(blind)
     with pytest.raises(CheckpointError, match=r"no checkpoint at gone\.safetensors"):
         replay(fused_log, "gone.safetensors")
@@ -137,10 +136,10 @@ def test_what_can_not_be_compared_is_named(fused_log: Path, tmp_path: Path) -> N
 
 def test_auto_is_settled_as_a_run_would(fused_log: Path, quick: list[str], tmp_path: Path) -> None:
     taken = replay(fused_log, "auto")
-    assert "estimates differ" in taken["note"]
+    assert "estimates differ" in taken.note
     blind = tmp_path / "blind.mcap"
     run_grasp(load_config(None, [*quick, "vision.checkpoint=auto"]), blind)
-    assert replay(blind)["identical"] is True
+    assert replay(blind).identical is True
 
 
 @pytest.mark.parametrize("kind", ["off", "wrong"])
@@ -151,5 +150,5 @@ def test_decisions_on_an_estimator_that_was_made_to_fail_are_still_compared(
     fault = f"faults=[{{unit: estimator, kind: {kind}, at_s: 0.6}}]"
     run_grasp(load_config(None, [*quick_vision, fault]), path)
     result = replay(path)
-    assert result["identical"] is True
-    assert "faults were injected" in result["note"]
+    assert result.identical is True
+    assert "faults were injected" in result.note

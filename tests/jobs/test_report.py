@@ -7,13 +7,18 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from mcap.records import Chunk, McapRecord
 
 from gripper_force.config import config_from, dump_config
 from gripper_force.errors import LogError
+from gripper_force.jobs import report as report_module
+from gripper_force.jobs.report import pictures as pictures_module
 from gripper_force.jobs.report import write_report
-from gripper_force.jobs.report.data import SOURCES, bins, read_run
-from gripper_force.jobs.report.pictures import overlay, take_pictures
-from gripper_force.runtime.log import LogWriter
+from gripper_force.jobs.report.data import SOURCES, Run, histogram, read_run
+from gripper_force.jobs.report.figure import CSS_COLOURS
+from gripper_force.jobs.report.pictures import FrameSampler, Picture, overlay
+from gripper_force.runtime import log as log_module
+from gripper_force.runtime.log import LogReader, LogWriter
 from gripper_force.types import (
     NS_PER_MS,
     NS_PER_S,
@@ -39,7 +44,7 @@ PHASES = [(0.0, "open"), (0.5, "approach"), (1.1, "contact"), (1.4, "ramp"), (2.
 
 
 def force_n(t_s: float) -> float:
-    """What the load cell reads: contact, a ramp with some overshoot, hold, release."""
+    """Force of the load cell: contact, a ramp with some overshoot, hold, release."""
     overshoot = 0.35 * np.exp(-((t_s - 2.35) ** 2) / 0.01)
     return float(
         np.interp(t_s, [1.1, 1.4, 2.2, 5.0, 5.4], [0, 0.5, TARGET_N, TARGET_N + 0.05, 0]) + overshoot
@@ -47,7 +52,7 @@ def force_n(t_s: float) -> float:
 
 
 def picture(force: float) -> Gray:
-    """A blob that spreads with the force."""
+    """An image of a blob that spreads with the force."""
     y, x = np.mgrid[-1:1:128j, -1:1:128j]
     return np.asarray(60 + 25 * x + 120 * np.exp(-(x**2 + y**2) / (0.05 + 0.05 * force)), np.uint8)
 
@@ -87,7 +92,7 @@ def write_grasp(path: Path, *, checkpoint: Path | None = None, digest: str = "")
 
 
 def write_recording(path: Path) -> Path:
-    """An imported recording: frames and a load cell, no more."""
+    """An imported recording: frames and load-cell samples only."""
     with LogWriter(path, config=dump_config(config_from({"object": "egg"}, "")), metadata={}) as log:
         for i in range(40):
             t_ns = i * 33 * NS_PER_MS
@@ -109,10 +114,18 @@ def write_network(path: Path) -> str:
     return load_checkpoint(path).digest
 
 
-class Page(HTMLParser):
-    """Checks that elements close in order, and collects what the tests ask for."""
+def read(path: Path) -> tuple[Run, list[Picture], str]:
+    """The run, its pictures, and the note on them."""
+    log = LogReader(path)
+    sampler = FrameSampler(log)
+    run = read_run(log, sampler.add)
+    return run, *sampler.pictures(run)
 
-    VOID = frozenset({"meta", "img", "br", "path", "rect"})
+
+class Page(HTMLParser):
+    """Checks that elements close in order, and collects text, classes and sources."""
+
+    VOID = frozenset({"meta", "br"})
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -125,7 +138,7 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         values = dict(attrs)
-        self.sources += [values[key] or "" for key in ("src", "href") if key in values]
+        self.sources += [values[key] or "" for key in ("src", "href", "xlink:href") if key in values]
         self.classes += (values.get("class") or "").split()
         if tag not in self.VOID:
             self.open.append(tag)
@@ -151,7 +164,7 @@ def page(grasp: Path) -> str:
     return write_report(grasp).html.read_text(encoding="utf-8")
 
 
-def test_the_report_lies_beside_the_log_or_where_it_is_asked_for(grasp: Path, page: str) -> None:
+def test_report_is_written_next_to_log_or_into_folder(grasp: Path, page: str) -> None:
     assert grasp.with_suffix(".html").is_file()
     image = cv2.imread(str(grasp.with_suffix(".png")))
     assert image is not None
@@ -161,14 +174,34 @@ def test_the_report_lies_beside_the_log_or_where_it_is_asked_for(grasp: Path, pa
     assert paths.html.read_text(encoding="utf-8") == page, "the same log gives the same page"
 
 
-def test_the_page_is_well_formed_and_needs_nothing_from_outside(page: str) -> None:
+def test_log_is_read_once(grasp: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    decode, times_ns = log_module.breakup_chunk, []
+
+    def count(chunk: Chunk, **options: bool) -> list[McapRecord]:
+        times_ns.append(chunk.message_start_time)
+        return decode(chunk, **options)
+
+    monkeypatch.setattr(log_module, "breakup_chunk", count)
+    write_report(grasp, tmp_path)
+    assert len(times_ns) == len(set(times_ns)) > 50
+
+
+def test_figure_is_drawn_once(grasp: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    draw, drawn = report_module.draw, []
+    monkeypatch.setattr(report_module, "draw", lambda *given: drawn.append(draw(*given)) or drawn[-1])
+    write_report(grasp, tmp_path)
+    assert len(drawn) == 1
+
+
+def test_page_is_well_formed_and_needs_no_other_file(page: str) -> None:
     parsed = Page(page)
-    assert parsed.sources
-    assert all(source.startswith("data:image/png;base64,") for source in parsed.sources)
-    assert not re.search(r"https?://|@import|url\(", page)
+    images = [source for source in parsed.sources if not source.startswith("#")]
+    assert len(images) == 6
+    assert all(source.startswith("data:image/png;base64,") for source in images)
+    assert not re.search(r"https?://|@import|url\((?!#)", page)
 
 
-def test_the_headline_tells_what_was_asked_and_what_came_of_it(page: str) -> None:
+def test_headline_shows_target_result_and_latency(page: str) -> None:
     text = Page(page).text
     for what, value in [("Target", "4"), ("Error, steady", "+0.04"), ("Overshoot", None)]:
         assert what in text
@@ -179,13 +212,14 @@ def test_the_headline_tells_what_was_asked_and_what_came_of_it(page: str) -> Non
     assert any(re.fullmatch(r"1\d\.\d / [34]\d\.\d", entry) for entry in text), "latency p50 / p99"
 
 
-def test_texts_of_the_log_are_escaped(page: str) -> None:
+def test_texts_of_log_are_escaped(page: str) -> None:
     assert "1 frame lost &lt;after&gt; 41 &amp; before 43" in page
 
 
-def test_every_source_has_its_curve_and_its_numbers_for_the_pointer(page: str) -> None:
-    for source in SOURCES:
-        assert f'class="curve {source}"' in page
+def test_every_source_has_a_curve_and_values_for_the_pointer(page: str) -> None:
+    for source, style in SOURCES.items():
+        assert f"stroke: var(--{source})" in page
+        assert style.label in Page(page).text
     tree = json.loads(re.search(r"const all = (.*);", page)[1])  # type: ignore[index]
     assert [line["source"] for line in tree["forces"]] == ["load_cell", "fused", "vision", "current"]
     assert [line["source"] for line in tree["errors"]] == ["fused", "vision", "current"]
@@ -195,8 +229,8 @@ def test_every_source_has_its_curve_and_its_numbers_for_the_pointer(page: str) -
             assert line["t"] == sorted(line["t"])
 
 
-def test_time_zero_is_the_request_and_phases_follow_it(grasp: Path) -> None:
-    run = read_run(grasp)
+def test_time_zero_is_the_first_request(grasp: Path) -> None:
+    run = read_run(LogReader(grasp))
     assert run.target_n == TARGET_N
     assert run.outcome == "held"
     assert [(span.phase, round(span.start_s, 2)) for span in run.phases] == [
@@ -207,59 +241,102 @@ def test_time_zero_is_the_request_and_phases_follow_it(grasp: Path) -> None:
     assert run.score.overshoot_n == pytest.approx(0.4, abs=0.15)
 
 
-def test_errors_are_taken_against_the_valid_samples(grasp: Path) -> None:
-    run = read_run(grasp)
+def test_errors_use_valid_samples_only(grasp: Path) -> None:
+    run = read_run(LogReader(grasp))
     assert len(run.forces["load_cell"].t_s) == 600 - 12
     assert abs(run.errors["fused"].value_n.mean()) < 0.02
     in_hold = (run.errors["current"].t_s > 3) & (run.errors["current"].t_s < 4)
     assert run.errors["current"].value_n[in_hold].mean() == pytest.approx(-0.15 * TARGET_N + 0.3, abs=0.05)
 
 
-def test_the_table_holds_requests_phases_outcomes_and_events_in_order(grasp: Path) -> None:
-    lines = read_run(grasp).lines
-    assert [line.t_s for line in lines] == sorted(line.t_s for line in lines)
-    texts = [(line.unit, line.text) for line in lines]
+def test_event_rows_hold_requests_phases_outcomes_and_events_in_order(grasp: Path) -> None:
+    rows = read_run(LogReader(grasp)).event_rows
+    assert [row.t_s for row in rows] == sorted(row.t_s for row in rows)
+    texts = [(row.unit, row.text) for row in rows]
     assert ("request", "grasp at 4 N") in texts
     assert ("outcome", "held") in texts
     assert ("phase", "ramp") in texts
     assert ("control", "steady within 0.2 N") in texts
 
 
-def test_frames_span_the_grip_and_carry_attention(grasp: Path) -> None:
-    run = read_run(grasp)
-    pictures, note = take_pictures(grasp, run)
+def test_pointer_areas_lie_over_the_charts(page: str) -> None:
+    areas = re.findall(
+        r'class="chart" data-series="(\w+)" data-from="(.*?)" data-to="(.*?)" style="(.*?)"', page
+    )
+    assert [name for name, *_ in areas] == ["forces", "errors"]
+    tops, bottoms = [], []
+    for _, begin_s, end_s, style in areas:
+        assert (float(begin_s), float(end_s)) == (pytest.approx(-0.5), pytest.approx(5.5, abs=0.06))
+        box = {key: float(value) for key, value in re.findall(r"(\w+):([\d.]+)%", style)}
+        assert 0 < box["left"] < 10
+        assert 90 < box["left"] + box["width"] <= 100
+        tops.append(box["top"])
+        bottoms.append(box["top"] + box["height"])
+    assert 0 < tops[0] < bottoms[0] < tops[1] < bottoms[1] < 100
+
+
+def test_drawing_uses_the_colours_of_the_page(page: str) -> None:
+    drawing = page[page.index("<svg") : page.index("</svg>")]
+    assert not [colour for colour in CSS_COLOURS if colour in drawing]
+    variables = set(re.findall(r"var\((--\w+)\)", drawing))
+    dark = page[page.index("prefers-color-scheme:dark") :].split("}}")[0]
+    assert variables
+    assert all(f"{name}:" in dark for name in variables)
+
+
+def test_frames_span_the_grip_and_show_attention(grasp: Path) -> None:
+    _, pictures, note = read(grasp)
     assert len(pictures) == 6
     assert pictures[0].t_s == pytest.approx(0.3, abs=0.03)
     assert pictures[-1].t_s == pytest.approx(4.8, abs=0.03)
-    assert "where the network looks" in note
+    assert "spatial attention" in note
     assert np.ptp(pictures[3].image, axis=2).max() > 20, "the attention is in colour"
     assert pictures[3].load_cell_n == pytest.approx(TARGET_N, abs=0.2)
 
 
-def test_frames_of_a_recording_span_its_touch(tmp_path: Path) -> None:
+def test_frames_of_recording_span_its_touch(tmp_path: Path) -> None:
     path = tmp_path / "egg.mcap"
     with LogWriter(path, config="", metadata={}) as log:
         for i in range(300):
             t_ns = i * 20 * NS_PER_MS
             log.write(Frame(t_ns, t_ns, i, picture(0.0)))
             log.write(LoadCellSample(t_ns, 5.0 if 100 <= i < 200 else 0.01, 0.0))
-    pictures, note = take_pictures(path, read_run(path))
+    _, pictures, note = read(path)
     assert [round(p.t_s, 1) for p in pictures] == [1.7, 2.2, 2.7, 3.2, 3.8, 4.3]
     assert note == ""
 
 
+def test_long_log_keeps_few_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pictures_module, "_KEPT", 20)
+    path = tmp_path / "egg.mcap"
+    with LogWriter(path, config="", metadata={}) as log:
+        for i in range(300):
+            log.write(Frame(i * 20 * NS_PER_MS, i * 20 * NS_PER_MS, i, picture(0.0)))
+    reader = LogReader(path)
+    sampler = FrameSampler(reader)
+    kept = []
+
+    def add(frame: Frame) -> None:
+        sampler.add(frame)
+        kept.append(len(sampler._kept))
+
+    shown, _ = sampler.pictures(read_run(reader, add))
+    assert max(kept) <= 20
+    assert np.diff([one.t_s for one in shown]) == pytest.approx(300 * 0.02 / 5, abs=0.4)
+
+
 def test_attention_of_another_checkpoint_is_not_shown(tmp_path: Path) -> None:
-    missing = write_grasp(tmp_path / "missing.mcap")
-    pictures, note = take_pictures(missing, read_run(missing))
+    missing = write_grasp(tmp_path / "missing.mcap", digest="of the run")
+    _, pictures, note = read(missing)
     assert "Attention is not shown" in note
     assert "nowhere.safetensors" in note
     assert all(np.ptp(picture.image, axis=2).max() == 0 for picture in pictures)
     write_network(tmp_path / "other.safetensors")
     other = write_grasp(tmp_path / "o.mcap", checkpoint=tmp_path / "other.safetensors", digest="of another")
-    assert "is not the run's checkpoint" in take_pictures(other, read_run(other))[1]
+    assert "is not the run's checkpoint" in read(other)[2]
 
 
-def test_a_recording_without_a_run_is_reported_with_what_it_has(tmp_path: Path) -> None:
+def test_report_of_recording_without_a_run(tmp_path: Path) -> None:
     paths = write_report(write_recording(tmp_path / "egg.mcap"))
     parsed = Page(paths.html.read_text(encoding="utf-8"))
     assert "Egg" in parsed.text
@@ -267,16 +344,17 @@ def test_a_recording_without_a_run_is_reported_with_what_it_has(tmp_path: Path) 
     for absent in ("Target", "Latency", "Error against the load cell", "Phases and events"):
         assert absent not in parsed.text
     assert not any("ttention" in text for text in parsed.text)
-    assert {"curve", "load_cell", "frames"} <= set(parsed.classes)
+    assert "stroke: var(--load_cell)" in paths.html.read_text(encoding="utf-8")
+    assert sum(source.startswith("data:") for source in parsed.sources) == 6
 
 
-def test_an_empty_log_is_reported_too(tmp_path: Path) -> None:
+def test_report_of_empty_log(tmp_path: Path) -> None:
     path = tmp_path / "empty.mcap"
     LogWriter(path, config="", metadata={}).close()
     assert "Sponge" in Page(write_report(path).html.read_text(encoding="utf-8")).text
 
 
-def test_a_log_cut_short_is_reported_on_request(grasp: Path, tmp_path: Path) -> None:
+def test_truncated_log_is_reported_with_recover(grasp: Path, tmp_path: Path) -> None:
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(grasp.read_bytes()[: grasp.stat().st_size // 2])
     with pytest.raises(LogError, match="--recover"):
@@ -284,14 +362,14 @@ def test_a_log_cut_short_is_reported_on_request(grasp: Path, tmp_path: Path) -> 
     assert write_report(cut, recover=True).html.is_file()
 
 
-def test_a_report_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+def test_report_that_cannot_be_written_raises(tmp_path: Path) -> None:
     log = write_recording(tmp_path / "egg.mcap")
     (tmp_path / "file").touch()
     with pytest.raises(LogError, match="can't write the report"):
         write_report(log, tmp_path / "file" / "below")
 
 
-def test_the_overlay_colours_where_attention_is_and_leaves_the_rest() -> None:
+def test_overlay_colours_only_where_attention_is() -> None:
     attention = np.zeros((8, 8), np.float32)
     attention[1, 6] = 0.9
     image = overlay(np.full((64, 64), 100, np.uint8), attention)
@@ -301,8 +379,8 @@ def test_the_overlay_colours_where_attention_is_and_leaves_the_rest() -> None:
     assert (image[40:, :20] == 100).all()
 
 
-def test_a_histogram_loses_no_value() -> None:
+def test_histogram_counts_every_value() -> None:
     values = np.array([*np.full(99, 5.0), 500.0])
-    counts, edges = bins(values)
+    counts, edges = histogram(values)
     assert counts.sum() == 100
     assert len(edges) == len(counts) + 1

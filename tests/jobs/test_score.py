@@ -10,7 +10,7 @@ MS = 1_000_000
 
 
 def statuses(*phases):
-    """100 cycles of 10 ms for each phase named."""
+    """100 cycles of 10 ms for each phase."""
     return [
         GraspStatus(10 * MS * i, phase, "", 0.0, 0.05)
         for i, phase in enumerate(p for p in phases for _ in range(100))
@@ -21,7 +21,7 @@ def cell(force_of_s, seconds):
     return [LoadCellSample(10 * MS * i, force_of_s(i / 100), 0.0) for i in range(round(100 * seconds))]
 
 
-def test_scores_a_known_curve():
+def test_score_of_known_curve():
     states = statuses(Phase.OPEN, Phase.RAMP, Phase.HOLD, Phase.HOLD, Phase.HOLD, Phase.RELEASE)
     force = lambda t: 9.0 if t < 1 else 0.0 if t > 5 else 4.5 if t < 2 else 4.08  # noqa: E731
     score = score_grasp(cell(force, 6), states, 4.0)
@@ -31,7 +31,7 @@ def test_scores_a_known_curve():
     assert score.settle_s == pytest.approx(1.0)
 
 
-def test_the_last_grasp_counts_and_rejected_samples_do_not():
+def test_score_uses_last_grasp_and_valid_samples():
     states = statuses(Phase.RAMP, Phase.HOLD, Phase.RELEASE, Phase.RAMP, Phase.HOLD, Phase.HOLD)
     samples = cell(lambda t: 2.0 if t < 3 else 1.0, 6)
     samples[450] = LoadCellSample(450 * 10 * MS, -70.0, 0.0, valid=False)
@@ -39,29 +39,29 @@ def test_the_last_grasp_counts_and_rejected_samples_do_not():
     assert (score.steady_error_n, score.overshoot_n, score.settle_s) == (0.0, 0.0, 0.0)
 
 
-def test_a_hard_first_touch_is_overshoot():
+def test_hard_contact_is_overshoot():
     states = statuses(Phase.APPROACH, Phase.CONTACT, Phase.RAMP, Phase.HOLD)
     score = score_grasp(cell(lambda t: 3.0 if 0.5 < t < 1.5 else 2.0, 4), states, 2.0)
     assert score.overshoot_n == pytest.approx(1.0)
     assert score.settle_s == 0.0  # which counts from the ramp on
 
 
-def test_never_settled_is_nan():
+def test_settling_time_is_nan_without_settling():
     assert math.isnan(score_grasp(cell(lambda _: 2.0, 2), statuses(Phase.RAMP, Phase.HOLD), 4.0).settle_s)
 
 
 @pytest.mark.parametrize(("gap_s", "counts"), [(0.2, True), (0.3, False)])
-def test_a_load_cell_with_a_gap_in_the_hold_compares_nothing(gap_s, counts):
+def test_gap_of_load_cell_in_hold_raises(gap_s, counts):
     states = statuses(Phase.RAMP, Phase.HOLD, Phase.HOLD)
     samples = [s for s in cell(lambda _: 2.0, 3) if not 2.5 <= s.t_ns / 1e9 < 2.5 + gap_s]
     if counts:
         assert score_grasp(samples, states, 2.0).steady_error_n == 0.0
     else:
-        with pytest.raises(DataError, match=r"no sound sample for 0\.31 s of the hold"):
+        with pytest.raises(DataError, match=r"no valid sample for 0\.31 s of the hold"):
             score_grasp(samples, states, 2.0)
 
 
-def test_nothing_to_score():
+def test_run_without_hold_or_samples_raises():
     with pytest.raises(DataError, match="no hold"):
         score_grasp(cell(lambda _: 1.0, 1), statuses(Phase.APPROACH), 4.0)
     with pytest.raises(DataError, match="load cell"):

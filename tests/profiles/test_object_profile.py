@@ -100,7 +100,10 @@ def test_names_what_differs() -> None:
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("format: gripper-force-rig/1", "no object profile of format"),
+        (
+            "format: gripper-force-rig/1",
+            r".* does not have the object profile format gripper-force-object/1 \(it is 'gripper-force-rig/1'",
+        ),
         ("[1, 2]", "mapping"),
         ("format: gripper-force-object/1", "Field required"),
     ],

@@ -62,8 +62,11 @@ def test_what_it_sets_are_keys_of_the_configuration(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("{}", "is no rig profile of format gripper-force-rig/1, it says None"),
-        ("format: gripper-force-rig/2", "it says 'gripper-force-rig/2'"),
+        ("{}", r".* does not have the rig profile format gripper-force-rig/1 \(it is None\)"),
+        (
+            "format: gripper-force-rig/2",
+            r".* does not have the rig profile format gripper-force-rig/1 \(it is 'gripper-force-rig/2'\)",
+        ),
         (
             "format: gripper-force-rig/1\nsevro: {}",
             "unknown rig profile key 'sevro'.*load_cell, servo, camera",

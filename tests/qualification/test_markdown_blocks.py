@@ -6,7 +6,7 @@ from gripper_force.errors import DataError
 from gripper_force.qualification.markdown_blocks import write_between
 
 
-def test_what_stood_between_the_lines_is_replaced(tmp_path: Path) -> None:
+def test_text_between_the_lines_is_replaced(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text("# Before\n<!-- here -->\nold\n<!-- end of here -->\nafter\n")
     for _ in range(2):
@@ -15,9 +15,9 @@ def test_what_stood_between_the_lines_is_replaced(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", [None, "", "<!-- here -->", "<!-- end of here --> <!-- here -->"])
-def test_a_page_without_a_place_is_refused(text: str | None, tmp_path: Path) -> None:
+def test_a_page_without_the_lines_raises(text: str | None, tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     if text is not None:
         page.write_text(text)
-    with pytest.raises(DataError, match="to write between"):
+    with pytest.raises(DataError, match="it needs one line"):
         write_between(page, "here", "new")

@@ -10,46 +10,50 @@ from typer.testing import CliRunner
 from gripper_force import cli
 from gripper_force.config import Config
 from gripper_force.qualification import soak as soaking
-from gripper_force.qualification.soak import WARM_UP, Sample, judge, soak
+from gripper_force.qualification.soak import WARM_UP, Growth, Sample, measure_growth, soak
 from gripper_force.runtime.log import LogWriter
 from gripper_force.types import NS_PER_S, Event
 
 
-def rising(mb_a_grasp: float = 0.0, handles: int = 0, threads: int = 0) -> list[Sample]:
-    """An hour of grasps after which something was left over from each, and a warm-up that takes much."""
+def rising(mb_per_grasp: float = 0.0, handles: int = 0, threads: int = 0) -> list[Sample]:
+    """Samples of an hour of grasps with this growth per grasp, after a warm-up with large growth."""
     cold = [Sample(6.0 * i, 300.0 + 40 * i, 9, 2) for i in range(WARM_UP)]
     warm = range(595)
     return cold + [
-        Sample(6.0 * (WARM_UP + i), 500 + mb_a_grasp * i, 9 + handles * i, 4 + threads * i) for i in warm
+        Sample(6.0 * (WARM_UP + i), 500 + mb_per_grasp * i, 9 + handles * i, 4 + threads * i) for i in warm
     ]
 
 
-def test_what_stays_flat_is_good() -> None:
-    assert judge(rising()) == {"ok": True, "growth_mb": 0.0, "slope_mb_h": 0.0}
+def test_constant_memory_is_ok() -> None:
+    assert measure_growth(rising()) == Growth(ok=True, growth_mb=0.0, slope_mb_h=0.0)
 
 
-@pytest.mark.parametrize("samples", [rising(mb_a_grasp=0.04), rising(handles=1), rising(threads=1)])
-def test_what_grows_is_told(samples: list[Sample]) -> None:
-    assert not judge(samples)["ok"]
+@pytest.mark.parametrize("samples", [rising(mb_per_grasp=0.04), rising(handles=1), rising(threads=1)])
+def test_growth_is_not_ok(samples: list[Sample]) -> None:
+    assert not measure_growth(samples).ok
 
 
-def test_objects_that_take_more_than_others_are_no_growth() -> None:
+def test_different_memory_of_objects_is_not_growth() -> None:
     samples = [replace(s, memory_mb=s.memory_mb + 40 * (i % 4 == 1)) for i, s in enumerate(rising())]
     for count in range(WARM_UP + 4, WARM_UP + 20):
-        assert judge(samples[:count])["growth_mb"] == 0
+        assert measure_growth(samples[:count]).growth_mb == 0
 
 
-def test_growth_is_counted_from_the_end_of_the_warm_up() -> None:
-    verdict = judge(rising(mb_a_grasp=0.01))
-    assert verdict["ok"]
-    assert verdict["growth_mb"] == pytest.approx(5.91)
-    assert verdict["slope_mb_h"] == pytest.approx(6.0, abs=0.05)
+def test_growth_counts_from_the_end_of_the_warm_up() -> None:
+    growth = measure_growth(rising(mb_per_grasp=0.01))
+    assert growth.ok
+    assert growth.growth_mb == pytest.approx(5.91)
+    assert growth.slope_mb_h == pytest.approx(6.0, abs=0.05)
 
 
-def test_a_few_grasps_leave_nothing_behind(monkeypatch: pytest.MonkeyPatch, quick_vision: list[str]) -> None:
+def test_stability_soak_finds_no_growth_in_a_few_grasps(
+    monkeypatch: pytest.MonkeyPatch, quick_vision: list[str]
+) -> None:
     monkeypatch.setattr(soaking, "WARM_UP", 1)
     sets = [part for one in quick_vision for part in ("--set", one)]
-    done = CliRunner().invoke(cli.app, ["stability", "--soak", "0", "--seed", "3", "--json", *sets])
+    done = CliRunner().invoke(
+        cli.app, ["stability", "soak", "--seconds", "0", "--seed", "3", "--json", *sets]
+    )
     assert done.exit_code == 0, done.stderr
     report: dict[str, Any] = json.loads(done.stdout)
     assert report["ok"] is True
@@ -60,10 +64,10 @@ def test_a_few_grasps_leave_nothing_behind(monkeypatch: pytest.MonkeyPatch, quic
 
 
 @pytest.mark.parametrize("grasps", [3, 12])
-def test_ctrl_c_tells_what_was_seen_so_far(grasps: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interrupt_returns_the_results_so_far(grasps: int, monkeypatch: pytest.MonkeyPatch) -> None:
     left = iter(range(grasps))
 
-    def broken_off(config: Config) -> dict[str, Any]:
+    def interrupted(config: Config) -> dict[str, Any]:
         if next(left, None) is None:
             raise KeyboardInterrupt
         with LogWriter(config.log.directory / "run.mcap", config="", metadata={}) as log:
@@ -71,7 +75,7 @@ def test_ctrl_c_tells_what_was_seen_so_far(grasps: int, monkeypatch: pytest.Monk
             log.write(Event(NS_PER_S, "session", "tick"))
         return {"result": "held"}
 
-    monkeypatch.setattr(soaking, "grasp", broken_off)
+    monkeypatch.setattr(soaking, "grasp", interrupted)
     if grasps < WARM_UP:
         with pytest.raises(KeyboardInterrupt):
             soak(Config(), 3600)
@@ -80,9 +84,7 @@ def test_ctrl_c_tells_what_was_seen_so_far(grasps: int, monkeypatch: pytest.Monk
     assert (report["ok"], report["grasps"], report["simulated_s"]) == (False, 12, 12.0)
 
 
-def test_a_thread_and_a_file_that_are_left_open_are_found(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_leaked_threads_and_files_are_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     left: list[Any] = []
     end = threading.Event()
 

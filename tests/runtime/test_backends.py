@@ -1,12 +1,16 @@
+import sys
+from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from gripper_force.config import Config, load_config
+from gripper_force.config import Config, LoadCellConfig, load_config
 from gripper_force.errors import ConfigError, DeviceError, DeviceNotFoundError, LogError
+from gripper_force.interfaces import Clock
 from gripper_force.runtime import backends
 from gripper_force.runtime.backends import MonotonicClock, open_devices
+from gripper_force.types import LoadCellSample
 from gripper_hw.dynamixel.virtual import find_bus
 
 
@@ -29,7 +33,9 @@ def changed(config: Config, **sections: dict[str, object]) -> Config:
 )
 def test_an_unknown_backend_is_named_with_the_known_ones(config: Config, unit: str, known: str) -> None:
     with (
-        pytest.raises(ConfigError, match=f"no {unit} backend 'oak9'; there are {known}"),
+        pytest.raises(
+            ConfigError, match=rf"unknown {unit}\.backend 'oak9'.*; use {known} or package\.module:Class"
+        ),
         open_devices(changed(config, **{unit: {"backend": "oak9"}})),
     ):
         pass
@@ -56,7 +62,7 @@ def test_lockstep_needs_a_simulated_servo(config: Config) -> None:
 @pytest.mark.parametrize(("unit", "backend"), [("camera", "oak"), ("load_cell", "serial")])
 def test_a_real_sensor_keeps_no_simulated_time(config: Config, unit: str, backend: str) -> None:
     mixed = changed(config, **{unit: {"backend": backend, "port": "/dev/nowhere"}})
-    sentence = rf"{unit}\.backend={backend} can't keep .*set clock=realtime"
+    sentence = rf"{unit}\.backend={backend} cannot follow simulated time; set clock=realtime"
     with pytest.raises(ConfigError, match=sentence), open_devices(mixed):
         pass
 
@@ -99,25 +105,20 @@ def closed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     def device(name: str) -> SimpleNamespace:
         return SimpleNamespace(close=lambda: calls.append(name), start=lambda: calls.append(f"{name} starts"))
 
-    real = backends.load
-
-    def load(path: str) -> object:
-        if path == backends.SERVO:
-            return lambda *_: device("servo")
-        if path != backends.RIG:
-            return real(path)
+    def make_rig(_: Config) -> SimpleNamespace:
         rig = device("rig")
         rig.clock, rig.start_ns, rig.check, rig.notes = MonotonicClock(), 0, lambda: None, dict
         rig.camera, rig.load_cell, rig.render_under_light = device("camera"), device("load cell"), None
-        return lambda *_: rig
+        return rig
 
-    monkeypatch.setattr(backends, "load", load)
+    monkeypatch.setattr(backends, "load_servo_class", lambda _: lambda *_: device("servo"))
+    monkeypatch.setattr(backends, "_rig_class", lambda: make_rig)
     return calls
 
 
 def test_playback_needs_the_log_to_play(config: Config) -> None:
     plays = changed(config, camera={"backend": "playback"})
-    with pytest.raises(ConfigError, match=r"camera\.path, the log to play"), open_devices(plays):
+    with pytest.raises(ConfigError, match=r"camera\.path; set it to the log to play"), open_devices(plays):
         pass
 
 
@@ -160,3 +161,48 @@ def test_the_hosts_clock_sleeps_until_its_time() -> None:
     clock.sleep_until_ns(begin_ns - 1)
     clock.sleep_until_ns(begin_ns + 2_000_000)
     assert clock.now_ns() >= begin_ns + 2_000_000
+
+
+class OwnLoadCell:
+    """A third-party load cell without samples."""
+
+    supports_lockstep = True
+
+    def __init__(self, config: LoadCellConfig, clock: Clock) -> None:
+        self.options, self.clock = config.options, clock
+
+    def start(self) -> None: ...
+
+    def close(self) -> None: ...
+
+    def drain(self) -> list[LoadCellSample]:
+        return []
+
+    def counts(self) -> dict[str, int]:
+        return {}
+
+
+def test_a_third_party_backend_is_opened_with_its_options(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "own_devices", sys.modules[__name__])
+    section = {"backend": "own_devices:OwnLoadCell", "options": {"gain": 3}}
+    with open_devices(changed(config, load_cell=section)) as devices:
+        assert type(devices.load_cell).__name__ == "OwnLoadCell"
+        assert devices.load_cell.options == {"gain": 3}
+        assert devices.load_cell.clock is devices.clock
+
+
+def test_a_registered_backend_is_opened_by_its_name(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "own_devices", sys.modules[__name__])
+    point = EntryPoint("mine", "own_devices:OwnLoadCell", "gripper_force.load_cells")
+    monkeypatch.setattr(
+        "gripper_force.plugins.entry_points", lambda group: EntryPoints([point]).select(group=group)
+    )
+    with open_devices(changed(config, load_cell={"backend": "mine"})) as devices:
+        assert type(devices.load_cell).__name__ == "OwnLoadCell"
+    with (
+        pytest.raises(ConfigError, match=r"did you mean 'mine'.*phidget, mine or package"),
+        open_devices(changed(config, load_cell={"backend": "mines"})),
+    ):
+        pass

@@ -97,7 +97,7 @@ def test_a_slow_disk_keeps_nobody_waiting(gate: Gate, path: Path) -> None:
 
 @pytest.mark.parametrize("count", [1, recorder_module.ROOM + 100])
 def test_a_disk_that_hangs_does_not_keep_the_run_from_ending(
-    ood_limit: Gate, monkeypatch: pytest.MonkeyPatch, count: int
+    gate: Gate, monkeypatch: pytest.MonkeyPatch, count: int
 ) -> None:
     monkeypatch.setattr(recorder_module, "_PATIENCE_S", 0.05)
     gate.opened.clear()
@@ -138,7 +138,7 @@ def test_records_of_a_chunk_that_is_not_written_count_as_lost(path: Path) -> Non
             return getattr(self.file, name)
 
     files: list[Full] = []
-    log = LogWriter(path, config="", metadata={}, through=lambda f: files.append(Full(f)) or files[0])  # type: ignore[arg-type, func-returns-value]
+    log = LogWriter(path, config="", metadata={}, wrap_file=lambda f: files.append(Full(f)) or files[0])  # type: ignore[arg-type, func-returns-value]
     log_queue = LogQueue(log, lockstep=True)
     for i in range(10):
         log_queue.write(Event(i, "test", "kept"))

@@ -17,12 +17,14 @@ import numpy as np
 import pytest
 
 from gripper_force.config import Config, config_from_text, load_config
-from gripper_force.errors import ConfigError, DataError, DeviceError, DeviceTimeoutError, SimulationError
+from gripper_force.errors import DataError, DeviceError, DeviceTimeoutError, RequestError, SimulationError
 from gripper_force.interfaces import Camera, Devices
+from gripper_force.jobs.grasp import grasp_and_release, run_grasp
 from gripper_force.runtime import session as session_module
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log import LogReader
-from gripper_force.runtime.session import Session, open_session, run_grasp
+from gripper_force.runtime.resolve import ResolvedConfig, resolve
+from gripper_force.runtime.session import Session, open_run, open_session
 from gripper_force.types import (
     NS_PER_MS,
     Event,
@@ -113,12 +115,12 @@ def open_rig(quick: list[str], tmp_path: Path, heard: list[bytes]) -> Iterator[t
     with ExitStack() as devices_stay, ExitStack() as run:
 
         def begin(*overrides: str, camera: Camera | None = None) -> Rig:
-            config = load_config(None, [*quick, *overrides])
-            devices = devices_stay.enter_context(open_devices(config))
+            settings = resolve(load_config(None, [*quick, *overrides]))
+            devices = devices_stay.enter_context(open_devices(settings.config))
             devices.camera = camera
             bus = virtual.find_bus("rig")
             assert bus is not None
-            session = run.enter_context(open_session(config, devices, tmp_path / "run.mcap", None))
+            session = run.enter_context(open_session(settings, devices, tmp_path / "run.mcap"))
             return Rig(devices, session, bus, heard)
 
         yield run, begin
@@ -223,13 +225,13 @@ def test_the_log_says_what_ran(fused_log: Path, tiny_checkpoint: Path) -> None:
 
 
 def test_progress_tells_each_phase_once(quick: list[str], tmp_path: Path) -> None:
-    told: list[GraspStatus] = []
-    run_grasp(load_config(None, quick), tmp_path / "run.mcap", told.append)
-    assert [s.phase for s in told] == ["approach", "contact", "ramp", "hold", "open"]
+    told: list[str] = []
+    run_grasp(load_config(None, quick), tmp_path / "run.mcap", lambda text, steps=1: told.append(text))
+    assert [text.split()[2] for text in told] == ["approach", "contact", "ramp", "hold", "open"]
 
 
 def test_a_target_over_the_limit_is_refused_before_anything_moves(quick: list[str], tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"target_n 13 N is too near to control\.force_limit_n 10 N"):
+    with pytest.raises(RequestError, match=r"a target of 13 N is too close to control\.force_limit_n 10 N"):
         run_grasp(load_config(None, [*quick, "target_n=13"]), tmp_path / "run.mcap")
     assert not list(tmp_path.iterdir())
 
@@ -371,17 +373,17 @@ def test_hold_keeps_the_grip_and_disarms_the_watchdog(open_rig: tuple[ExitStack,
 @pytest.mark.parametrize("on_fault", ["limp", "hold", "open"])
 def test_a_fault_ends_as_configured(quick: list[str], tmp_path: Path, on_fault: str) -> None:
     path = tmp_path / "run.mcap"
-    config = load_config(None, [*quick, f"control.on_fault={on_fault}"])
-    with open_devices(config) as devices:
+    settings = resolve(load_config(None, [*quick, f"control.on_fault={on_fault}"]))
+    with open_devices(settings.config) as devices:
         bus = virtual.find_bus("rig")
         assert bus is not None
-        with open_session(config, devices, path, None) as session:
+        with open_session(settings, devices, path) as session:
 
-            def stop(status: GraspStatus) -> None:
-                if status.phase == Phase.HOLD:
+            def stop(text: str, steps: int = 1) -> None:
+                if "hold" in text:
                     session.stop_soon()
 
-            session_module.grasp_in(session, config, False, stop)
+            grasp_and_release(session, 3.0, stop)
         last = list(LogReader(path).records(GraspStatus))[-1]
         assert (last.phase, last.outcome) == (Phase.FAULT, Outcome.FAULT)
         assert bus.servos[0].get("torque_enable") == (on_fault == "hold")
@@ -419,7 +421,7 @@ def test_a_servo_that_can_not_be_stopped_is_told(open_rig: tuple[ExitStack, Open
     rig = begin()
     rig.session.cycle()
     rig.bus.tamper = lambda _: None
-    with pytest.raises(DeviceError, match="no sound answer"):
+    with pytest.raises(DeviceError, match="no valid reply"):
         run.close()
 
 
@@ -490,6 +492,7 @@ def test_stop_soon_leads_to_fault_within_a_cycle(open_rig: tuple[ExitStack, Open
     assert all(d.command.goal_current_a <= before_a for d in after)
 
 
+@pytest.mark.usefixtures("own_process")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_waits_for_the_end_of_the_cycle(
     open_rig: tuple[ExitStack, OpenRig], tmp_path: Path, number: signal.Signals
@@ -515,6 +518,7 @@ def test_a_signal_waits_for_the_end_of_the_cycle(
     assert signal.getsignal(number) == handler
 
 
+@pytest.mark.usefixtures("own_process")
 def test_a_second_signal_does_not_wait_and_torque_still_goes_off(open_rig: tuple[ExitStack, OpenRig]) -> None:
     run, begin = open_rig
     rig = begin()
@@ -532,6 +536,7 @@ def test_a_second_signal_does_not_wait_and_torque_still_goes_off(open_rig: tuple
     assert rig.is_off()
 
 
+@pytest.mark.usefixtures("own_process")
 def test_a_signal_while_torque_goes_off_waits_for_that(open_rig: tuple[ExitStack, OpenRig]) -> None:
     run, begin = open_rig
     rig = begin()
@@ -548,13 +553,13 @@ def test_a_signal_while_torque_goes_off_waits_for_that(open_rig: tuple[ExitStack
     assert rig.is_off()
 
 
+@pytest.mark.usefixtures("own_process")
 def test_a_session_in_another_thread_leaves_signals_alone(quick: list[str], tmp_path: Path) -> None:
     handler = signal.getsignal(signal.SIGINT)
     seen: list[object] = []
 
     def run() -> None:
-        config = load_config(None, quick)
-        with open_devices(config) as devices, open_session(config, devices, tmp_path / "run.mcap", None):
+        with open_run(load_config(None, quick), tmp_path / "run.mcap"):
             seen.append(signal.getsignal(signal.SIGINT))
 
     thread = threading.Thread(target=run)
@@ -632,6 +637,7 @@ def test_a_full_disk_does_not_end_the_grasp_and_is_told_after_it(quick: list[str
 # Real time.
 
 
+@pytest.mark.usefixtures("own_process")
 def test_in_real_time_the_loop_runs_and_the_grasp_ends(
     quick: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -662,7 +668,7 @@ def test_a_session_needs_no_load_cell(open_rig: tuple[ExitStack, OpenRig], tmp_p
 
 def test_versions_are_those_of_installed_packages() -> None:
     devices = SimpleNamespace(notes={"serial": "7"})
-    about = session_module._metadata(Config(), devices, None)  # type: ignore[arg-type]
+    about = session_module._metadata(ResolvedConfig(Config()), devices)  # type: ignore[arg-type]
     assert about["serial"] == "7"
     assert about["checkpoint"] == ""
     assert about["version numpy"] == np.__version__
@@ -671,6 +677,6 @@ def test_versions_are_those_of_installed_packages() -> None:
 
 def test_the_version_of_an_engine_of_its_own_is_in_the_log() -> None:
     openvino = pytest.importorskip("openvino")
-    config = load_config(None, ["vision.engine=openvino"])
-    about = session_module._metadata(config, SimpleNamespace(notes={}), read_model("small"))  # type: ignore[arg-type]
+    run = ResolvedConfig(load_config(None, ["vision.engine=openvino"]), read_model("small"))
+    about = session_module._metadata(run, SimpleNamespace(notes={}))  # type: ignore[arg-type]
     assert openvino.__version__.startswith(about["version openvino"])

@@ -1,18 +1,23 @@
 import math
 from datetime import date
+from hashlib import sha256
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from gripper_force.config import VisionConfig
 from gripper_force.errors import ConfigError, DataError, NonFiniteError
-from gripper_force.profiles.correction import Correction, ProfileArrays
-from gripper_force.profiles.object_profile import Interval, ObjectProfile, OutputCurve
+from gripper_force.profiles.correction import Correction, ProfileArrays, pack
+from gripper_force.profiles.object_profile import Interval, ObjectProfile, OutputCurve, write_object
+from gripper_force.types import ForceEstimate
 from gripper_force.vision.batch_inference import features, predict
 from gripper_force.vision.checkpoint import Checkpoint
 from gripper_force.vision.engines.pytorch import TorchEngine
-from gripper_force.vision.estimator import ForceEstimate, ForceEstimator
+from gripper_force.vision.estimator import ForceEstimator, open_estimator
 from gripper_force.vision.header import Header, NetworkConfig, Residual
+from gripper_force.vision.model_files import read_model
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess, downscale
 
@@ -41,7 +46,7 @@ def run(estimator: ForceEstimator, frames: np.ndarray) -> list[ForceEstimate | N
     return [estimator.update(frame) for frame in frames]
 
 
-def test_equals_the_whole_clip_at_once(frames: np.ndarray) -> None:
+def test_streaming_equals_batch_inference(frames: np.ndarray) -> None:
     checkpoint = ensemble("ssam", "scam")
     estimates = run(ForceEstimator(TorchEngine(checkpoint), REGION), frames)
     small = np.stack([downscale(frame, REGION, 32) for frame in frames])
@@ -70,7 +75,7 @@ def test_without_a_reference_every_frame_counts(frames: np.ndarray) -> None:
     assert estimator.reference is None
 
 
-def test_the_reference_is_what_the_region_shows(frames: np.ndarray) -> None:
+def test_reference_is_mean_of_region(frames: np.ndarray) -> None:
     estimator = ForceEstimator(TorchEngine(ensemble("ssam")), REGION)
     run(estimator, frames)
     expected = np.mean([downscale(frame, REGION, 32) for frame in frames[:4]], axis=0).round()
@@ -78,7 +83,7 @@ def test_the_reference_is_what_the_region_shows(frames: np.ndarray) -> None:
     np.testing.assert_array_equal(estimator.reference, expected)
 
 
-def test_attention_is_that_of_the_newest_frame(frames: np.ndarray) -> None:
+def test_attention_map_is_of_newest_frame(frames: np.ndarray) -> None:
     estimator = ForceEstimator(TorchEngine(ensemble("scam", "ssam")))
     assert estimator.attention_map() is None
     run(estimator, frames[:5])
@@ -93,13 +98,13 @@ def test_attention_is_that_of_the_newest_frame(frames: np.ndarray) -> None:
     assert not np.array_equal(earlier, newest)
 
 
-def test_no_map_without_spatial_attention(frames: np.ndarray) -> None:
+def test_no_attention_map_without_ssam(frames: np.ndarray) -> None:
     estimator = ForceEstimator(TorchEngine(ensemble("scam", "none")))
     run(estimator, frames[:5])
     assert estimator.attention_map() is None
 
 
-def test_nan_never_leaves_the_network(frames: np.ndarray) -> None:
+def test_nan_from_a_network_is_refused(frames: np.ndarray) -> None:
     checkpoint = ensemble("ssam", "scam")
     checkpoint.networks[1].out.bias.fill_(torch.nan)
     estimator = ForceEstimator(TorchEngine(checkpoint))
@@ -107,25 +112,8 @@ def test_nan_never_leaves_the_network(frames: np.ndarray) -> None:
         run(estimator, frames)
 
 
-def test_an_input_that_is_not_finite_never_enters_the_stream(frames: np.ndarray) -> None:
-    inputs = frames[:3, :32, :32].astype(np.float32) / 255
-    spoiled = inputs[1].copy()
-    spoiled[3, 4] = np.nan
-    engine = TorchEngine(ensemble("ssam"))
-    expected = [engine.step(frame).forces_n for frame in inputs]
-    engine.reset()
-    seen = []
-    for frame in inputs:
-        with pytest.raises(NonFiniteError, match="prepared frame"):
-            engine.step(spoiled)
-        seen.append(engine.step(frame).forces_n)
-    np.testing.assert_array_equal(seen, expected)
-
-
 @pytest.mark.parametrize("force_n", [-150.0, -100.6, -100.4, 0.0, 100.4, 100.6, 1e30])
-def test_the_claimed_error_grows_beyond_the_forces_that_validation_knew(
-    frames: np.ndarray, force_n: float
-) -> None:
+def test_claimed_error_grows_beyond_validated_forces(frames: np.ndarray, force_n: float) -> None:
     checkpoint = ensemble("ssam")
     checkpoint.networks[0].out.weight.zero_()
     checkpoint.networks[0].out.bias.fill_(force_n / 20)
@@ -135,40 +123,47 @@ def test_the_claimed_error_grows_beyond_the_forces_that_validation_knew(
     assert estimate.std_n == pytest.approx(known_n + max(abs(force_n) - 100.5, 0), rel=1e-5, abs=1e-4)
 
 
-def test_bad_frames_and_regions_are_named(frames: np.ndarray) -> None:
+def test_invalid_frame_or_region_is_refused(frames: np.ndarray) -> None:
     with pytest.raises(ConfigError, match="region"):
         ForceEstimator(TorchEngine(ensemble("ssam")), (0, 0, 100, 100)).update(frames[0])
     with pytest.raises(DataError, match="gray"):
         ForceEstimator(TorchEngine(ensemble("ssam"))).update(frames)
 
 
-def correction(gate: float, mean: np.ndarray) -> Correction:
-    """Half of the force and 0.2 N, a head that counts one feature, and a plane of one dimension."""
-    rng = np.random.default_rng(0)
-    unit = rng.normal(size=(len(mean), 1))
-    profile = ObjectProfile(
+def profile_of(ood_limit: float, checkpoint: str = "", weights: str = "") -> ObjectProfile:
+    """An object profile that halves the force and adds 0.2 N."""
+    return ObjectProfile(
         object="mug",
         date=date(2026, 1, 2),
-        checkpoint="",
-        camera={},
+        checkpoint=checkpoint,
+        camera={"camera.rate_hz": 1.0},
         touches=3,
         frames=30,
         force_n=5.0,
         output=OutputCurve(kind="affine", estimate_n=(0.0, 2.0), force_n=(0.2, 1.2)),
         interval=Interval(coverage=0.9, base_n=0.3, share=0.1),
-        ood_limit=gate,
+        ood_limit=ood_limit,
         before_n=0.5,
-        weights="",
+        weights=weights,
     )
+
+
+def arrays_of(mean: np.ndarray) -> ProfileArrays:
+    """A head that adds 0.1 N and one feature, and a subspace of one dimension."""
+    rng = np.random.default_rng(0)
+    unit = rng.normal(size=(len(mean), 1))
     head = np.zeros(len(mean), np.float32)
     head[3] = 2.0
-    arrays = ProfileArrays(
+    return ProfileArrays(
         head, np.array([0.1], np.float32), mean, unit / np.linalg.norm(unit), np.array([1.0], np.float32)
     )
-    return Correction(profile, arrays)
 
 
-def test_a_profile_corrects_each_frame_as_it_would_the_whole_clip(frames: np.ndarray) -> None:
+def correction(ood_limit: float, mean: np.ndarray) -> Correction:
+    return Correction(profile_of(ood_limit), arrays_of(mean))
+
+
+def test_profile_corrects_a_stream_like_a_batch(frames: np.ndarray) -> None:
     checkpoint = ensemble("ssam", "scam")
     small = np.stack([downscale(frame, REGION, 32) for frame in frames])
     forces, read = features(checkpoint.networks, checkpoint.header.preprocess, small)
@@ -182,8 +177,59 @@ def test_a_profile_corrects_each_frame_as_it_would_the_whole_clip(frames: np.nda
         assert estimate.std_n == pytest.approx(half_n / 1.6449, abs=1e-3)
 
 
-def test_what_a_profile_does_not_know_gives_no_estimate(frames: np.ndarray) -> None:
+def test_out_of_distribution_frame_gives_no_estimate(frames: np.ndarray) -> None:
     checkpoint = ensemble("ssam")
     estimator = ForceEstimator(TorchEngine(checkpoint), REGION, correction(1e-6, np.zeros(7, np.float32)))
-    with pytest.raises(DataError, match=r"profile 'mug'.*see whether it is that object"):
+    with pytest.raises(DataError, match=r"profile 'mug'; check that the object is the profile's"):
         run(estimator, frames)
+
+
+def test_loads_a_network_by_name_or_path(tiny_checkpoint: Path, frames: np.ndarray) -> None:
+    estimator = ForceEstimator.load(tiny_checkpoint, region=REGION)
+    expected = open_estimator(read_model(tiny_checkpoint), VisionConfig(region=REGION))
+    estimates = run(estimator, frames)
+    assert estimates[:3] == [None] * 3
+    assert estimates == run(expected, frames)
+    assert ForceEstimator.load("small").reference is None
+
+
+@pytest.mark.parametrize("by_path", [True, False])
+def test_loads_an_object_profile_of_the_same_network(
+    tiny_checkpoint: Path, frames: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, by_path: bool
+) -> None:
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    path = tmp_path / "gripper-force" / "objects" / "mug.yaml"
+    model = read_model(tiny_checkpoint)
+    weights = pack(arrays_of(np.zeros(14, np.float32)))
+    digest = sha256(weights).hexdigest()
+    write_object(path, profile_of(1e6, model.digest, digest), weights)
+    plain = run(ForceEstimator.load(tiny_checkpoint), frames)[-1]
+    corrected = run(ForceEstimator.load(tiny_checkpoint, profile=path if by_path else "mug"), frames)[-1]
+    assert plain is not None
+    assert corrected is not None
+    assert abs(corrected.force_n - (0.5 * plain.force_n + 0.3)) < 2.01  # the head adds 2 N times tanh
+    write_object(path, profile_of(1e6, "a" * 64, digest), weights)
+    with pytest.raises(
+        ConfigError, match=r"mug\.yaml is of network aaaaaaaaaaaa, not .*; calibrate the object"
+    ):
+        ForceEstimator.load(tiny_checkpoint, profile=path)
+
+
+def test_load_names_what_is_unknown(tiny_checkpoint: Path) -> None:
+    with pytest.raises(ConfigError, match="no object profile 'no_such_object'"):
+        ForceEstimator.load(tiny_checkpoint, profile="no_such_object")
+    with pytest.raises(ConfigError, match=r"unknown vision\.engine 'tensorrt'"):
+        ForceEstimator.load(tiny_checkpoint, engine="tensorrt")
+
+
+def test_pytorchs_threads_are_set_unless_switched_off(tiny_checkpoint: Path) -> None:
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(3)
+        ForceEstimator.load(tiny_checkpoint)
+        open_estimator(read_model(tiny_checkpoint), VisionConfig(threads=2), set_threads=False)
+        assert torch.get_num_threads() == 3
+        open_estimator(read_model(tiny_checkpoint), VisionConfig(threads=2))
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)

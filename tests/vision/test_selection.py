@@ -1,3 +1,4 @@
+from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -7,8 +8,10 @@ from hypothesis import strategies as st
 
 from gripper_force.config import BudgetConfig, VisionConfig
 from gripper_force.errors import ConfigError
-from gripper_force.vision import selection
-from gripper_force.vision.selection import Candidate, candidates, pareto, resolve_auto, select
+from gripper_force.vision import selection, step_benchmark
+from gripper_force.vision.model_files import read_model
+from gripper_force.vision.selection import Choice, candidates, pareto_front, resolve_auto, select
+from gripper_force.vision.step_benchmark import Candidate, cache_key, engine_version
 
 AUTO = VisionConfig(checkpoint="auto", engine="auto")
 SLOW = Candidate("default", "torch", "float32", 1, 6.0, 8.0, 0.18)
@@ -21,59 +24,54 @@ ALL = [SLOW, FAST, LEAN, SMALL]
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(selection, "_STEPS", 5)
+    monkeypatch.setattr(step_benchmark, "_STEPS", 5)
     resolve_auto.cache_clear()
+    engine_version.cache_clear()
     return tmp_path / "gripper-force" / "engines.json"
 
 
 @pytest.mark.parametrize(
     ("latency_ms", "error_n", "chosen"),
     [
-        (None, None, SLOW),  # the most exact
+        (None, None, SLOW),  # the most accurate
         (7.0, None, SMALL),
         (7.0, 0.2, LEAN),  # one thread for 1.4 ms costs less than two for 1 ms
         (1.8, 0.2, FAST),
         (None, 0.18, SLOW),
     ],
 )
-def test_takes_the_cheapest_that_keeps_the_budget(
+def test_selects_the_cheapest_within_the_budget(
     latency_ms: float | None, error_n: float | None, chosen: Candidate
 ) -> None:
-    vision, why = select(ALL, AUTO, BudgetConfig(latency_ms=latency_ms, error_n=error_n))
-    assert (vision.checkpoint, vision.engine, vision.precision, vision.threads) == (
-        chosen.checkpoint,
-        chosen.engine,
-        chosen.precision,
-        chosen.threads,
-    )
-    assert str(chosen) in why
-    assert "of 4 candidates" in why
+    choice = select(ALL, BudgetConfig(latency_ms=latency_ms, error_n=error_n))
+    assert (choice.candidate, choice.tested) == (chosen, 4)
+    assert str(chosen) in str(choice)
+    assert choice.reason in str(choice)
+    assert "of 4 candidates" in str(choice)
 
 
-def test_a_budget_that_nothing_keeps_names_what_there_is() -> None:
+def test_budget_that_no_candidate_keeps_is_an_error_with_the_front() -> None:
     with pytest.raises(ConfigError, match=r"budget\.latency_ms=0\.1.*small on openvino.*0\.230 N"):
-        select(ALL, AUTO, BudgetConfig(latency_ms=0.1))
+        select(ALL, BudgetConfig(latency_ms=0.1))
 
 
 @given(st.lists(st.tuples(st.floats(0.1, 10), st.floats(0.1, 1)), min_size=1, max_size=20))
-def test_the_front_holds_what_nothing_beats(figures: list[tuple[float, float]]) -> None:
+def test_no_candidate_beats_the_front(figures: list[tuple[float, float]]) -> None:
     tested = [Candidate("x", "torch", "float32", 1, ms, ms, error_n) for ms, error_n in figures]
-    front = pareto(tested)
+    front = pareto_front(tested)
     for candidate in tested:
         assert any(f.p50_ms <= candidate.p50_ms and f.error_n <= candidate.error_n for f in front)
     for candidate in front:
         assert not any(f.p50_ms < candidate.p50_ms and f.error_n < candidate.error_n for f in tested)
 
 
-def test_what_is_named_is_left_alone(cache: Path) -> None:
+def test_config_without_auto_is_unchanged(cache: Path) -> None:
     named = VisionConfig(checkpoint="default", engine="torch")
-    assert resolve_auto(named, BudgetConfig()) == (named, "")
+    assert resolve_auto(named, BudgetConfig()) == (named, None)
     assert not cache.exists()
 
 
-def test_measures_once_and_remembers(
-    cache: Path, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_measurements_are_cached(cache: Path, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     vision = VisionConfig(checkpoint=str(tiny_checkpoint), engine="auto")
     monkeypatch.setattr(selection, "installed", lambda: ["torch"])
     first = candidates(vision)
@@ -82,13 +80,47 @@ def test_measures_once_and_remembers(
     assert cache.exists()
     monkeypatch.setattr(selection, "open_engine", None)  # a second measurement would call it
     assert candidates(vision) == first
-    chosen, why = resolve_auto(vision, BudgetConfig())
-    assert chosen.engine == "torch"
-    assert why.startswith("took ")
+    resolved, choice = resolve_auto(vision, BudgetConfig())
+    assert isinstance(choice, Choice)
+    assert choice.tested == len(first)
+    assert (resolved.engine, resolved.threads) == ("torch", choice.candidate.threads)
+    assert str(choice).startswith("took ")
+
+
+def test_engine_of_another_package_is_measured_and_not_cached(
+    cache: Path, tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "unversioned_engines.py").write_text(
+        "from gripper_force.vision.engines.pytorch import TorchEngine as OtherEngine\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(selection, "SHIPPED", {"tiny": tiny_checkpoint})
+    monkeypatch.setattr(selection, "read_model", lambda _name: read_model(tiny_checkpoint))
+    other = VisionConfig.model_construct(
+        **VisionConfig(checkpoint="auto").model_dump() | {"engine": "unversioned_engines:OtherEngine"}
+    )
+    (candidate,) = candidates(other)
+    assert (candidate.checkpoint, candidate.engine) == ("tiny", "unversioned_engines:OtherEngine")
+    assert not cache.exists()
+
+
+def test_version_is_of_the_package_that_holds_the_engine(monkeypatch: pytest.MonkeyPatch) -> None:
+    point = metadata.EntryPoint("other", "numpy:ndarray", "gripper_force.engines")
+    assert engine_version("torch") == metadata.version("torch")
+    assert engine_version("numpy.no_engine:Engine") == metadata.version("numpy")
+    assert engine_version("no_such_package:Engine") == engine_version(":Engine") == ""
+    monkeypatch.setattr(step_benchmark, "registered", lambda _group: {"other": point})
+    assert engine_version("other") == ""  # this entry point belongs to no distribution
+
+
+def test_key_names_file_engine_settings_and_machine(tiny_checkpoint: Path) -> None:
+    model = read_model(tiny_checkpoint)
+    key = cache_key(model, "torch", "float32", 2)
+    assert key.startswith(f"{model.digest[:16]} .safetensors torch {engine_version('torch')} float32 2 ")
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"a": {"b": 1}}'])
-def test_a_damaged_memory_is_measured_anew(
+def test_damaged_cache_is_measured_again(
     cache: Path, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch, text: str
 ) -> None:
     cache.parent.mkdir(parents=True)
@@ -97,13 +129,13 @@ def test_a_damaged_memory_is_measured_anew(
     assert candidates(VisionConfig(checkpoint=str(tiny_checkpoint), engine="auto"))
 
 
-def test_precision_is_only_chosen_where_the_checkpoint_is(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_precision_is_only_chosen_together_with_the_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
     if find_spec("openvino") is None:
         pytest.skip("openvino is not installed: pip install 'gripper-force[engines]'")
     monkeypatch.setattr(selection, "SHIPPED", {"default": selection.SHIPPED["default"]})
 
     def precisions(vision: VisionConfig) -> set[str]:
-        return {precision for _, (_, _, precision, _) in selection._candidates(vision)}
+        return {setting.precision for setting in selection._settings(vision)}
 
     assert precisions(VisionConfig(engine="auto")) == {"float32"}
     assert precisions(AUTO) == {"float32", "bfloat16"}

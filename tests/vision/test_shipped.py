@@ -3,17 +3,14 @@ from pathlib import Path
 import pytest
 
 from gripper_force.config import load_config
-from gripper_force.jobs.dataset import load_clips
 from gripper_force.jobs.evaluate import evaluate
 from gripper_force.jobs.simulate import plan, simulate
-from gripper_force.vision.checkpoint import load_checkpoint
 
 
 @pytest.mark.parametrize("moving", ["false", "true"])
 def test_the_shipped_network_sees_force_whatever_passes_behind(moving: str, tmp_path: Path) -> None:
     config = load_config(None, [f"sim.moving_background={moving}"])
     list(simulate(plan("tap", 4, 903_000), tmp_path, config, jobs=1))
-    checkpoint = load_checkpoint()
-    result = evaluate(checkpoint, load_clips(tmp_path, checkpoint.header.preprocess, quiet=True))
-    assert result["mae_n"] < 0.4
-    assert max(each["mae_n"] for each in result["per_object"].values()) < 0.7
+    result = evaluate(tmp_path)
+    assert result.mae_n < 0.4
+    assert max(errors.mae_n for errors in result.per_object.values()) < 0.7

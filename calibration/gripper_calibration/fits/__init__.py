@@ -1,1 +1,1 @@
-"""Fits: numbers in, values with intervals out; no device, no file."""
+"""Fits: arrays in, calibrated values with intervals out. They use no devices and no files."""

@@ -12,17 +12,18 @@ from gripper_force.profiles.rig_profile import CalibratedValue
 from gripper_force.spikes import find_spikes
 
 BATCHES: Final = 10
-"""Readings of a converter are no independent draws. The means of so few long batches nearly are, and give an
-interval without a model of the noise: Schmeiser, "Batch size effects in the analysis of simulation output",
-Operations Research 30 (1982) 556, doi:10.1287/opre.30.3.556, finds no use in more than 30."""
+"""Batches per rest. Consecutive readings are not independent, but the means of a few long batches nearly are,
+and they give an interval without a noise model. More than 30 give no benefit: Schmeiser, "Batch size
+effects in the analysis of simulation output", Operations Research 30 (1982) 556, doi:10.1287/opre.30.3.556."""
 
-LEAST_READINGS: Final = 4 * BATCHES
-_MOST_REJECTED: Final = 0.2
-_MOST_MOVED: Final = 0.02
-_MOST_RETURN: Final = 0.02
-_MOST_UNKNOWN: Final = 0.05
-_CLEAR: Final = 10
-_LARGEST: Final = 1e9
+MIN_READINGS: Final = 4 * BATCHES
+_MAX_REJECTED: Final = 0.2
+_MAX_RANGE: Final = 0.02
+_MAX_RETURN_ERROR: Final = 0.02
+_MAX_HALF_WIDTH: Final = 0.05
+"""Limits as shares: of the readings (rejected), of the change by the load (the others)."""
+_CHANGE_TO_SPREAD: Final = 10
+_MAX_RAW: Final = 1e9
 _S_PER_MIN: Final = 60.0
 
 Floats = npt.NDArray[np.float64]
@@ -31,12 +32,12 @@ Bools = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Rest:
-    """Readings under a load that rests.
+    """Readings under a load at rest.
 
     Attributes:
         t_s: Times, (N,).
-        raw: Readings in the sensor's own unit, (N,).
-        valid: Whether the sensor itself stands by them, (N,).
+        raw: Readings in the sensor's unit, (N,).
+        valid: True for readings that the sensor's driver marks as valid, (N,).
     """
 
     t_s: Floats
@@ -45,22 +46,22 @@ class Rest:
 
 
 @dataclass(frozen=True, slots=True)
-class Level:
-    """What a rest says.
+class RestStatistics:
+    """Statistics of a rest.
 
     Attributes:
         raw: Mean reading.
         half_raw: Half of its 95 % confidence interval.
-        moved_raw: How far the reading went from its first to its last batch, and in between.
+        range_raw: Peak-to-peak range of the batch means.
         noise_raw: Standard deviation of a reading about the drift.
-        drift_raw_min: Drift a minute.
+        drift_raw_min: Drift per minute.
         drift_half_raw_min: Half of its 95 % confidence interval.
-        kept: Readings that count, (N,).
+        kept: True for the readings that were used, (N,).
     """
 
     raw: float
     half_raw: float
-    moved_raw: float
+    range_raw: float
     noise_raw: float
     drift_raw_min: float
     drift_half_raw_min: float
@@ -68,18 +69,18 @@ class Level:
 
 
 @dataclass(frozen=True, slots=True)
-class Weighing:
-    """Tare and scale, and what they rest on.
+class LoadCellFit:
+    """Tare and scale with the data they come from.
 
     Attributes:
-        rests: What was read.
+        rests: The readings.
         tare_raw: Reading without load.
-        n_per_raw: Newtons for one unit of the reading.
+        n_per_raw: Newtons per unit of the reading.
         noise_n: Standard deviation of one reading.
-        drift_n_min: Drift without load, a minute.
-        return_n: What is read after the load was taken off, against before.
-        rejected: Readings left out.
-        levels: Of the three rests.
+        drift_n_min: Drift without load, per minute.
+        return_n: Difference of the empty readings after and before the load.
+        rejected: Number of rejected readings.
+        statistics: Statistics of the three rests.
     """
 
     rests: tuple[Rest, Rest, Rest]
@@ -89,41 +90,43 @@ class Weighing:
     drift_n_min: CalibratedValue
     return_n: float
     rejected: int
-    levels: tuple[Level, Level, Level]
+    statistics: tuple[RestStatistics, RestStatistics, RestStatistics]
 
 
-def level(rest: Rest, scale: float, name: str) -> Level:
-    """Mean, noise and drift of a rest, without what sticks out.
+def rest_statistics(rest: Rest, scale: float, name: str) -> RestStatistics:
+    """Returns mean, noise and drift of a rest, without spikes.
 
     Args:
         rest: The readings.
-        scale: Newtons for one unit of the reading as far as known, to tell a spike; 0 where it is not.
-        name: What rests, for the error.
+        scale: Approximate newtons per unit of the reading, to detect spikes; 0 if unknown.
+        name: Name of the rest, for the error message.
 
     Raises:
-        DataError: There are too few readings, or too many that are rejected.
+        DataError: There are too few readings, or too many rejected ones.
     """
-    kept = rest.valid & (np.abs(rest.raw) < _LARGEST) & np.isfinite(rest.t_s)
+    kept = rest.valid & (np.abs(rest.raw) < _MAX_RAW) & np.isfinite(rest.t_s)
     if scale and kept.any():
         force_n = (rest.raw[kept] - _trend(rest.raw[kept])) * scale
-        # A resting load knows no side: what can't be a dip can't be a bump either.
+        # Spikes of a load at rest occur in both directions.
         kept[kept] = ~(find_spikes(force_n) | find_spikes(-force_n))
     rejected = len(rest.raw) - int(kept.sum())
-    if kept.sum() < LEAST_READINGS:
+    if kept.sum() < MIN_READINGS:
         raise DataError(
-            f"{name}, {int(kept.sum())} of {len(rest.raw)} readings are of use, and {LEAST_READINGS} are "
-            "needed; see what doctor says of the load cell, or record for longer"
+            f"{name}, only {int(kept.sum())} of {len(rest.raw)} readings are usable, and {MIN_READINGS} are "
+            "needed; check the load cell with `gripper-force doctor`, or increase --seconds"
         )
-    if rejected > _MOST_REJECTED * len(rest.raw):
+    if rejected > _MAX_REJECTED * len(rest.raw):
         raise DataError(
-            f"{name}, {rejected} of {len(rest.raw)} readings were rejected (saturated, stuck, no number, or "
-            "spikes); see to the load cell's range and wiring"
+            f"{name}, {rejected} of {len(rest.raw)} readings were rejected (saturated, stuck, not a number, "
+            "or spikes); check the load cell's range and wiring"
         )
     t_s, raw = rest.t_s[kept], rest.raw[kept]
     centre = float(np.median(raw))
     batches_t_s = np.array([part.mean() for part in np.array_split(t_s, BATCHES)])
     if not (np.diff(batches_t_s) > 0).all():
-        raise DataError(f"{name}, the readings' times do not go forwards, so no drift can be told from them")
+        raise DataError(
+            f"{name}, the times of the readings do not increase; check the load cell's clock or the log"
+        )
     batches = np.array([part.mean() - centre for part in np.array_split(raw, BATCHES)])
     rate, offset = np.polyfit(batches_t_s - batches_t_s.mean(), batches, 1)
     trend = offset + rate * (batches_t_s - batches_t_s.mean())
@@ -131,10 +134,10 @@ def level(rest: Rest, scale: float, name: str) -> Level:
     quantile = float(stats.t.ppf(0.975, BATCHES - 2))
     span = float(np.sqrt(np.sum((batches_t_s - batches_t_s.mean()) ** 2)))
     noise = float(np.std(raw - centre - offset - rate * (t_s - batches_t_s.mean())))
-    return Level(
+    return RestStatistics(
         raw=centre + float(offset),
         half_raw=quantile * spread / np.sqrt(BATCHES) + _rounding(raw),
-        moved_raw=float(np.ptp(batches)),
+        range_raw=float(np.ptp(batches)),
         noise_raw=noise,
         drift_raw_min=float(rate) * _S_PER_MIN,
         drift_half_raw_min=quantile * spread / span * _S_PER_MIN,
@@ -142,75 +145,79 @@ def level(rest: Rest, scale: float, name: str) -> Level:
     )
 
 
-def fit_load_cell(empty: Rest, loaded: Rest, again: Rest, force_n: float) -> Weighing:
-    """Tare and scale by a known force.
+def fit_load_cell(empty: Rest, loaded: Rest, again: Rest, force_n: float) -> LoadCellFit:
+    """Fits tare and scale to three rests.
 
-    The tare lies between what is read before and after: what differs is taken as uncertain, not as drift.
+    The tare lies between the empty readings before and after. Their difference counts as uncertainty, not as
+    drift.
 
     Args:
         empty: Readings without load.
         loaded: Readings under the force.
-        again: Readings after it was taken off.
+        again: Readings after the load was removed.
         force_n: The force, positive.
 
     Raises:
-        DataError: The readings are too few, do not rest, hardly change with the load, or do not come back.
+        DataError: There are too few readings, or they do not settle, hardly change with the load, or do not
+            return to the empty value.
     """
     rough = _rough_scale(empty, loaded, force_n)
-    first = level(empty, rough, "without load")
-    under = level(loaded, rough, "under load")
-    last = level(again, rough, "after the load was taken off")
+    first = rest_statistics(empty, rough, "without load")
+    under = rest_statistics(loaded, rough, "under load")
+    last = rest_statistics(again, rough, "after unloading")
     change = under.raw - (first.raw + last.raw) / 2
-    unit = "of the reading's unit"
-    largest = max(first.half_raw, under.half_raw, last.half_raw, force_n / _LARGEST)
+    unit = "units of the reading"
+    largest = max(first.half_raw, under.half_raw, last.half_raw, force_n / _MAX_RAW)
     if not abs(change) > largest:
         raise DataError(
-            f"the load changes the reading by {change:.4g}, and each is only known within {largest:.4g} "
-            f"{unit}; check that the load hangs on the cell, or take a heavier one"
+            f"the load changes the reading by {change:.4g} {unit}, and the readings are only known to within "
+            f"{largest:.4g}; check that the load acts on the cell, or use a heavier load"
         )
     for name, one in (("without load", first), ("under load", under), ("after unloading", last)):
-        if one.moved_raw > _MOST_MOVED * abs(change):
+        if one.range_raw > _MAX_RANGE * abs(change):
             raise DataError(
-                f"the reading does not rest {name}: it moves by {100 * one.moved_raw / abs(change):.1f} % of "
-                "the load; wait until nothing swings, keep draughts off, or take a heavier load"
+                f"the reading does not settle {name}: it varies by {100 * one.range_raw / abs(change):.1f} % "
+                "of the load; wait until nothing swings, avoid draughts, or use a heavier load"
             )
-    came_back = last.raw - first.raw
-    if abs(came_back) > _MOST_RETURN * abs(change):
+    return_raw = last.raw - first.raw
+    if abs(return_raw) > _MAX_RETURN_ERROR * abs(change):
         raise DataError(
-            f"without load the cell reads {100 * abs(came_back / change):.1f} % of the load more or less "
-            "than before it; see that nothing touches it or has slipped, and repeat"
+            f"the empty reading after the load differs from the one before it by "
+            f"{100 * abs(return_raw / change):.1f} % of the load; check that nothing touches the cell or has "
+            "slipped, and repeat"
         )
-    tare_half = abs(came_back) / 2 + max(first.half_raw, last.half_raw)
-    change_half = abs(came_back) / 2 + float(
+    tare_half = abs(return_raw) / 2 + max(first.half_raw, last.half_raw)
+    change_half = abs(return_raw) / 2 + float(
         np.hypot(under.half_raw, np.hypot(first.half_raw, last.half_raw) / 2)
     )
-    if change_half > _MOST_UNKNOWN * abs(change):
+    if change_half > _MAX_HALF_WIDTH * abs(change):
         raise DataError(
-            f"the load changes the reading by {change:.4g}, and that is only known within {change_half:.4g} "
-            f"{unit}; take a heavier load, or record for longer"
+            f"the load changes the reading by {change:.4g} {unit}, and this is only known to within "
+            f"{change_half:.4g}; use a heavier load, or increase --seconds"
         )
     n_per_raw = force_n / change
     ends = sorted(force_n / (change + side * change_half) for side in (-1, 1))
     tare = (first.raw + last.raw) / 2
     drift = (first.drift_raw_min + last.drift_raw_min) / 2 * n_per_raw
     drift_half = float(np.hypot(first.drift_half_raw_min, last.drift_half_raw_min)) / 2 * abs(n_per_raw)
-    levels = (first, under, last)
-    return Weighing(
+    statistics = (first, under, last)
+    return LoadCellFit(
         rests=(empty, loaded, again),
         tare_raw=CalibratedValue(value=tare, low=tare - tare_half, high=tare + tare_half),
         n_per_raw=CalibratedValue(value=n_per_raw, low=ends[0], high=ends[1]),
-        noise_n=max(one.noise_raw for one in levels) * abs(n_per_raw),
+        noise_n=max(one.noise_raw for one in statistics) * abs(n_per_raw),
         drift_n_min=CalibratedValue(value=drift, low=drift - drift_half, high=drift + drift_half),
-        return_n=came_back * n_per_raw,
-        rejected=sum(int((~one.kept).sum()) for one in levels),
-        levels=levels,
+        return_n=return_raw * n_per_raw,
+        rejected=sum(int((~one.kept).sum()) for one in statistics),
+        statistics=statistics,
     )
 
 
 def allan_deviation(rest: Rest, kept: Bools) -> tuple[Floats, Floats]:
-    """Averaging times in s and the Allan deviation of the kept readings at each, in the reading's unit.
+    """Returns averaging times in s and the Allan deviation at each, in the reading's unit, (K,) each.
 
-    Overlapping, at octaves: Riley, "Handbook of frequency stability analysis", NIST SP 1065 (2008), 5.2.4.
+    Overlapping estimator, at octaves: Riley, "Handbook of frequency stability analysis", NIST SP 1065 (2008),
+    5.2.4.
     """
     raw = rest.raw[kept]
     period_s = float(np.median(np.diff(rest.t_s[kept])))
@@ -224,18 +231,20 @@ def allan_deviation(rest: Rest, kept: Bools) -> tuple[Floats, Floats]:
 
 
 def _rough_scale(empty: Rest, loaded: Rest, force_n: float) -> float:
-    """Newtons for a unit of the reading by the medians; 0 where noise alone could change them so."""
+    """Newtons per unit of the reading from the medians; 0 if noise could explain their difference."""
     medians, spreads = [], []
     for rest in (empty, loaded):
-        usable = rest.raw[rest.valid & (np.abs(rest.raw) < _LARGEST)]
+        usable = rest.raw[rest.valid & (np.abs(rest.raw) < _MAX_RAW)]
         medians.append(float(np.median(usable)) if len(usable) else 0.0)
         spreads.append(float(np.median(np.abs(usable - medians[-1]))) if len(usable) else 0.0)
     change = medians[1] - medians[0]
-    return force_n / change if abs(change) > max(_CLEAR * max(spreads), force_n / _LARGEST) else 0.0
+    return (
+        force_n / change if abs(change) > max(_CHANGE_TO_SPREAD * max(spreads), force_n / _MAX_RAW) else 0.0
+    )
 
 
 def _trend(raw: Floats) -> Floats:
-    """A line through the medians of parts, which spikes leave as it is."""
+    """Line through the medians of parts of the readings, robust against spikes, (N,)."""
     parts = [part for part in np.array_split(np.arange(len(raw)), BATCHES) if len(part)]
     middles = np.array([part.mean() for part in parts])
     medians = np.array([np.median(raw[part]) for part in parts])
@@ -245,7 +254,7 @@ def _trend(raw: Floats) -> Floats:
 
 
 def _rounding(raw: Floats) -> float:
-    """Half of the last digit that is told, where noise does not blur it."""
+    """Half of the reading's resolution if noise is smaller than that, else 0."""
     values = np.unique(raw)
     if len(values) > 2:
         return 0.0

@@ -1,4 +1,4 @@
-"""How unlike the calibration's frames a frame may be before its estimate counts for nothing."""
+"""Fit of the out-of-distribution limit from left-out touches."""
 
 from collections.abc import Iterable
 from typing import Final
@@ -7,19 +7,25 @@ import numpy as np
 
 from gripper_calibration.fits.touches import Floats
 
-AXES: Final = 32
-"""Dimensions of the plane near which the features of one object lie."""
+SUBSPACE_DIMENSIONS: Final = 32
+"""Dimensions of the subspace near which the features of one object lie."""
 
-UNKNOWN: Final = 1.0
-"""With one or two touches nothing tells how touches differ: as unlike as frames are among each other."""
+DEFAULT_LIMIT: Final = 1.0
+"""Limit with one or two touches, which do not show how touches differ: a deviation off the subspace as large as
+the calibration frames' mean square distance from their mean."""
 
 _QUANTILE: Final = 0.995
-_FEWEST: Final = 3
+_MIN_TOUCHES: Final = 3
 
 
-def limit(left_out: Iterable[Floats]) -> float:
-    """The gate's limit from the ood_score of each touch's frames to all other touches, (N,) each."""
+def fit_ood_limit(left_out: Iterable[Floats]) -> float:
+    """Returns the out-of-distribution limit.
+
+    Args:
+        left_out: For each touch, the out-of-distribution scores of its frames against all other touches,
+            (N,) each.
+    """
     worst = [float(np.quantile(ood_score, _QUANTILE)) for ood_score in left_out]
-    if len(worst) < _FEWEST:
-        return UNKNOWN
+    if len(worst) < _MIN_TOUCHES:
+        return DEFAULT_LIMIT
     return 1.5 * (1 + 2 / len(worst)) * max(worst)

@@ -1,4 +1,4 @@
-"""Touches of one object, as the fits see them."""
+"""Touches of one object, as input of the fits."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -12,22 +12,22 @@ from gripper_force.profiles.correction import Features
 
 Floats = npt.NDArray[np.float64]
 
-LEAST_PEAK_N: Final = 1.0
-"""A calibration without a touch of this force says nothing about forces."""
+MIN_PEAK_N: Final = 1.0
+"""A calibration without a touch of this force contains no information about forces."""
 
-_LEAST_CORRELATION: Final = 0.5
-_LEAST_FRAMES: Final = 20
+_MIN_CORRELATION: Final = 0.5
+_MIN_FRAMES: Final = 20
 
 
 @dataclass(frozen=True, eq=False)
 class Touches:
-    """Frames of all touches with a label.
+    """The labelled frames of all touches.
 
     Attributes:
-        features: What the network's last layers make the estimates from, (N, F).
-        estimate_n: The network's estimates, (N,).
-        force_n: What the load cell felt, (N,).
-        touch: Number of each frame's touch, (N,).
+        features: Inputs of the network's last layers, (N, F).
+        estimate_n: Visual estimates of the network, (N,).
+        force_n: Load-cell forces, (N,).
+        touch: Number of the touch of each frame, (N,).
     """
 
     features: Features
@@ -37,49 +37,54 @@ class Touches:
 
     @property
     def numbers(self) -> list[int]:
-        """The touches there are."""
+        """Numbers of the touches, rising."""
         return [int(number) for number in np.unique(self.touch)]
 
     def only(self, numbers: list[int]) -> "Touches":
-        """These touches alone."""
-        return self._part(np.isin(self.touch, numbers))
+        """Returns these touches."""
+        return self._select(np.isin(self.touch, numbers))
 
     def without(self, number: int) -> "Touches":
-        """All touches but this one."""
-        return self._part(self.touch != number)
+        """Returns all touches except this one."""
+        return self._select(self.touch != number)
 
-    def thinned(self, most: int) -> "Touches":
-        """Evenly spaced frames, no more than so many: neighbours tell nearly the same."""
+    def thinned(self, max_frames: int) -> "Touches":
+        """Returns at most ``max_frames`` evenly spaced frames. Adjacent frames carry nearly the same data."""
         keep = np.zeros(len(self.touch), bool)
-        keep[:: max(1, -(-len(self.touch) // most))] = True
-        return self._part(keep)
+        keep[:: max(1, -(-len(self.touch) // max_frames))] = True
+        return self._select(keep)
 
-    def _part(self, keep: npt.NDArray[np.bool_]) -> "Touches":
+    def _select(self, keep: npt.NDArray[np.bool_]) -> "Touches":
         return Touches(self.features[keep], self.estimate_n[keep], self.force_n[keep], self.touch[keep])
 
 
 def check(touches: Touches) -> None:
-    """Raises `DataError` where nothing can be learnt from the touches."""
+    """Checks that the touches are sufficient for a calibration.
+
+    Raises:
+        DataError: Values are not finite, there are too few frames, the forces are too small, or the estimates
+            do not correlate with the load cell.
+    """
     if not (np.isfinite(touches.force_n).all() and np.isfinite(touches.features).all()):
-        raise DataError("the touches hold values that are not finite; see what the load cell gave")
-    if len(touches.force_n) < _LEAST_FRAMES:
+        raise DataError("the touches contain values that are not finite; check the load cell's samples")
+    if len(touches.force_n) < _MIN_FRAMES:
         raise DataError(
-            f"{len(touches.force_n)} frames have a label, and a calibration needs {_LEAST_FRAMES}; touch "
-            "longer"
+            f"only {len(touches.force_n)} frames have a label, and a calibration needs {_MIN_FRAMES}; record "
+            "longer touches"
         )
     peak_n = float(np.quantile(touches.force_n, 0.99))
-    if peak_n < LEAST_PEAK_N:
+    if peak_n < MIN_PEAK_N:
         raise DataError(
-            f"the load cell felt no more than {peak_n:.2f} N in all touches, and a calibration needs "
-            f"{LEAST_PEAK_N:g} N; press harder, or see to load_cell.n_per_raw and its sign"
+            f"the load cell measured no more than {peak_n:.2f} N in all touches, and a calibration needs "
+            f"{MIN_PEAK_N:g} N; press harder, or check load_cell.n_per_raw and its sign"
         )
     contact = touches.force_n > CONTACT_N
     pair = touches.estimate_n[contact], touches.force_n[contact]
     flat = min(float(np.ptp(values)) for values in pair) < 1e-6
     correlation = 0.0 if flat else float(np.corrcoef(*pair)[0, 1])
-    if correlation < _LEAST_CORRELATION:
+    if correlation < _MIN_CORRELATION:
         raise DataError(
-            f"what the network sees does not follow the load cell: their correlation in contact is "
-            f"{correlation:.2f}, and {_LEAST_CORRELATION:g} is needed; see vision.region, the first frames "
-            "(open jaws) and the timestamps"
+            "the network's estimates do not follow the load cell: their correlation in contact is "
+            f"{correlation:.2f}, and {_MIN_CORRELATION:g} is needed; check vision.region, the first frames "
+            "(they must show open jaws) and the timestamps"
         )

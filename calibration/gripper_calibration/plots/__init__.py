@@ -1,1 +1,1 @@
-"""The pictures of calibrations, one module each."""
+"""Figures of the calibrations, one module each."""

@@ -1,74 +1,91 @@
-"""An object's calibration as a picture: before and after, what is left, and how many touches are enough."""
+"""Figure of an object's calibration: errors before and after, residuals, and the learning curve."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 
-from gripper_calibration.fits.object_fit import Fitted
+from gripper_calibration.fits.object_fit import LearningCurvePoint, ObjectFit
 from gripper_calibration.fits.touches import Touches
-from gripper_calibration.plots.style import DATA, FIT, GRAY, name, picture
+from gripper_calibration.plots.style import DATA, FIT, GRAY, label_axes, saved_figure
 from gripper_force.profiles.correction import curve_n
 from gripper_force.profiles.object_profile import ObjectProfile
 
 
 def draw(
     profile: ObjectProfile,
-    fitted: Fitted,
+    fit: ObjectFit,
     touches: Touches,
-    curve: list[tuple[int, float, float]],
+    curve: Sequence[LearningCurvePoint],
     path: Path,
 ) -> None:
-    """Draws it; ``curve`` is what `fits.correction.learning_curve` gives."""
-    left_out = np.isfinite(fitted.left_out_n).all()
-    after_n = fitted.left_out_n if left_out else fitted.predict(touches)
-    how = "each touch by all others" if left_out else "fitted on the same touches"
+    """Draws the estimates before and after the correction, the residuals with the interval, and the curve.
+
+    Args:
+        profile: The profile.
+        fit: The fit it was made from.
+        touches: The touches it was fitted to.
+        curve: Points of `gripper_calibration.fits.object_fit.learning_curve`.
+        path: File to write.
+
+    Raises:
+        DataError: The file can't be written.
+    """
+    validated = np.isfinite(fit.cross_validated_n).all()
+    after_n = fit.cross_validated_n if validated else fit.predict(touches)
+    method = "cross-validated" if validated else "fitted on the same touches"
     error_n = after_n - touches.force_n
-    reach_n = max(float(touches.force_n.max()), float(touches.estimate_n.max()))
-    line = np.linspace(0, reach_n, 100)
-    half_n = profile.interval.half_width_n(line)
-    share = np.abs(error_n) <= profile.interval.half_width_n(after_n)
+    after_mae_n = float(np.abs(error_n).mean())
+    max_n = max(float(touches.force_n.max()), float(touches.estimate_n.max()))
+    line_n = np.linspace(0, max_n, 100)
+    half_n = profile.interval.half_width_n(line_n)
+    covered = np.abs(error_n) <= profile.interval.half_width_n(after_n)
     title = (
         f"{profile.object}: {profile.touches} touches, MAE {profile.before_n:.3f} N before, "
-        f"{np.abs(error_n).mean():.3f} N after ({how})"
+        f"{after_mae_n:.3f} N after ({method})"
     )
-    with picture(path, title, 7.0) as figure:
-        (before, after), (left, enough) = figure.subplots(2, 2)
-        before.plot(touches.estimate_n, touches.force_n, ".", ms=2, color=DATA)
-        before.plot(line, line, color=GRAY, lw=0.8, label="equal")
+    with saved_figure(path, title, 7.0) as figure:
+        (before_plot, after_plot), (residual_plot, curve_plot) = figure.subplots(2, 2)
+        before_plot.plot(touches.estimate_n, touches.force_n, ".", ms=2, color=DATA)
+        before_plot.plot(line_n, line_n, color=GRAY, lw=0.8, label="equal")
         knots = np.array(profile.output.estimate_n), np.array(profile.output.force_n)
-        alone = not fitted.arrays.head.any()
-        label = fitted.candidate if alone else "its line; the last layer, refitted, adds the rest"
-        before.plot(line, curve_n(*knots, line), color=FIT, label=label)
-        name(before, "before", "the network's estimate, N", "load cell, N")
-        before.legend()
-        after.plot(after_n, touches.force_n, ".", ms=2, color=DATA)
-        after.plot(line, line, color=GRAY, lw=0.8)
-        name(after, "after", "corrected estimate, N", "load cell, N")
-        left.plot(
-            touches.force_n, touches.estimate_n - touches.force_n, ".", ms=2, color=GRAY, label="before"
-        )
-        left.plot(touches.force_n, error_n, ".", ms=2, color=DATA, label="after")
-        label = (
-            f"interval, promised {100 * profile.interval.coverage:.0f} %, holds {100 * share.mean():.0f} %"
-        )
-        left.plot(line, half_n, color=FIT, label=label)
-        left.plot(line, -half_n, color=FIT)
-        name(left, "what is left, by force", "load cell, N", "error, N")
-        left.legend()
-        for count, mae_n, _ in curve:
-            enough.plot(count, mae_n, ".", color=DATA)
-        drawn = sorted({count for count, _, _ in curve})
-        means_n = {c: np.mean([mae_n for count, mae_n, _ in curve if count == c]) for c in drawn}
-        if left_out:  # the same experiment, with every choice of all but one
-            means_n[profile.touches - 1] = np.abs(error_n).mean()
-        counts = list(means_n)
-        enough.plot(counts, list(means_n.values()), ".-", color=FIT, label="after, on those left out")
-        enough.axhline(profile.before_n, color=GRAY, lw=0.8, label="before")
-        enough.set_xscale("log", base=2)
-        enough.set_xticks(counts, [str(count) for count in counts])
-        enough.set_ylim(0)
-        name(enough, "how many touches are enough", "touches calibrated on", "MAE, N")
-        if counts:
-            enough.legend()
-        else:
-            enough.text(0.5, 0.5, "one touch can't tell", transform=enough.transAxes, ha="center")
+        refitted = fit.arrays.head.any()
+        label = "its line; the refitted last layer adds the rest" if refitted else fit.candidate
+        before_plot.plot(line_n, curve_n(*knots, line_n), color=FIT, label=label)
+        label_axes(before_plot, "before", "visual estimate, N", "load cell, N")
+        before_plot.legend()
+        after_plot.plot(after_n, touches.force_n, ".", ms=2, color=DATA)
+        after_plot.plot(line_n, line_n, color=GRAY, lw=0.8)
+        label_axes(after_plot, "after", "corrected estimate, N", "load cell, N")
+        before_error_n = touches.estimate_n - touches.force_n
+        residual_plot.plot(touches.force_n, before_error_n, ".", ms=2, color=GRAY, label="before")
+        residual_plot.plot(touches.force_n, error_n, ".", ms=2, color=DATA, label="after")
+        label = f"{100 * profile.interval.coverage:.0f} % interval, contains {100 * covered.mean():.0f} %"
+        residual_plot.plot(line_n, half_n, color=FIT, label=label)
+        residual_plot.plot(line_n, -half_n, color=FIT)
+        label_axes(residual_plot, "errors", "load cell, N", "error, N")
+        residual_plot.legend()
+        _plot_learning_curve(curve_plot, profile, curve, after_mae_n if validated else None)
+
+
+def _plot_learning_curve(
+    axes: Axes, profile: ObjectProfile, curve: Sequence[LearningCurvePoint], after_mae_n: float | None
+) -> None:
+    for point in curve:
+        axes.plot(point.touches, point.mae_n, ".", color=DATA)
+    counts = sorted({point.touches for point in curve})
+    means_n = {n: float(np.mean([point.mae_n for point in curve if point.touches == n])) for n in counts}
+    if after_mae_n is not None:  # cross-validation fits on all touches but one
+        means_n[profile.touches - 1] = after_mae_n
+    label_axes(axes, "learning curve", "touches in the fit", "MAE, N")
+    axes.axhline(profile.before_n, color=GRAY, lw=0.8, label="before")
+    if means_n:
+        axes.plot(list(means_n), list(means_n.values()), ".-", color=FIT, label="after, on the other touches")
+        axes.set_xscale("log", base=2)
+        axes.set_xticks(list(means_n), [str(count) for count in means_n])
+        axes.legend()
+    else:  # a logarithmic axis without data is an error
+        axes.set_xticks([])
+        axes.text(0.5, 0.5, "too few touches", transform=axes.transAxes, ha="center")
+    axes.set_ylim(0)

@@ -1,4 +1,4 @@
-"""What the pictures of all calibrations share: size, style, and a file beside the profile."""
+"""Shared style of the calibration figures."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,8 +20,8 @@ GRAY: Final = "#8a9099"
 
 
 @contextmanager
-def picture(path: Path, title: str, height_in: float) -> Iterator[Figure]:
-    """A figure 10 inches wide to draw on, which is written to ``path`` at the end.
+def saved_figure(path: Path, title: str, height_in: float) -> Iterator[Figure]:
+    """Yields an empty figure, 10 inches wide, and saves it to ``path`` at the end.
 
     Raises:
         DataError: The file can't be written.
@@ -33,18 +33,18 @@ def picture(path: Path, title: str, height_in: float) -> Iterator[Figure]:
         try:
             figure.savefig(path)
         except OSError as error:
-            raise DataError(f"can't write the picture {path}: {error}") from error
+            raise DataError(f"can't write the figure {path}: {error}; check its folder") from error
 
 
-def name(axes: Axes, title: str, x: str, y: str) -> None:
-    """Writes what a plot shows, and the units of its axes."""
+def label_axes(axes: Axes, title: str, x: str, y: str) -> None:
+    """Sets the title and the axis labels of a plot."""
     axes.set_title(title)
     axes.set_xlabel(x)
     axes.set_ylabel(y)
 
 
-def text_of(estimate: CalibratedValue, unit: str) -> str:
-    """A value and its interval."""
-    if estimate.low is None or estimate.high is None:
-        return f"{estimate.value:.5g} {unit} (given)"
-    return f"{estimate.value:.5g} {unit} ({estimate.low:.5g} to {estimate.high:.5g})"
+def value_text(value: CalibratedValue, unit: str) -> str:
+    """Returns a value with its unit and interval, for a person."""
+    if value.low is None or value.high is None:
+        return f"{value.value:.5g} {unit} (given)"
+    return f"{value.value:.5g} {unit} ({value.low:.5g} to {value.high:.5g})"

@@ -1,1 +1,1 @@
-"""Procedures: what to do with the devices so that a fit gets its numbers."""
+"""Calibration procedures: they operate the devices or read logs, run a fit, and write a profile and a figure."""

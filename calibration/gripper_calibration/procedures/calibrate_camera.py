@@ -1,8 +1,8 @@
-"""What a camera sees of the jaws, how long to expose, and how late its pictures come, from some touches."""
+"""Calibration of a camera: exposure, region of interest and lag, from touches of a compliant object."""
 
 import time
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,25 +13,26 @@ import cv2
 import numpy as np
 
 from gripper_calibration.fits.camera_fit import (
-    ExposureStep,
+    ExposureCandidate,
     Markers,
-    Touch,
-    choose_exposure,
+    TouchLag,
+    estimate_lag,
     find_markers,
-    lag_of,
-    region_about,
-    telling,
+    region_around,
+    select_exposure,
+    usable_touches,
 )
 from gripper_calibration.plots.camera_plot import draw
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
+from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.recording.lag import camera_lags_s, load_cell_lag_s
 from gripper_force.jobs.recording.record import RecordingPlan, record
 from gripper_force.jobs.recording.summary import releases_ns
 from gripper_force.profiles.rig_profile import CalibratedValue, CameraCalibration, read_rig, update_rig
-from gripper_force.runtime.assembly import checkpoint_of, settled
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.resolve import ResolvedConfig, make_estimator, resolve, resolve_vision
 from gripper_force.types import (
     NS_PER_MS,
     NS_PER_S,
@@ -42,103 +43,117 @@ from gripper_force.types import (
     Request,
     ServoState,
 )
-from gripper_force.vision.estimator import open_estimator
 from gripper_force.vision.preprocess import Region, downscale
 
 EXPOSURES_US: Final = (500, 1000, 2000, 4000, 8000, 16000)
-"""The ladder, as far as half of a frame's period: what is exposed for longer is late and blurred."""
+"""Candidate exposures. Those above half a frame's period are skipped: their images are late and blurred."""
 
 TOUCHES: Final = 10
 
 _SETTLE_NS: Final = 300 * NS_PER_MS
-_PATIENCE_NS: Final = 3 * NS_PER_S
+_TIMEOUT_NS: Final = 3 * NS_PER_S
 _POLL_NS: Final = 5 * NS_PER_MS
 _SMALL_PX: Final = 48
-_LOOKED_AT: Final = 200
-"""Pictures of the touches that are searched for markers."""
+_MAX_SEARCHED: Final = 200
+"""Images of the touches that are searched for markers."""
 
 _REFERENCE_FRAMES: Final = 10
 _TIMED_FRAMES: Final = 60
 
-Progress = Callable[[str, float], None]
-"""Told of the step and the force in newtons, some times a second."""
-
 
 @dataclass(frozen=True, slots=True)
 class CameraObservation:
-    """What one recording of touches shows.
+    """Evaluation of one recording of touches.
 
     Attributes:
-        reference: Mean of the first pictures, with open jaws.
-        markers: Markers of pictures that were searched.
-        widest: Of those that show both, the picture where they are furthest apart; else the reference.
+        reference: Mean of the first images, with open jaws, (H, W) uint8.
+        markers: Markers in each searched image.
+        widest: The image with both markers furthest apart, or the reference if none shows both.
         widest_markers: The markers in it.
-        touches: What each touch says of the lag.
-        use_ms: From the camera's timestamp to the cycle that has the picture, median over all.
-        rate_hz: Rate of the pictures.
+        touches: Lag of each touch.
+        use_ms: Median time from the camera's timestamp to the control cycle that gets the frame.
+        rate_hz: Frame rate.
     """
 
     reference: Gray
     markers: list[Markers]
     widest: Gray
     widest_markers: Markers
-    touches: list[Touch]
+    touches: list[TouchLag]
     use_ms: float
     rate_hz: float
 
 
-def calibrate(
+@dataclass(frozen=True, slots=True)
+class CameraResult:
+    """Result of `calibrate_camera`.
+
+    Attributes:
+        calibration: The section of the rig profile.
+        correlation_lag_ms: Median time shift with the highest correlation of image and force.
+        use_ms: Median time from the camera's timestamp to the control cycle that gets the frame.
+        compute_ms: Time of one estimate.
+        touches: Number of touches.
+        touches_that_tell: Number of touches that determine the lag.
+        rig: The rig profile.
+        report: The figure, PNG.
+    """
+
+    calibration: CameraCalibration
+    correlation_lag_ms: float
+    use_ms: float
+    compute_ms: float
+    touches: int
+    touches_that_tell: int
+    rig: Path
+    report: Path
+
+
+def calibrate_camera(
     config: Config,
     rig: Path,
     *,
     region: Region | None = None,
     exposures_us: Sequence[int] = EXPOSURES_US,
     touches: int = TOUCHES,
-    progress: Progress = lambda _step, _force_n: None,
-) -> dict[str, Any]:
-    """Tries exposures, touches the object, writes the rig profile's section and pictures beside it.
+    progress: Progress = no_progress,
+) -> CameraResult:
+    """Selects an exposure, touches the object, and writes the rig profile's section and figures beside it.
 
     Args:
-        config: The run, with an object between the jaws that gives way, and is not wider than the picture.
-        rig: The rig profile to write, or to replace the section of.
-        region: Region of interest of the frame, chosen by hand; None: from the markers on the jaws.
-        exposures_us: The ladder.
-        touches: How often to touch.
-        progress: Told of the step and the force.
-
-    Returns:
-        The section, what each touch says, and the paths.
+        config: The configuration. A compliant object, not wider than the image, is between the jaws.
+        rig: Rig profile to write; an existing one keeps its other sections.
+        region: Region of interest of the frame in pixels; None: from the markers on the jaws.
+        exposures_us: Candidate exposures.
+        touches: Number of touches.
+        progress: Called with the step and the force a few times per second.
 
     Raises:
         ConfigError: There is no camera or load cell, the region is not within the frame, or the profile can't
             be read or written.
         DeviceError: A device failed. The servo was stopped as configured.
-        DataError: No exposure is usable, the markers are not seen, or the touches tell no lag.
+        DataError: No exposure is usable, the markers are not visible, or the lag is undetermined.
     """
     if config.camera.backend in ("none", "playback"):
         raise ConfigError(
-            f"calibrate camera needs one that can be set, and camera.backend is {config.camera.backend}; "
-            "name yours"
+            f"calibrate camera needs a camera with settings, but camera.backend is {config.camera.backend}; "
+            "set the backend of yours"
         )
     if rig.exists():
-        read_rig(rig)  # before anything has moved
-    config = _with(config, "calibration", rig=None, object=None)  # what they say of the camera is found anew
+        read_rig(rig)  # a damaged profile is reported before anything moves
+    config = _with(config, "calibration", rig=None, object=None)  # their camera settings are replaced
     config = _with(config, "vision", region=region)
-    ladder, pictures = _climb(config, exposures_us, progress)
-    rung = choose_exposure(ladder)
-    config = _with(config, "camera", exposure_us=rung.exposure_us)
+    candidates, images = _try_exposures(config, exposures_us, progress)
+    selected = select_exposure(candidates)
+    config = _with(config, "camera", exposure_us=selected.exposure_us)
     with TemporaryDirectory() as aside:
-
-        def tell(_set: int, touch: int, force_n: float) -> None:
-            progress(f"touch {touch} of {touches}", force_n)
-
-        (log,) = record(config, RecordingPlan(1, touches), Path(aside), tell)
-        seen = watch(log, region)
-    height, width = seen.reference.shape
-    found_region = region_about(seen.markers, width, height) if region is None else region
-    lag = lag_of(seen.touches)
-    taken_ms = compute_ms(_with(config, "vision", region=found_region), seen.reference)
-    wait_ms = seen.use_ms + taken_ms + 500 / seen.rate_hz
+        (log,) = record(config, RecordingPlan(1, touches), Path(aside), progress)
+        observed = observe(log, region)
+    height, width = observed.reference.shape
+    found_region = region_around(observed.markers, width, height) if region is None else region
+    lag = estimate_lag(observed.touches)
+    estimate_ms = compute_ms(_with(config, "vision", region=found_region), observed.reference)
+    wait_ms = observed.use_ms + estimate_ms + 500 / observed.rate_hz
     camera = config.camera
     found = CameraCalibration(
         date=datetime.now(UTC).replace(microsecond=0),
@@ -146,9 +161,9 @@ def calibrate(
         side_px=camera.side_px,
         rate_hz=camera.rate_hz,
         gain=camera.gain,
-        exposure_us=rung.exposure_us,
-        mean=rung.mean,
-        clipped=rung.clipped,
+        exposure_us=selected.exposure_us,
+        mean=selected.mean,
+        clipped=selected.clipped,
         region=found_region,
         markers=region is None,
         lag_ms=lag,
@@ -156,28 +171,28 @@ def calibrate(
         reference=f"{rig.stem}-reference.png",
     )
     update_rig(rig, found)
-    _write(rig.with_name(found.reference), seen.reference)
+    _write(rig.with_name(found.reference), observed.reference)
     report = rig.with_name(f"{rig.stem}-camera.png")
-    draw(found, seen.widest, seen.widest_markers, ladder, pictures, seen.touches, report)
-    telling_ms = [touch.correlation_ms for touch in telling(seen.touches)]
-    return {
-        **found.model_dump(mode="json"),
-        "correlation_lag_ms": float(np.nanmedian(telling_ms)),
-        "use_ms": seen.use_ms,
-        "compute_ms": taken_ms,
-        "touches": len(seen.touches),
-        "touches_that_tell": len(telling_ms),
-        "rig": rig,
-        "report": report,
-    }
+    draw(found, observed.widest, observed.widest_markers, candidates, images, observed.touches, report)
+    correlations_ms = [touch.correlation_ms for touch in usable_touches(observed.touches)]
+    return CameraResult(
+        calibration=found,
+        correlation_lag_ms=float(np.nanmedian(correlations_ms)),
+        use_ms=observed.use_ms,
+        compute_ms=estimate_ms,
+        touches=len(observed.touches),
+        touches_that_tell=len(correlations_ms),
+        rig=rig,
+        report=report,
+    )
 
 
-def watch(log: Path, region: Region | None) -> CameraObservation:
-    """Looks for markers and lags in a recorded set of touches.
+def observe(log: Path, region: Region | None) -> CameraObservation:
+    """Finds markers and lags in a recorded set of touches.
 
     Args:
         log: The set, as `gripper_force.jobs.recording.record` writes it.
-        region: Region of interest, if it is known; then no markers are looked for.
+        region: Region of interest, if it is known; markers are then not searched.
     """
     records: dict[type, list[Any]] = defaultdict(list)
     frames: list[Frame] = []
@@ -187,23 +202,23 @@ def watch(log: Path, region: Region | None) -> CameraObservation:
         if isinstance(item, Frame):
             frames.append(item)
             waiting.append(item)
-        elif isinstance(item, ServoState):  # of the cycle that had the frames before it
+        elif isinstance(item, ServoState):  # of the cycle that got the frames before it
             used_ms += [(item.t_ns - frame.t_ns) / NS_PER_MS for frame in waiting]
             waiting = []
         else:
             records[type(item)].append(item)
-    step = -(-len(frames) // _LOOKED_AT)
-    looked_at = frames[::step] if region is None else []
-    markers = [find_markers(frame.gray) for frame in looked_at]
-    apart = [_apart_px(one) for one in markers]
-    widest = int(np.argmax(apart)) if apart and max(apart) > 0 else None
+    step = -(-len(frames) // _MAX_SEARCHED)
+    searched = frames[::step] if region is None else []
+    markers = [find_markers(frame.gray) for frame in searched]
+    distances = [_distance_px(one) for one in markers]
+    widest = int(np.argmax(distances)) if distances and max(distances) > 0 else None
     reference = np.mean([frame.gray for frame in frames[:_REFERENCE_FRAMES]], axis=0)
     as_gray: Gray = np.rint(reference).astype(np.uint8)
     frame_s = np.array([frame.t_ns for frame in frames]) / NS_PER_S
     return CameraObservation(
         reference=as_gray,
         markers=markers,
-        widest=as_gray if widest is None else looked_at[widest].gray,
+        widest=as_gray if widest is None else searched[widest].gray,
         widest_markers={} if widest is None else markers[widest],
         touches=_touches(frames, region, records),
         use_ms=float(np.median(used_ms)),
@@ -211,7 +226,7 @@ def watch(log: Path, region: Region | None) -> CameraObservation:
     )
 
 
-def _touches(frames: list[Frame], region: Region | None, records: dict[type, list[Any]]) -> list[Touch]:
+def _touches(frames: list[Frame], region: Region | None, records: dict[type, list[Any]]) -> list[TouchLag]:
     frame_s = np.array([frame.t_ns for frame in frames]) / NS_PER_S
     images = np.stack([downscale(frame.gray, region, _SMALL_PX) for frame in frames])
     cells = sorted((s for s in records[LoadCellSample] if s.valid), key=lambda sample: sample.t_ns)
@@ -226,35 +241,35 @@ def _touches(frames: list[Frame], region: Region | None, records: dict[type, lis
     for at_s, camera_s, correlation_s in zip(releases_s, by_servo_s, by_force_s, strict=True):
         cell_lag_s = load_cell_lag_s(cell_s, force_n, servo_s, width_m, at_s)
         at_n = float(np.interp(at_s, cell_s, force_n))
-        touches.append(Touch(at_n, 1e3 * (float(camera_s) - cell_lag_s), 1e3 * float(correlation_s)))
+        touches.append(TouchLag(at_n, 1e3 * (float(camera_s) - cell_lag_s), 1e3 * float(correlation_s)))
     return touches
 
 
-def _climb(
+def _try_exposures(
     config: Config, exposures_us: Sequence[int], progress: Progress
-) -> tuple[list[ExposureStep], list[Gray]]:
+) -> tuple[list[ExposureCandidate], list[Gray]]:
     longest_us = 0.5e6 / config.camera.rate_hz
-    ladder, pictures = [], []
+    candidates, images = [], []
     for exposure_us in exposures_us:
         if exposure_us > longest_us:
             continue
-        progress(f"exposure of {exposure_us} us", 0.0)
-        gray = _picture(_with(config, "camera", exposure_us=exposure_us))
+        progress(f"exposure of {exposure_us} us", 0)
+        gray = _capture(_with(config, "camera", exposure_us=exposure_us))
         region = config.vision.region
         part = gray if region is None else downscale(gray, region, min(region[2:]))
-        ladder.append(ExposureStep.of(exposure_us, part))
-        pictures.append(gray)
-    if not ladder:
+        candidates.append(ExposureCandidate.measure(exposure_us, part))
+        images.append(gray)
+    if not candidates:
         raise ConfigError(
-            f"no exposure of the ladder is as short as half of a frame's period, {longest_us:.0f} us at "
-            f"camera.rate_hz {config.camera.rate_hz:g}; name shorter ones with --exposure-us"
+            f"every candidate exposure is longer than half a frame ({longest_us:.0f} us at camera.rate_hz "
+            f"{config.camera.rate_hz:g}); pass shorter ones with --exposure-us"
         )
-    return ladder, pictures
+    return candidates, images
 
 
-def _picture(config: Config) -> Gray:
-    """The newest picture of a camera that has run for a while."""
-    with open_devices(config) as devices:
+def _capture(config: Config) -> Gray:
+    """Returns the newest image of a camera that has run for 0.3 s."""
+    with open_devices(resolve(config, vision=False).config) as devices:
         camera, clock = devices.camera, devices.clock
         assert camera is not None
         camera.start()
@@ -266,22 +281,22 @@ def _picture(config: Config) -> Gray:
             devices.check()
             if (frame := camera.newest()) is not None:
                 gray = frame.gray
-            if gray is None and now_ns - begin_ns > _PATIENCE_NS:
+            if gray is None and now_ns - begin_ns > _TIMEOUT_NS:
                 raise DeviceTimeoutError(
-                    f"the camera gave no frame for {_PATIENCE_NS / NS_PER_S:g} s at an exposure of "
-                    f"{config.camera.exposure_us} us; check its cable, and see what doctor says"
+                    f"the camera gave no frame for {_TIMEOUT_NS / NS_PER_S:g} s at an exposure of "
+                    f"{config.camera.exposure_us} us; check its cable, and run `gripper-force doctor`"
                 )
         return gray
 
 
 def compute_ms(config: Config, gray: Gray) -> float:
-    """What the network takes for a picture: on a simulated clock what it is said to, else as measured."""
-    checkpoint = checkpoint_of(config)
-    if checkpoint is None:
-        return 0.0
-    if config.clock == "lockstep":
+    """Time of one estimate: configured on the simulated clock, otherwise measured; 0 without vision."""
+    config, model, _ = resolve_vision(config)
+    if config.clock == "lockstep" and model is not None:
         return config.vision.lockstep_compute_ms
-    estimator = open_estimator(checkpoint, settled(config)[0].vision)
+    estimator = make_estimator(ResolvedConfig(config, model))
+    if estimator is None:
+        return 0.0
     each_ms = []
     for _ in range(_TIMED_FRAMES):
         begin_ns = time.perf_counter_ns()
@@ -299,7 +314,7 @@ def _shifted(estimate: CalibratedValue, by: float) -> CalibratedValue:
     return CalibratedValue(value=estimate.value + by, low=low, high=high)
 
 
-def _apart_px(markers: Markers) -> float:
+def _distance_px(markers: Markers) -> float:
     if len(markers) < 2:
         return 0.0
     first, second = (corners.mean(axis=0) for corners in markers.values())
@@ -308,4 +323,4 @@ def _apart_px(markers: Markers) -> float:
 
 def _write(path: Path, gray: Gray) -> None:
     if not cv2.imwrite(str(path), gray):
-        raise DataError(f"can't write the picture {path}; check its folder")
+        raise DataError(f"can't write the image {path}; check its folder")

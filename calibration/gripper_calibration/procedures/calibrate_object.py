@@ -1,7 +1,8 @@
-"""An object's profile from touches: with the load cell in place once, and without it from then on."""
+"""Calibration of an object: touches with the load cell in place, or logs of them, into an object profile."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from hashlib import sha256
 from pathlib import Path
@@ -9,101 +10,224 @@ from typing import Any, Final
 
 import numpy as np
 
-from gripper_calibration import touch_logs
-from gripper_calibration.fits.object_fit import COVERAGE, fit_correction, learning_curve
-from gripper_calibration.fits.plant_fit import crushed_by, fit_plant, stiffness_n_m
+from gripper_calibration.fits.object_fit import (
+    COVERAGE,
+    LearningCurvePoint,
+    fit_correction,
+    learning_curve,
+)
+from gripper_calibration.fits.plant_fit import crushing_touch, fit_plant, stiffness_n_m
 from gripper_calibration.plots.object_plot import draw
+from gripper_calibration.touch_logs import join, read_log
 from gripper_force.config import Config
 from gripper_force.errors import DataError
-from gripper_force.jobs.recording.record import Progress, RecordingPlan, record
+from gripper_force.interfaces import Progress, Prompt, no_progress
+from gripper_force.jobs.recording.record import RecordingPlan, record
 from gripper_force.profiles.correction import pack
-from gripper_force.profiles.object_profile import ObjectProfile, check_place, write_object
-from gripper_force.runtime.assembly import settled
+from gripper_force.profiles.object_profile import ObjectProfile, check_place, user_folder, write_object
+from gripper_force.runtime.resolve import ResolvedConfig, make_estimator, resolve_vision
 from gripper_force.types import NS_PER_MS
-from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
-from gripper_force.vision.estimator import open_estimator
-from gripper_force.vision.model_files import read_model
+from gripper_force.vision.checkpoint import load_checkpoint
 
-Advance = Callable[[str], None]
-"""Told of each log that was read, and of each step of the fit."""
+TOUCHES: Final = 8
+"""Default number of touches: enough for an object of a kind that the network was not trained on."""
 
-_TIMED: Final = 30
+_TIMED_FRAMES: Final = 30
 
 
-def touch(
-    config: Config,
-    touches: int,
-    peak_n: float | None,
-    folder: Path,
-    *,
-    ask: Callable[[int], None] = lambda _: None,
-    progress: Progress = lambda _set, _touch, _force_n: None,
-) -> Iterator[Path]:
-    """Touches the object with random peaks, a log each; those that are there already are not done again.
+@dataclass(frozen=True, slots=True)
+class ObjectCalibration:
+    """Result of `calibrate_object`.
 
-    A simulated object stays the same one on the same rig, and is put down anew each time.
-
-    Args:
-        config: The run; its object is the one that lies there.
-        touches: How many there are to be in all.
-        peak_n: The most to press with; None for what the force limit leaves, but no more than 12 N.
-        folder: Where the logs are.
-        ask: Told of the number of a touch before it is done; returns once it may be.
-        progress: Told of the touch and the force, a few times a second.
-
-    Raises:
-        GripperError: As `gripper_force.jobs.recording.record.record` does. Touches that are done stay.
+    Attributes:
+        profile: The profile.
+        profile_path: Its YAML file. The ``.safetensors`` file beside it belongs to it.
+        report_path: The figure, PNG.
+        correction: Name of the selected correction, one of the keys of `candidates_mae_n`.
+        candidates_mae_n: Cross-validated MAE of each candidate correction; empty with fewer than three touches.
+        crushed_at_n: Largest force of the touch after which the object stayed narrower; None if it sprang back
+            after all touches.
+        stiffness_std_n_m: Standard deviation of the stiffness over the touches; None with fewer than two.
+        touches_needed: Learning curve: mean results of fits on fewer touches, tested on the other touches.
+        without_contact: Logs that were not used because they show no contact.
     """
-    sim = config.sim
-    same = {
-        name: config.seed if getattr(sim, name) is None else getattr(sim, name)
-        for name in ("object_seed", "rig_seed")
-    }
-    config = config.model_copy(update={"sim": sim.model_copy(update=same)})
-    yield from record(config, RecordingPlan(touches, 1, peak_n, test_every=None), folder, progress, ask)
+
+    profile: ObjectProfile
+    profile_path: Path
+    report_path: Path
+    correction: str
+    candidates_mae_n: dict[str, float]
+    crushed_at_n: float | None
+    stiffness_std_n_m: float | None
+    touches_needed: tuple[LearningCurvePoint, ...]
+    without_contact: tuple[Path, ...]
+
+    @property
+    def mae_before_n(self) -> float:
+        """MAE of the uncorrected network on the touches, in N."""
+        return self.profile.before_n
+
+    @property
+    def mae_after_n(self) -> float | None:
+        """Cross-validated MAE of the corrected estimate, in N; None with fewer than three touches."""
+        return self.profile.after_n
+
+    @property
+    def coverage(self) -> float:
+        """Coverage of the profile's interval: the share of frames of new touches within it."""
+        return self.profile.interval.coverage
+
+    def as_dict(self) -> dict[str, Any]:
+        """Returns the result as the command prints it: the profile's keys and those of the calibration."""
+        return {
+            **self.profile.model_dump(mode="json"),
+            "correction": self.correction,
+            "candidates_mae_n": self.candidates_mae_n,
+            "crushed_at_n": self.crushed_at_n,
+            "stiffness_std_n_m": self.stiffness_std_n_m,
+            "touches_needed": [point._asdict() for point in self.touches_needed],
+            "without_contact": list(self.without_contact),
+            "profile": self.profile_path,
+            "report": self.report_path,
+        }
 
 
-def calibrate(
-    config: Config, name: str, paths: Sequence[Path], out: Path, advance: Advance
-) -> dict[str, Any]:
-    """Makes an object's profile from logs, with a picture beside it.
+def calibrate_object(
+    config: Config,
+    name: str,
+    *,
+    logs: Sequence[Path] | None = None,
+    touches: int = TOUCHES,
+    peak_n: float | None = None,
+    folder: Path | None = None,
+    out: Path | None = None,
+    prompt: Prompt | None = None,
+    progress: Progress = no_progress,
+) -> ObjectCalibration:
+    """Makes an object profile and a figure, from new touches or from logs.
+
+    Without ``logs``, the configured devices touch the object with random peak forces, with the load cell in
+    place; see `record_touches`. An interrupted recording continues with the same arguments.
 
     Args:
-        config: Names the network, and its threads.
-        name: What the object is to be called.
-        paths: Logs of touches.
-        out: The profile to write, ``*.yaml``.
-        advance: Told of what was done.
+        config: The configuration: the devices, and the network that the profile belongs to. Its ``object`` is
+            replaced by ``name``.
+        name: Name of the object. In simulation it must be one of the simulated objects.
+        logs: Logs of touches, or folders to search for ``*.mcap``. The devices are then not used.
+        touches: Number of touches, including those already in ``folder``. Not used with ``logs``.
+        peak_n: Largest force of a touch in N; None for what the force limit permits, up to 12 N.
+        folder: Folder of the touches' logs; None for ``data/touches/NAME``.
+        out: Profile to write, ``*.yaml``; None for ``NAME.yaml`` in the user's folder of profiles.
+        prompt: Called before each touch, so that a person can place the object anew; None for no pause.
+        progress: Called during the touches, with one step for each touch, and after them, with one step for each
+            log read and two for the fit.
 
     Returns:
-        The profile, the errors of all candidates, how many touches are enough, and the paths.
+        The profile, its files, and the errors of all candidate corrections.
 
     Raises:
-        DataError: The logs can't be used, or nothing can be learnt from them.
-        ConfigError: The profile can't be written.
+        ConfigError: There is no camera or load cell, the peak is not within the force limit, or the profile
+            can't be written.
+        DataError: The load cell reads a force at rest, a touch failed, or the touches are not sufficient for a
+            calibration.
+        LogError: A log can't be read.
+        CheckpointError: The network can't be read.
+        DeviceError: A device failed. The servo was stopped as configured, and completed touches are kept.
+
+    Example:
+        ::
+
+            config = gripper_force.load_config(Path("my.yaml"))
+            result = gripper_force.calibrate_object(config, "mug", touches=8)
+            print(result.profile_path, result.mae_before_n, result.mae_after_n)
     """
+    out = out or user_folder() / f"{name}.yaml"
     check_place(out)
-    config, _ = settled(config)
-    checkpoint = load_checkpoint(config.vision.checkpoint)
+    if logs is None:
+        named = config.model_copy(update={"object": name})
+        paths = []
+        for path in record_touches(named, touches, peak_n, folder, prompt=prompt, progress=progress):
+            paths.append(path)
+            progress(f"touch {len(paths)} of {touches}")
+    else:
+        paths = [p for path in logs for p in (sorted(path.rglob("*.mcap")) if path.is_dir() else [path])]
     if not paths:
-        raise DataError(f"there is no log of {name!r} to calibrate from; touch it first")
-    parts = {}
+        raise DataError(f"there is no log to calibrate {name!r} from; record touches of it first")
+    return _fit_and_write(config, name, paths, out, progress)
+
+
+def record_touches(
+    config: Config,
+    touches: int,
+    peak_n: float | None = None,
+    folder: Path | None = None,
+    *,
+    prompt: Prompt | None = None,
+    progress: Progress = no_progress,
+) -> Iterator[Path]:
+    """Touches the configured object with random peak forces, one log each. Existing logs are kept.
+
+    A simulated object and rig stay the same; the object is placed anew for each touch.
+
+    Args:
+        config: The configuration.
+        touches: Number of touches, including existing ones.
+        peak_n: Largest force in N; None for what the force limit permits, up to 12 N.
+        folder: Folder of the logs; None for ``data/touches/OBJECT``.
+        prompt: Called before each new touch; None for no pause.
+        progress: Called with the touch and the force a few times per second, with 0 steps.
+
+    Yields:
+        The log of each touch, once it is complete.
+
+    Raises:
+        GripperError: As `gripper_force.jobs.recording.record.record`. Completed touches are kept.
+    """
+    sim = config.sim
+    seeds = {
+        key: config.seed if getattr(sim, key) is None else getattr(sim, key)
+        for key in ("object_seed", "rig_seed")
+    }
+    config = config.model_copy(update={"sim": sim.model_copy(update=seeds)})
+    folder = folder or default_folder(config.object)
+    yield from record(config, _plan(touches, peak_n), folder, progress, prompt)
+
+
+def touch_paths(config: Config, touches: int, folder: Path | None = None) -> list[Path]:
+    """Returns the paths of the logs that `record_touches` writes, in order."""
+    return _plan(touches, None).paths(config, folder or default_folder(config.object))
+
+
+def default_folder(name: str) -> Path:
+    """Returns the folder of the logs of an object's touches."""
+    return Path("data/touches") / name
+
+
+def _plan(touches: int, peak_n: float | None) -> RecordingPlan:
+    return RecordingPlan(touches, touches=1, peak_n=peak_n, test_every=None)
+
+
+def _fit_and_write(
+    config: Config, name: str, paths: Sequence[Path], out: Path, progress: Progress
+) -> ObjectCalibration:
+    config, model, _ = resolve_vision(config)
+    checkpoint = load_checkpoint(config.vision.checkpoint)
+    recordings = {}
     for path in paths:
-        parts[path] = touch_logs.read_one(path, checkpoint)
-        advance(path.name)
-    felt = {path: part for path, part in parts.items() if part.has_contact}
-    recorded = touch_logs.join(felt or parts)  # without any, the fit says what was felt
+        recordings[path] = read_log(path, checkpoint)
+        progress(path.name)
+    with_contact = {path: recording for path, recording in recordings.items() if recording.has_contact}
+    recorded = join(with_contact or recordings)  # without any contact, the fit reports the largest force
     touches = recorded.touches
-    fitted = fit_correction(touches, COVERAGE)
-    advance("fitted")
+    fit = fit_correction(touches, COVERAGE)
+    progress("fitted the correction")
     curve = list(learning_curve(touches, COVERAGE))
-    advance("how many touches are enough")
+    progress("computed the learning curve")
     forces_n = [press.force_n for press in recorded.presses]
     stiffness = stiffness_n_m(recorded.width_m, forces_n)
     peaks_n = np.array([force_n.max() for force_n in forces_n])
-    crushed = crushed_by(np.array([width_m[0] for width_m in recorded.width_m]), peaks_n)
-    weights = pack(fitted.arrays)
-    bore_n = float(touches.force_n.max() if crushed is None else peaks_n[:crushed].max())
+    crushed = crushing_touch(np.array([width_m[0] for width_m in recorded.width_m]), peaks_n)
+    weights = pack(fit.arrays)
     profile = ObjectProfile(
         object=name,
         date=datetime.now(UTC).date(),
@@ -111,51 +235,53 @@ def calibrate(
         camera=recorded.camera,
         touches=len(touches.numbers),
         frames=len(touches.touch),
-        force_n=bore_n,
-        output=fitted.output,
-        interval=fitted.interval,
-        ood_limit=fitted.ood_limit,
+        force_n=float(touches.force_n.max() if crushed is None else peaks_n[:crushed].max()),
+        output=fit.output,
+        interval=fit.interval,
+        ood_limit=fit.ood_limit,
         stiffness_n_m=float(np.median(stiffness)) if len(stiffness) else None,
-        plant=fit_plant(recorded.presses, recorded.delay_s + _compute_s(config, checkpoint)),
-        before_n=fitted.before_n,
-        after_n=fitted.after_n,
+        plant=fit_plant(recorded.presses, recorded.delay_s + _compute_s(ResolvedConfig(config, model))),
+        before_n=fit.before_n,
+        after_n=fit.after_n,
         weights=sha256(weights).hexdigest(),
     )
     write_object(out, profile, weights)
-    picture = out.with_suffix(".png")
-    draw(profile, fitted, touches, curve, picture)
-    return {
-        **profile.model_dump(mode="json"),
-        "correction": fitted.candidate,
-        "candidates_mae_n": fitted.errors_n,
-        "crushed_at_n": None if crushed is None else float(peaks_n[crushed]),
-        "stiffness_std_n_m": float(stiffness.std(ddof=1)) if len(stiffness) > 1 else None,
-        "touches_needed": _table(curve),
-        "without_contact": [path for path in parts if path not in felt],
-        "profile": out,
-        "report": picture,
-    }
+    report = out.with_suffix(".png")
+    draw(profile, fit, touches, curve, report)
+    return ObjectCalibration(
+        profile=profile,
+        profile_path=out,
+        report_path=report,
+        correction=fit.candidate,
+        candidates_mae_n=fit.errors_n,
+        crushed_at_n=None if crushed is None else float(peaks_n[crushed]),
+        stiffness_std_n_m=float(stiffness.std(ddof=1)) if len(stiffness) > 1 else None,
+        touches_needed=_mean_curve(curve),
+        without_contact=tuple(path for path in recordings if path not in with_contact),
+    )
 
 
-def _compute_s(config: Config, checkpoint: Checkpoint) -> float:
-    """How long an estimate takes: on the simulated clock what is set, else measured."""
-    if config.clock == "lockstep":
-        return config.vision.lockstep_compute_ms * NS_PER_MS / 1e9
-    estimator = open_estimator(read_model(config.vision.checkpoint), config.vision)
-    size = checkpoint.header.preprocess.size
+def _compute_s(run: ResolvedConfig) -> float:
+    """Computing time of an estimate: configured on the simulated clock, otherwise measured."""
+    if run.config.clock == "lockstep":
+        return run.config.vision.lockstep_compute_ms * NS_PER_MS / 1e9
+    estimator = make_estimator(run)
+    if run.model is None or estimator is None:
+        return 0.0
+    size = run.model.header.preprocess.size
     rng = np.random.default_rng(0)
-    taken_s = []
-    for frame in rng.integers(60, 180, (_TIMED, size, size), np.uint8):
+    times_s = []
+    for frame in rng.integers(60, 180, (_TIMED_FRAMES, size, size), np.uint8):
         begin_s = time.perf_counter()
         estimator.update(frame)
-        taken_s.append(time.perf_counter() - begin_s)
-    return float(np.median(taken_s))
+        times_s.append(time.perf_counter() - begin_s)
+    return float(np.median(times_s))
 
 
-def _table(curve: list[tuple[int, float, float]]) -> list[dict[str, Any]]:
+def _mean_curve(curve: Sequence[LearningCurvePoint]) -> tuple[LearningCurvePoint, ...]:
+    """Mean over the draws of each number of touches."""
     rows = []
-    for count in sorted({count for count, _, _ in curve}):
-        draws = [(mae_n, share) for number, mae_n, share in curve if number == count]
-        mae_n, covered = np.array(draws).T
-        rows.append({"touches": count, "mae_n": float(mae_n.mean()), "covered": float(covered.mean())})
-    return rows
+    for count in sorted({point.touches for point in curve}):
+        _, mae_n, covered = np.array([point for point in curve if point.touches == count]).T
+        rows.append(LearningCurvePoint(count, float(mae_n.mean()), float(covered.mean())))
+    return tuple(rows)

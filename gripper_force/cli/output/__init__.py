@@ -1,1 +1,1 @@
-"""What each command prints for a person."""
+"""Tables that commands print for people."""

@@ -1,50 +1,59 @@
-"""What was measured of speed, memory and error."""
+"""Tables of the `bench` commands."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from rich.table import Column, Table
 
 from gripper_force.cli.console import number, out, pairs
 
+if TYPE_CHECKING:
+    from gripper_force.qualification.bench.bus_bench import BusCost
+    from gripper_force.qualification.bench.command_bench import CommandCost
+    from gripper_force.qualification.bench.estimator_bench import EstimatorCost, Ratios
+    from gripper_force.qualification.bench.loop_bench import LogCost, LoopCost
+    from gripper_force.qualification.bench.scene_bench import SceneCost
+    from gripper_force.qualification.bench.startup_bench import Start
+    from gripper_force.qualification.bench.training_bench import Point
 
-def commands_table(r: dict[str, Any]) -> None:
-    """What commands take."""
+
+def commands_table(costs: "Sequence[CommandCost]") -> None:
+    """Prints the time and memory of commands."""
     table = Table("gripper-force", "time s", "CPU s", "memory MB", box=None)
-    for c in r["commands"]:
+    for c in costs:
         figures = (number(c.wall_s, digits=1), number(c.cpu_s, digits=1), number(c.memory_mb, digits=0))
         table.add_row(c.command, *figures)
     out.print(table)
-    out.print(f"[dim]load {r['load']:.1f} on {r['cores']} cores[/]")
 
 
-def startup_table(r: dict[str, Any]) -> None:
-    """What scenes take to start."""
+def startup_table(starts: "Sequence[Start]") -> None:
+    """Prints the start-up time and memory of scenes."""
     table = Table("scene", "time s", "memory MB", "libraries", "threads", box=None)
-    for s in r["startup"]:
+    for s in starts:
         figures = (number(s.time_s, digits=2), number(s.memory_mb, digits=0))
         libraries = ", ".join(name for name in s.loaded if "gripper_" not in name)
         table.add_row(s.scene, *figures, libraries, ", ".join(s.threads))
     out.print(table)
-    out.print(f"[dim]load {r['load']:.1f} on {r['cores']} cores[/]")
 
 
-def scene_table(r: dict[str, Any]) -> None:
-    """What the levels of detail of simulated objects cost."""
+def scene_table(costs: "Sequence[SceneCost]") -> None:
+    """Prints speed and error of the detail levels of simulated objects."""
     columns = ("object", "detail", "unknowns", "step ms", "iterations", "simulated s/s", "RMSE N", "worst N")
     table = Table(*columns, box=None)
-    for s in r["scene"]:
+    for s in costs:
         solver = (str(s.unknowns), f"{s.step_ms:g}", number(s.iterations, digits=1))
         figures = (number(s.speed, digits=1), number(s.error_n), number(s.worst_n))
         table.add_row(s.object, s.detail, *solver, *figures)
     out.print(table)
-    out.print(f"[dim]load {r['load']:.1f} on {r['cores']} cores[/]")
 
 
-def loop_table(r: dict[str, Any]) -> None:
-    """What a loop in real time did."""
-    table = Table("beside", "missed %", "late", "worst", "bus", "cycle", "estimate", "lost", box=None)
-    for c in r["loop"]:
+def loop_table(costs: "Sequence[LoopCost]", log: "LogCost") -> None:
+    """Prints the timing of the real-time loop, and the cost of its log."""
+    table = Table(
+        "in parallel", "missed %", "late", "worst", "bus", "cycle", "estimate", "lost records", box=None
+    )
+    for c in costs:
         late, bus, cycle, estimate = (
             "/".join(number(ms, digits=2) for ms in pair)
             for pair in (
@@ -58,72 +67,70 @@ def loop_table(r: dict[str, Any]) -> None:
         table.add_row(c.beside, missed, late, worst, bus, cycle, estimate, str(c.lost_records))
     out.print(table)
     out.print(
-        f"[dim]p50/p99 in ms of {r['loop'][0].cycles} cycles; a servo behind a pseudo-terminal, a recorded "
+        f"[dim]p50/p99 in ms of {costs[0].cycles} cycles; virtual servo over a pseudo-terminal, recorded "
         "camera, no physics[/]"
     )
-    log = r["log"]
     pairs(
         {
             "log of the run, MB/s": log.run_mb_s,
-            "log at most, MB/s": log.write_mb_s,
-            "us a record": log.record_us,
+            "highest log rate, MB/s": log.write_mb_s,
+            "us per record": log.record_us,
             "replay, times real time": log.replay_times,
         }
     )
-    out.print(f"[dim]load {r['load']:.1f} on {r['cores']} cores[/]")
 
 
-def bus_table(r: dict[str, Any]) -> None:
-    """What a bus cycle takes."""
-    columns = ("Mbaud", "latency ms", "client", "line ms", "p50 ms", "p99 ms", "p50/line", "CPU % at 200Hz")
+def bus_table(costs: "Sequence[BusCost]") -> None:
+    """Prints the time of a bus cycle."""
+    columns = ("Mbaud", "latency ms", "client", "line ms", "p50 ms", "p99 ms", "p50/line", "CPU % at 200 Hz")
     table = Table(*columns, box=None)
-    for c in r["bus"]:
+    for c in costs:
         figures = (c.line_ms, c.p50_ms, c.p99_ms, c.p50_ms / c.line_ms)
         numbers = (number(value) for value in figures)
         share = number(100 * c.cpu_share, digits=1)
         setting = (f"{c.baud_rate / 1e6:g}", f"{c.latency_ms:g}")
         table.add_row(*setting, c.client, *numbers, share)
     out.print(table)
-    out.print(f"[dim]load {r['load']:.1f} on {r['cores']} cores[/]")
 
 
-def estimator_table(r: dict[str, Any]) -> None:
-    """Speed against error of the visual estimate."""
-    columns = ("p50 ms", "p99 ms", "/roof", "MAE N", "worst", "MB", "")
-    table = Table("network", "px", Column("way", no_wrap=True), *columns, box=None)
+def estimator_table(costs: "Sequence[EstimatorCost]", ratios: "Ratios", plot: Path, file: Path) -> None:
+    """Prints speed and error of the visual estimate."""
+    columns = ("p50 ms", "p99 ms", "/roofline", "MAE N", "worst N", "MB", "")
+    table = Table("network", "px", Column("variant", no_wrap=True), *columns, box=None)
     short = {"float32": "f32", "bfloat16": "bf16"}
-    for e in r["estimator"]:
-        share = None if e.least_ms is None else e.p50_ms / e.least_ms
+    for e in costs:
+        over_roofline = None if e.least_ms is None else e.p50_ms / e.least_ms
         table.add_row(
             Path(e.checkpoint).stem,
             str(e.size),
             f"{e.engine} {short.get(e.precision, e.precision)} x{e.threads}",
             *(number(value, digits=2) for value in (e.p50_ms, e.p99_ms)),
-            number(share, digits=1),
+            number(over_roofline, digits=1),
             number(e.mae_n),
             number(e.worst_n, digits=2),
             number(e.memory_mb, digits=0),
             "*" if e.front else "",
         )
     out.print(table)
-    for checkpoint, told in r["ratios"].items():
+    for checkpoint, ratio in ratios.items():
         pairs(
             {
-                f"{Path(checkpoint).stem}: fastest that keeps the error": told["fastest"],
-                "faster than the window in PyTorch": f"{told['times_faster_than_window']:.0f} times",
-                "faster than the plain one": f"{told['times_faster_than_plain_window']:.0f} times",
+                f"{Path(checkpoint).stem}: fastest with the error of float32": ratio["fastest"],
+                "faster than our whole-window PyTorch": f"{ratio['times_faster_than_window']:.0f} times",
+                "faster than plain whole-window PyTorch": (
+                    f"{ratio['times_faster_than_plain_window']:.0f} times"
+                ),
             }
         )
-    pairs({"*": "no other way is faster and more exact"})
-    pairs({"plot": str(r["plot"]), "kept in": str(r["file"])})
-    out.print(f"[dim]load {r['load']:.1f} on {r['cores']} cores[/]")
+    pairs({"*": "Pareto front: no other variant is both faster and more accurate"})
+    pairs({"plot": str(plot), "results": str(file)})
 
 
-def learning_table(r: dict[str, Any]) -> None:
-    """Ways to train."""
-    table = Table("way", "minutes", "steps", "MAE N", "RMSE N", box=None)
-    for p in r["points"]:
+def training_table(points: "Sequence[Point]", reached: Mapping[str, float | None], folder: Path) -> None:
+    """Prints the validation error of training recipes over time."""
+    table = Table("recipe", "minutes", "steps", "MAE N", "RMSE N", box=None)
+    for p in points:
         table.add_row(p.way, number(p.minutes, digits=2), str(p.steps), number(p.mae_n), number(p.rmse_n))
     out.print(table)
-    pairs({f"{way}: as good as the paper's, min": m for way, m in r["as_good_as_paper_min"].items()})
-    pairs({"kept in": str(r["folder"])})
+    pairs({f"{recipe}: as good as the paper's, min": minutes for recipe, minutes in reached.items()})
+    pairs({"results": str(folder)})

@@ -1,4 +1,4 @@
-"""What was found of a rig and of an object."""
+"""Tables of calibrations of a rig and of an object."""
 
 import math
 from typing import Any
@@ -7,7 +7,7 @@ from gripper_force.cli.console import number, pairs
 
 
 def rig_table(r: dict[str, Any]) -> None:
-    """What a calibration of the rig found, each value with its 95 % interval."""
+    """Prints the calibrated values of a rig, each with its 95 % interval."""
     pairs({name: _found(value) for name, value in r.items()})
 
 
@@ -22,7 +22,7 @@ def _found(value: Any) -> Any:
 
 
 def object_table(r: dict[str, Any]) -> None:
-    """An object's profile."""
+    """Prints an object's profile."""
     after_n = r["after_n"]
     interval, plant = r["interval"], r["plant"]
     pairs(
@@ -32,15 +32,15 @@ def object_table(r: dict[str, Any]) -> None:
             **(
                 {}
                 if (at := r["crushed_at_n"]) is None
-                else {"crushed": f"it stayed narrower after {at:.1f} N"}
+                else {"crushed": f"the object stayed narrower after {at:.1f} N"}
             ),
             "error before": number(r["before_n"], "N"),
-            "error after": "not known with so few touches" if after_n is None else number(after_n, "N"),
+            "error after": "unknown with so few touches" if after_n is None else number(after_n, "N"),
             "correction": r["correction"],
-            "interval": f"{100 * interval['coverage']:.0f} % within {interval['base_n']:.2f} N at no force, "
+            "interval": f"{100 * interval['coverage']:.0f} % within {interval['base_n']:.2f} N at 0 N, "
             f"{math.hypot(interval['base_n'], 5 * interval['share']):.2f} N at 5 N",
             "stiffness": number(r["stiffness_n_m"], "N/m", 0),
-            "loop": "not known: no servo in these logs"
+            "loop": "unknown: these logs hold no servo"
             if plant is None
             else f"gain {plant['gain']:.2f}, lag {plant['lag_ms']:.0f} ms, delay {plant['delay_ms']:.0f} ms, "
             f"phase margin {plant['phase_margin_deg']:.0f} degrees",

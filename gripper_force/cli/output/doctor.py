@@ -1,15 +1,18 @@
-"""What is there, what is wrong with it, and what a set-up changes."""
+"""Tables of `doctor`: checks, and register changes."""
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.markup import escape
 from rich.table import Table
 
 from gripper_force.cli.console import err, out
 
+if TYPE_CHECKING:  # --help loads no NumPy
+    from gripper_force.jobs.checks import RegisterChange, SetupResult
+
 
 def checks_table(r: dict[str, Any]) -> None:
-    """What doctor found, and what to do."""
+    """Prints the checks and the suggested fixes."""
     marks = {True: "[green]ok[/]", False: "[bold red]problem[/]", None: "-"}
     table = Table(box=None, show_header=False, pad_edge=False)
     for check in r["checks"]:
@@ -19,15 +22,15 @@ def checks_table(r: dict[str, Any]) -> None:
     out.print(table)
 
 
-def changes_table(servo: str, changes: list[Any]) -> None:
-    """Registers that would change, on stderr."""
+def changes_table(servo: str, changes: "list[RegisterChange]") -> None:
+    """Prints the registers that would change, on stderr."""
     table = Table(servo, "is", "becomes", box=None, pad_edge=False)
     for change in changes:
         table.add_row(change.register, change.old, change.new)
     err.print(table)
 
 
-def setup_line(r: dict[str, Any]) -> None:
-    """What became of a servo's set-up."""
-    done = "set up, and read back" if r["applied"] else "left as it is"
-    out.print(f"servo {r['servo']}: {done if r['changes'] else 'nothing to change'}")
+def setup_line(r: "SetupResult") -> None:
+    """Prints the result of a servo's setup."""
+    done = "written and read back" if r.applied else "unchanged"
+    out.print(f"servo {r.servo}: {done if r.changes else 'nothing to change'}")

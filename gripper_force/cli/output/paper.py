@@ -1,21 +1,26 @@
-"""The paper's tables, made again."""
+"""Tables of the `reproduce` command."""
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 from rich.table import Table
 
 from gripper_force.cli.console import out
 
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
 
-def paper_tables(r: dict[str, Any]) -> None:
-    """The paper's tables, and where its figures are."""
-    from gripper_force.qualification.paper.paper_tables import show
+    from gripper_force.qualification.paper import paper_tables as paper
 
-    for made in r["tables"]:
+
+def paper_tables(tables: "Sequence[paper.Table]", figures: "Mapping[str, str]") -> None:
+    """Prints the paper's tables, and the files of its figures."""
+    from gripper_force.qualification.paper.paper_tables import cell_text
+
+    for made in tables:
         table = Table(*made.columns, title=made.title, title_justify="left", box=None)
         for row in made.rows:
-            table.add_row(*map(show, row))
+            table.add_row(*map(cell_text, row))
         out.print(table)
         out.print()
-    for name, path in r["figures"].items():
+    for name, path in figures.items():
         out.print(f"{name}: {path}", soft_wrap=True)

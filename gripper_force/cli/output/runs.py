@@ -1,29 +1,20 @@
-"""How a grasp, several, or a replay went, and how far off estimates are."""
+"""Tables of a grasp, of trials, of a replay, and of errors of estimates."""
 
-from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rich.markup import escape
 from rich.table import Table
 
-from gripper_force.cli.console import err, number, out, pairs
+from gripper_force.cli.console import number, out, pairs
+
+if TYPE_CHECKING:  # --help loads neither NumPy nor PyTorch
+    from gripper_force.jobs.evaluate import Evaluation
+    from gripper_force.jobs.grasp import Summary
+    from gripper_force.jobs.metrics import ForceBin
+    from gripper_force.jobs.replay import ReplayResult
 
 
-def phases() -> Callable[[Any], None]:
-    """What prints a line for each phase of a grasp on stderr, with the time since the first."""
-    begin_ns: list[int] = []
-
-    def show_phase(status: Any) -> None:
-        begin_ns.append(status.t_ns)
-        after_s = (status.t_ns - begin_ns[0]) / 1e9
-        note = f" [bold]{status.outcome}[/]" if status.outcome else ""
-        err.print(f"[dim]{after_s:8.2f} s[/] {status.phase}{note} [dim]{escape(status.reason)}[/]")
-
-    return show_phase
-
-
-def grasp_table(r: dict[str, Any]) -> None:
-    """How a grasp went."""
+def grasp_table(r: "Summary") -> None:
+    """Prints the figures of a grasp."""
     share = ""
     if r["steady_error_n"] is not None:
         share = f" ({100 * r['steady_error_n'] / r['target_n']:+.1f} %)"
@@ -49,7 +40,7 @@ def grasp_table(r: dict[str, Any]) -> None:
 
 
 def trials_table(r: dict[str, Any]) -> None:
-    """How each of several grasps went, and what they come to."""
+    """Prints the figures of each trial and over all trials."""
     table = Table(
         "object", "target N", "load cell N", "error %", "overshoot N", "settle s", "result", box=None
     )
@@ -68,45 +59,45 @@ def trials_table(r: dict[str, Any]) -> None:
     summary = dict(r["summary"])
     errors = summary.pop("estimate_mae_n")
     pairs(summary)
-    table = Table("MAE over the whole run, N", "vision", "current", "fused", "floor", box=None)
+    table = Table("MAE over the run, N", "vision", "current", "fused", "floor", box=None)
     for name, e in errors.items():
         table.add_row(name, *(number(e[key]) for key in ("visual", "current", "fused", "floor")))
     out.print(table)
 
 
-def errors_table(r: dict[str, Any]) -> None:
-    """Errors of estimates: over all, by object and by force."""
-    pairs({key: r[key] for key in ("mae_n", "rmse_n", "bias_n", "floor_n", "frames")})
+def errors_table(r: "Evaluation") -> None:
+    """Prints errors of estimates: over all frames, by object and by force."""
+    pairs({key: getattr(r, key) for key in ("mae_n", "rmse_n", "bias_n", "floor_n", "frames")})
     table = Table("object", "MAE N", "RMSE N", "contact MAE N", "floor N", "frames", box=None)
-    for name, o in r["per_object"].items():
-        figures = (o["mae_n"], o["rmse_n"], o["contact_mae_n"], o["floor_n"])
-        table.add_row(name, *(number(value) for value in figures), str(o["frames"]))
+    for name, o in r.per_object.items():
+        figures = (o.mae_n, o.rmse_n, o.contact_mae_n, o.floor_n)
+        table.add_row(name, *(number(value) for value in figures), str(o.frames))
     out.print(table)
-    _bins_table(r["per_bin"])
+    _bins_table(r.per_bin)
 
 
-def _bins_table(bins: list[dict[str, Any]]) -> None:
+def _bins_table(bins: "list[ForceBin]") -> None:
     table = Table("force N", "MAE N", "bias N", "frames", box=None)
     for b in bins:
-        span = f"{b['from_n']:.0f}-{b['to_n']:.0f}"
-        table.add_row(span, number(b["mae_n"]), number(b["bias_n"]), str(b["frames"]))
+        span = f"{b.from_n:.0f}-{b.to_n:.0f}"
+        table.add_row(span, number(b.mae_n), number(b.bias_n), str(b.frames))
     out.print(table)
 
 
-def replay_table(r: dict[str, Any]) -> None:
-    """What a replay gave."""
-    identical = {True: "yes, to the bit", False: "no", None: "nothing to compare"}[r["identical"]]
-    if r["note"]:
-        identical += f": {r['note']}"
+def replay_table(r: "ReplayResult", report: str | None = None) -> None:
+    """Prints the result of a replay."""
+    identical = {True: "yes, bit for bit", False: "no", None: "nothing to compare"}[r.identical]
+    if r.note:
+        identical += f": {r.note}"
     found = {"identical": identical}
-    if r["changed"] and not r["identical"]:
-        found["commands"] = f"at most {1e3 * r['changed']['goal_current_a']:.0f} mA off the run's"
-        found["fused force"] = f"at most {r['changed']['fused_n']:.2f} N off the run's"
-    pairs({**found, "log": r["log"], **({"report": r["report"]} if "report" in r else {})})
+    if r.changed and not r.identical:
+        found["commands"] = f"at most {1e3 * r.changed['goal_current_a']:.0f} mA from the run's"
+        found["fused force"] = f"at most {r.changed['fused_n']:.2f} N from the run's"
+    pairs({**found, "log": r.log, **({} if report is None else {"report": report})})
     table = Table("source", "MAE N", "RMSE N", "bias N", "contact MAE N", "lag ms", "samples", box=None)
-    for name, s in r["sources"].items():
-        figures = (s["mae_n"], s["rmse_n"], s["bias_n"], s["contact_mae_n"])
-        lag = number(1e3 * s["lag_s"], digits=0)
-        table.add_row(name, *(number(value) for value in figures), lag, str(s["frames"]))
+    for name, s in r.sources.items():
+        figures = (s.mae_n, s.rmse_n, s.bias_n, s.contact_mae_n)
+        lag = number(1e3 * s.lag_s, digits=0)
+        table.add_row(name, *(number(value) for value in figures), lag, str(s.frames))
     out.print(table)
-    _bins_table(r["per_bin"])
+    _bins_table(r.per_bin)

@@ -1,44 +1,51 @@
-"""What hard cases, faults and long use came to."""
+"""Tables of the `stability` commands."""
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 from rich.markup import escape
 from rich.table import Table
 
-from gripper_force.cli.console import number, out, pairs, plain
+from gripper_force.cli.console import number, out, pairs
+
+if TYPE_CHECKING:
+    from gripper_force.qualification.fault_matrix.matrix import MatrixReport
+    from gripper_force.qualification.fuzz.fuzzer import FuzzReport
+    from gripper_force.qualification.numerics.suite import NumericsReport
+    from gripper_force.qualification.soak import SoakReport
 
 
-def fuzz_table(r: dict[str, Any]) -> None:
-    """What readers made of hostile input."""
+def fuzz_table(r: "FuzzReport") -> None:
+    """Prints the outcomes of random and damaged input, reader by reader."""
     table = Table("target", "inputs", "results", "typed errors", "findings", box=None)
     for name, row in r["targets"].items():
-        table.add_row(name, *(str(row[key]) for key in ("inputs", "results", "typed_errors", "findings")))
+        counts = (row["inputs"], row["results"], row["typed_errors"], row["findings"])
+        table.add_row(name, *map(str, counts))
     out.print(table)
     for finding in r["findings"]:
         out.print(f"[bold red]{escape(f'{finding.target}:{finding.index}')}[/] {escape(finding.error)}")
-        out.print(f"  kept as {finding.file}", soft_wrap=True)
+        out.print(f"  input: {finding.file}", soft_wrap=True)
     pairs({"inputs": r["inputs"], "seed": r["seed"], "seconds": r["wall_s"]})
 
 
-def numerics_tables(r: dict[str, Any]) -> None:
-    """Hard cases for the numbers, part by part."""
-    from gripper_force.qualification.numerics.suite import said
+def numerics_tables(r: "NumericsReport") -> None:
+    """Prints the hard numerical cases, part by part."""
+    from gripper_force.qualification.numerics.suite import with_unit
 
     for name, rows in r["parts"].items():
         title = f"{name} ({r['seconds'][name]:.0f} s)"
-        table = Table("case", "how", "found", "bound", title=title, title_justify="left", box=None)
+        table = Table("case", "method", "found", "bound", title=title, title_justify="left", box=None)
         for row in rows:
             colour = "green" if row.ok else "bold red"
-            found = f"[{colour}]{said(row.figure, row.unit)}[/]"
-            table.add_row(escape(row.case), escape(row.detail), found, said(row.bound, row.unit))
+            found = f"[{colour}]{with_unit(row.figure, row.unit)}[/]"
+            table.add_row(escape(row.case), escape(row.detail), found, with_unit(row.bound, row.unit))
         out.print(table)
         out.print()
 
 
-def faults_table(r: dict[str, Any]) -> None:
-    """The fault matrix."""
+def faults_table(r: "MatrixReport") -> None:
+    """Prints the fault matrix."""
     table = Table(
-        "fault", "expected", "as expected", "worst ms", "of", "live ms", "peak over limit", box=None
+        "fault", "expected", "as expected", "worst ms", "within ms", "live ms", "peak over limit", box=None
     )
     for row in r["rows"]:
         colour = "green" if row["ok"] == row["runs"] else "bold red"
@@ -53,12 +60,12 @@ def faults_table(r: dict[str, Any]) -> None:
         )
     out.print(table)
     for row in r["rows"]:
-        for seed, why_not in row["failures"].items():
-            out.print(f"[bold red]{row['row']}[/], seed {seed}: {plain(why_not)}", soft_wrap=True)
+        for seed, failure in row["failures"].items():
+            out.print(f"[bold red]{row['row']}[/], seed {seed}: {escape(failure)}", soft_wrap=True)
 
 
-def soak_table(r: dict[str, Any]) -> None:
-    """The process over many grasps."""
+def soak_table(r: "SoakReport") -> None:
+    """Prints memory, open files and threads over many grasps."""
     table = Table("simulated s", "memory MB", "files", "threads", box=None)
     for s in r["samples"]:
         table.add_row(

@@ -1,1 +1,1 @@
-"""Recording sets of touches from a press rig, and judging what was recorded."""
+"""Recording of sets of touches from a press rig, and checks of the recorded sets."""

@@ -1,4 +1,4 @@
-"""Touches: press up to a force, and let go. The same procedure in a simulated rig and in a real one."""
+"""One touch: press up to a force, hold, and open. The same for a simulated and a real rig."""
 
 from typing import Final, Protocol
 
@@ -6,74 +6,80 @@ from gripper_force.control.state_machine import Decision
 from gripper_force.types import NS_PER_S, LoadCellSample, Outcome, Phase, RequestKind
 
 _CLEAR_M: Final = 0.008
-"""How much wider than the object the jaws open between two touches: with less of a run-up they don't come to
-their speed, and a controller that has not seen them move takes long to believe in contact."""
+"""Distance by which the jaws open beyond the contact width between two touches. With less they do not reach
+their speed, and the controller then detects contact late."""
 
 
-class Toucher(Protocol):
-    """What touches need of a `gripper_force.runtime.session.Session`."""
+class TouchSession(Protocol):
+    """Part of a `gripper_force.runtime.session.Session` that touches use."""
 
     @property
     def last_load_cell_sample(self) -> LoadCellSample | None:
-        """The newest valid sample of the load cell."""
+        """Newest valid sample of the load cell."""
         ...
 
     def cycle(self, kind: RequestKind | None = None, target_n: float = 0.0) -> Decision:
-        """The next control cycle."""
+        """Runs the next control cycle, with a request or without."""
         ...
 
 
 def touch(
-    rig: Toucher, peak_n: float, hold_s: float, *, free_n: float, timeout_s: float, patience_s: float
+    session: TouchSession,
+    peak_n: float,
+    hold_s: float,
+    *,
+    free_n: float,
+    timeout_s: float,
+    release_timeout_s: float,
 ) -> str:
     """Presses once, and opens until the object is free.
 
     Args:
-        rig: A session that is open.
+        session: An open session.
         peak_n: Force to press up to.
-        hold_s: How long to keep it; what is felt comes after what is asked for.
-        free_n: The most that the load cell may still feel of an object that is free.
-        timeout_s: How long the way to the force may take.
-        patience_s: How long the way back may take.
+        hold_s: Duration of the hold; the measured force follows the commanded force with a delay.
+        free_n: Largest load-cell force of a free object.
+        timeout_s: Longest time until the force is reached.
+        release_timeout_s: Longest time until the object is free again.
 
     Returns:
-        Why it did not come to that, or an empty text.
+        Reason of a failure, as a predicate; empty after a success.
     """
-    touch_m = ramp(rig, peak_n, timeout_s)
-    status = rig.cycle().status
+    contact_m = ramp(session, peak_n, timeout_s)
+    status = session.cycle().status
     if status.phase != Phase.HOLD:
         outcome = status.outcome.replace("_", " ") or f"not within {timeout_s:g} s"
-        return f"came to no force: {outcome}, in phase {status.phase}"
-    wait(rig, hold_s)
-    status = rig.cycle(RequestKind.RELEASE).status
-    end_ns = status.t_ns + round(patience_s * NS_PER_S)
-    clear_m = touch_m + _CLEAR_M
-    while (status.width_m < clear_m and status.phase != Phase.OPEN) or _felt_n(rig) > free_n:
+        return f"reached no force: {outcome}, in phase {status.phase}"
+    wait(session, hold_s)
+    status = session.cycle(RequestKind.RELEASE).status
+    end_ns = status.t_ns + round(release_timeout_s * NS_PER_S)
+    clear_m = contact_m + _CLEAR_M
+    while (status.width_m < clear_m and status.phase != Phase.OPEN) or _load_cell_n(session) > free_n:
         if status.t_ns > end_ns:
-            return f"caught on a pad: {_felt_n(rig):.2f} N are felt {patience_s:g} s after letting go"
-        status = rig.cycle().status
+            return f"caught on a pad: still {_load_cell_n(session):.2f} N after {release_timeout_s:g} s of opening"
+        status = session.cycle().status
     return ""
 
 
-def ramp(rig: Toucher, target_n: float, timeout_s: float) -> float:
-    """Presses until a force is reached, or can't be. Returns the width in metres where the object was met."""
-    status = rig.cycle(RequestKind.GRASP, target_n).status
-    touch_m = status.width_m
+def ramp(session: TouchSession, target_n: float, timeout_s: float) -> float:
+    """Presses until a force is reached or has failed. Returns the width in metres at first contact."""
+    status = session.cycle(RequestKind.GRASP, target_n).status
+    contact_m = status.width_m
     end_ns = status.t_ns + round(timeout_s * NS_PER_S)
     while status.phase != Phase.HOLD and status.outcome == Outcome.NONE and status.t_ns < end_ns:
         if status.phase == Phase.APPROACH:
-            touch_m = status.width_m
-        status = rig.cycle().status
-    return touch_m
+            contact_m = status.width_m
+        status = session.cycle().status
+    return contact_m
 
 
-def wait(rig: Toucher, duration_s: float) -> None:
-    """Goes on as before for a time."""
-    status = rig.cycle().status
+def wait(session: TouchSession, duration_s: float) -> None:
+    """Runs cycles without a request for a time."""
+    status = session.cycle().status
     end_ns = status.t_ns + round(duration_s * NS_PER_S)
     while status.t_ns < end_ns:
-        status = rig.cycle().status
+        status = session.cycle().status
 
 
-def _felt_n(rig: Toucher) -> float:
-    return 0.0 if rig.last_load_cell_sample is None else rig.last_load_cell_sample.force_n
+def _load_cell_n(session: TouchSession) -> float:
+    return 0.0 if session.last_load_cell_sample is None else session.last_load_cell_sample.force_n

@@ -1,9 +1,9 @@
-"""What a report shows, read from a log. No drawing here."""
+"""Data of a report, read from a log in one pass."""
 
-from collections.abc import Iterable
+from collections import defaultdict
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
@@ -30,8 +30,8 @@ Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Style:
-    """How a source of force is named and coloured, in every picture; on light and on dark ground."""
+class SourceStyle:
+    """Label and colours of a source of force, on a light and on a dark background."""
 
     label: str
     light: str
@@ -39,17 +39,17 @@ class Style:
 
 
 SOURCES: Final = {
-    "current": Style("motor current", "#d55e00", "#f08c4a"),
-    "vision": Style("vision", "#009e73", "#35c79c"),
-    "fused": Style("fusion", "#0072b2", "#56b4e9"),
-    "load_cell": Style("load cell", "#1b1f24", "#f2f4f7"),
+    "current": SourceStyle("motor current", "#d55e00", "#f08c4a"),
+    "vision": SourceStyle("vision", "#009e73", "#35c79c"),
+    "fused": SourceStyle("fusion", "#0072b2", "#56b4e9"),
+    "load_cell": SourceStyle("load cell", "#1b1f24", "#f2f4f7"),
 }
-"""In the order they are drawn. Hues by Okabe and Ito, which colour-blind readers tell apart."""
+"""Sources in drawing order. Hues of Okabe and Ito, which colour-blind readers can distinguish."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Series:
-    """A quantity over time: s since the request, and N. Both (N,)."""
+    """A force over time: seconds since the request, (N,), and newtons, (N,)."""
 
     t_s: Floats
     value_n: Floats
@@ -66,7 +66,7 @@ class Span:
 
 @dataclass(frozen=True, slots=True)
 class EventRow:
-    """A line of the table of events."""
+    """A row of the table of phases and events."""
 
     t_s: float
     unit: str
@@ -78,24 +78,24 @@ class Run:
     """A run as a report shows it.
 
     Attributes:
-        name: The log's name.
-        config: Its configuration.
+        name: File name of the log without its suffix.
+        config: Configuration of the run.
         config_text: The same as YAML.
         metadata: Versions, digests and other facts.
         zero_ns: Log time of 0 s: the first grasp request, or the log's start.
         begin_s: Time of the first record.
         end_s: Time of the last record.
-        target_n: What was asked for; None in a recording without a request.
-        outcome: The last outcome, empty where there is none.
-        score: The grasp against the load cell; None where nothing was held, or nothing measured it.
-        forces: By source; a source that the log lacks is absent.
-        errors: Force less the load cell's, by source; only where the load cell gives valid samples.
-        reference: The target, shaped by the ramp.
-        phases: In order, open ones left out.
-        lines: Requests, phases and events in order.
-        compute_ms: Time each estimate took.
-        camera_age_ms: Age of each frame when it could first be used.
-        latency_ms: From the middle of the exposure to the estimate.
+        target_n: Target force of the last grasp request; None in a recording without a request.
+        outcome: Last outcome; empty without one.
+        score: Grasp compared with the load cell; None without a hold or a load cell.
+        forces: Force by source; sources that the log lacks are absent.
+        errors: Force minus the load cell's force, by source; only where the load cell gives valid samples.
+        reference: Target force, shaped by the ramp.
+        phases: Phases in order, without the open ones.
+        event_rows: Requests, phases and events in order.
+        compute_ms: Computing time of each estimate, (N,).
+        camera_age_ms: Age of each frame when it was received, (N,).
+        latency_ms: Time from the middle of the exposure to the estimate, (N,).
     """
 
     name: str
@@ -119,12 +119,12 @@ class Run:
 
     @property
     def object(self) -> str:
-        """What was grasped, in words."""
+        """Name of the object, for a heading."""
         return self.config.object.replace("_", " ").capitalize()
 
     @property
     def title(self) -> str:
-        """What was grasped, how hard, and what came of it."""
+        """Object, target and outcome, in one line."""
         parts = [self.object]
         if self.target_n is not None:
             parts.append(f"target {self.target_n:g} N")
@@ -133,35 +133,43 @@ class Run:
         return " · ".join(parts)
 
 
-def read_run(path: Path, *, recover: bool = False) -> Run:
-    """Reads a log.
+def read_run(log: LogReader, on_frame: Callable[[Frame], None] = lambda frame: None) -> Run:
+    """Reads a log in one pass.
+
+    Args:
+        log: Log of a run or of a recording.
+        on_frame: Called with each frame while the log is read. Frames are not kept.
 
     Raises:
         LogError: The log can't be read.
-        ConfigError: It holds a configuration that this version does not understand.
+        ConfigError: The log holds a configuration that this version does not understand.
     """
-    log = LogReader(path, recover=recover)
-    vision = list(log.records(VisualForce))
-    fused = list(log.records(FusedForce))
-    status = list(log.records(GraspStatus))
-    requests = list(log.records(Request))
+    records: dict[type, list[Any]] = defaultdict(list)
+    ages_ns = []
+    for record in log.records(VisualForce, FusedForce, GraspStatus, Request, LoadCellSample, Event, Frame):
+        if isinstance(record, Frame):
+            ages_ns.append(record.received_ns - record.t_ns)
+            on_frame(record)
+        else:
+            records[type(record)].append(record)
+    vision, fused, status = records[VisualForce], records[FusedForce], records[GraspStatus]
+    requests = records[Request]
     grasps = [request for request in requests if request.kind == RequestKind.GRASP]
     zero_ns = grasps[0].t_ns if grasps else log.start_ns
     target_n = grasps[-1].target_n if grasps else None
-    cell = sorted((s for s in log.records(LoadCellSample) if s.valid), key=lambda s: s.t_ns)
+    samples = sorted((s for s in records[LoadCellSample] if s.valid), key=lambda s: s.t_ns)
     forces = {
         "current": _series(zero_ns, ((r.t_ns, r.current_n) for r in fused)),
         "vision": _series(zero_ns, ((r.t_ns, r.force_n) for r in vision)),
         "fused": _series(zero_ns, ((r.t_ns, r.force_n) for r in fused)),
-        "load_cell": _series(zero_ns, ((r.t_ns, r.force_n) for r in cell)),
+        "load_cell": _series(zero_ns, ((r.t_ns, r.force_n) for r in samples)),
     }
     forces = {source: series for source, series in forces.items() if len(series.t_s)}
-    # An empty log still has a time axis.
+    # An empty log still needs a time axis.
     end_s = (log.start_ns + max(log.duration_ns, NS_PER_MS) - zero_ns) / NS_PER_S
-    ages = [frame.received_ns - frame.t_ns for frame in log.records(Frame)]
     return Run(
-        name=path.stem,
-        config=config_from_text(log.config, str(path)),
+        name=log.path.stem,
+        config=config_from_text(log.config, str(log.path)),
         config_text=log.config,
         metadata=log.metadata,
         zero_ns=zero_ns,
@@ -169,20 +177,24 @@ def read_run(path: Path, *, recover: bool = False) -> Run:
         end_s=end_s,
         target_n=target_n,
         outcome=next((s.outcome for s in reversed(status) if s.outcome), ""),
-        score=_score(cell, status, target_n),
+        score=_score(samples, status, target_n),
         forces=forces,
         errors=_errors(forces),
         reference=_series(zero_ns, ((s.t_ns, s.reference_n) for s in status)),
         phases=_phases(zero_ns, end_s, status),
-        event_rows=_lines(zero_ns, requests, status, log.records(Event)),
+        event_rows=_event_rows(zero_ns, requests, status, records[Event]),
         compute_ms=np.array([v.compute_ms for v in vision]),
-        camera_age_ms=np.array(ages) / NS_PER_MS,
+        camera_age_ms=np.array(ages_ns) / NS_PER_MS,
         latency_ms=np.array([v.ready_ns - v.t_ns for v in vision]) / NS_PER_MS,
     )
 
 
-def bins(values: Floats) -> tuple[Floats, Floats]:
-    """Counts, (30,), and edges, (31,), to just above the 99.5th percentile; the rest is in the last bin."""
+def histogram(values: Floats) -> tuple[Floats, Floats]:
+    """Histogram up to just above the 99.5th percentile; the last bin also counts all larger values.
+
+    Returns:
+        Counts, (30,), and edges, (31,).
+    """
     top = max(float(np.percentile(values, 99.5)) * 1.15, 1e-3)
     counts, edges = np.histogram(np.clip(values, 0, top), bins=30, range=(0, top))
     return counts.astype(np.float64), edges
@@ -195,12 +207,12 @@ def _series(zero_ns: int, pairs: Iterable[tuple[int, float]]) -> Series:
 
 
 def _score(
-    cell: list[LoadCellSample], status: list[GraspStatus], target_n: float | None
+    samples: list[LoadCellSample], status: list[GraspStatus], target_n: float | None
 ) -> GraspScore | None:
     if target_n is None:
         return None
     try:
-        return score_grasp(cell, status, target_n)
+        return score_grasp(samples, status, target_n)
     except DataError:
         return None
 
@@ -226,15 +238,15 @@ def _phases(zero_ns: int, end_s: float, status: list[GraspStatus]) -> list[Span]
     return [span for span in spans if span.phase != Phase.OPEN]
 
 
-def _lines(
-    zero_ns: int, requests: list[Request], status: list[GraspStatus], events: Iterable[Event]
+def _event_rows(
+    zero_ns: int, requests: list[Request], status: list[GraspStatus], events: list[Event]
 ) -> list[EventRow]:
     entries = [(r.t_ns, "request", _request_text(r)) for r in requests]
     before: GraspStatus | None = None
     for s in status:
         if before is None or s.phase != before.phase:
-            why = f": {s.reason}" if s.reason not in {"", s.phase} else ""
-            entries.append((s.t_ns, "phase", s.phase + why))
+            reason = f": {s.reason}" if s.reason not in {"", s.phase} else ""
+            entries.append((s.t_ns, "phase", s.phase + reason))
         elif s.reason:
             entries.append((s.t_ns, "control", s.reason))
         if s.outcome and (before is None or s.outcome != before.outcome):

@@ -1,51 +1,29 @@
-"""A run as one HTML page that holds all it needs."""
+"""The report as one HTML page that needs no other file and no network."""
 
-import base64
 import json
-from collections.abc import Iterable
-from dataclasses import dataclass
 from html import escape
-from io import BytesIO
 from pathlib import Path
 from string import Template
 from typing import Final
 
-import matplotlib.image
 import numpy as np
-from matplotlib.ticker import MaxNLocator
 
-from gripper_force.jobs.report.data import SOURCES, Floats, Run, Series, bins
-from gripper_force.jobs.report.pictures import Picture
+from gripper_force.jobs.report.data import SOURCES, Run
+from gripper_force.jobs.report.figure import Svg, thin
 
-_POINTS: Final = 2000
-"""Points a curve is drawn with at most; more can't be seen."""
-_LINES: Final = 300
+_MAX_EVENT_ROWS: Final = 300
 
 
-@dataclass(frozen=True, slots=True)
-class _Axes:
-    """The ranges of a chart; a point's place in percent of its box."""
-
-    x: tuple[float, float]
-    y: tuple[float, float]
-
-    def left(self, x: float) -> float:
-        return 100 * (x - self.x[0]) / (self.x[1] - self.x[0])
-
-    def top(self, y: float) -> float:
-        return 100 * (self.y[1] - y) / (self.y[1] - self.y[0])
-
-
-def render(run: Run, pictures: list[Picture], note: str) -> str:
-    """The page as text.
+def render(run: Run, drawing: Svg, note: str) -> str:
+    """Returns the page.
 
     Args:
-        run: What was logged.
-        pictures: Frames over the grasp.
-        note: What is laid over them.
+        run: The run.
+        drawing: Its figure.
+        note: Note on the frames' overlay; may be empty.
     """
     template = Template(Path(__file__).with_name("page.html").read_text(encoding="utf-8"))
-    sections = [_force(run), _error(run), _latency(run), _frames(pictures, note), _events(run)]
+    sections = [_drawing(run, drawing, note), _events(run)]
     return template.substitute(
         title=escape(run.title),
         name=escape(run.name),
@@ -59,8 +37,8 @@ def render(run: Run, pictures: list[Picture], note: str) -> str:
     )
 
 
-def _palette(ground: str) -> str:
-    return "".join(f"--{source}:{getattr(style, ground)};" for source, style in SOURCES.items())
+def _palette(scheme: str) -> str:
+    return "".join(f"--{source}:{getattr(style, scheme)};" for source, style in SOURCES.items())
 
 
 def _headline(run: Run) -> str:
@@ -75,7 +53,7 @@ def _headline(run: Run) -> str:
 
 
 def _cards(run: Run) -> list[tuple[str, str, str]]:
-    """Name, value and unit of each figure of the headline."""
+    """Name, value and unit of each value under the heading."""
     cards = [] if run.target_n is None else [("Target", f"{run.target_n:g}", "N")]
     if run.score is not None:
         settle = f"{run.score.settle_s:.2f}" if np.isfinite(run.score.settle_s) else "never"
@@ -95,81 +73,28 @@ def _cards(run: Run) -> list[tuple[str, str, str]]:
     return cards
 
 
-def _force(run: Run) -> str:
-    curves = dict(run.forces)
-    if not curves:
-        return ""
-    values = np.concatenate([series.value_n for series in [*curves.values(), run.reference]])
-    axes = _axes(run, values, headroom=0.1)
-    drawn = [_path("target", run.reference, axes)] if len(run.reference.t_s) else []
-    drawn += [_path(source, curves[source], axes) for source in SOURCES if source in curves]
-    legend = [(source, SOURCES[source].label) for source in SOURCES if source in curves]
-    legend += [("target", "target")] if len(run.reference.t_s) else []
-    bands = _bands(run, axes, named=True)
-    chart = _chart(axes, "".join(drawn), "tall", "grip force, N", bands=bands, data="forces")
-    return f"<section><h2>Force</h2>{_legend(legend)}{chart}</section>"
-
-
-def _error(run: Run) -> str:
-    if not run.errors:
-        return ""
-    values = np.concatenate([series.value_n for series in run.errors.values()])
-    axes = _axes(run, np.append(values, 0.0))
-    zero = f'<path class="zero" d="M0 {axes.top(0):.2f}H100"/>'
-    curves = "".join(_path(source, series, axes) for source, series in run.errors.items())
-    bands = _bands(run, axes, named=False)
-    chart = _chart(axes, zero + curves, "short", "error, N", bands=bands, data="errors")
-    legend = _legend([(source, SOURCES[source].label) for source in run.errors])
-    return f"<section><h2>Error against the load cell</h2>{legend}{chart}</section>"
-
-
-def _latency(run: Run) -> str:
-    rows = [
-        ("Estimator, per frame", run.compute_ms, "vision"),
-        ("Frame's age on arrival", run.camera_age_ms, "plain"),
-    ]
-    shown = "".join(_histogram(name, values, style) for name, values, style in rows if len(values))
-    if not shown or not len(run.latency_ms):
-        return ""
-    return f'<section><h2>Latency</h2><div class="pair">{shown}</div></section>'
-
-
-def _histogram(name: str, values_ms: Floats, style: str) -> str:
-    counts, edges = bins(values_ms)
-    axes = _Axes((0.0, float(edges[-1])), (0.0, 1.05 * float(counts.max())))
-    bars = "".join(
-        f'<rect class="bar {style}" x="{axes.left(left):.2f}" width="{95 / len(counts):.2f}" '
-        f'y="{axes.top(count):.2f}" height="{100 - axes.top(count):.2f}"/>'
-        for left, count in zip(edges, counts, strict=False)
-    )
-    p50, p99 = np.percentile(values_ms, [50, 99])
-    figures = f"p50 {p50:.1f} · p99 {p99:.1f} · largest {values_ms.max():.1f} ms"
-    chart = _chart(axes, bars, "small", "frames", x_name="ms")
-    return f"<figure><figcaption><b>{name}</b> {figures}</figcaption>{chart}</figure>"
-
-
-def _frames(pictures: list[Picture], note: str) -> str:
-    if not pictures:
-        return ""
-    shown = "".join(
-        f'<figure><img alt="camera frame" src="data:image/png;base64,{_png(picture)}">'
-        f"<figcaption>{escape(picture.caption)}</figcaption></figure>"
-        for picture in pictures
+def _drawing(run: Run, drawing: Svg, note: str) -> str:
+    charts = "".join(
+        f'<div class="chart" data-series="{name}" data-from="{run.begin_s:.6g}" data-to="{run.end_s:.6g}" '
+        f'style="left:{chart.left:.3f}%;top:{chart.top:.3f}%;'
+        f'width:{chart.width:.3f}%;height:{chart.height:.3f}%"></div>'
+        for name, chart in drawing.charts.items()
     )
     text = f'<p class="note">{escape(note)}</p>' if note else ""
-    return f'<section><h2>Frames</h2><div class="frames">{shown}</div>{text}</section>'
+    figure = f'<div class="scroll"><div class="drawing">{drawing.text}{charts}</div></div>'
+    return f"<section>{figure}{text}</section>"
 
 
 def _events(run: Run) -> str:
     if not run.event_rows:
         return ""
     rows = "".join(
-        f"<tr><td>{line.t_s:.3f}</td><td>{escape(line.unit)}</td><td>{escape(line.text)}</td></tr>"
-        for line in run.event_rows[:_LINES]
+        f"<tr><td>{row.t_s:.3f}</td><td>{escape(row.unit)}</td><td>{escape(row.text)}</td></tr>"
+        for row in run.event_rows[:_MAX_EVENT_ROWS]
     )
-    more = len(run.event_rows) - _LINES
-    rest = f'<p class="note">{more} more are in the log.</p>' if more > 0 else ""
-    head = "<thead><tr><th>s</th><th>unit</th><th>what</th></tr></thead>"
+    more = len(run.event_rows) - _MAX_EVENT_ROWS
+    rest = f'<p class="note">{more} more rows are in the log.</p>' if more > 0 else ""
+    head = "<thead><tr><th>s</th><th>unit</th><th>text</th></tr></thead>"
     return f"<section><h2>Phases and events</h2><table>{head}<tbody>{rows}</tbody></table>{rest}</section>"
 
 
@@ -177,82 +102,19 @@ def _facts(run: Run) -> str:
     rows = "".join(
         f"<tr><td>{escape(key)}</td><td>{escape(value)}</td></tr>" for key, value in run.metadata.items()
     )
-    return f"<details><summary>Versions and facts</summary><table>{rows}</table></details>" if rows else ""
-
-
-def _axes(run: Run, values: Floats, headroom: float = 0.0) -> _Axes:
-    low, high = min(float(values.min()), 0.0), float(values.max())
-    span = max(high - low, 0.1)
-    return _Axes((run.begin_s, run.end_s), (low - 0.04 * span, high + (0.04 + headroom) * span))
-
-
-def _chart(
-    axes: _Axes, drawn: str, size: str, y_name: str, *, x_name: str = "s", bands: str = "", data: str = ""
-) -> str:
-    """A box of 100 by 100 that stretches to its place; words are HTML over it, so they keep their size."""
-    y_ticks, x_ticks = _ticks(axes.y, 6), _ticks(axes.x, 8)
-    grid = "".join(f"M0 {axes.top(y):.2f}H100" for y in y_ticks)
-    words = "".join(f'<i class="y" style="top:{axes.top(y):.2f}%">{y:g}</i>' for y in y_ticks)
-    words += "".join(f'<i class="x" style="left:{axes.left(x):.2f}%">{x:g}</i>' for x in x_ticks)
-    words += f'<i class="yname">{y_name}</i><i class="xname">{x_name}</i>'
-    limits = f'data-from="{axes.x[0]:.6g}" data-to="{axes.x[1]:.6g}"'
-    return (
-        f'<div class="chart {size}" data-series="{data}" {limits}>{bands}'
-        '<svg viewBox="0 0 100 100" preserveAspectRatio="none" aria-hidden="true">'
-        f'<path class="grid" d="{grid}"/>{drawn}</svg>{words}</div>'
-    )
-
-
-def _ticks(limits: tuple[float, float], count: int) -> list[float]:
-    inside = (
-        tick
-        for tick in MaxNLocator(count, steps=[1, 2, 5, 10]).tick_values(*limits)
-        if limits[0] <= tick <= limits[1]
-    )
-    return [round(float(tick), 9) for tick in inside]
-
-
-def _bands(run: Run, axes: _Axes, *, named: bool) -> str:
-    bands = ""
-    for i, span in enumerate(run.phases):
-        left, width = axes.left(span.start_s), axes.left(span.end_s) - axes.left(span.start_s)
-        name = f"<span>{span.phase}</span>" if named else ""
-        bands += f'<b class="band{i % 2}" style="left:{left:.2f}%;width:{width:.2f}%">{name}</b>'
-    return bands
-
-
-def _path(style: str, series: Series, axes: _Axes) -> str:
-    thin = _thin(series)
-    points = zip(thin.t_s, thin.value_n, strict=True)
-    d = "L".join(f"{axes.left(t):.3f} {axes.top(v):.2f}" for t, v in points)
-    return f'<path class="curve {style}" d="M{d}"/>'
-
-
-def _thin(series: Series) -> Series:
-    if len(series.t_s) <= _POINTS:
-        return series
-    keep = np.linspace(0, len(series.t_s) - 1, _POINTS).astype(int)
-    return Series(series.t_s[keep], series.value_n[keep])
-
-
-def _legend(entries: Iterable[tuple[str, str]]) -> str:
-    return (
-        '<div class="legend">'
-        + "".join(f'<span class="{s}">{label}</span>' for s, label in entries)
-        + "</div>"
-    )
+    return f"<details><summary>Versions and metadata</summary><table>{rows}</table></details>" if rows else ""
 
 
 def _series_json(run: Run) -> str:
-    """What the page's script reads out under the pointer: name, colour, times in ms and values in mN."""
+    """Values that the page's script shows at the pointer: label, source, times in ms and forces in mN."""
     groups = {"forces": run.forces, "errors": run.errors}
     tree = {
         group: [
             {
                 "label": SOURCES[source].label,
                 "source": source,
-                "t": (1000 * _thin(curves[source]).t_s).round().astype(int).tolist(),
-                "v": (1000 * _thin(curves[source]).value_n).round().astype(int).tolist(),
+                "t": (1000 * thin(curves[source]).t_s).round().astype(int).tolist(),
+                "v": (1000 * thin(curves[source]).value_n).round().astype(int).tolist(),
             }
             for source in reversed(SOURCES)
             if source in curves
@@ -260,9 +122,3 @@ def _series_json(run: Run) -> str:
         for group, curves in groups.items()
     }
     return json.dumps(tree, separators=(",", ":"))
-
-
-def _png(picture: Picture) -> str:
-    file = BytesIO()
-    matplotlib.image.imsave(file, picture.image, format="png")
-    return base64.b64encode(file.getvalue()).decode()

@@ -1,8 +1,7 @@
-"""Camera frames over a grasp, and where the network looked."""
+"""Camera frames over a grasp, with the network's spatial attention over them."""
 
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import cv2
@@ -10,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib import colormaps
 
+from gripper_force.config import config_from_text
 from gripper_force.errors import CheckpointError, DataError
 from gripper_force.jobs.report.data import Run
 from gripper_force.runtime.log import LogReader
@@ -17,17 +17,28 @@ from gripper_force.types import NS_PER_S, Frame, Gray, Phase
 from gripper_force.vision.preprocess import downscale
 
 if TYPE_CHECKING:
+    from gripper_force.config import Config
     from gripper_force.vision.estimator import ForceEstimator
 
 COUNT: Final = 6
-_SIDE: Final = 256
+"""Frames shown."""
+
+_SIDE_PX: Final = 256
+_KEPT: Final = 512
+"""Frames kept while the log is read, 32 MiB at most. Logs with no more frames lose none."""
+
 _LEAD_S: Final = 0.3
+"""Time shown before contact and after release."""
+
 _OPACITY: Final = 0.5
-_TOUCHED: Final = 0.05
-"""Share of the largest force that shows where a recording without phases grips."""
+_TOUCH_SHARE: Final = 0.05
+"""Share of the largest force above which a recording without phases counts as in contact."""
 
 Colour = npt.NDArray[np.uint8]
 """An RGB image, (H, W, 3)."""
+
+Attention = npt.NDArray[np.float32]
+"""Spatial attention, (h, w), in 0..1."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,7 +52,7 @@ class Picture:
 
     @property
     def caption(self) -> str:
-        """Time and forces, a line each."""
+        """Time and forces, one per line."""
         lines = [f"{self.t_s:.2f} s"]
         if self.load_cell_n is not None:
             lines.append(f"load cell {_newtons(self.load_cell_n)}")
@@ -50,80 +61,111 @@ class Picture:
         return "\n".join(lines)
 
 
-def take_pictures(path: Path, run: Run, *, recover: bool = False) -> tuple[list[Picture], str]:
-    """Frames over the grasp as the network sees them, with its attention laid over where the run used it.
+@dataclass(frozen=True, slots=True, eq=False)
+class _Candidate:
+    """A downscaled frame, (S, S), and the attention on it."""
 
-    Returns:
-        The pictures, and a sentence on what is laid over them or why nothing is.
+    t_ns: int
+    gray: Gray
+    attention: Attention | None
+
+
+class FrameSampler:
+    """Samples frames while a log is read, and then picks those to show.
+
+    The frames to show depend on when the grip ends, which is only known at the log's end. So evenly spaced
+    frames are kept, at most 512: whenever there are more, every second one is dropped.
+
+    Args:
+        log: The log. The run's checkpoint is loaded to compute the attention, if the log names one.
 
     Raises:
-        LogError: The log can't be read.
+        ConfigError: The log holds a configuration that this version does not understand.
     """
-    log = LogReader(path, recover=recover)
-    wanted = _choose([frame.t_ns for frame in log.records(Frame)], run)
-    if not wanted:
-        return [], ""
-    estimator, note = _estimator(run)
-    pictures = []
-    for frame in log.records(Frame):
-        if estimator is not None:
-            with suppress(DataError):  # the run went on without this frame as well
-                estimator.update(frame.gray)
-        if frame.t_ns in wanted:
-            attention = estimator.attention_map() if estimator is not None else None
-            pictures.append(_picture(frame, run, attention))
-        if frame.t_ns >= max(wanted):
-            break
-    return pictures, note
 
+    def __init__(self, log: LogReader) -> None:
+        config = config_from_text(log.config, str(log.path))
+        self._region = config.vision.region
+        self._estimator, self._note = _open_estimator(config, log.metadata.get("checkpoint", ""))
+        self._kept: list[_Candidate] = []
+        self._step = 1
+        self._count = 0
 
-def _choose(times_ns: list[int], run: Run) -> set[int]:
-    """Capture times, evenly spread from just before contact to just after release."""
-    if not times_ns:
-        return set()
-    t_s = (np.array(times_ns) - run.zero_ns) / NS_PER_S
-    begin_s, end_s = _grip(run)
-    spread = np.linspace(max(begin_s - _LEAD_S, t_s[0]), min(end_s + _LEAD_S, t_s[-1]), COUNT)
-    return {times_ns[int(np.abs(t_s - t).argmin())] for t in spread}
+    def add(self, frame: Frame) -> None:
+        """Takes the next frame of the log.
+
+        Raises:
+            ConfigError: The region of interest reaches beyond the frame.
+        """
+        attention = None
+        if self._estimator is not None:
+            with suppress(DataError):  # the run continued without an estimate for this frame, too
+                self._estimator.update(frame.gray)
+            attention = self._estimator.attention_map()
+        if self._count % self._step == 0:
+            gray = downscale(frame.gray, self._region, _SIDE_PX)
+            kept = None if attention is None else attention.copy()
+            self._kept.append(_Candidate(frame.t_ns, gray, kept))
+        if len(self._kept) > _KEPT:
+            self._kept = self._kept[::2]
+            self._step *= 2
+        self._count += 1
+
+    def pictures(self, run: Run) -> tuple[list[Picture], str]:
+        """Picks frames spread evenly from just before contact to just after release.
+
+        Args:
+            run: The run whose frames were added.
+
+        Returns:
+            The pictures in order, and a note on the attention: what is shown, or why it is not.
+        """
+        if not self._kept:
+            return [], ""
+        t_s = (np.array([kept.t_ns for kept in self._kept]) - run.zero_ns) / NS_PER_S
+        begin_s, end_s = _grip(run)
+        spread_s = np.linspace(max(begin_s - _LEAD_S, t_s[0]), min(end_s + _LEAD_S, t_s[-1]), COUNT)
+        chosen = sorted({int(np.abs(t_s - t).argmin()) for t in spread_s})
+        pictures = [_picture(self._kept[i], float(t_s[i]), run) for i in chosen]
+        return pictures, self._note if "vision" in run.forces else ""
 
 
 def _grip(run: Run) -> tuple[float, float]:
-    """When the grip begins and ends: by the phases, else by the load cell, else the whole log."""
+    """Start and end of the grip: by the phases, else by the load cell, else the whole log."""
     phases = [span for span in run.phases if span.phase in {Phase.CONTACT, Phase.RAMP, Phase.HOLD}]
     if phases:
         return phases[0].start_s, phases[-1].end_s
     cell = run.forces.get("load_cell")
-    if cell is not None and (touched := cell.value_n > _TOUCHED * cell.value_n.max()).any():
+    if cell is not None and (touched := cell.value_n > _TOUCH_SHARE * cell.value_n.max()).any():
         return float(cell.t_s[touched][0]), float(cell.t_s[touched][-1])
     return run.begin_s, run.end_s
 
 
-def _estimator(run: Run) -> "tuple[ForceEstimator | None, str]":
-    if "vision" not in run.forces:
+def _open_estimator(config: "Config", digest: str) -> "tuple[ForceEstimator | None, str]":
+    if not digest:
         return None, ""
-    # Loaded here, as a recording without estimates needs no network and its libraries are slow to import.
+    # Imported here: a recording without estimates needs no network, and these imports are slow.
     from gripper_force.vision.estimator import open_estimator
     from gripper_force.vision.model_files import read_model
 
     try:
-        checkpoint = read_model(run.config.vision.checkpoint)
+        checkpoint = read_model(config.vision.checkpoint)
     except CheckpointError as error:
         return None, f"Attention is not shown: {error}."
-    if checkpoint.digest != run.metadata.get("checkpoint"):
-        return None, f"Attention is not shown: {run.config.vision.checkpoint!r} is not the run's checkpoint."
-    estimator = open_estimator(checkpoint, run.config.vision)
-    return estimator, "Laid over: where the network looks (spatial attention), from dark to bright."
+    if checkpoint.digest != digest:
+        return None, f"Attention is not shown: {config.vision.checkpoint!r} is not the run's checkpoint."
+    return open_estimator(checkpoint, config.vision), "Overlay: spatial attention, from dark to bright."
 
 
-def _picture(frame: Frame, run: Run, attention: npt.NDArray[np.float32] | None) -> Picture:
-    gray = downscale(frame.gray, run.config.vision.region, _SIDE)
-    t_s = (frame.t_ns - run.zero_ns) / NS_PER_S
+def _picture(frame: _Candidate, t_s: float, run: Run) -> Picture:
+    attention = frame.attention if "vision" in run.forces else None
+    gray = frame.gray
     image = np.repeat(gray[:, :, None], 3, axis=2) if attention is None else overlay(gray, attention)
     return Picture(t_s, image, _at(run, "vision", t_s), _at(run, "load_cell", t_s))
 
 
-def overlay(gray: Gray, attention: npt.NDArray[np.float32]) -> Colour:
-    """A frame, (S, S), with a map, (h, w) in 0..1, in colour over it; the weight follows the map."""
+def overlay(gray: Gray, attention: Attention) -> Colour:
+    """Returns a frame, (S, S), in colour with attention over it, whose opacity follows the attention."""
     spread = cv2.resize(attention, gray.shape[::-1], interpolation=cv2.INTER_CUBIC).clip(0, 1)  # (S, S)
     spread = (spread - spread.min()) / max(float(np.ptp(spread)), 1e-6)
     heat = colormaps["inferno"](spread)[:, :, :3] * 255  # (S, S, 3)

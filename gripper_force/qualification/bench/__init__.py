@@ -1,1 +1,1 @@
-"""Benchmarks. Each one alternates with its comparison, so that their ratio holds on a noisy machine."""
+"""Benchmarks. Each alternates with what it is compared with, so that ratios are valid on a busy machine."""

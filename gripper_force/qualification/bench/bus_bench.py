@@ -1,4 +1,4 @@
-"""Cost of a servo bus cycle: the driver beside a plain loop of the vendor's SDK and bare bytes."""
+"""Cost of a servo bus cycle: the driver, a plain loop of the vendor's SDK, and bare bytes."""
 
 import multiprocessing
 import os
@@ -28,40 +28,43 @@ from gripper_hw.dynamixel.virtual import VirtualBus
 BUS_SETTINGS: Final = tuple(
     (baud_rate, latency_ms) for latency_ms in (0.0, 1.0) for baud_rate in (1_000_000, 2_000_000, 4_000_000)
 )
-"""Bits a second, and how much later than on the wire an answer comes out of the adapter."""
+"""Baud rate in bits per second, and latency of the adapter in ms after an answer was on the wire."""
 
 _MODEL: Final = "XM430-W350"
 _IDS: Final = (1, 2)
 _RATE_HZ: Final = 200
 _TURN: Final = 50
-"""Cycles of one client before those of the other."""
+"""Cycles of one client before the next client's turn."""
 
 _FIRMWARE: Final = 52
 _READ_SIZE, _WRITE_OFFSET, _WRITE_SIZE = 16, 13, 6
-"""As the driver's; it reads 13 to 20 bytes in turn."""
+"""Sizes as of the driver, which reads 13 to 20 bytes, varying from cycle to cycle."""
 
-_BITS_A_BYTE: Final = 10
+_BITS_PER_BYTE: Final = 10
+"""Start bit, 8 data bits and stop bit."""
+
 _OVERSLEPT_NS: Final = 150_000
+"""Time before a deadline from which the line process polls, as a sleep ends late."""
 
-_PATIENCE_MS: Final = 1000.0
-"""More than a session's: on a busy machine the line itself may be late, and is to be measured anyhow."""
+_REPLY_MARGIN_MS: Final = 1000.0
+"""Longer than in a session: on a busy machine the line process itself may be late."""
 
 Cycle = Callable[[], object]
 
 
 @dataclass(frozen=True, slots=True)
 class BusCost:
-    """What a cycle takes, a read of two servos and a write of their goals, by one client at one setting.
+    """Cost of a cycle, a read of two servos and a write of their goals, for one client at one setting.
 
     Attributes:
         client: ``driver``; ``plain SDK``, GroupSyncRead and GroupSyncWrite over the SDK's own port, as in its
-            examples; or ``bare bytes``, packets made beforehand: what this machine takes to carry them.
-        baud_rate: Bits a second.
-        latency_ms: See `BUS_SETTINGS`.
-        line_ms: What the line alone takes: the bytes' own time, and the latency.
-        p50_ms: Median of a cycle, back to back with the next.
-        p99_ms: 99th percentile of it.
-        cpu_share: Share of one CPU that the client takes at 200 cycles a second.
+            examples; or ``bare bytes``, precomputed packets, which shows the cost of this machine's I/O.
+        baud_rate: Bits per second.
+        latency_ms: Latency of the adapter, see `BUS_SETTINGS`.
+        line_ms: Time of the line alone: transmission of the bytes, and the latency.
+        p50_ms: Median time of a cycle, back to back with the next.
+        p99_ms: 99th percentile of that time.
+        cpu_share: Share of one CPU that the client uses at 200 cycles per second.
     """
 
     client: str
@@ -74,28 +77,31 @@ class BusCost:
 
 
 def bus(cycles: int) -> Iterator[tuple[BusCost, ...]]:
-    """Measures the servo's driver, beside what `BusCost` names, setting by setting.
+    """Measures the clients of `BusCost` at each setting of `BUS_SETTINGS`.
 
     Args:
-        cycles: How many of each client at each setting.
+        cycles: Cycles of each client at each setting.
+
+    Yields:
+        The costs at a setting, one per client.
 
     Raises:
-        DeviceError: The driver gave the line up, on a machine that is far too busy.
+        DeviceError: The driver gave up, because the machine is far too busy.
     """
     for baud_rate, latency_ms in BUS_SETTINGS:
         yield bus_cost(baud_rate, latency_ms, cycles)
 
 
 def bus_cost(baud_rate: int, latency_ms: float, cycles: int) -> tuple[BusCost, ...]:
-    """Measures the clients that `BusCost` names, in turn.
+    """Measures the clients of `BusCost` at one setting, in turns.
 
     Args:
-        baud_rate: Bits a second.
-        latency_ms: How much later than on the wire an answer comes out of the adapter.
-        cycles: How many of each client.
+        baud_rate: Bits per second.
+        latency_ms: Latency of the adapter.
+        cycles: Cycles of each client.
 
     Raises:
-        DeviceError: The driver gave the line up.
+        DeviceError: The driver gave up.
     """
     with _line(baud_rate, latency_ms) as (paths, sent), ExitStack() as stack:
         clients = {
@@ -124,7 +130,7 @@ def bus_cost(baud_rate: int, latency_ms: float, cycles: int) -> tuple[BusCost, .
 @contextmanager
 def _driver(path: str, baud_rate: int) -> Iterator[Cycle]:
     config = ServoConfig(
-        model=_MODEL, port=path, baud_rate=baud_rate, bus_watchdog_ms=2540, reply_margin_ms=_PATIENCE_MS
+        model=_MODEL, port=path, baud_rate=baud_rate, bus_watchdog_ms=2540, reply_margin_ms=_REPLY_MARGIN_MS
     )
     bus = DynamixelBus(config, _IDS)
 
@@ -168,7 +174,7 @@ def _plain_sdk(path: str, baud_rate: int) -> Iterator[Cycle]:
 
 @contextmanager
 def _bare_bytes(path: str) -> Iterator[Cycle]:
-    """The driver's packets, made beforehand: what the machine itself takes to carry them to and fro."""
+    """Client that sends precomputed packets of the driver: the cost of the machine's I/O alone."""
     data = load_model(_MODEL).indirect_windows(_FIRMWARE)[0].data
     read = frame(BROADCAST_ID, Instruction.FAST_SYNC_READ, struct.pack("<HH", data, _READ_SIZE) + bytes(_IDS))
     goals = b"".join(bytes((id_,)) + bytes(_WRITE_SIZE) for id_ in _IDS)
@@ -196,7 +202,7 @@ def _time_ns(cycle: Cycle) -> int:
 
 
 def _cpu_share(cycle: Cycle, cycles: int) -> float:
-    """Share of a CPU that this thread takes for so many cycles at 200 Hz."""
+    """Share of a CPU that this thread uses for ``cycles`` cycles at 200 Hz."""
     start_ns, cpu_ns = time.monotonic_ns(), time.thread_time_ns()
     for i in range(1, cycles + 1):
         cycle()
@@ -205,15 +211,15 @@ def _cpu_share(cycle: Cycle, cycles: int) -> float:
 
 
 def _wire_ns(count: int, baud_rate: int) -> float:
-    return count * _BITS_A_BYTE * NS_PER_S / baud_rate
+    return count * _BITS_PER_BYTE * NS_PER_S / baud_rate
 
 
-# The line: a process of its own, as it must neither share Python's lock with a client nor be late.
+# The line runs in a separate process, as it must neither share Python's lock with a client nor be late.
 
 
 @contextmanager
 def _line(baud_rate: int, latency_ms: float) -> Iterator[tuple[list[str], Sequence[int]]]:
-    """Serves a virtual bus to three clients: their paths, and how many bytes went over the wire for each."""
+    """Serves a virtual bus to three clients. Yields their paths, and the bytes on the wire for each."""
     context = multiprocessing.get_context("spawn")
     sent: MutableSequence[int] = context.RawArray("q", 3)
     here, there = context.Pipe()
@@ -228,7 +234,7 @@ def _line(baud_rate: int, latency_ms: float) -> Iterator[tuple[list[str], Sequen
 
 
 def _serve(parent: Connection, sent: MutableSequence[int], baud_rate: int, latency_ms: float) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's, which lets go then
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C, and then closes the pipe
     bus = VirtualBus(VirtualServo(id_, load_model(_MODEL)) for id_ in _IDS)
     clients = {}
     paths = []
@@ -238,7 +244,7 @@ def _serve(parent: Connection, sent: MutableSequence[int], baud_rate: int, laten
         clients[master] = i
         paths.append(os.ttyname(slave))
     parent.send(paths)
-    free_ns = 0.0  # when the wire is
+    free_ns = 0.0  # time from which the wire is free
     while parent.fileno() not in (ready := select.select([parent.fileno(), *clients], [], [])[0]):
         for master in ready:
             request = os.read(master, 4096)
@@ -252,7 +258,7 @@ def _serve(parent: Connection, sent: MutableSequence[int], baud_rate: int, laten
 
 
 def _wait_until(t_ns: float) -> None:
-    """Sleeps, but for the last moments: a sleep ends late."""
+    """Sleeps until shortly before a time and then polls, as a sleep ends late."""
     if (left_ns := t_ns - _OVERSLEPT_NS - time.monotonic_ns()) > 0:
         time.sleep(left_ns / NS_PER_S)
     while time.monotonic_ns() < t_ns:

@@ -1,4 +1,4 @@
-"""What commands take: time and memory."""
+"""Time and memory of commands."""
 
 import os
 import subprocess
@@ -27,27 +27,27 @@ COMMANDS: Final = (
     "calibrate camera --object sponge --seed 3 --set sim.markers=true --rig rig.yaml",
     "calibrate object tube --touches 3 --folder touches --out tube.yaml",
     "reproduce 7",
-    "stability --part filter",
-    "stability --fuzz 10000",
-    "stability --soak 60",
-    "bench --bus --cycles 100",
+    "stability numerics --part filter",
+    "stability fuzz --cases 10000",
+    "stability soak --seconds 60",
+    "bench bus --cycles 100",
     "doctor",
 )
-"""What `commands` measures, in this order, in one folder: some need what others made."""
+"""Command lines that `commands` runs, in this order and in one folder: some use files of earlier ones."""
 
-_SOUND: Final = (0, 1)
-"""Exit codes: done, and done with something found."""
+_ALLOWED: Final = (0, 1)
+"""Exit codes of a command that ran; 1 for a bad result."""
 
 
 @dataclass(frozen=True, slots=True)
 class CommandCost:
-    """What a command takes.
+    """Cost of a command.
 
     Attributes:
-        command: Its arguments.
-        wall_s: Time.
-        cpu_s: Time of the CPUs, of all its processes.
-        memory_mb: Peak memory (resident set) of its largest process.
+        command: Arguments of ``gripper-force``.
+        wall_s: Duration.
+        cpu_s: CPU time of all its processes.
+        memory_mb: Peak resident memory of its largest process.
     """
 
     command: str
@@ -57,10 +57,10 @@ class CommandCost:
 
 
 def commands(lines: Sequence[str] = COMMANDS) -> Iterator[CommandCost]:
-    """Runs commands, each in a process of its own, in a folder that is gone afterwards.
+    """Runs commands, each in its own process, in a temporary folder.
 
     Raises:
-        GripperError: One failed.
+        GripperError: A command failed.
     """
     with TemporaryDirectory() as name:
         folder = Path(name)
@@ -77,7 +77,7 @@ def commands(lines: Sequence[str] = COMMANDS) -> Iterator[CommandCost]:
                 _, status, usage = os.wait4(process.pid, 0)
                 process.returncode = os.waitstatus_to_exitcode(status)
                 wall_s = time.monotonic() - begin_s
-                if process.returncode not in _SOUND:
+                if process.returncode not in _ALLOWED:
                     stderr.seek(0)
                     raise GripperError(f"gripper-force {line} failed: {stderr.read().strip()[-500:]}")
             yield CommandCost(line, wall_s, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024)

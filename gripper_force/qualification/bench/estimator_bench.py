@@ -1,7 +1,7 @@
-"""The visual estimate's speed against its error: every model, engine, precision and number of threads.
+"""Speed and error of the visual estimate: every model, engine, precision and number of threads.
 
-All ways take turns, a few steps each, so that their ratios hold on a machine that does other things as well.
-The paper's way, the whole window for each frame, is measured among them.
+All variants alternate, a few steps each, so that their ratios are valid on a busy machine. They include the
+paper's method, which processes the whole window for each frame.
 """
 
 import json
@@ -14,36 +14,39 @@ from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Final, get_args
+from typing import Final, TypedDict, get_args
 
 import numpy as np
 import torch
 
 from gripper_force.errors import ConfigError
+from gripper_force.interfaces import Progress
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import Clip
 from gripper_force.qualification.bench.roofline import Roofline, measure
 from gripper_force.types import NS_PER_MS
-from gripper_force.vision import selection
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.engines import Engine, Floats, Precision, open_engine
 from gripper_force.vision.export import export, inputs_of
 from gripper_force.vision.header import Model
 from gripper_force.vision.model_files import cache_folder, read_model
-from gripper_force.vision.selection import Candidate, installed, key_of
+from gripper_force.vision.selection import installed
+from gripper_force.vision.step_benchmark import Candidate, cache_key, update_cache
 
 WINDOW: Final = "torch, window"
-"""The paper's way: each frame passes the network with the whole window before it."""
+"""The paper's method: for each frame, the network processes the whole window before it."""
 
 PLAIN_WINDOW: Final = "torch, window, plain"
-"""The same with channels first, as PyTorch builds a network, where ours have them last."""
+"""The same with channels first, PyTorch's default layout; ours is channels last."""
 
 _ROUNDS: Final = 40
+"""Rounds in which each variant has its turn."""
+
 _STEPS: Final = 15
-"""Steps of each way in a round."""
+"""Steps of each variant in a round."""
 
 _WINDOWS: Final = 2
-"""Windows in a round: they take a hundred times as long."""
+"""Windows in a round; a window takes a hundred times as long as a step."""
 
 _MEMORY: Final = """
 import sys
@@ -58,29 +61,30 @@ for _ in range(30):
 status = open("/proc/self/status").read()
 print(int(status.split("VmHWM:")[1].split()[0]) / 1024)
 """
+"""Program that prints the peak memory in MB of a process that only computes estimates."""
 
 
 @dataclass(frozen=True, slots=True)
 class EstimatorCost:
-    """One way to compute an estimate.
+    """Cost and error of one variant.
 
     Attributes:
         checkpoint: Name or path.
         members: Networks of the ensemble.
         size: Side of the input in pixels.
         engine: As ``vision.engine``, or `WINDOW` or `PLAIN_WINDOW`.
-        precision: float32, bfloat16, or int8: the convolutions so, and the rest in bfloat16.
+        precision: float32, bfloat16, or int8 (convolutions in int8, the rest in bfloat16).
         threads: CPU threads.
         p50_ms: Median time of a frame.
-        p99_ms: 99th percentile of it.
-        frames_s: Frames a second, one after the other.
-        least_ms: The machine's roofline for this network and precision.
-        memory_mb: Peak memory of a process that computes nothing else; None where it was not measured.
+        p99_ms: 99th percentile of that time.
+        frames_s: Frames per second, one after the other.
+        least_ms: Roofline of this machine for this network and precision; None for windows.
+        memory_mb: Peak memory of a process that computes nothing else; None if not measured.
         mae_n: Mean absolute error on the held-out frames.
         rmse_n: Root mean squared error.
         worst_n: Largest error.
-        frames: Held-out frames.
-        front: Whether no other way is faster and more exact.
+        frames: Number of held-out frames.
+        front: True if no other variant is both faster and more accurate.
     """
 
     checkpoint: str
@@ -103,13 +107,10 @@ class EstimatorCost:
 
 @dataclass
 class _Timed:
-    """One way that takes turns with others."""
+    """A variant that alternates with others, and its step times so far."""
 
     step: Callable[[Floats], object]
     taken_ns: list[int]
-
-
-Advance = Callable[[str], None]
 
 
 def bench(
@@ -117,71 +118,73 @@ def bench(
     held_out: Callable[[Model], Sequence[Clip]],
     scaling: Callable[[Model], Sequence[Clip]],
     threads: Sequence[int],
-    advance: Advance,
+    progress: Progress,
 ) -> list[EstimatorCost]:
-    """Measures every way to run each checkpoint that this machine can.
+    """Measures every variant of each checkpoint that this machine can run.
 
     Args:
         sources: Checkpoints, by name or path.
-        held_out: Reads recordings that training never saw, at the model's size.
-        scaling: Reads recordings to scale int8 on: others than these.
+        held_out: Loads recordings that were not in the training data, at the model's size.
+        scaling: Loads other recordings, to calibrate int8 on.
         threads: Numbers of CPU threads.
-        advance: Told what was done.
+        progress: Called after each measurement.
 
     Raises:
-        ConfigError: A package is missing.
+        ConfigError: A package is not installed, or an engine fails in a separate process.
         CheckpointError: A checkpoint can't be read.
-        DataError: The recordings are too few.
+        DataError: There are too few recordings.
     """
     logging.getLogger("nncf").setLevel(logging.ERROR)
     roofs = {(p, t): measure(p, t) for p in ("float32", "bfloat16", "int8") for t in threads}
-    advance("roofline")
+    progress("roofline")
     rows: list[EstimatorCost] = []
     for source in sources:
         model = read_model(source)
         clips = held_out(model)
-        eights = cache_folder() / f"{model.digest[:32]}-int8.xml"
-        export(model, eights, [clip.frames for clip in scaling(model)])
-        advance(f"{source}: int8")
-        ways = [(model, *way) for way in _ways()]
-        ways += [(read_model(eights), "openvino", "int8", "bfloat16")]
-        for each in _timed(source, model, ways, clips, threads, roofs, advance):
+        int8_path = cache_folder() / f"{model.digest[:32]}-int8.xml"
+        export(model, int8_path, [clip.frames for clip in scaling(model)])
+        progress(f"{source}: int8")
+        variants = [(model, *variant) for variant in _variants()]
+        variants += [(read_model(int8_path), "openvino", "int8", "bfloat16")]
+        for each in _measure(source, model, variants, clips, threads, roofs, progress):
             rows.append(each)
     return _with_front(rows)
 
 
-def _ways() -> list[tuple[str, str, Precision]]:
-    """Engine, the precision's name and its setting."""
-    ways: list[tuple[str, str, Precision]] = []
+def _variants() -> list[tuple[str, str, Precision]]:
+    """Engine, name of the precision, and precision setting of each variant."""
+    variants: list[tuple[str, str, Precision]] = []
     for engine in installed():
         for precision in get_args(Precision):
             if precision == "float32" or engine == "openvino":
-                ways.append((engine, precision, precision))
-    return ways
+                variants.append((engine, precision, precision))
+    return variants
 
 
-def _timed(
+def _measure(
     source: str,
     model: Model,
-    ways: Sequence[tuple[Model, str, str, Precision]],
+    variants: Sequence[tuple[Model, str, str, Precision]],
     clips: Sequence[Clip],
     threads: Sequence[int],
     roofs: dict[tuple[str, int], Roofline],
-    advance: Advance,
+    progress: Progress,
 ) -> Iterator[EstimatorCost]:
     errors: dict[tuple[str, str], dict[str, float]] = {}
     frames = list(inputs_of(model, clips[0].frames))
     for count in threads:
         engines = {}
-        for file, engine, name, precision in ways:
+        for file, engine, name, precision in variants:
             engines[engine, name] = open_engine(file, engine, precision, count)
             if (engine, name) not in errors:
                 errors[engine, name] = _errors(engines[engine, name], model, clips)
-                advance(f"{source}: {engine}, {name}: {errors[engine, name]['mae_n']:.3f} N")
+                progress(f"{source}: {engine}, {name}: {errors[engine, name]['mae_n']:.3f} N")
         for window in (WINDOW, PLAIN_WINDOW):
             errors[window, "float32"] = errors["torch", "float32"]
-        taken = _in_turns({way: _Timed(engine.step, []) for way, engine in engines.items()}, model, frames)
-        advance(f"{source}: {count} threads")
+        taken = _in_turns(
+            {variant: _Timed(engine.step, []) for variant, engine in engines.items()}, model, frames
+        )
+        progress(f"{source}: {count} threads")
         for (engine, name), taken_ns in taken.items():
             p50_ms, p99_ms = np.percentile(taken_ns, [50, 99]) / NS_PER_MS
             row = EstimatorCost(
@@ -204,16 +207,16 @@ def _timed(
                 frames=int(errors[engine, name]["frames"]),
             )
             if not engine.startswith(WINDOW):
-                file, precision = next((f, p) for f, e, n, p in ways if (e, n) == (engine, name))
+                file, precision = next((f, p) for f, e, n, p in variants if (e, n) == (engine, name))
                 row = replace(row, memory_mb=_memory_mb(file, engine, precision, count))
-                way = Candidate(source, engine, precision, count, row.p50_ms, row.p99_ms, row.mae_n)
+                candidate = Candidate(source, engine, precision, count, row.p50_ms, row.p99_ms, row.mae_n)
                 if file is model:
-                    selection.remember({key_of(model, engine, precision, count): way})
+                    update_cache({cache_key(model, engine, precision, count): candidate})
             yield row
 
 
 def _errors(engine: Engine, model: Model, clips: Sequence[Clip]) -> dict[str, float]:
-    """Over all frames that have a label, as a run would see them."""
+    """Errors over all labelled frames, streamed as in a run."""
     estimates, measured = [], []
     for clip in clips:
         engine.reset()
@@ -244,22 +247,22 @@ def _in_turns(
         PLAIN_WINDOW: _Timed(lambda _: [network(clip, clip.shape[1] - 1) for network in plain], []),
     }
     for turn in range(_ROUNDS + 1):
-        for way in timed.values():
-            _take(way, frames, _STEPS, keep=turn > 0)
+        for variant in timed.values():
+            _time_steps(variant, frames, _STEPS, keep=turn > 0)
         if turn % 4 == 0:
             for window in windows.values():
-                _take(window, frames, _WINDOWS, keep=turn > 0)
+                _time_steps(window, frames, _WINDOWS, keep=turn > 0)
     taken_ns = {(name, "float32"): window.taken_ns for name, window in windows.items()}
-    return taken_ns | {name: way.taken_ns for name, way in timed.items()}
+    return taken_ns | {name: variant.taken_ns for name, variant in timed.items()}
 
 
-def _take(way: _Timed, frames: Sequence[Floats], steps: int, *, keep: bool) -> None:
+def _time_steps(variant: _Timed, frames: Sequence[Floats], steps: int, *, keep: bool) -> None:
     for i in range(steps):
         begin_ns = time.perf_counter_ns()
-        way.step(frames[i % len(frames)])
+        variant.step(frames[i % len(frames)])
         taken_ns = time.perf_counter_ns() - begin_ns
         if keep:
-            way.taken_ns.append(taken_ns)
+            variant.taken_ns.append(taken_ns)
 
 
 def _memory_mb(model: Model, engine: str, precision: str, threads: int) -> float:
@@ -270,14 +273,14 @@ def _memory_mb(model: Model, engine: str, precision: str, threads: int) -> float
         check=False,
     )
     if done.returncode:
-        raise ConfigError(f"{engine} does not run in a process of its own: {done.stderr.strip()[-300:]}")
+        raise ConfigError(f"{engine} fails in a separate process: {done.stderr.strip()[-300:]}")
     return float(done.stdout.split()[-1])
 
 
 def _with_front(rows: Sequence[EstimatorCost]) -> list[EstimatorCost]:
-    """Marks the ways that no other beats in both time and error."""
+    """Marks the Pareto front of time and error."""
 
-    def beaten(row: EstimatorCost) -> bool:
+    def dominated(row: EstimatorCost) -> bool:
         return any(
             other.p50_ms <= row.p50_ms
             and other.mae_n <= row.mae_n
@@ -285,19 +288,23 @@ def _with_front(rows: Sequence[EstimatorCost]) -> list[EstimatorCost]:
             for other in rows
         )
 
-    return [replace(row, front=not beaten(row)) for row in rows]
+    return [replace(row, front=not dominated(row)) for row in rows]
 
 
 def write_json(path: Path, rows: Sequence[EstimatorCost]) -> None:
-    """Keeps what was measured, and on what."""
-    about = {"machine": platform.platform(), "python": platform.python_version(), "torch": torch.__version__}
+    """Writes the results, and the machine they were measured on."""
+    machine = {
+        "machine": platform.platform(),
+        "python": platform.python_version(),
+        "torch": torch.__version__,
+    }
     path.parent.mkdir(parents=True, exist_ok=True)
-    text = json.dumps({**about, "estimator": [asdict(row) for row in rows]}, indent=1)
+    text = json.dumps({**machine, "estimator": [asdict(row) for row in rows]}, indent=1)
     path.write_text(text, encoding="utf-8")
 
 
 def draw(path: Path, rows: Sequence[EstimatorCost]) -> None:
-    """Plots error against time, and the front."""
+    """Plots error over time, with the Pareto front."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -328,14 +335,14 @@ def draw(path: Path, rows: Sequence[EstimatorCost]) -> None:
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter("{x:g}")
         axes.yaxis.set_minor_formatter("{x:g}")
-        axes.set_xlabel("median time of a frame, ms (filled: more than one thread)")
+        axes.set_xlabel("median time per frame, ms (filled: more than one thread)")
         axes.set_ylabel("mean absolute error, N")
         axes.legend(loc="lower left", bbox_to_anchor=(1.0, 0.0), fontsize=8)
         figure.savefig(path, dpi=130)
 
 
 def markdown(rows: Sequence[EstimatorCost]) -> str:
-    """The table for a page."""
+    """Markdown table of the results."""
     lines = [
         "| checkpoint | networks, px | engine | precision | threads | p50, p99 ms | over roofline "
         "| MAE, RMSE, worst N | MB | front |",
@@ -353,24 +360,47 @@ def markdown(rows: Sequence[EstimatorCost]) -> str:
     return "\n".join(lines) + "\n"
 
 
-Ratios = dict[str, dict[str, Any]]
+class Ratio(TypedDict):
+    """The fastest accurate variant of a checkpoint, compared with whole windows.
+
+    Attributes:
+        fastest: Engine, precision and threads of the variant.
+        p50_ms: Its median time.
+        p99_ms: Its 99th percentile.
+        times_faster_than_window: Median time of `WINDOW` over that of the variant.
+        times_faster_than_plain_window: Median time of `PLAIN_WINDOW` over that of the variant.
+        mae_over_float32: Error of the variant over that of float32.
+    """
+
+    fastest: str
+    p50_ms: float
+    p99_ms: float
+    times_faster_than_window: float
+    times_faster_than_plain_window: float
+    mae_over_float32: float
+
+
+Ratios = dict[str, Ratio]
+"""Ratio by checkpoint."""
 
 
 def ratios(rows: Sequence[EstimatorCost]) -> Ratios:
-    """Of each checkpoint: the fastest way that keeps the error, against the window, ours and the plain one.
+    """Compares the fastest accurate variant of each checkpoint with whole windows, each at its best threads.
 
-    Kept is an error at most 2 % over that of float32. Each has as many threads as serve it best.
+    Accurate means an error of at most 1.02 times that of float32.
     """
-    told: Ratios = {}
+    result: Ratios = {}
     for source in dict.fromkeys(row.checkpoint for row in rows):
         own = [row for row in rows if row.checkpoint == source]
         window, plain = (
-            min((row for row in own if row.engine == way), key=lambda row: row.p50_ms)
-            for way in (WINDOW, PLAIN_WINDOW)
+            min((row for row in own if row.engine == name), key=lambda row: row.p50_ms)
+            for name in (WINDOW, PLAIN_WINDOW)
         )
-        exact = [row for row in own if not row.engine.startswith(WINDOW) and row.mae_n <= 1.02 * window.mae_n]
-        best = min(exact, key=lambda row: row.p50_ms)
-        told[source] = {
+        accurate = [
+            row for row in own if not row.engine.startswith(WINDOW) and row.mae_n <= 1.02 * window.mae_n
+        ]
+        best = min(accurate, key=lambda row: row.p50_ms)
+        result[source] = {
             "fastest": f"{best.engine}, {best.precision}, {best.threads} threads",
             "p50_ms": best.p50_ms,
             "p99_ms": best.p99_ms,
@@ -378,4 +408,4 @@ def ratios(rows: Sequence[EstimatorCost]) -> Ratios:
             "times_faster_than_plain_window": plain.p50_ms / best.p50_ms,
             "mae_over_float32": best.mae_n / window.mae_n,
         }
-    return told
+    return result

@@ -1,4 +1,4 @@
-"""What this machine could do at best: matrix products a second, and bytes a second, measured as they are now.
+"""Roofline of this machine: measured rate of matrix products, and of reading weights.
 
 S. Williams, A. Waterman, D. Patterson, "Roofline: an insightful visual performance model for multicore
 architectures", Communications of the ACM 52 (2009) 65-76, doi:10.1145/1498765.1498785.
@@ -17,23 +17,24 @@ from gripper_force.vision.header import NetworkConfig
 from gripper_force.vision.network import cost
 
 _SIDE: Final = 1024
-"""Side of the matrices whose product tells the arithmetic rate: nothing else limits one so large."""
+"""Side of the matrices for the arithmetic rate; products of this size are limited by arithmetic only."""
 
 _BYTES: Final = {"float32": 4, "bfloat16": 2, "int8": 1}
-"""Of a weight."""
+"""Bytes per weight."""
 
 _PRODUCTS: Final = 30
+"""Repetitions; the fastest counts."""
 
 
 @dataclass(frozen=True, slots=True)
 class Roofline:
-    """Rates of this machine.
+    """Highest rates of this machine.
 
     Attributes:
         precision: float32, bfloat16 or int8.
         threads: CPU threads.
-        flops: Operations a second of a matrix product, additions and multiplications.
-        bytes_s: Bytes a second at which a matrix as large as a network's weights is read.
+        flops: Additions and multiplications per second of a matrix product.
+        bytes_s: Bytes per second when reading a matrix as large as a network's weights.
     """
 
     precision: str
@@ -42,7 +43,7 @@ class Roofline:
     bytes_s: float
 
     def least_ms(self, members: Sequence[NetworkConfig]) -> float:
-        """The least time of an ensemble's step: of its arithmetic, or of reading its weights, if longer."""
+        """Shortest possible time of an ensemble's step in ms: its arithmetic, or reading its weights, if longer."""
         costs = [cost(member) for member in members]
         arithmetic_s = 2 * sum(multiply_adds for _, multiply_adds in costs) / self.flops
         reading_s = _BYTES[self.precision] * sum(parameters for parameters, _ in costs) / self.bytes_s
@@ -50,14 +51,19 @@ class Roofline:
 
 
 def measure(precision: str, threads: int) -> Roofline:
-    """Measures with OpenVINO, which has the fastest products here."""
+    """Measures the rates with OpenVINO, which has the fastest matrix products.
+
+    Args:
+        precision: float32, bfloat16 or int8.
+        threads: CPU threads.
+    """
     square = 2 * _SIDE**3 / _least_s(precision, threads, _SIDE)
     read = _BYTES[precision] * _SIDE**2 * 2 / _least_s(precision, threads, 1, columns=2 * _SIDE)
     return Roofline(precision, threads, square, read)
 
 
 def _least_s(precision: str, threads: int, rows: int, columns: int = _SIDE) -> float:
-    """The least time of a product (rows, 1024) x (1024, columns)."""
+    """Shortest measured time of a product (rows, 1024) x (1024, columns), in s."""
     import openvino
     from openvino import opset13 as ops
 
@@ -69,7 +75,7 @@ def _least_s(precision: str, threads: int, rows: int, columns: int = _SIDE) -> f
     if precision == "int8":
         import nncf
 
-        with redirect_stdout(StringIO()):  # it shows its progress there
+        with redirect_stdout(StringIO()):  # NNCF prints its progress on stdout
             model = nncf.quantize(model, nncf.Dataset([data]), subset_size=1)
     hint = "bf16" if precision == "bfloat16" else "f32"
     settings = {"INFERENCE_PRECISION_HINT": hint, "INFERENCE_NUM_THREADS": threads, "NUM_STREAMS": 1}

@@ -1,4 +1,4 @@
-"""Speed against error of the simulated scene: each object at each level of detail, against the finest."""
+"""Speed and error of the simulated scene: each object at each level of detail, compared with the finest."""
 
 import time
 from collections.abc import Iterable, Iterator
@@ -10,33 +10,42 @@ import numpy.typing as npt
 
 from gripper_force.config import GripperConfig
 from gripper_force.types import NS_PER_MS, NS_PER_S
-from gripper_hw.sim.detail_level import keep
+from gripper_hw.sim.detail_level import write_table
 from gripper_hw.sim.objects import OBJECTS, Detail
 from gripper_hw.sim.scene import Scene
 from gripper_hw.sim.world import World
 
 _CLOSING_M_S: Final = 0.016
-_MOST_N: Final = 10.0
-_LONGEST_NS: Final = 4 * NS_PER_S
+"""Closing speed of the jaws on the path."""
+
+_MAX_FORCE_N: Final = 10.0
+"""Force at which a squeeze ends."""
+
+_MAX_NS: Final = 4 * NS_PER_S
+"""Longest squeeze, in simulated time."""
+
 _SAMPLE_NS: Final = 5 * NS_PER_MS
-_TIMES: Final = 2
+"""Interval of the compared forces."""
+
+_REPEATS: Final = 2
+"""Runs of each scene; the faster one counts."""
 
 Curve = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class SceneCost:
-    """An object at a level of detail, squeezed along one path up to 10 N: physics alone, without noise.
+    """Cost of an object at a level of detail, squeezed along a fixed path up to 10 N, physics only, no noise.
 
     Attributes:
-        object: Its name.
-        detail: The level.
-        unknowns: Degrees of freedom of the scene: how fine the mesh is.
+        object: Name of the object.
+        detail: Level of detail.
+        unknowns: Degrees of freedom of the scene.
         step_ms: Time step.
-        iterations: The solver's iterations in a step, on the average.
-        speed: Simulated seconds a second of one CPU.
-        error_n: Root mean square difference of its force from the finest level's at equal travel.
-        worst_n: The greatest difference.
+        iterations: Mean number of solver iterations per step.
+        speed: Simulated seconds per CPU second.
+        error_n: RMS difference of the force to the finest level at equal travel.
+        worst_n: Largest difference.
     """
 
     object: str
@@ -50,7 +59,7 @@ class SceneCost:
 
 
 class _FollowPath:
-    """A motor that moves the jaws along the path with more current than any object needs."""
+    """Motor that moves the jaws along the path, with more current than any object needs."""
 
     def control(self, t_ns: int, position_rad: float, velocity_rad_s: float, current_noise_a: float) -> float:
         goal_rad = _CLOSING_M_S / GripperConfig().pinion_radius_m * t_ns / NS_PER_S
@@ -58,7 +67,7 @@ class _FollowPath:
 
 
 class _Squeeze(NamedTuple):
-    """Force every 5 ms of the path, (N,), and what it took."""
+    """Force every 5 ms of the path in N, (N,), and the cost of the simulation."""
 
     force_n: Curve
     unknowns: int
@@ -68,21 +77,21 @@ class _Squeeze(NamedTuple):
 
 
 def scene_costs(names: list[str], keep_table: bool) -> Iterator[SceneCost]:
-    """Squeezes objects up to 10 N at each level, along one path.
+    """Squeezes objects up to 10 N at each level of detail, along one path.
 
     Args:
-        names: Keys of `OBJECTS`; none: all.
-        keep_table: Whether to keep the table for ``sim.detail=auto``.
+        names: Keys of `OBJECTS`; an empty list means all.
+        keep_table: True to write the table of ``sim.detail=auto``.
 
     Raises:
-        ConfigError: There is no such object.
-        SimulationError: A scene broke.
+        ConfigError: An object does not exist.
+        SimulationError: A simulation became unstable.
     """
     table: dict[str, dict[str, dict[str, float]]] = {}
     for name in names or OBJECTS:
-        seen = {detail: _squeeze(name, detail) for detail in get_args(Detail)}
-        fine_n = seen["fine"].force_n
-        for detail, one in seen.items():
+        squeezes = {detail: _squeeze(name, detail) for detail in get_args(Detail)}
+        fine_n = squeezes["fine"].force_n
+        for detail, one in squeezes.items():
             span = min(len(fine_n), len(one.force_n))
             off_n = one.force_n[:span] - fine_n[:span]
             error_n = float(np.sqrt(np.mean(off_n**2)))
@@ -102,18 +111,18 @@ def scene_costs(names: list[str], keep_table: bool) -> Iterator[SceneCost]:
             }
             yield row
     if keep_table:
-        keep(table)
+        write_table(table)
 
 
 def _squeeze(name: str, detail: Detail) -> _Squeeze:
-    """Closes on an object; of two times that this takes, the shorter."""
+    """Squeezes an object twice; the shorter time counts."""
     scene = Scene(name, detail)
     cost_s = []
-    for _ in range(_TIMES):
-        world = World(scene, GripperConfig(), _FollowPath(), nm_per_a=1.78, seed=0, seen=False)
+    for _ in range(_REPEATS):
+        world = World(scene, GripperConfig(), _FollowPath(), nm_per_a=1.78, seed=0, textured=False)
         force_n, iterations = [], []
         begin_s = time.process_time()
-        while world.force_n < _MOST_N and world.t_ns < _LONGEST_NS:
+        while world.force_n < _MAX_FORCE_N and world.t_ns < _MAX_NS:
             world.advance_to(world.t_ns + _SAMPLE_NS)
             force_n.append(world.force_n)
             iterations.append(world.iterations)
@@ -124,7 +133,7 @@ def _squeeze(name: str, detail: Detail) -> _Squeeze:
 
 
 def markdown(rows: Iterable[SceneCost]) -> str:
-    """The table for a page."""
+    """Markdown table of the costs."""
     lines = [
         "| object | detail | unknowns | step, ms | iterations | simulated s/s | RMSE, N | worst, N |",
         "|---|---|---|---|---|---|---|---|",

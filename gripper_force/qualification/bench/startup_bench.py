@@ -1,4 +1,4 @@
-"""What a scene takes until its first control cycle: time, memory, and what is loaded and running by then."""
+"""Start-up of a scene up to its first control cycle: time, memory, loaded modules and running threads."""
 
 import json
 import os
@@ -44,99 +44,99 @@ HEAVY: Final = (
     "gripper_hw.playback",
     "gripper_hw.sim",
 )
-"""Modules that only some scenes ask for: libraries, and rooms of our own."""
+"""Modules that only some scenes need: libraries, and packages of this project."""
 
 _SERVO: Final = frozenset({"dynamixel_sdk", "serial"})
 _SIMULATED: Final = _SERVO | {"gripper_hw.dynamixel.virtual", "gripper_hw.sim", "mujoco"}
-_EYES: Final = frozenset({"gripper_force.vision", "cv2", "safetensors"})
+_VISION: Final = frozenset({"gripper_force.vision", "cv2", "safetensors"})
 
 
 @dataclass(frozen=True, slots=True)
 class StartupCase:
-    """What is started.
+    """A scene to start.
 
     Attributes:
-        name: For the table.
-        asks_for: What of `HEAVY` it may load.
-        threads: Threads it may have besides the main one.
-        settings: Of a grasp, keys of the configuration; ``{servo}``, ``{load_cell}``, ``{log}`` and
-            ``{network}`` stand for what `stand_ins` gives.
-        command: The arguments of another command, run as a whole.
+        name: Name in the table.
+        needs: Modules of `HEAVY` that it may load.
+        threads: Threads that it may have besides the main one.
+        settings: Configuration keys of a grasp; ``{servo}``, ``{load_cell}``, ``{log}`` and ``{network}`` are
+            replaced by the values of `simulated_devices`.
+        command: Arguments of another command, which is run as a whole.
     """
 
     name: str
-    asks_for: frozenset[str] = frozenset()
+    needs: frozenset[str] = frozenset()
     threads: frozenset[str] = frozenset()
     settings: tuple[str, ...] = ()
     command: tuple[str, ...] = ()
 
 
-PATIENT: Final = ("servo.bus_watchdog_ms=2540", "servo.reply_margin_ms=100")
-"""On a busy machine a stand-in for the servo may be late too, and that is not to end what is measured."""
+LONG_TIMEOUTS: Final = ("servo.bus_watchdog_ms=2540", "servo.reply_margin_ms=100")
+"""On a busy machine the virtual servo may be late too, which must not end the measurement."""
 
-_REAL: Final = ("servo.port={servo}", "clock=realtime", *PATIENT)
-_NO_CELL: Final = ("load_cell.backend=none",)
-_BLIND: Final = ("camera.backend=none", "control.feedback=current")
+_REAL: Final = ("servo.port={servo}", "clock=realtime", *LONG_TIMEOUTS)
+_NO_LOAD_CELL: Final = ("load_cell.backend=none",)
+_NO_CAMERA: Final = ("camera.backend=none", "control.feedback=current")
 _RECORDED: Final = ("camera.backend=playback", "camera.path={log}")
 _NO_NETWORK: Final = ("vision.checkpoint=none", "control.feedback=current")
 
 STARTUP_CASES: Final = (
     StartupCase("--help", command=("--help",)),
     StartupCase(
-        "doctor, a real servo alone",  # it lists all devices there are, and asks each room
+        "doctor, real servo alone",  # it lists all devices, through every device package
         _SERVO | {"depthai", "gripper_hw.cameras", "gripper_hw.load_cells", "gripper_hw.sim"},
-        command=("doctor", *(f"--set={key}" for key in (*_REAL, *_NO_CELL, *_BLIND))),
+        command=("doctor", *(f"--set={key}" for key in (*_REAL, *_NO_LOAD_CELL, *_NO_CAMERA))),
     ),
-    StartupCase("real servo", _SERVO, frozenset({"recorder"}), (*_REAL, *_NO_CELL, *_BLIND)),
+    StartupCase("real servo", _SERVO, frozenset({"log_queue"}), (*_REAL, *_NO_LOAD_CELL, *_NO_CAMERA)),
     StartupCase(
         "real servo, serial load cell",
         _SERVO | {"gripper_hw.load_cells"},
-        frozenset({"recorder", "load-cell"}),
-        (*_REAL, *_BLIND, "load_cell.backend=serial", "load_cell.port={load_cell}"),
+        frozenset({"log_queue", "load-cell"}),
+        (*_REAL, *_NO_CAMERA, "load_cell.backend=serial", "load_cell.port={load_cell}"),
     ),
     StartupCase(
         "real servo, recorded camera",
         _SERVO | {"gripper_hw.playback"},
-        frozenset({"recorder", "perception"}),
-        (*_REAL, *_NO_CELL, *_RECORDED, *_NO_NETWORK),
+        frozenset({"log_queue", "perception"}),
+        (*_REAL, *_NO_LOAD_CELL, *_RECORDED, *_NO_NETWORK),
     ),
     *(
         StartupCase(
             f"real servo, recorded camera, {engine}",
-            _SERVO | {"gripper_hw.playback", engine} | _EYES,
-            frozenset({"recorder", "perception"}),
-            (*_REAL, *_NO_CELL, *_RECORDED, "vision.checkpoint={network}", f"vision.engine={engine}"),
+            _SERVO | {"gripper_hw.playback", engine} | _VISION,
+            frozenset({"log_queue", "perception"}),
+            (*_REAL, *_NO_LOAD_CELL, *_RECORDED, "vision.checkpoint={network}", f"vision.engine={engine}"),
         )
         for engine in ("torch", "openvino", "onnxruntime")
         if find_spec(engine) is not None
     ),
-    StartupCase("simulated, motor current alone", _SIMULATED, settings=(*_BLIND, *_NO_CELL)),
-    StartupCase("simulated, load cell", _SIMULATED, settings=_BLIND),
+    StartupCase("simulated, motor current alone", _SIMULATED, settings=(*_NO_CAMERA, *_NO_LOAD_CELL)),
+    StartupCase("simulated, load cell", _SIMULATED, settings=_NO_CAMERA),
     StartupCase(
-        "simulated, a whole grasp without report",
+        "simulated, complete grasp without report",
         _SIMULATED,
-        command=("grasp", *(f"--set={key}" for key in ("object=stapler", *_BLIND, "log.report=false"))),
+        command=("grasp", *(f"--set={key}" for key in ("object=stapler", *_NO_CAMERA, "log.report=false"))),
     ),
     StartupCase("simulated, camera, no network", _SIMULATED | {"cv2"}, settings=_NO_NETWORK),
     StartupCase(
         "simulated, vision (the default)",
-        _SIMULATED | _EYES | {"torch"},
+        _SIMULATED | _VISION | {"torch"},
         settings=("vision.checkpoint={network}",),
     ),
 )
-"""What `startup` starts, and what a test holds to what it asks for."""
+"""Scenes of `startup`. A test checks that each loads only what it needs."""
 
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """What a scene took.
+    """Cost of starting a scene.
 
     Attributes:
-        scene: Its name.
-        time_s: From the start of the process to the end of the first cycle, or of the whole command.
-        memory_mb: Resident set then.
-        loaded: What of `HEAVY` was loaded then.
-        threads: Python's threads then, without the main one.
+        scene: Name of the scene.
+        time_s: Time from the start of the process to the end of the first cycle, or of the whole command.
+        memory_mb: Resident memory at that time.
+        loaded: Modules of `HEAVY` loaded at that time.
+        threads: Python threads at that time, without the main one.
     """
 
     scene: str
@@ -155,22 +155,23 @@ if kind == "grasp":
     import gripper_force.jobs.grasp
     startup_child.first_cycle(int(fd), arguments)
 else:
-    atexit.register(startup_child.tell, int(fd))
+    atexit.register(startup_child.report, int(fd))
     sys.argv[1:] = arguments
     gripper_force.cli.main()
 """
-"""The process of a scene: what the command line does, and a word to this process at the first cycle."""
+"""Program of a scene's process: it runs as the command line does, and reports at the first cycle."""
 
 
 def startup(scenes: Sequence[StartupCase], times: int = 3) -> Iterator[Start]:
-    """Starts each scene in a process of its own, so many times after a first; gives the medians of each.
+    """Starts each scene in its own process, and gives the medians over ``times`` starts.
 
-    At the first, files come into memory, and a network is exported for an engine that needs it so.
+    A first start is not counted: it loads files into the page cache, and exports a network if the engine needs
+    it.
 
     Raises:
         GripperError: A scene did not start.
     """
-    with stand_ins() as places:
+    with simulated_devices() as places:
         for scene in scenes:
             start(scene, places)
             starts = [start(scene, places) for _ in range(times)]
@@ -183,10 +184,10 @@ def start(scene: StartupCase, places: dict[str, str]) -> Start:
 
     Args:
         scene: The scene.
-        places: What `stand_ins` gives.
+        places: Values of `simulated_devices`.
 
     Raises:
-        GripperError: It did not start.
+        GripperError: The scene did not start.
     """
     arguments = [text.format(**places) for text in (*scene.settings, *scene.command)]
     kind = "command" if scene.command else "grasp"
@@ -207,15 +208,15 @@ def start(scene: StartupCase, places: dict[str, str]) -> Start:
         if not line:
             stderr.seek(0)
             raise GripperError(f"the scene {scene.name!r} did not start: {stderr.read().strip()[-500:]}")
-    told = json.loads(line)
-    dotted = [f"{module}." for module in told["modules"]]
+    report = json.loads(line)
+    dotted = [f"{module}." for module in report["modules"]]
     loaded = tuple(name for name in HEAVY if any(module.startswith(f"{name}.") for module in dotted))
-    return Start(scene.name, time_s, told["memory_mb"], loaded, tuple(told["threads"]))
+    return Start(scene.name, time_s, report["memory_mb"], loaded, tuple(report["threads"]))
 
 
 @contextmanager
-def stand_ins() -> Iterator[dict[str, str]]:
-    """A virtual servo and a silent load cell behind pseudo-terminals, a log to play, and a network."""
+def simulated_devices() -> Iterator[dict[str, str]]:
+    """Yields a virtual servo and a silent load cell at pseudo-terminals, a log to play, and a network."""
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory()))
         servo = stack.enter_context(serve_virtual_servo(Config().servo.model))

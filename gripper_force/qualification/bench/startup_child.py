@@ -1,4 +1,4 @@
-"""What a process that `bench.startup` started tells of itself; loads nothing that would be seen in it."""
+"""Code in a process started by `startup_bench`. Imports only modules that do not affect the result."""
 
 import json
 import os
@@ -7,8 +7,8 @@ import threading
 from pathlib import Path
 
 
-def tell(fd: int) -> None:
-    """Writes to ``fd`` which modules are loaded, which threads run, and the memory they all take."""
+def report(fd: int) -> None:
+    """Writes the loaded modules, the running threads and the memory of the process to ``fd``, as JSON."""
     main = threading.main_thread()
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
     about = {
@@ -21,17 +21,10 @@ def tell(fd: int) -> None:
 
 
 def first_cycle(fd: int, settings: list[str]) -> None:
-    """Does what a grasp does up to its first cycle, and tells ``fd`` of it."""
+    """Runs a grasp up to its first cycle, and reports to ``fd``."""
     from gripper_force.config import load_config
-    from gripper_force.runtime.assembly import checkpoint_of
-    from gripper_force.runtime.backends import open_devices
-    from gripper_force.runtime.session import open_session
+    from gripper_force.runtime.session import open_run
 
-    config = load_config(None, settings)
-    checkpoint = checkpoint_of(config)
-    with (
-        open_devices(config) as devices,
-        open_session(config, devices, Path("grasp.mcap"), checkpoint) as session,
-    ):
+    with open_run(load_config(None, settings), Path("grasp.mcap")) as session:
         session.cycle()
-        tell(fd)
+        report(fd)

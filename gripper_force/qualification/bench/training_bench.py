@@ -1,4 +1,4 @@
-"""Error on a validation split against minutes of training, for several ways to train, in turns."""
+"""Validation error over minutes of training, for several recipes in turns."""
 
 import json
 from collections.abc import Callable, Iterator, Sequence
@@ -26,28 +26,32 @@ Load = Callable[[Preprocess], list[Clip]]
 
 PAPER: Final = "paper"
 
-WAYS: Final[dict[str, dict[str, Any]]] = {
+COMPARED: Final[dict[str, dict[str, Any]]] = {
     "short clips, a tenth": {},
     "short clips": {},
     "dense windows": {"clips": 3, "clip_frames": 88, "short_share": 0.0},
     "separate windows": {"windows": "separate", "short_share": 0.0},
     PAPER: RECIPES["shin2019"],
 }
-"""What each sets. The first two are our recipe, once with a tenth of the time. The next two change its clips
-alone: as many frames a step in fewer clips, and windows that share nothing. The last is the paper's recipe.
+"""Recipe keys by name. The first two are our recipe, once with a tenth of the time. The next two change only
+its clips: the same number of frames per step in fewer clips, and windows computed separately. The last is the
+paper's recipe.
 """
 
 TURNS: Final = 200
+"""Turns of each recipe."""
+
 POINTS: Final = 12
+"""Evaluations of each recipe, at logarithmic intervals."""
 
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """What a network does on the validation split after so much training.
+    """Validation error of a network after some training.
 
     Attributes:
-        way: One of `WAYS`.
-        minutes: Of its own training; the others' turns and the validation don't count.
+        way: Name of the recipe in `COMPARED`.
+        minutes: Time of its own training, without the others' turns and without validation.
         steps: Optimiser steps.
         mae_n: Mean absolute error.
         rmse_n: Root mean squared error.
@@ -61,49 +65,52 @@ class Point:
 
 
 def learn(load: Load, minutes: float, overrides: Sequence[str], out: Path) -> Iterator[Point]:
-    """Trains one network each way, in turns, and keeps all points in ``learning.json`` and ``learning.png``.
+    """Trains one network with each recipe, in turns; writes ``learning.json`` and ``learning.png``.
 
-    Every way gets the same minutes, and its schedule ends with them; the first gets a tenth. A point before
-    the end is worse than a training of just so long would be, as the learning rate is still high.
+    Each recipe gets the same minutes, and its schedule ends with them; the first gets a tenth. A point before
+    the end is worse than the result of a training of that length, as the learning rate is still high.
 
     Args:
-        load: Gives the data, reduced to a size; whole sets of them are held out.
-        minutes: For each way.
-        overrides: Keys of the recipe that are the same for all, as ``key=value``.
-        out: Folder for the results. The points are written one by one, the picture at the end, early or not.
+        load: Loads the data at the size of a `Preprocess`; whole sets of it are held out for validation.
+        minutes: Training time of each recipe.
+        overrides: Keys of all recipes, as ``key=value``.
+        out: Folder for the results. Points are written one by one, the figure at the end or at an interrupt.
+
+    Yields:
+        The points, as they are measured.
 
     Raises:
-        ConfigError: A key is wrong, or more than one network is asked for.
-        DataError: The data can't be trained on.
+        ConfigError: A key is wrong, more than one network is requested, or the folder can't be written to.
+        DataError: The data can't be used for training.
         NonFiniteError: A training diverged.
     """
-    budgets = {way: minutes / (10 if i == 0 else 1) for i, way in enumerate(WAYS)}
+    budgets = {recipe: minutes / (10 if i == 0 else 1) for i, recipe in enumerate(COMPARED)}
     configs = {}
-    for way, keys in WAYS.items():
-        given = {"attentions": ["ssam"], "epochs": None, "minutes": budgets[way]}
-        configs[way] = section_from(TrainConfig, list(overrides), {**keys, **given})
+    for recipe, keys in COMPARED.items():
+        given = {"attentions": ["ssam"], "epochs": None, "minutes": budgets[recipe]}
+        configs[recipe] = section_from(TrainConfig, list(overrides), {**keys, **given})
     if any(len(config.attentions) > 1 for config in configs.values()):
-        raise ConfigError("one network is trained each way: set attentions to one")
+        raise ConfigError("bench training trains one network with each recipe; set attentions to one module")
     points: list[Point] = []
-    _keep(points, configs, out)  # fails now where it would fail later
+    _save(points, configs, out)  # an unwritable folder must fail before the training
     with joined(configs[PAPER].device) as ranks:
         if ranks.count > 1:
-            raise ConfigError("ways of training are compared in one process; start it without torchrun")
+            raise ConfigError("bench training runs in one process; start it without torchrun")
         clips: dict[int, list[Clip]] = {}
         trainers, held_out = {}, {}
-        for way, config in configs.items():
+        for recipe, config in configs.items():
             size = config.preprocess.size
             if size not in clips:
                 clips[size] = load(config.preprocess)
-            training, held_out[way] = split_by(clips[size], "set", config.validation, config.seed)
-            trainers[way] = Trainer(config, 0, Batches(training, config, ranks), ranks)
+            training, held_out[recipe] = split_by(clips[size], "set", config.validation, config.seed)
+            trainers[recipe] = Trainer(config, 0, Batches(training, config, ranks), ranks)
         try:
-            for way in _in_turns(trainers, minutes, budgets):
-                trainer, preprocess = trainers[way], configs[way].preprocess
-                forces = estimates(held_out[way], [trainer.network], preprocess, ranks.device)
-                spent = trainer.done * budgets[way]
-                points.append(Point(way, spent, trainer.step, metrics.mae(*forces), metrics.rmse(*forces)))
-                _keep(points, configs, out)
+            for recipe in _in_turns(trainers, minutes, budgets):
+                trainer, preprocess = trainers[recipe], configs[recipe].preprocess
+                forces = estimates(held_out[recipe], [trainer.network], preprocess, ranks.device)
+                spent = trainer.done * budgets[recipe]
+                points.append(Point(recipe, spent, trainer.step, metrics.mae(*forces), metrics.rmse(*forces)))
+                _save(points, configs, out)
                 yield points[-1]
         finally:
             if points:
@@ -111,44 +118,46 @@ def learn(load: Load, minutes: float, overrides: Sequence[str], out: Path) -> It
 
 
 def _in_turns(trainers: dict[str, Trainer], minutes: float, budgets: dict[str, float]) -> Iterator[str]:
-    """Trains each way for a short while, and again; stops where one is to be looked at."""
+    """Trains the recipes alternately; yields the name of a recipe when it is due for evaluation."""
     marks = set(np.geomspace(2, TURNS, POINTS).round().astype(int).tolist())
     for turn in range(1, TURNS + 1):
-        for way, trainer in trainers.items():
+        for recipe, trainer in trainers.items():
             before = trainer.step
-            for _ in trainer.steps(min(1.0, minutes * turn / TURNS / budgets[way])):
+            for _ in trainer.steps(min(1.0, minutes * turn / TURNS / budgets[recipe])):
                 pass
             if trainer.step > before and (turn in marks or trainer.done >= 1):
-                yield way
+                yield recipe
 
 
 def reached(points: Sequence[Point]) -> dict[str, float | None]:
-    """Minutes after which each way was as good as the paper's recipe at its end; None if it never was."""
+    """Minutes after which each recipe was as good as the paper's recipe at its end; None if it never was."""
     goal_n = [point.mae_n for point in points if point.way == PAPER][-1]
     return {
-        way: min((p.minutes for p in points if p.way == way and p.mae_n <= goal_n), default=None)
-        for way in WAYS
+        recipe: min((p.minutes for p in points if p.way == recipe and p.mae_n <= goal_n), default=None)
+        for recipe in COMPARED
     }
 
 
-def _keep(points: Sequence[Point], configs: dict[str, TrainConfig], out: Path) -> None:
-    recipes = {way: config.model_dump(mode="json") for way, config in configs.items()}
-    kept = {"recipes": recipes, "points": [asdict(point) for point in points]}
+def _save(points: Sequence[Point], configs: dict[str, TrainConfig], out: Path) -> None:
+    recipes = {recipe: config.model_dump(mode="json") for recipe, config in configs.items()}
+    contents = {"recipes": recipes, "points": [asdict(point) for point in points]}
     try:
         out.mkdir(parents=True, exist_ok=True)
-        (out / "learning.json").write_text(json.dumps(kept, indent=1), encoding="utf-8")
+        (out / "learning.json").write_text(json.dumps(contents, indent=1), encoding="utf-8")
     except OSError as error:
-        raise ConfigError(f"can't keep results in {out}: {error.strerror}; name another folder") from error
+        raise ConfigError(
+            f"can't write results to {out}: {error.strerror}; give another folder with --out"
+        ) from error
 
 
 def draw(points: Sequence[Point]) -> Figure:
-    """Error against minutes, a line for each way."""
+    """Plots validation error over minutes, with a line for each recipe."""
     with rc_context(STYLE):
         figure = Figure(figsize=(7, 4), layout="constrained")
         axes = figure.add_subplot()
-        for way in WAYS:
-            own = [point for point in points if point.way == way]
-            axes.plot([p.minutes for p in own], [p.mae_n for p in own], "o-", markersize=3, label=way)
+        for recipe in COMPARED:
+            own = [point for point in points if point.way == recipe]
+            axes.plot([p.minutes for p in own], [p.mae_n for p in own], "o-", markersize=3, label=recipe)
         axes.set(xscale="log", xlabel="minutes of training", ylabel="validation MAE, N")
         axes.set_ylim(bottom=0)
         axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))

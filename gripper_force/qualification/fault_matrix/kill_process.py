@@ -1,4 +1,4 @@
-"""A grasp in a process of its own that is killed or stopped, with the world and its servo in this one."""
+"""A grasp in a separate process that is killed or stopped, with the simulated world and servo in this one."""
 
 import sys
 import time
@@ -22,18 +22,24 @@ from gripper_hw.sim.simulated_rig import SimulatedRig
 
 _BUS: Final = "killed"
 _CONTACT_NS: Final = 30 * NS_PER_S
+"""Time limit for the process to start and grip."""
+
 _TRIP_NS: Final = NS_PER_S
+"""Time limit for the watchdog to trip; it is set to tens of ms."""
+
 _AFTER_S: Final = 0.3
+"""Time after the trip in which the peak force is still observed."""
+
 _POLL_S: Final = 5e-4
 
 
 @dataclass(frozen=True, slots=True)
 class KillTrial:
-    """What became of the grip.
+    """Result of a killed or stopped grasp.
 
     Attributes:
-        tripped_ms: Time from the signal to the trip of the servo's Bus Watchdog; None: it never tripped.
-        peak_n: Highest force at the load cell.
+        tripped_ms: Time from the signal to the trip of the servo's Bus Watchdog; None if it did not trip.
+        peak_n: Highest load-cell force.
         lost_ms: Time before the signal that the log lacks.
     """
 
@@ -43,15 +49,15 @@ class KillTrial:
 
 
 def kill_trial(config: Config, folder: Path, number: Signals) -> KillTrial:
-    """Lets another process grasp in real time over a pseudo-terminal, and sends it a signal in mid-grasp.
+    """Runs a grasp in another process in real time over a pseudo-terminal, and sends it a signal.
 
     Args:
-        config: The grasp. It runs without camera, on the motor current.
-        folder: Where the log goes.
+        config: Configuration of the grasp. It runs on motor current, without camera.
+        folder: Folder for the log.
         number: The signal.
 
     Raises:
-        DeviceTimeoutError: The process never came to grip anything.
+        DeviceTimeoutError: The process did not grip anything.
         SimulationError: This machine is too slow for the scene.
     """
     world = config.model_copy(
@@ -69,45 +75,45 @@ def kill_trial(config: Config, folder: Path, number: Signals) -> KillTrial:
         server = stack.enter_context(PtyServer(bus))
         rig.load_cell.start()
         rig.start()
-        said = stack.enter_context((folder / "said.txt").open("w+"))
-        child = Popen(_command(config, server.device_path, folder), stdout=DEVNULL, stderr=said)
+        stderr = stack.enter_context((folder / "stderr.txt").open("w+"))
+        child = Popen(_command(config, server.device_path, folder), stdout=DEVNULL, stderr=stderr)
         stack.callback(child.wait)
         stack.callback(child.kill)
         forces_n = [0.0]
 
-        def goes_on() -> bool:
+        def running() -> bool:
             rig.check()
             forces_n.extend(sample.force_n for sample in rig.load_cell.drain())
             return child.poll() is None
 
-        def grips() -> bool:
+        def gripping() -> bool:
             return forces_n[-1] > 0.5 * config.target_n
 
         def tripped() -> bool:
             with bus.lock:
                 return bus.servos[0].tripped
 
-        if not _wait(grips, goes_on, _CONTACT_NS):
-            said.seek(0)
-            last = (said.read().strip().splitlines() or ["it said nothing"])[-1]
+        if not _wait(gripping, running, _CONTACT_NS):
+            stderr.seek(0)
+            last = (stderr.read().strip().splitlines() or ["no error output"])[-1]
             raise DeviceTimeoutError(
-                f"the process that was to grip {config.object!r} and be killed never did: {last}"
+                f"the process did not grip {config.object!r} within {_CONTACT_NS // NS_PER_S} s: {last}"
             )
         time.sleep(float(np.random.default_rng([config.seed, 32]).uniform(0.0, 0.5)))
         sent_ns = time.monotonic_ns()
         child.send_signal(number)
-        fell = _wait(tripped, lambda: True, _TRIP_NS)
-        tripped_ms = (time.monotonic_ns() - sent_ns) / NS_PER_MS if fell else None
+        did_trip = _wait(tripped, lambda: True, _TRIP_NS)
+        tripped_ms = (time.monotonic_ns() - sent_ns) / NS_PER_MS if did_trip else None
         time.sleep(_AFTER_S)
         child.send_signal(SIGKILL)
         child.wait()
-        goes_on()
+        running()
         return KillTrial(tripped_ms, max(forces_n), _lost_ms(folder, sent_ns))
 
 
-def _wait(condition: Callable[[], bool], goes_on: Callable[[], bool], most_ns: int) -> bool:
-    end_ns = time.monotonic_ns() + most_ns
-    while time.monotonic_ns() < end_ns and goes_on():
+def _wait(condition: Callable[[], bool], running: Callable[[], bool], limit_ns: int) -> bool:
+    end_ns = time.monotonic_ns() + limit_ns
+    while time.monotonic_ns() < end_ns and running():
         if condition():
             return True
         time.sleep(_POLL_S)
@@ -116,7 +122,7 @@ def _wait(condition: Callable[[], bool], goes_on: Callable[[], bool], most_ns: i
 
 def _command(config: Config, port: str, folder: Path) -> list[str]:
     changes = {
-        # three processes share this machine with the world
+        # a long margin, as the processes and the simulated world share this machine
         "servo": {"port": port, "reply_margin_ms": 20.0},
         "camera": {"backend": "none"},
         "load_cell": {"backend": "none"},
@@ -132,7 +138,7 @@ def _command(config: Config, port: str, folder: Path) -> list[str]:
 
 
 def _lost_ms(folder: Path, sent_ns: int) -> float:
-    """Both processes share the host's monotonic clock, which is the log's."""
+    """Time before the signal that the log lacks. Both processes use the host's monotonic clock."""
     last_ns = 0
     with suppress(LogError):
         for path in folder.glob("*.mcap"):

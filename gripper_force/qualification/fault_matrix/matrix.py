@@ -1,7 +1,8 @@
-"""The fault matrix: every part fails in mid-grasp, and the log tells what became of the object.
+"""The fault matrix: each part fails during a grasp, and the reaction is judged from the log.
 
-Each row breaks one part of the simulated rig at a seeded moment between the first touch and the end of the
-hold. A run without the fault stands beside it. Rows that end a process are real processes in real time.
+Each row injects one fault into the simulated rig at a seeded moment between first contact and the end of the
+hold. It is compared with the same grasp without the fault. Rows that kill or stop a process use real
+processes in real time.
 """
 
 import hashlib
@@ -12,23 +13,23 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from statistics import median
-from typing import Any, Final
+from typing import Any, Final, NotRequired, TypedDict
 
 import numpy as np
 
 from gripper_force import __version__
 from gripper_force.config import Config, config_from, dump_config
 from gripper_force.errors import DataError, GripperError, LogError
-from gripper_force.interfaces import Devices
-from gripper_force.jobs.grasp import TRIAL_OBJECTS, TRIAL_TARGETS_N
+from gripper_force.interfaces import Devices, Progress, no_progress
+from gripper_force.jobs.grasp import TRIAL_OBJECTS, TRIAL_TARGETS_N, grasp_and_release
 from gripper_force.jobs.processes import process_pool
 from gripper_force.qualification.fault_matrix.cases import ROWS, FaultCase
-from gripper_force.qualification.fault_matrix.judge import Grasp, Sound, judge
+from gripper_force.qualification.fault_matrix.judge import FaultFreeGrasp, Grasp, judge
 from gripper_force.qualification.fault_matrix.kill_process import kill_trial
-from gripper_force.runtime.assembly import checkpoint_of
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log import LogReader
-from gripper_force.runtime.session import grasp_in, open_session
+from gripper_force.runtime.resolve import resolve
+from gripper_force.runtime.session import open_session
 from gripper_force.types import (
     NS_PER_MS,
     NS_PER_S,
@@ -39,42 +40,113 @@ from gripper_force.types import (
 )
 
 LIMIT_SHARE: Final = 1.25
-"""The force limit of each run over its target; a limit that is far away tests nothing."""
+"""Force limit of each run over its target; a limit far above the target would never act."""
 
 TOLERANCE: Final = 0.05
-"""A peak may exceed the limit by this share."""
+"""Share by which a peak may exceed the force limit."""
 
-_AFTER_NS = 300 * NS_PER_MS
-_MOST_LOST_MS = 100 + 5
-"""A chunk of the log, and a cycle."""
+_AFTER_NS: Final = 300 * NS_PER_MS
+"""Time after the run in which the peak force is still observed."""
 
-_GRIPPING = (Phase.CONTACT, Phase.RAMP, Phase.HOLD)
+_MOST_LOST_MS: Final = 100 + 5
+"""Longest allowed gap at the end of a log: one chunk and one control cycle."""
 
-Summary = dict[str, Any]
+_GRIPPING: Final = (Phase.CONTACT, Phase.RAMP, Phase.HOLD)
 
 
-class _Kept:
-    """Outcomes that go into a file as they come, so that a matrix that was broken off can go on."""
+class Outcome(TypedDict):
+    """Outcome of one grasp with a fault.
+
+    Attributes:
+        seed: Seed of the grasp.
+        result: Result of the grasp, or the name of the error that ended it.
+        peak_over_limit: Peak force over the force limit, minus one.
+        took_ms: Time from the fault to the safe state, if there was one.
+        lost_records: Records that the log lacks.
+        lost_ms: Time before the signal that the log lacks, for rows with a process.
+        failure: Deviation from the expected reaction; empty if there is none.
+    """
+
+    seed: int
+    result: str
+    peak_over_limit: float
+    took_ms: float | None
+    lost_records: int
+    lost_ms: NotRequired[float]
+    failure: str
+
+
+class RowSummary(TypedDict):
+    """Summary of a row over its grasps, in lockstep and (``live_...``) in real time.
+
+    Attributes:
+        row: Name of the fault.
+        expected: Expected reaction.
+        within_ms: Time limit of the reaction, or None.
+        runs: Number of grasps.
+        ok: Grasps with the expected reaction.
+        results: Number of grasps by result.
+        peak_over_limit: Highest peak force over the force limit, minus one.
+        median_ms: Median time to the safe state.
+        worst_ms: Longest time to the safe state.
+        lost_records: Most records that a log lacks.
+        lost_ms: Longest time before the signal that a log lacks.
+        failures: Deviation by seed, for grasps with an unexpected reaction.
+        live_runs: As above, in real time.
+        live_median_ms: As above, in real time.
+        live_worst_ms: As above, in real time.
+        live_peak_over_limit: As above, in real time.
+        live_results: As above, in real time.
+    """
+
+    row: str
+    expected: str
+    within_ms: float | None
+    runs: int
+    ok: int
+    results: dict[str, int]
+    peak_over_limit: float
+    median_ms: float | None
+    worst_ms: float | None
+    lost_records: int
+    lost_ms: float
+    failures: dict[int, str]
+    live_runs: int
+    live_median_ms: float | None
+    live_worst_ms: float | None
+    live_peak_over_limit: float | None
+    live_results: dict[str, int]
+
+
+class MatrixReport(TypedDict):
+    """All rows; ``ok`` is True if every grasp had the expected reaction."""
+
+    rows: list[RowSummary]
+    ok: bool
+
+
+class _OutcomeFile:
+    """File that takes each outcome at once, so that an interrupted matrix can be continued."""
 
     def __init__(self, path: Path, config: Config, resume: bool) -> None:
         self._path = path
-        self._of = hashlib.sha256(f"{__version__} {dump_config(config)}".encode()).hexdigest()
-        self.outcomes: dict[str, Summary] = {}
+        self._digest = hashlib.sha256(f"{__version__} {dump_config(config)}".encode()).hexdigest()
+        self.outcomes: dict[str, Outcome] = {}
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             if not (resume and path.exists()):
                 path.write_text("", encoding="utf-8")
             for line in path.read_text(encoding="utf-8").splitlines():
-                of, key, outcome = json.loads(line)
+                digest, key, outcome = json.loads(line)
                 self.outcomes[key] = outcome
-                if of != self._of:
-                    raise DataError(f"{path} is of another configuration; run without --resume")
+                if digest != self._digest:
+                    raise DataError(f"{path} was made with another configuration; run without --resume")
         except (OSError, ValueError, TypeError) as error:
-            raise DataError(f"can't go on with {path}: {error}; run without --resume") from error
+            raise DataError(f"can't continue with {path}: {error}; run without --resume") from error
 
-    def add(self, key: str, outcome: Summary) -> Summary:
+    def add(self, key: str, outcome: Outcome) -> Outcome:
         with self._path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps([self._of, key, outcome]) + "\n")
+            file.write(json.dumps([self._digest, key, outcome]) + "\n")
         return outcome
 
 
@@ -87,59 +159,58 @@ def run_matrix(
     *,
     resume: bool = False,
     rows: Sequence[FaultCase] = ROWS,
-    advance: Callable[[str], None] = lambda _: None,
-) -> Iterator[Summary]:
+    progress: Progress = no_progress,
+) -> Iterator[RowSummary]:
     """Runs every row with every seed.
 
     Args:
-        config: Everything but object, target, force limit, seed and faults.
+        config: Configuration; object, target, force limit, seed and faults are replaced.
         seeds: Grasps of each row, in lockstep.
         live_seeds: Grasps of each row in real time, one after the other.
         jobs: Processes.
-        keep: File that takes each outcome as it comes.
-        resume: Whether to go on from what is kept there.
-        rows: Lines of the matrix.
-        advance: Called after each grasp, with the row's name; see `count_grasps`.
+        keep: File for the outcomes, written one by one.
+        resume: True to continue from the outcomes in that file.
+        rows: Rows of the matrix.
+        progress: Called after each grasp with the row's name; see `count_grasps` for their number.
 
     Yields:
-        For each row, in order: ``row, expected, within_ms, runs, ok, results, peak_over_limit, worst_ms,
-        median_ms, lost_records, lost_ms, failures``, and of the real time ``live_runs, live_median_ms,
-        live_worst_ms, live_peak_over_limit, live_results``.
+        The summary of each row, in order.
 
     Raises:
-        DataError: What is kept can't be read or written, or is of another configuration.
+        DataError: The file can't be read or written, or was made with another configuration.
+        GripperError: A grasp fails without a fault, or does not start.
     """
     drawn = [_draw(config, i).model_dump(mode="json") for i in range(seeds)]
     simulated = [row for row in rows if row.unit != "process"]
-    kept = _Kept(keep, config, resume)
+    file = _OutcomeFile(keep, config, resume)
     with process_pool(jobs) as pool:
 
-        def begin(row: FaultCase, index: int, clock: str) -> Callable[[], Summary]:
-            """Starts a grasp, if none is kept; what is returned waits for its outcome."""
+        def begin(row: FaultCase, index: int, clock: str) -> Callable[[], Outcome]:
+            """Starts a grasp unless its outcome is in the file. Returns a function that waits for it."""
             key = f"{row.name}, {clock}, {index}"
-            if key in kept.outcomes:
-                return lambda: kept.outcomes[key]
+            if key in file.outcomes:
+                return lambda: file.outcomes[key]
             if row.unit == "process":
-                run = pool.submit(_kill, drawn[index], row)
+                run = pool.submit(_run_process_row, drawn[index], row)
             else:
-                run = pool.submit(_broken, drawn[index], sound[index], row, clock)
-            return lambda: kept.add(key, run.result())
+                run = pool.submit(_run_with_fault, drawn[index], fault_free[index], row, clock)
+            return lambda: file.add(key, run.result())
 
-        def end(runs: Iterable[Callable[[], Summary]], name: str) -> list[Summary]:
+        def end(runs: Iterable[Callable[[], Outcome]], name: str) -> list[Outcome]:
             outcomes = []
             for run in runs:
                 outcomes.append(run())
-                advance(name)
+                progress(name)
             return outcomes
 
-        without = [pool.submit(_sound, tree) for tree in drawn] if simulated else []
-        sound = []
+        without = [pool.submit(_run_without_fault, tree) for tree in drawn] if simulated else []
+        fault_free = []
         for grasp in without:
-            sound.append(grasp.result())
-            advance("without a fault")
+            fault_free.append(grasp.result())
+            progress("without a fault")
         begun = {row: [begin(row, i, "lockstep") for i in range(seeds)] for row in simulated}
         done = {row: end(begun[row], row.name) for row in simulated}
-        for row in rows:  # real time wants the machine for itself, so one grasp after the other
+        for row in rows:  # one grasp at a time: in real time each needs the machine for itself
             if row in done:
                 live = (begin(row, i, "realtime") for i in range(min(live_seeds, seeds)))
                 yield _summary(row, done[row], end(live, f"{row.name}, in real time"))
@@ -148,7 +219,7 @@ def run_matrix(
 
 
 def count_grasps(seeds: int, live_seeds: int, rows: Sequence[FaultCase] = ROWS) -> int:
-    """How many grasps `run_matrix` does."""
+    """Number of grasps of `run_matrix`."""
     simulated = sum(row.unit != "process" for row in rows)
     return seeds * (len(rows) + bool(simulated)) + min(live_seeds, seeds) * simulated
 
@@ -166,58 +237,64 @@ def _draw(config: Config, index: int) -> Config:
     )
 
 
-def _sound(tree: dict[str, Any]) -> Sound:
+def _run_without_fault(tree: dict[str, Any]) -> FaultFreeGrasp:
     config = config_from(tree, "stability")
     with tempfile.TemporaryDirectory() as folder:
         run = _grasp(config, Path(folder))
         gripping = [s.t_ns / NS_PER_S for s in run.records(GraspStatus) if s.phase in _GRIPPING]
         if not gripping:
             raise GripperError(
-                f"the grasp of {config.object!r} with seed {config.seed} fails without a fault"
+                f"the grasp of {config.object!r} with seed {config.seed} fails even without a fault; "
+                "check the configuration with gripper-force grasp"
             )
-        return Sound(gripping[0], gripping[-1], run.cycles, run.peak_n, tuple(run.records(ServoCommand)))
+        return FaultFreeGrasp(
+            gripping[0], gripping[-1], run.cycles, run.peak_n, tuple(run.records(ServoCommand))
+        )
 
 
-def _broken(tree: dict[str, Any], sound: Sound, row: FaultCase, clock: str = "lockstep") -> Summary:
+def _run_with_fault(
+    tree: dict[str, Any], fault_free: FaultFreeGrasp, row: FaultCase, clock: str = "lockstep"
+) -> Outcome:
     config = config_from(tree, "stability")
     rng = np.random.default_rng([config.seed, 31])
-    at_s = float(rng.uniform(sound.begin_s + 0.05, max(sound.end_s - 0.5, sound.begin_s + 0.06)))
+    earliest_s, latest_s = fault_free.begin_s + 0.05, max(fault_free.end_s - 0.5, fault_free.begin_s + 0.06)
+    at_s = float(rng.uniform(earliest_s, latest_s))
     fault = {"unit": row.unit, "kind": row.kind, "at_s": at_s, "for_s": row.for_s}
     config = config_from({**tree, "faults": [fault], "clock": clock}, "stability")
     with tempfile.TemporaryDirectory() as folder:
         run = _grasp(config, Path(folder))
-        took_ms, why_not = judge(row, run, sound, config, run.start_ns + round(at_s * NS_PER_S))
-    peak_n = sound.peak_n if row.unit == "load_cell" else run.peak_n  # the broken cell can't tell
+        took_ms, failure = judge(row, run, fault_free, config, run.start_ns + round(at_s * NS_PER_S))
+    peak_n = fault_free.peak_n if row.unit == "load_cell" else run.peak_n  # the faulty cell can't measure it
     over = peak_n / config.control.force_limit_n - 1
     if over > TOLERANCE:
-        why_not = f"the peak is {100 * over:.1f} % over the limit"
-    elif not why_not and row.within_ms is not None and not (took_ms is not None and took_ms <= row.within_ms):
-        why_not = f"it took {took_ms} ms"
+        failure = f"the peak force is {100 * over:.1f} % over the limit"
+    elif not failure and row.within_ms is not None and not (took_ms is not None and took_ms <= row.within_ms):
+        failure = f"the reaction took {took_ms} ms"
     return {
         "seed": config.seed,
         "result": run.result,
-        "over": over,
+        "peak_over_limit": over,
         "took_ms": took_ms,
-        "lost": run.lost,
-        "why_not": why_not,
+        "lost_records": run.lost,
+        "failure": failure,
     }
 
 
 def _grasp(config: Config, folder: Path) -> Grasp:
-    """Grasps, and watches for a while what becomes of the object afterwards."""
-    path, checkpoint, result, session = folder / "run.mcap", checkpoint_of(config), "", None
-    with open_devices(config) as devices:
+    """Runs a grasp, and observes the force for a while afterwards."""
+    path, run, result, session = folder / "run.mcap", resolve(config), "", None
+    with open_devices(run.config) as devices:
         try:
-            with open_session(config, devices, path, checkpoint) as session:
-                result = grasp_in(session, config, checkpoint is not None)
+            with open_session(run, devices, path) as session:
+                result = grasp_and_release(session, config.target_n)
         except LogError:
-            pass  # of the losses, which are counted
+            pass  # reports lost records, which are counted below
         except GripperError as error:
             result = type(error).__name__
-        peak_n = _watch(devices)
+        peak_n = _peak_after(devices)
         start_ns = devices.start_ns
     if session is None:
-        raise GripperError(f"the grasp of {config.object!r} with seed {config.seed} never began: {result}")
+        raise GripperError(f"the grasp of {config.object!r} with seed {config.seed} did not start: {result}")
     log = LogReader(path, recover=True)
     cells_n = [sample.force_n for sample in log.records(LoadCellSample) if sample.valid]
     return Grasp(
@@ -230,14 +307,14 @@ def _grasp(config: Config, folder: Path) -> Grasp:
     )
 
 
-def _watch(devices: Devices) -> float:
-    """The highest force after the run has ended and nobody is in charge any more."""
+def _peak_after(devices: Devices) -> float:
+    """Highest force in N within `_AFTER_NS` after the end of the run."""
     devices.clock.sleep_until_ns(devices.clock.now_ns() + _AFTER_NS)
     samples = devices.load_cell.drain() if devices.load_cell is not None else []
     return max((sample.force_n for sample in samples if sample.valid), default=0.0)
 
 
-def _kill(tree: dict[str, Any], row: FaultCase) -> Summary:
+def _run_process_row(tree: dict[str, Any], row: FaultCase) -> Outcome:
     config = config_from(tree, "stability")
     with tempfile.TemporaryDirectory() as folder:
         try:
@@ -245,61 +322,61 @@ def _kill(tree: dict[str, Any], row: FaultCase) -> Summary:
         except GripperError as error:
             return {
                 "seed": config.seed,
-                "result": "never gripped",
-                "over": -1.0,
+                "result": "no grip",
+                "peak_over_limit": -1.0,
                 "took_ms": None,
-                "lost": 0,
-                "why_not": str(error),
+                "lost_records": 0,
+                "failure": str(error),
             }
     over = trial.peak_n / config.control.force_limit_n - 1
-    why_not = "" if trial.tripped_ms is not None else "the watchdog did not trip"
+    failure = "" if trial.tripped_ms is not None else "the watchdog did not trip"
     if trial.lost_ms > _MOST_LOST_MS:
-        why_not = f"the log lacks the last {trial.lost_ms:.0f} ms"
+        failure = f"the log lacks the last {trial.lost_ms:.0f} ms"
     return {
         "seed": config.seed,
-        "result": "watchdog tripped" if trial.tripped_ms is not None else "goes on",
-        "over": over,
+        "result": "watchdog tripped" if trial.tripped_ms is not None else "not tripped",
+        "peak_over_limit": over,
         "took_ms": trial.tripped_ms,
-        "lost": 0,
+        "lost_records": 0,
         "lost_ms": trial.lost_ms,
-        "why_not": why_not,
+        "failure": failure,
     }
 
 
-def _summary(row: FaultCase, outcomes: list[Summary], live: list[Summary]) -> Summary:
+def _summary(row: FaultCase, outcomes: list[Outcome], live: list[Outcome]) -> RowSummary:
     both = outcomes or live
     return {
         "row": row.name,
         "expected": str(row.expected),
         "within_ms": row.within_ms,
         "runs": len(both),
-        "ok": sum(not o["why_not"] for o in both),
+        "ok": sum(not o["failure"] for o in both),
         "results": dict(Counter(o["result"] for o in both)),
-        "peak_over_limit": max(o["over"] for o in both),
+        "peak_over_limit": max(o["peak_over_limit"] for o in both),
         "median_ms": _median_ms(outcomes),
         "worst_ms": _worst_ms(outcomes),
-        "lost_records": max(o["lost"] for o in both),
+        "lost_records": max(o["lost_records"] for o in both),
         "lost_ms": max(o.get("lost_ms", 0.0) for o in both),
-        "failures": {o["seed"]: o["why_not"] for o in both if o["why_not"]},
+        "failures": {o["seed"]: o["failure"] for o in both if o["failure"]},
         "live_runs": len(live),
         "live_median_ms": _median_ms(live),
         "live_worst_ms": _worst_ms(live),
-        "live_peak_over_limit": max((o["over"] for o in live), default=None),
+        "live_peak_over_limit": max((o["peak_over_limit"] for o in live), default=None),
         "live_results": dict(Counter(o["result"] for o in live)),
     }
 
 
-def _median_ms(outcomes: list[Summary]) -> float | None:
+def _median_ms(outcomes: list[Outcome]) -> float | None:
     took_ms = [o["took_ms"] for o in outcomes if o["took_ms"] is not None]
     return median(took_ms) if took_ms else None
 
 
-def _worst_ms(outcomes: list[Summary]) -> float | None:
+def _worst_ms(outcomes: list[Outcome]) -> float | None:
     return max((o["took_ms"] for o in outcomes if o["took_ms"] is not None), default=None)
 
 
-def markdown(summaries: Sequence[Summary]) -> str:
-    """The matrix as a table in Markdown."""
+def markdown(summaries: Sequence[RowSummary]) -> str:
+    """Markdown table of the matrix."""
     head = (
         "| fault | expected | within | runs as expected | result | peak over limit: lockstep, real time "
         "| time: median, worst | real time: median, worst | lost |\n|---|---|---|---|---|---|---|---|---|\n"
@@ -307,7 +384,7 @@ def markdown(summaries: Sequence[Summary]) -> str:
     return head + "".join(_markdown_row(s) for s in summaries)
 
 
-def _markdown_row(s: Summary) -> str:
+def _markdown_row(s: RowSummary) -> str:
     results = ", ".join(f"{name} {count}" for name, count in sorted(s["results"].items()))
     lost = f"{s['lost_records']} records" if s["lost_records"] else "-"
     cells = (
@@ -328,5 +405,5 @@ def _peaks(lockstep: float, live: float | None) -> str:
     return f"{100 * lockstep:+.0f} %" + ("" if live is None else f", {100 * live:+.0f} %")
 
 
-def _times(middle_ms: float | None, worst_ms: float | None) -> str:
-    return "-" if middle_ms is None or worst_ms is None else f"{middle_ms:.0f}, {worst_ms:.0f} ms"
+def _times(median_ms: float | None, worst_ms: float | None) -> str:
+    return "-" if median_ms is None or worst_ms is None else f"{median_ms:.0f}, {worst_ms:.0f} ms"

@@ -1,4 +1,4 @@
-"""What of the servo's bus reads bytes from outside, for `gripper_force.qualification.fuzz.fuzzer`."""
+"""Fuzz targets of the servo bus: packet parser, virtual servo and driver."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,7 +13,10 @@ from gripper_hw.dynamixel.servo import DynamixelServo
 from gripper_hw.dynamixel.virtual import VirtualBus, VirtualServo, register_bus, unregister_bus
 
 _CYCLES: Final = 4
+"""Control cycles of the driver."""
+
 _PIECE: Final = 13
+"""Bytes that arrive at once."""
 
 
 def _instructions() -> list[bytes]:
@@ -44,8 +47,8 @@ def _answers() -> list[bytes]:
     return [*_instructions(), status(1, 0, b"\xff\xff\xfd\x01"), status(1, 0x80), status(1, 0, bytes(30)) * 3]
 
 
-def _with_true_checksums(data: bytes) -> bytes:
-    """Gives every packet that is there in full the checksum of what it holds now."""
+def _repair_checksums(data: bytes) -> bytes:
+    """Replaces the checksum of each complete packet by that of its present contents."""
     fixed = bytearray(data)
     start = fixed.find(HEADER)
     while start >= 0 and len(fixed) >= start + 7:
@@ -72,12 +75,12 @@ def _serve(data: bytes, _path: Path) -> None:
         bus.transact(data[at : at + _PIECE])
         now_ns += NS_PER_MS
         servo.control(now_ns, 0.3, 0.1)
-    now_ns += 1000 * NS_PER_MS  # a packet that broke off is forgotten, and a reboot is over
+    now_ns += 1000 * NS_PER_MS  # an incomplete packet has timed out, and a reboot is over
     assert not servo.get("status_return_level") or bus.transact(frame(servo.id, Instruction.PING))
 
 
 def _drive(data: bytes, _path: Path) -> None:
-    """The driver over a bus whose answers are changed as the input says."""
+    """Runs the driver over a bus whose answers are changed by a script, the input."""
     now_ns = 0
     bus = VirtualBus([VirtualServo(1, load_model("XM430-W350"))], lambda: now_ns)
     script = iter(data)
@@ -97,7 +100,7 @@ def _drive(data: bytes, _path: Path) -> None:
 
 
 def _tampered(answer: bytes, script: Iterator[int]) -> bytes | None:
-    """What arrives of an answer: the script's next byte tells what becomes of it, more of them how."""
+    """Answer as it arrives: the script's next byte selects the change, further bytes are its parameters."""
     change = _CHANGES.get(next(script, 0))
     return answer if change is None else change(answer, lambda: next(script, 0))
 
@@ -108,22 +111,22 @@ def _flipped(answer: bytes, take: Callable[[], int]) -> bytes:
     return bytes(data)
 
 
-def _lying(answer: bytes, take: Callable[[], int]) -> bytes:
-    """Anything but the header may be wrong, and the checksum is right."""
+def _changed_with_checksum(answer: bytes, take: Callable[[], int]) -> bytes:
+    """Changes a byte after the header; the checksum is correct."""
     data = bytearray(answer)
     data[4 + take() % (len(data) - 4)] = take()
-    return _with_true_checksums(bytes(data))
+    return _repair_checksums(bytes(data))
 
 
-def _other(_answer: bytes, take: Callable[[], int]) -> bytes:
+def _random_status(_answer: bytes, take: Callable[[], int]) -> bytes:
     return status(take(), take(), bytes(take() for _ in range(take() % 64)))
 
 
 _CHANGES: Final[dict[int, Callable[[bytes, Callable[[], int]], bytes | None]]] = {
     1: lambda _answer, _take: None,
     2: _flipped,
-    3: _lying,
-    4: _other,
+    3: _changed_with_checksum,
+    4: _random_status,
     5: lambda answer, take: answer[: take() % (len(answer) + 1)],
     6: lambda answer, _take: answer + answer,
     7: lambda answer, take: bytes(take() for _ in range(take() % 32)) + answer,
@@ -132,16 +135,20 @@ _CHANGES: Final[dict[int, Callable[[bytes, Callable[[], int]], bytes | None]]] =
 
 
 def _scripts() -> list[bytes]:
-    """An undisturbed run has some 80 answers; the changes come at any of them."""
-    calm = bytes(90)
+    """Scripts with a change early, in the middle and late; an undisturbed run has about 80 answers."""
+    unchanged = bytes(90)
     return [
-        calm,
-        *(calm[:at] + bytes((change, 6, 3)) * 2 + calm for at in (0, 20, 62) for change in _CHANGES),
+        unchanged,
+        *(
+            unchanged[:at] + bytes((change, 6, 3)) * 2 + unchanged
+            for at in (0, 20, 62)
+            for change in _CHANGES
+        ),
     ]
 
 
 TARGETS: Final = [
-    Target("packets", _answers, _parse, 40, (HEADER, b"\xff\xff\xfd"), _with_true_checksums),
-    Target("virtual servo", _instructions, _serve, 10, (HEADER,), _with_true_checksums),
+    Target("packets", _answers, _parse, 40, (HEADER, b"\xff\xff\xfd"), _repair_checksums),
+    Target("virtual servo", _instructions, _serve, 10, (HEADER,), _repair_checksums),
     Target("servo driver", _scripts, _drive, 2, tuple(bytes((change,)) for change in _CHANGES)),
 ]

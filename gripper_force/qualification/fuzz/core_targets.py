@@ -1,4 +1,4 @@
-"""What of the core reads input from outside, for `gripper_force.qualification.fuzz.fuzzer`."""
+"""Fuzz targets of the core: configurations, profiles, logs, checkpoints and tables."""
 
 import json
 import struct
@@ -47,8 +47,8 @@ from gripper_force.profiles.rig_profile import (
     ServoCalibration,
 )
 from gripper_force.qualification.fuzz.fuzzer import Target
-from gripper_force.runtime.assembly import controller_from
 from gripper_force.runtime.log import LogReader, LogWriter
+from gripper_force.runtime.resolve import make_controller
 from gripper_force.schema import dump
 from gripper_force.types import (
     NS_PER_MS,
@@ -67,14 +67,20 @@ from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess
 
 _SIDE: Final = 16
+"""Side of the images in pixels."""
+
 _ATTENTIONS: Final = ("ssam", "scam", "none")
 _HEADER_END: Final = b"]}}"
+"""End of the JSON header of a safetensors file."""
+
 _BODY: Final = struct.Struct("<BHQ")
-_ABOUT: Final = {"object": "sponge", "scene": json.dumps({"stiffness": 1.02}), "exposure_ms": "4.0"}
+"""Topic number, length and time of a message."""
+
+_METADATA: Final = {"object": "sponge", "scene": json.dumps({"stiffness": 1.02}), "exposure_ms": "4.0"}
 _CONFIG: Final = Config(gripper=GripperConfig(nm_per_a=1.8, current_step_a=0.003))
 
 
-# Configuration.
+# Configurations and profiles.
 
 
 def _object(weights: str = "") -> ObjectProfile:
@@ -94,8 +100,8 @@ def _object(weights: str = "") -> ObjectProfile:
     )
 
 
-_SOME_FEATURES: Final = np.linspace(-1, 1, 8, dtype=np.float32)[None]
-_HALF: Final = ProfileArrays(
+_FEATURES: Final = np.linspace(-1, 1, 8, dtype=np.float32)[None]
+_ARRAYS: Final = ProfileArrays(
     head=np.ones(8, np.float32),
     offset=np.ones(1, np.float32),
     mean=np.ones(8, np.float32),
@@ -110,24 +116,24 @@ def _objects() -> list[bytes]:
 
 def _read_object(data: bytes, path: Path) -> None:
     path.write_bytes(data)
-    _correct(Correction(read_object(path), _HALF))
+    _correct(Correction(read_object(path), _ARRAYS))
 
 
-def _halves() -> list[bytes]:
-    return [pack(_HALF)]
+def _array_files() -> list[bytes]:
+    return [pack(_ARRAYS)]
 
 
-def _read_half(data: bytes, path: Path) -> None:
-    profile = path.with_name("half.yaml")
+def _read_arrays(data: bytes, path: Path) -> None:
+    profile = path.with_name("object.yaml")
     weights_path(profile).write_bytes(data)
     _correct(load_correction(profile, _object(sha256(data).hexdigest()), 8))
 
 
 def _correct(correction: Correction) -> None:
-    force_n = correction.force_n([-1.0, 0.0, 5.0, 30.0], np.repeat(_SOME_FEATURES, 4, 0))
+    force_n = correction.force_n([-1.0, 0.0, 5.0, 30.0], np.repeat(_FEATURES, 4, 0))
     assert not np.isnan(force_n).any()
     assert (correction.half_width_n(force_n) > 0).all()
-    assert correction.ood_score(_SOME_FEATURES) >= 0
+    assert correction.ood_score(_FEATURES) >= 0
 
 
 def _configs() -> list[bytes]:
@@ -188,8 +194,8 @@ def _assign(data: bytes, _path: Path) -> None:
 
 def _use_config(config: Config) -> None:
     completed = config.model_copy(update={"gripper": _completed(config.gripper)})
-    config_from_text(dump_config(completed), "its own dump")
-    controller_from(completed).step(0, _state(0), None, Request(0, RequestKind.GRASP, config.target_n))
+    config_from_text(dump_config(completed), "a dumped configuration")
+    make_controller(completed).step(0, _state(0), None, Request(0, RequestKind.GRASP, config.target_n))
 
 
 def _completed(gripper: GripperConfig) -> GripperConfig:
@@ -203,15 +209,15 @@ def _completed(gripper: GripperConfig) -> GripperConfig:
 def _log() -> bytes:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "run.mcap"
-        with LogWriter(path, config=dump_config(_CONFIG), metadata=_ABOUT) as log:
+        with LogWriter(path, config=dump_config(_CONFIG), metadata=_METADATA) as log:
             _grasp_into(log)
         return path.read_bytes()
 
 
 def _grasp_into(log: LogWriter) -> None:
-    """A short grasp, with every kind of record a run has."""
+    """Writes a short grasp with every kind of record of a run."""
     rng = np.random.default_rng(0)
-    controller = controller_from(_CONFIG)
+    controller = make_controller(_CONFIG)
     position_rad = 0.0
     for cycle in range(14):
         t_ns = cycle * 20 * NS_PER_MS
@@ -252,12 +258,12 @@ def _messages() -> Iterator[tuple[str, int, bytes]]:
         yield channel.topic, message.log_time, message.data
 
 
-def _bare(messages: Iterable[tuple[str, int, bytes]]) -> bytes:
-    """A log that is neither compressed nor sealed with checksums."""
+def _uncompressed(messages: Iterable[tuple[str, int, bytes]]) -> bytes:
+    """Log without compression and checksums."""
     out = BytesIO()
     writer = Writer(out, compression=CompressionType.NONE, enable_crcs=False)
     writer.start()
-    writer.add_metadata("gripper_force", _ABOUT)
+    writer.add_metadata("gripper_force", _METADATA)
     writer.add_attachment(0, 0, "config.yaml", "application/yaml", dump_config(_CONFIG).encode())
     channels = {}
     for topic, schema in _topics().items():
@@ -270,11 +276,11 @@ def _bare(messages: Iterable[tuple[str, int, bytes]]) -> bytes:
 
 
 def _logs() -> list[bytes]:
-    return [_log(), _bare(_messages())]
+    return [_log(), _uncompressed(_messages())]
 
 
 def _bodies() -> list[bytes]:
-    """What a log's messages say, each behind its topic, length and time."""
+    """All messages of a log, each after its topic, length and time."""
     numbers = {topic: i for i, topic in enumerate(_topics())}
     return [b"".join(_BODY.pack(numbers[t], len(data), ns) + data for t, ns, data in _messages())]
 
@@ -286,7 +292,7 @@ def _log_of(bodies: bytes) -> bytes:
         number, length, log_ns = _BODY.unpack_from(bodies, at)
         at += _BODY.size + length
         messages.append((topics[number % len(topics)], log_ns, bodies[at - length : at]))
-    return _bare(messages)
+    return _uncompressed(messages)
 
 
 def _read_log(data: bytes, path: Path) -> None:
@@ -296,10 +302,10 @@ def _read_log(data: bytes, path: Path) -> None:
 
 
 def _use_records(data: bytes, path: Path) -> None:
-    """A sound log with records that are not."""
+    """Uses a valid log with damaged records."""
     log = _log_of(data)
     typed: GripperError | None = None
-    for use in (_replay_log, _learn_log, _report_log, _summarise_log):
+    for use in (_replay_log, _load_log_clip, _report_log, _summarise_log):
         try:
             use(log, path)
         except GripperError as error:
@@ -313,22 +319,22 @@ def _replay_log(data: bytes, path: Path) -> None:
     replay(path, "none", recover=True)
 
 
-def _see_log(data: bytes, path: Path) -> None:
+def _replay_log_with_vision(data: bytes, path: Path) -> None:
     path.write_bytes(data)
-    eyes = path.with_suffix(".safetensors")
-    if not eyes.exists():
-        eyes.write_bytes(_checkpoints()[0])
-    replay(path, str(eyes), recover=True)
+    checkpoint = path.with_suffix(".safetensors")
+    if not checkpoint.exists():
+        checkpoint.write_bytes(_checkpoints()[0])
+    replay(path, str(checkpoint), recover=True)
 
 
-def _learn_log(data: bytes, path: Path) -> None:
+def _load_log_clip(data: bytes, path: Path) -> None:
     path.write_bytes(data)
     load_clip(path, Preprocess(size=_SIDE), None)
 
 
 def _report_log(data: bytes, path: Path) -> None:
     path.write_bytes(data)
-    read_run(path, recover=True)
+    read_run(LogReader(path, recover=True))
 
 
 def _summarise_log(data: bytes, path: Path) -> None:
@@ -374,14 +380,14 @@ def _checkpoints() -> list[bytes]:
     ]
 
 
-def _true_length(data: bytes) -> bytes:
-    """Tells the header's length as it is, so that a header that grew or shrank is read."""
+def _repair_length(data: bytes) -> bytes:
+    """Replaces the header length of a safetensors file by that of its present header."""
     end = data.find(_HEADER_END, 8) + len(_HEADER_END)
     return (end - 8).to_bytes(8, "little") + data[8:] if end > len(_HEADER_END) else data
 
 
 def _use_header(data: bytes, path: Path) -> None:
-    """A sound file with a header of ours that is not."""
+    """Uses a valid checkpoint file with a damaged header of this project."""
     text = data.decode(errors="replace")
     attention = next((name for name in _ATTENTIONS if name in text), "none")
     _use_checkpoint(save(_tensors(attention), {FORMAT: text}), path)
@@ -422,16 +428,16 @@ TARGETS: Final = [
     Target("config", _configs, _read_config, 6, _YAML_WORDS),
     Target("rig profile", _rigs, _read_rig, 6, _YAML_WORDS),
     Target("object profile", _objects, _read_object, 6, _YAML_WORDS),
-    Target("half of an object profile", _halves, _read_half, 3, _TYPES, _true_length),
+    Target("object profile arrays", _array_files, _read_arrays, 3, _TYPES, _repair_length),
     Target("assignment", _assignments, _assign, 8, _YAML_WORDS),
     Target("log", _logs, _read_log, 3, _LOG_WORDS),
     Target("log replayed", _logs, _replay_log, 2, _LOG_WORDS),
-    Target("log seen", _logs, _see_log, 1, _LOG_WORDS),
-    Target("records of a log", _bodies, _use_records, 2, _LOG_WORDS),
-    Target("log learnt", _logs, _learn_log, 1, _LOG_WORDS),
+    Target("log replayed with vision", _logs, _replay_log_with_vision, 1, _LOG_WORDS),
+    Target("log records", _bodies, _use_records, 2, _LOG_WORDS),
+    Target("log as clip", _logs, _load_log_clip, 1, _LOG_WORDS),
     Target("log reported", _logs, _report_log, 1, _LOG_WORDS),
     Target("log summarised", _logs, _summarise_log, 1, _LOG_WORDS),
-    Target("checkpoint", _checkpoints, _use_checkpoint, 4, _TYPES, _true_length),
+    Target("checkpoint", _checkpoints, _use_checkpoint, 4, _TYPES, _repair_length),
     Target("checkpoint header", _headers, _use_header, 4),
-    Target("table of forces", _tables, _read_table, 8, (b"frame", b"t_s")),
+    Target("force table", _tables, _read_table, 8, (b"frame", b"t_s")),
 ]

@@ -1,8 +1,8 @@
-"""Random and damaged input for everything that reads bytes or text from outside.
+"""Fuzzer: random and damaged input for all readers of external bytes or text.
 
 An input must give a result or a `GripperError`. Any other exception is a finding, and so are a crash, a hang,
-and a wish for more memory than `MEMORY_BYTES`. Input ``i`` of a target is a function of the seed, the name of
-the target and ``i``, so a finding is seen again by its number.
+and an allocation beyond `MEMORY_BYTES`. Input ``i`` of a target is a function of the seed, the target's name
+and ``i``, so a finding is reproduced by its number.
 """
 
 import random
@@ -16,29 +16,27 @@ import traceback
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from multiprocessing import connection, get_context
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypedDict
 
 from gripper_force.errors import ConfigError, GripperError
+from gripper_force.interfaces import Progress, no_progress
 from gripper_force.types import NS_PER_S
 
-FUZZ_TARGETS: Final = tuple(
-    f"gripper_force.qualification.fuzz.{name}"
-    for name in ("core_targets", "bus_targets", "load_cell_targets")
-)
-"""Modules with a list ``TARGETS``; each worker process imports them."""
-
 HANG_S: Final = 30.0
-"""Far beyond the slowest input, which takes under a second: a machine may be busy."""
+"""Time limit of an input. The slowest takes under a second; the rest is for a busy machine."""
 
 MEMORY_BYTES: Final = 512 * 2**20
-"""What inputs may take on top of what the readers themselves do."""
+"""Memory that inputs may take in addition to that of the readers themselves."""
 
 _POLL_S: Final = 0.25
 _LONGEST: Final = 1 << 18
+"""Largest input, in bytes."""
+
 _PACKAGES: Final = ("gripper_force", "gripper_hw", "gripper_calibration")
+"""Packages whose lines name the place of a finding."""
+
 _INTEGERS: Final = (
     *(0, 1, 2, 3, 7, 16, 127, 128, 255, 256, 1023, 1024, 0x7FFF, 0x8000, 0xFFFF, 1 << 20, 1 << 28),
     *(0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, 1 << 40, (1 << 63) - 1, 1 << 63, (1 << 64) - 1),
@@ -70,12 +68,12 @@ class Target:
     """One reader of input.
 
     Attributes:
-        name: What it is called.
-        examples: Makes inputs to damage, the same in every process.
+        name: Name in reports and in ``--only``.
+        examples: Returns valid inputs to damage, the same in every process.
         feed: Reads an input. The path is a scratch file for readers of files.
-        weight: How many inputs it gets, relative to others.
-        words: Bytes that mean something to it.
-        repair: Makes a damaged input pass its checksums; done to half of the inputs.
+        weight: Share of the inputs, relative to other targets.
+        words: Byte strings with a meaning in this format.
+        repair: Makes a damaged input pass its checksums; applied to half of the inputs.
     """
 
     name: str
@@ -88,13 +86,13 @@ class Target:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """An input that got neither a result nor a typed error.
+    """An input that gave neither a result nor a typed error.
 
     Attributes:
-        target: Whose.
-        index: Its number.
-        error: What came of it, and where.
-        file: Where it was kept.
+        target: Name of the target.
+        index: Number of the input.
+        error: Exception, crash or hang, with its place in the code.
+        file: File that holds the input.
     """
 
     target: str
@@ -103,13 +101,40 @@ class Finding:
     file: str
 
 
-Advance = Callable[[str, int], None]
-"""Told what goes on, and how many inputs more are done."""
+class TargetCounts(TypedDict):
+    """Number of inputs of a target, in total and by outcome."""
+
+    inputs: int
+    results: int
+    typed_errors: int
+    findings: int
 
 
-def load_targets(modules: Sequence[str]) -> list[Target]:
-    """The targets of modules, each of which has a list ``TARGETS``."""
-    return [target for module in modules for target in import_module(module).TARGETS]
+class FuzzReport(TypedDict):
+    """Result of `fuzz`.
+
+    Attributes:
+        ok: True if there are no findings.
+        targets: Counts by target.
+        findings: One finding of each kind.
+        inputs: Number of inputs.
+        seed: Seed of the inputs.
+        wall_s: Duration.
+    """
+
+    ok: bool
+    targets: dict[str, TargetCounts]
+    findings: list[Finding]
+    inputs: int
+    seed: int
+    wall_s: float
+
+
+def all_targets() -> list[Target]:
+    """All targets of the project."""
+    from gripper_force.qualification.fuzz import bus_targets, core_targets, load_cell_targets
+
+    return [*core_targets.TARGETS, *bus_targets.TARGETS, *load_cell_targets.TARGETS]
 
 
 def fuzz(
@@ -117,30 +142,26 @@ def fuzz(
     seed: int,
     jobs: int,
     out: Path,
-    advance: Advance = lambda _note, _done: None,
+    progress: Progress = no_progress,
     *,
     only: str | None = None,
-) -> dict[str, Any]:
+) -> FuzzReport:
     """Feeds ``count`` inputs to all targets, in several processes.
 
     Args:
-        count: Inputs over all targets; each target gets one at least.
-        seed: Of all inputs.
+        count: Inputs over all targets; each target gets at least one.
+        seed: Seed of all inputs.
         jobs: Processes.
-        out: Folder for the inputs that were findings.
-        advance: Told of progress.
-        only: A target's name, which then gets all inputs; or ``<name>:<number>`` for that input alone.
-
-    Returns:
-        ``ok`` (nothing was found), ``targets`` (by name: ``inputs``, ``results``, ``typed_errors``,
-        ``findings``), ``findings`` (one of each kind), ``inputs``, ``seed`` and ``wall_s``.
+        out: Folder for the inputs of findings.
+        progress: Called several times a second; a step is an input.
+        only: A target's name, which then gets all inputs, or ``<name>:<number>`` for that input alone.
 
     Raises:
-        ConfigError: There is no such target.
+        ConfigError: ``only`` names no target.
         GripperError: A process died before its first input.
     """
     begin_s = time.monotonic()
-    targets = load_targets(FUZZ_TARGETS)
+    targets = all_targets()
     plan = _plan(targets, count, only)
     findings: dict[tuple[str, str], Finding] = {}
     done = 0
@@ -152,10 +173,10 @@ def fuzz(
                 for t, index, error in [found for worker in workers for found in worker.poll()]:
                     target = targets[t]
                     if (key := (target.name, _kind(error))) not in findings:
-                        file = _keep(out, target, seed, index)
+                        file = _save_input(out, target, seed, index)
                         findings[key] = Finding(target.name, index, error, str(file))
                 now = sum(sum(worker.counts(t)) for worker in workers for t in range(len(targets)))
-                advance(f"{len(findings)} findings", now - done)
+                progress(f"{len(findings)} findings", now - done)
                 done = now
         finally:
             for worker in workers:
@@ -186,7 +207,7 @@ def input_of(target: Target, examples: Sequence[bytes], seed: int, index: int) -
 
 
 def mutate(rng: random.Random, examples: Sequence[bytes], words: Sequence[bytes]) -> bytes:
-    """Damages one of the examples in one to eight ways; one input in 50 is nothing but random bytes."""
+    """Damages one of the examples in one to eight ways; one input in 50 is random bytes only."""
     if rng.random() < 0.02:
         return rng.randbytes(int(rng.expovariate(1 / 100)))
     data = bytearray(rng.choice(examples))
@@ -233,7 +254,7 @@ def _splice(rng: random.Random, data: bytearray, examples: Sequence[bytes], _wor
 
 
 def _integer(rng: random.Random, data: bytearray, *_: object) -> None:
-    """A lie where a length, a count, an address or a time may be."""
+    """Overwrites bytes by an extreme integer, as a length, a count, an address or a time may stand there."""
     size = rng.choice((1, 2, 4, 8))
     number = rng.choice(_INTEGERS) % (1 << 8 * size)
     at = rng.randint(0, len(data))
@@ -251,7 +272,7 @@ def _word(rng: random.Random, data: bytearray, _examples: object, words: Sequenc
 
 
 def _digits(rng: random.Random, data: bytearray, _examples: object, words: Sequence[bytes]) -> None:
-    """Another number, or no number, in the place of one that is written out."""
+    """Replaces a decimal number by another number or by a word."""
     found = _DIGITS.search(data, rng.randint(0, len(data)))
     if found is not None:
         number = str(rng.choice((-1, 1)) * rng.choice(_INTEGERS)).encode()
@@ -264,33 +285,35 @@ _DAMAGES: Final[tuple[_Damage, ...]] = (
 
 
 def _span(rng: random.Random, data: bytearray) -> slice:
-    """Some bytes in a row, mostly few."""
+    """Random slice of the data, mostly short."""
     start = rng.randint(0, len(data))
     return slice(start, min(len(data), start + int(rng.expovariate(1 / 6))))
 
 
 def _plan(targets: Sequence[Target], count: int, only: str | None) -> list[range]:
-    """The numbers of the inputs that each target gets."""
+    """Numbers of the inputs of each target."""
     if only is None:
         total = sum(target.weight for target in targets)
         return [range(max(1, round(count * target.weight / total))) for target in targets]
     name, colon, number = only.partition(":")
     if name not in {target.name for target in targets} or (colon and not number.isdecimal()):
         known = ", ".join(target.name for target in targets)
-        raise ConfigError(f"no input {only!r}; give <target> or <target>:<number>, of {known}")
+        raise ConfigError(
+            f"no fuzz input {only!r}; give <target> or <target>:<number>, with a target of {known}"
+        )
     wanted = range(int(number), int(number) + 1) if colon else range(count)
     return [wanted if target.name == name else range(0) for target in targets]
 
 
 class _Worker:
-    """A process that feeds its share of the inputs, and the next one in its place where it dies or hangs."""
+    """A process that feeds its share of the inputs; it is replaced when it dies or hangs."""
 
     def __init__(self, seed: int, plan: Sequence[range], number: int, jobs: int, folder: Path) -> None:
         self._context = get_context("spawn")
         self._shares = [numbers[number::jobs] for numbers in plan]
-        # Target, place in its share, begin of the input (0: none yet); then three counts for each target.
+        # Target, place in its share, start of the input in ns (0: none yet); then three counts per target.
         self._shared = self._context.RawArray("q", 3 + 3 * len(plan))
-        self._task = (FUZZ_TARGETS, seed, self._shares, folder / str(number), self._shared)
+        self._task = (all_targets, seed, self._shares, folder / str(number), self._shared)
         self.busy = True
         self._begin(0, 0)
 
@@ -304,12 +327,12 @@ class _Worker:
         theirs.close()
 
     def counts(self, target: int) -> tuple[int, int, int]:
-        """Results, typed errors and findings of a target so far."""
+        """Returns results, typed errors and findings of a target so far."""
         a, b, c = self._shared[3 + 3 * target : 6 + 3 * target]
         return a, b, c
 
     def poll(self) -> list[tuple[int, int, str]]:
-        """Findings since the last call: target, number, error."""
+        """Returns the findings since the last call: target, number, error."""
         if not self.busy:
             return []
         ended = not self.process.is_alive()
@@ -326,18 +349,18 @@ class _Worker:
         elif not begin_ns:
             raise GripperError(f"a fuzzing process ended with code {code} before its first input")
         else:
-            why = (
-                f"Hang: no end after {HANG_S:.0f} s"
+            error = (
+                f"Hang: not finished after {HANG_S:.0f} s"
                 if hangs
                 else f"Crash: the process ended with code {code}"
             )
-            found.append((target, self._shares[target][place], why))
+            found.append((target, self._shares[target][place], error))
             self._shared[5 + 3 * target] += 1
             self._begin(target, place + 1)
         return found
 
     def kill(self) -> None:
-        """Ends the process."""
+        """Kills the process."""
         self.process.kill()
         self.process.join()
 
@@ -352,7 +375,7 @@ class _Worker:
 
 
 def _work(
-    modules: Sequence[str],
+    make_targets: Callable[[], list[Target]],
     seed: int,
     shares: Sequence[range],
     scratch: Path,
@@ -361,13 +384,13 @@ def _work(
     first_place: int,
     pipe: connection.Connection,
 ) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process that reads the pipe ends this one
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent, which reads the pipe, ends this process
     warnings.simplefilter("ignore")
-    targets = load_targets(modules)
+    targets = make_targets()
     examples = [target.examples() if share else () for target, share in zip(targets, shares, strict=True)]
     limit = _address_space() + MEMORY_BYTES
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-    told = set()
+    reported = set()
     for t, target in list(enumerate(targets))[first_target:]:
         for place in range(first_place if t == first_target else 0, len(shares[t])):
             index = shares[t][place]
@@ -375,8 +398,8 @@ def _work(
             shared[0], shared[1], shared[2] = t, place, time.monotonic_ns()
             error = _outcome(target, data, scratch)
             shared[3 + 3 * t + _COLUMNS.get(error, 2)] += 1
-            if error not in _COLUMNS and (kind := (t, _kind(error))) not in told:
-                told.add(kind)
+            if error not in _COLUMNS and (kind := (t, _kind(error))) not in reported:
+                reported.add(kind)
                 pipe.send((t, index, error))
 
 
@@ -389,10 +412,10 @@ def _outcome(target: Target, data: bytes, scratch: Path) -> str:
         target.feed(data, scratch)
     except GripperError:
         return _TYPED
-    except BaseException as error:  # libraries in Rust panic past Exception
+    except BaseException as error:  # panics of Rust libraries do not derive from Exception
         frames = traceback.extract_tb(error.__traceback__)
         ours = [frame for frame in frames if any(package in frame.filename for package in _PACKAGES)]
-        where = f"{Path(ours[-1].filename).name}:{ours[-1].lineno}" if ours else "nowhere"
+        where = f"{Path(ours[-1].filename).name}:{ours[-1].lineno}" if ours else "unknown"
         message = " ".join(str(error)[:200].split())
         return f"{type(error).__name__} at {where}: {message}"
     return _RESULT
@@ -402,7 +425,7 @@ def _kind(error: str) -> str:
     return error.partition(": ")[0]
 
 
-def _keep(out: Path, target: Target, seed: int, index: int) -> Path:
+def _save_input(out: Path, target: Target, seed: int, index: int) -> Path:
     out.mkdir(parents=True, exist_ok=True)
     path = out / f"{target.name}-{seed}-{index}.bin"
     path.write_bytes(input_of(target, target.examples(), seed, index))

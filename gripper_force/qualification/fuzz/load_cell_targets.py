@@ -1,4 +1,4 @@
-"""What of the load cells reads bytes from outside, for `gripper_force.qualification.fuzz.fuzzer`."""
+"""Fuzz targets of the load cells: serial lines and sample validation."""
 
 import struct
 from collections.abc import Callable
@@ -8,10 +8,12 @@ from typing import Final
 
 from gripper_force.qualification.fuzz.fuzzer import Target
 from gripper_force.types import NS_PER_MS
-from gripper_hw.load_cells.line_formats import LONGEST_LINE, PARSERS, LineSplitter, Reading
-from gripper_hw.load_cells.screening import Screen
+from gripper_hw.load_cells.line_formats import MAX_LINE_BYTES, PARSERS, LineSplitter, Reading
+from gripper_hw.load_cells.screening import SampleValidator
 
 _PIECE: Final = 100
+"""Bytes that arrive at once."""
+
 _SAMPLE: Final = struct.Struct("<dq")
 
 
@@ -29,27 +31,27 @@ def _frames() -> list[bytes]:
 
 
 def _read_lines(parse: Callable[[bytes], Reading | None], data: bytes, _path: Path) -> None:
-    splitter, screen = LineSplitter(), Screen(100.0, -1e-3, noisy=True)
+    splitter, validator = LineSplitter(), SampleValidator(100.0, -1e-3, noisy=True)
     for t_ns, at in enumerate(range(0, len(data), _PIECE)):
         for line in splitter.feed(data[at : at + _PIECE]):
             if (reading := parse(line)) is not None:
-                screen.add(t_ns * NS_PER_MS, reading.raw, saturated=reading.saturated)
-        screen.take(t_ns * NS_PER_MS)
-    assert len(splitter._begun) <= LONGEST_LINE + _PIECE
+                validator.add(t_ns * NS_PER_MS, reading.raw, saturated=reading.saturated)
+        validator.take(t_ns * NS_PER_MS)
+    assert len(splitter._partial) <= MAX_LINE_BYTES + _PIECE
 
 
 def _readings() -> list[bytes]:
     return [b"".join(_SAMPLE.pack(0.01 * i % 3, 12 * NS_PER_MS * i) for i in range(40))]
 
 
-def _screen(data: bytes, _path: Path) -> None:
-    screen = Screen(0.5, 2.0, noisy=True)
+def _validate(data: bytes, _path: Path) -> None:
+    validator = SampleValidator(0.5, 2.0, noisy=True)
     taken = 0
-    whole = data[: len(data) // _SAMPLE.size * _SAMPLE.size]
-    for raw, t_ns in _SAMPLE.iter_unpack(whole):
-        screen.add(t_ns, raw)
-        taken += len(screen.take(t_ns)) if t_ns & 3 == 0 else 0
-    assert taken <= len(whole) // _SAMPLE.size
+    complete = data[: len(data) // _SAMPLE.size * _SAMPLE.size]
+    for raw, t_ns in _SAMPLE.iter_unpack(complete):
+        validator.add(t_ns, raw)
+        taken += len(validator.take(t_ns)) if t_ns & 3 == 0 else 0
+    assert taken <= len(complete) // _SAMPLE.size
 
 
 TARGETS: Final = [
@@ -57,5 +59,5 @@ TARGETS: Final = [
         "lines of hx711", _counts, partial(_read_lines, PARSERS["hx711"]), 20, (b"+", b"8388608", b"-8388608")
     ),
     Target("lines of cas", _frames, partial(_read_lines, PARSERS["cas"]), 20, (b"OL,", b"kg", b" g", b".")),
-    Target("readings", _readings, _screen, 4),
+    Target("readings", _readings, _validate, 4),
 ]

@@ -1,4 +1,4 @@
-"""Small networks that are hard on numbers."""
+"""Numerically hard small networks."""
 
 import math
 from collections.abc import Callable
@@ -18,11 +18,11 @@ from gripper_force.vision.preprocess import Preprocess
 Change = Callable[[ForceNetwork], None]
 
 KNOWN_N: Final = (0.5, 9.5)
-"""Validation of these networks knew these forces."""
+"""Forces in N at which the validation error of these networks is given."""
 
 
 def scaled(factor: float, recurrence: float = 1.0) -> Change:
-    """Gates and tanh with so many times their weights, that of the recurrence apart."""
+    """Scales the weights of gates and tanh layers by ``factor``, recurrent ones by ``recurrence``."""
 
     def change(network: ForceNetwork) -> None:
         for part in (network.attention, network.blstm, network.dense):
@@ -50,7 +50,7 @@ def _denormal(network: ForceNetwork) -> None:
 
 
 def faint(network: ForceNetwork) -> None:
-    """Activations that float32 has few digits for, and the next layer makes large again."""
+    """Makes activations denormal in float32, and scales them up in the next layer."""
     first, second = _pair(network, 2)
     assert first.bias is not None
     first.weight.mul_(1e-39)
@@ -59,7 +59,7 @@ def faint(network: ForceNetwork) -> None:
 
 
 def outlier(network: ForceNetwork) -> None:
-    """A channel of each pair a thousand times what it was, and taken back by the next: the same forces."""
+    """Scales a channel of each pair of layers by 1000 and back in the next layer; forces do not change."""
     for i in range(5):
         first, second = _pair(network, i)
         assert first.bias is not None
@@ -69,7 +69,7 @@ def outlier(network: ForceNetwork) -> None:
 
 
 def overflow(network: ForceNetwork) -> None:
-    """Weights whose products go beyond what float32 can hold."""
+    """Scales weights so that their products overflow float32."""
     for i in range(5):
         for convolution in _pair(network, i):
             convolution.weight.mul_(1e15)
@@ -85,7 +85,7 @@ def _pair(network: ForceNetwork, index: int) -> tuple[nn.Conv2d, nn.Conv2d]:
 
 
 HARD: Final[dict[str, Change]] = {
-    "weights as drawn": lambda _network: None,
+    "random weights": lambda _network: None,
     "one channel x 1000": outlier,
     "denormal weights, x 1e-39": _denormal,
     "gates and tanh saturated, weights x 100": scaled(1e2),
@@ -95,24 +95,24 @@ HARD: Final[dict[str, Change]] = {
     "batch-norm variance 0": _variance(0.0),
 }
 STEEP: Final = tuple(HARD)[3:]
-"""So steep that of numbers with eight bits nothing is left in the end."""
+"""Changes after which the 8 significant bits of bfloat16 leave no correct digit."""
 
 
 def drawn(change: Change, attention: str = "ssam", size: int = 32) -> ForceNetwork:
-    """A small network with random weights, changed."""
+    """Small network with random weights, changed by ``change``."""
     shape = {"attention": attention, "size": size, "width": 0.25, "hidden": 16, "head": 32}
     network = ForceNetwork(NetworkConfig.model_validate(shape))
     with torch.no_grad():
         for weight in network.backbone.parameters():
             if weight.dim() == 4:
-                # PyTorch draws so small that nothing of the frame is left at the end; this is He's scale.
+                # PyTorch's initial weights are so small that the image signal vanishes; this is He's scale.
                 weight.mul_(math.sqrt(6))
         change(network)
     return network.eval().requires_grad_(False)
 
 
 def saved(path: Path, *networks: ForceNetwork) -> Model:
-    """An ensemble as a checkpoint."""
+    """Saves an ensemble as a checkpoint, and returns its model."""
     header = Header(
         members=tuple(network.config for network in networks),
         preprocess=Preprocess(size=networks[0].config.size),

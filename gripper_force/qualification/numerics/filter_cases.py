@@ -1,8 +1,8 @@
-"""Hard cases for the fusion filter, each against the same equations in decimal numbers of 50 digits.
+"""Hard cases for the fusion filter, compared with the same equations in decimal numbers of 50 digits.
 
-The reference is written anew from the description of `gripper_force.control.fusion`, not taken from its code.
-Binary doubles keep 16 digits, so what differs is rounding, or a mistake. Fractions would be exact, but theirs
-grow with every step; 50 digits lose nothing that counts in a million.
+The reference is a second implementation after the description of `gripper_force.control.fusion`, not a copy
+of its code. Doubles have 16 digits, so a difference is rounding, or a mistake. Fractions would be exact but
+grow with each step; the error of 50 digits is negligible over a million steps.
 """
 
 import math
@@ -26,23 +26,23 @@ from gripper_force.qualification.numerics.suite import NumericalCase
 from gripper_force.types import NS_PER_MS, NS_PER_S, Request, RequestKind, ServoState, VisualForce
 
 CYCLES: Final = 1_000_000
-"""Of the longest case: 83 minutes at 200 Hz."""
+"""Cycles of the longest case: 83 minutes at 200 Hz."""
 
 _ROUNDING_N: Final = 1e-9
-"""A billionth of what the loop calls even; a filter that loses digits as it goes is far beyond."""
+"""Bound of the rounding error. A filter whose error grows with the number of cycles exceeds it by far."""
 
-_LEFT: Final = 1e-15
-"""Share of a huge reading that may stay in those after it: a few times the last digit of a double."""
+_RESIDUE_SHARE: Final = 1e-15
+"""Share of an outlier that may remain in later estimates: a few times the precision of a double."""
 
 _DAY_NS: Final = 86_400 * NS_PER_S
 _DIGITS: Final = 50
 
 Input = tuple[int, float, VisualForce | None]
-"""Time of a cycle, the motor's push in it, and the newest estimate."""
+"""Time of a cycle, its motor force in N, and the newest visual estimate."""
 
 
-class _Exact:
-    """The filter of `Fusion` for jaws that touch something, in decimal numbers."""
+class _DecimalFusion:
+    """The filter of `Fusion` in contact, in decimal numbers."""
 
     def __init__(self, control: ControlConfig, transmission: Transmission) -> None:
         _, lag_s, _ = control.plant
@@ -61,7 +61,7 @@ class _Exact:
         self._run = 0
 
     def step(self, t_ns: int, motor_force_n: float, visual: VisualForce | None) -> tuple[Decimal, Decimal]:
-        """One cycle: the force and its standard deviation."""
+        """Runs a cycle; returns the force and its standard deviation, in N."""
         before_n = self._force_n
         dt_s = Decimal(0)
         if self._history:
@@ -81,14 +81,14 @@ class _Exact:
         self._history.append((t_ns, self._force_n))
         if visual is not None and visual.t_ns > self._newest_ns:
             self._newest_ns = visual.t_ns
-            self._take(t_ns, visual)
+            self._correct(t_ns, visual)
         prior_n2 = self._prior_n2(self._force_n)
         force_n = max(self._force_n + self._share * self._difference_n, Decimal(0))
         return force_n, (self._variance_n2 + (1 - self._share) * prior_n2).sqrt()
 
-    def _take(self, t_ns: int, visual: VisualForce) -> None:
-        sound = abs(visual.force_n) <= 1e9 and abs(visual.std_n) <= 1e9
-        if not (sound and 0 <= t_ns - visual.t_ns <= self._oldest_ns and visual.std_n <= self._most_std_n):
+    def _correct(self, t_ns: int, visual: VisualForce) -> None:
+        usable = abs(visual.force_n) <= 1e9 and abs(visual.std_n) <= 1e9
+        if not (usable and 0 <= t_ns - visual.t_ns <= self._oldest_ns and visual.std_n <= self._most_std_n):
             return
         claimed_n2 = Decimal(max(visual.std_n, fusion._VISION_FLOOR_N)) ** 2
         then_n = self._force_at(visual.t_ns)
@@ -104,7 +104,7 @@ class _Exact:
                 return
             self._variance_n2 = prior_n2
         self._run = 0
-        # In the information form: what was known and what is new add up.
+        # Information form: the information of prior and measurement adds up.
         noise_n2 = Decimal(fusion._FRAME_NOISE_N) ** 2
         total_n2 = self._variance_n2 + noise_n2
         self._difference_n = (self._difference_n * noise_n2 + difference_n * self._variance_n2) / total_n2
@@ -128,11 +128,11 @@ class _Exact:
 
 
 def cases(config: Config, _maps: Path | None, cycles: int = CYCLES) -> Iterator[NumericalCase]:
-    """Rows of the filter.
+    """Yields the cases of the filter.
 
     Args:
-        config: Whose control and gripper are tested.
-        cycles: Of the longest case.
+        config: Control and gripper under test.
+        cycles: Cycles of the longest case.
     """
     control, gripper = config.control, config.gripper
 
@@ -151,50 +151,50 @@ def cases(config: Config, _maps: Path | None, cycles: int = CYCLES) -> Iterator[
     rng = np.random.default_rng([config.seed, 40])
     yield against(f"{cycles} cycles", "4 ± 3 N, frames at 60 Hz", _steady(rng, cycles))
     yield NumericalCase(
-        "a clock near 2^62 ns",
-        "146 years of uptime, beside the same cycles from 0; estimates that differ by a bit",
-        _moved(control, gripper, 2**62, config.seed),
+        "clock near 2^62 ns",
+        "146 years of uptime, compared with the same cycles from 0; number of estimates that differ",
+        _count_shifted(control, gripper, 2**62, config.seed),
         0.0,
     )
     late = (one for day in range(10) for one in _steady(rng, 200, begin_ns=NS_PER_S + day * _DAY_NS))
-    yield against("ten days of uptime", "a second of cycles a day, nothing between", late)
+    yield against("ten days of uptime", "one second of cycles per day", late)
     yield against("repeated timestamps", "every cycle and every frame four times", _repeated(rng))
-    yield against("a clock that goes backward", "100 ms back, twice a second", _backward(rng))
-    yield against("irregular cycles", "1 to 50 ms, a pause of 2 s at times", _irregular(rng))
+    yield against("clock that jumps backward", "100 ms back, twice a second", _backward(rng))
+    yield against("irregular cycles", "1 to 50 ms, with pauses of 2 s", _irregular(rng))
     yield against(
         "irregular and dropped frames", "two of three lost, 5 to 95 ms late, out of order", _ragged(rng)
     )
-    for name, std_n in (("0", 0.0), ("the smallest number", 5e-324), ("negative", -1.0)):
+    for name, std_n in (("0", 0.0), ("5e-324", 5e-324), ("negative", -1.0)):
         yield against(
-            f"claimed error {name}", "no frame is believed without bound", _steady(rng, 4000, std_n=std_n)
+            f"claimed error {name}", "the weight of a frame stays bounded", _steady(rng, 4000, std_n=std_n)
         )
     for name, force_n, std_n in _REFUSED:
         yield NumericalCase(
             f"estimates of {name}",
-            "every second one; off from the filter that never sees those",
-            _unheard(control, gripper, force_n, std_n, config.seed),
+            "every second estimate; difference to a filter that does not get them",
+            _effect_of_refused_n(control, gripper, force_n, std_n, config.seed),
             0.0,
             "N",
         )
     nothing = {"friction_n": 0.0, "friction_std": 0.0, "gain_std": 0.0}
-    yield against("prior variance 0", "nothing is unknown of the rig", _steady(rng, 4000), **nothing)
+    yield against("prior variance 0", "rig parameters known exactly", _steady(rng, 4000), **nothing)
     wide = {"friction_std": 1e9, "gain_std": 1e9}
     yield against(
-        "prior variance without end", "10^18 N², the most that can be configured", _steady(rng, 4000), **wide
+        "largest prior variance", "10^18 N², the largest that can be configured", _steady(rng, 4000), **wide
     )
     tiny = ((t_ns, 5e-324 * (t_ns // CYCLE_NS % 3), None) for t_ns in range(0, NS_PER_S, CYCLE_NS))
-    yield against("denormal currents", "0 to 2 of the smallest number", tiny)
+    yield against("denormal currents", "0 to 2 times the smallest double", tiny)
     for huge_n in (1e3, 1e9):
         yield against(
             f"one reading of {huge_n:g} N",
-            "then a second of ordinary ones",
+            "followed by a second of normal readings",
             _spiked(rng, huge_n),
-            bound_n=max(_ROUNDING_N, _LEFT * huge_n),
+            bound_n=max(_ROUNDING_N, _RESIDUE_SHARE * huge_n),
         )
     yield NumericalCase(
-        "servo readings that are not finite",
-        "every tenth, each number in turn, in a whole grasp; commands beyond limits or not finite",
-        float(_wild_commands(control, gripper, config.servo.current_limit_a)),
+        "non-finite servo readings",
+        "every tenth, each quantity in turn, in a whole grasp; number of commands outside limits",
+        float(_count_bad_commands(control, gripper, config.servo.current_limit_a)),
         0.0,
     )
 
@@ -209,12 +209,12 @@ _REFUSED: Final = (
 
 
 def worst_n(control: ControlConfig, gripper: GripperConfig, inputs: Iterator[Input]) -> float:
-    """Most that force or standard deviation are off from the reference; infinite where one is not finite.
+    """Largest error of force and standard deviation against the reference, in N; infinite if not finite.
 
-    Beyond 1 N as a share of the force.
+    Above 1 N the error is relative.
     """
     transmission = transmission_of(gripper)
-    tested, exact = Fusion(control, transmission), _Exact(control, transmission)
+    tested, reference = Fusion(control, transmission), _DecimalFusion(control, transmission)
     worst = 0.0
     with localcontext(prec=_DIGITS):
         for t_ns, motor_force_n, visual in inputs:
@@ -222,13 +222,13 @@ def worst_n(control: ControlConfig, gripper: GripperConfig, inputs: Iterator[Inp
             found, _ = tested.step(t_ns, servo, visual)
             if not (math.isfinite(found.force_n) and math.isfinite(found.std_n)):
                 return math.inf
-            force_n, std_n = exact.step(t_ns, transmission.force_n(servo.current_a), visual)
+            force_n, std_n = reference.step(t_ns, transmission.force_n(servo.current_a), visual)
             for number, true in ((found.force_n, force_n), (found.std_n, std_n)):
                 worst = max(worst, float(abs(Decimal(number) - true) / max(true, Decimal(1))))
     return worst
 
 
-# What goes in.
+# Inputs.
 
 
 def _servo(t_ns: int, current_a: float) -> ServoState:
@@ -236,11 +236,11 @@ def _servo(t_ns: int, current_a: float) -> ServoState:
 
 
 def _motor_force_n(rng: np.random.Generator, t_ns: int) -> float:
-    """Push of a grip that goes up and down, and turns the play over."""
+    """Motor force of an oscillating grip, which reverses friction."""
     return 5.0 + 3.0 * math.sin(t_ns / NS_PER_S) + float(rng.normal(0.0, 0.2))
 
 
-def _seen(rng: np.random.Generator, t_ns: int, seq: int, std_n: float = 0.1) -> VisualForce:
+def _visual(rng: np.random.Generator, t_ns: int, seq: int, std_n: float = 0.1) -> VisualForce:
     force_n = 4.0 + 3.0 * math.sin(t_ns / NS_PER_S) + float(rng.normal(0.0, 0.15))
     return VisualForce(t_ns, t_ns, seq, force_n, std_n, 12.0)
 
@@ -250,7 +250,7 @@ def _steady(
 ) -> Iterator[Input]:
     for cycle in range(cycles):
         t_ns = begin_ns + cycle * CYCLE_NS
-        visual = _seen(rng, t_ns - 40 * NS_PER_MS, cycle, std_n) if cycle % 10 in (0, 3, 6) else None
+        visual = _visual(rng, t_ns - 40 * NS_PER_MS, cycle, std_n) if cycle % 10 in (0, 3, 6) else None
         yield t_ns, _motor_force_n(rng, t_ns), visual
 
 
@@ -262,8 +262,8 @@ def _repeated(rng: np.random.Generator) -> Iterator[Input]:
 def _backward(rng: np.random.Generator) -> Iterator[Input]:
     for cycle, (t_ns, motor_force_n, visual) in enumerate(_steady(rng, 4000)):
         back_ns = 100 * NS_PER_MS * (cycle // 100)
-        seen = visual and replace(visual, t_ns=visual.t_ns - back_ns, ready_ns=visual.ready_ns - back_ns)
-        yield t_ns - back_ns, motor_force_n, seen
+        moved = visual and replace(visual, t_ns=visual.t_ns - back_ns, ready_ns=visual.ready_ns - back_ns)
+        yield t_ns - back_ns, motor_force_n, moved
 
 
 def _irregular(rng: np.random.Generator) -> Iterator[Input]:
@@ -273,7 +273,7 @@ def _irregular(rng: np.random.Generator) -> Iterator[Input]:
         yield (
             t_ns,
             _motor_force_n(rng, t_ns),
-            _seen(rng, t_ns - 40 * NS_PER_MS, cycle) if cycle % 3 == 0 else None,
+            _visual(rng, t_ns - 40 * NS_PER_MS, cycle) if cycle % 3 == 0 else None,
         )
 
 
@@ -281,7 +281,7 @@ def _ragged(rng: np.random.Generator) -> Iterator[Input]:
     for cycle, (t_ns, motor_force_n, visual) in enumerate(_steady(rng, 8000)):
         late_ns = int(rng.integers(5 * NS_PER_MS, 95 * NS_PER_MS))
         kept = visual is not None and rng.random() < 1 / 3
-        yield t_ns, motor_force_n, _seen(rng, t_ns - late_ns, cycle) if kept else None
+        yield t_ns, motor_force_n, _visual(rng, t_ns - late_ns, cycle) if kept else None
 
 
 def _spiked(rng: np.random.Generator, huge_n: float) -> Iterator[Input]:
@@ -289,61 +289,60 @@ def _spiked(rng: np.random.Generator, huge_n: float) -> Iterator[Input]:
         yield t_ns, huge_n if cycle == 400 else motor_force_n, visual
 
 
-# What is compared with the filter itself.
+# Comparisons of the filter with itself.
 
 
-def _moved(control: ControlConfig, gripper: GripperConfig, by_ns: int, seed: int) -> float:
-    """How many estimates differ where all times are later by the same."""
+def _count_shifted(control: ControlConfig, gripper: GripperConfig, by_ns: int, seed: int) -> float:
+    """Number of estimates that change when all times are shifted by ``by_ns``."""
     transmission = transmission_of(gripper)
-    here, there = Fusion(control, transmission), Fusion(control, transmission)
+    original, shifted = Fusion(control, transmission), Fusion(control, transmission)
     different = 0
     for t_ns, motor_force_n, visual in _ragged(np.random.default_rng([seed, 41])):
         current_a = transmission.current_a(motor_force_n)
         later = visual and replace(visual, t_ns=visual.t_ns + by_ns, ready_ns=visual.ready_ns + by_ns)
-        one, _ = here.step(t_ns, _servo(t_ns, current_a), visual)
-        other, _ = there.step(t_ns + by_ns, _servo(t_ns + by_ns, current_a), later)
+        one, _ = original.step(t_ns, _servo(t_ns, current_a), visual)
+        other, _ = shifted.step(t_ns + by_ns, _servo(t_ns + by_ns, current_a), later)
         different += replace(other, t_ns=t_ns) != one
     return float(different)
 
 
-def _unheard(
+def _effect_of_refused_n(
     control: ControlConfig, gripper: GripperConfig, force_n: float, std_n: float, seed: int
 ) -> float:
-    """Most that the estimate is off because of estimates that can't be used."""
+    """Largest change of the fused estimate by visual estimates that must be rejected, in N."""
     transmission = transmission_of(gripper)
-    # What vision says after such an estimate counts anew: only what the filter holds is compared.
-    hears, spared = Fusion(control, transmission), Fusion(control, transmission)
+    with_bad, without_bad = Fusion(control, transmission), Fusion(control, transmission)
     worst = 0.0
     for number, (t_ns, motor_force_n, visual) in enumerate(_steady(np.random.default_rng([seed, 42]), 4000)):
         servo = _servo(t_ns, transmission.current_a(motor_force_n))
         bad = visual is not None and number % 2 == 1
-        spoiled = replace(visual, force_n=force_n, std_n=std_n) if visual and bad else visual
-        found, _ = hears.step(t_ns, servo, spoiled)
-        expected, _ = spared.step(t_ns, servo, None if bad else visual)
+        changed = replace(visual, force_n=force_n, std_n=std_n) if visual and bad else visual
+        found, _ = with_bad.step(t_ns, servo, changed)
+        expected, _ = without_bad.step(t_ns, servo, None if bad else visual)
         off = max(abs(found.force_n - expected.force_n), abs(found.std_n - expected.std_n))
         worst = max(worst, off) if math.isfinite(off) else math.inf
     return worst
 
 
-def _wild_commands(control: ControlConfig, gripper: GripperConfig, current_limit_a: float) -> int:
-    """How many commands of a grasp break a limit while the servo says things that are not finite."""
+def _count_bad_commands(control: ControlConfig, gripper: GripperConfig, current_limit_a: float) -> int:
+    """Number of commands of a grasp beyond a limit while servo readings are extreme or not finite."""
     transmission = transmission_of(gripper)
-    broken = 0
+    bad = 0
     for name in ("position_rad", "velocity_rad_s", "current_a", "temperature_c", "voltage_v"):
-        for wild in (math.nan, math.inf, -math.inf, sys.float_info.max):
-            spoiled: dict[str, Any] = {name: wild}
+        for extreme in (math.nan, math.inf, -math.inf, sys.float_info.max):
+            changed: dict[str, Any] = {name: extreme}
             controller = GraspController(control, transmission, current_limit_a)
             request: Request | None = Request(0, RequestKind.GRASP, 4.0)
             for cycle in range(400):
                 t_ns = cycle * CYCLE_NS
                 servo = replace(_servo(t_ns, 0.03), position_rad=min(0.001 * cycle, 0.3))
                 if cycle % 10 == 9:
-                    servo = replace(servo, **spoiled)
+                    servo = replace(servo, **changed)
                 command = controller.step(t_ns, servo, None, request).command
                 request = None
                 ends = sorted((transmission.open_position_rad, transmission.closed_position_rad))
-                broken += not (
+                bad += not (
                     0 <= command.goal_current_a <= current_limit_a
                     and ends[0] <= command.goal_position_rad <= ends[1]
                 )
-    return broken
+    return bad

@@ -1,4 +1,4 @@
-"""Ill-conditioned fits of the last layer, against the same regression in decimal numbers of 50 digits."""
+"""Ill-conditioned fits of the last layer, compared with the same regression in decimals of 50 digits."""
 
 from collections.abc import Iterable, Iterator
 from decimal import Decimal, localcontext
@@ -17,16 +17,16 @@ _FEATURES: Final = 30
 _DIGITS: Final = 50
 _EPS: Final = float(np.finfo(np.float64).eps)
 
-_STEPS: Final = (1.0, 0.1, 0.01, 0.001)
-"""How much features move in a touch. Where the network's own last layer makes newtons of it, it is 0.1."""
+_CHANGES: Final = (1.0, 0.1, 0.01, 0.001)
+"""Changes of the features within a touch. With the network's own last layer the change is 0.1."""
 
-_NOTICED_N: Final = 0.005
-"""A tenth of the error that is allowed to any estimate at best."""
+_NEGLIGIBLE_N: Final = 0.005
+"""A tenth of the smallest error that an estimate is allowed to have."""
 
 
 def cases() -> Iterator[NumericalCase]:
-    """Rows of the last layer's fit."""
-    for name, features in _hard().items():
+    """Yields the cases of the fit of the last layer."""
+    for name, features in _feature_sets().items():
         worst, error_n, bound_n = 0.0, 0.0, 0.0
         missing_n = np.random.default_rng(1).normal(0.0, 2.0, len(features))
         for penalty in PENALTIES.tolist():
@@ -37,21 +37,21 @@ def cases() -> Iterator[NumericalCase]:
         yield NumericalCase(
             f"last layer fitted to {name}", "all penalties; against 50 digits", error_n, bound_n, "N"
         )
-    moved_n = max(_moved_n(steps) for steps in _STEPS)
-    detail = "what float32 rounds away of it and of its features, where these move by 1 to 0.001"
-    yield NumericalCase("last layer of a profile", detail, moved_n, _NOTICED_N, "N")
+    rounding_n = max(_rounding_n(change) for change in _CHANGES)
+    detail = "float32 rounding error of the layer and its features, for feature changes of 1 to 0.001"
+    yield NumericalCase("last layer of a profile", detail, rounding_n, _NEGLIGIBLE_N, "N")
 
 
-def _hard() -> dict[str, Features]:
+def _feature_sets() -> dict[str, Features]:
     rng = np.random.default_rng(0)
     plain = np.tanh(rng.normal(size=(_FRAMES, _FEATURES)))
     one = np.repeat(plain[:1], _FRAMES, axis=0)
     sets = {
         "ordinary frames": plain,
         "more frames than features": np.tanh(rng.normal(size=(_FRAMES, 5))),
-        "every frame twice": np.repeat(plain[::2], 2, axis=0),
+        "duplicated frames": np.repeat(plain[::2], 2, axis=0),
         "frames on a line": np.outer(rng.normal(size=_FRAMES), plain[0]) / 4,
-        "one frame, again and again": one,
+        "one repeated frame": one,
         "frames that differ in their last digits": one * (1 + 1e-7 * rng.normal(size=plain.shape)),
         "saturated features": np.sign(plain),
         "denormal features": 1e-40 * plain,
@@ -61,7 +61,7 @@ def _hard() -> dict[str, Features]:
 
 
 def _off_n(features: Features, missing_n: Floats, penalty: float) -> float:
-    """How far the fit's forces at its own frames are off."""
+    """Largest error of the fitted forces at the frames of the fit, in N."""
     ridge = Ridge(features)
     weights, offset_n = ridge.solve(missing_n, penalty)
     found_n = features.astype(np.float64) @ weights + offset_n
@@ -71,11 +71,11 @@ def _off_n(features: Features, missing_n: Floats, penalty: float) -> float:
 
 
 def _allowed_n(features: Features, missing_n: Floats, penalty: float) -> float:
-    """What a stable solution may be off.
+    """Error bound of a numerically stable solution, in N.
 
-    That is the length of the sums, times the condition that the penalty leaves, times what is lost where
-    frames are centred that differ by less than they are large (N. J. Higham, "Accuracy and Stability of
-    Numerical Algorithms", 2002, sections 1.7, 3.1 and 10.1).
+    It is the product of the length of the sums, the condition number with the penalty, and the cancellation
+    when nearly equal frames are centred (N. J. Higham, "Accuracy and Stability of Numerical Algorithms",
+    2002, sections 1.7, 3.1 and 10.1).
     """
     deviation = features - features.mean(0, dtype=np.float64)
     largest = float(np.abs(features).max())
@@ -91,18 +91,18 @@ def _exact(features: Features, missing_n: Floats, penalty: float) -> list[Decima
     deviation = [[value - m for value, m in zip(row, mean, strict=True)] for row in frames]
     gram = [[_sum(a * b for a, b in zip(x, y, strict=True)) for y in deviation] for x in deviation]
     spread = max(_sum(gram[i][i] for i in range(count)) / count, Decimal("1e-12"))
-    felt_n = [Decimal(value) for value in missing_n.tolist()]
-    mean_n = _sum(felt_n) / count
+    missing = [Decimal(value) for value in missing_n.tolist()]
+    mean_n = _sum(missing) / count
     damped = [
         [value + (i == j) * Decimal(penalty) * spread * count for j, value in enumerate(row)]
         for i, row in enumerate(gram)
     ]
-    along = _solved(damped, [value - mean_n for value in felt_n])
+    along = _solved(damped, [value - mean_n for value in missing])
     return [mean_n + _sum(g * a for g, a in zip(row, along, strict=True)) for row in gram]
 
 
 def _solved(matrix: list[list[Decimal]], right: list[Decimal]) -> list[Decimal]:
-    """Gaussian elimination; a positive definite matrix needs no pivots."""
+    """Solves by Gaussian elimination; a positive definite matrix needs no pivoting."""
     rows = [[*row, value] for row, value in zip(matrix, right, strict=True)]
     for i, pivot in enumerate(rows):
         for row in rows[i + 1 :]:
@@ -120,14 +120,14 @@ def _sum(numbers: Iterable[Decimal]) -> Decimal:
     return sum(numbers, Decimal(0))
 
 
-def _moved_n(steps: float) -> float:
-    """How much rounding to float32 moves the forces of a profile that is fitted to such features."""
+def _rounding_n(change: float) -> float:
+    """Largest force error in N from rounding a fitted profile and its features to float32."""
     rng = np.random.default_rng(2)
     estimate_n = np.tile(np.concatenate([np.zeros(20), np.linspace(0, 8, 40)]), 6)
     force_n = 1.2 * estimate_n + 0.5 * np.sin(estimate_n) + rng.normal(0, 0.05, len(estimate_n))
     along = rng.normal(size=(2, _FEATURES))
     hidden = np.column_stack([estimate_n / 8, np.sin(estimate_n)])
-    features = np.tanh(0.5 + steps * (hidden @ along + 0.01 * rng.normal(size=(len(estimate_n), _FEATURES))))
+    features = np.tanh(0.5 + change * (hidden @ along + 0.01 * rng.normal(size=(len(estimate_n), _FEATURES))))
     touches = Touches(features.astype(np.float32), estimate_n, force_n, np.repeat(np.arange(6), 60))
     head = fit_correction(touches).arrays.head.astype(np.float64)
     return float(2 * 2.0**-24 * (np.abs(features) @ np.abs(head)).max())

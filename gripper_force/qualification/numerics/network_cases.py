@@ -1,4 +1,4 @@
-"""Hard cases for the network: each engine and precision, and the estimator, against float64."""
+"""Hard cases for the network: each engine and precision, and the estimator, compared with float64."""
 
 import math
 import resource
@@ -18,7 +18,7 @@ from gripper_force.errors import CheckpointError, GripperError, NonFiniteError
 from gripper_force.jobs.dataset import Clip, load_clip
 from gripper_force.jobs.simulate import SimulationPlan, make_log
 from gripper_force.qualification.numerics import head_fit_cases
-from gripper_force.qualification.numerics.adversarial_frames import REFERENCE, spoiled
+from gripper_force.qualification.numerics.adversarial_frames import REFERENCE, disturbed
 from gripper_force.qualification.numerics.adversarial_networks import (
     HARD,
     KNOWN_N,
@@ -54,17 +54,17 @@ STREAMED: Final = 1_000_000
 """Frames of the longest stream, through a small network: 4.6 hours at 60 Hz."""
 
 _LEAK_MB: Final = 1.0
-"""A byte a frame of the longest stream."""
+"""Allowed growth: one byte per frame of the longest stream."""
 
 LONG: Final = 10_000
-"""Frames of a stream through the network that is tested."""
+"""Frames of a stream through the configured network."""
 
 _COMPARED: Final = 40
-"""Frames of a grasp that are run in float64, which is slow: two windows, with the first contact in them."""
+"""Frames of a grasp that are run in float64, which is slow: two windows, which include first contact."""
 
 _PREPARED: Final = 8 * EPS
-"""What preparing a frame rounds away of its largest number: mean, deviation, quotient and difference of two,
-and the gain."""
+"""Rounding error of frame preparation, relative to the largest number: mean, deviation, quotient and
+difference of two, and the gain."""
 
 
 def cases(
@@ -74,13 +74,13 @@ def cases(
     long: int = LONG,
     variants: Sequence[EngineVariant] = ENGINE_VARIANTS,
 ) -> Iterator[NumericalCase]:
-    """Rows of the network.
+    """Yields the cases of the network.
 
     Args:
-        config: Whose checkpoint is tested, and from which claimed error on estimates do not count.
+        config: Checkpoint under test, and the claimed error above which estimates are rejected.
         streamed: Frames through a small network.
-        long: Frames through that of the checkpoint.
-        variants: Engines and precisions; what is not installed is left out.
+        long: Frames through the network of the checkpoint.
+        variants: Engines and precisions; engines that are not installed are left out.
 
     Raises:
         CheckpointError: ``vision.checkpoint`` is none, or was exported.
@@ -102,11 +102,11 @@ def cases(
         yield from head_fit_cases.cases()
 
 
-# What goes in.
+# Inputs.
 
 
 def _recordings(folder: Path, preprocess: Preprocess, seed: int) -> tuple[Clip, Clip]:
-    """A press and a grasp in the simulated rig."""
+    """Returns a press and a grasp in the simulated rig."""
     tree = load_config(None, ["sim.detail=coarse"]).model_dump(mode="json")
     press, grasp = (
         load_clip(make_log(SimulationPlan(kind, "sponge", 990_001 + seed), folder, tree), preprocess, None)
@@ -116,7 +116,7 @@ def _recordings(folder: Path, preprocess: Preprocess, seed: int) -> tuple[Clip, 
 
 
 def _contact(grasp: Clip, size: int) -> Gray:
-    """The frames of no contact that a run begins with, and those in which contact begins."""
+    """Frames without contact at the start of a run, and those around first contact, (T, S, S)."""
     first = int(np.argmax(grasp.forces_n > 2.0)) - _COMPARED // 3
     frames = np.concatenate([grasp.frames[:REFERENCE], grasp.frames[first : first + _COMPARED - REFERENCE]])
     return np.stack([downscale(frame, None, size) for frame in frames])
@@ -127,18 +127,18 @@ def _inputs(reference: ReferenceEnsemble, grasp: Clip) -> Floats:
 
 
 def _run(engine: Engine, inputs: Floats) -> Float64Result:
-    """Each member's forces over a stream, (M, T)."""
+    """Forces of each member over a stream in N, (M, T)."""
     engine.reset()
     return np.stack([engine.step(frame).forces_n for frame in inputs], axis=1).astype(np.float64)
 
 
 def _row(case: str, detail: str, off_n: Float64Result, bound_n: Float64Result) -> NumericalCase:
-    """The member that comes nearest to its bound, or is farthest beyond."""
+    """Case of the member with the largest error relative to its bound."""
     worst = int(np.argmax(np.nan_to_num(off_n / bound_n, nan=np.inf)))
     return NumericalCase(case, f"{detail}; against float64", float(off_n[worst]), float(bound_n[worst]), "N")
 
 
-# The network that is tested.
+# The configured network.
 
 
 def _engines(
@@ -153,19 +153,17 @@ def _engines(
     for variant in variants:
         found_n = _run(reference.open(variant, [press.frames]), inputs)
         off_n = np.abs(found_n - true_n).max(1)
-        yield _row(
-            variant.name, "a simulated grasp, the network as it is", off_n, bounds_n[variant.precision]
-        )
+        yield _row(variant.name, "simulated grasp, configured network", off_n, bounds_n[variant.precision])
         if variant.precision == "int8":
-            yield _as_said("int8, what its export says", reference, found_n, true_n)
+            yield _export_error("int8, error that its export reports", reference, found_n, true_n)
 
 
-def _as_said(
+def _export_error(
     case: str, reference: ReferenceEnsemble, found_n: Float64Result, true_n: Float64Result
 ) -> NumericalCase:
     off_n = np.abs(found_n.mean(0) - true_n.mean(0)).mean()
-    detail = "mean error in a grasp; the largest that the export said, of the press that it was scaled on"
-    return NumericalCase(case, detail, float(off_n), reference.said_n, "N")
+    detail = "mean error in a grasp; bound: largest error that the export reports for its calibration press"
+    return NumericalCase(case, detail, float(off_n), reference.reported_n, "N")
 
 
 # Weights.
@@ -173,7 +171,7 @@ def _as_said(
 
 def _weights(folder: Path, variants: Sequence[EngineVariant], grasp: Clip) -> Iterator[NumericalCase]:
     torch.manual_seed(0)
-    # All in one ensemble: one export serves them all.
+    # One ensemble of all networks needs only one export.
     kinds = [(name, kind) for name in HARD for kind in (("ssam", "scam") if "gates" in name else ("ssam",))]
     networks = [drawn(HARD[name], kind) for name, kind in kinds]
     reference = ReferenceEnsemble(saved(folder / "hard.safetensors", *networks), folder)
@@ -189,35 +187,33 @@ def _weights(folder: Path, variants: Sequence[EngineVariant], grasp: Clip) -> It
         for name in HARD:
             own = [name == other for other, _ in kinds]
             if precision == "float32" or name not in STEEP:
-                yield _row(
-                    f"{name}: {precision}", "a small network, the worst engine", off_n[own], bound_n[own]
-                )
+                yield _row(f"{name}: {precision}", "small network, worst engine", off_n[own], bound_n[own])
         if precision != "float32":
-            reach_n = np.array([_reach_n(network) for network in reference.networks])
-            share = np.max([np.abs(one_n).max(1) / reach_n for one_n in forces_n])
-            detail = "no digit is left; of the most that the last layers can say"
+            limit_n = np.array([_limit_n(network) for network in reference.networks])
+            share = np.max([np.abs(one_n).max(1) / limit_n for one_n in forces_n])
+            detail = "no correct digit left; largest output over the largest possible output"
             yield NumericalCase(
                 f"all others: {precision}", detail, float(share), 1 + 2 * ROUNDING[precision].numbers
             )
 
 
-def _reach_n(network: ForceNetwork) -> float:
-    """The most that a last layer can say: what goes into it lies in -1..1."""
+def _limit_n(network: ForceNetwork) -> float:
+    """Largest possible output of a network in N: the inputs of its last layer lie in -1..1."""
     total = network.out.weight.abs().sum() + network.out.bias.abs().sum()
     return float(total) * network.config.label_scale_n
 
 
 def _refused(folder: Path, variants: Sequence[EngineVariant], grasp: Clip) -> Iterator[NumericalCase]:
-    """Networks that nobody can compute: an engine other than PyTorch refuses them, or computes them."""
-    hopeless = {
-        "recurrence x 100: each rounding doubles with each frame": scaled(1e2, 1e2),
-        "activations below 1e-38, made large again": faint,
+    """Cases of networks beyond float32: an exported engine must refuse them, or compute them correctly."""
+    extreme = {
+        "recurrent weights x 100: rounding errors double with each frame": scaled(1e2, 1e2),
+        "activations below 1e-38, then scaled up": faint,
         "weights that overflow": overflow,
     }
-    for number, (name, change) in enumerate(hopeless.items()):
+    for number, (name, change) in enumerate(extreme.items()):
         torch.manual_seed(0)
         network = drawn(change, "scam")
-        reference = ReferenceEnsemble(saved(folder / f"hopeless-{number}.safetensors", network), folder)
+        reference = ReferenceEnsemble(saved(folder / f"extreme-{number}.safetensors", network), folder)
         inputs = _inputs(reference, grasp)
         true_n = reference.forces_n(inputs)
         worst_n, refusals = 0.0, 0
@@ -237,12 +233,12 @@ def _refused(folder: Path, variants: Sequence[EngineVariant], grasp: Clip) -> It
         )
         if change is overflow:
             yield NumericalCase(
-                f"{name}: torch", "estimates that came out", float(_estimates(reference, grasp)), 0.0
+                f"{name}: torch", "number of estimates", float(_estimates(reference, grasp)), 0.0
             )
 
 
 def _estimates(reference: ReferenceEnsemble, grasp: Clip) -> int:
-    """How many estimates PyTorch makes of a grasp."""
+    """Number of estimates by PyTorch in a grasp."""
     estimator = ForceEstimator(reference.open(ENGINE_VARIANTS[0]))
     made = 0
     for frame in _contact(grasp, reference.model.header.preprocess.size):
@@ -261,11 +257,11 @@ def _outlier_in_int8(
             inputs = _inputs(reference, grasp)
             clip = np.stack([downscale(frame, None, inputs.shape[1]) for frame in press.frames])
             found_n = _run(reference.open(variant, [clip]), inputs)
-            yield _as_said("one channel x 1000: int8", reference, found_n, reference.forces_n(inputs))
+            yield _export_error("one channel x 1000: int8", reference, found_n, reference.forces_n(inputs))
 
 
 def _half(folder: Path) -> NumericalCase:
-    """Weights that half precision can't hold, in a checkpoint."""
+    """Case of weights outside the range of half precision in a checkpoint."""
     worst = 0.0
     for factor in (1e7, 1e-7, 1e-38):
         network = drawn(scaled(factor))
@@ -275,8 +271,8 @@ def _half(folder: Path) -> NumericalCase:
             if tensor.is_floating_point():
                 off = (loaded[name].double() - tensor.double()).abs().max() / tensor.double().abs().max()
                 worst = max(worst, float(off.nan_to_num(0.0)))
-    detail = "saved and loaded; the worst weight is off by this share of its layer's largest"
-    return NumericalCase("weights x 10^7, 10^-7 and 10^-38 in a file", detail, worst, 2.0**-11)
+    detail = "saved and loaded; largest weight error over the largest weight of its layer"
+    return NumericalCase("weights x 10^7, 10^-7 and 10^-38 in a checkpoint", detail, worst, 2.0**-11)
 
 
 # Frames.
@@ -284,14 +280,12 @@ def _half(folder: Path) -> NumericalCase:
 
 def _not_finite(folder: Path, variants: Sequence[EngineVariant], grasp: Clip) -> Iterator[NumericalCase]:
     torch.manual_seed(0)
-    reference = ReferenceEnsemble(
-        saved(folder / "drawn.safetensors", drawn(HARD["weights as drawn"])), folder
-    )
+    reference = ReferenceEnsemble(saved(folder / "drawn.safetensors", drawn(HARD["random weights"])), folder)
     inputs = _inputs(reference, grasp)
-    wilds = [np.array(inputs[0]) for _ in range(3)]
-    for frame, wild in zip(wilds, (math.nan, math.inf, -math.inf), strict=True):
-        frame[3, 4] = wild
-    taken, changed, longest = 0, 0.0, 0
+    bad_frames = [np.array(inputs[0]) for _ in range(3)]
+    for frame, value in zip(bad_frames, (math.nan, math.inf, -math.inf), strict=True):
+        frame[3, 4] = value
+    accepted, changed, longest = 0, 0.0, 0
     for variant in variants:
         if variant.precision == "int8":
             continue
@@ -300,7 +294,7 @@ def _not_finite(folder: Path, variants: Sequence[EngineVariant], grasp: Clip) ->
         engine.reset()
         found_n = []
         for number, frame in enumerate(inputs):
-            taken += _takes(engine, wilds[number % 3])
+            accepted += _accepts(engine, bad_frames[number % 3])
             found_n.append(engine.step(frame).forces_n)
         changed = max(changed, float(np.abs(np.stack(found_n, axis=1) - expected_n).max()))
         engine.reset()
@@ -308,15 +302,20 @@ def _not_finite(folder: Path, variants: Sequence[EngineVariant], grasp: Clip) ->
         after_n = np.stack([engine.step(frame).forces_n for frame in inputs], axis=1)
         longest = max(longest, int(np.flatnonzero((after_n != expected_n).any(0)).max(initial=-1)) + 1)
     yield NumericalCase(
-        "frames of NaN and infinity", "before each frame, all engines; taken in", float(taken), 0.0
+        "frames of NaN and infinity",
+        "one before each frame, all engines; number accepted",
+        float(accepted),
+        0.0,
     )
-    yield NumericalCase("what is seen after them", "off from a stream without them", changed, 0.0, "N")
+    yield NumericalCase(
+        "estimates after frames of NaN and infinity", "difference to a stream without them", changed, 0.0, "N"
+    )
     context = float(reference.networks[0].config.context)
-    detail = "all engines; until all is as if it had not been"
+    detail = "all engines; frames until the estimates equal those without it"
     yield NumericalCase("a frame of 3e38, which overflows", detail, float(longest), context, "frames")
 
 
-def _takes(engine: Engine, frame: Floats) -> bool:
+def _accepts(engine: Engine, frame: Floats) -> bool:
     try:
         engine.step(frame)
     except NonFiniteError:
@@ -325,68 +324,70 @@ def _takes(engine: Engine, frame: Floats) -> bool:
 
 
 def _frames(reference: ReferenceEnsemble, grasp: Clip, config: Config) -> Iterator[NumericalCase]:
-    """The estimator, as a run uses it: flagged, or as near to float64 as rounding allows."""
+    """Cases of disturbed frames: the estimator flags them, or is as close to float64 as rounding allows."""
     preprocess = reference.model.header.preprocess
     clip = _contact(grasp, preprocess.size)
-    inputs = _exactly(clip, preprocess)
+    inputs = _prepare_float64(clip, preprocess)
     off = _PREPARED * float(np.abs(inputs).max())
     bound_n = float(reference.bound_n(inputs, ROUNDING["float32"], off).mean())
     engine = reference.open(ENGINE_VARIANTS[0])
     forces_n: dict[bytes, Float64Result] = {}
-    calm: list[_Seen] = []
-    farthest, where = 0.0, ""
-    for name, frames in spoiled(clip, config.seed).items():
-        seen = _see(engine, frames, config.control.vision_std_n)
-        # Most cases leave the same frames, and float64 is slow.
-        taken = np.stack([frame for frame, one in zip(frames, seen, strict=True) if one.taken])
-        if taken.tobytes() not in forces_n:
-            forces_n[taken.tobytes()] = reference.forces_n(_exactly(taken, preprocess)).mean(0)
-        true_n = forces_n[taken.tobytes()]
-        found = zip((one.visual for one in seen if one.taken), true_n.tolist(), strict=True)
+    undisturbed: list[_Processed] = []
+    largest, largest_case = 0.0, ""
+    for name, frames in disturbed(clip, config.seed).items():
+        processed = _process(engine, frames, config.control.vision_std_n)
+        # Most cases accept the same frames, and float64 is slow.
+        accepted = np.stack([frame for frame, one in zip(frames, processed, strict=True) if one.accepted])
+        if accepted.tobytes() not in forces_n:
+            forces_n[accepted.tobytes()] = reference.forces_n(_prepare_float64(accepted, preprocess)).mean(0)
+        true_n = forces_n[accepted.tobytes()]
+        found = zip((one.visual for one in processed if one.accepted), true_n.tolist(), strict=True)
         worst_n = max((abs(one.force_n - force_n) for one, force_n in found if one), default=0.0)
-        flagged = len(frames) - preprocess.lead_in - sum(one.visual is not None for one in seen)
+        flagged = len(frames) - preprocess.lead_in - sum(one.visual is not None for one in processed)
         detail = f"{flagged} of {len(frames)} flagged; error of the others, against float64"
         yield NumericalCase(name, detail, worst_n, bound_n, "N")
-        calm = calm or seen
-        for one, before in zip(seen, calm, strict=False):
-            if len(seen) == len(calm) and one.visual and before.visual:
+        undisturbed = undisturbed or processed
+        for one, before in zip(processed, undisturbed, strict=False):
+            if len(processed) == len(undisturbed) and one.visual and before.visual:
                 off = abs(one.visual.force_n - before.visual.force_n) / one.visual.std_n
-                farthest, where = max((farthest, where), (off, name))
-    detail = f"most that one of these is off from the undisturbed grasp ({where}), in claimed errors"
-    yield NumericalCase("what disturbed frames do to a grasp", detail, farthest, fusion._GATE)
-    begun = sum(_begins(engine, np.full_like(clip, level)) for level in (0, 128, 255))
-    yield NumericalCase("black, gray or white from the first", "runs that begin", float(begun), 0.0)
+                largest, largest_case = max((largest, largest_case), (off, name))
+    detail = f"largest difference to the undisturbed grasp ({largest_case}), over the claimed error"
+    yield NumericalCase("effect of disturbed frames on a grasp", detail, largest, fusion._GATE)
+    started = sum(_starts(engine, np.full_like(clip, level)) for level in (0, 128, 255))
+    yield NumericalCase(
+        "black, gray or white frames from the start", "number of runs that start", float(started), 0.0
+    )
 
 
-class _Seen(NamedTuple):
-    """Whether the network took a frame in, and the estimate that counts."""
+class _Processed(NamedTuple):
+    """Result of a frame: accepted by the network or not, and the estimate if it is used."""
 
-    taken: bool
+    accepted: bool
     visual: VisualForce | None
 
 
-def _see(engine: Engine, frames: Sequence[Gray], limit_n: float) -> list[_Seen]:
-    """What becomes of frames, one every 16 ms, where estimates with a larger claimed error do not count."""
+def _process(engine: Engine, frames: Sequence[Gray], limit_n: float) -> list[_Processed]:
+    """Processes frames, one every 16 ms; estimates with a claimed error over ``limit_n`` are not used."""
     processor = FrameProcessor(ForceEstimator(engine))
     result = []
     for number, gray in enumerate(frames):
         t_ns = number * 16 * NS_PER_MS
-        seen = processor.process(Frame(t_ns, t_ns, number, gray))
-        counts = seen.visual is not None and seen.visual.std_n <= limit_n
-        result.append(_Seen(not seen.problem, seen.visual if counts else None))
+        processed = processor.process(Frame(t_ns, t_ns, number, gray))
+        used = processed.visual is not None and processed.visual.std_n <= limit_n
+        result.append(_Processed(not processed.problem, processed.visual if used else None))
     return result
 
 
-def _begins(engine: Engine, frames: Gray) -> bool:
+def _starts(engine: Engine, frames: Gray) -> bool:
     try:
-        _see(engine, list(frames), math.inf)
+        _process(engine, list(frames), math.inf)
     except GripperError:
         return False
     return True
 
 
-def _exactly(clip: Gray, preprocess: Preprocess) -> Float64Result:
-    """What `inputs_of` makes of a recording, in float64."""
+def _prepare_float64(clip: Gray, preprocess: Preprocess) -> Float64Result:
+    """Prepared frames as by `inputs_of`, in float64, (T, S, S)."""
     frames = clip.astype(np.float64)
     deviation = np.maximum(frames.std((1, 2), keepdims=True), FLAT_STD)
     standard: Float64Result = (frames - frames.mean((1, 2), keepdims=True)) / deviation
@@ -396,27 +397,29 @@ def _exactly(clip: Gray, preprocess: Preprocess) -> Float64Result:
 
 
 def _range(folder: Path, grasp: Clip, config: Config) -> NumericalCase:
-    """Last layers that say far too much: what may count beyond the forces that validation knew."""
+    """Case of far too large outputs: estimates used beyond the validated range of forces."""
     limit_n = config.control.vision_std_n
-    total, counted, beyond_n = 0, 0, 0.0
+    total, used, beyond_n = 0, 0, 0.0
     for factor in (1.0, 10.0, 1e3, 1e6):
         for sign in (-1.0, 1.0):
             torch.manual_seed(0)
-            network = drawn(HARD["weights as drawn"])
+            network = drawn(HARD["random weights"])
             network.out.weight.mul_(sign * factor)
             network.out.bias.zero_()
             reference = ReferenceEnsemble(saved(folder / "range.safetensors", network), folder)
             frames = list(_contact(grasp, network.config.size))
             forces_n = [
                 one.visual.force_n
-                for one in _see(reference.open(ENGINE_VARIANTS[0]), frames, limit_n)
+                for one in _process(reference.open(ENGINE_VARIANTS[0]), frames, limit_n)
                 if one.visual
             ]
             total += len(frames) - reference.model.header.preprocess.lead_in
-            counted += len(forces_n)
+            used += len(forces_n)
             least_n, most_n = KNOWN_N[0] - RESIDUAL_HALF_N, KNOWN_N[1] + RESIDUAL_HALF_N
             beyond_n = max([beyond_n, *(max(least_n - f, f - most_n) for f in forces_n)])
-    detail = f"{total - counted} of {total} estimates flagged; the others beyond what validation knew"
+    detail = (
+        f"{total - used} of {total} estimates flagged; largest excess of the others over the validated range"
+    )
     return NumericalCase("last layers x 1 to 10^6", detail, beyond_n, limit_n, "N")
 
 
@@ -431,38 +434,38 @@ def _streams(
     streamed: int,
     long: int,
 ) -> Iterator[NumericalCase]:
-    # The fastest in float32 that is there.
+    # The fastest installed engine in float32.
     names = {variant.engine: variant for variant in variants if variant.precision == "float32"}
     variant = names.get("openvino", ENGINE_VARIANTS[0])
     torch.manual_seed(0)
     small = ReferenceEnsemble(
-        saved(folder / "small.safetensors", drawn(HARD["weights as drawn"], size=16)), folder
+        saved(folder / "small.safetensors", drawn(HARD["random weights"], size=16)), folder
     )
     noise = np.random.default_rng(0).standard_normal((997, 16, 16)).astype(np.float32)
-    detail = f"{variant.name}; off from a stream that begins a window before, ten times"
+    detail = f"{variant.name}; difference to a stream started one window earlier, checked ten times"
     drift_n, grown_mb, last_n, last = _stream(small, variant, noise, streamed)
     bound_n = small.bound_n(last, ROUNDING["float32"])
-    yield NumericalCase(f"{streamed} frames, a small network", detail, drift_n, float(bound_n.max()), "N")
+    yield NumericalCase(f"{streamed} frames, small network", detail, drift_n, float(bound_n.max()), "N")
     off_n = np.abs(last_n - small.forces_n(last)[:, -1])
-    yield _row(f"the last of {streamed} frames", variant.name, off_n, bound_n)
+    yield _row(f"last of {streamed} frames", variant.name, off_n, bound_n)
     yield NumericalCase(
-        f"memory over {streamed} frames", "growth after a tenth of them", grown_mb, _LEAK_MB, "MB"
+        f"memory over {streamed} frames", "growth after the first tenth", grown_mb, _LEAK_MB, "MB"
     )
     drift_n, _, _, last = _stream(
         reference, variant, np.stack(list(inputs_of(reference.model, press.frames))), long
     )
     bound_n = reference.bound_n(last, ROUNDING["float32"])
-    yield NumericalCase(f"{long} frames, the network as it is", detail, drift_n, float(bound_n.max()), "N")
+    yield NumericalCase(f"{long} frames, configured network", detail, drift_n, float(bound_n.max()), "N")
 
 
 def _stream(
     reference: ReferenceEnsemble, variant: EngineVariant, pool: Floats, frames: int
 ) -> tuple[float, float, Float64Result, Floats]:
-    """Streams frames of a pool, again and again.
+    """Streams the frames of a pool repeatedly.
 
     Returns:
-        The most that it was off from a stream that begins a window before, in N; growth of memory in MB; the
-        last forces, (M,); and the inputs that these depend on.
+        Largest difference to a stream started one window earlier, in N; growth of memory in MB; last forces,
+        (M,); and the inputs that these depend on, (T, S, S).
     """
     engine, fresh = reference.open(variant), reference.open(variant)
     context = max(network.config.context for network in reference.networks)
@@ -471,8 +474,8 @@ def _stream(
         forces_n = engine.step(pool[number % len(pool)]).forces_n
         if (number + 1) % (frames // 10) == 0 and number >= context:
             window = pool[np.arange(number - context, number + 1) % len(pool)]
-            anew_n = _run(fresh, window)[:, -1]
-            drift_n = max(drift_n, float(np.abs(forces_n - anew_n).max()))
+            fresh_n = _run(fresh, window)[:, -1]
+            drift_n = max(drift_n, float(np.abs(forces_n - fresh_n).max()))
             begin_mb = begin_mb or _resident_mb()
     return drift_n, max(_resident_mb() - begin_mb, 0.0), forces_n.astype(np.float64), window
 

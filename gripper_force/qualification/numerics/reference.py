@@ -1,11 +1,10 @@
-"""An ensemble in float64, and how far off it may be in fewer digits.
+"""An ensemble in float64, and error bounds for lower precisions.
 
-The bounds come from float64 as well. To compute in few digits is to compute exactly with weights and
-activations that are a little off (N. J. Higham, "Accuracy and Stability of Numerical Algorithms", 2002,
-sections 1.5 and 3.1). So the float64 network is run with its weights, and what goes into its convolutions,
-moved at random by what the precision rounds away, a few times; an engine may be off by a few times as much as
-the farthest of these runs. An ill-conditioned network gets the wide bound that it deserves, a good one a
-narrow one.
+The bounds come from float64 as well. Reduced precision is modelled as exact arithmetic on slightly perturbed
+weights and activations (N. J. Higham, "Accuracy and Stability of Numerical Algorithms", 2002, sections 1.5
+and 3.1). The float64 network is run a few times with its weights and the inputs of its convolutions perturbed
+at random by the rounding error of a precision. An engine may differ by a few times the largest deviation of
+these runs. So an ill-conditioned network gets a large bound, and a well-conditioned one a small bound.
 """
 
 import copy
@@ -29,25 +28,27 @@ from gripper_force.vision.model_files import read_model
 from gripper_force.vision.network import ForceNetwork
 
 _DRAWS: Final = 4
+"""Random perturbations for a bound."""
+
 _MARGIN: Final = 4.0
-"""How many times the farthest of the draws an engine may be off: the draws are few, and round nothing but
-weights and what goes into convolutions."""
+"""Bound over the largest deviation: draws are few, and perturb only weights and inputs of convolutions."""
 
 EPS: Final = 2.0**-24
-"""What float32 rounds away, as a share."""
+"""Relative rounding error of float32."""
 
 Float64Result = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class Rounding:
-    """What a precision rounds away, as shares.
+    """Relative rounding errors of a precision.
 
     Attributes:
-        sums: Of a sum, for each of its products; it grows with their root (N. J. Higham and T. Mary, "A new
-            approach to probabilistic rounding error analysis", 2019, doi:10.1137/18M1226312).
-        numbers: Of each weight, and of each number that goes into a convolution.
-        steps: Of the largest weight of a channel, and of the range of what goes into a convolution.
+        sums: Of a sum; it grows with the square root of the number of products (N. J. Higham and T. Mary, "A
+            new approach to probabilistic rounding error analysis", 2019, doi:10.1137/18M1226312).
+        numbers: Of each weight, and of each input of a convolution.
+        steps: Quantisation step over the largest weight of a channel, and over the range of the inputs of a
+            convolution.
     """
 
     sums: float = EPS
@@ -64,12 +65,12 @@ ROUNDING: Final = {
 
 @dataclass(frozen=True, slots=True)
 class EngineVariant:
-    """A variant to compute.
+    """An engine with a precision.
 
     Attributes:
-        engine: One of `gripper_force.vision.engines.ENGINES`.
-        precision: One of `ROUNDING`.
-        file: Ending of the file that it runs.
+        engine: Key of `gripper_force.vision.engines.ENGINES`.
+        precision: Key of `ROUNDING`.
+        file: Ending of the model file.
     """
 
     engine: str
@@ -78,7 +79,7 @@ class EngineVariant:
 
     @property
     def name(self) -> str:
-        """In words."""
+        """Engine and precision as text."""
         return f"{self.engine}, {self.precision}"
 
 
@@ -92,63 +93,65 @@ ENGINE_VARIANTS: Final = (
 
 
 class ReferenceEnsemble:
-    """An ensemble in float64, and beside it the engines that run it.
+    """An ensemble in float64, and the engines that run it.
 
     Attributes:
-        model: Its checkpoint.
-        networks: In float64.
-        said_n: Largest error that its last export told of.
+        model: The checkpoint.
+        networks: Networks in float64.
+        reported_n: Largest error that the last export reported, in N.
     """
 
     def __init__(self, model: Model, folder: Path) -> None:
         self.model = model
         self.networks = [copy.deepcopy(network).double() for network in load_checkpoint(model.path).networks]
-        self.said_n = math.nan
+        self.reported_n = math.nan
         self._folder = folder
 
     def open(self, variant: EngineVariant, clips: Sequence[Gray] = ()) -> Engine:
-        """An engine, its file made at the first use.
+        """Opens an engine; its model file is exported at the first use.
 
         Args:
-            variant: Which.
-            clips: Recordings to scale int8 on.
+            variant: Engine and precision.
+            clips: Recordings to calibrate int8 on, (T, H, W) each.
 
         Raises:
-            CheckpointError: What the export made computes something else.
+            CheckpointError: The exported model computes something else.
         """
         model = self.model
         if variant.engine != "torch":
             path = self._folder / f"{model.path.stem}{variant.file}"
             if not path.exists():
-                said = export(model, path, clips if variant.precision == "int8" else None)
-                self.said_n = said["largest_n"]
+                reported = export(model, path, clips if variant.precision == "int8" else None)
+                self.reported_n = reported["largest_n"]
             model = read_model(path)
         precision: Precision = "bfloat16" if variant.precision == "bfloat16" else "float32"
         return open_engine(model, variant.engine, precision)
 
     def forces_n(self, inputs: Floats | Float64Result) -> Float64Result:
-        """Each member's forces for prepared frames (T, S, S), (M, T)."""
+        """Forces of each member in N, (M, T), for prepared frames (T, S, S)."""
         return _forces_n(self.networks, inputs)
 
-    def bound_n(self, inputs: Floats | Float64Result, rounding: Rounding, off: float = 0.0) -> Float64Result:
-        """How far off each member may be, (M,); see the module.
+    def bound_n(
+        self, inputs: Floats | Float64Result, rounding: Rounding, input_error: float = 0.0
+    ) -> Float64Result:
+        """Error bound of each member in N, (M,); see the module.
 
         Args:
             inputs: Prepared frames, (T, S, S).
-            rounding: What is lost.
-            off: How far the inputs themselves may be off.
+            rounding: Rounding errors of the precision.
+            input_error: Largest error of the inputs themselves.
         """
         true_n = self.forces_n(inputs)
         rng = np.random.default_rng(0)
         generator = torch.Generator().manual_seed(0)
-        farthest_n = np.zeros(len(self.networks))
+        largest_n = np.zeros(len(self.networks))
         for _ in range(_DRAWS):
-            networks = [_moved(network, rounding, generator) for network in self.networks]
-            moved_n = _forces_n(networks, inputs + off * rng.choice((-1.0, 1.0), inputs.shape))
-            farthest_n = np.maximum(farthest_n, np.abs(moved_n - true_n).max(1))
-        # The last digit of the label's scale is lost in any case.
+            networks = [_perturbed(network, rounding, generator) for network in self.networks]
+            perturbed_n = _forces_n(networks, inputs + input_error * rng.choice((-1.0, 1.0), inputs.shape))
+            largest_n = np.maximum(largest_n, np.abs(perturbed_n - true_n).max(1))
+        # The output is scaled by the label scale, whose rounding error always remains.
         scale_n = np.array([network.config.label_scale_n for network in self.networks])
-        bound_n: Float64Result = _MARGIN * (farthest_n + EPS * scale_n)
+        bound_n: Float64Result = _MARGIN * (largest_n + EPS * scale_n)
         return bound_n
 
 
@@ -159,8 +162,8 @@ def _forces_n(networks: Sequence[ForceNetwork], inputs: Floats | Float64Result) 
 
 
 @torch.no_grad()
-def _moved(network: ForceNetwork, rounding: Rounding, generator: torch.Generator) -> ForceNetwork:
-    """A copy whose weights are off by what is rounded away, and what goes into its convolutions as well."""
+def _perturbed(network: ForceNetwork, rounding: Rounding, generator: torch.Generator) -> ForceNetwork:
+    """Copy of a network whose weights and convolution inputs are perturbed by their rounding errors."""
 
     def signs(like: Tensor) -> Tensor:
         return torch.randint(0, 2, like.shape, generator=generator).to(like) * 2 - 1
@@ -169,15 +172,15 @@ def _moved(network: ForceNetwork, rounding: Rounding, generator: torch.Generator
         x = given[0]
         return x + signs(x) * (x.abs() * rounding.numbers + (x.max() - x.min()) * rounding.steps / 2)
 
-    moved = copy.deepcopy(network)
-    for module in moved.modules():
+    perturbed = copy.deepcopy(network)
+    for module in perturbed.modules():
         convolves = isinstance(module, nn.Conv2d)
         for weight in module.parameters(recurse=False):
             products = weight[0].numel() if weight.dim() > 1 else 1
-            off = weight.abs() * (rounding.sums * math.sqrt(products) + rounding.numbers)
+            error = weight.abs() * (rounding.sums * math.sqrt(products) + rounding.numbers)
             if convolves and weight.dim() > 1:
-                off = off + weight.abs().amax((1, 2, 3), keepdim=True) * rounding.steps
-            weight.add_(signs(weight) * off)
+                error = error + weight.abs().amax((1, 2, 3), keepdim=True) * rounding.steps
+            weight.add_(signs(weight) * error)
         if convolves and (rounding.numbers or rounding.steps):
             module.register_forward_pre_hook(rounded)
-    return moved
+    return perturbed

@@ -1,23 +1,15 @@
-"""Numerical stability: hard cases of each part, each with a figure and the bound that it must keep."""
+"""Numerical test suite: hard cases of each part, each with a figure and a bound."""
 
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Final, TypedDict
 
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError
-from gripper_force.runtime.backends import load
-
-PARTS: Final = {
-    "network": "gripper_force.qualification.numerics.network_cases:cases",
-    "loop": "gripper_force.qualification.loop_margin.loop_cases:cases",
-    "filter": "gripper_force.qualification.numerics.filter_cases:cases",
-    "simulator": "gripper_force.qualification.numerics.simulator_cases:cases",
-}
-"""Parts of the suite, in the order of the page, and the `Part` of each."""
+from gripper_force.interfaces import Progress, no_progress
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,12 +17,12 @@ class NumericalCase:
     """One hard case.
 
     Attributes:
-        case: What was done.
-        detail: How, and what it is measured against.
-        figure: What was found. NaN breaks any bound.
-        bound: The most that the figure may be; infinite where it only informs.
-        unit: Of both.
-        ok: Whether the figure keeps its bound.
+        case: Name of the case.
+        detail: Inputs, and what the figure is compared with.
+        figure: Measured value. NaN exceeds any bound.
+        bound: Largest allowed figure; infinite if the case is informative only.
+        unit: Unit of both.
+        ok: True if the figure is within its bound.
     """
 
     case: str
@@ -45,55 +37,95 @@ class NumericalCase:
 
 
 Part = Callable[[Config, Path | None], Iterator[NumericalCase]]
-"""Yields its rows, and draws its maps into a folder if it is given one."""
+"""Yields the cases of a part, and draws its maps into a folder, if one is given."""
+
+
+class NumericsReport(TypedDict):
+    """Result of `run`.
+
+    Attributes:
+        parts: Cases by part.
+        seconds: Duration of each part.
+        ok: True if all cases are within their bounds.
+    """
+
+    parts: dict[str, list[NumericalCase]]
+    seconds: dict[str, float]
+    ok: bool
+
+
+def _network(config: Config, maps: Path | None) -> Iterator[NumericalCase]:
+    from gripper_force.qualification.numerics.network_cases import cases
+
+    return cases(config, maps)
+
+
+def _loop(config: Config, maps: Path | None) -> Iterator[NumericalCase]:
+    from gripper_force.qualification.loop_margin.loop_cases import cases
+
+    return cases(config, maps)
+
+
+def _filter(config: Config, maps: Path | None) -> Iterator[NumericalCase]:
+    from gripper_force.qualification.numerics.filter_cases import cases
+
+    return cases(config, maps)
+
+
+def _simulator(config: Config, maps: Path | None) -> Iterator[NumericalCase]:
+    from gripper_force.qualification.numerics.simulator_cases import cases
+
+    return cases(config, maps)
+
+
+PARTS: Final[dict[str, Part]] = {
+    "network": _network,
+    "loop": _loop,
+    "filter": _filter,
+    "simulator": _simulator,
+}
+"""Parts of the suite, in the order of docs/stability.md. Each imports its libraries when it is called."""
 
 
 def run(
-    config: Config,
-    parts: Sequence[str],
-    maps: Path | None = None,
-    advance: Callable[[str, int], None] = lambda _note, _done: None,
-) -> dict[str, Any]:
+    config: Config, parts: Sequence[str], maps: Path | None = None, progress: Progress = no_progress
+) -> NumericsReport:
     """Runs parts of the suite.
 
     Args:
-        config: What is tested: control and its limits, the gripper, the estimator's checkpoint.
-        parts: Names of `PARTS`; none means all of them.
+        config: Control and its limits, the gripper, and the estimator's checkpoint under test.
+        parts: Names in `PARTS`; an empty sequence means all of them.
         maps: Folder for the maps, or None for no maps.
-        advance: Told of each case, and how many more parts are done.
-
-    Returns:
-        ``parts`` (name to a list of `NumericalCase`), ``seconds`` of each, and ``ok``.
+        progress: Called after each case with 0 steps, and after each part with 1.
 
     Raises:
-        ConfigError: There is no such part.
+        ConfigError: A part does not exist.
     """
     if unknown := [name for name in parts if name not in PARTS]:
-        raise ConfigError(f"stability has no part {unknown[0]!r}; there are {', '.join(PARTS)}")
+        raise ConfigError(f"no part {unknown[0]!r}; choose from {', '.join(PARTS)}")
     rows: dict[str, list[NumericalCase]] = {}
     seconds: dict[str, float] = {}
     for name in [part for part in PARTS if part in parts or not parts]:
-        cases: Part = load(PARTS[name])
         begin_s = time.monotonic()
         rows[name] = []
-        for row in cases(config, maps):
+        for row in PARTS[name](config, maps):
             rows[name].append(row)
-            advance(f"{name}: {row.case}", 0)
+            progress(f"{name}: {row.case}", 0)
         seconds[name] = round(time.monotonic() - begin_s, 1)
-        advance(name, 1)
+        progress(name, 1)
     return {"parts": rows, "seconds": seconds, "ok": all(row.ok for part in rows.values() for row in part)}
 
 
 def markdown(rows: Sequence[NumericalCase]) -> str:
-    """The cases of a part as a table in Markdown."""
-    head = "| case | how | found | bound | |\n|---|---|---|---|---|\n"
+    """Markdown table of the cases of a part."""
+    head = "| case | method | found | bound | |\n|---|---|---|---|---|\n"
     return head + "".join(
-        f"| {row.case} | {row.detail} | {said(row.figure, row.unit)} | {said(row.bound, row.unit)} "
-        f"| {'ok' if row.ok else '**broken**'} |\n"
+        f"| {row.case} | {row.detail} | {with_unit(row.figure, row.unit)} | {with_unit(row.bound, row.unit)} "
+        f"| {'ok' if row.ok else '**exceeded**'} |\n"
         for row in rows
     )
 
 
-def said(number: float, unit: str) -> str:
-    """A figure with its unit; a bound that is none is a dash."""
-    return "-" if number == math.inf else f"{number:.3g} {unit}".rstrip()
+def with_unit(figure: float, unit: str) -> str:
+    """Figure with its unit; a dash for an infinite bound."""
+    return "-" if figure == math.inf else f"{figure:.3g} {unit}".rstrip()

@@ -1,1 +1,1 @@
-"""The tables and figures of Shin et al. 2019, made again and set beside the paper's own numbers."""
+"""The tables and figures of Shin et al. 2019, reproduced and compared with the paper's numbers."""

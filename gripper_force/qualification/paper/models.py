@@ -1,4 +1,4 @@
-"""Which networks the paper's tables compare, and how each scale trains them."""
+"""Networks that the paper's tables compare, and their training at each scale."""
 
 from typing import Annotated, Any, Final, Literal
 
@@ -26,7 +26,7 @@ NETS: Final[dict[str, dict[str, Any]]] = {
     "mobile-ssam-1": {"attentions": ("ssam",), "backbone": "mobile"},
     "mobile-scam-1": {"attentions": ("scam",), "backbone": "mobile"},
 }
-"""Single networks, by what sets each apart from the recipe of the scale."""
+"""Single networks, with their differences from the recipe of the scale."""
 
 BASELINE: Final = "baseline"
 PROPOSED: Final = "proposed, ensemble"
@@ -52,22 +52,22 @@ MODELS: Final[dict[str, tuple[str, ...]]] = {
     "ResNet, ensemble": ("resnet-ssam-1", "resnet-scam-1"),
     "mobile, ensemble": ("mobile-ssam-1", "mobile-scam-1"),
 }
-"""What the tables list: a network, or the average of several.
+"""Models in the tables: a network, or the mean of several.
 
-The members of an ensemble have different seeds, each the next, so that two plain networks are as far apart as
-SSAM and SCAM are.
+The members of an ensemble have consecutive seeds, so that two plain networks differ in their seed just as SSAM
+and SCAM do.
 """
 
 
 class Scale(Section):
-    """How much of everything.
+    """Size of a reproduction.
 
     Attributes:
         protocol: Scale of the simulated protocol that the networks are trained on.
         size: Side of the input in pixels.
         width: Multiplier of the backbone's channels.
         steps: Optimiser steps of each network.
-        seeds: How often each network is trained.
+        seeds: Seeds with which each network is trained.
     """
 
     protocol: Literal["small", "full"] = "small"
@@ -77,7 +77,7 @@ class Scale(Section):
     seeds: Annotated[int, Field(ge=1, le=100)] = 3
 
     def recipe(self, net: str, seed: int) -> TrainConfig:
-        """How one network is trained: all alike, but for what sets it apart."""
+        """Recipe of one network; recipes differ only in the keys of `NETS` and the seed."""
         return TrainConfig(
             **NETS[net],
             preprocess=Preprocess(size=self.size),

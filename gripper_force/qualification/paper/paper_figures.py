@@ -1,4 +1,4 @@
-"""The paper's figures 6 to 9, drawn of the test sets."""
+"""The paper's figures 6 to 9, drawn from the test sets."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -20,13 +20,14 @@ from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess, downscale
 
 _BINS: Final = 11
-"""Of 1 N each."""
+"""Force bins of 1 N each."""
 
 _COLOURS: Final = {BASELINE: "#8a9099", SINGLE_FRAME: "#2a9d8f", PROPOSED: "#d1495b"}
 _LOADS: Final = (0.0, 0.25, 0.6, 1.0)
 """Shares of a clip's largest force at which attention is shown."""
 
 _SIDE: Final = 192
+"""Side of the images in figure 8, in pixels."""
 
 
 def error_by_force(test: Test) -> Figure:
@@ -59,7 +60,7 @@ def error_by_force(test: Test) -> Figure:
 
 
 def force_over_time(test: Test, models: Sequence[str], title: str) -> Figure:
-    """Figures 7 and 9: estimates of a test set of each object beside the load cell."""
+    """Figures 7 and 9: estimates and load cell for one test set of each object."""
     with rc_context(STYLE):
         figure = Figure(figsize=(10, 6), layout="constrained")
         figure.suptitle(title, x=0.008, ha="left", fontsize=12, fontweight="bold")
@@ -77,7 +78,7 @@ def force_over_time(test: Test, models: Sequence[str], title: str) -> Figure:
 
 
 def attention(test: Test, network: ForceNetwork, preprocess: Preprocess) -> Figure:
-    """Figure 8: where SSAM looks, on frames of each object at rising force."""
+    """Figure 8: spatial attention (SSAM) on frames of each object at rising force."""
     numbers = _one_of_each(test)
     with rc_context({**STYLE, "axes.grid": False}):
         figure = Figure(figsize=(2.1 * len(_LOADS), 2.3 * len(numbers)), layout="constrained")
@@ -88,11 +89,13 @@ def attention(test: Test, network: ForceNetwork, preprocess: Preprocess) -> Figu
             rise_n = clip.forces_n[: peak + 1]
             for axes, share in zip(row, _LOADS, strict=True):
                 index = peak if share == 1 else int(np.abs(rise_n - share * rise_n[-1]).argmin())
-                _look(axes, clip, index, network, preprocess)
+                _draw_attention(axes, clip, index, network, preprocess)
     return figure
 
 
-def _look(axes: Axes, clip: Clip, index: int, network: ForceNetwork, preprocess: Preprocess) -> None:
+def _draw_attention(
+    axes: Axes, clip: Clip, index: int, network: ForceNetwork, preprocess: Preprocess
+) -> None:
     gates = _gates(clip.frames[: index + 1][-network.config.context - 1 :], clip.frames, network, preprocess)
     gray = downscale(clip.frames[index], None, _SIDE)
     axes.imshow(overlay(gray, gates))
@@ -104,14 +107,14 @@ def _look(axes: Axes, clip: Clip, index: int, network: ForceNetwork, preprocess:
 
 @torch.inference_mode()
 def _gates(frames: Gray, clip: Gray, network: ForceNetwork, preprocess: Preprocess) -> np.ndarray:
-    """Spatial attention of the last of some frames, (h, w)."""
+    """Spatial attention at the last of the frames, (h, w)."""
     leading = torch.from_numpy(clip[None, : preprocess.reference_frames])
     inputs = normalise(torch.from_numpy(frames)[None], leading, preprocess)  # (1, T, 1, S, S)
     state = None
     for i in range(inputs.shape[1]):
-        seen, state = network.step(inputs[:, i], state)
-    assert seen.gates is not None
-    return np.asarray(seen.gates[0, 0].numpy(), np.float32)
+        output, state = network.step(inputs[:, i], state)
+    assert output.gates is not None
+    return np.asarray(output.gates[0, 0].numpy(), np.float32)
 
 
 def _one_of_each(test: Test) -> list[int]:

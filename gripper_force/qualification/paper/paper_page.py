@@ -1,4 +1,4 @@
-"""What is asked for, made and put into a page."""
+"""Runs the requested reproductions and formats them for docs/paper.md."""
 
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
@@ -9,16 +9,18 @@ from typing import Final
 from matplotlib.figure import Figure
 
 from gripper_force.errors import ConfigError
+from gripper_force.interfaces import Progress
 from gripper_force.qualification.paper import experiment, paper_figures, paper_tables
-from gripper_force.qualification.paper.experiment import Advance, Test, checkpoint_path
+from gripper_force.qualification.paper.experiment import Test, checkpoint_path
 from gripper_force.qualification.paper.models import BASELINE, PROPOSED, SINGLE_FRAME, Scale
 from gripper_force.vision.checkpoint import load_checkpoint
 
-WHAT: Final = (*sorted(paper_tables.MODELS_OF), "all")
-"""What `gripper-force reproduce` can be asked for."""
+NAMES: Final = (*sorted(paper_tables.MODELS_OF), "all")
+"""Arguments of `gripper-force reproduce`."""
 
 
-Bar = Callable[[str, int], AbstractContextManager[Advance]]
+ProgressBar = Callable[[str, int], AbstractContextManager[Progress]]
+"""Shows a progress bar with a label and a number of steps, and gives its `Progress` callback."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,28 +31,28 @@ class PaperResult:
     figures: dict[str, Figure]
 
 
-def asked_for(what: str) -> tuple[str, ...]:
-    """The tables and figures that ``what`` stands for. Raises `ConfigError` if it stands for none."""
-    if what not in WHAT:
-        raise ConfigError(f"nothing to reproduce is named {what!r}; there are {', '.join(WHAT)}")
-    return tuple(paper_tables.MODELS_OF) if what == "all" else (what,)
+def expand_name(name: str) -> tuple[str, ...]:
+    """Names of the tables and figures of an argument of `NAMES`. Raises `ConfigError` for any other."""
+    if name not in NAMES:
+        raise ConfigError(f"can't reproduce {name!r}; choose from {', '.join(NAMES)}")
+    return tuple(paper_tables.MODELS_OF) if name == "all" else (name,)
 
 
 def reproduce(
-    names: Sequence[str], scale: Scale, data: Path | None, out: Path, jobs: int, bar: Bar
+    names: Sequence[str], scale: Scale, data: Path | None, out: Path, jobs: int, bar: ProgressBar
 ) -> tuple[PaperResult, Test | None]:
-    """Makes tables and figures, and first of all the logs and networks they need that are not there yet.
+    """Makes tables and figures. First simulates the missing logs and trains the missing networks.
 
     Args:
-        names: Of `paper_tables.MODELS_OF`.
-        scale: How much of everything.
+        names: Keys of `paper_tables.MODELS_OF`.
+        scale: Size of the reproduction.
         data: Folder with logs in ``train`` and ``test``; None for simulated ones.
         out: Folder for the networks.
         jobs: Processes.
-        bar: Shows progress: called with a label and the number of steps.
+        bar: Shows progress.
 
     Returns:
-        What was made, and the estimates it was made of; None where there is no need of any.
+        Tables and figures, and the estimates they are based on; None if they need none.
 
     Raises:
         DataError: See `experiment.run`.
@@ -62,20 +64,22 @@ def reproduce(
         if data is None:
             data = Path("data/shin2019") / scale.protocol
             missing = experiment.missing_logs(scale, data)
-            with bar("simulating", missing) as advance:
-                experiment.simulate_missing(scale, data, jobs, advance)
-        with bar("training", scale.seeds * len(experiment.networks(models))) as advance:
-            test = experiment.run(scale, models, data, out, jobs, advance)
-    with bar("timing", paper_tables.TIMED * ("7" in names)) as advance:
-        return _make(names, test, scale, out, advance), test
+            with bar("simulating", missing) as progress:
+                experiment.simulate_missing(scale, data, jobs, progress)
+        with bar("training", scale.seeds * len(experiment.networks(models))) as progress:
+            test = experiment.run(scale, models, data, out, jobs, progress)
+    with bar("timing", paper_tables.TIMED * ("7" in names)) as progress:
+        return _make(names, test, scale, out, progress), test
 
 
-def _make(names: Sequence[str], test: Test | None, scale: Scale, out: Path, advance: Advance) -> PaperResult:
+def _make(
+    names: Sequence[str], test: Test | None, scale: Scale, out: Path, progress: Progress
+) -> PaperResult:
     made: dict[str, paper_tables.Table] = {}
     drawn: dict[str, Figure] = {}
     for name in names:
         if name == "7":
-            made[name] = paper_tables.times(advance)
+            made[name] = paper_tables.times(progress)
             continue
         assert test is not None
         match name:
@@ -102,10 +106,14 @@ def _make(names: Sequence[str], test: Test | None, scale: Scale, out: Path, adva
 def markdown(
     result: PaperResult, scale_name: str, scale: Scale, test: Test | None, pictures: str
 ) -> dict[str, str]:
-    """What was made, in Markdown, by the name of its place in the page.
+    """Markdown by the name of its place in the page. The place of the scale's name describes its networks.
 
-    The scale's own name stands for what the networks of its tables are; ``pictures`` is the folder of the
-    figures, as the page names it.
+    Args:
+        result: Tables and figures.
+        scale_name: Key of `models.SCALES`.
+        scale: Size of the reproduction.
+        test: Estimates, or None.
+        pictures: Folder of the figures, relative to the page.
     """
     made = {name: table.markdown() for name, table in result.tables.items()}
     for name in result.figures:
@@ -114,11 +122,11 @@ def markdown(
     if test is not None:
         lines = [
             f"Made by `gripper-force reproduce all --scale {scale_name}`:",
-            f"{scale.size}x{scale.size} pixels, width {scale.width:g}, {scale.steps} steps a network,",
+            f"{scale.size}x{scale.size} pixels, width {scale.width:g}, {scale.steps} steps per network,",
             f"{scale.seeds} seeds.",
             f"Tested on {len(test.clips)} sets: {len(test.measured_n)} frames, of which",
-            f"{100 * test.contact.mean():.0f} % in contact. MAE: mean ± s.d. over seeds. Ratio: that of",
-            "the baseline over it. p: Wilcoxon's signed-rank test against the baseline, paired by test set.",
+            f"{100 * test.contact.mean():.0f} % in contact. MAE: mean ± s.d. over seeds. Ratio: MAE of the",
+            "baseline over that of the model. p: Wilcoxon's signed-rank test against the baseline, paired by test set.",
         ]
         parts[scale_name] = " ".join(lines) + "\n"
     return parts
@@ -127,6 +135,6 @@ def markdown(
 _CAPTIONS: Final = {
     "fig6": f"Figure 6: error by force, of baseline, {SINGLE_FRAME} and {PROPOSED}",
     "fig7": "Figure 7: estimates over time, one test set of each object",
-    "fig8": "Figure 8: where SSAM looks, at rising force; brighter is more",
+    "fig8": "Figure 8: spatial attention (SSAM) at rising force; brighter means more attention",
     "fig9": "Figure 9: estimates of baseline and proposed model over time",
 }

@@ -1,13 +1,13 @@
-"""The paper's tables, each row with the paper's numbers and ours."""
+"""The paper's tables, each row with the paper's numbers and the reproduced ones."""
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 import torch
 
+from gripper_force.interfaces import Progress
 from gripper_force.jobs.training.recipe import TrainConfig
 from gripper_force.qualification.paper.experiment import Test
 from gripper_force.qualification.paper.models import BASELINE, NETS, PROPOSED, SINGLE_FRAME, TWO_PLAIN
@@ -19,7 +19,7 @@ Cell = str | float | None
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Names of columns, and rows of cells; a number is shown with three digits, None as a dash."""
+    """A table; numbers are shown with three digits, None and NaN as a dash."""
 
     title: str
     columns: tuple[str, ...]
@@ -27,14 +27,14 @@ class Table:
     note: str = ""
 
     def markdown(self) -> str:
-        """The table in Markdown."""
+        """Markdown of the table."""
         head = "| " + " | ".join(self.columns) + " |\n|" + "---|" * len(self.columns) + "\n"
-        body = "".join("| " + " | ".join(map(show, row)) + " |\n" for row in self.rows)
+        body = "".join("| " + " | ".join(map(cell_text, row)) + " |\n" for row in self.rows)
         return f"**{self.title}**\n\n{head}{body}" + (f"\n{self.note}\n" if self.note else "")
 
 
-def show(cell: Cell) -> str:
-    """A cell as text."""
+def cell_text(cell: Cell) -> str:
+    """Text of a cell."""
     if cell is None or (isinstance(cell, float) and not np.isfinite(cell)):
         return "–"
     return f"{cell:.3f}" if isinstance(cell, float) else cell
@@ -42,7 +42,7 @@ def show(cell: Cell) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _Row:
-    """A model, its RMSE and MAE in the paper, and its name in the table, if that is another one."""
+    """A model, its RMSE and MAE in the paper, and its name in the table, if different."""
 
     model: str
     rmse_n: float | None = None
@@ -68,7 +68,7 @@ COMPARISONS: Final[dict[str, tuple[str, tuple[_Row, ...]]]] = {
         ),
     ),
     "4": (
-        "Table 4: earlier frames n that attention sees",
+        "Table 4: number n of earlier frames in the attention",
         (
             _BASELINE,
             _Row(SINGLE_FRAME, 0.10313, 0.04051, "n = 0, ensemble"),
@@ -121,8 +121,13 @@ OBJECTS: Final[dict[str, tuple[float, float, float]]] = {
 """Table 9 of the paper: MAE of baseline, single-frame and proposed model by object."""
 
 _TIMES_S: Final = {"plain": 0.308, "ssam-1": 0.342, "scam-1": 0.338}
+"""Table 7 of the paper: time of an estimate."""
+
 _RUNS: Final = 128
-"""The paper averages as many."""
+"""Estimates that are timed; the paper averages the same number."""
+
+_WARM_UP: Final = 8
+"""Estimates before the first that is timed."""
 
 _CLAIMS: Final = (
     ("the ensemble beats the baseline", PROPOSED, BASELINE),
@@ -149,7 +154,7 @@ MODELS_OF: Final[dict[str, tuple[str, ...]]] = {
 
 
 def comparison(test: Test, name: str) -> Table:
-    """A table of errors over all test sets, of `COMPARISONS`."""
+    """A table of `COMPARISONS`: errors over all test sets."""
     title, rows = COMPARISONS[name]
     baseline_n = test.mae_n(BASELINE)
     cells: list[tuple[Cell, ...]] = []
@@ -185,7 +190,7 @@ def objects(test: Test) -> Table:
 
 
 def claims(test: Test) -> Table:
-    """What the paper claims, each as a paired test over the test sets."""
+    """The paper's claims, each with a paired test over the test sets."""
     rows = []
     for text, better, worse in _CLAIMS:
         a, b = test.mae_by_set_n(better), test.mae_by_set_n(worse)
@@ -198,11 +203,11 @@ def claims(test: Test) -> Table:
                 _p(test.p_value(better, worse)),
             )
         )
-    return Table("Claims", ("claim", "less MAE", "test sets", "seeds", "p"), tuple(rows))
+    return Table("Claims", ("claim", "MAE reduction", "test sets", "seeds", "p"), tuple(rows))
 
 
-def times(advance: Callable[[str], None]) -> Table:
-    """The paper's table 7: time of an estimate, with the whole window computed again and streamed."""
+def times(progress: Progress) -> Table:
+    """The paper's table 7: time of an estimate, with the whole window for each frame, and streamed."""
     networks = {net: ForceNetwork(TrainConfig(**NETS[net]).network(0)).eval() for net in _TIMES_S}
     window = networks["plain"].config.window
     frame = torch.zeros(1, 1, 128, 128)
@@ -210,24 +215,24 @@ def times(advance: Callable[[str], None]) -> Table:
     ms: dict[tuple[str, str], list[float]] = {}
     with torch.inference_mode():
         states = {net: network.step(frame, None)[1] for net, network in networks.items()}
-        for run in range(_RUNS + 8):  # in turns, so that what else the machine does falls on all alike
+        for run in range(_RUNS + _WARM_UP):  # in turns, so that other load affects all alike
             for net, network in networks.items():
                 begin_ns = time.perf_counter_ns()
                 network(clip, window - 1)
                 middle_ns = time.perf_counter_ns()
                 states[net] = network.step(frame, states[net])[1]
                 end_ns = time.perf_counter_ns()
-                if run >= 8:
+                if run >= _WARM_UP:
                     ms.setdefault((net, "window"), []).append((middle_ns - begin_ns) / NS_PER_MS)
                     ms.setdefault((net, "stream"), []).append((end_ns - middle_ns) / NS_PER_MS)
-            advance("timing")
-    plain = {way: float(np.median(ms["plain", way])) for way in ("window", "stream")}
+            progress("timing")
+    plain = {method: float(np.median(ms["plain", method])) for method in ("window", "stream")}
     rows = []
     for net, paper_s in _TIMES_S.items():
         row: list[Cell] = [net, f"{1e3 * paper_s:.0f}", f"{paper_s / _TIMES_S['plain']:.2f}"]
-        for way in ("window", "stream"):
-            p50, p99 = np.percentile(ms[net, way], [50, 99])
-            row += [f"{p50:.1f}, {p99:.1f}", f"{p50 / plain[way]:.2f}"]
+        for method in ("window", "stream"):
+            p50, p99 = np.percentile(ms[net, method], [50, 99])
+            row += [f"{p50:.1f}, {p99:.1f}", f"{p50 / plain[method]:.2f}"]
         rows.append(tuple(row))
     columns = (
         "network",
@@ -241,8 +246,8 @@ def times(advance: Callable[[str], None]) -> Table:
     return Table("Table 7: time of an estimate", columns, tuple(rows))
 
 
-TIMED: Final = _RUNS + 8
-"""How often `times` calls ``advance``."""
+TIMED: Final = _RUNS + _WARM_UP
+"""Number of calls of ``progress`` by `times`."""
 
 
 def _paper(value: float | None) -> str:

@@ -1,38 +1,38 @@
-"""Engines: what computes an ensemble's streaming step, chosen by name; all give the same newtons.
+"""Engines: libraries that compute an ensemble's streaming step. All give the same forces.
 
-An engine is imported when a run names it, and of PyTorch, OpenVINO and ONNX Runtime only the one that runs.
+An engine's library is imported when a run names the engine, and no other is.
 """
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from importlib import import_module
-from typing import Any, Final, Literal
+from typing import Final, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
 
 from gripper_force.errors import ConfigError, NonFiniteError
+from gripper_force.plugins import load_class
 from gripper_force.vision.header import Header, Model
 
 Floats = npt.NDArray[np.float32]
 Precision = Literal["float32", "bfloat16"]
 
 ENGINES: Final = {
-    "torch": "pytorch:TorchEngine",
-    "openvino": "openvino:OpenVinoEngine",
-    "onnxruntime": "onnxruntime:OnnxEngine",
+    "torch": "gripper_force.vision.engines.pytorch:TorchEngine",
+    "openvino": "gripper_force.vision.engines.openvino:OpenVinoEngine",
+    "onnxruntime": "gripper_force.vision.engines.onnxruntime:OnnxEngine",
 }
-"""Modules of this package, and classes in them."""
+"""Built-in engines: name and class. Each name is also that of the package that the engine needs."""
 
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What an ensemble makes of one frame.
+    """Output of an ensemble for one frame.
 
     Attributes:
-        forces_n: Each member's force, (M,).
-        features: What the members' last layers make these from, side by side, (F,).
-        attention: Where SSAM looks, (h, w) in 0..1; None without SSAM.
+        forces_n: Force estimate of each of the M members, (M,).
+        features: Inputs of the members' last layers, concatenated over the members, (F,).
+        attention: Attention map of SSAM, (h, w) in 0..1; None without SSAM.
     """
 
     forces_n: Floats
@@ -41,73 +41,75 @@ class Step:
 
 
 class Engine(ABC):
-    """An ensemble, ready to take one frame after the other. One thread alone may use it."""
+    """An ensemble that takes one frame after the other. Not thread-safe.
+
+    A subclass is constructed as ``Class(model, precision, threads)``, with the arguments of `open_engine`,
+    and implements `_zero_states` and `_infer`. `gripper_force.testing.engine_contract.EngineContract` tests
+    it.
+    """
 
     def __init__(self, header: Header) -> None:
         self.header = header
         self._begun = False
 
     def reset(self) -> None:
-        """Forgets the stream."""
+        """Forgets all frames; the next one is the first of a new stream."""
         self._begun = False
 
     def step(self, frame: Floats) -> Step:
-        """Takes the next prepared frame of the stream, (S, S).
+        """Processes the next prepared frame of the stream.
+
+        Args:
+            frame: Output of `gripper_force.vision.preprocess.Normaliser`, (S, S).
 
         Raises:
-            NonFiniteError: It holds NaN or infinity. The stream goes on as if it had not been there.
+            NonFiniteError: The frame holds NaN or infinity. It is skipped: the states do not change.
         """
-        # OpenVINO's rectifier makes zeros of NaN, and a force like any other comes out.
+        # OpenVINO's ReLU maps NaN to 0, so the result would look like any other force.
         if not np.isfinite(frame).all():
-            raise NonFiniteError("a prepared frame holds NaN or infinity; look at the camera's image")
+            raise NonFiniteError("a prepared frame holds NaN or infinity; check the camera's image")
         if not self._begun:
-            # Frames before the first count as copies of it, so the first is taken in as often as it counts.
-            self._blank()
+            # Frames before the first count as copies of the first.
+            self._zero_states()
             for _ in range(max(member.context for member in self.header.members)):
-                self._run(frame)
+                self._infer(frame)
             self._begun = True
-        return self._run(frame)
+        return self._infer(frame)
 
     @abstractmethod
-    def _blank(self) -> None:
-        """Makes all states zero."""
+    def _zero_states(self) -> None:
+        """Sets all states of the networks to zero."""
 
     @abstractmethod
-    def _run(self, frame: Floats) -> Step:
-        """One step, from the states that the last one left."""
+    def _infer(self, frame: Floats) -> Step:
+        """Runs the networks on one frame, (S, S), and updates the states."""
 
 
 def open_engine(
-    model: Model, engine: str = "torch", precision: Precision = "float32", threads: int = 1
+    model: Model, engine: str = "torch", precision: Precision = "float32", threads: int | None = 1
 ) -> Engine:
-    """Loads a model into an engine; the first step is as fast as any.
+    """Loads a model into an engine and runs it once, so that a run's first step is as fast as the others.
 
     Args:
-        model: A checkpoint, or what `gripper_force.vision.export` made of one.
-        engine: One of `ENGINES`.
-        precision: Of the arithmetic; bfloat16 with OpenVINO only. What a file has in int8 stays so.
-        threads: CPU threads to compute with.
+        model: A checkpoint, or a file that `gripper_force.vision.export` made of one.
+        engine: One of `ENGINES`, a name registered as an entry point in the group ``gripper_force.engines``,
+            or ``package.module:Class``.
+        precision: Precision of the arithmetic. Of the built-in engines only OpenVINO computes in bfloat16.
+            Layers that a file holds in int8 stay in int8.
+        threads: CPU threads to compute with. PyTorch has one setting for the whole process, which is changed;
+            None leaves it as it is, and gives OpenVINO and ONNX Runtime their own default, all cores.
 
     Raises:
-        ConfigError: There is no such engine, its package is not installed, or it can't run this file so.
+        ConfigError: The engine or the precision is unknown, a package is not installed, or the engine can't
+            run this file or this precision.
         CheckpointError: The file is damaged.
     """
-    if engine not in ENGINES:
-        raise ConfigError(f"no vision.engine {engine!r}; there are {', '.join(ENGINES)}")
-    if precision != "float32" and engine != "openvino":
-        raise ConfigError(f"vision.engine={engine} computes in float32: {precision} needs openvino")
-    module, name = ENGINES[engine].split(":")
-    opened: Engine = load_engine(module, name)(model, precision, threads)
+    if precision not in get_args(Precision):
+        raise ConfigError(f"unknown vision.precision {precision!r}; use {' or '.join(get_args(Precision))}")
+    if precision != "float32" and engine in ENGINES and engine != "openvino":
+        raise ConfigError(f"vision.engine={engine} computes in float32 only; {precision} needs openvino")
+    engine_class = load_class("engines", ENGINES, engine, "vision.engine", extra="engines")
+    opened: Engine = engine_class(model, precision, threads)
     opened.step(np.zeros((model.header.preprocess.size,) * 2, np.float32))
     opened.reset()
     return opened
-
-
-def load_engine(module: str, name: str) -> Any:
-    """Imports an engine's class. Raises `ConfigError` where its package is not installed."""
-    try:
-        return getattr(import_module(f"gripper_force.vision.engines.{module}"), name)
-    except ModuleNotFoundError as error:
-        raise ConfigError(
-            f"vision.engine={module} needs the package {error.name}: pip install 'gripper-force[engines]'"
-        ) from error

@@ -6,37 +6,44 @@ import onnxruntime
 from gripper_force.errors import CheckpointError
 from gripper_force.vision.engines import Engine, Floats, Precision, Step
 from gripper_force.vision.header import Model
-from gripper_force.vision.model_files import exported
+from gripper_force.vision.model_files import exported_file
 
 
 class OnnxEngine(Engine):
-    """Runs an ONNX file, in float32."""
+    """Runs an ONNX file in float32."""
 
-    def __init__(self, model: Model, precision: Precision = "float32", threads: int = 1) -> None:
-        """Loads the file, or the one that a checkpoint was exported to, once on each machine.
+    def __init__(self, model: Model, precision: Precision = "float32", threads: int | None = None) -> None:
+        """Loads an ONNX file. A checkpoint is exported first, once on each machine.
+
+        Args:
+            model: A checkpoint or an ONNX file.
+            precision: Ignored; always float32.
+            threads: CPU threads; None for ONNX Runtime's default.
 
         Raises:
+            ConfigError: The file was exported for another engine.
             CheckpointError: The file is damaged.
         """
         super().__init__(model.header)
-        path = exported(model, ".onnx")
+        path = exported_file(model, ".onnx")
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
+        options.intra_op_num_threads = threads or 0  # 0: the default
         # Threads that spin while they wait would take the core that the control thread needs.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         try:
             self._session = onnxruntime.InferenceSession(path, options, ["CPUExecutionProvider"])
-        except Exception as error:  # its own classes derive from Exception alone
-            raise CheckpointError(f"ONNX Runtime can't run {path}: {error}") from error
-        self._shapes = {port.name: port.shape for port in self._session.get_inputs()[1:]}
-        self._frame = self._session.get_inputs()[0].name
-        self._given = len(self._session.get_outputs()) - len(self._shapes)
+        except Exception as error:  # ONNX Runtime's classes have no common base but Exception
+            raise CheckpointError(f"ONNX Runtime can't run {path}: {error}; export it again") from error
+        frame, *states = self._session.get_inputs()
+        self._frame_name = frame.name
+        self._state_shapes = {port.name: port.shape for port in states}
+        self._first_state = len(self._session.get_outputs()) - len(states)
 
-    def _blank(self) -> None:
-        self._state = [np.zeros(shape, np.float32) for shape in self._shapes.values()]
+    def _zero_states(self) -> None:
+        self._states = [np.zeros(shape, np.float32) for shape in self._state_shapes.values()]
 
-    def _run(self, frame: Floats) -> Step:
-        feed = {self._frame: frame[None, None], **dict(zip(self._shapes, self._state, strict=True))}
-        out = self._session.run(None, feed)
-        self._state = out[self._given :]
-        return Step(out[0], out[1], out[2] if self._given > 2 else None)
+    def _infer(self, frame: Floats) -> Step:
+        states = zip(self._state_shapes, self._states, strict=True)
+        outputs = self._session.run(None, {self._frame_name: frame[None, None], **dict(states)})
+        self._states = outputs[self._first_state :]
+        return Step(outputs[0], outputs[1], outputs[2] if self._first_state > 2 else None)

@@ -3,41 +3,48 @@
 import numpy as np
 import torch
 
-from gripper_force.errors import ConfigError
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
 from gripper_force.vision.engines import Engine, Floats, Precision, Step
 from gripper_force.vision.ensemble_step import ATTENTION, EnsembleStep
-from gripper_force.vision.header import EXPORTED, Model
+from gripper_force.vision.header import Model
+from gripper_force.vision.model_files import check_not_exported
 
 
 class TorchEngine(Engine):
-    """Runs the networks as they are."""
+    """Runs the networks of a checkpoint in float32."""
 
-    def __init__(self, model: Model | Checkpoint, precision: Precision = "float32", threads: int = 1) -> None:
-        """Loads a checkpoint, or takes one that is loaded. There is one precision: float32."""
-        torch.set_num_threads(threads)
-        checkpoint = model if isinstance(model, Checkpoint) else _load(model)
-        super().__init__(checkpoint.header)
-        self._step = EnsembleStep(checkpoint.networks).eval()
-        self._outputs = self._step.outputs
-        self._forward = self._step.forward
+    def __init__(
+        self, model: Model | Checkpoint, precision: Precision = "float32", threads: int | None = None
+    ) -> None:
+        """Takes a checkpoint, or loads one.
 
-    def _blank(self) -> None:
-        self._state = self._step.blank()
+        Args:
+            model: The checkpoint.
+            precision: Ignored; always float32.
+            threads: CPU threads of PyTorch in this whole process; None leaves the setting as it is.
+
+        Raises:
+            ConfigError: The file was exported for another engine.
+            CheckpointError: The file is damaged.
+        """
+        if threads is not None:
+            torch.set_num_threads(threads)
+        if isinstance(model, Model):
+            check_not_exported(model)
+            model = load_checkpoint(model.path)
+        super().__init__(model.header)
+        self._step = EnsembleStep(model.networks).eval()
+        self._has_attention = ATTENTION in self._step.outputs
+
+    def _zero_states(self) -> None:
+        self._states = self._step.zero_states()
 
     @torch.inference_mode()
-    def _run(self, frame: Floats) -> Step:
-        out = self._forward(torch.from_numpy(frame)[None, None], *self._state)
-        first = len(out) - len(self._state)
-        self._state = list(out[first:])
-        forces_n, features, *looks = (np.asarray(tensor.numpy(), np.float32) for tensor in out[:first])
-        return Step(forces_n, features, looks[0] if ATTENTION in self._outputs else None)
-
-
-def _load(model: Model) -> Checkpoint:
-    if model.path.suffix in EXPORTED:
-        raise ConfigError(
-            f"{model.path} was exported for another engine: set vision.engine={EXPORTED[model.path.suffix]}, "
-            "or name the checkpoint that it was made of"
+    def _infer(self, frame: Floats) -> Step:
+        outputs = self._step.forward(torch.from_numpy(frame)[None, None], *self._states)
+        first_state = len(outputs) - len(self._states)
+        self._states = list(outputs[first_state:])
+        forces_n, features, *attention = (
+            np.asarray(tensor.numpy(), np.float32) for tensor in outputs[:first_state]
         )
-    return load_checkpoint(model.path)
+        return Step(forces_n, features, attention[0] if self._has_attention else None)

@@ -1,6 +1,6 @@
-"""Real cameras."""
+"""Drivers for real cameras."""
 
 import os
 
-# DepthAI logs to stdout, where `--json` promises one object alone. Set the variable yourself to see its log.
+# DepthAI logs to stdout, where `--json` prints exactly one object. Set the variable to see the log.
 os.environ.setdefault("DEPTHAI_LEVEL", "off")

@@ -1,4 +1,4 @@
-"""An OAK camera by DepthAI v3. The device crops and shrinks: 16 kB instead of 1 MB a frame cross USB.
+"""Driver for OAK cameras by DepthAI v3. The device crops and downscales: 16 kB per frame cross USB, not 1 MB.
 
 Manual: https://docs.luxonis.com/software-v3/depthai/
 """
@@ -15,26 +15,30 @@ from gripper_force.config import CameraConfig
 from gripper_force.errors import DeviceError, DeviceLostError, DeviceNotFoundError
 from gripper_force.interfaces import Clock
 from gripper_force.types import Gray
-from gripper_hw.cameras.reader import BackgroundCamera, Read, Shot, square
+from gripper_hw.cameras.reader import BackgroundCamera, RawFrame, ReadFrame, crop_square
 
-PICTURE = (1280, 800)
-"""Width and height in pixels of what the sensor is asked for: all of an OV9282."""
+SENSOR_SIZE_PX = (1280, 800)
+"""Width and height requested from the sensor: all of an OV9282."""
 
 _DEFAULT_ISO = 100
-_WAIT = timedelta(milliseconds=50)
+"""Sensitivity where ``camera.gain`` is null: DepthAI sets exposure and sensitivity together."""
+
+_QUEUE_TIMEOUT = timedelta(milliseconds=50)
+"""Longest wait for one frame; between two waits the camera can be closed."""
+
 _US = timedelta(microseconds=1)
 
-FrameSource = Callable[[CameraConfig, ExitStack], tuple[Any, Any]]
-"""Makes a ``depthai.Pipeline`` with an output that gives pictures of size `PICTURE`; the stack closes it."""
+PipelineSource = Callable[[CameraConfig, ExitStack], tuple[Any, Any]]
+"""Makes a ``depthai.Pipeline`` and an output of frames of `SENSOR_SIZE_PX`; the stack closes both."""
 
 
-def device_source(config: CameraConfig, stack: ExitStack) -> tuple[Any, Any]:
-    """A pipeline on the device, with its sensor's output. Raises `DeviceNotFoundError`."""
+def device_pipeline(config: CameraConfig, stack: ExitStack) -> tuple[Any, Any]:
+    """Makes a pipeline on the configured device and its sensor's output. Raises `DeviceNotFoundError`."""
     import depthai as dai
 
     device = dai.Device(_find(config.device, dai.Device.getAllAvailableDevices()))
     stack.callback(device.close)
-    device.setMaxReconnectionAttempts(0)  # the library's own way back takes any device, and 10 s a try
+    device.setMaxReconnectionAttempts(0)  # the library would reconnect to any device, with 10 s per attempt
     sensor = choose_sensor(device.getConnectedCameraFeatures())
     pipeline = stack.enter_context(dai.Pipeline(device))
     camera = pipeline.create(dai.node.Camera).build(sensor.socket)
@@ -42,12 +46,16 @@ def device_source(config: CameraConfig, stack: ExitStack) -> tuple[Any, Any]:
         iso = _DEFAULT_ISO if config.gain is None else config.gain
         camera.initialControl.setManualExposure(config.exposure_us, iso)
     mono = dai.CameraSensorType.MONO in sensor.supportedTypes
-    kind = dai.ImgFrame.Type.GRAY8 if mono else dai.ImgFrame.Type.NV12
-    return pipeline, camera.requestOutput(PICTURE, kind, fps=config.rate_hz)
+    frame_type = dai.ImgFrame.Type.GRAY8 if mono else dai.ImgFrame.Type.NV12
+    return pipeline, camera.requestOutput(SENSOR_SIZE_PX, frame_type, fps=config.rate_hz)
 
 
 def choose_sensor(features: Sequence[Any]) -> Any:
-    """The mono sensor on the lowest socket, else the colour sensor there. Raises `DeviceNotFoundError`."""
+    """Returns the mono sensor on the lowest socket, else the colour sensor there.
+
+    Raises:
+        DeviceNotFoundError: The device has no sensor.
+    """
     import depthai as dai
 
     if not features:
@@ -56,13 +64,13 @@ def choose_sensor(features: Sequence[Any]) -> Any:
 
 
 def build_queue(config: CameraConfig, pipeline: Any, output: Any) -> Any:
-    """Completes the pipeline from the source's output to the queue that holds the newest gray frame.
+    """Completes a pipeline: crops, downscales and converts, and returns the queue of the newest gray frame.
 
-    Where the pipeline has no device, the host does the device's work.
+    If the pipeline has no device, this runs on the host.
     """
     import depthai as dai
 
-    left, top, side = square(config, *PICTURE)
+    left, top, side = crop_square(config, *SENSOR_SIZE_PX)
     manip = pipeline.create(dai.node.ImageManip)
     manip.setRunOnHost(pipeline.getDefaultDevice() is None)
     manip.initialConfig.addCrop(left, top, side, side)
@@ -75,68 +83,71 @@ def build_queue(config: CameraConfig, pipeline: Any, output: Any) -> Any:
 
 
 class OakCamera(BackgroundCamera):
-    """The mono sensor of an OAK camera, or its colour sensor in gray.
+    """The mono sensor of an OAK camera, or its colour sensor converted to gray.
 
-    Frame times are the device's, synchronised to the host's clock by the library.
+    The library converts the device's frame times to the host's clock.
 
     Args:
-        config: Its section of the configuration.
+        config: The camera section of the configuration.
         clock: The run's clock.
-        source: What gives the pictures; a test puts a host's node here.
+        source: Makes the pipeline; tests pass a pipeline that runs on the host.
     """
 
-    def __init__(self, config: CameraConfig, clock: Clock, source: FrameSource = device_source) -> None:
+    def __init__(self, config: CameraConfig, clock: Clock, source: PipelineSource = device_pipeline) -> None:
         super().__init__(config, clock)
         self._source = source
 
     @contextmanager
-    def _opened(self) -> Iterator[Read]:
+    def _open(self) -> Iterator[ReadFrame]:
         import depthai as dai
 
-        broken: list[Exception] = []
+        pipeline_errors: list[Exception] = []
 
         def run() -> None:
             try:
                 pipeline.run()
-            except Exception as error:  # `read` tells
-                broken.append(error)
+            except Exception as error:  # `read` raises it
+                pipeline_errors.append(error)
 
-        def read() -> Shot | None:
-            if broken:
-                raise DeviceLostError(f"the OAK camera's pipeline broke: {broken[0]}")
+        def read() -> RawFrame | None:
+            if pipeline_errors:
+                raise DeviceLostError(
+                    f"the OAK camera's pipeline failed: {pipeline_errors[0]}; check its cable and power"
+                )
             try:
-                frame = queue.get(_WAIT)
+                frame = queue.get(_QUEUE_TIMEOUT)
             except dai.MessageQueue.QueueException as error:
                 raise DeviceLostError("the OAK camera is gone; check its cable and power") from error
             if frame is None:
                 return None
             t_ns = frame.getTimestamp(dai.CameraExposureOffset.MIDDLE) // _US * 1000
             gray: Gray = np.array(frame.getFrame())
-            return Shot(t_ns, frame.getSequenceNum(), gray)
+            return RawFrame(t_ns, frame.getSequenceNum(), gray)
 
         try:
             with ExitStack() as stack:
                 pipeline, output = self._source(self._config, stack)
                 queue = build_queue(self._config, pipeline, output)
-                # `pipeline.start` would hold Python's lock, and so the control thread, until the device runs.
+                # `pipeline.start` would hold the GIL, and block the control thread, until the device runs.
                 runner = threading.Thread(target=run, name="oak", daemon=True)
                 runner.start()
                 stack.callback(runner.join)
                 stack.callback(pipeline.stop)
                 while runner.is_alive() and not pipeline.isRunning():
-                    runner.join(0.01)  # to stop what does not run yet would do nothing
+                    runner.join(0.01)  # `pipeline.stop` has no effect before the pipeline runs
                 yield read
-        except RuntimeError as error:  # the library's, on the way in or out
-            raise DeviceError(f"the OAK camera can't be used: {error}") from error
+        except RuntimeError as error:  # DepthAI raises it while opening and closing
+            raise DeviceError(f"the OAK camera cannot be used: {error}; check its cable and power") from error
 
 
 def _find(wanted: str | int | None, available: Sequence[Any]) -> Any:
-    fits = [info for info in available if wanted is None or str(wanted) in (info.deviceId, info.name)]
-    if len(fits) == 1:
-        return fits[0]
+    """Returns the only device with this id or address (None: any). Raises `DeviceNotFoundError`."""
+    matches = [info for info in available if wanted is None or str(wanted) in (info.deviceId, info.name)]
+    if len(matches) == 1:
+        return matches[0]
     known = ", ".join(f"{info.deviceId} at {info.name}" for info in available) or "none"
-    asked = "null" if wanted is None else wanted
+    shown = "null" if wanted is None else wanted
     raise DeviceNotFoundError(
-        f"{len(fits)} free OAK cameras fit camera.device={asked} (free: {known}); check cable, power and "
-        "hw/udev, that no other program has it, and name one of several by its id"
+        f"{len(matches)} free OAK cameras match camera.device={shown} (free: {known}); check cable, power, "
+        "the rules of hw/udev, and that no other program uses it; of several, name one by its id"
     )

@@ -1,4 +1,4 @@
-"""What real cameras have in common: a thread that reads, keeps the newest frame, and finds the way back."""
+"""Base class of real cameras: a thread reads the device, keeps the newest frame and reopens a lost device."""
 
 import atexit
 import threading
@@ -13,28 +13,39 @@ from gripper_force.errors import ConfigError, DeviceError, DeviceLostError
 from gripper_force.interfaces import Clock
 from gripper_force.types import NS_PER_MS, NS_PER_S, Frame, Gray
 
-_FIRST_FRAME_NS = 5 * NS_PER_S
-_RETRY_S = 0.5
+_FIRST_FRAME_TIMEOUT_NS = 5 * NS_PER_S
+"""Longest wait for the first frame after the device was opened; later frames have ``camera.timeout_ms``."""
+
+_REOPEN_PERIOD_S = 0.5
+"""Pause between two attempts to open a lost camera."""
+
 _RATE_FRAMES = 120
+"""Frames over which the rate is measured."""
 
 
-class Shot(NamedTuple):
-    """A picture from a device: the middle of its exposure, the device's number, and (H, W) uint8."""
+class RawFrame(NamedTuple):
+    """A frame as the device delivers it.
+
+    Attributes:
+        t_ns: Host time at the middle of the exposure.
+        seq: The device's frame number; it restarts when the device is opened again.
+        gray: Image, (H, W) uint8.
+    """
 
     t_ns: int
     seq: int
     gray: Gray
 
 
-Read = Callable[[], Shot | None]
-"""Waits a short while for the next picture; None if there was none. Raises `DeviceError`."""
+ReadFrame = Callable[[], RawFrame | None]
+"""Waits a short time for the next frame; returns None if none came. Raises `DeviceError`."""
 
 
 class BackgroundCamera(ABC):
-    """A camera that a thread of its own opens, reads, and opens again after a loss.
+    """A camera that a background thread opens, reads, and reopens after a loss.
 
     Args:
-        config: Its section of the configuration.
+        config: The camera section of the configuration.
         clock: The run's clock, which must be the host's.
     """
 
@@ -46,7 +57,7 @@ class BackgroundCamera(ABC):
         self._times_ns: deque[int] = deque(maxlen=_RATE_FRAMES)
         self._lock = threading.Lock()
         self._failure: Exception | None = None
-        self._begun, self._stop = threading.Event(), threading.Event()
+        self._ready, self._stop = threading.Event(), threading.Event()
         self._thread: threading.Thread | None = None
 
     @property
@@ -57,24 +68,25 @@ class BackgroundCamera(ABC):
         return (len(times_ns) - 1) * NS_PER_S / (times_ns[-1] - times_ns[0]) if len(times_ns) > 1 else 0.0
 
     def start(self) -> None:
-        """Opens the device and returns when the first frame is there.
+        """Opens the device and returns after the first frame.
 
         Raises:
-            ConfigError: The region reaches beyond the picture.
+            ConfigError: The region reaches beyond the image.
             DeviceError: The device is missing, in use, gives no frames or refuses a setting.
         """
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name="camera", daemon=True)
-            atexit.register(self.close)  # a device's library aborts a process that ends under its threads
+            atexit.register(self.close)  # device libraries abort a process that exits while their threads run
             self._thread.start()
-        self._begun.wait()
+        self._ready.wait()
         if self._failure is not None:
             raise self._failure
 
     def newest(self) -> Frame | None:
-        """The newest frame that was not handed out yet, or None, also while the camera is lost. Never blocks.
+        """Returns the newest frame that was not returned yet, or None. Never blocks.
 
-        A lost camera is no error; a defect in the camera's thread is raised here.
+        A lost camera is not an error: the result is None until it is back. An unexpected exception of the
+        camera's thread is raised here.
         """
         if self._failure is not None:
             raise self._failure
@@ -83,11 +95,11 @@ class BackgroundCamera(ABC):
         return frame
 
     def counts(self) -> dict[str, int]:
-        """How often the camera was gone, or gave no frame for ``camera.timeout_ms``."""
+        """Number of losses: the camera was gone, or gave no frame for ``camera.timeout_ms``."""
         return {"losses": self._losses}
 
     def close(self) -> None:
-        """Stops capturing, once the device's library returns. May be called twice."""
+        """Stops capturing; returns when the device's library does. May be called twice."""
         self._stop.set()
         if self._thread is not None:
             self._thread.join()
@@ -95,74 +107,79 @@ class BackgroundCamera(ABC):
         self._newest = None
 
     @abstractmethod
-    def _opened(self) -> AbstractContextManager[Read]:
-        """Opens the device; raises `DeviceError`. The camera's thread alone enters, reads and leaves."""
+    def _open(self) -> AbstractContextManager[ReadFrame]:
+        """Opens the device. Called and used by the camera's thread only. Raises `DeviceError`."""
 
     def _run(self) -> None:
         try:
             while not self._stop.is_set():
                 try:
                     self._capture()
-                except (DeviceError, ConfigError):  # also one that comes back with another picture
-                    if not self._begun.is_set():
+                except (DeviceError, ConfigError):  # ConfigError: it is back with another image size
+                    if not self._ready.is_set():
                         raise
-                self._stop.wait(_RETRY_S)
+                self._stop.wait(_REOPEN_PERIOD_S)
         except Exception as error:  # `start` or `newest` raises it in the caller's thread
             self._failure = error
         finally:
-            self._begun.set()
+            self._ready.set()
 
     def _capture(self) -> None:
-        """Opens the camera and keeps its newest frame until it is lost or closed. Raises what prevents it."""
-        with self._opened() as read:
-            shot = self._next_shot(read, _FIRST_FRAME_NS)
-            # A camera that comes back counts from 0; a frame's number must stay its own.
-            shift = max(0, self._next_seq - shot.seq) if shot is not None else 0
+        """Opens the camera and stores its frames until it is lost or closed. Raises if opening fails."""
+        with self._open() as read:
+            raw = self._next_frame(read, _FIRST_FRAME_TIMEOUT_NS)
+            # A reopened camera counts from 0 again; frame numbers must keep rising.
+            seq_offset = max(0, self._next_seq - raw.seq) if raw is not None else 0
             with self._lock:
                 self._times_ns.clear()
             try:
-                while shot is not None:
-                    self._keep(shot, shift)
-                    shot = self._next_shot(read, round(self._config.timeout_ms * NS_PER_MS))
+                while raw is not None:
+                    self._store(raw, seq_offset)
+                    raw = self._next_frame(read, round(self._config.timeout_ms * NS_PER_MS))
             except DeviceError:
                 self._losses += 1
 
-    def _next_shot(self, read: Read, patience_ns: int) -> Shot | None:
-        """The next picture, or None if the camera is to be closed. Raises `DeviceLostError`."""
-        deadline_ns = self._clock.now_ns() + patience_ns
+    def _next_frame(self, read: ReadFrame, timeout_ns: int) -> RawFrame | None:
+        """Returns the next frame, or None if the camera is to be closed. Raises `DeviceLostError`."""
+        deadline_ns = self._clock.now_ns() + timeout_ns
         while not self._stop.is_set():
-            if (shot := read()) is not None:
-                return shot
+            if (raw := read()) is not None:
+                return raw
             if self._clock.now_ns() > deadline_ns:
                 raise DeviceLostError(
-                    f"the {self._config.backend} camera gave no frame for {patience_ns / NS_PER_MS:g} ms; "
-                    "check its cable, and that no other program reads it"
+                    f"the {self._config.backend} camera gave no frame for {timeout_ns / NS_PER_MS:g} ms; "
+                    "check its cable, and that no other program uses it"
                 )
         return None
 
-    def _keep(self, shot: Shot, shift: int) -> None:
-        frame = Frame(shot.t_ns, self._clock.now_ns(), shot.seq + shift, shot.gray)
+    def _store(self, raw: RawFrame, seq_offset: int) -> None:
+        frame = Frame(raw.t_ns, self._clock.now_ns(), raw.seq + seq_offset, raw.gray)
         self._next_seq = frame.seq + 1
         with self._lock:
             self._newest = frame
             self._times_ns.append(frame.t_ns)
-        self._begun.set()
+        self._ready.set()
 
 
-def square(config: CameraConfig, width: int, height: int) -> tuple[int, int, int]:
-    """The part of a picture that becomes the frame: the largest square in the middle of ``camera.region``.
+def crop_square(config: CameraConfig, width: int, height: int) -> tuple[int, int, int]:
+    """Returns the part of an image that becomes the frame: the largest centred square of ``camera.region``.
+
+    Args:
+        config: The camera section of the configuration.
+        width: Width of the image in pixels.
+        height: Height of the image in pixels.
 
     Returns:
-        Left, top and side in pixels, as are the picture's width and height.
+        Left, top and side of the square in pixels.
 
     Raises:
-        ConfigError: The region reaches beyond the picture.
+        ConfigError: The region reaches beyond the image.
     """
     left, top, columns, rows = config.region or (0, 0, width, height)
     if not (0 <= left < left + columns <= width and 0 <= top < top + rows <= height):
         raise ConfigError(
-            f"camera.region {[left, top, columns, rows]} (left, top, width, height) must lie within "
-            f"the camera's picture of {width}x{height} pixels"
+            f"camera.region {[left, top, columns, rows]} (left, top, width, height) reaches beyond the "
+            f"camera's image of {width}x{height} pixels; choose a region within it"
         )
     side = min(columns, rows)
     return left + (columns - side) // 2, top + (rows - side) // 2, side

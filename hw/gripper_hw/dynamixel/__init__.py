@@ -1,1 +1,1 @@
-"""Dynamixel servos over the unmodified SDK, and a virtual bus that answers Protocol 2.0."""
+"""Driver for Dynamixel X-series servos over the unmodified SDK, and a virtual Protocol 2.0 bus."""

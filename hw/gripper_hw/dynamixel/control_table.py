@@ -1,22 +1,23 @@
-"""The control table of X-series servos, and what sets one model apart, as data (``servos/*.yaml``)."""
+"""Control table of X-series servos and data of each model, from ``servos/*.yaml``."""
 
 import math
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypedDict
 
 import yaml
 
 from gripper_force.errors import ConfigError
 
 TICKS_PER_REV: Final = 4096
-ZERO_TICK: Final = 2048
-VELOCITY_UNIT_RAD_S: Final = 0.229 * 2 * math.pi / 60
+ZERO_TICK: Final = 2048  # the middle of the turn is 0 rad
+VELOCITY_UNIT_RAD_S: Final = 0.229 * 2 * math.pi / 60  # 0.229 rpm
 WATCHDOG_UNIT_MS: Final = 20
 CURRENT_BASED_POSITION_MODE: Final = 5
 
 _TICKS_PER_RAD: Final = TICKS_PER_REV / (2 * math.pi)
+_FOLDER: Final = resources.files("gripper_hw.dynamixel") / "servos"
 _SHARED: Final = "x_series.yaml"
 
 
@@ -24,13 +25,13 @@ class Register(NamedTuple):
     """One entry of the control table.
 
     Attributes:
-        address: First byte.
-        size: Bytes, 1, 2 or 4.
+        address: Address of the first byte.
+        size: Number of bytes: 1, 2 or 4.
         access: ``r`` or ``rw``.
-        signed: Two's complement.
+        signed: True for two's complement.
         unit: Unit of one step; empty for a pure number.
-        initial: Factory setting; None where a model has its own, or lacks the register.
-        range: Least and greatest value that may be written; None where nothing but the size bounds it.
+        initial: Factory setting; None if it depends on the model, or a model lacks the register.
+        range: Lowest and highest value that may be written; None if only the size limits it.
     """
 
     address: int
@@ -43,20 +44,26 @@ class Register(NamedTuple):
 
     @property
     def eeprom(self) -> bool:
-        """True where the value survives power-off and can't be written while torque is on."""
+        """True if the value survives power-off and can't be written while torque is on."""
         return self.address < 64
 
     def encode(self, value: int) -> bytes:
-        """Bytes of ``value``, little-endian."""
+        """Returns ``value`` as ``size`` bytes, little-endian."""
         return value.to_bytes(self.size, "little", signed=self.signed)
 
     def decode(self, data: bytes | bytearray) -> int:
-        """The value of ``size`` little-endian bytes."""
+        """Returns the value of ``size`` little-endian bytes."""
         return int.from_bytes(data, "little", signed=self.signed)
 
 
 class IndirectWindow(NamedTuple):
-    """A row of two-byte addresses, and the row of bytes that stand for them."""
+    """Indirect addresses and the indirect data bytes that they map.
+
+    Attributes:
+        address: Address of the first indirect address; each has two bytes.
+        data: Address of the first indirect data byte.
+        length: Number of data bytes.
+    """
 
     address: int
     data: int
@@ -65,21 +72,21 @@ class IndirectWindow(NamedTuple):
 
 @dataclass(frozen=True)
 class ServoModel:
-    """One model, as its manual gives it.
+    """Data of one model, from its manual.
 
     Attributes:
-        name: The vendor's name, without the ``-T`` or ``-R`` of its connector.
+        name: The vendor's name, without the connector's ``-T`` or ``-R``.
         number: Model Number, register 0.
-        current_unit_a: One step of every current.
-        stall_torque_nm: Torque at the horn at stall, at the nominal voltage.
-        stall_current_a: Current at stall.
-        no_load_rpm: Speed without load.
-        nominal_voltage_v: Supply the three values above hold for.
-        voltage_range_v: Least and greatest supply.
+        current_unit_a: Unit of all current registers.
+        stall_torque_nm: Stall torque at the horn, at the nominal voltage.
+        stall_current_a: Stall current, at the nominal voltage.
+        no_load_rpm: Speed without load, at the nominal voltage.
+        nominal_voltage_v: Supply voltage of the three values above.
+        voltage_range_v: Lowest and highest supply voltage.
         operating_modes: Values that Operating Mode accepts.
-        min_firmware: The first firmware that answers Fast Sync Read.
-        indirect: First firmware to the indirect windows it has, in order of firmware.
-        initial: Factory settings that differ from model to model, by register name.
+        min_firmware: First firmware that supports Fast Sync Read.
+        indirect: First firmware to the indirect windows from that version on, in order of firmware.
+        initial: Factory settings that depend on the model, by register name.
     """
 
     name: str
@@ -97,32 +104,32 @@ class ServoModel:
 
     @property
     def nm_per_a(self) -> float:
-        """Torque constant at the horn, stall torque by stall current: a prior, to be calibrated."""
+        """Torque constant at the horn, stall torque over stall current: a prior, to be calibrated."""
         return self.stall_torque_nm / self.stall_current_a
 
     @property
     def max_current_a(self) -> float:
-        """The greatest Current Limit."""
+        """Highest Current Limit."""
         return self.initial["current_limit"] * self.current_unit_a
 
     def indirect_windows(self, firmware: int) -> tuple[IndirectWindow, ...]:
-        """The indirect addresses that servos of this model have with ``firmware``."""
+        """Returns the indirect windows of this model with ``firmware``."""
         return self.indirect[max(first for first in self.indirect if first <= firmware)]
 
 
 def ticks_from_rad(position_rad: float) -> int:
-    """Position in ticks; 0 rad is tick 2048."""
+    """Converts radians to ticks; 0 rad is tick 2048."""
     return round(ZERO_TICK + position_rad * _TICKS_PER_RAD)
 
 
 def rad_from_ticks(ticks: int) -> float:
-    """Position in radians; tick 2048 is 0 rad."""
+    """Converts ticks to radians; tick 2048 is 0 rad."""
     return (ticks - ZERO_TICK) / _TICKS_PER_RAD
 
 
 def model_names() -> tuple[str, ...]:
-    """Names `load_model` knows."""
-    files = (entry.name for entry in _servos().iterdir())
+    """Names of the models that `load_model` accepts, sorted."""
+    files = (entry.name for entry in _FOLDER.iterdir())
     return tuple(sorted(name.removesuffix(".yaml") for name in files if name != _SHARED))
 
 
@@ -131,15 +138,15 @@ def load_model(name: str) -> ServoModel:
     """Loads a model by its name.
 
     Raises:
-        ConfigError: The model is not known, or controls no current.
+        ConfigError: The model is unknown, or has no current control.
     """
-    if name in _without_current_control():
+    if name in _shared()["without_current_control"]:
         raise ConfigError(_no_current_control(name))
     if name not in model_names():
-        raise ConfigError(f"unknown servo model {name!r}; known: {', '.join(model_names())}")
+        raise ConfigError(f"unknown servo.model {name!r}; use one of {', '.join(model_names())}")
     tree = _load(f"{name}.yaml")
-    for row in ("operating_modes", "voltage_range_v"):
-        tree[row] = tuple(tree[row])
+    for key in ("operating_modes", "voltage_range_v"):
+        tree[key] = tuple(tree[key])
     tree["indirect"] = {
         first: tuple(IndirectWindow(*window) for window in windows)
         for first, windows in sorted(tree["indirect"].items())
@@ -147,49 +154,55 @@ def load_model(name: str) -> ServoModel:
     return ServoModel(name=name, **tree)
 
 
-def check_model_number(model: ServoModel, number: int, where: str) -> None:
-    """Compares a servo's Model Number with the model it should be.
+def check_model_number(model: ServoModel, number: int, label: str) -> None:
+    """Compares a servo's Model Number with the configured model.
+
+    Args:
+        model: The configured model.
+        number: The servo's Model Number.
+        label: Name of the servo for the error message.
 
     Raises:
-        ConfigError: It is another model. The sentence names it, and says so where it controls no current.
+        ConfigError: The servo is another model. The message names it and says if it has no current control.
     """
     if number == model.number:
         return
-    for name, known in _without_current_control().items():
+    for name, known in _shared()["without_current_control"].items():
         if number == known:
-            raise ConfigError(f"{where} is an {name}: {_no_current_control(name)}")
+            raise ConfigError(f"{label} is an {name}: {_no_current_control(name)}")
     name = next((known for known in model_names() if load_model(known).number == number), "an unknown model")
     raise ConfigError(
-        f"{where} is {name} (model number {number}), not the configured {model.name} ({model.number}); "
-        "set servo.model to what is fitted"
+        f"{label} is {name} (model number {number}), not the configured {model.name} ({model.number}); "
+        "set servo.model to the model that is connected"
     )
 
 
 def _no_current_control(name: str) -> str:
     return (
-        f"{name} has no current control (its register 126 is Present Load, not a current), so it can't set a "
-        f"force; use one of {', '.join(model_names())}"
+        f"{name} has no current control (its register 126 is Present Load, not a current), so it can't "
+        f"control force; use one of {', '.join(model_names())}"
     )
 
 
+class _SharedFile(TypedDict):
+    registers: dict[str, list[Any]]
+    without_current_control: dict[str, int]
+
+
+def _load(file_name: str) -> Any:
+    return yaml.safe_load((_FOLDER / file_name).read_text(encoding="utf-8"))
+
+
 @cache
-def _without_current_control() -> dict[str, int]:
-    return dict(_load(_SHARED)["without_current_control"])
-
-
-def _servos() -> Any:
-    return resources.files("gripper_hw.dynamixel") / "servos"
-
-
-def _load(name: str) -> dict[str, Any]:
-    tree: dict[str, Any] = yaml.safe_load((_servos() / name).read_text(encoding="utf-8"))
-    return tree
+def _shared() -> _SharedFile:
+    shared: _SharedFile = _load(_SHARED)
+    return shared
 
 
 def _registers() -> dict[str, Register]:
-    rows = _load(_SHARED)["registers"].items()
+    rows = _shared()["registers"].items()
     return {name: Register._make((*row[:6], row[6] and tuple(row[6]))) for name, row in rows}
 
 
 REGISTERS: Final = _registers()
-"""Register name to its entry, in order of address. Indirect addresses differ by model: see `ServoModel`."""
+"""Registers by name, in order of address. Indirect addresses depend on the model: see `ServoModel`."""

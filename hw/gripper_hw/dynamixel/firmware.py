@@ -1,8 +1,8 @@
-"""What runs inside one virtual X-series servo: its control table, access rules, safety and motor control.
+"""Firmware of one virtual X-series servo: control table, access rules, safety and motor control.
 
 Source: https://emanual.robotis.com/docs/en/dxl/x/xm430-w350/ and https://emanual.robotis.com/docs/en/dxl/protocol2/.
-Left out: profiles, the secondary id, reverse drive, feed-forward gains, PWM Slope and Startup Configuration,
-which are stored and do nothing, and the backup of the control table.
+Not implemented: profiles, the secondary id, reverse drive, feed-forward gains, PWM Slope and Startup
+Configuration, which are stored without effect, and the backup of the control table.
 """
 
 import math
@@ -32,10 +32,10 @@ INPUT_VOLTAGE_ERROR: Final = 0x01
 OVERHEATING_ERROR: Final = 0x04
 OVERLOAD_ERROR: Final = 0x20
 
-CURRENT_LOOP_S: Final = 0.002
-REBOOT_NS: Final = 200_000_000
+CURRENT_LOOP_S: Final = 0.002  # time constant
+REBOOT_NS: Final = 200_000_000  # no replies for this time
 
-_FULL_PWM: Final = 885
+_FULL_PWM: Final = 885  # 100 % duty
 _RAD_S_TO_TICKS: Final = TICKS_PER_REV / (2 * math.pi)
 _LAST_ADDRESS: Final = REGISTERS["present_temperature"].address
 
@@ -46,31 +46,33 @@ class _Address(IntEnum):
     GOAL_POSITION = REGISTERS["goal_position"].address
 
 
-_LIMITED_BY: Final = {
+_LIMIT_REGISTERS: Final = {
     REGISTERS["goal_pwm"].address: "pwm_limit",
     REGISTERS["goal_current"].address: "current_limit",
     REGISTERS["goal_velocity"].address: "velocity_limit",
 }
-_GOALS: Final = frozenset(_LIMITED_BY) | {_Address.GOAL_POSITION}
+_GOALS: Final = frozenset(_LIMIT_REGISTERS) | {_Address.GOAL_POSITION}
 
 
 class VirtualServo:
-    """One servo: a firmware that a plant drives through `control`.
+    """One servo's firmware. A plant calls `control`.
 
-    Its methods are not locked. A plant in another thread than the bus's holds `VirtualBus.lock` meanwhile.
+    The methods are not thread-safe: a plant in a thread other than the bus's must hold `VirtualBus.lock`.
 
     Attributes:
-        id: Its id on the bus.
-        model: Its model.
+        id: Id on the bus.
+        model: Model of the servo.
         tripped: True after a Bus Watchdog trip, until 0 is written to the watchdog: the goals are read-only.
-        silent_until_ns: It is rebooting, and deaf, before this time.
-        excess: Fault: share of its current that the motor is given beyond what its goals ask.
+        silent_until_ns: End of a reboot; before this time the servo ignores all packets.
+        excess_current_ratio: Fault: motor current beyond the commanded one, as a fraction of it.
     """
 
     def __init__(self, id: int, model: ServoModel, firmware: int = 52) -> None:
         self.model = model
         self._registers = _registers_of(model, model.indirect_windows(firmware))
-        self._register_at = {address: register for register in self._registers for address in _span(register)}
+        self._register_at = {
+            address: register for register in self._registers for address in _addresses(register)
+        }
         self._pointer_at = _pointers(model.indirect_windows(firmware))
         self._memory = bytearray(max(self._register_at) + 1)
         self._stall_a = model.stall_current_a
@@ -78,38 +80,38 @@ class VirtualServo:
         self._position_rad = 0.0
         self._velocity_rad_s = 0.0
         self._current_a = 0.0
-        self._measured_a = 0.0
+        self._present_current_a = 0.0
         self._pwm = 0.0
         self._integral = 0.0
         self._turn_ticks = 0
         self._temperature_c = 30.0
         self._voltage_v = model.nominal_voltage_v
         self._t_ns: int | None = None  # of the last control step
-        self._fed_ns = 0
-        self._registered: tuple[int, bytes] | None = None
+        self._last_packet_ns = 0
+        self._pending_write: tuple[int, bytes] | None = None
         self.silent_until_ns = 0
-        self.excess = 0.0
+        self.excess_current_ratio = 0.0
         self._reset(eeprom=True)
-        self._poke("firmware_version", firmware)
-        self._poke("id", id)
+        self._store("firmware_version", firmware)
+        self._store("id", id)
         self._reset(eeprom=False)
 
-    # The plant's side.
+    # Calls from the plant.
 
     def control(
         self, t_ns: int, position_rad: float, velocity_rad_s: float, current_noise_a: float = 0.0
     ) -> float:
         """Runs one step of the firmware.
 
-        Position modes drive a voltage from the position's PID, so back-EMF damps them; mode 5 bounds the
-        current that results by Goal Current. What a real servo does in mode 5 when its watchdog trips is not
-        documented: this one goes limp.
+        In the position modes the position PID sets a voltage, so back-EMF damps the motion; mode 5 limits the
+        resulting current to Goal Current. The reaction of a real servo in mode 5 to a watchdog trip is not
+        documented: this one turns the motor current off.
 
         Args:
             t_ns: Time of the step.
-            position_rad: Angle of the horn as the encoder sees it; 0 rad is tick 2048.
-            velocity_rad_s: Speed of the horn.
-            current_noise_a: Error of the current's measurement in this step.
+            position_rad: Angle of the horn at the encoder; 0 rad is tick 2048.
+            velocity_rad_s: Angular velocity of the horn.
+            current_noise_a: Measurement error of the current in this step.
 
         Returns:
             Motor current in A.
@@ -120,18 +122,18 @@ class VirtualServo:
         self._velocity_rad_s = velocity_rad_s
         self.check_watchdog(t_ns)
         if self._torque_on and not self.tripped:
-            wanted_a = self._wanted_current_a(dt_s)
-            self._current_a += (wanted_a - self._current_a) * -math.expm1(-dt_s / CURRENT_LOOP_S)
-            given_a = self._current_a * (1 + self.excess)
+            target_a = self._target_current_a(dt_s)
+            self._current_a += (target_a - self._current_a) * -math.expm1(-dt_s / CURRENT_LOOP_S)
+            motor_a = self._current_a * (1 + self.excess_current_ratio)
         else:
-            given_a = self._current_a = 0.0
+            motor_a = self._current_a = 0.0
             self._pwm = 0.0
             self._integral = 0.0
-        self._measured_a = given_a + current_noise_a
-        return given_a
+        self._present_current_a = motor_a + current_noise_a
+        return motor_a
 
-    def sense(self, *, temperature_c: float | None = None, voltage_v: float | None = None) -> None:
-        """Sets temperature and supply, and raises the hardware error that they mean."""
+    def set_conditions(self, *, temperature_c: float | None = None, voltage_v: float | None = None) -> None:
+        """Sets temperature and supply voltage, and raises the hardware error if one is outside its limits."""
         if temperature_c is not None:
             self._temperature_c = temperature_c
             if temperature_c > self.get("temperature_limit"):
@@ -142,12 +144,12 @@ class VirtualServo:
                 self.raise_hardware_error(INPUT_VOLTAGE_ERROR)
 
     def raise_hardware_error(self, bits: int) -> None:
-        """Sets bits of Hardware Error Status; torque goes off where Shutdown names one of them."""
+        """Sets bits of Hardware Error Status; turns torque off if Shutdown contains one of them."""
         self.set("hardware_error_status", self.get("hardware_error_status") | bits)
         if bits & self.get("shutdown"):
             self.set("torque_enable", 0)
 
-    # The bus's side.
+    # Calls from the bus.
 
     @property
     def alert(self) -> bool:
@@ -155,74 +157,76 @@ class VirtualServo:
         return self._memory[REGISTERS["hardware_error_status"].address] != 0
 
     def check_watchdog(self, t_ns: int) -> None:
-        """Trips the Bus Watchdog when no instruction packet has come for its time."""
+        """Trips the Bus Watchdog if no instruction packet arrived within its time."""
         if (
             self._watchdog_ns > 0
             and self._torque_on
             and not self.tripped
-            and t_ns - self._fed_ns > self._watchdog_ns
+            and t_ns - self._last_packet_ns > self._watchdog_ns
         ):
             self.set("bus_watchdog", -1)
 
     def feed_watchdog(self, t_ns: int) -> None:
-        """Takes note of an instruction packet, whoever it is for."""
-        self._fed_ns = t_ns
+        """Records an instruction packet to any servo."""
+        self._last_packet_ns = t_ns
 
     def read(self, address: int, size: int) -> tuple[Error, bytes]:
-        """Reads bytes. Starts at a defined address; gaps between registers read 0."""
+        """Reads bytes from a defined address on; gaps between registers read 0."""
         if size == 0 or address + size > len(self._memory) or address not in self._register_at:
             return Error.ACCESS, b""
         self._refresh()
-        return Error.NONE, bytes(self._memory[self._target(address + offset)] for offset in range(size))
+        return Error.NONE, bytes(self._memory[self._resolve(address + offset)] for offset in range(size))
 
     def write(self, address: int, data: bytes) -> Error:
-        """Writes whole registers; all or, where one is refused, none."""
+        """Writes whole registers; if one is refused, none is written."""
         error = self.check_write(address, data)
         if error is Error.NONE:
             mode = self._mode
-            for target, byte in self._targets(address, data).items():
+            for target, byte in self._resolve_all(address, data).items():
                 self._memory[target] = byte
             if self.get("operating_mode") != mode:
-                self._poke("goal_current", self.get("current_limit"))
+                self._store("goal_current", self.get("current_limit"))
             self._apply()
         return error
 
     def check_write(self, address: int, data: bytes) -> Error:
-        """What `write` would answer."""
+        """Returns the error that `write` would return."""
         if not data or address + len(data) > len(self._memory):
             return Error.ACCESS
-        values = self._targets(address, data)
+        values = self._resolve_all(address, data)
         for target in values:
             register = self._register_at.get(target)
             if register is None or register.access != "rw" or (register.eeprom and self._torque_on):
                 return Error.ACCESS
-            span = _span(register)
-            if any(part not in values for part in span):
+            addresses = _addresses(register)
+            if any(part not in values for part in addresses):
                 return Error.DATA_LENGTH
             if target == register.address:
-                error = self._check_value(register, register.decode(bytes(values[part] for part in span)))
+                error = self._check_value(
+                    register, register.decode(bytes(values[part] for part in addresses))
+                )
                 if error is not Error.NONE:
                     return error
         return Error.NONE
 
     def register_write(self, address: int, data: bytes) -> Error:
-        """Keeps a write for `action`."""
+        """Stores a write for `action`."""
         error = self.check_write(address, data)
         if error is Error.NONE:
-            self._registered = address, data
+            self._pending_write = address, data
             self.set("registered_instruction", 1)
         return error
 
     def action(self) -> Error:
-        """Carries out the write that was registered."""
-        if self._registered is None:
+        """Executes the stored write."""
+        if self._pending_write is None:
             return Error.INSTRUCTION
-        registered, self._registered = self._registered, None
+        pending, self._pending_write = self._pending_write, None
         self.set("registered_instruction", 0)
-        return self.write(*registered)
+        return self.write(*pending)
 
     def reboot(self, t_ns: int) -> None:
-        """Restarts: silent for a while, RAM at its initial values, the count of turns forgotten."""
+        """Restarts: no replies for `REBOOT_NS`, RAM at its initial values, multi-turn count reset."""
         self._reset(eeprom=False)
         self.clear_turns()
         self.silent_until_ns = t_ns + REBOOT_NS
@@ -235,53 +239,51 @@ class VirtualServo:
         values = {name: self.get(name) for name in (*kept, "firmware_version")}
         self._reset(eeprom=True)
         for name, value in values.items():
-            self._poke(name, value)
+            self._store(name, value)
         self.reboot(t_ns)
         return Error.NONE
 
     def clear_turns(self) -> None:
-        """Brings Present Position back to within one turn."""
+        """Resets the multi-turn count: Present Position is within one turn again."""
         ticks = self._ticks() - self._homing_ticks
         self._turn_ticks -= ticks // TICKS_PER_REV * TICKS_PER_REV
 
     def get(self, name: str) -> int:
-        """A register's value, without access rules."""
+        """Returns a register's value, without access rules."""
         register = REGISTERS[name]
         return register.decode(self._memory[register.address : register.address + register.size])
 
     def set(self, name: str, value: int) -> None:
         """Sets a register, without access rules."""
-        self._poke(name, value)
+        self._store(name, value)
         self._apply()
 
-    # Within.
-
-    def _poke(self, name: str, value: int) -> None:
+    def _store(self, name: str, value: int) -> None:
         register = REGISTERS[name]
         self._memory[register.address : register.address + register.size] = register.encode(value)
 
     def _reset(self, *, eeprom: bool) -> None:
-        """Gives one of the two areas its initial values."""
+        """Sets the EEPROM or the RAM area to its initial values."""
         for register in self._registers:
             if register.eeprom is eeprom and register.initial is not None:
                 self._memory[register.address : register.address + register.size] = register.encode(
                     register.initial
                 )
         if not eeprom:
-            self._poke("goal_pwm", self.get("pwm_limit"))
-            self._poke("goal_current", self.get("current_limit"))
-            self._registered = None
+            self._store("goal_pwm", self.get("pwm_limit"))
+            self._store("goal_current", self.get("current_limit"))
+            self._pending_write = None
         self._apply()
 
-    def _target(self, address: int) -> int:
-        """Where a byte lies: for indirect data, where its indirect address points."""
+    def _resolve(self, address: int) -> int:
+        """Returns the address of a byte; for indirect data, the one in its indirect address."""
         pointer = self._pointer_at.get(address)
         return address if pointer is None else self._memory[pointer] | self._memory[pointer + 1] << 8
 
-    def _targets(self, address: int, data: bytes) -> dict[int, int]:
-        return {self._target(address + offset): byte for offset, byte in enumerate(data)}
+    def _resolve_all(self, address: int, data: bytes) -> dict[int, int]:
+        return {self._resolve(address + offset): byte for offset, byte in enumerate(data)}
 
-    def _wanted_current_a(self, dt_s: float) -> float:
+    def _target_current_a(self, dt_s: float) -> float:
         mode = self._mode
         back_emf = self._velocity_rad_s / self._no_load_rad_s
         limit_a = self._current_limit_a
@@ -321,7 +323,7 @@ class VirtualServo:
             return Error.DATA_RANGE
         if register.range is not None and not register.range[0] <= value <= register.range[1]:
             return Error.DATA_RANGE
-        limit = _LIMITED_BY.get(register.address)
+        limit = _LIMIT_REGISTERS.get(register.address)
         if limit is not None and abs(value) > self.get(limit):
             return Error.DATA_LIMIT
         match register.address:
@@ -335,7 +337,7 @@ class VirtualServo:
         return Error.NONE
 
     def _apply(self) -> None:
-        """Makes what `control` needs out of the registers once, when they change."""
+        """Caches the register values that `control` uses. Called after every change."""
         self.id = self.get("id")
         self._mode = self.get("operating_mode")
         self._torque_on = self.get("torque_enable") == 1
@@ -355,27 +357,27 @@ class VirtualServo:
         self._position_d = self.get("position_d_gain") / 16 / 1000 / _FULL_PWM
 
     def _refresh(self) -> None:
-        """Quantises what was last sensed into the present registers."""
+        """Writes the last measurements into the present registers, quantised."""
         velocity = round(self._velocity_rad_s / VELOCITY_UNIT_RAD_S)
         for name, value in (
             ("present_position", self._ticks()),
             ("present_velocity", velocity),
-            ("present_current", round(self._measured_a / self.model.current_unit_a)),
+            ("present_current", round(self._present_current_a / self.model.current_unit_a)),
             ("present_pwm", round(self._pwm * _FULL_PWM)),
             ("present_input_voltage", round(self._voltage_v * 10)),
             ("present_temperature", max(0, round(self._temperature_c))),
             ("realtime_tick", (self._t_ns or 0) // 1_000_000 % 32768),
             ("moving", int(abs(velocity) > self.get("moving_threshold"))),
         ):
-            self._poke(name, value)
+            self._store(name, value)
 
 
-def _span(register: Register) -> range:
+def _addresses(register: Register) -> range:
     return range(register.address, register.address + register.size)
 
 
 def _pointers(windows: tuple[IndirectWindow, ...]) -> dict[int, int]:
-    """Address of an indirect data byte to the address of its indirect address."""
+    """Maps the address of each indirect data byte to the address of its indirect address."""
     return {
         window.data + index: window.address + 2 * index
         for window in windows
@@ -384,17 +386,17 @@ def _pointers(windows: tuple[IndirectWindow, ...]) -> dict[int, int]:
 
 
 def _registers_of(model: ServoModel, windows: tuple[IndirectWindow, ...]) -> tuple[Register, ...]:
-    """The shared registers that the model has, with its own values, and its indirect addresses and data."""
+    """Returns the model's registers with its initial values, its indirect addresses and its indirect data."""
     pointers = _pointers(windows)
-    own = {"model_number": model.number, **model.initial}
+    overrides = {"model_number": model.number, **model.initial}
     registers = [
         register._replace(initial=initial)
         for name, register in REGISTERS.items()
-        if (initial := own.get(name, register.initial)) is not None
+        if (initial := overrides.get(name, register.initial)) is not None
     ]
-    greatest = max([*pointers, _LAST_ADDRESS])
+    max_address = max([*pointers, _LAST_ADDRESS])
     for data, pointer in pointers.items():
-        registers.append(Register(pointer, 2, "rw", False, "", data, (64, greatest)))
+        registers.append(Register(pointer, 2, "rw", False, "", data, (64, max_address)))
         registers.append(Register(data, 1, "rw", False, "", 0, None))
     return tuple(
         register._replace(range=(0, model.initial["current_limit"]))

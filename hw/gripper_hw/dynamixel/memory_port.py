@@ -1,4 +1,4 @@
-"""The port of a virtual bus in this process's memory; apart, as a real servo needs no virtual one."""
+"""Port of a virtual bus in this process. A separate module, so that a real servo does not import it."""
 
 from collections.abc import Iterable
 from typing import Final
@@ -10,39 +10,39 @@ from gripper_hw.dynamixel.virtual import VirtualBus, find_bus
 
 
 class MemoryPort(PortHandler):  # type: ignore[misc]
-    """A line to a `VirtualBus` in this process. Never sleeps: an answer is there at once, or never."""
+    """In-process port of a `VirtualBus`. Never sleeps: a reply is available at once, or never."""
 
     def __init__(self, name: str, bus_name: str) -> None:
         super().__init__(name)
-        self._name = bus_name
+        self._bus_name = bus_name
         self._received = bytearray()
-        bus = find_bus(self._name)
+        bus = find_bus(self._bus_name)
         if bus is None:
             raise DeviceNotFoundError(
-                f"no virtual bus named {self._name!r} is registered in this process; "
+                f"no virtual bus named {self._bus_name!r} is registered in this process; "
                 "simulate one first, or set servo.port to a device path"
             )
         if bus in _in_use:
-            raise DeviceError(f"the port {name} is in use; close its other user first")
+            raise DeviceError(f"the servo's port {name} is in use; close its other user first")
         self._bus: VirtualBus | None = bus
         _in_use.add(bus)
 
     def closePort(self) -> None:  # noqa: N802
-        """Lets go of the bus. May be called twice."""
+        """Releases the bus. May be called twice."""
         self.is_using = False
         if self._bus is not None:
             _in_use.discard(self._bus)
             self._bus = None
 
     def clearPort(self) -> None:  # noqa: N802
-        """Throws away what was received."""
+        """Discards received bytes."""
         self._received.clear()
 
     def writePort(self, packet: Iterable[int]) -> int:  # noqa: N802
-        """Sends a packet; the answer is there when it returns."""
-        if self._bus is None or find_bus(self._name) is not self._bus:
-            self.closePort()  # as with a device file: plugged in again, it is another one
-            raise DeviceLostError(f"the virtual bus {self._name!r} is gone; start again")
+        """Sends a packet; the reply has arrived when this returns."""
+        if self._bus is None or find_bus(self._bus_name) is not self._bus:
+            self.closePort()  # like a device file: after it is plugged in again it must be reopened
+            raise DeviceLostError(f"the virtual bus {self._bus_name!r} is gone; start again")
         data = bytes(packet)
         self._received += self._bus.transact(data)
         return len(data)
@@ -54,11 +54,11 @@ class MemoryPort(PortHandler):  # type: ignore[misc]
         return data
 
     def isPacketTimeout(self) -> bool:  # noqa: N802
-        """True once all that came was read: no more will come."""
+        """True once all received bytes were read: no more will arrive."""
         return not self._received
 
     def drain(self) -> None:
-        """Throws away what was received."""
+        """Discards received bytes."""
         self._received.clear()
 
 

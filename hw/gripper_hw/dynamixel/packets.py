@@ -1,6 +1,6 @@
-"""Protocol 2.0 on the wire: framing, CRC and byte stuffing (https://emanual.robotis.com/docs/en/dxl/protocol2/).
+"""Protocol 2.0 packets: framing, CRC and byte stuffing (https://emanual.robotis.com/docs/en/dxl/protocol2/).
 
-The driver leaves these to the vendor's SDK; this is the servo's side, for the virtual bus.
+The virtual bus uses this module. The driver uses the vendor's SDK instead.
 """
 
 from collections.abc import Iterator
@@ -12,11 +12,11 @@ BROADCAST_ID: Final = 0xFE
 ALERT: Final = 0x80
 STATUS: Final = 0x55
 
-_MAX_LENGTH: Final = 1024  # a longer claim is noise that looks like a header
+_MAX_LENGTH: Final = 1024  # a longer length field is noise that looks like a header
 
 
 class Instruction(IntEnum):
-    """What a client asks of a servo."""
+    """Instruction byte of a packet from a client."""
 
     PING = 0x01
     READ = 0x02
@@ -35,7 +35,7 @@ class Instruction(IntEnum):
 
 
 class Error(IntEnum):
-    """The error number of a status packet."""
+    """Error number of a status packet."""
 
     NONE = 0
     RESULT_FAIL = 1
@@ -48,7 +48,7 @@ class Error(IntEnum):
 
 
 class Packet(NamedTuple):
-    """A packet as received; ``intact`` is False where its CRC is wrong."""
+    """A received packet; ``intact`` is False if its CRC is wrong."""
 
     id: int
     instruction: int
@@ -70,42 +70,42 @@ _CRC_TABLE: Final = _crc_table()
 
 
 def crc16(data: bytes, crc: int = 0) -> int:
-    """CRC-16 with polynomial 0x8005, most significant bit first."""
+    """CRC-16 with polynomial 0x8005, most significant bit first; ``crc`` continues an earlier one."""
     for byte in data:
         crc = (crc << 8 & 0xFFFF) ^ _CRC_TABLE[crc >> 8 ^ byte]
     return crc
 
 
 def stuff(body: bytes) -> bytes:
-    """Breaks up what looks like a header."""
+    """Inserts stuffing bytes, so that no header pattern occurs in the body."""
     return body.replace(b"\xff\xff\xfd", b"\xff\xff\xfd\xfd")
 
 
 def unstuff(body: bytes) -> bytes:
-    """Undoes `stuff`."""
+    """Removes the bytes that `stuff` inserted."""
     return body.replace(b"\xff\xff\xfd\xfd", b"\xff\xff\xfd")
 
 
 def frame(id_: int, instruction: int, params: bytes = b"") -> bytes:
-    """A whole packet."""
+    """Returns a complete packet."""
     body = stuff(bytes((instruction,)) + params)
     head = HEADER + bytes((id_,)) + (len(body) + 2).to_bytes(2, "little") + body
     return head + crc16(head).to_bytes(2, "little")
 
 
 def status(id_: int, error: int, params: bytes = b"") -> bytes:
-    """A status packet."""
+    """Returns a complete status packet."""
     return frame(id_, STATUS, bytes((error,)) + params)
 
 
 class Parser:
-    """Cuts packets out of a stream that may hold garbage and may break anywhere."""
+    """Extracts packets from a byte stream that may contain garbage and may be split anywhere."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> Iterator[Packet]:
-        """Takes bytes and yields every packet that is complete by now."""
+        """Adds received bytes and yields every packet that is now complete."""
         self._buffer += data
         while (packet := self._next()) is not None:
             yield packet
@@ -128,7 +128,7 @@ class Parser:
             return None
         raw = bytes(buffer[: 7 + length])
         intact = crc16(raw[:-2]) == int.from_bytes(raw[-2:], "little")
-        # A damaged length may have swallowed the head of the next packet: look for it behind this header.
+        # A corrupt length field may cover the next packet's header: search again right after this header.
         del buffer[: len(raw) if intact else len(HEADER)]
         body = unstuff(raw[7:-2])
         return Packet(raw[4], body[0], body[1:], intact)

@@ -1,4 +1,4 @@
-"""A virtual bus behind a pseudo-terminal, for any Dynamixel client, and a small motor for it to move."""
+"""Serves a virtual bus at a pseudo-terminal for any Dynamixel client, with a simple motor model."""
 
 import contextlib
 import os
@@ -15,18 +15,18 @@ from gripper_hw.dynamixel.control_table import load_model
 from gripper_hw.dynamixel.firmware import VirtualServo
 from gripper_hw.dynamixel.virtual import VirtualBus
 
-_STEP_NS: Final = 500_000
-_MAX_CATCH_UP_NS: Final = 250_000_000
+_STEP_NS: Final = 500_000  # integration step
+_MAX_CATCH_UP_NS: Final = 250_000_000  # bounds the time to compute after a long pause
 
 
 class PtyServer:
     """Serves a bus at `device_path` until closed. A context manager.
 
-    Clients may come and go. The path needs no baud rate: bytes pass at once.
+    Clients may connect and disconnect. Any baud rate works: bytes pass at once.
 
     Attributes:
-        bus: What is served.
-        device_path: Where.
+        bus: The virtual bus.
+        device_path: Path of the pseudo-terminal.
     """
 
     def __init__(self, bus: VirtualBus) -> None:
@@ -40,7 +40,7 @@ class PtyServer:
         self._thread.start()
 
     def unplug(self) -> None:
-        """Ends it as a pulled cable does: the client's next access fails. May be called twice."""
+        """Ends serving like a pulled cable: the client's next access fails. May be called twice."""
         if not self._thread.is_alive():
             return
         os.write(self._wake_write, b"\0")
@@ -58,24 +58,24 @@ class PtyServer:
 
     def _serve(self) -> None:
         with contextlib.ExitStack() as handles:
-            # The slave stays open here, or the master would fail between two clients.
+            # Without an open slave the master would fail between two clients.
             for handle in (self._master, self._slave, self._wake_read, self._wake_write):
                 handles.callback(os.close, handle)
             while True:
                 ready, _, _ = select.select([self._master, self._wake_read], [], [])
                 if self._wake_read in ready:
                     return
-                answer = self.bus.transact(os.read(self._master, 4096))
-                with contextlib.suppress(BlockingIOError):  # a line does not wait for who listens
-                    os.write(self._master, answer)
+                reply = self.bus.transact(os.read(self._master, 4096))
+                with contextlib.suppress(BlockingIOError):  # like a real bus, it does not wait for readers
+                    os.write(self._master, reply)
 
 
 class BenchMotor:
-    """One degree of freedom on a servo's horn: inertia, friction, and a spring it meets at an angle.
+    """Plant on a servo's horn, one degree of freedom: inertia, dry friction, and a spring at an angle.
 
     Attributes:
         position_rad: Angle of the horn.
-        velocity_rad_s: Its speed.
+        velocity_rad_s: Angular velocity of the horn.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class BenchMotor:
         self._t_ns: int | None = None
 
     def advance(self, now_ns: int) -> None:
-        """Brings motor and firmware up to ``now_ns``; of a long pause only the last 0.25 s are run."""
+        """Advances motor and firmware to ``now_ns``; simulates at most the last 0.25 s."""
         t_ns = now_ns if self._t_ns is None else max(self._t_ns, now_ns - _MAX_CATCH_UP_NS)
         while t_ns + _STEP_NS <= now_ns:
             t_ns += _STEP_NS
@@ -111,21 +111,21 @@ class BenchMotor:
         if self._contact_rad is not None and self.position_rad > self._contact_rad:
             torque_nm -= self._stiffness_nm_per_rad * (self.position_rad - self._contact_rad)
         free_rad_s = self.velocity_rad_s + torque_nm / self._inertia_kg_m2 * step_s
-        braked_rad_s = self._friction_nm / self._inertia_kg_m2 * step_s
-        # Dry friction takes up to so much speed a step, and never turns the motion round.
-        self.velocity_rad_s = max(0.0, abs(free_rad_s) - braked_rad_s) * (1 if free_rad_s > 0 else -1)
+        friction_rad_s = self._friction_nm / self._inertia_kg_m2 * step_s
+        # Dry friction can stop the motion, but never reverse it.
+        self.velocity_rad_s = max(0.0, abs(free_rad_s) - friction_rad_s) * (1 if free_rad_s > 0 else -1)
         self.position_rad += self.velocity_rad_s * step_s
 
 
 def serve_virtual_servo(model_name: str, ids: Iterable[int] = (1,)) -> PtyServer:
-    """Serves servos that each move a `BenchMotor`, in real time.
+    """Serves virtual servos, each with a `BenchMotor`, in real time.
 
     Args:
-        model_name: A name `load_model` knows.
-        ids: Their ids.
+        model_name: Name of the model (see `load_model`).
+        ids: Servo ids.
 
     Raises:
-        ConfigError: The model is not known.
+        ConfigError: The model is unknown, or has no current control.
     """
     model = load_model(model_name)
     motors = [BenchMotor(VirtualServo(id_, model)) for id_ in ids]

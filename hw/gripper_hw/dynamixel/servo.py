@@ -1,7 +1,7 @@
 """Dynamixel servos in current-based position mode, over the vendor's unmodified SDK.
 
-A cycle is one fast sync read and one sync write, both through indirect addresses, for all servos of a bus.
-Registers and their rules: https://emanual.robotis.com/docs/en/dxl/x/xm430-w350/.
+A cycle is one fast sync read and one sync write for all servos of a bus, both through indirect addresses.
+Registers: https://emanual.robotis.com/docs/en/dxl/x/xm430-w350/.
 """
 
 import math
@@ -35,9 +35,9 @@ from gripper_hw.dynamixel.control_table import (
 )
 from gripper_hw.dynamixel.transport import Transport
 
-_READ: Final = {  # name: bytes
+_READ_FIELDS: Final = {  # name: bytes
     "present_current": 2,
-    "present_velocity": 2,  # the upper half only repeats the sign, and room is scarce: 20 bytes on an XL330
+    "present_velocity": 2,  # the upper two bytes only extend the sign, and an XL330 has only 20 bytes
     "present_position": 4,
     "hardware_error_status": 1,
     "present_temperature": 1,
@@ -46,16 +46,18 @@ _READ: Final = {  # name: bytes
 }
 _READ_BLOCK: Final = struct.Struct("<hhiBBHb")
 CYCLE_BYTES: Final = _READ_BLOCK.size
-"""What a cycle reads of each servo."""
+"""Bytes that a cycle reads from each servo."""
 
-_WRITE: Final = {"goal_current": 2, "goal_position": 4}
+_WRITE_FIELDS: Final = {"goal_current": 2, "goal_position": 4}
 _WRITE_BLOCK: Final = struct.Struct("<hi")
 _INDIRECT_ADDRESSES: Final = tuple(
-    REGISTERS[name].address + offset for name, size in (_READ | _WRITE).items() for offset in range(size)
+    REGISTERS[name].address + offset
+    for name, size in (_READ_FIELDS | _WRITE_FIELDS).items()
+    for offset in range(size)
 )
-_VOLTAGE_UNIT_V: Final = 0.1
+_VOLTAGE_UNIT_V: Final = 0.1  # unit of Present Input Voltage
 
-_TRAVEL_RAD: Final = 255 * 2 * math.pi  # a turn less than Goal Position takes either way
+_MAX_TRAVEL_RAD: Final = 255 * 2 * math.pi  # Goal Position accepts 256 turns either way; one turn less
 _TORQUE_OFF_TRIES: Final = 5
 _HARDWARE_ERRORS: Final = {
     0x01: "input voltage",
@@ -70,18 +72,19 @@ class DynamixelBus:
     """Servos of one model on one port, read and written together.
 
     Attributes:
-        model: Their model.
-        ids: Their ids, in the order of states and commands.
-        firmware: Their firmware versions, known after `start`.
+        model: Model of all servos.
+        ids: Servo ids, in the order of states and commands.
+        firmware: Firmware versions in the order of ``ids``; empty before `start`.
     """
 
     def __init__(
         self, config: ServoConfig, ids: Sequence[int], clock_ns: Callable[[], int] = time.monotonic_ns
     ) -> None:
-        """Takes note of what to drive; `start` opens the port.
+        """Checks the configuration; `start` opens the port.
 
         Raises:
-            ConfigError: The model is not known, controls no current, or can't give the configured one.
+            ConfigError: The model is unknown, has no current control, or allows less than
+                ``servo.current_limit_a``.
         """
         self.model = load_model(config.model)
         if config.current_limit_a > self.model.max_current_a:
@@ -92,20 +95,20 @@ class DynamixelBus:
         self.ids = tuple(ids)
         self.firmware: tuple[int, ...] = ()
         self._config = config
-        self._line = Transport(config, clock_ns)
+        self._transport = Transport(config, clock_ns)
         self._current_limit = math.floor(config.current_limit_a / self.model.current_unit_a)
-        self._watchdog = math.ceil(config.bus_watchdog_ms / WATCHDOG_UNIT_MS)
+        self._watchdog_setting = math.ceil(config.bus_watchdog_ms / WATCHDOG_UNIT_MS)
         self._expected_watchdog = 0
-        self._data = 0  # where the cycle reads, and behind it writes
+        self._data_address = 0  # indirect data: the block that is read, followed by the block that is written
 
     @property
     def stats(self) -> BusStats:
         """Counters since construction."""
-        return self._line.stats
+        return self._transport.stats
 
     @property
     def settings(self) -> dict[str, int]:
-        """What every servo's registers hold in a run, from before torque comes on."""
+        """Register values that `start` sets before it turns torque on, by register name."""
         return {
             "return_delay_time": 0,
             "drive_mode": 0,
@@ -114,7 +117,7 @@ class DynamixelBus:
             "status_return_level": 2,
             "profile_acceleration": 0,
             "profile_velocity": 0,
-            # Another program's gains could make the position loop ring within the current it is allowed.
+            # Gains left by another program could make the position loop oscillate within the current limit.
             "position_p_gain": self.model.initial["position_p_gain"],
             "position_i_gain": 0,
             "position_d_gain": 0,
@@ -123,34 +126,33 @@ class DynamixelBus:
         }
 
     def start(self) -> tuple[ServoState, ...]:
-        """Opens the port, sets every servo up, and turns torque on at the present position with no current.
+        """Opens the port, configures the servos, and turns torque on at the present position with no current.
 
-        Where this raises, each servo of the right model that was reached has no torque, or turning it off
-        was tried.
+        On an error, torque off is tried on every servo of the right model that was reached.
 
         Raises:
-            DeviceNotFoundError: The port is not there, or a servo does not answer on it.
-            ConfigError: Another model answers.
-            HardwareFaultError: A servo reports an error of its own.
-            DeviceError: The port is in use, a firmware is too old, or a register does not take its value.
+            DeviceNotFoundError: The port does not exist, or a servo does not answer.
+            ConfigError: A servo is another model, or the SDK does not support the baud rate.
+            HardwareFaultError: A servo reports a hardware error.
+            DeviceError: The port is in use, a firmware is too old, or a register does not keep its value.
         """
-        self._line.open()
+        self._transport.open()
         self._expected_watchdog = 0
         with ExitStack() as undo:
             undo.callback(self.close)
             firmware = []
             for id_ in self.ids:
-                self._identify(id_)
-                undo.callback(self._abandon, id_)
-                firmware.append(self._firmware(id_))
+                self._check_model(id_)
+                undo.callback(self._try_torque_off, id_)
+                firmware.append(self._read_firmware(id_))
             self.firmware = tuple(firmware)
             window = self._common_window()
             for id_ in self.ids:
-                self._set_up(id_, window)
-            self._data = window.data
+                self._configure(id_, window)
+            self._data_address = window.data
             for id_, state in zip(self.ids, self.read(), strict=True):
-                self._energise(id_, state)
-            self._expected_watchdog = self._watchdog
+                self._enable_torque(id_, state)
+            self._expected_watchdog = self._watchdog_setting
             states = self.read()
             undo.pop_all()
         return states
@@ -159,34 +161,38 @@ class DynamixelBus:
         """Reads every servo in one transaction.
 
         Raises:
-            HardwareFaultError: A servo's watchdog tripped, or it restarted and forgot its settings. A
-                hardware error is no reason to raise: the state carries it.
-            DeviceTimeoutError: No sound answer came, after every retry.
+            HardwareFaultError: A servo's watchdog tripped, or it restarted and lost its settings. A hardware
+                error does not raise: it is a field of the state.
+            DeviceTimeoutError: No valid reply after every retry.
             DeviceLostError: The port is gone.
         """
-        t_ns, blocks = self._line.sync_read(self.ids, self._data, _READ_BLOCK.size)
+        t_ns, blocks = self._transport.sync_read(self.ids, self._data_address, _READ_BLOCK.size)
         self.stats.cycles += 1
-        return tuple(self._state(t_ns, id_, block) for id_, block in zip(self.ids, blocks, strict=True))
+        return tuple(
+            self._decode_state(t_ns, id_, block) for id_, block in zip(self.ids, blocks, strict=True)
+        )
 
     def write(self, commands: Sequence[ServoCommand]) -> None:
-        """Writes the goals of every servo in one transaction; the current is bounded by the configured limit.
+        """Writes the goals of every servo in one transaction; the current is clamped to the configured limit.
 
         Raises:
             NonFiniteError: A goal is NaN or infinite. Nothing was sent.
-            DeviceTimeoutError: The port did not take the packet, after every retry.
+            DeviceTimeoutError: The port did not accept the packet after every retry.
             DeviceLostError: The port is gone.
         """
-        blocks = [self._goals(command) for command in commands]
-        self._line.sync_write(self._data + _READ_BLOCK.size, dict(zip(self.ids, blocks, strict=True)))
+        blocks = [self._encode_goals(command) for command in commands]
+        self._transport.sync_write(
+            self._data_address + _READ_BLOCK.size, dict(zip(self.ids, blocks, strict=True))
+        )
 
     def stop(self, *, hold: bool) -> None:
-        """Turns torque off and makes sure; with ``hold`` disarms the watchdogs and keeps the goals instead.
+        """Turns torque off and verifies it; with ``hold`` disarms the watchdogs and keeps the goals instead.
 
-        Every servo is tried, whatever happens with the others.
+        Every servo is tried, even if another one fails.
 
         Raises:
-            DeviceError: A servo could not be stopped. With ``hold``, also where it had already stopped by
-                itself, or can't be told to hold: then its torque is turned off, or that was tried.
+            DeviceError: A servo could not be stopped. With ``hold``, also if it had already stopped by itself
+                or its watchdog could not be disarmed; torque off is then tried.
         """
         action = self._hold if hold else self._torque_off
         failure: DeviceError | None = None
@@ -200,105 +206,107 @@ class DynamixelBus:
         self._expected_watchdog = 0
 
     def close(self) -> None:
-        """Releases the port and leaves torque as it is. May be called twice."""
-        self._line.close()
+        """Releases the port. Does not change the torque. May be called twice."""
+        self._transport.close()
 
     # Start.
 
-    def _where(self, id_: int) -> str:
+    def _label(self, id_: int) -> str:
         return f"the servo with id {id_} on {self._config.port}"
 
-    def _identify(self, id_: int) -> None:
-        """Another model is left alone: what its registers mean is not known."""
-        where = self._where(id_)
+    def _check_model(self, id_: int) -> None:
+        """Raises if another model answers. Nothing is written to it: its registers may differ."""
+        label = self._label(id_)
         try:
-            number = self._line.ping(id_)
+            number = self._transport.ping(id_)
         except DeviceTimeoutError as error:
             raise DeviceNotFoundError(
-                f"{where} does not answer at {self._config.baud_rate} baud; "
+                f"{label} does not answer at {self._config.baud_rate} baud; "
                 "check its power, servo.id and servo.baud_rate"
             ) from error
-        if number != self.model.number:  # a late answer can pass for a ping's, and not for a read's
-            number = self._line.get(id_, "model_number")
-        check_model_number(self.model, number, where)
+        if number != self.model.number:  # a late reply can be mistaken for a ping's, not for a read's
+            number = self._transport.get(id_, "model_number")
+        check_model_number(self.model, number, label)
 
-    def _firmware(self, id_: int) -> int:
-        self._line.ask_for_answers(id_)
-        firmware = self._line.get(id_, "firmware_version")
+    def _read_firmware(self, id_: int) -> int:
+        self._transport.enable_replies(id_)
+        firmware = self._transport.get(id_, "firmware_version")
         if firmware < self.model.min_firmware:
             raise DeviceError(
-                f"{self._where(id_)} has firmware {firmware}, which lacks Fast Sync Read; update it to "
+                f"{self._label(id_)} has firmware {firmware}, which lacks Fast Sync Read; update it to "
                 f"{self.model.min_firmware} or newer with DYNAMIXEL Wizard"
             )
         return firmware
 
     def _common_window(self) -> IndirectWindow:
-        """One transaction has one address for all, so all must have their indirect data in one place."""
+        """Returns the indirect window that all servos share: a transaction has one address for all."""
         windows = {self.model.indirect_windows(firmware)[0] for firmware in self.firmware}
         if len(windows) > 1:
             raise DeviceError(
-                f"the servos on {self._config.port} have firmware {self.firmware}, which differ in their "
-                "indirect addresses; update all to the same version"
+                f"the servos on {self._config.port} have firmware versions {self.firmware}, whose indirect "
+                "addresses differ; update all to the same version"
             )
         return windows.pop()
 
-    def _set_up(self, id_: int, window: IndirectWindow) -> None:
-        # In this order: to clear a watchdog that tripped in an earlier run would set the motor going again.
-        self._line.set(id_, "torque_enable", 0, tries=_TORQUE_OFF_TRIES)
-        self._line.set(id_, "bus_watchdog", 0)
-        hardware_error = self._line.get(id_, "hardware_error_status")
+    def _configure(self, id_: int, window: IndirectWindow) -> None:
+        # In this order: clearing a watchdog that tripped in an earlier run would restart the motor.
+        self._transport.set(id_, "torque_enable", 0, tries=_TORQUE_OFF_TRIES)
+        self._transport.set(id_, "bus_watchdog", 0)
+        hardware_error = self._transport.get(id_, "hardware_error_status")
         if hardware_error:
             raise HardwareFaultError(
                 f"servo {id_} reports {hardware_error_text(hardware_error)}; remove the cause, then "
                 "power-cycle or reboot it"
             )
         for name, value in self.settings.items():
-            if not REGISTERS[name].eeprom or self._line.get(id_, name) != value:  # the EEPROM wears out
-                self._line.set(id_, name, value)
-        self._line.set(id_, "goal_pwm", self._line.get(id_, "pwm_limit"))  # another program may have left 0
+            if not REGISTERS[name].eeprom or self._transport.get(id_, name) != value:  # limits EEPROM wear
+                self._transport.set(id_, name, value)
+        pwm_limit = self._transport.get(id_, "pwm_limit")
+        self._transport.set(id_, "goal_pwm", pwm_limit)  # another program may have left 0
         pointers = struct.pack(f"<{len(_INDIRECT_ADDRESSES)}H", *_INDIRECT_ADDRESSES)
-        self._line.write(id_, window.address, pointers)
-        if self._line.read(id_, window.address, len(pointers)) != pointers:
+        self._transport.write(id_, window.address, pointers)
+        if self._transport.read(id_, window.address, len(pointers)) != pointers:
             raise DeviceError(
-                f"servo {id_} did not take its indirect addresses; power-cycle it and start again"
+                f"servo {id_} did not keep its indirect addresses; power-cycle it and start again"
             )
 
-    def _energise(self, id_: int, state: ServoState) -> None:
-        self._line.set(id_, "goal_current", 0)
-        self._line.set(id_, "goal_position", ticks_from_rad(state.position_rad))
-        self._line.set(id_, "bus_watchdog", self._watchdog)
-        self._line.set(id_, "torque_enable", 1)
+    def _enable_torque(self, id_: int, state: ServoState) -> None:
+        self._transport.set(id_, "goal_current", 0)
+        self._transport.set(id_, "goal_position", ticks_from_rad(state.position_rad))
+        self._transport.set(id_, "bus_watchdog", self._watchdog_setting)
+        self._transport.set(id_, "torque_enable", 1)
 
-    def _abandon(self, id_: int) -> None:
-        with suppress(DeviceError):  # the error that brought us here is the one to tell
+    def _try_torque_off(self, id_: int) -> None:
+        with suppress(DeviceError):  # the earlier error is the one to report
             self._torque_off(id_)
 
     # Stop.
 
     def _torque_off(self, id_: int) -> None:
-        self._line.set(id_, "torque_enable", 0, tries=_TORQUE_OFF_TRIES)
-        self._line.set(id_, "bus_watchdog", 0)
+        self._transport.set(id_, "torque_enable", 0, tries=_TORQUE_OFF_TRIES)
+        self._transport.set(id_, "bus_watchdog", 0)
 
     def _hold(self, id_: int) -> None:
         try:
-            # Disarming a watchdog that has tripped would set the motor going again.
-            if self._line.get(id_, "bus_watchdog") < 0 or not self._line.get(id_, "torque_enable"):
+            # Disarming a tripped watchdog would restart the motor.
+            if self._transport.get(id_, "bus_watchdog") < 0 or not self._transport.get(id_, "torque_enable"):
                 raise HardwareFaultError(
-                    f"servo {id_} can't hold: it had stopped by itself, and its torque was turned off"
+                    f"servo {id_} can't hold: it had stopped by itself, and its torque was turned off; "
+                    "find the cause, then start again"
                 )
-            self._line.set(id_, "bus_watchdog", 0)
+            self._transport.set(id_, "bus_watchdog", 0)
         except DeviceError:
-            self._abandon(id_)  # whether it holds is not known, so it must not go on by itself
+            self._try_torque_off(id_)  # it is unknown whether it holds
             raise
 
     # Cycle.
 
-    def _state(self, t_ns: int, id_: int, block: bytes) -> ServoState:
+    def _decode_state(self, t_ns: int, id_: int, block: bytes) -> ServoState:
         current, velocity, ticks, hardware_error, temperature, voltage, watchdog = _READ_BLOCK.unpack(block)
         if watchdog != self._expected_watchdog:
-            why = "its bus watchdog tripped" if watchdog < 0 else "it restarted and forgot its settings"
+            reason = "its bus watchdog tripped" if watchdog < 0 else "it restarted and lost its settings"
             raise HardwareFaultError(
-                f"servo {id_} stopped by itself: {why}; stop the run, look for the cause, and start again"
+                f"servo {id_} stopped by itself: {reason}; stop the run, find the cause, and start again"
             )
         return ServoState(
             t_ns=t_ns,
@@ -310,14 +318,14 @@ class DynamixelBus:
             hardware_error=hardware_error,
         )
 
-    def _goals(self, command: ServoCommand) -> bytes:
+    def _encode_goals(self, command: ServoCommand) -> bytes:
         if not (math.isfinite(command.goal_position_rad) and math.isfinite(command.goal_current_a)):
             raise NonFiniteError(
                 f"the servo's goals must be finite, got position {command.goal_position_rad} rad and "
                 f"current {command.goal_current_a} A; nothing was sent"
             )
         current = max(0.0, min(self._current_limit, command.goal_current_a / self.model.current_unit_a))
-        position_rad = max(-_TRAVEL_RAD, min(_TRAVEL_RAD, command.goal_position_rad))
+        position_rad = max(-_MAX_TRAVEL_RAD, min(_MAX_TRAVEL_RAD, command.goal_position_rad))
         return _WRITE_BLOCK.pack(round(current), ticks_from_rad(position_rad))
 
 
@@ -325,7 +333,7 @@ class DynamixelServo:
     """The gripper's servo: one id of a `DynamixelBus` (see `gripper_force.interfaces.Servo`)."""
 
     def __init__(self, config: ServoConfig, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
-        """Takes note of what to drive; `start` opens the port. Raises as `DynamixelBus`."""
+        """Checks the configuration; `start` opens the port. Raises the errors of `DynamixelBus`."""
         self._bus = DynamixelBus(config, (config.id,), clock_ns)
         self.model = self._bus.model
 
@@ -349,46 +357,31 @@ class DynamixelServo:
         return self._bus.stats
 
     @property
-    def nm_per_a(self) -> float:
-        """Torque constant at the horn by the vendor's table: a prior, to be calibrated."""
-        return self.model.nm_per_a
-
-    @property
-    def current_step_a(self) -> float:
-        """Resolution of the goal current."""
-        return self.model.current_unit_a
-
-    @property
-    def voltage_range_v(self) -> tuple[float, float]:
-        """Least and greatest supply it works at, by the vendor's table."""
-        return self.model.voltage_range_v
-
-    @property
     def firmware(self) -> int | None:
         """Firmware version; None before `start`."""
         return self._bus.firmware[0] if self._bus.firmware else None
 
     def start(self) -> ServoState:
-        """Sets the servo up and turns torque on; raises as `DynamixelBus.start`."""
+        """Configures the servo and turns torque on; raises the errors of `DynamixelBus.start`."""
         return self._bus.start()[0]
 
     def read(self) -> ServoState:
-        """Reads the state in one transaction; raises as `DynamixelBus.read`."""
+        """Reads the state in one transaction; raises the errors of `DynamixelBus.read`."""
         return self._bus.read()[0]
 
     def write(self, command: ServoCommand) -> None:
-        """Writes the goals in one transaction; raises as `DynamixelBus.write`."""
+        """Writes the goals in one transaction; raises the errors of `DynamixelBus.write`."""
         self._bus.write((command,))
 
     def stop(self, *, hold: bool) -> None:
-        """Turns torque off, or holds; raises as `DynamixelBus.stop`."""
+        """Turns torque off, or holds; raises the errors of `DynamixelBus.stop`."""
         self._bus.stop(hold=hold)
 
     def close(self) -> None:
-        """Releases the port and leaves torque as it is. May be called twice."""
+        """Releases the port. Does not change the torque. May be called twice."""
         self._bus.close()
 
 
 def hardware_error_text(bits: int) -> str:
-    """What the bits of Hardware Error Status mean."""
+    """Names of the bits set in Hardware Error Status."""
     return " and ".join(name for bit, name in _HARDWARE_ERRORS.items() if bits & bit) or f"error {bits:#x}"

@@ -1,15 +1,15 @@
-"""Which ports and servos are there, how are they set, and how long is a cycle? Also what sets a servo up."""
+"""Diagnostics of serial ports and servos: model, registers and cycle time. Also the setup of a servo."""
 
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from serial.tools import list_ports
 
 from gripper_force.config import Config, ServoConfig
 from gripper_force.errors import DeviceError, DeviceTimeoutError, GripperError
-from gripper_force.jobs.doctor import Agree, Check, RegisterChange, judged, only, time_ms
+from gripper_force.jobs.checks import Check, Confirm, RegisterChange, SetupResult, judged, keep_only, time_ms
 from gripper_force.runtime.backends import open_devices
 from gripper_hw.dynamixel.control_table import (
     REGISTERS,
@@ -23,8 +23,8 @@ from gripper_hw.dynamixel.transport import Transport
 
 _SYSFS: Final = Path("/sys/bus/usb-serial/devices")
 _CYCLES: Final = 200
-_PATIENCE_MS: Final = 100.0
-"""More than servo.reply_margin_ms: a line that is too slow for a run is to be measured, not to fail."""
+_MIN_REPLY_MARGIN_MS: Final = 100.0
+"""Longer than servo.reply_margin_ms, so that a bus too slow for a run is measured instead of failing."""
 
 _BAUD_RATES: Final = (57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
 _MODES: Final = {
@@ -35,15 +35,15 @@ _MODES: Final = {
     5: "current-based position",
     16: "PWM",
 }
-_SHOWN: Final = ("return_delay_time", "current_limit", "operating_mode", "bus_watchdog")
+_ALWAYS_LISTED: Final = ("return_delay_time", "current_limit", "operating_mode", "bus_watchdog")
 
 
 def probe(config: Config, sysfs: Path = _SYSFS) -> Iterator[Check]:
-    """Lists serial ports and servos, and looks at the configured servo. Only reads.
+    """Lists serial ports and servos, and checks the configured servo. Only reads.
 
     Args:
-        config: The run.
-        sysfs: Where the kernel lists USB serial adapters.
+        config: Configuration of the run.
+        sysfs: Folder in which the kernel lists USB serial adapters.
 
     Raises:
         GripperError: The port can't be opened, or the servo is another model.
@@ -52,105 +52,108 @@ def probe(config: Config, sysfs: Path = _SYSFS) -> Iterator[Check]:
     yield from (Check("servo", "listed", port, None) for port in ports or ["no serial port"])
     servo = config.servo
     if config.clock == "lockstep" and not servo.port.startswith(VIRTUAL_PREFIX):
-        advice = "a real servo can't keep simulated time: set clock=realtime"
+        advice = "a real servo does not follow simulated time: set clock=realtime"
         yield Check("servo", "clock", "lockstep", False, advice)
-    with _opened(config) as looked:
+    with _opened(config) as inspection:
         yield Check("servo", "port", servo.port, True)
         timer = sysfs / Path(servo.port).resolve().name / "latency_timer"
         if timer.is_file():
             latency_ms = int(timer.read_text())
-            fast, advice = latency_ms < servo.reply_margin_ms, "install hw/udev's rules, which make it 1 ms"
+            fast = latency_ms < servo.reply_margin_ms
+            advice = "install the rules of hw/udev, which set it to 1 ms"
             yield judged("servo", "latency timer", f"{latency_ms} ms", fast, advice)
-        found = looked.line.scan()
+        found = inspection.transport.scan()
         for id_, (number, firmware) in sorted(found.items()):
             if id_ != servo.id:
-                yield Check(f"servo {id_}", "model", f"{_model(number)}, firmware {firmware}", None)
+                yield Check(f"servo {id_}", "model", f"{_model_name(number)}, firmware {firmware}", None)
         if servo.id in found:
-            yield from looked.checks(config, *found[servo.id])
+            yield from inspection.checks(config, *found[servo.id])
             return
     answered = ", ".join(str(id_) for id_ in sorted(found)) or "none"
-    what = f"no answer at {servo.baud_rate} baud (ids that answer: {answered})"
+    found_text = f"no answer at {servo.baud_rate} baud (ids that answer: {answered})"
     advice = "check power, cable and servo.id"
     if rate := _other_baud_rate(servo):
         advice = f"it answers at {rate} baud: set servo.baud_rate={rate}"
-    yield Check(f"servo {servo.id}", "model", what, False, advice)
+    yield Check(f"servo {servo.id}", "model", found_text, False, advice)
 
 
-def setup(config: Config, agree: Agree) -> dict[str, Any]:
-    """Sets the configured servo up as a run would, so that EEPROM is written now and not then.
+def setup(config: Config, confirm: Confirm) -> SetupResult:
+    """Writes the registers that a run would write, if ``confirm`` returns True. A run then writes no EEPROM.
 
     Raises:
         GripperError: See `gripper_force.jobs.doctor.setup`.
     """
-    with _opened(config) as looked:
-        return looked.set_up(config.servo.id, agree)
+    with _opened(config) as inspection:
+        return inspection.set_up(config.servo.id, confirm)
 
 
-class _Looked:
-    """The configured servo, looked at without a start: it stays as it is."""
+class _Inspection:
+    """Reads the configured servo without `DynamixelBus.start`, which would change it."""
 
     def __init__(self, config: ServoConfig) -> None:
-        bus = DynamixelBus(config, (config.id,))  # never opened: it knows what a run sets
+        bus = DynamixelBus(config, (config.id,))  # never opened: only for the settings of a run
         self.model = bus.model
-        self.line = Transport(config)
+        self.transport = Transport(config)
         self._config = config
-        self._wanted = bus.settings | {"bus_watchdog": 0}  # what a start writes once torque is off
+        self._expected = bus.settings | {"bus_watchdog": 0}  # a start writes them while torque is off
 
     def checks(self, config: Config, number: int, firmware: int) -> Iterator[Check]:
-        """Looks at the configured servo."""
+        """Checks the configured servo."""
         id_ = config.servo.id
         unit = f"servo {id_}"
         check_model_number(self.model, number, f"the servo with id {id_} on {config.servo.port}")
-        able = firmware >= self.model.min_firmware
+        supported = firmware >= self.model.min_firmware
         advice = f"update it to {self.model.min_firmware} or newer with DYNAMIXEL Wizard"
-        yield judged(unit, "model", f"{self.model.name}, firmware {firmware}", able, advice)
+        yield judged(unit, "model", f"{self.model.name}, firmware {firmware}", supported, advice)
         try:
             values = self._values(id_)
-            error, torque = self.line.get(id_, "hardware_error_status"), self.line.get(id_, "torque_enable")
+            error = self.transport.get(id_, "hardware_error_status")
+            torque = self.transport.get(id_, "torque_enable")
         except DeviceTimeoutError:
-            advice = "its Status Return Level may be 0, which a run sets right; else check the cable"
-            yield Check(unit, "registers", "it answers a ping, and no read", False, advice)
+            advice = "its Status Return Level may be 0, which a run corrects; otherwise check the cable"
+            yield Check(unit, "registers", "it answers a ping, but no read", False, advice)
             return
         text, advice = hardware_error_text(error), "remove the cause, then power-cycle or reboot it"
         yield judged(unit, "hardware error", text if error else "none", not error, advice)
-        advice = "it holds as it was told to, and the next run lets go first"
+        advice = "it still holds; the next run turns torque off first"
         yield judged(unit, "torque", "on" if torque else "off", not torque, advice, harmless=True)
-        for name, new in self._wanted.items():
-            if name in _SHOWN or values[name] != new:
+        for name, new in self._expected.items():
+            if name in _ALWAYS_LISTED or values[name] != new:
                 same, text = values[name] == new, self._text(name, values[name])
-                advice = f"a run sets {self._text(name, new)}, and so does doctor --setup"
+                advice = f"a run sets {self._text(name, new)}; so does doctor --setup"
                 yield judged(unit, name.replace("_", " "), text, same, advice, harmless=True)
-        if not able:
+        if not supported:
             return
-        start = REGISTERS["present_current"].address  # as many bytes as a cycle's, wherever they lie
-        median_ms, p99_ms = time_ms(lambda: self.line.sync_read((id_,), start, CYCLE_BYTES), _CYCLES)
+        start = REGISTERS["present_current"].address  # any address, but as many bytes as a cycle reads
+        median_ms, p99_ms = time_ms(lambda: self.transport.sync_read((id_,), start, CYCLE_BYTES), _CYCLES)
         found = f"median {median_ms:.2f} ms, p99 {p99_ms:.2f} ms of {_CYCLES} reads"
         rate_hz, lockstep = config.control.rate_hz, config.clock == "lockstep"
-        advice = f"longer than a cycle at control.rate_hz={rate_hz:g}: close what computes, or lower it"
+        advice = f"longer than a cycle at control.rate_hz={rate_hz:g}: close other programs, or lower it"
         yield judged(unit, "bus cycle", found, p99_ms <= 1e3 / rate_hz, advice, harmless=lockstep)
 
-    def set_up(self, id_: int, agree: Agree) -> dict[str, Any]:
-        """See `setup`."""
-        check_model_number(self.model, self.line.ping(id_), f"the servo with id {id_} on {self._config.port}")
-        if self.line.get(id_, "torque_enable"):
+    def set_up(self, id_: int, confirm: Confirm) -> SetupResult:
+        """Implements `setup`."""
+        number = self.transport.ping(id_)
+        check_model_number(self.model, number, f"the servo with id {id_} on {self._config.port}")
+        if self.transport.get(id_, "torque_enable"):
             raise DeviceError(
-                f"servo {id_} has torque on, so nothing was changed; take the object out, then power-cycle it"
+                f"servo {id_} has torque on, so nothing was changed; remove the object, then power-cycle it"
             )
         values = self._values(id_)
-        wanted = {name: new for name, new in self._wanted.items() if values[name] != new}
+        differing = {name: new for name, new in self._expected.items() if values[name] != new}
         text = self._text
         changes = [
-            RegisterChange(name, text(name, values[name]), text(name, new)) for name, new in wanted.items()
+            RegisterChange(name, text(name, values[name]), text(name, new)) for name, new in differing.items()
         ]
-        applied = bool(changes) and agree(f"servo {id_}", changes)
+        applied = bool(changes) and confirm(f"servo {id_}", changes)
         if applied:
-            self.line.ask_for_answers(id_)
-            for name, new in wanted.items():
-                self.line.set(id_, name, new)
-        return {"servo": id_, "changes": changes, "applied": applied}
+            self.transport.enable_replies(id_)
+            for name, new in differing.items():
+                self.transport.set(id_, name, new)
+        return SetupResult(id_, changes, applied)
 
     def _values(self, id_: int) -> dict[str, int]:
-        return {name: self.line.get(id_, name) for name in self._wanted}
+        return {name: self.transport.get(id_, name) for name in self._expected}
 
     def _text(self, name: str, value: int) -> str:
         match name:
@@ -166,18 +169,18 @@ class _Looked:
 
 
 @contextmanager
-def _opened(config: Config) -> Iterator[_Looked]:
+def _opened(config: Config) -> Iterator[_Inspection]:
     with ExitStack() as stack:
         if config.servo.port.startswith(VIRTUAL_PREFIX):
-            stack.enter_context(open_devices(only(config, "servo")))
-        looked = _Looked(config.servo)
-        stack.callback(looked.line.close)
-        _open(looked.line, config.servo)
-        yield looked
+            stack.enter_context(open_devices(keep_only(config, "servo")))
+        inspection = _Inspection(config.servo)
+        stack.callback(inspection.transport.close)
+        _open(inspection.transport, config.servo)
+        yield inspection
 
 
-def _open(line: Transport, servo: ServoConfig) -> None:
-    line.open(max(_PATIENCE_MS, servo.reply_margin_ms))
+def _open(transport: Transport, servo: ServoConfig) -> None:
+    transport.open(max(_MIN_REPLY_MARGIN_MS, servo.reply_margin_ms))
 
 
 def _other_baud_rate(servo: ServoConfig) -> int | None:
@@ -187,13 +190,13 @@ def _other_baud_rate(servo: ServoConfig) -> int | None:
         if rate == servo.baud_rate:
             continue
         other = servo.model_copy(update={"baud_rate": rate, "retries": 0})
-        with suppress(GripperError), closing(Transport(other)) as line:
-            _open(line, other)
-            line.ping(servo.id)
+        with suppress(GripperError), closing(Transport(other)) as transport:
+            _open(transport, other)
+            transport.ping(servo.id)
             return rate
     return None
 
 
-def _model(number: int) -> str:
+def _model_name(number: int) -> str:
     known = {load_model(name).number: name for name in model_names()}
     return known.get(number, f"model number {number}")

@@ -1,4 +1,4 @@
-"""Transactions with servos over the vendor's unmodified SDK: retried, counted, and never given a late answer.
+"""Transactions with servos over the vendor's unmodified SDK: retried, counted, late replies rejected.
 
 Protocol 2.0: https://emanual.robotis.com/docs/en/dxl/protocol2/.
 """
@@ -23,15 +23,15 @@ from gripper_hw.dynamixel.control_table import REGISTERS
 from gripper_hw.dynamixel.packets import BROADCAST_ID
 from gripper_hw.dynamixel.port import Port, open_port
 
-_LENGTHS: Final = 8
-"""A read asks for 0 to 7 bytes more than it needs, each time another number: an answer to one of the seven
-requests before has another length. The most fills the 20 bytes of an XL330's indirect data."""
+_READ_LENGTHS: Final = 8
+"""A read requests 0 to 7 bytes more than it needs, in turn, so that a late reply to one of the seven previous
+requests has another length. The longest request fills the 20 bytes of an XL330's indirect data."""
 
-_ANSWER_ALL: Final = 2
-"""Status Return Level: an answer to every instruction."""
+_REPLY_TO_ALL: Final = 2
+"""Status Return Level: a reply to every instruction."""
 
 _ERROR_CRC: Final = 3
-_ERROR_MASK: Final = 0x7F  # the bit above is the alert, which the read block tells in full
+_ERROR_MASK: Final = 0x7F  # bit 7 is the alert; the read block contains the full hardware error
 _ERRORS: Final = {
     1: "result fail",
     2: "instruction error",
@@ -45,34 +45,35 @@ _T = TypeVar("_T")
 
 
 class Transport:
-    """A port, and whole transactions with the servos on it.
+    """Complete transactions with the servos on one port.
 
-    Where nothing else is said, each method tries as often as the configuration says and raises
-    `DeviceTimeoutError` where no sound answer came, `DeviceLostError` where the port is gone, and
-    `DeviceError` where a servo refused, or the line is not open.
+    Unless stated otherwise, every method makes up to ``1 + servo.retries`` attempts and raises
+    `DeviceTimeoutError` without a valid reply, `DeviceLostError` if the port is gone, and `DeviceError` if a
+    servo refused the request or the port is not open.
 
     Attributes:
         stats: Counters since construction.
     """
 
     def __init__(self, config: ServoConfig, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
-        """Takes note of the port; `open` opens it."""
+        """Stores the configuration; `open` opens the port."""
         self.stats = BusStats()
         self._config = config
         self._clock_ns = clock_ns
         self._packets = PacketHandler(2.0)
         self._port: Port | None = None
-        self._requests = 0
+        self._request_count = 0
 
     def open(self, reply_margin_ms: float | None = None) -> None:
         """Opens the port.
 
         Args:
-            reply_margin_ms: How long to wait for an answer beyond its bytes' time; None: as configured.
+            reply_margin_ms: Reply timeout beyond the transmission time; None: as configured.
 
         Raises:
-            DeviceNotFoundError: The port is not there.
-            DeviceError: It is in use.
+            ConfigError: The SDK does not support the baud rate.
+            DeviceNotFoundError: The port does not exist.
+            DeviceError: The port is in use.
         """
         margin_ms = self._config.reply_margin_ms if reply_margin_ms is None else reply_margin_ms
         self._port = open_port(self._config.port, self._config.baud_rate, margin_ms)
@@ -83,17 +84,17 @@ class Transport:
             self._port.closePort()
             self._port = None
 
-    # One servo.
+    # Transactions with one servo.
 
     def ping(self, id_: int) -> int:
-        """The model number. An answer that comes late can pass for a ping's, and for no other's."""
-        what = f"a ping of servo {id_}"
+        """Returns the model number. Unlike other replies, a late one can be mistaken for a ping's reply."""
+        description = f"a ping of servo {id_}"
 
-        def once() -> tuple[int, int]:
+        def attempt() -> tuple[int, int]:
             number, result, error = self._packets.ping(self._port, id_)
-            return _checked(what, result, error), number
+            return _check_result(description, result, error), number
 
-        return self._transact(what, once)
+        return self._transact(description, attempt)
 
     def get(self, id_: int, name: str) -> int:
         """Reads a register."""
@@ -101,48 +102,48 @@ class Transport:
         return register.decode(self.read(id_, register.address, register.size))
 
     def set(self, id_: int, name: str, value: int, tries: int = 1) -> None:
-        """Writes a register and reads it back, up to so many times; raises `DeviceError` if it differs."""
+        """Writes a register and reads it back, up to ``tries`` times; raises `DeviceError` if it differs."""
         register = REGISTERS[name]
-        for left in reversed(range(tries)):
+        for tries_left in reversed(range(tries)):
             try:
                 self.write(id_, register.address, register.encode(value))
                 if self.get(id_, name) == value:
                     return
             except DeviceTimeoutError:
-                if not left:
+                if not tries_left:
                     raise
         raise DeviceError(f"servo {id_} did not keep {name} = {value}; power-cycle it and start again")
 
     def read(self, id_: int, address: int, size: int) -> bytes:
         """Reads ``size`` bytes at an address."""
-        what = f"a read of {size} bytes at {address} of servo {id_}"
+        description = f"a read of {size} bytes at {address} of servo {id_}"
 
-        def once() -> tuple[int, bytes]:
-            asked = self._length(size)
-            sent = self._packets.readTx(self._port, id_, address, asked)
-            result, answer = self._answer(sent, id_, 1 + asked)
-            return _checked(what, result, answer[0] if answer else 0), answer[1 : 1 + size]
+        def attempt() -> tuple[int, bytes]:
+            requested = self._padded_size(size)
+            sent = self._packets.readTx(self._port, id_, address, requested)
+            result, reply = self._receive(sent, id_, 1 + requested)
+            return _check_result(description, result, reply[0] if reply else 0), reply[1 : 1 + size]
 
-        return self._transact(what, once)
+        return self._transact(description, attempt)
 
     def write(self, id_: int, address: int, data: bytes) -> None:
-        """Writes bytes at an address, and waits for the servo to say that it took them."""
-        what = f"a write of {len(data)} bytes at {address} of servo {id_}"
+        """Writes bytes at an address and waits for the servo's reply."""
+        description = f"a write of {len(data)} bytes at {address} of servo {id_}"
 
-        def once() -> tuple[int, None]:
+        def attempt() -> tuple[int, None]:
             result, error = self._packets.writeTxRx(self._port, id_, address, len(data), data)
-            return _checked(what, result, error), None
+            return _check_result(description, result, error), None
 
-        self._transact(what, once)
+        self._transact(description, attempt)
 
-    def ask_for_answers(self, id_: int) -> None:
-        """Another program may have left the servo mute; a sync write is a write that awaits no answer."""
-        self.sync_write(REGISTERS["status_return_level"].address, {id_: bytes((_ANSWER_ALL,))})
+    def enable_replies(self, id_: int) -> None:
+        """Sets Status Return Level to 2 by a sync write, which needs no reply: the level may be 0 before."""
+        self.sync_write(REGISTERS["status_return_level"].address, {id_: bytes((_REPLY_TO_ALL,))})
 
-    # All servos at once.
+    # Transactions with several servos.
 
     def scan(self) -> dict[int, tuple[int, int]]:
-        """Id to model number and firmware of all that answer; tried once."""
+        """Returns id to model number and firmware of every servo that replies; a single attempt."""
         found, _ = self._packets.broadcastPing(self._port)
         return {id_: (number, firmware) for id_, (number, firmware) in found.items()}
 
@@ -150,47 +151,48 @@ class Transport:
         """Reads ``size`` bytes of each servo by one fast sync read.
 
         Returns:
-            When the answer was asked for, and the bytes in the order of ``ids``.
+            Time of the request in ns, and the bytes in the order of ``ids``.
         """
 
-        def once() -> tuple[int, tuple[int, list[bytes]]]:
+        def attempt() -> tuple[int, tuple[int, list[bytes]]]:
             t_ns = self._clock_ns()
-            asked = self._length(size)
-            sent = self._packets.syncReadTx(self._port, address, asked, ids, len(ids), True)
-            step = asked + 4  # error number and id come before a servo's data, a CRC after
-            result, answer = self._answer(sent, BROADCAST_ID, step * len(ids) - 2)
-            if result == COMM_SUCCESS and answer[1::step] != bytes(ids):
+            requested = self._padded_size(size)
+            sent = self._packets.syncReadTx(self._port, address, requested, ids, len(ids), True)
+            step = requested + 4  # error number and id before a servo's data, CRC after it
+            result, reply = self._receive(sent, BROADCAST_ID, step * len(ids) - 2)
+            if result == COMM_SUCCESS and reply[1::step] != bytes(ids):
                 result = COMM_RX_CORRUPT
-            starts = range(2, len(answer), step)
-            return result, (t_ns, [answer[start : start + size] for start in starts])
+            starts = range(2, len(reply), step)
+            return result, (t_ns, [reply[start : start + size] for start in starts])
 
-        return self._transact("a fast sync read", once)
+        return self._transact("a fast sync read", attempt)
 
     def sync_write(self, address: int, blocks: dict[int, bytes]) -> None:
-        """Writes a block of the same size to each servo, by id; none answers."""
+        """Writes one block per servo, by id. All blocks have the same size; no servo replies."""
         (size,) = {len(block) for block in blocks.values()}
         params = b"".join(bytes((id_,)) + block for id_, block in blocks.items())
 
-        def once() -> tuple[int, None]:
+        def attempt() -> tuple[int, None]:
             result: int = self._packets.syncWriteTxOnly(self._port, address, size, params, len(params))
             return result, None
 
-        self._transact("a sync write", once)
+        self._transact("a sync write", attempt)
 
-    # How a transaction goes.
+    # Attempts and replies.
 
-    def _transact(self, what: str, once: Callable[[], tuple[int, _T]]) -> _T:
-        """Tries a transaction until it succeeds; ``once`` returns the SDK's result code and a value."""
+    def _transact(self, description: str, attempt: Callable[[], tuple[int, _T]]) -> _T:
+        """Repeats a transaction until it succeeds; ``attempt`` returns the SDK's result code and a value."""
         if self._port is None:
             raise DeviceError(
-                f"the servo's port {self._config.port} is not open, so {what} was not sent; start first"
+                f"the servo's port {self._config.port} is not open, so {description} was not sent; "
+                "call start() first"
             )
-        for attempt in range(self._config.retries + 1):
-            self.stats.retries += attempt > 0
-            self._port.is_using = False  # an interrupted transaction would leave it set for ever
+        for number in range(self._config.retries + 1):
+            self.stats.retries += number > 0
+            self._port.is_using = False  # an interrupted transaction leaves it set
             try:
-                result, value = once()
-            except IndexError:  # the SDK indexes into answers that are too short
+                result, value = attempt()
+            except IndexError:  # raised by the SDK for replies that are too short
                 result = COMM_RX_CORRUPT
             if result == COMM_SUCCESS:
                 return value
@@ -198,43 +200,49 @@ class Transport:
                 self.stats.corrupt += 1
             else:
                 self.stats.timeouts += 1
-            self._port.drain()  # or the rest of a damaged answer would meet the next request on the line
+            self._port.drain()  # the rest of a corrupt reply would collide with the next request
         raise DeviceTimeoutError(
-            f"no sound answer to {what} on {self._config.port} after {self._config.retries + 1} tries; check "
-            "cable, power, and that the adapter's latency timer is below servo.reply_margin_ms"
+            f"no valid reply to {description} on {self._config.port} after {self._config.retries + 1} tries; "
+            "check cable, power, and that the adapter's latency timer is below servo.reply_margin_ms"
         )
 
-    def _length(self, size: int) -> int:
-        """How many bytes a read asks for to get ``size``: see `_LENGTHS`."""
-        self._requests += 1
-        return size + self._requests % _LENGTHS
+    def _padded_size(self, size: int) -> int:
+        """Number of bytes to request in order to read ``size``: see `_READ_LENGTHS`."""
+        self._request_count += 1
+        return size + self._request_count % _READ_LENGTHS
 
-    def _answer(self, sent: int, id_: int, size: int) -> tuple[int, bytes]:
-        """Listens for the answer to what was ``sent``, and passes over those to requests before.
+    def _receive(self, result: int, id_: int, size: int) -> tuple[int, bytes]:
+        """Receives the reply to a request and skips late replies to earlier ones.
 
-        The SDK's own reads compare the id alone, and cut an answer to the length that they look for.
+        The SDK's own reads compare only the id, and cut a reply to the expected length.
+
+        Args:
+            result: The SDK's result code of sending the request.
+            id_: Id in the reply.
+            size: Bytes of the reply from the error number on.
 
         Returns:
-            The SDK's result code, and ``size`` bytes from the error number on; or 1, where that is no 0.
+            The SDK's result code, and ``size`` bytes from the error number on, or only the error number if it
+            is not 0.
         """
-        result = sent
         while result == COMM_SUCCESS:
             packet, result = self._packets.rxPacket(self._port, id_ == BROADCAST_ID)
             if result != COMM_SUCCESS:
                 break
             length = packet[PKT_LENGTH_L] | packet[PKT_LENGTH_H] << 8
-            answer = bytes(packet[PKT_ERROR : PKT_INSTRUCTION + length - 2])
-            whole = len(answer) == size or (len(answer) == 1 and answer[0] & _ERROR_MASK)
-            if whole and packet[PKT_ID] == id_:
-                return result, answer
+            reply = bytes(packet[PKT_ERROR : PKT_INSTRUCTION + length - 2])
+            complete = len(reply) == size or (len(reply) == 1 and reply[0] & _ERROR_MASK)
+            if complete and packet[PKT_ID] == id_:
+                return result, reply
         return result, b""
 
 
-def _checked(what: str, result: int, error: int) -> int:
-    """The SDK's result code, where the servo's own error number is no reason to raise `DeviceError`."""
+def _check_result(description: str, result: int, error: int) -> int:
+    """Returns the SDK's result code; raises `DeviceError` if the servo reports an error other than CRC."""
     number = error & _ERROR_MASK
     if result != COMM_SUCCESS or number == 0:
         return result
     if number == _ERROR_CRC:
-        return int(COMM_RX_CORRUPT)  # our packet was damaged on its way: worth another try
-    raise DeviceError(f"{what} was refused: {_ERRORS.get(number, f'error {number}')}")
+        return int(COMM_RX_CORRUPT)  # the request was corrupted on the bus: retry
+    reason = _ERRORS.get(number, f"error {number}")
+    raise DeviceError(f"{description} was refused ({reason}); power-cycle the servo and start again")

@@ -1,4 +1,4 @@
-"""A virtual X-series bus that answers Protocol 2.0 bytes, and the names of ``virtual:<name>`` ports.
+"""Virtual X-series bus that speaks Protocol 2.0, and the registry of ``virtual:<name>`` ports.
 
 Source: https://emanual.robotis.com/docs/en/dxl/protocol2/.
 """
@@ -25,20 +25,20 @@ from gripper_hw.dynamixel.packets import (
 
 __all__ = ["VirtualBus", "VirtualServo", "find_bus", "register_bus", "unregister_bus"]
 
-_STALE_NS: Final = 20_000_000
-_CLEAR_TURNS: Final = b"\x01\x44\x58\x4c\x22"
+_STALE_NS: Final = 20_000_000  # pause after which an incomplete packet is discarded
+_CLEAR_TURNS: Final = b"\x01\x44\x58\x4c\x22"  # parameters of Clear for the multi-turn count
 
 
 class VirtualBus:
-    """Servos on one line.
+    """Virtual servos on one bus.
 
     Attributes:
-        servos: Who is on the line.
-        lock: Held while a packet is carried out.
-        clock_ns: Time of the watchdogs and reboots.
-        before_packet: Called with the lock held before a packet is carried out; brings a plant up to now.
-        tamper: Fault hook: takes each answer off the line and returns what arrives, None for silence.
-        is_unplugged: Fault hook: whether nothing leads to it now.
+        servos: Servos on the bus.
+        lock: Held while a packet is executed.
+        clock_ns: Clock of the watchdogs and reboots.
+        before_packet: Called with the lock held before a packet is executed; advances the plant to now.
+        tamper: Fault hook: takes each reply and returns the bytes that arrive, None for no reply.
+        is_unplugged: Fault hook: returns True while the bus is unplugged.
     """
 
     def __init__(
@@ -47,13 +47,7 @@ class VirtualBus:
         clock_ns: Callable[[], int] = time.monotonic_ns,
         before_packet: Callable[[], None] | None = None,
     ) -> None:
-        """Builds a bus.
-
-        Args:
-            servos: Who is on the line.
-            clock_ns: See the attributes.
-            before_packet: See the attributes.
-        """
+        """Creates a bus; see the class for the arguments."""
         self.servos = tuple(servos)
         self.lock = threading.RLock()
         self.clock_ns = clock_ns
@@ -61,84 +55,82 @@ class VirtualBus:
         self.is_unplugged: Callable[[], bool] = lambda: False
         self.before_packet = before_packet
         self._parser = Parser()
-        self._heard_ns = 0
+        self._last_data_ns = 0
 
     def transact(self, data: bytes) -> bytes:
-        """Takes bytes off the line and returns the answer's; may break anywhere, may hold anything."""
+        """Executes received bytes and returns the replies; ``data`` may be any piece of any byte stream."""
         with self.lock:
             now_ns = self.clock_ns()
-            if now_ns - self._heard_ns > _STALE_NS:
-                self._parser = Parser()  # a packet that broke off is forgotten, as in a real servo
-            self._heard_ns = now_ns
-            answers = [self._carry_out(packet) for packet in self._parser.feed(data)]
+            if now_ns - self._last_data_ns > _STALE_NS:
+                self._parser = Parser()  # a real servo discards an incomplete packet too
+            self._last_data_ns = now_ns
+            replies = [self._execute(packet) for packet in self._parser.feed(data)]
         if self.tamper is not None:
-            answers = [self.tamper(answer) or b"" for answer in answers if answer]
-        return b"".join(answers)
+            replies = [self.tamper(reply) or b"" for reply in replies if reply]
+        return b"".join(replies)
 
-    def _carry_out(self, packet: Packet) -> bytes:
+    def _execute(self, packet: Packet) -> bytes:
         if packet.instruction == STATUS:
             return b""
         if self.before_packet is not None:
             self.before_packet()
         now_ns = self.clock_ns()
-        live = {servo.id: servo for servo in self.servos if now_ns >= servo.silent_until_ns}
-        for servo in live.values():
+        online = {servo.id: servo for servo in self.servos if now_ns >= servo.silent_until_ns}
+        for servo in online.values():
             servo.check_watchdog(now_ns)
             if packet.intact:
                 servo.feed_watchdog(now_ns)
         if packet.intact and packet.instruction in _GROUP_READS:
-            return self._group_read(packet, live)
+            return self._group_read(packet, online)
         if packet.intact and packet.instruction in _GROUP_WRITES:
             for id_, address, data in _GROUP_WRITES[packet.instruction](packet.params):
-                if id_ in live:
-                    live[id_].write(address, data)
+                if id_ in online:
+                    online[id_].write(address, data)
             return b""
         if packet.id != BROADCAST_ID:
-            return _answer(live[packet.id], packet, now_ns) if packet.id in live else b""
-        answers = [_answer(servo, packet, now_ns) for _, servo in sorted(live.items())]
-        return b"".join(answers) if packet.instruction == Instruction.PING else b""
+            return _reply(online[packet.id], packet, now_ns) if packet.id in online else b""
+        replies = [_reply(servo, packet, now_ns) for _, servo in sorted(online.items())]
+        return b"".join(replies) if packet.instruction == Instruction.PING else b""
 
-    def _group_read(self, packet: Packet, live: dict[int, VirtualServo]) -> bytes:
-        """Each servo answers after the one before it, so a missing one silences those behind it."""
+    def _group_read(self, packet: Packet, online: dict[int, VirtualServo]) -> bytes:
+        """Each servo replies after the one before it, so a missing servo silences all that follow."""
         reads = _GROUP_READS[packet.instruction](packet.params)
         blocks = []
         for id_, address, size in reads:
-            if id_ not in live or live[id_].get("status_return_level") == 0:
+            if id_ not in online or online[id_].get("status_return_level") == 0:
                 break
-            error, data = live[id_].read(address, size)
-            blocks.append((id_, error | _alert(live[id_]), data))
+            error, data = online[id_].read(address, size)
+            blocks.append((id_, error | _alert(online[id_]), data))
         if packet.instruction in (Instruction.SYNC_READ, Instruction.BULK_READ):
             return b"".join(status(*block) for block in blocks)
         return _fast_status(blocks, 1 + sum(size + 4 for _, _, size in reads))
 
 
 def _fast_status(blocks: list[tuple[int, int, bytes]], length: int) -> bytes:
-    """One packet to which every servo adds a block; the CRC runs on, and nothing is stuffed."""
+    """One packet to which every servo adds a block; the CRC is cumulative, and nothing is stuffed."""
     if not blocks:
         return b""
-    answer = HEADER + bytes((BROADCAST_ID,)) + (length & 0xFFFF).to_bytes(2, "little") + bytes((STATUS,))
+    reply = HEADER + bytes((BROADCAST_ID,)) + (length & 0xFFFF).to_bytes(2, "little") + bytes((STATUS,))
     for id_, error, data in blocks:
-        answer += bytes((error, id_)) + data
-        answer += crc16(answer).to_bytes(2, "little")
-    return answer
+        reply += bytes((error, id_)) + data
+        reply += crc16(reply).to_bytes(2, "little")
+    return reply
 
 
-def _answer(servo: VirtualServo, packet: Packet, now_ns: int) -> bytes:
-    """Carries out one servo's instruction and builds its status packet."""
+def _reply(servo: VirtualServo, packet: Packet, now_ns: int) -> bytes:
+    """Executes one servo's instruction and returns its status packet."""
     level = servo.get("status_return_level")
     id_ = servo.id
     if not packet.intact:
         error, data = Error.CRC, b""
     else:
-        error, data = _obey(servo, packet, now_ns)
+        error, data = _run_instruction(servo, packet, now_ns)
     return (
-        status(id_, error | _alert(servo), data)
-        if level >= _ANSWER_LEVELS.get(packet.instruction, 2)
-        else b""
+        status(id_, error | _alert(servo), data) if level >= _REPLY_LEVELS.get(packet.instruction, 2) else b""
     )
 
 
-def _obey(servo: VirtualServo, packet: Packet, now_ns: int) -> tuple[Error, bytes]:
+def _run_instruction(servo: VirtualServo, packet: Packet, now_ns: int) -> tuple[Error, bytes]:
     params = packet.params
     head = int.from_bytes(params[:2], "little")
     match packet.instruction:
@@ -198,7 +190,7 @@ def _word(data: bytes, at: int) -> int:
     return data[at] | data[at + 1] << 8
 
 
-_ANSWER_LEVELS: Final[dict[int, int]] = {Instruction.PING: 0, Instruction.READ: 1}
+_REPLY_LEVELS: Final[dict[int, int]] = {Instruction.PING: 0, Instruction.READ: 1}
 _GROUP_READS: Final[dict[int, Callable[[bytes], list[tuple[int, int, int]]]]] = {
     Instruction.SYNC_READ: _sync_read,
     Instruction.FAST_SYNC_READ: _sync_read,
@@ -214,7 +206,7 @@ _buses: Final[dict[str, VirtualBus]] = {}
 
 
 def register_bus(name: str, bus: VirtualBus) -> None:
-    """Makes a bus reachable as port ``virtual:<name>`` in this process.
+    """Makes a bus available as port ``virtual:<name>`` in this process.
 
     Raises:
         ConfigError: The name is taken.
@@ -224,11 +216,11 @@ def register_bus(name: str, bus: VirtualBus) -> None:
 
 
 def unregister_bus(name: str) -> None:
-    """Takes a bus away; a port that has it open sees it unplugged. An unknown name is no error."""
+    """Removes a bus; an open port then reports it as unplugged. An unknown name is not an error."""
     _buses.pop(name, None)
 
 
 def find_bus(name: str) -> VirtualBus | None:
-    """The bus that is registered as ``name`` and plugged in, or None."""
+    """Returns the bus registered as ``name``, or None if it is missing or unplugged."""
     bus = _buses.get(name)
     return None if bus is None or bus.is_unplugged() else bus

@@ -1,1 +1,1 @@
-"""Load cells: boards and weighing indicators on a serial port, and Phidget bridges."""
+"""Drivers for load cells: boards and weighing indicators on a serial port, and Phidget bridges."""

@@ -1,16 +1,16 @@
-"""The lines that load cells print on a serial port, as bytes: no parser ever raises."""
+"""Parsers of the lines that load cells send on a serial port. They accept any bytes and never raise."""
 
 import math
 import re
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
-LONGEST_LINE: Final = 256
-"""Bytes without an end of line beyond this are no load cell's."""
+MAX_LINE_BYTES: Final = 256
+"""Longest line in bytes; data without a line feed beyond this is discarded."""
 
 HX711_MIN: Final = -0x800000
 HX711_MAX: Final = 0x7FFFFF
-"""The converter has 24 bits, and gives one of these two where its input is out of range."""
+"""Limits of the 24-bit converter; it gives one of these two if its input is out of range."""
 
 _HX711: Final = re.compile(rb"\s*(?:\d+,)?([+-]?\d{1,8})\s*")
 _CAS: Final = re.compile(rb"(?:(ST|US|OL),(?:GS|NT),(?:..,)?)?(.{8})(?: ?(kg|g | g))?", re.DOTALL)
@@ -20,11 +20,11 @@ _KG: Final = {b"kg": 1.0, b"g": 1e-3}
 
 
 class Reading(NamedTuple):
-    """What a line says.
+    """One reading of a load cell.
 
     Attributes:
-        raw: The reading, in the sensor's own unit; NaN where it has none.
-        saturated: The sensor says that it is beyond its range.
+        raw: The reading in the sensor's unit; NaN if the line has no number.
+        saturated: True if the sensor reports that it is beyond its range.
     """
 
     raw: float
@@ -32,12 +32,12 @@ class Reading(NamedTuple):
 
 
 def parse_hx711(line: bytes) -> Reading | None:
-    """Reads ``<raw>`` or ``<micros>,<raw>`` in counts, as boards with an HX711 converter print them.
+    """Parses ``<raw>`` or ``<micros>,<raw>`` in counts, as boards with an HX711 converter send them.
 
     See https://cdn.sparkfun.com/datasheets/Sensors/ForceFlex/hx711_english.pdf for the counts.
 
     Returns:
-        The reading, or None where the line is none.
+        The reading, or None if the line is not valid.
     """
     found = _HX711.fullmatch(line)
     if found is None or not HX711_MIN <= (raw := int(found[1])) <= HX711_MAX:
@@ -46,14 +46,14 @@ def parse_hx711(line: bytes) -> Reading | None:
 
 
 def parse_cas(line: bytes) -> Reading | None:
-    """Reads a weighing indicator's frame without its end of line, in kg.
+    """Parses a weighing indicator's frame without its line feed; the reading is in kg.
 
     With CR and LF a frame has 22 bytes (``ST,GS,<id><lamp>,<8 bytes> kg``), 18 (``ST,GS,<8 bytes>kg``) or 10
-    (the 8 bytes alone, taken as kg). The lamp byte is no ASCII: its bit 7 is set. See the appendix "Data
+    (only the 8 bytes, taken as kg). The lamp byte is not ASCII: its bit 7 is set. See the appendix "Data
     format" of the CAS CI-400's manual: https://www.easymanua.ls/cas/ci-400-series/manual?p=103
 
     Returns:
-        The reading, or None where the line is none.
+        The reading, or None if the line is not valid.
     """
     found = _CAS.fullmatch(line.removesuffix(b"\r"))
     if found is None or len(found[0]) not in _CAS_LENGTHS:
@@ -67,24 +67,24 @@ def parse_cas(line: bytes) -> Reading | None:
 
 
 PARSERS: Final[dict[str, Callable[[bytes], Reading | None]]] = {"hx711": parse_hx711, "cas": parse_cas}
-"""By the value of ``load_cell.format``."""
+"""Parser for each value of ``load_cell.format``."""
 
 
 class LineSplitter:
-    """Cuts received bytes into lines. Leaves out the first: it may have begun before the port was open."""
+    """Splits received bytes into lines. Discards the first: it may have begun before the port was opened."""
 
     def __init__(self) -> None:
-        self._begun = bytearray()
-        self._torn = True
+        self._partial = bytearray()
+        self._discard_next = True
 
     def feed(self, data: bytes) -> list[bytes]:
-        """The lines that ``data`` completes, without the line feeds."""
-        *lines, rest = (self._begun + data).split(b"\n")
-        if self._torn and lines:
+        """Returns the lines that ``data`` completes, without the line feeds."""
+        *lines, rest = (self._partial + data).split(b"\n")
+        if self._discard_next and lines:
             del lines[0]
-            self._torn = False
-        if len(rest) > LONGEST_LINE:
+            self._discard_next = False
+        if len(rest) > MAX_LINE_BYTES:
             rest = bytearray()
-            self._torn = True
-        self._begun = bytearray(rest)
+            self._discard_next = True
+        self._partial = bytearray(rest)
         return [bytes(line) for line in lines]

@@ -1,6 +1,6 @@
-"""A load cell on a Phidget bridge (1046, four inputs), through the vendor's Phidget22.
+"""Driver for a load cell on a Phidget bridge (1046, four inputs), by the vendor's package Phidget22.
 
-See https://www.phidgets.com/?tier=3&catid=98&pcid=78&prodid=35 for the bridge.
+Bridge: https://www.phidgets.com/?tier=3&catid=98&pcid=78&prodid=35
 """
 
 import math
@@ -14,7 +14,10 @@ from gripper_hw.load_cells.screening import LiveLoadCell
 
 MIN_RATE_HZ: Final = 1
 MAX_RATE_HZ: Final = 122
+"""Limits of the bridge's sample rate."""
+
 ATTACH_TIMEOUT_MS: Final = 2000
+"""Longest wait for the bridge when it is opened."""
 
 _TIMED_OUT: Final = 3
 """``ErrorCode.EPHIDGET_TIMEOUT``"""
@@ -23,31 +26,31 @@ _OUT_OF_RANGE: Final = 4103
 
 
 class PhidgetLoadCell(LiveLoadCell):
-    """Samples one input of the bridge in V/V. The vendor's library finds it again after it was unplugged.
+    """A load cell on one input of the bridge, in V/V. The vendor's library reconnects to an unplugged bridge.
 
     Args:
-        config: Its section of the configuration: channel, rate, tare and scale.
+        config: The load cell section of the configuration: channel, rate, tare and scale.
         clock: The run's clock.
 
     Raises:
-        ConfigError: The bridge does not sample at this rate.
+        ConfigError: The bridge cannot sample at this rate.
     """
 
     def __init__(self, config: LoadCellConfig, clock: Clock) -> None:
         super().__init__(config, clock, unit_n=math.nan, noisy=True)
         if not MIN_RATE_HZ <= config.rate_hz <= MAX_RATE_HZ:
             raise ConfigError(
-                f"load_cell.rate_hz is {config.rate_hz:g}, and a Phidget bridge gives {MIN_RATE_HZ} to "
-                f"{MAX_RATE_HZ} samples a second; set one of these"
+                f"load_cell.rate_hz={config.rate_hz:g} is out of a Phidget bridge's range; "
+                f"set it to {MIN_RATE_HZ} to {MAX_RATE_HZ} samples/s"
             )
         self._channel: Any = None
 
     def start(self) -> None:
-        """Opens the bridge's input and begins to sample.
+        """Opens the bridge's input and starts sampling.
 
         Raises:
-            DeviceNotFoundError: There is no bridge.
-            DeviceError: Phidget22 or a library that it needs is not installed, or the bridge refuses.
+            DeviceNotFoundError: No bridge is connected.
+            DeviceError: Phidget22 or a system library is not installed, or the bridge refuses a setting.
         """
         if self._channel is not None:
             return
@@ -57,7 +60,7 @@ class PhidgetLoadCell(LiveLoadCell):
         def configure(channel: Any) -> None:
             channel.setBridgeGain(phidget.BridgeGain.BRIDGE_GAIN_128)
             channel.setDataInterval(round(1000 / self._config.rate_hz))
-            channel.setVoltageRatioChangeTrigger(0.0)  # else a reading that stays the same gives no sample
+            channel.setVoltageRatioChangeTrigger(0.0)  # else an unchanged reading gives no sample
             channel.setBridgeEnabled(True)
 
         try:
@@ -65,17 +68,19 @@ class PhidgetLoadCell(LiveLoadCell):
             channel.setOnVoltageRatioChangeHandler(self._sampled)
             channel.setOnErrorHandler(self._failed)
             channel.setOnDetachHandler(self._detached)
-            channel.setOnAttachHandler(configure)  # it forgets its settings while it is away
+            channel.setOnAttachHandler(configure)  # it loses its settings when unplugged
             channel.openWaitForAttachment(ATTACH_TIMEOUT_MS)
-            configure(channel)  # here an error reaches the caller, and in the handler it does not
+            configure(channel)  # an error in the handler would not reach the caller
         except phidget.PhidgetException as error:
             channel.close()
             if error.code == _TIMED_OUT:
                 raise DeviceNotFoundError(
-                    f"no Phidget bridge answers for input {self._config.channel}; check its cable, and that "
-                    "hw/udev's rules are installed"
+                    f"no Phidget bridge answers for load_cell.channel={self._config.channel}; check its "
+                    "cable, and that the rules of hw/udev are installed"
                 ) from error
-            raise DeviceError(f"the Phidget bridge refuses: {error.description}; plug it in again") from error
+            raise DeviceError(
+                f"could not configure the Phidget bridge ({error.description}); unplug and reconnect it"
+            ) from error
         self._channel = channel
 
     def close(self) -> None:
@@ -98,13 +103,13 @@ class PhidgetLoadCell(LiveLoadCell):
 def _load_phidget22() -> Any:
     try:
         phidget: Any = import_module("Phidget22.Devices.VoltageRatioInput")
-        phidget.Phidget.getLibraryVersion()  # loads the native library, and a channel's own error is untidy
+        phidget.Phidget.getLibraryVersion()  # loads the native library: a channel's error for that is unclear
     except ImportError as error:
         raise DeviceError(
-            "load_cell.backend=phidget needs the package Phidget22; pip install 'gripper-force[phidget]'"
+            "load_cell.backend=phidget needs the package Phidget22; run pip install 'gripper-force[phidget]'"
         ) from error
     except OSError as error:
         raise DeviceError(
-            f"Phidget22 can't load a library of the system ({error}); install that, on Debian libusb-1.0-0"
+            f"Phidget22 cannot load a system library ({error}); install it, on Debian libusb-1.0-0"
         ) from error
     return phidget

@@ -1,4 +1,4 @@
-"""Readings to samples: newtons, and a mark on what no live cell under a grip says. The reading is kept."""
+"""Conversion of readings to samples in newtons, with implausible samples marked as invalid."""
 
 import math
 from collections import deque
@@ -14,29 +14,32 @@ from gripper_force.types import NS_PER_S, LoadCellSample
 
 STUCK_NS: Final = NS_PER_S // 20
 STUCK_SAMPLES: Final = 10
-"""A reading that stays the same to the bit for longer, and for so many samples, is no live converter's, as
-that always has noise."""
+"""A converter always has noise, so a reading that stays identical for longer than this time and for more
+samples than this is stuck."""
 
-DOUBT_SAMPLES: Final = 20
-DOUBT_SHARE: Final = 0.4
-"""Where more of the last samples than this were rejected, none of the others is to be believed either."""
+DOUBT_WINDOW_SAMPLES: Final = 20
+MAX_REJECTED_SHARE: Final = 0.4
+"""If more than this share of the last samples was rejected, all samples are rejected."""
 
-PATIENCE_NS: Final = NS_PER_S
-"""How long a sample waits for those after it. At 10 samples/s, the slowest HX711, they take 0.3 s."""
+MAX_WAIT_NS: Final = NS_PER_S
+"""Longest wait of a sample for those after it. At 10 samples/s, the slowest HX711, they take 0.3 s."""
+
+_MAX_UNTAKEN: Final = 100_000
+"""Samples kept if they are never taken; the oldest are dropped."""
 
 
 @dataclass(slots=True)
 class LoadCellStats:
-    """Counters of one load cell since it was made: rejected samples by cause, and what went wrong on the way.
+    """Counters of one load cell since its construction: rejected samples by cause, and connection faults.
 
     Attributes:
-        saturated: The sensor was beyond its range.
-        stuck: The reading stayed the same for too long.
-        not_finite: The force is no finite number; that of every sample where the cell is not calibrated.
-        spikes: See `find_spikes`.
-        doubtful: Too many of the samples around it were rejected.
-        unreadable: Lines that are none of the configured format; they give no sample.
-        losses: How often the device went away.
+        saturated: Samples beyond the sensor's range.
+        stuck: Samples whose reading stayed the same for too long.
+        not_finite: Samples whose force is NaN or infinite; all samples if the load cell is not calibrated.
+        spikes: Samples that `find_spikes` rejects.
+        doubtful: Samples rejected because too many of the samples before them were rejected.
+        unreadable: Lines that are not of the configured format; they give no sample.
+        losses: Losses of the device.
     """
 
     saturated: int = 0
@@ -48,38 +51,40 @@ class LoadCellStats:
     losses: int = 0
 
 
-class Screen:
-    """Turns readings into samples, some time later: whether it is a spike shows in the samples that follow.
+class SampleValidator:
+    """Converts readings to samples and marks implausible ones as invalid. The reading itself is kept.
 
-    One thread may `add` while another `take`s.
+    A sample is delayed by the few samples after it, because a spike can only be detected with them. One
+    thread may call `add` while another calls `take`.
 
     Args:
-        tare_raw: The reading without load.
-        n_per_raw: Newtons for one unit of the reading; NaN where that is not known.
-        noisy: The readings are a converter's own. A weighing indicator rounds, and may rest on one value.
+        tare_raw: Reading without load.
+        n_per_raw: Newtons per unit of the reading; NaN if unknown.
+        noisy: True if the readings are a converter's, which always vary. A weighing indicator rounds, so its
+            reading may stay the same.
     """
 
     def __init__(self, tare_raw: float, n_per_raw: float, *, noisy: bool) -> None:
         self.stats = LoadCellStats()
         self._tare_raw, self._n_per_raw, self._noisy = tare_raw, n_per_raw, noisy
-        self._added: deque[LoadCellSample] = deque(maxlen=100_000)
+        self._added: deque[LoadCellSample] = deque(maxlen=_MAX_UNTAKEN)
         self._waiting: list[LoadCellSample] = []
-        self._before_n: deque[float] = deque(maxlen=HAMPEL_HALF_WINDOW)
+        self._previous_n: deque[float] = deque(maxlen=HAMPEL_HALF_WINDOW)
         self._last_raw = math.nan
-        self._last_ns = self._same_since_ns = self._same = 0
-        self._rejected: deque[bool] = deque(maxlen=DOUBT_SAMPLES)
+        self._last_ns = self._same_since_ns = self._same_count = 0
+        self._rejected: deque[bool] = deque(maxlen=DOUBT_WINDOW_SAMPLES)
 
     def add(self, t_ns: int, raw: float, *, saturated: bool = False) -> None:
-        """Takes a reading that came at ``t_ns``."""
-        if raw != self._last_raw or t_ns - self._last_ns > PATIENCE_NS:
-            self._same_since_ns, self._same = t_ns, 0
-        self._same += 1
+        """Adds a reading received at ``t_ns``."""
+        if raw != self._last_raw or t_ns - self._last_ns > MAX_WAIT_NS:
+            self._same_since_ns, self._same_count = t_ns, 0
+        self._same_count += 1
         self._last_raw, self._last_ns = raw, t_ns
         force_n = (raw - self._tare_raw) * self._n_per_raw
         valid = False
         if saturated:
             self.stats.saturated += 1
-        elif self._noisy and self._same > STUCK_SAMPLES and t_ns - self._same_since_ns > STUCK_NS:
+        elif self._noisy and self._same_count > STUCK_SAMPLES and t_ns - self._same_since_ns > STUCK_NS:
             self.stats.stuck += 1
         elif not math.isfinite(force_n):
             self.stats.not_finite += 1
@@ -88,69 +93,72 @@ class Screen:
         self._added.append(LoadCellSample(t_ns, force_n, raw, valid))
 
     def take(self, now_ns: int) -> list[LoadCellSample]:
-        """The samples that can be judged at ``now_ns`` and were not taken yet, oldest first."""
+        """Returns the samples that were not taken yet and can be checked at ``now_ns``, oldest first."""
         while self._added:
             self._waiting.append(self._added.popleft())
-        ready = self._ready(now_ns)
+        ready = self._ready_count(now_ns)
         if not ready:
             return []
         candidates_n = [sample.force_n for sample in self._waiting if sample.valid]
-        spikes = iter(find_spikes(np.array([*self._before_n, *candidates_n]))[len(self._before_n) :])
+        spikes = iter(find_spikes(np.array([*self._previous_n, *candidates_n]))[len(self._previous_n) :])
         taken, self._waiting = self._waiting[:ready], self._waiting[ready:]
         for i, sample in enumerate(taken):
             if sample.valid:
-                self._before_n.append(sample.force_n)
+                self._previous_n.append(sample.force_n)
                 if next(spikes):
                     self.stats.spikes += 1
                     taken[i] = replace(sample, valid=False)
             self._rejected.append(not taken[i].valid)
-            if taken[i].valid and sum(self._rejected) > DOUBT_SHARE * DOUBT_SAMPLES:
+            if taken[i].valid and sum(self._rejected) > MAX_REJECTED_SHARE * DOUBT_WINDOW_SAMPLES:
                 self.stats.doubtful += 1
                 taken[i] = replace(sample, valid=False)
         return taken
 
     def counts(self) -> dict[str, int]:
-        """The counters by name."""
+        """Counters by name (see `LoadCellStats`)."""
         return {name: getattr(self.stats, name) for name in LoadCellStats.__slots__}
 
-    def _ready(self, now_ns: int) -> int:
-        """How many of the waiting samples have the followers they need, or waited for them long enough."""
+    def _ready_count(self, now_ns: int) -> int:
+        """Number of waiting samples that have enough followers, or waited `MAX_WAIT_NS` for them."""
         ready, followers = len(self._waiting), 0
         for i in reversed(range(ready)):
             if self._waiting[i].valid:
-                if followers < HAMPEL_HALF_WINDOW and now_ns - self._waiting[i].t_ns <= PATIENCE_NS:
+                if followers < HAMPEL_HALF_WINDOW and now_ns - self._waiting[i].t_ns <= MAX_WAIT_NS:
                     ready = i
                 followers += 1
         return ready
 
 
 class LiveLoadCell:
-    """What real load cells have in common: the run's clock, the screen, and the samples handed out.
+    """Base class of real load cells: adds readings at the run's time and returns checked samples.
 
     Args:
-        config: Their section of the configuration.
+        config: The load cell section of the configuration.
         clock: The run's clock, which must be the host's.
-        unit_n: Newtons for one unit of the reading where the configuration says nothing; NaN if unknown.
-        noisy: See `Screen`.
+        unit_n: Newtons per unit of the reading if ``load_cell.n_per_raw`` is not set; NaN if unknown.
+        noisy: See `SampleValidator`.
     """
 
     def __init__(self, config: LoadCellConfig, clock: Clock, *, unit_n: float, noisy: bool) -> None:
         self._config, self._clock = config, clock
         n_per_raw = unit_n if config.n_per_raw is None else config.n_per_raw
-        self._screen = Screen(config.tare_raw, n_per_raw, noisy=noisy)
+        self._validator = SampleValidator(config.tare_raw, n_per_raw, noisy=noisy)
 
     @property
     def stats(self) -> LoadCellStats:
         """Counters of rejected samples and losses."""
-        return self._screen.stats
+        return self._validator.stats
 
     def drain(self) -> list[LoadCellSample]:
-        """The samples since the last call that can be judged by now, oldest first. Never blocks or raises."""
-        return self._screen.take(self._clock.now_ns())
+        """Returns the samples since the last call that can be checked by now, oldest first.
+
+        Never blocks or raises.
+        """
+        return self._validator.take(self._clock.now_ns())
 
     def counts(self) -> dict[str, int]:
-        """What went wrong since it was made: cause to how often (see `LoadCellStats`)."""
-        return self._screen.counts()
+        """Number of rejected samples and faults since construction, by cause (see `LoadCellStats`)."""
+        return self._validator.counts()
 
     def _add(self, raw: float, *, saturated: bool = False) -> None:
-        self._screen.add(self._clock.now_ns(), raw, saturated=saturated)
+        self._validator.add(self._clock.now_ns(), raw, saturated=saturated)

@@ -1,4 +1,4 @@
-"""A load cell that prints lines on a serial port."""
+"""Driver for load cells that send lines on a serial port."""
 
 import math
 import termios
@@ -16,30 +16,33 @@ from gripper_hw.load_cells.screening import LiveLoadCell
 from gripper_hw.serial_line import open_line
 
 RECONNECT_S: Final = 0.5
-"""Pause between two tries to open a port that went away."""
+"""Pause between two attempts to open a lost port."""
 
 STANDARD_GRAVITY_M_S2: Final = 9.80665
 
 
 class SerialLoadCell(LiveLoadCell):
-    """Reads the port in a thread of its own, which opens it again after it went away.
+    """A load cell on a serial port. A background thread reads the port, and reopens it after a loss.
 
-    A sample carries the time at which its line was complete.
+    A sample's time is when its line was complete.
 
     Args:
-        config: Its section of the configuration: port, baud rate, format, tare and scale.
+        config: The load cell section of the configuration: port, baud rate, format, tare and scale.
         clock: The run's clock.
 
     Raises:
-        ConfigError: No port is configured.
+        ConfigError: ``load_cell.port`` is not set.
     """
 
     def __init__(self, config: LoadCellConfig, clock: Clock) -> None:
-        counts = config.format == "hx711"
-        super().__init__(config, clock, unit_n=math.nan if counts else STANDARD_GRAVITY_M_S2, noisy=counts)
+        in_counts = config.format == "hx711"  # else in kg
+        unit_n = math.nan if in_counts else STANDARD_GRAVITY_M_S2
+        super().__init__(config, clock, unit_n=unit_n, noisy=in_counts)
         if config.port is None:
-            raise ConfigError("load_cell.backend=serial needs load_cell.port; take one of /dev/serial/by-id")
-        self._name = config.port
+            raise ConfigError(
+                "load_cell.backend=serial needs load_cell.port; set it to one of /dev/serial/by-id"
+            )
+        self._port_name = config.port
         self._parse = PARSERS[config.format]
         self._stop = threading.Event()
         self._lock = threading.Lock()
@@ -47,11 +50,11 @@ class SerialLoadCell(LiveLoadCell):
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Opens the port, exclusively, and begins to read.
+        """Opens the port exclusively and starts reading.
 
         Raises:
-            DeviceNotFoundError: There is no such port.
-            DeviceError: It is in use, or can't be opened.
+            DeviceNotFoundError: The port does not exist.
+            DeviceError: The port is in use or cannot be opened.
         """
         if self._thread is None:
             port = self._open()
@@ -71,12 +74,12 @@ class SerialLoadCell(LiveLoadCell):
         while port is not None:
             try:
                 with port:
-                    self._listen(port)
+                    self._read_lines(port)
             except (OSError, termios.error):
                 self.stats.losses += 1
             port = self._reopen()
 
-    def _listen(self, port: serial.Serial) -> None:
+    def _read_lines(self, port: serial.Serial) -> None:
         lines = LineSplitter()
         with self._lock:
             self._port = port
@@ -98,4 +101,4 @@ class SerialLoadCell(LiveLoadCell):
         return None
 
     def _open(self) -> serial.Serial:
-        return open_line(self._name, self._config.baud_rate, unit="load_cell", timeout_s=None)
+        return open_line(self._port_name, self._config.baud_rate, unit="load_cell", timeout_s=None)

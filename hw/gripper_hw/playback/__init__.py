@@ -1,7 +1,7 @@
-"""Recordings as devices: a camera and a load cell that play a log, or a grasp imported from elsewhere.
+"""Playback: a camera and a load cell that return the frames and samples of a log, recorded or imported.
 
-At speed ``recorded`` they go as the clock goes, with times shifted to it; at speed ``full`` as fast as they
-are asked, with times as recorded.
+At speed ``recorded``, data come at the pace of the clock, with times shifted to it. At speed ``full``, each
+call returns the next data, with times as recorded.
 """
 
 from collections.abc import Iterator
@@ -14,17 +14,19 @@ from gripper_force.runtime.log import LogReader
 from gripper_force.types import Frame, LoadCellSample
 
 
-class _Playback:
-    """A log, and the time it is shifted by.
+class _PlaybackDevice:
+    """A log, and the shift of its times to the run's clock.
 
     Raises:
         ConfigError: No path is configured.
-        LogError: The log can't be read.
+        LogError: The log cannot be read.
     """
+
+    supports_lockstep = True
 
     def __init__(self, config: CameraConfig | LoadCellConfig, clock: Clock, unit: str) -> None:
         if config.path is None:
-            raise ConfigError(f"{unit}.backend=playback needs {unit}.path, the log to play")
+            raise ConfigError(f"{unit}.backend=playback needs {unit}.path; set it to the log to play")
         self._log = LogReader(config.path)
         self._clock = clock
         self._speed = config.speed
@@ -32,36 +34,36 @@ class _Playback:
         self._started = False
 
     def start(self) -> None:
-        """Begins to play: the log's first record is now."""
+        """Starts playback: the log's first record is played now."""
         self._started = True
         if self._speed == "recorded":
             self._shift_ns = self._clock.now_ns() - self._log.start_ns
 
     def counts(self) -> dict[str, int]:
-        """What went wrong when the log was made shows in its records."""
+        """Empty: playback loses nothing; faults of the recording are in its records."""
         return {}
 
     def _log_now_ns(self) -> int:
         return self._clock.now_ns() - self._shift_ns
 
 
-class PlaybackCamera(_Playback):
+class PlaybackCamera(_PlaybackDevice):
     """Plays the frames of a log.
 
-    At speed ``recorded``, `newest` is a camera's: frames that came while nobody asked are lost, and their
-    numbers skipped. At speed ``full``, each call hands out the next frame. After the last it gives None.
+    At speed ``recorded``, `newest` skips frames as a real camera does if it is called too rarely. At speed
+    ``full``, each call returns the next frame. After the last frame the result is None.
 
     Args:
-        config: Its section of the configuration: the log's path, and the speed.
+        config: The camera section of the configuration: the log's path, and the speed.
         clock: The run's clock.
 
     Attributes:
-        finished: True once the last frame was handed out.
+        finished: True after the last frame was returned.
 
     Raises:
         ConfigError: No path is configured.
-        LogError: The log can't be read.
-        DataError: It holds no frames.
+        LogError: The log cannot be read.
+        DataError: The log holds no frames.
     """
 
     def __init__(self, config: CameraConfig, clock: Clock) -> None:
@@ -70,17 +72,19 @@ class PlaybackCamera(_Playback):
         self._next = next(self._frames, None)
         self.finished = False
         if self._next is None:
-            raise DataError(f"{config.path} holds no camera frames to play")
+            raise DataError(
+                f"{config.path} holds no camera frames to play; choose another log, or camera.backend=none"
+            )
 
     def newest(self) -> Frame | None:
-        """The newest frame that was not handed out yet, or None. Never blocks. Raises `LogError`."""
+        """Returns the newest frame that was not returned yet, or None. Never blocks. Raises `LogError`."""
         frame = None
         if self._speed == "full" and self._started:
-            frame = self._take()
+            frame = self._advance()
         elif self._started:
             log_ns = self._log_now_ns()
             while self._next is not None and self._next.received_ns <= log_ns:
-                frame = self._take()
+                frame = self._advance()
         self.finished = self._next is None
         if frame is None or not self._shift_ns:
             return frame
@@ -89,53 +93,56 @@ class PlaybackCamera(_Playback):
         )
 
     def close(self) -> None:
-        """Stops playing. May be called twice."""
+        """Stops playback. May be called twice."""
         self._next = None
         self._frames = iter(())
 
-    def _take(self) -> Frame | None:
+    def _advance(self) -> Frame | None:
         frame, self._next = self._next, next(self._frames, None)
         return frame
 
 
-class PlaybackLoadCell(_Playback):
+class PlaybackLoadCell(_PlaybackDevice):
     """Plays the load-cell samples of a log.
 
-    At recorded speed, `drain` gives the samples up to now; at full speed, all of them at the first call.
+    At speed ``recorded``, `drain` returns the samples up to now; at speed ``full``, all at the first call.
 
     Args:
-        config: Its section of the configuration: the log's path, and the speed.
+        config: The load cell section of the configuration: the log's path, and the speed.
         clock: The run's clock.
 
     Raises:
         ConfigError: No path is configured.
-        LogError: The log can't be read.
-        DataError: It holds no samples.
+        LogError: The log cannot be read.
+        DataError: The log holds no samples.
     """
 
     def __init__(self, config: LoadCellConfig, clock: Clock) -> None:
         super().__init__(config, clock, "load_cell")
         self._samples = list(self._log.records(LoadCellSample))
-        self._taken = 0
+        self._returned = 0
         if not self._samples:
-            raise DataError(f"{config.path} holds no load-cell samples to play")
+            raise DataError(
+                f"{config.path} holds no load-cell samples to play; choose another log, or "
+                "load_cell.backend=none"
+            )
 
     @property
     def finished(self) -> bool:
-        """True once the last sample was handed out."""
-        return self._taken == len(self._samples)
+        """True after the last sample was returned."""
+        return self._returned == len(self._samples)
 
     def drain(self) -> list[LoadCellSample]:
-        """Every sample since the last call, oldest first. Never blocks."""
-        first = self._taken
+        """Returns all samples since the last call, oldest first. Never blocks."""
+        first = self._returned
         if self._speed == "full" and self._started:
-            self._taken = len(self._samples)
+            self._returned = len(self._samples)
         elif self._started:
             log_ns = self._log_now_ns()
-            while not self.finished and self._samples[self._taken].t_ns <= log_ns:
-                self._taken += 1
-        return [replace(s, t_ns=s.t_ns + self._shift_ns) for s in self._samples[first : self._taken]]
+            while not self.finished and self._samples[self._returned].t_ns <= log_ns:
+                self._returned += 1
+        return [replace(s, t_ns=s.t_ns + self._shift_ns) for s in self._samples[first : self._returned]]
 
     def close(self) -> None:
-        """Stops playing. May be called twice."""
-        self._taken = len(self._samples)
+        """Stops playback. May be called twice."""
+        self._returned = len(self._samples)

@@ -1,1 +1,1 @@
-"""One MuJoCo world behind a virtual servo, a camera and a load cell."""
+"""Simulated rig: one MuJoCo world that drives the virtual servo, the camera and the load cell."""

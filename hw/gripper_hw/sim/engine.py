@@ -1,4 +1,4 @@
-"""MuJoCo. EGL comes with the first drawing; where it is missing, one clear sentence says so."""
+"""Import of MuJoCo. EGL is only loaded for the first rendering; if it is missing, a clear error is raised."""
 
 import importlib
 import os
@@ -7,7 +7,7 @@ from typing import Any, Final
 from gripper_force.errors import SimulationError
 
 NO_EGL = (
-    "MuJoCo can't draw on this machine because EGL is missing; "
+    "MuJoCo cannot render on this machine because EGL is missing; "
     "on Debian or Ubuntu: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri"
 )
 
@@ -18,24 +18,24 @@ import mujoco  # noqa: E402
 os.environ["MUJOCO_GL"] = _GL
 
 
-def _quiet(_: str) -> None:
-    """Takes the place of a MUJOCO_LOG.TXT in the working directory: `World` looks at every warning itself."""
+def _ignore_warning(_: str) -> None:
+    """Ignores a warning. MuJoCo would write it to MUJOCO_LOG.TXT; `World` checks the warning counters."""
 
 
-mujoco.set_mju_user_warning(_quiet)
-# Each scene draws textures of its own: a cache of them would grow with every grasp, and never be used again.
+mujoco.set_mju_user_warning(_ignore_warning)
+# Every scene has new textures: the cache would grow with each grasp and never be hit.
 mujoco.mj_setCacheCapacity(mujoco.mj_getCache(), 0)
 
 
-def new_renderer(model: Any, side: int) -> Any:
-    """Something that draws square pictures of a model. Raises `SimulationError` without EGL."""
+def new_renderer(model: Any, side_px: int) -> Any:
+    """Returns a MuJoCo renderer of square images of a model. Raises `SimulationError` without EGL."""
     from mujoco.rendering.classic import gl_context
 
     try:
         if not hasattr(gl_context, "GLContext"):
             importlib.reload(gl_context)
-        return mujoco.Renderer(model, side, side)
-    # What MuJoCo raises where libEGL, or a driver for it, is absent.
+        return mujoco.Renderer(model, side_px, side_px)
+    # MuJoCo raises any of these if libEGL, or a driver for it, is missing.
     except (AttributeError, ImportError, RuntimeError, mujoco.FatalError) as error:
         raise SimulationError(NO_EGL) from error
 

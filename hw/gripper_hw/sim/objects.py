@@ -1,7 +1,7 @@
-"""The four objects of Shin et al. 2019 (fig. 4), a ball and a gauge as MuJoCo bodies, at three levels each.
+"""Four objects of Shin et al. 2019 (fig. 4), a ball and a gauge as MuJoCo bodies, at three levels of detail.
 
-A level of detail is a mesh and a time step. The finer one is what the coarser ones are measured against:
-docs/simulation.md has the table of speed against error.
+A level of detail is a mesh and a time step. docs/simulation.md has a table of speed and error, measured
+against the finest level.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ Detail = Literal["coarse", "medium", "fine"]
 Points = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
-# Stiffer contacts than these chatter: 0 N dropouts and 50 N spikes were seen at solref .002.
+# Stiffer contacts chatter: at solref .002 there were dropouts to 0 N and spikes of 50 N.
 _SOFT_CONTACT = 'solref=".01 1" solimp=".9 .95 .001"'
 _SHELL_CONTACT = 'solref=".005 1" solimp=".95 .99 .001"'
 
@@ -26,22 +26,22 @@ BLOCK_WIDTH_M = 0.030
 """Width of the gauge ``block`` between the jaws."""
 
 GAUGES = frozenset({"block"})
-"""Objects that are known exactly: no size or stiffness is drawn for them."""
+"""Objects with exact dimensions: no size or stiffness is drawn for them."""
 
-FOR_PADS_ALONE = frozenset({"ball"})
-"""Objects that the tip of a rod would dent until their mesh turns inside out."""
+PADS_ONLY = frozenset({"ball"})
+"""Objects that only pads may press: the tip of a rod would invert elements of their mesh."""
 
 
 @dataclass(frozen=True)
 class ObjectModel:
-    """One object, ready to be put between the jaws.
+    """One object between the jaws.
 
     Attributes:
-        body: MJCF inside the object's body; its origin stands on the table at the gripper's centre.
+        body: MJCF inside the object's body; its origin is on the table at the gripper's centre.
         contact: MJCF contact attributes, shared by the object and the pads.
-        texture: Name of the texture image, or None for a plain material.
-        grip_height_m: Height of the jaws over the table.
-        timestep_s: Physics step that this mesh needs.
+        texture: File name of the texture image, or None for a plain material.
+        grip_height_m: Height of the jaws above the table.
+        timestep_s: Physics step for this mesh.
     """
 
     body: str
@@ -57,12 +57,12 @@ def build_object(name: str, detail: Detail, size: float, stiffness: float) -> Ob
     Args:
         name: A key of `OBJECTS`.
         detail: Level of detail.
-        size: Factor on all lengths. Material moduli are scaled against it, so that it leaves the force at a
-            given travel of the jaws as it is.
+        size: Factor on all lengths. Material moduli are scaled inversely, so that the force at a given travel
+            of the jaws does not change.
         stiffness: Factor on the force at a given travel of the jaws.
 
     Raises:
-        ConfigError: No such object.
+        ConfigError: The object does not exist.
     """
     try:
         builder = OBJECTS[name]
@@ -83,7 +83,7 @@ def _sponge(detail: Detail, size: float, stiffness: float) -> ObjectModel:
     grid = np.stack(np.meshgrid(*[np.arange(n) for n in counts], indexing="ij"), -1).reshape(-1, 3) * spacing
     uv = np.c_[grid[:, 0] + 0.5 * grid[:, 1], grid[:, 2] + 0.5 * grid[:, 1]] / 0.1
     nodes = 1 if order == "trilinear" else 2
-    young = 1.5e4 * stiffness / size  # a block's stiffness goes with E * area / length
+    young = 1.5e4 * stiffness / size  # stiffness of a block is proportional to E * area / length
     body = f"""<flexcomp name="object" type="grid" dim="3" count="{_text(counts)}" spacing="{_text(spacing)}"
       dof="{order}" cellcount="{_text(cells)}" pos="0 0 {lengths[2] / 2 + 0.001:.6g}" mass=".2" radius=".001"
       material="object" flatskin="true" texcoord="{_text(uv)}">
@@ -99,11 +99,13 @@ def _tube(detail: Detail, size: float, stiffness: float) -> ObjectModel:
     ]
     radius, length = 0.022 * size, 0.05 * size
     points, uv, faces = _shell_of_revolution(radius, radius, length, around, along, seam_rad=-np.pi / 2)
-    points = points[:, [0, 2, 1]] - [0, length / 2, 0]  # the axis lies along y: both ends can be seen
+    points = points[:, [0, 2, 1]] - [0, length / 2, 0]  # axis along y, so that the camera sees both ends
     points[:, 2] += radius + 0.0012
-    # A pinned strip: one pinned line would be a hinge.
+    # Pins a strip: a single pinned line would act as a hinge.
     pins = np.flatnonzero(points[:, 2] < 0.0012 + radius * (1 - np.cos(np.deg2rad(24))))
-    young = 3.0e7 * stiffness * size**2  # a ring's stiffness goes with E * thickness^3 * length / radius^3
+    young = (
+        3.0e7 * stiffness * size**2
+    )  # stiffness of a ring is proportional to E * thickness^3 * length / radius^3
     body = _shell(points, uv, faces, pins, young, thickness=0.0022, damping=0.004, radius=0.0012)
     return ObjectModel(body, _SHELL_CONTACT, "tube.png", 0.022 * size, dt)
 
@@ -124,8 +126,8 @@ def _cup(detail: Detail, size: float, stiffness: float) -> ObjectModel:
 
 
 def _stapler(detail: Detail, size: float, stiffness: float) -> ObjectModel:
-    # Two rigid parts and a spring: only the step can be refined. The spring's moment pushes on an arm
-    # that grows with the size, hence its powers.
+    # Two rigid parts and a spring: only the step can be refined. The spring's moment acts on an arm
+    # proportional to the size, hence the powers of the size.
     dt = {"coarse": 0.0025, "medium": 0.00125, "fine": 0.0005}[detail]
     linear, cubic = 3.2 * stiffness * size**2, 40.0 * stiffness * size**4
     preload_deg = np.rad2deg(0.15 / 3.2)
@@ -139,8 +141,8 @@ def _stapler(detail: Detail, size: float, stiffness: float) -> ObjectModel:
 
     solid = f'contype="0" conaffinity="1" condim="3" {_SOFT_CONTACT}'
     tilt = 'euler="0 -7 0"'
-    # It lies on its side, and a slide lets it centre itself: fixed to the world it would over-constrain the
-    # jaws.
+    # It lies on its side, on a slide so that it centres itself: fixed to the world it would over-constrain
+    # the jaws.
     body = f"""<body pos="{_text(np.array([-0.030, 0.045, 0.030]) * s)}" quat="-.5 .5 -.5 .5">
       <joint name="self_centre" type="slide" axis="0 0 1" stiffness="20" damping="8"/>
       <body pos="{-0.055 * s:.6g} 0 0">
@@ -160,7 +162,7 @@ def _stapler(detail: Detail, size: float, stiffness: float) -> ObjectModel:
 
 
 def _block(detail: Detail, size: float, _stiffness: float) -> ObjectModel:
-    # A load cell's body between the jaws: rigid, and free to centre and to align itself.
+    # The body of a load cell: rigid, and free to centre and align itself.
     dt = {"coarse": 0.0025, "medium": 0.00125, "fine": 0.0005}[detail]
     half = np.array([BLOCK_WIDTH_M / 2, 0.012, 0.020]) * size
     body = f"""<body pos="0 0 {0.030 * size:.6g}">
@@ -175,12 +177,14 @@ def _ball(detail: Detail, size: float, stiffness: float) -> ObjectModel:
     cells, dt = {"coarse": (4, 0.0025), "medium": (6, 0.0025), "fine": (8, 0.00125)}[detail]
     radius = 0.024 * size
     points, tetrahedra = _solid_ball(cells)
-    # Seen from the front: the angle from there is the distance from the texture's middle.
+    # The angle from the front direction is the distance from the texture's centre.
     across = points[:, [0, 2]] / np.maximum(np.hypot(points[:, 0], points[:, 2]), 1e-9)[:, None]
     uv = 0.5 + across * (np.arccos(np.clip(-points[:, 1], -1, 1)) / (2 * np.pi))[:, None]
     points = points * radius + [0, 0, radius + 0.001]
     pins = np.flatnonzero(points[:, 2] < 0.001 + 0.15 * radius)
-    young = 9.0e4 * stiffness / size**0.75  # between a block's 1 and the 1/2 of two spheres that just touch
+    young = (
+        9.0e4 * stiffness / size**0.75
+    )  # exponent between 1 (a block) and 1/2 (two spheres in point contact)
     body = f"""<flexcomp name="object" type="direct" dim="3" mass=".2" radius=".001" material="object"
       point="{_text(points)}" element="{_text(tetrahedra)}" texcoord="{_text(uv)}">
       <contact selfcollide="none" condim="3" friction=".6" {_SHELL_CONTACT}/>
@@ -200,7 +204,7 @@ OBJECTS: dict[str, Callable[[Detail, float, float], ObjectModel]] = {
 
 
 def _solid_ball(cells: int) -> tuple[Points, Indices]:
-    """Points (N, 3) of a unit ball and tetrahedra (M, 4): a cube of cells, blown up to a ball."""
+    """Returns points (N, 3) of a unit ball and tetrahedra (M, 4): a cube of cells, mapped to a ball."""
     count = cells + 1
     cube = np.stack(np.meshgrid(*[np.linspace(-1, 1, count)] * 3, indexing="ij"), -1).reshape(-1, 3)
     u, v = np.roll(cube, -1, axis=1) ** 2, np.roll(cube, -2, axis=1) ** 2
@@ -208,20 +212,20 @@ def _solid_ball(cells: int) -> tuple[Points, Indices]:
     number = np.arange(count**3).reshape(count, count, count)
     tetrahedra = []
     for i, j, k in np.ndindex(cells, cells, cells):
-        # Neighbours are mirrored, so that their diagonals meet.
+        # Neighbouring cells are mirrored, so that their diagonals meet.
         (a, b, c, d), (e, f, g, h) = (
             number[i + x, j : j + 2, k : k + 2].ravel() for x in ((0, 1) if (i + j + k) % 2 else (1, 0))
         )
         tetrahedra += [(a, b, c, e), (d, c, b, h), (f, e, h, b), (g, h, e, c), (b, c, e, h)]
     corners = np.array(tetrahedra)
-    # Along the cube's edges there are some with all corners on the ball: flat ones, which turn inside out.
+    # At the cube's edges some have all corners on the ball: they are flat and would invert.
     outside = np.abs(cube).max(axis=1) == 1
     used, corners = np.unique(corners[~outside[corners].all(axis=1)], return_inverse=True)
     return points[used], _outward(points[used], corners.reshape(-1, 4))
 
 
 def _outward(points: Points, tetrahedra: Indices) -> Indices:
-    """The same tetrahedra with corners in such an order that each volume is positive."""
+    """Returns the tetrahedra with their corners ordered so that each volume is positive."""
     corners = points[tetrahedra]  # (M, 4, 3)
     negative = np.linalg.det(corners[:, 1:] - corners[:, :1]) < 0
     return np.where(negative[:, None], tetrahedra[:, [0, 1, 3, 2]], tetrahedra)
@@ -237,7 +241,7 @@ def _shell_of_revolution(
     seam_rad: float,
     bottom: bool = False,
 ) -> tuple[Points, Points, Indices]:
-    """Points (N, 3), texture coordinates (N, 2) and triangles (M, 3) of a wall along +z."""
+    """Returns points (N, 3), texture coordinates (N, 2) and triangles (M, 3) of a wall along +z."""
     ring, level = np.arange(around), np.arange(along)
     angle = 2 * np.pi * ring / around + seam_rad
     share = level / (along - 1)
@@ -256,7 +260,7 @@ def _shell_of_revolution(
         for i in range(around):
             a, b = i + around * j, (i + 1) % around + around * j
             d, c = a + around, b + around
-            # Diagonals alternate, or the shell would be stiffer one way round than the other.
+            # Diagonals alternate; otherwise the shell would be stiffer one way round than the other.
             faces += [(a, b, c), (a, c, d)] if (i + j) % 2 else [(a, b, d), (b, c, d)]
     if bottom:
         inner = points[:around] * [0.5, 0.5, 1.0]

@@ -11,44 +11,46 @@ import numpy as np
 from gripper_force.fault_injection import Faults
 from gripper_force.interfaces import Camera, Clock, LoadCell
 from gripper_force.types import NS_PER_MS, NS_PER_S, Frame, LoadCellSample
-from gripper_hw.load_cells.screening import Screen
+from gripper_hw.load_cells.screening import SampleValidator
 
-_SLOW_FRAME_NS = NS_PER_S // 5
-_LATE_FRAME_NS = 300 * NS_PER_MS
-_LOST_FRAMES = 0.8
-_LIGHT = 6.0
+# The values of the fault kinds of `FAULTS`, in the order of its units: camera, load cell, clock.
+_SLOW_FRAME_PERIOD_NS = NS_PER_S // 5
+_FRAME_DELAY_NS = 300 * NS_PER_MS
+_LOST_FRAMES_SHARE = 0.8
+_LIGHT_FACTOR = 6.0
 _GAMMA = 2.2
+"""Encoding of the simulated camera."""
 
-_SLOW_SAMPLE_NS = NS_PER_S // 2
-_LATE_SAMPLE_NS = 500 * NS_PER_MS
+_SLOW_SAMPLE_PERIOD_NS = NS_PER_S // 2
+_SAMPLE_DELAY_NS = 500 * NS_PER_MS
 _GAP_NS = 300 * NS_PER_MS
 _FULL_SCALE_N = 200.0
 
-_SLOW_CYCLE_NS = 15 * NS_PER_MS
+_CYCLE_DELAY_NS = 15 * NS_PER_MS
 _DAY_S = 86_400.0
 
 
 class FaultyCamera:
-    """A camera whose frames are lost, late, repeated or spoiled."""
+    """A camera with faults: frames are lost, delayed, repeated or corrupted."""
 
     def __init__(self, camera: Camera, faults: Faults, clock: Clock, seed: int) -> None:
         self._camera, self._faults, self._clock = camera, faults, clock
         self._rng = np.random.default_rng([seed, 4])
-        self._late: deque[Frame] = deque()
+        self._delayed: deque[Frame] = deque()
         self._last: Frame | None = None
         self._next_ns = 0
 
     def start(self) -> None:
-        """Begins to capture."""
+        """Starts capturing."""
         self._camera.start()
 
     def newest(self) -> Frame | None:
-        """The newest frame, as the fault lets it through."""
+        """Returns the newest frame, changed by the active fault, or None."""
         now_ns, frame = self._clock.now_ns(), self._camera.newest()
         kind = self._faults.active("camera", now_ns)
         if kind == "delayed":
             return self._delay(frame, now_ns)
-        self._late.clear()
+        self._delayed.clear()
         if frame is None or kind == "off":
             return None
         match kind:
@@ -58,19 +60,19 @@ class FaultyCamera:
                 noise = self._rng.integers(0, 256, frame.gray.shape, np.uint8)
                 return replace(frame, gray=noise)
             case "wrong":
-                bright = 255 * np.minimum(_LIGHT * (frame.gray / 255) ** _GAMMA, 1) ** (1 / _GAMMA)
+                bright = 255 * np.minimum(_LIGHT_FACTOR * (frame.gray / 255) ** _GAMMA, 1) ** (1 / _GAMMA)
                 return replace(frame, gray=bright.astype(np.uint8))
             case "slow":
                 if now_ns < self._next_ns:
                     return None
-                self._next_ns = now_ns + _SLOW_FRAME_NS
-            case "intermittent" if self._rng.random() < _LOST_FRAMES:
+                self._next_ns = now_ns + _SLOW_FRAME_PERIOD_NS
+            case "intermittent" if self._rng.random() < _LOST_FRAMES_SHARE:
                 return None
         self._last = frame
         return frame
 
     def counts(self) -> dict[str, int]:
-        """What the camera within counts."""
+        """Counters of the wrapped camera."""
         return self._camera.counts()
 
     def close(self) -> None:
@@ -79,50 +81,50 @@ class FaultyCamera:
 
     def _delay(self, frame: Frame | None, now_ns: int) -> Frame | None:
         if frame is not None:
-            self._late.append(replace(frame, received_ns=frame.received_ns + _LATE_FRAME_NS))
+            self._delayed.append(replace(frame, received_ns=frame.received_ns + _FRAME_DELAY_NS))
         newest = None
-        while self._late and self._late[0].received_ns <= now_ns:
-            newest = self._late.popleft()
+        while self._delayed and self._delayed[0].received_ns <= now_ns:
+            newest = self._delayed.popleft()
         return newest
 
 
 class FaultyLoadCell:
-    """A load cell that fails, behind the screen that real ones have."""
+    """A load cell with faults. Its samples are validated like those of real load cells."""
 
     def __init__(self, cell: LoadCell, faults: Faults, clock: Clock, seed: int) -> None:
         self._cell, self._faults, self._clock = cell, faults, clock
         self._rng = np.random.default_rng([seed, 5])
-        self._screen = Screen(0.0, 1.0, noisy=True)
-        self._late: deque[LoadCellSample] = deque()
+        self._validator = SampleValidator(0.0, 1.0, noisy=True)
+        self._delayed: deque[LoadCellSample] = deque()
         self._last_n = 0.0
         self._next_ns = 0
 
     def start(self) -> None:
-        """Begins to sample."""
+        """Starts sampling."""
         self._cell.start()
 
     def drain(self) -> list[LoadCellSample]:
-        """The samples since the last call that can be judged by now."""
+        """Returns the samples since the last call that can be checked by now, oldest first."""
         now_ns = self._clock.now_ns()
-        self._late.extend(replace(s, t_ns=s.t_ns + _LATE_SAMPLE_NS) for s in self._cell.drain())
-        while self._late:
-            on_time_ns = self._late[0].t_ns - _LATE_SAMPLE_NS
-            kind = self._faults.active("load_cell", on_time_ns)
-            if kind == "delayed" and self._late[0].t_ns > now_ns:
+        self._delayed.extend(replace(s, t_ns=s.t_ns + _SAMPLE_DELAY_NS) for s in self._cell.drain())
+        while self._delayed:
+            sampled_ns = self._delayed[0].t_ns - _SAMPLE_DELAY_NS
+            kind = self._faults.active("load_cell", sampled_ns)
+            if kind == "delayed" and self._delayed[0].t_ns > now_ns:
                 break
-            sample = self._late.popleft()
-            self._read(kind, sample.t_ns if kind == "delayed" else on_time_ns, sample.raw)
-        return self._screen.take(now_ns)
+            sample = self._delayed.popleft()
+            self._add(kind, sample.t_ns if kind == "delayed" else sampled_ns, sample.raw)
+        return self._validator.take(now_ns)
 
     def counts(self) -> dict[str, int]:
-        """What the screen rejects: cause to how often."""
-        return self._screen.counts()
+        """Number of rejected samples, by cause."""
+        return self._validator.counts()
 
     def close(self) -> None:
         """Stops sampling. May be called twice."""
         self._cell.close()
 
-    def _read(self, kind: str, t_ns: int, raw: float) -> None:
+    def _add(self, kind: str, t_ns: int, raw: float) -> None:
         match kind:
             case "off":
                 return
@@ -135,47 +137,47 @@ class FaultyLoadCell:
             case "slow":
                 if t_ns < self._next_ns:
                     return
-                self._next_ns = t_ns + _SLOW_SAMPLE_NS
+                self._next_ns = t_ns + _SLOW_SAMPLE_PERIOD_NS
             case "intermittent" if t_ns // _GAP_NS % 2:
                 return
         self._last_n = raw
         if kind == "wrong":
             raw = _FULL_SCALE_N
-        self._screen.add(t_ns, raw, saturated=raw >= _FULL_SCALE_N)
+        self._validator.add(t_ns, raw, saturated=raw >= _FULL_SCALE_N)
 
 
 class FaultyClock:
-    """A clock that oversleeps, or a host whose wall clock jumps, which nothing here may go by."""
+    """A clock with faults: it sleeps too long, or the host's wall clock (which no code may use) jumps."""
 
     def __init__(self, clock: Clock, faults: Faults) -> None:
         self._clock, self._faults = clock, faults
-        self._jump = mock.patch("time.time", self._wrong_time)
-        self._right_time = time.time
-        self._jumped = False
+        self._time_patch = mock.patch("time.time", self._wrong_time)
+        self._real_time = time.time
+        self._patched = False
 
     def now_ns(self) -> int:
         """Monotonic time."""
         return self._clock.now_ns()
 
     def sleep_until_ns(self, t_ns: int) -> None:
-        """Returns at ``t_ns``, or when the fault lets it."""
+        """Returns at ``t_ns``, or later because of the active fault."""
         kind = self._faults.active("clock", t_ns)
-        if (kind == "wrong") != self._jumped:
+        if (kind == "wrong") != self._patched:
             self.close()
             if kind == "wrong":
-                self._jump.start()
-                self._jumped = True
+                self._time_patch.start()
+                self._patched = True
         if kind == "stuck":
             t_ns = self._faults.end_ns("clock", t_ns)
         elif kind == "slow":
-            t_ns += _SLOW_CYCLE_NS
+            t_ns += _CYCLE_DELAY_NS
         self._clock.sleep_until_ns(t_ns)
 
     def close(self) -> None:
-        """Sets the wall clock right. May be called twice."""
-        if self._jumped:
-            self._jump.stop()
-            self._jumped = False
+        """Restores the wall clock. May be called twice."""
+        if self._patched:
+            self._time_patch.stop()
+            self._patched = False
 
     def _wrong_time(self) -> float:
-        return self._right_time() - _DAY_S
+        return self._real_time() - _DAY_S

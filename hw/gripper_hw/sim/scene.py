@@ -1,4 +1,4 @@
-"""A scene: everything that is drawn from the seed, and the MJCF that it makes."""
+"""Scenes: parameters drawn from the seed, and the MJCF made of them."""
 
 import base64
 import re
@@ -11,21 +11,21 @@ import numpy.typing as npt
 
 from gripper_force.config import GripperConfig, SimConfig
 from gripper_force.errors import ConfigError
-from gripper_hw.sim.objects import FOR_PADS_ALONE, GAUGES, ObjectModel, build_object
+from gripper_hw.sim.objects import GAUGES, PADS_ONLY, ObjectModel, build_object
 
 LUX_LEVELS = (350.0, 550.0, 750.0)
 """The paper's three light levels."""
 
-# MuJoCo's default friction is soft: under a constant push it creeps, and in three seconds it is gone. All of
-# it acts at the horn, for on light jaws friction this hard makes the pads chatter.
+# MuJoCo's default friction is soft: under a constant force it creeps, and vanishes within three seconds. All
+# friction acts at the horn, because on light jaws friction this hard makes the pads chatter.
 _HARD_FRICTION = 'solreffriction=".005 1" solimpfriction=".997 .999 .001"'
 _PAD_HALF_THICKNESS_M = 0.004
 _ROD_RADIUS_M = 0.012
 _FINGER_X_M = {"pads": 0.009, "rods": 0.022}
-"""How far behind the middle of a pad its finger is."""
+"""Distance of the finger behind the centre of a pad, by tool."""
 
-PASSING = 4
-"""Things that pass behind the object in a scene whose background moves."""
+BACKGROUND_OBJECTS = 4
+"""Number of objects that move behind the grasped object in a scene with a moving background."""
 
 _MARKER_MATERIALS = "".join(
     f'<texture name="marker_{i}" type="2d" file="marker_{i}.png"/>'
@@ -33,43 +33,45 @@ _MARKER_MATERIALS = "".join(
     for i in (0, 1)
 )
 
+# One gray pixel, in place of textures that are never rendered.
 _BLANK_PNG = base64.b64decode(
     "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVQIHWNoAAAAggCB8KrjIgAAAABJRU5ErkJggg=="
 )
 
+# Position of the camera relative to the point between the jaws.
 _CAMERA_FROM_GRIP_M = np.array([0.10, -0.30, 0.125])
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What one scene is made of. Each number but the first two may be drawn from the seed.
+    """Parameters of one scene. The numbers may be drawn from the seed.
 
     Attributes:
-        object: The object's name.
+        object: Name of the object.
         detail: Level of detail of its mesh.
-        tool: What touches it, as in `gripper_force.config.SimConfig`.
+        tool: Ends of the jaws, ``pads`` or ``rods``.
         size: Factor on the object's lengths.
         stiffness: Factor on the object's force at a given travel.
-        offset_m: Place of the object against the gripper's centre, x and y.
-        yaw_deg: Turn of the object about the vertical.
-        camera_offset_m: Shift of the camera.
-        camera_target_offset_m: Shift of the point it looks at.
+        offset_m: Position of the object relative to the gripper's centre, x and y.
+        yaw_deg: Rotation of the object about the vertical.
+        camera_offset_m: Offset of the camera's position.
+        camera_target_offset_m: Offset of the point the camera is aimed at.
         camera_fovy_deg: Vertical field of view.
         lux: Illumination.
         light_direction: Direction of the key light.
-        light_ambient: Share of the light that comes from everywhere.
+        light_ambient: Ambient share of the light.
         texture_seed: Seed of the object's texture.
-        table_seed: Seed of the table's.
-        shot_noise: Photon noise at full scale.
-        nm_per_a: True torque constant over the catalogue's.
+        table_seed: Seed of the table's texture, the light's variation and the background.
+        shot_noise: Standard deviation of the photon noise at full scale, as a share of it.
+        nm_per_a: True torque constant divided by the catalogue's.
         servo_friction_nm: Coulomb friction of motor and gears at the horn.
         servo_damping_nm_s: Viscous friction at the horn.
-        jaw_friction_n: Coulomb friction of one rail; it is felt at the horn.
+        jaw_friction_n: Coulomb friction of one rail; applied at the horn.
         backlash_m: Half of the gear play at the rack.
-        rod_length_m: How far a rod, where that is the tool, stands out of its finger.
-        markers: Whether each finger carries an ArUco marker.
-        changing_light: Whether the light swells and fades.
-        moving_background: Whether things pass behind the object.
+        rod_length_m: Length of a rod beyond its finger (tool ``rods`` only).
+        markers: True if each finger carries an ArUco marker.
+        changing_light: True if the light varies over time.
+        moving_background: True if objects move in the background.
     """
 
     object: str
@@ -103,27 +105,27 @@ def draw_scene(object_name: str, seed: int, config: SimConfig) -> Scene:
     """Draws a scene. The same arguments give the same scene.
 
     Args:
-        object_name: The object's name.
-        seed: Draws how the object is placed, and whatever ``config`` names no seed for.
-        config: What else is asked for: ``object_seed`` draws the object itself, ``rig_seed`` the gripper and
-            its surroundings.
+        object_name: Name of the object.
+        seed: Seed of the object's place, and of everything for which ``config`` has no seed.
+        config: The sim section of the configuration: ``object_seed`` draws the object, ``rig_seed`` the
+            gripper and its surroundings.
     """
 
-    def drawn(own_seed: int | None) -> Scene:
-        return _draw(object_name, seed if own_seed is None else own_seed, config)
+    def draw(other_seed: int | None) -> Scene:
+        return _draw(object_name, seed if other_seed is None else other_seed, config)
 
-    placed, itself, rig = drawn(None), drawn(config.object_seed), drawn(config.rig_seed)
-    known = object_name in GAUGES
+    placement, grasped, rig = draw(None), draw(config.object_seed), draw(config.rig_seed)
+    exact = object_name in GAUGES
     return replace(
         rig,
         markers=config.markers,
         changing_light=config.changing_light,
         moving_background=config.moving_background,
-        size=1.0 if known else itself.size,
-        stiffness=1.0 if known else itself.stiffness,
-        texture_seed=itself.texture_seed,
-        offset_m=placed.offset_m,
-        yaw_deg=placed.yaw_deg,
+        size=1.0 if exact else grasped.size,
+        stiffness=1.0 if exact else grasped.stiffness,
+        texture_seed=grasped.texture_seed,
+        offset_m=placement.offset_m,
+        yaw_deg=placement.yaw_deg,
     )
 
 
@@ -133,12 +135,14 @@ def _draw(object_name: str, seed: int, config: SimConfig) -> Scene:
     if not config.randomise:
         return Scene(object_name, config.detail, config.tool, yaw_deg=config.yaw_deg, lux=lux)
 
-    def shift(*spread: float) -> tuple[float, ...]:
-        return tuple(float(v) for v in rng.uniform(-1, 1, len(spread)) * spread)
+    def offsets(*half_widths: float) -> tuple[float, ...]:
+        return tuple(float(v) for v in rng.uniform(-1, 1, len(half_widths)) * half_widths)
 
-    x, y = shift(0.0015, 0.003)
-    # The camera is bolted to the gripper: what varies is how well, and its lens.
-    camera, target, light = shift(0.003, 0.003, 0.003), shift(0.0015, 0.0015, 0.0015), shift(0.15, 0.15, 0.15)
+    x, y = offsets(0.0015, 0.003)
+    # The camera is mounted on the gripper: only the mounting's precision and the lens vary.
+    camera = offsets(0.003, 0.003, 0.003)
+    target = offsets(0.0015, 0.0015, 0.0015)
+    light = offsets(0.15, 0.15, 0.15)
     return Scene(
         object_name,
         config.detail,
@@ -153,27 +157,36 @@ def _draw(object_name: str, seed: int, config: SimConfig) -> Scene:
         lux=lux * float(rng.uniform(0.95, 1.05)),
         light_direction=(-0.40 + light[0], 0.55 + light[1], -0.75 + light[2]),
         light_ambient=float(rng.uniform(0.22, 0.38)),
-        texture_seed=(textures := int(rng.integers(2**31))),
-        table_seed=textures,
+        texture_seed=(texture_seed := int(rng.integers(2**31))),
+        table_seed=texture_seed,
         shot_noise=float(rng.uniform(0.012, 0.024)),
         nm_per_a=float(rng.uniform(0.92, 1.08)),
         servo_friction_nm=float(rng.uniform(0.021, 0.039)),
         servo_damping_nm_s=float(rng.uniform(0.007, 0.013)),
         jaw_friction_n=float(rng.uniform(0.14, 0.26)),
         backlash_m=float(rng.uniform(0.0002, 0.0004)),
-        # How far the jaws are closed is no measure of the force: how tools are mounted differs by more.
+        # This varies more than the jaws' travel under force, so that travel alone does not give the force.
         rod_length_m=0.020 + (float(rng.uniform(-0.003, 0.003)) if config.tool == "rods" else 0.0),
     )
 
 
-def scene_mjcf(scene: Scene, gripper: GripperConfig, *, seen: bool = True) -> tuple[str, dict[str, bytes]]:
-    """MJCF text and its assets, blank ones for a scene that is not ``seen``.
+def scene_mjcf(
+    scene: Scene, gripper: GripperConfig, *, textured: bool = True
+) -> tuple[str, dict[str, bytes]]:
+    """Returns the MJCF text of a scene, and its assets by file name.
+
+    Args:
+        scene: The scene.
+        gripper: The gripper's geometry.
+        textured: False for blank textures, if the scene is never rendered.
 
     Raises:
-        ConfigError: The object is unknown, or the tool is not for it.
+        ConfigError: The object does not exist, or the tool is not suitable for it.
     """
-    if scene.tool == "rods" and scene.object in FOR_PADS_ALONE:
-        raise ConfigError(f"rods would dent the simulated {scene.object} beyond its model; set sim.tool=pads")
+    if scene.tool == "rods" and scene.object in PADS_ONLY:
+        raise ConfigError(
+            f"sim.tool=rods would dent the simulated {scene.object} beyond its model; set sim.tool=pads"
+        )
     model = build_object(scene.object, scene.detail, scene.size, scene.stiffness)  # type: ignore[arg-type]
     grip = np.array([0.0, 0.0, model.grip_height_m])
     position = grip + _CAMERA_FROM_GRIP_M + scene.camera_offset_m
@@ -196,7 +209,7 @@ def scene_mjcf(scene: Scene, gripper: GripperConfig, *, seen: bool = True) -> tu
         contact=model.contact,
         jaw_start=_text([gripper.open_width_m / 2 + _PAD_HALF_THICKNESS_M]),
         jaw_travel=_text([gripper.open_width_m / 2 - 0.001]),
-        passing=_passing(scene),
+        background=_background(scene),
         left_tool=_tool(scene, -1),
         right_tool=_tool(scene, 1),
         left_marker=_marker(scene, -1),
@@ -212,7 +225,7 @@ def scene_mjcf(scene: Scene, gripper: GripperConfig, *, seen: bool = True) -> tu
         backlash_m=scene.backlash_m,
         pinion_radius_m=gripper.pinion_radius_m,
     )
-    if not seen:
+    if not textured:
         return text, dict.fromkeys(re.findall(r'file="(.+?)"', text), _BLANK_PNG)
     from gripper_hw.sim.textures import draw_markers, draw_textures
 
@@ -223,14 +236,14 @@ def scene_mjcf(scene: Scene, gripper: GripperConfig, *, seen: bool = True) -> tu
 def _tool(scene: Scene, side: int) -> str:
     if scene.tool == "pads":
         return 'type="box" size=".004 .012 .011"'
-    # The tip of a rod of 20 mm is where a pad's face would be.
+    # The tip of a rod of 20 mm is at the position of a pad's face.
     root = _ROD_RADIUS_M - _PAD_HALF_THICKNESS_M + 0.020
     ends = _text([side * (root - scene.rod_length_m), 0, 0, side * root, 0, 0])
     return f'type="capsule" size="{_ROD_RADIUS_M}" fromto="{ends}"'
 
 
 def _marker(scene: Scene, side: int) -> str:
-    """A plate on a jaw, where the finger of a pad is: nearer to the object it would hide the contact."""
+    """Plate on a jaw, at the position of a pad's finger: nearer to the object it would hide the contact."""
     if not scene.markers:
         return ""
     place = _text([side * _FINGER_X_M["pads"], -0.0125, 0.0])
@@ -240,14 +253,16 @@ def _marker(scene: Scene, side: int) -> str:
     )
 
 
-def _passing(scene: Scene) -> str:
-    """Boxes and eggs, from dark to bright; `World` moves them."""
+def _background(scene: Scene) -> str:
+    """Boxes and ellipsoids, from dark to bright; `World` moves them."""
     if not scene.moving_background:
         return ""
     return "".join(
-        f'<geom name="passing_{i}" type="{"ellipsoid" if i % 2 else "box"}" size="{_text(size)}" '
-        f'rgba="{_text([*(3 * [(i + 1) / PASSING]), 1])}" contype="0" conaffinity="0"/>'
-        for i, size in enumerate(np.random.default_rng(scene.table_seed).uniform(0.008, 0.025, (PASSING, 3)))
+        f'<geom name="background_{i}" type="{"ellipsoid" if i % 2 else "box"}" size="{_text(size)}" '
+        f'rgba="{_text([*(3 * [(i + 1) / BACKGROUND_OBJECTS]), 1])}" contype="0" conaffinity="0"/>'
+        for i, size in enumerate(
+            np.random.default_rng(scene.table_seed).uniform(0.008, 0.025, (BACKGROUND_OBJECTS, 3))
+        )
     )
 
 

@@ -1,4 +1,4 @@
-"""The simulated rig: one world behind a virtual servo, a camera and a load cell."""
+"""Simulated rig: a world that drives a virtual servo, a camera and a load cell."""
 
 import json
 import threading
@@ -27,113 +27,123 @@ from gripper_hw.sim.world import World
 if TYPE_CHECKING:
     from gripper_hw.dynamixel.bus_faults import WireFaults
 
-FRAME_SIDE = 128
-_OVERSAMPLED = 2
-"""A pixel gathers light over its area; else edges would move by whole pixels."""
+FRAME_SIDE_PX = 128
+_SUPERSAMPLING = 2
+"""Rendered pixels per frame pixel and axis. Without it, edges would move by whole pixels."""
 
-_EXPOSURE_US = 4000
+_NOMINAL_EXPOSURE_US = 4000
 _WHITE_LUX = 470.0
-"""Light at which a perfectly white surface fills the range at that exposure."""
+"""Light at which a perfectly white surface reaches full scale at the nominal exposure."""
 
 _LUMA = np.array([0.299, 0.587, 0.114], np.float32)
+"""Weights of red, green and blue in gray (ITU-R BT.601)."""
+
 _GAMMA = 2.2
 _READ_NOISE = 0.002
+"""Standard deviation of the read noise, as a share of full scale."""
+
 _VIGNETTE = 0.12
-_UNREAD = 64
-"""Frames kept that have arrived and nobody took."""
+"""Loss of light at the middle of an image's edge."""
+
+_MAX_UNREAD_FRAMES = 64
+_MAX_UNREAD_SAMPLES = 100_000
+"""Frames and samples kept if they are never read; the oldest are dropped."""
 
 _REALTIME_SLICE_NS = 5 * NS_PER_MS
+"""Longest simulated time between two checks for the end of the thread."""
+
 _REALTIME_MAX_LAG_NS = 500 * NS_PER_MS
+"""Largest lag of the world behind the host's time; more is an error."""
 
 
 class LockstepClock:
-    """Simulated time. To sleep is to let the world go on."""
+    """Simulated time. Sleeping advances the world."""
 
     def __init__(self, world: World) -> None:
         self._world = world
         self._now_ns = 0
 
     def now_ns(self) -> int:
-        """Simulated time."""
+        """Returns the simulated time."""
         return self._now_ns
 
     def sleep_until_ns(self, t_ns: int) -> None:
-        """Moves the world to ``t_ns``."""
+        """Simulates the world up to ``t_ns``."""
         self._now_ns = max(self._now_ns, t_ns)
         self._world.advance_to(self._now_ns)
 
 
 class SimulatedCamera:
-    """Draws the world at the middle of each exposure and hands the picture on after the camera's latency."""
+    """Renders the world at the middle of each exposure; a frame is available after the camera's latency."""
 
     def __init__(self, world: World, scene: Scene, config: Config, clock: Clock, start_ns: int) -> None:
         self._world, self._scene, self._clock, self._start_ns = world, scene, clock, start_ns
         self._surroundings = Surroundings(scene)
         self._latency_ns = round(config.sim.camera_latency_ms * NS_PER_MS)
         self._period_ns = round(NS_PER_S / config.camera.rate_hz)
-        self._exposure = _exposure(config)
+        self._exposure = _relative_exposure(config)
         self._rng = np.random.default_rng([config.seed, 2])
-        self._under_way: deque[Frame] = deque(maxlen=_UNREAD + self._latency_ns // self._period_ns)
+        self._pending: deque[Frame] = deque(maxlen=_MAX_UNREAD_FRAMES + self._latency_ns // self._period_ns)
         self._seq = 0
         self._started = self._closed = False
 
     def start(self) -> None:
-        """Begins to capture."""
+        """Starts capturing."""
         if not self._started:
             self._started = True
-            self._world.every(self._period_ns, self._capture)
+            self._world.call_every(self._period_ns, self._capture)
 
     def newest(self) -> Frame | None:
-        """The newest frame that has arrived and was not handed out, or None."""
+        """Returns the newest available frame that was not returned yet, or None."""
         now_ns, frame = self._clock.now_ns(), None
-        while self._under_way and self._under_way[0].received_ns <= now_ns:
-            frame = self._under_way.popleft()
+        while self._pending and self._pending[0].received_ns <= now_ns:
+            frame = self._pending.popleft()
         return frame
 
     def counts(self) -> dict[str, int]:
-        """Nothing goes wrong here."""
+        """Empty: without injected faults nothing is lost or rejected."""
         return {}
 
     def close(self) -> None:
-        """Stops capturing; the world owns the drawing context. May be called twice."""
+        """Stops capturing. May be called twice. The world frees the rendering context."""
         self._closed = True
-        self._under_way.clear()
+        self._pending.clear()
 
     def _capture(self, t_ns: int) -> None:
         if self._closed:
             return
-        picture = self._world.render(_OVERSAMPLED * FRAME_SIDE)
-        lux = self._scene.lux * self._surroundings.light(t_ns / NS_PER_S)
-        gray = expose(picture, lux * self._exposure, self._scene.shot_noise, self._rng)
+        image = self._world.render(_SUPERSAMPLING * FRAME_SIDE_PX)
+        lux = self._scene.lux * self._surroundings.light_factor(t_ns / NS_PER_S)
+        gray = expose(image, lux * self._exposure, self._scene.shot_noise, self._rng)
         t_ns += self._start_ns
-        self._under_way.append(Frame(t_ns, t_ns + self._latency_ns, self._seq, gray))
+        self._pending.append(Frame(t_ns, t_ns + self._latency_ns, self._seq, gray))
         self._seq += 1
 
 
 class SimulatedLoadCell:
-    """Strain gauges behind the pads: the mean of both, with white noise."""
+    """Simulated load cell: mean force on the two pads, with white noise."""
 
-    _NOISE_N = 0.01
+    _NOISE_N = 0.01  # standard deviation
 
     def __init__(self, world: World, config: Config, start_ns: int) -> None:
         self._world, self._start_ns = world, start_ns
         self._period_ns = round(NS_PER_S / config.load_cell.rate_hz)
         self._rng = np.random.default_rng([config.seed, 3])
-        self._samples: deque[LoadCellSample] = deque(maxlen=100_000)
+        self._samples: deque[LoadCellSample] = deque(maxlen=_MAX_UNREAD_SAMPLES)
         self._started = self._closed = False
 
     def start(self) -> None:
-        """Begins to sample."""
+        """Starts sampling."""
         if not self._started:
             self._started = True
-            self._world.every(self._period_ns, self._sample)
+            self._world.call_every(self._period_ns, self._sample)
 
     def drain(self) -> list[LoadCellSample]:
-        """Every sample since the last call."""
+        """Returns all samples since the last call, oldest first."""
         return [self._samples.popleft() for _ in range(len(self._samples))]
 
     def counts(self) -> dict[str, int]:
-        """Nothing goes wrong here."""
+        """Empty: without injected faults nothing is lost or rejected."""
         return {}
 
     def close(self) -> None:
@@ -149,7 +159,7 @@ class SimulatedLoadCell:
 
 
 class _LockedMotor:
-    """Keeps the world's thread and the bus' apart."""
+    """The virtual servo's firmware as the world's motor: holds the bus's lock and applies wire faults."""
 
     def __init__(
         self, servo: VirtualServo, lock: AbstractContextManager[object], faults: "WireFaults | None"
@@ -164,20 +174,38 @@ class _LockedMotor:
 
 
 class SimulatedRig:
-    """Owns the world, and serves its servo as the port that the configuration names.
+    """Owns the world, and offers its servo at the virtual port ``servo.port``.
 
-    In lockstep the session's clock moves the world. In real time a thread of the rig's own keeps the world at
-    the host's time, and says so in a `SimulationError` where the machine is too slow for the scene.
+    In lockstep the run's clock advances the world. In real time a thread keeps the world at the host's time;
+    if the machine is too slow for the scene, `check` raises `SimulationError`.
+
+    Args:
+        config: A configuration without ``sim.detail: auto`` (see `resolve`).
+
+    Attributes:
+        scene: The simulated scene.
+        clock: The run's clock.
+        camera: The simulated camera, with its faults.
+        load_cell: The simulated load cell, with its faults.
+        start_ns: Start of the run on its clock.
+
+    Raises:
+        ConfigError: ``servo.port`` is not virtual or already in use, ``sim.detail`` is not resolved, or the
+            object does not exist.
+        SimulationError: The scene cannot be built.
     """
 
     def __init__(self, config: Config) -> None:
         if not config.servo.port.startswith("virtual:"):
             raise ConfigError(
-                f"servo.port {config.servo.port!r} is no virtual port, and a simulated camera or load cell "
-                "sees the simulated rig's servo alone; set camera.backend and load_cell.backend to what you "
-                "have, or to none, or set servo.port to virtual:rig"
+                f"servo.port {config.servo.port!r} is not virtual, but a simulated camera or load cell needs "
+                "the simulated servo; set camera.backend and load_cell.backend to real devices or none, or "
+                "set servo.port to virtual:rig"
             )
-        config, self._why = resolve_detail(config)
+        if config.sim.detail == "auto":
+            raise ConfigError(
+                "sim.detail is still auto; resolve the configuration with SimulatedRig.resolve first"
+            )
         self._config = config
         self.scene = draw_scene(config.object, config.seed, config.sim)
         model = load_model(config.servo.model)
@@ -192,16 +220,16 @@ class SimulatedRig:
 
             wire = WireFaults(bus, faults, config.seed)
         motor = _LockedMotor(servo, bus.lock, wire)
-        seen = config.camera.backend == "simulated"
-        self._world = World(self.scene, config.gripper, motor, model.nm_per_a, config.seed, seen=seen)
-        self._exposure_ms = config.sim.exposure_ms * _exposure(config)
+        textured = config.camera.backend == "simulated"
+        self._world = World(self.scene, config.gripper, motor, model.nm_per_a, config.seed, textured=textured)
+        self._exposure_ms = config.sim.exposure_ms * _relative_exposure(config)
         clock: Clock = LockstepClock(self._world) if self._lockstep else MonotonicClock()
         self.clock: Clock = clock
         self.camera: Camera = SimulatedCamera(self._world, self.scene, config, clock, start_ns)
         self.load_cell: LoadCell = SimulatedLoadCell(self._world, config, start_ns)
         self._closing = ExitStack()
         if config.faults:
-            self._break_devices(faults, config.seed)
+            self._wrap_in_faults(faults, config.seed)
         self._bus_name = config.servo.port.removeprefix("virtual:")
         register_bus(self._bus_name, bus)
         self.start_ns = start_ns
@@ -209,7 +237,20 @@ class SimulatedRig:
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
 
-    def _break_devices(self, faults: Faults, seed: int) -> None:
+    @staticmethod
+    def resolve(config: Config) -> tuple[Config, str]:
+        """Replaces ``sim.detail: auto`` by a level of detail.
+
+        Returns:
+            The configuration with a level, and the reason for the choice; an empty reason if it was not
+            ``auto``.
+
+        Raises:
+            ConfigError: The object has no measured levels, no budget is set, or no level meets it.
+        """
+        return resolve_detail(config)
+
+    def _wrap_in_faults(self, faults: Faults, seed: int) -> None:
         from gripper_hw.sim.rig_faults import FaultyCamera, FaultyClock, FaultyLoadCell
 
         clock = self.clock
@@ -222,30 +263,29 @@ class SimulatedRig:
             self.load_cell = FaultyLoadCell(self.load_cell, faults, clock, seed)
 
     def start(self) -> None:
-        """Sets the world going; in lockstep the clock does that."""
+        """Starts the world's thread; in lockstep the clock advances the world instead."""
         if not self._lockstep and self._thread is None:
-            self._thread = threading.Thread(target=self._keep_pace, name="simulated-rig", daemon=True)
+            self._thread = threading.Thread(target=self._run_in_real_time, name="simulated-rig", daemon=True)
             self._thread.start()
 
     def check(self) -> None:
-        """Raises what broke the world's own thread, if anything did."""
+        """Re-raises an exception of the world's thread, if there was one."""
         if self._failure is not None:
             raise self._failure
 
     def notes(self) -> dict[str, str]:
-        """What a log should know of the scene."""
-        why = {"detail": self._why} if self._why else {}
-        return {"scene": json.dumps(asdict(self.scene)), "exposure_ms": str(self._exposure_ms), **why}
+        """Facts for the log: the scene's parameters and the exposure."""
+        return {"scene": json.dumps(asdict(self.scene)), "exposure_ms": str(self._exposure_ms)}
 
     def render_under_light(self, lux: float) -> tuple[Camera, dict[str, str]]:
-        """A further camera, which sees what a rig of its own with this ``sim.lux`` would, and its notes."""
+        """Returns a camera of this world with the images of a rig of this ``sim.lux``, and its notes."""
         config = self._config.model_copy(update={"sim": self._config.sim.model_copy(update={"lux": lux})})
         scene = draw_scene(config.object, config.seed, config.sim)
         camera = SimulatedCamera(self._world, scene, config, self.clock, self.start_ns)
         return camera, {**self.notes(), "scene": json.dumps(asdict(scene))}
 
     def close(self) -> None:
-        """Stops the world and takes its bus away. May be called twice."""
+        """Stops the world and unregisters its bus. May be called twice."""
         self._stop.set()
         if self._thread is not None:
             self._thread.join()
@@ -256,18 +296,18 @@ class SimulatedRig:
             self._world.close()
 
     def _bus_time_ns(self) -> int:
-        # The firmware's clock is the world's, so that its watchdog counts simulated time.
+        # Simulated time, so that the watchdog of the firmware counts it.
         return self._world.t_ns
 
-    def _keep_pace(self) -> None:
+    def _run_in_real_time(self) -> None:
         try:
             while not self._stop.is_set():
                 due_ns = time.monotonic_ns() - self.start_ns
                 lag_ns = due_ns - self._world.t_ns
                 if lag_ns > _REALTIME_MAX_LAG_NS:
                     raise SimulationError(  # noqa: TRY301
-                        f"this machine can't simulate {self.scene.object!r} ({self.scene.detail}) in real "
-                        "time: take sim.detail=coarse, or clock=lockstep"
+                        f"this machine is too slow to simulate {self.scene.object!r} ({self.scene.detail}) "
+                        "in real time; set sim.detail=coarse or clock=lockstep"
                     )
                 self._world.advance_to(min(due_ns, self._world.t_ns + _REALTIME_SLICE_NS))
                 if lag_ns < _REALTIME_SLICE_NS:
@@ -275,23 +315,33 @@ class SimulatedRig:
         except Exception as error:  # `check` raises it in the session's thread
             self._failure = error
         finally:
-            self._world.close()  # the drawing context belongs to this thread
+            self._world.close()  # the rendering context belongs to this thread
 
 
-def _exposure(config: Config) -> float:
-    """Share of the light that falls in, against the simulated camera's usual exposure."""
-    return (config.camera.exposure_us or _EXPOSURE_US) / _EXPOSURE_US
+def _relative_exposure(config: Config) -> float:
+    """Returns the exposure time divided by the nominal one."""
+    return (config.camera.exposure_us or _NOMINAL_EXPOSURE_US) / _NOMINAL_EXPOSURE_US
 
 
-def expose(picture: npt.NDArray[np.uint8], lux: float, shot_noise: float, rng: np.random.Generator) -> Gray:
-    """Turns a rendered picture (2H, 2W, 3) into what a gray camera with locked exposure sees: (H, W) uint8.
+def expose(image: npt.NDArray[np.uint8], lux: float, shot_noise: float, rng: np.random.Generator) -> Gray:
+    """Converts a rendered image to a frame of a gray camera with locked exposure.
 
-    It is averaged over each pixel, linearised, lit, vignetted, given photon and read noise, and encoded.
+    The image is averaged over each pixel and linearised; light, vignette, photon and read noise are applied;
+    the result is encoded with gamma 2.2.
+
+    Args:
+        image: Rendered image, (2 H, 2 W, 3) uint8.
+        lux: Illumination, scaled by the relative exposure.
+        shot_noise: Standard deviation of the photon noise at full scale, as a share of it.
+        rng: Source of the noise.
+
+    Returns:
+        Frame, (H, W) uint8.
     """
     import cv2
 
-    height, width = picture.shape[0] // _OVERSAMPLED, picture.shape[1] // _OVERSAMPLED
-    pixels = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
+    height, width = image.shape[0] // _SUPERSAMPLING, image.shape[1] // _SUPERSAMPLING
+    pixels = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
     gray = pixels @ _LUMA / 255.0  # (H, W)
     y, x = np.ogrid[:height, :width]
     radius2 = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / (width * width / 4)

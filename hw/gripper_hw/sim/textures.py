@@ -1,35 +1,48 @@
-"""Textures drawn from a seed."""
+"""Random textures and ArUco markers as PNG files."""
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 Image = npt.NDArray[np.uint8]
-_SIDE = 256
+_SIDE_PX = 256
 
 
 def draw_textures(object_texture: str | None, seed: int, table_seed: int) -> dict[str, bytes]:
-    """PNG files by name: the table and, if the object has one, its own."""
+    """Draws the texture of the table and, if it has one, of the object.
+
+    Args:
+        object_texture: File name of the object's texture, or None.
+        seed: Seed of the object's texture.
+        table_seed: Seed of the table's texture.
+
+    Returns:
+        File name to content of a PNG file.
+    """
     images = {"table.png": _table(np.random.default_rng(table_seed))}
     if object_texture is not None:
         rng = np.random.default_rng(seed)
-        _table(rng)  # objects of one seed keep their texture: this was once the only table
-        images[object_texture] = _OF_OBJECTS[object_texture](rng)
+        _table(rng)  # the table was once drawn first from this seed; without this, textures would change
+        images[object_texture] = _OBJECT_TEXTURES[object_texture](rng)
     return {name: cv2.imencode(".png", image)[1].tobytes() for name, image in images.items()}
 
 
 def draw_markers() -> dict[str, bytes]:
-    """PNG files by name: the ArUco markers 0 and 1, each in its quiet zone."""
+    """Draws the ArUco markers 0 and 1, each with its quiet zone.
+
+    Returns:
+        File name to content of a PNG file.
+    """
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
-    sheets = {
+    images = {
         f"marker_{i}.png": np.pad(cv2.aruco.generateImageMarker(dictionary, i, 192), 32, constant_values=255)
         for i in (0, 1)
     }
-    return {name: cv2.imencode(".png", sheet)[1].tobytes() for name, sheet in sheets.items()}
+    return {name: cv2.imencode(".png", image)[1].tobytes() for name, image in images.items()}
 
 
 def _clouds(rng: np.random.Generator, sigma: float) -> npt.NDArray[np.float32]:
-    noise = rng.standard_normal((_SIDE, _SIDE)).astype(np.float32)
+    noise = rng.standard_normal((_SIDE_PX, _SIDE_PX)).astype(np.float32)
     smooth = np.asarray(cv2.GaussianBlur(noise, (0, 0), sigma, borderType=cv2.BORDER_REFLECT), np.float32)
     scaled: npt.NDArray[np.float32] = smooth / smooth.std()
     return scaled
@@ -46,7 +59,7 @@ def _table(rng: np.random.Generator) -> Image:
 def _sponge(rng: np.random.Generator) -> Image:
     gray = np.ascontiguousarray(175 + 21 * _clouds(rng, 6) + 21 * _clouds(rng, 2))
     for _ in range(170):
-        x, y = (int(v) for v in rng.integers(0, _SIDE, 2))
+        x, y = (int(v) for v in rng.integers(0, _SIDE_PX, 2))
         pore = int(rng.integers(2, 6))
         axes = (pore, max(1, int(pore * rng.uniform(0.5, 1))))
         shade = float(rng.uniform(50, 95))
@@ -55,37 +68,37 @@ def _sponge(rng: np.random.Generator) -> Image:
 
 
 def _cup(rng: np.random.Generator) -> Image:
-    image = np.full((_SIDE, _SIDE, 3), 235, np.uint8)
+    image = np.full((_SIDE_PX, _SIDE_PX, 3), 235, np.uint8)
     for top, bottom in ((0.30, 0.36), (0.74, 0.77)):
-        cv2.rectangle(image, (0, int(top * _SIDE)), (_SIDE, int(bottom * _SIDE)), (90, 60, 40), -1)
+        cv2.rectangle(image, (0, int(top * _SIDE_PX)), (_SIDE_PX, int(bottom * _SIDE_PX)), (90, 60, 40), -1)
     turn, motifs = rng.uniform(0, 1), 8
     for i in range(motifs):
-        x = int((i + turn) * _SIDE / motifs)
-        cv2.circle(image, (x, int(0.55 * _SIDE)), int(0.038 * _SIDE), (60, 90, 180), -1, cv2.LINE_AA)
-        leaf = (int(0.03 * _SIDE), int(0.08 * _SIDE))
-        cv2.ellipse(image, (x, int(0.16 * _SIDE)), leaf, 20, 0, 360, (80, 140, 80), -1, cv2.LINE_AA)
-        cv2.line(image, (x + 14, int(0.40 * _SIDE)), (x + 14, int(0.70 * _SIDE)), (150, 150, 150), 2)
+        x = int((i + turn) * _SIDE_PX / motifs)
+        cv2.circle(image, (x, int(0.55 * _SIDE_PX)), int(0.038 * _SIDE_PX), (60, 90, 180), -1, cv2.LINE_AA)
+        leaf = (int(0.03 * _SIDE_PX), int(0.08 * _SIDE_PX))
+        cv2.ellipse(image, (x, int(0.16 * _SIDE_PX)), leaf, 20, 0, 360, (80, 140, 80), -1, cv2.LINE_AA)
+        cv2.line(image, (x + 14, int(0.40 * _SIDE_PX)), (x + 14, int(0.70 * _SIDE_PX)), (150, 150, 150), 2)
     return image
 
 
 def _tube(rng: np.random.Generator) -> Image:
-    image = np.full((_SIDE, _SIDE, 3), (150, 165, 160), np.uint8)
+    image = np.full((_SIDE_PX, _SIDE_PX, 3), (150, 165, 160), np.uint8)
     turn = rng.uniform(0, 1)
-    for i in range(8):  # lines along the axis show how the section turns oval
-        x = int((i + turn) * _SIDE / 8)
-        cv2.line(image, (x, 0), (x, _SIDE), (70, 80, 75), 3)
-    for j in range(6):  # rings show how it bends
-        y = int((j + 0.5) * _SIDE / 6)
-        cv2.line(image, (0, y), (_SIDE, y), (215, 220, 215), 5)
+    for i in range(8):  # lines along the axis show the deformation of the section
+        x = int((i + turn) * _SIDE_PX / 8)
+        cv2.line(image, (x, 0), (x, _SIDE_PX), (70, 80, 75), 3)
+    for j in range(6):  # rings show bending
+        y = int((j + 0.5) * _SIDE_PX / 6)
+        cv2.line(image, (0, y), (_SIDE_PX, y), (215, 220, 215), 5)
     return image
 
 
 def _ball(rng: np.random.Generator) -> Image:
-    image = np.full((_SIDE, _SIDE, 3), (60, 130, 200), np.uint8)
+    image = np.full((_SIDE_PX, _SIDE_PX, 3), (60, 130, 200), np.uint8)
     bands = _clouds(rng, 14)
     image[np.abs(bands) < 0.35] = (200, 220, 235)
     image[bands > 1.1] = (60, 60, 70)
     return image
 
 
-_OF_OBJECTS = {"sponge.png": _sponge, "cup.png": _cup, "tube.png": _tube, "ball.png": _ball}
+_OBJECT_TEXTURES = {"sponge.png": _sponge, "cup.png": _cup, "tube.png": _tube, "ball.png": _ball}

@@ -1,4 +1,4 @@
-"""The MuJoCo world: physics, contact force and pictures of one scene."""
+"""MuJoCo world: physics, contact force and rendering of one scene."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -16,13 +16,22 @@ from gripper_hw.sim.scene import Scene, scene_mjcf
 from gripper_hw.sim.surroundings import Surroundings
 
 _MAX_PENETRATION_M = 0.004
-_MAX_RACK_SLIP_M = 0.005
-_GUARD_PERIOD_NS = 5_000_000
-_LONGEST_STEP_S = 0.004
-"""At 8 ms a tube goes on without a warning, and presses with 22 N where it should with 12."""
+"""Deepest plausible contact of a pad in the object."""
 
-# Each costs more than the whole of the rest of a 128x128 picture in software.
-_NOT_DRAWN = (
+_MAX_RACK_SLIP_M = 0.005
+"""Largest plausible difference between rack and pinion; the gear play is at most 0.4 mm."""
+
+_MAX_FORCE_N = 200.0
+"""Largest plausible grip force."""
+
+_CHECK_PERIOD_NS = 5_000_000
+_MAX_STEP_S = 0.004
+"""At 8 ms a tube presses with 22 N instead of 12 N, without any warning of MuJoCo."""
+
+_CURRENT_NOISE_A = 0.003
+
+# In software rendering, each of these costs more than all the rest of a 128x128 image.
+_DISABLED_RENDER_FLAGS = (
     mujoco.mjtRndFlag.mjRND_SHADOW,
     mujoco.mjtRndFlag.mjRND_REFLECTION,
     mujoco.mjtRndFlag.mjRND_SKYBOX,
@@ -32,36 +41,47 @@ _NOT_DRAWN = (
 
 
 class Motor(Protocol):
-    """The servo's firmware, stepped with the physics."""
+    """The servo's firmware, called at each physics step."""
 
     def control(self, t_ns: int, position_rad: float, velocity_rad_s: float, current_noise_a: float) -> float:
-        """Takes what the encoder sees and returns the motor current in ampere."""
+        """Returns the motor current in A.
+
+        Args:
+            t_ns: Simulated time.
+            position_rad: Angle of the horn.
+            velocity_rad_s: Angular velocity of the horn.
+            current_noise_a: Error of the current's measurement in this step.
+        """
         ...
 
 
 @dataclass
-class _Tap:
+class _PeriodicCall:
     period_ns: int
     due_ns: int
     call: Callable[[int], None]
 
 
 class World:
-    """One scene in motion.
+    """Simulation of one scene.
 
     Args:
-        scene: What is simulated.
+        scene: The scene.
         gripper: The gripper's geometry.
         motor: The servo's firmware.
-        nm_per_a: Its torque constant by the catalogue.
-        seed: Draws the current's noise.
-        seen: Whether it may be drawn; a world that no camera sees has no textures.
-        step_s: Time step in place of the scene's own, to see what the step does.
+        nm_per_a: The servo's torque constant by the catalogue.
+        seed: Seed of the current noise.
+        textured: False for blank textures, if the world is never rendered.
+        step_s: Time step in place of the scene's, to study its effect.
 
     Attributes:
         t_ns: Simulated time.
         step_ns: Time step of the physics.
         force_n: Grip force: mean of the normal forces on the two pads.
+
+    Raises:
+        ConfigError: The object does not exist, or the tool is not suitable for it.
+        SimulationError: MuJoCo refuses the scene, or the time step is too long.
     """
 
     def __init__(
@@ -72,20 +92,22 @@ class World:
         nm_per_a: float,
         seed: int,
         *,
-        seen: bool = True,
+        textured: bool = True,
         step_s: float | None = None,
     ) -> None:
-        text, assets = scene_mjcf(scene, gripper, seen=seen)
+        text, assets = scene_mjcf(scene, gripper, textured=textured)
         try:
             self._model: Any = mujoco.MjModel.from_xml_string(text, assets)
         except ValueError as error:
-            raise SimulationError(f"MuJoCo refuses the scene of {scene.object!r}: {error}") from error
+            raise SimulationError(
+                f"MuJoCo refuses the scene of {scene.object!r} ({error}); take another seed or object"
+            ) from error
         if step_s is not None:
             self._model.opt.timestep = step_s
-        if not 0 < self._model.opt.timestep <= _LONGEST_STEP_S:
+        if not 0 < self._model.opt.timestep <= _MAX_STEP_S:
             raise SimulationError(
-                f"a step of {1e3 * self._model.opt.timestep:g} ms is no step for {scene.object!r}: what "
-                f"comes of it can't be trusted; take one of at most {1e3 * _LONGEST_STEP_S:g} ms"
+                f"a step of {1e3 * self._model.opt.timestep:g} ms gives wrong forces for {scene.object!r}; "
+                f"take one above 0 and at most {1e3 * _MAX_STEP_S:g} ms"
             )
         self._data: Any = mujoco.MjData(self._model)
         self._scene, self._motor, self._surroundings = scene, motor, Surroundings(scene)
@@ -96,33 +118,33 @@ class World:
         self._qpos, self._dof = int(servo.qposadr[0]), int(servo.dofadr[0])
         self._left = int(self._model.sensor("left_force").adr[0]) + 1
         self._right = int(self._model.sensor("right_force").adr[0]) + 1
-        self._taps: list[_Tap] = []
+        self._periodic_calls: list[_PeriodicCall] = []
         self._renderer: Any = None
-        self._picture: tuple[int, npt.NDArray[np.uint8]] | None = None
+        self._image: tuple[int, npt.NDArray[np.uint8]] | None = None
         self.t_ns = 0
         self.force_n = 0.0
         mujoco.mj_forward(self._model, self._data)
-        self.every(_GUARD_PERIOD_NS, self._guard)
+        self.call_every(_CHECK_PERIOD_NS, self._check_state)
 
     @property
     def unknowns(self) -> int:
-        """Degrees of freedom of the scene."""
+        """Number of degrees of freedom of the scene."""
         return int(self._model.nv)
 
     @property
     def iterations(self) -> int:
-        """The solver's, in the last step."""
+        """Number of iterations of the solver in the last step."""
         return int(self._data.solver_niter.sum())
 
-    def every(self, period_ns: int, call: Callable[[int], None]) -> None:
-        """Calls ``call(t_ns)`` at each multiple of a period, to the next physics step."""
-        self._taps.append(_Tap(period_ns, self.t_ns + period_ns, call))
+    def call_every(self, period_ns: int, call: Callable[[int], None]) -> None:
+        """Registers ``call(t_ns)`` for each multiple of a period, rounded up to the next physics step."""
+        self._periodic_calls.append(_PeriodicCall(period_ns, self.t_ns + period_ns, call))
 
     def advance_to(self, t_ns: int) -> None:
-        """Lets the world go on. Raises `SimulationError` once it can't be trusted any more."""
+        """Simulates up to a time. Raises `SimulationError` if the state becomes implausible."""
         data = self._data
         while self.t_ns + self.step_ns <= t_ns:
-            noise_a = float(self._rng.normal(0.0, 0.003))
+            noise_a = float(self._rng.normal(0.0, _CURRENT_NOISE_A))
             current_a = self._motor.control(
                 self.t_ns, float(data.qpos[self._qpos]), float(data.qvel[self._dof]), noise_a
             )
@@ -130,60 +152,64 @@ class World:
             try:
                 mujoco.mj_step(self._model, data)
             except mujoco.FatalError as error:
-                raise SimulationError(self._broken(str(error))) from error
+                raise SimulationError(self._failure_text(str(error))) from error
             self.t_ns += self.step_ns
             sensors = data.sensordata
             self.force_n = 0.5 * (abs(float(sensors[self._left])) + abs(float(sensors[self._right])))
-            for tap in self._taps:
-                if tap.due_ns <= self.t_ns:
-                    tap.due_ns += tap.period_ns
-                    tap.call(self.t_ns)
+            for periodic in self._periodic_calls:
+                if periodic.due_ns <= self.t_ns:
+                    periodic.due_ns += periodic.period_ns
+                    periodic.call(self.t_ns)
 
-    def render(self, side: int) -> npt.NDArray[np.uint8]:
-        """The world as it stands, (side, side, 3) uint8. Raises `SimulationError` without EGL."""
+    def render(self, side_px: int) -> npt.NDArray[np.uint8]:
+        """Renders the present state, (side_px, side_px, 3) uint8. Raises `SimulationError` without EGL."""
         if self._renderer is None:
-            self._renderer = self._new_renderer(side)
-        if self._picture is None or self._picture[0] != self.t_ns:  # one drawing serves all light levels
+            self._renderer = self._new_renderer(side_px)
+        if self._image is None or self._image[0] != self.t_ns:  # one rendering serves all light levels
             self._move_background()
             self._renderer.update_scene(self._data, "camera")
-            self._picture = self.t_ns, self._renderer.render()
-        return self._picture[1]
+            self._image = self.t_ns, self._renderer.render()
+        return self._image[1]
 
     def close(self) -> None:
-        """Frees the drawing context."""
+        """Frees the rendering context."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
 
-    def _new_renderer(self, side: int) -> Any:
-        renderer = new_renderer(self._model, side)
-        for flag in _NOT_DRAWN:
+    def _new_renderer(self, side_px: int) -> Any:
+        renderer = new_renderer(self._model, side_px)
+        for flag in _DISABLED_RENDER_FLAGS:
             renderer.scene.flags[flag] = 0
         return renderer
 
     def _move_background(self) -> None:
-        """Nothing touches what passes, so it moves where it is drawn: the physics is the same without it."""
-        for i, place_m in enumerate(self._surroundings.places_m(self.t_ns / NS_PER_S)):
-            self._data.geom_xpos[self._model.geom(f"passing_{i}").id] = place_m
+        """Moves the background objects. They have no contacts, so only the rendered positions change."""
+        for i, position_m in enumerate(self._surroundings.positions_m(self.t_ns / NS_PER_S)):
+            self._data.geom_xpos[self._model.geom(f"background_{i}").id] = position_m
 
-    def _guard(self, _: int) -> None:
-        """`discrete` fails silently: a wrong world has to be looked for."""
+    def _check_state(self, _: int) -> None:
+        """Raises `SimulationError` for an implausible state; the integrator `discrete` reports no error."""
         data = self._data
         if not np.isfinite(data.qacc).all():
-            raise SimulationError(self._broken("an acceleration is not finite"))
+            raise SimulationError(self._failure_text("an acceleration is not finite"))
         if (warnings := np.flatnonzero(data.warning.number)).size:
-            raise SimulationError(self._broken(f"MuJoCo warns {mujoco.mjtWarning(int(warnings[0])).name}"))
+            raise SimulationError(
+                self._failure_text(f"MuJoCo warns {mujoco.mjtWarning(int(warnings[0])).name}")
+            )
         if data.ncon and (depth := -float(data.contact.dist.min())) > _MAX_PENETRATION_M:
-            raise SimulationError(self._broken(f"a pad is {depth * 1e3:.1f} mm deep in the object"))
+            raise SimulationError(self._failure_text(f"a pad is {depth * 1e3:.1f} mm deep in the object"))
         if (slip := abs(float(data.ten_length[0]))) > _MAX_RACK_SLIP_M:
-            raise SimulationError(self._broken(f"the rack has slipped {slip * 1e3:.1f} mm on its pinion"))
-        if self.force_n > 200.0:
-            raise SimulationError(self._broken(f"the grip force reads {self.force_n:.0f} N"))
+            raise SimulationError(
+                self._failure_text(f"the rack has slipped {slip * 1e3:.1f} mm on its pinion")
+            )
+        if self.force_n > _MAX_FORCE_N:
+            raise SimulationError(self._failure_text(f"the grip force reads {self.force_n:.0f} N"))
 
-    def _broken(self, what: str) -> str:
+    def _failure_text(self, cause: str) -> str:
         s = self._scene
         return (
-            f"the simulation of {s.object!r} ({s.detail}) broke at {self.t_ns / NS_PER_S:.3f} s: {what}; "
+            f"the simulation of {s.object!r} ({s.detail}) broke at {self.t_ns / NS_PER_S:.3f} s: {cause}; "
             "take a finer sim.detail or another seed"
         )
 

@@ -5,14 +5,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gripper_calibration.fits.camera_fit import (
-    METHOD_MS,
-    ExposureStep,
+    METHOD_ERROR_MS,
+    ExposureCandidate,
     Markers,
-    Touch,
-    choose_exposure,
+    TouchLag,
+    estimate_lag,
     find_markers,
-    lag_of,
-    region_about,
+    region_around,
+    select_exposure,
 )
 from gripper_force.errors import DataError
 from gripper_force.types import Gray
@@ -47,7 +47,7 @@ def test_both_markers_are_found_where_they_are() -> None:
 
 def test_the_region_is_the_square_about_both_markers() -> None:
     seen = [find_markers(picture((0, 30, 50), (1, 80, 52))), find_markers(picture((0, 34, 50), (1, 76, 52)))]
-    left, top, width, height = region_about(seen, 128, 128)
+    left, top, width, height = region_around(seen, 128, 128)
     assert width == height == pytest.approx(80 + SIDE_PX - 30 + SIDE_PX, abs=2)
     assert (left, top) == pytest.approx((30 - SIDE_PX / 2, 60 - width / 2), abs=2)
 
@@ -64,13 +64,16 @@ def test_the_region_is_the_square_about_both_markers() -> None:
 def test_a_marker_that_is_not_seen_whole_is_named(
     shown: tuple[tuple[int, int, int], ...], counts: str
 ) -> None:
-    with pytest.raises(DataError, match=rf"no picture shows both markers whole: of 1 there is {counts}"):
-        region_about([find_markers(picture(*shown))], 128, 128)
+    with pytest.raises(DataError, match=rf"no image shows both markers completely: of 1 images, {counts}"):
+        region_around([find_markers(picture(*shown))], 128, 128)
 
 
 def test_something_far_larger_that_looks_like_a_marker_is_none_of_a_pair() -> None:
-    with pytest.raises(DataError, match="no picture shows both"):
-        region_about([{0: at(10, 10), 1: at(60, 60, 40.0)}], 128, 128)
+    with pytest.raises(
+        DataError,
+        match="no image shows both markers completely: of 1 images, marker 0 in 1 and marker 1 in 1",
+    ):
+        region_around([{0: at(10, 10), 1: at(60, 60, 40.0)}], 128, 128)
 
 
 @given(
@@ -81,7 +84,7 @@ def test_something_far_larger_that_looks_like_a_marker_is_none_of_a_pair() -> No
     st.integers(112, 160),
 )
 def test_the_region_is_a_square_within_the_picture(seen: list[Markers], width: int, height: int) -> None:
-    left, top, side, same = region_about(seen, width, height)
+    left, top, side, same = region_around(seen, width, height)
     assert side == same > 0
     assert 0 <= left <= left + side <= width
     assert 0 <= top <= top + side <= height
@@ -93,46 +96,47 @@ def test_the_region_is_a_square_within_the_picture(seen: list[Markers], width: i
 
 def test_the_best_lit_picture_that_is_not_clipped_is_chosen() -> None:
     ladder = [
-        ExposureStep(500, 35, 0.0),
-        ExposureStep(1000, 50, 0.0),
-        ExposureStep(2000, 71, 0.0),
-        ExposureStep(4000, 95, 0.02),
+        ExposureCandidate(500, 35, 0.0),
+        ExposureCandidate(1000, 50, 0.0),
+        ExposureCandidate(2000, 71, 0.0),
+        ExposureCandidate(4000, 95, 0.02),
     ]
-    assert choose_exposure(ladder).exposure_us == 2000
+    assert select_exposure(ladder).exposure_us == 2000
 
 
 @pytest.mark.parametrize("gray", [250, 255, 0, 39])
 def test_pictures_that_are_clipped_or_dark_are_refused(gray: int) -> None:
-    rung = ExposureStep.of(4000, np.full((64, 64), gray, np.uint8))
+    rung = ExposureCandidate.measure(4000, np.full((64, 64), gray, np.uint8))
     with pytest.raises(
-        DataError, match=r"no exposure gives a picture .* \(4000 us: mean \d+, \d+\.\d % clip"
+        DataError,
+        match=r"the image is dark or clipped at every exposure \([\d.]+ us: mean [\d.]+, [\d.]+ % clipped",
     ):
-        choose_exposure([rung])
+        select_exposure([rung])
 
 
-def touches(*lags_ms: float, force_n: float = 5.0) -> list[Touch]:
-    return [Touch(force_n, lag_ms, lag_ms + 20) for lag_ms in lags_ms]
+def touches(*lags_ms: float, force_n: float = 5.0) -> list[TouchLag]:
+    return [TouchLag(force_n, lag_ms, lag_ms + 20) for lag_ms in lags_ms]
 
 
 @given(st.lists(st.floats(-150, 150), min_size=3, max_size=30))
 def test_the_interval_holds_the_lag_and_is_no_narrower_than_the_method(lags_ms: list[float]) -> None:
-    lag = lag_of(touches(*lags_ms))
+    lag = estimate_lag(touches(*lags_ms))
     assert lag.value == pytest.approx(np.median(lags_ms))
-    assert lag.half >= METHOD_MS - 1e-9
+    assert lag.half >= METHOD_ERROR_MS - 1e-9
 
 
 def test_touches_that_contradict_each_other_widen_it() -> None:
-    assert lag_of(touches(-60, -20, 20, 60)).half > 60
-    assert lag_of(touches(18, 19, 20, 21)).half < 6
+    assert estimate_lag(touches(-60, -20, 20, 60)).half > 60
+    assert estimate_lag(touches(18, 19, 20, 21)).half < 6
 
 
 def test_weak_touches_are_left_out() -> None:
-    assert lag_of([*touches(10, 11, 12), *touches(90, 95, 99, force_n=2.0)]).value == 11
+    assert estimate_lag([*touches(10, 11, 12), *touches(90, 95, 99, force_n=2.0)]).value == 11
 
 
 def test_too_few_touches_that_tell_are_refused() -> None:
     nan = float("nan")
-    with pytest.raises(DataError, match="2 of 4 touches tell the camera's lag, and it takes 3"):
-        lag_of(touches(10, 11, nan, nan))
+    with pytest.raises(DataError, match="only 2 of 4 touches determine the camera's lag, and 3 are needed"):
+        estimate_lag(touches(10, 11, nan, nan))
     with pytest.raises(DataError, match="0 of 0 touches"):
-        lag_of([])
+        estimate_lag([])

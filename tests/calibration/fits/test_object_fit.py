@@ -4,8 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gripper_calibration.fits import ood_fit
-from gripper_calibration.fits.interval_fit import by_conformal
-from gripper_calibration.fits.object_fit import _simplest, fit_correction, learning_curve
+from gripper_calibration.fits.interval_fit import conformal_interval
+from gripper_calibration.fits.object_fit import _select_simplest, fit_correction, learning_curve
 from gripper_calibration.fits.touches import Floats, Touches
 from gripper_force.errors import DataError
 
@@ -112,7 +112,9 @@ def test_the_interval_is_the_quantile_of_left_out_errors_and_each_touch_counts_t
     counts = np.array([10] * 9 + [1000])
     touch = np.repeat(np.arange(10), counts)
     for coverage, expected_n in ((0.5, 0.5), (0.8, 0.8), (0.9, 0.9)):
-        interval = by_conformal(np.zeros(len(touch)), np.repeat(error_n, counts), touch, coverage - 1e-9)
+        interval = conformal_interval(
+            np.zeros(len(touch)), np.repeat(error_n, counts), touch, coverage - 1e-9
+        )
         assert float(interval.half_width_n(0.0)) == pytest.approx(expected_n * np.sqrt(1 + 1 / 10), rel=1e-6)
 
 
@@ -121,7 +123,7 @@ def test_the_interval_grows_with_the_force_as_the_errors_do(share: float) -> Non
     rng = np.random.default_rng(0)
     force_n = np.tile(np.linspace(0, 10, 50), 40)
     predicted_n = force_n + np.hypot(0.05, share * force_n) * rng.normal(size=len(force_n))
-    interval = by_conformal(predicted_n, force_n, np.repeat(np.arange(40), 50), 0.9)
+    interval = conformal_interval(predicted_n, force_n, np.repeat(np.arange(40), 50), 0.9)
     for at_n in (2.0, 5.0, 9.0):
         expected_n = 1.645 * np.hypot(0.05, share * at_n)
         assert float(interval.half_width_n(at_n)) == pytest.approx(expected_n, rel=0.15)
@@ -129,10 +131,10 @@ def test_the_interval_grows_with_the_force_as_the_errors_do(share: float) -> Non
 
 def test_the_gate_is_as_wide_as_new_touches_are_strange() -> None:
     ood_score = [np.linspace(0, top, 2001) for top in (0.1, 0.3, 0.2)]
-    assert ood_fit.limit(ood_score) == pytest.approx(1.5 * (1 + 2 / 3) * 0.3 * 0.995, rel=1e-3)
-    assert ood_fit.limit([*ood_score] * 100) == pytest.approx(1.5 * 0.3 * 0.995, rel=0.01)
-    assert ood_fit.limit(ood_score[:2]) == ood_fit.UNKNOWN
-    assert ood_fit.limit([]) == ood_fit.UNKNOWN
+    assert ood_fit.fit_ood_limit(ood_score) == pytest.approx(1.5 * (1 + 2 / 3) * 0.3 * 0.995, rel=1e-3)
+    assert ood_fit.fit_ood_limit([*ood_score] * 100) == pytest.approx(1.5 * 0.3 * 0.995, rel=0.01)
+    assert ood_fit.fit_ood_limit(ood_score[:2]) == ood_fit.DEFAULT_LIMIT
+    assert ood_fit.fit_ood_limit([]) == ood_fit.DEFAULT_LIMIT
 
 
 def test_the_simplest_that_is_no_worse_by_a_standard_error_is_taken() -> None:
@@ -141,7 +143,7 @@ def test_the_simplest_that_is_no_worse_by_a_standard_error_is_taken() -> None:
     for by_n, chosen in ((0.0, 1), (0.06, 1), (0.07, 2)):
         # The third is the best; the second is worse by as much in the mean, scattered by `better`.
         error_n = np.column_stack([base + 1.0, base + by_n + better - 0.25, base])
-        assert _simplest(error_n) == chosen
+        assert _select_simplest(error_n) == chosen
 
 
 def test_frames_of_another_object_are_stranger_than_those_of_new_touches() -> None:

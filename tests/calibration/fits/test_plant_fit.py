@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from gripper_calibration.fits.plant_fit import PressSeries, crushed_by, fit_plant, stiffness_n_m
+from gripper_calibration.fits.plant_fit import PressSeries, crushing_touch, fit_plant, stiffness_n_m
 
 
 def pressed(
@@ -53,12 +53,12 @@ def test_an_object_that_stays_narrower_was_crushed_by_the_hardest_touch_so_far(
     peak_n[last] = 9.0
     contact_m = 0.05 + np.array(lies_m)
     contact_m[last + 1 :] -= 0.012
-    assert crushed_by(contact_m, peak_n) == last
+    assert crushing_touch(contact_m, peak_n) == last
 
 
 def test_an_object_that_springs_back_was_not_crushed() -> None:
     rng = np.random.default_rng(0)
     for _ in range(50):
-        assert crushed_by(0.05 + rng.uniform(-0.002, 0.002, 12), rng.uniform(1, 9, 12)) is None
-    assert crushed_by(np.array([0.05, 0.03]), np.array([1.0, 2.0])) is None
-    assert crushed_by(np.array([]), np.array([])) is None
+        assert crushing_touch(0.05 + rng.uniform(-0.002, 0.002, 12), rng.uniform(1, 9, 12)) is None
+    assert crushing_touch(np.array([0.05, 0.03]), np.array([1.0, 2.0])) is None
+    assert crushing_touch(np.array([]), np.array([])) is None

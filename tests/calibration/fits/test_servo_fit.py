@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from gripper_calibration.fits.servo_fit import (
-    LEAST_PASSES,
-    LEAST_PRESSES,
+    MIN_PASSES,
+    MIN_PRESSES,
     FreePass,
     Nominal,
     ServoPress,
@@ -134,15 +134,21 @@ Spoil = Callable[[list[ServoPress], list[FreePass]], tuple[list[ServoPress], lis
 @pytest.mark.parametrize(
     ("spoil", "sentence"),
     [
-        (lambda p, q: (p[: LEAST_PRESSES - 1], q), "4 presses slid both ways, and 5 are needed"),
-        (lambda p, q: (p, q[: LEAST_PASSES - 1]), "travelled freely 7 times, and 8 are needed"),
+        (lambda p, q: (p[: MIN_PRESSES - 1], q), "only 4 presses slid in both directions, and 5 are needed"),
+        (lambda p, q: (p, q[: MIN_PASSES - 1]), "the jaws travelled freely only 7 times, and 8 are needed"),
         (lambda p, q: ([replace(one, force_n=0 * one.force_n) for one in p], q), "force does not rise with"),
         (lambda p, q: ([replace(one, turn=len(one.t_s)) for one in p], q), "force does not fall with"),
         (lambda p, q: ([replace(one, current_a=-one.current_a) for one in p], q), "gripper.closing_sign"),
-        (lambda p, q: ([replace(one, current_a=0 * one.current_a) for one in p], q), "more current does not"),
+        (
+            lambda p, q: ([replace(one, current_a=0 * one.current_a) for one in p], q),
+            "the force does not grow with the current",
+        ),
         (lambda p, q: (p[:1] * 6, q), "too much alike"),
         (lambda p, q: (p, q[1::2] * 2), "too much alike"),
-        (lambda p, q: ([*p[:3], *(replace(one, gauge_m=0.06) for one in p[3:])], q), "--gauge-mm names them"),
+        (
+            lambda p, q: ([*p[:3], *(replace(one, gauge_m=0.06) for one in p[3:])], q),
+            "the angles at the gauges do not match their widths",
+        ),
     ],
 )
 def test_what_tells_nothing_is_refused_with_a_sentence(spoil: Spoil, sentence: str) -> None:

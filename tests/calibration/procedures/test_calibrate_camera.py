@@ -8,13 +8,13 @@ import cv2
 import pytest
 from typer.testing import CliRunner
 
-from gripper_calibration.fits.camera_fit import lag_of
-from gripper_calibration.procedures.calibrate_camera import calibrate, compute_ms, watch
+from gripper_calibration.fits.camera_fit import estimate_lag
+from gripper_calibration.procedures.calibrate_camera import calibrate_camera, compute_ms, observe
 from gripper_force.cli import app
-from gripper_force.config import load_config
+from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
 from gripper_force.jobs.recording.record import RecordingPlan, record
-from gripper_force.profiles.apply import rig_mismatches
+from gripper_force.profiles.apply import read_profiles, rig_mismatches
 from gripper_force.profiles.rig_profile import read_rig
 from gripper_force.runtime.log import LogReader, LogWriter
 from gripper_force.types import NS_PER_MS, Frame
@@ -45,7 +45,7 @@ def shifted(log: Path, folder: Path, by_ms: float) -> Path:
 
 @pytest.mark.parametrize("by_ms", [-25.0, 0.0, 25.0])
 def test_a_known_lag_lies_within_the_stated_interval(log: Path, tmp_path: Path, by_ms: float) -> None:
-    lag = lag_of(watch(shifted(log, tmp_path, by_ms), WHOLE).touches)
+    lag = estimate_lag(observe(shifted(log, tmp_path, by_ms), WHOLE).touches)
     assert lag.low is not None
     assert lag.high is not None
     assert lag.low < by_ms < lag.high
@@ -53,19 +53,19 @@ def test_a_known_lag_lies_within_the_stated_interval(log: Path, tmp_path: Path, 
 
 
 def test_the_plain_comparison_with_force_says_too_much(log: Path) -> None:
-    assert all(touch.correlation_ms > 10 for touch in watch(log, WHOLE).touches if touch.force_n > 3)
+    assert all(touch.correlation_ms > 10 for touch in observe(log, WHOLE).touches if touch.force_n > 3)
 
 
 def test_the_cameras_latency_and_the_wait_for_a_cycle_are_seen(log: Path) -> None:
-    seen = watch(log, None)
+    seen = observe(log, None)
     assert 15 <= seen.use_ms <= 20  # a latency of 15 ms, and the next cycle of 5
     assert seen.rate_hz == pytest.approx(30, rel=0.05)  # of whole physics steps
     assert len(seen.widest_markers) == 2
-    assert watch(log, WHOLE).markers == []
+    assert observe(log, WHOLE).markers == []
 
 
 def test_what_the_network_takes_is_measured_on_a_clock_that_is_real(log: Path, tiny_checkpoint: Path) -> None:
-    gray = watch(log, WHOLE).reference
+    gray = observe(log, WHOLE).reference
     assert compute_ms(load_config(None, QUICK), gray) == 0.0
     config = load_config(None, [*QUICK, f"vision.checkpoint={tiny_checkpoint}"])
     assert compute_ms(config, gray) == config.vision.lockstep_compute_ms
@@ -95,26 +95,33 @@ def test_the_command_writes_profile_reference_and_report(tmp_path: Path) -> None
     assert config.control.plant_delay_ms == found.delay_ms.value
 
 
+def mismatches(config: Config) -> list[str]:
+    return rig_mismatches(config, read_profiles(config))
+
+
 def test_another_camera_than_the_profiles_is_told(tmp_path: Path) -> None:
     rig = tmp_path / "rig.yaml"
-    calibrate(load_config(None, QUICK), rig, region=(4, 4, 120, 120), exposures_us=[4000], touches=3)
+    calibrate_camera(load_config(None, QUICK), rig, region=(4, 4, 120, 120), exposures_us=[4000], touches=3)
     found = read_rig(rig).camera
     assert found is not None
     assert (found.region, found.markers) == ((4, 4, 120, 120), False)
     named = [*QUICK, f"calibration.rig={rig}"]
-    assert rig_mismatches(load_config(None, named)) == []
+    assert mismatches(load_config(None, named)) == []
     another = load_config(None, [*named, "camera.exposure_us=500", "camera.side_px=64"])
-    why = "of camera.side_px 128, not 64; camera.exposure_us 4000, not 500; calibrate again"
+    why = "with camera.side_px 128, not 64; camera.exposure_us 4000, not 500; calibrate again"
     with pytest.raises(ConfigError, match=why):
-        rig_mismatches(another)
+        mismatches(another)
     warned = load_config(None, [*named, "camera.exposure_us=500", "calibration.on_mismatch=warn"])
-    assert rig_mismatches(warned) == ["camera.exposure_us 4000, not 500"]
-    assert rig_mismatches(load_config(None, [*named, "camera.backend=none"])) == []
+    assert mismatches(warned) == ["camera.exposure_us 4000, not 500"]
+    assert mismatches(load_config(None, [*named, "camera.backend=none"])) == []
 
 
 def test_without_markers_nothing_is_written_and_the_way_out_is_named(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"no picture shows both markers whole: .* or choose with --region"):
-        calibrate(
+    with pytest.raises(
+        DataError,
+        match=r"no image shows both markers completely: of [\d.]+ images, marker [\d.]+ in [\d.]+ and mark",
+    ):
+        calibrate_camera(
             load_config(None, [*QUICK, "camera.rate_hz=10"]),
             tmp_path / "rig.yaml",
             exposures_us=[4000],
@@ -126,10 +133,25 @@ def test_without_markers_nothing_is_written_and_the_way_out_is_named(tmp_path: P
 @pytest.mark.parametrize(
     ("sets", "exposures_us", "error", "why"),
     [
-        (["sim.lux=90000"], [500, 4000], DataError, "no exposure gives a picture that is neither dark nor"),
+        (
+            ["sim.lux=90000"],
+            [500, 4000],
+            DataError,
+            r"the image is dark or clipped at every exposure \(500 us: mean 233, 76\.3 % clipped, 4000 u",
+        ),
         (["sim.lux=1"], [500, 4000], DataError, r"4000 us: mean \d+, 0.0 % clipped"),
-        ([], [17_000], ConfigError, "half of a frame's period, 16667 us"),
-        (["camera.backend=none"], [4000], ConfigError, "and camera.backend is none; name yours"),
+        (
+            [],
+            [17_000],
+            ConfigError,
+            r"every candidate exposure is longer than half a frame \(16667 us at camera\.rate_hz 30\)",
+        ),
+        (
+            ["camera.backend=none"],
+            [4000],
+            ConfigError,
+            r"calibrate camera needs a camera with settings, but camera\.backend is none",
+        ),
         (
             ["faults=[{unit: camera, kind: off}]"],
             [4000],
@@ -142,7 +164,7 @@ def test_what_can_not_be_calibrated_is_refused_before_anything_moves(
     tmp_path: Path, sets: list[str], exposures_us: list[int], error: type[Exception], why: str
 ) -> None:
     with pytest.raises(error, match=why):
-        calibrate(load_config(None, [*QUICK, *sets]), tmp_path / "rig.yaml", exposures_us=exposures_us)
+        calibrate_camera(load_config(None, [*QUICK, *sets]), tmp_path / "rig.yaml", exposures_us=exposures_us)
 
 
 @pytest.mark.parametrize(

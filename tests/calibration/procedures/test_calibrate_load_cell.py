@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from gripper_calibration.procedures.calibrate_load_cell import calibrate, weigh
+from gripper_calibration.procedures.calibrate_load_cell import calibrate_load_cell, weigh
 from gripper_force.cli import app
 from gripper_force.config import Config, config_from, load_config
 from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
@@ -69,13 +69,11 @@ def test_a_board_is_calibrated_through_its_own_driver(board: Board, tmp_path: Pa
     rig = tmp_path / "rig.yaml"
     asked: list[str] = []
 
-    def ask(what: str) -> None:
-        asked.append(what)
-        board.do(what)
+    def ask(text: str) -> None:
+        asked.append(text)
+        board.do(text)
 
-    result = calibrate(
-        config_of(board), WEIGHT_N, rig, ask=ask, seconds=1.5, progress=lambda _step, _raw: None
-    )
+    result = calibrate_load_cell(config_of(board), WEIGHT_N, rig, prompt=ask, seconds=1.5)
     assert [what.split()[0] for what in asked] == ["Take", "Put", "Take"]
     found = read_rig(rig).load_cell
     assert found is not None
@@ -84,7 +82,7 @@ def test_a_board_is_calibrated_through_its_own_driver(board: Board, tmp_path: Pa
     assert found.tare_raw.value == pytest.approx(TARE, abs=30)
     assert found.n_per_raw.value == pytest.approx(N_PER_RAW, rel=0.01)
     assert found.noise_n == pytest.approx(0.01, rel=0.3)
-    assert Path(result["report"]).stat().st_size > 10_000
+    assert Path(result.report).stat().st_size > 10_000
     settings = load_config(None, [f"calibration.rig={rig}"]).load_cell
     assert (settings.tare_raw, settings.n_per_raw) == (found.tare_raw.value, found.n_per_raw.value)
 
@@ -97,7 +95,7 @@ class Cell:
         self._asked, self._asked_ns = 0, 0
         self._rng = np.random.default_rng(0)
 
-    def ask(self, _what: str) -> None:
+    def ask(self, text: str) -> None:
         self._asked, self._asked_ns = self._asked + 1, self._now_ns
 
     def now_ns(self) -> int:
@@ -125,7 +123,7 @@ class Cell:
 
 def weighed(reading: Callable[[int, float], float | None]) -> tuple[float, float]:
     cell = Cell(reading)
-    fit = weigh(cell, cell, WEIGHT_N, ask=cell.ask, seconds=3.0, patience_s=30.0)
+    fit = weigh(cell, cell, WEIGHT_N, prompt=cell.ask, seconds=3.0, timeout_s=30.0)
     return fit.tare_raw.value, fit.n_per_raw.value
 
 
@@ -144,8 +142,14 @@ def test_it_waits_for_a_load_that_comes_late_and_swings() -> None:
     ("reading", "sentence"),
     [
         (lambda asked, t_s: 500, "the load changes the reading by"),
-        (lambda asked, t_s: 500 + 50_000 * (asked >= 2), "more or less than before it"),
-        (lambda asked, t_s: 500 + 50_000 * (asked == 2) + 2e3 * t_s, "does not rest"),
+        (
+            lambda asked, t_s: 500 + 50_000 * (asked >= 2),
+            r"the empty reading after the load differs from the one before it by 200\.0 % of the load",
+        ),
+        (
+            lambda asked, t_s: 500 + 50_000 * (asked == 2) + 2e3 * t_s,
+            r"the reading does not settle without load: it varies by 6\.7 % of the load",
+        ),
     ],
 )
 def test_where_patience_ends_it_says_what_is_wrong(
@@ -156,7 +160,7 @@ def test_where_patience_ends_it_says_what_is_wrong(
 
 
 def test_a_silent_cell_is_named() -> None:
-    with pytest.raises(DeviceTimeoutError, match=r"gives no reading \(counted: 3 unreadable\)"):
+    with pytest.raises(DeviceTimeoutError, match=r"gives no readings \(counted: 3 unreadable\)"):
         weighed(lambda asked, t_s: None)
 
 
@@ -181,5 +185,5 @@ def test_without_a_terminal_nobody_is_asked(board: Board, tmp_path: Path) -> Non
     flags = [part for option in options for part in ("--set", option)]
     end = CliRunner().invoke(app, ["calibrate", "load-cell", "--force-n", "5", "--rig", str(rig), *flags])
     assert isinstance(end.exception, ConfigError)
-    assert "nobody can be asked here to do this: Take everything off" in str(end.exception)
+    assert "this needs a person at a terminal: Take everything off" in str(end.exception)
     assert not rig.exists()

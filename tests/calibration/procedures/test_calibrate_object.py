@@ -11,17 +11,16 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from gripper_calibration.procedures import calibrate_object as job
-from gripper_calibration.procedures.calibrate_object import calibrate, touch
+from gripper_calibration.procedures.calibrate_object import calibrate_object, record_touches
 from gripper_force.cli import app
 from gripper_force.cli import calibrate as cli_calibrate
 from gripper_force.config import Config, load_config
-from gripper_force.errors import ConfigError, DataError
+from gripper_force.errors import ConfigError, DataError, RequestError
 from gripper_force.jobs.grasp import grasp
 from gripper_force.jobs.replay import replay
 from gripper_force.profiles.object_profile import read_object, weights_path
-from gripper_force.runtime.assembly import make_controller
-from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.resolve import resolve
 from gripper_force.types import Event, LoadCellSample
 
 QUICK = [
@@ -40,13 +39,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def touched(folder: Path) -> list[Path]:
-    return list(touch(load_config(None, QUICK), 3, 6.0, folder / "touches"))
+    return list(record_touches(load_config(None, QUICK), 3, 6.0, folder / "touches"))
 
 
 @pytest.fixture(scope="module")
 def profile(folder: Path, touched: list[Path]) -> Path:
     path = folder / "mine.yaml"
-    calibrate(load_config(None, QUICK), "stapler", touched, path, lambda _: None)
+    calibrate_object(load_config(None, QUICK), "stapler", logs=touched, out=path)
     return path
 
 
@@ -55,12 +54,12 @@ def run(folder: Path, *more: str) -> Config:
 
 
 def test_touches_that_are_there_are_not_done_again(touched: list[Path], folder: Path) -> None:
-    asked: list[int] = []
+    asked: list[str] = []
     config = load_config(None, QUICK)
     touched[1].unlink()
-    again = list(touch(config, 3, 6.0, folder / "touches", ask=asked.append))
+    again = list(record_touches(config, 3, 6.0, folder / "touches", prompt=asked.append))
     assert again == touched
-    assert asked == [2]
+    assert asked == ["Put the object down for touch 2"]
 
 
 def test_a_profile_tells_of_the_object_and_halves_the_error(profile: Path) -> None:
@@ -79,16 +78,16 @@ def test_a_profile_tells_of_the_object_and_halves_the_error(profile: Path) -> No
     assert profile.with_suffix(".png").stat().st_size > 10_000
 
 
-def test_a_grasp_with_it_is_corrected_and_replays_to_the_bit(profile: Path, tmp_path: Path) -> None:
+def test_a_grasp_with_it_is_corrected_and_replays_bit_for_bit(profile: Path, tmp_path: Path) -> None:
     alone = grasp(run(tmp_path))
     known = grasp(run(tmp_path, f"calibration.object={profile}"))
     assert known["estimate_mae_n"]["visual"] < 0.7 * alone["estimate_mae_n"]["visual"]
     log = Path(known["log"])
     assert LogReader(log).metadata["profile"] == read_object(profile).weights
-    assert replay(log)["identical"]
+    assert replay(log).identical
     other = replay(log, overrides=["calibration.object=null"])
-    assert not other["identical"]
-    assert "profile was" in other["note"]
+    assert not other.identical
+    assert "profile was" in other.note
 
 
 def test_its_plant_tunes_the_loop_and_gives_way_to_what_is_set(profile: Path) -> None:
@@ -96,13 +95,12 @@ def test_its_plant_tunes_the_loop_and_gives_way_to_what_is_set(profile: Path) ->
     assert plant is not None
     for keys, lag_ms in (([], plant.lag_ms), (["control.plant_lag_ms=77"], 77)):
         config = load_config(None, [*QUICK, f"calibration.object={profile}", *keys])
-        with open_devices(config) as devices:
-            control = make_controller(config, devices)[0].control
+        control = resolve(config).config.control
         assert control.plant == pytest.approx((plant.gain, lag_ms * 1e-3, plant.delay_ms * 1e-3))
 
 
 def test_more_than_was_pressed_with_is_refused(profile: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="more than the object profile"):
+    with pytest.raises(RequestError, match=r"that the object profile .* was calibrated with"):
         grasp(run(tmp_path, f"calibration.object={profile}", "target_n=8"))
     assert not list(tmp_path.glob("*.mcap"))
 
@@ -126,9 +124,11 @@ def test_half_a_profile_is_no_profile(profile: Path, tmp_path: Path) -> None:
 
 
 def test_logs_of_two_cameras_are_refused(touched: list[Path], tmp_path: Path) -> None:
-    other = list(touch(load_config(None, [*QUICK, "camera.exposure_us=3000"]), 1, 6.0, tmp_path / "other"))
+    other = list(
+        record_touches(load_config(None, [*QUICK, "camera.exposure_us=3000"]), 1, 6.0, tmp_path / "other")
+    )
     with pytest.raises(DataError, match="exposure_us 3000"):
-        calibrate(load_config(), "stapler", [*touched, *other], tmp_path / "p.yaml", lambda _: None)
+        calibrate_object(load_config(), "stapler", logs=[*touched, *other], out=tmp_path / "p.yaml")
     assert not (tmp_path / "p.yaml").exists()
 
 
@@ -146,11 +146,11 @@ def test_the_command_calibrates_from_logs(touched: list[Path], tmp_path: Path) -
 def test_what_crushed_it_is_more_than_it_bears(
     touched: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(job, "crushed_by", lambda _contact_m, _peak_n: 2)
-    found = calibrate(load_config(None, QUICK), "stapler", touched, tmp_path / "it.yaml", lambda _: None)
+    monkeypatch.setattr(job, "crushing_touch", lambda _contact_m, _peak_n: 2)
+    found = calibrate_object(load_config(None, QUICK), "stapler", logs=touched, out=tmp_path / "it.yaml")
     peaks_n = [max(sample.force_n for sample in LogReader(path).records(LoadCellSample)) for path in touched]
-    assert found["force_n"] == pytest.approx(max(peaks_n[:2]), abs=0.3)
-    assert found["crushed_at_n"] == pytest.approx(peaks_n[2], abs=0.3)
+    assert found.profile.force_n == pytest.approx(max(peaks_n[:2]), abs=0.3)
+    assert found.crushed_at_n == pytest.approx(peaks_n[2], abs=0.3)
     assert abs(peaks_n[2] - max(peaks_n[:2])) > 0.3
 
 
@@ -190,22 +190,22 @@ def test_who_stops_early_gets_a_profile_of_what_there_is_and_may_go_on(
     assert "Put the object down for touch 3, then press Enter" in stopped.stderr
     finished = by_hand(tmp_path, monkeypatch, Terminal(1, interrupt))
     assert json.loads(finished.stdout)["touches"] == 3
-    assert "2 of 3 touches were there already" in " ".join(finished.stderr.split())
+    assert "2 of 3 touches exist already" in " ".join(finished.stderr.split())
 
 
 def test_a_terminal_that_is_gone_is_no_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     result = by_hand(tmp_path, monkeypatch, Terminal(0, lambda: ""))
     assert isinstance(result.exception, ConfigError)
-    assert "no answer came to this: Put the object down for touch 1" in str(result.exception)
+    assert "no answer to this: Put the object down for touch 1" in str(result.exception)
     assert not list(tmp_path.rglob("*.mcap"))
 
 
 def test_where_no_profile_can_be_written_nothing_is_fitted(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="can't write"):
-        calibrate(load_config(), "stapler", [], tmp_path / "file" / "p.yaml", lambda _: None)
+        calibrate_object(load_config(), "stapler", logs=[], out=tmp_path / "file" / "p.yaml")
 
 
 def test_no_logs_is_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no log"):
-        calibrate(load_config(), "stapler", [], tmp_path / "p.yaml", lambda _: None)
+        calibrate_object(load_config(), "stapler", logs=[], out=tmp_path / "p.yaml")

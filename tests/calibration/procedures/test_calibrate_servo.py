@@ -7,14 +7,14 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from gripper_calibration.procedures.calibrate_servo import calibrate
+from gripper_calibration.procedures.calibrate_servo import calibrate_servo
 from gripper_force.cli import app
 from gripper_force.cli.output.calibrate import rig_table
 from gripper_force.config import Config, load_config
-from gripper_force.errors import ConfigError, DataError, DeviceError
+from gripper_force.errors import ConfigError, DataError, DeviceError, RequestError
+from gripper_force.jobs.grasp import run_grasp
 from gripper_force.profiles.rig_profile import CalibratedValue, LoadCellCalibration, read_rig, update_rig
 from gripper_force.runtime.log import LogReader
-from gripper_force.runtime.session import run_grasp
 from gripper_force.types import Event
 from gripper_hw.dynamixel.control_table import load_model
 from gripper_hw.dynamixel.virtual import VirtualBus, find_bus
@@ -31,10 +31,10 @@ def config_of(*overrides: str) -> Config:
 def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("rig") / "rig.yaml"
     asked: list[str] = []
-    result = calibrate(config_of(), [0.03], path, ask=asked.append)
+    result = calibrate_servo(config_of(), [0.03], path, prompt=asked.append)
     assert asked == ["Put the load cell with its width of 30 mm between the open jaws"]
-    assert Path(result["report"]).stat().st_size > 20_000
-    assert (result["presses"], result["passes"]) == (6, 12)
+    assert Path(result.report).stat().st_size > 20_000
+    assert (result.presses, result.passes) == (6, 12)
     return path
 
 
@@ -64,14 +64,16 @@ def test_the_scenes_torque_and_friction_are_found(rig: Path) -> None:
 
 def test_a_grasp_beyond_what_was_calibrated_is_refused(rig: Path, tmp_path: Path) -> None:
     config = config_of(f"calibration.rig={rig}", "control.force_limit_n=20", "target_n=11")
-    with pytest.raises(ConfigError, match=r"target_n 11 N is more than the rig profile .* 9\.\d N"):
+    with pytest.raises(RequestError, match=r"target of 11 N is above the 9\.\d N that the rig profile"):
         run_grasp(config, tmp_path / "run.mcap")
 
 
 def test_a_profile_of_another_servo_is_refused_or_told(rig: Path, tmp_path: Path) -> None:
     another = (f"calibration.rig={rig}", "servo.model=XM430-W210", "camera.backend=none", "target_n=2")
     path = tmp_path / "run.mcap"
-    with pytest.raises(ConfigError, match=r"is of a servo XM430-W350, and this one is XM430-W210"):
+    with pytest.raises(
+        ConfigError, match=r"the rig profile .* was made with a servo XM430-W350, and this one is XM430-W210"
+    ):
         run_grasp(config_of(*another), path)
     assert not path.exists()
     run_grasp(config_of(*another, "calibration.on_mismatch=warn"), path)
@@ -84,10 +86,10 @@ def test_a_profile_of_another_servo_is_refused_or_told(rig: Path, tmp_path: Path
     [
         (["load_cell.backend=none"], 0.03, ConfigError, "calibrate servo needs a load cell"),
         ([], 0.09, ConfigError, "a gauge of 90 mm does not fit between jaws that open to 92 mm"),
-        ([], 0.06, DataError, "a gauge of 60 mm was met where the jaws should be 30 mm apart"),
+        ([], 0.06, DataError, "the jaws met the gauge of 60 mm at a width of 30 mm"),
         (["faults=[{unit: load_cell, kind: 'off'}]"], 0.03, DataError, "no valid sample at rest"),
         (["faults=[{unit: load_cell, kind: wrong}]"], 0.03, DataError, "no valid sample at rest"),
-        (["gripper.closing_sign=-1"], 0.03, DataError, "the load cell felt nothing"),
+        (["gripper.closing_sign=-1"], 0.03, DataError, "the jaws closed without a force on the load cell"),
         (
             ["faults=[{unit: load_cell, kind: stuck, at_s: 1}]"],
             0.03,
@@ -95,7 +97,7 @@ def test_a_profile_of_another_servo_is_refused_or_told(rig: Path, tmp_path: Path
             "no valid sample for 1 s in closing on the gauge",
         ),
         (["faults=[{unit: servo, kind: wrong, at_s: 3}]"], 0.03, DeviceError, "hardware error"),
-        (["servo.current_limit_a=0.15"], 0.03, DataError, "give .* N, where 9.* N were to come"),
+        (["servo.current_limit_a=0.15"], 0.03, DataError, r"[\d.]+ A give [\d.]+ N instead of [\d.]+ N"),
     ],
 )
 def test_what_fails_is_named_and_leaves_no_torque(
@@ -107,8 +109,8 @@ def test_what_fails_is_named_and_leaves_no_torque(
         buses.append(find_bus("rig"))
 
     with pytest.raises(kind, match=sentence) as caught:
-        calibrate(
-            config_of(*overrides), [gauge_m], tmp_path / "rig.yaml", ask=lambda _: None, progress=progress
+        calibrate_servo(
+            config_of(*overrides), [gauge_m], tmp_path / "rig.yaml", prompt=lambda _: None, progress=progress
         )
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
@@ -135,12 +137,15 @@ def test_a_scale_that_the_run_does_not_go_by_is_refused(tmp_path: Path) -> None:
         drift_n_min=CalibratedValue(value=0.0),
     )
     update_rig(rig, cell)
-    with pytest.raises(ConfigError, match=r"to 2 N for one unit .*--set calibration\.rig="):
-        calibrate(config_of(), [0.03], rig, ask=lambda _: None)
+    with pytest.raises(
+        ConfigError,
+        match=r".* has [\d.]+ N per raw unit for this load cell, but load_cell\.n_per_raw is None",
+    ):
+        calibrate_servo(config_of(), [0.03], rig, prompt=lambda _: None)
 
 
 def test_without_a_terminal_nobody_is_asked(tmp_path: Path) -> None:
     arguments: list[Any] = ["calibrate", "servo", "--gauge-mm", "30", "--rig", str(tmp_path / "rig.yaml")]
     end = CliRunner().invoke(app, arguments)
     assert isinstance(end.exception, ConfigError)
-    assert "nobody can be asked here to do this: Put the load cell" in str(end.exception)
+    assert "this needs a person at a terminal: Put the load cell" in str(end.exception)

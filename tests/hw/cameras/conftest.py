@@ -1,4 +1,4 @@
-"""Real cameras without the devices: what gives the pictures is replaced, and there is a cable to pull."""
+"""Camera drivers without devices: the source of the images is replaced and can be unplugged."""
 
 import threading
 import time
@@ -17,23 +17,23 @@ from gripper_force.config import CameraConfig
 from gripper_force.interfaces import Camera
 from gripper_force.runtime.backends import MonotonicClock
 from gripper_force.types import Frame, Gray
-from gripper_hw.cameras.oak import PICTURE, OakCamera
+from gripper_hw.cameras.oak import SENSOR_SIZE_PX, OakCamera
 from gripper_hw.cameras.uvc import UvcCamera
 
-PATIENCE_S = 30.0
+TIMEOUT_S = 30.0
 
 Take = Callable[..., list[Frame]]
 
 
 @pytest.fixture
 def take() -> Take:
-    """Takes the next frames of a camera; ``wait`` lets time pass."""
+    """Waits for the next frames of a camera; ``wait`` lets time pass."""
 
     def take(camera: Camera, count: int, wait: Callable[[], None] = lambda: time.sleep(0.002)) -> list[Frame]:
         frames: list[Frame] = []
-        deadline = time.monotonic() + PATIENCE_S
+        deadline = time.monotonic() + TIMEOUT_S
         while len(frames) < count:
-            assert time.monotonic() < deadline, f"{len(frames)} of {count} frames came"
+            assert time.monotonic() < deadline, f"{len(frames)} of {count} frames received"
             if (frame := camera.newest()) is None:
                 wait()
             else:
@@ -44,14 +44,14 @@ def take() -> Take:
 
 
 class HostSensor(dai.node.ThreadedHostNode):  # type: ignore[misc]
-    """Gives a picture 100 times a second while it is plugged in."""
+    """Gives 100 images per second while plugged in."""
 
     def __init__(self, plugged: threading.Event, gray: Gray, colour: bool, exposure_us: int) -> None:
         dai.node.ThreadedHostNode.__init__(self)
         kind = dai.Node.DatatypeHierarchy(dai.DatatypeEnum.ImgFrame, False)
         self.output = self.createOutput(possibleDatatypes=[kind])
         self.plugged, self.exposure_us = plugged, exposure_us
-        self.picture = cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR) if colour else gray
+        self.image = cv2.cvtColor(gray, cv2.COLOR_GRAY2BGR) if colour else gray
         self.kind = dai.ImgFrame.Type.NV12 if colour else dai.ImgFrame.Type.GRAY8
 
     def run(self) -> None:
@@ -60,7 +60,7 @@ class HostSensor(dai.node.ThreadedHostNode):  # type: ignore[misc]
             while self.isRunning():
                 if self.plugged.is_set():
                     frame = dai.ImgFrame()
-                    frame.setCvFrame(self.picture, self.kind)
+                    frame.setCvFrame(self.image, self.kind)
                     frame.setSequenceNum(seq)
                     frame.setTimestamp(timedelta(seconds=time.monotonic()))
                     frame.cam.exposureTimeUs = self.exposure_us
@@ -68,11 +68,11 @@ class HostSensor(dai.node.ThreadedHostNode):  # type: ignore[misc]
                     seq += 1
                 time.sleep(0.01)
         except Exception:
-            return  # the pipeline is being stopped, and what gets out of here would abort the process
+            return  # the pipeline is being stopped, and an exception here would abort the process
 
 
 class FileCapture:
-    """A video file as a camera: paced, without an end, with a driver's controls and time stamps."""
+    """An endless video file in place of a V4L2 camera, with its pace, controls and timestamps."""
 
     def __init__(self, path: str, plugged: threading.Event, refused: frozenset[int] = frozenset()) -> None:
         self.path, self.plugged, self.refused = path, plugged, refused
@@ -82,7 +82,7 @@ class FileCapture:
             cv2.CAP_PROP_EXPOSURE: 157,
             cv2.CAP_PROP_GAIN: 8,
         }
-        self.stamp_ms = 0.0
+        self.timestamp_ms = 0.0
 
     def isOpened(self) -> bool:  # noqa: N802
         return bool(self.capture.isOpened())
@@ -93,19 +93,19 @@ class FileCapture:
         return control not in self.refused
 
     def get(self, control: int) -> float:
-        return self.stamp_ms if control == cv2.CAP_PROP_POS_MSEC else self.controls[control]
+        return self.timestamp_ms if control == cv2.CAP_PROP_POS_MSEC else self.controls[control]
 
     def read(self) -> tuple[bool, Any]:
         time.sleep(0.01)
-        self.stamp_ms = time.monotonic_ns() / 1e6
+        self.timestamp_ms = time.monotonic_ns() / 1e6
         if not self.plugged.is_set():
             return False, None
-        there, image = self.capture.read()
-        if not there:
+        received, image = self.capture.read()
+        if not received:
             self.capture.release()
             self.capture.open(self.path)
-            there, image = self.capture.read()
-        return there, image
+            received, image = self.capture.read()
+        return received, image
 
     def release(self) -> None:
         self.capture.release()
@@ -113,7 +113,7 @@ class FileCapture:
 
 @pytest.fixture(scope="session")
 def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Thirty frames of 320x240 pixels that grow brighter."""
+    """Thirty frames of 320x240 pixels with rising brightness."""
     path = tmp_path_factory.mktemp("video") / "camera.avi"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30, (320, 240))
     assert writer.isOpened()
@@ -125,7 +125,7 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def plugged() -> threading.Event:
-    """The cable: cleared, the camera is gone."""
+    """Set while the camera is plugged in."""
     event = threading.Event()
     event.set()
     return event
@@ -136,15 +136,15 @@ def make_oak(plugged: threading.Event) -> Callable[..., OakCamera]:
     """An `OakCamera` whose pipeline runs on the host."""
 
     def make(gray: Gray | None = None, colour: bool = False, **config: Any) -> OakCamera:
-        width, height = PICTURE
-        shown = np.zeros((height, width), np.uint8) if gray is None else gray
+        width, height = SENSOR_SIZE_PX
+        image = np.zeros((height, width), np.uint8) if gray is None else gray
 
         def source(config: CameraConfig, stack: ExitStack) -> tuple[Any, Any]:
             pipeline = stack.enter_context(dai.Pipeline(createImplicitDevice=False))
-            sensor = pipeline.create(HostSensor, plugged, shown, colour, config.exposure_us or 0)
+            sensor = pipeline.create(HostSensor, plugged, image, colour, config.exposure_us or 0)
             return pipeline, sensor.output
 
-        section = CameraConfig(backend="oak", **{"timeout_ms": 2000} | config)  # a machine may be busy
+        section = CameraConfig(backend="oak", **{"timeout_ms": 2000} | config)
         return OakCamera(section, MonotonicClock(), source)
 
     return make
@@ -152,7 +152,7 @@ def make_oak(plugged: threading.Event) -> Callable[..., OakCamera]:
 
 @pytest.fixture
 def make_uvc(plugged: threading.Event, video: Path) -> Callable[..., UvcCamera]:
-    """A `UvcCamera` that a video file feeds."""
+    """A `UvcCamera` that reads a video file."""
 
     def make(refused: frozenset[int] = frozenset(), **config: Any) -> UvcCamera:
         section = CameraConfig(backend="uvc", **{"device": str(video)} | config)

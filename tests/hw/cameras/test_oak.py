@@ -13,7 +13,7 @@ from gripper_force.errors import ConfigError, DeviceError, DeviceLostError, Devi
 from gripper_force.runtime.backends import MonotonicClock
 from gripper_force.types import NS_PER_MS, Frame, Gray
 from gripper_hw.cameras import oak
-from gripper_hw.cameras.oak import PICTURE, OakCamera, choose_sensor
+from gripper_hw.cameras.oak import SENSOR_SIZE_PX, OakCamera, choose_sensor
 
 Take = Callable[..., list[Frame]]
 MakeOak = Callable[..., OakCamera]
@@ -22,7 +22,7 @@ MakeOak = Callable[..., OakCamera]
 @pytest.fixture
 def scene() -> Gray:
     """A white square of 80 pixels at (700, 300), 700 pixels from the left."""
-    width, height = PICTURE
+    width, height = SENSOR_SIZE_PX
     gray = np.zeros((height, width), np.uint8)
     gray[300:380, 700:780] = 255
     return gray
@@ -37,7 +37,7 @@ def scene() -> Gray:
         ((600, 200, 200, 200), 100, (slice(50, 90), slice(50, 90))),
     ],
 )
-def test_the_middle_square_of_the_region_becomes_the_frame(
+def test_centre_square_of_region_becomes_frame(
     make_oak: MakeOak, take: Take, scene: Gray, region: Any, side_px: int, square: tuple[slice, slice]
 ) -> None:
     camera = make_oak(scene, region=region, side_px=side_px)
@@ -48,23 +48,23 @@ def test_the_middle_square_of_the_region_becomes_the_frame(
     assert gray[square].mean() > 200
 
 
-def test_a_colour_sensor_is_turned_gray(make_oak: MakeOak, take: Take, scene: Gray) -> None:
-    pictures = []
+def test_colour_sensor_is_converted_to_gray(make_oak: MakeOak, take: Take, scene: Gray) -> None:
+    images = []
     for colour in (False, True):
         camera = make_oak(scene // 2, colour=colour)
         camera.start()
-        pictures.append(take(camera, 1)[0].gray.astype(int))
+        images.append(take(camera, 1)[0].gray.astype(int))
         camera.close()
-    assert pictures[1].shape == (128, 128)
-    assert np.abs(pictures[1] - pictures[0]).mean() < 2
+    assert images[1].shape == (128, 128)
+    assert np.abs(images[1] - images[0]).mean() < 2
 
 
-def test_a_region_beyond_the_picture_is_refused(make_oak: MakeOak) -> None:
+def test_region_beyond_image_is_refused(make_oak: MakeOak) -> None:
     with pytest.raises(ConfigError, match=r"camera\.region \[1200, 0, 100, 100\] .*1280x800"):
         make_oak(region=(1200, 0, 100, 100)).start()
 
 
-def test_a_frames_time_is_the_middle_of_its_exposure(make_oak: MakeOak, take: Take) -> None:
+def test_frame_time_is_middle_of_exposure(make_oak: MakeOak, take: Take) -> None:
     camera = make_oak(exposure_us=400_000)
     camera.start()
     for frame in take(camera, 3):
@@ -72,7 +72,7 @@ def test_a_frames_time_is_the_middle_of_its_exposure(make_oak: MakeOak, take: Ta
     camera.close()
 
 
-def test_without_a_device_one_sentence_says_so_and_the_environment_stays() -> None:
+def test_missing_device_is_one_line_and_environment_is_unchanged() -> None:
     if dai.Device.getAllAvailableDevices():
         pytest.skip("an OAK camera is connected")
     before = dict(os.environ)
@@ -84,7 +84,7 @@ def test_without_a_device_one_sentence_says_so_and_the_environment_stays() -> No
     assert dict(os.environ) == before
 
 
-def test_one_of_several_devices_is_found_by_id_or_address_and_never_by_chance() -> None:
+def test_one_of_several_devices_must_be_named_by_id_or_address() -> None:
     first, second = dai.DeviceInfo("14442C10D13EABCE00"), dai.DeviceInfo("14442C10D13EABCE01")
     second.name = "169.254.1.222"
     both = [first, second]
@@ -97,7 +97,7 @@ def test_one_of_several_devices_is_found_by_id_or_address_and_never_by_chance() 
         oak._find(7, both)
 
 
-def test_the_mono_sensor_is_chosen_and_colour_where_there_is_none() -> None:
+def test_mono_sensor_is_preferred_to_colour() -> None:
     def sensor(socket: dai.CameraBoardSocket, kind: dai.CameraSensorType) -> dai.CameraFeatures:
         features = dai.CameraFeatures()
         features.socket, features.supportedTypes = socket, [kind]
@@ -112,26 +112,26 @@ def test_the_mono_sensor_is_chosen_and_colour_where_there_is_none() -> None:
         choose_sensor([])
 
 
-def test_a_pipeline_that_can_not_be_built_or_run_is_one_sentence(make_oak: MakeOak) -> None:
-    def with_a_devices(node: Any) -> OakCamera:
+def test_pipeline_that_cannot_be_built_or_run_is_a_device_error(make_oak: MakeOak) -> None:
+    def with_device_node(node: Any) -> OakCamera:
         camera = make_oak()
         source = camera._source
 
-        def broken(config: CameraConfig, stack: ExitStack) -> tuple[Any, Any]:
+        def source_with_node(config: CameraConfig, stack: ExitStack) -> tuple[Any, Any]:
             pipeline, output = source(config, stack)
             pipeline.create(node)
             return pipeline, output
 
-        camera._source = broken
+        camera._source = source_with_node
         return camera
 
-    with pytest.raises(DeviceError, match=r"can't be used: .*host only"):
-        with_a_devices(dai.node.Script).start()
-    with pytest.raises(DeviceLostError, match=r"pipeline broke: .*[Nn]o devices"):
-        with_a_devices(dai.node.Sync).start()
+    with pytest.raises(DeviceError, match=r"cannot be used: .*host only"):
+        with_device_node(dai.node.Script).start()
+    with pytest.raises(DeviceLostError, match=r"pipeline failed: .*[Nn]o devices"):
+        with_device_node(dai.node.Sync).start()
 
 
-def test_a_pipeline_that_ends_is_a_loss_and_a_new_one_is_built(make_oak: MakeOak, take: Take) -> None:
+def test_ended_pipeline_is_a_loss_and_is_rebuilt(make_oak: MakeOak, take: Take) -> None:
     camera, pipelines = make_oak(), []
     source = camera._source
 
@@ -153,7 +153,7 @@ def test_a_pipeline_that_ends_is_a_loss_and_a_new_one_is_built(make_oak: MakeOak
     assert len(pipelines) == 2
 
 
-def test_cameras_come_and_go(make_oak: MakeOak, take: Take) -> None:
+def test_camera_can_be_opened_repeatedly(make_oak: MakeOak, take: Take) -> None:
     for _ in range(5):
         camera = make_oak()
         camera.start()

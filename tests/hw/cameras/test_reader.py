@@ -13,23 +13,23 @@ from gripper_force.config import CameraConfig
 from gripper_force.errors import ConfigError, DeviceError, DeviceLostError, DeviceNotFoundError
 from gripper_force.runtime.backends import MonotonicClock
 from gripper_hw.cameras import reader
-from gripper_hw.cameras.reader import BackgroundCamera, Read, Shot, square
+from gripper_hw.cameras.reader import BackgroundCamera, RawFrame, ReadFrame, crop_square
 
 GRAY = np.zeros((1, 1), np.uint8)
 
 
 class Camera(BackgroundCamera):
-    """Reads what it is given."""
+    """Reads frames from the function `read`."""
 
-    read: Callable[[], Shot | None]
+    read: Callable[[], RawFrame | None]
 
     @contextmanager
-    def _opened(self) -> Iterator[Read]:
+    def _open(self) -> Iterator[ReadFrame]:
         yield self.read
 
 
-def test_a_camera_that_gives_no_frame_at_all_can_not_be_started(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reader, "_FIRST_FRAME_NS", 1_000_000)
+def test_start_fails_without_a_first_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reader, "_FIRST_FRAME_TIMEOUT_NS", 1_000_000)
     camera = Camera(CameraConfig(backend="oak"), MonotonicClock())
     camera.read = lambda: None
     with pytest.raises(DeviceLostError, match="the oak camera gave no frame for 1 ms; "):
@@ -37,7 +37,7 @@ def test_a_camera_that_gives_no_frame_at_all_can_not_be_started(monkeypatch: pyt
     camera.close()
 
 
-def test_a_defect_in_the_thread_is_raised_to_who_asks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_exception_of_thread_is_raised_by_start_and_newest(monkeypatch: pytest.MonkeyPatch) -> None:
     camera = Camera(CameraConfig(backend="oak"), MonotonicClock())
     camera.read = lambda: 1 // 0  # type: ignore[assignment, return-value]
     with pytest.raises(ZeroDivisionError):
@@ -48,22 +48,22 @@ def test_a_defect_in_the_thread_is_raised_to_who_asks(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("error", [DeviceError, DeviceLostError])
-def test_whatever_goes_wrong_later_is_a_loss_and_the_camera_comes_back(
+def test_error_after_start_is_a_loss_and_camera_is_reopened(
     monkeypatch: pytest.MonkeyPatch, error: type[Exception]
 ) -> None:
-    monkeypatch.setattr(reader, "_RETRY_S", 0.0)
+    monkeypatch.setattr(reader, "_REOPEN_PERIOD_S", 0.0)
     camera = Camera(CameraConfig(backend="oak"), MonotonicClock())
-    shots: Iterator[Shot | None] = iter(())
+    raw_frames: Iterator[RawFrame | None] = iter(())
 
-    def read() -> Shot | None:
-        nonlocal shots
+    def read() -> RawFrame | None:
+        nonlocal raw_frames
         try:
-            return next(shots)
+            return next(raw_frames)
         except StopIteration:
-            shots = iter([Shot(2, 0, GRAY)] * 10_000)
+            raw_frames = iter([RawFrame(2, 0, GRAY)] * 10_000)
             raise error("something") from None
 
-    shots = iter([Shot(1, 0, GRAY)])
+    raw_frames = iter([RawFrame(1, 0, GRAY)])
     camera.read = read
     camera.start()
     while (frame := camera.newest()) is None or frame.t_ns == 1:
@@ -73,22 +73,22 @@ def test_whatever_goes_wrong_later_is_a_loss_and_the_camera_comes_back(
     camera.close()
 
 
-def test_a_camera_that_comes_back_with_another_picture_is_still_away(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reader, "_RETRY_S", 0.0)
+def test_camera_with_another_image_size_stays_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reader, "_REOPEN_PERIOD_S", 0.0)
     tries = iter([None, ConfigError("the region"), DeviceNotFoundError("no camera"), None])
 
     class Changed(BackgroundCamera):
         @contextmanager
-        def _opened(self) -> Iterator[Read]:
+        def _open(self) -> Iterator[ReadFrame]:
             if (error := next(tries)) is not None:
                 raise error
-            shots = iter([Shot(1, 0, GRAY)])
-            yield lambda: next(shots, None) or lose()
+            raw_frames = iter([RawFrame(1, 0, GRAY)])
+            yield lambda: next(raw_frames, None) or lose()
 
-    def lose() -> Shot:
+    def lose() -> RawFrame:
         if next(lost):
             raise DeviceLostError("gone")
-        return Shot(2, 5, GRAY)
+        return RawFrame(2, 5, GRAY)
 
     lost = chain([True], repeat(False))
     camera = Changed(CameraConfig(backend="oak"), MonotonicClock())
@@ -99,17 +99,17 @@ def test_a_camera_that_comes_back_with_another_picture_is_still_away(monkeypatch
     camera.close()
 
 
-def test_a_program_that_forgets_to_close_still_releases_the_device() -> None:
+def test_device_is_released_at_exit_without_close() -> None:
     program = """
 from contextlib import contextmanager
 from gripper_force.runtime.backends import MonotonicClock
 from gripper_force.config import CameraConfig
-from gripper_hw.cameras.reader import BackgroundCamera, Shot
+from gripper_hw.cameras.reader import BackgroundCamera, RawFrame
 
 class Camera(BackgroundCamera):
     @contextmanager
-    def _opened(self):
-        yield lambda: Shot(0, 0, None)
+    def _open(self):
+        yield lambda: RawFrame(0, 0, None)
         print("released")
 
 Camera(CameraConfig(backend="oak"), MonotonicClock()).start()
@@ -122,7 +122,7 @@ numbers = st.integers(-20, 200)
 
 
 @given(st.tuples(numbers, numbers, numbers, numbers), st.integers(1, 150), st.integers(1, 150))
-def test_the_square_lies_in_the_middle_of_a_region_that_lies_in_the_picture(
+def test_square_is_centred_in_region_within_image(
     region: tuple[int, int, int, int], width: int, height: int
 ) -> None:
     left, top, columns, rows = region
@@ -130,9 +130,9 @@ def test_the_square_lies_in_the_middle_of_a_region_that_lies_in_the_picture(
     config = CameraConfig(region=region)
     if not inside:
         with pytest.raises(ConfigError, match=r"camera\.region"):
-            square(config, width, height)
+            crop_square(config, width, height)
         return
-    x, y, side = square(config, width, height)
+    x, y, side = crop_square(config, width, height)
     assert side == min(columns, rows)
     for start, low, size in ((x, left, columns), (y, top, rows)):
         assert low <= start
@@ -140,5 +140,5 @@ def test_the_square_lies_in_the_middle_of_a_region_that_lies_in_the_picture(
         assert abs((start - low) - (low + size - start - side)) <= 1
 
 
-def test_without_a_region_the_whole_picture_counts() -> None:
-    assert square(CameraConfig(), 1280, 800) == (240, 0, 800)
+def test_default_region_is_whole_image() -> None:
+    assert crop_square(CameraConfig(), 1280, 800) == (240, 0, 800)

@@ -1,4 +1,4 @@
-"""Every fault of bus, servo and plant is told by its own error or survived, and nothing stale is believed."""
+"""Every fault of bus, servo and plant raises its own error or is recovered; stale data are never used."""
 
 from collections import deque
 from contextlib import contextmanager, suppress
@@ -27,17 +27,17 @@ from gripper_hw.dynamixel.virtual import VirtualBus, VirtualServo, register_bus,
 
 MODEL = load_model("XM430-W350")
 CYCLE_NS = 5 * NS_PER_MS
-SILENT = {"garbage", "wrong", "slow", "delayed"}
+UNREADABLE = {"garbage", "wrong", "slow", "delayed"}
 
 
 class Bench:
-    """A driver, and a servo that stands elsewhere in every cycle."""
+    """A driver and a servo whose position changes in every cycle."""
 
     def __init__(self, servo: DynamixelServo, bus: VirtualBus) -> None:
         self.servo, self.bus, self.firmware = servo, bus, bus.servos[0]
         self.now_ns = self.cycles = 0
 
-    def go_on(self, cycles: int = 1) -> None:
+    def advance(self, cycles: int = 1) -> None:
         for _ in range(cycles):
             self.cycles += 1
             self.now_ns += CYCLE_NS
@@ -47,8 +47,8 @@ class Bench:
     def position_rad(self) -> float:
         return rad_from_ticks(2048 + 3 * self.cycles)
 
-    def read_fresh(self) -> None:
-        """Reads; whatever comes is of now."""
+    def read_and_check(self) -> None:
+        """Reads, and checks that the state is the present one."""
         state = self.servo.read()
         assert state.position_rad == self.position_rad
         assert state.t_ns == self.now_ns
@@ -69,90 +69,90 @@ def bench(*faults: FaultConfig, seed: int = 0, **config):
 
 
 def fault(unit: str, kind: str, at_s: float = 0.0475, for_s: float = 0.1) -> FaultConfig:
-    """By default the first ten cycles go well, and the thirtieth again."""
+    """By default cycles 10 to 29 are faulty, at 50 to 145 ms."""
     return FaultConfig.model_validate({"unit": unit, "kind": kind, "at_s": at_s, "for_s": for_s})
 
 
-def read_until_the_fault(b: Bench) -> None:
+def read_until_fault(b: Bench) -> None:
     b.servo.start()
     for _ in range(9):
-        b.go_on()
-        b.read_fresh()
-    b.go_on()
+        b.advance()
+        b.read_and_check()
+    b.advance()
 
 
 # The bus.
 
 
-@pytest.mark.parametrize("kind", sorted(SILENT))
-def test_an_unsound_or_late_answer_is_an_error_at_once_and_never_believed(kind):
+@pytest.mark.parametrize("kind", sorted(UNREADABLE))
+def test_corrupt_or_late_reply_raises_and_is_never_used(kind):
     with bench(fault("bus", kind)) as b:
-        read_until_the_fault(b)
+        read_until_fault(b)
         for _ in range(19):
-            with pytest.raises(DeviceTimeoutError, match="no sound answer"):
+            with pytest.raises(DeviceTimeoutError, match="no valid reply"):
                 b.servo.read()
-            b.go_on()
-        b.go_on()
-        b.read_fresh()
+            b.advance()
+        b.advance()
+        b.read_and_check()
 
 
-@pytest.mark.parametrize("kind", sorted(SILENT))
-def test_torque_goes_off_through_any_of_them(kind):
-    """The answers are lost, not the instructions; that they were obeyed can't be confirmed."""
+@pytest.mark.parametrize("kind", sorted(UNREADABLE))
+def test_stop_turns_torque_off_despite_lost_replies(kind):
+    """Only the replies are lost: the instruction is executed, but can't be confirmed."""
     with bench(fault("bus", kind)) as b:
-        read_until_the_fault(b)
+        read_until_fault(b)
         with pytest.raises(DeviceTimeoutError):
             b.servo.stop(hold=False)
         assert b.firmware.get("torque_enable") == 0
 
 
-@pytest.mark.parametrize("kind", sorted(SILENT))
-def test_no_start_through_any_of_them(kind):
+@pytest.mark.parametrize("kind", sorted(UNREADABLE))
+def test_start_fails_and_leaves_torque_off(kind):
     with bench(fault("bus", kind, at_s=0.0)) as b:
         with pytest.raises(DeviceError):
             b.servo.start()
         assert b.firmware.get("torque_enable") == 0
 
 
-def test_an_unplugged_bus_is_lost_and_found_again():
+def test_unplugged_bus_is_lost_until_plugged_in_and_restarted():
     with bench(fault("bus", "off")) as b:
-        read_until_the_fault(b)
+        read_until_fault(b)
         for call in (b.servo.read, lambda: b.servo.stop(hold=False)):
             with pytest.raises(DeviceLostError, match="gone"):
                 call()
         b.servo.close()
         with pytest.raises(DeviceNotFoundError):
             b.servo.start()
-        b.go_on(20)
+        b.advance(20)
         b.servo.start()
-        b.go_on()
-        b.read_fresh()
+        b.advance()
+        b.read_and_check()
 
 
-def test_what_was_unplugged_stays_lost_until_it_is_opened_again():
+def test_unplugged_port_stays_lost_until_reopened():
     with bench(fault("bus", "off", for_s=0.01)) as b:
-        read_until_the_fault(b)
+        read_until_fault(b)
         with pytest.raises(DeviceLostError):
             b.servo.read()
-        b.go_on(5)
+        b.advance(5)
         with pytest.raises(DeviceLostError):
             b.servo.read()
 
 
-def test_retries_carry_lost_answers():
+def test_retries_recover_lost_replies():
     with bench(fault("bus", "intermittent", for_s=1.0), retries=10) as b:
-        read_until_the_fault(b)
+        read_until_fault(b)
         for _ in range(50):
-            b.read_fresh()
-            b.go_on()
+            b.read_and_check()
+            b.advance()
         stats = b.servo.stats
         assert stats.retries == stats.timeouts > 20
 
 
-def test_the_same_seed_loses_the_same_answers():
+def test_same_seed_loses_the_same_replies():
     def retries(seed):
         with bench(fault("bus", "intermittent"), retries=10, seed=seed) as b:
-            read_until_the_fault(b)
+            read_until_fault(b)
             for _ in range(5):
                 b.servo.read()
             return b.servo.stats.retries
@@ -169,17 +169,17 @@ def test_the_same_seed_loses_the_same_answers():
     st.integers(0, 5),
     st.integers(0, 2**32),
 )
-def test_whatever_befalls_the_bus_a_state_is_of_now_or_there_is_none(spans, retries, seed):
+def test_read_returns_a_current_state_or_raises_for_any_bus_faults(spans, retries, seed):
     faults = [fault("bus", kind, at * 0.005, length * 0.005) for kind, at, length in spans]
     with bench(*faults, retries=retries, seed=seed, bus_watchdog_ms=2540) as b:
         for _ in range(50):
-            b.go_on()
+            b.advance()
             with suppress(DeviceError):
-                b.servo.start() if b.servo._bus._line._port is None else b.read_fresh()
+                b.servo.start() if b.servo._bus._transport._port is None else b.read_and_check()
             if b.bus.is_unplugged():
                 b.servo.close()
-        b.go_on(40)
-        if b.servo._bus._line._port is None:
+        b.advance(40)
+        if b.servo._bus._transport._port is None:
             b.servo.start()
         b.servo.stop(hold=False)
         assert b.firmware.get("torque_enable") == 0
@@ -187,7 +187,7 @@ def test_whatever_befalls_the_bus_a_state_is_of_now_or_there_is_none(spans, retr
 
 @settings(deadline=None, max_examples=60)
 @given(st.integers(1, 7), st.integers(0, 6), st.integers(0, 2**32))
-def test_an_answer_up_to_seven_requests_late_is_not_believed(late, retries, seed):
+def test_reply_up_to_seven_requests_late_is_rejected(late, retries, seed):
     with bench(retries=retries) as b:
         b.servo.start()
         for _ in range(seed % 8):
@@ -200,19 +200,19 @@ def test_an_answer_up_to_seven_requests_late_is_not_believed(late, retries, seed
 
         b.bus.tamper = delay
         for _ in range(12):
-            b.go_on()
+            b.advance()
             with pytest.raises(DeviceTimeoutError):
                 b.servo.read()
         with pytest.raises(DeviceTimeoutError):
-            b.servo._bus._line.get(1, "present_position")
+            b.servo._bus._transport.get(1, "present_position")
 
 
 @settings(deadline=None, max_examples=100)
 @given(st.integers(0, 100), st.integers(1, 255))
-def test_no_damaged_byte_is_believed(at, bits):
+def test_reply_with_any_corrupt_byte_is_rejected(at, bits):
     with bench(retries=0) as b:
         b.servo.start()
-        b.go_on()
+        b.advance()
 
         def damage(answer):
             where = at % len(answer)
@@ -226,43 +226,43 @@ def test_no_damaged_byte_is_believed(at, bits):
 # The servo and the motor.
 
 
-def test_a_servo_without_power_falls_silent_and_comes_back_with_its_ram_reset():
+def test_power_loss_times_out_and_then_reports_the_restart():
     with bench(fault("servo", "off")) as b:
-        read_until_the_fault(b)
+        read_until_fault(b)
         with pytest.raises(DeviceTimeoutError):
             b.servo.read()
         assert b.firmware.get("torque_enable") == 0
-        b.go_on(19)
+        b.advance(19)
         with pytest.raises(DeviceTimeoutError):
             b.servo.read()
-        b.go_on(REBOOT_NS // CYCLE_NS + 1)
-        with pytest.raises(HardwareFaultError, match="restarted and forgot"):
+        b.advance(REBOOT_NS // CYCLE_NS + 1)
+        with pytest.raises(HardwareFaultError, match="restarted and lost"):
             b.servo.read()
         assert (b.firmware.get("torque_enable"), b.firmware.get("bus_watchdog")) == (0, 0)
         assert b.firmware.get("goal_current") == b.firmware.get("current_limit")
         b.servo.close()
         b.servo.start()
-        b.go_on()
+        b.advance()
         b.servo.read()
 
 
-def test_a_servo_whose_power_is_cut_now_and_then_is_told():
+def test_intermittent_power_reports_each_restart():
     with bench(fault("servo", "intermittent", for_s=10.0)) as b:
-        read_until_the_fault(b)
+        read_until_fault(b)
         with pytest.raises(DeviceTimeoutError):
             b.servo.read()
         assert b.firmware.get("torque_enable") == 0
-        b.go_on(50)
-        with pytest.raises(HardwareFaultError, match="restarted and forgot"):
+        b.advance(50)
+        with pytest.raises(HardwareFaultError, match="restarted and lost"):
             b.servo.read()
-        b.go_on(10)  # 0.3 s after the first time
+        b.advance(10)  # 0.3 s after the first time
         with pytest.raises(DeviceTimeoutError):
             b.servo.read()
 
 
-def test_a_tripped_watchdog_is_told_and_no_start_clears_it():
+def test_stuck_watchdog_trip_raises_and_prevents_start():
     with bench(fault("servo", "stuck")) as b:
-        read_until_the_fault(b)
+        read_until_fault(b)
         with pytest.raises(HardwareFaultError, match="watchdog tripped"):
             b.servo.read()
         assert b.firmware.control(b.now_ns, 0.0, 0.0) == 0.0
@@ -272,25 +272,25 @@ def test_a_tripped_watchdog_is_told_and_no_start_clears_it():
         assert b.firmware.get("torque_enable") == 0
 
 
-def test_an_overload_is_in_the_state_and_takes_torque():
+def test_overload_is_in_the_state_and_turns_torque_off():
     with bench(fault("servo", "wrong")) as b:
-        read_until_the_fault(b)
+        read_until_fault(b)
         assert b.servo.read().hardware_error == OVERLOAD_ERROR
         assert b.firmware.get("torque_enable") == 0
-        b.go_on(30)
+        b.advance(30)
         assert b.servo.read().hardware_error == OVERLOAD_ERROR  # until it is rebooted
         b.servo.close()
         with pytest.raises(HardwareFaultError, match="overload"):
             b.servo.start()
 
 
-def test_a_motor_with_more_current_than_its_goal_asks_says_so_and_obeys_torque_off():
+def test_excess_motor_current_is_measured_and_ends_with_torque_off():
     with bench(fault("plant", "wrong", for_s=1.0)) as b:
         b.servo.start()
         b.servo.write(ServoCommand(0, 1.0, 0.2))
         given_a = []
         for _ in range(160):
-            b.go_on()
+            b.advance()
             b.servo.read()  # the fault acts on packets
             given_a.append(b.firmware.control(b.now_ns, b.position_rad, 0.0))
             assert b.servo.read().current_a == pytest.approx(given_a[-1], abs=MODEL.current_unit_a)
@@ -335,15 +335,15 @@ def read_on(devices) -> None:
 
 
 @pytest.mark.parametrize(("unit", "kind"), PAIRS)
-def test_the_simulated_rig_suffers_what_is_configured(unit, kind):
+def test_simulated_rig_has_the_configured_fault(unit, kind):
     with rig(unit, kind) as devices, pytest.raises(DeviceError):
         read_on(devices)
 
 
-def test_a_cut_between_two_cycles_counts():
+def test_power_cut_between_two_cycles_is_detected():
     with rig("servo", "off", for_s=0.001) as devices:
         with pytest.raises(DeviceTimeoutError):
             read_on(devices)
         devices.clock.sleep_until_ns(REBOOT_NS + 20 * NS_PER_MS)
-        with pytest.raises(HardwareFaultError, match="restarted and forgot"):
+        with pytest.raises(HardwareFaultError, match="restarted and lost"):
             devices.servo.read()

@@ -32,7 +32,7 @@ def test_models_match_the_vendors_tables(name, number, unit_a, limit, nm_per_a, 
     assert range_v[0] < model.nominal_voltage_v < range_v[1]
 
 
-def test_an_unknown_model_is_refused_with_the_known_ones():
+def test_unknown_model_error_lists_the_known_ones():
     with pytest.raises(ConfigError) as caught:
         load_model("AX-12")
     assert all(name in str(caught.value) for name in model_names())
@@ -40,12 +40,12 @@ def test_an_unknown_model_is_refused_with_the_known_ones():
 
 
 @pytest.mark.parametrize("name", ["XL430-W250", "XC430-W150", "XC430-W240"])
-def test_a_model_without_current_control_is_refused_with_the_reason(name):
+def test_model_without_current_control_error_gives_the_reason(name):
     with pytest.raises(ConfigError, match=r"no current control.*Present Load"):
         load_model(name)
 
 
-def test_a_found_model_number_is_compared():
+def test_check_model_number():
     model = load_model("XM430-W350")
     check_model_number(model, 1020, "it")
     with pytest.raises(ConfigError, match=r"XM430-W210.*1030.*not the configured XM430-W350"):
@@ -66,11 +66,11 @@ def test_a_found_model_number_is_compared():
         ("XC330-T288", 53, [(168, 208, 20)]),
     ],
 )
-def test_firmware_decides_the_indirect_windows(name, firmware, windows):
+def test_indirect_windows_depend_on_firmware(name, firmware, windows):
     assert list(load_model(name).indirect_windows(firmware)) == windows
 
 
-def test_registers_do_not_overlap_and_say_where_they_lie():
+def test_registers_do_not_overlap():
     ends = 0
     for register in REGISTERS.values():
         assert register.address >= ends
@@ -85,7 +85,7 @@ def test_registers_do_not_overlap_and_say_where_they_lie():
 
 
 @given(st.sampled_from(sorted(REGISTERS)), st.data())
-def test_register_values_survive_their_bytes(name, data):
+def test_register_encode_decode_round_trip(name, data):
     register = REGISTERS[name]
     bits = 8 * register.size
     least, greatest = (-(1 << bits - 1), (1 << bits - 1) - 1) if register.signed else (0, (1 << bits) - 1)
@@ -94,6 +94,6 @@ def test_register_values_survive_their_bytes(name, data):
 
 
 @given(st.integers(-1_048_575, 1_048_575))
-def test_ticks_survive_radians(ticks):
+def test_ticks_radians_round_trip(ticks):
     assert ticks_from_rad(rad_from_ticks(ticks)) == ticks
     assert rad_from_ticks(2048) == 0.0

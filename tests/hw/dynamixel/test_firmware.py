@@ -26,7 +26,7 @@ from gripper_hw.dynamixel.packets import Error
 
 MODEL = load_model("XM430-W350")
 COMPLETE = load_model("XL330-M288")
-"""It has every register."""
+"""A model that has every register."""
 
 MS = 1_000_000
 
@@ -41,7 +41,7 @@ def make(mode: int = CURRENT_BASED_POSITION_MODE, **values: int) -> VirtualServo
 def settle(
     servo: VirtualServo, position_rad: float = 0.0, velocity_rad_s: float = 0.0, start_ns: int = 0
 ) -> float:
-    """Motor current after 50 ms at one place and speed."""
+    """Motor current after 50 ms at a constant position and velocity."""
     for t_ns in range(start_ns, start_ns + 51 * MS, MS):
         current_a = servo.control(t_ns, position_rad, velocity_rad_s)
     return current_a
@@ -61,7 +61,7 @@ def read(servo: VirtualServo, name: str) -> int:
 
 
 @pytest.mark.parametrize("model", model_names())
-def test_initial_values_are_the_models(model):
+def test_initial_values_match_the_model(model):
     servo = VirtualServo(7, load_model(model), firmware=48)
     assert (read(servo, "model_number"), read(servo, "firmware_version")) == (load_model(model).number, 48)
     assert (read(servo, "id"), servo.id) == (7, 7)
@@ -74,7 +74,7 @@ def test_read_only_registers_refuse_writes(name):
     assert write(VirtualServo(1, MODEL), name, 0) is Error.ACCESS
 
 
-def test_a_model_has_its_own_registers_only():
+def test_model_lacks_registers_of_other_models():
     startup = REGISTERS["startup_configuration"].address
     assert VirtualServo(1, COMPLETE).read(startup, 1) == (Error.NONE, b"\0")
     assert VirtualServo(1, MODEL).read(startup, 1) == (Error.ACCESS, b"")
@@ -83,7 +83,7 @@ def test_a_model_has_its_own_registers_only():
 @pytest.mark.parametrize(
     "name", [name for name, entry in REGISTERS.items() if entry.access == "rw" and entry.eeprom]
 )
-def test_the_eeprom_is_locked_while_torque_is_on(name):
+def test_eeprom_is_locked_while_torque_is_on(name):
     servo = VirtualServo(1, COMPLETE)
     before = servo.get(name)
     assert write(servo, name, before) is Error.NONE or name == "secondary_id"
@@ -94,7 +94,7 @@ def test_the_eeprom_is_locked_while_torque_is_on(name):
 @pytest.mark.parametrize(
     "name", [name for name, entry in REGISTERS.items() if entry.access == "rw" and entry.range]
 )
-def test_values_beyond_the_range_are_refused_and_the_bounds_taken(name):
+def test_values_outside_the_range_are_refused_and_the_bounds_accepted(name):
     servo = VirtualServo(1, COMPLETE)
     servo.set("operating_mode", CURRENT_BASED_POSITION_MODE)
     register = REGISTERS[name]
@@ -115,7 +115,7 @@ def test_values_beyond_the_range_are_refused_and_the_bounds_taken(name):
 @pytest.mark.parametrize(
     "name", [name for name, entry in REGISTERS.items() if entry.access == "rw" and entry.size > 1]
 )
-def test_a_part_of_a_register_is_refused(name):
+def test_partial_register_write_is_refused(name):
     register = REGISTERS[name]
     servo = VirtualServo(1, MODEL)
     assert servo.write(register.address, bytes(register.size - 1)) is Error.DATA_LENGTH
@@ -123,7 +123,7 @@ def test_a_part_of_a_register_is_refused(name):
 
 
 @pytest.mark.parametrize("name", ["goal_current", "goal_pwm", "goal_velocity"])
-def test_goals_are_bounded_by_their_limit_registers(name):
+def test_goals_outside_their_limit_registers_are_refused(name):
     servo = VirtualServo(1, MODEL)
     limit = servo.get(name.removeprefix("goal_") + "_limit")
     assert write(servo, name, -limit) is Error.NONE
@@ -131,7 +131,7 @@ def test_goals_are_bounded_by_their_limit_registers(name):
     assert servo.get(name) == -limit
 
 
-def test_goal_position_is_bounded_in_position_mode_alone():
+def test_position_limits_apply_only_in_position_mode():
     servo = VirtualServo(1, MODEL)
     assert write(servo, "goal_position", 4096) is Error.DATA_LIMIT
     assert write(servo, "goal_position", 4095) is Error.NONE
@@ -140,7 +140,7 @@ def test_goal_position_is_bounded_in_position_mode_alone():
     assert write(servo, "goal_position", 1_048_576) is Error.DATA_RANGE
 
 
-def test_current_limit_is_bounded_by_the_model_and_modes_are_the_models():
+def test_current_limit_and_operating_modes_depend_on_the_model():
     servo = VirtualServo(1, MODEL)
     assert write(servo, "current_limit", 1193) is Error.NONE
     assert write(servo, "current_limit", 1194) is Error.DATA_RANGE
@@ -159,9 +159,9 @@ def test_undefined_addresses_are_refused_and_gaps_read_zero():
     assert data[14:20] == bytes(6)
 
 
-def test_a_write_that_is_refused_in_part_changes_nothing():
+def test_partly_refused_write_changes_nothing():
     servo = VirtualServo(1, MODEL)
-    assert servo.write(64, b"\x01\x02") is Error.DATA_RANGE  # torque on, and an LED that is no LED
+    assert servo.write(64, b"\x01\x02") is Error.DATA_RANGE  # torque on, and an invalid LED value
     assert servo.get("torque_enable") == 0
 
 
@@ -186,12 +186,12 @@ def test_indirect_data_reads_and_writes_its_target(model, firmware, address, dat
     assert servo.write(address, (10).to_bytes(2, "little")) is Error.DATA_RANGE
 
 
-def test_windows_of_another_firmware_are_not_there():
+def test_indirect_windows_of_another_firmware_are_absent():
     assert VirtualServo(1, load_model("XL330-M288"), 52).read(248, 1)[0] is Error.ACCESS
     assert VirtualServo(1, load_model("XL330-M288"), 51).read(248, 1)[0] is Error.NONE
 
 
-def test_a_new_mode_resets_the_goal_current():
+def test_mode_change_resets_the_goal_current():
     servo = VirtualServo(1, MODEL)
     write(servo, "goal_current", 5)
     write(servo, "operating_mode", 5)
@@ -211,7 +211,7 @@ def test_registered_write_waits_for_action():
 # Safety.
 
 
-def test_the_watchdog_trips_and_locks_the_goals_until_cleared():
+def test_watchdog_trip_locks_the_goals_until_cleared():
     servo = make(goal_position=4000, bus_watchdog=2)
     servo.feed_watchdog(0)
     for t_ns in range(0, 40 * MS + 1, MS):
@@ -226,13 +226,13 @@ def test_the_watchdog_trips_and_locks_the_goals_until_cleared():
     assert settle(servo, start_ns=42 * MS) < -1.0
 
 
-def test_the_watchdog_sleeps_while_torque_is_off():
+def test_watchdog_is_inactive_while_torque_is_off():
     servo = make(bus_watchdog=1, torque_enable=0)
     servo.check_watchdog(10**12)
     assert read(servo, "bus_watchdog") == 1
 
 
-def test_a_hardware_error_in_shutdown_takes_torque_until_reboot():
+def test_hardware_error_in_shutdown_keeps_torque_off_until_reboot():
     servo = make(goal_position=4000)
     servo.raise_hardware_error(OVERLOAD_ERROR)
     assert servo.alert
@@ -244,25 +244,25 @@ def test_a_hardware_error_in_shutdown_takes_torque_until_reboot():
     assert write(servo, "torque_enable", 1) is Error.NONE
 
 
-def test_a_hardware_error_outside_shutdown_leaves_torque():
+def test_hardware_error_outside_shutdown_keeps_torque():
     servo = make(shutdown=0)
     servo.raise_hardware_error(OVERLOAD_ERROR)
     assert servo.alert
     assert read(servo, "torque_enable") == 1
 
 
-def test_heat_and_supply_raise_their_errors():
+def test_temperature_and_voltage_raise_hardware_errors():
     servo = make()
-    servo.sense(temperature_c=80.0, voltage_v=12.0)
+    servo.set_conditions(temperature_c=80.0, voltage_v=12.0)
     assert not servo.alert
-    servo.sense(temperature_c=80.5)
+    servo.set_conditions(temperature_c=80.5)
     assert read(servo, "hardware_error_status") == OVERHEATING_ERROR
-    servo.sense(voltage_v=9.0)
+    servo.set_conditions(voltage_v=9.0)
     assert read(servo, "hardware_error_status") == OVERHEATING_ERROR | 1
     assert (read(servo, "present_temperature"), read(servo, "present_input_voltage")) == (80, 90)
 
 
-def test_a_reboot_resets_ram_keeps_the_eeprom_and_forgets_turns():
+def test_reboot_resets_ram_and_turns_and_keeps_the_eeprom():
     servo = make(bus_watchdog=5, return_delay_time=0)
     servo.write(168, (126).to_bytes(2, "little"))
     settle(servo, position_rad=rad_from_ticks(5000))
@@ -276,7 +276,7 @@ def test_a_reboot_resets_ram_keeps_the_eeprom_and_forgets_turns():
 
 
 @pytest.mark.parametrize(("option", "id_", "baud"), [(0xFF, 1, 1), (0x01, 9, 1), (0x02, 9, 3)])
-def test_factory_reset_keeps_what_its_option_says(option, id_, baud):
+def test_factory_reset_options(option, id_, baud):
     servo = VirtualServo(9, MODEL, firmware=47)
     servo.set("baud_rate", 3)
     servo.set("operating_mode", 5)
@@ -290,18 +290,18 @@ def test_factory_reset_keeps_what_its_option_says(option, id_, baud):
 
 
 @pytest.mark.parametrize("mode", MODEL.operating_modes)
-def test_without_torque_there_is_no_current(mode):
+def test_current_is_zero_without_torque(mode):
     assert settle(make(mode, torque_enable=0, goal_current=500, goal_position=4000, goal_velocity=100)) == 0.0
 
 
-def test_current_follows_its_loop():
+def test_current_follows_the_loop_time_constant():
     servo = make(CURRENT_MODE, goal_current=100)
     servo.control(0, 0.0, 0.0)
     current_a = servo.control(round(CURRENT_LOOP_S * 1e9), 0.0, 0.0)
     assert current_a == pytest.approx(100 * MODEL.current_unit_a * (1 - math.exp(-1)))
 
 
-def test_current_mode_holds_goal_current_at_any_speed_the_supply_allows():
+def test_current_mode_holds_goal_current_up_to_no_load_speed():
     servo = make(CURRENT_MODE, goal_current=-100)
     assert settle(servo, velocity_rad_s=-2.0) == pytest.approx(-0.269, abs=1e-6)
     no_load_rad_s = MODEL.no_load_rpm * 2 * math.pi / 60
@@ -310,13 +310,13 @@ def test_current_mode_holds_goal_current_at_any_speed_the_supply_allows():
 
 @pytest.mark.parametrize("goal", [0, 1, 100, 400])
 @pytest.mark.parametrize("side", [-1, 1])
-def test_mode_5_bounds_the_current_by_its_goal(goal, side):
+def test_mode_5_limits_the_current_to_its_goal(goal, side):
     servo = make(goal_current=goal, goal_position=2048 + side * 2000)
     assert settle(servo) == pytest.approx(side * goal * MODEL.current_unit_a, abs=1e-6)
     assert read(servo, "present_current") == side * goal
 
 
-def test_mode_5_is_bounded_by_current_limit_and_holds_its_position():
+def test_mode_5_obeys_current_limit_and_holds_its_position():
     assert settle(make(current_limit=50, goal_current=400, goal_position=4000)) == pytest.approx(50 * 2.69e-3)
     assert settle(make(goal_position=2048)) == pytest.approx(0.0, abs=1e-9)
 
@@ -331,7 +331,7 @@ def test_position_mode_brakes_near_its_goal():
     assert settle(servo, velocity_rad_s=0.0, start_ns=60 * MS) > 0.0
 
 
-def test_position_gains_act():
+def test_position_gains_have_effect():
     assert settle(make(POSITION_MODE, goal_position=2058)) > settle(
         make(POSITION_MODE, goal_position=2058, position_p_gain=100)
     )
@@ -343,7 +343,7 @@ def test_position_gains_act():
     )
 
 
-def test_the_integral_starts_anew_with_torque():
+def test_integral_resets_when_torque_goes_off():
     servo = make(POSITION_MODE, goal_position=2058, position_i_gain=10_000)
     fresh_a = settle(servo)
     settle(servo, start_ns=60 * MS)
@@ -353,20 +353,20 @@ def test_the_integral_starts_anew_with_torque():
     assert settle(servo, start_ns=120 * MS) == pytest.approx(fresh_a, rel=1e-3)
 
 
-def test_velocity_mode_rests_at_its_goal():
+def test_velocity_mode_needs_no_current_at_its_goal():
     servo = make(VELOCITY_MODE, goal_velocity=100)
     assert settle(servo, velocity_rad_s=100 * VELOCITY_UNIT_RAD_S) == pytest.approx(0.0, abs=1e-9)
     assert settle(servo, velocity_rad_s=0.0, start_ns=60 * MS) > 0.5
 
 
-def test_pwm_mode_is_a_voltage():
+def test_pwm_mode_sets_a_voltage():
     servo = make(PWM_MODE, goal_pwm=442)
     assert settle(servo) == pytest.approx(MODEL.stall_current_a * 442 / 885, abs=1e-3)
     assert read(servo, "present_pwm") == 442
     assert settle(make(PWM_MODE, goal_pwm=442, pwm_limit=100)) == pytest.approx(2.3 * 100 / 885, abs=1e-3)
 
 
-def test_goal_pwm_bounds_the_other_modes():
+def test_goal_pwm_limits_the_other_modes():
     servo = make(CURRENT_BASED_POSITION_MODE, goal_current=400, goal_position=10_000, goal_pwm=100)
     assert settle(servo) == pytest.approx(2.3 * 100 / 885, abs=1e-3)
 
@@ -381,13 +381,13 @@ def test_present_registers_are_quantised():
     assert read(servo, "moving") == 1
 
 
-def test_time_that_steps_back_is_no_time():
+def test_backward_time_step_has_no_effect():
     servo = make(CURRENT_MODE, goal_current=100)
     current_a = settle(servo)
     assert servo.control(0, 0.0, 0.0) == current_a
 
 
-def test_zero_is_the_middle_of_the_turn():
+def test_zero_rad_is_tick_2048_plus_homing_offset():
     servo = VirtualServo(1, MODEL)
     assert read(servo, "present_position") == 2048
     servo.set("homing_offset", -48)

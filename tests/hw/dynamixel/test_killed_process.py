@@ -1,4 +1,4 @@
-"""Grasps that are killed or stopped in mid-motion, in processes of their own, on servos in others."""
+"""Grasp processes that are killed or stopped in motion; the virtual servos run in other processes."""
 
 import json
 import signal
@@ -21,7 +21,7 @@ COMMAND = [sys.executable, "-c", "from gripper_force.cli import main; main()"]
 SIGNALS = (signal.SIGKILL, signal.SIGSTOP)
 PACKETS = sdk.PacketHandler(2.0)
 STARVED_MS = 400
-"""How late a busy machine may let a process come to its next cycle."""
+"""Longest delay of a cycle on a busy machine."""
 
 
 @contextmanager
@@ -50,7 +50,7 @@ def grasp(port: str, folder: Path, quick: list[str]) -> list[str]:
         "load_cell.backend": "none",
         "servo.reply_margin_ms": STARVED_MS,
         "servo.bus_watchdog_ms": 2 * STARVED_MS,
-        "gripper.open_width_m": 2.0,  # so far that it is on its way for 40 s
+        "gripper.open_width_m": 2.0,  # far enough for 40 s of motion
         "control.timeout_s": 60,
         "log.directory": folder,
         "log.report": "false",
@@ -59,7 +59,7 @@ def grasp(port: str, folder: Path, quick: list[str]) -> list[str]:
     return ["grasp", *(part for one in sets for part in ("--set", one))]
 
 
-def test_the_servo_lets_go_by_itself_and_the_log_is_whole(quick, tmp_path):
+def test_watchdog_stops_the_motor_and_the_log_is_readable(quick, tmp_path):
     for attempt in range(3):
         try:
             kill_both(quick, tmp_path / str(attempt))
@@ -71,7 +71,7 @@ def test_the_servo_lets_go_by_itself_and_the_log_is_whole(quick, tmp_path):
 
 
 class BusyError(Exception):
-    """A grasp gave up before it was killed."""
+    """A grasp ended with an error before it was killed."""
 
 
 def kill_both(quick: list[str], tmp_path: Path) -> None:
@@ -85,14 +85,14 @@ def kill_both(quick: list[str], tmp_path: Path) -> None:
         for child in children:
             if not any("approach" in line for line in child.stderr):
                 check_busy(child)
-        time.sleep(1.0)  # some way
+        time.sleep(1.0)  # of motion
         for child in children:
             if child.poll() is not None:
                 check_busy(child)
         sent_ns = time.monotonic_ns()
         for number, child in zip(SIGNALS, children, strict=True):
             child.send_signal(number)
-        time.sleep(3 * STARVED_MS / 1e3)  # in silence: any packet would feed the watchdog
+        time.sleep(3 * STARVED_MS / 1e3)  # without packets, which would feed the watchdog
         for port in ports:
             check_servo(port)
     for number in SIGNALS:
@@ -101,7 +101,7 @@ def kill_both(quick: list[str], tmp_path: Path) -> None:
 
 def check_busy(child: subprocess.Popen[str]) -> None:
     said = child.stdout.read() + child.stderr.read()
-    assert any(sentence in said for sentence in ("no sound answer", "watchdog tripped")), said
+    assert any(sentence in said for sentence in ("no valid reply", "watchdog tripped")), said
     raise BusyError(said)
 
 
@@ -124,6 +124,6 @@ def check_log(folder: Path, sent_ns: int) -> None:
     (path,) = folder.glob("*.mcap")
     log = LogReader(path, recover=True)
     states, commands = list(log.records(ServoState)), list(log.records(ServoCommand))
-    assert states[-1].position_rad > states[0].position_rad + 0.01  # it was on its way
+    assert states[-1].position_rad > states[0].position_rad + 0.01  # it was moving
     assert abs(len(states) - len(commands)) <= 1
     assert (sent_ns - states[-1].t_ns) / NS_PER_MS < 100 + STARVED_MS

@@ -20,35 +20,35 @@ PING = frame(1, Instruction.PING)
     ("name", "advice"),
     [("/dev/ttyNotThere", "plug it in"), ("virtual:nobody", "simulate one first")],
 )
-def test_a_missing_port_says_what_to_do(name, advice):
+def test_missing_port_error_has_a_remedy(name, advice):
     with pytest.raises(DeviceNotFoundError, match=advice):
         open_port(name, 1_000_000, 4.0)
 
 
-def test_a_file_that_is_no_line_is_refused(tmp_path):
+def test_regular_file_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(DeviceError, match="can't open"):
         open_port(str(tmp_path / "file"), 1_000_000, 4.0)
 
 
-def test_an_odd_baud_rate_is_refused(tmp_path):
+def test_unsupported_baud_rate_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="baud_rate 12345"):
         open_port(str(tmp_path), 12_345, 4.0)
 
 
-def test_a_port_is_exclusive_until_closed(line):
-    port = open_port(line.port, 1_000_000, 250.0)
+def test_port_is_exclusive_until_closed(endpoint):
+    port = open_port(endpoint.port, 1_000_000, 250.0)
     with pytest.raises(DeviceError, match="in use"):
-        open_port(line.port, 1_000_000, 250.0)
+        open_port(endpoint.port, 1_000_000, 250.0)
     port.closePort()
     port.closePort()
-    open_port(line.port, 1_000_000, 250.0).closePort()
+    open_port(endpoint.port, 1_000_000, 250.0).closePort()
 
 
-def test_a_pulled_plug_is_told_each_time_and_leaves_no_port_busy(line):
-    port = open_port(line.port, 1_000_000, 250.0)
+def test_unplugged_port_raises_every_time_and_is_not_left_busy(endpoint):
+    port = open_port(endpoint.port, 1_000_000, 250.0)
     assert PACKETS.ping(port, 1)[1] == sdk.COMM_SUCCESS
-    line.unplug()
+    endpoint.unplug()
     for _ in range(2):
         with pytest.raises(DeviceLostError, match="gone"):
             PACKETS.ping(port, 1)
@@ -56,15 +56,15 @@ def test_a_pulled_plug_is_told_each_time_and_leaves_no_port_busy(line):
     port.closePort()
 
 
-def test_a_closed_port_is_lost(line):
-    port = open_port(line.port, 1_000_000, 250.0)
+def test_closed_port_raises_device_lost(endpoint):
+    port = open_port(endpoint.port, 1_000_000, 250.0)
     port.closePort()
     with pytest.raises(DeviceLostError):
         PACKETS.ping(port, 1)
 
 
-def test_what_was_received_before_is_not_the_next_answer(line):
-    port = open_port(line.port, 1_000_000, 250.0)
+def test_drain_discards_an_earlier_reply(endpoint):
+    port = open_port(endpoint.port, 1_000_000, 250.0)
     port.writePort(PING)
     port.setPacketTimeoutMillis(100.0)
     port.drain()
@@ -73,8 +73,8 @@ def test_what_was_received_before_is_not_the_next_answer(line):
     port.closePort()
 
 
-def test_the_sdk_may_ask_for_less_than_nothing(line):
-    port = open_port(line.port, 1_000_000, 250.0)
+def test_read_of_negative_length_is_empty(endpoint):
+    port = open_port(endpoint.port, 1_000_000, 250.0)
     port.writePort(PING)
     port.setPacketTimeoutMillis(1000.0)
     assert port.readPort(1) == b"\xff"
@@ -83,7 +83,7 @@ def test_the_sdk_may_ask_for_less_than_nothing(line):
     port.closePort()
 
 
-def test_a_program_with_many_files_open_reads_too(line, tmp_path):
+def test_works_with_file_descriptors_above_1024(endpoint, tmp_path):
     with contextlib.ExitStack() as stack:
         file = stack.enter_context((tmp_path / "file").open("w"))
         soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -93,14 +93,14 @@ def test_a_program_with_many_files_open_reads_too(line, tmp_path):
         while last < 1024:
             last = os.dup(file.fileno())
             stack.callback(os.close, last)
-        port = open_port(line.port, 1_000_000, 250.0)
+        port = open_port(endpoint.port, 1_000_000, 250.0)
         stack.callback(port.closePort)
         number, result, _ = sdk.PacketHandler(2.0).ping(port, 1)
         assert (number, result) == (1020, sdk.COMM_SUCCESS)
 
 
-def test_an_answer_may_come_in_pieces(line):
-    port = open_port(line.port, 1_000_000, 100.0)
+def test_reply_may_arrive_in_pieces(endpoint):
+    port = open_port(endpoint.port, 1_000_000, 100.0)
     port.writePort(PING)
     port.setPacketTimeout(14)
     found = b""
@@ -112,8 +112,8 @@ def test_an_answer_may_come_in_pieces(line):
 
 
 @pytest.fixture
-def deaf_line():
-    """A port whose other end reads nothing."""
+def deaf_port():
+    """A port whose other end never reads."""
     master, slave = pty.openpty()
     tty.setraw(slave)
     port = open_port(os.ttyname(slave), 57_600, 4.0)
@@ -123,13 +123,13 @@ def deaf_line():
     os.close(slave)
 
 
-def test_the_time_for_an_answer_counts_both_packets_and_the_margin(deaf_line):
-    deaf_line.writePort(PING)
-    deaf_line.setPacketTimeout(100)
-    assert deaf_line.packet_timeout == pytest.approx(110 * 10_000 / 57_600 + 4.0)
+def test_timeout_includes_both_packets_and_the_margin(deaf_port):
+    deaf_port.writePort(PING)
+    deaf_port.setPacketTimeout(100)
+    assert deaf_port.packet_timeout == pytest.approx(110 * 10_000 / 57_600 + 4.0)
 
 
-def test_a_line_that_never_falls_silent_is_given_up():
+def test_endless_stream_of_bytes_is_abandoned():
     master, slave = pty.openpty()
     tty.setraw(slave)
     port = open_port(os.ttyname(slave), 1_000_000, 4.0)
@@ -141,19 +141,19 @@ def test_a_line_that_never_falls_silent_is_given_up():
 
     thread = threading.Thread(target=babble)
     thread.start()
-    # On a busy machine the other thread may come too late for one try.
+    # On a busy machine the other thread may be too late for one try.
     assert any(PACKETS.ping(port, 1)[1] == sdk.COMM_RX_CORRUPT for _ in range(50))
     port.drain()
     done.set()
-    port.clearPort()  # or the last write would wait for ever
+    port.clearPort()  # otherwise the last write would block
     thread.join()
     port.closePort()
     os.close(master)
     os.close(slave)
 
 
-def test_a_line_that_takes_no_more_is_not_lost(deaf_line):
-    while deaf_line.writePort(bytes(1000)):
+def test_full_output_buffer_is_not_a_lost_port(deaf_port):
+    while deaf_port.writePort(bytes(1000)):
         pass
-    assert PACKETS.ping(deaf_line, 1)[1] == sdk.COMM_TX_FAIL
-    assert not deaf_line.is_using
+    assert PACKETS.ping(deaf_port, 1)[1] == sdk.COMM_TX_FAIL
+    assert not deaf_port.is_using

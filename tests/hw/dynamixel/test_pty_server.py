@@ -17,7 +17,7 @@ MODEL = load_model("XM430-W350")
 MS = 1_000_000
 
 
-def test_the_vendors_own_port_finds_the_servos_and_clients_come_and_go():
+def test_vendors_port_finds_the_servos_of_consecutive_clients():
     with serve_virtual_servo("XL330-M288", ids=(1, 2)) as server:
         for id_ in (1, 2):
             port = sdk.PortHandler(server.device_path)
@@ -26,7 +26,7 @@ def test_the_vendors_own_port_finds_the_servos_and_clients_come_and_go():
             port.closePort()
 
 
-def test_a_served_motor_moves():
+def test_served_motor_moves():
     with serve_virtual_servo("XM430-W350") as server:
         port = sdk.PortHandler(server.device_path)
         port.openPort()
@@ -40,12 +40,12 @@ def test_a_served_motor_moves():
     assert ticks > 2090
 
 
-def test_an_unknown_model_is_refused():
+def test_unknown_model_is_refused():
     with pytest.raises(ConfigError, match="known"):
         serve_virtual_servo("AX-12")
 
 
-def test_nothing_is_left_behind():
+def test_close_releases_handles_and_threads():
     handles = len(list(Path("/proc/self/fd").iterdir()))
     threads = threading.active_count()
     server = PtyServer(VirtualBus([VirtualServo(1, MODEL)]))
@@ -55,7 +55,7 @@ def test_nothing_is_left_behind():
     assert threading.active_count() == threads
 
 
-def test_a_client_that_never_reads_does_not_stop_the_bus():
+def test_client_that_never_reads_does_not_block_the_bus():
     answered = threading.Semaphore(0)
 
     def flood(answer: bytes) -> bytes:
@@ -89,27 +89,27 @@ def motor_in_mode_5(goal_ticks: int, goal_current: int, **plant: float) -> Bench
     return BenchMotor(servo, **plant)
 
 
-def test_a_free_motor_reaches_its_goal_and_rests():
+def test_free_motor_reaches_its_goal_and_stops():
     motor = motor_in_mode_5(2048 + 500, 400)
     run(motor, 1500)
     assert motor.position_rad == pytest.approx(500 * 2 * 3.14159265 / 4096, abs=0.01)
     assert motor.velocity_rad_s == 0.0
 
 
-def test_a_motor_in_contact_presses_as_hard_as_its_goal_current():
+def test_contact_torque_matches_the_goal_current():
     motor = motor_in_mode_5(4000, 100, contact_rad=0.5, stiffness_nm_per_rad=20.0)
     run(motor, 2000)
     pressed_nm = 20.0 * (motor.position_rad - 0.5)
     assert pressed_nm == pytest.approx(100 * MODEL.current_unit_a * MODEL.nm_per_a, abs=0.051)  # friction
 
 
-def test_a_motor_without_torque_stays():
+def test_motor_without_torque_does_not_move():
     motor = BenchMotor(VirtualServo(1, MODEL))
     run(motor, 100)
     assert (motor.position_rad, motor.velocity_rad_s) == (0.0, 0.0)
 
 
-def test_a_long_pause_is_cut_short():
+def test_long_pause_is_simulated_only_in_part():
     motor = motor_in_mode_5(4000, 400)
     motor.advance(0)
     motor.advance(10**15)

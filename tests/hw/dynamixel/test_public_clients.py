@@ -1,6 +1,6 @@
-"""Dynamixel clients that others wrote find in the virtual servo what they would find in a real one.
+"""Public Dynamixel clients work with the virtual servo as with a real one.
 
-They are no dependencies of ours: they run in an environment of their own.
+They are not dependencies of this project and run in a separate environment.
 """
 
 import json
@@ -12,18 +12,19 @@ import pytest
 
 from gripper_hw.dynamixel.pty_server import serve_virtual_servo
 
-WANTED = "GRIPPER_FORCE_CLIENT_PYTHON"
-HOW = (
-    f"{WANTED} names no python that has {{client}}: python3 -m venv /tmp/clients && /tmp/clients/bin/pip "
-    f"install rustypot dynamixel-python; then {WANTED}=/tmp/clients/bin/python pytest {__file__}"
+PYTHON_VARIABLE = "GRIPPER_FORCE_CLIENT_PYTHON"
+SKIP_REASON = (
+    f"{PYTHON_VARIABLE} does not name a Python that has {{client}}; run python3 -m venv /tmp/clients && "
+    "/tmp/clients/bin/pip install rustypot dynamixel-python; "
+    f"then {PYTHON_VARIABLE}=/tmp/clients/bin/python pytest {__file__}"
 )
 
-# Each finds servos 1 and 2, reads their positions, turns torque on, is refused another operating mode, sends
-# both to a goal and sees them come there. The table of the XL330 is the one that all three know.
+# Each script finds servos 1 and 2, reads their positions, turns torque on, is refused another operating mode,
+# and moves both to a goal. The XL330 is the model that all three clients support.
 ROBOTIS = """
 from dynamixel_sdk import *
 from dynamixel_sdk import port_handler
-port_handler.LATENCY_TIMER = 1000  # a busy machine is later than any adapter
+port_handler.LATENCY_TIMER = 1000  # a busy machine is slower than any adapter
 port, packets = PortHandler(path), PacketHandler(2.0)
 port.openPort()
 port.setBaudRate(1_000_000)
@@ -54,7 +55,7 @@ positions = lambda: bus.sync_read_raw_present_position([1, 2])
 before = positions()
 celsius = bus.sync_read_present_temperature([1, 2])
 for register in bus.registers():
-    # Its table is another firmware's: that had a limit of acceleration, and indirect data from 224 on.
+    # Its table is of another firmware, with an acceleration limit and with indirect data from 224 on.
     if register.addr not in (40, 228, 229):
         assert bus.read_register_with_error(1, register.name)[1] == 0, register.name
 bus.sync_write_torque_enable([1, 2], [True, True])
@@ -85,7 +86,7 @@ for _ in range(100_000):
     if min(positions()) > 2200:
         break
 json.dump({"models": models, "before": before, "celsius": celsius, "refusal": refusal,
-           "came": min(positions()) > 2200}, sys.stdout)
+           "arrived": min(positions()) > 2200}, sys.stdout)
 """
 
 
@@ -97,10 +98,10 @@ json.dump({"models": models, "before": before, "celsius": celsius, "refusal": re
         pytest.param("dxl2", DYNAMIXEL_PYTHON, id="dynamixel-python"),
     ],
 )
-def test_a_public_client_finds_what_a_real_servo_has(client: str, script: str) -> None:
-    python = sys.executable if client == "dynamixel_sdk" else os.environ.get(WANTED, "")
+def test_public_client_works_with_the_virtual_servo(client: str, script: str) -> None:
+    python = sys.executable if client == "dynamixel_sdk" else os.environ.get(PYTHON_VARIABLE, "")
     if not python or subprocess.run([python, "-c", f"import {client}"], capture_output=True).returncode:
-        pytest.skip(HOW.format(client=client))
+        pytest.skip(SKIP_REASON.format(client=client))
     with serve_virtual_servo("XL330-M288", ids=(1, 2)) as server:
         code = f"import json, sys\npath = {server.device_path!r}{script}{REPORT}"
         run = subprocess.run([python, "-c", code], capture_output=True, text=True, timeout=120)
@@ -110,5 +111,5 @@ def test_a_public_client_finds_what_a_real_servo_has(client: str, script: str) -
         "before": [2048, 2048],
         "celsius": [30, 30],
         "refusal": 7,  # access error: torque is on
-        "came": True,
+        "arrived": True,
     }

@@ -34,8 +34,8 @@ MODEL = load_model("XM430-W350")
 MS = 1_000_000
 
 
-def drive(line, **config) -> DynamixelServo:
-    return DynamixelServo(line.config(**config), lambda: line.now_ns)
+def drive(endpoint, **config) -> DynamixelServo:
+    return DynamixelServo(endpoint.config(**config), lambda: endpoint.now_ns)
 
 
 def write_packet(name: str, value: int, id_: int = 1) -> Packet:
@@ -48,20 +48,20 @@ def command(position_rad: float = 0.0, current_a: float = 0.1) -> ServoCommand:
 
 
 @pytest.fixture
-def started(line):
-    """A line and the servo that was started on it."""
-    servo = drive(line)
+def started(endpoint):
+    """A bus endpoint and a servo started on it."""
+    servo = drive(endpoint)
     servo.start()
-    yield line, servo
+    yield endpoint, servo
     servo.close()
 
 
 # Start.
 
 
-def test_start_sets_the_servo_up(line):
-    servo: Servo = drive(line, current_limit_a=1.0, bus_watchdog_ms=41)
-    firmware = line.bus.servos[0]
+def test_start_configures_the_servo(endpoint):
+    servo: Servo = drive(endpoint, current_limit_a=1.0, bus_watchdog_ms=41)
+    firmware = endpoint.bus.servos[0]
     firmware.control(0, 1.0, 0.0)
     state = servo.start()
     assert state.position_rad == pytest.approx(1.0, abs=1e-3)
@@ -76,17 +76,16 @@ def test_start_sets_the_servo_up(line):
         "goal_position": ticks_from_rad(1.0),
     }
     assert {name: firmware.get(name) for name in expected} == expected
-    assert servo.nm_per_a == MODEL.nm_per_a
     servo.close()
 
 
-def test_start_writes_the_present_position_as_goal_before_torque_comes_on(line):
-    firmware = line.bus.servos[0]
+def test_start_writes_the_present_position_as_goal_before_torque_comes_on(endpoint):
+    firmware = endpoint.bus.servos[0]
     firmware.control(0, -0.7, 0.0)
-    servo = drive(line)
+    servo = drive(endpoint)
     servo.start()
     servo.close()
-    writes = [packet for packet in line.packets() if packet.instruction == Instruction.WRITE]
+    writes = [packet for packet in endpoint.packets() if packet.instruction == Instruction.WRITE]
     goal = writes.index(write_packet("goal_position", ticks_from_rad(-0.7)))
     watchdog = writes.index(write_packet("bus_watchdog", 2))
     torque_off, torque_on = (writes.index(write_packet("torque_enable", value)) for value in (0, 1))
@@ -95,133 +94,133 @@ def test_start_writes_the_present_position_as_goal_before_torque_comes_on(line):
     assert torque_off < mode < goal < watchdog < torque_on == len(writes) - 1
 
 
-def test_start_reads_back_all_it_writes(memory_line):
-    drive(memory_line).start()
-    packets = memory_line.packets()
+def test_start_reads_back_every_write(memory_endpoint):
+    drive(memory_endpoint).start()
+    packets = memory_endpoint.packets()
     for write, read in itertools.pairwise(packets):
         if write.instruction == Instruction.WRITE:
             assert (read.id, read.instruction, read.params[:2]) == (1, Instruction.READ, write.params[:2])
             assert 0 <= int.from_bytes(read.params[2:], "little") - (len(write.params) - 2) < 8
 
 
-def test_a_second_start_leaves_the_eeprom_alone(started):
-    line, servo = started
+def test_second_start_does_not_write_the_eeprom(started):
+    endpoint, servo = started
     servo.stop(hold=False)
     servo.close()
-    line.heard.clear()
+    endpoint.received.clear()
     servo.start()
-    writes = [packet for packet in line.packets() if packet.instruction == Instruction.WRITE]
+    writes = [packet for packet in endpoint.packets() if packet.instruction == Instruction.WRITE]
     assert all(int.from_bytes(packet.params[:2], "little") >= 64 for packet in writes)
 
 
-def test_a_tripped_watchdog_is_cleared_only_once_torque_is_off(memory_line):
-    firmware = memory_line.bus.servos[0]
+def test_start_clears_a_tripped_watchdog_after_torque_off(memory_endpoint):
+    firmware = memory_endpoint.bus.servos[0]
     firmware.set("torque_enable", 1)
     firmware.set("bus_watchdog", -1)
-    drive(memory_line).start()
-    writes = [packet for packet in memory_line.packets() if packet.instruction == Instruction.WRITE]
+    drive(memory_endpoint).start()
+    writes = [packet for packet in memory_endpoint.packets() if packet.instruction == Instruction.WRITE]
     assert writes[:2] == [write_packet("torque_enable", 0), write_packet("bus_watchdog", 0)]
 
 
 @pytest.mark.parametrize("level", [0, 1])
-def test_a_servo_that_was_left_mute_is_started(line, level):
-    line.bus.servos[0].set("status_return_level", level)
-    servo = drive(line)
+def test_start_enables_replies(endpoint, level):
+    endpoint.bus.servos[0].set("status_return_level", level)
+    servo = drive(endpoint)
     servo.start()
-    assert line.bus.servos[0].get("status_return_level") == 2
+    assert endpoint.bus.servos[0].get("status_return_level") == 2
     assert servo.stats.retries == 0
     servo.close()
 
 
-def test_nobody_at_that_id(line):
+def test_missing_id_is_reported_and_releases_the_port(endpoint):
     with pytest.raises(DeviceNotFoundError, match=r"id 9 .*does not answer"):
-        drive(line, id=9, reply_margin_ms=2.0).start()
-    drive(line).start()  # the port was let go of
+        drive(endpoint, id=9, reply_margin_ms=2.0).start()
+    drive(endpoint).start()  # the port was released
 
 
-def test_another_model_is_left_alone(make_memory_line):
-    line = make_memory_line(VirtualServo(1, load_model("XM430-W210")))
+def test_another_model_is_refused_and_not_written(make_memory_endpoint):
+    endpoint = make_memory_endpoint(VirtualServo(1, load_model("XM430-W210")))
     with pytest.raises(ConfigError, match="XM430-W210"):
-        drive(line).start()
-    assert all(packet.instruction != Instruction.WRITE for packet in line.packets())
+        drive(endpoint).start()
+    assert all(packet.instruction != Instruction.WRITE for packet in endpoint.packets())
 
 
-def test_a_servo_without_current_control_is_refused_when_found(memory_line):
-    memory_line.bus.servos[0].set("model_number", 1060)
+def test_connected_servo_without_current_control_is_refused(memory_endpoint):
+    memory_endpoint.bus.servos[0].set("model_number", 1060)
     with pytest.raises(ConfigError, match=r"XL430-W250.*Present Load"):
-        drive(memory_line).start()
+        drive(memory_endpoint).start()
 
 
 @pytest.mark.parametrize("model", ["XL430-W250", "AX-12"])
-def test_a_model_that_will_not_do_is_refused_before_any_port_is_opened(model):
+def test_unsuitable_model_is_refused_before_the_port_is_opened(model):
     with pytest.raises(ConfigError, match=model):
         DynamixelServo(ServoConfig(port="virtual:nobody", model=model))
 
 
-def test_more_current_than_the_model_allows_is_refused():
+def test_current_limit_above_the_models_is_refused():
     with pytest.raises(ConfigError, match=r"current_limit_a is 1.2.*0.91"):
         DynamixelServo(ServoConfig(port="virtual:nobody", model="XC330-T288"))
 
 
-def test_spec_is_the_models_data_and_needs_no_port():
+def test_spec_contains_the_models_data_and_needs_no_port():
     config = ServoConfig(port="virtual:nobody", model="XC330-T288")
     assert DynamixelServo.spec(config) == ServoSpec(
         nm_per_a=pytest.approx(0.92 / 0.80), current_step_a=0.001, voltage_range_v=(6.5, 12.0)
     )
-    with pytest.raises(ConfigError, match="unknown servo model 'AX-12'"):
+    with pytest.raises(ConfigError, match=r"unknown servo\.model 'AX-12'"):
         DynamixelServo.spec(ServoConfig(model="AX-12"))
 
 
-def test_old_firmware_is_refused_and_loses_its_torque(make_memory_line):
-    line = make_memory_line(VirtualServo(1, MODEL, firmware=44))
-    line.bus.servos[0].set("torque_enable", 1)
+def test_old_firmware_is_refused_with_torque_off(make_memory_endpoint):
+    endpoint = make_memory_endpoint(VirtualServo(1, MODEL, firmware=44))
+    endpoint.bus.servos[0].set("torque_enable", 1)
     with pytest.raises(DeviceError, match=r"firmware 44.*update it to 45"):
-        drive(line).start()
-    assert line.bus.servos[0].get("torque_enable") == 0
+        drive(endpoint).start()
+    assert endpoint.bus.servos[0].get("torque_enable") == 0
 
 
-def test_a_start_where_one_servo_is_missing_turns_the_others_torque_off(make_memory_line):
-    line = make_memory_line(VirtualServo(1, MODEL))
-    line.bus.servos[0].set("torque_enable", 1)
+def test_missing_servo_fails_start_and_turns_the_others_off(make_memory_endpoint):
+    endpoint = make_memory_endpoint(VirtualServo(1, MODEL))
+    endpoint.bus.servos[0].set("torque_enable", 1)
     with pytest.raises(DeviceNotFoundError, match="id 2"):
-        DynamixelBus(line.config(reply_margin_ms=2.0), (1, 2)).start()
-    assert line.bus.servos[0].get("torque_enable") == 0
+        DynamixelBus(endpoint.config(reply_margin_ms=2.0), (1, 2)).start()
+    assert endpoint.bus.servos[0].get("torque_enable") == 0
 
 
-def test_gains_and_bounds_that_another_program_left_are_set_right(line):
-    firmware = line.bus.servos[0]
+def test_start_overwrites_gains_of_another_program(endpoint):
+    firmware = endpoint.bus.servos[0]
     odd = ("position_p_gain", "position_i_gain", "position_d_gain", "feedforward_1st_gain", "goal_pwm")
     usual = {name: firmware.get(name) for name in odd}
     for name in odd:
         firmware.set(name, 1)
-    drive(line).start()
+    drive(endpoint).start()
     assert {name: firmware.get(name) for name in odd} == usual
 
 
-def test_a_hardware_error_refuses_start_and_leaves_torque_off(memory_line):
-    firmware = memory_line.bus.servos[0]
+def test_hardware_error_prevents_start_with_torque_off(memory_endpoint):
+    firmware = memory_endpoint.bus.servos[0]
     firmware.set("shutdown", 0)
     firmware.set("torque_enable", 1)
     firmware.raise_hardware_error(OVERLOAD_ERROR | OVERHEATING_ERROR)
     with pytest.raises(HardwareFaultError, match="overheating and overload"):
-        drive(memory_line).start()
+        drive(memory_endpoint).start()
     assert firmware.get("torque_enable") == 0
 
 
-def test_a_start_that_fails_late_turns_torque_off(memory_line):
-    firmware = memory_line.bus.servos[0]
+def test_late_failure_of_start_turns_torque_off(memory_endpoint):
+    firmware = memory_endpoint.bus.servos[0]
 
     def lose_the_last_read(answer):
         return None if firmware.get("torque_enable") and answer[4] == BROADCAST_ID else answer
 
-    memory_line.bus.tamper = lose_the_last_read
+    memory_endpoint.bus.tamper = lose_the_last_read
     with pytest.raises(DeviceTimeoutError):
-        drive(memory_line).start()
+        drive(memory_endpoint).start()
     assert firmware.get("torque_enable") == 0
 
 
-def test_a_register_that_does_not_keep_its_value_is_told(memory_line):
-    firmware = memory_line.bus.servos[0]
+def test_register_that_does_not_keep_its_value_is_reported(memory_endpoint):
+    firmware = memory_endpoint.bus.servos[0]
     real = firmware.write
 
     def forgetful(address, data):
@@ -231,22 +230,22 @@ def test_a_register_that_does_not_keep_its_value_is_told(memory_line):
 
     firmware.write = forgetful
     with pytest.raises(DeviceError, match="did not keep operating_mode = 5"):
-        drive(memory_line).start()
+        drive(memory_endpoint).start()
 
 
 @pytest.mark.parametrize(
     ("model", "firmware", "data"),
     [("XM430-W350", 52, 224), ("XL330-M288", 51, 224), ("XL330-M288", 52, 208), ("XC330-T288", 52, 208)],
 )
-def test_the_cycle_uses_the_models_indirect_data(make_memory_line, model, firmware, data):
-    line = make_memory_line(VirtualServo(1, load_model(model), firmware))
-    servo = drive(line, model=model, current_limit_a=0.9)
+def test_cycle_uses_the_models_indirect_data(make_memory_endpoint, model, firmware, data):
+    endpoint = make_memory_endpoint(VirtualServo(1, load_model(model), firmware))
+    servo = drive(endpoint, model=model, current_limit_a=0.9)
     assert servo.firmware is None
     servo.start()
-    line.heard.clear()
+    endpoint.received.clear()
     servo.read()
     servo.write(command())
-    read, write = line.packets()
+    read, write = endpoint.packets()
     assert (read.instruction, write.instruction) == (Instruction.FAST_SYNC_READ, Instruction.SYNC_WRITE)
     assert (read.params[:2], read.params[4:]) == (struct.pack("<H", data), b"\x01")
     assert 13 <= int.from_bytes(read.params[2:4], "little") <= 20
@@ -257,12 +256,12 @@ def test_the_cycle_uses_the_models_indirect_data(make_memory_line, model, firmwa
 # The cycle.
 
 
-def test_read_gives_signed_si_units(started):
-    line, servo = started
-    firmware = line.bus.servos[0]
-    firmware.sense(temperature_c=41.0, voltage_v=11.3)
+def test_read_returns_signed_si_units(started):
+    endpoint, servo = started
+    firmware = endpoint.bus.servos[0]
+    firmware.set_conditions(temperature_c=41.0, voltage_v=11.3)
     firmware.control(0, -2.0, -1.5, current_noise_a=-0.25)
-    line.now_ns = 7 * MS
+    endpoint.now_ns = 7 * MS
     state = servo.read()
     assert state.t_ns == 7 * MS
     assert state.position_rad == pytest.approx(-2.0, abs=1e-3)
@@ -271,11 +270,11 @@ def test_read_gives_signed_si_units(started):
     assert (state.temperature_c, state.voltage_v, state.hardware_error) == (41.0, pytest.approx(11.3), 0)
 
 
-def test_data_that_looks_like_a_header_is_read_right(started):
+def test_data_that_contains_a_header_pattern_is_read_correctly(started):
     """The SDK's removeStuffing misreads such data; fast sync read is not stuffed."""
-    line, servo = started
+    endpoint, servo = started
     current, velocity, ticks = struct.unpack("<hhi", bytes.fromhex("fffffd00aafffdfd"))
-    line.bus.servos[0].control(
+    endpoint.bus.servos[0].control(
         0, rad_from_ticks(ticks), velocity * VELOCITY_UNIT_RAD_S, current * MODEL.current_unit_a
     )
     state = servo.read()
@@ -285,21 +284,21 @@ def test_data_that_looks_like_a_header_is_read_right(started):
 
 
 def test_write_sets_both_goals_in_one_packet(started):
-    line, servo = started
-    line.heard.clear()
+    endpoint, servo = started
+    endpoint.received.clear()
     servo.write(command(0.5, 0.269))
-    servo.read()  # so that the write has been carried out
-    assert [packet.instruction for packet in line.packets()] == [
+    servo.read()  # so that the write was executed
+    assert [packet.instruction for packet in endpoint.packets()] == [
         Instruction.SYNC_WRITE,
         Instruction.FAST_SYNC_READ,
     ]
-    firmware = line.bus.servos[0]
+    firmware = endpoint.bus.servos[0]
     assert (firmware.get("goal_current"), firmware.get("goal_position")) == (100, ticks_from_rad(0.5))
 
 
 @settings(deadline=None, max_examples=50)
 @given(st.floats(allow_nan=False, allow_infinity=False), st.floats(allow_nan=False, allow_infinity=False))
-def test_goals_stay_within_current_limit_and_travel(position_rad, current_a):
+def test_goals_are_clamped_to_current_limit_and_travel(position_rad, current_a):
     bus = VirtualBus([VirtualServo(1, MODEL)], lambda: 0)
     register_bus("goals", bus)
     servo = DynamixelServo(ServoConfig(port="virtual:goals", current_limit_a=0.5), lambda: 0)
@@ -316,164 +315,164 @@ def test_goals_stay_within_current_limit_and_travel(position_rad, current_a):
     unregister_bus("goals")
 
 
-def test_two_servos_are_read_and_written_together(make_line):
-    line = make_line(VirtualServo(1, MODEL), VirtualServo(2, MODEL))
-    bus = DynamixelBus(line.config(), (2, 1), lambda: line.now_ns)
+def test_two_servos_share_one_read_and_one_write(make_endpoint):
+    endpoint = make_endpoint(VirtualServo(1, MODEL), VirtualServo(2, MODEL))
+    bus = DynamixelBus(endpoint.config(), (2, 1), lambda: endpoint.now_ns)
     bus.start()
-    for servo, position_rad in zip(line.bus.servos, (0.25, -0.25), strict=True):
+    for servo, position_rad in zip(endpoint.bus.servos, (0.25, -0.25), strict=True):
         servo.control(0, position_rad, 0.0)
-    line.heard.clear()
+    endpoint.received.clear()
     bus.write((command(0.2, 0.2), command(0.1, 0.1)))
     second, first = bus.read()
     assert (round(first.position_rad, 2), round(second.position_rad, 2)) == (0.25, -0.25)
-    assert len(line.packets()) == 2
-    assert [servo.get("goal_position") for servo in line.bus.servos] == [
+    assert len(endpoint.packets()) == 2
+    assert [servo.get("goal_position") for servo in endpoint.bus.servos] == [
         ticks_from_rad(0.1),
         ticks_from_rad(0.2),
     ]
     bus.stop(hold=False)
-    assert [servo.get("torque_enable") for servo in line.bus.servos] == [0, 0]
+    assert [servo.get("torque_enable") for servo in endpoint.bus.servos] == [0, 0]
     bus.close()
 
 
-def test_servos_whose_firmware_differs_in_indirect_data_are_refused(make_memory_line):
+def test_firmware_versions_with_different_indirect_data_are_refused(make_memory_endpoint):
     model = load_model("XL330-M288")
-    line = make_memory_line(VirtualServo(1, model, 51), VirtualServo(2, model, 52))
+    endpoint = make_memory_endpoint(VirtualServo(1, model, 51), VirtualServo(2, model, 52))
     with pytest.raises(DeviceError, match=r"\(51, 52\).*same version"):
-        DynamixelBus(line.config(model="XL330-M288"), (1, 2)).start()
+        DynamixelBus(endpoint.config(model="XL330-M288"), (1, 2)).start()
 
 
-def test_a_hardware_error_travels_in_the_state(started):
-    line, servo = started
-    line.bus.servos[0].raise_hardware_error(OVERLOAD_ERROR)
+def test_hardware_error_is_in_the_state(started):
+    endpoint, servo = started
+    endpoint.bus.servos[0].raise_hardware_error(OVERLOAD_ERROR)
     assert servo.read().hardware_error == OVERLOAD_ERROR
 
 
-def test_a_tripped_watchdog_is_told_and_not_cleared(started):
-    line, servo = started
-    line.now_ns += 41 * MS
+def test_tripped_watchdog_raises_and_is_not_cleared(started):
+    endpoint, servo = started
+    endpoint.now_ns += 41 * MS
     for _ in range(2):
         with pytest.raises(HardwareFaultError, match="watchdog tripped"):
             servo.read()
-    assert line.bus.servos[0].get("bus_watchdog") == -1
+    assert endpoint.bus.servos[0].get("bus_watchdog") == -1
 
 
-def test_reading_in_time_keeps_the_watchdog_quiet(started):
-    line, servo = started
+def test_reading_in_time_feeds_the_watchdog(started):
+    endpoint, servo = started
     for _ in range(10):
-        line.now_ns += 40 * MS
+        endpoint.now_ns += 40 * MS
         servo.read()
     assert servo.stats.cycles == 12  # two of them in start
 
 
-def test_a_servo_that_restarted_is_told(started):
-    line, servo = started
-    line.bus.servos[0].reboot(line.now_ns)
-    line.now_ns += REBOOT_NS
-    with pytest.raises(HardwareFaultError, match="restarted and forgot"):
+def test_restarted_servo_raises(started):
+    endpoint, servo = started
+    endpoint.bus.servos[0].reboot(endpoint.now_ns)
+    endpoint.now_ns += REBOOT_NS
+    with pytest.raises(HardwareFaultError, match="restarted and lost"):
         servo.read()
 
 
 # Stop.
 
 
-def test_stop_turns_torque_off_on_the_wire(started):
-    line, servo = started
-    line.heard.clear()
+def test_stop_sends_torque_off_and_reads_it_back(started):
+    endpoint, servo = started
+    endpoint.received.clear()
     servo.stop(hold=False)
-    assert line.packets()[0] == write_packet("torque_enable", 0)
-    assert line.packets()[1].instruction == Instruction.READ
-    assert line.bus.servos[0].get("torque_enable") == 0
+    assert endpoint.packets()[0] == write_packet("torque_enable", 0)
+    assert endpoint.packets()[1].instruction == Instruction.READ
+    assert endpoint.bus.servos[0].get("torque_enable") == 0
 
 
 def test_stop_with_hold_keeps_the_goals_and_disarms_the_watchdog(started):
-    line, servo = started
+    endpoint, servo = started
     servo.write(command(0.5, 0.3))
-    line.heard.clear()
+    endpoint.received.clear()
     servo.stop(hold=True)
-    line.now_ns += 10_000 * MS
+    endpoint.now_ns += 10_000 * MS
     assert servo.read().hardware_error == 0
-    firmware = line.bus.servos[0]
+    firmware = endpoint.bus.servos[0]
     assert (firmware.get("torque_enable"), firmware.get("bus_watchdog")) == (1, 0)
     assert firmware.get("goal_position") == ticks_from_rad(0.5)
-    assert write_packet("torque_enable", 0) not in line.packets()
+    assert write_packet("torque_enable", 0) not in endpoint.packets()
 
 
-def test_hold_after_a_trip_does_not_set_the_motor_going_again(started):
-    line, servo = started
+def test_hold_after_a_watchdog_trip_does_not_restart_the_motor(started):
+    endpoint, servo = started
     servo.write(command(0.5, 0.3))
     servo.read()
-    line.now_ns += 41 * MS
+    endpoint.now_ns += 41 * MS
     with pytest.raises(HardwareFaultError, match="can't hold"):
         servo.stop(hold=True)
-    firmware = line.bus.servos[0]
+    firmware = endpoint.bus.servos[0]
     assert (firmware.get("torque_enable"), firmware.get("bus_watchdog")) == (0, 0)
     torque, watchdog = (
-        line.packets().index(write_packet(name, 0), 10) for name in ("torque_enable", "bus_watchdog")
+        endpoint.packets().index(write_packet(name, 0), 10) for name in ("torque_enable", "bus_watchdog")
     )
     assert torque < watchdog
 
 
-def test_a_servo_that_restarted_can_not_hold(memory_line):
-    servo = drive(memory_line)
+def test_restarted_servo_can_not_hold(memory_endpoint):
+    servo = drive(memory_endpoint)
     servo.start()
-    memory_line.bus.servos[0].set("torque_enable", 0)
+    memory_endpoint.bus.servos[0].set("torque_enable", 0)
     with pytest.raises(HardwareFaultError, match="can't hold"):
         servo.stop(hold=True)
 
 
-def test_a_servo_that_can_not_be_told_to_hold_loses_its_torque(memory_line):
-    servo = drive(memory_line)
+def test_failed_hold_turns_torque_off(memory_endpoint):
+    servo = drive(memory_endpoint)
     servo.start()
     deaf = REGISTERS["bus_watchdog"].address.to_bytes(2, "little")
 
     def lose_what_is_said_of_the_watchdog(answer):
-        packet = memory_line.packets()[-1]
+        packet = memory_endpoint.packets()[-1]
         return None if packet.params[:2] == deaf else answer
 
-    memory_line.bus.tamper = lose_what_is_said_of_the_watchdog
+    memory_endpoint.bus.tamper = lose_what_is_said_of_the_watchdog
     with pytest.raises(DeviceTimeoutError):
         servo.stop(hold=True)
-    assert memory_line.bus.servos[0].get("torque_enable") == 0
+    assert memory_endpoint.bus.servos[0].get("torque_enable") == 0
 
 
-def test_stop_goes_on_through_lost_answers(memory_line):
-    servo = drive(memory_line, retries=0)
+def test_stop_retries_after_lost_replies(memory_endpoint):
+    servo = drive(memory_endpoint, retries=0)
     servo.start()
     lost = iter(range(4))
-    memory_line.bus.tamper = lambda answer: answer if next(lost, None) is None else None
+    memory_endpoint.bus.tamper = lambda answer: answer if next(lost, None) is None else None
     servo.stop(hold=False)
     assert servo.stats.timeouts == 4
-    assert memory_line.bus.servos[0].get("torque_enable") == 0
+    assert memory_endpoint.bus.servos[0].get("torque_enable") == 0
 
 
-def test_stop_sends_torque_off_even_if_no_answer_ever_comes(memory_line):
-    servo = drive(memory_line)
+def test_stop_turns_torque_off_without_any_reply(memory_endpoint):
+    servo = drive(memory_endpoint)
     servo.start()
-    memory_line.bus.tamper = lambda answer: None
-    memory_line.heard.clear()
+    memory_endpoint.bus.tamper = lambda answer: None
+    memory_endpoint.received.clear()
     with pytest.raises(DeviceTimeoutError):
         servo.stop(hold=False)
-    assert memory_line.packets().count(write_packet("torque_enable", 0)) == 15
-    assert memory_line.bus.servos[0].get("torque_enable") == 0
+    assert memory_endpoint.packets().count(write_packet("torque_enable", 0)) == 15
+    assert memory_endpoint.bus.servos[0].get("torque_enable") == 0
 
 
-def test_stop_tries_every_servo(make_memory_line):
-    line = make_memory_line(VirtualServo(1, MODEL), VirtualServo(2, MODEL))
-    bus = DynamixelBus(line.config(), (1, 2), lambda: line.now_ns)
+def test_stop_tries_every_servo(make_memory_endpoint):
+    endpoint = make_memory_endpoint(VirtualServo(1, MODEL), VirtualServo(2, MODEL))
+    bus = DynamixelBus(endpoint.config(), (1, 2), lambda: endpoint.now_ns)
     bus.start()
-    line.bus.servos[0].silent_until_ns = 10**12
+    endpoint.bus.servos[0].silent_until_ns = 10**12
     with pytest.raises(DeviceTimeoutError, match="servo 1"):
         bus.stop(hold=False)
-    assert [servo.get("torque_enable") for servo in line.bus.servos] == [1, 0]
+    assert [servo.get("torque_enable") for servo in endpoint.bus.servos] == [1, 0]
 
 
-# Faults on the wire: see test_line.py and test_faults.py as well.
+# Faults on the bus: see test_transport.py and test_bus_faults.py as well.
 
 
-def test_a_pulled_plug_is_told_at_once(started):
-    line, servo = started
-    line.unplug()
+def test_unplugged_bus_raises_at_once(started):
+    endpoint, servo = started
+    endpoint.unplug()
     for call in (servo.read, lambda: servo.write(command()), lambda: servo.stop(hold=False), servo.read):
         with pytest.raises(DeviceLostError, match="gone"):
             call()
@@ -482,7 +481,7 @@ def test_a_pulled_plug_is_told_at_once(started):
     servo.close()
 
 
-def test_registers_of_the_cycle_exist_in_every_model():
+def test_cycle_fits_the_indirect_data_of_every_model():
     for name in control_table.model_names():
         model = load_model(name)
         assert model.indirect_windows(model.min_firmware)[0].length >= 20

@@ -7,6 +7,7 @@ import pytest
 
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DeviceError, DeviceNotFoundError
+from gripper_force.jobs.checks import SetupResult
 from gripper_hw.dynamixel.control_table import REGISTERS, load_model
 from gripper_hw.dynamixel.firmware import OVERLOAD_ERROR
 from gripper_hw.dynamixel.packets import Instruction
@@ -14,36 +15,36 @@ from gripper_hw.dynamixel.servo import DynamixelServo
 from gripper_hw.dynamixel.servo_probe import probe, setup
 from gripper_hw.dynamixel.virtual import VirtualServo
 
-pytestmark = pytest.mark.parametrize("make_line", ["pty"], indirect=True)
+pytestmark = pytest.mark.parametrize("make_endpoint", ["pty"], indirect=True)
 
 READS = {Instruction.PING, Instruction.READ, Instruction.FAST_SYNC_READ}
 MODEL = load_model("XM430-W350")
 
 
-def config_of(line, **servo) -> Config:
-    # A cycle of a second, as nothing is said here about how fast a busy machine is.
+def config_of(endpoint, **servo) -> Config:
+    # A cycle of one second, so that a busy machine passes.
     return Config.model_validate(
-        {"clock": "realtime", "servo": line.config(**servo), "control": {"rate_hz": 1.0}}
+        {"clock": "realtime", "servo": endpoint.config(**servo), "control": {"rate_hz": 1.0}}
     )
 
 
-def rows(line, **servo):
-    return {(check.unit, check.name): check for check in probe(config_of(line, **servo))}
+def rows(endpoint, **servo):
+    return {(check.unit, check.name): check for check in probe(config_of(endpoint, **servo))}
 
 
-def written(line) -> dict[str, int]:
-    """Every register that was written, one by one."""
+def written(endpoint) -> dict[str, int]:
+    """Every register that was written."""
     names = {register.address: name for name, register in REGISTERS.items()}
     values = {}
-    for packet in line.packets():
+    for packet in endpoint.packets():
         if packet.instruction == Instruction.WRITE:
             name = names[int.from_bytes(packet.params[:2], "little")]
             values[name] = REGISTERS[name].decode(packet.params[2:])
     return values
 
 
-def test_a_servo_as_it_comes_is_fit_and_is_only_read(line):
-    found = rows(line)
+def test_factory_settings_pass_and_nothing_is_written(endpoint):
+    found = rows(endpoint)
     assert not [check for check in found.values() if check.ok is False]
     texts = {name: check.found for (unit, name), check in found.items() if unit == "servo 1"}
     assert "of 200 reads" in texts.pop("bus cycle")
@@ -56,104 +57,107 @@ def test_a_servo_as_it_comes_is_fit_and_is_only_read(line):
         "operating mode": "3 (position)",
         "bus watchdog": "off",
     }
-    assert found["servo 1", "return delay time"].advice == "a run sets 0 us, and so does doctor --setup"
-    assert {packet.instruction for packet in line.packets()} == READS
+    assert found["servo 1", "return delay time"].advice == "a run sets 0 us; so does doctor --setup"
+    assert {packet.instruction for packet in endpoint.packets()} == READS
 
 
-def test_a_servo_that_runs_is_left_running(line):
-    servo = DynamixelServo(line.config(), lambda: line.now_ns)
+def test_running_servo_is_not_changed(endpoint):
+    servo = DynamixelServo(endpoint.config(), lambda: endpoint.now_ns)
     servo.start()
     servo.close()
-    line.heard.clear()
-    check = rows(line)["servo 1", "torque"]
+    endpoint.received.clear()
+    check = rows(endpoint)["servo 1", "torque"]
     assert (check.found, check.ok) == ("on", True)
-    assert "the next run lets go first" in check.advice
-    assert {packet.instruction for packet in line.packets()} == READS
+    assert "the next run turns torque off first" in check.advice
+    assert {packet.instruction for packet in endpoint.packets()} == READS
 
 
-def test_a_fault_of_the_servo_is_a_problem(line):
-    line.bus.servos[0].raise_hardware_error(OVERLOAD_ERROR)
-    check = rows(line)["servo 1", "hardware error"]
+def test_hardware_error_is_a_problem(endpoint):
+    endpoint.bus.servos[0].raise_hardware_error(OVERLOAD_ERROR)
+    check = rows(endpoint)["servo 1", "hardware error"]
     assert (check.found, check.ok) == ("overload", False)
     assert "reboot" in check.advice
 
 
-def test_old_firmware_is_a_problem_and_its_cycle_is_not_measured(make_line):
-    found = rows(make_line(VirtualServo(1, MODEL, firmware=44)))
+def test_old_firmware_is_a_problem_and_its_cycle_is_not_measured(make_endpoint):
+    found = rows(make_endpoint(VirtualServo(1, MODEL, firmware=44)))
     assert found["servo 1", "model"].ok is False
     assert "update it to 45 or newer" in found["servo 1", "model"].advice
     assert ("servo 1", "bus cycle") not in found
 
 
-def test_a_mute_servo_is_told_from_a_missing_one(line):
-    line.bus.servos[0].set("status_return_level", 0)
-    check = rows(line, retries=0)["servo 1", "registers"]
+def test_servo_without_replies_is_distinguished_from_a_missing_one(endpoint):
+    endpoint.bus.servos[0].set("status_return_level", 0)
+    check = rows(endpoint, retries=0)["servo 1", "registers"]
     assert check.ok is False
     assert "Status Return Level" in check.advice
 
 
-def test_answers_too_late_for_a_run_are_measured_all_the_same(line):
+def test_replies_too_late_for_a_run_are_still_measured(endpoint):
     def late(answer):
         time.sleep(0.01)
         return answer
 
-    line.bus.tamper = late
-    cycle = rows(line, reply_margin_ms=1.0)["servo 1", "bus cycle"]
+    endpoint.bus.tamper = late
+    cycle = rows(endpoint, reply_margin_ms=1.0)["servo 1", "bus cycle"]
     assert cycle.found.endswith(" of 200 reads")
 
 
-def test_other_servos_are_listed(make_line):
-    line = make_line(VirtualServo(1, MODEL), VirtualServo(7, load_model("XL330-M288")))
-    check = rows(line)["servo 7", "model"]
+def test_other_servos_are_listed(make_endpoint):
+    endpoint = make_endpoint(VirtualServo(1, MODEL), VirtualServo(7, load_model("XL330-M288")))
+    check = rows(endpoint)["servo 7", "model"]
     assert (check.found, check.ok) == ("XL330-M288, firmware 52", None)
 
 
-def test_a_missing_servo_is_a_problem_that_names_who_is_there(make_line):
-    line = make_line(VirtualServo(7, MODEL))
-    check = rows(line, reply_margin_ms=20.0)["servo 1", "model"]
+def test_missing_servo_check_lists_the_ids_that_answer(make_endpoint):
+    endpoint = make_endpoint(VirtualServo(7, MODEL))
+    check = rows(endpoint, reply_margin_ms=20.0)["servo 1", "model"]
     assert (check.found, check.ok) == ("no answer at 1000000 baud (ids that answer: 7)", False)
     assert check.advice == "check power, cable and servo.id"
 
 
-def test_a_servo_at_another_baud_rate_is_found(line):
-    fd = os.open(line.port, os.O_RDWR | os.O_NOCTTY)
-    line.bus.tamper = lambda answer: answer if termios.tcgetattr(fd)[4] == termios.B57600 else None
-    check = rows(line)["servo 1", "model"]
+def test_servo_at_another_baud_rate_is_found(endpoint):
+    fd = os.open(endpoint.port, os.O_RDWR | os.O_NOCTTY)
+    endpoint.bus.tamper = lambda answer: answer if termios.tcgetattr(fd)[4] == termios.B57600 else None
+    check = rows(endpoint)["servo 1", "model"]
     os.close(fd)
     assert (check.found, check.ok) == ("no answer at 1000000 baud (ids that answer: none)", False)
     assert check.advice == "it answers at 57600 baud: set servo.baud_rate=57600"
 
 
 @pytest.mark.parametrize(("latency_ms", "ok"), [(16, False), (1, True)])
-def test_a_slow_adapter_is_a_problem(line, tmp_path, latency_ms, ok):
-    adapter = tmp_path / Path(line.port).name
+def test_adapter_latency_is_checked(endpoint, tmp_path, latency_ms, ok):
+    adapter = tmp_path / Path(endpoint.port).name
     adapter.mkdir()
     (adapter / "latency_timer").write_text(f"{latency_ms}\n")
-    checks = probe(config_of(line, reply_margin_ms=10.0), tmp_path)
+    checks = probe(config_of(endpoint, reply_margin_ms=10.0), tmp_path)
     check = next(check for check in checks if check.name == "latency timer")
     assert (check.found, check.ok) == (f"{latency_ms} ms", ok)
     assert ("hw/udev" in check.advice) is not ok
 
 
-def test_what_hides_the_servo_is_raised(line):
+def test_wrong_model_and_missing_port_raise(endpoint):
     with pytest.raises(ConfigError, match=r"XM430-W350 .*, not the configured XL330-M288"):
-        rows(line, model="XL330-M288")
+        rows(endpoint, model="XL330-M288")
     with pytest.raises(DeviceNotFoundError, match="there is no port /dev/nowhere"):
-        rows(line, port="/dev/nowhere")
+        rows(endpoint, port="/dev/nowhere")
 
 
-def test_a_real_servo_needs_real_time(line):
-    config = config_of(line).model_copy(update={"clock": "lockstep"})
+def test_lockstep_clock_with_a_real_servo_is_a_problem(endpoint):
+    config = config_of(endpoint).model_copy(update={"clock": "lockstep"})
     check = next(check for check in probe(config) if check.name == "clock")
-    assert (check.ok, check.advice) == (False, "a real servo can't keep simulated time: set clock=realtime")
+    assert (check.ok, check.advice) == (
+        False,
+        "a real servo does not follow simulated time: set clock=realtime",
+    )
 
 
 # Setup.
 
 
-def test_setup_asks_and_writes_nothing_if_told_not_to(line):
+def test_setup_writes_nothing_if_declined(endpoint):
     asked = []
-    result = setup(config_of(line), lambda *question: bool(asked.append(question)))
+    result = setup(config_of(endpoint), lambda *question: bool(asked.append(question)))
     ((servo, changes),) = asked
     assert servo == "servo 1"
     assert [(c.register, c.old, c.new) for c in changes] == [
@@ -161,45 +165,45 @@ def test_setup_asks_and_writes_nothing_if_told_not_to(line):
         ("current_limit", "3.209 A", "1.200 A"),
         ("operating_mode", "3 (position)", "5 (current-based position)"),
     ]
-    assert result == {"servo": 1, "changes": changes, "applied": False}
-    assert {packet.instruction for packet in line.packets()} <= READS
+    assert result == SetupResult(1, changes, applied=False)
+    assert {packet.instruction for packet in endpoint.packets()} <= READS
 
 
-def test_setup_writes_what_it_showed_and_a_start_need_not(line):
-    assert setup(config_of(line), lambda *_: True)["applied"]
-    assert written(line) == {
+def test_setup_writes_the_listed_changes_so_that_start_does_not(endpoint):
+    assert setup(config_of(endpoint), lambda *_: True).applied
+    assert written(endpoint) == {
         "return_delay_time": 0,
         "current_limit": int(1.2 / MODEL.current_unit_a),
         "operating_mode": 5,
     }
-    line.heard.clear()
-    servo = DynamixelServo(line.config(), lambda: line.now_ns)
+    endpoint.received.clear()
+    servo = DynamixelServo(endpoint.config(), lambda: endpoint.now_ns)
     servo.start()
     servo.stop(hold=False)
     servo.close()
-    writes = [packet for packet in line.packets() if packet.instruction == Instruction.WRITE]
+    writes = [packet for packet in endpoint.packets() if packet.instruction == Instruction.WRITE]
     assert writes
     assert all(int.from_bytes(packet.params[:2], "little") >= 64 for packet in writes)
-    assert setup(config_of(line), pytest.fail) == {"servo": 1, "changes": [], "applied": False}
+    assert setup(config_of(endpoint), pytest.fail) == SetupResult(1, [], applied=False)
 
 
-def test_setup_undoes_what_another_program_left(line):
-    firmware = line.bus.servos[0]
+def test_setup_overwrites_registers_of_another_program(endpoint):
+    firmware = endpoint.bus.servos[0]
     odd = {"drive_mode": 4, "status_return_level": 1, "profile_velocity": 50, "profile_acceleration": 5}
     for name, value in odd.items():
         firmware.set(name, value)
-    setup(config_of(line), lambda *_: True)
+    setup(config_of(endpoint), lambda *_: True)
     assert [firmware.get(name) for name in odd] == [0, 2, 0, 0]
 
 
-def test_setup_refuses_while_torque_is_on(line):
-    line.bus.servos[0].set("torque_enable", 1)
+def test_setup_refuses_while_torque_is_on(endpoint):
+    endpoint.bus.servos[0].set("torque_enable", 1)
     with pytest.raises(DeviceError, match="servo 1 has torque on, so nothing was changed"):
-        setup(config_of(line), pytest.fail)
-    assert not written(line)
+        setup(config_of(endpoint), pytest.fail)
+    assert not written(endpoint)
 
 
-def test_setup_refuses_another_model(line):
+def test_setup_refuses_another_model(endpoint):
     with pytest.raises(ConfigError, match="not the configured XL330-M288"):
-        setup(config_of(line, model="XL330-M288"), pytest.fail)
-    assert not written(line)
+        setup(config_of(endpoint, model="XL330-M288"), pytest.fail)
+    assert not written(endpoint)

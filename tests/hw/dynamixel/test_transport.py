@@ -14,16 +14,16 @@ MODEL = load_model("XM430-W350")
 START = REGISTERS["present_current"].address
 SIZE = 13
 TICKS = slice(6, 10)
-"""Where Present Position lies in what is read from there."""
+"""Present Position within the bytes read from there."""
 
 
 @pytest.fixture
-def opened(line):
-    """A virtual bus, and an open line to it."""
-    client = Transport(line.config(), lambda: line.now_ns)
-    client.open()
-    yield line, client
-    client.close()
+def opened(endpoint):
+    """A virtual bus endpoint and an open transport to it."""
+    transport = Transport(endpoint.config(), lambda: endpoint.now_ns)
+    transport.open()
+    yield endpoint, transport
+    transport.close()
 
 
 def first(count, damage):
@@ -36,9 +36,9 @@ DAMAGES = {
     "silence": lambda answer: None,
     "truncated": lambda answer: answer[:-3],
     "corrupt": lambda answer: answer[:-1] + bytes((answer[-1] ^ 0x5A,)),
-    "short, yet sound": lambda answer: frame(BROADCAST_ID, 0x55, b"\x00"),
+    "short, with valid CRC": lambda answer: frame(BROADCAST_ID, 0x55, b"\x00"),
     "of another size": lambda answer: frame(BROADCAST_ID, 0x55, b"\x00\x01" + bytes(4)),
-    "of nobody": lambda answer: frame(BROADCAST_ID, 0x55, b"\x00\x07" + bytes(15)),
+    "of a missing id": lambda answer: frame(BROADCAST_ID, 0x55, b"\x00\x07" + bytes(15)),
     "of another servo": lambda answer: status(7, 0, bytes(15)),
     "noise": lambda answer: b"\xff\xff\xfd\x00\x01\x00\x00" + bytes(20),
 }
@@ -46,100 +46,102 @@ DAMAGES = {
 
 @pytest.mark.parametrize("damage", DAMAGES)
 @pytest.mark.parametrize("count", [1, 2])
-def test_a_damaged_answer_is_retried_and_counted(opened, damage, count):
-    line, client = opened
-    line.bus.tamper = first(count, DAMAGES[damage])
-    _, (block,) = client.sync_read((1,), START, SIZE)
+def test_damaged_reply_is_retried_and_counted(opened, damage, count):
+    endpoint, transport = opened
+    endpoint.bus.tamper = first(count, DAMAGES[damage])
+    _, (block,) = transport.sync_read((1,), START, SIZE)
     assert int.from_bytes(block[TICKS], "little") == 2048
-    assert client.stats.retries == count
-    assert client.stats.timeouts + client.stats.corrupt == count
+    assert transport.stats.retries == count
+    assert transport.stats.timeouts + transport.stats.corrupt == count
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_damage_without_end_is_a_timeout(opened, damage):
-    line, client = opened
-    line.bus.tamper = DAMAGES[damage]
+def test_persistent_damage_is_a_timeout(opened, damage):
+    endpoint, transport = opened
+    endpoint.bus.tamper = DAMAGES[damage]
     with pytest.raises(DeviceTimeoutError, match="after 3 tries"):
-        client.sync_read((1,), START, SIZE)
-    assert len(line.packets()) == 3
-    line.bus.tamper = None
-    client.sync_read((1,), START, SIZE)  # it comes back by itself
+        transport.sync_read((1,), START, SIZE)
+    assert len(endpoint.packets()) == 3
+    endpoint.bus.tamper = None
+    transport.sync_read((1,), START, SIZE)  # works again without a restart
 
 
-def test_an_answer_that_is_too_short_is_no_value(opened):
-    """The SDK fills short data up with the packet's CRC."""
-    line, client = opened
-    line.bus.tamper = first(1, lambda answer: status(1, 0))
-    assert client.get(1, "present_position") == 2048
-    assert client.stats.retries == 1
+def test_short_reply_is_rejected(opened):
+    """The SDK pads short data with the packet's CRC."""
+    endpoint, transport = opened
+    endpoint.bus.tamper = first(1, lambda answer: status(1, 0))
+    assert transport.get(1, "present_position") == 2048
+    assert transport.stats.retries == 1
 
 
-def test_noise_before_an_answer_is_skipped(opened):
-    line, client = opened
-    line.bus.tamper = lambda answer: b"\x00\xff\xff\x12" + answer
-    client.sync_read((1,), START, SIZE)
-    assert client.get(1, "present_position") == 2048
-    assert client.stats.retries == 0
+def test_noise_before_a_reply_is_skipped(opened):
+    endpoint, transport = opened
+    endpoint.bus.tamper = lambda answer: b"\x00\xff\xff\x12" + answer
+    transport.sync_read((1,), START, SIZE)
+    assert transport.get(1, "present_position") == 2048
+    assert transport.stats.retries == 0
 
 
-def test_an_instruction_damaged_on_its_way_is_retried(opened):
-    line, client = opened
-    for number, call in enumerate((lambda: client.ping(1), lambda: client.set(1, "goal_current", 7)), 1):
-        line.bus.tamper = first(1, lambda answer: status(1, 3))
+def test_corrupt_instruction_is_retried(opened):
+    endpoint, transport = opened
+    for number, call in enumerate(
+        (lambda: transport.ping(1), lambda: transport.set(1, "goal_current", 7)), 1
+    ):
+        endpoint.bus.tamper = first(1, lambda answer: status(1, 3))
         call()
-        assert (client.stats.retries, client.stats.corrupt) == (number, number)
-    assert line.bus.servos[0].get("goal_current") == 7
+        assert (transport.stats.retries, transport.stats.corrupt) == (number, number)
+    assert endpoint.bus.servos[0].get("goal_current") == 7
 
 
-def test_a_late_answer_is_not_taken_for_the_next():
-    """It comes after the time for it is over and before a retry without a pause would have had its own."""
+def test_late_reply_is_not_used_for_the_next_request():
+    """The reply arrives after its timeout, when a retry without a pause would still be waiting."""
     firmware = VirtualServo(1, MODEL)
     bus = VirtualBus([firmware], lambda: 0)
     margin_s = 0.2
     with PtyServer(bus) as server:
-        client = Transport(ServoConfig(port=server.device_path, reply_margin_ms=margin_s * 1e3))
-        client.open()
+        transport = Transport(ServoConfig(port=server.device_path, reply_margin_ms=margin_s * 1e3))
+        transport.open()
 
         def delay(answer):
             bus.tamper = None
-            firmware.control(0, 1.0, 0.0)  # the world moves on
+            firmware.control(0, 1.0, 0.0)  # the horn moves meanwhile
             time.sleep(1.5 * margin_s)
             return answer
 
         bus.tamper = delay
-        _, (block,) = client.sync_read((1,), START, SIZE)
+        _, (block,) = transport.sync_read((1,), START, SIZE)
         assert int.from_bytes(block[TICKS], "little") > 2048
-        assert (client.stats.timeouts, client.stats.retries) == (1, 1)
-        client.close()
+        assert (transport.stats.timeouts, transport.stats.retries) == (1, 1)
+        transport.close()
 
 
-def test_a_servo_that_refuses_says_what(opened):
-    line, client = opened
-    line.bus.servos[0].set("bus_watchdog", -1)
+def test_refusal_names_the_error(opened):
+    endpoint, transport = opened
+    endpoint.bus.servos[0].set("bus_watchdog", -1)
     with pytest.raises(DeviceError, match="data range error"):
-        client.set(1, "goal_current", 1)
+        transport.set(1, "goal_current", 1)
 
 
-def test_blocks_go_to_the_servo_that_they_are_for(make_line):
-    line = make_line(VirtualServo(1, MODEL), VirtualServo(2, MODEL))
-    client = Transport(line.config(), lambda: line.now_ns)
-    client.open()
+def test_sync_write_and_read_map_blocks_to_ids(make_endpoint):
+    endpoint = make_endpoint(VirtualServo(1, MODEL), VirtualServo(2, MODEL))
+    transport = Transport(endpoint.config(), lambda: endpoint.now_ns)
+    transport.open()
     goal = REGISTERS["goal_current"]
-    client.sync_write(goal.address, {2: goal.encode(20), 1: goal.encode(10)})
-    assert [client.get(id_, "goal_current") for id_ in (1, 2)] == [10, 20]
-    _, blocks = client.sync_read((2, 1), goal.address, goal.size)
+    transport.sync_write(goal.address, {2: goal.encode(20), 1: goal.encode(10)})
+    assert [transport.get(id_, "goal_current") for id_ in (1, 2)] == [10, 20]
+    _, blocks = transport.sync_read((2, 1), goal.address, goal.size)
     assert [goal.decode(block) for block in blocks] == [20, 10]
-    assert client.scan().keys() == {1, 2}
-    client.close()
+    assert transport.scan().keys() == {1, 2}
+    transport.close()
 
 
-def test_nothing_is_sent_without_a_port(line):
-    client = Transport(line.config())
+def test_closed_or_unplugged_port_raises(endpoint):
+    transport = Transport(endpoint.config())
     with pytest.raises(DeviceError, match="not open, so a ping of servo 1 was not sent"):
-        client.ping(1)
-    client.open()
-    line.unplug()
+        transport.ping(1)
+    transport.open()
+    endpoint.unplug()
     with pytest.raises(DeviceLostError, match="gone"):
-        client.ping(1)
-    client.close()
-    client.close()
+        transport.ping(1)
+    transport.close()
+    transport.close()

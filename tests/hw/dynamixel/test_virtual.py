@@ -1,4 +1,4 @@
-"""The virtual bus, as the vendor's unmodified SDK sees it."""
+"""The virtual bus with the vendor's unmodified SDK as client."""
 
 import struct
 
@@ -21,11 +21,11 @@ CURRENT, POSITION, LED = 126, 132, 65
 
 
 @pytest.fixture
-def pair(make_line):
+def pair(make_endpoint):
     """An XM430 with id 1 and an XL330 with id 2."""
-    line = make_line(VirtualServo(1, MODEL), VirtualServo(2, load_model("XL330-M288")))
-    port = open_port(line.port, 1_000_000, 30.0)
-    yield line, port
+    endpoint = make_endpoint(VirtualServo(1, MODEL), VirtualServo(2, load_model("XL330-M288")))
+    port = open_port(endpoint.port, 1_000_000, 30.0)
+    yield endpoint, port
     port.closePort()
 
 
@@ -36,9 +36,9 @@ def test_ping(pair):
     assert PACKETS.ping(port, 3)[1] == sdk.COMM_RX_TIMEOUT
 
 
-def test_broadcast_ping_finds_all(make_memory_line):
-    line = make_memory_line(VirtualServo(4, MODEL, firmware=46), VirtualServo(2, MODEL))
-    port = open_port(line.port, 1_000_000, 1.0)
+def test_broadcast_ping_finds_all(make_memory_endpoint):
+    endpoint = make_memory_endpoint(VirtualServo(4, MODEL, firmware=46), VirtualServo(2, MODEL))
+    port = open_port(endpoint.port, 1_000_000, 1.0)
     assert PACKETS.broadcastPing(port) == ({2: [1020, 52], 4: [1020, 46]}, OK)
     port.closePort()
 
@@ -57,45 +57,45 @@ def test_read_and_write(pair):
 
 
 def test_registered_writes_act_together(pair):
-    line, port = pair
+    endpoint, port = pair
     for id_ in (1, 2):
         assert PACKETS.regWriteTxRx(port, id_, LED, 1, [1]) == (OK, 0)
-    assert [servo.get("led") for servo in line.bus.servos] == [0, 0]
+    assert [servo.get("led") for servo in endpoint.bus.servos] == [0, 0]
     assert PACKETS.action(port, BROADCAST_ID) == OK
     assert PACKETS.read1ByteTxRx(port, 2, LED) == (1, OK, 0)
-    assert [servo.get("led") for servo in line.bus.servos] == [1, 1]
+    assert [servo.get("led") for servo in endpoint.bus.servos] == [1, 1]
 
 
-def test_reboot_is_silent_for_a_while_and_resets_ram(pair):
-    line, port = pair
+def test_reboot_pauses_replies_and_resets_ram(pair):
+    endpoint, port = pair
     PACKETS.write1ByteTxRx(port, 1, LED, 1)
     assert PACKETS.reboot(port, 1) == (OK, 0)
     assert PACKETS.ping(port, 1)[1] == sdk.COMM_RX_TIMEOUT
     assert PACKETS.ping(port, 2)[1] == OK
-    line.now_ns += REBOOT_NS
+    endpoint.now_ns += REBOOT_NS
     assert PACKETS.read1ByteTxRx(port, 1, LED) == (0, OK, 0)
 
 
 def test_factory_reset(pair):
-    line, port = pair
+    endpoint, port = pair
     PACKETS.write1ByteTxRx(port, 2, 11, 5)
     assert PACKETS.factoryReset(port, 2, 0x02) == (OK, 0)
-    line.now_ns += REBOOT_NS
+    endpoint.now_ns += REBOOT_NS
     assert PACKETS.read1ByteTxRx(port, 2, 11) == (3, OK, 0)
     assert PACKETS.factoryReset(port, 2, 0x77) == (OK, Error.DATA_RANGE)
 
 
-def test_clear_brings_the_position_within_one_turn(pair):
-    line, port = pair
-    line.bus.servos[0].control(0, 10.0, 0.0)
+def test_clear_resets_the_multi_turn_position(pair):
+    endpoint, port = pair
+    endpoint.bus.servos[0].control(0, 10.0, 0.0)
     before = PACKETS.read4ByteTxRx(port, 1, POSITION)[0]
     assert PACKETS.clearMultiTurn(port, 1) == (OK, 0)
     assert PACKETS.read4ByteTxRx(port, 1, POSITION)[0] == before % 4096 != before
 
 
-def test_status_return_level_decides_who_is_answered(pair):
-    line, port = pair
-    servo = line.bus.servos[0]
+def test_status_return_level(pair):
+    endpoint, port = pair
+    servo = endpoint.bus.servos[0]
     servo.set("status_return_level", 1)
     assert PACKETS.write1ByteTxRx(port, 1, LED, 1)[0] == sdk.COMM_RX_TIMEOUT
     assert servo.get("led") == 1
@@ -108,9 +108,9 @@ def test_status_return_level_decides_who_is_answered(pair):
     assert PACKETS.ping(port, 1)[1] == OK
 
 
-def test_a_hardware_error_sets_the_alert_bit_of_every_answer(pair):
-    line, port = pair
-    line.bus.servos[0].raise_hardware_error(OVERLOAD_ERROR)
+def test_hardware_error_sets_the_alert_bit_of_every_reply(pair):
+    endpoint, port = pair
+    endpoint.bus.servos[0].raise_hardware_error(OVERLOAD_ERROR)
     assert PACKETS.read1ByteTxRx(port, 1, 70) == (OVERLOAD_ERROR, OK, 0x80)
     assert PACKETS.write1ByteTxRx(port, 1, LED, 2) == (OK, 0x80 | Error.DATA_RANGE)
     assert PACKETS.ping(port, 1) == (1020, OK, 0x80)
@@ -119,8 +119,8 @@ def test_a_hardware_error_sets_the_alert_bit_of_every_answer(pair):
 
 @pytest.mark.parametrize("fast", [False, True])
 def test_sync_read(pair, fast):
-    line, port = pair
-    for servo, position_rad in zip(line.bus.servos, (0.1, -0.1), strict=True):
+    endpoint, port = pair
+    for servo, position_rad in zip(endpoint.bus.servos, (0.1, -0.1), strict=True):
         servo.control(0, position_rad, 0.0)
     group = sdk.GroupSyncRead(port, PACKETS, CURRENT, 10)
     group.addParam(1)
@@ -133,8 +133,8 @@ def test_sync_read(pair, fast):
 
 @pytest.mark.parametrize("fast", [False, True])
 def test_bulk_read(pair, fast):
-    line, port = pair
-    line.bus.servos[1].set("led", 1)
+    endpoint, port = pair
+    endpoint.bus.servos[1].set("led", 1)
     group = sdk.GroupBulkRead(port, PACKETS)
     group.addParam(1, POSITION, 4)
     group.addParam(2, LED, 1)
@@ -143,7 +143,7 @@ def test_bulk_read(pair, fast):
 
 
 def test_sync_and_bulk_write(pair):
-    line, port = pair
+    endpoint, port = pair
     sync = sdk.GroupSyncWrite(port, PACKETS, 102, 2)
     sync.addParam(1, [10, 0])
     sync.addParam(2, [20, 0])
@@ -152,28 +152,28 @@ def test_sync_and_bulk_write(pair):
     bulk.addParam(1, LED, 1, [1])
     bulk.addParam(2, 104, 4, [30, 0, 0, 0])
     assert bulk.txPacket() == OK
-    assert PACKETS.ping(port, 1)[1] == OK  # now both writes have been carried out
-    first, second = line.bus.servos
+    assert PACKETS.ping(port, 1)[1] == OK  # now both writes were executed
+    first, second = endpoint.bus.servos
     assert (first.get("goal_current"), second.get("goal_current")) == (10, 20)
     assert (first.get("led"), second.get("goal_velocity")) == (1, 30)
 
 
-STUFFY = bytes.fromhex("fffffd00aafffdfd0102")
+STUFFED_DATA = bytes.fromhex("fffffd00aafffdfd0102")
 
 
 @pytest.mark.parametrize("how", ["read", "fast sync read"])
-def test_the_sdk_misreads_stuffed_data_but_for_fast_sync_read(pair, how):
-    """If the first case fails, the SDK has been mended; the driver needs no change."""
-    line, port = pair
-    current, velocity, ticks = struct.unpack("<hii", STUFFY)
-    _sense_raw(line.bus.servos[0], current, velocity, ticks)
+def test_sdk_misreads_stuffed_data_except_in_fast_sync_read(pair, how):
+    """If the first case fails, the SDK has been fixed; the driver needs no change."""
+    endpoint, port = pair
+    current, velocity, ticks = struct.unpack("<hii", STUFFED_DATA)
+    _sense_raw(endpoint.bus.servos[0], current, velocity, ticks)
     if how == "read":
-        assert bytes(PACKETS.readTxRx(port, 1, CURRENT, 10)[0]) != STUFFY
+        assert bytes(PACKETS.readTxRx(port, 1, CURRENT, 10)[0]) != STUFFED_DATA
     else:
         group = sdk.GroupSyncRead(port, PACKETS, CURRENT, 10)
         group.addParam(1)
         assert group.fastSyncRead() == OK
-        assert bytes(group.data_dict[1]) == STUFFY
+        assert bytes(group.data_dict[1]) == STUFFED_DATA
 
 
 def _sense_raw(servo, current, velocity, ticks):
@@ -182,7 +182,7 @@ def _sense_raw(servo, current, velocity, ticks):
     )
 
 
-# Below the SDK, at the wire.
+# Bytes on the bus, without the SDK.
 
 
 def answers(bus, data):
@@ -194,23 +194,23 @@ def bus():
     return VirtualBus([VirtualServo(1, MODEL)], lambda: 0)
 
 
-def test_an_unknown_instruction_and_a_bad_crc_are_told(bus):
+def test_unknown_instruction_and_bad_crc_are_reported(bus):
     assert answers(bus, frame(1, 0x77))[0].params[0] == Error.INSTRUCTION
     assert answers(bus, frame(1, Instruction.READ, b"\x00"))[0].params[0] == Error.INSTRUCTION
     assert answers(bus, frame(1, Instruction.PING)[:-1] + b"\x00")[0].params[0] == Error.CRC
 
 
-def test_an_answer_is_no_instruction(bus):
+def test_status_packet_is_not_executed(bus):
     assert bus.transact(frame(1, 0x55, b"\x00")) == b""
 
 
-def test_a_packet_in_pieces_is_answered_once_whole(bus):
+def test_packet_in_pieces_is_executed_once_complete(bus):
     packet = frame(1, Instruction.PING)
     assert all(bus.transact(packet[at : at + 1]) == b"" for at in range(len(packet) - 1))
     assert bus.transact(packet[-1:]) != b""
 
 
-def test_a_packet_that_broke_off_is_forgotten():
+def test_stale_incomplete_packet_is_discarded():
     now_ns = 0
     bus = VirtualBus([VirtualServo(1, MODEL)], lambda: now_ns)
     bus.transact(frame(1, Instruction.WRITE, bytes(200))[:20])
@@ -218,7 +218,7 @@ def test_a_packet_that_broke_off_is_forgotten():
     assert len(answers(bus, frame(1, Instruction.PING))) == 1
 
 
-def test_the_plant_is_brought_up_to_now_before_each_packet():
+def test_plant_is_advanced_before_each_packet():
     servo = VirtualServo(1, MODEL)
     bus = VirtualBus([servo], lambda: 0, before_packet=lambda: servo.control(0, 0.5, 0.0))
     data = answers(bus, frame(1, Instruction.READ, struct.pack("<HH", POSITION, 4)))[0].params[1:]
@@ -240,7 +240,7 @@ def test_any_packet_feeds_the_watchdog_and_silence_trips_it():
     assert servo.tripped
 
 
-def test_tamper_changes_or_silences_answers(bus):
+def test_tamper_changes_or_drops_replies(bus):
     bus.tamper = lambda answer: answer[:-3]
     assert len(bus.transact(frame(1, Instruction.PING))) == 11
     bus.tamper = lambda answer: None
@@ -255,7 +255,7 @@ instructions = st.sampled_from(sorted(Instruction)) | st.integers(0, 255)
 @given(
     st.lists(st.binary(max_size=40) | st.builds(frame, ids, instructions, st.binary(max_size=40)), max_size=6)
 )
-def test_any_bytes_are_survived(chunks):
+def test_bus_accepts_any_bytes(chunks):
     servos = [VirtualServo(1, MODEL), VirtualServo(2, load_model("XL330-M288"))]
     now_ns = 0
     bus = VirtualBus(servos, lambda: now_ns)
@@ -277,7 +277,7 @@ def test_any_bytes_are_survived(chunks):
 
 @settings(deadline=None)
 @given(st.integers(0, 700), st.binary(min_size=1, max_size=24))
-def test_what_a_write_took_can_be_read_back(address, data):
+def test_accepted_write_can_be_read_back(address, data):
     servo = VirtualServo(1, MODEL)
     if servo.write(address, data) is Error.NONE:
         assert servo.read(address, len(data)) == (Error.NONE, data)
@@ -285,7 +285,7 @@ def test_what_a_write_took_can_be_read_back(address, data):
         assert bytes(servo.read(0, 120)[1]) == bytes(VirtualServo(1, MODEL).read(0, 120)[1])
 
 
-def test_names_are_looked_up_and_not_taken_twice(bus):
+def test_bus_names_are_unique(bus):
     register_bus("a", bus)
     register_bus("a", bus)
     assert find_bus("a") is bus

@@ -1,14 +1,16 @@
-"""Boards behind pseudo-terminals: real bytes on a port that can be pulled out and plugged in again."""
+"""Boards behind pseudo-terminals, which can be unplugged, and a stub of the Phidget library."""
 
 import os
 import pty
+import sys
 import threading
 import time
 import tty
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Literal
+from types import SimpleNamespace
+from typing import Any, Literal
 
 import pytest
 
@@ -18,8 +20,8 @@ from gripper_force.types import LoadCellSample
 
 Format = Literal["hx711", "cas"]
 
-PATIENCE_S = 60.0
-"""How long to wait on a busy machine before a test fails."""
+TIMEOUT_S = 60.0
+"""Longest wait on a busy machine before a test fails."""
 
 LINES: dict[Format, Callable[[int], bytes]] = {
     "hx711": lambda i: b"%d,%d\r\n" % (1000 * i, i),
@@ -28,7 +30,7 @@ LINES: dict[Format, Callable[[int], bytes]] = {
 
 
 class Board:
-    """Prints 0, 1, 2... counts or grams, and goes on counting when it is plugged in again."""
+    """Sends 0, 1, 2... counts or grams, and continues the count when it is plugged in again."""
 
     def __init__(self, link: Path, form: Format) -> None:
         self.path = str(link)
@@ -86,17 +88,17 @@ def plug_in(tmp_path: Path) -> Callable[[Format], AbstractContextManager[Board]]
 def board(
     request: pytest.FixtureRequest, plug_in: Callable[[Format], AbstractContextManager[Board]]
 ) -> Iterator[Board]:
-    """An HX711 board, or what the test's parameter names."""
+    """An HX711 board, or the format of the test's parameter."""
     with plug_in(getattr(request, "param", "hx711")) as board:
         yield board
 
 
 @pytest.fixture
 def wait_until() -> Callable[[Callable[[], bool]], None]:
-    def wait(is_so: Callable[[], bool]) -> None:
-        deadline_s = time.monotonic() + PATIENCE_S
-        while not is_so():
-            assert time.monotonic() < deadline_s, "it never came"
+    def wait(condition: Callable[[], bool]) -> None:
+        deadline_s = time.monotonic() + TIMEOUT_S
+        while not condition():
+            assert time.monotonic() < deadline_s, "condition not met"
             time.sleep(0.01)
 
     return wait
@@ -104,17 +106,63 @@ def wait_until() -> Callable[[Callable[[], bool]], None]:
 
 @pytest.fixture
 def collect() -> Callable[..., list[LoadCellSample]]:
-    """Drains a cell until there are so many samples; `pause` lets time pass for the cell."""
+    """Drains a load cell until it gave this many samples; `pause` lets time pass for it."""
 
     def collect(
         cell: LoadCell, count: int, pause: Callable[[], None] = lambda: time.sleep(0.01)
     ) -> list[LoadCellSample]:
         samples: list[LoadCellSample] = []
-        deadline_s = time.monotonic() + PATIENCE_S
+        deadline_s = time.monotonic() + TIMEOUT_S
         while len(samples) < count:
-            assert time.monotonic() < deadline_s, f"{len(samples)} of {count} samples came"
+            assert time.monotonic() < deadline_s, f"{len(samples)} of {count} samples received"
             samples += cell.drain()
             pause()
         return samples
 
     return collect
+
+
+class PhidgetError(Exception):
+    """Stub of the vendor's PhidgetException."""
+
+    def __init__(self, code: int) -> None:
+        self.code, self.description = code, "Timed Out" if code == 3 else "Invalid Argument"
+
+
+class Channel:
+    """Stub of the vendor's VoltageRatioInput: records the values it is given."""
+
+    attach_error: PhidgetError | None = None
+    made: list["Channel"]
+
+    def __init__(self) -> None:
+        self.told: dict[str, Any] = {}
+        self.closed = 0
+        self.made.append(self)
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda value: self.told.update({name.removeprefix("set"): value})
+
+    def openWaitForAttachment(self, timeout_ms: int) -> None:  # noqa: N802
+        if self.attach_error is not None:
+            raise self.attach_error
+
+    def close(self) -> None:
+        self.closed += 1
+
+
+@pytest.fixture
+def phidget_library(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """A stub of the vendor's library without a bridge."""
+
+    class Fresh(Channel):
+        made: list[Channel] = []  # noqa: RUF012
+
+    library = SimpleNamespace(
+        VoltageRatioInput=Fresh,
+        PhidgetException=PhidgetError,
+        BridgeGain=SimpleNamespace(BRIDGE_GAIN_128=8),
+        Phidget=SimpleNamespace(getLibraryVersion=lambda: "1.26"),
+    )
+    monkeypatch.setitem(sys.modules, "Phidget22.Devices.VoltageRatioInput", library)
+    return library

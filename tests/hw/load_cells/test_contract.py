@@ -1,19 +1,22 @@
-"""What every load cell keeps to, simulated, played or real."""
+"""The load cell contract on every built-in load cell, and tests of what some of them add to it."""
 
+import math
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
-from dataclasses import dataclass
+from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from gripper_force.config import LoadCellConfig, load_config
+from gripper_force.config import Config, LoadCellConfig, load_config
 from gripper_force.errors import DeviceError
-from gripper_force.interfaces import Clock, LoadCell
-from gripper_force.runtime.backends import MonotonicClock
+from gripper_force.interfaces import LoadCell
+from gripper_force.runtime.backends import LOAD_CELLS, MonotonicClock
 from gripper_force.runtime.log import LogWriter
-from gripper_force.types import NS_PER_MS, LoadCellSample
+from gripper_force.testing.load_cell_contract import LoadCellContract
+from gripper_force.types import NS_PER_MS, NS_PER_S, LoadCellSample
+from gripper_hw.load_cells.phidget import PhidgetLoadCell
 from gripper_hw.load_cells.serial import SerialLoadCell
 from gripper_hw.playback import PlaybackLoadCell
 from gripper_hw.sim.simulated_rig import SimulatedRig
@@ -21,132 +24,157 @@ from gripper_hw.sim.simulated_rig import SimulatedRig
 PERIOD_NS = 5 * NS_PER_MS
 
 
-@dataclass
-class Fitted:
-    """A load cell, its clock, a way to let time pass, and the number of each sample."""
+class NumberedContract(LoadCellContract):
+    """The contract, on a device whose samples can be numbered, so that a lost one shows."""
 
-    cell: LoadCell
-    clock: Clock
-    pause: Callable[[], None]
-    number: Callable[[LoadCellSample], int]
+    def number(self, sample: LoadCellSample) -> int:
+        raise NotImplementedError
 
-
-class SteppedClock:
-    def __init__(self) -> None:
-        self.t_ns = 77_000_000_000
-
-    def now_ns(self) -> int:
-        return self.t_ns
-
-    def sleep_until_ns(self, t_ns: int) -> None:
-        self.t_ns = t_ns
+    def test_no_sample_is_lost_or_rejected(
+        self, load_cell: LoadCell, wait: Callable[[float], None], collect
+    ) -> None:
+        load_cell.start()
+        samples = collect(load_cell, 50, lambda: wait(0.01))
+        numbers = [self.number(sample) for sample in samples]
+        assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+        assert all(sample.valid for sample in samples)
+        assert not any(load_cell.counts().values())
 
 
-def step(clock: Clock) -> Callable[[], None]:
-    return lambda: clock.sleep_until_ns(clock.now_ns() + 7 * NS_PER_MS)
+class TestSimulatedLoadCell(NumberedContract):
+    @pytest.fixture
+    def config(self, quick: list[str]) -> Config:
+        return load_config(None, quick)
+
+    @pytest.fixture
+    def rig(self, config: Config) -> Iterator[SimulatedRig]:
+        with closing(SimulatedRig(config)) as rig:
+            yield rig
+
+    @pytest.fixture
+    def load_cell(self, rig: SimulatedRig) -> LoadCell:
+        return rig.load_cell
+
+    @pytest.fixture
+    def now_ns(self, rig: SimulatedRig) -> Callable[[], int]:
+        return rig.clock.now_ns
+
+    @pytest.fixture
+    def wait(self, rig: SimulatedRig) -> Callable[[float], None]:
+        return lambda seconds: rig.clock.sleep_until_ns(rig.clock.now_ns() + round(seconds * NS_PER_S))
+
+    def number(self, sample: LoadCellSample) -> int:
+        return sample.t_ns // PERIOD_NS
 
 
-def simulated(stack: ExitStack, quick: list[str], tmp_path: Path) -> Fitted:
-    rig = SimulatedRig(load_config(None, quick))
-    stack.callback(rig.close)
-    return Fitted(rig.load_cell, rig.clock, step(rig.clock), lambda sample: sample.t_ns // PERIOD_NS)
+class TestSimulatedLoadCellWithFaults(TestSimulatedLoadCell):
+    @pytest.fixture
+    def config(self, quick: list[str]) -> Config:
+        return load_config(None, [*quick, "faults=[{unit: load_cell, kind: stuck, at_s: 1000}]"])
 
 
-def playback(stack: ExitStack, quick: list[str], tmp_path: Path) -> Fitted:
-    path = tmp_path / "run.mcap"
-    with LogWriter(path, config="", metadata={}) as log:
-        for i in range(200):
-            log.write(LoadCellSample(i * PERIOD_NS, 0.1 * i, float(i)))
-    clock = SteppedClock()
-    cell = PlaybackLoadCell(LoadCellConfig(backend="playback", path=path), clock)
-    return Fitted(cell, clock, step(clock), lambda sample: round(sample.raw))
+class TestPlaybackLoadCell(NumberedContract):
+    @pytest.fixture
+    def section(self, tmp_path: Path) -> LoadCellConfig:
+        path = tmp_path / "run.mcap"
+        with LogWriter(path, config="", metadata={}) as log:
+            for i in range(1000):
+                log.write(LoadCellSample(i * PERIOD_NS, 0.1 * i, float(i)))
+        return LoadCellConfig(backend="playback", path=path)
+
+    @pytest.fixture
+    def load_cell(self, section: LoadCellConfig) -> LoadCell:
+        return PlaybackLoadCell(section, MonotonicClock())
+
+    @pytest.fixture
+    def second_load_cell(self, section: LoadCellConfig) -> LoadCell:
+        return PlaybackLoadCell(section, MonotonicClock())
+
+    def number(self, sample: LoadCellSample) -> int:
+        return round(sample.raw)
 
 
-@pytest.fixture(params=["simulated", "playback", "hx711", "cas"])
-def fitted(request: pytest.FixtureRequest, quick: list[str], tmp_path: Path) -> Iterator[Fitted]:
-    with ExitStack() as stack:
-        if request.param in ("hx711", "cas"):
-            board = stack.enter_context(request.getfixturevalue("plug_in")(request.param))
-            clock, scale = MonotonicClock(), 1 if request.param == "hx711" else 1000
-            fitted = Fitted(
-                SerialLoadCell(board.config(), clock),
-                clock,
-                lambda: time.sleep(0.01),
-                lambda sample: round(sample.raw * scale),
-            )
-        else:
-            make = simulated if request.param == "simulated" else playback
-            fitted = make(stack, quick, tmp_path)
-        stack.callback(fitted.cell.close)
-        yield fitted
+class TestHx711LoadCell(NumberedContract):
+    form = "hx711"
+    numbers_per_raw = 1
+
+    @pytest.fixture
+    def board(self, plug_in):
+        with plug_in(self.form) as board:
+            yield board
+
+    @pytest.fixture
+    def load_cell(self, board) -> LoadCell:
+        return SerialLoadCell(board.config(), MonotonicClock())
+
+    @pytest.fixture
+    def second_load_cell(self, board) -> LoadCell:
+        return SerialLoadCell(board.config(), MonotonicClock())
+
+    def number(self, sample: LoadCellSample) -> int:
+        return round(sample.raw * self.numbers_per_raw)
+
+    def test_port_is_exclusive_until_closed(
+        self, load_cell: LoadCell, second_load_cell: LoadCell, collect
+    ) -> None:
+        load_cell.start()
+        with pytest.raises(DeviceError) as caught:
+            second_load_cell.start()
+        assert "\n" not in str(caught.value)
+        load_cell.close()
+        second_load_cell.start()
+        collect(second_load_cell, 1)
+
+    def test_unplugged_load_cell_is_read_again_when_it_is_back(
+        self, board, load_cell: SerialLoadCell, collect, wait_until
+    ) -> None:
+        load_cell.start()
+        samples = collect(load_cell, 10)
+        board.unplug()
+        wait_until(lambda: load_cell.stats.losses == 1)
+        samples += load_cell.drain()
+        board.plug()
+        samples += collect(load_cell, 20)
+        load_cell.close()
+        assert load_cell.stats.losses == 1
+        assert load_cell.stats.unreadable == 0
+        raws = [sample.raw for sample in samples]
+        assert raws == sorted(set(raws))
+        times_ns = [sample.t_ns for sample in samples]
+        assert times_ns == sorted(set(times_ns))
 
 
-def test_nothing_comes_before_the_start_or_after_the_end(fitted: Fitted, collect) -> None:
-    cell = fitted.cell
-    fitted.pause()
-    assert cell.drain() == []
-    cell.start()
-    collect(cell, 20, fitted.pause)
-    cell.close()
-    closed_ns = fitted.clock.now_ns()
-    cell.close()
-    fitted.pause()
-    assert all(sample.t_ns <= closed_ns for sample in cell.drain())
+class TestCasLoadCell(TestHx711LoadCell):
+    form = "cas"
+    numbers_per_raw = 1000
 
 
-def test_a_cell_may_be_closed_before_it_was_started(fitted: Fitted) -> None:
-    fitted.cell.close()
-    assert fitted.cell.drain() == []
+class TestPhidgetLoadCell(NumberedContract):
+    """A stub of the vendor's library gives 1, 2, 3... microvolts per volt while the test waits."""
+
+    @pytest.fixture
+    def load_cell(self, phidget_library: SimpleNamespace) -> LoadCell:
+        config = LoadCellConfig(backend="phidget", rate_hz=100, n_per_raw=1000.0)
+        return PhidgetLoadCell(config, MonotonicClock())
+
+    @pytest.fixture
+    def wait(self, phidget_library: SimpleNamespace) -> Callable[[float], None]:
+        number = 0
+
+        def wait(seconds: float) -> None:
+            nonlocal number
+            for _ in range(math.ceil(seconds / 0.01)):
+                time.sleep(0.01)
+                for channel in phidget_library.VoltageRatioInput.made:
+                    if not channel.closed:
+                        number += 1
+                        channel.told["OnVoltageRatioChangeHandler"](channel, number * 1e-6)
+
+        return wait
+
+    def number(self, sample: LoadCellSample) -> int:
+        return round(sample.raw * 1e6)
 
 
-def test_times_rise_and_none_lies_in_the_future(fitted: Fitted) -> None:
-    begin_ns = fitted.clock.now_ns()
-    fitted.cell.start()
-    times_ns: list[int] = []
-    while len(times_ns) < 50:
-        fitted.pause()
-        times_ns += [sample.t_ns for sample in fitted.cell.drain()]
-        assert max(times_ns, default=begin_ns) <= fitted.clock.now_ns()
-    assert times_ns[0] >= begin_ns
-    assert times_ns == sorted(set(times_ns))
-
-
-def test_each_sample_comes_once_and_in_order(fitted: Fitted, collect) -> None:
-    fitted.cell.start()
-    samples = collect(fitted.cell, 50, fitted.pause)
-    numbers = [fitted.number(sample) for sample in samples]
-    assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
-    assert all(sample.valid for sample in samples)
-    assert not any(fitted.cell.counts().values())
-
-
-@pytest.mark.parametrize("board", ["hx711", "cas"], indirect=True)
-def test_a_port_is_exclusive_until_closed(board, collect) -> None:
-    first, second = (SerialLoadCell(board.config(), MonotonicClock()) for _ in range(2))
-    first.start()
-    with pytest.raises(DeviceError, match=r"load cell's port .*load_cell is in use") as caught:
-        second.start()
-    assert "\n" not in str(caught.value)
-    first.close()
-    second.start()
-    collect(second, 1)
-    second.close()
-
-
-@pytest.mark.parametrize("board", ["hx711", "cas"], indirect=True)
-def test_a_cell_that_goes_away_is_read_again_once_it_is_back(board, collect, wait_until) -> None:
-    cell = SerialLoadCell(board.config(), MonotonicClock())
-    cell.start()
-    samples = collect(cell, 10)
-    board.unplug()
-    wait_until(lambda: cell.stats.losses == 1)
-    samples += cell.drain()
-    board.plug()
-    samples += collect(cell, 20)
-    cell.close()
-    assert cell.stats.losses == 1
-    assert cell.stats.unreadable == 0
-    raws = [sample.raw for sample in samples]
-    assert raws == sorted(set(raws))
-    times_ns = [sample.t_ns for sample in samples]
-    assert times_ns == sorted(set(times_ns))
+def test_contract_runs_on_every_built_in_load_cell() -> None:
+    assert set(LOAD_CELLS) == {"none", "simulated", "playback", "serial", "phidget"}

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from gripper_hw.load_cells.line_formats import (
     HX711_MAX,
     HX711_MIN,
-    LONGEST_LINE,
+    MAX_LINE_BYTES,
     PARSERS,
     LineSplitter,
     Reading,
@@ -20,7 +20,7 @@ numbers = st.decimals(-999, 9999, places=3).map(lambda kg: b"%8.3f" % kg)
 
 @st.composite
 def frames(draw: st.DrawFn) -> tuple[bytes, str, bytes]:
-    """A frame without its line feed, what it says of the state, and its number."""
+    """A frame without its line feed, its state and its number."""
     number, state = draw(numbers), draw(st.sampled_from(["ST", "US", "OL"]))
     head = state.encode() + b"," + draw(st.sampled_from([b"GS", b"NT"])) + b","
     identity = bytes([draw(st.integers(0x30, 0x7F)), draw(st.integers(0x80, 0xFF))])
@@ -36,7 +36,7 @@ def like_frames() -> st.SearchStrategy[bytes]:
 
 
 @given(st.sampled_from(sorted(PARSERS)), st.one_of(st.binary(max_size=40), like_frames()))
-def test_whatever_came_is_a_reading_or_none(form: str, line: bytes) -> None:
+def test_any_bytes_give_a_reading_or_none(form: str, line: bytes) -> None:
     reading = PARSERS[form](line)
     assert reading is None or reading.saturated or math.isfinite(reading.raw)
 
@@ -44,20 +44,18 @@ def test_whatever_came_is_a_reading_or_none(form: str, line: bytes) -> None:
 @given(
     st.integers(HX711_MIN, HX711_MAX), st.none() | st.integers(0, 2**32), st.sampled_from(["", "\r", " \r"])
 )
-def test_counts_are_read_back_with_and_without_the_boards_time(
-    raw: int, micros: int | None, end: str
-) -> None:
+def test_counts_are_parsed_with_and_without_board_time(raw: int, micros: int | None, end: str) -> None:
     line = f"{raw}{end}" if micros is None else f"{micros},{raw}{end}"
     assert parse_hx711(line.encode()) == Reading(raw, saturated=raw in (HX711_MIN, HX711_MAX))
 
 
 @pytest.mark.parametrize("line", [b"", b"8388608", b"-8388609", b"1.5", b"1,2,3", b"12 34", b"ready", b"1_0"])
-def test_what_no_converter_can_say_is_no_reading(line: bytes) -> None:
+def test_invalid_hx711_line_gives_no_reading(line: bytes) -> None:
     assert parse_hx711(line) is None
 
 
 @given(frames())
-def test_frames_of_all_three_lengths_are_read_back(frame: tuple[bytes, str, bytes]) -> None:
+def test_frames_of_all_three_lengths_are_parsed(frame: tuple[bytes, str, bytes]) -> None:
     line, state, number = frame
     assert parse_cas(line) == Reading(float(number), saturated=state == "OL")
 
@@ -72,11 +70,11 @@ def test_frames_of_all_three_lengths_are_read_back(frame: tuple[bytes, str, byte
         (b"ST,NT,+    135g ", 0.135),
     ],
 )
-def test_numbers_as_indicators_write_them(line: bytes, raw: float) -> None:
+def test_number_formats_of_indicators_are_parsed(line: bytes, raw: float) -> None:
     assert parse_cas(line) == Reading(pytest.approx(raw))
 
 
-def test_an_overload_without_a_number_is_saturation() -> None:
+def test_overload_without_number_is_saturation() -> None:
     reading = parse_cas(b"OL,GS,1\xc4," + 9 * b" " + b"kg")
     assert reading is not None
     assert reading.saturated
@@ -84,7 +82,7 @@ def test_an_overload_without_a_number_is_saturation() -> None:
 
 
 @given(frames(), st.data())
-def test_a_torn_frame_is_no_reading(frame: tuple[bytes, str, bytes], data: st.DataObject) -> None:
+def test_partial_frame_gives_no_reading(frame: tuple[bytes, str, bytes], data: st.DataObject) -> None:
     line = frame[0].removesuffix(b"\r")
     cut = data.draw(st.integers(1, len(line) - 1))
     assert parse_cas(line[:cut]) is None
@@ -92,14 +90,14 @@ def test_a_torn_frame_is_no_reading(frame: tuple[bytes, str, bytes], data: st.Da
 
 
 @given(st.binary(max_size=200), st.lists(st.integers(0, 200)))
-def test_lines_are_the_same_however_they_arrive(data: bytes, cuts: list[int]) -> None:
+def test_lines_do_not_depend_on_chunks(data: bytes, cuts: list[int]) -> None:
     splitter, lines = LineSplitter(), []
     for begin, end in zip([0, *sorted(cuts)], [*sorted(cuts), 200], strict=True):
         lines += splitter.feed(data[begin:end])
     assert lines == data.split(b"\n")[1:-1]
 
 
-def test_a_flood_without_a_line_feed_is_thrown_away() -> None:
+def test_long_data_without_line_feed_is_discarded() -> None:
     splitter = LineSplitter()
-    splitter.feed(b"torn\n" + bytes(LONGEST_LINE + 1))
+    splitter.feed(b"torn\n" + bytes(MAX_LINE_BYTES + 1))
     assert splitter.feed(b"end of it\n12\n") == [b"12"]

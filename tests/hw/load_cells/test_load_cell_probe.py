@@ -4,8 +4,8 @@ from typing import Any
 import pytest
 
 from gripper_force.config import Config
-from gripper_force.jobs import doctor
-from gripper_force.jobs.doctor import Check
+from gripper_force.jobs import checks
+from gripper_force.jobs.checks import Check
 from gripper_hw.load_cells.load_cell_probe import probe
 
 REAL = {"clock": "realtime", "servo": {"port": "/dev/nowhere"}}
@@ -15,7 +15,7 @@ def rows(config: dict[str, Any]) -> dict[str, Check]:
     return {check.name: check for check in probe(Config.model_validate(config))}
 
 
-def test_a_simulated_cell_is_measured_in_its_own_time() -> None:
+def test_simulated_load_cell_is_measured_in_simulated_time() -> None:
     found = rows({"object": "stapler", "sim": {"detail": "coarse"}, "load_cell": {"rate_hz": 100.0}})
     assert all(check.ok for check in found.values())
     assert found["rate"].found == "100.0 Hz of simulated, in simulated time"
@@ -23,7 +23,7 @@ def test_a_simulated_cell_is_measured_in_its_own_time() -> None:
     assert found["rejected"].found.startswith("0 of ")
 
 
-def test_a_board_on_a_serial_port_is_measured(board) -> None:
+def test_board_on_serial_port_is_measured(board) -> None:
     section = board.config().model_dump(mode="json")
     found = rows(REAL | {"load_cell": section})
     assert found["rate"].ok is True
@@ -31,7 +31,7 @@ def test_a_board_on_a_serial_port_is_measured(board) -> None:
     assert "noise" in found
 
 
-def test_a_cell_without_a_scale_is_a_problem(board) -> None:
+def test_load_cell_without_scale_is_a_problem(board) -> None:
     section = board.config(n_per_raw=None).model_dump(mode="json")
     found = rows(REAL | {"load_cell": section})
     assert "noise" not in found
@@ -40,8 +40,8 @@ def test_a_cell_without_a_scale_is_a_problem(board) -> None:
     assert "set load_cell.n_per_raw" in found["rejected"].advice
 
 
-def test_a_silent_cell_is_a_problem(board, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "_FIRST_NS", 0)
+def test_load_cell_without_samples_is_a_problem(board, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checks, "_FIRST_NS", 0)
     section = board.config().model_dump(mode="json")
     check = rows(REAL | {"load_cell": section})["rate"]
     assert check.ok is False
@@ -49,12 +49,12 @@ def test_a_silent_cell_is_a_problem(board, monkeypatch: pytest.MonkeyPatch) -> N
     assert "load_cell.baud_rate" in check.advice
 
 
-def test_no_cell_is_no_problem() -> None:
+def test_no_load_cell_is_no_problem() -> None:
     assert rows({"load_cell": {"backend": "none"}}) == {
         "backend": Check("load cell", "backend", "none", None)
     }
 
 
-def test_a_recording_is_a_cell(fused_log: Path) -> None:
+def test_playback_is_measured(fused_log: Path) -> None:
     section = {"backend": "playback", "path": str(fused_log)}
     assert rows(REAL | {"camera": {"backend": "none"}, "load_cell": section})["rejected"].ok is True

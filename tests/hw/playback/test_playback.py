@@ -15,7 +15,7 @@ FIRST_MS = 1000
 """Log time of the first record."""
 
 
-class HandClock:
+class ManualClock:
     def __init__(self, t_ms: int) -> None:
         self.t_ms = t_ms
 
@@ -28,7 +28,7 @@ class HandClock:
 
 @pytest.fixture
 def log(tmp_path: Path) -> Path:
-    """Samples every 5 ms, and a frame every 20 ms that is received 15 ms late."""
+    """A sample every 5 ms, and a frame every 20 ms with a latency of 15 ms."""
     path = tmp_path / "run.mcap"
     with LogWriter(path, config="", metadata={}) as writer:
         for i in range(60):
@@ -40,13 +40,13 @@ def log(tmp_path: Path) -> Path:
 
 
 def camera_of(
-    path: Path, clock: HandClock, speed: Literal["recorded", "full"] = "recorded"
+    path: Path, clock: ManualClock, speed: Literal["recorded", "full"] = "recorded"
 ) -> PlaybackCamera:
     return PlaybackCamera(CameraConfig(backend="playback", path=path, speed=speed), clock)
 
 
 def load_cell_of(
-    path: Path, clock: HandClock, speed: Literal["recorded", "full"] = "recorded"
+    path: Path, clock: ManualClock, speed: Literal["recorded", "full"] = "recorded"
 ) -> PlaybackLoadCell:
     return PlaybackLoadCell(LoadCellConfig(backend="playback", path=path, speed=speed), clock)
 
@@ -55,8 +55,8 @@ def recorded_frames(path: Path) -> list[tuple[int, int, int]]:
     return [(f.t_ns, f.received_ns, f.seq) for f in LogReader(path).records(Frame)]
 
 
-def test_frames_come_when_they_came_with_times_on_the_runs_clock(log: Path) -> None:
-    clock = HandClock(50)
+def test_recorded_speed_keeps_pace_and_shifts_times(log: Path) -> None:
+    clock = ManualClock(50)
     camera: Camera = camera_of(log, clock)
     camera.start()
     shift_ns = (50 - FIRST_MS) * NS_PER_MS
@@ -70,8 +70,8 @@ def test_frames_come_when_they_came_with_times_on_the_runs_clock(log: Path) -> N
     assert played == recorded_frames(log)
 
 
-def test_a_slow_reader_gets_the_newest_frame_and_sees_the_gap(log: Path) -> None:
-    clock = HandClock(0)
+def test_slow_reader_skips_frames(log: Path) -> None:
+    clock = ManualClock(0)
     camera = camera_of(log, clock)
     camera.start()
     assert camera.newest() is None
@@ -83,8 +83,8 @@ def test_a_slow_reader_gets_the_newest_frame_and_sees_the_gap(log: Path) -> None
     assert not camera.finished
 
 
-def test_full_speed_hands_out_every_frame_as_recorded_whatever_the_clock_says(log: Path) -> None:
-    camera = camera_of(log, HandClock(7), "full")
+def test_full_speed_returns_every_frame_as_recorded(log: Path) -> None:
+    camera = camera_of(log, ManualClock(7), "full")
     camera.start()
     played = []
     while not camera.finished:
@@ -95,8 +95,8 @@ def test_full_speed_hands_out_every_frame_as_recorded_whatever_the_clock_says(lo
     assert camera.newest() is None
 
 
-def test_after_the_end_there_is_nothing_more(log: Path) -> None:
-    clock = HandClock(0)
+def test_playback_ends_after_last_record(log: Path) -> None:
+    clock = ManualClock(0)
     camera, cell = camera_of(log, clock), load_cell_of(log, clock)
     camera.start()
     cell.start()
@@ -111,8 +111,8 @@ def test_after_the_end_there_is_nothing_more(log: Path) -> None:
     assert cell.drain() == []
 
 
-def test_samples_are_drained_once_and_in_step_with_the_frames(log: Path) -> None:
-    clock = HandClock(0)
+def test_samples_are_returned_once_at_recorded_pace(log: Path) -> None:
+    clock = ManualClock(0)
     cell: LoadCell = load_cell_of(log, clock)
     cell.start()
     shift_ns = FIRST_MS * NS_PER_MS
@@ -128,15 +128,15 @@ def test_samples_are_drained_once_and_in_step_with_the_frames(log: Path) -> None
     assert played == [(s.t_ns, s.force_n, s.raw, s.valid) for s in recorded]
 
 
-def test_full_speed_drains_every_sample_at_once_as_recorded(log: Path) -> None:
-    cell = load_cell_of(log, HandClock(7), "full")
+def test_full_speed_returns_all_samples_at_once(log: Path) -> None:
+    cell = load_cell_of(log, ManualClock(7), "full")
     cell.start()
     assert cell.drain() == list(LogReader(log).records(LoadCellSample))
     assert cell.drain() == []
 
 
-def test_closed_devices_play_no_more_and_may_be_closed_again(log: Path) -> None:
-    clock = HandClock(0)
+def test_closed_devices_return_nothing(log: Path) -> None:
+    clock = ManualClock(0)
     devices = camera_of(log, clock), load_cell_of(log, clock)
     for device in devices:
         device.start()
@@ -147,13 +147,13 @@ def test_closed_devices_play_no_more_and_may_be_closed_again(log: Path) -> None:
     assert devices[1].drain() == []
 
 
-def test_a_recording_without_the_sensor_is_refused(tmp_path: Path) -> None:
+def test_log_without_data_of_sensor_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with LogWriter(path, config="", metadata={}) as writer:
         writer.write(Event(0, "session", "nothing else"))
     with pytest.raises(DataError, match="no camera frames"):
-        camera_of(path, HandClock(0))
+        camera_of(path, ManualClock(0))
     with pytest.raises(DataError, match="no load-cell samples"):
-        load_cell_of(path, HandClock(0))
+        load_cell_of(path, ManualClock(0))
     with pytest.raises(LogError, match="No such file"):
-        camera_of(tmp_path / "missing.mcap", HandClock(0))
+        camera_of(tmp_path / "missing.mcap", ManualClock(0))

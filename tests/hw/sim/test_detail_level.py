@@ -1,3 +1,4 @@
+from contextlib import closing
 from typing import get_args
 
 import pytest
@@ -7,7 +8,7 @@ from hypothesis import strategies as st
 from gripper_force.config import BudgetConfig, load_config
 from gripper_force.errors import ConfigError
 from gripper_hw.sim import detail_level as detail
-from gripper_hw.sim.detail_level import choose, resolve_detail
+from gripper_hw.sim.detail_level import resolve_detail, select_level
 from gripper_hw.sim.objects import OBJECTS, Detail
 from gripper_hw.sim.simulated_rig import SimulatedRig
 
@@ -20,7 +21,7 @@ tables = st.dictionaries(
 
 
 @given(tables, st.none() | figures, st.none() | figures)
-def test_what_is_taken_keeps_the_budget_and_nothing_faster_does(
+def test_fastest_level_within_budget_is_selected(
     levels: detail.Levels, error_n: float | None, speed: float | None
 ) -> None:
     fits = [
@@ -30,16 +31,16 @@ def test_what_is_taken_keeps_the_budget_and_nothing_faster_does(
     ]
     budget = BudgetConfig(sim_error_n=error_n, sim_speed=speed)
     if fits and (error_n, speed) != (None, None):
-        taken, why = choose(levels, budget, "tube")
+        taken, why = select_level(levels, budget, "tube")
         assert levels[taken]["speed"] == max(fits)
         assert why.startswith(f"took sim.detail={taken} ")
     else:
         with pytest.raises(ConfigError):
-            choose(levels, budget, "tube")
+            select_level(levels, budget, "tube")
 
 
 @pytest.mark.parametrize("name", OBJECTS)
-def test_the_shipped_table_knows_every_object(name: str) -> None:
+def test_shipped_table_has_every_object(name: str) -> None:
     strict, loose = (
         resolve_detail(
             load_config(None, [f"object={name}", "sim.detail=auto", f"budget.sim_error_n={error_n}"])
@@ -50,34 +51,45 @@ def test_the_shipped_table_knows_every_object(name: str) -> None:
     assert loose[0].sim.detail in ("coarse", "medium")
 
 
-def test_a_level_that_is_named_stays() -> None:
+def test_configured_level_is_kept() -> None:
     config = load_config(None, ["budget.sim_speed=1e6"])
     assert resolve_detail(config) == (config, "")
 
 
 @pytest.mark.parametrize(
-    ("overrides", "sentence"),
+    ("overrides", "message"),
     [
-        ([], "needs to know what for: set budget.sim_error_n or budget.sim_speed"),
-        (["object=brick", "budget.sim_speed=1"], "knows nothing of 'brick', but of sponge, paper_cup"),
+        ([], "needs a budget; set budget.sim_error_n or budget.sim_speed"),
+        (["object=brick", "budget.sim_speed=1"], "has no data of 'brick', only of sponge, paper_cup"),
         (
             ["object=tube", "budget.sim_error_n=0.1", "budget.sim_speed=4"],
-            r"no level of detail of a simulated tube keeps budget.sim_error_n=0.1 and budget.sim_speed=4; "
-            r"there are coarse: .* N off the finest at .* simulated s/s, medium: ",
+            r"no sim.detail level for tube meets budget.sim_error_n=0.1 and budget.sim_speed=4; "
+            r"available: coarse: .* N error against the finest, .* simulated s/s, medium: ",
         ),
     ],
 )
-def test_what_cannot_be_chosen_is_one_sentence(overrides: list[str], sentence: str) -> None:
-    with pytest.raises(ConfigError, match=sentence):
+def test_unresolvable_level_is_refused(overrides: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         resolve_detail(load_config(None, ["sim.detail=auto", *overrides]))
 
 
-def test_the_rig_simulates_what_was_taken_and_says_why(quick: list[str]) -> None:
+def test_rig_simulates_selected_level_and_gives_the_reason(quick: list[str]) -> None:
     overrides = [*quick, "sim.detail=auto", "budget.sim_error_n=0.05"]
-    rig = SimulatedRig(load_config(None, overrides))
-    try:
+    config, reason = SimulatedRig.resolve(load_config(None, overrides))
+    with closing(SimulatedRig(config)) as rig:
         assert rig.scene.detail == "medium"
-        assert "took sim.detail=medium" in rig.notes()["detail"]
-        assert "budget.sim_error_n=0.05" in rig.notes()["detail"]
-    finally:
-        rig.close()
+    assert "took sim.detail=medium" in reason
+    assert "budget.sim_error_n=0.05" in reason
+
+
+def test_rig_refuses_unresolved_level(quick: list[str]) -> None:
+    with pytest.raises(ConfigError, match=r"sim\.detail is still auto; "):
+        SimulatedRig(load_config(None, [*quick, "sim.detail=auto"]))
+
+
+def test_rig_resolves_level(quick: list[str]) -> None:
+    config = load_config(None, [*quick, "sim.detail=auto", "budget.sim_error_n=0.05"])
+    resolved, reason = SimulatedRig.resolve(config)
+    assert resolved.sim.detail == "medium"
+    assert reason.startswith("took sim.detail=medium ")
+    assert SimulatedRig.resolve(resolved) == (resolved, "")

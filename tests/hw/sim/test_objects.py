@@ -7,7 +7,7 @@ import pytest
 from gripper_force.config import GripperConfig
 from gripper_force.errors import ConfigError
 from gripper_hw.sim.engine import mujoco
-from gripper_hw.sim.objects import BLOCK_WIDTH_M, FOR_PADS_ALONE, GAUGES, OBJECTS, Detail, build_object
+from gripper_hw.sim.objects import BLOCK_WIDTH_M, GAUGES, OBJECTS, PADS_ONLY, Detail, build_object
 from gripper_hw.sim.scene import Scene, scene_mjcf
 
 DETAILS = get_args(Detail)
@@ -22,7 +22,7 @@ def model_of(name: str, detail: str = "coarse", size: float = 1.0, stiffness: fl
 def press(model: mujoco.MjModel, force_n: float, time_s: float) -> tuple[float, float]:
     """Closes slowly with a constant torque. Returns travel of the right jaw in m, and grip force in N.
 
-    Nothing but the object resists in the end, so that what the object takes is what the motor gives.
+    Without friction only the object resists in the end, so the grip force equals the motor's force.
     """
     data = mujoco.MjData(model)
     data.ctrl[0] = 2 * force_n * RADIUS_M
@@ -33,8 +33,8 @@ def press(model: mujoco.MjModel, force_n: float, time_s: float) -> tuple[float, 
     return float(data.joint("right").qpos[0]), float(np.mean(np.abs(data.sensordata[[1, 5]])))
 
 
-@pytest.mark.parametrize("name", sorted(OBJECTS.keys() - FOR_PADS_ALONE))
-def test_rods_press_a_turned_object_and_let_go_of_it(name: str) -> None:
+@pytest.mark.parametrize("name", sorted(OBJECTS.keys() - PADS_ONLY))
+def test_rods_press_and_release_a_rotated_object(name: str) -> None:
     scene = Scene(name, "coarse", "rods", yaw_deg=34, offset_m=(0.0015, 0.003))
     model = mujoco.MjModel.from_xml_string(*scene_mjcf(scene, GripperConfig()))
     data = mujoco.MjData(model)
@@ -49,26 +49,26 @@ def test_rods_press_a_turned_object_and_let_go_of_it(name: str) -> None:
     assert forces_n[1] == 0
 
 
-@pytest.mark.parametrize("name", FOR_PADS_ALONE)
-def test_what_rods_would_dent_is_refused_to_them(name: str) -> None:
+@pytest.mark.parametrize("name", PADS_ONLY)
+def test_rods_are_refused_for_objects_they_would_dent(name: str) -> None:
     with pytest.raises(ConfigError, match="rods would dent the simulated ball beyond its model"):
         scene_mjcf(Scene(name, "coarse", "rods"), GripperConfig())
 
 
 def travel_at(name: str, force_n: float, size: float = 1.0, stiffness: float = 1.0) -> float:
-    """How far the jaws go on from a touch of 0.5 N to a force."""
+    """Travel of the jaws from 0.5 N to a force, in m."""
     model = model_of(name, "coarse" if name == "ball" else "medium", size, stiffness)
     return press(model, force_n, 1.6)[0] - press(model, 0.5, 1.6)[0]
 
 
-def test_an_unknown_object_is_named_with_the_known_ones() -> None:
+def test_error_of_unknown_object_lists_known_ones() -> None:
     with pytest.raises(ConfigError, match="no simulated object 'egg'; there are sponge, paper_cup, tube"):
         build_object("egg", "coarse", 1.0, 1.0)
 
 
 @pytest.mark.parametrize("detail", DETAILS)
 @pytest.mark.parametrize("name", OBJECTS)
-def test_every_object_stands_still_untouched_at_every_level(name: str, detail: str) -> None:
+def test_untouched_object_does_not_move(name: str, detail: str) -> None:
     model = model_of(name, detail)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -82,7 +82,7 @@ def test_every_object_stands_still_untouched_at_every_level(name: str, detail: s
 
 
 @pytest.mark.parametrize("name", OBJECTS)
-def test_a_finer_level_costs_no_less(name: str) -> None:
+def test_finer_level_costs_no_less(name: str) -> None:
     models = [model_of(name, detail) for detail in DETAILS]
     cost = [model.nv / model.opt.timestep for model in models]
     assert cost == sorted(cost)
@@ -92,14 +92,14 @@ def test_a_finer_level_costs_no_less(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", OBJECTS)
-def test_every_object_takes_what_the_motor_gives(name: str) -> None:
+def test_grip_force_equals_motor_force(name: str) -> None:
     travel_m, force_n = press(model_of(name), 3.0, 1.5)
     assert force_n == pytest.approx(3.0, abs=0.1)
     assert 0.005 < travel_m < 0.04
 
 
 @pytest.mark.parametrize("name", sorted(OBJECTS.keys() - GAUGES))
-def test_size_leaves_stiffness_alone_and_stiffness_scales_the_force(name: str) -> None:
+def test_size_does_not_change_stiffness_and_stiffness_scales_force(name: str) -> None:
     travel_m = travel_at(name, 4.0)
     for size in (0.96, 1.04):
         assert travel_at(name, 4.0, size=size) == pytest.approx(travel_m, rel=0.06)
@@ -108,7 +108,7 @@ def test_size_leaves_stiffness_alone_and_stiffness_scales_the_force(name: str) -
 
 @pytest.mark.parametrize("tool", ["pads", "rods"])
 @pytest.mark.parametrize("detail", DETAILS)
-def test_the_block_is_as_wide_as_it_is_said_to_be_and_reads_a_clean_force(detail: str, tool: str) -> None:
+def test_block_has_its_width_and_gives_exact_force(detail: str, tool: str) -> None:
     scene = Scene("block", detail, tool, yaw_deg=4, offset_m=(0.0015, 0.003))
     model = mujoco.MjModel.from_xml_string(*scene_mjcf(scene, GripperConfig()))
     model.dof_frictionloss[:] = 0
@@ -127,7 +127,7 @@ def test_the_block_is_as_wide_as_it_is_said_to_be_and_reads_a_clean_force(detail
     assert all(BLOCK_WIDTH_M - 0.002 < width_m < BLOCK_WIDTH_M for width_m in widths_m)  # tips give way
 
 
-def test_no_part_of_the_ball_is_so_flat_that_it_turns_inside_out() -> None:
+def test_no_tetrahedron_of_ball_is_flat() -> None:
     text = ElementTree.fromstring(build_object("ball", "fine", 1.0, 1.0).body)
     points = np.array(text.attrib["point"].split(), float).reshape(-1, 3)
     corners = points[np.array(text.attrib["element"].split(), int).reshape(-1, 4)]

@@ -29,7 +29,7 @@ class Clock:
 
 @dataclass
 class Source:
-    """A camera and a load cell without fault; every picture and every reading is another one."""
+    """A camera and a load cell without faults; all images and readings differ."""
 
     clock: Clock
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
@@ -60,7 +60,7 @@ def faults(unit: str, kind: str) -> Faults:
 
 
 def frames_of(kind: str) -> list[tuple[int, Frame]]:
-    """Three seconds of frames with the time each was handed out at."""
+    """Three seconds of frames with the time at which each was returned."""
     clock = Clock()
     camera = FaultyCamera(Source(clock), faults("camera", kind), clock, seed=1)
     camera.start()
@@ -75,7 +75,7 @@ def frames_of(kind: str) -> list[tuple[int, Frame]]:
 
 
 @pytest.mark.parametrize("kind", FAULTS["camera"])
-def test_a_camera_fails_as_configured_and_recovers(kind: str) -> None:
+def test_camera_fails_as_configured_and_recovers(kind: str) -> None:
     given = frames_of(kind)
     during = [frame for t_ns, frame in given if BEGIN_NS <= t_ns < END_NS]
     before = [frame for t_ns, frame in given if t_ns < BEGIN_NS]
@@ -113,11 +113,11 @@ def samples_of(kind: str) -> list[LoadCellSample]:
 
 
 @pytest.mark.parametrize("kind", FAULTS["load_cell"])
-def test_a_load_cell_fails_as_configured_and_recovers(kind: str) -> None:
+def test_load_cell_fails_as_configured_and_recovers(kind: str) -> None:
     samples = samples_of(kind)
     assert all(a.t_ns < b.t_ns or kind == "delayed" for a, b in pairwise(samples))
     during = [s for s in samples if BEGIN_NS <= s.t_ns < END_NS]
-    believed = [s for s in during if s.valid]
+    accepted = [s for s in during if s.valid]
     assert all(s.valid for s in samples if s.t_ns < BEGIN_NS - 20 * SAMPLE_NS)
     assert all(s.valid for s in samples if s.t_ns > END_NS + NS_PER_S)
     assert all(abs(s.force_n - 3.0) < 0.1 for s in samples if s.valid and s.t_ns > END_NS + NS_PER_S)
@@ -126,12 +126,12 @@ def test_a_load_cell_fails_as_configured_and_recovers(kind: str) -> None:
             assert during == []
         case "stuck":
             assert len({s.raw for s in during}) == 1
-            assert len(believed) <= 12
+            assert len(accepted) <= 12
         case "garbage":
             assert any(not math.isfinite(s.raw) for s in during)
-            assert len(believed) < 20
+            assert len(accepted) < 20
         case "wrong":
-            assert believed == []
+            assert accepted == []
         case "slow":
             assert len(during) == 2
         case "delayed":
@@ -141,12 +141,12 @@ def test_a_load_cell_fails_as_configured_and_recovers(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", FAULTS["clock"])
-def test_a_clock_fails_as_configured(kind: str) -> None:
-    clock, right_time = Clock(), time.time
+def test_clock_fails_as_configured(kind: str) -> None:
+    clock, real_time = Clock(), time.time
     faulty = FaultyClock(clock, faults("clock", kind))
     faulty.sleep_until_ns(BEGIN_NS - 1)
     assert faulty.now_ns() == BEGIN_NS - 1
-    assert time.time is right_time
+    assert time.time is real_time
     faulty.sleep_until_ns(BEGIN_NS + 1)
     match kind:
         case "stuck":
@@ -155,16 +155,16 @@ def test_a_clock_fails_as_configured(kind: str) -> None:
             assert faulty.now_ns() == BEGIN_NS + 1 + 15 * NS_PER_MS
         case "wrong":
             assert faulty.now_ns() == BEGIN_NS + 1
-            assert right_time() - time.time() > 80_000
+            assert real_time() - time.time() > 80_000
     faulty.sleep_until_ns(END_NS + 1)
-    assert time.time is right_time
+    assert time.time is real_time
 
 
-def test_a_run_that_ends_while_the_wall_clock_is_wrong_sets_it_right() -> None:
-    right_time = time.time
+def test_close_restores_the_wall_clock() -> None:
+    real_time = time.time
     faulty = FaultyClock(Clock(), faults("clock", "wrong"))
     faulty.sleep_until_ns(BEGIN_NS + 1)
-    assert time.time is not right_time
+    assert time.time is not real_time
     faulty.close()
     faulty.close()
-    assert time.time is right_time
+    assert time.time is real_time

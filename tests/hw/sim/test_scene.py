@@ -10,7 +10,7 @@ from gripper_hw.sim.engine import mujoco
 from gripper_hw.sim.scene import LUX_LEVELS, Scene, draw_scene, scene_mjcf
 
 
-def test_a_seed_draws_one_scene_and_another_seed_another() -> None:
+def test_scene_depends_on_seed_only() -> None:
     config = SimConfig()
     assert draw_scene("tube", 3, config) == draw_scene("tube", 3, config)
     first, second = asdict(draw_scene("tube", 3, config)), asdict(draw_scene("tube", 4, config))
@@ -26,7 +26,7 @@ def test_a_seed_draws_one_scene_and_another_seed_another() -> None:
     }
 
 
-def test_what_is_asked_for_is_not_drawn() -> None:
+def test_configured_values_are_not_drawn() -> None:
     scene = draw_scene("cup", 3, SimConfig(randomise=False, lux=350, detail="fine", tool="rods"))
     assert scene == Scene("cup", "fine", "rods", lux=350.0)
     assert {draw_scene("cup", i, SimConfig(randomise=False)).lux for i in range(20)} == set(LUX_LEVELS)
@@ -34,7 +34,7 @@ def test_what_is_asked_for_is_not_drawn() -> None:
 
 
 @pytest.mark.parametrize("randomise", [True, False])
-def test_a_turn_and_a_light_change_nothing_else_of_the_scene(randomise: bool) -> None:
+def test_yaw_and_lux_change_nothing_else(randomise: bool) -> None:
     config = SimConfig(randomise=randomise, lux=550)
     asked = SimConfig(randomise=randomise, lux=350, yaw_deg=20)
     before, after = (draw_scene("tube", 3, c) for c in (config, asked))
@@ -43,7 +43,7 @@ def test_a_turn_and_a_light_change_nothing_else_of_the_scene(randomise: bool) ->
     assert replace(after, yaw_deg=before.yaw_deg, lux=before.lux) == before
 
 
-def test_the_scenes_of_old_logs_are_drawn_again_to_the_bit() -> None:
+def test_scenes_of_old_logs_are_drawn_identically() -> None:
     scene = draw_scene("sponge", 100_000, SimConfig())
     assert (scene.yaw_deg, scene.lux, scene.texture_seed, scene.backlash_m) == (
         2.9191085508820542,
@@ -53,7 +53,7 @@ def test_the_scenes_of_old_logs_are_drawn_again_to_the_bit() -> None:
     )
 
 
-def test_rods_are_mounted_anew_for_each_scene_and_that_changes_nothing_else() -> None:
+def test_rod_length_is_drawn_and_changes_nothing_else() -> None:
     pads, rods = (draw_scene("tube", 3, SimConfig(tool=tool)) for tool in ("pads", "rods"))
     assert replace(rods, tool="pads", rod_length_m=pads.rod_length_m) == pads
     lengths_m = [draw_scene("tube", seed, SimConfig(tool="rods")).rod_length_m for seed in range(50)]
@@ -61,7 +61,7 @@ def test_rods_are_mounted_anew_for_each_scene_and_that_changes_nothing_else() ->
 
 
 @given(st.integers(0, 2**32), st.integers(0, 2**32), st.integers(0, 2**32))
-def test_one_object_on_one_rig_is_touched_again_in_another_place(own: int, seed: int, other: int) -> None:
+def test_seed_places_the_same_object_on_the_same_rig(own: int, seed: int, other: int) -> None:
     assume(seed != other)
     config = SimConfig(object_seed=own, rig_seed=own + 1, size_spread=0.15)
     first, again = (asdict(draw_scene("tube", s, config)) for s in (seed, other))
@@ -73,7 +73,7 @@ def test_one_object_on_one_rig_is_touched_again_in_another_place(own: int, seed:
         assert first[name] == (of_object if name in itself else of_rig)[name], name
 
 
-def test_the_texture_goes_with_the_object_and_the_table_with_the_rig() -> None:
+def test_object_seed_draws_texture_and_rig_seed_draws_table() -> None:
     def textures(**seeds: int) -> dict[str, bytes]:
         return scene_mjcf(draw_scene("tube", 1, SimConfig(**seeds)), GripperConfig())[1]  # type: ignore[arg-type]
 
@@ -83,7 +83,7 @@ def test_the_texture_goes_with_the_object_and_the_table_with_the_rig() -> None:
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.15])
-def test_size_stays_within_its_spread_and_fills_it(spread: float) -> None:
+def test_size_fills_its_spread(spread: float) -> None:
     config = SimConfig(size_spread=spread)
     off = [abs(draw_scene("tube", seed, config).size - 1) for seed in range(50)]
     assert max(off) <= spread + 1e-12
@@ -91,19 +91,19 @@ def test_size_stays_within_its_spread_and_fills_it(spread: float) -> None:
 
 
 @pytest.mark.parametrize("spread", [0.0, 0.3])
-def test_stiffness_stays_within_its_spread_and_fills_it(spread: float) -> None:
+def test_stiffness_fills_its_spread(spread: float) -> None:
     config = SimConfig(stiffness_spread=spread)
     off = [abs(draw_scene("tube", seed, config).stiffness - 1) for seed in range(50)]
     assert max(off) <= spread
     assert max(off) >= 0.8 * spread
 
 
-def test_a_gauge_is_known_exactly() -> None:
+def test_gauge_has_exact_size_and_stiffness() -> None:
     scene = draw_scene("block", 3, SimConfig(stiffness_spread=0.5))
     assert replace(draw_scene("tube", 3, SimConfig()), object="block", size=1.0, stiffness=1.0) == scene
 
 
-def test_every_drawn_number_reaches_the_model() -> None:
+def test_every_drawn_number_changes_the_model() -> None:
     gripper = GripperConfig()
     plain = Scene("sponge", "coarse", "rods")
     before = scene_mjcf(plain, gripper)
@@ -117,7 +117,7 @@ def test_every_drawn_number_reaches_the_model() -> None:
             assert after[1] != before[1]
 
 
-def test_no_name_is_left_unfilled_and_the_textures_are_there() -> None:
+def test_template_is_complete_and_textures_exist() -> None:
     for name, texture in [
         ("sponge", "sponge.png"),
         ("paper_cup", "cup.png"),
@@ -132,7 +132,7 @@ def test_no_name_is_left_unfilled_and_the_textures_are_there() -> None:
         assert all(data.startswith(b"\x89PNG") for data in assets.values())
 
 
-def test_jaws_end_in_pads_or_in_rods_and_meet_an_object_at_the_same_width() -> None:
+def test_pads_and_rods_touch_an_object_at_the_same_width() -> None:
     pads, rods = (
         mujoco.MjModel.from_xml_string(*scene_mjcf(Scene("stapler", "coarse", tool), GripperConfig()))
         for tool in ("pads", "rods")
@@ -143,6 +143,6 @@ def test_jaws_end_in_pads_or_in_rods_and_meet_an_object_at_the_same_width() -> N
         assert rod.pos[0] + sign * (rod.size[0] + rod.size[1]) == pytest.approx(sign * pad.size[0])
 
 
-def test_an_unknown_object_is_named() -> None:
+def test_unknown_object_is_refused() -> None:
     with pytest.raises(ConfigError, match="no simulated object 'egg'"):
         scene_mjcf(Scene("egg", "coarse"), GripperConfig())

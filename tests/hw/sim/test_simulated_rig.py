@@ -57,7 +57,7 @@ def squeeze(rig: SimulatedRig) -> tuple[list[ServoState], list[Frame], list[Load
     return states, frames, samples
 
 
-def test_a_seed_gives_one_world_to_the_bit_and_another_seed_another(make_rig: MakeRig) -> None:
+def test_same_seed_gives_identical_data_and_another_seed_differs(make_rig: MakeRig) -> None:
     first, again, other = (squeeze(make_rig(f"seed={seed}")) for seed in (5, 5, 6))
     assert first[0] == again[0]
     assert first[2] == again[2]
@@ -68,17 +68,17 @@ def test_a_seed_gives_one_world_to_the_bit_and_another_seed_another(make_rig: Ma
     assert (first[1][0].gray != other[1][0].gray).any()
 
 
-def test_a_moving_background_is_seen_and_touches_nothing(make_rig: MakeRig) -> None:
+def test_moving_background_changes_images_only(make_rig: MakeRig) -> None:
     still, moving = (squeeze(make_rig(f"sim.moving_background={asked}")) for asked in ("false", "true"))
     assert moving[0] == still[0]
     assert moving[2] == still[2]
     differs = np.array([a.gray != b.gray for a, b in zip(moving[1], still[1], strict=True)])  # (T, H, W)
-    assert differs.any((1, 2)).mean() > 0.3  # they pass out of sight as well
+    assert differs.any((1, 2)).mean() > 0.3  # they also move out of view
     assert (differs[0] != differs[-1]).any()
     assert differs.mean() < 0.5
 
 
-def test_a_changing_light_is_seen_and_touches_nothing(make_rig: MakeRig) -> None:
+def test_changing_light_changes_images_only(make_rig: MakeRig) -> None:
     steady, changing = (squeeze(make_rig(f"sim.changing_light={asked}")) for asked in ("false", "true"))
     assert changing[2] == steady[2]
     linear = [[(f.gray / 255.0) ** 2.2 for f in frames] for frames in (changing[1], steady[1])]
@@ -88,7 +88,7 @@ def test_a_changing_light_is_seen_and_touches_nothing(make_rig: MakeRig) -> None
 
 
 @pytest.mark.parametrize("latency_ms", [0.0, 40.0])
-def test_a_frame_comes_after_the_cameras_latency(make_rig: MakeRig, latency_ms: float) -> None:
+def test_frame_is_available_after_camera_latency(make_rig: MakeRig, latency_ms: float) -> None:
     rig = make_rig(f"sim.camera_latency_ms={latency_ms}", "camera.rate_hz=100")
     rig.camera.start()
     frames = []
@@ -104,7 +104,7 @@ def test_a_frame_comes_after_the_cameras_latency(make_rig: MakeRig, latency_ms: 
     assert frames[0].gray.dtype == np.uint8
 
 
-def test_who_asks_late_gets_the_newest_frame(make_rig: MakeRig) -> None:
+def test_slow_reader_gets_newest_frame(make_rig: MakeRig) -> None:
     rig = make_rig("camera.rate_hz=100")
     rig.camera.start()
     rig.clock.sleep_until_ns(200 * NS_PER_MS)
@@ -115,10 +115,10 @@ def test_who_asks_late_gets_the_newest_frame(make_rig: MakeRig) -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [80, 200])
-def test_the_load_cell_samples_at_its_rate_with_its_noise(make_rig: MakeRig, rate_hz: int) -> None:
+def test_load_cell_has_its_rate_and_noise(make_rig: MakeRig, rate_hz: int) -> None:
     rig = make_rig(f"load_cell.rate_hz={rate_hz}")
     rig.load_cell.start()
-    rig.load_cell.start()  # a second start is none
+    rig.load_cell.start()  # has no effect
     rig.clock.sleep_until_ns(NS_PER_S)
     samples = rig.load_cell.drain()
     assert len(samples) == rate_hz
@@ -128,7 +128,7 @@ def test_the_load_cell_samples_at_its_rate_with_its_noise(make_rig: MakeRig, rat
     assert 0.007 < np.std(forces_n) < 0.013
 
 
-def test_the_notes_hold_the_scene_and_the_exposure(make_rig: MakeRig) -> None:
+def test_notes_hold_scene_and_exposure(make_rig: MakeRig) -> None:
     rig = make_rig("sim.exposure_ms=7")
     notes = rig.notes()
     assert json.loads(notes["scene"]) == json.loads(json.dumps(asdict(rig.scene)))
@@ -144,7 +144,7 @@ def first_gray(rig: SimulatedRig) -> np.ndarray:
     return frame.gray
 
 
-def test_a_longer_exposure_is_brighter_up_to_what_the_camera_can_say(make_rig: MakeRig) -> None:
+def test_longer_exposure_is_brighter_up_to_saturation(make_rig: MakeRig) -> None:
     grays = {us: first_gray(make_rig(f"camera.exposure_us={us}")) for us in ("null", 2000, 4000, 400_000)}
     assert (grays["null"] == grays[4000]).all()
     ratio = np.median(grays[4000] / np.maximum(grays[2000], 1.0))
@@ -153,7 +153,7 @@ def test_a_longer_exposure_is_brighter_up_to_what_the_camera_can_say(make_rig: M
     assert make_rig("camera.exposure_us=6000").notes()["exposure_ms"] == "6.0"
 
 
-def test_the_servos_watchdog_counts_simulated_time(make_rig: MakeRig) -> None:
+def test_servo_watchdog_counts_simulated_time(make_rig: MakeRig) -> None:
     rig = make_rig()
     servo = servo_of(rig)
     servo.start()
@@ -166,18 +166,18 @@ def test_the_servos_watchdog_counts_simulated_time(make_rig: MakeRig) -> None:
     servo.close()
 
 
-def test_a_port_that_is_real_is_refused(quick: list[str]) -> None:
-    with pytest.raises(ConfigError, match=r"'/dev/ttyUSB0' is no virtual port"):
+def test_real_port_is_refused(quick: list[str]) -> None:
+    with pytest.raises(ConfigError, match=r"'/dev/ttyUSB0' is not virtual"):
         SimulatedRig(load_config(None, [*quick, "servo.port=/dev/ttyUSB0"]))
 
 
-def test_an_unknown_object_is_named_and_leaves_no_bus(quick: list[str]) -> None:
+def test_unknown_object_is_refused_and_leaves_no_bus(quick: list[str]) -> None:
     with pytest.raises(ConfigError, match="no simulated object 'egg'; there are sponge"):
         SimulatedRig(load_config(None, [*quick, "object=egg"]))
     assert find_bus("rig") is None
 
 
-def test_a_closed_rig_leaves_nothing_behind(make_rig: MakeRig) -> None:
+def test_closed_rig_leaves_no_bus_and_no_thread(make_rig: MakeRig) -> None:
     rig = make_rig("clock=realtime")
     rig.start()
     rig.start()
@@ -188,37 +188,37 @@ def test_a_closed_rig_leaves_nothing_behind(make_rig: MakeRig) -> None:
     assert "simulated-rig" not in {thread.name for thread in threading.enumerate()}
 
 
-def broken_after(make_rig: MakeRig, patch: Callable[[SimulatedRig], None]) -> BaseException:
-    """What `check` raises of a rig in real time that was tampered with."""
+def error_of_patched_rig(make_rig: MakeRig, patch: Callable[[SimulatedRig], None]) -> BaseException:
+    """Returns the exception that `check` raises for a patched rig in real time."""
     rig = make_rig("clock=realtime")
     patch(rig)
     rig.start()
     until_s = time.monotonic() + 20
-    with pytest.raises(Exception) as caught:  # noqa: PT012 - polled
+    with pytest.raises(Exception) as caught:
         while time.monotonic() < until_s:
             rig.check()
             time.sleep(0.005)
     return caught.value
 
 
-def test_a_machine_that_is_too_slow_is_told_so(make_rig: MakeRig, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_slow_machine_is_an_error(make_rig: MakeRig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rig_module, "_REALTIME_MAX_LAG_NS", -1)
-    error = broken_after(make_rig, lambda _: None)
+    error = error_of_patched_rig(make_rig, lambda _: None)
     assert isinstance(error, SimulationError)
-    assert "can't simulate 'stapler' (coarse) in real time" in str(error)
+    assert "too slow to simulate 'stapler' (coarse) in real time" in str(error)
 
 
-def test_whatever_breaks_the_worlds_thread_is_told_by_check(
-    make_rig: MakeRig, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_exception_of_thread_is_raised_by_check(make_rig: MakeRig, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise MemoryError("no more")
 
-    error = broken_after(make_rig, lambda rig: monkeypatch.setattr(rig.load_cell._world, "advance_to", fail))
+    error = error_of_patched_rig(
+        make_rig, lambda rig: monkeypatch.setattr(rig.load_cell._world, "advance_to", fail)
+    )
     assert isinstance(error, MemoryError)
 
 
-def test_more_light_is_brighter_and_more_noise_rougher() -> None:
+def test_light_sets_brightness_and_noise_sets_variance() -> None:
     picture = np.full((64, 64, 3), 128, np.uint8)
 
     def grays(lux: float, noise: float) -> np.ndarray:

@@ -5,18 +5,18 @@ import sys
 import pytest
 
 from gripper_force.config import Config
-from gripper_force.jobs.doctor import Check
+from gripper_force.jobs.checks import Check
 from gripper_hw.sim.simulation_probe import probe
 from gripper_hw.sim.world import World
 
 
-def test_a_scene_is_drawn() -> None:
+def test_scene_is_rendered() -> None:
     (check,) = probe(Config.model_validate({"object": "stapler", "sim": {"detail": "coarse"}}))
     assert (check.unit, check.name, check.ok) == ("simulation", "EGL", True)
-    assert check.found.startswith("draws 16x16 pixels of 'stapler'")
+    assert check.found.startswith("renders 16x16 pixels of 'stapler'")
 
 
-def test_each_picture_that_is_timed_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_timed_image_is_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
     times_ns = []
     render = World.render
 
@@ -29,7 +29,7 @@ def test_each_picture_that_is_timed_is_drawn(monkeypatch: pytest.MonkeyPatch) ->
     assert len(set(times_ns)) == len(times_ns) > 3
 
 
-def test_without_egl_it_says_what_to_install() -> None:
+def test_missing_egl_gives_advice() -> None:
     code = (
         "from gripper_force import config\nfrom gripper_force.jobs import doctor\n"
         "doctor.PROBES = {'simulation': 'gripper_hw.sim.simulation_probe'}\n"
@@ -41,6 +41,8 @@ def test_without_egl_it_says_what_to_install() -> None:
     assert "advice='on Debian or Ubuntu: apt-get install libegl1" in done.stdout
 
 
-def test_it_is_not_asked_where_no_camera_is_simulated() -> None:
+def test_simulation_is_not_checked_without_a_simulated_camera() -> None:
     config = Config.model_validate({"camera": {"backend": "none"}})
-    assert list(probe(config)) == [Check("simulation", "EGL", "not needed: no camera is simulated", None)]
+    assert list(probe(config)) == [
+        Check("simulation", "EGL", "not needed: the camera is not simulated", None)
+    ]

@@ -22,15 +22,15 @@ RADIUS_M = GripperConfig().pinion_radius_m
 
 
 class Current:
-    """A motor that is given its current by hand, and a brake so that it closes slowly."""
+    """A motor with a constant current, and a brake so that it closes slowly."""
 
     def __init__(self, current_a: float, brake_a_s: float = 0.0) -> None:
         self.current_a = current_a
         self.brake_a_s = brake_a_s
-        self.seen: list[tuple[int, float]] = []
+        self.calls: list[tuple[int, float]] = []
 
     def control(self, t_ns: int, position_rad: float, velocity_rad_s: float, current_noise_a: float) -> float:
-        self.seen.append((t_ns, position_rad))
+        self.calls.append((t_ns, position_rad))
         return self.current_a - self.brake_a_s * velocity_rad_s
 
 
@@ -49,7 +49,7 @@ def make_world() -> Iterator[Callable[..., World]]:
 
 
 @pytest.mark.parametrize("gain", [0.9, 1.1])
-def test_the_grip_is_the_motors_torque_through_the_pinion_less_friction(
+def test_grip_is_motor_torque_over_pinion_radius_minus_friction(
     make_world: Callable[..., World], gain: float
 ) -> None:
     current_a = 0.13
@@ -61,20 +61,20 @@ def test_the_grip_is_the_motors_torque_through_the_pinion_less_friction(
     assert given_n - friction_n < world.force_n < given_n - 0.1 * friction_n
 
 
-def test_the_motor_is_stepped_with_the_physics(make_world: Callable[..., World]) -> None:
+def test_motor_is_called_at_each_physics_step(make_world: Callable[..., World]) -> None:
     motor = Current(0.1)
     world = make_world(motor)
     world.advance_to(101 * NS_PER_MS)
-    assert [t_ns for t_ns, _ in motor.seen] == list(range(0, 100 * NS_PER_MS, 2_500_000))
+    assert [t_ns for t_ns, _ in motor.calls] == list(range(0, 100 * NS_PER_MS, 2_500_000))
     assert world.t_ns == 100 * NS_PER_MS
-    assert motor.seen[0][1] == 0.0
-    assert motor.seen[-1][1] > 0.1
+    assert motor.calls[0][1] == 0.0
+    assert motor.calls[-1][1] > 0.1
 
 
-def test_a_tap_is_called_at_each_multiple_of_its_period(make_world: Callable[..., World]) -> None:
+def test_periodic_call_is_made_at_each_multiple_of_its_period(make_world: Callable[..., World]) -> None:
     world = make_world(Current(0.0))
     calls: list[int] = []
-    world.every(16_666_667, calls.append)
+    world.call_every(16_666_667, calls.append)
     world.advance_to(1000 * NS_PER_MS)
     assert len(calls) == 59
     late_ns = np.array(calls) - 16_666_667 * np.arange(1, 60)
@@ -93,7 +93,7 @@ def test_a_tap_is_called_at_each_multiple_of_its_period(make_world: Callable[...
         (10.0, "deep in the object"),
     ],
 )
-def test_an_absurd_torque_breaks_loudly(
+def test_absurd_torque_raises(
     make_world: Callable[..., World],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -110,18 +110,18 @@ def test_an_absurd_torque_breaks_loudly(
     assert capfd.readouterr().err == ""
 
 
-def test_a_scene_that_mujoco_refuses_is_named(make_world: Callable[..., World]) -> None:
+def test_scene_that_mujoco_refuses_is_named(make_world: Callable[..., World]) -> None:
     with pytest.raises(SimulationError, match="MuJoCo refuses the scene of 'sponge'"):
         make_world(Current(0.0), object="sponge", size=-1.0)
 
 
-def test_the_textures_of_past_worlds_are_not_kept(make_world: Callable[..., World]) -> None:
+def test_textures_of_past_worlds_are_not_cached(make_world: Callable[..., World]) -> None:
     for seed in range(3):
         make_world(Current(0.0), object="sponge", texture_seed=seed)
     assert mujoco.mj_getCacheSize(mujoco.mj_getCache()) == 0
 
 
-def test_the_picture_shows_the_jaws_move(make_world: Callable[..., World]) -> None:
+def test_image_shows_motion_of_jaws(make_world: Callable[..., World]) -> None:
     world = make_world(Current(0.1))
     before = world.render(64)
     assert before.shape == (64, 64, 3)
@@ -132,9 +132,7 @@ def test_the_picture_shows_the_jaws_move(make_world: Callable[..., World]) -> No
 
 
 @pytest.mark.parametrize("tool", ["pads", "rods"])
-def test_markers_can_be_read_off_the_picture_and_change_no_physics(
-    make_world: Callable[..., World], tool: str
-) -> None:
+def test_markers_are_detected_and_do_not_change_physics(make_world: Callable[..., World], tool: str) -> None:
     worlds = [make_world(Current(0.2, 0.1), object="tube", tool=tool, markers=on) for on in (True, False)]
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     seen = []
@@ -163,7 +161,7 @@ NO_LIBRARY = """
 
 
 @pytest.mark.parametrize("lacks", ["library", "driver"])
-def test_without_egl_one_sentence_names_the_packages(lacks: str, tmp_path: Path) -> None:
+def test_missing_egl_names_the_packages(lacks: str, tmp_path: Path) -> None:
     env = dict(os.environ)
     if lacks == "library":
         (tmp_path / "sitecustomize.py").write_text(textwrap.dedent(NO_LIBRARY))

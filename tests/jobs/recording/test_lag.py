@@ -12,7 +12,7 @@ RELEASES_S = [2.0, 4.5, 7.0]
 
 
 def width_m(t_s: Floats) -> Floats:
-    """Presses that rest, and then open ever faster until they are open."""
+    """Width over time: presses at rest that then open with increasing speed."""
     width = np.full(t_s.shape, 0.06)
     for i, release_s in enumerate(RELEASES_S):
         depth = 0.008 + 0.004 * i
@@ -23,7 +23,7 @@ def width_m(t_s: Floats) -> Floats:
 
 
 def pictures(t_s: Floats, rng: np.random.Generator) -> Gray:
-    """A bright jaw that moves over a dim picture, (T, 24, 24)."""
+    """Images of a bright jaw that moves over a dark background, (T, 24, 24)."""
     edge = (width_m(t_s) - 0.04) * 1000  # in pixels
     bright = np.clip(edge[:, None] - np.arange(24) + 0.5, 0, 1)
     rows = np.repeat(60 + 120 * bright[:, None, :], 24, axis=1)
@@ -33,7 +33,7 @@ def pictures(t_s: Floats, rng: np.random.Generator) -> Gray:
 
 @pytest.mark.parametrize("rate_hz", [30.0, 60.0, 149.0])
 @pytest.mark.parametrize("lag_s", [-0.04, 0.0, 0.0123, 0.1])
-def test_pictures_tell_their_lag_against_the_encoder(lag_s: float, rate_hz: float) -> None:
+def test_camera_lag_against_encoder(lag_s: float, rate_hz: float) -> None:
     t_s = np.arange(0.003, 7.9, 1 / rate_hz)
     images = pictures(t_s, np.random.default_rng(1))
     found_s = camera_lags_s(t_s + lag_s, images, SERVO_S, width_m(SERVO_S), RELEASES_S)
@@ -43,7 +43,7 @@ def test_pictures_tell_their_lag_against_the_encoder(lag_s: float, rate_hz: floa
 
 @pytest.mark.parametrize("viscous_s", [0.0, 0.01, 0.03])
 @pytest.mark.parametrize("lag_s", [-0.04, 0.0, 0.0123, 0.1])
-def test_a_material_that_flows_is_not_taken_for_a_lag(lag_s: float, viscous_s: float) -> None:
+def test_viscosity_is_not_taken_for_load_cell_lag(lag_s: float, viscous_s: float) -> None:
     fine_s = np.arange(0, 8, 0.0005)
     depth_m = 0.06 - width_m(fine_s)
     force_n = np.clip(800 * (depth_m + viscous_s * np.gradient(depth_m, fine_s)), 0, None)
@@ -55,7 +55,7 @@ def test_a_material_that_flows_is_not_taken_for_a_lag(lag_s: float, viscous_s: f
     assert np.median(found_s) == pytest.approx(lag_s, abs=0.005)
 
 
-def test_what_does_not_move_or_is_not_there_tells_no_lag() -> None:
+def test_lag_without_movement_or_data_is_unknown() -> None:
     t_s = np.arange(0, 8, 1 / 60)
     images = np.full((len(t_s), 24, 24), 90, np.uint8)
     still = np.full(len(SERVO_S), 0.06)
@@ -68,7 +68,7 @@ def test_what_does_not_move_or_is_not_there_tells_no_lag() -> None:
 
 
 def force_n(t_s: Floats, viscous_s: float) -> Floats:
-    """What gives way along a curve, and flows."""
+    """Force of a material with a nonlinear spring and viscosity."""
     fine_s = np.arange(0, 8, 0.0005)
     depth_m = 0.06 - width_m(fine_s)
     force = 6e4 * np.clip(depth_m + viscous_s * np.gradient(depth_m, fine_s), 0, None) ** 2
@@ -77,7 +77,7 @@ def force_n(t_s: Floats, viscous_s: float) -> Floats:
 
 @pytest.mark.parametrize("viscous_s", [0.0, 0.03])
 @pytest.mark.parametrize("lag_s", [-0.1, 0.06, 0.1])
-def test_without_an_encoder_a_clear_lag_is_found_but_for_the_flow(lag_s: float, viscous_s: float) -> None:
+def test_force_lag_without_encoder_is_found_up_to_viscosity(lag_s: float, viscous_s: float) -> None:
     t_s = np.arange(0.003, 7.9, 1 / 30)
     images = pictures(t_s, np.random.default_rng(3))
     found_s = force_lag_s(t_s, images, t_s + lag_s, force_n(t_s, viscous_s))
@@ -85,13 +85,13 @@ def test_without_an_encoder_a_clear_lag_is_found_but_for_the_flow(lag_s: float, 
 
 
 @pytest.mark.parametrize("viscous_s", [0.0, 0.02, 0.05])
-def test_without_an_encoder_flow_is_not_taken_for_a_lag(viscous_s: float) -> None:
+def test_viscosity_is_not_taken_for_force_lag(viscous_s: float) -> None:
     t_s = np.arange(0.003, 7.9, 1 / 30)
     images = pictures(t_s, np.random.default_rng(4))
     assert force_lag_s(t_s, images, t_s, force_n(t_s, viscous_s)) == 0.0
 
 
-def test_without_an_encoder_what_tells_nothing_has_no_lag() -> None:
+def test_force_lag_without_information_is_zero() -> None:
     t_s = np.arange(0, 4, 1 / 30)
     images = pictures(t_s, np.random.default_rng(5))
     force = force_n(t_s, 0.0)
@@ -102,6 +102,6 @@ def test_without_an_encoder_what_tells_nothing_has_no_lag() -> None:
 
 
 @given(arrays(np.uint8, (45, 16, 16)), arrays(np.float64, 45, elements=st.floats(-1e308, 1e308)))
-def test_without_an_encoder_any_recording_has_a_lag_within_bounds(images: Gray, force: Floats) -> None:
+def test_force_lag_is_within_bounds(images: Gray, force: Floats) -> None:
     t_s = np.arange(45) / 30
     assert abs(force_lag_s(t_s, images, t_s, force)) < 0.15

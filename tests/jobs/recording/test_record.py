@@ -22,15 +22,15 @@ from gripper_hw.dynamixel import virtual
 
 @pytest.fixture
 def config(quick: list[str]) -> Config:
-    """The cheapest rig that has all it takes."""
+    """The cheapest rig that can record."""
     return load_config(None, [*quick, "camera.backend=simulated", "camera.rate_hz=20", "control.ramp_n_s=30"])
 
 
 def made(config: Config, plan: RecordingPlan, out: Path) -> list[Path]:
-    return list(record(config, plan, out, lambda *_: None))
+    return list(record(config, plan, out))
 
 
-def test_sets_have_names_and_sides() -> None:
+def test_paths_of_sets() -> None:
     plan = RecordingPlan(15, degrees=10, lux=350.0)
     paths = plan.paths(load_config(None, ["object=paper_cup"]), Path("data"))
     assert paths[0] == Path("data/train/paper_cup-10deg-350lux-01.mcap")
@@ -38,10 +38,11 @@ def test_sets_have_names_and_sides() -> None:
     assert RecordingPlan(1).paths(load_config(), Path())[0] == Path("train/sponge-01.mcap")
 
 
-def test_a_set_is_a_log_to_train_on(config: Config, tmp_path: Path) -> None:
-    told: list[tuple[int, int, float]] = []
+def test_set_is_a_log_for_training(config: Config, tmp_path: Path) -> None:
+    progress: list[str] = []
+    prompts: list[str] = []
     plan = RecordingPlan(1, 2, 5.0, degrees=10, lux=350)
-    (path,) = record(config, plan, tmp_path, lambda *now: told.append(now))
+    (path,) = record(config, plan, tmp_path, lambda text, steps=1: progress.append(text), prompts.append)
     assert list(tmp_path.rglob("*.*")) == [path]
     assert path == tmp_path / "train" / "stapler-10deg-350lux-01.mcap"
     log = LogReader(path)
@@ -65,11 +66,12 @@ def test_a_set_is_a_log_to_train_on(config: Config, tmp_path: Path) -> None:
     assert clip.valid.all()
     assert clip.forces_n[:10].max() < 0.1
     assert 0.8 < clip.forces_n.max() < 6
-    assert {touch for _, touch, _ in told} == {0, 1, 2}
-    assert max(force_n for *_, force_n in told) > 0.5
+    assert {text.split(":")[0] for text in progress} == {"at rest", "touch 1 of 2", "touch 2 of 2"}
+    assert max(float(text.split()[-2]) for text in progress) > 0.5
+    assert prompts == ["Put the object between the jaws for set 1"]
 
 
-def test_what_is_there_is_kept_and_seeds_go_by_the_set(config: Config, tmp_path: Path) -> None:
+def test_existing_sets_are_kept(config: Config, tmp_path: Path) -> None:
     plan = RecordingPlan(2, 1)
     kept, missing = plan.paths(config, tmp_path)
     assert made(config, RecordingPlan(1, 1), tmp_path) == [kept]
@@ -86,27 +88,27 @@ def test_what_is_there_is_kept_and_seeds_go_by_the_set(config: Config, tmp_path:
     assert made(retared, plan, tmp_path) == [kept, missing]
     assert missing.read_bytes() == missing_bytes
     dimmed = config.model_copy(update={"sim": config.sim.model_copy(update={"lux": 100.0})})
-    with pytest.raises(DataError, match=r"stapler-01\.mcap is there already .* sim\.lux None, not 100"):
+    with pytest.raises(DataError, match=r"stapler-01\.mcap exists already .* sim\.lux None, not 100"):
         made(dimmed, plan, tmp_path)
-    with pytest.raises(DataError, match=r"target_n 9\.0, not 5\.0; take another folder"):
+    with pytest.raises(DataError, match=r"target_n 9\.0, not 5\.0; use another folder"):
         made(config, RecordingPlan(2, 1, peak_n=5.0), tmp_path)
 
 
 @pytest.mark.parametrize(
     ("overrides", "plan", "sentence"),
     [
-        (["camera.backend=none"], RecordingPlan(1), r"needs a camera, and camera\.backend is none"),
-        (["load_cell.backend=none"], RecordingPlan(1), r"needs a load cell, and load_cell\.backend is none"),
-        (["object=../egg"], RecordingPlan(1), r"object '\.\./egg' is no name for a log"),
+        (["camera.backend=none"], RecordingPlan(1), r"needs a camera, but camera\.backend is none"),
+        (["load_cell.backend=none"], RecordingPlan(1), r"needs a load cell, but load_cell\.backend is none"),
+        (["object=../egg"], RecordingPlan(1), r"object '\.\./egg' can't be part of a file name"),
         (
             [],
             RecordingPlan(1, peak_n=12.0),
-            r"up to 12 N are not within 1 to 9 N, which control\.force_limit_n 10 N",
+            r"up to 12 N are not within 1 to 9 N, the range for control\.force_limit_n 10 N",
         ),
         ([], RecordingPlan(1, peak_n=0.5), "up to 0.5 N are not within 1 to 9 N"),
     ],
 )
-def test_what_can_not_be_recorded_is_refused_before_anything_moves(
+def test_wrong_configuration_raises_before_any_motion(
     overrides: list[str], plan: RecordingPlan, sentence: str, quick: list[str], tmp_path: Path
 ) -> None:
     config = load_config(None, [*quick, "camera.backend=simulated", *overrides])
@@ -122,10 +124,10 @@ def test_what_can_not_be_recorded_is_refused_before_anything_moves(
         ("load_cell", "stuck", r"no valid sample for 2 s in set 1 \(rejected: [0-9]+ stuck\)"),
         ("load_cell", "wrong", "load cell is saturated in set 1, where it last read -?0.0 N"),
         ("camera", "off", "camera has given no frame for 2 s in set 1"),
-        ("servo", "wrong", "set 1 ended at a fault: the servo reports hardware error 0x20"),
+        ("servo", "wrong", "set 1 ended with a fault: the servo reports hardware error 0x20"),
     ],
 )
-def test_a_part_that_fails_ends_the_recording(
+def test_device_failure_ends_recording(
     unit: str, kind: str, sentence: str, config: Config, tmp_path: Path
 ) -> None:
     broken = load_config(None, [f"faults=[{{unit: {unit}, kind: {kind}, at_s: 0.2}}]"]).faults
@@ -134,11 +136,11 @@ def test_a_part_that_fails_ends_the_recording(
     assert not list(tmp_path.rglob("*.mcap"))
 
 
-def test_after_a_fault_the_jaws_open_where_that_is_configured(config: Config, tmp_path: Path) -> None:
+def test_jaws_open_after_fault_if_configured(config: Config, tmp_path: Path) -> None:
     overrides = ["faults=[{unit: plant, kind: wrong, at_s: 1.0}]", "control.on_fault=open"]
     faulty = load_config(None, overrides)
     control = config.control.model_copy(update={"on_fault": faulty.control.on_fault})
-    with pytest.raises(DeviceError, match="set 1 ended at a fault"):
+    with pytest.raises(DeviceError, match="set 1 ended with a fault"):
         made(
             config.model_copy(update={"faults": faulty.faults, "control": control}),
             RecordingPlan(1),
@@ -151,8 +153,8 @@ def test_after_a_fault_the_jaws_open_where_that_is_configured(config: Config, tm
 
 
 @pytest.fixture
-def cell_feels(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[float], float]], None]:
-    """Changes what the rig's load cell says."""
+def change_load_cell(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[float], float]], None]:
+    """Returns a function that replaces the readings of the rig's load cell."""
     open_devices = module.open_devices
 
     class Changed:
@@ -178,39 +180,40 @@ def cell_feels(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[float], f
     return change
 
 
-def test_a_load_cell_that_reads_a_force_at_rest_is_to_be_tared(
-    cell_feels: Callable[[Callable[[float], float]], None], config: Config, tmp_path: Path
+def test_force_at_rest_raises(
+    change_load_cell: Callable[[Callable[[float], float]], None], config: Config, tmp_path: Path
 ) -> None:
-    cell_feels(lambda force_n: force_n + 0.8)
+    change_load_cell(lambda force_n: force_n + 0.8)
     with pytest.raises(DataError, match=r"reads 0\.[78][0-9]* N with open jaws; .* set load_cell\.tare_raw="):
         made(config, RecordingPlan(1), tmp_path)
 
 
-def test_a_touch_that_is_not_felt_is_told(
-    cell_feels: Callable[[Callable[[float], float]], None], config: Config, tmp_path: Path
+def test_touch_that_load_cell_does_not_measure_raises(
+    change_load_cell: Callable[[Callable[[float], float]], None], config: Config, tmp_path: Path
 ) -> None:
-    cell_feels(lambda force_n: -force_n)
-    with pytest.raises(DataError, match=r"touch 1 of set 1 pressed with .* N .* felt 0\.[0-9]* N; see that"):
+    change_load_cell(lambda force_n: -force_n)
+    with pytest.raises(
+        DataError, match=r"touch 1 of set 1 pressed with .* N .* measured 0\.[0-9]* N; check that"
+    ):
         made(config, RecordingPlan(1), tmp_path)
 
 
-def test_a_touch_that_comes_to_no_force_ends_the_recording(config: Config, tmp_path: Path) -> None:
+def test_touch_that_reaches_no_force_raises(config: Config, tmp_path: Path) -> None:
     control = config.control.model_copy(update={"timeout_s": 0.3})
-    with pytest.raises(DataError, match=r"touch 1 of set 1 came to no force: .* is between the jaws"):
+    with pytest.raises(DataError, match=r"touch 1 of set 1 reached no force: .* is between the jaws"):
         made(config.model_copy(update={"control": control}), RecordingPlan(1), tmp_path)
     assert not list(tmp_path.rglob("*.mcap"))
 
 
-def test_an_interrupted_recording_stops_the_servo_and_keeps_whole_sets(
-    config: Config, tmp_path: Path
-) -> None:
+@pytest.mark.usefixtures("own_process")
+def test_interrupted_recording_stops_servo_and_keeps_complete_sets(config: Config, tmp_path: Path) -> None:
     torque: list[int] = []
 
-    def interrupt(one: int, touch: int, _force_n: float) -> None:
+    def interrupt(text: str, steps: int = 1) -> None:
         bus = virtual.find_bus("rig")
         assert bus is not None
         torque.append(bus.servos[0].get("torque_enable"))
-        if (one, touch) == (2, 1):
+        if text.startswith("touch 2 of 3"):
             rig.append(bus)
             os.kill(os.getpid(), signal.SIGTERM)
 
@@ -223,8 +226,8 @@ def test_an_interrupted_recording_stops_the_servo_and_keeps_whole_sets(
     assert [path.name for path in tmp_path.rglob("*.mcap")] == ["stapler-01.mcap"]
 
 
-def test_peaks_leave_what_the_force_limit_needs() -> None:
-    _, peak_n = module._ready(load_config(None, ["control.force_limit_n=5"]), RecordingPlan(1))
+def test_peak_follows_force_limit() -> None:
+    _, peak_n = module._checked(load_config(None, ["control.force_limit_n=5"]), RecordingPlan(1))
     assert peak_n == pytest.approx(4.5)
-    _, peak_n = module._ready(load_config(None, ["control.force_limit_n=20"]), RecordingPlan(1))
+    _, peak_n = module._checked(load_config(None, ["control.force_limit_n=20"]), RecordingPlan(1))
     assert np.isclose(peak_n, 12)

@@ -8,16 +8,21 @@ from gripper_force.qualification.bench import bus_bench as bus
 from gripper_force.qualification.bench.bus_bench import bus_cost
 
 
-def test_the_bus_is_measured_and_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bench_bus_prints_a_table_and_json(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bus, "BUS_SETTINGS", ((4_000_000, 1.0),))
-    call = ["bench", "--bus", "--cycles", "2"]
+    call = ["bench", "bus", "--cycles", "2"]
     assert "plain SDK" in CliRunner().invoke(cli.app, call).stdout
-    told = json.loads(CliRunner().invoke(cli.app, [*call, "--json"]).stdout)
-    assert [cost["client"] for cost in told["bus"]] == ["driver", "plain SDK", "bare bytes"]
-    assert {"load", "cores"} < set(told)
+    printed = json.loads(CliRunner().invoke(cli.app, [*call, "--json"]).stdout)
+    assert [cost["client"] for cost in printed["bus"]] == ["driver", "plain SDK", "bare bytes"]
+    assert {"load", "cores"} < set(printed)
 
 
-def test_no_answer_comes_before_its_bytes_were_on_the_wire() -> None:
+def test_bench_bus_rejects_configuration_keys() -> None:
+    done = CliRunner().invoke(cli.app, ["bench", "bus", "--set", "servo.id=2"])
+    assert "bench bus uses no configuration; leave out --set servo.id=2" in str(done.exception)
+
+
+def test_cycle_takes_at_least_the_time_of_its_bytes_on_the_line() -> None:
     cycles, baud_rate, latency_ms = 4, 57_600, 5.0
     ours, theirs, bare = bus_cost(baud_rate, latency_ms, cycles)
     assert [c.client for c in (ours, theirs, bare)] == ["driver", "plain SDK", "bare bytes"]

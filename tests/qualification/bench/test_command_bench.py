@@ -17,14 +17,14 @@ def test_commands_are_run_and_measured() -> None:
     assert second.memory_mb > 10
 
 
-def test_a_command_that_fails_is_told() -> None:
+def test_a_failing_command_raises_with_its_message() -> None:
     with pytest.raises(GripperError, match=r"gripper-force replay nothing failed: .*nothing"):
         list(commands.commands(["replay nothing"]))
 
 
-def test_the_cost_of_commands_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bench_commands_prints_a_table_and_json(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(commands, "COMMANDS", ("--help",))
     monkeypatch.setattr(commands, "commands", lambda: iter([commands.CommandCost("--help", 0.4, 0.3, 55.0)]))
-    assert "0.4" in CliRunner().invoke(cli.app, ["bench", "--commands"]).stdout
-    told = json.loads(CliRunner().invoke(cli.app, ["bench", "--commands", "--json"]).stdout)
-    assert told["commands"] == [{"command": "--help", "wall_s": 0.4, "cpu_s": 0.3, "memory_mb": 55.0}]
+    assert "0.4" in CliRunner().invoke(cli.app, ["bench", "commands"]).stdout
+    printed = json.loads(CliRunner().invoke(cli.app, ["bench", "commands", "--json"]).stdout)
+    assert printed["commands"] == [{"command": "--help", "wall_s": 0.4, "cpu_s": 0.3, "memory_mb": 55.0}]

@@ -60,44 +60,49 @@ def recordings(seed: int) -> list[Clip]:
     ]
 
 
-def test_measures_every_way(tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bench_measures_every_variant(
+    tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for package in ("openvino", "nncf"):
         if find_spec(package) is None:
             pytest.skip(f"{package} is not installed: pip install 'gripper-force[engines]'")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(estimator, "_ROUNDS", 4)
     monkeypatch.setattr(estimator, "_STEPS", 2)
-    monkeypatch.setattr(estimator, "_ways", lambda: [("torch", "float32", "float32")])
-    told: list[str] = []
+    monkeypatch.setattr(estimator, "_variants", lambda: [("torch", "float32", "float32")])
+    reports: list[str] = []
 
     def scaling(model: Model) -> Sequence[Clip]:
         return recordings(1)
 
-    rows = bench([str(tiny_checkpoint)], lambda model: recordings(0), scaling, [1], told.append)
+    def progress(text: str, steps: int = 1) -> None:
+        reports.append(text)
+
+    rows = bench([str(tiny_checkpoint)], lambda model: recordings(0), scaling, [1], progress)
     assert [(row.engine, row.precision) for row in rows] == [
         (WINDOW, "float32"),
         (PLAIN_WINDOW, "float32"),
         ("torch", "float32"),
         ("openvino", "int8"),
     ]
-    assert all(row.frames == 2 * 157 for row in rows)  # three of each are reference alone
+    assert all(row.frames == 2 * 157 for row in rows)  # the first three of each are the reference
     assert rows[0].mae_n == rows[1].mae_n == rows[2].mae_n != rows[3].mae_n
     assert all(row.p99_ms >= row.p50_ms > 0 for row in rows)
     assert [row.memory_mb for row in rows[:2]] == [None, None]
     assert all(row.memory_mb is not None and row.memory_mb > 30 for row in rows[2:])
     assert any(row.front for row in rows)
-    assert told
+    assert reports
 
 
-def test_ratios_are_to_the_window_and_keep_the_error() -> None:
-    told = ratios([PAPER, PLAIN, ROW, FAST, ROUGH])[ROW.checkpoint]
-    assert told["times_faster_than_window"] == 100
-    assert told["times_faster_than_plain_window"] == 150
-    assert told["fastest"] == "openvino, bfloat16, 1 threads"
-    assert told["mae_over_float32"] == pytest.approx(1.015)
+def test_ratios_compare_the_fastest_accurate_variant_with_the_window() -> None:
+    ratio = ratios([PAPER, PLAIN, ROW, FAST, ROUGH])[ROW.checkpoint]
+    assert ratio["times_faster_than_window"] == 100
+    assert ratio["times_faster_than_plain_window"] == 150
+    assert ratio["fastest"] == "openvino, bfloat16, 1 threads"
+    assert ratio["mae_over_float32"] == pytest.approx(1.015)
 
 
-def test_the_page_the_file_and_the_plot_hold_every_row(tmp_path: Path) -> None:
+def test_page_file_and_plot_hold_every_row(tmp_path: Path) -> None:
     rows = estimator._with_front([PAPER, ROW, FAST, ROUGH])
     assert [row.front for row in rows] == [False, True, True, True]
     lines = markdown(rows).splitlines()

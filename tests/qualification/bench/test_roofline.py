@@ -9,7 +9,7 @@ from gripper_force.vision.network import cost
 SMALL = NetworkConfig(size=32, width=0.25)
 
 
-def test_the_longer_of_arithmetic_and_reading_counts() -> None:
+def test_least_time_is_the_longer_of_arithmetic_and_reading() -> None:
     parameters, multiply_adds = cost(SMALL)
     assert Roofline("float32", 1, 1e9, 1e15).least_ms([SMALL]) == pytest.approx(2e-6 * multiply_adds)
     assert Roofline("float32", 1, 1e15, 1e9).least_ms([SMALL, SMALL]) == pytest.approx(8e-6 * parameters)
@@ -17,7 +17,7 @@ def test_the_longer_of_arithmetic_and_reading_counts() -> None:
 
 
 @pytest.mark.parametrize("precision", ["float32", "bfloat16", "int8"])
-def test_this_machine_has_rates(precision: str) -> None:
+def test_rates_of_this_machine_are_measured(precision: str) -> None:
     if find_spec("nncf") is None:
         pytest.skip("nncf is not installed: pip install 'gripper-force[engines]'")
     roof = measure(precision, 1)

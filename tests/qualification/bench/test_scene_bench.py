@@ -14,38 +14,40 @@ from gripper_hw.sim import detail_level as detail
 ROW = SceneCost("tube", "coarse", 168, 2.5, 30.3, 8.7, 0.443, 2.223)
 
 
-def test_levels_of_detail_are_measured_and_shown() -> None:
-    told = json.loads(CliRunner().invoke(cli.app, ["bench", "--scene", "--object", "block", "--json"]).stdout)
-    assert [(row["object"], row["detail"]) for row in told["scene"]] == [
+def test_bench_scene_measures_each_detail_level() -> None:
+    printed = json.loads(
+        CliRunner().invoke(cli.app, ["bench", "scene", "--object", "block", "--json"]).stdout
+    )
+    assert [(row["object"], row["detail"]) for row in printed["scene"]] == [
         ("block", detail) for detail in ("coarse", "medium", "fine")
     ]
 
 
-def test_the_table_goes_into_a_page_and_is_kept(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    asked = []
+def test_write_updates_the_page_and_the_shipped_table(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    calls = []
 
     def costs(names: list[str], keep_table: bool) -> list[SceneCost]:
-        asked.append((names, keep_table))
+        calls.append((names, keep_table))
         return [ROW]
 
     monkeypatch.setattr(scene, "scene_costs", costs)
     page = tmp_path / "page.md"
     page.write_text("before\n<!-- detail -->\nold\n<!-- end of detail -->\nafter\n")
-    done = CliRunner().invoke(cli.app, ["bench", "--scene", "--write", str(page)])
+    done = CliRunner().invoke(cli.app, ["bench", "scene", "--write", str(page)])
     assert "0.443" in done.stdout
     assert "| tube | coarse | 168 | 2.5 | 30.3 | 8.7 | 0.44 | 2.22 |" in page.read_text()
     assert "old" not in page.read_text()
-    assert asked == [([], True)]
+    assert calls == [([], True)]
 
 
-def test_a_part_of_the_table_is_not_kept(tmp_path: Path) -> None:
-    call = ["bench", "--scene", "--object", "tube", "--write", str(tmp_path / "page.md")]
+def test_write_needs_all_objects(tmp_path: Path) -> None:
+    call = ["bench", "scene", "--object", "tube", "--write", str(tmp_path / "page.md")]
     assert "--write needs all objects" in str(CliRunner().invoke(cli.app, call).exception)
 
 
-def test_levels_differ_in_cost_and_error_and_are_kept(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_finer_levels_cost_more_and_have_less_error(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(detail, "_TABLE", tmp_path / "detail.yaml")
     coarse, medium, fine = scene_costs(["stapler"], keep_table=True)
     assert [row.detail for row in (coarse, medium, fine)] == ["coarse", "medium", "fine"]
@@ -58,6 +60,6 @@ def test_levels_differ_in_cost_and_error_and_are_kept(
     assert kept["stapler"]["coarse"]["error_n"] == round(coarse.error_n, 3)
 
 
-def test_an_object_that_is_unknown_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unknown_object_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ConfigError, match="no simulated object 'brick'"):
         list(scene_costs(["brick"], keep_table=False))

@@ -16,7 +16,7 @@ from gripper_force.vision.model_files import read_model
 
 @pytest.fixture(scope="module")
 def places(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
-    with pytest.MonkeyPatch.context() as patch, startup.stand_ins() as places:
+    with pytest.MonkeyPatch.context() as patch, startup.simulated_devices() as places:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         for engine in ("openvino", "onnxruntime"):
             if find_spec(engine) is not None:
@@ -25,22 +25,22 @@ def places(tiny_checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> I
 
 
 @pytest.mark.parametrize("scene", STARTUP_CASES, ids=lambda scene: scene.name)
-def test_a_scene_loads_and_runs_only_what_it_asks_for(scene: StartupCase, places: dict[str, str]) -> None:
+def test_a_scene_loads_and_runs_only_what_it_needs(scene: StartupCase, places: dict[str, str]) -> None:
     started = start(scene, places)
-    assert set(started.loaded) <= scene.asks_for
+    assert set(started.loaded) <= scene.needs
     assert set(started.threads) == scene.threads
     assert started.time_s > 0
     assert 10 < started.memory_mb < 2000
 
 
-def test_a_scene_that_does_not_start_is_told(places: dict[str, str]) -> None:
+def test_a_scene_that_does_not_start_raises_with_its_message(places: dict[str, str]) -> None:
     with pytest.raises(GripperError, match=r"(?s)the scene 'broken' did not start: .*no_such_key"):
         start(StartupCase("broken", settings=("no_such_key=1",)), places)
 
 
-def test_what_starting_takes_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bench_startup_prints_a_table_and_json(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(startup, "STARTUP_CASES", STARTUP_CASES[:1])
-    assert "--help" in CliRunner().invoke(cli.app, ["bench", "--startup"]).stdout
-    told = json.loads(CliRunner().invoke(cli.app, ["bench", "--startup", "--json"]).stdout)
-    (row,) = told["startup"]
+    assert "--help" in CliRunner().invoke(cli.app, ["bench", "startup"]).stdout
+    printed = json.loads(CliRunner().invoke(cli.app, ["bench", "startup", "--json"]).stdout)
+    (row,) = printed["startup"]
     assert (row["scene"], row["loaded"], row["threads"]) == ("--help", [], [])

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 from gripper_force import cli
 from gripper_force.errors import ConfigError
 from gripper_force.jobs.dataset import Clip
-from gripper_force.qualification.bench.training_bench import WAYS, Point, learn, reached
+from gripper_force.qualification.bench.training_bench import COMPARED, Point, learn, reached
 from gripper_force.vision.preprocess import Preprocess
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 KEYS = ["preprocess.size=16", "width=0.1", "device=cpu", "validation=0.3", "clips=2"]
 
 
-def test_every_way_is_trained_for_its_time_and_kept(clips: list[Clip], tmp_path: Path) -> None:
+def test_every_recipe_is_trained_for_its_time_and_saved(clips: list[Clip], tmp_path: Path) -> None:
     sizes = []
 
     def load(preprocess: Preprocess) -> list[Clip]:
@@ -26,8 +26,8 @@ def test_every_way_is_trained_for_its_time_and_kept(clips: list[Clip], tmp_path:
     points = list(learn(load, 0.004, KEYS, tmp_path))
     assert sizes == [16]
     ends = {point.way: point for point in points}
-    assert set(ends) == set(WAYS)
-    first, *others = WAYS
+    assert set(ends) == set(COMPARED)
+    first, *others = COMPARED
     assert all(ends[way].minutes >= 0.004 and ends[way].steps > 0 for way in others)
     assert ends[first].minutes >= 0.0004
     kept = json.loads((tmp_path / "learning.json").read_text())
@@ -36,14 +36,14 @@ def test_every_way_is_trained_for_its_time_and_kept(clips: list[Clip], tmp_path:
     assert (tmp_path / "learning.png").stat().st_size > 1000
 
 
-def test_what_is_broken_off_is_kept(clips: list[Clip], tmp_path: Path) -> None:
+def test_an_interrupted_comparison_keeps_its_points(clips: list[Clip], tmp_path: Path) -> None:
     training = learn(lambda _: clips, 1.0, KEYS, tmp_path)
     point = next(training)
     training.close()
     assert json.loads((tmp_path / "learning.json").read_text())["points"] == [asdict(point)]
 
 
-def test_when_a_way_is_as_good_as_the_paper_is_told() -> None:
+def test_reached_gives_the_time_to_the_error_of_the_paper() -> None:
     def point(way: str, minutes: float, mae_n: float) -> Point:
         return Point(way, minutes, 1, mae_n, mae_n)
 
@@ -53,18 +53,17 @@ def test_when_a_way_is_as_good_as_the_paper_is_told() -> None:
     assert (found["short clips"], found["dense windows"], found["paper"]) == (2, None, 2)
 
 
-def test_one_network_is_trained_each_way(clips: list[Clip], tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="set attentions to one"):
+def test_several_networks_or_a_bad_folder_raise(clips: list[Clip], tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="set attentions to one module"):
         next(learn(lambda _: clips, 1.0, ["attentions=[ssam, scam]"], tmp_path))
     (tmp_path / "file").touch()
-    with pytest.raises(ConfigError, match="name another folder"):
+    with pytest.raises(ConfigError, match="give another folder"):
         next(learn(lambda _: clips, 1.0, KEYS, tmp_path / "file"))
 
 
-def test_the_command_shows_what_was_measured(few_logs: Path, tmp_path: Path) -> None:
+def test_bench_training_prints_and_saves_results(few_logs: Path, tmp_path: Path) -> None:
     sets = [part for key in KEYS for part in ("--set", key)]
-    call = ["bench", "--training", str(few_logs), "--minutes", "0.01", "--jobs", "1", *sets]
+    call = ["bench", "training", str(few_logs), "--minutes", "0.01", "--jobs", "1", *sets]
     shown = CliRunner().invoke(cli.app, [*call, "--out", str(tmp_path / "kept")])
     assert "as good as the paper's" in shown.stdout
     assert "learning.png" in {path.name for path in (tmp_path / "kept").iterdir()}
-    assert isinstance(CliRunner().invoke(cli.app, [*call, "--bus"]).exception, ConfigError)

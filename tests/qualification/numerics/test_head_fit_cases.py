@@ -8,14 +8,14 @@ from gripper_calibration.fits.touches import Floats
 from gripper_force.qualification.numerics import head_fit_cases as conditioning
 
 
-def test_every_case_keeps_its_bound() -> None:
+def test_every_case_is_within_its_bound() -> None:
     rows = list(conditioning.cases())
     assert [row.case for row in rows if not row.ok] == []
     assert len({row.case for row in rows}) == len(rows)
 
 
 @pytest.mark.parametrize("share", [1e-9, np.nan])
-def test_a_fit_that_is_a_little_off_is_found(share: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_small_error_of_the_fit_is_found(share: float, monkeypatch: pytest.MonkeyPatch) -> None:
     right = Ridge.solve
 
     def wrong(self: Ridge, missing_n: Floats, penalty: float) -> tuple[Floats, float]:
@@ -27,6 +27,6 @@ def test_a_fit_that_is_a_little_off_is_found(share: float, monkeypatch: pytest.M
     assert "last layer fitted to ordinary frames" in broken
 
 
-def test_the_reference_solves() -> None:
+def test_the_reference_solves_a_linear_system() -> None:
     matrix = [[Decimal(4), Decimal(1)], [Decimal(1), Decimal(3)]]
     assert conditioning._solved(matrix, [Decimal(6), Decimal(7)]) == [Decimal(1), Decimal(2)]

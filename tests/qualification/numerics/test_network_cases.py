@@ -31,7 +31,7 @@ def one_thread() -> None:
 
 @pytest.fixture(scope="module")
 def grasp() -> Clip:
-    """A dark disc that grows on a background."""
+    """Recording of a dark disc that grows with the force, on a noisy background."""
     rng = np.random.default_rng(0)
     forces_n = np.linspace(-2, 6, 80).clip(0).astype(np.float32)
     y, x = np.mgrid[:32, :32]
@@ -50,15 +50,15 @@ def broken(rows: list[NumericalCase]) -> list[str]:
     return [row.case for row in rows if not row.ok]
 
 
-def test_every_case_keeps_its_bound(tiny_checkpoint: Path) -> None:
-    """Of those that need no export."""
+def test_every_case_is_within_its_bound(tiny_checkpoint: Path) -> None:
+    """Covers the cases that need no export."""
     config = Config.model_validate({"vision": {"checkpoint": str(tiny_checkpoint)}})
     rows = list(suite.cases(config, None, streamed=300, long=300, variants=TORCH))
     assert broken(rows) == []
     assert len({row.case for row in rows}) == len(rows)
 
 
-def test_an_engine_is_compared_with_float64(reference: ReferenceEnsemble, grasp: Clip) -> None:
+def test_a_wrong_engine_is_found(reference: ReferenceEnsemble, grasp: Clip) -> None:
     pytest.importorskip("openvino")
     (row,) = suite._engines(reference, [OPENVINO], grasp, grasp)
     assert row.ok
@@ -68,21 +68,23 @@ def test_an_engine_is_compared_with_float64(reference: ReferenceEnsemble, grasp:
     assert not row.ok
 
 
-def test_what_prepares_frames_is_compared_too(
+def test_wrong_frame_preparation_is_found(
     reference: ReferenceEnsemble, grasp: Clip, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(suite, "DIFFERENCE_GAIN", 2.01)
-    assert "a grasp" in broken(list(suite._frames(reference, grasp, Config())))
+    assert "undisturbed grasp" in broken(list(suite._frames(reference, grasp, Config())))
 
 
-def test_frames_that_nobody_refuses_are_found(
+def test_missing_frame_checks_are_found(
     reference: ReferenceEnsemble, grasp: Clip, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(FrameChecks, "check", lambda _self, _small: None)
-    assert "black, gray or white from the first" in broken(list(suite._frames(reference, grasp, Config())))
+    assert "black, gray or white frames from the start" in broken(
+        list(suite._frames(reference, grasp, Config()))
+    )
 
 
-def test_a_claim_that_does_not_grow_is_found(
+def test_a_claimed_error_that_does_not_grow_is_found(
     grasp: Clip, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert suite._range(tmp_path, grasp, Config()).ok
@@ -90,20 +92,20 @@ def test_a_claim_that_does_not_grow_is_found(
     assert not suite._range(tmp_path, grasp, Config()).ok
 
 
-def test_an_engine_that_takes_nan_in_is_found(
+def test_an_engine_that_accepts_nan_is_found(
     grasp: Clip, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert broken(list(suite._not_finite(tmp_path, TORCH, grasp))) == []
 
     def step(self: Engine, frame: Floats) -> Step:
-        self._blank()
-        return self._run(frame)
+        self._zero_states()
+        return self._infer(frame)
 
     monkeypatch.setattr(Engine, "step", step)
     assert "frames of NaN and infinity" in broken(list(suite._not_finite(tmp_path, TORCH, grasp)))
 
 
-def test_a_stream_that_drifts_is_found(
+def test_a_drifting_stream_is_found(
     reference: ReferenceEnsemble, grasp: Clip, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pool = suite._inputs(reference, grasp)
@@ -122,7 +124,7 @@ def test_a_stream_that_drifts_is_found(
     assert suite._stream(reference, ENGINE_VARIANTS[0], pool, 300)[0] > bound_n
 
 
-def test_a_row_is_that_of_the_worst_member() -> None:
+def test_a_case_is_that_of_the_worst_member() -> None:
     off_n: Float64Result = np.array([0.1, np.nan, 0.3])
     assert not suite._row("case", "detail", off_n, np.ones(3)).ok
     assert suite._row("case", "detail", off_n[[0, 2]], np.array([0.05, 1.0])).figure == 0.1

@@ -21,7 +21,7 @@ def inputs() -> np.ndarray:
     return np.random.default_rng(0).standard_normal((25, 32, 32)).astype(np.float32)
 
 
-def test_float64_agrees_with_float32_as_far_as_that_goes(reference: ReferenceEnsemble) -> None:
+def test_float64_agrees_with_float32_up_to_rounding(reference: ReferenceEnsemble) -> None:
     frames = np.random.default_rng(0).integers(0, 256, (25, 32, 32), np.uint8)
     networks = [network.float() for network in reference.networks]
     expected = predict(networks, reference.model.header.preprocess, frames)
@@ -30,18 +30,20 @@ def test_float64_agrees_with_float32_as_far_as_that_goes(reference: ReferenceEns
     assert 0 < np.abs(found_n - expected).max() < 1e-3 * np.abs(expected).max()
 
 
-def test_fewer_digits_allow_for_more(reference: ReferenceEnsemble, inputs: np.ndarray) -> None:
+def test_lower_precision_has_a_larger_bound(reference: ReferenceEnsemble, inputs: np.ndarray) -> None:
     single, half, eight = (reference.bound_n(inputs, rounding).max() for rounding in ROUNDING.values())
     assert 0 < 100 * single < min(half, eight)
 
 
-def test_nothing_lost_leaves_the_last_digit(reference: ReferenceEnsemble, inputs: np.ndarray) -> None:
+def test_bound_without_rounding_is_that_of_the_label_scale(
+    reference: ReferenceEnsemble, inputs: np.ndarray
+) -> None:
     bound_n = reference.bound_n(inputs, Rounding(sums=0.0))
     assert bound_n == pytest.approx(4 * 20 * 2.0**-24)
-    assert (reference.bound_n(inputs, Rounding(sums=0.0), off=1e-3) > bound_n).all()
+    assert (reference.bound_n(inputs, Rounding(sums=0.0), input_error=1e-3) > bound_n).all()
 
 
-def test_a_steeper_network_is_allowed_more(reference: ReferenceEnsemble, inputs: np.ndarray) -> None:
+def test_a_steeper_network_has_a_larger_bound(reference: ReferenceEnsemble, inputs: np.ndarray) -> None:
     before_n = reference.bound_n(inputs, ROUNDING["float32"])[0]
     reference.networks[0].out.weight.mul_(10)
     assert reference.bound_n(inputs, ROUNDING["float32"])[0] > 5 * before_n

@@ -22,7 +22,7 @@ def forces_n() -> np.ndarray:
 
 @pytest.fixture(scope="session")
 def touches(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bright square that grows with the force: logs of two sets of each object, in train and in test."""
+    """Logs of two sets of each object, in train and test, with a bright square that grows with the force."""
     folder = tmp_path_factory.mktemp("touches")
     rng = np.random.default_rng(0)
     for side in ("train", "test"):
@@ -43,7 +43,7 @@ def touches(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def estimates() -> Estimates:
-    """Eight test sets. Plain networks are off by 0.4 N, all others by 0.2 N, each with noise of its own."""
+    """Estimates of eight test sets: plain networks have an error of 0.4 N, others of 0.2 N, plus noise."""
     rng = np.random.default_rng(1)
 
     def noise_n(count: int) -> np.ndarray:

@@ -6,7 +6,7 @@ from gripper_force.qualification.paper.paper_tables import COMPARISONS, MODELS_O
 
 @pytest.mark.parametrize("scale", SCALES.values(), ids=list(SCALES))
 @pytest.mark.parametrize("net", NETS)
-def test_each_network_is_trained_like_the_others(net: str, scale: object) -> None:
+def test_recipes_of_networks_differ_only_in_the_network(net: str, scale: object) -> None:
     assert hasattr(scale, "recipe")
     recipe, plain = scale.recipe(net, 1), scale.recipe("plain", 1)
     apart = {key for key, value in recipe if value != getattr(plain, key)}

@@ -6,17 +6,17 @@ from typer.testing import CliRunner
 
 from gripper_force import cli
 from gripper_force.errors import ConfigError, GripperError
-from gripper_force.qualification.paper.paper_page import WHAT, asked_for
+from gripper_force.qualification.paper.paper_page import NAMES, expand_name
 
 
-def test_all_is_everything() -> None:
-    assert set(asked_for("all")) | {"all"} == set(WHAT)
-    assert asked_for("fig8") == ("fig8",)
-    with pytest.raises(ConfigError, match="nothing to reproduce is named '10'; there are 3, 4"):
-        asked_for("10")
+def test_all_expands_to_everything() -> None:
+    assert set(expand_name("all")) | {"all"} == set(NAMES)
+    assert expand_name("fig8") == ("fig8",)
+    with pytest.raises(ConfigError, match="can't reproduce '10'; choose from 3, 4"):
+        expand_name("10")
 
 
-def test_a_figure_is_made_from_logs_and_put_into_a_page(touches: Path, tmp_path: Path) -> None:
+def test_reproduce_makes_a_figure_and_writes_it_into_a_page(touches: Path, tmp_path: Path) -> None:
     page = tmp_path / "paper.md"
     places = ("small", "small fig8", "small 3")
     page.write_text("# Paper\n" + "".join(f"<!-- {p} -->\nold {p}\n<!-- end of {p} -->\n" for p in places))
@@ -32,19 +32,19 @@ def test_a_figure_is_made_from_logs_and_put_into_a_page(touches: Path, tmp_path:
     assert "(paper/fig8.png)" in text
     assert "old small 3" in text
     assert text.count("old") == 1
-    assert "32x32 pixels, width 0.25, 2 steps a network, 1 seeds" in text
+    assert "32x32 pixels, width 0.25, 2 steps per network, 1 seeds" in text
 
 
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["10"], "nothing to reproduce is named '10'"),
-        (["3", "--scale", "huge"], "no scale 'huge'; there are small, full"),
+        (["10"], "can't reproduce '10'"),
+        (["3", "--scale", "huge"], "no scale 'huge'; choose from small, full"),
         (["3", "--set", "sise=3"], "sise"),
         (["3", "--data", "nowhere", "--out", "OUT"], "no logs in nowhere/train"),
     ],
 )
-def test_bad_input_is_a_sentence(arguments: list[str], sentence: str, tmp_path: Path) -> None:
+def test_bad_input_raises(arguments: list[str], sentence: str, tmp_path: Path) -> None:
     arguments = [str(tmp_path) if part == "OUT" else part for part in arguments]
     done = CliRunner().invoke(cli.app, ["reproduce", *arguments])
     assert isinstance(done.exception, GripperError)

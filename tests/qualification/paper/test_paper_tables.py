@@ -36,10 +36,14 @@ def test_claims_are_tested_by_set_and_by_seed(estimates: Estimates) -> None:
     assert less == "+50.0 %"
 
 
-def test_times_are_taken_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_times_of_window_and_stream(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tables, "_RUNS", 1)
     turns: list[str] = []
-    table = tables.times(turns.append)
+
+    def progress(text: str, steps: int = 1) -> None:
+        turns.append(text)
+
+    table = tables.times(progress)
     assert [row[:3] for row in table.rows] == [
         ("plain", "308", "1.00"),
         ("ssam-1", "342", "1.11"),
@@ -49,7 +53,7 @@ def test_times_are_taken_in_turns(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(turns) == 9
 
 
-def test_a_table_in_markdown() -> None:
+def test_markdown_of_a_table() -> None:
     table = Table("T", ("a", "b"), (("x", 0.12345), ("y", None), ("z", float("nan"))), "A note.")
     assert (
         table.markdown() == "**T**\n\n| a | b |\n|---|---|\n| x | 0.123 |\n| y | – |\n| z | – |\n\nA note.\n"

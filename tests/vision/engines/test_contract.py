@@ -1,6 +1,5 @@
-"""What every engine owes: the same newtons as the window, frame by frame, whatever computes them."""
+"""Contract of the built-in engines: frame by frame the same forces as the whole window."""
 
-from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -9,10 +8,11 @@ import pytest
 import torch
 
 from gripper_force.errors import CheckpointError, ConfigError
+from gripper_force.testing.engine_contract import EngineContract
 from gripper_force.vision.checkpoint import load_checkpoint, save_checkpoint
-from gripper_force.vision.engines import ENGINES, Engine, open_engine
-from gripper_force.vision.header import Attention, Header, NetworkConfig, Residual
-from gripper_force.vision.model_files import cache_folder, exported, read_model
+from gripper_force.vision.engines import ENGINES, Engine, Precision, open_engine
+from gripper_force.vision.header import Attention, Header, Model, NetworkConfig, Residual
+from gripper_force.vision.model_files import cache_folder, exported_file, read_model
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess
 
@@ -23,7 +23,7 @@ def needs(engine: str) -> None:
 
 
 def write(path: Path, *shapes: tuple[Attention, int, str]) -> Path:
-    """An ensemble that has learnt nothing: attention, earlier frames and backbone of each member."""
+    """Writes an untrained ensemble; shapes: attention, earlier frames and backbone of each member."""
     torch.manual_seed(0)
     configs = tuple(
         NetworkConfig.model_validate(
@@ -56,10 +56,16 @@ def ensemble(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write(path, ("scam", 1, "vgg"), ("ssam", 2, "vgg"), ("none", 1, "mobile"))
 
 
-@pytest.fixture(params=["torch", "openvino", "onnxruntime"])
+@pytest.fixture(params=ENGINES)
 def engine(request: pytest.FixtureRequest, ensemble: Path) -> Engine:
     needs(request.param)
     return open_engine(read_model(ensemble), request.param)
+
+
+class TestEngines(EngineContract):
+    @pytest.fixture
+    def engine(self, engine: Engine) -> Engine:
+        return engine
 
 
 def frames(count: int, seed: int = 0) -> np.ndarray:
@@ -80,38 +86,16 @@ def test_streams_what_whole_windows_give(engine: Engine, ensemble: Path) -> None
     np.testing.assert_allclose(streamed, windows(ensemble, clip), rtol=1e-5, atol=1e-5)
 
 
-def test_a_reset_forgets_everything(engine: Engine, ensemble: Path) -> None:
-    for frame in frames(9, seed=1):
-        engine.step(frame)
-    engine.reset()
-    clip = frames(4)
-    again = np.stack([engine.step(frame).forces_n for frame in clip])
-    np.testing.assert_allclose(again, windows(ensemble, clip), rtol=1e-5, atol=1e-5)
-
-
-def test_gives_features_and_attention_of_the_newest_frame(engine: Engine) -> None:
+def test_features_and_attention_are_of_the_newest_frame(engine: Engine) -> None:
     first, second = (engine.step(frame) for frame in frames(2))
-    assert first.features.shape == (21,)
-    assert first.features.dtype == first.forces_n.dtype == np.float32
     assert first.attention is not None
     assert second.attention is not None
     assert first.attention.shape == (2, 2)
     assert not np.array_equal(first.attention, second.attention)
-    assert not np.array_equal(first.features, second.features)  # what was given is not written over
+    assert not np.array_equal(first.features, second.features)
 
 
-def test_two_runs_are_the_same_to_the_bit(engine: Engine) -> None:
-    clip = frames(8)
-
-    def run() -> Iterator[bytes]:
-        engine.reset()
-        for frame in clip:
-            yield engine.step(frame).forces_n.tobytes()
-
-    assert list(run()) == list(run())
-
-
-def test_bfloat16_is_near(ensemble: Path) -> None:
+def test_bfloat16_is_close_to_float64(ensemble: Path) -> None:
     needs("openvino")
     clip = frames(10)
     opened = open_engine(read_model(ensemble), "openvino", "bfloat16")
@@ -119,7 +103,7 @@ def test_bfloat16_is_near(ensemble: Path) -> None:
     np.testing.assert_allclose(streamed, windows(ensemble, clip), atol=20 * 2**-7)
 
 
-def test_without_spatial_attention_there_is_no_map(tmp_path: Path) -> None:
+def test_network_without_ssam_gives_no_attention_map(tmp_path: Path) -> None:
     model = read_model(write(tmp_path / "plain.safetensors", ("none", 0, "vgg")))
     for name in ("torch", "openvino", "onnxruntime"):
         if find_spec(name) is not None:
@@ -127,52 +111,92 @@ def test_without_spatial_attention_there_is_no_map(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("suffix", "name"), [(".xml", "openvino"), (".onnx", "onnxruntime")])
-def test_a_machine_exports_once(ensemble: Path, suffix: str, name: str) -> None:
+def test_checkpoint_is_exported_once_per_machine(ensemble: Path, suffix: str, name: str) -> None:
     needs(name)
     model = read_model(ensemble)
-    path = exported(model, suffix)
+    path = exported_file(model, suffix)
     assert path.parent == cache_folder()
     written = path.stat().st_mtime_ns
-    assert exported(model, suffix) == path
+    assert exported_file(model, suffix) == path
     assert path.stat().st_mtime_ns == written
     again = read_model(path)
     assert (again.header, again.digest) == (model.header, model.digest)
 
 
-def test_a_damaged_file_is_named(ensemble: Path, tmp_path: Path) -> None:
+def test_damaged_file_is_named_in_error(ensemble: Path, tmp_path: Path) -> None:
     needs("openvino")
     model = read_model(ensemble)
     for suffix in (".xml", ".bin"):
-        whole = exported(model, ".xml").with_suffix(suffix)
+        whole = exported_file(model, ".xml").with_suffix(suffix)
         (tmp_path / "cut").with_suffix(suffix).write_bytes(whole.read_bytes())
     (tmp_path / "cut.bin").write_bytes(b"")
     with pytest.raises(CheckpointError, match=r"cut\.xml"):
         open_engine(read_model(tmp_path / "cut.xml"), "openvino")
     (tmp_path / "cut.xml").write_text("<net", encoding="utf-8")
-    with pytest.raises(CheckpointError, match="damaged or no OpenVINO file"):
+    with pytest.raises(CheckpointError, match="damaged or not an OpenVINO file"):
         read_model(tmp_path / "cut.xml")
     (tmp_path / "cut.xml").write_text("<net/>", encoding="utf-8")
     with pytest.raises(CheckpointError, match="not made by `gripper-force export`"):
         read_model(tmp_path / "cut.xml")
     needs("onnxruntime")
     (tmp_path / "cut.onnx").write_bytes(b"no network")
-    with pytest.raises(CheckpointError, match="damaged or no ONNX file"):
+    with pytest.raises(CheckpointError, match="damaged or not an ONNX file"):
         read_model(tmp_path / "cut.onnx")
 
 
-def test_what_does_not_go_together_is_refused(ensemble: Path) -> None:
+def test_incompatible_engine_file_and_precision_are_refused(ensemble: Path) -> None:
     model = read_model(ensemble)
-    with pytest.raises(ConfigError, match=r"no vision\.engine 'tensorrt'; there are torch"):
+    with pytest.raises(
+        ConfigError, match=r"unknown vision\.engine 'tensorrt'; use torch, openvino, onnxruntime"
+    ):
         open_engine(model, "tensorrt")
+    with pytest.raises(ConfigError, match=r"'openvno' \(did you mean 'openvino'\?\)"):
+        open_engine(model, "openvno")
     with pytest.raises(ConfigError, match="bfloat16 needs openvino"):
         open_engine(model, "torch", "bfloat16")
+    with pytest.raises(ConfigError, match=r"unknown vision\.precision 'int8'; use float32 or bfloat16"):
+        open_engine(model, "torch", "int8")  # type: ignore[arg-type]
     needs("openvino")
-    file = read_model(exported(model, ".xml"))
+    file = read_model(exported_file(model, ".xml"))
     for name in ("torch", "onnxruntime"):
         needs(name)
         with pytest.raises(ConfigError, match=r"set vision\.engine=openvino"):
             open_engine(file, name)
 
 
-def test_every_engine_is_covered() -> None:
-    assert set(ENGINES) == {"torch", "openvino", "onnxruntime"}
+def test_only_a_number_of_threads_changes_pytorchs_setting(ensemble: Path) -> None:
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(3)
+        open_engine(read_model(ensemble), "torch", threads=None)
+        assert torch.get_num_threads() == 3
+        open_engine(read_model(ensemble), "torch", threads=2)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("name", ["openvino", "onnxruntime"])
+def test_engine_runs_with_its_default_of_threads(ensemble: Path, name: str) -> None:
+    needs(name)
+    opened = open_engine(read_model(ensemble), name, threads=None)
+    np.testing.assert_allclose(
+        opened.step(frames(1)[0]).forces_n, windows(ensemble, frames(1))[0], rtol=1e-5, atol=1e-5
+    )
+
+
+def test_engine_of_another_package_gets_model_precision_and_threads(
+    ensemble: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "other_engines.py").write_text(
+        "from gripper_force.vision.engines.pytorch import TorchEngine\n"
+        "class OtherEngine(TorchEngine):\n"
+        "    def __init__(self, model, precision, threads):\n"
+        "        super().__init__(model)\n"
+        "        self.arguments = model, precision, threads\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    model: Model = read_model(ensemble)
+    precision: Precision = "bfloat16"
+    opened = open_engine(model, "other_engines:OtherEngine", precision, 2)
+    assert opened.arguments == (model, precision, 2)  # type: ignore[attr-defined]

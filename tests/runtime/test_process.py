@@ -3,7 +3,7 @@ import threading
 
 import pytest
 
-from gripper_force.runtime.priority import PRIORITY, real_time_priority
+from gripper_force.runtime.process import PRIORITY, real_time_priority
 
 
 def policy() -> int:

@@ -1,0 +1,5 @@
+"""``python -m gripper_force`` is the ``gripper-force`` command."""
+
+from gripper_force.cli import main
+
+main()

@@ -1,0 +1,154 @@
+"""Commands that use a gripper or the log of one: grasp, replay, doctor, virtual-servo."""
+
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from gripper_force.cli import console
+from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, load_settings
+from gripper_force.cli.output.doctor import changes_table, checks_table, setup_line
+from gripper_force.cli.output.runs import grasp_table, replay_table, trials_table
+from gripper_force.errors import ConfigError
+
+if TYPE_CHECKING:
+    from gripper_force.jobs.checks import RegisterChange
+
+
+def grasp(
+    config: ConfigPath = None,
+    set_: Overrides = None,
+    as_json: AsJson = False,
+    object_: Annotated[str | None, typer.Option("--object", help="Object to grasp.")] = None,
+    target_n: Annotated[float | None, typer.Option(help="Target force in newtons.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the simulated scene.")] = None,
+    feedback: Annotated[str | None, typer.Option(help="fused, current or vision.")] = None,
+    profile: Annotated[
+        str | None, typer.Option(help="Object profile: a name or a path; own: the one named like the object.")
+    ] = None,
+    trials: Annotated[
+        int, typer.Option(min=0, help="Number of grasps of the four paper objects, with targets of 1 to 8 N.")
+    ] = 0,
+    jobs: Jobs = CORES,
+) -> None:
+    """Grasp with a target force and report the error. Exit code 1 if nothing was held."""
+    from gripper_force.jobs import grasp as job
+
+    settings = load_settings(
+        config,
+        set_,
+        {
+            "object": object_,
+            "target_n": target_n,
+            "seed": seed,
+            "control.feedback": feedback,
+            "calibration.object": profile,
+        },
+    )
+    if not trials:
+        log = job.new_log(settings)
+        try:
+            result = job.grasp(settings, console.line, log)
+        except KeyboardInterrupt:
+            if log.exists():
+                console.err.print(
+                    f"the run until then is in {log}: gripper-force replay {log}", soft_wrap=True
+                )
+            raise
+        console.show(result, as_json, grasp_table)
+        if result["result"] != "held":
+            raise typer.Exit(1)
+        return
+    if object_ is not None or target_n is not None:
+        raise ConfigError(
+            "--trials uses all four objects with drawn targets; leave out --object and --target-n"
+        )
+    results = []
+    with console.bar("grasping", trials) as progress:
+        for one in job.trials(settings, trials, jobs):
+            results.append(one)
+            progress(f"{one['object']} {one['target_n']:.1f} N: {one['result']}")
+    summary = job.overall(results, settings.control.force_limit_n)
+    console.show({"trials": results, "summary": summary}, as_json, trials_table)
+
+
+def replay(
+    log: Annotated[Path, typer.Argument(help="Log of a run or of an imported recording.")],
+    as_json: AsJson = False,
+    checkpoint: Annotated[str | None, typer.Option(help="Estimate with another checkpoint.")] = None,
+    set_: Overrides = None,
+    recover: Annotated[bool, typer.Option(help="Read the intact part of a truncated log.")] = False,
+    report: Annotated[bool, typer.Option(help="Write the report again, beside the log.")] = False,
+) -> None:
+    """Run estimator and controller again on a log, and compare the estimates with its load cell."""
+    from gripper_force.jobs.replay import replay as job
+
+    if report and (set_ or checkpoint):
+        raise ConfigError("--report shows the run as it was; leave out --set and --checkpoint, or --report")
+    result = job(log, checkpoint, overrides=set_, recover=recover)
+    if not report:
+        console.show(result, as_json, replay_table)
+        return
+    from gripper_force.jobs.report import write_report
+
+    page = str(write_report(log, recover=recover).html)
+    shown = {**console.jsonable(result), "report": page}
+    console.show(shown, as_json, lambda _: replay_table(result, page))
+
+
+def doctor(
+    config: ConfigPath = None,
+    set_: Overrides = None,
+    setup: Annotated[
+        bool, typer.Option("--setup", help="Show changes of the servo's registers, ask, and write them.")
+    ] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="With --setup: write without asking.")] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Check every device and this machine, and suggest fixes. Exit code 1 if there is a problem."""
+    from gripper_force.jobs import doctor as job
+
+    settings = load_settings(config, set_, {})
+    if setup:
+        result = job.setup(settings, lambda servo, changes: _confirmed(servo, changes, yes))
+        console.show(result, as_json, setup_line)
+        return
+    with console.err.status("checking"):
+        checks = list(job.doctor(settings))
+    ok = all(check.ok is not False for check in checks)
+    console.show({"checks": checks, "ok": ok}, as_json, checks_table)
+    if not ok:
+        raise typer.Exit(1)
+
+
+def virtual_servo(
+    model: Annotated[str | None, typer.Option(help="Servo model.")] = None,
+    ids: Annotated[list[int] | None, typer.Option("--id", help="Servo id. Repeatable.")] = None,
+    set_: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Serve virtual servos at a device path that any Dynamixel client can open, until Ctrl-C."""
+    from gripper_hw.dynamixel.pty_server import serve_virtual_servo
+
+    servo = load_settings(None, set_, {"servo.model": model}).servo
+    servo_ids = ids or [servo.id]
+    with serve_virtual_servo(servo.model, servo_ids) as server:
+        console.show({"port": server.device_path, "model": servo.model, "ids": servo_ids}, as_json)
+        sys.stdout.flush()
+        console.err.print("serving until Ctrl-C")
+        signal.pause()
+
+
+def _confirmed(servo: str, changes: "list[RegisterChange]", yes: bool) -> bool:
+    changes_table(servo, changes)
+    try:
+        return yes or typer.confirm(f"Write these to {servo}?", err=True)
+    except typer.Abort as abort:
+        if not isinstance(abort.__context__, EOFError):
+            raise
+        console.err.print()
+        raise ConfigError(
+            f"the question was not answered, so nothing was written to {servo}; pass --yes in scripts"
+        ) from abort

@@ -1,0 +1,114 @@
+"""Building blocks of `gripper_force.jobs.doctor` that the probes of the devices share."""
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Final, Literal, TypeVar
+
+import numpy as np
+
+from gripper_force.config import Config
+from gripper_force.interfaces import Devices
+from gripper_force.types import NS_PER_MS, NS_PER_S
+
+_FIRST_NS: Final = 5 * NS_PER_S
+"""Longest start of a sensor: an Arduino restarts when its port is opened."""
+
+_POLL_NS: Final = NS_PER_MS
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One row of the diagnosis.
+
+    Attributes:
+        unit: The device or part that was checked.
+        name: The property that was checked.
+        found: Its value, with units.
+        ok: False if something must be done; None if the row only informs.
+        advice: The remedy, or something to know.
+    """
+
+    unit: str
+    name: str
+    found: str
+    ok: bool | None
+    advice: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class RegisterChange:
+    """A servo register that the setup would change; values with units."""
+
+    register: str
+    old: str
+    new: str
+
+
+@dataclass(frozen=True, slots=True)
+class SetupResult:
+    """Result of a servo's setup.
+
+    Attributes:
+        servo: Id of the servo.
+        changes: Registers that differed from what a run needs.
+        applied: True if they were written and read back.
+    """
+
+    servo: int
+    changes: list[RegisterChange]
+    applied: bool
+
+
+Confirm = Callable[[str, list[RegisterChange]], bool]
+"""Receives a servo's name and the changes; returns True to apply them."""
+
+
+def keep_only(config: Config, unit: Literal["servo", "camera", "load_cell"]) -> Config:
+    """Returns the configuration without the other sensors, so that their failures do not hide this one's."""
+    others = {"camera", "load_cell"} - {unit}
+    return config.model_copy(
+        update={name: getattr(config, name).model_copy(update={"backend": "none"}) for name in others}
+    )
+
+
+def gather(devices: Devices, take: Callable[[], Iterable[T]]) -> list[T]:
+    """Collects what a sensor gives within one second from its first item on. May be empty."""
+    clock, items = devices.clock, list[T]()
+    end_ns = clock.now_ns() + _FIRST_NS
+    while (now_ns := clock.now_ns()) < end_ns:
+        devices.check()
+        new = list(take())
+        if new and not items:
+            end_ns = now_ns + NS_PER_S
+        items += new
+        clock.sleep_until_ns(now_ns + _POLL_NS)
+    return items
+
+
+def clock_name(config: Config) -> str:
+    """Name of the time that the run's clock keeps."""
+    return "simulated time" if config.clock == "lockstep" else "real time"
+
+
+def rate_hz(times_ns: list[int]) -> float:
+    """Rate of events at two or more times."""
+    return (len(times_ns) - 1) * NS_PER_S / max(1, times_ns[-1] - times_ns[0])
+
+
+def time_ms(call: Callable[[], object], count: int) -> tuple[float, float]:
+    """Median and 99th percentile of the time that ``call`` takes, in ms."""
+    times_ns = []
+    for _ in range(count):
+        start_ns = time.perf_counter_ns()
+        call()
+        times_ns.append(time.perf_counter_ns() - start_ns)
+    median_ms, p99_ms = np.percentile(times_ns, (50, 99)) / NS_PER_MS
+    return float(median_ms), float(p99_ms)
+
+
+def judged(unit: str, name: str, found: str, good: bool, advice: str, *, harmless: bool = False) -> Check:
+    """Makes a check, with advice if it is not good. A harmless one does not count as a problem."""
+    return Check(unit, name, found, True) if good else Check(unit, name, found, harmless, advice)

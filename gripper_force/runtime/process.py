@@ -1,0 +1,116 @@
+"""Process-wide settings, which belong to the program and are changed only with its permission."""
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import Final
+
+PRIORITY: Final = 10
+"""Real-time priority of the control loop: above every ordinary thread, below the kernel's own threads."""
+
+_SWITCH_INTERVAL_S: Final = 2e-4
+"""Python's default lets a computing thread delay the control thread by 5 ms."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessOptions:
+    """Process-wide settings that gripper-force may change while a gripper is open. See `own_process`."""
+
+    signals: bool = False
+    switch_interval: bool = False
+    real_time_priority: bool = False
+    torch_threads: bool = False
+
+
+_allowed = ProcessOptions()
+
+
+def own_process(
+    *,
+    signals: bool = True,
+    switch_interval: bool = True,
+    real_time_priority: bool = True,
+    torch_threads: bool = True,
+) -> None:
+    """Allows gripper-force to change process-wide settings. The command line does; a library user may.
+
+    Without this call the library changes none of them. Call it once, before a gripper is opened, in a program
+    whose main purpose is the gripper.
+
+    Args:
+        signals: Ctrl-C (SIGINT) and SIGTERM end a run between two control cycles. A second one ends it at
+            once. Handlers are set only while a gripper is open, and only by the main thread.
+        switch_interval: Python switches threads every 0.2 ms in real time, so that a computing thread delays
+            the control loop less.
+        real_time_priority: The thread of the control loop gets real-time priority, if the kernel allows it.
+        torch_threads: PyTorch computes with ``vision.threads`` threads in the whole process.
+    """
+    global _allowed
+    _allowed = ProcessOptions(signals, switch_interval, real_time_priority, torch_threads)
+
+
+def allowed() -> ProcessOptions:
+    """The settings that the program allows to change."""
+    return _allowed
+
+
+@contextmanager
+def real_time_settings() -> Iterator[str]:
+    """Applies the allowed thread settings to this process and thread while the control loop runs.
+
+    Yields:
+        Reason why real-time priority was refused, and the remedy; empty if it was granted or not allowed.
+    """
+    with ExitStack() as stack:
+        if _allowed.switch_interval:
+            stack.callback(sys.setswitchinterval, sys.getswitchinterval())
+            sys.setswitchinterval(_SWITCH_INTERVAL_S)
+        yield stack.enter_context(real_time_priority()) if _allowed.real_time_priority else ""
+
+
+@contextmanager
+def real_time_priority() -> Iterator[str]:
+    """Gives this thread real-time priority, so that it runs as soon as it wakes. Threads it starts have none.
+
+    Without it, a thread that wakes on a core that computes an estimate may wait for 3 ms (Linux 6.18).
+    See sched(7), https://man7.org/linux/man-pages/man7/sched.7.html.
+
+    Yields:
+        Reason for a refusal, and the remedy; empty if granted.
+    """
+    before, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
+    except PermissionError:
+        yield (
+            "the control loop has no real-time priority, so cycles may start 3 ms late; allow it with "
+            f"'@dialout - rtprio {PRIORITY}' in /etc/security/limits.conf, and log in again"
+        )
+        return
+    try:
+        yield ""
+    finally:
+        # An unprivileged process cannot clear this flag once it is set.
+        os.sched_setscheduler(0, before | os.SCHED_RESET_ON_FORK, parameter)
+
+
+@contextmanager
+def deferred_signals(interrupt: Callable[[], None]) -> Iterator[None]:
+    """Calls ``interrupt`` on SIGINT and SIGTERM instead of raising at once, if the program allows it.
+
+    An exception in the middle of a bus transaction would leave the transaction incomplete.
+    """
+    if not _allowed.signals or threading.current_thread() is not threading.main_thread():
+        yield  # only the main thread can set handlers
+        return
+    signals = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda *_: interrupt()) for number in signals]
+    try:
+        yield
+    finally:
+        for number, handler in zip(signals, before, strict=True):
+            signal.signal(number, handler)

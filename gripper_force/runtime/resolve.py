@@ -1,0 +1,187 @@
+"""Resolution of a configuration: every choice made and every file read, once, before devices open."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from gripper_force.config import Config, ControlConfig, GripperConfig
+from gripper_force.control.limits import largest_target_n
+from gripper_force.control.state_machine import MAX_CYCLE_S, GraspController
+from gripper_force.control.transmission import Transmission
+from gripper_force.errors import ConfigError, RequestError
+from gripper_force.interfaces import ServoSpec
+from gripper_force.profiles.apply import read_correction, read_profiles, rig_mismatches, with_plant
+from gripper_force.runtime.backends import load_servo_class, resolve_simulation
+from gripper_force.runtime.process import allowed
+
+if TYPE_CHECKING:  # a run without vision imports none of these
+    from gripper_force.profiles.correction import Correction
+    from gripper_force.vision.estimator import ForceEstimator
+    from gripper_force.vision.header import Model
+
+_SUPPLY_TOLERANCE_V = 0.5
+"""A supply set to the end of the servo's range reads slightly beyond it."""
+
+_CYCLES_PER_WATCHDOG = 2
+"""One lost cycle must not make the servo stop."""
+
+
+@dataclass(frozen=True, slots=True)
+class ResolvedConfig:
+    """A configuration with no choice left, and what was read for it.
+
+    Attributes:
+        config: The complete configuration: no ``auto``, servo data filled in, plant of the object profile.
+        model: The network's file, or None for a run without vision.
+        correction: The object profile's correction of estimates, or None.
+        target_limits_n: Largest calibrated force by profile.
+        notes: Facts for the log: unit and sentence.
+        choice: The network that ``auto`` chose and why; empty if nothing was left to choose.
+    """
+
+    config: Config
+    model: Model | None = None
+    correction: Correction | None = None
+    target_limits_n: Mapping[str, float] = field(default_factory=dict)
+    notes: tuple[tuple[str, str], ...] = ()
+    choice: str = ""
+
+    def check_target(self, target_n: float) -> None:
+        """Raises `RequestError` if a target is beyond the force limit or a profile's calibrated range."""
+        limit_n = self.config.control.force_limit_n
+        if not (math.isfinite(target_n) and target_n > 0):
+            raise RequestError(f"a target of {target_n} N is not a positive force; request more than 0 N")
+        if target_n > largest_target_n(limit_n):
+            raise RequestError(
+                f"a target of {target_n:g} N is too close to control.force_limit_n {limit_n:g} N; request at "
+                f"most {largest_target_n(limit_n):g} N, or raise the limit"
+            )
+        for name, most_n in self.target_limits_n.items():
+            if target_n > most_n:
+                raise RequestError(
+                    f"a target of {target_n:g} N is above the {most_n:.1f} N that the {name} was calibrated "
+                    "with; request less, or calibrate with larger forces"
+                )
+
+
+def resolve(config: Config, *, vision: bool = True) -> ResolvedConfig:
+    """Resolves a configuration: rig and object profile, ``auto``, budgets, servo data, level of detail.
+
+    Args:
+        config: A configuration as loaded.
+        vision: False for a run that only records frames: no network is loaded.
+
+    Raises:
+        ConfigError: Something is unknown, missing, inconsistent or beyond the budget.
+        CheckpointError: The network's file cannot be read.
+    """
+    if not vision:
+        config = config.model_copy(update={"vision": config.vision.model_copy(update={"checkpoint": "none"})})
+    _check_rate(config)
+    config, model, choice = resolve_vision(config)
+    config, detail = resolve_simulation(config)
+    spec = load_servo_class(config).spec(config.servo)
+    profiles = read_profiles(config)
+    config = config.model_copy(
+        update={
+            "gripper": _complete_gripper(config.gripper, spec),
+            "control": with_plant(_complete_control(config.control, spec), profiles),
+        }
+    )
+    correction = read_correction(config, profiles, model)
+    mismatches = {
+        "object profile": () if correction is None else correction.differs,
+        "rig profile": rig_mismatches(config, profiles),
+    }
+    notes = [
+        ("vision", choice),
+        ("simulation", detail),
+        *(
+            ("session", f"the {profile} was made with {'; '.join(found)}")
+            for profile, found in mismatches.items()
+            if found
+        ),
+    ]
+    return ResolvedConfig(
+        config,
+        model,
+        correction,
+        profiles.target_limits_n,
+        tuple((unit, text) for unit, text in notes if text),
+        choice,
+    )
+
+
+def resolve_vision(config: Config) -> tuple[Config, Model | None, str]:
+    """Chooses network and engine where the configuration says ``auto``, and reads the network's header.
+
+    Returns:
+        The configuration without ``auto``, the network's file (None without vision), and the reason for the
+        choice (empty if nothing was left to choose).
+
+    Raises:
+        ConfigError: Nothing fits the budget.
+        CheckpointError: The network's file cannot be read.
+    """
+    if not config.uses_vision:
+        return config, None, ""
+    from gripper_force.vision.model_files import read_model
+
+    choice = None
+    if "auto" in (config.vision.checkpoint, config.vision.engine):
+        from gripper_force.vision.selection import resolve_auto
+
+        vision, choice = resolve_auto(config.vision, config.budget)
+        config = config.model_copy(update={"vision": vision})
+    return config, read_model(config.vision.checkpoint), "" if choice is None else str(choice)
+
+
+def make_estimator(run: ResolvedConfig) -> ForceEstimator | None:
+    """Opens the estimator of a run, or returns None for a run without vision."""
+    if run.model is None:
+        return None
+    from gripper_force.vision.estimator import open_estimator
+
+    return open_estimator(run.model, run.config.vision, run.correction, set_threads=allowed().torch_threads)
+
+
+def make_controller(config: Config) -> GraspController:
+    """Builds the controller of a complete configuration, such as that of a `ResolvedConfig` or of a log.
+
+    Raises:
+        ConfigError: The configuration is not complete.
+    """
+    gripper = config.gripper
+    if gripper.nm_per_a is None:
+        raise ConfigError("gripper.nm_per_a is not set: this configuration was never resolved for a servo")
+    transmission = Transmission.from_config(gripper, gripper.nm_per_a, gripper.current_step_a or 0.0)
+    return GraspController(config.control, transmission, config.servo.current_limit_a)
+
+
+def _complete_gripper(gripper: GripperConfig, spec: ServoSpec) -> GripperConfig:
+    known = {"nm_per_a": spec.nm_per_a, "current_step_a": spec.current_step_a}
+    return gripper.model_copy(update={k: v for k, v in known.items() if getattr(gripper, k) is None})
+
+
+def _complete_control(control: ControlConfig, spec: ServoSpec) -> ControlConfig:
+    if control.voltage_limits_v is not None:
+        return control
+    low_v, high_v = spec.voltage_range_v
+    limits_v = (low_v - _SUPPLY_TOLERANCE_V, high_v + _SUPPLY_TOLERANCE_V)
+    return control.model_copy(update={"voltage_limits_v": limits_v})
+
+
+def _check_rate(config: Config) -> None:
+    rate_hz, watchdog_ms = config.control.rate_hz, config.servo.bus_watchdog_ms
+    if rate_hz < 1 / MAX_CYCLE_S:
+        raise ConfigError(
+            f"control.rate_hz {rate_hz:g} is too slow for a force loop; set at least {1 / MAX_CYCLE_S:g}"
+        )
+    if rate_hz < (least_hz := 1e3 * _CYCLES_PER_WATCHDOG / watchdog_ms):
+        raise ConfigError(
+            f"with control.rate_hz {rate_hz:g} and servo.bus_watchdog_ms {watchdog_ms} the servo would stop "
+            f"by itself; set the rate to at least {least_hz:.4g}, or a longer watchdog time"
+        )

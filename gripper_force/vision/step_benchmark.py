@@ -1,0 +1,144 @@
+"""Timing of an engine's step, and the cache of measurements of this machine."""
+
+import json
+import os
+import platform
+import time
+from dataclasses import asdict, dataclass
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from gripper_force.plugins import registered
+from gripper_force.types import NS_PER_MS
+from gripper_force.vision.engines import ENGINES, Engine, Precision
+from gripper_force.vision.header import Model
+from gripper_force.vision.model_files import cache_folder
+
+_STEPS: Final = 150
+"""Timed steps of a measurement."""
+
+_WARM_UP_STEPS: Final = 20
+"""Steps before the timed ones."""
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A network, an engine and its settings, with the time and error measured for them on this machine.
+
+    Attributes:
+        checkpoint: Name or path.
+        engine: As ``vision.engine``.
+        precision: As ``vision.precision``.
+        threads: As ``vision.threads``.
+        p50_ms: Median time of an estimate.
+        p99_ms: 99th percentile of the time of an estimate.
+        error_n: Mean absolute error: on held-out logs where `gripper-force bench estimator` measured it, else
+            on the validation data of the training, as in the checkpoint's header.
+    """
+
+    checkpoint: str
+    engine: str
+    precision: Precision
+    threads: int
+    p50_ms: float
+    p99_ms: float
+    error_n: float
+
+    @property
+    def cost_ms(self) -> float:
+        """Median time of an estimate, multiplied by the number of threads."""
+        return self.p50_ms * self.threads
+
+    def __str__(self) -> str:
+        """Returns the settings, time and error, for people."""
+        return (
+            f"{self.checkpoint} on {self.engine}, {self.precision}, {self.threads} "
+            f"thread{'s' if self.threads > 1 else ''}: p99 {self.p99_ms:.2f} ms, {self.error_n:.3f} N"
+        )
+
+
+def step_times_ms(engine: Engine) -> tuple[float, float]:
+    """Measures an engine's step on frames of noise.
+
+    Returns:
+        Median and 99th percentile of the time of a step.
+    """
+    size = engine.header.preprocess.size
+    frames = np.random.default_rng(0).normal(size=(8, size, size)).astype(np.float32)
+    taken_ns = []
+    for i in range(_STEPS + _WARM_UP_STEPS):
+        begin_ns = time.perf_counter_ns()
+        engine.step(frames[i % len(frames)])
+        taken_ns.append(time.perf_counter_ns() - begin_ns)
+    p50_ns, p99_ns = np.percentile(taken_ns[_WARM_UP_STEPS:], [50, 99])
+    return float(p50_ns / NS_PER_MS), float(p99_ns / NS_PER_MS)
+
+
+@cache
+def engine_version(engine: str) -> str:
+    """Returns the installed version of the package that an engine needs; empty if none is installed or known.
+
+    Args:
+        engine: As ``vision.engine``.
+    """
+    if engine not in ENGINES and (point := registered("engines").get(engine)) is not None:
+        return point.dist.version if point.dist is not None else ""
+    package = engine if engine in ENGINES else engine.partition(":")[0].partition(".")[0]
+    try:
+        return version(package)
+    except (PackageNotFoundError, ValueError):  # the latter: an empty name
+        return ""
+
+
+def cache_key(model: Model, engine: str, precision: str, threads: int) -> str:
+    """Returns the key of a measurement: file, engine and its version, settings, and machine."""
+    parts = (model.digest[:16], model.path.suffix, engine, engine_version(engine))
+    return " ".join((*parts, precision, str(threads), _machine()))
+
+
+def read_cache() -> dict[str, Candidate]:
+    """Returns the measurements of this machine by `cache_key`; none if the file is missing or malformed."""
+    try:
+        return {
+            key: Candidate(**candidate)
+            for key, candidate in json.loads(_cache_file().read_text(encoding="utf-8")).items()
+        }
+    except (OSError, ValueError, TypeError, AttributeError):
+        return {}
+
+
+def update_cache(measured: dict[str, Candidate]) -> None:
+    """Adds measurements to the cache. Does nothing if its folder is not writable."""
+    path = _cache_file()
+    entries = {key: asdict(candidate) for key, candidate in (read_cache() | measured).items()}
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_suffix(f".{os.getpid()}")
+        partial.write_text(json.dumps(entries, indent=1), encoding="utf-8")
+        partial.replace(path)
+    except OSError:
+        return
+
+
+def _cache_file() -> Path:
+    return cache_folder() / "engines.json"
+
+
+@cache
+def _machine() -> str:
+    cpu = next(
+        (line.split(":", 1)[1].strip() for line in _cpu_info() if line.startswith("model name")),
+        platform.processor(),
+    )
+    return f"{platform.node()} {cpu} {os.cpu_count()}"
+
+
+def _cpu_info() -> list[str]:
+    try:
+        return Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return []

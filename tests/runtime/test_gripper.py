@@ -1,0 +1,534 @@
+import asyncio
+import math
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import gripper_force as gf
+from gripper_force.control.limits import largest_target_n
+from gripper_force.runtime import gripper as gripper_module
+from gripper_force.runtime.log import LogReader
+from gripper_hw.dynamixel.pty_server import PtyServer, serve_virtual_servo
+from gripper_hw.dynamixel.virtual import VirtualBus, find_bus
+
+Open = Callable[..., gf.Gripper]
+
+
+@pytest.fixture
+def simulated(quick: list[str]) -> Iterator[Open]:
+    """Opens grippers on the simulated rig in lockstep; closes them at the end."""
+    opened: list[gf.Gripper] = []
+
+    def make(*overrides: str, **options: Any) -> gf.Gripper:
+        opened.append(gf.open_gripper(overrides=[*quick, *overrides], **options))
+        return opened[-1]
+
+    yield make
+    for gripper in opened:
+        gripper.close()
+
+
+@pytest.fixture
+def server() -> Iterator[PtyServer]:
+    with serve_virtual_servo("XM430-W350") as served:
+        yield served
+
+
+@pytest.fixture
+def real_time(quick: list[str], server: PtyServer) -> Iterator[Open]:
+    """Opens grippers in real time on a virtual servo behind a pseudo-terminal, without an object."""
+    opened: list[gf.Gripper] = []
+
+    def make(*overrides: str, **options: Any) -> gf.Gripper:
+        sets = [
+            *quick,
+            "clock=realtime",
+            f"servo.port={server.device_path}",
+            "load_cell.backend=none",
+            "servo.bus_watchdog_ms=2540",  # the machine that tests may be busy
+            "servo.reply_margin_ms=500",
+            *overrides,
+        ]
+        opened.append(gf.open_gripper(overrides=sets, **options))
+        return opened[-1]
+
+    yield make
+    for gripper in opened:
+        gripper.close()
+
+
+def bus() -> VirtualBus:
+    found = find_bus("rig")
+    assert found is not None
+    return found
+
+
+def torque(served: PtyServer | None = None) -> int:
+    return (bus() if served is None else served.bus).servos[0].get("torque_enable")
+
+
+# In lockstep.
+
+
+def test_grasp_changes_of_force_and_release(simulated: Open) -> None:
+    gripper = simulated()
+    assert gripper.state.phase == gf.Phase.OPEN
+    result = gripper.grasp(3.0)
+    assert (result.outcome, result.held) == (gf.Outcome.HELD, True)
+    assert result.force_n == pytest.approx(3.0, rel=0.1)
+    assert 0.03 < result.width_m < 0.08
+    assert result.std_n > 0
+    assert result.vision_share == 0
+    assert "N for" in result.reason
+    raised = gripper.set_force(5.0)
+    assert raised.held
+    assert raised.force_n == pytest.approx(5.0, rel=0.1)
+    assert gripper.state.load_cell_n == pytest.approx(5.0, abs=1.5)
+    assert gripper.release() > 0.085
+    assert gripper.state.phase == gf.Phase.OPEN
+
+
+def test_the_same_configuration_gives_the_same_result(simulated: Open) -> None:
+    first = simulated()
+    result = first.grasp(3.0)
+    first.close()
+    assert simulated().grasp(3.0) == result
+
+
+def test_wait_false_returns_at_once_and_steps_go_on(simulated: Open) -> None:
+    gripper = simulated()
+    assert gripper.grasp(3.0, wait=False) is None
+    before = gripper.state
+    phases = {gripper.step().phase for _ in range(300)}
+    assert gripper.state.t_ns - before.t_ns == 300 * 5_000_000
+    assert {gf.Phase.APPROACH, gf.Phase.CONTACT} <= phases
+
+
+def test_sleep_runs_the_simulated_time(simulated: Open) -> None:
+    gripper = simulated()
+    before_ns = gripper.state.t_ns
+    gripper.sleep(0.5)
+    assert gripper.state.t_ns - before_ns == pytest.approx(0.5e9, abs=5e6)
+
+
+def test_move_positions_the_jaws_and_names_an_obstacle(simulated: Open) -> None:
+    gripper = simulated()
+    assert gripper.move(0.08) == pytest.approx(0.08, abs=0.001)
+    assert gripper.state.outcome == gf.Outcome.MOVED
+    assert gripper.move(0.01) > 0.03
+    assert gripper.state.outcome == gf.Outcome.BLOCKED
+    assert gripper.force_n < 1.5
+    assert gripper.grasp(3.0).held
+
+
+def test_no_log_is_written_without_a_path(
+    simulated: Open, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    gripper = simulated()
+    gripper.grasp(2.0)
+    gripper.close()
+    assert list(tmp_path.rglob("*")) == []
+
+
+def test_a_log_can_be_replayed(simulated: Open, tmp_path: Path) -> None:
+    gripper = simulated(log=tmp_path / "run.mcap")
+    gripper.grasp(3.0)
+    gripper.set_force(4.0)
+    gripper.move(0.09)
+    gripper.release()
+    gripper.close()
+    assert [r.kind for r in LogReader(tmp_path / "run.mcap").records(gf.Request)] == [
+        "grasp",
+        "grasp",
+        "move",
+        "release",
+    ]
+    assert gf.replay(tmp_path / "run.mcap").identical is True
+
+
+def test_vision_share_counts_the_hold(quick_vision: list[str]) -> None:
+    with gf.open_gripper(overrides=[*quick_vision, "vision.lockstep_compute_ms=1"]) as gripper:
+        assert gripper.frame is not None
+        assert gripper.frame.gray.dtype == "uint8"
+        result = gripper.grasp(3.0)
+        assert 0 <= result.vision_share <= 1
+        assert gripper.config.gripper.nm_per_a is not None  # the resolved configuration
+
+
+@pytest.mark.parametrize("target_n", [0.0, -1.0, 9.1, math.nan, math.inf])
+def test_a_force_out_of_range_is_refused(simulated: Open, target_n: float) -> None:
+    gripper = simulated()
+    with pytest.raises(gf.RequestError, match="target of"):
+        gripper.grasp(target_n)
+    assert gripper.step().phase == gf.Phase.OPEN
+
+
+@pytest.mark.parametrize("width_m", [-0.001, 0.2, math.nan, math.inf])
+def test_a_width_out_of_range_is_refused(simulated: Open, width_m: float) -> None:
+    with pytest.raises(gf.RequestError, match="move request was refused: a width"):
+        simulated().move(width_m)
+
+
+def test_force_is_only_set_on_a_gripped_object(simulated: Open) -> None:
+    with pytest.raises(gf.RequestError, match=r"no object is gripped .*call grasp first"):
+        simulated().set_force(2.0)
+
+
+def test_a_stop_ends_the_grasp_and_a_release_resets_it(simulated: Open) -> None:
+    gripper = simulated()
+    gripper.grasp(3.0)
+    gripper.stop()
+    state = gripper.step()
+    assert (state.phase, state.outcome, state.reason) == (gf.Phase.FAULT, gf.Outcome.FAULT, "stop requested")
+    with pytest.raises(gf.RequestError, match="release"):
+        gripper.grasp(2.0)
+    gripper.release()
+    assert gripper.grasp(2.0).held
+
+
+def test_a_closed_gripper_refuses(simulated: Open) -> None:
+    gripper = simulated()
+    gripper.close()
+    gripper.close()
+    for call in (gripper.step, gripper.release, lambda: gripper.grasp(2.0), lambda: gripper.move(0.05)):
+        with pytest.raises(gf.RequestError, match="closed"):
+            call()
+
+
+def test_lockstep_has_no_background_thread(quick: list[str]) -> None:
+    with pytest.raises(gf.ConfigError, match="clock=lockstep runs in the caller's thread"):
+        gf.open_gripper(overrides=quick, background=True)
+
+
+def test_overrides_do_not_go_with_a_config(quick: list[str]) -> None:
+    config = gf.load_config(None, quick)
+    with pytest.raises(gf.ConfigError, match="overrides need a file"):
+        gf.open_gripper(config, overrides=["seed=1"])
+    with gf.open_gripper(config) as gripper:
+        assert gripper.config.object == "stapler"
+
+
+# The servo at the end, on the bus.
+
+
+@pytest.mark.parametrize(("on_exit", "after"), [("release", 0), ("hold", 1)])
+def test_the_servo_ends_as_configured(quick: list[str], on_exit: str, after: int) -> None:
+    ended: list[int] = []
+    with closing(Recorded(ended)), gf.open_gripper(overrides=[*quick, f"on_exit={on_exit}"]) as gripper:
+        gripper.grasp(3.0)
+        assert torque() == 1
+    assert ended == [after]
+
+
+@pytest.mark.parametrize(("on_fault", "after"), [("limp", 0), ("hold", 1)])
+@pytest.mark.parametrize("error", [ValueError("the caller's"), gf.DataError("no picture")])
+def test_an_exception_in_the_callers_code_is_a_fault(
+    quick: list[str], on_fault: str, after: int, error: Exception
+) -> None:
+    ended: list[int] = []
+    with (
+        closing(Recorded(ended)),
+        pytest.raises(type(error)),
+        gf.open_gripper(overrides=[*quick, f"control.on_fault={on_fault}"]) as gripper,
+    ):
+        gripper.grasp(3.0)
+        raise error
+    assert ended == [after]
+
+
+def test_ctrl_c_is_no_fault(quick: list[str]) -> None:
+    ended: list[int] = []
+    with (
+        closing(Recorded(ended)),
+        pytest.raises(KeyboardInterrupt),
+        gf.open_gripper(overrides=[*quick, "on_exit=hold", "control.on_fault=limp"]) as gripper,
+    ):
+        gripper.grasp(3.0)
+        raise KeyboardInterrupt
+    assert ended == [1]
+
+
+def test_an_interrupt_within_a_bus_transaction_leaves_no_torque(quick: list[str]) -> None:
+    ended: list[int] = []
+
+    def interrupt(answer: bytes) -> bytes:
+        raise KeyboardInterrupt
+
+    with (
+        closing(Recorded(ended)),
+        pytest.raises(KeyboardInterrupt),
+        gf.open_gripper(overrides=quick) as gripper,
+    ):
+        gripper.grasp(3.0)
+        bus().tamper = interrupt
+        try:
+            gripper.step()
+        finally:
+            bus().tamper = None
+    assert ended == [0]
+
+
+def test_an_error_that_the_caller_handled_still_ends_as_a_fault(quick: list[str]) -> None:
+    ended: list[int] = []
+    with closing(Recorded(ended)), pytest.raises(gf.DeviceError):
+        with gf.open_gripper(overrides=[*quick, "on_exit=hold"]) as gripper:
+            gripper.grasp(3.0)
+            bus().tamper = lambda _: None
+            with pytest.raises(gf.DeviceTimeoutError):
+                gripper.step()
+            bus().tamper = None
+            with pytest.raises(gf.DeviceTimeoutError):
+                gripper.grasp(2.0)  # a failed run stays failed
+        raise gf.DeviceError("reached: closing raised nothing")
+    assert ended == [0]
+
+
+class Recorded:
+    """Keeps the torque of the rig's servo at the moment its bus is taken away."""
+
+    def __init__(self, ended: list[int]) -> None:
+        import gripper_hw.sim.simulated_rig as rig
+
+        self._rig, self._before = rig, rig.unregister_bus
+
+        def unregister(name: str) -> None:
+            if (found := find_bus(name)) is not None:
+                ended.append(found.servos[0].get("torque_enable"))
+            self._before(name)
+
+        rig.unregister_bus = unregister
+
+    def close(self) -> None:
+        self._rig.unregister_bus = self._before
+
+
+@settings(max_examples=8)
+@given(
+    calls=st.lists(
+        st.one_of(
+            st.tuples(st.just("grasp"), st.floats(-1, 11)),
+            st.tuples(st.just("set_force"), st.floats(-1, 11)),
+            st.tuples(st.just("move"), st.floats(-0.01, 0.1)),
+            st.tuples(st.just("stop"), st.none()),
+            st.tuples(st.just("release"), st.none()),
+        ),
+        max_size=8,
+    )
+)
+def test_any_sequence_of_requests_keeps_the_limit_and_ends_without_torque(
+    quick: list[str], calls: list[tuple[str, float | None]]
+) -> None:
+    ended: list[int] = []
+    with closing(Recorded(ended)), gf.open_gripper(overrides=quick) as gripper:
+        limit_n = gripper.config.control.force_limit_n
+        for name, value in calls:
+            options: dict[str, Any] = {} if name == "stop" else {"wait": False}
+            try:
+                getattr(gripper, name)(*([] if value is None else [value]), **options)
+            except gf.RequestError:
+                continue
+            for _ in range(150):
+                state = gripper.step()
+                assert state.load_cell_n is None or state.load_cell_n < limit_n * 1.05
+                assert state.reference_n <= largest_target_n(limit_n)
+    assert ended == [0]
+
+
+# In real time.
+
+
+def test_the_background_thread_runs_the_cycle(real_time: Open, server: PtyServer) -> None:
+    gripper = real_time()
+    assert torque(server) == 1
+    assert "control" in {thread.name for thread in threading.enumerate()}
+    assert gripper.grasp(3.0).outcome == gf.Outcome.NO_OBJECT
+    assert gripper.release() > 0.085
+    with pytest.raises(gf.RequestError, match="open with background=False"):
+        gripper.step()
+    gripper.close()
+    assert torque(server) == 0
+    assert "control" not in {thread.name for thread in threading.enumerate()}
+
+
+def test_the_callers_own_loop(real_time: Open, server: PtyServer) -> None:
+    gripper = real_time(background=False)
+    gripper.move(0.06, wait=False)
+    states = [gripper.step() for _ in range(40)]
+    assert states[-1].phase == gf.Phase.MOVE
+    assert {b.t_ns > a.t_ns for a, b in pairwise(states)} == {True}
+    gripper.close()
+    assert torque(server) == 0
+
+
+def test_another_thread_stops_a_waiting_call(real_time: Open, server: PtyServer) -> None:
+    gripper = real_time("control.approach_speed_m_s=0.005")
+    timer = threading.Timer(0.2, gripper.stop)
+    timer.start()
+    result = gripper.grasp(3.0)
+    timer.join()
+    assert (result.outcome, result.reason) == (gf.Outcome.FAULT, "stop requested")
+
+
+def test_a_newer_request_replaces_a_waiting_one(real_time: Open) -> None:
+    gripper = real_time("control.approach_speed_m_s=0.005")
+    timer = threading.Timer(0.2, lambda: gripper.release(wait=False))
+    timer.start()
+    with pytest.raises(gf.RequestError, match="replaced by a release request"):
+        gripper.grasp(3.0)
+    timer.join()
+
+
+def test_a_gripper_is_used_from_threads_other_than_the_main_one(real_time: Open) -> None:
+    gripper = real_time()
+    results: list[float] = []
+    thread = threading.Thread(target=lambda: results.append(gripper.move(0.06)))
+    thread.start()
+    thread.join()
+    assert results == [pytest.approx(0.06, abs=0.001)]
+
+
+def test_asyncio(real_time: Open) -> None:
+    gripper = real_time()
+
+    async def main() -> tuple[float, int]:
+        moving = asyncio.create_task(asyncio.to_thread(gripper.move, 0.05))
+        reads = 0
+        while not moving.done():
+            assert gripper.state.t_ns > 0
+            reads += 1
+            await asyncio.sleep(0.02)
+        return await moving, reads
+
+    width_m, reads = asyncio.run(main())
+    assert width_m == pytest.approx(0.05, abs=0.001)
+    assert reads > 5
+
+
+def test_a_lost_device_is_raised_in_the_waiting_call(real_time: Open, server: PtyServer) -> None:
+    gripper = real_time("control.approach_speed_m_s=0.005")
+    timer = threading.Timer(0.2, server.unplug)
+    timer.start()
+    with pytest.raises(gf.DeviceLostError):
+        gripper.grasp(3.0)
+    timer.join()
+    with pytest.raises(gf.DeviceLostError):
+        gripper.sleep(1.0)
+
+
+def test_a_device_lost_meanwhile_is_raised_when_the_gripper_is_closed(
+    real_time: Open, server: PtyServer
+) -> None:
+    gripper = real_time()
+    server.unplug()
+    while "control" in {thread.name for thread in threading.enumerate()}:
+        time.sleep(0.01)
+    with pytest.raises(gf.DeviceLostError):
+        gripper.close()
+
+
+def test_a_missing_port_is_raised_when_the_gripper_is_opened(quick: list[str]) -> None:
+    sets = [*quick, "clock=realtime", "servo.port=/dev/ttyNONE", "load_cell.backend=none"]
+    with pytest.raises(gf.DeviceNotFoundError, match="/dev/ttyNONE"):
+        gf.open_gripper(overrides=sets)
+    assert "control" not in {thread.name for thread in threading.enumerate()}
+
+
+def test_the_callers_exception_ends_the_run_and_keeps_its_traceback(
+    real_time: Open, server: PtyServer
+) -> None:
+    with pytest.raises(ValueError, match="mine") as caught, real_time("on_exit=hold") as gripper:
+        gripper.move(0.06)
+        raise ValueError("mine")
+    assert torque(server) == 0
+    assert [entry.name for entry in caught.traceback][-1] == (
+        "test_the_callers_exception_ends_the_run_and_keeps_its_traceback"
+    )
+
+
+def test_a_control_thread_that_hangs_is_an_error(real_time: Open, monkeypatch: pytest.MonkeyPatch) -> None:
+    gripper = real_time()
+    monkeypatch.setattr(gripper_module, "_JOIN_S", 0.0)
+    monkeypatch.setattr(gripper._closing, "is_set", lambda: False)
+    with pytest.raises(gf.DeviceTimeoutError, match="control thread did not end"):
+        gripper.close()
+    monkeypatch.undo()
+    assert gripper._thread is not None
+    gripper._thread.join()
+
+
+PROGRAM = """
+import sys, time
+import gripper_force as gf
+
+gripper = gf.open_gripper(overrides=sys.argv[2:])
+gripper.move(0.06)
+print("ready", flush=True)
+if sys.argv[1] == "wait":
+    gripper.sleep(60)
+elif sys.argv[1] == "raise":
+    raise ValueError("the caller's")
+"""
+
+
+@pytest.mark.parametrize(
+    ("ending", "number", "code"), [("wait", signal.SIGINT, -2), ("raise", None, 1), ("end", None, 0)]
+)
+def test_a_program_that_forgets_to_close_leaves_no_torque(
+    quick: list[str], server: PtyServer, ending: str, number: signal.Signals | None, code: int
+) -> None:
+    sets = [*quick, "clock=realtime", f"servo.port={server.device_path}", "load_cell.backend=none"]
+    sets += ["servo.bus_watchdog_ms=2540", "servo.reply_margin_ms=500"]
+    with subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, ending, *sets],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        if number is not None:
+            process.send_signal(number)
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == code, said
+    assert torque(server) == 0
+    assert server.bus.servos[0].get("hardware_error_status") == 0
+
+
+# Nothing of the process is changed without permission.
+
+
+def test_the_process_stays_as_it_is(real_time: Open) -> None:
+    import torch
+
+    handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    before = sys.getswitchinterval(), torch.get_num_threads()
+    gripper = real_time()
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
+    gripper.move(0.08)
+    assert (sys.getswitchinterval(), torch.get_num_threads()) == before
+
+
+@pytest.mark.usefixtures("own_process")
+def test_a_program_may_ask_for_signals_and_timing(real_time: Open) -> None:
+    before, handler = sys.getswitchinterval(), signal.getsignal(signal.SIGTERM)
+    gripper = real_time("control.approach_speed_m_s=0.005")
+    assert sys.getswitchinterval() < before
+    timer = threading.Timer(0.2, lambda: signal.raise_signal(signal.SIGTERM))
+    timer.start()
+    with pytest.raises(KeyboardInterrupt), gripper:
+        gripper.grasp(3.0)
+    timer.join()
+    assert sys.getswitchinterval() == pytest.approx(before)
+    assert signal.getsignal(signal.SIGTERM) == handler

@@ -1,0 +1,118 @@
+import math
+from dataclasses import FrozenInstanceError
+from pathlib import Path
+
+import pytest
+
+from gripper_force.config import Config, load_config
+from gripper_force.errors import ConfigError, RequestError
+from gripper_force.runtime.resolve import ResolvedConfig, make_controller, make_estimator, resolve
+from gripper_hw.dynamixel.servo import DynamixelServo
+
+NO_SENSORS = ["camera.backend=none", "load_cell.backend=none"]
+
+
+def test_a_configuration_that_was_never_resolved_has_no_controller() -> None:
+    with pytest.raises(ConfigError, match=r"gripper\.nm_per_a is not set"):
+        make_controller(Config())
+
+
+def test_servo_data_fill_in_what_is_left_open() -> None:
+    config = resolve(load_config(None, NO_SENSORS)).config
+    spec = DynamixelServo.spec(config.servo)
+    assert config.gripper.nm_per_a == spec.nm_per_a
+    assert config.gripper.current_step_a == spec.current_step_a
+    low_v, high_v = spec.voltage_range_v
+    assert config.control.voltage_limits_v is not None
+    assert config.control.voltage_limits_v[0] < low_v < high_v < config.control.voltage_limits_v[1]
+    make_controller(config)
+
+
+def test_configured_values_are_kept() -> None:
+    given = ["gripper.nm_per_a=1.5", "gripper.current_step_a=0.001", "control.voltage_limits_v=[11, 13]"]
+    config = load_config(None, [*NO_SENSORS, *given])
+    assert resolve(config).config == config
+
+
+@pytest.mark.parametrize("key", ["camera.backend=none", "vision.checkpoint=none"])
+def test_a_run_without_vision_has_no_network(key: str) -> None:
+    run = resolve(load_config(None, [key]))
+    assert run.model is None
+    assert make_estimator(run) is None
+
+
+def test_a_run_that_only_records_has_no_network() -> None:
+    assert resolve(Config(), vision=False).model is None
+
+
+def test_auto_becomes_a_network_and_an_engine_with_the_reason() -> None:
+    assert resolve(Config()).choice == ""
+    run = resolve(load_config(None, ["vision.checkpoint=auto"]))
+    assert "auto" not in (run.config.vision.checkpoint, run.config.vision.engine)
+    assert run.config.vision.checkpoint in run.choice
+    assert ("vision", run.choice) in run.notes
+
+
+def test_the_level_of_detail_is_chosen_before_devices_open() -> None:
+    run = resolve(load_config(None, [*NO_SENSORS, "sim.detail=auto", "budget.sim_error_n=10"]))
+    assert run.config.sim.detail != "auto"
+    assert [unit for unit, _ in run.notes] == ["simulation"]
+
+
+def test_resolving_again_changes_nothing() -> None:
+    run = resolve(load_config(None, NO_SENSORS))
+    assert resolve(run.config).config == run.config
+
+
+def test_a_resolved_configuration_is_frozen() -> None:
+    run = ResolvedConfig(Config())
+    with pytest.raises(FrozenInstanceError):
+        run.choice = "x"  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(
+    ("slow", "message"),
+    [
+        (["control.rate_hz=10", "servo.bus_watchdog_ms=500"], "too slow for a force loop; set at least 20"),
+        (["control.rate_hz=40"], "would stop by itself; set the rate to at least 50"),
+    ],
+)
+def test_a_loop_too_slow_for_itself_or_for_the_servo_is_refused(slow: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        resolve(load_config(None, [*NO_SENSORS, *slow]))
+
+
+@pytest.mark.parametrize("target_n", [9.01, 0.0, -1.0, math.nan, math.inf])
+def test_a_target_out_of_range_is_refused(target_n: float) -> None:
+    with pytest.raises(RequestError, match="target of"):
+        ResolvedConfig(Config()).check_target(target_n)
+
+
+def test_a_target_beyond_a_profile_is_refused() -> None:
+    run = resolve(load_config(None, ["object=sponge", "calibration.object=own", "control.force_limit_n=60"]))
+    (most_n,) = run.target_limits_n.values()
+    run.check_target(most_n)
+    with pytest.raises(RequestError, match=r"object profile .*sponge\.yaml was calibrated with"):
+        run.check_target(most_n + 0.1)
+
+
+@pytest.mark.parametrize(
+    ("key", "message"),
+    [
+        ("servo.backend=dynamixl", "did you mean 'dynamixel'"),
+        ("servo.backend=no_such_package:Servo", "servo.backend=no_such_package:Servo needs no_such_package"),
+        ("vision.checkpoint=none", None),
+    ],
+)
+def test_a_wrong_servo_backend_is_named(key: str, message: str | None) -> None:
+    config = load_config(None, [*NO_SENSORS, key])
+    if message is None:
+        resolve(config)
+    else:
+        with pytest.raises(ConfigError, match=message):
+            resolve(config)
+
+
+def test_a_missing_checkpoint_is_found_before_devices_open(tmp_path: Path) -> None:
+    with pytest.raises(Exception, match=r"no\.safetensors"):
+        resolve(load_config(None, [f"vision.checkpoint={tmp_path}/no.safetensors"]))

@@ -1,0 +1,68 @@
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import pytest
+
+from gripper_force import plugins
+from gripper_force.errors import ConfigError
+from gripper_force.plugins import load_class
+
+BUILTIN = {"fraction": "fractions:Fraction", "decimal": "decimal:Decimal"}
+
+
+def load(name: str, extra: str | None = None) -> object:
+    return load_class("shapes", BUILTIN, name, "shape.kind", extra=extra)
+
+
+@pytest.fixture(autouse=True)
+def points(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Entry points of other packages, of which one has a built-in name."""
+    found = [
+        EntryPoint("fraction", "nowhere:Nothing", "gripper_force.shapes"),
+        EntryPoint("path", "pathlib:Path", "gripper_force.shapes"),
+        EntryPoint("gone", "no_such_package.shapes:Shape", "gripper_force.shapes"),
+    ]
+    monkeypatch.setattr(
+        plugins, "entry_points", lambda group: [point for point in found if point.group == group]
+    )
+
+
+def test_finds_builtin_registered_and_named_classes() -> None:
+    from fractions import Fraction
+
+    assert load("fraction") is Fraction
+    assert load("path") is Path
+    assert load("pathlib:Path") is Path
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        (
+            "fractoin",
+            r"^unknown shape\.kind 'fractoin' \(did you mean 'fraction'\?\); use fraction, decimal, ",
+        ),
+        ("zzz", r"'zzz'; use fraction, decimal, gone, path or package\.module:Class$"),
+        (
+            "no_such_package.a:B",
+            r"^shape\.kind=no_such_package\.a:B needs no_such_package, which is not inst",
+        ),
+        ("gone", r"needs no_such_package, which is not installed; install it"),
+        ("pathlib:Paht", r"the module pathlib has no attribute 'Paht'; name one of its classes"),
+        ("pathlib:", r"the module pathlib has no attribute ''"),
+        (":Path", r"can't import ''"),
+        (".a:Path", r"can't import '\.a'"),
+        ("math:pi", r"math:pi is not a class; name a class"),
+    ],
+)
+def test_errors_name_key_and_problem(name: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        load(name)
+
+
+def test_builtin_class_without_its_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(BUILTIN, "gone", "no_such_package:Shape")
+    with pytest.raises(ConfigError, match=r"pip install 'gripper-force\[shapes\]'"):
+        load("gone", extra="shapes")
+    with pytest.raises(ConfigError, match="install it"):
+        load("no_such_package:Shape", extra="shapes")

@@ -1,0 +1,169 @@
+"""The public names, what importing them costs, and how much code an embedding program can reach."""
+
+import inspect
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import grimp
+import pytest
+
+import gripper_force as gf
+
+ROOT = Path(__file__).parents[1]
+HEAVY = {"torch", "mujoco", "depthai", "typer"}
+
+PUBLIC = [
+    "__version__",
+    "BusStats",
+    "Camera",
+    "CameraConfig",
+    "CheckpointError",
+    "Clock",
+    "Config",
+    "ConfigError",
+    "DataError",
+    "DeviceError",
+    "DeviceLostError",
+    "DeviceNotFoundError",
+    "DeviceTimeoutError",
+    "EstimateSource",
+    "Event",
+    "ForceEstimate",
+    "ForceEstimator",
+    "Frame",
+    "FusedForce",
+    "GraspResult",
+    "GraspStatus",
+    "Gripper",
+    "GripperError",
+    "GripperState",
+    "HardwareFaultError",
+    "LoadCell",
+    "LoadCellConfig",
+    "LoadCellSample",
+    "LogError",
+    "LogReader",
+    "NonFiniteError",
+    "Outcome",
+    "Phase",
+    "Progress",
+    "Record",
+    "Request",
+    "RequestError",
+    "RequestKind",
+    "Servo",
+    "ServoCommand",
+    "ServoConfig",
+    "ServoSpec",
+    "ServoState",
+    "SimulationError",
+    "VisualForce",
+    "calibrate_object",
+    "evaluate",
+    "load_config",
+    "open_gripper",
+    "own_process",
+    "replay",
+]
+
+
+def test_the_public_names_are_these() -> None:
+    """A change here is a change of the public interface: see the rules of versions in CONTRIBUTING.md."""
+    assert gf.__all__ == PUBLIC
+    assert set(PUBLIC) <= set(dir(gf))
+    assert all(getattr(gf, name) is not None for name in gf.__all__)
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'grip'"):
+        _ = gf.grip
+
+
+@pytest.mark.parametrize("name", PUBLIC[1:])
+def test_every_public_name_has_a_docstring(name: str) -> None:
+    value = getattr(gf, name)
+    if not inspect.isclass(value) and not callable(value):
+        return  # a type alias
+    text = inspect.getdoc(value) or ""
+    assert len(text) > 10
+    assert not text.startswith(
+        ("What ", "How ", "Whether ", "Where ", "When ", "Who ", "Is ", "Are ", "Does ")
+    )
+    if inspect.isfunction(value):
+        assert "Raises:" in text or name == "own_process"
+        assert all(parameter in text for parameter in inspect.signature(value).parameters)
+
+
+def modules_after(code: str, *arguments: str) -> set[str]:
+    program = f"import json, sys\n{code}\nprint(json.dumps(list(sys.modules)))"
+    done = subprocess.run(
+        [sys.executable, "-c", program, *arguments], capture_output=True, text=True, check=True, timeout=120
+    )
+    return set(json.loads(done.stdout.splitlines()[-1]))
+
+
+def test_the_import_loads_nothing_heavy() -> None:
+    modules = modules_after("import gripper_force")
+    assert not modules & (HEAVY | {"numpy", "pydantic", "yaml", "serial"})
+    assert {name for name in modules if name.startswith("gripper_")} == {"gripper_force"}
+
+
+def test_a_gripper_on_motor_current_loads_nothing_heavy() -> None:
+    code = """
+import gripper_force as gf
+from gripper_hw.dynamixel.pty_server import serve_virtual_servo
+with serve_virtual_servo("XM430-W350") as server:
+    o = {"clock": "realtime", "servo.port": server.device_path, "camera.backend": "none"}
+    o |= {"load_cell.backend": "none", "control.feedback": "current"}
+    with gf.open_gripper(overrides=o) as gripper:
+        gripper.move(0.08)
+"""
+    modules = modules_after(code)
+    assert not modules & HEAVY
+    assert not {
+        name for name in modules if name.startswith(("gripper_force.qualification", "gripper_force.cli"))
+    }
+
+
+def test_the_code_that_an_embedding_program_reaches_is_small() -> None:
+    """`open_gripper` with any built-in device, and the devices' own imports: at most 12,000 lines."""
+    graph = grimp.build_graph(
+        "gripper_force", "gripper_hw", "gripper_calibration", exclude_type_checking_imports=True
+    )
+    from gripper_force.runtime import backends
+    from gripper_force.vision.engines import ENGINES
+
+    named = [
+        *backends.SERVOS.values(),
+        *backends.CAMERAS.values(),
+        *backends.LOAD_CELLS.values(),
+        backends.RIG,
+    ]
+    start = {
+        "gripper_force",
+        "gripper_force.runtime.gripper",
+        *(name.split(":")[0] for name in named if name),
+    }
+    start |= {path.split(":")[0] for path in ENGINES.values()}
+    reached = set(start)
+    for module in start:
+        reached |= graph.find_upstream_modules(module)
+    top = {".".join(name.split(".")[:2]) for name in reached}
+    assert not top & {"gripper_force.cli", "gripper_force.qualification", "gripper_force.jobs"}
+    lines = sum(len(_file(module).read_text().splitlines()) for module in reached)
+    assert 6_000 < lines <= 12_000
+
+
+def _file(module: str) -> Path:
+    roots = {"gripper_force": ROOT, "gripper_hw": ROOT / "hw", "gripper_calibration": ROOT / "calibration"}
+    path = roots[module.split(".")[0]].joinpath(*module.split("."))
+    return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+
+
+def test_versions_agree() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "gripper_force", "--version"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == f"gripper-force {gf.__version__}"
