@@ -121,7 +121,7 @@ def profile_of(kind: str, number: int, out: Path) -> str:
 def errors_table(rows: list[dict[str, Any]]) -> None:
     """Prints errors and intervals by number of touches."""
     print(
-        "| touches | MAE N before | after | ratio | in 90 % interval | half-width at 5 N | over OOD limit | refused |"
+        "| touches | MAE N before | after | ratio | in 90 % interval | half-width at 5 N | rejected | refused |"
     )
     print("|---|---|---|---|---|---|---|---|")
     for count in COUNTS:

@@ -65,10 +65,10 @@ VARIANTS: dict[str, dict[str, Any]] = {
 DEFAULT = "deeper: ResNet-18"
 RIDGE = "ridge regression"
 PROCESSES = {"Gaussian process, difference": False, "Gaussian process, magnitude": True}
-"""Gaussian processes on single frames, and True for those on magnitudes. They fit in a second, not minutes."""
+"""Gaussian processes on single frames, and True for those on magnitudes. They fit within a second."""
 
 COMPONENTS, LENGTH, LINEAR, NOISE = 60, 4.0, 0.3, 0.1
-"""Number of principal components, length scale in standard deviations of the first one, linear part, noise."""
+"""Principal components, length scale in standard deviations of the first one, linear part, noise."""
 
 COLUMNS = {
     "mae_n": "MAE N",
@@ -125,7 +125,7 @@ def _rows(result: Evaluation) -> list[dict[str, Any]]:
 
 
 def gaussian_process(training: list[Clip], test: list[Clip], preprocess: Preprocess) -> list[np.ndarray]:
-    """Returns Gaussian process forces from principal components of 32x32 images, squared exponential kernel."""
+    """Returns the forces of a Gaussian process on principal components of 32x32 images (RBF kernel)."""
 
     def images_of(clip: Clip) -> np.ndarray:
         frames = torch.from_numpy(clip.frames)[None]

@@ -55,7 +55,7 @@ def main() -> None:
         mean = sum(errors) / len(errors)
         half = sorted(widths[name])[len(errors) // 2]
         print(
-            f"{name}: {inside} of {len(errors)} contained, mean error {mean:+.2f} half intervals of {half:.3g}"
+            f"{name}: {inside} of {len(errors)} inside, mean error {mean:+.2f} half intervals of {half:.3g}"
         )
 
 

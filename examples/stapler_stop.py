@@ -3,8 +3,8 @@
     gripper-force simulate --out data/test --presses 48 --grasps 0 --first-seed 900000
     python examples/stapler_stop.py data/test
 
-Prints the travel of the jaws per newton by force, from the logs, and in the same bins the error of the network
-and of the best constant prediction per bin. Where the jaws no longer move, a camera sees no change.
+Prints the travel of the jaws per newton by force, from the logs, and in the same bins the error of the
+network and of the best constant prediction per bin. Where the jaws no longer move, a camera sees no change.
 """
 
 import argparse
