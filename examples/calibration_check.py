@@ -120,9 +120,7 @@ def profile_of(kind: str, number: int, out: Path) -> str:
 
 def errors_table(rows: list[dict[str, Any]]) -> None:
     """Prints errors and intervals by number of touches."""
-    print(
-        "| touches | MAE N before | after | ratio | in 90 % interval | half-width at 5 N | rejected | refused |"
-    )
+    print("| touches | MAE N before | after | ratio | in 90 % interval | half-width | rejected | refused |")
     print("|---|---|---|---|---|---|---|---|")
     for count in COUNTS:
         part = [row for row in rows if row["touches"] == count]

@@ -72,15 +72,15 @@ def test_too_much_force_reverses_the_motor_force_within_friction(loop, transmiss
 
 @pytest.mark.parametrize("feedback", ["fused", "current", "vision"])
 @settings(deadline=None, max_examples=30)
-@given(lies=st.lists(st.floats(-100, 100), min_size=5, max_size=5), target_n=st.floats(0.1, 12))
+@given(forces_n=st.lists(st.floats(-100, 100), min_size=5, max_size=5), target_n=st.floats(0.1, 12))
 def test_no_estimate_drives_the_motor_force_out_of_its_plausible_range(
-    transmission, feedback, lies, target_n
+    transmission, feedback, forces_n, target_n
 ):
     loop = ForceLoop(ControlConfig(feedback=feedback), transmission)
     loop.start(0.0, target_n)
-    for lie_n in lies:
+    for force_n in forces_n:
         for _ in range(200):
-            motor_force_n = loop.step(0.05, target_n, estimate(lie_n, bias_n=lie_n))
+            motor_force_n = loop.step(0.05, target_n, estimate(force_n, bias_n=lie_n))
             room_n = 3 * transmission.bias_std_n(loop.reference_n) + transmission.friction_n
             assert abs(motor_force_n - loop.reference_n) <= room_n * (1 + 1e-9)
     # No wind-up: a second of the opposite error takes effect at once.
