@@ -80,9 +80,9 @@ def test_no_estimate_drives_the_motor_force_out_of_its_plausible_range(
     loop.start(0.0, target_n)
     for force_n in forces_n:
         for _ in range(200):
-            motor_force_n = loop.step(0.05, target_n, estimate(force_n, bias_n=lie_n))
-            room_n = 3 * transmission.bias_std_n(loop.reference_n) + transmission.friction_n
-            assert abs(motor_force_n - loop.reference_n) <= room_n * (1 + 1e-9)
+            motor_force_n = loop.step(0.05, target_n, estimate(force_n, bias_n=force_n))
+            margin_n = 3 * transmission.bias_std_n(loop.reference_n) + transmission.friction_n
+            assert abs(motor_force_n - loop.reference_n) <= margin_n * (1 + 1e-9)
     # No wind-up: a second of the opposite error takes effect at once.
     assert loop.step(0.05, target_n, estimate(100.0)) < motor_force_n + 1e-9
 
