@@ -1,13 +1,13 @@
-"""What calibrating on an object brings, on simulated objects that training never saw.
+"""Benefit of object calibration, measured on simulated objects that are not in the training data.
 
-The objects differ from training's in stiffness (up to a half, training 5 %), size (up to 10 %, training 4 %)
-and texture, and a fifth one, a ball, is of another kind. Each lies on one rig, is touched again and again and
-put down anew each time. The last touches are for test alone.
+The objects differ from those in training in stiffness (up to 50 %, training 5 %), size (up to 10 %, training
+4 %) and texture; a fifth one, a ball, is of another kind. Each object is touched many times on one rig, and
+put down anew each time. The last touches are used for testing only.
 
-    python examples/calibration_check.py                # error and interval against the number of touches
+    python examples/calibration_check.py                # error and interval by number of touches
     python examples/calibration_check.py --grasps 40    # grasps with a profile of 8 touches, and without
 
-What is there in OUT is not made again.
+Results that exist in OUT are reused.
 """
 
 import argparse
@@ -41,16 +41,23 @@ TARGETS_N = (1.0, 8.0)
 
 
 def configure(kind: str, number: int, out: Path, *more: str) -> Config:
-    """The rig with one of the objects on it."""
-    which = 970_000 + number
-    keys = [f"object={kind}", "sim.stiffness_spread=0.5", "sim.size_spread=0.1", f"seed={100 * which}"]
+    """Returns the configuration of a rig with one of the objects."""
+    object_seed = 970_000 + number
+    keys = [f"object={kind}", "sim.stiffness_spread=0.5", "sim.size_spread=0.1", f"seed={100 * object_seed}"]
     return load_config(
-        None, [*keys, f"sim.object_seed={which}", f"sim.rig_seed={which}", f"log.directory={out}", *more]
+        None,
+        [
+            *keys,
+            f"sim.object_seed={object_seed}",
+            f"sim.rig_seed={object_seed}",
+            f"log.directory={out}",
+            *more,
+        ],
     )
 
 
 def errors(kind: str, number: int, out: Path) -> list[dict[str, Any]]:
-    """Touches an object, and calibrates on ever more touches. A row for each draw."""
+    """Touches an object and calibrates on increasing numbers of touches. Returns a row for each draw."""
     kept = out / f"{kind}-{number}.json"
     if kept.exists():
         rows: list[dict[str, Any]] = json.loads(kept.read_text())
@@ -68,7 +75,7 @@ def errors(kind: str, number: int, out: Path) -> list[dict[str, Any]]:
             row: dict[str, Any] = {"object": kind, "touches": count, "before_n": before_n}
             try:
                 fitted = fit_correction(touches.only([int(n) for n in drawn]))
-            except DataError:  # a light touch may tell nothing: the network then stays as it is
+            except DataError:  # a light touch may be unusable: the network stays uncorrected
                 rows.append({**row, "after_n": before_n, "refused": 1.0})
                 continue
             after_n = fitted.predict(test)
@@ -90,7 +97,7 @@ def errors(kind: str, number: int, out: Path) -> list[dict[str, Any]]:
 def one_grasp(
     kind: str, number: int, trial: int, target_n: float, profile: str, feedback: str, out: Path
 ) -> Any:
-    """One grasp, with a profile of the object or with none."""
+    """Runs one grasp with a profile of the object, or without one, and returns its summary."""
     kept = out / f"grasp-{kind}-{number}-{trial}-{'profile' if profile else 'none'}-{feedback}.json"
     if not kept.exists():
         known = [f"calibration.object={profile}"] if profile else []
@@ -102,7 +109,7 @@ def one_grasp(
 
 
 def profile_of(kind: str, number: int, out: Path) -> str:
-    """A profile of the object's first touches."""
+    """Makes a profile of the first touches of an object, and returns its path."""
     path = out / f"{kind}-{number}.yaml"
     if not path.exists():
         config = configure(kind, number, out)
@@ -111,10 +118,8 @@ def profile_of(kind: str, number: int, out: Path) -> str:
 
 
 def errors_table(rows: list[dict[str, Any]]) -> None:
-    """Prints what the touches bring."""
-    print(
-        "| touches | MAE N before | after | ratio | in 90 % interval | half-width at 5 N | gated | refused |"
-    )
+    """Prints errors and intervals by number of touches."""
+    print("| touches | MAE N before | after | ratio | in 90 % interval | half-width | rejected | refused |")
     print("|---|---|---|---|---|---|---|---|")
     for count in COUNTS:
         part = [row for row in rows if row["touches"] == count]
@@ -140,7 +145,7 @@ def errors_table(rows: list[dict[str, Any]]) -> None:
 
 
 def grasps_table(results: dict[tuple[str, str], list[dict[str, Any]]]) -> None:
-    """Prints what grasps get out of it."""
+    """Prints the results of the grasps."""
     print(
         "| feedback | profile | median error | within 8 % or 0.25 N | MAE of estimate | held | over limit |"
     )
@@ -164,7 +169,7 @@ def main() -> None:
     """Prints the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--each", type=int, default=3, help="objects of each kind")
-    parser.add_argument("--grasps", type=int, default=0, help="so many grasps with and without a profile")
+    parser.add_argument("--grasps", type=int, default=0, help="number of grasps with and without a profile")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--out", type=Path, default=Path("data/calibration"))
     options = parser.parse_args()

@@ -1,7 +1,7 @@
-"""What else tells the force in the protocol's sets? Errors of regressors that see less than a film.
+"""Force error of regressors with less input than an image sequence, on the sets of the paper's protocol.
 
-Each is fitted in closed form on train/ (ridge regression on random Fourier features) and judged on test/,
-with the penalty that does best there: what is printed is the least error that it can come to.
+Each is fitted in closed form on train/ (ridge regression on random Fourier features) and evaluated on test/,
+with the penalty that is best there: the printed error is a lower bound.
 
     gripper-force simulate --protocol shin2019 --scale small --out data/paper
     python examples/protocol_check.py data/paper
@@ -27,7 +27,7 @@ Pixels = npt.NDArray[np.float32]
 SIZE: Final = 32
 COMPONENTS: Final = 40
 HISTORY_S: Final = np.arange(20) / 149.0
-"""The paper's window."""
+"""Times of the paper's window of 20 frames."""
 
 SET_FRAMES: Final = 500
 ROWS: Final = 20_000
@@ -41,9 +41,9 @@ class Samples:
 
     Attributes:
         force_n: Load-cell force, (N,).
-        position_rad: Position of the servo in the last 20 frames, newest first, (N, 20).
-        image: Frames of 32x32 pixels over 255, (N, 1024).
-        change: The same less each log's first frame.
+        position_rad: Servo position at the last 20 frames, newest first, (N, 20).
+        image: Frames of 32x32 pixels, divided by 255, (N, 1024).
+        change: The same minus the first frame of each log.
         environment: Object and angle, (N,).
     """
 
@@ -55,10 +55,10 @@ class Samples:
 
 
 def load(folder: Path) -> Samples:
-    """Reads all logs of a folder, and keeps an equal share of the frames of each."""
+    """Reads all logs of a folder and keeps an equal share of the frames of each."""
     paths = sorted(folder.glob("*.mcap"))
     if not paths:
-        sys.exit(f"{folder} holds no logs; make them with gripper-force simulate --protocol shin2019")
+        sys.exit(f"{folder} contains no logs; make them with gripper-force simulate --protocol shin2019")
     step = -(-len(paths) * SET_FRAMES // ROWS)
     logs = [_read(path, step) for path in paths]
     columns = [field.name for field in fields(Samples)]
@@ -85,13 +85,13 @@ def _read(path: Path, step: int) -> Samples:
 
 
 def regress(x: Array, y: Array, x_test: Array, y_test: Array) -> Array:
-    """Ridge regression on random Fourier features of the standardised inputs, and on these themselves.
+    """Returns predictions of ridge regression on the standardised inputs and their random Fourier features.
 
-    Of the answers for several penalties the one that is nearest to ``y_test``.
+    Of several penalties, the one with the smallest error on ``y_test`` is used.
     """
     mean, scale = x.mean(0), x.std(0) + 1e-9
     rng = np.random.default_rng(0)
-    # Frequencies of several scales, so that none has to be chosen for each input.
+    # Frequencies of several scales, so that no scale has to be chosen for each input.
     spread = np.exp(rng.uniform(np.log(0.1), np.log(3.0), FEATURES)) / np.sqrt(x.shape[1])
     weights = rng.standard_normal((x.shape[1], FEATURES)) * spread
     phases = rng.uniform(0, 2 * np.pi, FEATURES)
@@ -102,15 +102,15 @@ def regress(x: Array, y: Array, x_test: Array, y_test: Array) -> Array:
 
     f = features(x)
     normal, right, f_test = f.T @ f / len(f), f.T @ y / len(f), features(x_test)
-    answers: list[Array] = [
+    predictions: list[Array] = [
         f_test @ np.linalg.solve(normal + penalty * np.eye(len(normal)), right) for penalty in PENALTIES
     ]
-    errors = [float(np.abs(answer - y_test).mean()) for answer in answers]
-    return answers[int(np.argmin(errors))]
+    errors = [float(np.abs(prediction - y_test).mean()) for prediction in predictions]
+    return predictions[int(np.argmin(errors))]
 
 
 def components(images: Pixels) -> tuple[Array, Array]:
-    """Middle and principal axes of images, (1024,) and (1024, 40)."""
+    """Returns mean and principal axes of images, (1024,) and (1024, 40)."""
     centre: Array = images.mean(0, dtype=np.float64)
     axes: Array = np.linalg.eigh(np.cov(images, rowvar=False))[1]
     return centre, axes[:, -COMPONENTS:]
@@ -130,19 +130,19 @@ def main() -> None:
     def brightness(samples: Samples) -> Array:
         return np.asarray(samples.image.mean(1), np.float64)[:, None]
 
-    def unknown(see: Callable[[Samples], Array]) -> Array:
-        return regress(see(train), train.force_n, see(test), test.force_n)
+    def across_environments(inputs_of: Callable[[Samples], Array]) -> Array:
+        return regress(inputs_of(train), train.force_n, inputs_of(test), test.force_n)
 
-    def known(see: Callable[[Samples], Array]) -> Array:
-        answer: Array = np.empty_like(test.force_n)
+    def per_environment(inputs_of: Callable[[Samples], Array]) -> Array:
+        prediction: Array = np.empty_like(test.force_n)
         for name in np.unique(test.environment):
-            fit, judge = train.environment == name, test.environment == name
-            answer[judge] = regress(
-                see(train)[fit], train.force_n[fit], see(test)[judge], test.force_n[judge]
+            fit, evaluate = train.environment == name, test.environment == name
+            prediction[evaluate] = regress(
+                inputs_of(train)[fit], train.force_n[fit], inputs_of(test)[evaluate], test.force_n[evaluate]
             )
-        return answer
+        return prediction
 
-    def seen(pixels: Callable[[Samples], Pixels]) -> Callable[[Samples], Array]:
+    def principal(pixels: Callable[[Samples], Pixels]) -> Callable[[Samples], Array]:
         centre, axes = components(pixels(train))
 
         def scores(samples: Samples) -> Array:
@@ -153,18 +153,20 @@ def main() -> None:
 
     rows = {
         "nothing: the mean of train/": np.full_like(test.force_n, train.force_n.mean()),
-        "mean brightness of the frame": unknown(brightness),
-        "servo position": unknown(position),
-        "servo position, object and angle known": known(position),
-        "servo position over 20 frames": unknown(history),
-        "servo position over 20 frames, object and angle known": known(history),
-        "one frame (40 components)": unknown(seen(lambda samples: samples.image)),
-        "one frame less the first (40 components)": unknown(seen(lambda samples: samples.change)),
+        "mean brightness of the frame": across_environments(brightness),
+        "servo position": across_environments(position),
+        "servo position, object and angle known": per_environment(position),
+        "servo position over 20 frames": across_environments(history),
+        "servo position over 20 frames, object and angle known": per_environment(history),
+        "one frame (40 components)": across_environments(principal(lambda samples: samples.image)),
+        "one frame minus the first (40 components)": across_environments(
+            principal(lambda samples: samples.change)
+        ),
     }
     contact = test.force_n > CONTACT_N
-    print("| what the regressor sees | MAE, N | MAE in contact, N |\n|---|---|---|")
-    for name, answer in rows.items():
-        error_n = np.abs(answer - test.force_n)
+    print("| input of the regressor | MAE, N | MAE in contact, N |\n|---|---|---|")
+    for name, prediction in rows.items():
+        error_n = np.abs(prediction - test.force_n)
         print(f"| {name} | {error_n.mean():.2f} | {error_n[contact].mean():.2f} |")
 
 

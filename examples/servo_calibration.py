@@ -1,8 +1,8 @@
-"""How often the intervals of `gripper-force calibrate servo` hold the truth, over simulated rigs.
+"""Coverage of the intervals of `gripper-force calibrate servo`, over simulated rigs.
 
     python examples/servo_calibration.py --seeds 100
 
-Each rig has a motor, friction and gear play of its own. 95 of 100 is what a 95 % interval promises.
+Motor, friction and gear play differ from rig to rig. A 95 % interval should contain 95 of 100 true values.
 """
 
 import argparse
@@ -17,7 +17,7 @@ from gripper_hw.sim.scene import draw_scene
 
 
 def main() -> None:
-    """Prints each rig's errors in half intervals, and the coverage of each parameter."""
+    """Prints the errors of each rig in half intervals, and the coverage of each parameter."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=100)
     parser.add_argument("--first-seed", type=int, default=0)
@@ -39,9 +39,9 @@ def main() -> None:
             "friction_n": friction_n,
             "free_friction_n": friction_n,
             "friction_share": 0.0,
-            # The rails' own viscous friction is 2 N s/m in every scene.
+            # The viscous friction of the rails is 2 N s/m in every scene.
             "damping_n_s_m": scene.servo_damping_nm_s / (2 * radius_m**2) + 2.0,
-            # Open is 0 rad; closing, the pinion leads the rack by half of the gear play.
+            # Open is 0 rad; while closing, the pinion leads the rack by half of the gear play.
             "open_position_rad": scene.backlash_m / radius_m,
         }
         line = []
@@ -55,7 +55,9 @@ def main() -> None:
         inside = sum(abs(error) <= 1 for error in errors)
         mean = sum(errors) / len(errors)
         half = sorted(widths[name])[len(errors) // 2]
-        print(f"{name}: {inside} of {len(errors)} held, mean error {mean:+.2f} half intervals of {half:.3g}")
+        print(
+            f"{name}: {inside} of {len(errors)} inside, mean error {mean:+.2f} half intervals of {half:.3g}"
+        )
 
 
 if __name__ == "__main__":

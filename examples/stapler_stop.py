@@ -1,11 +1,10 @@
-"""What a picture can tell of a stapler that is pressed against its stop, and what that costs an eye.
+"""Visual information on a stapler pressed against its stop, and the resulting error of the network.
 
     gripper-force simulate --out data/test --presses 48 --grasps 0 --first-seed 900000
     python examples/stapler_stop.py data/test
 
-How far the jaws still travel for a newton, by force, from the logs alone; and the network's error in the same
-bins, beside that of somebody who sees nothing and says one number to all frames of a bin, the best one in
-hindsight. Where the jaws don't move any more, nothing moves that a camera could see.
+Prints the travel of the jaws per newton by force, from the logs, and in the same bins the error of the
+network and of the best constant prediction per bin. Where the jaws no longer move, a camera sees no change.
 """
 
 import argparse
@@ -23,16 +22,16 @@ from gripper_force.vision.checkpoint import load_checkpoint
 
 OBJECT = "stapler"
 EDGES_N = (1.0, 4.0, 8.0, 14.0)
-"""Soft, stiffer, and past the stop."""
+"""Bins: soft, stiffer, and past the stop."""
 
 _RISE_N = 0.05
-"""What the force must rise by in 20 ms: on the way back friction holds the jaws where they were."""
+"""Least rise of the force in 20 ms. While the force falls, friction keeps the jaws in place."""
 
 Floats = npt.NDArray[np.float64]
 
 
-def travel(paths: list[Path], least_n: float, most_n: float) -> Floats:
-    """Slope of the jaws' distance over the rising force of each log that has one there, mm/N, (K,)."""
+def travel(paths: list[Path], low_n: float, high_n: float) -> Floats:
+    """Returns the slope of jaw distance over rising force within a force range, mm/N, for each log, (K,)."""
     slopes = []
     for path in paths:
         reader = LogReader(path)
@@ -40,9 +39,9 @@ def travel(paths: list[Path], least_n: float, most_n: float) -> Floats:
         cells = np.array([(c.t_ns, c.force_n) for c in reader.records(LoadCellSample) if c.valid])
         force_n = np.interp(table[:, 0], cells[:, 0], cells[:, 1])
         rising = np.concatenate([np.zeros(4), force_n[4:] - force_n[:-4]]) > _RISE_N
-        there = rising & (force_n > least_n) & (force_n < most_n)
-        if there.sum() >= 20 and np.ptp(force_n[there]) > 1:
-            slopes.append(1e3 * np.polyfit(force_n[there], table[there, 1], 1)[0])
+        in_bin = rising & (force_n > low_n) & (force_n < high_n)
+        if in_bin.sum() >= 20 and np.ptp(force_n[in_bin]) > 1:
+            slopes.append(1e3 * np.polyfit(force_n[in_bin], table[in_bin, 1], 1)[0])
     return np.array(slopes)
 
 
@@ -59,28 +58,28 @@ def main() -> None:
     paths = sorted(options.data.rglob("*.mcap"))
     clips = load_clips(paths, preprocess)
     forces_n = [members_n.mean(0) for members_n in estimates(checkpoint, clips)]
-    told = [clip.valid & (np.arange(len(clip.frames)) >= preprocess.lead_in) for clip in clips]
-    measured_n = np.concatenate([clip.forces_n[t] for clip, t in zip(clips, told, strict=True)])
-    error_n = np.abs(np.concatenate([f[t] for f, t in zip(forces_n, told, strict=True)]) - measured_n)
-    its_own = np.concatenate(
-        [np.full(t.sum(), clip.object == OBJECT) for clip, t in zip(clips, told, strict=True)]
+    used = [clip.valid & (np.arange(len(clip.frames)) >= preprocess.lead_in) for clip in clips]
+    measured_n = np.concatenate([clip.forces_n[t] for clip, t in zip(clips, used, strict=True)])
+    error_n = np.abs(np.concatenate([f[t] for f, t in zip(forces_n, used, strict=True)]) - measured_n)
+    is_stapler = np.concatenate(
+        [np.full(t.sum(), clip.object == OBJECT) for clip, t in zip(clips, used, strict=True)]
     )
 
     pressed = [path for path, clip in zip(paths, clips, strict=True) if clip.object == OBJECT]
-    print(f"| {OBJECT}, N | travel mm/N | frames | network MAE N | one number for all, MAE N |")
+    print(f"| {OBJECT}, N | travel mm/N | frames | network MAE N | best constant, MAE N |")
     print("|---|---|---|---|---|")
     for low, high in pairwise(EDGES_N):
-        there = its_own & (measured_n >= low) & (measured_n < high)
-        blind_n = np.abs(measured_n[there] - np.median(measured_n[there])).mean()
+        in_bin = is_stapler & (measured_n >= low) & (measured_n < high)
+        constant_n = np.abs(measured_n[in_bin] - np.median(measured_n[in_bin])).mean()
         slope = np.median(travel(pressed, low, high))
-        figures = f"{there.sum()} | {error_n[there].mean():.2f} | {blind_n:.2f}"
+        figures = f"{in_bin.sum()} | {error_n[in_bin].mean():.2f} | {constant_n:.2f}"
         print(f"| {low:g} to {high:g} | {slope:.2f} | {figures} |")
-    past = its_own & (measured_n >= EDGES_N[-2])
+    past = is_stapler & (measured_n >= EDGES_N[-2])
     rest_n = error_n[~past]
-    known_n = (rest_n.sum() + past.sum() * blind_n) / len(error_n)
+    replaced_n = (rest_n.sum() + past.sum() * constant_n) / len(error_n)
     print(
         f"\nMAE over all frames {error_n.mean():.3f} N; over all but the {OBJECT}'s from {EDGES_N[-2]:g} N "
-        f"on {rest_n.mean():.3f} N; with the one number there {known_n:.3f} N"
+        f"on {rest_n.mean():.3f} N; with the best constant there {replaced_n:.3f} N"
     )
 
 

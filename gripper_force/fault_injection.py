@@ -1,4 +1,4 @@
-"""Faults on purpose: which is on when, and the two that the core itself suffers, estimator and disk.
+"""Fault injection: schedule of the faults, and faults of estimator and disk.
 
 `gripper_force.fault_config.FAULTS` lists the kinds of each unit; the simulated devices carry out the others.
 """
@@ -13,15 +13,18 @@ from gripper_force.fault_config import FaultConfig
 from gripper_force.interfaces import Clock
 from gripper_force.types import NS_PER_MS, NS_PER_S, ForceEstimate, Gray
 
-_SEEN_SHARE = 2 / 3
+_WRONG_GAIN = 2 / 3
+"""Gain of a wrong estimator."""
+
 _SLOW_WRITE_NS = 50 * NS_PER_MS
+"""Time of each write to a slow disk."""
 
 
 class Faults:
-    """The faults of one run over time.
+    """Schedule of the faults of one run.
 
     Attributes:
-        start_ns: The run's start on the run's clock.
+        start_ns: Start of the run on its clock.
     """
 
     def __init__(self, faults: Sequence[FaultConfig] = (), start_ns: int = 0) -> None:
@@ -32,24 +35,24 @@ class Faults:
         ]
 
     def has(self, unit: str) -> bool:
-        """Whether the unit ever has a fault."""
+        """Returns True if the unit has a fault at any time."""
         return any(fault.unit == unit for fault, _, _ in self._faults)
 
     def active(self, unit: str, t_ns: int) -> str:
-        """The kind of the unit's fault at a time, ``ok`` where it has none. The one listed last counts."""
+        """Returns the kind of the unit's fault at a time, or ``ok``. The last one listed has priority."""
         for fault, begin_ns, end_ns in reversed(self._faults):
             if fault.unit == unit and begin_ns <= t_ns < end_ns:
                 return fault.kind
         return "ok"
 
     def end_ns(self, unit: str, t_ns: int) -> int:
-        """When the fault that the unit has at a time ends; that time where it has none."""
+        """Returns the end of the fault that the unit has at a time, or that time if it has none."""
         ends = (end for fault, begin, end in self._faults if fault.unit == unit and begin <= t_ns < end)
         return max(ends, default=t_ns)
 
 
 class FaultyEstimator:
-    """An estimator that fails as configured."""
+    """Wrapper that makes an estimator fail as configured."""
 
     def __init__(self, estimator: Any, faults: Faults, clock: Clock, *, lockstep: bool) -> None:
         self._estimator, self._faults, self._clock, self._lockstep = estimator, faults, clock, lockstep
@@ -57,48 +60,48 @@ class FaultyEstimator:
 
     @property
     def reference(self) -> Gray | None:
-        """The no-contact picture of the estimator within."""
+        """Reference frame of the wrapped estimator."""
         reference: Gray | None = self._estimator.reference
         return reference
 
     def update(self, gray: Gray) -> ForceEstimate | None:
-        """Takes the next frame, and gives what is left of the estimate."""
+        """Passes the next frame to the estimator and returns its estimate with the active fault applied."""
         now_ns = self._clock.now_ns()
         kind = self._faults.active("estimator", now_ns)
         self._calls += 1
         if kind == "off" or (kind == "intermittent" and self._calls % 2):
-            raise RuntimeError("the estimator fails, as configured")
+            raise RuntimeError("injected fault: the estimator fails")
         if kind == "stuck":
-            if not self._lockstep:  # there time would stand still with it
+            if not self._lockstep:  # lockstep time would not advance
                 self._clock.sleep_until_ns(self._faults.end_ns("estimator", now_ns))
             return None
         estimate: ForceEstimate | None = self._estimator.update(gray)
         if estimate is None or kind == "ok":
             return estimate
-        force_n = _SEEN_SHARE * estimate.force_n
+        force_n = _WRONG_GAIN * estimate.force_n
         if kind == "garbage":
             force_n = (math.nan, math.inf, -math.inf)[self._calls % 3]
         return ForceEstimate(force_n, estimate.std_n)
 
 
 class FaultyFile:
-    """A log's file on a disk that fails as configured."""
+    """Wrapper of a log file that fails as configured."""
 
     def __init__(self, file: BinaryIO, faults: Faults, clock: Clock, *, lockstep: bool) -> None:
         self._file, self._faults, self._clock, self._lockstep = file, faults, clock, lockstep
         self._writes = 0
 
     def write(self, data: bytes) -> int:
-        """Writes, or fails."""
+        """Writes the data or fails."""
         now_ns = self._clock.now_ns()
         kind = self._faults.active("disk", now_ns)
         self._writes += 1
         if kind == "off":
-            self._file.write(data[: len(data) // 2])  # a full disk takes what still fits
+            self._file.write(data[: len(data) // 2])  # a full disk writes what still fits
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         if kind == "intermittent" and self._writes % 2:
             raise OSError(errno.EIO, os.strerror(errno.EIO))
-        if kind == "slow" and not self._lockstep:  # there a write takes no time
+        if kind == "slow" and not self._lockstep:  # in lockstep a write takes no time
             self._clock.sleep_until_ns(now_ns + _SLOW_WRITE_NS)
         return self._file.write(data)
 
@@ -107,5 +110,5 @@ class FaultyFile:
 
 
 def _ns(seconds: float) -> int:
-    """Nanoseconds; a time beyond all runs for infinity."""
+    """Returns nanoseconds; infinity becomes a time beyond the end of any run."""
     return round(min(seconds, 1e9) * NS_PER_S)

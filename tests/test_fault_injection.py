@@ -44,7 +44,7 @@ def faults(unit: str, kind: str, at_s: float = 1.0, for_s: float = 1.0) -> Fault
 
 @pytest.mark.parametrize("unit", FAULTS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_pairs_that_are_not_supported_are_refused(unit: str, kind: str) -> None:
+def test_unsupported_pairs_are_refused(unit: str, kind: str) -> None:
     tree = {"faults": [{"unit": unit, "kind": kind}]}
     if kind in FAULTS[unit]:
         assert config_from(tree, "test").faults[0].kind == kind
@@ -71,7 +71,7 @@ def test_faults_are_off_by_default() -> None:
 
 
 @given(st.floats(0, 100), st.floats(0.001, 100), st.integers(0, 300_000_000_000), st.integers(0, 10**15))
-def test_a_fault_lasts_as_long_as_it_says(at_s: float, for_s: float, t_ns: int, start_ns: int) -> None:
+def test_fault_lasts_for_its_duration(at_s: float, for_s: float, t_ns: int, start_ns: int) -> None:
     active = Faults([FaultConfig(unit="bus", kind="off", at_s=at_s, for_s=for_s)], start_ns)
     expected = round(at_s * 1e9) <= t_ns < round((at_s + for_s) * 1e9)
     assert (active.active("bus", start_ns + t_ns) == "off") == expected
@@ -85,7 +85,7 @@ def test_ok_ends_a_fault() -> None:
 
 
 @pytest.mark.parametrize("kind", FAULTS["estimator"])
-def test_an_estimator_fails_as_configured(kind: str) -> None:
+def test_estimator_fails_as_configured(kind: str) -> None:
     clock = Clock()
     estimator = FaultyEstimator(Two(), faults("estimator", kind), clock, lockstep=True)
     assert estimator.update(GRAY).force_n == 2.0
@@ -114,14 +114,14 @@ def test_an_estimator_fails_as_configured(kind: str) -> None:
     assert estimator.update(GRAY).force_n == 2.0
 
 
-def test_in_real_time_an_estimator_hangs() -> None:
+def test_estimator_blocks_in_real_time() -> None:
     clock = Clock(1_200_000_000)
     FaultyEstimator(Two(), faults("estimator", "stuck"), clock, lockstep=False).update(GRAY)
     assert clock.t_ns == 2_000_000_000
 
 
 @pytest.mark.parametrize("kind", FAULTS["disk"])
-def test_a_disk_fails_as_configured(kind: str) -> None:
+def test_disk_fails_as_configured(kind: str) -> None:
     clock, raw = Clock(), io.BytesIO()
     file = FaultyFile(raw, faults("disk", kind), clock, lockstep=False)
     file.write(b"before")

@@ -34,7 +34,7 @@ LATENCY_S = (0.027, 0.045)
 
 
 def make_gripper(**changes: Any) -> Gripper:
-    """The plant with end stops, and an object that leaves the jaws room."""
+    """The plant with end stops, and an object that the jaws reach after some travel."""
     return Gripper(TRANSMISSION, **{"contact_m": 0.016, "stops_m": (0.0, 0.045), **changes})
 
 
@@ -44,7 +44,7 @@ def make_vision(noise_n: float = 0.1, **changes: float) -> SimulatedVision:
 
 @dataclass
 class Run:
-    """A closed loop and all that went in and out of it."""
+    """A closed loop with all its inputs and outputs."""
 
     config: ControlConfig
     plant: Gripper

@@ -31,7 +31,7 @@ def test_margins_are_those_of_the_rule(loop):
     assert loop.margins["hold"].gains.proportional == 0
 
 
-def test_vision_alone_is_never_faster_than_for_a_plant_nobody_knows(transmission):
+def test_vision_alone_is_never_faster_than_for_the_nominal_plant(transmission):
     def gains(**plant):
         return ForceLoop(ControlConfig(feedback="vision", **plant), transmission).margins["vision"].gains
 
@@ -42,11 +42,11 @@ def test_vision_alone_is_never_faster_than_for_a_plant_nobody_knows(transmission
     assert gains(plant_gain=2.0).integral_s == cautious.integral_s / 2
 
 
-def test_the_ramp_takes_the_bias_off(loop, transmission):
+def test_ramp_subtracts_the_bias(loop, transmission):
     assert ramp(loop, 4.0, bias_n=0.3) == pytest.approx(4.0 + transmission.friction_n - 0.3)
 
 
-def test_hold_leaves_a_small_error_alone(loop):
+def test_hold_ignores_a_small_error(loop):
     motor_force_n = ramp(loop, 4.0)
     for error_n in (0.2, -0.4):
         for _ in range(50):
@@ -54,7 +54,7 @@ def test_hold_leaves_a_small_error_alone(loop):
         assert held_n == pytest.approx(motor_force_n)
 
 
-def test_hold_integrates_what_is_missing(loop):
+def test_hold_integrates_a_missing_force(loop):
     motor_force_n = ramp(loop, 4.0)
     for _ in range(100):
         raised_n = loop.step(0.005, 4.0, estimate(3.8))
@@ -62,7 +62,7 @@ def test_hold_integrates_what_is_missing(loop):
     assert raised_n - motor_force_n == pytest.approx(0.5 * 0.2 * gain)
 
 
-def test_too_much_turns_the_push_back_into_the_play(loop, transmission):
+def test_too_much_force_reverses_the_motor_force_within_friction(loop, transmission):
     motor_force_n = ramp(loop, 4.0)
     turned_n = loop.step(0.005, 4.0, estimate(4.1))
     assert turned_n == pytest.approx(motor_force_n - 0.75 * transmission.friction_n, abs=0.01)
@@ -72,20 +72,22 @@ def test_too_much_turns_the_push_back_into_the_play(loop, transmission):
 
 @pytest.mark.parametrize("feedback", ["fused", "current", "vision"])
 @settings(deadline=None, max_examples=30)
-@given(lies=st.lists(st.floats(-100, 100), min_size=5, max_size=5), target_n=st.floats(0.1, 12))
-def test_no_estimate_drives_the_push_beyond_what_is_plausible(transmission, feedback, lies, target_n):
+@given(forces_n=st.lists(st.floats(-100, 100), min_size=5, max_size=5), target_n=st.floats(0.1, 12))
+def test_no_estimate_drives_the_motor_force_out_of_its_plausible_range(
+    transmission, feedback, forces_n, target_n
+):
     loop = ForceLoop(ControlConfig(feedback=feedback), transmission)
     loop.start(0.0, target_n)
-    for lie_n in lies:
+    for force_n in forces_n:
         for _ in range(200):
-            motor_force_n = loop.step(0.05, target_n, estimate(lie_n, bias_n=lie_n))
-            room_n = 3 * transmission.bias_std_n(loop.reference_n) + transmission.friction_n
-            assert abs(motor_force_n - loop.reference_n) <= room_n * (1 + 1e-9)
-    # Nothing is wound up: a second of the opposite error is felt at once.
+            motor_force_n = loop.step(0.05, target_n, estimate(force_n, bias_n=force_n))
+            margin_n = 3 * transmission.bias_std_n(loop.reference_n) + transmission.friction_n
+            assert abs(motor_force_n - loop.reference_n) <= margin_n * (1 + 1e-9)
+    # No wind-up: a second of the opposite error takes effect at once.
     assert loop.step(0.05, target_n, estimate(100.0)) < motor_force_n + 1e-9
 
 
-def test_retarget_starts_where_the_ramp_is(loop, transmission):
+def test_retarget_starts_at_the_present_reference(loop, transmission):
     ramp(loop, 4.0)
     loop.retarget(2.0)
     assert loop.reference_n == 4.0

@@ -14,7 +14,7 @@ MS = 1_000_000
 
 
 class Bench:
-    """A motor that pushes with a known force, and an vision that is 40 ms late."""
+    """A motor with a known force, and vision with a delay of 40 ms."""
 
     def __init__(self, transmission, **control):
         self.transmission = transmission
@@ -63,7 +63,7 @@ def test_current_alone_subtracts_friction(bench, transmission):
     assert (estimate.source, estimate.bias_n, b.events) == ("current", 0.0, [])
 
 
-def test_friction_is_a_play(bench, transmission):
+def test_friction_acts_as_play(bench, transmission):
     b = bench(feedback="current")
     b.run(1.0, lambda _: 3.0 + transmission.friction_n)
     assert b.run(1.0, lambda _: 3.0 - 0.9 * transmission.friction_n).force_n == pytest.approx(3.0, abs=1e-6)
@@ -79,18 +79,18 @@ def test_vision_finds_the_bias(bench):
     assert b.events == ["vision in use; the force estimate is fused"]
 
 
-def test_latency_leaves_no_error_on_a_ramp(bench, transmission):
-    """The comparison is made at the capture time, so a ramp that vision sees late makes no bias."""
+def test_latency_causes_no_error_on_a_ramp(bench, transmission):
+    """The comparison is made at the capture time, so the delay of vision causes no bias on a ramp."""
     b = bench()
     friction_n = transmission.friction_n
     b.run(0.5, lambda _: friction_n, lambda _: 0.0)
     ramp = lambda t: max(4.0 * (t - 0.5), 0.0)  # noqa: E731
-    lag_s = 0.06  # of the plant, on both sides of the comparison
+    lag_s = 0.06  # lag of the plant, on both sides of the comparison
     estimate = b.run(1.5, lambda t: ramp(t) + friction_n, lambda t: ramp(t - lag_s))
     assert estimate.bias_n == pytest.approx(0.0, abs=0.03)
 
 
-def test_free_travel_tells_friction(bench, transmission):
+def test_free_travel_identifies_friction(bench, transmission):
     b = bench(feedback="current")
     nominal_n = transmission.friction_n
     before = b.run(0.5, lambda _: nominal_n + 0.2)
@@ -104,22 +104,22 @@ def test_free_travel_tells_friction(bench, transmission):
     assert b.run(0.005, lambda _: nominal_n + 3.2).friction_n == nominal_n
 
 
-def test_jaws_that_open_are_believed_to_the_eye(bench, transmission):
+def test_vision_is_followed_while_the_jaws_open(bench, transmission):
     friction_n = transmission.friction_n
     estimates = []
     for opening in (False, True):
         b = bench()
         b.run(1.0, lambda _: 3.0 + friction_n, lambda _: 3.0)
-        # Within the play, the current says that nothing has changed.
+        # Within the friction play, the current estimate does not change.
         estimates.append(b.run(0.3, lambda _: 3.0 - 0.5 * friction_n, lambda _: 2.2, opening=opening).force_n)
     assert estimates[1] == pytest.approx(2.2, abs=0.1)
     assert estimates[0] > estimates[1]
 
 
 @given(st.lists(st.floats(-50, 50), min_size=1, max_size=30))
-def test_whatever_the_push_friction_is_never_negative(transmission, pushes_n):
+def test_friction_is_never_negative_for_any_motor_force(transmission, motor_forces_n):
     b = Bench(transmission, feedback="current")
-    for motor_force_n in pushes_n:
+    for motor_force_n in motor_forces_n:
         assert b.run(0.005, lambda _, n=motor_force_n: n, free=True).friction_n >= 0
 
 
@@ -135,7 +135,7 @@ def test_whatever_the_push_friction_is_never_negative(transmission, pushes_n):
         (9.0, 0.1, 40, "differs from the motor current by"),
     ],
 )
-def test_bad_vision_drops_out_and_is_named(bench, seen_n, std_n, latency_ms, reason):
+def test_bad_vision_drops_out_with_its_reason(bench, seen_n, std_n, latency_ms, reason):
     b = bench(vision_age_ms=60.0)
     b.run(1.0, lambda _: 4.0, lambda _: 3.2)
     before = b.estimate
@@ -156,7 +156,7 @@ def test_not_finite_drops_out_in_the_same_cycle(bench):
     assert b.run(0.005, lambda _: 4.0, lambda _: math.nan).source == "current"
 
 
-def test_silence_widens(bench):
+def test_std_grows_without_vision(bench):
     b = bench()
     sharp = b.run(1.0, lambda _: 4.0, lambda _: 3.2).std_n
     wide = b.run(5.0, lambda _: 4.0)
@@ -165,7 +165,7 @@ def test_silence_widens(bench):
     assert "no new estimate" in b.events[-1]
 
 
-def test_a_jump_is_gated_until_it_lasts(bench):
+def test_jump_is_gated_until_it_persists(bench):
     b = bench()
     b.run(2.0, lambda _: 4.0, lambda _: 3.2)
     assert b.run(0.2, lambda _: 4.0, lambda _: 2.6).bias_n == pytest.approx(3.2 - 3.05, abs=0.05)
@@ -173,7 +173,7 @@ def test_a_jump_is_gated_until_it_lasts(bench):
     assert b.run(1.0, lambda _: 4.0, lambda _: 2.6).force_n == pytest.approx(2.6, abs=0.05)
 
 
-def test_jumps_to_both_sides_never_get_in(bench):
+def test_jumps_to_both_sides_are_always_rejected(bench):
     b = bench()
     b.run(2.0, lambda _: 4.0, lambda _: 3.05)
     estimate = b.run(2.0, lambda _: 4.0, lambda t: 3.05 + (0.6 if round(t * 1000) // 15 % 2 else -0.6))
@@ -189,7 +189,7 @@ def test_vision_alone_is_the_newest_estimate(bench):
     assert b.run(0.1, lambda _: 4.0).force_n == pytest.approx(3.07, abs=0.05)
 
 
-def test_the_same_estimate_counts_once(transmission):
+def test_repeated_estimate_is_used_once(transmission):
     fusion = Fusion(ControlConfig(), transmission)
     visual = VisualForce(0, 0, 0, 0.3, 0.1, 1.0)
     for i in range(5):
@@ -204,7 +204,7 @@ def test_a_gripper_without_friction(transmission):
     assert b.run(1.0, lambda _: 2.0).force_n == pytest.approx(2.0, abs=1e-6)
 
 
-def test_an_estimate_from_before_the_first_reading_meets_the_oldest_current(transmission):
+def test_estimate_before_the_first_reading_is_compared_with_the_oldest_current(transmission):
     fusion = Fusion(ControlConfig(), transmission)
     servo = ServoState(50 * MS, 0.0, 0.0, transmission.current_a(1.0), 30.0, 12.0, 0)
     estimate, _ = fusion.step(50 * MS, servo, VisualForce(10 * MS, 50 * MS, 0, 0.3, 0.1, 1.0))
@@ -212,8 +212,8 @@ def test_an_estimate_from_before_the_first_reading_meets_the_oldest_current(tran
     assert 0.0 < estimate.bias_n < 0.3 - estimate.current_n
 
 
-def test_a_rig_that_is_hardly_known_leaves_vision_its_own_error(transmission):
-    """One less a gain close to one has no digits left."""
+def test_vision_keeps_its_error_on_a_rig_with_a_wide_prior(transmission):
+    """`1 - gain` cancels for a gain close to one."""
     loose = Bench(replace(transmission, friction_std=1e9))
     known = Bench(replace(transmission, friction_std=1e2))
     ends = [b.run(1.0, lambda _: 4.0, lambda _: 3.4) for b in (loose, known)]

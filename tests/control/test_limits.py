@@ -95,13 +95,13 @@ def test_over_force_halves_within_five_cycles():
 
 @settings(deadline=None)
 @given(st.floats(0.9, 1.1), st.floats(0.5, 1.5), st.floats(2.0, 60.0))
-def test_the_ceiling_keeps_the_limit_whatever_the_torque_constant_is(gain, friction_n, limit_n):
+def test_ceiling_keeps_the_force_limit_for_any_torque_constant(gain, friction_n, limit_n):
     config = ControlConfig(force_limit_n=limit_n)
     ceiling_a = Limits(config, FINE, 99.0).ceiling_a(friction_n)
     assert gain * FINE.force_n(ceiling_a) - friction_n <= 1.05 * limit_n + 0.1 * friction_n
 
 
-def test_a_current_that_was_too_much_is_not_reached_again():
+def test_current_that_caused_an_over_force_is_not_reached_again():
     limits = Limits(CONFIG, FINE, 1.0)
     wanted = ServoCommand(0, 0.0, 0.2)
 
@@ -118,7 +118,7 @@ def test_a_current_that_was_too_much_is_not_reached_again():
     assert run(5.0)[-1] == pytest.approx(0.2)
 
 
-def test_a_force_that_friction_holds_up_is_not_eased_until_the_object_drops():
+def test_force_kept_up_by_friction_does_not_lower_the_current_further():
     limits = Limits(CONFIG, FINE, 1.0)
     for _ in range(100):
         limits.apply(ServoCommand(0, 0.0, 0.2), 5.0, 0.95, 6.0, 0.005, may_rise=True)

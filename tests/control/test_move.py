@@ -66,7 +66,7 @@ def test_speed_and_lead_are_bounded_and_the_width_is_reached(
     for _ in range(1200):
         run.go(0.005)
         speeds_m_s.append(abs(run.plant.v_m_s))
-    # The servo's position loop passes the speed of its goal by no more than this while it settles.
+    # The servo's position loop overshoots the speed of its goal by no more than this while settling.
     assert max(speeds_m_s) <= 1.2 * speed_m_s + 0.001
     assert run.last.status.width_m == pytest.approx(width_m, abs=0.0005)
     assert not any("obstacle" in reason for reason in run.reasons)
@@ -200,7 +200,7 @@ def test_newer_move_pre_empts_an_older_one(make_run):
     assert sum(reason.startswith("moved") for reason in run.reasons) == 1
 
 
-def test_late_cycles_do_not_make_the_goal_leap(make_run):
+def test_late_cycle_does_not_make_the_goal_jump(make_run):
     run = make_run(plant=FAR).move(0.03, 0.5)
     before_m = run.transmission.width_m(run.last.command.goal_position_rad)
     run.t_ns += 2_000_000_000

@@ -47,24 +47,24 @@ def tripped_by(change):
 
 
 @pytest.mark.parametrize(("change", "reason"), ILL.values(), ids=ILL)
-def test_what_forbids_to_go_on_trips_it_at_once(change, reason):
+def test_bad_readings_trip_at_once(change, reason):
     assert reason in tripped_by(change).reason
 
 
 @pytest.mark.parametrize(("change", "reason"), ILL.values(), ids=ILL)
-def test_it_is_latched_and_opens_only_once_the_cause_is_gone(change, reason):
+def test_latch_clears_only_once_the_cause_is_gone(change, reason):
     safety = tripped_by(change)
     assert reason in safety.reset()
     assert reason in safety.reason
     healed = replace(WELL, position_rad=change.get("position_rad", WELL.position_rad))
     healed = healed if is_sound(healed) else WELL
     assert not check(safety, healed)
-    assert reason in safety.reason  # still: nobody has asked
+    assert reason in safety.reason  # kept until a reset
     assert safety.reset() == ""
     assert safety.reason == ""
 
 
-def test_the_first_reason_stays():
+def test_first_reason_is_kept():
     safety = Safety(CONFIG)
     assert safety.trip("stop requested")
     assert not safety.trip("something else")
@@ -72,25 +72,25 @@ def test_the_first_reason_stays():
     assert safety.reason == "stop requested"
 
 
-def test_without_limits_any_voltage_will_do():
+def test_any_voltage_is_allowed_without_limits():
     assert not check(Safety(ControlConfig()), replace(WELL, voltage_v=3.0))
 
 
-def test_a_fast_horn_does_not_leap():
+def test_fast_rotation_is_no_jump():
     safety = Safety(CONFIG)
     for i in range(20):
         moved = replace(WELL, t_ns=i * 5_000_000, position_rad=0.3 + i * 0.005 * 11)
         assert not check(safety, moved)
 
 
-def test_a_force_that_stays_over_its_limit_trips_it():
+def test_force_that_stays_over_its_limit_trips():
     safety = Safety(CONFIG)
     assert not any(check(safety, WELL, over_force=i % 40 != 0) for i in range(400))
     assert any(check(safety, WELL, over_force=True) for _ in range(60))
     assert "over its limit" in safety.reason
 
 
-def test_a_motor_that_takes_more_than_its_goal_trips_it():
+def test_motor_current_above_its_goal_trips():
     safety = Safety(CONFIG)
     assert not any(check(safety, replace(WELL, current_a=0.14)) for _ in range(100))
     assert not any(check(safety, replace(WELL, current_a=-0.3 if i % 4 else 0.1)) for i in range(100))
@@ -119,7 +119,7 @@ readings = st.builds(
 
 
 @given(st.lists(st.tuples(readings, st.booleans(), st.booleans())))
-def test_it_is_never_open_in_a_cycle_that_has_a_cause(cycles):
+def test_latch_is_tripped_in_every_cycle_with_a_cause(cycles):
     safety = Safety(CONFIG)
     for servo, over_force, asks in cycles:
         check(safety, servo, over_force=over_force)

@@ -17,42 +17,42 @@ PHASES = ("open", "approach", "contact", "ramp", "hold", "release", "move")
 
 
 def phases(run):
-    """The phases in order, repetitions left out."""
+    """Returns the phases in order, without repetitions."""
     names = [status.phase for status in run.statuses]
     return [name for i, name in enumerate(names) if i == 0 or names[i - 1] != name]
 
 
 @pytest.mark.parametrize("target_n", TARGETS_N)
-def test_fused_holds_what_was_asked(drawn_run, target_n):
+def test_fused_feedback_holds_the_target(drawn_run, target_n):
     seen, overshoot, outcomes = [], [], []
     for seed in range(8):
         run = drawn_run(seed).grasp(target_n, 7.5)
         assert phases(run) == ["approach", "contact", "ramp", "hold"]
         outcomes.append(run.last.status.outcome)
         score = score_grasp(run.cell, run.statuses, target_n)
-        # What the vision is off by over the whole grasp is no fault of the loop.
+        # A constant gain error of vision is not an error of the loop.
         seen.append(abs(score.steady_n * run.vision.gain - target_n) / target_n)
         overshoot.append(score.overshoot_n)
-    # Where friction is heaviest, a force a shade too high takes longer than this to come down.
+    # With the largest friction, a force slightly too high takes longer than this to fall.
     assert outcomes.count("held") >= 7
     deadband = 0.025 / target_n
     assert np.median(seen) < 0.015 + deadband
-    # The share that motor current has in the estimate brings its own error in.
+    # The share of the motor current in the estimate adds its error.
     assert max(seen) < 0.02 + 5 * deadband
     assert max(overshoot) < max(0.12 * target_n, 0.2)
 
 
 @pytest.mark.parametrize("feedback", ["fused", "current"])
-def test_the_approach_learns_friction_and_touches_gently(drawn_run, feedback):
+def test_approach_identifies_friction_and_limits_the_impact(drawn_run, feedback):
     nominal_n, learned_n = [], []
     for seed in range(8):
         run = drawn_run(seed, feedback=feedback)
         true_n = run.plant.friction_n / run.plant.gain
         nominal_n.append(run.transmission.friction_n - true_n)
         learned_n.append(run.to_phase("contact").last.estimate.friction_n - true_n)
-        # What 1.3 kg at 25 mm/s press into 3 kN/m, and the touch.
+        # Impact of 1.3 kg at 25 mm/s on 3 kN/m, plus the contact limit.
         assert max(sample.force_n for sample in run.cell) < 2.2
-    # A way of 8 mm may be too short to get even.
+    # A travel of 8 mm may be too short for a steady speed.
     assert (np.abs(learned_n) < np.abs(nominal_n) + 0.1).all()
     assert np.median(np.abs(learned_n)) < 0.5 * np.median(np.abs(nominal_n))
 
@@ -74,7 +74,7 @@ def test_vision_alone_holds(drawn_run):
         assert run.last.status.outcome == "held"
 
 
-def test_fused_goes_on_when_vision_drops_out(make_run):
+def test_fused_feedback_continues_when_vision_drops_out(make_run):
     run = make_run(plant={"gain": 1.08}, vision_off_s=3.0).grasp(4.0)
     assert run.last.estimate.source == "current"
     assert [text for text in run.texts if "vision dropped out" in text]
@@ -82,11 +82,11 @@ def test_fused_goes_on_when_vision_drops_out(make_run):
     assert run.last.estimate.std_n > next(
         d.estimate.std_n for d in run.decisions if d.estimate.t_ns == 2_950_000_000
     )
-    assert run.plant.force_n == pytest.approx(4.0, rel=0.04)  # what vision taught is kept
+    assert run.plant.force_n == pytest.approx(4.0, rel=0.04)  # the bias found with vision is kept
 
 
-def test_holds_still_against_friction(make_run):
-    """No limit cycle: over the last three seconds the force hardly moves."""
+def test_hold_has_no_limit_cycle(make_run):
+    """The force is nearly constant over the last three seconds."""
     run = make_run().grasp(4.0, 7.0)
     late = [sample.force_n for sample in run.cell[-600:]]
     assert max(late) - min(late) < 0.03 * 4.0
@@ -122,7 +122,7 @@ def test_object_lost_in_the_ramp_is_no_object(make_run):
 
 
 @pytest.mark.parametrize(("moves_m", "reason"), [(0.004, "closed by"), (1.0, "closed")])
-def test_slip_is_told_and_nothing_is_let_go(make_run, moves_m, reason):
+def test_slip_is_reported_without_a_release(make_run, moves_m, reason):
     run = make_run().grasp(4.0, 4.0)
     assert run.last.status.outcome == "held"
     run.plant.contact_m += moves_m
@@ -132,17 +132,17 @@ def test_slip_is_told_and_nothing_is_let_go(make_run, moves_m, reason):
     assert any(reason in status.reason for status in run.statuses)
 
 
-def test_jaws_that_meet_before_it_is_held_are_a_slip(make_run):
+def test_jaws_that_close_before_held_are_a_slip(make_run):
     run = make_run(settle_s=5.0).to_phase("hold")
     run.plant.contact_m = 1.0
     run.go(1.0)
     assert run.last.status.outcome == "slip"
 
 
-def test_collapse_of_the_force_is_a_slip(make_run):
+def test_force_collapse_is_a_slip(make_run):
     run = make_run(feedback="vision").grasp(4.0, 5.0)
     run.vision.gain = 0.0
-    run.spoil = lambda _, servo: replace(servo, current_a=0.0)  # the motor gives way too
+    run.spoil = lambda _, servo: replace(servo, current_a=0.0)  # the motor current drops too
     run.go(1.5)
     assert run.last.status.outcome == "slip"
     assert any("fell to" in status.reason for status in run.statuses)
@@ -164,7 +164,7 @@ def test_retarget_without_letting_go(make_run):
     assert run.last.status.outcome == "held"
 
 
-def test_a_new_target_in_contact_counts(make_run):
+def test_new_target_in_contact_is_used(make_run):
     run = make_run().to_phase("contact").grasp(2.0, 4.0)
     assert run.plant.force_n == pytest.approx(2.0, abs=0.1)
 
@@ -183,7 +183,7 @@ def test_grasp_pre_empts(make_run, phase):
 
 
 @pytest.mark.parametrize("phase", PHASES)
-def test_stop_wins_in_every_phase(make_run, phase):
+def test_stop_has_priority_in_every_phase(make_run, phase):
     run = make_run().to_phase(phase)
     before_a = run.last.command.goal_current_a
     start = len(run.decisions)
@@ -199,17 +199,17 @@ def test_stop_wins_in_every_phase(make_run, phase):
 
 
 @pytest.mark.parametrize("on_fault", ["limp", "hold"])
-def test_a_force_that_seems_too_much_never_keeps_the_jaws_from_opening(make_run, on_fault):
+def test_estimate_over_the_limit_never_prevents_opening(make_run, on_fault):
     run = make_run(vision={"noise_n": 0.7}, feedback="vision", on_fault=on_fault, force_limit_n=4.5)
     run.to_phase("hold")
-    run.vision.gain = 1.3  # pictures that are on their way when the stop comes
+    run.vision.gain = 1.3  # estimates in flight when the stop comes
     run.go(0.02).go(0.5, "stop")
     assert any("over the limit" in event.text for d in run.decisions[-100:] for event in d.events)
     run.go(4.0, "release")
     assert run.last.status.phase == "open"
 
 
-def test_a_stop_while_the_jaws_open_holds_them_where_they_are(make_run):
+def test_stop_during_a_release_holds_the_position(make_run):
     run = make_run(on_fault="hold").to_phase("hold").go(0.15, "release")
     run.go(0.005, "stop")
     stopped_m = run.last.status.width_m
@@ -242,7 +242,7 @@ def test_at_fault_the_jaws_open(make_run, phase):
     assert run.last.status.phase == "fault"
 
 
-def test_a_servo_that_grows_hot_holds_less_and_says_so(make_run):
+def test_hot_servo_holds_less_and_reports_it(make_run):
     run = make_run().to_phase("hold").go(1.0)
     before_n, before_a = run.plant.force_n, run.last.command.goal_current_a
     run.spoil = lambda _, servo: replace(servo, temperature_c=65.0)
@@ -258,7 +258,7 @@ def test_a_servo_that_grows_hot_holds_less_and_says_so(make_run):
 
 
 @pytest.mark.parametrize("gain", [0.92, 1.08])
-def test_an_eye_that_sees_too_little_can_not_force_the_limit(make_run, gain):
+def test_vision_that_reads_low_cannot_exceed_the_limit(make_run, gain):
     run = make_run(force_limit_n=5.0, plant={"gain": gain}, vision={"gain": 0.6}).grasp(4.4, 6.0)
     assert max(sample.force_n for sample in run.cell) <= 1.05 * 5.0
 
@@ -301,7 +301,7 @@ def test_nothing_moves_before_a_request(make_run):
     assert run.plant.x_m == pytest.approx(0.01, abs=1e-4)
 
 
-def test_a_first_reading_that_is_not_finite_moves_nothing(make_run):
+def test_non_finite_first_reading_moves_nothing(make_run):
     run = make_run(plant={"x_m": 0.01})
     run.spoil = lambda _, servo: replace(servo, position_rad=math.nan)
     run.go(0.5)
@@ -320,7 +320,7 @@ def test_unknown_requests_are_refused(make_run):
     assert "refused 'dance': unknown kind of request; use grasp, release, move or stop" in run.texts
 
 
-def test_too_much_force_is_eased(make_run):
+def test_too_much_force_lowers_the_current(make_run):
     run = make_run(force_limit_n=3.0).grasp(2.5, 4.0)
     before_a = run.last.command.goal_current_a
     run.spoil = lambda _, servo: replace(servo, current_a=0.15)
@@ -329,7 +329,7 @@ def test_too_much_force_is_eased(make_run):
     assert min(d.command.goal_current_a for d in run.decisions[-60:]) < 0.7 * before_a
 
 
-def test_a_late_cycle_is_no_leap(make_run):
+def test_late_cycle_causes_no_jump(make_run):
     run = make_run().to_phase("ramp")
     before = run.last.status.reference_n
     run.t_ns += 2_000_000_000
@@ -337,7 +337,7 @@ def test_a_late_cycle_is_no_leap(make_run):
     assert run.last.status.reference_n - before <= 8.0 * 0.05
 
 
-def test_replay_is_equal_to_the_bit(drawn_run, transmission):
+def test_replay_is_bit_for_bit_identical(drawn_run, transmission):
     run = drawn_run(3).grasp(4.0, 4.0).go(1.0, "release")
     again = GraspController(run.config, transmission, 1.2)
     assert [again.step(*inputs) for inputs in run.inputs] == run.decisions
@@ -373,7 +373,7 @@ requests = st.one_of(
     st.lists(st.tuples(servos, visuals, requests), min_size=1, max_size=30),
     st.sampled_from(["fused", "current", "vision"]),
 )
-def test_whatever_comes_in_the_command_is_within_limits(transmission, inputs, feedback):
+def test_command_is_within_limits_for_any_input(transmission, inputs, feedback):
     config = ControlConfig(feedback=feedback)
     controller = GraspController(config, transmission, 0.3)
     for i, (servo, visual, request) in enumerate(inputs):

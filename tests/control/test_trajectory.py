@@ -19,7 +19,7 @@ def test_arrives_without_overshoot_within_rate(start, target, rate, dt_s):
     assert profile.value == target
 
 
-def test_gathers_speed():
+def test_starts_at_rest():
     profile = TrapezoidalProfile(0.4)
     profile.start(0.0, 8.0)
     first = profile.step(8.0, 0.005)

@@ -35,7 +35,7 @@ def test_two_racks_share_the_torque():
     assert gripper.force_n(1.0) == pytest.approx(2.0 / (2 * 0.01))
 
 
-def test_a_configured_torque_constant_goes_before_the_servos():
+def test_configured_torque_constant_overrides_the_servos():
     assert Transmission.from_config(GripperConfig(nm_per_a=1.0), 2.0).n_per_a == pytest.approx(25.0)
 
 
@@ -44,7 +44,7 @@ def test_uncertainty_grows_with_force():
     assert gripper.bias_std_n(8.0) > gripper.bias_std_n(0.0) == pytest.approx(0.25 * gripper.friction_n)
 
 
-def test_what_was_calibrated_is_less_uncertain():
+def test_calibration_reduces_uncertainty():
     gripper = Transmission.from_config(GripperConfig(friction_std=0.1, gain_std=0.02), 1.78)
     assert gripper.bias_std_n(0.0) == pytest.approx(0.1 * gripper.friction_n)
     assert gripper.bias_std_n(1e3) == pytest.approx(0.02 * 1e3, rel=1e-3)

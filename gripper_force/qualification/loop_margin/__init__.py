@@ -1,1 +1,1 @@
-"""Stability margins of the force loop over stiffness and delay."""
+"""Gain margins of the force loop over stiffness and delay."""

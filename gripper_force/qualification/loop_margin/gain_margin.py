@@ -1,11 +1,11 @@
-"""The gain margin of the force loop: predicted from the plant that was identified, and observed.
+"""Gain margin of the force loop: predicted from the identified plant, and observed.
 
-The margin is the factor by which the loop's gain may be raised before a swing of the force stops dying out.
-It is raised as a user would, by ``control.plant_gain``: gains go with its inverse.
+The margin is the factor by which the loop gain can be raised until an oscillation of the force no longer
+decays. The gain is raised as a user would do it, by ``control.plant_gain``: gains follow its inverse.
 
-The loop is not linear. Its deadband leaves small errors alone, friction takes the swing of small pushes, and
-the push is bounded. The swing is therefore released from several times what friction takes, at a high force,
-on a rig that is said to be known so badly that no bound and no gate acts.
+The loop is not linear. Its deadband ignores small errors, friction absorbs small motor forces, and the motor
+force is bounded. Therefore the oscillation starts with several times the friction, at a high force, with
+prior variances so large that no bound and no gate acts.
 """
 
 import math
@@ -32,26 +32,30 @@ from gripper_force.qualification.loop_margin.analytic_plant import (
 )
 from gripper_force.types import NS_PER_S, EstimateSource, Phase, Request, RequestKind, ServoCommand
 
-SWING_N: Final = 4.0
-"""From where the swing is released, with vision alone: four times what friction takes."""
+AMPLITUDE_N: Final = 4.0
+"""Initial amplitude with vision alone: four times the friction."""
 
-FUSED_SWING_N: Final = 2.0
-"""The same for the fused loop, whose bounds and gates are those of the rig as it is."""
+FUSED_AMPLITUDE_N: Final = 2.0
+"""Initial amplitude of the fused loop, which keeps the configured bounds and gates."""
 
 FRAME_S: Final = 1 / 60
-MARGINS: Final = {"vision": (0.3, 8.0), "fused": (1.0, 30.0)}
-"""Between what the margin is looked for."""
+"""Time between frames."""
+
+SEARCH_RANGE: Final = {"vision": (0.3, 8.0), "fused": (1.0, 30.0)}
+"""Range of the bisection for the margin, by feedback."""
 
 _PRESS_N: Final = 9.0
 _PRESS_S: Final = 7.0
-_GENTLE_M_S: Final = 0.005  # else the impact on a stiff object leaves more force than the ramp begins with
+_APPROACH_M_S: Final = (
+    0.005  # at more, the impact on a stiff object leaves more force than the ramp starts with
+)
 _TARGET_N: Final = 20.0
-_OPEN_M: Final = 1.0  # room for the softest object
+_OPEN_WIDTH_M: Final = 1.0  # room for the softest object
 _TIME_S: Final = 10.0
-_LAST_S: Final = 2.0
-_LEAST_SWING_N: Final = 1.0
+_JUDGED_S: Final = 2.0  # time at the end over which the oscillation is judged
+_LEAST_AMPLITUDE_N: Final = 1.0
 _NOISE_N: Final = 0.02
-_HALVINGS: Final = 7
+_BISECTIONS: Final = 7
 _CYCLE_S: Final = CYCLE_NS / NS_PER_S
 _CURRENT_LOOP_S: Final = 0.002
 _ALIASES: Final = 8
@@ -60,21 +64,21 @@ Complex = npt.NDArray[np.complexfloating[Any, Any]]
 
 
 @dataclass(frozen=True, slots=True)
-class Identified:
-    """What calibration finds of a plant: `gripper_calibration.fits.plant_fit`.
+class IdentifiedPlant:
+    """Plant identified by calibration: `gripper_calibration.fits.plant_fit`.
 
     Attributes:
-        gain: Contact force for one newton of push.
-        lag_s: From push to contact force.
+        gain: Contact force per newton of motor force.
+        lag_s: Lag from motor force to contact force.
     """
 
     gain: float
     lag_s: float
 
 
-def identify(config: Config, truth: Gripper) -> Identified:
-    """Presses by motor current alone, and fits the plant to ramps and holds, as calibration does."""
-    control = config.control.model_copy(update={"feedback": "current", "approach_speed_m_s": _GENTLE_M_S})
+def identify(config: Config, truth: Gripper) -> IdentifiedPlant:
+    """Presses with motor current alone and fits the plant to ramps and holds, as calibration does."""
+    control = config.control.model_copy(update={"feedback": "current", "approach_speed_m_s": _APPROACH_M_S})
     presses = []
     for seed in range(3):
         rng = np.random.default_rng([config.seed, 43, seed])
@@ -93,78 +97,78 @@ def identify(config: Config, truth: Gripper) -> Identified:
             gripper.advance(decision.command, _CYCLE_S)
         presses.append(PressSeries(*(np.array(column) for column in zip(*rows, strict=True))))
     found = fit_plant(presses, 0.035)
-    assert found is not None  # the presses above cover the whole range of forces
-    return Identified(found.gain, 1e-3 * found.lag_ms)
+    assert found is not None  # the presses above cover the whole force range
+    return IdentifiedPlant(found.gain, 1e-3 * found.lag_ms)
 
 
-def by_identified_plant(gains: Gains, plant: Identified, delay_s: float) -> float:
-    """Margin with vision alone that gain, lag and delay predict."""
+def margin_by_lag(gains: Gains, plant: IdentifiedPlant, delay_s: float) -> float:
+    """Returns the margin with vision alone, predicted from gain, lag and delay."""
 
     def force(s: Complex) -> Complex:
         return plant.gain / (plant.lag_s * s + 1)
 
-    return _sampled(gains, force, delay_s)
+    return _sampled_margin(gains, force, delay_s)
 
 
-def with_inertia(gains: Gains, plant: Identified, truth: Gripper, delay_s: float) -> float:
-    """Margin with vision alone that the identified gain predicts, with inertia and friction of the jaws.
+def margin_with_inertia(gains: Gains, plant: IdentifiedPlant, truth: Gripper, delay_s: float) -> float:
+    """Returns the margin with vision alone, predicted from the identified gain, inertia and friction.
 
-    Friction counts as the damper that takes as much out of each swing (its describing function), and the
-    swing is what friction has left of it when vision first tells of it.
+    Friction is a damper that removes the same energy per oscillation (its describing function), for the
+    amplitude that friction has left when vision first shows the oscillation.
     """
     stiffness_n_m, friction_n = truth.stiffness_n_m, truth.friction_n
 
     def force(s: Complex) -> Complex:
-        swings = np.abs(s.imag) * (delay_s + FRAME_S / 2) / (2 * math.pi)
-        left_n = np.maximum(SWING_N - 4 * friction_n * swings, _LEAST_SWING_N)
-        braking = 1j * np.sign(s.imag) * 4 * friction_n / (math.pi * left_n)
+        periods = np.abs(s.imag) * (delay_s + FRAME_S / 2) / (2 * math.pi)
+        remaining_n = np.maximum(AMPLITUDE_N - 4 * friction_n * periods, _LEAST_AMPLITUDE_N)
+        braking = 1j * np.sign(s.imag) * 4 * friction_n / (math.pi * remaining_n)
         return plant.gain / (1 + (truth.mass_kg * s**2 + truth.damping_n_s_m * s) / stiffness_n_m + braking)
 
-    return _sampled(gains, force, delay_s)
+    return _sampled_margin(gains, force, delay_s)
 
 
-def by_rule(gains: Gains, plant: Identified, delay_s: float) -> float:
-    """Margin of the fused hold that its tuning promises: an integral, and all lags of stuck jaws as delay."""
-    whole_s = plant.lag_s + delay_s + FRAME_S / 2 + OBSERVER_LAG_S
-    return math.pi / 2 / (gains.integral_s * plant.gain * whole_s)
+def margin_by_rule(gains: Gains, plant: IdentifiedPlant, delay_s: float) -> float:
+    """Returns the margin of the fused hold by its tuning: integral control, all lags as delay."""
+    total_s = plant.lag_s + delay_s + FRAME_S / 2 + OBSERVER_LAG_S
+    return math.pi / 2 / (gains.integral_s * plant.gain * total_s)
 
 
-def _sampled(gains: Gains, force: Callable[[Complex], Complex], delay_s: float) -> float:
-    """Margin of a PI controller on frames that are each held until the next.
+def _sampled_margin(gains: Gains, force: Callable[[Complex], Complex], delay_s: float) -> float:
+    """Returns the margin of a PI controller on frames that are each held until the next.
 
-    What is above half the frame rate is folded back by the sampling, so the loop's response is a sum.
+    Sampling aliases frequencies above half the frame rate, so the response of the loop is a sum.
     """
     omega = np.geomspace(0.5, math.pi / FRAME_S, 4000)
     loop = np.zeros(len(omega), complex)
-    for fold in range(-_ALIASES, _ALIASES + 1):
-        s = 1j * (omega + fold * 2 * math.pi / FRAME_S)
+    for alias in range(-_ALIASES, _ALIASES + 1):
+        s = 1j * (omega + alias * 2 * math.pi / FRAME_S)
         held = (1 - np.exp(-s * FRAME_S)) / (s * FRAME_S)
         late = np.exp(-s * (delay_s + _CYCLE_S / 2)) / (1 + _CURRENT_LOOP_S * s)
         loop += (gains.proportional + gains.integral_s / s) * held * late * force(s)
     factor = -1 / loop
-    turns = np.flatnonzero((np.diff(np.sign(factor.imag)) != 0) & (factor.real[1:] > 0))
-    found = [*factor.real[turns], *factor.real[-1:][factor.real[-1:] > 0]]  # at half the rate it is real
+    crossings = np.flatnonzero((np.diff(np.sign(factor.imag)) != 0) & (factor.real[1:] > 0))
+    found = [*factor.real[crossings], *factor.real[-1:][factor.real[-1:] > 0]]  # at half the rate it is real
     return float(min(found, default=math.inf))
 
 
-def observed(config: Config, truth: Gripper, feedback: str, delay_s: float) -> float:
-    """Margin of the unmodified controller, by halving the interval within which it lies."""
-    low, high = MARGINS[feedback]
-    for _ in range(_HALVINGS):
+def observed_margin(config: Config, truth: Gripper, feedback: str, delay_s: float) -> float:
+    """Returns the margin of the unmodified controller, by bisection."""
+    low, high = SEARCH_RANGE[feedback]
+    for _ in range(_BISECTIONS):
         middle = math.sqrt(low * high)
-        if dies_out(config, truth, feedback, delay_s, middle):
+        if oscillation_decays(config, truth, feedback, delay_s, middle):
             low = middle
         else:
             high = middle
     return math.sqrt(low * high)
 
 
-def dies_out(config: Config, truth: Gripper, feedback: str, delay_s: float, factor: float) -> bool:
-    """Whether a swing dies out with so many times the loop gain, and vision counts to the end."""
-    alone = feedback == "vision"
-    swing_n = SWING_N if alone else FUSED_SWING_N
-    rig = replace(truth.transmission, open_width_m=_OPEN_M)
-    if alone:
+def oscillation_decays(config: Config, truth: Gripper, feedback: str, delay_s: float, factor: float) -> bool:
+    """Returns True if an oscillation decays with ``factor`` times the loop gain while vision stays in use."""
+    vision_alone = feedback == "vision"
+    amplitude_n = AMPLITUDE_N if vision_alone else FUSED_AMPLITUDE_N
+    rig = replace(truth.transmission, open_width_m=_OPEN_WIDTH_M)
+    if vision_alone:
         rig = replace(rig, gain_std=0.5)
     given = {
         **config.control.model_dump(),
@@ -175,7 +179,7 @@ def dies_out(config: Config, truth: Gripper, feedback: str, delay_s: float, fact
         "vision_timeout_ms": 400.0,
     }
     control = ControlConfig.model_validate(given)
-    depth_m = (_TARGET_N - swing_n) / truth.stiffness_n_m
+    depth_m = (_TARGET_N - amplitude_n) / truth.stiffness_n_m
     jaw_m = truth.contact_m + depth_m
     gripper = replace(
         truth,
@@ -204,11 +208,11 @@ def dies_out(config: Config, truth: Gripper, feedback: str, delay_s: float, fact
         )
         forces_n.append(gripper.force_n)
         gripper.advance(command, _CYCLE_S)
-    last = forces_n[-round(_LAST_S / _CYCLE_S) :]
-    return max(last) - min(last) < swing_n / 2 and source != EstimateSource.CURRENT
+    last = forces_n[-round(_JUDGED_S / _CYCLE_S) :]
+    return max(last) - min(last) < amplitude_n / 2 and source != EstimateSource.CURRENT
 
 
 def gains_of(config: Config, feedback: str) -> Gains:
-    """The gains that the force loop takes."""
+    """Returns the gains of the force loop."""
     margins = ForceLoop(config.control, transmission_of(config.gripper)).margins
     return margins["vision" if feedback == "vision" else "hold"].gains

@@ -1,4 +1,4 @@
-"""What the force loop is tried on, and what came of it."""
+"""Grid of plants for the force loop, and the results on it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from gripper_force.qualification.loop_margin.analytic_plant import CURRENT_STEP_
 
 
 class Verdict(StrEnum):
-    """How a grasp ended. The worse comes later."""
+    """Verdict on a grasp, from best to worst."""
 
     HOLDS = "holds"
     CURRENT = "holds on current alone"
@@ -23,17 +23,17 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """What is tried.
+    """Values to try.
 
     Attributes:
-        stiffness_n_m: Of the map of verdicts.
-        delay_s: Likewise.
-        factors: Of the loop gain, a map each.
-        margin_stiffness_n_m: Of the map of margins.
-        margin_delay_s: Likewise.
-        tuned_delay_s: Delays for which vision alone is tuned anew.
-        sweep: Values that are all combined: ``delay_s``, and attributes of `Gripper`; friction as a share of
-            what is taken for it.
+        stiffness_n_m: Stiffnesses of the verdict maps.
+        delay_s: Delays of the verdict maps.
+        factors: Factors on the loop gain, one map each.
+        margin_stiffness_n_m: Stiffnesses of the margin maps.
+        margin_delay_s: Delays of the margin maps.
+        tuned_delay_s: Delays for which vision alone is retuned.
+        sweep: Values to try in all combinations: ``delay_s``, and attributes of `Gripper`; friction as a
+            share of the assumed one.
     """
 
     stiffness_n_m: Sequence[float]
@@ -65,40 +65,40 @@ FULL: Final = Grid(
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """A grasp on an analytic plant.
+    """Result of a grasp on an analytic plant.
 
     Attributes:
-        verdict: How it ended.
-        peak_n: The most the object felt.
-        swing_n: How far the force went up and down in the last two seconds.
-        off: How far its mean there is from the target, as a share.
-        broken: Commands beyond limits, or not finite.
+        verdict: Verdict on the grasp.
+        peak_n: Largest contact force.
+        peak_to_peak_n: Peak-to-peak force in the last two seconds.
+        error_share: Error of the mean force in the last two seconds, as a share of the target.
+        violations: Number of commands outside limits or not finite.
     """
 
     verdict: Verdict
     peak_n: float
-    swing_n: float
-    off: float
-    broken: int
+    peak_to_peak_n: float
+    error_share: float
+    violations: int
 
 
 Trials = dict[tuple[float, float], Trial]
-"""By stiffness and delay."""
+"""Trials by stiffness and delay."""
 
 Field = npt.NDArray[np.float64]
-"""A number for each delay and stiffness, (D, S)."""
+"""Values by delay and stiffness, (D, S)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Margins:
-    """Factors by which the loop gain may be raised, each (D, S).
+    """Gain margins, each (D, S).
 
     Attributes:
-        vision: Observed, with vision alone.
-        identified: Predicted for it from gain, lag and delay.
-        inertia: Predicted for it from the same gain, with inertia and friction of the jaws.
-        fused: Observed, with motor current and vision.
-        rule: What its tuning promises.
+        vision: Observed with vision alone.
+        identified: Predicted with vision alone from gain, lag and delay.
+        inertia: Predicted with vision alone from the same gain, with inertia and friction of the jaws.
+        fused: Observed with motor current and vision.
+        rule: Predicted with motor current and vision by the tuning rule.
     """
 
     vision: Field

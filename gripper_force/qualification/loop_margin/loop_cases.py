@@ -1,4 +1,4 @@
-"""The force loop on hard plants: where it holds, rings or would crush, and how much gain it would bear."""
+"""Force loop on difficult plants: verdicts of grasps, and gain margins."""
 
 import math
 from collections import Counter
@@ -21,15 +21,15 @@ from gripper_force.qualification.loop_margin.analytic_plant import (
     transmission_of,
 )
 from gripper_force.qualification.loop_margin.gain_margin import (
+    AMPLITUDE_N,
     FRAME_S,
-    SWING_N,
-    Identified,
-    by_identified_plant,
-    by_rule,
+    IdentifiedPlant,
     gains_of,
     identify,
-    observed,
-    with_inertia,
+    margin_by_lag,
+    margin_by_rule,
+    margin_with_inertia,
+    observed_margin,
 )
 from gripper_force.qualification.loop_margin.grid import FULL, Field, Grid, Margins, Trial, Trials, Verdict
 from gripper_force.qualification.loop_margin.maps import draw_margins, draw_verdicts
@@ -37,26 +37,36 @@ from gripper_force.qualification.numerics.suite import NumericalCase
 from gripper_force.types import NS_PER_S, EstimateSource, Outcome, Request, RequestKind
 
 _TARGET_N: Final = 4.0
-_TRAVEL_M: Final = 0.02  # what a soft object leaves of the stroke
+_MAX_COMPRESSION_M: Final = 0.02  # travel available to compress a soft object
 _CONTACT_M: Final = 0.008
 _TIME_S: Final = 7.0
-_LAST_S: Final = 2.0
+_JUDGED_S: Final = 2.0
+"""Time at the end of a grasp over which the force is judged."""
+
 _VISION_NOISE_N: Final = 0.1
-_OVER: Final = 0.05
-_LOST: Final = 0.1
-_AGREE: Final = 0.2
+_OVER_SHARE: Final = 0.05
+"""Share over the force limit from which a grasp crushes; `Limits` allows no more."""
+
+_LOST_SHARE: Final = 0.1
+"""Error of the mean force, as a share of the target, from which a grasp does not hold."""
+
+_AGREEMENT: Final = 0.2
+"""Bound on the deviation of observed from predicted margins."""
+
 _DPI: Final = 110
-_FROM_S: Final = 0.035
+_LATE_S: Final = 0.035
+"""Delay of vision from which predicted margins have a bound."""
+
 _CYCLE_S: Final = CYCLE_NS / NS_PER_S
 
 
 def target_n(stiffness_n_m: float) -> float:
-    """What is asked of a grasp: soft objects leave no travel for more."""
-    return min(_TARGET_N, _TRAVEL_M * stiffness_n_m)
+    """Returns the target force of a grasp, which is less for soft objects: the travel is limited."""
+    return min(_TARGET_N, _MAX_COMPRESSION_M * stiffness_n_m)
 
 
 def grasp(config: Config, truth: Gripper, delay_s: float, seed: int) -> Trial:
-    """Grasps once with the unmodified controller."""
+    """Runs one grasp with the unmodified controller and judges it."""
     control, rig = config.control, truth.transmission
     wanted_n, gripper = target_n(truth.stiffness_n_m), replace(truth)
     controller = GraspController(control, rig, config.servo.current_limit_a)
@@ -64,7 +74,7 @@ def grasp(config: Config, truth: Gripper, delay_s: float, seed: int) -> Trial:
     vision = SimulatedVision(delay_s, _VISION_NOISE_N)
     rng = np.random.default_rng([config.seed, 45, seed])
     bounds = _Bounds(config, truth)
-    forces_n, broken = [], 0
+    forces_n, violations = [], 0
     for cycle, (servo_noise, vision_noise) in enumerate(
         rng.standard_normal((round(_TIME_S / _CYCLE_S), 2)).tolist()
     ):
@@ -74,26 +84,29 @@ def grasp(config: Config, truth: Gripper, delay_s: float, seed: int) -> Trial:
         decision = controller.step(t_ns, servo, visual, request)
         request = None
         command = decision.command
-        broken += not bounds.keep(command.goal_current_a, command.goal_position_rad)
+        violations += not bounds.contains(command.goal_current_a, command.goal_position_rad)
         forces_n.append(gripper.force_n)
         gripper.advance(command, _CYCLE_S)
-    last_n = np.array(forces_n[-round(_LAST_S / _CYCLE_S) :])
-    swing_n, off = float(np.ptp(last_n)), abs(float(last_n.mean()) / wanted_n - 1)
-    if gripper.peak_n > (1 + _OVER) * control.force_limit_n:
+    last_n = np.array(forces_n[-round(_JUDGED_S / _CYCLE_S) :])
+    peak_to_peak_n, error_share = float(np.ptp(last_n)), abs(float(last_n.mean()) / wanted_n - 1)
+    if gripper.peak_n > (1 + _OVER_SHARE) * control.force_limit_n:
         verdict = Verdict.CRUSHES
-    elif swing_n > 2 * tolerance_n(wanted_n):
+    elif peak_to_peak_n > 2 * tolerance_n(wanted_n):
         verdict = Verdict.RINGS
-    elif decision.status.outcome in (Outcome.NO_OBJECT, Outcome.SLIP, Outcome.FAULT) or off > _LOST:
+    elif (
+        decision.status.outcome in (Outcome.NO_OBJECT, Outcome.SLIP, Outcome.FAULT)
+        or error_share > _LOST_SHARE
+    ):
         verdict = Verdict.LOSES
     elif decision.estimate.source == EstimateSource.CURRENT:
         verdict = Verdict.CURRENT
     else:
         verdict = Verdict.HOLDS
-    return Trial(verdict, gripper.peak_n, swing_n, off, broken)
+    return Trial(verdict, gripper.peak_n, peak_to_peak_n, error_share, violations)
 
 
 class _Bounds:
-    """What no command may leave, reckoned apart from `gripper_force.control.limits`."""
+    """Limits of every command, computed independently of `gripper_force.control.limits`."""
 
     def __init__(self, config: Config, truth: Gripper) -> None:
         rig = truth.transmission
@@ -103,37 +116,37 @@ class _Bounds:
         )
         self._low_rad, self._high_rad = sorted((rig.open_position_rad, rig.closed_position_rad))
 
-    def keep(self, current_a: float, position_rad: float) -> bool:
-        """Whether a command is within; what is not finite is not."""
+    def contains(self, current_a: float, position_rad: float) -> bool:
+        """Returns True if a command is within the limits; a non-finite one is not."""
         return 0 <= current_a <= self._most_a and self._low_rad <= position_rad <= self._high_rad
 
 
 def crushing_n_m(control: ControlConfig, truth: Gripper) -> float:
-    """Stiffness from which the impact of the first touch alone is beyond the force limit."""
+    """Returns the stiffness from which the impact of first contact alone exceeds the force limit."""
     speed_m_s = min(control.approach_speed_m_s, 0.010 * _TARGET_N)
-    return ((1 + _OVER) * control.force_limit_n / speed_m_s) ** 2 / truth.mass_kg
+    return ((1 + _OVER_SHARE) * control.force_limit_n / speed_m_s) ** 2 / truth.mass_kg
 
 
 def cases(config: Config, maps: Path | None, grid: Grid = FULL) -> Iterator[NumericalCase]:
-    """Rows of the force loop; its maps go into ``maps``.
+    """Yields the cases of the force loop and draws its maps.
 
     Args:
-        config: Whose control, gripper and limits are tested.
-        maps: Folder, or None.
-        grid: What is tried.
+        config: Configuration of control, gripper and limits.
+        maps: Folder of the maps, or None.
+        grid: Values to try.
     """
     truth = Gripper(transmission_of(config.gripper), contact_m=_CONTACT_M)
     verdicts: dict[tuple[str, float], Trials] = {}
     for feedback, factor in product(("fused", "vision"), grid.factors):
-        verdicts[feedback, factor] = trials = _try_all(config, truth, grid, feedback, factor)
+        verdicts[feedback, factor] = trials = _run_grid(config, truth, grid, feedback, factor)
         yield _map_row(config, truth, feedback, factor, trials)
     swept = _sweep(config, truth, grid)
     yield from _sweep_rows(grid, swept)
-    everything = [*swept.values(), *(trial for trials in verdicts.values() for trial in trials.values())]
+    all_trials = [*swept.values(), *(trial for trials in verdicts.values() for trial in trials.values())]
     yield NumericalCase(
-        "commands beyond limits, or not finite",
-        f"goal current and goal position of every cycle of these {len(everything)} grasps",
-        float(sum(trial.broken for trial in everything)),
+        "commands outside limits or not finite",
+        f"goal current and goal position of every cycle of these {len(all_trials)} grasps",
+        float(sum(trial.violations for trial in all_trials)),
         0.0,
     )
     plants = {k: identify(config, replace(truth, stiffness_n_m=k)) for k in grid.margin_stiffness_n_m}
@@ -147,7 +160,7 @@ def cases(config: Config, maps: Path | None, grid: Grid = FULL) -> Iterator[Nume
         draw_margins(grid, margins).savefig(maps / "loop-margins.png", dpi=_DPI)
 
 
-def _try_all(config: Config, truth: Gripper, grid: Grid, feedback: str, factor: float) -> Trials:
+def _run_grid(config: Config, truth: Gripper, grid: Grid, feedback: str, factor: float) -> Trials:
     gain = config.control.plant[0] / factor
     control = config.control.model_copy(update={"feedback": feedback, "plant_gain": gain})
     config = config.model_copy(update={"control": control})
@@ -158,12 +171,12 @@ def _try_all(config: Config, truth: Gripper, grid: Grid, feedback: str, factor: 
 
 
 def _map_row(config: Config, truth: Gripper, feedback: str, factor: float, trials: Trials) -> NumericalCase:
-    """The fused loop is to hold with the gain that it has; of anything else the map tells."""
+    """Returns the case of one map. Only the fused loop with its configured gain has a bound."""
     soft = {key: t for key, t in trials.items() if key[0] < crushing_n_m(config.control, truth)}
     bad = sum(trial.verdict not in (Verdict.HOLDS, Verdict.CURRENT) for trial in soft.values())
     return NumericalCase(
         f"{_LOOPS[feedback]}, loop gain x {factor:g}",
-        f"{_counted(trials.values())}; share that is not held of those that the touch alone does not crush",
+        f"{_verdict_counts(trials.values())}; share not held of those that first contact does not crush",
         100 * bad / len(soft),
         0.0 if (feedback, factor) == ("fused", 1.0) else math.inf,
         "%",
@@ -186,17 +199,17 @@ def _sweep_rows(grid: Grid, swept: dict[tuple[float, ...], Trial]) -> Iterator[N
             trials = [trial for key, trial in swept.items() if key[number] == value]
             yield NumericalCase(
                 f"{_LOOPS['fused']}, {_NAMES[name].format(value)}",
-                f"{_counted(trials)}; share that rings, all else combined",
+                f"{_verdict_counts(trials)}; share that rings, over all other values",
                 100 * sum(trial.verdict == Verdict.RINGS for trial in trials) / len(trials),
                 math.inf,
                 "%",
             )
 
 
-def _margins(config: Config, truth: Gripper, grid: Grid, plants: dict[float, Identified]) -> Margins:
+def _margins(config: Config, truth: Gripper, grid: Grid, plants: dict[float, IdentifiedPlant]) -> Margins:
     vision, hold = gains_of(config, "vision"), gains_of(config, "fused")
 
-    def field(margin: Callable[[Gripper, Identified, float], float]) -> Field:
+    def field(margin: Callable[[Gripper, IdentifiedPlant, float], float]) -> Field:
         return np.array(
             [
                 [margin(replace(truth, stiffness_n_m=k), plants[k], delay_s) for k in plants]
@@ -205,44 +218,46 @@ def _margins(config: Config, truth: Gripper, grid: Grid, plants: dict[float, Ide
         )
 
     return Margins(
-        vision=field(lambda gripper, _, delay_s: observed(config, gripper, "vision", delay_s)),
-        identified=field(lambda _, plant, delay_s: by_identified_plant(vision, plant, delay_s)),
-        inertia=field(lambda gripper, plant, delay_s: with_inertia(vision, plant, gripper, delay_s)),
-        fused=field(lambda gripper, _, delay_s: observed(config, gripper, "fused", delay_s)),
-        rule=field(lambda _, plant, delay_s: by_rule(hold, plant, delay_s)),
+        vision=field(lambda gripper, _, delay_s: observed_margin(config, gripper, "vision", delay_s)),
+        identified=field(lambda _, plant, delay_s: margin_by_lag(vision, plant, delay_s)),
+        inertia=field(lambda gripper, plant, delay_s: margin_with_inertia(vision, plant, gripper, delay_s)),
+        fused=field(lambda gripper, _, delay_s: observed_margin(config, gripper, "fused", delay_s)),
+        rule=field(lambda _, plant, delay_s: margin_by_rule(hold, plant, delay_s)),
     )
 
 
 def _margin_rows(grid: Grid, margins: Margins) -> Iterator[NumericalCase]:
-    late = np.array(grid.margin_delay_s) >= _FROM_S
-    for cells, name, bound in ((late, "from", 100 * _AGREE), (~late, "below", math.inf)):
-        for how, predicted, least in (
+    late = np.array(grid.margin_delay_s) >= _LATE_S
+    for cells, name, bound in ((late, "from", 100 * _AGREEMENT), (~late, "below", math.inf)):
+        for basis, predicted, bound_percent in (
             ("gain, inertia and friction", margins.inertia, bound),
             ("gain and lag alone", margins.identified, math.inf),
         ):
             ratio = (margins.vision / predicted)[cells]
             yield NumericalCase(
-                f"margin of vision alone, delay {name} {1e3 * _FROM_S:.0f} ms, by {how}",
+                f"margin of vision alone, delay {name} {1e3 * _LATE_S:.0f} ms, by {basis}",
                 f"observed over predicted on {ratio.size} cells: {ratio.min():.2f} to {ratio.max():.2f}, "
-                f"median {np.median(ratio):.2f}; nine cells of ten agree within",
+                f"median {np.median(ratio):.2f}; nine of ten cells agree within",
                 100 * float(np.quantile(np.abs(ratio - 1), 0.9)),
-                least,
+                bound_percent,
                 "%",
             )
-    short = 1 - margins.fused / margins.rule
+    shortfall = 1 - margins.fused / margins.rule
     yield NumericalCase(
         f"margin of {_LOOPS['fused']}",
-        f"least {margins.fused.min():.1f}, median {np.median(margins.fused):.1f}; most that it falls short "
-        "of what its tuning promises",
-        100 * max(float(short.max()), 0.0),
-        100 * _AGREE,
+        f"minimum {margins.fused.min():.1f}, median {np.median(margins.fused):.1f}; largest shortfall "
+        "from the margin of its tuning",
+        100 * max(float(shortfall.max()), 0.0),
+        100 * _AGREEMENT,
         "%",
     )
 
 
-def _tuned_row(config: Config, truth: Gripper, grid: Grid, plants: dict[float, Identified]) -> NumericalCase:
-    """Vision alone with the gains that an object profile gives it."""
-    found, promised = [], []
+def _tuned_row(
+    config: Config, truth: Gripper, grid: Grid, plants: dict[float, IdentifiedPlant]
+) -> NumericalCase:
+    """Returns the case of vision alone with the gains of an object profile."""
+    found, predicted = [], []
     for (stiffness, plant), delay_s in product(plants.items(), grid.tuned_delay_s):
         known = {
             "plant_gain": plant.gain,
@@ -250,19 +265,19 @@ def _tuned_row(config: Config, truth: Gripper, grid: Grid, plants: dict[float, I
             "plant_delay_ms": 1e3 * (delay_s + FRAME_S / 2),
         }
         tuned = config.model_copy(update={"control": config.control.model_copy(update=known)})
-        found.append(observed(tuned, replace(truth, stiffness_n_m=stiffness), "vision", delay_s))
-        promised.append(by_identified_plant(gains_of(tuned, "vision"), plant, delay_s))
+        found.append(observed_margin(tuned, replace(truth, stiffness_n_m=stiffness), "vision", delay_s))
+        predicted.append(margin_by_lag(gains_of(tuned, "vision"), plant, delay_s))
     return NumericalCase(
-        "margin of vision alone, tuned by what was identified",
+        "margin of vision alone, tuned to the identified plant",
         f"observed {min(found):.2f} to {max(found):.2f}, predicted by gain and lag alone "
-        f"{min(promised):.2f} to {max(promised):.2f}; of {len(found)} cells those where a swing of "
-        f"{SWING_N:g} N grows",
+        f"{min(predicted):.2f} to {max(predicted):.2f}; cells of {len(found)} where an oscillation "
+        f"of {AMPLITUDE_N:g} N grows",
         float(sum(margin < 1 for margin in found)),
         0.0,
     )
 
 
-def _counted(trials: Iterable[Trial]) -> str:
+def _verdict_counts(trials: Iterable[Trial]) -> str:
     counts = Counter(trial.verdict for trial in trials)
     return ", ".join(f"{verdict} {counts[verdict]}" for verdict in Verdict if counts[verdict])
 

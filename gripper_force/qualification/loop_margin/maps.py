@@ -26,7 +26,7 @@ _TITLES: Final = {"fused": "current and vision", "vision": "vision alone"}
 def draw_verdicts(
     grid: Grid, verdicts: dict[tuple[str, float], Trials], margins: Margins, crushing_n_m: float
 ) -> Figure:
-    """What became of each grasp, by loop and loop gain, with the borders that were predicted."""
+    """Draws the verdict of each grasp by loop and loop gain, with the predicted stability boundaries."""
     delay_ms = 1e3 * np.array(grid.delay_s)
     loops = list(dict.fromkeys(feedback for feedback, _ in verdicts))
     with rc_context({**STYLE, "axes.grid": False, "hatch.linewidth": 0.5, "hatch.color": _INK}):
@@ -62,46 +62,48 @@ def draw_verdicts(
 
 
 def _hatch(panel: Axes, grid: Grid, predicted: Field, factor: float) -> None:
-    """Where less than so many times the gain is predicted to ring."""
+    """Hatches the area where the predicted margin is below ``factor``."""
     if min(predicted.shape) > 1 and predicted.min() < factor:
-        where = (grid.margin_stiffness_n_m, 1e3 * np.array(grid.margin_delay_s))
-        panel.contourf(*where, predicted, [0.0, factor], hatches=["///"], colors="none")
+        position = (grid.margin_stiffness_n_m, 1e3 * np.array(grid.margin_delay_s))
+        panel.contourf(*position, predicted, [0.0, factor], hatches=["///"], colors="none")
         if factor < predicted.max():
-            panel.contour(*where, predicted, [factor], colors=_INK, linewidths=1.2)
+            panel.contour(*position, predicted, [factor], colors=_INK, linewidths=1.2)
 
 
 def draw_margins(grid: Grid, margins: Margins) -> Figure:
-    """Observed and predicted margins, and their ratio, for both loops."""
+    """Draws observed and predicted margins, and their ratio, for both loops."""
     rows: tuple[tuple[str, Field, str, Field], ...] = (
         ("vision alone: observed", margins.vision, "predicted: gain, inertia, friction", margins.inertia),
         ("vision alone: observed", margins.vision, "predicted: gain and lag", margins.identified),
-        ("current and vision: observed", margins.fused, "promised by its tuning", margins.rule),
+        ("current and vision: observed", margins.fused, "predicted by its tuning", margins.rule),
     )
     with rc_context({**STYLE, "axes.grid": False}):
         figure = Figure(figsize=(11, 8.4), layout="constrained")
-        for line, (seen, observed, said, predicted) in zip(
+        for row, (observed_title, observed, predicted_title, predicted) in zip(
             figure.subplots(len(rows), 3, sharex=True, sharey=True), rows, strict=True
         ):
-            _numbers(line[0], grid, observed, seen, "viridis", LogNorm(0.5, 12))
-            _numbers(line[1], grid, predicted, said, "viridis", LogNorm(0.5, 12))
-            _numbers(line[2], grid, observed / predicted, "ratio", "RdBu", LogNorm(0.4, 2.5))
-            line[0].set_ylabel("delay of vision, ms")
-        for panel in line:
+            _draw_numbers(row[0], grid, observed, observed_title, "viridis", LogNorm(0.5, 12))
+            _draw_numbers(row[1], grid, predicted, predicted_title, "viridis", LogNorm(0.5, 12))
+            _draw_numbers(row[2], grid, observed / predicted, "ratio", "RdBu", LogNorm(0.4, 2.5))
+            row[0].set_ylabel("delay of vision, ms")
+        for panel in row:
             panel.set_xlabel("stiffness at a jaw, N/m")
     return figure
 
 
-def _numbers(panel: Axes, grid: Grid, values: Field, title: str, colours: str, scale: LogNorm) -> None:
-    panel.imshow(values, cmap=colours, norm=scale, aspect="auto", origin="lower")
+def _draw_numbers(
+    panel: Axes, grid: Grid, values: Field, title: str, colour_map: str, scale: LogNorm
+) -> None:
+    panel.imshow(values, cmap=colour_map, norm=scale, aspect="auto", origin="lower")
     panel.set_xticks(
         range(values.shape[1]), [f"{k:.0e}".replace("e+0", "e") for k in grid.margin_stiffness_n_m]
     )
     panel.set_yticks(range(values.shape[0]), [f"{1e3 * d:.0f}" for d in grid.margin_delay_s])
     panel.set_title(title)
-    for (row, column), value in np.ndenumerate(values):
+    for (y, x), value in np.ndenumerate(values):
         shade = float(scale(value))
-        dark = shade < 0.55 if colours == "viridis" else not 0.2 < shade < 0.8
+        dark = shade < 0.55 if colour_map == "viridis" else not 0.2 < shade < 0.8
         panel.text(
-            column, row, f"{value:.2g}", ha="center", va="center", fontsize=7,
+            x, y, f"{value:.2g}", ha="center", va="center", fontsize=7,
             color="white" if dark else "black",
         )  # fmt: skip

@@ -17,7 +17,7 @@ RIG = transmission_of(GripperConfig())
 
 
 def press(gripper: Gripper, motor_force_n: float, time_s: float = 3.0) -> Gripper:
-    """Lets the motor push with a constant force, far from its goal position."""
+    """Applies a constant motor force, far from the goal position."""
     goal_rad = RIG.position_rad(0.0)
     for _ in range(round(time_s / 0.005)):
         gripper.advance(ServoCommand(0, goal_rad, RIG.current_a(motor_force_n)), 0.005)
@@ -31,7 +31,7 @@ def press(gripper: Gripper, motor_force_n: float, time_s: float = 3.0) -> Grippe
     play_m=st.floats(0, 1e-3),
 )
 @settings(max_examples=15, deadline=None)
-def test_it_rests_where_push_spring_and_friction_balance(
+def test_jaw_rests_where_motor_force_spring_and_friction_balance(
     stiffness_n_m: float, motor_force_n: float, gain: float, play_m: float
 ) -> None:
     gripper = press(
@@ -43,14 +43,14 @@ def test_it_rests_where_push_spring_and_friction_balance(
     assert gripper.peak_n >= gripper.force_n
 
 
-def test_the_impact_is_that_of_a_mass_on_a_spring() -> None:
+def test_impact_is_that_of_a_mass_on_a_spring() -> None:
     gripper = Gripper(RIG, stiffness_n_m=1e5, friction_n=0.0, damping_n_s_m=0.0, play_m=0.0, contact_m=0.001)
     gripper.v_m_s = 0.025
     press(gripper, 0.0, 0.2)
     assert gripper.peak_n == pytest.approx(0.025 * math.sqrt(1.3e5), rel=0.02)
 
 
-def test_play_moves_the_jaw_late_and_the_object_holds_the_teeth_together() -> None:
+def test_play_delays_the_jaw_and_contact_keeps_the_teeth_engaged() -> None:
     gripper = press(Gripper(RIG, play_m=0.001, contact_m=0.005), 3.0)
     assert gripper.jaw_m == pytest.approx(gripper.x_m - 0.001)
     pressed_m = gripper.jaw_m
@@ -59,7 +59,7 @@ def test_play_moves_the_jaw_late_and_the_object_holds_the_teeth_together() -> No
     assert gripper.jaw_m < pressed_m
 
 
-def test_the_goal_current_goes_in_steps() -> None:
+def test_goal_current_is_quantised() -> None:
     coarse, fine = (Gripper(RIG, step_a=step_a, friction_n=0.0, contact_m=0.0) for step_a in (0.01, 0.0))
     asked_a = 0.104
     for gripper in (coarse, fine):
@@ -68,7 +68,7 @@ def test_the_goal_current_goes_in_steps() -> None:
     assert fine.current_a == pytest.approx(asked_a)
 
 
-def test_the_servo_speaks_in_its_own_steps() -> None:
+def test_readings_are_quantised() -> None:
     gripper = Gripper(RIG, x_m=0.0123456, v_m_s=0.00777, current_a=0.0501)
     servo = gripper.read(7, 0.0)
     assert servo.t_ns == 7
@@ -77,7 +77,7 @@ def test_the_servo_speaks_in_its_own_steps() -> None:
     assert servo.velocity_rad_s == pytest.approx(0.00777 / 0.02, abs=0.012)
 
 
-def test_vision_is_late_by_its_delay_and_keeps_the_newest() -> None:
+def test_vision_has_its_delay_and_returns_the_newest_estimate() -> None:
     vision = SimulatedVision(0.035, 0.0)
     seen = {t_ms: vision.sample(t_ms * NS_PER_MS, float(t_ms), 0.0) for t_ms in range(0, 200, 5)}
     first = next(visual for visual in seen.values() if visual is not None)

@@ -34,7 +34,7 @@ def verdict(truth: Gripper, delay_s: float = 0.035, **control: object) -> Verdic
     return grasp(changed, truth, delay_s, 0).verdict
 
 
-def test_every_case_of_a_small_grid_keeps_its_bound_and_maps_are_drawn(tmp_path: Path) -> None:
+def test_small_grid_keeps_its_bounds_and_draws_maps(tmp_path: Path) -> None:
     rows = list(cases(CONFIG, tmp_path / "maps", SMALL))
     assert [row.case for row in rows if not row.ok] == []
     assert len({row.case for row in rows}) == len(rows)
@@ -44,21 +44,21 @@ def test_every_case_of_a_small_grid_keeps_its_bound_and_maps_are_drawn(tmp_path:
     ]
 
 
-def test_a_grasp_holds_and_one_whose_frames_are_too_old_holds_on_current() -> None:
+def test_grasp_with_frames_that_are_too_old_holds_on_current() -> None:
     assert verdict(TRUTH) == Verdict.HOLDS
     assert verdict(TRUTH, 0.15) == Verdict.CURRENT
 
 
-def test_eight_times_the_gain_rings_with_vision_late() -> None:
+def test_eight_times_the_gain_rings_with_late_vision() -> None:
     assert verdict(replace(TRUTH, stiffness_n_m=100.0), 0.08, plant_gain=1 / 8) == Verdict.RINGS
 
 
-def test_an_object_that_is_too_far_away_is_not_held() -> None:
+def test_object_out_of_reach_is_not_held() -> None:
     assert verdict(replace(TRUTH, contact_m=0.2)) == Verdict.LOSES
 
 
 @pytest.mark.parametrize(("share", "crushed"), [(0.7, False), (1.4, True)])
-def test_the_first_touch_crushes_what_is_too_stiff(share: float, crushed: bool) -> None:
+def test_first_contact_crushes_objects_that_are_too_stiff(share: float, crushed: bool) -> None:
     stiff = replace(TRUTH, stiffness_n_m=share * crushing_n_m(CONFIG.control, TRUTH))
     assert (verdict(stiff) == Verdict.CRUSHES) is crushed
 
@@ -67,7 +67,7 @@ def test_the_first_touch_crushes_what_is_too_stiff(share: float, crushed: bool) 
     ("current_a", "position_rad"),
     [(-0.01, 0.1), (0.5, 0.1), (math.nan, 0.1), (0.1, math.inf), (0.1, -0.1), (0.1, 3.0)],
 )
-def test_commands_beyond_limits_are_seen(current_a: float, position_rad: float) -> None:
+def test_commands_outside_limits_are_detected(current_a: float, position_rad: float) -> None:
     bounds = _Bounds(CONFIG, TRUTH)
-    assert bounds.keep(0.1, 0.1)
-    assert not bounds.keep(current_a, position_rad)
+    assert bounds.contains(0.1, 0.1)
+    assert not bounds.contains(current_a, position_rad)
