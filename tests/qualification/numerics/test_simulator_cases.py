@@ -39,7 +39,7 @@ def test_undetected_cases_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("step_s", [0.008, 0.0, math.nan])
 def test_an_invalid_time_step_raises(step_s: float) -> None:
-    with pytest.raises(SimulationError, match="is no step for 'stapler'"):
+    with pytest.raises(SimulationError, match="gives wrong forces for 'stapler'"):
         World(
             Scene("stapler", "coarse"),
             GripperConfig(),
