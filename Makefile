@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 EGL_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri
 
-.PHONY: grasp test setup setup-dev format clean
+.PHONY: grasp test docs setup setup-dev format clean
 
 grasp: setup
 	$(BIN)/gripper-force grasp $(ARGS)
@@ -15,9 +15,14 @@ test: setup-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto $(ARGS)
 	$(BIN)/coverage run -m pytest -q tests/control/test_safety.py tests/control/test_limits.py
 	$(BIN)/coverage report
+
+docs: setup-dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	@echo open build/site/index.html
 
 format: setup-dev
 	$(BIN)/ruff check --fix .

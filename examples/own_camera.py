@@ -18,13 +18,15 @@ class PatternCamera:
     def __init__(self, config: gf.CameraConfig, clock: gf.Clock) -> None:
         self._clock, self._period_ns = clock, round(1e9 / config.rate_hz)
         self._side_px = int(config.options.get("side_px", 128))
-        self._start_ns = 0
+        self._start_ns: int | None = None  # None: not started, or closed
         self._seq = -1
 
     def start(self) -> None:
         self._start_ns = self._clock.now_ns()
 
     def newest(self) -> gf.Frame | None:
+        if self._start_ns is None:
+            return None
         now_ns = self._clock.now_ns()
         seq = (now_ns - self._start_ns) // self._period_ns
         if seq <= self._seq:
@@ -38,7 +40,7 @@ class PatternCamera:
         return {}
 
     def close(self) -> None:
-        pass
+        self._start_ns = None
 
     def _read(self, seq: int) -> np.ndarray:
         stripes = (np.arange(self._side_px) + seq) // 8 % 2 * 120 + 60

@@ -1,10 +1,15 @@
-"""What the core asks of a device; `gripper_force.runtime.backends` picks the class by name."""
+"""Protocols of devices, which `gripper_force.runtime.backends` opens by name, and of callbacks."""
+
+from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from gripper_force.types import Frame, LoadCellSample, ServoCommand, ServoState
+
+if TYPE_CHECKING:
+    from gripper_force.config import ServoConfig
 
 
 @dataclass(slots=True)
@@ -65,33 +70,23 @@ class Servo(Protocol):
 
     @property
     def stats(self) -> BusStats:
-        """Counters of retries and losses."""
+        """Counters of cycles, retries and losses."""
         ...
 
-    @property
-    def nm_per_a(self) -> float:
-        """Torque constant at the horn by the vendor's table: a prior, to be calibrated."""
-        ...
-
-    @property
-    def current_step_a(self) -> float:
-        """Resolution of the goal current."""
-        ...
-
-    @property
-    def voltage_range_v(self) -> tuple[float, float]:
-        """Least and greatest supply it works at, by the vendor's table."""
+    @staticmethod
+    def spec(config: ServoConfig) -> ServoSpec:
+        """Returns the data of the configured model, without a connection. Raises `ConfigError`."""
         ...
 
     def start(self) -> ServoState:
         """Checks the model, sets mode and limits, reads them back, arms the watchdog and turns torque on.
 
-        The present position is the goal when torque comes on, so nothing moves.
+        The present position is the goal when torque turns on, so nothing moves. If this raises, torque is off.
         """
         ...
 
     def read(self) -> ServoState:
-        """Reads all of a `ServoState` in one bus transaction."""
+        """Reads a `ServoState` in one bus transaction."""
         ...
 
     def write(self, command: ServoCommand) -> None:
@@ -99,27 +94,27 @@ class Servo(Protocol):
         ...
 
     def stop(self, *, hold: bool) -> None:
-        """Ends a run: torque off; with ``hold`` the goals are kept and the watchdog is disarmed."""
+        """Ends a run: turns torque off, or with ``hold`` keeps the goals and disarms the watchdog."""
         ...
 
     def close(self) -> None:
-        """Releases the port. Does not change the torque. May be called twice."""
+        """Releases the port without changing the torque. May be called twice."""
         ...
 
 
 class Camera(Protocol):
-    """A gray camera."""
+    """A gray camera. With the class attribute ``supports_lockstep = True`` it follows simulated time."""
 
     def start(self) -> None:
-        """Opens the device and begins to capture."""
+        """Opens the device and starts to capture."""
         ...
 
     def newest(self) -> Frame | None:
-        """The newest frame that was not handed out yet, or None. Never blocks."""
+        """Returns the newest frame that was not returned before, or None. Never blocks."""
         ...
 
     def counts(self) -> dict[str, int]:
-        """What went wrong since it was made: cause to how often."""
+        """Returns the number of problems since construction by cause."""
         ...
 
     def close(self) -> None:
@@ -128,18 +123,21 @@ class Camera(Protocol):
 
 
 class LoadCell(Protocol):
-    """A force reference, fitted to calibrate and to check; no decision depends on it."""
+    """A force reference for calibration and checks; no control decision depends on it.
+
+    With the class attribute ``supports_lockstep = True`` it follows simulated time.
+    """
 
     def start(self) -> None:
-        """Opens the device and begins to sample."""
+        """Opens the device and starts to sample."""
         ...
 
     def drain(self) -> list[LoadCellSample]:
-        """Every sample since the last call, oldest first. Never blocks."""
+        """Returns all samples since the last call, oldest first. Never blocks."""
         ...
 
     def counts(self) -> dict[str, int]:
-        """What went wrong since it was made: cause to how often."""
+        """Returns the number of problems since construction by cause."""
         ...
 
     def close(self) -> None:
@@ -148,30 +146,30 @@ class LoadCell(Protocol):
 
 
 class Clock(Protocol):
-    """Time as the session sees it."""
+    """The run's clock."""
 
     def now_ns(self) -> int:
-        """Monotonic time."""
+        """Returns the monotonic time in nanoseconds."""
         ...
 
     def sleep_until_ns(self, t_ns: int) -> None:
-        """Returns at ``t_ns``. In lockstep this is what makes the simulated world go on."""
+        """Waits until ``t_ns``. In lockstep this advances the simulated world."""
         ...
 
 
 @dataclass(slots=True)
 class Devices:
-    """What a run drives, built by `gripper_force.runtime.backends.open_devices`.
+    """The devices of a run, opened by `gripper_force.runtime.backends.open_devices`.
 
     Attributes:
         clock: The run's time.
         servo: The gripper's servo.
         camera: The camera, or None.
         load_cell: The load cell, or None.
-        lockstep: True where the clock is simulated and the run is deterministic.
+        lockstep: True if the clock is simulated and the run is deterministic.
         start_ns: The run's start on its clock.
-        check: Raises what broke in a thread of the devices' own, if anything did.
-        notes: Facts about the devices that the log should hold (a scene's drawn parameters, a serial number).
+        check: Re-raises an exception from a device's background thread, if there was one.
+        notes: Facts about the devices for the log, such as the scene's parameters or a serial number.
         render_under_light: Returns another camera of the same simulated world under another light, given in
             lux, and that camera's notes; None without a simulated world.
     """

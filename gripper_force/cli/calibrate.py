@@ -143,8 +143,7 @@ def object_(
     from gripper_calibration.procedures import calibrate_object as job
 
     settings = load_settings(config, set_, {"object": name, "seed": seed})
-    if logs is None:
-        logs = _touches(settings, touches, peak_n, folder, pause)
+    logs = _touches(settings, touches, peak_n, folder, pause) if logs is None else job.find_logs(logs)
     with console.bar("calibrating", len(logs) + 2) as progress:
         result = job.calibrate_object(settings, name, logs=logs, out=out, progress=progress)
     console.show(result.as_dict(), as_json, object_table)

@@ -55,7 +55,7 @@ def simulate(
     if protocol is None:
         if scale is not None:
             raise ConfigError(
-                "--scale only applies with --protocol shin2019; add that option, or omit --scale"
+                "--scale only applies with --protocol; add --protocol shin2019, or omit --scale"
             )
         settings = load_settings(config, set_, {})
         seed, plans = 100_000 if first_seed is None else first_seed, []

@@ -9,6 +9,7 @@ no more than that. Format: https://mcap.dev/spec
 """
 
 import contextlib
+import dataclasses
 import re
 import struct
 from collections.abc import Callable, Iterator, Mapping
@@ -402,9 +403,9 @@ class LogReader:
         if record_type is None or schema is None or schema.encoding != "protobuf":
             raise LogError(f"{self.path} holds the topic {channel.topic}, which gripper-force doesn't know")
         codec = _CODECS[record_type]
-        # foxglove.RawImage is protobuf's to evolve; a record of ours has to agree field by field.
+        # Foxglove and protobuf keep foxglove.RawImage compatible; our own records must agree field by field.
         if schema.name != codec.schema_name or (
-            record_type is not Frame and _fields(schema.data) != _fields(codec.schema)
+            record_type is not Frame and not _is_readable(_fields(schema.data), record_type)
         ):
             raise LogError(
                 f"{self.path} holds {channel.topic} as another version of gripper-force wrote it; "
@@ -472,6 +473,16 @@ def _stream(data: bytes) -> ReadDataStream:
 def _fields(schema: bytes) -> list[tuple[str, int, int]]:
     files = FileDescriptorSet.FromString(schema).file
     return [(f.name, f.number, f.type) for file in files for m in file.message_type for f in m.field]
+
+
+def _is_readable(fields: list[tuple[str, int, int]], record_type: type[Record]) -> bool:
+    """Returns True if the fields are those of the record, or lack only later ones whose default is zero."""
+    known = _fields(_CODECS[record_type].schema)
+    missing = known[len(fields) :]
+    defaults = {field.name: field.default for field in dataclasses.fields(record_type)}
+    return fields == known[: len(fields)] and all(
+        defaults[name] in (0.0, "", False) for name, _, _ in missing
+    )
 
 
 def _version(metadata: Mapping[str, str]) -> str:

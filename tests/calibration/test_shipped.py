@@ -10,7 +10,7 @@ from gripper_force.vision.checkpoint import load_checkpoint
 
 
 @pytest.mark.parametrize("name", TRIAL_OBJECTS)
-def test_a_shipped_profile_is_of_the_shipped_network_and_the_usual_camera(
+def test_shipped_profiles_match_the_shipped_network_and_the_default_camera(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))

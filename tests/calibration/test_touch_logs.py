@@ -13,7 +13,7 @@ from gripper_force.vision.checkpoint import load_checkpoint
 
 
 @given(st.lists(st.tuples(st.integers(5, 40), st.integers(3, 40), st.floats(1, 12)), min_size=1, max_size=6))
-def test_each_contact_is_a_touch_with_the_rests_about_it(parts: list[tuple[int, int, float]]) -> None:
+def test_touch_numbers_divide_at_the_rests(parts: list[tuple[int, int, float]]) -> None:
     rests = [np.concatenate([np.zeros(rest), np.full(press, force_n)]) for rest, press, force_n in parts]
     number = touch_numbers(np.concatenate([*rests, np.zeros(5)]))
     assert (np.diff(number) >= 0).all()
@@ -22,7 +22,7 @@ def test_each_contact_is_a_touch_with_the_rests_about_it(parts: list[tuple[int, 
         assert (number[begin + rest : begin + rest + press] == i).all()
 
 
-def test_a_flicker_of_the_force_does_not_end_a_touch() -> None:
+def test_short_loss_of_contact_does_not_end_a_touch() -> None:
     force_n = np.concatenate([np.zeros(10), np.full(20, 3.0), np.zeros(2), np.full(20, 3.0), np.zeros(10)])
     assert touch_numbers(force_n).max() == 0
     assert touch_numbers(np.zeros(30)).max() == 0
@@ -39,7 +39,7 @@ def recording(path: Path, forces_n: list[float], *, keys: str = "object: mug") -
     return path
 
 
-def test_logs_that_do_not_belong_together_are_refused(tmp_path: Path, tiny_checkpoint: Path) -> None:
+def test_join_refuses_logs_of_different_objects_or_load_cells(tmp_path: Path, tiny_checkpoint: Path) -> None:
     checkpoint = load_checkpoint(tiny_checkpoint)
     forces_n = [0.0] * 10 + [2.0] * 20
     mug = read_log(recording(tmp_path / "a.mcap", forces_n), checkpoint)
@@ -56,13 +56,13 @@ def test_logs_that_do_not_belong_together_are_refused(tmp_path: Path, tiny_check
     assert both.touches.numbers == [0, 1]
 
 
-def test_a_log_without_contact_is_no_touch_and_has_no_lag(tmp_path: Path, tiny_checkpoint: Path) -> None:
+def test_log_without_contact_has_no_lag(tmp_path: Path, tiny_checkpoint: Path) -> None:
     recorded = read_log(recording(tmp_path / "a.mcap", [0.0] * 30), load_checkpoint(tiny_checkpoint))
     assert not recorded.has_contact
     assert recorded.delay_s == pytest.approx(0.02 + 1 / 60)
 
 
-def test_a_log_whose_labels_end_too_soon_is_refused(tmp_path: Path, tiny_checkpoint: Path) -> None:
+def test_log_without_labels_after_the_lead_in_is_refused(tmp_path: Path, tiny_checkpoint: Path) -> None:
     path = recording(tmp_path / "a.mcap", [0.0, 0.0] + [float("nan")] * 30)
     with pytest.raises(
         DataError, match=r".* has no label after its first 3 frames, which the network needs as lead-in"
@@ -70,7 +70,7 @@ def test_a_log_whose_labels_end_too_soon_is_refused(tmp_path: Path, tiny_checkpo
         read_log(path, load_checkpoint(tiny_checkpoint))
 
 
-def test_a_recording_without_a_servo_tells_of_touches_alone(tmp_path: Path, tiny_checkpoint: Path) -> None:
+def test_recording_without_a_servo_has_no_presses(tmp_path: Path, tiny_checkpoint: Path) -> None:
     path = recording(tmp_path / "clip.mcap", [max(0.0, 0.2 * (i - 10)) for i in range(40)])
     recorded = read_log(path, load_checkpoint(tiny_checkpoint))
     assert recorded.presses == []

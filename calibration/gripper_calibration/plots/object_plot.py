@@ -41,10 +41,8 @@ def draw(
     line_n = np.linspace(0, max_n, 100)
     half_n = profile.interval.half_width_n(line_n)
     covered = np.abs(error_n) <= profile.interval.half_width_n(after_n)
-    title = (
-        f"{profile.object}: {profile.touches} touches, MAE {profile.before_n:.3f} N before, "
-        f"{after_mae_n:.3f} N after ({method})"
-    )
+    count = "1 touch" if profile.touches == 1 else f"{profile.touches} touches"
+    title = f"{profile.object}: {count}, MAE {profile.before_n:.3f} N before, {after_mae_n:.3f} N after ({method})"
     with saved_figure(path, title, 7.0) as figure:
         (before_plot, after_plot), (residual_plot, curve_plot) = figure.subplots(2, 2)
         before_plot.plot(touches.estimate_n, touches.force_n, ".", ms=2, color=DATA)

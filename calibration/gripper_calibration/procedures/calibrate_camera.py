@@ -1,13 +1,12 @@
 """Calibration of a camera: exposure, region of interest and lag, from touches of a compliant object."""
 
 import time
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import Final
 
 import cv2
 import numpy as np
@@ -49,6 +48,7 @@ EXPOSURES_US: Final = (500, 1000, 2000, 4000, 8000, 16000)
 """Candidate exposures. Those above half a frame's period are skipped: their images are late and blurred."""
 
 TOUCHES: Final = 10
+"""Default number of touches."""
 
 _SETTLE_NS: Final = 300 * NS_PER_MS
 _TIMEOUT_NS: Final = 3 * NS_PER_S
@@ -194,8 +194,10 @@ def observe(log: Path, region: Region | None) -> CameraObservation:
         log: The set, as `gripper_force.jobs.recording.record` writes it.
         region: Region of interest, if it is known; markers are then not searched.
     """
-    records: dict[type, list[Any]] = defaultdict(list)
     frames: list[Frame] = []
+    samples: list[LoadCellSample] = []
+    statuses: list[GraspStatus] = []
+    requests: list[Request] = []
     used_ms: list[float] = []
     waiting: list[Frame] = []
     for item in LogReader(log).records(Frame, ServoState, LoadCellSample, GraspStatus, Request):
@@ -205,43 +207,53 @@ def observe(log: Path, region: Region | None) -> CameraObservation:
         elif isinstance(item, ServoState):  # of the cycle that got the frames before it
             used_ms += [(item.t_ns - frame.t_ns) / NS_PER_MS for frame in waiting]
             waiting = []
-        else:
-            records[type(item)].append(item)
+        elif isinstance(item, LoadCellSample):
+            samples.append(item)
+        elif isinstance(item, GraspStatus):
+            statuses.append(item)
+        elif isinstance(item, Request):
+            requests.append(item)
     step = -(-len(frames) // _MAX_SEARCHED)
     searched = frames[::step] if region is None else []
     markers = [find_markers(frame.gray) for frame in searched]
     distances = [_distance_px(one) for one in markers]
     widest = int(np.argmax(distances)) if distances and max(distances) > 0 else None
-    reference = np.mean([frame.gray for frame in frames[:_REFERENCE_FRAMES]], axis=0)
-    as_gray: Gray = np.rint(reference).astype(np.uint8)
+    mean = np.mean([frame.gray for frame in frames[:_REFERENCE_FRAMES]], axis=0)
+    reference: Gray = np.rint(mean).astype(np.uint8)
     frame_s = np.array([frame.t_ns for frame in frames]) / NS_PER_S
     return CameraObservation(
-        reference=as_gray,
+        reference=reference,
         markers=markers,
-        widest=as_gray if widest is None else searched[widest].gray,
+        widest=reference if widest is None else searched[widest].gray,
         widest_markers={} if widest is None else markers[widest],
-        touches=_touches(frames, region, records),
+        touches=_touch_lags(frames, region, samples, statuses, releases_ns(requests)),
         use_ms=float(np.median(used_ms)),
         rate_hz=float(1 / np.median(np.diff(frame_s))),
     )
 
 
-def _touches(frames: list[Frame], region: Region | None, records: dict[type, list[Any]]) -> list[TouchLag]:
+def _touch_lags(
+    frames: list[Frame],
+    region: Region | None,
+    samples: list[LoadCellSample],
+    statuses: list[GraspStatus],
+    release_times_ns: list[int],
+) -> list[TouchLag]:
     frame_s = np.array([frame.t_ns for frame in frames]) / NS_PER_S
     images = np.stack([downscale(frame.gray, region, _SMALL_PX) for frame in frames])
-    cells = sorted((s for s in records[LoadCellSample] if s.valid), key=lambda sample: sample.t_ns)
-    cell_s = np.array([sample.t_ns for sample in cells]) / NS_PER_S
-    force_n = np.array([sample.force_n for sample in cells])
-    servo_s = np.array([status.t_ns for status in records[GraspStatus]]) / NS_PER_S
-    width_m = np.array([status.width_m for status in records[GraspStatus]])
-    releases_s = [t_ns / NS_PER_S for t_ns in releases_ns(records[Request])]
+    valid = sorted((s for s in samples if s.valid), key=lambda sample: sample.t_ns)
+    cell_s = np.array([sample.t_ns for sample in valid]) / NS_PER_S
+    force_n = np.array([sample.force_n for sample in valid])
+    servo_s = np.array([status.t_ns for status in statuses]) / NS_PER_S
+    width_m = np.array([status.width_m for status in statuses])
+    releases_s = [t_ns / NS_PER_S for t_ns in release_times_ns]
     by_servo_s = camera_lags_s(frame_s, images, servo_s, width_m, releases_s)
     by_force_s = camera_lags_s(frame_s, images, cell_s, force_n, releases_s)
     touches = []
-    for at_s, camera_s, correlation_s in zip(releases_s, by_servo_s, by_force_s, strict=True):
-        cell_lag_s = load_cell_lag_s(cell_s, force_n, servo_s, width_m, at_s)
-        at_n = float(np.interp(at_s, cell_s, force_n))
-        touches.append(TouchLag(at_n, 1e3 * (float(camera_s) - cell_lag_s), 1e3 * float(correlation_s)))
+    for release_s, camera_s, correlation_s in zip(releases_s, by_servo_s, by_force_s, strict=True):
+        cell_lag_s = load_cell_lag_s(cell_s, force_n, servo_s, width_m, release_s)
+        release_n = float(np.interp(release_s, cell_s, force_n))
+        touches.append(TouchLag(release_n, 1e3 * (float(camera_s) - cell_lag_s), 1e3 * float(correlation_s)))
     return touches
 
 
@@ -297,12 +309,12 @@ def compute_ms(config: Config, gray: Gray) -> float:
     estimator = make_estimator(ResolvedConfig(config, model))
     if estimator is None:
         return 0.0
-    each_ms = []
+    times_ms = []
     for _ in range(_TIMED_FRAMES):
         begin_ns = time.perf_counter_ns()
         estimator.update(gray)
-        each_ms.append((time.perf_counter_ns() - begin_ns) / NS_PER_MS)
-    return float(np.median(each_ms))
+        times_ms.append((time.perf_counter_ns() - begin_ns) / NS_PER_MS)
+    return float(np.median(times_ms))
 
 
 def _with(config: Config, section: str, **values: object) -> Config:

@@ -19,8 +19,8 @@ from gripper_force.runtime.backends import MonotonicClock, open_load_cell
 from gripper_force.types import NS_PER_MS, NS_PER_S, LoadCellSample
 
 STANDARD_GRAVITY_M_S2: Final = 9.80665
-NEUTRAL: Final = 1e-9
-"""Newtons per raw unit, so small that no threshold in newtons acts: the driver then only rejects saturated and
+NEUTRAL_N_PER_RAW: Final = 1e-9
+"""A scale so small that no threshold in newtons acts: the driver then only rejects saturated and
 stuck readings. The fit rejects spikes, because it knows the scale."""
 
 _PERIOD_NS: Final = 50 * NS_PER_MS
@@ -30,7 +30,7 @@ _SILENT_NS: Final = 3 * NS_PER_S
 _MAX_FORCE_N: Final = 1000.0
 _MIN_CHANGE: Final = 10
 _MAX_RANGE: Final = 0.01
-_NAMES: Final = ("empty", "loaded", "empty again")
+"""A load is accepted if its change is this many times its uncertainty and its range this share of the change."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +87,7 @@ def calibrate_load_cell(
     if rig.exists():
         read_rig(rig)  # a damaged profile is reported before anyone carries masses
     clock = MonotonicClock()
-    neutral = section.model_copy(update={"tare_raw": 0.0, "n_per_raw": NEUTRAL})
+    neutral = section.model_copy(update={"tare_raw": 0.0, "n_per_raw": NEUTRAL_N_PER_RAW})
     cell: LoadCell = open_load_cell(config.model_copy(update={"load_cell": neutral}), clock)
     with closing(cell):
         cell.start()
@@ -120,7 +120,7 @@ def weigh(
     """Prompts for the three loads in turn, and reads each until it is at rest.
 
     Args:
-        cell: A started load cell with the scale `NEUTRAL`.
+        cell: A started load cell with the scale `NEUTRAL_N_PER_RAW`.
         clock: Its clock.
         force_n: Weight of the known mass, in newtons.
         prompt: Called when a person has to change the load.
@@ -132,15 +132,15 @@ def weigh(
         DeviceTimeoutError: The cell gives no readings.
         DataError: A reading does not rest, hardly changes with the load, or does not return.
     """
-    scale = _Scale(cell, clock, round(seconds * NS_PER_S), round(timeout_s * NS_PER_S), progress)
+    reader = _RestReader(cell, clock, round(seconds * NS_PER_S), round(timeout_s * NS_PER_S), progress)
     prompt("Take everything off the load cell")
-    empty = scale.read(_NAMES[0], lambda _: True)
+    empty = reader.read("empty", lambda _: True)
     tare = rest_statistics(empty, 0.0, "without load")
     prompt(
         f"Put the mass of {force_n / STANDARD_GRAVITY_M_S2:.4g} kg ({force_n:.4g} N) on it and let it rest"
     )
 
-    def rests(rest: Rest) -> bool:
+    def is_loaded(rest: Rest) -> bool:
         try:
             now = rest_statistics(rest, 0.0, "under load")
         except DataError:
@@ -150,23 +150,23 @@ def weigh(
             change > _MIN_CHANGE * (now.half_raw + tare.half_raw) and now.range_raw < _MAX_RANGE * change
         )
 
-    loaded = scale.read(_NAMES[1], rests)
-    under = rest_statistics(loaded, 0.0, "under load")
+    loaded = reader.read("loaded", is_loaded)
+    loaded_statistics = rest_statistics(loaded, 0.0, "under load")
 
-    def is_back(rest: Rest) -> bool:
+    def is_unloaded(rest: Rest) -> bool:
         try:
-            now = rest_statistics(rest, 0.0, "after the load was taken off")
+            now = rest_statistics(rest, 0.0, "after unloading")
         except DataError:
             return False
-        change = abs(under.raw - tare.raw)
+        change = abs(loaded_statistics.raw - tare.raw)
         return bool(abs(now.raw - tare.raw) < _MAX_RANGE * change and now.range_raw < _MAX_RANGE * change)
 
     prompt("Take the mass off again")
-    again = scale.read(_NAMES[2], is_back)
+    again = reader.read("empty again", is_unloaded)
     return fit_load_cell(empty, loaded, again, force_n)
 
 
-class _Scale:
+class _RestReader:
     """Reads a load cell until a span of readings is good, or a time has passed."""
 
     def __init__(

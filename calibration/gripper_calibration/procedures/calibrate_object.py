@@ -132,6 +132,7 @@ def calibrate_object(
             calibration.
         LogError: A log can't be read.
         CheckpointError: The network can't be read.
+        CheckpointError: The network can't be read.
         DeviceError: A device failed. The servo was stopped as configured, and completed touches are kept.
 
     Example:
@@ -150,7 +151,7 @@ def calibrate_object(
             paths.append(path)
             progress(f"touch {len(paths)} of {touches}")
     else:
-        paths = [p for path in logs for p in (sorted(path.rglob("*.mcap")) if path.is_dir() else [path])]
+        paths = find_logs(logs)
     if not paths:
         raise DataError(f"there is no log to calibrate {name!r} from; record touches of it first")
     return _fit_and_write(config, name, paths, out, progress)
@@ -196,6 +197,11 @@ def record_touches(
 def touch_paths(config: Config, touches: int, folder: Path | None = None) -> list[Path]:
     """Returns the paths of the logs that `record_touches` writes, in order."""
     return _plan(touches, None).paths(config, folder or default_folder(config.object))
+
+
+def find_logs(paths: Sequence[Path]) -> list[Path]:
+    """Returns the logs among the paths, and those in folders among them, sorted within each folder."""
+    return [log for path in paths for log in (sorted(path.rglob("*.mcap")) if path.is_dir() else [path])]
 
 
 def default_folder(name: str) -> Path:

@@ -38,11 +38,11 @@ _RATE_HZ: Final = 200.0
 _PEAK_SHARE: Final = 1.05
 """Peak force as a share of the largest target, so that every target lies within the calibrated range."""
 _APPROACH_M_S: Final = 0.008
-_TOUCH_N: Final = 0.5
-_FREE_N: Final = 0.2
+_CONTACT_N: Final = 0.5
+_NO_CONTACT_N: Final = 0.2
 _REST_S: Final = 0.5
 _MAX_TARE_N: Final = 1.0
-_CLEAR_M: Final = 0.005
+_CLEARANCE_M: Final = 0.005
 _BRAKE_RAD: Final = 0.3
 """Distance from the goal at which the servo's own position control takes over."""
 _SPEED_UP_S: Final = 0.1
@@ -110,10 +110,10 @@ def calibrate_servo(
             "calibrate servo needs a load cell, but load_cell.backend is none; set the backend of yours"
         )
     for width_m in gauges_m:
-        if not 0 < width_m < config.gripper.open_width_m - 2 * _CLEAR_M:
+        if not 0 < width_m < config.gripper.open_width_m - 2 * _CLEARANCE_M:
             raise ConfigError(
                 f"a gauge of {1e3 * width_m:g} mm does not fit between jaws that open to "
-                f"{1e3 * config.gripper.open_width_m:g} mm (gripper.open_width_m)"
+                f"{1e3 * config.gripper.open_width_m:g} mm (gripper.open_width_m); use a narrower one"
             )
     known = read_rig(rig) if rig.exists() else RigProfile()
     given = Nominal(
@@ -125,9 +125,9 @@ def calibrate_servo(
     passes: list[FreePass] = []
     for width_m in gauges_m:
         prompt(f"Put the load cell with its width of {1e3 * width_m:g} mm between the open jaws")
-        more = measure(config, width_m, progress)
-        presses += more[0]
-        passes += more[1]
+        new_presses, new_passes = measure(config, width_m, progress)
+        presses += new_presses
+        passes += new_passes
     fit = fit_servo(presses, passes, given)
     found = _section(fit, config)
     update_rig(rig, found)
@@ -181,7 +181,9 @@ def _section(fit: ServoFit, config: Config) -> ServoCalibration:
     )
 
 
-def measure(config: Config, gauge_m: float, progress: Progress) -> tuple[list[ServoPress], list[FreePass]]:
+def measure(
+    config: Config, gauge_m: float, progress: Progress = no_progress
+) -> tuple[list[ServoPress], list[FreePass]]:
     """Presses the gauge between the jaws, and moves freely beside it.
 
     Args:
@@ -193,22 +195,22 @@ def measure(config: Config, gauge_m: float, progress: Progress) -> tuple[list[Se
         DeviceError: A device failed. The servo has no torque.
         DataError: The load cell reads a force without contact, or the jaws met nothing.
     """
-    with open_devices(config) as devices, _moving(config, devices, progress) as jaws:
+    with open_devices(config) as devices, _torque_on(config, devices, progress) as jaws:
         jaws.open()
         jaws.tare()
         jaws.step_name = "closing on the gauge"
-        touch_rad = jaws.touch(gauge_m)
+        contact_rad = jaws.close_on_gauge(gauge_m)
         peak_n = _PEAK_SHARE * largest_target_n(config.control.force_limit_n)
         presses = []
         for number, (rate_n_s, share) in enumerate(PRESSES, start=1):
             jaws.step_name = f"{1e3 * gauge_m:g} mm, press {number} of {len(PRESSES)}"
             if number > 1:
-                jaws.touch(gauge_m)
+                jaws.close_on_gauge(gauge_m)
             presses.append(jaws.press(gauge_m, rate_n_s, share * peak_n))
-            jaws.back_off(touch_rad)
+            jaws.back_off(contact_rad)
         jaws.step_name = f"{1e3 * gauge_m:g} mm, free travel"
         friction_a = float(np.median([_friction_a(press) for press in presses]))
-        passes = [one for speed in SPEEDS_M_S for one in jaws.travel(friction_a, speed, touch_rad)]
+        passes = [one for speed in SPEEDS_M_S for one in jaws.travel(friction_a, speed, contact_rad)]
     return presses, passes
 
 
@@ -217,12 +219,14 @@ def _friction_a(press: ServoPress) -> float:
     middle_n = press.force_n[press.turn - 1] / 2
     near = np.abs(press.force_n - middle_n) < middle_n / 4
     rising = np.arange(len(press.force_n)) < press.turn
-    up_a, down_a = press.current_a[near & rising], press.current_a[near & ~rising]
-    return float(up_a.mean() - down_a.mean()) / 2 if len(up_a) and len(down_a) else 0.0
+    rising_a, falling_a = press.current_a[near & rising], press.current_a[near & ~rising]
+    if not (len(rising_a) and len(falling_a)):
+        return 0.0
+    return float(rising_a.mean() - falling_a.mean()) / 2
 
 
 @contextmanager
-def _moving(config: Config, devices: Devices, progress: Progress) -> Iterator["_Jaws"]:
+def _torque_on(config: Config, devices: Devices, progress: Progress) -> Iterator["_Jaws"]:
     """Gives jaws under torque, and turns torque off at every end."""
     assert devices.load_cell is not None
     devices.load_cell.start()
@@ -296,7 +300,7 @@ class _Jaws:
 
     def open(self) -> None:
         """Moves to the open position, or as far as the jaws go."""
-        self._go(self._sign * self._nominal.open_position_rad)
+        self._move_to(self._sign * self._nominal.open_position_rad)
 
     def tare(self) -> None:
         """Takes the load cell's reading at rest as zero force."""
@@ -317,12 +321,12 @@ class _Jaws:
             )
         self.force_n -= self._tare_n
 
-    def touch(self, gauge_m: float) -> float:
+    def close_on_gauge(self, gauge_m: float) -> float:
         """Closes slowly until the load cell measures contact. Returns the angle."""
         speed_rad = _APPROACH_M_S / self._nominal.pinion_radius_m / _RATE_HZ
         goal_rad = self.closing_rad
         end_rad = self._sign * self._nominal.closed_position_rad
-        while self.force_n < _TOUCH_N:
+        while self.force_n < _CONTACT_N:
             goal_rad += speed_rad
             if goal_rad > end_rad + _BEYOND_RAD / 4:
                 raise DataError(
@@ -341,13 +345,13 @@ class _Jaws:
     def press(self, gauge_m: float, rate_n_s: float, peak_n: float) -> ServoPress:
         """Raises the current until the peak force is measured, then lowers it until the force is gone."""
         step_a = abs(self._nominal.current_a(rate_n_s)) / _RATE_HZ
-        most_a = 1.5 * abs(self._nominal.current_a(peak_n + self._nominal.friction_n))
+        max_a = 1.5 * abs(self._nominal.current_a(peak_n + self._nominal.friction_n))
         current_a = abs(self.state.current_a)
         for _ in range(round(_REST_S * _RATE_HZ)):  # lets the force of the impact fade
             self.cycle(self.closing_rad + _BEYOND_RAD, current_a)
         first, mark = len(self._states), len(self._forces)
         while self.force_n < peak_n:
-            if current_a > min(most_a, self._config.servo.current_limit_a):
+            if current_a > min(max_a, self._config.servo.current_limit_a):
                 raise DataError(
                     f"{current_a:.2f} A give {self.force_n:.1f} N instead of {peak_n:.1f} N; check that the load "
                     "cell lies in the path of the force, its scale, and servo.current_limit_a"
@@ -355,8 +359,7 @@ class _Jaws:
             current_a += step_a
             self.cycle(self.closing_rad + _BEYOND_RAD, current_a)
         turn = len(self._states) - first
-        least_a = -most_a
-        while self.force_n > _FREE_N and current_a > least_a:
+        while self.force_n > _NO_CONTACT_N and current_a > -max_a:
             current_a -= step_a
             self.cycle(self.closing_rad + np.sign(current_a) * _BEYOND_RAD, abs(current_a))
         states, forces = self._states[first:], self._forces[mark:]
@@ -375,25 +378,26 @@ class _Jaws:
             turn=turn,
         )
 
-    def back_off(self, touch_rad: float) -> None:
+    def back_off(self, contact_rad: float) -> None:
         """Moves away from the gauge."""
-        self._go(touch_rad - 2 * _CLEAR_M / self._nominal.pinion_radius_m)
+        self._move_to(contact_rad - 2 * _CLEARANCE_M / self._nominal.pinion_radius_m)
 
-    def travel(self, friction_a: float, speed_m_s: float, touch_rad: float) -> list[FreePass]:
+    def travel(self, friction_a: float, speed_m_s: float, contact_rad: float) -> list[FreePass]:
         """Opens and closes under a constant current. A pass in which the jaws stick is left out."""
         nominal = self._nominal
-        grid_a = nominal.current_step_a
+        step_a = nominal.current_step_a
         wanted_a = friction_a + abs(nominal.current_a(nominal.damping_n_s_m * speed_m_s))
-        current_a = round(wanted_a / grid_a) * grid_a
-        clear_rad = _CLEAR_M / nominal.pinion_radius_m
-        ends = (self._sign * nominal.open_position_rad + clear_rad, touch_rad - clear_rad)
+        current_a = round(wanted_a / step_a) * step_a
+        clear_rad = _CLEARANCE_M / nominal.pinion_radius_m
+        ends = (self._sign * nominal.open_position_rad + clear_rad, contact_rad - clear_rad)
         passes = []
         for side, end_rad in ((-1, ends[0]), (1, ends[1])):
-            one = self._pass(side, end_rad, current_a)
-            passes += [] if one is None else [one]
+            if (one := self._pass(side, end_rad, current_a)) is not None:
+                passes.append(one)
         return passes
 
     def _pass(self, side: int, end_rad: float, current_a: float) -> FreePass | None:
+        """One pass, without its acceleration; None if the jaws stuck."""
         for _ in range(round(_MAX_PASS_S * _RATE_HZ)):
             if side * self._sign * self.state.velocity_rad_s > _MIN_SPEED_RAD_S:
                 break
@@ -404,7 +408,7 @@ class _Jaws:
             if side * (end_rad - self.closing_rad) < _BRAKE_RAD:
                 break
         states = self._states[first:]
-        self._go(end_rad)
+        self._move_to(end_rad)
         if len(states) < _RATE_HZ / 10 or abs(states[-1].velocity_rad_s) < _MIN_SPEED_RAD_S:
             return None
         return FreePass(
@@ -414,16 +418,16 @@ class _Jaws:
             closing_rad_s=self._sign * np.array([state.velocity_rad_s for state in states]),
         )
 
-    def _go(self, goal_rad: float) -> None:
+    def _move_to(self, goal_rad: float) -> None:
         """Moves at a constant low speed, and rests at the goal."""
         speed_rad = 4 * _APPROACH_M_S / self._nominal.pinion_radius_m / _RATE_HZ
-        at_rad = self.closing_rad
-        while abs(goal_rad - at_rad) > speed_rad:
-            at_rad += float(np.copysign(speed_rad, goal_rad - at_rad))
-            self.cycle(at_rad, self._moving_current_a())
+        next_rad = self.closing_rad
+        while abs(goal_rad - next_rad) > speed_rad:
+            next_rad += float(np.copysign(speed_rad, goal_rad - next_rad))
+            self.cycle(next_rad, self._moving_current_a())
         for _ in range(round(_REST_S * _RATE_HZ)):
             self.cycle(goal_rad, self._moving_current_a())
 
     def _moving_current_a(self) -> float:
         """Current that moves the jaws against twice the nominal friction, and presses with little more."""
-        return abs(self._nominal.current_a(2 * self._nominal.friction_n + _TOUCH_N))
+        return abs(self._nominal.current_a(2 * self._nominal.friction_n + _CONTACT_N))

@@ -1,1 +1,1 @@
-"""Imports of recordings that were made elsewhere, to logs."""
+"""Conversion of recordings made elsewhere to logs."""

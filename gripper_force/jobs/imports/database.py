@@ -1,18 +1,19 @@
-"""The published database of Shin et al. 2019, turned into logs.
+"""Import of the published database of Shin et al. 2019 to logs.
 
-Its layout, by https://github.com/hyeon-jo/Interaction-force-estimation-based-on-deep-learning: a folder
+Its layout, from https://github.com/hyeon-jo/Interaction-force-estimation-based-on-deep-learning: a folder
 ``<object>_<degrees>_<illumination>`` for each of the 48 environments, with images ``N.jpg`` and a table
 ``test.txt`` of lines such as ``4,-0.00318538,0.00328883``: number of the image, force in newtons, unused.
 
-*Sets.* Nothing in a folder tells where one of the paper's sets ends. A set is four touches (its table 1), so
-a folder is cut in the rest after each fourth touch, and where numbers are missing for longer than the network
-looks back. In a split each log is a set of its own: the paper collected sets "for each environment", so none
-was seen under two lights. As in the simulated protocol, sets 13 to 15 of each folder are for test.
+*Sets.* The folders do not mark where one of the paper's sets ends. A set is four touches (table 1), so a
+folder is cut in the rest after each fourth touch, and where numbers are missing for longer than the network
+looks back. For splits each log is a separate set: the paper collected sets "for each environment", so no set
+was recorded under two lights. As in the simulated protocol, sets 13 to 15 of each folder are for test.
 
-*Forces* stay as published, so that errors compare with the paper's; only spikes are marked as not valid.
+*Forces* stay as published, so that errors can be compared with the paper's; only spikes are marked as not
+valid.
 
-*Damage* ends nothing that can go on. What is missing, doubled, out of order or no line of a table is counted,
-and the summary names the first of each.
+*Damaged data* does not stop the import if the rest is usable. Missing, repeated, unordered and malformed
+entries are counted, and the summary names the first of each kind.
 """
 
 import math
@@ -36,16 +37,20 @@ from gripper_force.types import NS_PER_S, Frame, Gray
 from gripper_force.vision.preprocess import Region, downscale
 
 LUX: Final = {"50": 350, "70": 550, "75": 550, "100": 750}
-"""What the third part of a folder's name means. For 550 lux the database's page says 70, and the
+"""Light levels in lux by the third part of a folder's name. For 550 lux the database's page says 70, and the
 authors' code (https://github.com/cxz1418/SSAM_ForcePrediction) 75."""
 
-_SHORTEST: Final = 5
-"""Frames with contact in turn that are no noise."""
-_REST: Final = 15
+_MIN_TOUCH_FRAMES: Final = 5
+"""Shortest touch, in frames; shorter contact is noise."""
+
+_MIN_REST_FRAMES: Final = 15
 """Frames without contact between two touches, at least; less is a bounce."""
-_HOLE: Final = 20
-"""Missing numbers that no log bridges: the network looks back over 20 frames."""
-_MOST_N: Final = 1000.0
+
+_MAX_MISSING: Final = 20
+"""Missing numbers within one log, at most: the network looks back over 20 frames."""
+
+_MAX_FORCE_N: Final = 1000.0
+"""Larger values are malformed lines."""
 
 _LINE: Final = re.compile(r"\s*([0-9]{1,9})\s*,\s*([-+.0-9eE]+)\s*,[^,]*")
 _FOLDER: Final = re.compile(r"(.+)_([0-9]+)_([0-9]+)")
@@ -57,19 +62,19 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class EnvironmentSummary:
-    """What became of the folder of one environment.
+    """Result of importing one environment.
 
     Attributes:
-        folder: Its name.
-        object: What was touched.
+        folder: Name of the folder.
+        object: The object touched.
         degrees: Angle of the press.
-        lux: Illumination.
-        logs: Sets that are logs now.
-        kept: How many of these were so before, and were left as they are.
+        lux: Light level in lux.
+        logs: Number of logs.
+        kept: Number of these that existed before and were not changed.
         touches: Touches in all sets.
-        frames: Frames in the logs that were written now.
-        spikes_rejected: Samples marked as not valid in the logs that were written now.
-        problems: What is wrong with the folder, a sentence each.
+        frames: Frames in the new logs.
+        spikes_rejected: Samples marked as not valid in the new logs.
+        problems: Problems of the folder, one sentence each.
     """
 
     folder: str
@@ -85,16 +90,16 @@ class EnvironmentSummary:
 
 
 def find_environments(folder: Path) -> tuple[list[Path], list[str]]:
-    """Looks a database over before anything of it is imported.
+    """Finds and checks the environments of a database, before any is imported.
 
     Returns:
-        The folders of the environments, and the names of what else lies beside them.
+        The folders of the environments, and the names of other entries.
 
     Raises:
-        DataError: There is no environment, one has no table, or an illumination is not known.
+        DataError: There is no environment, one has no table, or an illumination is unknown.
     """
     if not folder.is_dir():
-        raise DataError(f"{folder} is no folder")
+        raise DataError(f"{folder} is not a folder; check the path")
     entries = sorted(folder.iterdir())
     found = [entry for entry in entries if entry.is_dir() and _FOLDER.fullmatch(entry.name)]
     if not found:
@@ -105,7 +110,7 @@ def find_environments(folder: Path) -> tuple[list[Path], list[str]]:
     if bare := [entry.name for entry in found if not (entry / "test.txt").is_file()]:
         raise DataError(
             f"{len(bare)} of {len(found)} folders in {folder} have no test.txt: {', '.join(bare[:5])}; "
-            "fetch them again, or take them away"
+            "download them again, or move them away"
         )
     for entry in found:
         _environment(entry)
@@ -115,33 +120,35 @@ def find_environments(folder: Path) -> tuple[list[Path], list[str]]:
 def import_environment(
     folder: Path, out: Path, *, rate_hz: float = RATE_HZ, region: Region | None = None, size: int = 128
 ) -> EnvironmentSummary:
-    """Imports one environment into logs ``out/<folder>-<set>.mcap``.
+    """Imports one environment into logs ``<folder>-<set>.mcap``.
 
-    Logs that are there already are left as they are, so an import that was broken off can go on.
+    Existing logs are kept, so an interrupted import can be continued.
 
     Args:
         folder: One of `find_environments`.
-        out: Where the logs go, into ``train`` and ``test`` as those of `paper_protocol.plan_protocol`.
-        rate_hz: Frame rate that the numbers of the images are turned into times with.
-        region: Part of the images to keep in pixels: left, top, width, height; None for the whole.
+        out: Folder of the logs, in ``train`` and ``test`` like those of `paper_protocol.plan_protocol`.
+        rate_hz: Frame rate, from which times are computed from the images' numbers.
+        region: Region of the images to keep in pixels: left, top, width, height; None for the whole image.
         size: Side of the logged frames in pixels.
 
     Raises:
-        DataError: No line of its table is usable, or none of the images that it names is there.
-        ConfigError: The region reaches beyond an image.
+        DataError: No line of its table is usable, or none of the images in its table exists.
+        ConfigError: The region is not within an image.
         LogError: A log can't be written.
     """
     object_name, degrees, illumination = _environment(folder)
     forces_n, problems = read_table(folder / "test.txt")
     images = {int(path.stem): path for path in folder.glob("*.jpg") if _IMAGE.fullmatch(path.stem)}
     if not images.keys() & forces_n.keys():
-        raise DataError(f"{folder} holds no image that its test.txt names, such as {min(forces_n)}.jpg")
-    problems += _told("{} forces have no image", sorted(forces_n.keys() - images.keys()))
+        raise DataError(
+            f"{folder} holds no image that its test.txt names, such as {min(forces_n)}.jpg; download it again"
+        )
+    problems += _problem("{} forces have no image", sorted(forces_n.keys() - images.keys()))
     others = [p.name for p in folder.iterdir() if p.name != "test.txt" and p not in images.values()]
-    problems += _told("{} files are neither N.jpg nor test.txt and were left out", sorted(others))
-    problems += _told("{} images have no force", sorted(images.keys() - forces_n.keys()))
+    problems += _problem("{} files are neither N.jpg nor test.txt and were left out", sorted(others))
+    problems += _problem("{} images have no force", sorted(images.keys() - forces_n.keys()))
     sets = find_sets(np.array(list(forces_n)), np.array(list(forces_n.values())))
-    about = {
+    metadata = {
         "object": object_name,
         "source": folder.name,
         "degrees": str(degrees),
@@ -172,8 +179,8 @@ def import_environment(
             empty.append(log.stem)
             continue
         samples = load_cell_samples([t_ns[n] for n in labelled], np.array([forces_n[n] for n in labelled]))
-        metadata = {**about, "set": log.stem, "split": split_of(i), "touches": str(touches)}
-        spikes += write_recording(log, config, metadata, frames, samples)
+        own = {"set": log.stem, "split": split_of(i), "touches": str(touches)}
+        spikes += write_recording(log, config, {**metadata, **own}, frames, samples)
         frame_count += len(frames)
     return EnvironmentSummary(
         folder=folder.name,
@@ -187,8 +194,8 @@ def import_environment(
         spikes_rejected=spikes,
         problems=(
             *problems,
-            *_told("{} images can't be decoded and were left out", damaged),
-            *_told("{} sets have no image with a force and became no log", empty),
+            *_problem("{} images can't be decoded and were left out", damaged),
+            *_problem("{} sets have no image with a force and gave no log", empty),
         ),
     )
 
@@ -197,20 +204,19 @@ def read_table(path: Path) -> tuple[dict[int, float], list[str]]:
     """Reads a table ``test.txt``.
 
     Returns:
-        Number of an image to force in N, by rising number, and a sentence for each kind of line that was not
-        taken as it stands.
+        Force in N by number of the image, sorted by number, and a sentence for each kind of problem.
 
     Raises:
-        DataError: It can't be read, or no line of it is usable.
+        DataError: The table can't be read, or no line is usable.
     """
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"can't read the table of forces {path}: {error}") from error
+        raise DataError(f"can't read the table of forces {path}: {error}; download it again") from error
     rows: dict[int, set[float]] = {}
     bad: list[str] = []
-    disorder: list[str] = []
-    doubles: Counter[int] = Counter()
+    unordered: list[str] = []
+    repeated: Counter[int] = Counter()
     last = -1
     for i, line in enumerate(lines, start=1):
         if not line.strip():
@@ -220,20 +226,23 @@ def read_table(path: Path) -> tuple[dict[int, float], list[str]]:
             continue
         number, force_n = row
         if number in rows:
-            doubles[number] += 1
+            repeated[number] += 1
         elif number < last:
-            disorder.append(f"line {i}, number {number} after {last}")
+            unordered.append(f"line {i}, number {number} after {last}")
         rows.setdefault(number, set()).add(force_n)
         last = number
     forces_n = {number: min(rows[number]) for number in sorted(rows) if len(rows[number]) == 1}
     if not forces_n:
-        raise DataError(f"{path} has no usable line; it needs lines such as 4,-0.0032,0.0033")
-    doubtful = [number for number in rows if number not in forces_n]
+        raise DataError(f"{path} has no usable line; it needs lines like 4,-0.0032,0.0033")
+    conflicting = [number for number in rows if number not in forces_n]
     return forces_n, [
-        *_told("{} lines are no number,force,unused and were left out", bad),
-        *_told("{} lines were out of order and were sorted", disorder),
-        *_told("{} numbers came twice with one force and were taken once", sorted(doubles.keys() & forces_n)),
-        *_told("{} numbers came with several forces and have none now", sorted(doubtful)),
+        *_problem("{} lines are not number,force,unused and were left out", bad),
+        *_problem("{} lines were out of order and were sorted", unordered),
+        *_problem(
+            "{} numbers occur twice with the same force and were used once",
+            sorted(repeated.keys() & forces_n),
+        ),
+        *_problem("{} numbers occur with several forces and were left without one", sorted(conflicting)),
     ]
 
 
@@ -243,7 +252,7 @@ def _row(line: str) -> tuple[int, float] | None:
         force_n = float(found[2]) if found else math.nan
     except ValueError:
         return None
-    return (int(found[1]), force_n) if found and abs(force_n) <= _MOST_N else None
+    return (int(found[1]), force_n) if found and abs(force_n) <= _MAX_FORCE_N else None
 
 
 def find_sets(number: Numbers, force_n: Floats) -> list[tuple[int, int]]:
@@ -254,11 +263,11 @@ def find_sets(number: Numbers, force_n: Floats) -> list[tuple[int, int]]:
         force_n: Forces in N, (N,).
 
     Returns:
-        First number of each set, and how many touches are in it.
+        First number of each set, and its number of touches.
     """
     sets: list[tuple[int, int]] = []
-    holes = np.flatnonzero(np.diff(number) > _HOLE) + 1
-    for part in np.split(np.arange(len(number)), holes):
+    gaps = np.flatnonzero(np.diff(number) > _MAX_MISSING) + 1
+    for part in np.split(np.arange(len(number)), gaps):
         starts, ends = _touches(force_n[part])
         count = max(math.ceil(len(starts) / TOUCHES), 1)
         for i in range(count):
@@ -269,26 +278,26 @@ def find_sets(number: Numbers, force_n: Floats) -> list[tuple[int, int]]:
 
 
 def _touches(force_n: Floats) -> tuple[Numbers, Numbers]:
-    """First index of each touch, and the index behind its last."""
+    """Returns the first index of each touch, and the index after its last."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], force_n > CONTACT_N, [False]]).astype(np.int8)))
-    lasting = edges[1::2] - edges[::2] >= _SHORTEST
-    starts, ends = edges[::2][lasting], edges[1::2][lasting]
-    rested = starts[1:] - ends[:-1] >= _REST
+    long_enough = edges[1::2] - edges[::2] >= _MIN_TOUCH_FRAMES
+    starts, ends = edges[::2][long_enough], edges[1::2][long_enough]
+    rested = starts[1:] - ends[:-1] >= _MIN_REST_FRAMES
     return starts[np.append(True, rested)[: len(starts)]], ends[np.append(rested, True)[: len(ends)]]
 
 
 def _environment(folder: Path) -> tuple[str, int, str]:
-    """Object, degrees and illumination, by the folder's name."""
+    """Returns object, degrees and illumination from a folder's name."""
     found = _FOLDER.fullmatch(folder.name)
     if not found or found[3] not in LUX:
         known = ", ".join(f"{name} ({lux} lux)" for name, lux in LUX.items())
-        raise DataError(f"the illumination in the name of {folder} is not known; known are {known}")
+        raise DataError(f"the illumination in the name of {folder} is unknown; use one of {known}")
     name = re.sub(r"[ _]+", "_", found[1].lower())
     return {"papercup": "paper_cup"}.get(name, name), int(found[2]), found[3]
 
 
 def _read_image(path: Path) -> Gray | None:
-    """(H, W) uint8, or None for what is no whole JPEG: a decoder would fill up the rest in gray."""
+    """Reads an image, (H, W) uint8. Returns None for a truncated JPEG, which a decoder would fill with gray."""
     data = path.read_bytes()
     if not data.rstrip(b"\0").endswith(b"\xff\xd9"):
         return None
@@ -298,6 +307,6 @@ def _read_image(path: Path) -> Gray | None:
         return None
 
 
-def _told(sentence: str, cases: Sequence[object]) -> list[str]:
-    """The sentence with how many there are and the first of them; nothing where there is none."""
+def _problem(sentence: str, cases: Sequence[object]) -> list[str]:
+    """Returns the sentence with the number of cases and the first one; empty without any."""
     return [f"{sentence.format(len(cases))}, the first is {cases[0]}"] if cases else []

@@ -1,8 +1,8 @@
-"""A video and a table of forces, turned into a log, so recordings made elsewhere can be replayed and learnt.
+"""Import of a video and its table of forces to a log, for replay, training and evaluation.
 
 A recording is a video and a CSV table with the columns ``frame`` (from 0), ``t_s`` and ``force_n``; more
-columns are allowed. It is either a folder with one video and one table, or a pair ``X.avi`` and ``X.csv``. A
-name ``<date>_<object>_<trial>`` tells what was grasped.
+columns are allowed. It is either a folder with one video and one table, or a pair ``X.avi`` and ``X.csv``. The
+object is read from a name of the form ``<date>_<object>_<trial>``.
 """
 
 import csv
@@ -30,28 +30,33 @@ from gripper_force.vision.preprocess import Region, downscale
 VIDEO_SUFFIXES: Final = frozenset({".avi", ".mp4", ".mkv", ".mov"})
 
 TARE_S: Final = 0.25
+"""Start of a recording that the tare is estimated from."""
+
 TARE_SPREAD_N: Final = 0.05
+"""Largest range of the force in that time."""
+
 TARE_RISE_N: Final = 1.0
+"""Smallest later rise of the force, and largest later fall, that a tare needs."""
 
 Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
 class ImportSummary:
-    """What became of one recording.
+    """Result of importing one recording.
 
     Attributes:
         log: The log written.
-        object: What was grasped.
+        object: The object.
         frames: Frames in the log.
-        samples: Load-cell samples in the log, the rejected ones among them.
+        samples: Load-cell samples in the log, including rejected ones.
         spikes_rejected: Samples marked as not valid.
-        tare_n: Offset removed from every sample; 0 where none could be trusted.
-        tare_note: Why no tare was removed; empty where it was.
-        force_lag_s: Time by which the forces trailed the pictures; it was taken out. 0 where none is beyond
-            doubt, see `recording.lag.force_lag_s`.
-        frames_without_force: Frames that have no row in the table.
-        forces_without_frame: Rows that have no frame in the video.
+        tare_n: Offset subtracted from every sample; 0 without a reliable tare.
+        tare_note: Reason why no tare was subtracted; empty if it was.
+        force_lag_s: Lag of the forces behind the images, which was removed; 0 if no lag is certain, see
+            `recording.lag.force_lag_s`.
+        frames_without_force: Frames without a row in the table.
+        forces_without_frame: Rows without a frame in the video.
     """
 
     log: Path
@@ -68,7 +73,7 @@ class ImportSummary:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForceTable:
-    """The rows of a table of forces.
+    """Rows of a table of forces.
 
     Attributes:
         frame: Frame numbers, (N,), rising.
@@ -87,19 +92,19 @@ def import_folder(
     """Imports every recording of a folder into ``out/<recording>.mcap``, with a progress bar on stderr.
 
     Args:
-        folder: Holds recordings, see above.
+        folder: Folder with recordings, see above.
         out: Folder for the logs.
         region: As for `import_video`.
-        align: Likewise.
+        align: As for `import_video`.
 
     Raises:
-        DataError: There is none, one lacks its table, or one can't be used.
+        DataError: There is no recording, or one lacks its table or is not usable.
         LogError: A log exists already or can't be written.
     """
     pairs = list(_recordings(folder))
     if not pairs:
         raise DataError(
-            f"{folder} holds no recordings: neither X.avi with X.csv nor folders with one of each"
+            f"{folder} holds no recordings; it needs X.avi with X.csv, or folders with one of each"
         )
     steps = track(pairs, "importing", console=Console(stderr=True))
     return [
@@ -121,23 +126,23 @@ def import_video(
 ) -> ImportSummary:
     """Writes one recording as a log of gray frames and load-cell samples.
 
-    Spikes and impossible values stay in the log, marked as not valid; the reading before tare is kept beside
-    the force, and the table as an attachment. Forces that come late or early beyond doubt are set right, and
-    the log's metadata say by how much.
+    Spikes and impossible values stay in the log, marked as not valid. The log also holds the readings before
+    tare, and the table as an attachment. A certain lag between forces and images is removed and noted in the
+    log's metadata.
 
     Args:
         video: The video.
         forces: The table, see `read_forces`.
         out: The log to write.
-        name: The recording's name, ``<date>_<object>_<trial>``; by default that of the video.
-        object_name: What was grasped; by default taken from the name.
-        region: Part of the frame to keep in pixels: left, top, width, height; None for the whole.
+        name: Name of the recording, ``<date>_<object>_<trial>``; by default that of the video.
+        object_name: The object; by default from the name.
+        region: Region of the frame to keep in pixels: left, top, width, height; None for the whole frame.
         size: Side of the logged frames in pixels.
-        align: Whether forces that come late or early beyond doubt are set right.
+        align: Remove a certain lag between forces and images.
 
     Raises:
-        DataError: The video or the table is missing or can't be used.
-        ConfigError: The region reaches beyond the frame.
+        DataError: The video or the table is missing or not usable.
+        ConfigError: The region is not within the frame.
         LogError: The log exists already or can't be written.
     """
     name = name or video.stem
@@ -182,7 +187,7 @@ def import_video(
 
 
 def object_of(name: str) -> str:
-    """What was grasped, by a recording's name: ``2023-12-16_foam_brick_2`` is a ``foam_brick``."""
+    """Returns the object in a recording's name: ``2023-12-16_foam_brick_2`` is a ``foam_brick``."""
     found = re.fullmatch(r"(?:\d{4}-\d{2}-\d{2}_)?(.+?)(?:_\d+)?", name)
     return found[1] if found else name
 
@@ -191,8 +196,8 @@ def read_forces(path: Path) -> ForceTable:
     """Reads a table with the columns ``frame``, ``t_s`` and ``force_n``.
 
     Raises:
-        DataError: It is missing, empty, lacks a column, or holds a value that is no finite number, a frame
-            twice, or rows that are out of order. The sentence names the line.
+        DataError: The table is missing or empty, lacks a column, or has a value that is not a finite number,
+            a repeated frame, or rows out of order. The message names the line.
     """
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
@@ -200,41 +205,44 @@ def read_forces(path: Path) -> ForceTable:
             columns = ("frame", "t_s", "force_n")
             missing = [column for column in columns if column not in (reader.fieldnames or [])]
             if missing:
-                raise DataError(f"{path} lacks the column {missing[0]!r}; it needs frame, t_s and force_n")
+                raise DataError(f"{path} lacks the column {missing[0]!r}; add frame, t_s and force_n")
             rows = [
                 [_number(path, reader.line_num, column, row[column]) for column in columns] for row in reader
             ]
     except OSError as error:
-        raise DataError(f"can't read the table of forces {path}: {error.strerror}") from error
+        raise DataError(f"can't read the table of forces {path}: {error.strerror}; check the path") from error
     except (UnicodeDecodeError, csv.Error) as error:
-        raise DataError(f"{path} is no CSV table: {error}") from error
+        raise DataError(f"{path} is not a CSV table ({error}); export it as CSV in UTF-8") from error
     if not rows:
-        raise DataError(f"{path} holds no rows")
+        raise DataError(f"{path} holds no rows; it needs one per frame")
     values = np.array(rows)  # (N, 3)
-    disorder = np.flatnonzero((np.diff(values[:, 0]) <= 0) | (np.diff(values[:, 1]) <= 0))
-    if len(disorder):
-        row = int(disorder[0])
+    unordered = np.flatnonzero((np.diff(values[:, 0]) <= 0) | (np.diff(values[:, 1]) <= 0))
+    if len(unordered):
+        row = int(unordered[0])
         raise DataError(
             f"{path}: frame {values[row + 1, 0]:.0f} at {values[row + 1, 1]:.4f} s follows frame "
-            f"{values[row, 0]:.0f} at {values[row, 1]:.4f} s; frames and times must rise from row to row"
+            f"{values[row, 0]:.0f} at {values[row, 1]:.4f} s; sort the rows by frame and time"
         )
     return ForceTable(values[:, 0].astype(np.int64), values[:, 1], values[:, 2])
 
 
 def estimate_tare(t_s: Floats, force_n: Floats) -> tuple[float, str]:
-    """Offset of the load cell, from the start of a recording that starts without contact.
+    """Estimates the load cell's offset from the start of a recording that starts without contact.
 
     Args:
         t_s: Times, (N,).
         force_n: Forces as measured, (N,).
 
     Returns:
-        The offset in N and an empty text; or 0 and the reason why the start can't be trusted as unloaded.
+        The offset in N and an empty text; or 0 and the reason why the start may not be unloaded.
     """
     start = force_n[t_s <= t_s[0] + TARE_S]
     offset = float(np.median(start))
     if len(start) < 3:
-        return 0.0, f"the first {TARE_S} s hold {len(start)} forces, too few to tell an offset from a touch"
+        return (
+            0.0,
+            f"the first {TARE_S} s hold {len(start)} forces, too few to distinguish an offset from a touch",
+        )
     if np.ptp(start) > TARE_SPREAD_N:
         return (
             0.0,
@@ -243,17 +251,17 @@ def estimate_tare(t_s: Floats, force_n: Floats) -> tuple[float, str]:
     if float(np.percentile(force_n, 25)) < offset - TARE_RISE_N:
         return 0.0, "the force starts above its later level, so the gripper may start loaded"
     if float(force_n.max()) < offset + TARE_RISE_N:
-        return 0.0, f"the force never rises by {TARE_RISE_N} N, so nothing tells that the start is unloaded"
+        return 0.0, f"the force never rises by {TARE_RISE_N} N, so the start may not be unloaded"
     return offset, ""
 
 
 def load_cell_samples(t_ns: Sequence[int], raw_n: Floats, tare_n: float = 0.0) -> list[LoadCellSample]:
-    """Samples with their tare removed and their spikes marked as not valid.
+    """Returns samples with the tare subtracted and spikes marked as not valid.
 
     Args:
         t_ns: Times, (N,).
         raw_n: Forces as measured, (N,).
-        tare_n: Offset to remove.
+        tare_n: Offset to subtract.
     """
     force_n = raw_n - tare_n
     return [
@@ -270,24 +278,24 @@ def write_recording(
     samples: list[LoadCellSample],
     table: Path | None = None,
 ) -> int:
-    """Writes an imported recording as a log, which appears once it is whole.
+    """Writes an imported recording as a log, which gets its name once it is complete.
 
     Args:
         out: The log to write.
-        config: What is known of how it was made.
-        metadata: Likewise, for people.
-        frames: The pictures.
+        config: Known configuration of the recording.
+        metadata: Metadata of the log.
+        frames: The frames.
         samples: The forces.
-        table: A file to attach, where the forces came from one.
+        table: File of the forces, to attach; None without one.
 
     Returns:
-        How many samples are not valid; the log's metadata say so too.
+        Number of samples that are not valid, which is also noted in the log's metadata.
 
     Raises:
         LogError: The log exists already or can't be written.
     """
     if out.exists():
-        raise LogError(f"can't write the log {out}: it exists already, and a log is never overwritten")
+        raise LogError(f"can't write the log {out}: it exists already; move it away, or use another folder")
     unfinished = out.with_name(f".{out.name}.part")
     unfinished.unlink(missing_ok=True)
     spikes = sum(not sample.valid for sample in samples)
@@ -303,9 +311,9 @@ def write_recording(
 
 
 def _recordings(folder: Path) -> Iterator[tuple[str, Path, Path]]:
-    """Name, video and table of each recording, by name."""
+    """Yields name, video and table of each recording, by name."""
     if not folder.is_dir():
-        raise DataError(f"{folder} is no folder")
+        raise DataError(f"{folder} is not a folder; check the path")
     for entry in sorted(folder.iterdir()):
         if entry.is_dir():
             videos = [path for path in sorted(entry.iterdir()) if path.suffix.lower() in VIDEO_SUFFIXES]
@@ -319,7 +327,7 @@ def _recordings(folder: Path) -> Iterator[tuple[str, Path, Path]]:
         elif entry.suffix.lower() in VIDEO_SUFFIXES:
             table = entry.with_suffix(".csv")
             if not table.is_file():
-                raise DataError(f"{entry} has no table of forces; {table.name} should lie beside it")
+                raise DataError(f"{entry} has no table of forces; put {table.name} next to it")
             yield entry.stem, entry, table
 
 
@@ -328,18 +336,18 @@ def _number(path: Path, line: int, column: str, text: str | None) -> float:
         value = float(text or "")
     except ValueError:
         value = math.nan
-    # From 2**53 on a float does not tell two frames apart.
+    # From 2**53 on a float can't represent every frame number.
     whole = value.is_integer() and abs(value) < 2**53
     if not math.isfinite(value) or (column == "frame" and not whole):
         kind = "frame number" if column == "frame" else "finite number"
-        raise DataError(f"{path}, line {line}: {column} is {text!r}, which is no {kind}")
+        raise DataError(f"{path}, line {line}: {column} is {text!r} and not a {kind}; correct the line")
     return value
 
 
 def _read_video(video: Path, region: Region | None, size: int) -> tuple[list[Gray], float]:
-    """Every frame, (size, size) uint8, and the frame rate."""
+    """Reads all frames, (size, size) uint8 each, and the frame rate."""
     if not video.is_file():
-        raise DataError(f"there is no video {video}")
+        raise DataError(f"no video {video}; check the path")
     frames: list[Gray] = []
     capture = cv2.VideoCapture(str(video))
     try:
@@ -350,12 +358,14 @@ def _read_video(video: Path, region: Region | None, size: int) -> tuple[list[Gra
     finally:
         capture.release()
     if not frames or not 0 < rate_hz < math.inf:
-        raise DataError(f"no frame of {video} can be decoded, or it tells no frame rate; is it a video?")
+        raise DataError(
+            f"{video} has no frame that can be decoded, or no frame rate; check that it is a video"
+        )
     return frames, rate_hz
 
 
 def _frame_times_s(table: ForceTable, frames: int, rate_hz: float) -> Floats:
-    """The table's times; between its rows interpolated, outside of them by the video's rate."""
+    """Returns the times of all frames: from the table, interpolated between its rows, else by the frame rate."""
     index = np.arange(frames)
     t_s = np.interp(index, table.frame, table.t_s)
     t_s += np.minimum(index - table.frame[0], 0) / rate_hz + np.maximum(index - table.frame[-1], 0) / rate_hz

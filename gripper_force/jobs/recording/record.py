@@ -141,7 +141,7 @@ def record(
             yield path
             continue
         if prompt is not None:
-            prompt(f"Put the object between the jaws for {'touch' if plan.touches == 1 else 'set'} {number}")
+            prompt(f"Put the object down for {'touch' if plan.touches == 1 else 'set'} {number}")
         unfinished = path.with_name(f".{path.name}.part")
         unfinished.unlink(missing_ok=True)
         notes = {"set": path.stem}

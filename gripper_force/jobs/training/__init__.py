@@ -1,1 +1,1 @@
-"""Training a force network: how it is asked for, what a step sees, one process or several, and the result."""
+"""Training of force networks: recipes, batches, the training loop, and training in several processes."""

@@ -1,4 +1,4 @@
-"""What a training step sees: clips drawn from all recordings, shifted, relit and with noise."""
+"""Training batches: clips drawn from all recordings, with random shift, light and noise."""
 
 from collections.abc import Sequence
 
@@ -15,12 +15,23 @@ from gripper_force.vision.batch_inference import normalise
 
 
 class Batches:
-    """All training frames on one device, and lists to draw clips from."""
+    """All training frames on one device, from which clips are drawn.
+
+    Args:
+        clips: Training data.
+        config: The recipe.
+        ranks: This process among those that train together.
+
+    Raises:
+        DataError: A recording is too short for its reference frames, or no frame shows contact.
+    """
 
     def __init__(self, clips: Sequence[Clip], config: TrainConfig, ranks: Ranks) -> None:
         for clip in clips:
             if len(clip.frames) < config.preprocess.reference_frames:
-                raise DataError(f"{clip.name} has {len(clip.frames)} frames, too few for its own reference")
+                raise DataError(
+                    f"{clip.name} has {len(clip.frames)} frames, too few for its reference frames; leave it out"
+                )
         lengths = [len(clip.frames) for clip in clips]
         forces_n = np.concatenate(
             [clip.nominal_n if config.labels == "nominal" else clip.forces_n for clip in clips]
@@ -37,9 +48,7 @@ class Batches:
         self._all = np.flatnonzero(valid)
         self._contact = np.flatnonzero(valid & (forces_n > CONTACT_N))
         if not len(self._contact):
-            raise DataError(
-                f"no training frame shows a force over {CONTACT_N} N; record or simulate contacts"
-            )
+            raise DataError(f"no training frame has a force above {CONTACT_N} N; record or simulate contacts")
         newtons = np.floor(forces_n[self._contact])
         self._levels = [self._contact[newtons == n] for n in np.unique(newtons)]
         self._pass = -1
@@ -47,19 +56,19 @@ class Batches:
 
     @property
     def labels(self) -> int:
-        """Frames that have one."""
+        """Number of frames with a label."""
         return len(self._all)
 
     def batch(self, step: int, count: int, length: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Draws the clips of one step, which depend on the seed and these arguments alone.
+        """Draws the clips of one step. They depend only on the seed and on these arguments.
 
         Args:
             step: Number of the step.
-            count: Clips, B. Where several processes train, each gets its share of them.
-            length: Frames of each clip, T.
+            count: Number of clips, B. With several processes each gets its share of them.
+            length: Frames per clip, T.
 
         Returns:
-            Inputs (B, T, 1, S, S), forces in N (B, T), and which of these are valid (B, T).
+            Inputs (B, T, 1, S, S), forces in N (B, T), and the mask of frames with a label (B, T).
         """
         config = self._config
         rng = np.random.default_rng((config.seed, step))
@@ -67,9 +76,9 @@ class Batches:
         begin = self._begin[ends]
         # Frames before a recording's first are copies of it, as for the estimator.
         index = np.maximum(ends[:, None] + np.arange(1 - length, 1), begin[:, None])  # (B, T)
-        # The leading frames go through the same distortion as the clip: they share the camera and the light.
+        # The reference frames get the same augmentation as the clip: they share the camera and the light.
         lead = begin[:, None] + np.arange(config.preprocess.reference_frames)  # (B, R)
-        gray = self._distorted(rng, np.concatenate([lead, index], axis=1))  # (B, R + T, S, S)
+        gray = self._augmented(rng, np.concatenate([lead, index], axis=1))  # (B, R + T, S, S)
         leading, frames = gray[:, : lead.shape[1]], gray[:, lead.shape[1] :]
         inputs = normalise(frames, leading, config.preprocess)
         where = torch.from_numpy(index[self._share]).to(self._device)
@@ -77,7 +86,7 @@ class Batches:
 
     def _ends(self, rng: np.random.Generator, step: int, count: int) -> npt.NDArray[np.int64]:
         draws = rng.random(count)
-        ends = np.array([self._in_turn(step * count + i) for i in range(count)])
+        ends = np.array([self._from_pass(step * count + i) for i in range(count)])
         by_force = draws < self._config.force_share
         in_contact = ~by_force & (draws < self._config.force_share + self._config.contact_share)
         ends[in_contact] = rng.choice(self._contact, int(in_contact.sum()))
@@ -86,19 +95,19 @@ class Batches:
         ]
         return ends
 
-    def _in_turn(self, i: int) -> int:
-        """Frame i of endless passes over all frames that have a label, each in an order of its own."""
+    def _from_pass(self, i: int) -> int:
+        """Returns frame i of endless passes over all frames with a label, each pass in another random order."""
         number, place = divmod(i, len(self._all))
         if number != self._pass:
             self._order = np.random.default_rng((self._config.seed, number, 1)).permutation(self._all)
             self._pass = number
         return int(self._order[place])
 
-    def _distorted(self, rng: np.random.Generator, index: npt.NDArray[np.int64]) -> Tensor:
-        """This process's clips of frames (B, T) as gray (B, T, S, S), each shifted, relit and with noise."""
+    def _augmented(self, rng: np.random.Generator, index: npt.NDArray[np.int64]) -> Tensor:
+        """Returns this process's clips of frames (B, T) as gray levels (B, T, S, S), each with its augmentation."""
         config = self._config
         size = config.preprocess.size
-        # Everything is drawn for all clips, so that a step is the same however many processes share it.
+        # Drawn for all clips, so that a step does not depend on the number of processes.
         shifts = rng.integers(-config.shift_px, config.shift_px, (2, len(index), 1), endpoint=True)
         rows, columns = (np.arange(size) + shifts).clip(0, size - 1)  # (B, S) each
         light = rng.normal(0, config.light, (2, len(index))).astype(np.float32)

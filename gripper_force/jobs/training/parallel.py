@@ -1,7 +1,7 @@
-"""Several processes, on one machine or more, that train one network: what `torchrun` starts.
+"""Training of one network in several processes, on one machine or more, started by `torchrun`.
 
-Each takes its share of a step's clips. Gradients are added up, and batch normalisation uses the statistics of
-all clips, so that a step is that of one process but for rounding.
+Each process takes its share of a step's clips. Gradients are summed, and batch normalisation uses the
+statistics of all clips, so that a step equals that of one process, except for rounding.
 """
 
 import itertools
@@ -25,9 +25,9 @@ class Ranks:
     """This process among those that train together.
 
     Attributes:
-        device: Where it computes.
-        rank: Its number. The first, 0, writes files and tells of progress.
-        count: How many there are.
+        device: Device that it computes on.
+        rank: Its number. The first process, 0, writes files and shows progress.
+        count: Number of processes.
     """
 
     device: str
@@ -36,16 +36,16 @@ class Ranks:
 
     @property
     def first(self) -> bool:
-        """Whether this process writes files and tells of progress."""
+        """True for the process that writes files and shows progress."""
         return self.rank == 0
 
     @property
     def share(self) -> slice:
-        """This process's part of a step's clips."""
+        """Slice of a step's clips that this process takes."""
         return slice(self.rank, None, self.count)
 
     def add_up(self, tensors: Iterable[Tensor]) -> None:
-        """Replaces tensors of one type by their sums over all processes."""
+        """Replaces tensors, all of one type, by their sums over all processes."""
         if self.count == 1:
             return
         tensors = list(tensors)
@@ -55,40 +55,40 @@ class Ranks:
             tensor.copy_(total.view_as(tensor))
 
     def as_first(self, value: float) -> float:
-        """The first process's value of something that every process measures for itself."""
+        """Returns the first process's value, for quantities that every process measures itself."""
         if self.count == 1:
             return value
-        told = torch.tensor([value], dtype=torch.float64, device=self.device)
-        dist.broadcast(told, 0)
-        return told.item()
+        shared = torch.tensor([value], dtype=torch.float64, device=self.device)
+        dist.broadcast(shared, 0)
+        return shared.item()
 
     def wait(self) -> None:
-        """Returns when all processes have come here."""
+        """Waits for all processes."""
         if self.count > 1:
             dist.barrier()
 
-    def agree(self, text: str, what: str) -> None:
-        """Raises `ConfigError` unless all processes give the same text."""
+    def check_equal(self, text: str, what: str) -> None:
+        """Raises `ConfigError` unless all processes pass the same text."""
         if self.count == 1:
             return
         texts: list[Any] = [None] * self.count
         dist.all_gather_object(texts, text)
         if len(set(texts)) > 1:
             raise ConfigError(
-                f"the training processes have different {what}; give all the same files and keys"
+                f"the training processes have different {what}; start all with the same files and keys"
             )
 
 
 @contextmanager
 def joined(device: str) -> Iterator[Ranks]:
-    """Joins the processes that `torchrun` has started, or stays alone; leaves them on every way out.
+    """Joins the processes that `torchrun` has started, if any, and leaves them at the end.
 
     Args:
-        device: ``cpu``, ``cuda``, or ``auto`` for CUDA where it is there. With CUDA each process of a machine
-            takes a GPU of its own.
+        device: ``cpu``, ``cuda``, or ``auto`` for CUDA if it is available. With CUDA each process of a
+            machine uses another GPU.
 
     Raises:
-        ConfigError: The others can't be joined, or there are fewer GPUs than processes.
+        ConfigError: The other processes can't be joined, or there are fewer GPUs than processes.
     """
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -100,20 +100,20 @@ def joined(device: str) -> Iterator[Ranks]:
         local, gpus = int(os.environ["LOCAL_RANK"]), torch.cuda.device_count()
         if local >= gpus:
             raise ConfigError(
-                f"{gpus} GPUs are too few for this machine's training processes; start so many with "
-                "`torchrun --nproc-per-node`, or say --set device=cpu"
+                f"{gpus} GPUs are too few for this machine's training processes; start that many with "
+                "`torchrun --nproc-per-node`, or use --set device=cpu"
             )
         device = f"cuda:{local}"
         torch.cuda.set_device(local)
     try:
-        store, rank = _meeting_place()
-        # Under a name of its own each time: what an earlier training left there would let one go on alone.
-        named = dist.PrefixStore(f"{next(_TIMES)}", store)  # type: ignore[attr-defined]
+        store, rank = _rendezvous()
+        # A new name for each training: keys of an earlier one would let a process continue alone.
+        named = dist.PrefixStore(f"{next(_GROUP_NUMBERS)}", store)  # type: ignore[attr-defined]
         backend = "gloo" if device == "cpu" else "nccl"
         dist.init_process_group(backend, store=named, rank=rank, world_size=count)
     except (RuntimeError, ValueError) as error:
         raise ConfigError(
-            f"can't join the other training processes, start all by torchrun: {error}"
+            f"can't join the other training processes: {error}; start all of them with torchrun"
         ) from error
     try:
         yield Ranks(device, rank, count)
@@ -121,17 +121,17 @@ def joined(device: str) -> Iterator[Ranks]:
         dist.destroy_process_group()
 
 
-_TIMES: Final = itertools.count()
+_GROUP_NUMBERS: Final = itertools.count()
 
 
 @cache
-def _meeting_place() -> tuple[Any, int]:
-    """A store that all processes see, and this one's rank, from what `torchrun` set in the environment."""
+def _rendezvous() -> tuple[Any, int]:
+    """Returns the store shared by all processes, and this process's rank, from `torchrun`'s environment."""
     store, rank, _ = next(iter(rendezvous("env://")))
     return store, rank
 
 
-class _Sum(torch.autograd.Function):
+class _AllReduceSum(torch.autograd.Function):
     @staticmethod
     def forward(_: Any, part: Tensor) -> Tensor:
         total = part.clone()
@@ -146,13 +146,13 @@ class _Sum(torch.autograd.Function):
 
 
 def _total(part: Tensor) -> Tensor:
-    """Sum over all processes; so is its gradient."""
-    total: Tensor = _Sum.apply(part)  # type: ignore[no-untyped-call]
+    """Returns the sum over all processes, with its gradient."""
+    total: Tensor = _AllReduceSum.apply(part)  # type: ignore[no-untyped-call]
     return total
 
 
-class _WholeBatchNorm(nn.BatchNorm2d):
-    """Batch normalisation by the statistics of all processes; torch's own refuses CPUs."""
+class _SyncBatchNorm(nn.BatchNorm2d):
+    """Batch normalisation with the statistics of all processes; PyTorch's does not support CPUs."""
 
     def forward(self, maps: Tensor) -> Tensor:
         if not self.training:
@@ -175,7 +175,7 @@ class _WholeBatchNorm(nn.BatchNorm2d):
 
 
 def share_statistics(network: nn.Module) -> None:
-    """Lets batch normalisation use all processes' statistics in training."""
+    """Makes a network's batch normalisation use the statistics of all processes in training."""
     for module in network.modules():
         if isinstance(module, nn.BatchNorm2d):
-            module.__class__ = _WholeBatchNorm
+            module.__class__ = _SyncBatchNorm

@@ -1,4 +1,4 @@
-"""How a force network is trained: every key, and recipes by name."""
+"""Training recipes: all keys, and recipes by name."""
 
 from typing import Annotated, Any, Final, Literal, Self
 
@@ -31,54 +31,57 @@ RECIPES: Final[dict[str, dict[str, Any]]] = {
         "precision": "float32",
     },
 }
-"""What each recipe sets; the rest are `TrainConfig`'s defaults, which make ``short_clips``.
+"""Keys that each recipe sets; all others have `TrainConfig`'s defaults, which are ``short_clips``.
 
-``shin2019`` is section III-E of the paper. Where that is silent: frames are standardised, as by everything
-here, and there is no augmentation, weight decay or limit to the gradient.
+``shin2019`` follows section III-E of the paper. What the paper does not state: frames are standardised, as in
+all recipes, and there is no augmentation, weight decay or gradient clipping.
 """
 
 
 class TrainConfig(Section):
-    """The recipe.
+    """A training recipe.
 
     Attributes:
-        attentions: One member of the ensemble each.
-        earlier_frames: n of SSAM and SCAM.
-        pooling: Of SSAM and SCAM: weighted or global average pooling.
-        backbone: Of all members.
+        attentions: Attention of each member of the ensemble.
+        earlier_frames: Number of earlier frames n that SSAM and SCAM use.
+        pooling: Pooling of SSAM and SCAM: weighted or global average.
+        backbone: Backbone of all members.
         width: Multiplier of the backbone's channels.
         hidden: Units of each direction of the BLSTM.
         head: Units of the dense layer.
-        preprocess: How frames are prepared.
-        steps: Optimiser steps for each member.
-        epochs: Passes over the training set for each member; stands in for ``steps`` where given. In a pass
-            every frame with a label ends one clip.
-        minutes: Time for the whole ensemble; stands in for both where given.
-        windows: ``shared``: all windows of a clip carry a loss, and each frame passes the backbone once for
-            all of them. ``separate``: a clip is one window and its n earlier frames, with one loss.
-        clips: Clips a step.
-        clip_frames: Frames a clip with shared windows; those from the window's length on carry a loss.
-        short_share: Share of the training, from its start, on clips of `short_frames`, as many more as cost
-            the same: what the backbone has to learn needs many scenes, not many moments of one.
-        short_frames: Frames of such a clip; the window before it is copies of its first, as at a run's start.
-        learning_rate: Its peak.
-        schedule: ``one_cycle``: up and down along two half cosines. ``step``: a tenth after each quarter of
-            the training.
+        preprocess: Preparation of frames.
+        steps: Optimiser steps per member.
+        epochs: Passes over the training set per member; replaces ``steps``. In a pass every frame with a
+            label is the last of one clip.
+        minutes: Training time of the whole ensemble; replaces ``steps`` and ``epochs``.
+        windows: ``shared``: all windows of a clip contribute to the loss, and each frame passes the backbone
+            once for all of them. ``separate``: a clip is one window and its n earlier frames, with one loss.
+        clips: Clips per step.
+        clip_frames: Frames per clip with shared windows; those from the window's length on contribute to the
+            loss.
+        short_share: Share of the training, from its start, with clips of `short_frames`, and more of them at
+            the same cost: the backbone learns more from many scenes than from many frames of one.
+        short_frames: Frames of such a clip; the window before it is filled with copies of its first frame, as
+            at the start of a run.
+        learning_rate: Peak learning rate.
+        schedule: ``one_cycle``: up and down along two half cosines. ``step``: divided by ten after each
+            quarter of the training.
         warmup: Share of the training in which the learning rate of ``one_cycle`` rises.
-        weight_decay: Of AdamW; without any it is Adam.
-        gradient_limit: Norm to which a larger gradient is cut; None for none.
-        labels: ``measured``: the load cell's. ``nominal``: what it would have read, had a simulated object
-            exactly its kind's stiffness: a look tells no more, so the rest is noise to be learnt by heart.
+        weight_decay: Weight decay of AdamW; 0 gives Adam.
+        gradient_limit: Norm to which larger gradients are clipped; None for no limit.
+        labels: ``measured``: forces of the load cell. ``nominal``: forces that a simulated object would have
+            with exactly the nominal stiffness of its kind. Images show no more than that; the difference
+            would be noise.
         contact_share: Share of clips that end in contact.
-        force_share: Share of clips whose last frame is drawn evenly over force, as high forces are rare.
+        force_share: Share of clips whose last frame is drawn evenly over force, because high forces are rare.
         shift_px: Largest shift of a clip.
-        light: Standard deviation of the logarithm of gain and gamma, drawn for each clip.
-        noise: Largest standard deviation of pixel noise, of full scale.
-        validation: Share of each object's sets that is held out for the error the checkpoint claims.
-        seed: Of weights and draws.
-        precision: Of the backbone's and the attention's arithmetic; the rest and all weights are float32.
-        device: Where to train; ``auto`` takes CUDA where it is there.
-        compile: Whether to compile the network; pays after some minutes on a GPU.
+        light: Standard deviation of the logarithm of gain and gamma, drawn per clip.
+        noise: Largest standard deviation of pixel noise, as a fraction of full scale.
+        validation: Share of each object's sets that is held out to measure the checkpoint's error.
+        seed: Seed of weights and draws.
+        precision: Arithmetic of backbone and attention; all else, and all weights, are float32.
+        device: Device to train on; ``auto`` uses CUDA if it is available.
+        compile: Compile the network; faster only after some minutes on a GPU.
     """
 
     attentions: Annotated[tuple[Attention, ...], Field(min_length=1)] = ("ssam", "scam")
@@ -121,13 +124,15 @@ class TrainConfig(Section):
         except ValidationError as error:
             raise ValueError(error.errors()[0]["msg"].removeprefix("Value error, ")) from error
         if self.windows == "separate" and self.short_share:
-            raise ValueError("short_share is of shared windows: set it to 0 for separate ones")
+            raise ValueError("short_share only applies to shared windows; set it to 0 for separate ones")
         if self.short_share and self.short_frames > self.clip_frames:
-            raise ValueError(f"short_frames {self.short_frames} is more than clip_frames {self.clip_frames}")
+            raise ValueError(
+                f"short_frames {self.short_frames} is more than clip_frames {self.clip_frames}; reduce it"
+            )
         return self
 
     def network(self, member: int) -> NetworkConfig:
-        """The shape of one member."""
+        """Returns the configuration of one member."""
         attention = self.attentions[member]
         return NetworkConfig(
             attention=attention,
@@ -142,11 +147,15 @@ class TrainConfig(Section):
 
 
 def recipe(name: str, overrides: list[str] | None = None) -> TrainConfig:
-    """One of `RECIPES` with some keys set otherwise, as ``key=value``.
+    """Returns a recipe of `RECIPES` with overrides.
+
+    Args:
+        name: Name of the recipe.
+        overrides: Keys to set, as ``key=value``.
 
     Raises:
-        ConfigError: There is no such recipe, or a key or value is wrong.
+        ConfigError: The recipe does not exist, or a key or value is wrong.
     """
     if name not in RECIPES:
-        raise ConfigError(f"no recipe {name!r}; there are {', '.join(RECIPES)}")
+        raise ConfigError(f"no recipe {name!r}; use one of {', '.join(RECIPES)}")
     return section_from(TrainConfig, overrides, RECIPES[name])

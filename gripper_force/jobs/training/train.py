@@ -1,7 +1,7 @@
-"""Training an ensemble on logs, to a checkpoint.
+"""Training of an ensemble and of its checkpoint.
 
-Diversity, not the number of labels, is what limits this task, so a step of our own recipe draws short clips
-from everywhere instead of long ones from a few recordings.
+The diversity of scenes limits this task, not the number of labels. So a step of the recipe ``short_clips``
+draws short clips from many recordings instead of long ones from a few.
 """
 
 import math
@@ -26,9 +26,10 @@ from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint, save_ch
 from gripper_force.vision.header import RESIDUAL_HALF_N, Header, Residual
 
 STATE_EVERY_S: Final = 60.0
+"""Time between two saved states: an interrupted training loses no more than this."""
 
 RESIDUAL_PRIOR: Final = 20
-"""Frames that count as much as the error over all forces, in the error claimed for one force."""
+"""Weight of the error over all forces, in frames, in the stated error at one force."""
 
 
 def train(
@@ -42,27 +43,27 @@ def train(
 ) -> Checkpoint:
     """Trains an ensemble and writes its checkpoint, together with all processes that `torchrun` started.
 
-    Each member's state is kept beside ``out`` every minute, until the checkpoint is written. With ``steps``,
-    on the CPU with one thread, a seed fixes the result to the bit, broken off and resumed or not.
+    Each member's state is saved next to ``out`` every minute, until the checkpoint is written. With ``steps``,
+    on the CPU with one thread, the result is bit for bit the same for a seed, also after an interruption.
 
     Args:
         config: The recipe.
         clips: Training data.
-        out: The checkpoint to write. All processes read it, so it lies where all machines see it.
-        validation_clips: What the error that the checkpoint claims is measured on; None: sets that are held
-            out of ``clips``.
-        init: Checkpoint whose weights to begin with, instead of random ones.
-        resume: Whether to go on from the states of a run that was broken off.
+        out: Checkpoint to write. All processes read it, so all machines need access to it.
+        validation_clips: Clips to measure the checkpoint's stated error on; None for sets held out of
+            ``clips``.
+        init: Checkpoint with the initial weights; None for random weights.
+        resume: Continue an interrupted training from its saved states.
 
     Returns:
         The checkpoint as written.
 
     Raises:
-        DataError: The data have no two sets of any object, hold no contact, or a recording is too short or of
-            another size.
+        DataError: No object has two sets, no frame shows contact, or a recording is too short or of another
+            size.
         NonFiniteError: The training diverged.
-        CheckpointError: A state is of another recipe or other data, or a file can't be written.
-        ConfigError: Several processes can't train together as they are.
+        CheckpointError: A state belongs to another recipe or other data, or a file can't be written.
+        ConfigError: The processes can't train together, for example because their recipes differ.
     """
     training, held_out = clips, validation_clips
     if held_out is None:
@@ -100,12 +101,16 @@ def _trained(
     ranks: Ranks,
 ) -> list[Trainer]:
     if ranks.count > config.clips:
-        raise ConfigError(f"{ranks.count} processes can't share {config.clips} clips a step; set more clips")
+        raise ConfigError(
+            f"{ranks.count} processes can't share {config.clips} clips per step; increase clips"
+        )
     if ranks.count > 1 and config.compile:
-        raise ConfigError("several processes train networks that are not compiled: leave compile out")
+        raise ConfigError("compile does not work with several processes; set compile=false")
     shapes = [config.network(member) for member in range(len(config.attentions))]
     if init is not None and [network.config for network in init.networks] != shapes:
-        raise CheckpointError("the checkpoint to begin with holds other networks than this recipe trains")
+        raise CheckpointError(
+            "the initial checkpoint has other networks than this recipe; use one trained with this recipe"
+        )
     batches = Batches(clips, config, ranks)
     start = init.digest if init is not None else ""
     identity = f"{config.model_dump_json(exclude={'device', 'compile'})} {digest(clips)} {start}"
@@ -117,10 +122,10 @@ def _trained(
             trainer = Trainer(config, member, batches, ranks)
             trainers.append(trainer)
             if init is not None:
-                trainer.begin_with(init.networks[member])
+                trainer.load_weights(init.networks[member])
             if resume:
                 trainer.restore(state, identity)
-            ranks.agree(f"{identity} {trainer.done}", "recipes, data or states")
+            ranks.check_equal(f"{identity} {trainer.done}", "recipes, data or states")
             task = progress.add_task(config.attentions[member], total=1.0, loss="")
             saved = time.monotonic()
             for rmse_n in trainer.steps():
@@ -136,7 +141,7 @@ def _trained(
 
 
 def _residuals(forces_n: npt.NDArray[np.float32], measured_n: npt.NDArray[np.float32]) -> list[Residual]:
-    """Root mean squared error by estimated force, which is what a run knows, in bins of 1 N."""
+    """Returns the root mean squared error in bins of 1 N of the estimate, the only force known in a run."""
     squared = np.square(forces_n - measured_n)
     newtons = np.floor(forces_n)
     residuals = []

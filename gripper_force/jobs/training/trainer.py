@@ -1,4 +1,4 @@
-"""The training of one network, step by step."""
+"""Training loop of one network."""
 
 import math
 import time
@@ -23,7 +23,18 @@ from gripper_force.vision.preprocess import Preprocess
 
 
 class Trainer:
-    """One network in training."""
+    """Trains one member of an ensemble.
+
+    Args:
+        config: The recipe.
+        member: Index of the member.
+        batches: Training data.
+        ranks: This process among those that train together.
+
+    Attributes:
+        network: The network.
+        step: Number of completed steps.
+    """
 
     def __init__(self, config: TrainConfig, member: int, batches: Batches, ranks: Ranks) -> None:
         torch.manual_seed(config.seed + member)
@@ -31,9 +42,9 @@ class Trainer:
         self._batches = batches
         self._ranks = ranks
         self._name = config.attentions[member]
-        self._last = config.steps
+        self._total_steps = config.steps
         if config.epochs is not None:
-            self._last = math.ceil(config.epochs * batches.labels / config.clips)
+            self._total_steps = math.ceil(config.epochs * batches.labels / config.clips)
         self.network = ForceNetwork(config.network(member)).to(ranks.device)
         if ranks.count > 1:
             share_statistics(self.network)
@@ -44,22 +55,25 @@ class Trainer:
             fused=True,
         )
         self._forward = torch.compile(self.network) if config.compile else self.network
-        self.step = 0  # how many are done
+        self.step = 0
         self._elapsed_s = 0.0
-        self._smooth_n = math.nan
+        self._smoothed_rmse_n = math.nan
 
     @property
     def done(self) -> float:
-        """Share of the training that is done, in 0..1 and beyond."""
+        """Completed share of the training, from 0; 1 and more at the end."""
         if self._config.minutes is None:
-            return self.step / self._last
+            return self.step / self._total_steps
         return self._elapsed_s / (60 * self._config.minutes / len(self._config.attentions))
 
     def steps(self, until: float = 1.0) -> Iterator[float]:
-        """Trains until so large a share is done; the network is then in evaluation mode.
+        """Trains until this share of the schedule is done, then switches to evaluation mode.
+
+        Args:
+            until: Share of the schedule.
 
         Yields:
-            After each step the root mean squared error of the last ones, in N.
+            Root mean squared error in N, smoothed over the last steps, after each step.
 
         Raises:
             NonFiniteError: The training diverged.
@@ -68,16 +82,18 @@ class Trainer:
         began = time.monotonic() - self._elapsed_s
         while self.done < until:
             loss = self._update()
-            if self.step % 10 == 0:  # not more often, as a GPU must be waited for
+            if self.step % 10 == 0:  # not more often: it waits for the GPU
                 rmse_n = math.sqrt(loss.item()) * self.network.config.label_scale_n
                 if not math.isfinite(rmse_n):
                     raise NonFiniteError(
-                        f"the training of {self._name} diverged by step {self.step}; lower learning_rate"
+                        f"the training of {self._name} diverged by step {self.step}; reduce learning_rate"
                     )
-                self._smooth_n = rmse_n if self.step == 0 else 0.9 * self._smooth_n + 0.1 * rmse_n
+                self._smoothed_rmse_n = (
+                    rmse_n if self.step == 0 else 0.9 * self._smoothed_rmse_n + 0.1 * rmse_n
+                )
             self.step += 1
             self._elapsed_s = self._ranks.as_first(time.monotonic() - began)
-            yield self._smooth_n
+            yield self._smoothed_rmse_n
         self.network.eval()
 
     def _update(self) -> Tensor:
@@ -107,19 +123,27 @@ class Trainer:
         self._optimizer.step()
         return total
 
-    def begin_with(self, network: ForceNetwork) -> None:
-        """Takes the weights of another network of the same shape."""
+    def load_weights(self, network: ForceNetwork) -> None:
+        """Copies the weights of another network of the same shape."""
         self.network.load_state_dict(network.state_dict())
 
     def save(self, path: Path, identity: str) -> None:
-        """Keeps all that is needed to go on; raises `CheckpointError` where it can't be written."""
+        """Saves the state of the training.
+
+        Args:
+            path: File to write.
+            identity: Text that identifies the training; `restore` compares it.
+
+        Raises:
+            CheckpointError: The file can't be written.
+        """
         tensors = {f"network.{name}": t.contiguous() for name, t in self.network.state_dict().items()}
         for i, moments in self._optimizer.state_dict()["state"].items():
             tensors |= {f"optimizer.{i}.{name}": t.contiguous() for name, t in moments.items()}
         progress = {
             "step": str(self.step),
             "elapsed_s": str(self._elapsed_s),
-            "smooth_n": str(self._smooth_n),
+            "smooth_n": str(self._smoothed_rmse_n),
             "identity": identity,
         }
         partial = path.with_suffix(".partial")
@@ -128,13 +152,19 @@ class Trainer:
             save_file(tensors, partial, metadata=progress)
             partial.replace(path)
         except (OSError, SafetensorError) as error:
-            raise CheckpointError(f"can't write the training state {path}: {error}") from error
+            raise CheckpointError(
+                f"can't write the training state {path}: {error}; check the folder and free space"
+            ) from error
 
     def restore(self, path: Path, identity: str) -> None:
-        """Goes on from a saved state; where there is none yet, from the beginning.
+        """Restores a saved state. Without one, the training starts from the beginning.
+
+        Args:
+            path: File that `save` wrote, or that does not exist.
+            identity: Text that identifies the training.
 
         Raises:
-            CheckpointError: The state can't be read, or is of another training.
+            CheckpointError: The state can't be read, or belongs to another training.
         """
         if not path.exists():
             return
@@ -143,10 +173,12 @@ class Trainer:
                 progress = file.metadata()
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
         except (OSError, SafetensorError) as error:
-            raise CheckpointError(f"can't read the training state {path}: {error}") from error
+            raise CheckpointError(
+                f"can't read the training state {path}: {error}; delete it or train without --resume"
+            ) from error
         if progress["identity"] != identity:
             raise CheckpointError(
-                f"the training state {path} is of another recipe or other data; train without resuming"
+                f"the training state {path} belongs to another recipe or other data; train without --resume"
             )
         weights: dict[str, Tensor] = {}
         moments: dict[int, dict[str, Tensor]] = {}
@@ -159,36 +191,36 @@ class Trainer:
                 moments.setdefault(int(number), {})[name] = tensor
         self.network.load_state_dict(weights)
         for i, parameter in enumerate(self.network.parameters()):
-            for name in ("exp_avg", "exp_avg_sq"):  # the fused optimiser wants the parameter's memory format
+            for name in ("exp_avg", "exp_avg_sq"):  # the fused optimiser needs the parameter's memory format
                 moments[i][name] = torch.empty_like(parameter).copy_(moments[i][name])
         self._optimizer.load_state_dict({**self._optimizer.state_dict(), "state": moments})
         self.step, self._elapsed_s = int(progress["step"]), float(progress["elapsed_s"])
-        self._smooth_n = float(progress["smooth_n"])
+        self._smoothed_rmse_n = float(progress["smooth_n"])
 
 
 def squared_error(
     network: Callable[[Tensor, int], Tensor], inputs: Tensor, forces_n: Tensor, valid: Tensor, first: int
 ) -> Tensor:
-    """Sum of the squared errors in N² over the frames from ``first`` on that have a label."""
+    """Returns the sum of squared errors in N² over the frames with a label from ``first`` on."""
     error_n = network(inputs, first) - forces_n[:, first:]
     return (error_n.square() * valid[:, first:]).sum()
 
 
 def one_cycle(done: float, warmup: float) -> float:
-    """The learning rate's share of its peak: up and down along two half cosines."""
+    """Returns the learning rate as a share of its peak: up and down along two half cosines."""
     if done < warmup:
         return 0.04 + 0.96 * (1 - math.cos(math.pi * done / warmup)) / 2
     return (1 + math.cos(math.pi * min(1.0, (done - warmup) / (1 - warmup)))) / 2
 
 
 def step_decay(done: float) -> float:
-    """The learning rate's share of its peak: a tenth after each quarter, 30 epochs of the paper's 120."""
+    """Returns the learning rate as a share of its peak: a tenth per quarter (30 of the paper's 120 epochs)."""
     return float(0.1 ** math.floor(4 * done))
 
 
 def estimates(
     clips: Sequence[Clip], networks: Sequence[ForceNetwork], preprocess: Preprocess, device: str
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """The ensemble's and the measured forces in N over all valid frames of the clips."""
+    """Returns the ensemble's and the measured forces in N, (N,) each, over all frames with a label."""
     forces_n = [predict(networks, preprocess, clip.frames, device).mean(0)[clip.valid] for clip in clips]
     return np.concatenate(forces_n), np.concatenate([clip.forces_n[clip.valid] for clip in clips])

@@ -357,21 +357,6 @@ class DynamixelServo:
         return self._bus.stats
 
     @property
-    def nm_per_a(self) -> float:
-        """Torque constant at the horn from the vendor's table: a prior, to be calibrated."""
-        return self.model.nm_per_a
-
-    @property
-    def current_step_a(self) -> float:
-        """Resolution of the goal current."""
-        return self.model.current_unit_a
-
-    @property
-    def voltage_range_v(self) -> tuple[float, float]:
-        """Lowest and highest supply voltage from the vendor's table."""
-        return self.model.voltage_range_v
-
-    @property
     def firmware(self) -> int | None:
         """Firmware version; None before `start`."""
         return self._bus.firmware[0] if self._bus.firmware else None

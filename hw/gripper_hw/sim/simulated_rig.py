@@ -101,7 +101,7 @@ class SimulatedCamera:
         return frame
 
     def counts(self) -> dict[str, int]:
-        """Empty: a simulated device has no faults of its own."""
+        """Empty: without injected faults nothing is lost or rejected."""
         return {}
 
     def close(self) -> None:
@@ -143,7 +143,7 @@ class SimulatedLoadCell:
         return [self._samples.popleft() for _ in range(len(self._samples))]
 
     def counts(self) -> dict[str, int]:
-        """Empty: a simulated device has no faults of its own."""
+        """Empty: without injected faults nothing is lost or rejected."""
         return {}
 
     def close(self) -> None:
@@ -195,8 +195,6 @@ class SimulatedRig:
         SimulationError: The scene cannot be built.
     """
 
-    _detail_reason = ""
-
     def __init__(self, config: Config) -> None:
         if not config.servo.port.startswith("virtual:"):
             raise ConfigError(
@@ -204,7 +202,6 @@ class SimulatedRig:
                 "the simulated servo; set camera.backend and load_cell.backend to real devices or none, or "
                 "set servo.port to virtual:rig"
             )
-        config, self._detail_reason = self.resolve(config)  # delete once open_devices gets a resolved config
         if config.sim.detail == "auto":
             raise ConfigError(
                 "sim.detail is still auto; resolve the configuration with SimulatedRig.resolve first"
@@ -277,9 +274,8 @@ class SimulatedRig:
             raise self._failure
 
     def notes(self) -> dict[str, str]:
-        """Facts for the log: the scene's parameters, the exposure, and the reason for the level of detail."""
-        detail = {"detail": self._detail_reason} if self._detail_reason else {}
-        return {"scene": json.dumps(asdict(self.scene)), "exposure_ms": str(self._exposure_ms), **detail}
+        """Facts for the log: the scene's parameters and the exposure."""
+        return {"scene": json.dumps(asdict(self.scene)), "exposure_ms": str(self._exposure_ms)}
 
     def render_under_light(self, lux: float) -> tuple[Camera, dict[str, str]]:
         """Returns a camera of this world with the images of a rig of this ``sim.lux``, and its notes."""

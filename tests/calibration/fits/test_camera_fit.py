@@ -21,8 +21,8 @@ MODULE_PX = 3
 SIDE_PX = 6 * MODULE_PX
 
 
-def picture(*places: tuple[int, int, int]) -> Gray:
-    """A noisy picture of 128x128 with markers: number, left and top of its black square."""
+def image(*places: tuple[int, int, int]) -> Gray:
+    """A noisy image of 128x128 with markers: number, left and top of its black square."""
     gray = np.full((128 + 2 * SIDE_PX,) * 2, 110.0)
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
     for number, left, top in places:
@@ -39,14 +39,14 @@ def at(left: float, top: float, side: float = 12.0) -> np.ndarray:
     return np.array([[left, top], [left + side, top], [left + side, top + side], [left, top + side]])
 
 
-def test_both_markers_are_found_where_they_are() -> None:
-    found = find_markers(picture((0, 12, 50), (1, 90, 58)))
+def test_markers_are_found_at_their_positions() -> None:
+    found = find_markers(image((0, 12, 50), (1, 90, 58)))
     for number, left, top in ((0, 12, 50), (1, 90, 58)):
         assert found[number] == pytest.approx(at(left - 0.5, top - 0.5, SIDE_PX), abs=1.0)
 
 
-def test_the_region_is_the_square_about_both_markers() -> None:
-    seen = [find_markers(picture((0, 30, 50), (1, 80, 52))), find_markers(picture((0, 34, 50), (1, 76, 52)))]
+def test_region_is_the_square_around_both_markers() -> None:
+    seen = [find_markers(image((0, 30, 50), (1, 80, 52))), find_markers(image((0, 34, 50), (1, 76, 52)))]
     left, top, width, height = region_around(seen, 128, 128)
     assert width == height == pytest.approx(80 + SIDE_PX - 30 + SIDE_PX, abs=2)
     assert (left, top) == pytest.approx((30 - SIDE_PX / 2, 60 - width / 2), abs=2)
@@ -61,14 +61,12 @@ def test_the_region_is_the_square_about_both_markers() -> None:
         (((5, 12, 50), (7, 90, 58)), "marker 0 in 0 and marker 1 in 0"),  # of something else
     ],
 )
-def test_a_marker_that_is_not_seen_whole_is_named(
-    shown: tuple[tuple[int, int, int], ...], counts: str
-) -> None:
+def test_missing_or_cut_off_marker_is_named(shown: tuple[tuple[int, int, int], ...], counts: str) -> None:
     with pytest.raises(DataError, match=rf"no image shows both markers completely: of 1 images, {counts}"):
-        region_around([find_markers(picture(*shown))], 128, 128)
+        region_around([find_markers(image(*shown))], 128, 128)
 
 
-def test_something_far_larger_that_looks_like_a_marker_is_none_of_a_pair() -> None:
+def test_markers_of_very_different_size_are_not_a_pair() -> None:
     with pytest.raises(
         DataError,
         match="no image shows both markers completely: of 1 images, marker 0 in 1 and marker 1 in 1",
@@ -83,7 +81,7 @@ def test_something_far_larger_that_looks_like_a_marker_is_none_of_a_pair() -> No
     st.integers(112, 160),
     st.integers(112, 160),
 )
-def test_the_region_is_a_square_within_the_picture(seen: list[Markers], width: int, height: int) -> None:
+def test_region_is_a_square_within_the_image(seen: list[Markers], width: int, height: int) -> None:
     left, top, side, same = region_around(seen, width, height)
     assert side == same > 0
     assert 0 <= left <= left + side <= width
@@ -94,24 +92,24 @@ def test_the_region_is_a_square_within_the_picture(seen: list[Markers], width: i
         assert (corners <= (left + side + 1, top + side + 1)).all()
 
 
-def test_the_best_lit_picture_that_is_not_clipped_is_chosen() -> None:
-    ladder = [
+def test_best_exposure_without_clipping_is_selected() -> None:
+    candidates = [
         ExposureCandidate(500, 35, 0.0),
         ExposureCandidate(1000, 50, 0.0),
         ExposureCandidate(2000, 71, 0.0),
         ExposureCandidate(4000, 95, 0.02),
     ]
-    assert select_exposure(ladder).exposure_us == 2000
+    assert select_exposure(candidates).exposure_us == 2000
 
 
 @pytest.mark.parametrize("gray", [250, 255, 0, 39])
-def test_pictures_that_are_clipped_or_dark_are_refused(gray: int) -> None:
-    rung = ExposureCandidate.measure(4000, np.full((64, 64), gray, np.uint8))
+def test_clipped_or_dark_images_are_refused(gray: int) -> None:
+    candidate = ExposureCandidate.measure(4000, np.full((64, 64), gray, np.uint8))
     with pytest.raises(
         DataError,
         match=r"the image is dark or clipped at every exposure \([\d.]+ us: mean [\d.]+, [\d.]+ % clipped",
     ):
-        select_exposure([rung])
+        select_exposure([candidate])
 
 
 def touches(*lags_ms: float, force_n: float = 5.0) -> list[TouchLag]:
@@ -119,22 +117,22 @@ def touches(*lags_ms: float, force_n: float = 5.0) -> list[TouchLag]:
 
 
 @given(st.lists(st.floats(-150, 150), min_size=3, max_size=30))
-def test_the_interval_holds_the_lag_and_is_no_narrower_than_the_method(lags_ms: list[float]) -> None:
+def test_lag_interval_is_at_least_the_error_of_the_method(lags_ms: list[float]) -> None:
     lag = estimate_lag(touches(*lags_ms))
     assert lag.value == pytest.approx(np.median(lags_ms))
     assert lag.half >= METHOD_ERROR_MS - 1e-9
 
 
-def test_touches_that_contradict_each_other_widen_it() -> None:
+def test_scattered_touches_widen_the_lag_interval() -> None:
     assert estimate_lag(touches(-60, -20, 20, 60)).half > 60
     assert estimate_lag(touches(18, 19, 20, 21)).half < 6
 
 
-def test_weak_touches_are_left_out() -> None:
+def test_weak_touches_are_not_used() -> None:
     assert estimate_lag([*touches(10, 11, 12), *touches(90, 95, 99, force_n=2.0)]).value == 11
 
 
-def test_too_few_touches_that_tell_are_refused() -> None:
+def test_too_few_usable_touches_are_refused() -> None:
     nan = float("nan")
     with pytest.raises(DataError, match="only 2 of 4 touches determine the camera's lag, and 3 are needed"):
         estimate_lag(touches(10, 11, nan, nan))

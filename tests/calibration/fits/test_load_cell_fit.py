@@ -18,7 +18,7 @@ Draws = npt.NDArray[np.float64]
 
 
 def rest(rng: np.random.Generator, force_n: float, drift_n_min: float = 0.0, noise_n: float = 0.01) -> Rest:
-    """HX711 counts at 80 Hz, whose noise has a memory of a tenth of a second."""
+    """HX711 counts at 80 Hz with autocorrelated noise."""
     t_s = np.arange(COUNT) / 80
     noise = lfilter([1.0], [1.0, -0.8], rng.normal(0, noise_n, COUNT))
     load_n = force_n + drift_n_min * t_s / 60 + noise
@@ -30,7 +30,7 @@ def rests(seed: int) -> tuple[Rest, Rest, Rest]:
     return rest(rng, 0.0), rest(rng, FORCE_N), rest(rng, 0.0)
 
 
-def test_the_intervals_hold_the_truth_in_95_of_100() -> None:
+def test_intervals_contain_the_true_values() -> None:
     held = np.zeros(3)
     for seed in range(100):
         fit = fit_load_cell(*rests(seed), FORCE_N)
@@ -40,13 +40,13 @@ def test_the_intervals_hold_the_truth_in_95_of_100() -> None:
     assert (held >= 92).all()
 
 
-def test_drift_is_told() -> None:
+def test_drift_is_measured() -> None:
     rng = np.random.default_rng(0)
     fit = fit_load_cell(rest(rng, 0.0, 0.5), rest(rng, FORCE_N, 0.5), rest(rng, 0.0, 0.5), FORCE_N)
     assert fit.drift_n_min.value == pytest.approx(0.5, abs=0.15)
 
 
-def test_spikes_to_either_side_and_invalid_readings_do_not_count() -> None:
+def test_spikes_and_invalid_readings_are_rejected() -> None:
     plain, spiky = rests(1), rests(1)
     for one in spiky:
         one.raw[50:750:70] += 40 / N_PER_RAW
@@ -89,13 +89,13 @@ def test_spikes_to_either_side_and_invalid_readings_do_not_count() -> None:
         ),
     ],
 )
-def test_what_can_not_be_weighed_is_refused_with_a_sentence(change: object, sentence: str) -> None:
+def test_unusable_rests_are_refused_with_a_message(change: object, sentence: str) -> None:
     with pytest.raises(DataError, match=sentence) as caught:
         fit_load_cell(*change(*rests(2)), FORCE_N)  # type: ignore[operator]
     assert "\n" not in str(caught.value)
 
 
-def test_an_indicator_that_rests_on_one_value_is_known_to_its_last_digit() -> None:
+def test_constant_reading_has_an_interval_of_its_last_digit() -> None:
     def shows(kg: float) -> Rest:
         return Rest(np.arange(100) / 10, np.full(100, kg), np.ones(100, np.bool_))
 
@@ -119,7 +119,7 @@ def odd_rests(draw: st.DrawFn) -> Rest:
 
 @settings(max_examples=100, deadline=None)
 @given(odd_rests(), odd_rests(), odd_rests(), st.floats(1e-6, 1e3))
-def test_odd_data_are_refused_or_known_to_within_what_is_said(
+def test_arbitrary_data_are_refused_or_fitted_within_the_interval_limit(
     e: Rest, u: Rest, a: Rest, force_n: float
 ) -> None:
     try:
@@ -133,7 +133,7 @@ def test_odd_data_are_refused_or_known_to_within_what_is_said(
     assert high - low <= 0.2 * abs(value)
 
 
-def test_averaging_white_noise_pays_by_the_root_of_its_time() -> None:
+def test_allan_deviation_of_white_noise_falls_with_the_square_root_of_time() -> None:
     raw = np.random.default_rng(0).normal(0, 1, 4096)
     tau_s, deviation = allan_deviation(Rest(np.arange(4096) / 80, raw, np.ones(4096, np.bool_)), raw < 9)
     assert tau_s[:6] == pytest.approx(np.array([1, 2, 4, 8, 16, 32]) / 80)

@@ -41,7 +41,7 @@ def touched(
 
 @pytest.mark.parametrize("count", [1, 2, 4, 8])
 @pytest.mark.parametrize("gain", [0.6, 1.5])
-def test_a_wrong_gain_is_put_right_by_a_few_touches(count: int, gain: float) -> None:
+def test_wrong_gain_is_corrected_with_few_touches(count: int, gain: float) -> None:
     fitted = fit_correction(touched(count, gain=gain, scatter=0.01))
     new = touched(5, gain=gain, scatter=0.01, seed=1)
     before_n = np.abs(new.estimate_n - new.force_n).mean()
@@ -52,8 +52,8 @@ def test_a_wrong_gain_is_put_right_by_a_few_touches(count: int, gain: float) -> 
 
 @pytest.mark.parametrize("count", [1, 2])
 @pytest.mark.parametrize("gain", [2.0, 3.5])
-def test_an_object_of_another_kind_is_not_held_to_what_was_thought_of_it(count: int, gain: float) -> None:
-    """The touches scatter, so that a prior without tails would win over them."""
+def test_prior_does_not_prevent_the_correction_of_a_new_kind_of_object(count: int, gain: float) -> None:
+    """The touches scatter, so that a prior without tails would outweigh them."""
     after_n, before_n = [], []
     for seed in range(6):
         fitted = fit_correction(touched(count, gain=gain, scatter=0.15, peak_n=3.0, seed=seed))
@@ -63,20 +63,20 @@ def test_an_object_of_another_kind_is_not_held_to_what_was_thought_of_it(count: 
     assert np.mean(after_n) < 0.45 * np.mean(before_n)
 
 
-def test_what_is_right_stays_as_it_is() -> None:
+def test_correct_network_is_not_changed() -> None:
     fitted = fit_correction(touched(8))
     assert fitted.candidate == "the network as it is"
     assert fitted.output.force_n == fitted.output.estimate_n
 
 
-def test_a_bend_is_followed_where_touches_tell_of_it() -> None:
+def test_nonlinear_error_is_corrected() -> None:
     fitted = fit_correction(touched(8, bend=-0.4))
     new = touched(5, bend=-0.4, seed=1)
     assert np.abs(fitted.predict(new) - new.force_n).mean() < 0.06
     assert fitted.candidate != "a line"
 
 
-def test_touches_that_contradict_each_other_leave_a_wide_interval() -> None:
+def test_scattered_touches_give_a_wide_interval() -> None:
     agreeing, torn = (fit_correction(touched(8, scatter=scatter, seed=3)) for scatter in (0.01, 0.4))
     assert torn.interval.share > 5 * agreeing.interval.share
 
@@ -87,7 +87,7 @@ def test_few_touches_have_a_wider_interval_than_many(count: int) -> None:
     assert few.interval.share > many.interval.share
 
 
-def test_spikes_of_the_load_cell_do_not_move_the_line() -> None:
+def test_load_cell_spikes_do_not_change_the_line() -> None:
     touches = touched(2, gain=0.7)
     spiky = touches.force_n.copy()
     spiky[np.random.default_rng(0).choice(len(spiky), 8, replace=False)] = -70.0
@@ -95,7 +95,7 @@ def test_spikes_of_the_load_cell_do_not_move_the_line() -> None:
     assert fitted.output.force_n[1] / fitted.output.estimate_n[1] == pytest.approx(0.7, abs=0.06)
 
 
-def test_new_touches_are_within_the_interval_as_often_as_promised() -> None:
+def test_interval_contains_new_touches_at_the_stated_coverage() -> None:
     within = []
     for seed in range(20):
         fitted = fit_correction(touched(8, gain=1.2, scatter=0.04, seed=2 * seed))
@@ -106,8 +106,8 @@ def test_new_touches_are_within_the_interval_as_often_as_promised() -> None:
     assert np.mean(within) == pytest.approx(0.9, abs=0.03)
 
 
-def test_the_interval_is_the_quantile_of_left_out_errors_and_each_touch_counts_the_same() -> None:
-    """Ten touches of one error each; the last is long, and counts no more than the others."""
+def test_interval_is_the_quantile_with_equal_weight_for_each_touch() -> None:
+    """Ten touches with one error each; the last is longer and has the same weight."""
     error_n = np.linspace(0.1, 1.0, 10)
     counts = np.array([10] * 9 + [1000])
     touch = np.repeat(np.arange(10), counts)
@@ -119,7 +119,7 @@ def test_the_interval_is_the_quantile_of_left_out_errors_and_each_touch_counts_t
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1])
-def test_the_interval_grows_with_the_force_as_the_errors_do(share: float) -> None:
+def test_interval_grows_with_force_like_the_errors(share: float) -> None:
     rng = np.random.default_rng(0)
     force_n = np.tile(np.linspace(0, 10, 50), 40)
     predicted_n = force_n + np.hypot(0.05, share * force_n) * rng.normal(size=len(force_n))
@@ -129,7 +129,7 @@ def test_the_interval_grows_with_the_force_as_the_errors_do(share: float) -> Non
         assert float(interval.half_width_n(at_n)) == pytest.approx(expected_n, rel=0.15)
 
 
-def test_the_gate_is_as_wide_as_new_touches_are_strange() -> None:
+def test_ood_limit_follows_the_scores_of_left_out_touches() -> None:
     ood_score = [np.linspace(0, top, 2001) for top in (0.1, 0.3, 0.2)]
     assert ood_fit.fit_ood_limit(ood_score) == pytest.approx(1.5 * (1 + 2 / 3) * 0.3 * 0.995, rel=1e-3)
     assert ood_fit.fit_ood_limit([*ood_score] * 100) == pytest.approx(1.5 * 0.3 * 0.995, rel=0.01)
@@ -137,7 +137,7 @@ def test_the_gate_is_as_wide_as_new_touches_are_strange() -> None:
     assert ood_fit.fit_ood_limit([]) == ood_fit.DEFAULT_LIMIT
 
 
-def test_the_simplest_that_is_no_worse_by_a_standard_error_is_taken() -> None:
+def test_simplest_candidate_within_one_standard_error_is_selected() -> None:
     better = np.array([0.3, 0.1, 0.2, 0.4])  # of each touch, mean 0.25, standard error 0.065
     base = np.array([1.0, 1.2, 0.8, 1.1])
     for by_n, chosen in ((0.0, 1), (0.06, 1), (0.07, 2)):
@@ -146,7 +146,7 @@ def test_the_simplest_that_is_no_worse_by_a_standard_error_is_taken() -> None:
         assert _select_simplest(error_n) == chosen
 
 
-def test_frames_of_another_object_are_stranger_than_those_of_new_touches() -> None:
+def test_ood_score_separates_another_object_from_new_touches() -> None:
     fitted = fit_correction(touched(8))
     new, other = touched(5, seed=1), touched(5, seed=1)
     other.features[:, ::2] *= -1
@@ -154,7 +154,7 @@ def test_frames_of_another_object_are_stranger_than_those_of_new_touches() -> No
     assert (fitted.arrays.ood_score(other.features) > fitted.ood_limit).mean() > 0.5
 
 
-def test_how_many_touches_are_enough_goes_down_and_tests_on_others() -> None:
+def test_learning_curve_tests_1_2_4_8_touches_on_the_others() -> None:
     rows = list(learning_curve(touched(9, gain=1.4, scatter=0.02), draws=2))
     assert {count for count, _, _ in rows} == {1, 2, 4, 8}
     assert all(mae_n < 0.5 and 0 <= share <= 1 for _, mae_n, share in rows)
@@ -175,12 +175,12 @@ def test_how_many_touches_are_enough_goes_down_and_tests_on_others() -> None:
     ],
     ids=["light", "wrong sign", "none", "constant", "noise", "another quantity"],
 )
-def test_what_tells_nothing_is_refused(touches: Touches, sentence: str) -> None:
+def test_insufficient_touches_are_refused(touches: Touches, sentence: str) -> None:
     with pytest.raises(DataError, match=sentence):
         fit_correction(touches)
 
 
-def test_values_that_are_not_finite_are_refused() -> None:
+def test_nonfinite_values_are_refused() -> None:
     touches = touched(2)
     touches.force_n[3] = np.nan
     with pytest.raises(DataError, match="not finite"):
@@ -197,11 +197,11 @@ def test_values_that_are_not_finite_are_refused() -> None:
     repeat=st.booleans(),
     seed=st.integers(0, 100),
 )
-def test_a_fit_is_refused_or_finite_and_never_falls(
+def test_any_fit_is_refused_or_finite_and_monotone(
     count: int, gain: float, offset_n: float, scatter: float, noise_n: float, repeat: bool, seed: int
 ) -> None:
     touches = touched(count, gain=gain, offset_n=offset_n, scatter=scatter, noise_n=noise_n, seed=seed)
-    if repeat:  # a camera that hangs: features without any spread
+    if repeat:  # a stuck camera: features without variance
         touches.features[:] = touches.features[0]
     try:
         fitted = fit_correction(touches)

@@ -21,7 +21,7 @@ def pressed(
 
 @settings(max_examples=30, deadline=None)
 @given(gain=st.floats(0.6, 1.5), lag_s=st.floats(0.01, 0.15), friction_n=st.floats(-0.4, 0.4))
-def test_gain_and_lag_come_back_whatever_the_friction(gain: float, lag_s: float, friction_n: float) -> None:
+def test_gain_and_lag_are_recovered_with_any_friction(gain: float, lag_s: float, friction_n: float) -> None:
     presses = [pressed(gain, lag_s, friction_n * s, seed) for seed, s in enumerate((1.0, 0.5, -1.0))]
     plant = fit_plant(presses, 0.04)
     assert plant is not None
@@ -31,14 +31,14 @@ def test_gain_and_lag_come_back_whatever_the_friction(gain: float, lag_s: float,
     assert plant.phase_margin_deg == pytest.approx(61.4, abs=0.1)  # SIMC's own, by its choice of gains
 
 
-def test_what_hardly_moves_tells_no_plant() -> None:
+def test_weak_presses_give_no_plant() -> None:
     still = PressSeries(np.arange(100) * 0.005, np.full(100, 2.0), np.full(100, 1.0))
     assert fit_plant([], 0.04) is None
     assert fit_plant([still], 0.04) is None
     assert fit_plant([pressed(0.01, 0.03, 0.0)], 0.04) is None
 
 
-def test_stiffness_is_the_slope_in_the_middle() -> None:
+def test_stiffness_is_the_slope_between_one_and_two_thirds() -> None:
     travel_m = np.linspace(0, 0.01, 200)
     force_n = 300 * travel_m + 1e6 * np.clip(travel_m - 0.0095, 0, None) ** 2
     slopes = stiffness_n_m([0.05 - travel_m, 0.05 - travel_m[:30]], [force_n, force_n[:30]])
@@ -46,7 +46,7 @@ def test_stiffness_is_the_slope_in_the_middle() -> None:
 
 
 @given(st.lists(st.floats(-0.001, 0.001), min_size=8, max_size=8), st.integers(2, 5))
-def test_an_object_that_stays_narrower_was_crushed_by_the_hardest_touch_so_far(
+def test_crushing_touch_is_the_strongest_before_the_object_stays_narrower(
     lies_m: list[float], last: int
 ) -> None:
     peak_n = np.array([2.0, 5.0, 3.0, 4.0, 2.0, 3.0, 5.0, 1.0])
@@ -56,7 +56,7 @@ def test_an_object_that_stays_narrower_was_crushed_by_the_hardest_touch_so_far(
     assert crushing_touch(contact_m, peak_n) == last
 
 
-def test_an_object_that_springs_back_was_not_crushed() -> None:
+def test_no_crushing_touch_if_the_object_springs_back() -> None:
     rng = np.random.default_rng(0)
     for _ in range(50):
         assert crushing_touch(0.05 + rng.uniform(-0.002, 0.002, 12), rng.uniform(1, 9, 12)) is None

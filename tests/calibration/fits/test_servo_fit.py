@@ -30,7 +30,7 @@ Floats = npt.NDArray[np.float64]
 def press(
     rng: np.random.Generator, rate_n_s: float, gauge_m: float = 0.03, growth: float = 0.0
 ) -> ServoPress:
-    """A motor against a play of friction and a spring; what is read of its current is rounded."""
+    """A motor against Coulomb friction and a spring, with quantised current readings."""
     rise_s, fall_s = 9.0 / rate_n_s, (9.0 + 2 * FRICTION_N + 1.0) / rate_n_s
     t_s = np.arange(0, rise_s + fall_s, 0.005)
     motor_force_n = FRICTION_N + rate_n_s * np.minimum(t_s, 2 * rise_s - t_s)
@@ -73,7 +73,7 @@ def holds(estimate: CalibratedValue, truth: float) -> bool:
     return estimate.low is not None and estimate.high is not None and estimate.low <= truth <= estimate.high
 
 
-def test_the_intervals_hold_the_truth_in_95_of_100() -> None:
+def test_intervals_contain_the_true_values() -> None:
     held = np.zeros(4)
     for seed in range(40):
         rng = np.random.default_rng(seed)
@@ -91,7 +91,7 @@ def test_the_intervals_hold_the_truth_in_95_of_100() -> None:
     assert (held >= 35).all()
 
 
-def test_two_gauges_tell_the_pinions_radius() -> None:
+def test_two_gauges_determine_the_pinion_radius() -> None:
     rng = np.random.default_rng(0)
     both = [*presses(rng), *presses(rng, gauge_m=0.06)]
     fit = fit_servo(both, passes(rng), replace(NOMINAL, pinion_radius_m=0.024))
@@ -102,21 +102,21 @@ def test_two_gauges_tell_the_pinions_radius() -> None:
     assert fit.open_position_rad.value == pytest.approx(OPEN_RAD, abs=2e-3)
 
 
-def test_friction_that_grows_with_the_force_is_told() -> None:
+def test_friction_growing_with_force_is_fitted() -> None:
     rng = np.random.default_rng(0)
     fit = fit_servo(presses(rng, growth=0.05), passes(rng), NOMINAL)
     assert fit.friction_share.value == pytest.approx(0.05, abs=0.01)
     assert fit.n_per_a.value == pytest.approx(N_PER_A, rel=0.01)
 
 
-def test_a_load_cell_of_unsure_scale_makes_forces_unsure() -> None:
+def test_uncertain_load_cell_scale_widens_the_intervals() -> None:
     rng = np.random.default_rng(0)
     data = presses(rng), passes(rng)
     fit = fit_servo(*data, replace(NOMINAL, scale_share=0.03))
     assert fit.nm_per_a.half > 0.03 * fit.nm_per_a.value > fit_servo(*data, NOMINAL).nm_per_a.half
 
 
-def test_spikes_do_not_count() -> None:
+def test_spikes_are_rejected() -> None:
     rng = np.random.default_rng(1)
     clean = presses(rng), passes(rng)
     plain = fit_servo(*clean, NOMINAL)
@@ -151,7 +151,7 @@ Spoil = Callable[[list[ServoPress], list[FreePass]], tuple[list[ServoPress], lis
         ),
     ],
 )
-def test_what_tells_nothing_is_refused_with_a_sentence(spoil: Spoil, sentence: str) -> None:
+def test_insufficient_data_are_refused_with_a_message(spoil: Spoil, sentence: str) -> None:
     rng = np.random.default_rng(2)
     with pytest.raises(DataError, match=sentence) as caught:
         fit_servo(*spoil(presses(rng), passes(rng)), NOMINAL)
@@ -181,7 +181,7 @@ def odd_passes(draw: st.DrawFn) -> FreePass:
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(odd_presses(), max_size=7), st.lists(odd_passes(), max_size=9), st.booleans())
-def test_odd_data_are_refused_or_known_to_within_what_is_said(
+def test_arbitrary_data_are_refused_or_fitted_within_the_interval_limit(
     some: list[ServoPress], others: list[FreePass], good: bool
 ) -> None:
     rng = np.random.default_rng(3)

@@ -1,4 +1,4 @@
-"""The simulated rig's camera, whose lag, latency and markers are known."""
+"""Calibration of the simulated camera, with known lag, latency and markers."""
 
 import json
 from dataclasses import replace
@@ -25,14 +25,14 @@ WHOLE = (0, 0, 128, 128)
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A set of touches; the markers are there."""
+    """A set of touches with visible markers."""
     config = load_config(None, [*QUICK, "sim.markers=true"])
     (path,) = record(config, RecordingPlan(1, 5), tmp_path_factory.mktemp("touches"), lambda *_: None)
     return path
 
 
 def shifted(log: Path, folder: Path, by_ms: float) -> Path:
-    """The same set from a camera whose timestamps are late."""
+    """The same set with late camera timestamps."""
     reader, path = LogReader(log), folder / "shifted.mcap"
     with LogWriter(path, config=reader.config, metadata=reader.metadata) as copy:
         for item in reader.records():
@@ -44,7 +44,7 @@ def shifted(log: Path, folder: Path, by_ms: float) -> Path:
 
 
 @pytest.mark.parametrize("by_ms", [-25.0, 0.0, 25.0])
-def test_a_known_lag_lies_within_the_stated_interval(log: Path, tmp_path: Path, by_ms: float) -> None:
+def test_known_lag_is_within_the_interval(log: Path, tmp_path: Path, by_ms: float) -> None:
     lag = estimate_lag(observe(shifted(log, tmp_path, by_ms), WHOLE).touches)
     assert lag.low is not None
     assert lag.high is not None
@@ -52,11 +52,11 @@ def test_a_known_lag_lies_within_the_stated_interval(log: Path, tmp_path: Path, 
     assert lag.half < 12
 
 
-def test_the_plain_comparison_with_force_says_too_much(log: Path) -> None:
+def test_correlation_with_force_overestimates_the_lag(log: Path) -> None:
     assert all(touch.correlation_ms > 10 for touch in observe(log, WHOLE).touches if touch.force_n > 3)
 
 
-def test_the_cameras_latency_and_the_wait_for_a_cycle_are_seen(log: Path) -> None:
+def test_camera_latency_and_wait_for_a_cycle_are_measured(log: Path) -> None:
     seen = observe(log, None)
     assert 15 <= seen.use_ms <= 20  # a latency of 15 ms, and the next cycle of 5
     assert seen.rate_hz == pytest.approx(30, rel=0.05)  # of whole physics steps
@@ -64,7 +64,7 @@ def test_the_cameras_latency_and_the_wait_for_a_cycle_are_seen(log: Path) -> Non
     assert observe(log, WHOLE).markers == []
 
 
-def test_what_the_network_takes_is_measured_on_a_clock_that_is_real(log: Path, tiny_checkpoint: Path) -> None:
+def test_computing_time_is_measured_in_real_time(log: Path, tiny_checkpoint: Path) -> None:
     gray = observe(log, WHOLE).reference
     assert compute_ms(load_config(None, QUICK), gray) == 0.0
     config = load_config(None, [*QUICK, f"vision.checkpoint={tiny_checkpoint}"])
@@ -72,7 +72,7 @@ def test_what_the_network_takes_is_measured_on_a_clock_that_is_real(log: Path, t
     assert 0 < compute_ms(config.model_copy(update={"clock": "realtime"}), gray) < 1000
 
 
-def test_the_command_writes_profile_reference_and_report(tmp_path: Path) -> None:
+def test_command_writes_profile_reference_and_report(tmp_path: Path) -> None:
     rig = tmp_path / "rig.yaml"
     asked = ["calibrate", "camera", "--rig", rig, "--exposure-us", 500, "--exposure-us", 4000, "--json"]
     sets = [part for key in (*QUICK, "sim.markers=true", "sim.lux=550") for part in ("--set", key)]
@@ -99,7 +99,7 @@ def mismatches(config: Config) -> list[str]:
     return rig_mismatches(config, read_profiles(config))
 
 
-def test_another_camera_than_the_profiles_is_told(tmp_path: Path) -> None:
+def test_different_camera_is_refused_or_reported(tmp_path: Path) -> None:
     rig = tmp_path / "rig.yaml"
     calibrate_camera(load_config(None, QUICK), rig, region=(4, 4, 120, 120), exposures_us=[4000], touches=3)
     found = read_rig(rig).camera
@@ -116,7 +116,7 @@ def test_another_camera_than_the_profiles_is_told(tmp_path: Path) -> None:
     assert mismatches(load_config(None, [*named, "camera.backend=none"])) == []
 
 
-def test_without_markers_nothing_is_written_and_the_way_out_is_named(tmp_path: Path) -> None:
+def test_without_markers_nothing_is_written(tmp_path: Path) -> None:
     with pytest.raises(
         DataError,
         match=r"no image shows both markers completely: of [\d.]+ images, marker [\d.]+ in [\d.]+ and mark",
@@ -160,7 +160,7 @@ def test_without_markers_nothing_is_written_and_the_way_out_is_named(tmp_path: P
         ),
     ],
 )
-def test_what_can_not_be_calibrated_is_refused_before_anything_moves(
+def test_unusable_cameras_are_refused_before_anything_moves(
     tmp_path: Path, sets: list[str], exposures_us: list[int], error: type[Exception], why: str
 ) -> None:
     with pytest.raises(error, match=why):
@@ -174,7 +174,7 @@ def test_what_can_not_be_calibrated_is_refused_before_anything_moves(
         ("10,10,100", "--region needs left,top,width,height in pixels, got '10,10,100'"),
     ],
 )
-def test_a_region_by_hand_is_checked(tmp_path: Path, region: str, why: str) -> None:
+def test_given_region_is_checked(tmp_path: Path, region: str, why: str) -> None:
     sets = [part for key in QUICK for part in ("--set", key)]
     asked = ["calibrate", "camera", "--rig", str(tmp_path / "rig.yaml"), "--region", region, *sets]
     done = CliRunner().invoke(app, asked)

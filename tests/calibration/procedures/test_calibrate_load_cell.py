@@ -1,4 +1,4 @@
-"""A board behind a pseudo-terminal, on which a hand puts a mass when it is asked to."""
+"""Load-cell calibration with a simulated board behind a pseudo-terminal."""
 
 import os
 import pty
@@ -23,7 +23,7 @@ TARE, N_PER_RAW, WEIGHT_N = -4_000, 1e-4, 5.0
 
 
 class Board:
-    """An HX711 that prints counts and feels what lies on it."""
+    """An HX711 that prints counts under a load."""
 
     def __init__(self) -> None:
         self.force_n = 0.0
@@ -65,7 +65,7 @@ def config_of(board: Board) -> Config:
     return config_from({"load_cell": cell}, "the test")
 
 
-def test_a_board_is_calibrated_through_its_own_driver(board: Board, tmp_path: Path) -> None:
+def test_board_is_calibrated_through_its_driver(board: Board, tmp_path: Path) -> None:
     rig = tmp_path / "rig.yaml"
     asked: list[str] = []
 
@@ -88,7 +88,7 @@ def test_a_board_is_calibrated_through_its_own_driver(board: Board, tmp_path: Pa
 
 
 class Cell:
-    """A load cell in a time of its own, whose reading a function of time and of what was asked gives."""
+    """A load cell with its own clock. A function of the prompts and the time gives its reading."""
 
     def __init__(self, reading: Callable[[int, float], float | None]) -> None:
         self._reading, self._now_ns, self._sampled_ns = reading, 0, 0
@@ -127,7 +127,7 @@ def weighed(reading: Callable[[int, float], float | None]) -> tuple[float, float
     return fit.tare_raw.value, fit.n_per_raw.value
 
 
-def test_it_waits_for_a_load_that_comes_late_and_swings() -> None:
+def test_waits_until_a_late_swinging_load_is_at_rest() -> None:
     def reading(asked: int, t_s: float) -> float:
         loaded = (asked == 2 and t_s > 8) or (asked == 3 and t_s < 6)
         swing = 2000 * np.exp(-(t_s - 8) / 2) * np.cos(9 * t_s) if asked == 2 and t_s > 8 else 0.0
@@ -152,14 +152,12 @@ def test_it_waits_for_a_load_that_comes_late_and_swings() -> None:
         ),
     ],
 )
-def test_where_patience_ends_it_says_what_is_wrong(
-    reading: Callable[[int, float], float], sentence: str
-) -> None:
+def test_timeout_names_the_problem(reading: Callable[[int, float], float], sentence: str) -> None:
     with pytest.raises(DataError, match=sentence):
         weighed(reading)
 
 
-def test_a_silent_cell_is_named() -> None:
+def test_silent_load_cell_is_an_error() -> None:
     with pytest.raises(DeviceTimeoutError, match=r"gives no readings \(counted: 3 unreadable\)"):
         weighed(lambda asked, t_s: None)
 
@@ -173,13 +171,13 @@ def test_a_silent_cell_is_named() -> None:
         (["--force-n", "nan", "--set", "load_cell.backend=serial"], "a mass of nan N can't be weighed"),
     ],
 )
-def test_what_makes_no_sense_is_refused(arguments: list[str], sentence: str) -> None:
+def test_invalid_arguments_are_refused(arguments: list[str], sentence: str) -> None:
     end = CliRunner().invoke(app, ["calibrate", "load-cell", *arguments])
     assert isinstance(end.exception, ConfigError)
     assert sentence in str(end.exception)
 
 
-def test_without_a_terminal_nobody_is_asked(board: Board, tmp_path: Path) -> None:
+def test_without_a_terminal_the_command_is_refused(board: Board, tmp_path: Path) -> None:
     rig = tmp_path / "rig.yaml"
     options = [f"load_cell.{key}" for key in ("backend=serial", f"port={board.port}")]
     flags = [part for option in options for part in ("--set", option)]

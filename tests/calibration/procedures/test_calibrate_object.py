@@ -1,27 +1,34 @@
-"""A profile from touches on the simulated rig, and what a grasp makes of it."""
+"""Object profiles from touches on the simulated rig, and grasps with them."""
 
 import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 from click.testing import Result
 from typer.testing import CliRunner
 
+from gripper_calibration import touch_logs
 from gripper_calibration.procedures import calibrate_object as job
 from gripper_calibration.procedures.calibrate_object import calibrate_object, record_touches
 from gripper_force.cli import app
 from gripper_force.cli import calibrate as cli_calibrate
-from gripper_force.config import Config, load_config
+from gripper_force.config import Config, config_from_text, load_config
+from gripper_force.control.transmission import Transmission
 from gripper_force.errors import ConfigError, DataError, RequestError
+from gripper_force.jobs.dataset import load_clip
 from gripper_force.jobs.grasp import grasp
 from gripper_force.jobs.replay import replay
 from gripper_force.profiles.object_profile import read_object, weights_path
 from gripper_force.runtime.log import LogReader
 from gripper_force.runtime.resolve import resolve
-from gripper_force.types import Event, LoadCellSample
+from gripper_force.types import NS_PER_S, Event, Frame, GraspStatus, LoadCellSample, Phase, ServoState
+from gripper_force.vision.batch_inference import features
+from gripper_force.vision.checkpoint import load_checkpoint
 
 QUICK = [
     "object=stapler",
@@ -53,16 +60,90 @@ def run(folder: Path, *more: str) -> Config:
     return load_config(None, [*QUICK, f"log.directory={folder}", "log.report=false", "target_n=2", *more])
 
 
-def test_touches_that_are_there_are_not_done_again(touched: list[Path], folder: Path) -> None:
+def test_existing_touches_are_not_repeated(touched: list[Path], folder: Path) -> None:
     asked: list[str] = []
     config = load_config(None, QUICK)
     touched[1].unlink()
     again = list(record_touches(config, 3, 6.0, folder / "touches", prompt=asked.append))
     assert again == touched
-    assert asked == ["Put the object down for touch 2"]
+    assert asked == ["Put the object between the jaws for touch 2"]
 
 
-def test_a_profile_tells_of_the_object_and_halves_the_error(profile: Path) -> None:
+def test_missing_touches_are_recorded_and_then_fitted(touched: list[Path], tmp_path: Path) -> None:
+    steps: list[int] = []
+    shutil.copy(touched[0], tmp_path)
+    result = calibrate_object(
+        load_config(None, QUICK[1:]),
+        "stapler",
+        touches=2,
+        peak_n=6.0,
+        folder=tmp_path,
+        out=tmp_path / "it.yaml",
+        progress=lambda _text, steps_done=1: steps.append(steps_done),
+    )
+    same = calibrate_object(load_config(), "stapler", logs=touched[:2], out=tmp_path / "same.yaml")
+    assert result.profile.weights == same.profile.weights
+    assert result.profile == read_object(result.profile_path)
+    assert result.mae_after_n is None
+    assert result.mae_before_n == result.as_dict()["before_n"]
+    assert result.coverage == 0.9
+    assert sum(steps) == 2 + 2 + 2
+
+
+def test_command_calibrates_from_one_touch(touched: list[Path], tmp_path: Path) -> None:
+    shutil.copy(touched[0], tmp_path)
+    keys = [part for key in QUICK[1:] for part in ("--set", key)]
+    given = ["calibrate", "object", "stapler", "--touches", "1", "--peak-n", "6", "--json", *keys]
+    result = CliRunner().invoke(
+        app, [*given, "--folder", str(tmp_path), "--out", str(tmp_path / "it.yaml")], catch_exceptions=False
+    )
+    assert result.exit_code == 0, result.stderr
+    found = json.loads(result.stdout)
+    assert (found["touches"], found["after_n"], found["touches_needed"]) == (1, None, [])
+    assert Path(found["report"]).stat().st_size > 10_000
+
+
+def test_log_is_read_once_with_the_results_of_separate_reads(
+    touched: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, checkpoint = touched[0], load_checkpoint()
+    preprocess = checkpoint.header.preprocess
+    clip = load_clip(path, preprocess, None)
+    reader = LogReader(path)
+    config = config_from_text(reader.config, str(path))
+    assert config.gripper.nm_per_a is not None
+    transmission = Transmission.from_config(config.gripper, config.gripper.nm_per_a)
+    phases = [status.phase for status in reader.records(GraspStatus)]
+    states = [
+        state
+        for state, phase in zip(reader.records(ServoState), phases, strict=False)
+        if phase in (Phase.RAMP, Phase.HOLD)
+    ]
+    delay_s = np.median([frame.received_ns - frame.t_ns for frame in reader.records(Frame)]) / NS_PER_S
+    passes: list[int] = []
+
+    class CountingReader(LogReader):
+        def records(self, *types: Any) -> Any:
+            passes.append(len(types))
+            return super().records(*types)
+
+    monkeypatch.setattr(touch_logs, "LogReader", CountingReader)
+    recorded = touch_logs.read_log(path, checkpoint)
+    assert passes == [4]
+    labelled = clip.valid & (np.arange(len(clip.frames)) >= preprocess.lead_in)
+    forces_n, read_out = features(checkpoint.networks, preprocess, clip.frames)
+    assert np.array_equal(recorded.touches.features, read_out[labelled])
+    assert np.array_equal(recorded.touches.estimate_n, forces_n.mean(0).astype(np.float64)[labelled])
+    assert np.array_equal(recorded.touches.force_n, clip.forces_n[labelled])
+    (press,), (width_m,) = recorded.presses, recorded.width_m
+    assert np.array_equal(press.t_s, np.array([state.t_ns for state in states]) / NS_PER_S)
+    assert width_m.tolist() == [transmission.width_m(state.position_rad) for state in states]
+    motor_force_n = np.array([transmission.force_n(state.current_a) for state in states])
+    assert np.array_equal(press.motor_force_n, motor_force_n - transmission.friction_n)
+    assert recorded.delay_s >= delay_s + 0.5 / config.camera.rate_hz
+
+
+def test_profile_reduces_the_error_and_has_stiffness_and_plant(profile: Path) -> None:
     found = read_object(profile)
     assert (found.object, found.touches) == ("stapler", 3)
     assert found.after_n is not None
@@ -73,7 +154,7 @@ def test_a_profile_tells_of_the_object_and_halves_the_error(profile: Path) -> No
     config = load_config(None, QUICK)
     seen_ms = config.sim.camera_latency_ms + 500 / config.camera.rate_hz
     known_ms = seen_ms + config.vision.lockstep_compute_ms
-    assert -0.01 < found.plant.delay_ms - known_ms < 60  # the rest is how late the network itself is
+    assert -0.01 < found.plant.delay_ms - known_ms < 60  # the rest is the lag of the network
     assert 30 < found.plant.phase_margin_deg < 90
     assert profile.with_suffix(".png").stat().st_size > 10_000
 
@@ -90,7 +171,7 @@ def test_a_grasp_with_it_is_corrected_and_replays_bit_for_bit(profile: Path, tmp
     assert "profile was" in other.note
 
 
-def test_its_plant_tunes_the_loop_and_gives_way_to_what_is_set(profile: Path) -> None:
+def test_plant_tunes_the_loop_unless_keys_are_set(profile: Path) -> None:
     plant = read_object(profile).plant
     assert plant is not None
     for keys, lag_ms in (([], plant.lag_ms), (["control.plant_lag_ms=77"], 77)):
@@ -99,13 +180,13 @@ def test_its_plant_tunes_the_loop_and_gives_way_to_what_is_set(profile: Path) ->
         assert control.plant == pytest.approx((plant.gain, lag_ms * 1e-3, plant.delay_ms * 1e-3))
 
 
-def test_more_than_was_pressed_with_is_refused(profile: Path, tmp_path: Path) -> None:
+def test_target_above_the_calibrated_force_is_refused(profile: Path, tmp_path: Path) -> None:
     with pytest.raises(RequestError, match=r"that the object profile .* was calibrated with"):
         grasp(run(tmp_path, f"calibration.object={profile}", "target_n=8"))
     assert not list(tmp_path.glob("*.mcap"))
 
 
-def test_another_exposure_is_refused_or_told_of(profile: Path, tmp_path: Path) -> None:
+def test_different_exposure_is_refused_or_reported(profile: Path, tmp_path: Path) -> None:
     keys = [f"calibration.object={profile}", "camera.exposure_us=3000"]
     with pytest.raises(ConfigError, match="exposure_us 4000, not 3000"):
         grasp(run(tmp_path, *keys))
@@ -114,7 +195,7 @@ def test_another_exposure_is_refused_or_told_of(profile: Path, tmp_path: Path) -
     assert any("exposure_us 4000, not 3000" in text for text in told)
 
 
-def test_half_a_profile_is_no_profile(profile: Path, tmp_path: Path) -> None:
+def test_profile_with_missing_or_wrong_weights_is_refused(profile: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copy(profile, tmp_path / "copy.yaml"))
     with pytest.raises(ConfigError, match="lacks its other half"):
         grasp(run(tmp_path, f"calibration.object={copy}"))
@@ -132,7 +213,7 @@ def test_logs_of_two_cameras_are_refused(touched: list[Path], tmp_path: Path) ->
     assert not (tmp_path / "p.yaml").exists()
 
 
-def test_the_command_calibrates_from_logs(touched: list[Path], tmp_path: Path) -> None:
+def test_command_calibrates_from_logs(touched: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "new" / "it.yaml"
     given = ["calibrate", "object", "stapler", "--from", str(touched[0].parent), "--out", str(out), "--json"]
     result = CliRunner().invoke(app, given)
@@ -143,7 +224,7 @@ def test_the_command_calibrates_from_logs(touched: list[Path], tmp_path: Path) -
     assert [row["touches"] for row in found["touches_needed"]] == [1, 2]
 
 
-def test_what_crushed_it_is_more_than_it_bears(
+def test_range_ends_below_the_crushing_touch(
     touched: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(job, "crushing_touch", lambda _contact_m, _peak_n: 2)
@@ -155,7 +236,7 @@ def test_what_crushed_it_is_more_than_it_bears(
 
 
 class Terminal:
-    """Somebody who presses Enter so often, and then does something else."""
+    """A terminal on which Enter is pressed some times, and then something else happens."""
 
     def __init__(self, often: int, then: Callable[[], str]) -> None:
         self._left, self._then = often, then
@@ -181,31 +262,31 @@ def by_hand(folder: Path, monkeypatch: pytest.MonkeyPatch, terminal: Terminal) -
     )
 
 
-def test_who_stops_early_gets_a_profile_of_what_there_is_and_may_go_on(
+def test_interrupted_command_calibrates_and_continues_later(
     touched: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stopped = by_hand(tmp_path, monkeypatch, Terminal(2, interrupt))
     assert json.loads(stopped.stdout)["touches"] == 2
     assert "stopped after 2 of 3 touches" in stopped.stderr
-    assert "Put the object down for touch 3, then press Enter" in stopped.stderr
+    assert "Put the object between the jaws for touch 3, then press Enter" in stopped.stderr
     finished = by_hand(tmp_path, monkeypatch, Terminal(1, interrupt))
     assert json.loads(finished.stdout)["touches"] == 3
     assert "2 of 3 touches exist already" in " ".join(finished.stderr.split())
 
 
-def test_a_terminal_that_is_gone_is_no_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_closed_terminal_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     result = by_hand(tmp_path, monkeypatch, Terminal(0, lambda: ""))
     assert isinstance(result.exception, ConfigError)
-    assert "no answer to this: Put the object down for touch 1" in str(result.exception)
+    assert "no answer to this: Put the object between the jaws for touch 1" in str(result.exception)
     assert not list(tmp_path.rglob("*.mcap"))
 
 
-def test_where_no_profile_can_be_written_nothing_is_fitted(tmp_path: Path) -> None:
+def test_unwritable_profile_is_refused_first(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="can't write"):
         calibrate_object(load_config(), "stapler", logs=[], out=tmp_path / "file" / "p.yaml")
 
 
-def test_no_logs_is_one_sentence(tmp_path: Path) -> None:
+def test_no_logs_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no log"):
         calibrate_object(load_config(), "stapler", logs=[], out=tmp_path / "p.yaml")

@@ -1,4 +1,4 @@
-"""On the simulated rig, with a gauge between the jaws whose friction and torque are known."""
+"""Servo calibration on the simulated rig, with known friction and torque."""
 
 from datetime import UTC, datetime
 from pathlib import Path
@@ -39,13 +39,13 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def about(estimate: CalibratedValue, truth: float, share: float) -> bool:
-    """Near the truth, and not claimed to be nearer by far than it is."""
+    """True if the value is close to the truth and the interval is plausible."""
     return (
         abs(estimate.value - truth) < min(share * truth, 2 * estimate.half) and estimate.half < share * truth
     )
 
 
-def test_the_scenes_torque_and_friction_are_found(rig: Path) -> None:
+def test_torque_and_friction_of_the_scene_are_found(rig: Path) -> None:
     found = read_rig(rig).servo
     assert found is not None
     config = config_of()
@@ -62,13 +62,13 @@ def test_the_scenes_torque_and_friction_are_found(rig: Path) -> None:
     assert load_config(None, [f"calibration.rig={rig}"]).gripper.nm_per_a == found.nm_per_a.value
 
 
-def test_a_grasp_beyond_what_was_calibrated_is_refused(rig: Path, tmp_path: Path) -> None:
+def test_target_above_the_calibrated_force_is_refused(rig: Path, tmp_path: Path) -> None:
     config = config_of(f"calibration.rig={rig}", "control.force_limit_n=20", "target_n=11")
     with pytest.raises(RequestError, match=r"target of 11 N is above the 9\.\d N that the rig profile"):
         run_grasp(config, tmp_path / "run.mcap")
 
 
-def test_a_profile_of_another_servo_is_refused_or_told(rig: Path, tmp_path: Path) -> None:
+def test_profile_of_another_servo_is_refused_or_reported(rig: Path, tmp_path: Path) -> None:
     another = (f"calibration.rig={rig}", "servo.model=XM430-W210", "camera.backend=none", "target_n=2")
     path = tmp_path / "run.mcap"
     with pytest.raises(
@@ -100,7 +100,7 @@ def test_a_profile_of_another_servo_is_refused_or_told(rig: Path, tmp_path: Path
         (["servo.current_limit_a=0.15"], 0.03, DataError, r"[\d.]+ A give [\d.]+ N instead of [\d.]+ N"),
     ],
 )
-def test_what_fails_is_named_and_leaves_no_torque(
+def test_failures_are_named_and_leave_the_torque_off(
     overrides: list[str], gauge_m: float, kind: type[Exception], sentence: str, tmp_path: Path
 ) -> None:
     buses: list[VirtualBus | None] = []
@@ -117,7 +117,7 @@ def test_what_fails_is_named_and_leaves_no_torque(
     assert all(bus is not None and bus.servos[0].get("torque_enable") == 0 for bus in buses)
 
 
-def test_a_person_reads_values_with_their_intervals(capsys: pytest.CaptureFixture[str]) -> None:
+def test_table_shows_values_with_intervals(capsys: pytest.CaptureFixture[str]) -> None:
     measured, given = {"value": 1.7, "low": 1.6, "high": 1.8}, {"value": 0.02, "low": None, "high": None}
     rig_table({"nm_per_a": measured, "pinion_radius_m": given, "force_n": [0.3, 9.5]})
     printed = capsys.readouterr().out
@@ -125,7 +125,7 @@ def test_a_person_reads_values_with_their_intervals(capsys: pytest.CaptureFixtur
         assert told in printed
 
 
-def test_a_scale_that_the_run_does_not_go_by_is_refused(tmp_path: Path) -> None:
+def test_profile_with_another_load_cell_scale_is_refused(tmp_path: Path) -> None:
     rig = tmp_path / "rig.yaml"
     cell = LoadCellCalibration(
         date=datetime(2026, 1, 2, tzinfo=UTC),
@@ -144,7 +144,7 @@ def test_a_scale_that_the_run_does_not_go_by_is_refused(tmp_path: Path) -> None:
         calibrate_servo(config_of(), [0.03], rig, prompt=lambda _: None)
 
 
-def test_without_a_terminal_nobody_is_asked(tmp_path: Path) -> None:
+def test_without_a_terminal_the_command_is_refused(tmp_path: Path) -> None:
     arguments: list[Any] = ["calibrate", "servo", "--gauge-mm", "30", "--rig", str(tmp_path / "rig.yaml")]
     end = CliRunner().invoke(app, arguments)
     assert isinstance(end.exception, ConfigError)

@@ -76,7 +76,6 @@ def test_start_configures_the_servo(endpoint):
         "goal_position": ticks_from_rad(1.0),
     }
     assert {name: firmware.get(name) for name in expected} == expected
-    assert servo.nm_per_a == MODEL.nm_per_a
     servo.close()
 
 

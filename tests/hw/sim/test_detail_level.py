@@ -1,3 +1,4 @@
+from contextlib import closing
 from typing import get_args
 
 import pytest
@@ -72,19 +73,16 @@ def test_unresolvable_level_is_refused(overrides: list[str], message: str) -> No
         resolve_detail(load_config(None, ["sim.detail=auto", *overrides]))
 
 
-def test_rig_simulates_selected_level_and_notes_the_reason(quick: list[str]) -> None:
+def test_rig_simulates_selected_level_and_gives_the_reason(quick: list[str]) -> None:
     overrides = [*quick, "sim.detail=auto", "budget.sim_error_n=0.05"]
-    rig = SimulatedRig(load_config(None, overrides))
-    try:
+    config, reason = SimulatedRig.resolve(load_config(None, overrides))
+    with closing(SimulatedRig(config)) as rig:
         assert rig.scene.detail == "medium"
-        assert "took sim.detail=medium" in rig.notes()["detail"]
-        assert "budget.sim_error_n=0.05" in rig.notes()["detail"]
-    finally:
-        rig.close()
+    assert "took sim.detail=medium" in reason
+    assert "budget.sim_error_n=0.05" in reason
 
 
-def test_rig_refuses_unresolved_level(quick: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(SimulatedRig, "resolve", staticmethod(lambda config: (config, "")))
+def test_rig_refuses_unresolved_level(quick: list[str]) -> None:
     with pytest.raises(ConfigError, match=r"sim\.detail is still auto; "):
         SimulatedRig(load_config(None, [*quick, "sim.detail=auto"]))
 

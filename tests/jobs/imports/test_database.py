@@ -13,12 +13,12 @@ from gripper_force.config import config_from_text
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs.dataset import load_clip
 from gripper_force.jobs.imports.database import (
-    TOUCHES,
     find_environments,
     find_sets,
     import_environment,
     read_table,
 )
+from gripper_force.jobs.paper_protocol import TOUCHES
 from gripper_force.runtime.log import LogReader
 from gripper_force.types import Frame, LoadCellSample
 from gripper_force.vision.preprocess import Preprocess
@@ -28,7 +28,7 @@ PERIOD = 40
 
 
 def touches(count: int, top_n: float = 6.0) -> npt.NDArray[np.float64]:
-    """As many touches, each with half of its rest before and half behind it."""
+    """Returns forces of this many touches, each with half of its rest before and half after it."""
     one = np.interp(np.arange(PERIOD), [0, 11, 17, 22, 28, PERIOD], [0, 0, top_n, top_n, 0, 0])
     return np.tile(one, count)
 
@@ -61,7 +61,7 @@ def environment(tmp_path: Path) -> Path:
     return write_environment(tmp_path / "db" / "papercup_10_70", touches(6) - 0.003)
 
 
-def test_an_environment_becomes_a_log_for_every_four_touches(environment: Path, tmp_path: Path) -> None:
+def test_environment_gives_one_log_per_four_touches(environment: Path, tmp_path: Path) -> None:
     row = import_environment(environment, tmp_path / "out")
     assert (row.folder, row.object, row.degrees, row.lux) == ("papercup_10_70", "paper_cup", 10, 550)
     assert (row.logs, row.kept, row.touches, row.frames, row.spikes_rejected) == (2, 0, 6, 240, 0)
@@ -88,7 +88,7 @@ def test_an_environment_becomes_a_log_for_every_four_touches(environment: Path, 
     assert samples[-1].t_ns == frames[-1].t_ns == round((frames[-1].seq - 164) * 1e9 / 149)
 
 
-def test_the_last_of_the_papers_sets_are_for_test(tmp_path: Path) -> None:
+def test_last_sets_are_for_test(tmp_path: Path) -> None:
     folder = write_environment(tmp_path / "db" / "sponge_0_50", touches(4 * 15))
     assert import_environment(folder, tmp_path / "out").logs == 15
     assert len(list((tmp_path / "out" / "train").iterdir())) == 12
@@ -96,7 +96,7 @@ def test_the_last_of_the_papers_sets_are_for_test(tmp_path: Path) -> None:
     assert test == ["sponge_0_50-13", "sponge_0_50-14", "sponge_0_50-15"]
 
 
-def test_logs_load_as_clips_that_begin_without_contact(environment: Path, tmp_path: Path) -> None:
+def test_clips_of_logs_start_without_contact(environment: Path, tmp_path: Path) -> None:
     import_environment(environment, tmp_path / "out")
     clips = [
         load_clip(path, Preprocess(size=16), None) for path in sorted((tmp_path / "out" / "train").iterdir())
@@ -109,7 +109,7 @@ def test_logs_load_as_clips_that_begin_without_contact(environment: Path, tmp_pa
     assert np.concatenate([clip.forces_n for clip in clips]) == pytest.approx(touches(6) - 0.003, abs=1e-6)
 
 
-def test_rate_region_and_size_are_the_callers(environment: Path, tmp_path: Path) -> None:
+def test_rate_region_and_size(environment: Path, tmp_path: Path) -> None:
     import_environment(environment, tmp_path / "out", rate_hz=30, region=(8, 0, 8, 8), size=32)
     log = LogReader(tmp_path / "out" / "train" / "papercup_10_70-01.mcap")
     assert config_from_text(log.config, "the log").camera.rate_hz == 30
@@ -125,12 +125,12 @@ def test_rate_region_and_size_are_the_callers(environment: Path, tmp_path: Path)
 @pytest.mark.parametrize(
     "names", [("sponge_0_50", "sponge"), ("Paper Cup_30_75", "paper_cup"), ("a_b_0_100", "a_b")]
 )
-def test_the_object_is_read_from_the_folders_name(names: tuple[str, str], tmp_path: Path) -> None:
+def test_object_from_folder_name(names: tuple[str, str], tmp_path: Path) -> None:
     folder = write_environment(tmp_path / "db" / names[0], touches(1))
     assert import_environment(folder, tmp_path / "out").object == names[1]
 
 
-def test_what_was_broken_off_goes_on(environment: Path, tmp_path: Path) -> None:
+def test_interrupted_import_continues(environment: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     import_environment(environment, out)
     first, second = sorted((out / "train").iterdir())
@@ -153,7 +153,7 @@ def test_what_was_broken_off_goes_on(environment: Path, tmp_path: Path) -> None:
     noise=st.integers(0, 2**32 - 1),
     first=st.integers(0, 1000),
 )
-def test_sets_are_four_touches_wherever_numbers_go_on(counts: list[int], noise: int, first: int) -> None:
+def test_sets_hold_four_touches_without_gaps(counts: list[int], noise: int, first: int) -> None:
     rng = np.random.default_rng(noise)
     numbers, forces = [], []
     for count in counts:
@@ -172,14 +172,14 @@ def test_sets_are_four_touches_wherever_numbers_go_on(counts: list[int], noise: 
     assert all(abs(force_n[number == start][0]) < 0.25 for start in starts)
 
 
-def test_bounces_and_single_samples_are_no_touches() -> None:
+def test_bounces_and_single_samples_are_not_touches() -> None:
     force_n = touches(2)
     force_n[17] = 0.0  # within the first
     force_n[38] = 3.0  # in the rest
     assert find_sets(np.arange(80), force_n) == [(0, 2)]
 
 
-def test_a_small_hole_is_bridged_and_seen_in_the_numbers(environment: Path, tmp_path: Path) -> None:
+def test_small_gap_stays_within_a_log(environment: Path, tmp_path: Path) -> None:
     for number in range(30, 40):
         (environment / f"{number}.jpg").unlink()
     write_table(environment, [(n, f) for n, f in enumerate(touches(6), start=4) if not 30 <= n < 40])
@@ -197,7 +197,7 @@ def problem_of(environment: Path, tmp_path: Path) -> str:
     return problem
 
 
-def test_images_and_forces_without_a_partner_are_named(environment: Path, tmp_path: Path) -> None:
+def test_unmatched_images_and_forces_are_reported(environment: Path, tmp_path: Path) -> None:
     for number in (17, 12):
         (environment / f"{number}.jpg").unlink()
     lines = rows_of(environment)
@@ -227,17 +227,17 @@ def test_images_and_forces_without_a_partner_are_named(environment: Path, tmp_pa
         "12,1e9,0",
     ],
 )
-def test_lines_that_are_none_are_named(line: str, environment: Path, tmp_path: Path) -> None:
+def test_malformed_lines_are_reported(line: str, environment: Path, tmp_path: Path) -> None:
     lines = rows_of(environment)
     lines[8] = line
     (environment / "test.txt").write_text("\r\n".join(lines))
     row = import_environment(environment, tmp_path / "out")
-    bad = f"1 lines are no number,force,unused and were left out, the first is line 9, {line!r}"
+    bad = f"1 lines are not number,force,unused and were left out, the first is line 9, {line!r}"
     assert row.problems == ((bad,) if line else ()) + ("1 images have no force, the first is 12",)
     assert (row.logs, row.frames) == (2, 240)
 
 
-def test_numbers_out_of_order_are_named_and_sorted(environment: Path, tmp_path: Path) -> None:
+def test_unordered_numbers_are_reported_and_sorted(environment: Path, tmp_path: Path) -> None:
     lines = rows_of(environment)
     lines[10], lines[11] = lines[11], lines[10]
     (environment / "test.txt").write_text("\n".join(lines))
@@ -248,19 +248,19 @@ def test_numbers_out_of_order_are_named_and_sorted(environment: Path, tmp_path: 
     assert [s.force_n for s in samples] == pytest.approx(touches(6)[: len(samples)] - 0.003, abs=1e-7)
 
 
-def test_numbers_that_come_twice_are_named(environment: Path, tmp_path: Path) -> None:
+def test_repeated_numbers_are_reported(environment: Path, tmp_path: Path) -> None:
     lines = rows_of(environment)
     (environment / "test.txt").write_text("\n".join([*lines[:30], lines[29], "20,3.5,0", *lines[30:]]))
     row = import_environment(environment, tmp_path / "out")
     assert row.problems == (
-        "1 numbers came twice with one force and were taken once, the first is 33",
-        "1 numbers came with several forces and have none now, the first is 20",
+        "1 numbers occur twice with the same force and were used once, the first is 33",
+        "1 numbers occur with several forces and were left without one, the first is 20",
         "1 images have no force, the first is 20",
     )
     assert row.frames == 240
 
 
-def test_images_that_can_not_be_decoded_are_named(environment: Path, tmp_path: Path) -> None:
+def test_undecodable_images_are_reported(environment: Path, tmp_path: Path) -> None:
     whole = (environment / "9.jpg").read_bytes()
     (environment / "9.jpg").write_bytes(whole[: len(whole) // 2])
     (environment / "10.jpg").write_bytes(b"")
@@ -270,17 +270,17 @@ def test_images_that_can_not_be_decoded_are_named(environment: Path, tmp_path: P
     )
 
 
-def test_a_set_without_images_becomes_no_log(environment: Path, tmp_path: Path) -> None:
+def test_set_without_images_gives_no_log(environment: Path, tmp_path: Path) -> None:
     for number in range(164, 244):
         (environment / f"{number}.jpg").write_bytes(b"")
     row = import_environment(environment, tmp_path / "out")
     assert row.problems[-1] == (
-        "1 sets have no image with a force and became no log, the first is papercup_10_70-02"
+        "1 sets have no image with a force and gave no log, the first is papercup_10_70-02"
     )
     assert row.logs == len(list((tmp_path / "out").iterdir())) == 1
 
 
-def test_strange_files_and_folders_are_named(environment: Path, tmp_path: Path) -> None:
+def test_unknown_files_and_folders_are_reported(environment: Path, tmp_path: Path) -> None:
     shutil.copy(environment / "9.jpg", environment / "09.jpg")
     (environment / "Thumbs.db").touch()
     (environment.parent / "notes").mkdir()
@@ -301,30 +301,26 @@ def test_spikes_are_rejected_and_stay_in_the_log(environment: Path, tmp_path: Pa
     assert [s.raw for s in samples if not s.valid] == [-9.0]
 
 
-def test_a_database_is_looked_over_first(environment: Path, tmp_path: Path) -> None:
+def test_database_is_checked_before_import(environment: Path, tmp_path: Path) -> None:
     database = environment.parent
-    with pytest.raises(DataError, match="gone is no folder"):
+    with pytest.raises(DataError, match="gone is not a folder"):
         find_environments(tmp_path / "gone")
     with pytest.raises(DataError, match=r"holds no folder named <object>.*; name the folder that holds"):
         find_environments(environment)
     (database / "sponge_0_50").mkdir()
-    with pytest.raises(DataError, match=r"1 of 2 folders in .* have no test\.txt: sponge_0_50; fetch"):
+    with pytest.raises(DataError, match=r"1 of 2 folders in .* have no test\.txt: sponge_0_50; download"):
         find_environments(database)
     (database / "sponge_0_50").rename(database / "sponge_0_60")
     (database / "sponge_0_60" / "test.txt").touch()
-    with pytest.raises(
-        DataError, match=r"sponge_0_60 is not known; known are 50 \(350 lux\), 70 \(550 lux\)"
-    ):
+    with pytest.raises(DataError, match=r"sponge_0_60 is unknown; use one of 50 \(350 lux\), 70 \(550 lux\)"):
         find_environments(database)
 
 
-def test_an_environment_without_any_usable_part_is_named(environment: Path, tmp_path: Path) -> None:
+def test_environment_without_usable_data_raises(environment: Path, tmp_path: Path) -> None:
     table = environment / "test.txt"
     for text in (b"", b"number,force\n", b"1,0.5,0\n1,0.6,0\n"):
         table.write_bytes(text)
-        with pytest.raises(
-            DataError, match=r"test\.txt has no usable line; it needs lines such as 4,-0\.0032"
-        ):
+        with pytest.raises(DataError, match=r"test\.txt has no usable line; it needs lines like 4,-0\.0032"):
             import_environment(environment, tmp_path / "out")
     table.write_bytes(b"\xff\xfe")
     with pytest.raises(DataError, match=r"can't read the table of forces .*test\.txt"):

@@ -68,7 +68,7 @@ def test_set_is_a_log_for_training(config: Config, tmp_path: Path) -> None:
     assert 0.8 < clip.forces_n.max() < 6
     assert {text.split(":")[0] for text in progress} == {"at rest", "touch 1 of 2", "touch 2 of 2"}
     assert max(float(text.split()[-2]) for text in progress) > 0.5
-    assert prompts == ["Put the object between the jaws for set 1"]
+    assert prompts == ["Put the object down for set 1"]
 
 
 def test_existing_sets_are_kept(config: Config, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from gripper_force.vision.batch_inference import normalise
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def test_batches_hold_what_a_run_would_see(clips: list[Clip], small_recipe: TrainConfig) -> None:
+def test_batches_equal_the_inputs_of_a_run(clips: list[Clip], small_recipe: TrainConfig) -> None:
     plain = small_recipe.model_copy(update={"shift_px": 0, "light": 0.0, "noise": 0.0, "clips": 40})
     inputs, forces_n, valid = Batches(clips, plain, Ranks("cpu")).batch(0, plain.clips, 22)
     assert inputs.shape == (40, 22, 1, 16, 16)
@@ -27,7 +27,7 @@ def test_batches_hold_what_a_run_would_see(clips: list[Clip], small_recipe: Trai
         assert force_n.item() in labels[same]
 
 
-def test_frames_without_label_carry_no_loss(clips: list[Clip], small_recipe: TrainConfig) -> None:
+def test_frames_without_label_have_no_loss(clips: list[Clip], small_recipe: TrainConfig) -> None:
     for clip in clips:
         clip.valid[::2] = False
         clip.forces_n[::2] = 1e9
@@ -37,9 +37,7 @@ def test_frames_without_label_carry_no_loss(clips: list[Clip], small_recipe: Tra
     assert (forces_n[valid] < 10).all()
 
 
-def test_nominal_labels_are_those_of_the_kinds_own_stiffness(
-    clips: list[Clip], small_recipe: TrainConfig
-) -> None:
+def test_nominal_labels_use_nominal_stiffness(clips: list[Clip], small_recipe: TrainConfig) -> None:
     known = [replace(clip, stiffness=0.5 if i else math.nan) for i, clip in enumerate(clips)]
     nominal = small_recipe.model_copy(update={"labels": "nominal"})
     _, measured_n, _ = Batches(known, small_recipe, Ranks("cpu")).batch(0, 60, 22)
@@ -59,7 +57,7 @@ def test_rare_forces_are_drawn_more_often(clips: list[Clip], small_recipe: Train
     assert (forces_n[:, -1] == 0).float().mean() > 0.15
 
 
-def test_in_a_pass_every_labelled_frame_ends_one_clip(clips: list[Clip], small_recipe: TrainConfig) -> None:
+def test_every_labelled_frame_ends_one_clip_per_pass(clips: list[Clip], small_recipe: TrainConfig) -> None:
     rng = np.random.default_rng(0)
     for clip in clips:
         clip.forces_n[:] = rng.permutation(10_000)[: len(clip.forces_n)]
@@ -81,9 +79,7 @@ def test_processes_share_the_batch_of_one(clips: list[Clip], small_recipe: Train
         assert torch.equal(all_clips[1::2], odd)
 
 
-def test_a_window_of_its_own_is_the_end_of_a_longer_clip(
-    clips: list[Clip], small_recipe: TrainConfig
-) -> None:
+def test_separate_window_is_the_end_of_a_longer_clip(clips: list[Clip], small_recipe: TrainConfig) -> None:
     batches = Batches(clips, small_recipe.model_copy(update={"noise": 0.0}), Ranks("cpu"))
     for long, short in zip(batches.batch(0, 4, 30), batches.batch(0, 4, 21), strict=True):
         torch.testing.assert_close(long[:, -21:], short)

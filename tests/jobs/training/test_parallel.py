@@ -15,7 +15,7 @@ from gripper_force.vision.checkpoint import load_checkpoint
 SCRIPT = Path(__file__).with_name("train_together.py")
 
 
-def test_two_processes_train_as_one_does(tmp_path: Path) -> None:
+def test_two_processes_train_like_one(tmp_path: Path) -> None:
     launches = {
         "one": [sys.executable],
         "two": [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"],
@@ -53,20 +53,20 @@ def test_two_processes_train_as_one_does(tmp_path: Path) -> None:
     assert second["left"]
 
 
-def test_one_process_stays_alone() -> None:
+def test_one_process_needs_no_others() -> None:
     with joined("cpu") as ranks:
         assert ranks == Ranks("cpu")
         assert ranks.first
         total = torch.ones(3)
         ranks.add_up([total])
-        ranks.agree("any", "thing")
+        ranks.check_equal("any", "thing")
         ranks.wait()
         assert total.tolist() == [1, 1, 1]
         assert ranks.as_first(0.5) == 0.5
         assert list(range(4))[ranks.share] == [0, 1, 2, 3]
 
 
-def test_processes_that_cannot_join_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_processes_that_cannot_join_raise(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WORLD_SIZE", "2")
     monkeypatch.delenv("RANK", raising=False)
     with pytest.raises(ConfigError, match="torchrun"), joined("cpu"):

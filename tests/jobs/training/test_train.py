@@ -23,7 +23,7 @@ from gripper_force.vision.preprocess import Preprocess
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def test_it_learns(
+def test_training_reduces_the_error(
     clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig, press: Callable[..., Clip]
 ) -> None:
     config = small_recipe.model_copy(update={"steps": 120, "clips": 8})
@@ -34,7 +34,7 @@ def test_it_learns(
     assert np.abs(error).mean() < 0.4 * constant
 
 
-def test_the_checkpoint_tells_where_it_comes_from(
+def test_checkpoint_holds_data_digest_and_metrics(
     clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig
 ) -> None:
     config = small_recipe.model_copy(update={"attentions": ("ssam", "scam")})
@@ -51,7 +51,7 @@ def test_the_checkpoint_tells_where_it_comes_from(
 
 @pytest.mark.parametrize("attention", ["none", "ssam", "scam", "se", "cbam"])
 @pytest.mark.parametrize(("backbone", "pooling"), [("vgg", "gap"), ("resnet18", "wap"), ("mobile", "wap")])
-def test_every_network_can_be_trained(
+def test_every_network_trains(
     attention: str, backbone: str, pooling: str, clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig
 ) -> None:
     recipe = {"attentions": [attention], "backbone": backbone, "pooling": pooling, "steps": 2, "clips": 2}
@@ -63,7 +63,7 @@ def test_every_network_can_be_trained(
     assert member.pooling == (pooling if attention in ("ssam", "scam") else "wap")
 
 
-def test_validation_clips_can_be_given(clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig) -> None:
+def test_validation_clips(clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig) -> None:
     out = tmp_path / "out.safetensors"
     checkpoint = train(small_recipe, clips[:-1], out, validation_clips=clips[-1:])
     forces_n = predict(checkpoint.networks, small_recipe.preprocess, clips[-1].frames)[0]
@@ -78,7 +78,9 @@ def test_validation_clips_can_be_given(clips: list[Clip], tmp_path: Path, small_
         )
 
 
-def test_a_seed_fixes_the_result(clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig) -> None:
+def test_same_seed_gives_identical_checkpoints(
+    clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig
+) -> None:
     a, b = tmp_path / "a.safetensors", tmp_path / "b.safetensors"
     train(small_recipe, clips, a)
     train(small_recipe, clips, b)
@@ -87,7 +89,7 @@ def test_a_seed_fixes_the_result(clips: list[Clip], tmp_path: Path, small_recipe
     assert a.read_bytes() != b.read_bytes()
 
 
-def test_a_broken_run_goes_on_to_the_same_result(
+def test_resumed_training_gives_the_same_result(
     clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_recipe: TrainConfig
 ) -> None:
     config = small_recipe.model_copy(update={"attentions": ("ssam", "scam")})
@@ -112,7 +114,7 @@ def test_a_broken_run_goes_on_to_the_same_result(
     assert not list(tmp_path.glob("*.state"))
 
 
-def test_a_state_of_another_recipe_is_refused(
+def test_state_of_another_training_raises(
     clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_recipe: TrainConfig
 ) -> None:
     out = tmp_path / "out.safetensors"
@@ -128,13 +130,13 @@ def test_a_state_of_another_recipe_is_refused(
         train(small_recipe, clips, out, resume=True)
 
 
-def test_divergence_is_named(clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig) -> None:
+def test_divergence_raises(clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig) -> None:
     clips[0].forces_n[:] = clips[1].forces_n[:] = clips[2].forces_n[:] = np.inf
     with pytest.raises(NonFiniteError, match="ssam diverged"):
         train(small_recipe, clips, tmp_path / "out.safetensors")
 
 
-def test_data_without_contact_or_split_are_refused(
+def test_data_without_contact_or_split_raise(
     clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig, press: Callable[..., Clip]
 ) -> None:
     with pytest.raises(DataError, match="two"):
@@ -147,7 +149,7 @@ def test_data_without_contact_or_split_are_refused(
         train(small_recipe, clips, tmp_path / "out.safetensors")
 
 
-def test_the_command_takes_a_recipe(few_logs: Path, tmp_path: Path) -> None:
+def test_command_takes_a_recipe(few_logs: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.safetensors"
     keys = ["preprocess.size=16", "attentions=[cbam]", "epochs=null", "steps=1", "clips=2", "device=cpu"]
     sets = [part for key in keys for part in ("--set", key)]

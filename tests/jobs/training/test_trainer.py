@@ -20,7 +20,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def gradients(
     network: ForceNetwork, inputs: torch.Tensor, forces_n: torch.Tensor, valid: torch.Tensor
 ) -> tuple[float, list[torch.Tensor]]:
-    """The training's loss on windows that are whole, and its gradients."""
+    """Loss of the training on complete windows, and its gradients."""
     network.zero_grad()
     loss = (
         squared_error(network, inputs, forces_n, valid, network.config.context)
@@ -38,7 +38,7 @@ def gradients(
 def test_shared_windows_give_the_loss_and_gradients_of_separate_ones(
     backbone: str, attention: str, earlier_frames: int, pooling: str
 ) -> None:
-    """For the same statistics of batch normalisation: here the running ones."""
+    """With the same statistics of batch normalisation: the running ones."""
     torch.manual_seed(0)
     shape = {"attention": attention, "earlier_frames": earlier_frames, "pooling": pooling}
     config = NetworkConfig.model_validate(
@@ -66,7 +66,7 @@ def test_shared_windows_give_the_loss_and_gradients_of_separate_ones(
 
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
 @pytest.mark.parametrize("windows", ["shared", "separate"])
-def test_each_precision_and_way_of_windows_trains(
+def test_every_precision_and_window_mode_trains(
     precision: str, windows: str, clips: list[Clip], small_recipe: TrainConfig
 ) -> None:
     recipe = {"precision": precision, "windows": windows, "short_share": 0.0, "steps": 40}
@@ -79,7 +79,7 @@ def test_each_precision_and_way_of_windows_trains(
     assert all(p.dtype == torch.float32 for p in trainer.network.parameters())
 
 
-def test_a_training_may_be_taken_in_parts(clips: list[Clip], small_recipe: TrainConfig) -> None:
+def test_training_in_parts(clips: list[Clip], small_recipe: TrainConfig) -> None:
     batches = Batches(clips, small_recipe, Ranks("cpu"))
     whole, parts = (Trainer(small_recipe, 0, batches, Ranks("cpu")) for _ in range(2))
     assert len(list(whole.steps())) == 4
@@ -95,7 +95,7 @@ def test_epochs_count_passes(clips: list[Clip], small_recipe: TrainConfig) -> No
     assert len(list(Trainer(config, 0, batches, Ranks("cpu")).steps())) == 4
 
 
-def test_a_time_budget_ends_the_training(
+def test_time_budget_ends_training(
     clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_recipe: TrainConfig
 ) -> None:
     seconds = iter(range(10_000))
@@ -115,7 +115,7 @@ def test_a_time_budget_ends_the_training(
     assert learning_rates[-1] < 1
 
 
-def test_the_learning_rate_rises_then_falls() -> None:
+def test_learning_rate_rises_then_falls() -> None:
     values = [one_cycle(x / 100, 0.25) for x in range(101)]
     assert values[0] == pytest.approx(0.04)
     assert values[25] == pytest.approx(1)
@@ -124,7 +124,7 @@ def test_the_learning_rate_rises_then_falls() -> None:
     assert values[25:] == sorted(values[25:], reverse=True)
 
 
-def test_a_checkpoint_in_evaluation_mode_is_as_good_as_in_training(
+def test_network_is_as_good_in_evaluation_mode_as_in_training(
     clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig
 ) -> None:
     config = small_recipe.model_copy(update={"steps": 60, "clips": 8})
@@ -137,6 +137,6 @@ def test_a_checkpoint_in_evaluation_mode_is_as_good_as_in_training(
     assert evaluated < 2 * trained + 0.2
 
 
-def test_the_paper_takes_a_tenth_every_30_of_120_epochs() -> None:
+def test_learning_rate_of_the_paper_falls_every_30_of_120_epochs() -> None:
     rates = [step_decay(epoch / 120) for epoch in (0, 29.9, 30, 60, 90, 119.9)]
     assert rates == pytest.approx([1, 1, 0.1, 0.01, 0.001, 0.001])

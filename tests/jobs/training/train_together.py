@@ -1,4 +1,4 @@
-"""What `test_parallel` runs, alone and under torchrun: trains on made-up clips, and writes down each loss."""
+"""Script of `test_parallel`, run alone and under torchrun: trains on synthetic clips and writes each loss."""
 
 import json
 import os
