@@ -118,7 +118,7 @@ def test_another_exposure_is_refused_or_told_of(profile: Path, tmp_path: Path) -
 
 def test_half_a_profile_is_no_profile(profile: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copy(profile, tmp_path / "copy.yaml"))
-    with pytest.raises(ConfigError, match="lacks its other half"):
+    with pytest.raises(ConfigError, match="belongs to the object profile"):
         grasp(run(tmp_path, f"calibration.object={copy}"))
     weights_path(copy).write_bytes(b"something else")
     with pytest.raises(ConfigError, match="does not belong to"):
