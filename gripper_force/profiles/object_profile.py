@@ -1,6 +1,6 @@
-"""The object profile: what `gripper-force calibrate object` found of one object, for one camera and network.
+"""Object profile: calibration of one object with one camera and network, by `gripper-force calibrate object`.
 
-A profile is a YAML file, with a safetensors file of the same name beside it for what is too long to read.
+A profile is a YAML file, with a safetensors file of the same name beside it for the arrays.
 `gripper_force.profiles.correction` applies it to the network's estimates.
 """
 
@@ -20,18 +20,18 @@ from gripper_force.schema import Finite, NonNegative, Positive, Section, dump, r
 FORMAT: Final = "gripper-force-object/1"
 
 SHIPPED: Final = "gripper_calibration"
-"""Package whose folder ``objects`` has the profiles that are shipped."""
+"""Package whose folder ``objects`` holds the shipped profiles."""
 
 Forces = Annotated[tuple[Finite, ...], Field(min_length=2)]
 
 
 class OutputCurve(Section):
-    """What the network says, and what the load cell says then; straight in between, and on beyond the ends.
+    """Piecewise linear curve from the network's estimate to the load cell's force, extrapolated linearly.
 
     Attributes:
-        kind: How it was found.
-        estimate_n: Estimates, rising.
-        force_n: Forces, never falling.
+        kind: Type of fit.
+        estimate_n: Estimates at the knots, rising.
+        force_n: Forces at the knots, never falling.
     """
 
     kind: Literal["identity", "affine", "monotone"]
@@ -41,7 +41,7 @@ class OutputCurve(Section):
     @model_validator(mode="after")
     def _rises(self) -> Self:
         if len(self.estimate_n) != len(self.force_n):
-            raise ValueError("estimate_n and force_n must be of one length")
+            raise ValueError("estimate_n and force_n must have the same length")
         if any(b <= a for a, b in zip(self.estimate_n, self.estimate_n[1:], strict=False)):
             raise ValueError("estimate_n must rise")
         if any(b < a for a, b in zip(self.force_n, self.force_n[1:], strict=False)):
@@ -50,12 +50,12 @@ class OutputCurve(Section):
 
 
 class Interval(Section):
-    """How far off an estimate is at most, with a stated probability.
+    """Interval that contains the force with a stated probability.
 
     Attributes:
         coverage: That probability, over frames of touches that were not calibrated on.
-        base_n: Half-width at no force.
-        share: What is added with the force, as the root of the sum of squares: half-width per newton.
+        base_n: Half-width at zero force.
+        share: Half-width per newton, added to ``base_n`` as the root of the sum of squares.
     """
 
     coverage: Annotated[float, Field(gt=0, lt=1)]
@@ -63,21 +63,21 @@ class Interval(Section):
     share: NonNegative
 
     def half_width_n(self, force_n: npt.ArrayLike) -> npt.NDArray[np.float64]:
-        """Half-width about forces, (N,)."""
+        """Returns the half-width, (N,), for forces (N,)."""
         width: npt.NDArray[np.float64] = np.hypot(self.base_n, self.share * np.asarray(force_n, np.float64))
         return width
 
 
 class LoopPlant(Section):
-    """The force loop's plant with this object, as `gripper_force.control.tuning` has it, and what follows.
+    """Plant of the force loop with this object (see `gripper_force.control.tuning`), and its PI controller.
 
     Attributes:
-        gain: Newtons at the contact for one of the motor's push.
-        lag_ms: From the motor's push to the contact force.
-        delay_ms: From the contact force to an estimate that can be used.
-        proportional: Gain of a PI controller by SIMC.
-        integral_s: Its integral gain, a second.
-        phase_margin_deg: Phase that it leaves.
+        gain: Contact force per newton of motor force.
+        lag_ms: Time constant from motor force to contact force.
+        delay_ms: Time from the contact force to an estimate that can be used.
+        proportional: Proportional gain of the PI controller by SIMC.
+        integral_s: Its integral gain in 1/s.
+        phase_margin_deg: Its phase margin.
     """
 
     gain: Positive
@@ -89,24 +89,25 @@ class LoopPlant(Section):
 
 
 class ObjectProfile(Section):
-    """What is known of one object.
+    """Calibration of one object.
 
     Attributes:
-        object: Its name.
-        date: When it was calibrated.
+        object: The object's name.
+        date: Date of the calibration.
         checkpoint: SHA-256 of the network's file.
         camera: The camera's settings, by key of the configuration.
-        touches: Touches it was calibrated on.
-        frames: Their frames.
-        force_n: Largest force that the object was pressed with and sprang back from. It holds up to there.
+        touches: Number of touches of the calibration.
+        frames: Number of their frames.
+        force_n: Largest force that the object was pressed with and recovered from. The profile holds up to
+            it.
         output: Correction of the network's output.
-        interval: How far off it is at most.
+        interval: Interval of the error of the corrected estimate.
         ood_limit: Highest out-of-distribution score at which an estimate is used, 0 to 1 (see
             `gripper_force.profiles.correction`). Version 0.1 called it ``gate``.
-        stiffness_n_m: Force over travel of both jaws, at half of the largest force.
-        plant: The force loop's plant; None where the logs hold no servo.
+        stiffness_n_m: Stiffness, force over travel of both jaws, at half of the largest force.
+        plant: The force loop's plant; None if the logs hold no servo.
         before_n: MAE of the network alone on these touches.
-        after_n: MAE of the corrected estimate on each touch, corrected by all others.
+        after_n: MAE of the corrected estimate on each touch, with a correction fitted to the others.
         weights: SHA-256 of the file beside it.
     """
 
@@ -135,7 +136,12 @@ class ObjectProfile(Section):
         return tree
 
     def mismatches(self, checkpoint: str, camera: dict[str, Any]) -> list[str]:
-        """What differs between the calibration and a run, in words."""
+        """Returns the differences between the calibration and a run, as text.
+
+        Args:
+            checkpoint: SHA-256 of the run's network.
+            camera: The run's camera settings, by key of the configuration; missing keys are not compared.
+        """
         differ = []
         if checkpoint != self.checkpoint:
             differ.append(f"network {self.checkpoint[:12]}, not {checkpoint[:12]}")
@@ -146,47 +152,49 @@ class ObjectProfile(Section):
 
 
 def weights_path(path: Path) -> Path:
-    """The file beside a profile."""
+    """Returns the path of the safetensors file beside a profile."""
     return path.with_suffix(".safetensors")
 
 
 def read_object(path: Path) -> ObjectProfile:
-    """Reads an object profile. Raises `ConfigError` that names the file and what is wrong with it."""
+    """Reads an object profile. Raises `ConfigError` if the file is missing or invalid."""
     return read_section(ObjectProfile, path, FORMAT, "object profile")
 
 
 def check_place(path: Path) -> None:
-    """Makes a profile's folder. Raises `ConfigError` where none can be written to that path."""
+    """Creates the folder of a profile. Raises `ConfigError` if the profile can't be written there."""
     if path.suffix != ".yaml":
-        raise ConfigError(f"an object profile is a file that ends in .yaml, and {path} does not")
-    place = path.with_name(f".{path.name}.part")
+        raise ConfigError(f"can't write an object profile to {path}; name a file that ends in .yaml")
+    probe = path.with_name(f".{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        place.touch()
-        place.unlink()
+        probe.touch()
+        probe.unlink()
     except OSError as error:
-        raise ConfigError(f"can't write {path}: {error.strerror}, {error.filename}") from error
+        raise ConfigError(
+            f"can't write {path}: {error.strerror}, {error.filename}; name another file"
+        ) from error
 
 
 def write_object(path: Path, profile: ObjectProfile, weights: bytes) -> None:
-    """Writes an object profile and the file beside it. Raises `ConfigError` where it can't."""
+    """Writes an object profile and the safetensors file beside it. Raises `ConfigError` if it can't."""
     write_all({weights_path(path): weights, path: dump(profile).encode()})
 
 
 def user_folder() -> Path:
-    """Where a user's own profiles are (https://specifications.freedesktop.org/basedir-spec/latest/)."""
+    """Returns the folder of the user's profiles (https://specifications.freedesktop.org/basedir-spec/latest/)."""
     base = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local/share"
     return Path(base) / "gripper-force" / "objects"
 
 
 def find_object(name: str) -> Path:
-    """The profile of that name, one's own before one that is shipped, or at that path.
+    """Returns the path of an object profile. The user's profiles come before the shipped ones.
 
     Args:
         name: A name such as ``sponge``, or a path that ends in ``.yaml``.
 
     Raises:
-        ConfigError: There is none of that name. The sentence names those there are.
+        ConfigError: No profile has that name.
     """
     if name.endswith(".yaml"):
         return Path(name)
@@ -197,6 +205,6 @@ def find_object(name: str) -> Path:
                 return path
         known = sorted({path.stem for folder in folders for path in folder.glob("*.yaml")})
     raise ConfigError(
-        f"no object profile {name!r}; there are {', '.join(known) or 'none'}; make one with "
+        f"no object profile {name!r}; known: {', '.join(known) or 'none'}; make one with "
         f"`gripper-force calibrate object {name}`"
     )

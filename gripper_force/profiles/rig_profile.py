@@ -1,4 +1,4 @@
-"""The rig profile: what `gripper-force calibrate load-cell`, `servo` and `camera` found of one rig."""
+"""Rig profile: calibration of one rig by `gripper-force calibrate load-cell`, `servo` and `camera`."""
 
 from pathlib import Path
 from typing import Annotated, Final, Literal, Self
@@ -19,19 +19,20 @@ from gripper_force.schema import (
 FORMAT: Final = "gripper-force-rig/1"
 
 _GAIN_DRIFT: Final = 0.02
-"""A magnet of neodymium gives 0.11 % less a kelvin, and a motor that works warms by 20 K and more."""
+"""Relative drift of the torque constant: neodymium magnets lose 0.11 % per kelvin, and a motor under load
+warms by 20 K and more."""
 
 _FRICTION_DRIFT: Final = 0.1
-"""What grease, wear and the place on the rack make of friction, as a share of it: an assumption."""
+"""Relative variation of friction with grease, wear and position on the rack: an assumption."""
 
 _NORMAL: Final = 1.96
-"""Half of a 95 % interval in standard deviations."""
+"""Half-width of a 95 % interval in standard deviations."""
 
 Range = Annotated[tuple[NonNegative, NonNegative], Field(description="least and most")]
 
 
 class CalibratedValue(Section):
-    """A calibrated value and its 95 % confidence interval; without one, the value was given, not measured."""
+    """A calibrated value and its 95 % confidence interval; no interval if it was given, not measured."""
 
     value: Finite
     low: Finite | None = None
@@ -40,28 +41,28 @@ class CalibratedValue(Section):
     @model_validator(mode="after")
     def _is_in_order(self) -> Self:
         if (self.low is None) != (self.high is None):
-            raise ValueError("low and high go together")
+            raise ValueError("low and high must be given together")
         if self.low is not None and self.high is not None and not self.low <= self.value <= self.high:
-            raise ValueError(f"the value {self.value:g} must lie between low and high")
+            raise ValueError(f"value {self.value:g} must lie between low and high")
         return self
 
     @property
     def half(self) -> float:
-        """Half of the interval's width; 0 where the value was given."""
+        """Half of the interval's width; 0 if the value was given."""
         return 0.0 if self.low is None or self.high is None else (self.high - self.low) / 2
 
 
 class LoadCellCalibration(Section):
-    """A load cell's tare and scale.
+    """Tare and scale of a load cell.
 
     Attributes:
-        date: When it was calibrated.
-        sensor: Backend and, of a serial one, format: the raw readings' unit goes with them.
+        date: Date of the calibration.
+        sensor: Backend and, for a serial one, format. They determine the unit of the raw readings.
         tare_raw: Reading without load.
-        n_per_raw: Newtons for one unit of the reading.
-        force_n: Forces it holds for.
-        noise_n: Standard deviation of a sample under a load that rests.
-        drift_n_min: Drift without load, a minute.
+        n_per_raw: Newtons per unit of the reading.
+        force_n: Least and greatest calibrated force.
+        noise_n: Standard deviation of samples under a constant load.
+        drift_n_min: Drift without load, per minute.
     """
 
     date: AwareDatetime
@@ -74,20 +75,20 @@ class LoadCellCalibration(Section):
 
 
 class ServoCalibration(Section):
-    """A servo's torque, its friction, and the jaws' geometry.
+    """Torque and friction of a servo, and the geometry of the jaws.
 
     Attributes:
-        date: When it was calibrated.
+        date: Date of the calibration.
         model: The servo's model.
         nm_per_a: Torque constant at the horn.
         friction_n: Coulomb friction at each jaw.
         damping_n_s_m: Viscous friction at each jaw.
-        pinion_radius_m: Pitch radius of the pinion, measured where gauges of two widths were pressed.
-        open_position_rad: Servo angle with the jaws open by `open_width_m`.
-        open_width_m: Distance between the jaws there.
-        force_n: Forces it holds for.
-        speed_m_s: Speeds of one jaw that it holds for.
-        residual_n: Root mean square of what the fit leaves of the forces.
+        pinion_radius_m: Pitch radius of the pinion, measured with gauges of two widths.
+        open_position_rad: Servo angle at the width ``open_width_m``.
+        open_width_m: Distance between the jaws at that angle.
+        force_n: Least and greatest calibrated force.
+        speed_m_s: Least and greatest calibrated speed of one jaw.
+        residual_n: Root mean square of the fit's residuals.
     """
 
     date: AwareDatetime
@@ -104,22 +105,23 @@ class ServoCalibration(Section):
 
 
 class CameraCalibration(Section):
-    """How a camera sees the jaws, and when.
+    """Exposure, region of interest and delay of a camera.
 
     Attributes:
-        date: When it was calibrated.
+        date: Date of the calibration.
         backend: The camera's backend.
-        side_px: Side of its frames.
-        rate_hz: Its frame rate.
-        gain: Its gain.
-        exposure_us: The exposure at which the picture is neither dark nor clipped.
-        mean: Mean gray value there.
-        clipped: Share of clipped pixels there.
+        side_px: Side of the frames.
+        rate_hz: Frame rate.
+        gain: Gain.
+        exposure_us: Exposure at which the image is neither dark nor clipped.
+        mean: Mean gray value at that exposure.
+        clipped: Share of clipped pixels at that exposure.
         region: Region of interest of the frame: left, top, width, height in pixels.
-        markers: Whether markers on the jaws told the region.
-        lag_ms: Time by which its timestamps are late against the load cell's.
-        delay_ms: From the contact force to an estimate that can be used: exposure to use, and half a frame.
-        reference: File beside the profile with the picture of open jaws.
+        markers: True if the region was found by markers on the jaws.
+        lag_ms: Delay of the camera's timestamps against the load cell's.
+        delay_ms: Time from the contact force to an estimate that can be used: from exposure to use, plus half
+            a frame period.
+        reference: File beside the profile with an image of the open jaws.
     """
 
     date: AwareDatetime
@@ -137,14 +139,14 @@ class CameraCalibration(Section):
     reference: str
 
     def mismatches(self, camera: Tree) -> list[str]:
-        """What differs between the calibration and a run's section ``camera``, in words."""
+        """Returns the differences between the calibration and a run's section ``camera``, as text."""
         mine = self.model_dump(mode="json")
         keys = ("backend", "side_px", "rate_hz", "gain", "exposure_us")
         return [f"camera.{key} {mine[key]}, not {camera[key]}" for key in keys if mine[key] != camera[key]]
 
 
 class RigProfile(Section):
-    """What is known of one rig; a section is there once its part was calibrated."""
+    """Calibration of one rig. The section of a part that was not calibrated is None."""
 
     format: Literal["gripper-force-rig/1"] = FORMAT
     load_cell: LoadCellCalibration | None = None
@@ -152,7 +154,7 @@ class RigProfile(Section):
     camera: CameraCalibration | None = None
 
     def settings(self) -> Tree:
-        """The configuration keys that it sets."""
+        """Returns the configuration keys that the profile sets, and their values."""
         tree: Tree = {}
         if (cell := self.load_cell) is not None:
             tree["load_cell"] = {"tare_raw": cell.tare_raw.value, "n_per_raw": cell.n_per_raw.value}
@@ -174,40 +176,40 @@ class RigProfile(Section):
         return tree
 
     def mismatches(self, model: str, sensor: str, camera: Tree) -> list[str]:
-        """What a run has otherwise than the profile, in words.
+        """Returns the differences between the profile's devices and a run's, as text.
 
         Args:
-            model: The run's servo.
-            sensor: Its load cell; one without raw readings is never another.
-            camera: Its section ``camera``; a run without a camera has no other.
+            model: The run's servo model.
+            sensor: The run's load cell. One without raw readings is not compared.
+            camera: The run's section ``camera``. Without a camera it is not compared.
         """
         differ = []
         if self.servo is not None and self.servo.model != model:
-            differ.append(f"a servo {self.servo.model}, and this one is {model}")
+            differ.append(f"servo {self.servo.model}, not {model}")
         real = sensor not in ("none", "simulated", "playback")
         if self.load_cell is not None and real and self.load_cell.sensor != sensor:
-            differ.append(f"a load cell {self.load_cell.sensor}, and this one is {sensor}")
+            differ.append(f"load cell {self.load_cell.sensor}, not {sensor}")
         if self.camera is not None and camera["backend"] != "none":
             differ += self.camera.mismatches(camera)
         return differ
 
 
 def _std(estimate: CalibratedValue, drift: float) -> float:
-    """Standard deviation in use, as a share of the value: the interval's, and at least what it drifts by."""
+    """Returns the relative standard deviation in use: the interval's, but at least the drift."""
     share = estimate.half / (_NORMAL * abs(estimate.value)) if estimate.value else 0.0
     return min(max(share, drift), 1.0)
 
 
 def read_rig(path: Path) -> RigProfile:
-    """Reads a rig profile. Raises `ConfigError` that names the file and what is wrong with it."""
+    """Reads a rig profile. Raises `ConfigError` if the file is missing or invalid."""
     return read_section(RigProfile, path, FORMAT, "rig profile")
 
 
 def update_rig(path: Path, section: LoadCellCalibration | ServoCalibration | CameraCalibration) -> RigProfile:
-    """Replaces one section of a rig profile, or begins one, and writes it.
+    """Replaces one section of a rig profile, or creates the profile, and writes it.
 
     Raises:
-        ConfigError: The file is there and no rig profile, or it can't be written.
+        ConfigError: The file exists and is not a rig profile, or it can't be written.
     """
     profile = read_rig(path) if path.exists() else RigProfile()
     names = {LoadCellCalibration: "load_cell", ServoCalibration: "servo", CameraCalibration: "camera"}

@@ -1,6 +1,6 @@
-"""From camera frames to newtons."""
+"""Force estimation from camera frames."""
 
 import sys
 
-# OpenVINO tells its maker of each import, over the network and from a thread, unless this is absent.
+# If this package can be imported, each import of OpenVINO sends a report to its vendor, from a thread.
 sys.modules.setdefault("openvino_telemetry", None)  # type: ignore[arg-type]

@@ -1,11 +1,11 @@
-"""Sequential image-based attention of Shin et al. 2019, equations 1 to 6, and what it is compared with.
+"""Sequential image-based attention of Shin et al. 2019, equations 1 to 6, and SE and CBAM for comparison.
 
 SSAM and SCAM take the feature maps of the newest frame and of the ``n`` frames before it, concatenated over
 channels, oldest first (the paper's X_tn), and excite the newest: X' = M(X_tn) * X + X.
-The paper counts ``n`` in two ways; as in its table of frame counts, n = 1 means the maps of t-1 and t. For
-n = 0 that table repeats the numbers of the baseline without attention; here n = 0 is what the equations give,
-attention to the newest map alone (the paper's "traditional" attention in table 3).
-SE and CBAM see the newest map only. All are called alike, with the stack and the newest map.
+The paper counts ``n`` in two ways; here, as in its table of frame counts, n = 1 means the maps of t-1 and t.
+For n = 0 that table repeats the numbers of the baseline without attention; here n = 0 follows the equations:
+attention to the newest map alone (the paper's "traditional" attention in table 3). SE and CBAM use the newest
+map only. All modules take the stack and the newest map.
 """
 
 import torch
@@ -16,7 +16,7 @@ from gripper_force.vision.header import Pooling
 
 
 class SpatialAttention(nn.Module):
-    """SSAM: one gate for each position (equations 1 to 3)."""
+    """SSAM: one gate per position (equations 1 to 3)."""
 
     def __init__(self, channels: int, earlier_frames: int, pooling: Pooling) -> None:
         super().__init__()
@@ -25,7 +25,7 @@ class SpatialAttention(nn.Module):
             # Weighted average pooling (WAP) over channels: Y_s + b is one 1x1 convolution.
             self.pool = nn.Conv2d((earlier_frames + 1) * channels, 1, 1)
         else:
-            # The paper gives no equation for this case. Equal weights in place of learned ones leave b.
+            # The paper gives no equation for this case. With equal weights, b is the only parameter.
             self.bias = nn.Parameter(torch.zeros(1))
 
     def forward(self, stack: Tensor, newest: Tensor) -> tuple[Tensor, Tensor]:
@@ -44,7 +44,7 @@ class SpatialAttention(nn.Module):
 
 
 class ChannelAttention(nn.Module):
-    """SCAM: one gate for each channel (equations 4 to 6)."""
+    """SCAM: one gate per channel (equations 4 to 6)."""
 
     def __init__(
         self, channels: int, earlier_frames: int, positions: int, reduction: int, pooling: Pooling
@@ -53,7 +53,7 @@ class ChannelAttention(nn.Module):
         stacked = (earlier_frames + 1) * channels
         self.pool: nn.Parameter | None = None
         if pooling == "wap":
-            # WAP over positions, with weights that all channels share; it starts as the plain average.
+            # WAP over positions, with weights shared by all channels; initialised as the plain average.
             self.pool = nn.Parameter(torch.full((positions,), 1 / positions))
         self.squeeze = nn.Linear(stacked, max(1, stacked // reduction))
         # The paper's M_c has nC gates for the C channels of X_t. Only gates for X_t's own channels can be
@@ -71,7 +71,7 @@ class ChannelAttention(nn.Module):
             The excited map X', (N, C, H, W), and the gates M_c in 0..1, (N, C, 1, 1).
         """
         pooled = stack.mean((2, 3)) if self.pool is None else stack.flatten(2) @ self.pool  # (N, (n+1)*C)
-        # The rectifier between F_0 and F_1 follows squeeze-and-excitation, which the paper builds on.
+        # The ReLU between F_0 and F_1 is that of squeeze-and-excitation, which the paper extends.
         gates = torch.sigmoid(self.excite(F.relu(self.squeeze(pooled))))[:, :, None, None]
         return gates * newest + newest, gates
 
@@ -92,8 +92,8 @@ class SqueezeExcitation(nn.Module):
 class Cbam(nn.Module):
     """CBAM of Woo et al. 2018 (https://arxiv.org/abs/1807.06521, equations 1 to 3).
 
-    Channels first, positions second. The authors' public code adds a batch normalisation to the 7x7
-    convolution; this is the paper's.
+    Channel attention, then spatial attention. The authors' public code adds a batch normalisation to the 7x7
+    convolution; this follows the paper.
     """
 
     def __init__(self, channels: int, reduction: int) -> None:

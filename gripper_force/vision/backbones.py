@@ -1,4 +1,4 @@
-"""Convolutional backbones: one gray frame in, one feature map out."""
+"""Convolutional backbones: one gray frame in, feature maps out."""
 
 from itertools import pairwise
 
@@ -7,10 +7,11 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 VGG_CHANNELS = (16, 32, 64, 128, 256)
+"""Channels of the five pairs of convolutions, table 2 of Shin et al. 2019."""
 
 
 class Backbone(nn.Module):
-    """Maps frames (N, 1, S, S) to feature maps (N, out_channels, S/s, S/s), none negative, s of `STRIDES`."""
+    """Maps frames (N, 1, S, S) to non-negative feature maps (N, out_channels, S/s, S/s), s from `STRIDES`."""
 
     out_channels: int
 
@@ -18,8 +19,8 @@ class Backbone(nn.Module):
 class Vgg(Backbone):
     """The VGG-like network of Shin et al. 2019, table 2: five pairs of 3x3 convolutions.
 
-    A 2x2 max pooling follows each of the first four pairs, and batch normalisation follows each pooling; the
-    latter is in the authors' public code, not in the paper.
+    A 2x2 max pooling follows each of the first four pairs, and batch normalisation follows each pooling. The
+    batch normalisation is in the authors' public code, not in the paper.
     """
 
     def __init__(self, width: float) -> None:
@@ -39,7 +40,7 @@ class Vgg(Backbone):
         for i, (first, second) in enumerate(zip(self.first, self.second, strict=True)):
             x = second(F.relu(first(x)))
             if i < len(self.norm):
-                # Pooling before the rectifier gives the same numbers for a quarter of its work.
+                # Pooling before the ReLU gives the same numbers with a quarter of its operations.
                 x = self.norm[i](F.relu(F.max_pool2d(x, 2)))  # (N, C_i, S / 2^(i+1), S / 2^(i+1))
         return torch.relu(x)
 
@@ -47,8 +48,8 @@ class Vgg(Backbone):
 class ResNet18(Backbone):
     """The 18-layer network of He et al. 2016 (https://arxiv.org/abs/1512.03385, table 1) without its head.
 
-    Shin et al. name it and give no sizes (table 6); only the gray input differs from the original. Their
-    public code holds a fragment that normalises before the convolutions instead, which nothing there calls.
+    Shin et al. name it without sizes (table 6); only the gray input differs from the original. Their public
+    code holds an unused fragment that normalises before the convolutions instead.
     """
 
     def __init__(self, width: float) -> None:
@@ -63,17 +64,17 @@ class ResNet18(Backbone):
 
     def forward(self, frames: Tensor) -> Tensor:
         """Maps frames (N, 1, S, S) to feature maps (N, C, S/32, S/32)."""
-        # Pooling before the rectifier, as in `Vgg`.
+        # Pooling before the ReLU, as in `Vgg`.
         x = F.relu(F.max_pool2d(self.stem(frames), 3, stride=2, padding=1))  # (N, C_0, S/4, S/4)
         maps: Tensor = self.blocks(x)
         return maps
 
 
 class Mobile(Backbone):
-    """A small network of the inverted residuals of MobileNetV2 (Sandler et al. 2018).
+    """A small network of inverted residuals as in MobileNetV2 (Sandler et al. 2018).
 
-    The original's 17 blocks take a CPU longer than `Vgg` does for a frame of 64 pixels, as the time goes into
-    calls and not into arithmetic. Six blocks at Vgg's stride take about half of Vgg's.
+    For a frame of 64 pixels on a CPU, the original's 17 blocks take longer than `Vgg`, because calls take
+    more time than arithmetic. Six blocks at the stride of `Vgg` take about half of its time.
     """
 
     def __init__(self, width: float) -> None:
@@ -92,7 +93,7 @@ class Mobile(Backbone):
 
 
 class _Residual(nn.Module):
-    """Two 3x3 convolutions beside a shortcut."""
+    """Two 3x3 convolutions with a shortcut."""
 
     def __init__(self, inputs: int, outputs: int, stride: int) -> None:
         super().__init__()
@@ -105,7 +106,7 @@ class _Residual(nn.Module):
 
 
 class _InvertedResidual(nn.Module):
-    """Wide inside, narrow outside, one 3x3 filter for each channel between; no rectifier at the end."""
+    """Inverted residual: 1x1 expansion, 3x3 depthwise convolution, 1x1 projection without ReLU."""
 
     def __init__(self, inputs: int, outputs: int, stride: int, expansion: int = 4) -> None:
         super().__init__()

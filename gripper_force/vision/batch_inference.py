@@ -1,4 +1,4 @@
-"""Whole clips at once: what streaming does frame by frame, as batches on any device."""
+"""Inference on whole recordings in batches, on any device. Equals streaming frame by frame."""
 
 from collections.abc import Sequence
 
@@ -12,16 +12,16 @@ from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import DIFFERENCE_GAIN, FLAT_STD, Preprocess
 
 CHUNK = 256
-"""Frames of a clip that pass the backbone together; bounds memory."""
+"""Frames that pass the backbone together; limits memory."""
 
 
 def normalise(frames: Tensor, leading: Tensor, preprocess: Preprocess) -> Tensor:
-    """Prepares the frames of recordings; equals `preprocess.Normaliser`.
+    """Prepares the frames of recordings as `preprocess.Normaliser` does.
 
     Args:
         frames: Gray levels, (B, T, S, S), uint8 or float32.
-        leading: The first of each recording, which show no contact, (B, R, S, S).
-        preprocess: What to do; ``R`` is its ``reference_frames``.
+        leading: First frames of each recording, which show no contact, (B, R, S, S).
+        preprocess: Settings; ``R`` is ``reference_frames``.
 
     Returns:
         The network's input, (B, T, 1, S, S) float32.
@@ -47,12 +47,12 @@ def predict(
 
     Args:
         networks: Members of the ensemble, in evaluation mode, on ``device``.
-        preprocess: What they were trained with.
+        preprocess: Preparation that the networks were trained with.
         frames: The recording, cropped and resized, (T, S, S) uint8.
-        device: Where to compute.
+        device: Device of the networks.
 
     Returns:
-        Each member's forces in N, (members, T).
+        Each member's forces in N, (M, T).
     """
     return features(networks, preprocess, frames, device)[0]
 
@@ -61,19 +61,21 @@ def predict(
 def features(
     networks: Sequence[ForceNetwork], preprocess: Preprocess, frames: Gray, device: str = "cpu"
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """As `predict`, with what the members' last layers make their forces from.
+    """Estimates the force for every frame, and returns the inputs of the members' last layers too.
+
+    Arguments are those of `predict`.
 
     Returns:
-        Each member's forces in N, (members, T), and the members' features side by side, (T, heads).
+        Each member's forces in N, (M, T), and the members' concatenated features, (T, F).
     """
     clip = torch.from_numpy(frames)[None].to(device)  # (1, T, S, S)
     leading = clip[:, : preprocess.reference_frames]
     context = max(network.config.context for network in networks)
-    forces, read = [], []
+    forces, all_features = [], []
     for begin in range(0, clip.shape[1], CHUNK):
         first = max(0, begin - context)
         inputs = normalise(clip[:, first : begin + CHUNK], leading, preprocess)
         part = [network.features(inputs, begin - first)[0] for network in networks]  # (chunk, head) each
         forces.append(torch.stack([n.force_n(f) for n, f in zip(networks, part, strict=True)]))
-        read.append(torch.cat(part, dim=1))
-    return torch.cat(forces, dim=1).cpu().numpy(), torch.cat(read).cpu().numpy()
+        all_features.append(torch.cat(part, dim=1))
+    return torch.cat(forces, dim=1).cpu().numpy(), torch.cat(all_features).cpu().numpy()

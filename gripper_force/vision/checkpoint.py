@@ -1,4 +1,4 @@
-"""One safetensors file holds a whole ensemble: weights, and in its header all that is needed to use them."""
+"""Checkpoints: one safetensors file per ensemble, with the weights and a header."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from gripper_force.vision.header import FORMAT, Header, NetworkConfig, digest_of
 from gripper_force.vision.network import ForceNetwork
 
 _RENAMED = {"blstm.onward.": "blstm.forward_lstm.", "blstm.backward_gates.": "blstm.backward_linear."}
-"""Weights by their names in checkpoints of version 0.1, and by their names now."""
+"""Names of weights in checkpoints of version 0.1, and their present names."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Checkpoint:
 
     Attributes:
         networks: The members, in evaluation mode, on the CPU, in float32.
-        header: What the file says about them.
+        header: The file's header.
         digest: SHA-256 of the file.
     """
 
@@ -33,9 +33,9 @@ class Checkpoint:
 
 
 def save_checkpoint(path: Path, networks: Sequence[ForceNetwork], header: Header) -> None:
-    """Writes an ensemble, matrices as float16 where that can hold them, and vectors as float32.
+    """Writes an ensemble: matrices as float16 where its range allows, vectors as float32.
 
-    Half precision halves the file and costs less than 1e-3 of the force.
+    Half precision halves the file and changes the force by less than 1e-3 of its value.
 
     Raises:
         CheckpointError: The file can't be written.
@@ -50,14 +50,16 @@ def save_checkpoint(path: Path, networks: Sequence[ForceNetwork], header: Header
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
     except OSError as error:
-        raise CheckpointError(f"can't write the checkpoint {path}: {error.strerror}") from error
+        raise CheckpointError(
+            f"can't write the checkpoint {path}: {error.strerror}; name another file"
+        ) from error
 
 
 def load_checkpoint(source: str | Path = "default") -> Checkpoint:
-    """Reads an ensemble.
+    """Loads an ensemble.
 
     Args:
-        source: A path, or ``default`` or ``small`` for one that is shipped.
+        source: A path, or ``default`` or ``small`` for a shipped checkpoint.
 
     Raises:
         CheckpointError: The file is missing, damaged, or of another network.
@@ -66,7 +68,9 @@ def load_checkpoint(source: str | Path = "default") -> Checkpoint:
     try:
         tensors = load(data)
     except SafetensorError as error:
-        raise CheckpointError(f"{path} is damaged or no safetensors file: {error}") from error
+        raise CheckpointError(
+            f"{path} is damaged or not a safetensors file: {error}; copy or train it again"
+        ) from error
     networks = tuple(_member(path, i, config, tensors) for i, config in enumerate(header.members))
     return Checkpoint(networks, header, digest_of(data))
 
@@ -78,30 +82,32 @@ def _current_name(name: str) -> str:
 
 
 def _stored(tensor: Tensor) -> Tensor:
-    kept = tensor.detach().cpu().contiguous()
-    # Biases and running variances are few, and the latter can lie below the smallest float16.
-    if kept.dim() < 2:
-        return kept
-    half = kept.half()
-    # Beyond 65504 and below 6e-5 it has no digits left; what it holds has eleven bits.
-    fits = (half - kept).abs().max() <= kept.abs().max() * 2**-11
-    return half if fits else kept
+    full = tensor.detach().cpu().contiguous()
+    # Vectors take little space, and running variances can lie below the smallest float16.
+    if full.dim() < 2:
+        return full
+    half = full.half()
+    # float16 has eleven bits between 6e-5 and 65504, and loses them outside.
+    fits = (half - full).abs().max() <= full.abs().max() * 2**-11
+    return half if fits else full
 
 
 def _member(path: Path, index: int, config: NetworkConfig, tensors: dict[str, Tensor]) -> ForceNetwork:
     prefix = f"{index}."
-    with torch.device("meta"):  # a header may claim any size: only what the weights confirm takes memory
+    with torch.device("meta"):  # a malformed header may claim any size; this allocates nothing
         network = ForceNetwork(config)
     dtypes = {name: tensor.dtype for name, tensor in network.state_dict().items()}
     own = {
         _current_name(name.removeprefix(prefix)): t for name, t in tensors.items() if name.startswith(prefix)
     }
-    # A copy, as what was read lies in the bytes of the file, which can't be written to.
+    # A copy, because the tensors share the file's bytes, which are read-only.
     state = {name: t.to(dtypes.get(name, t.dtype), copy=True) for name, t in own.items()}
     try:
         network.load_state_dict(state, assign=True)
     except RuntimeError as error:
-        raise CheckpointError(f"{path}: the weights of member {index} don't fit its header") from error
+        raise CheckpointError(
+            f"{path}: the weights of member {index} do not fit its header; copy or train the checkpoint again"
+        ) from error
     if not all(bool(tensor.isfinite().all()) for tensor in state.values()):
-        raise CheckpointError(f"{path}: the weights of member {index} hold NaN or infinity")
-    return network.in_fast_layout().eval().requires_grad_(False)
+        raise CheckpointError(f"{path}: the weights of member {index} hold NaN or infinity; train it again")
+    return network.to_channels_last().eval().requires_grad_(False)

@@ -1,4 +1,7 @@
-"""Is this what a camera that works sees here? A network answers any picture; somebody has to ask."""
+"""Plausibility checks on camera frames.
+
+A network returns a force for any image, so flat, badly exposed or garbled frames are rejected first.
+"""
 
 from typing import Final
 
@@ -11,32 +14,32 @@ from gripper_force.vision.preprocess import FLAT_STD
 BRIGHTNESS: Final = 1.6
 CONTRAST: Final = 2.5
 ROUGHNESS: Final = 2.5
-"""Factors by which a frame may differ from the run's first, either way. The extremes seen in presses are
-1.15, 1.33 and 1.2 in simulation, and 1.06, 1.04 and 1.1 with a finger camera."""
+"""Largest ratios of a frame to the first frame of the stream, in either direction. The extremes observed in
+presses are 1.15, 1.33 and 1.2 in simulation, and 1.06, 1.04 and 1.1 with a finger camera."""
 
 
 class FrameChecks:
-    """Compares each frame of a run with the first."""
+    """Compares brightness, contrast and roughness of each frame of a stream with the first frame's."""
 
     def __init__(self) -> None:
         self._first: tuple[float, float, float] | None = None
 
     def check(self, small: Gray) -> None:
-        """Takes the next frame.
+        """Checks the next frame.
 
         Args:
-            small: What the network is to see of it, (S, S) uint8.
+            small: Cropped and resized frame, (S, S) uint8.
 
         Raises:
-            DataError: It is flat, or its brightness, contrast or roughness are far from those of the run's
-                first frame.
+            DataError: The frame is flat, or its brightness, contrast or roughness are far from the first
+                frame's.
         """
         pixels = small.astype(np.float32)
         contrast = float(pixels.std())
         if contrast < FLAT_STD:
             level = pixels.mean()
             raise DataError(
-                f"the camera's picture is flat (gray level {level:.0f}); look at its lens, light and exposure"
+                f"the camera's image is flat (gray level {level:.0f}); check its lens, light and exposure"
             )
         brightness = float(pixels.mean())
         roughness = float(np.abs(np.diff(pixels)).mean()) / contrast
@@ -51,6 +54,6 @@ class FrameChecks:
         ):
             if not first / most <= now <= first * most:
                 raise DataError(
-                    f"the picture's {name} went from {first:.3g} to {now:.3g} since the run began; look at "
+                    f"the image's {name} changed from {first:.3g} to {now:.3g} since the first frame; check "
                     "the camera and the light"
                 )

@@ -1,4 +1,4 @@
-"""What a checkpoint says about itself, readable without PyTorch: shapes, preparation, errors."""
+"""Header of a checkpoint: shapes of the networks, preparation of frames, errors. Read without PyTorch."""
 
 import hashlib
 import json
@@ -15,29 +15,29 @@ from gripper_force.vision.preprocess import Preprocess
 Attention = Literal["none", "ssam", "scam", "se", "cbam"]
 BackboneName = Literal["vgg", "resnet18", "mobile"]
 Pooling = Literal["wap", "gap"]
-"""How SSAM squeezes channels and SCAM positions: averages with learned weights, or plain ones (table 5)."""
+"""Pooling of SSAM over channels and of SCAM over positions: weighted or global average (table 5)."""
 
 STRIDES: Final[dict[BackboneName, int]] = {"vgg": 16, "resnet18": 32, "mobile": 16}
-"""Pixels of a frame for one position of each backbone's maps."""
+"""Ratio of the side of a frame to the side of each backbone's feature maps."""
 
 Count = Annotated[int, Field(ge=1, le=100_000)]
 
 
 class NetworkConfig(Section):
-    """The shape of one network.
+    """Shape of one network.
 
     Attributes:
         attention: SSAM, SCAM, none (the paper's baseline), or SE or CBAM for comparison.
-        earlier_frames: n, the frames before the newest that SSAM and SCAM see; the others see none.
-        pooling: How SSAM and SCAM squeeze: weighted or global average pooling.
-        reduction: r of the perceptron; the paper gives none, this is that of SE and CBAM.
+        earlier_frames: n, the number of frames before the newest that SSAM and SCAM use; others use none.
+        pooling: Pooling of SSAM and SCAM: weighted (WAP) or global average pooling (GAP).
+        reduction: Reduction ratio r of the perceptron. The paper gives none; this is that of SE and CBAM.
         backbone: The paper's VGG-like network, its ResNet with 18 layers, or a small one for slow computers.
         size: Side of the input in pixels.
         width: Multiplier of the backbone's channels.
-        window: Frames the BLSTM sees.
+        window: Length of the BLSTM's input sequence in frames.
         hidden: Units of each direction of the BLSTM.
         head: Units of the dense layer.
-        label_scale_n: The last layer's output 1 means this force.
+        label_scale_n: Force at output 1 of the last layer.
     """
 
     attention: Attention = "none"
@@ -57,63 +57,62 @@ class NetworkConfig(Section):
         stride = STRIDES[self.backbone]
         if self.size % stride:
             raise ValueError(
-                f"size {self.size} does not suit the backbone {self.backbone}: take a multiple of {stride}"
+                f"size {self.size} does not fit the backbone {self.backbone}; use a multiple of {stride}"
             )
         if self.pooling == "gap" and not self.sequential:
             raise ValueError(
-                f"pooling gap is a choice of ssam and scam: with the attention {self.attention} leave it out"
+                f"pooling gap needs the attention ssam or scam, not {self.attention}; leave pooling out"
             )
         return self
 
     @property
     def sequential(self) -> bool:
-        """Whether attention may see earlier frames."""
+        """True if the attention can use earlier frames."""
         return self.attention in ("ssam", "scam")
 
     @property
     def maps_kept(self) -> int:
-        """Earlier frames whose maps a stream keeps."""
+        """Number of earlier frames whose maps a stream keeps."""
         return self.earlier_frames if self.sequential else 0
 
     @property
     def context(self) -> int:
-        """Earlier frames that one estimate depends on."""
+        """Number of earlier frames that an estimate depends on."""
         return self.window - 1 + self.maps_kept
 
 
 EXPORTED: Final = {".xml": "openvino", ".onnx": "onnxruntime"}
-"""What a checkpoint can be exported to, by ending, and the engine that runs it."""
+"""Suffixes of exported files, and the engine that runs each."""
 
 KEY: Final = "gripper_force"
-"""Where an exported file's description is: its ``header``, and the checkpoint's ``digest``."""
+"""Name in an exported file's metadata under which ``header`` and the checkpoint's ``digest`` are stored."""
 
 FORMAT: Final = "gripper-force-network/1"
-"""Key of the header in the file's metadata: the only one, as safetensors keeps no order of keys."""
+"""Key of the header in a checkpoint's metadata. It is the only key, as safetensors keeps no order of keys."""
 
 SHIPPED: Final = {name: Path(__file__).with_name(f"{name}.safetensors") for name in ("default", "small")}
-"""The checkpoints that come with the package."""
-
+"""Shipped checkpoints by name."""
 
 RESIDUAL_HALF_N: Final = 0.5
-"""A residual speaks for estimates as far off as this, either way."""
+"""Half-width of the range of estimates that a residual holds for."""
 
 
 class Residual(Section):
-    """How far off the ensemble was on validation data where it said about ``force_n``."""
+    """Error of the ensemble on validation data at estimates within `RESIDUAL_HALF_N` of ``force_n``."""
 
     force_n: Finite
     std_n: NonNegative
 
 
 class Header(Section):
-    """What a checkpoint says about itself.
+    """Metadata of a checkpoint.
 
     Attributes:
         members: Shapes of the networks whose mean is the estimate.
-        preprocess: How frames are prepared for them.
-        residuals: Error by estimated force, measured on validation data, by rising force.
+        preprocess: Preparation of frames.
+        residuals: Error by estimated force, measured on validation data, in order of rising force.
         data_digest: SHA-256 of the training set.
-        metrics: Figures on the validation data, such as ``mae_n``.
+        metrics: Metrics on the validation data, such as ``mae_n``.
     """
 
     members: tuple[NetworkConfig, ...]
@@ -125,20 +124,20 @@ class Header(Section):
     @model_validator(mode="after")
     def _fits(self) -> "Header":
         if not self.members or not self.residuals:
-            raise ValueError("an ensemble has at least one member and one residual")
+            raise ValueError("an ensemble needs at least one member and one residual")
         if any(member.size != self.preprocess.size for member in self.members):
-            raise ValueError("preprocess.size and the networks' size must agree")
+            raise ValueError("preprocess.size and the size of every member must be equal")
         return self
 
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """A file that holds an ensemble, and what it says about itself.
+    """File of an ensemble, and its header.
 
     Attributes:
         path: The file.
-        header: What it says.
-        digest: SHA-256 of the checkpoint: of the file itself, or of the one that it was exported from.
+        header: Its header.
+        digest: SHA-256 of the checkpoint: the file itself, or the one that it was exported from.
     """
 
     path: Path
@@ -147,10 +146,13 @@ class Model:
 
 
 def read_checkpoint(source: str | Path) -> tuple[Path, bytes, Header]:
-    """Reads a checkpoint's file, and its header.
+    """Reads a checkpoint.
 
     Args:
-        source: A path, or ``default`` or ``small`` for one that is shipped.
+        source: A path, or ``default`` or ``small`` for a shipped checkpoint.
+
+    Returns:
+        The file's path, its content, and the header.
 
     Raises:
         CheckpointError: The file is missing, damaged, or of another network.
@@ -159,12 +161,14 @@ def read_checkpoint(source: str | Path) -> tuple[Path, bytes, Header]:
     if not path.is_file():
         raise CheckpointError(f"no checkpoint at {path}; train one with `gripper-force train`")
     if path.suffix in EXPORTED:
-        raise CheckpointError(f"{path} was exported; this needs the checkpoint that it was made of")
+        raise CheckpointError(f"{path} is an exported file; name the checkpoint that it was exported from")
     try:
         data = path.read_bytes()
         metadata = _metadata(data)
     except (OSError, ValueError, AttributeError, TypeError) as error:
-        raise CheckpointError(f"{path} is damaged or no safetensors file: {error}") from error
+        raise CheckpointError(
+            f"{path} is damaged or not a safetensors file: {error}; copy or train it again"
+        ) from error
     if FORMAT not in metadata:
         raise CheckpointError(f"{path} is not a {FORMAT} file; train one with `gripper-force train`")
     return path, data, header_from(metadata[FORMAT], path)
@@ -177,7 +181,9 @@ def header_from(text: str, path: Path) -> Header:
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])
-        raise CheckpointError(f"the header of {path} is wrong at {key!r}: {first['msg']}") from error
+        raise CheckpointError(
+            f"the header of {path} is invalid at {key!r}: {first['msg']}; train the network again"
+        ) from error
 
 
 def exported_metadata(model: Model) -> dict[str, str]:
@@ -186,14 +192,15 @@ def exported_metadata(model: Model) -> dict[str, str]:
 
 
 def digest_of(data: bytes) -> str:
-    """SHA-256 of a checkpoint's file."""
+    """Returns the SHA-256 of a checkpoint's content."""
     return hashlib.sha256(data).hexdigest()
 
 
 def _metadata(data: bytes) -> dict[str, str]:
-    """What a safetensors file says about itself: a length in 8 bytes, then JSON.
+    """Returns the metadata of a safetensors file: a length in 8 bytes, then JSON.
 
-    Its own `safe_open` tells as well, but leaks 7 kB each time (in 0.8), which a day of grasps would feel.
+    `safetensors.safe_open` would return it too, but leaks 7 kB per call (version 0.8), which adds up in a
+    process that runs for a day.
     """
     length = int.from_bytes(data[:8], "little")
     return dict(json.loads(data[8 : 8 + length]).get("__metadata__") or {})

@@ -1,11 +1,12 @@
 """The force network of Shin et al. 2019: backbone, attention, average pooling, BLSTM, two dense layers.
 
-Three facts shape this module. Every frame passes the backbone once, also while streaming: the maps of the
-last n frames are kept, and of each of the next 20 windows how far the LSTM has come in it. So each frame
-takes one product of 20 rows, where a window from its beginning takes 20 products one after the other; the
-result is the same. Frames before the first count as copies of the first; the paper leaves that open, and a
-still hand before contact looks just so. And the backward LSTM is read at the last step, as in the authors'
-public code, where it has seen one frame only.
+- Every frame passes the backbone once, also while streaming. The state keeps the maps of the last n frames, and
+  the LSTM's state in each of the next 20 windows. A frame then takes one matrix product of 20 rows; computing
+  a window from its start would take 20 products in sequence. The results are equal.
+- Frames before the first count as copies of the first. The paper does not define them; a gripper at rest
+  before contact gives such frames.
+- The backward LSTM is read at the last step, as in the authors' public code. There it has processed one
+  frame only.
 """
 
 from typing import Final, NamedTuple, Self
@@ -29,8 +30,8 @@ BACKBONES: Final[dict[str, type[Vgg | ResNet18 | Mobile]]] = {
 class LastStepBlstm(nn.Module):
     """A bidirectional LSTM read at the last step.
 
-    There the backward direction has seen the last frame only, from a zero state: its recurrent weights and
-    its forget gate have no effect, so it is one linear layer with three gates.
+    There the backward direction has processed only the last frame, from a zero state. Its recurrent weights
+    and its forget gate have no effect, so it is one linear layer with three gates.
     """
 
     def __init__(self, inputs: int, hidden: int) -> None:
@@ -40,29 +41,30 @@ class LastStepBlstm(nn.Module):
 
     def forward(self, windows: Tensor) -> Tensor:
         """Maps windows (N, L, F) to the last step's two hidden states (N, 2*hidden)."""
-        forward_lstm = self.forward_lstm(windows)[0][:, -1]  # (N, hidden)
-        return torch.cat([forward_lstm, self._backward(windows[:, -1])], dim=1)
+        forward_hidden = self.forward_lstm(windows)[0][:, -1]  # (N, hidden)
+        return torch.cat([forward_hidden, self._backward(windows[:, -1])], dim=1)
 
     def advance(self, newest: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Takes the next vector of a stream into all windows that it lies in.
+        """Processes the next vector of a stream in all windows that contain it.
 
         Args:
             newest: The vector, (B, F).
-            hidden: Hidden states of the windows that have begun, (B, L, hidden): row k has seen k vectors.
-            cell: Their cell states, (B, L, hidden).
+            hidden: Hidden states of the windows in progress, (B, L, hidden): row k has processed k vectors.
+            cell: Cell states of the same windows, (B, L, hidden).
 
         Returns:
-            What `forward` gives for the window that ends here, (B, 2*hidden), and the next states.
+            The output of `forward` for the window that ends here, (B, 2*hidden), and the next states.
         """
-        into_weight, on_weight, into_bias, on_bias = self.forward_lstm.all_weights[0]
-        into = F.linear(newest, into_weight, into_bias + on_bias)  # (B, 4*hidden)
-        gates = into[:, None] + F.linear(hidden, on_weight)  # (B, L, 4*hidden)
+        input_weight, hidden_weight, input_bias, hidden_bias = self.forward_lstm.all_weights[0]
+        from_input = F.linear(newest, input_weight, input_bias + hidden_bias)  # (B, 4*hidden)
+        gates = from_input[:, None] + F.linear(hidden, hidden_weight)  # (B, L, 4*hidden)
         gate_in, forget, candidate, gate_out = gates.chunk(4, dim=2)
-        after = torch.sigmoid(forget) * cell + torch.sigmoid(gate_in) * torch.tanh(candidate)
-        shown = torch.sigmoid(gate_out) * torch.tanh(after)  # (B, L, hidden)
-        read = torch.cat([shown[:, -1], self._backward(newest)], dim=1)
-        # Row 0 has seen nothing: it stays as it is, zero, and each other row moves on by one.
-        return read, torch.cat([hidden[:, :1], shown[:, :-1]], 1), torch.cat([cell[:, :1], after[:, :-1]], 1)
+        next_cell = torch.sigmoid(forget) * cell + torch.sigmoid(gate_in) * torch.tanh(candidate)
+        next_hidden = torch.sigmoid(gate_out) * torch.tanh(next_cell)  # (B, L, hidden)
+        output = torch.cat([next_hidden[:, -1], self._backward(newest)], dim=1)
+        # Row 0 has processed nothing and stays zero; every other row moves on by one.
+        hidden = torch.cat([hidden[:, :1], next_hidden[:, :-1]], 1)
+        return output, hidden, torch.cat([cell[:, :1], next_cell[:, :-1]], 1)
 
     def _backward(self, newest: Tensor) -> Tensor:
         gate_in, candidate, gate_out = self.backward_linear(newest).chunk(3, dim=1)
@@ -71,12 +73,12 @@ class LastStepBlstm(nn.Module):
 
 
 class StreamState(NamedTuple):
-    """What a stream remembers between frames.
+    """State of a stream between frames.
 
     Attributes:
-        maps: Feature maps of the last n frames side by side, oldest first, (B, n*C, H, W).
-        hidden: LSTM of the windows that have begun, (B, window, hidden); see `LastStepBlstm.advance`.
-        cell: Likewise.
+        maps: Feature maps of the last n frames, concatenated over channels, oldest first, (B, n*C, H, W).
+        hidden: Hidden states of the LSTM, (B, window, hidden); see `LastStepBlstm.advance`.
+        cell: Cell states of the LSTM, (B, window, hidden).
     """
 
     maps: Tensor
@@ -85,13 +87,13 @@ class StreamState(NamedTuple):
 
 
 class Output(NamedTuple):
-    """What a stream gives for a frame.
+    """Output for one frame of a stream.
 
     Attributes:
         force_n: Forces, (B,).
-        features: What the last layer makes them from, (B, head).
-        gates: Attention: of positions (B, 1, H, W) from SSAM and CBAM, of channels (B, C, 1, 1) from SCAM and
-            SE, None without attention.
+        features: Inputs of the last layer, (B, head).
+        gates: Attention gates: (B, 1, H, W) of SSAM and CBAM, (B, C, 1, 1) of SCAM and SE, None without
+            attention.
     """
 
     force_n: Tensor
@@ -100,7 +102,7 @@ class Output(NamedTuple):
 
 
 class ForceNetwork(nn.Module):
-    """Frames in, newtons out."""
+    """Estimates the contact force for each frame of a sequence."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
@@ -111,24 +113,24 @@ class ForceNetwork(nn.Module):
         self.blstm = LastStepBlstm(channels, config.hidden)
         self.dense = nn.Linear(2 * config.hidden, config.head)
         self.out = nn.Linear(config.head, 1)
-        self.in_fast_layout()
+        self.to_channels_last()
 
-    def in_fast_layout(self) -> Self:
-        """Puts the channels last in memory: faster, the same numbers."""
+    def to_channels_last(self) -> Self:
+        """Puts the channels last in memory, which is faster and gives the same numbers."""
         moved: Self = self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         return moved
 
-    def in_plain_layout(self) -> Self:
-        """Puts the channels first, as PyTorch does by itself: to compare with."""
+    def to_channels_first(self) -> Self:
+        """Puts the channels first in memory, PyTorch's default, for comparison."""
         moved: Self = self.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
         return moved
 
     def forward(self, clips: Tensor, start: int = 0) -> Tensor:
-        """Estimates the force for the frames of whole clips; one backbone pass serves all windows.
+        """Estimates the force for the frames of clips, with one pass of the backbone for all windows.
 
         Args:
             clips: Prepared frames, (B, T, 1, S, S). Frames before the first count as copies of it.
-            start: First position of each clip to give an estimate for.
+            start: Index of the first frame of each clip to estimate.
 
         Returns:
             Forces in N, (B, T - start).
@@ -137,32 +139,32 @@ class ForceNetwork(nn.Module):
         return self.force_n(features.flatten(0, 1)).view(features.shape[:2])
 
     def features(self, clips: Tensor, start: int = 0) -> Tensor:
-        """What the last layer makes each frame's force from, (B, T - start, head); see `forward`."""
+        """Returns the inputs of the last layer, (B, T - start, head); arguments are those of `forward`."""
         batch, length = clips.shape[:2]
         flat = self.backbone(clips.flatten(0, 1))  # (B*T, C, H, W)
         maps = flat.view(batch, length, *flat.shape[1:])
         stack = flat
         if n := self.config.maps_kept:
-            begun = torch.cat([maps[:, :1].expand(-1, n, -1, -1, -1), maps], dim=1)  # (B, n + T, C, H, W)
-            stack = torch.cat([begun[:, k : k + length] for k in range(n + 1)], dim=2).flatten(0, 1)
+            padded = torch.cat([maps[:, :1].expand(-1, n, -1, -1, -1), maps], dim=1)  # (B, n + T, C, H, W)
+            stack = torch.cat([padded[:, k : k + length] for k in range(n + 1)], dim=2).flatten(0, 1)
         pooled = self._pool(stack, flat)[0].view(batch, length, -1)
         window = self.config.window
         padded = torch.cat([pooled[:, :1].expand(-1, window - 1, -1), pooled], dim=1)
         windows = padded.unfold(1, window, 1)[:, start:].transpose(2, 3)  # (B, T - start, window, C)
-        return self._read(windows.flatten(0, 1)).view(batch, length - start, -1)
+        return self._head(windows.flatten(0, 1)).view(batch, length - start, -1)
 
     def force_n(self, features: Tensor) -> Tensor:
-        """The last layer: features (N, head) to forces in N, (N,)."""
+        """Applies the last layer: features (N, head) to forces in N, (N,)."""
         with torch.autocast(features.device.type, enabled=False):
             force: Tensor = self.out(features).squeeze(1) * self.config.label_scale_n
         return force
 
     def step(self, frame: Tensor, state: StreamState | None) -> tuple[Output, StreamState]:
-        """Estimates the force for the next frame of a stream, exactly as `forward` would.
+        """Estimates the force for the next frame of a stream. Equals `forward` on the whole stream.
 
         Args:
             frame: Prepared frame, (B, 1, S, S).
-            state: What the last step returned; None for the first frame.
+            state: State that the last step returned; None for the first frame.
 
         Returns:
             The estimate, and the state for the next step.
@@ -175,15 +177,15 @@ class ForceNetwork(nn.Module):
         stack, kept = newest, state.maps
         if n := self.config.maps_kept:
             stack = torch.cat([state.maps, newest], dim=1)  # (B, (n+1)*C, H, W)
-            # A map is not cut out of the stack without need: that takes engines as long as a layer.
+            # Slicing takes engines as long as a layer, so it is avoided for n = 1.
             kept = newest if n == 1 else stack[:, newest.shape[1] :]
         pooled, gates = self._pool(stack, newest)
-        read, hidden, cell = self.blstm.advance(pooled, state.hidden, state.cell)
-        features = torch.tanh(self.dense(read))
+        output, hidden, cell = self.blstm.advance(pooled, state.hidden, state.cell)
+        features = torch.tanh(self.dense(output))
         return Output(self.force_n(features), features, gates), StreamState(kept, hidden, cell)
 
     def zero_state(self, batch: int = 1) -> StreamState:
-        """A state that remembers nothing: what a stream forgets after as many frames as `context` says."""
+        """Returns a state of zeros. It affects the outputs of `NetworkConfig.context` steps."""
         config = self.config
         side = config.size // STRIDES[config.backbone]
         like = self.out.weight
@@ -192,15 +194,19 @@ class ForceNetwork(nn.Module):
         return StreamState(maps, hidden, torch.zeros_like(hidden))
 
     def _pool(self, stack: Tensor, newest: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Excites the maps (N, C, H, W), seen with those before (N, (n+1)*C, H, W), and averages: (N, C)."""
+        """Applies attention to the newest maps (N, C, H, W) with the stack (N, (n+1)*C, H, W), and averages.
+
+        Returns:
+            The averages, (N, C), and the gates.
+        """
         gates = None
         if self.attention is not None:
             newest, gates = self.attention(stack, newest)
         return newest.mean((2, 3)), gates
 
-    def _read(self, windows: Tensor) -> Tensor:
+    def _head(self, windows: Tensor) -> Tensor:
         """Maps windows of pooled vectors (N, window, C) to features, (N, head)."""
-        # Mixed precision is for the backbone; here it would save nothing and cost digits of the label.
+        # Mixed precision only speeds up the backbone; here it would only cost precision.
         with torch.autocast(windows.device.type, enabled=False):
             return torch.tanh(self.dense(self.blstm(windows.to(self.dense.weight.dtype))))
 
@@ -223,11 +229,11 @@ def _attention(config: NetworkConfig, channels: int) -> nn.Module | None:
 
 
 def cost(config: NetworkConfig) -> tuple[int, int]:
-    """What a network takes.
+    """Computes the size and arithmetic of a network.
 
     Returns:
-        Its parameters, and the multiply-adds of one `ForceNetwork.step` in convolutions and matrix products.
-        SCAM's weighted pooling, a few thousand, is not among them.
+        The number of parameters, and of multiply-adds of one `ForceNetwork.step` in convolutions and matrix
+        products. SCAM's weighted pooling, a few thousand, is not included.
     """
     network = ForceNetwork(config).eval()
     with torch.no_grad(), FlopCounterMode(display=False) as counter:

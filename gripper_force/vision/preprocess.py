@@ -1,7 +1,7 @@
 """Prepares a camera frame for the network: crop, downscale, standardise, subtract the reference frame.
 
-The difference to a reference frame halves the error in simulation and is what lets the network transfer to
-objects it has not seen; raw gray values did not learn at all on real finger cameras.
+Subtracting a reference frame halves the error in simulation and lets the network transfer to unseen objects.
+On images of real finger cameras, training on raw gray values failed.
 """
 
 from typing import Annotated, Final, Self
@@ -19,21 +19,21 @@ Region = tuple[int, int, int, int]
 """Region of interest in pixels: left, top, width, height."""
 
 FLAT_STD: Final = 1.0
-"""Least standard deviation, in gray levels, to divide by: a flat frame must not turn into amplified noise."""
+"""Least standard deviation to divide by, in gray levels: the noise of a flat frame is not amplified."""
 
 DIFFERENCE_GAIN: Final = 2.0
-"""A difference of standardised frames is small; this brings it back to about unit variance."""
+"""Factor that brings a difference of standardised frames to about unit variance."""
 
 
 class Preprocess(Section):
-    """What is done to a frame; a network only understands frames prepared as in its training.
+    """Preparation of frames. A network needs frames prepared as in its training.
 
     Attributes:
         size: Side of the square input in pixels.
-        reference: Whether the mean of the first frames, which must show no contact, is subtracted.
-        reference_frames: How many frames that mean is taken over.
-        magnitude: Whether only the size of that difference counts. Where a soft pad that is lit from its
-            sides bulges, the sign tells where the lamps stand, and differs from pad to pad.
+        reference: Subtract the mean of the first frames, which must show no contact.
+        reference_frames: Number of frames of that mean.
+        magnitude: Take the absolute value of the difference. In images of a soft pad lit from the side, the
+            sign of a bulge's difference depends on the position of the lamps, which varies between pads.
     """
 
     size: Annotated[int, Field(ge=16, le=1024, multiple_of=16)] = 128
@@ -44,17 +44,17 @@ class Preprocess(Section):
     @model_validator(mode="after")
     def _has_difference(self) -> Self:
         if self.magnitude and not self.reference:
-            raise ValueError("magnitude is that of the difference to a reference: set reference too")
+            raise ValueError("magnitude needs the difference to a reference; set reference too")
         return self
 
     @property
     def lead_in(self) -> int:
-        """Frames that pass before the first estimate."""
+        """Number of frames before the first estimate."""
         return self.reference_frames - 1 if self.reference else 0
 
 
 def downscale(gray: Gray, region: Region | None, size: int) -> Gray:
-    """Cuts the region of interest out of a frame and resizes it.
+    """Crops a frame to the region of interest and resizes it.
 
     Args:
         gray: Frame, (H, W) uint8.
@@ -69,7 +69,9 @@ def downscale(gray: Gray, region: Region | None, size: int) -> Gray:
         ConfigError: The region reaches beyond the frame.
     """
     if gray.ndim != 2 or gray.dtype != np.uint8:
-        raise DataError(f"a gray frame has shape (H, W) and type uint8, got {gray.shape} {gray.dtype}")
+        raise DataError(
+            f"the frame is {gray.shape} {gray.dtype}, not (H, W) uint8; convert it to a gray image of bytes"
+        )
     if region is not None:
         left, top, width, height = region
         rows, columns = gray.shape
@@ -84,7 +86,7 @@ def downscale(gray: Gray, region: Region | None, size: int) -> Gray:
 
 
 class Normaliser:
-    """Standardises the frames of one run, one at a time, and subtracts the run's own reference."""
+    """Standardises the frames of a stream one by one and subtracts the stream's reference."""
 
     def __init__(self, preprocess: Preprocess) -> None:
         self._preprocess = preprocess
@@ -94,15 +96,18 @@ class Normaliser:
 
     @property
     def reference_image(self) -> Gray | None:
-        """Mean of the reference frames, (S, S) uint8; None until they are there, or where none is used."""
+        """Mean of the reference frames, (S, S) uint8; None until it is complete or if none is used."""
         return self._reference_image
 
     def push(self, small: Gray) -> list[npt.NDArray[np.float32]]:
-        """Takes the next frame, (S, S) uint8.
+        """Processes the next frame.
+
+        Args:
+            small: Cropped and resized frame, (S, S) uint8.
 
         Returns:
-            The inputs that are ready now, each (S, S) float32, oldest first: none while the reference is
-            being collected, then those frames themselves, and from then on one for each frame.
+            The network inputs that are ready, each (S, S) float32, oldest first: none while the reference is
+            being collected, then those of the reference frames, and from then on one per frame.
         """
         if not self._preprocess.reference:
             return [_standardise(small)]

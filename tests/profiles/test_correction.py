@@ -48,12 +48,12 @@ def written(path: Path, arrays: ProfileArrays) -> str:
 
 
 @given(st.floats(-20, 40))
-def test_a_curve_goes_straight_on_beyond_its_ends(at_n: float) -> None:
+def test_curve_is_extrapolated_linearly(at_n: float) -> None:
     value_n = float(curve_n(np.array([0.0, 2.0, 4.0]), np.array([0.5, 1.5, 4.5]), [at_n])[0])
     assert value_n == pytest.approx(0.5 + 0.5 * at_n if at_n < 2 else 1.5 + 1.5 * (at_n - 2))
 
 
-def test_the_interval_grows_with_the_force_and_fast_beyond_what_was_calibrated() -> None:
+def test_interval_grows_with_force_and_faster_beyond_calibrated_forces() -> None:
     correction = Correction(profile(), arrays())
     half_n = correction.half_width_n([-1.0, 0.0, 4.0, 6.0, 8.0])
     assert half_n[0] == pytest.approx(np.hypot(0.3, 0.1) + 0.7)
@@ -62,13 +62,13 @@ def test_the_interval_grows_with_the_force_and_fast_beyond_what_was_calibrated()
     assert correction.std_n([4.0])[0] * 1.6449 == pytest.approx(half_n[2], rel=1e-4)
 
 
-def test_strange_is_what_lies_off_the_plane() -> None:
+def test_ood_score_measures_distance_from_the_subspace() -> None:
     correction = Correction(profile(), arrays())
     on, off = np.array([[9, 9, 0, 0, 0], [9, 9, 0, 1, 1]], np.float32)
     assert correction.ood_score(np.stack([on, off])) == pytest.approx([0, 1 / 0.5])
 
 
-def test_both_halves_come_back_and_belong_together(tmp_path: Path) -> None:
+def test_arrays_round_trip_and_must_match_the_profile(tmp_path: Path) -> None:
     path = tmp_path / "mug.yaml"
     weights = written(path, arrays())
     correction = load_correction(path, profile(weights), 5)
@@ -80,12 +80,12 @@ def test_both_halves_come_back_and_belong_together(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="does not belong to"):
         load_correction(path, profile("0" * 64), 5)
     weights_path(path).unlink()
-    with pytest.raises(ConfigError, match="lacks its other half"):
+    with pytest.raises(ConfigError, match="belongs to the object profile"):
         load_correction(path, profile(weights), 5)
 
 
 @pytest.mark.parametrize("spread", [0.0, np.nan])
-def test_values_that_can_not_be_are_refused(tmp_path: Path, spread: float) -> None:
+def test_invalid_spread_is_refused(tmp_path: Path, spread: float) -> None:
     path = tmp_path / "mug.yaml"
     weights = written(path, arrays(spread=spread))
     with pytest.raises(ConfigError, match="not finite"):

@@ -42,13 +42,13 @@ def profile(**keys: object) -> ObjectProfile:
     return found.model_copy(update=keys)
 
 
-def test_comes_back_as_it_was_written(tmp_path: Path) -> None:
+def test_profile_round_trips(tmp_path: Path) -> None:
     write_object(tmp_path / "mug.yaml", profile(), b"weights")
     assert weights_path(tmp_path / "mug.yaml").read_bytes() == b"weights"
     assert read_object(tmp_path / "mug.yaml") == profile()
 
 
-def test_a_disk_that_is_full_leaves_both_halves_of_the_old_one(
+def test_full_disk_keeps_both_files_of_the_old_profile(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "mug.yaml"
@@ -67,7 +67,7 @@ def test_a_disk_that_is_full_leaves_both_halves_of_the_old_one(
     assert read_object(path).touches == 4
 
 
-def test_a_place_where_nothing_can_be_written_is_told_at_once(tmp_path: Path) -> None:
+def test_unwritable_path_is_refused_before_calibration(tmp_path: Path) -> None:
     check_place(tmp_path / "new" / "mug.yaml")
     assert list((tmp_path / "new").iterdir()) == []
     with pytest.raises(ConfigError, match=r"ends in \.yaml"):
@@ -77,18 +77,18 @@ def test_a_place_where_nothing_can_be_written_is_told_at_once(tmp_path: Path) ->
         check_place(tmp_path / "file" / "mug.yaml")
 
 
-def test_ones_own_come_before_those_that_are_shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_user_profiles_come_before_shipped_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     with pytest.raises(ConfigError, match="no object profile 'mug'"):
         find_object("mug")
     write_object(user_folder() / "mug.yaml", profile(), b"")
     assert find_object("mug") == tmp_path / "gripper-force" / "objects" / "mug.yaml"
-    with pytest.raises(ConfigError, match=r"there are .*mug"):
+    with pytest.raises(ConfigError, match=r"known: .*mug"):
         find_object("cup_of_another")
     assert find_object("some/where.yaml") == Path("some/where.yaml")
 
 
-def test_names_what_differs() -> None:
+def test_mismatches_name_network_and_settings() -> None:
     settings = load_config(None, ["camera.rate_hz=30"]).camera_settings()
     assert profile().mismatches("a" * 64, load_config().camera_settings()) == []
     assert profile().mismatches("c" * 64, settings) == [
@@ -108,7 +108,7 @@ def test_names_what_differs() -> None:
         ("format: gripper-force-object/1", "Field required"),
     ],
 )
-def test_what_is_no_profile_is_named(tmp_path: Path, text: str, sentence: str) -> None:
+def test_invalid_file_is_refused(tmp_path: Path, text: str, sentence: str) -> None:
     (tmp_path / "x.yaml").write_text(text)
     with pytest.raises(ConfigError, match=sentence):
         read_object(tmp_path / "x.yaml")
@@ -117,12 +117,12 @@ def test_what_is_no_profile_is_named(tmp_path: Path, text: str, sentence: str) -
 @pytest.mark.parametrize(
     ("estimate_n", "force_n", "sentence"),
     [
-        ((0.0, 1.0), (0.0, 1.0, 2.0), "one length"),
+        ((0.0, 1.0), (0.0, 1.0, 2.0), "the same length"),
         ((0.0, 0.0), (0.0, 1.0), "must rise"),
         ((0.0, 1.0), (1.0, 0.0), "must not fall"),
     ],
 )
-def test_a_curve_that_falls_is_refused(
+def test_invalid_curve_is_refused(
     estimate_n: tuple[float, ...], force_n: tuple[float, ...], sentence: str
 ) -> None:
     with pytest.raises(ValueError, match=sentence):

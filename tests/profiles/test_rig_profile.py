@@ -39,7 +39,7 @@ SERVO = ServoCalibration(
 )
 
 
-def test_only_the_section_that_was_calibrated_is_replaced(tmp_path: Path) -> None:
+def test_update_replaces_only_its_section(tmp_path: Path) -> None:
     path = tmp_path / "rigs" / "rig.yaml"
     update_rig(path, CELL)
     update_rig(path, SERVO)
@@ -48,7 +48,7 @@ def test_only_the_section_that_was_calibrated_is_replaced(tmp_path: Path) -> Non
     assert [file.name for file in path.parent.iterdir()] == ["rig.yaml"]
 
 
-def test_what_it_sets_are_keys_of_the_configuration(tmp_path: Path) -> None:
+def test_settings_are_keys_of_the_configuration(tmp_path: Path) -> None:
     path = tmp_path / "rig.yaml"
     update_rig(path, CELL)
     update_rig(path, SERVO)
@@ -78,7 +78,7 @@ def test_what_it_sets_are_keys_of_the_configuration(tmp_path: Path) -> None:
         ("format: [", "can't read the rig profile"),
     ],
 )
-def test_a_file_that_is_none_is_refused_with_a_sentence(tmp_path: Path, text: str, sentence: str) -> None:
+def test_invalid_file_is_refused_and_kept(tmp_path: Path, text: str, sentence: str) -> None:
     path = tmp_path / "rig.yaml"
     path.write_text(text)
     for use in (lambda: read_rig(path), lambda: update_rig(path, CELL)):
@@ -89,13 +89,13 @@ def test_a_file_that_is_none_is_refused_with_a_sentence(tmp_path: Path, text: st
     assert path.read_text() == text
 
 
-def test_a_folder_that_can_not_be_written_is_named(tmp_path: Path) -> None:
+def test_unwritable_folder_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match=r"can't write .*rig\.yaml: File exists, .*file"):
         update_rig(tmp_path / "file" / "rig.yaml", CELL)
 
 
 @pytest.mark.parametrize("bounds", [{"low": 2.0, "high": 3.0}, {"low": 0.0}, {"low": 0.0, "high": 0.5}])
-def test_an_interval_holds_its_value(bounds: dict[str, float]) -> None:
+def test_value_must_lie_within_its_interval(bounds: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=r"low and high|must lie between"):
         CalibratedValue(value=1.0, **bounds)

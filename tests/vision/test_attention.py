@@ -1,4 +1,4 @@
-"""The modules against their papers' equations, written out with loops over positions and channels."""
+"""Attention modules against their papers' equations, computed with loops over positions and channels."""
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +24,7 @@ def relu(x: Array) -> Array:
 
 
 def drawn(module: nn.Module) -> dict[str, Array]:
-    """Puts the module into float64 and draws its parameters, so that each of them matters."""
+    """Converts the module to float64 and draws random parameters."""
     for parameter in module.double().requires_grad_(False).parameters():
         nn.init.normal_(parameter)
     return {name: parameter.numpy() for name, parameter in module.named_parameters()}
@@ -92,13 +92,13 @@ def test_cbam_is_equations_1_to_3_of_its_paper(stack: Tensor) -> None:
 
 
 @torch.no_grad()
-def test_wap_of_positions_starts_as_the_average() -> None:
+def test_wap_over_positions_is_initialised_as_average() -> None:
     module = ChannelAttention(C, 0, positions=H * W, reduction=2, pooling="wap")
     x = torch.randn(1, C, H, W)
     torch.testing.assert_close(x.flatten(2) @ module.pool, x.mean((2, 3)))
 
 
-def test_a_squeeze_keeps_at_least_one_unit() -> None:
+def test_perceptron_has_at_least_one_unit() -> None:
     for module in (SqueezeExcitation(3, reduction=16), Cbam(3, reduction=16)):
         excited, _ = module(torch.ones(2, 3, 1, 1), torch.ones(2, 3, 1, 1))
         assert excited.shape == (2, 3, 1, 1)

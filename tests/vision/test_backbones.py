@@ -8,7 +8,7 @@ from gripper_force.vision.header import STRIDES
 
 
 def convolved(x: Tensor, pair: nn.Module, stride: int = 1) -> Tensor:
-    """A convolution and the batch normalisation after it, by their definitions, in evaluation mode."""
+    """Applies a convolution and batch normalisation in evaluation mode, by their definitions."""
     convolution, norm = pair.children()
     assert isinstance(convolution, nn.Conv2d)
     assert isinstance(norm, nn.BatchNorm2d)
@@ -54,7 +54,7 @@ def test_width_scales_the_channels(make: type[Vgg | ResNet18 | Mobile], full: in
     assert make(width=1e-3)(torch.zeros(2, 1, side, side)).shape == (2, 1, 1, 1)
 
 
-def test_equals_the_literal_order_of_layers() -> None:
+def test_equals_pooling_after_relu() -> None:
     torch.manual_seed(0)
     vgg = Vgg(width=0.25).eval()
     x = frames = torch.randn(2, 1, 32, 32)
@@ -65,7 +65,7 @@ def test_equals_the_literal_order_of_layers() -> None:
     torch.testing.assert_close(vgg(frames), x, rtol=0, atol=0)
 
 
-def test_resnet_is_the_18_layers_of_its_paper() -> None:
+def test_resnet_has_the_18_layers_of_its_paper() -> None:
     torch.manual_seed(0)
     resnet = ResNet18(width=0.125)
     drawn(resnet)
@@ -83,7 +83,7 @@ def test_resnet_has_the_known_size() -> None:
     resnet = ResNet18(width=1.0)
     layers = [m for m in resnet.modules() if isinstance(m, nn.Conv2d) and m.kernel_size != (1, 1)]
     assert len(layers) == 17, "the 18th is the head"
-    # torchvision's counts 11,689,512: 513,000 in its head, and a first layer that sees two colours more.
+    # torchvision's counts 11,689,512: 513,000 in its head, and two more input channels in its first layer.
     assert parameters(resnet) == 11_689_512 - 513_000 - 2 * 7 * 7 * 64
 
 

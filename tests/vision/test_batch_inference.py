@@ -2,14 +2,14 @@ import numpy as np
 import pytest
 import torch
 
-from gripper_force.vision import batch_inference as dense
+from gripper_force.vision import batch_inference
 from gripper_force.vision.header import NetworkConfig
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess
 
 
 @pytest.mark.parametrize("chunk", [1, 7, 40])
-def test_chunks_make_no_difference(chunk: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_result_does_not_depend_on_chunk_size(chunk: int, monkeypatch: pytest.MonkeyPatch) -> None:
     torch.manual_seed(0)
     tiny = NetworkConfig(size=16, width=0.25, hidden=6, head=7)
     networks = [
@@ -19,18 +19,18 @@ def test_chunks_make_no_difference(chunk: int, monkeypatch: pytest.MonkeyPatch) 
     frames = np.random.default_rng(0).integers(0, 256, (40, 16, 16), np.uint8)
     clip = torch.from_numpy(frames)[None]
     with torch.inference_mode():
-        inputs = dense.normalise(clip, clip[:, :4], Preprocess(size=16))
+        inputs = batch_inference.normalise(clip, clip[:, :4], Preprocess(size=16))
         whole = torch.cat([network(inputs) for network in networks])
-    monkeypatch.setattr(dense, "CHUNK", chunk)
-    forces = dense.predict(networks, Preprocess(size=16), frames)
+    monkeypatch.setattr(batch_inference, "CHUNK", chunk)
+    forces = batch_inference.predict(networks, Preprocess(size=16), frames)
     np.testing.assert_allclose(forces, whole, rtol=1e-5, atol=1e-5)
 
 
-def test_features_are_what_the_last_layers_make_the_forces_from() -> None:
+def test_last_layers_map_features_to_forces() -> None:
     torch.manual_seed(0)
     networks = [ForceNetwork(NetworkConfig(size=16, width=0.25, hidden=6, head=h)).eval() for h in (7, 5)]
     frames = np.random.default_rng(0).integers(0, 256, (12, 16, 16), np.uint8)
-    forces, features = dense.features(networks, Preprocess(size=16), frames)
+    forces, features = batch_inference.features(networks, Preprocess(size=16), frames)
     assert features.shape == (12, 7 + 5)
     with torch.inference_mode():
         parts = torch.from_numpy(features).split([7, 5], dim=1)

@@ -50,7 +50,7 @@ def test_round_trip(file: Path) -> None:
         torch.testing.assert_close(network(clip), original(clip), rtol=5e-3, atol=5e-3)
 
 
-def test_an_older_header_takes_the_defaults_of_what_it_lacks(file: Path, tmp_path: Path) -> None:
+def test_missing_header_keys_take_defaults(file: Path, tmp_path: Path) -> None:
     with safe_open(file, "pt") as opened:
         fields = json.loads(opened.metadata()[checkpoint.FORMAT])
         tensors = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118 - not a mapping
@@ -74,7 +74,7 @@ def test_an_older_header_takes_the_defaults_of_what_it_lacks(file: Path, tmp_pat
     ],
 )
 @torch.inference_mode()
-def test_every_kind_of_network_comes_back(choices: dict[str, str], tmp_path: Path) -> None:
+def test_every_network_shape_round_trips(choices: dict[str, str], tmp_path: Path) -> None:
     config = NetworkConfig.model_validate(SSAM.model_dump() | choices | {"size": 32})
     network = ForceNetwork(config).eval()
     whole = header(SSAM).model_copy(update={"members": (config,), "preprocess": Preprocess(size=32)})
@@ -92,7 +92,7 @@ def test_loading_is_bit_exact_after_the_first_rounding(file: Path, tmp_path: Pat
 
 
 @pytest.mark.parametrize("factor", [1e-30, 1e-7, 1e7])
-def test_what_half_precision_cannot_hold_is_kept_whole(factor: float, tmp_path: Path) -> None:
+def test_values_beyond_half_precision_are_stored_as_float32(factor: float, tmp_path: Path) -> None:
     network = ForceNetwork(SSAM)
     with torch.no_grad():
         network.dense.weight *= factor
@@ -102,7 +102,7 @@ def test_what_half_precision_cannot_hold_is_kept_whole(factor: float, tmp_path: 
     assert not torch.equal(loaded.blstm.forward_lstm.weight_ih_l0, network.blstm.forward_lstm.weight_ih_l0)
 
 
-def test_an_ensemble_of_full_size_fits_in_12_mb(tmp_path: Path) -> None:
+def test_full_size_ensemble_fits_in_12_mb(tmp_path: Path) -> None:
     configs = [NetworkConfig(attention="ssam"), NetworkConfig(attention="scam")]
     path = tmp_path / "full.safetensors"
     full = header(SSAM).model_copy(update={"members": tuple(configs), "preprocess": Preprocess()})
@@ -110,7 +110,7 @@ def test_an_ensemble_of_full_size_fits_in_12_mb(tmp_path: Path) -> None:
     assert path.stat().st_size < 12e6
 
 
-def test_a_missing_file_says_how_to_get_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_file_error_names_the_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(CheckpointError, match="train one"):
         load_checkpoint(tmp_path / "absent.safetensors")
     monkeypatch.setitem(SHIPPED, "default", tmp_path / "default.safetensors")
@@ -119,13 +119,13 @@ def test_a_missing_file_says_how_to_get_one(tmp_path: Path, monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("keep", [0, 7, 100, -1])
-def test_a_cut_file_is_named(file: Path, keep: int) -> None:
+def test_truncated_file_is_named(file: Path, keep: int) -> None:
     file.write_bytes(file.read_bytes()[:keep])
     with pytest.raises(CheckpointError, match="damaged"):
         load_checkpoint(file)
 
 
-def test_a_folder_is_no_checkpoint(tmp_path: Path) -> None:
+def test_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError):
         load_checkpoint(tmp_path)
 
@@ -144,14 +144,14 @@ def test_other_safetensors_files_are_refused(file: Path, tmp_path: Path) -> None
         load_checkpoint(other)
 
 
-def test_a_header_that_claims_a_giant_takes_no_memory_for_it(file: Path) -> None:
+def test_header_of_a_huge_network_allocates_nothing(file: Path) -> None:
     giant = header(SSAM.model_copy(update={"hidden": 100_000, "head": 100_000}))  # 80 GB
     save_checkpoint(file, [ForceNetwork(SSAM)], giant)
-    with pytest.raises(CheckpointError, match="member 0 don't fit"):
+    with pytest.raises(CheckpointError, match="member 0 do not fit"):
         load_checkpoint(file)
 
 
-def test_what_was_loaded_outlives_its_file(file: Path) -> None:
+def test_loaded_network_outlives_its_file(file: Path) -> None:
     weight = load_checkpoint(file).networks[0].out.bias
     before = weight.clone()
     with file.open("r+b") as opened:
@@ -159,7 +159,7 @@ def test_what_was_loaded_outlives_its_file(file: Path) -> None:
     assert torch.equal(weight, before)
 
 
-def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
+def test_non_finite_weights_are_refused(tmp_path: Path) -> None:
     network = ForceNetwork(SSAM)
     network.out.bias.data.fill_(torch.nan)
     save_checkpoint(tmp_path / "nan.safetensors", [network], header(SSAM))
@@ -167,14 +167,14 @@ def test_weights_that_are_not_finite_are_refused(tmp_path: Path) -> None:
         load_checkpoint(tmp_path / "nan.safetensors")
 
 
-def test_a_header_holds_together() -> None:
+def test_inconsistent_header_is_refused() -> None:
     with pytest.raises(ValidationError, match="at least one"):
         header()
-    with pytest.raises(ValidationError, match="agree"):
+    with pytest.raises(ValidationError, match="must be equal"):
         header(SSAM.model_copy(update={"size": 32}))
 
 
-def test_a_place_that_can_not_be_written_is_named(tmp_path: Path) -> None:
+def test_unwritable_path_is_named(tmp_path: Path) -> None:
     (tmp_path / "occupied").write_text("")
     with pytest.raises(CheckpointError, match="can't write"):
         save_checkpoint(tmp_path / "occupied" / "x.safetensors", [ForceNetwork(SSAM)], header(SSAM))

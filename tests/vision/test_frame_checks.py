@@ -16,7 +16,7 @@ RNG = np.random.default_rng(0)
 
 
 def scene(seed: int) -> Gray:
-    """A smooth picture with a sensor's noise."""
+    """Returns a smooth image with sensor noise."""
     y, x = np.mgrid[:128, :128] / 128
     picture = 110 + 60 * np.sin(6 * x) * np.cos(4 * y) + np.random.default_rng(seed).normal(0, 3, (128, 128))
     return picture.round().astype(np.uint8)
@@ -26,7 +26,7 @@ def look(plausibility: FrameChecks, gray: Gray) -> None:
     plausibility.check(downscale(gray, None, 64))
 
 
-def test_whole_runs_pass(fused_log: Path) -> None:
+def test_frames_of_a_grasp_pass(fused_log: Path) -> None:
     frames = [frame.gray for frame in LogReader(fused_log).records(Frame)]
     assert len(frames) > 50
     plausibility = FrameChecks()
@@ -44,7 +44,7 @@ FAULTS: dict[str, Callable[[Gray], Gray]] = {
 
 
 @pytest.mark.parametrize("what", FAULTS)
-def test_a_broken_picture_is_named_and_the_next_good_one_passes(what: str) -> None:
+def test_implausible_frame_is_refused_and_the_next_good_one_passes(what: str) -> None:
     plausibility = FrameChecks()
     for seed in range(5):
         look(plausibility, scene(seed))
@@ -53,13 +53,13 @@ def test_a_broken_picture_is_named_and_the_next_good_one_passes(what: str) -> No
     look(plausibility, scene(6))
 
 
-def test_a_covered_lens_is_told_from_the_first_frame_on() -> None:
+def test_covered_lens_is_refused_from_the_first_frame() -> None:
     with pytest.raises(DataError, match="lens"):
         look(FrameChecks(), np.full((128, 128), 3, np.uint8))
 
 
 @given(st.floats(0.75, 1.3), st.integers(-6, 6))
-def test_light_and_shift_of_a_grasp_pass(gain: float, shift: int) -> None:
+def test_moderate_light_change_and_shift_pass(gain: float, shift: int) -> None:
     plausibility = FrameChecks()
     look(plausibility, scene(0))
     look(plausibility, np.clip(np.roll(scene(1), shift, 1) * gain, 0, 255).astype(np.uint8))

@@ -16,7 +16,7 @@ SIZES = {"vgg": 32, "resnet18": 64, "mobile": 32}
 
 
 def build(config: NetworkConfig, seed: int = 0) -> ForceNetwork:
-    """A network in evaluation mode whose every number matters, its batch statistics too."""
+    """Returns a network in evaluation mode with random parameters and batch statistics."""
     torch.manual_seed(seed)
     network = ForceNetwork(config)
     for module in network.modules():
@@ -29,7 +29,7 @@ def build(config: NetworkConfig, seed: int = 0) -> ForceNetwork:
 
 
 def as_torch_blstm(blstm: LastStepBlstm) -> nn.LSTM:
-    """The same weights in PyTorch's own bidirectional LSTM, with noise where no weight may matter."""
+    """Returns PyTorch's bidirectional LSTM with the same weights, and noise in those that have no effect."""
     hidden = blstm.forward_lstm.hidden_size
     full = nn.LSTM(blstm.forward_lstm.input_size, hidden, batch_first=True, bidirectional=True)
     for name, weight in blstm.forward_lstm.named_parameters():
@@ -42,7 +42,7 @@ def as_torch_blstm(blstm: LastStepBlstm) -> nn.LSTM:
 
 
 def literal(network: ForceNetwork, frames: Tensor) -> Tensor:
-    """The newest force from the frames it depends on and nothing cached: (context + 1, 1, S, S) to ()."""
+    """Computes the newest force without a state: (context + 1, 1, S, S) to ()."""
     config = network.config
     maps = [network.backbone(frame[None]) for frame in frames]
     vectors = []
@@ -57,7 +57,7 @@ def literal(network: ForceNetwork, frames: Tensor) -> Tensor:
 
 
 def history(network: ForceNetwork, clip: Tensor, t: int) -> Tensor:
-    """The frames that the estimate at t depends on; copies of the first stand in for those before it."""
+    """Returns the frames that the estimate at t depends on, padded with copies of the first."""
     return clip[torch.arange(t - network.config.context, t + 1).clamp_min(0)]
 
 
@@ -73,7 +73,7 @@ def assert_same(actual: Tensor, expected: Tensor) -> None:
 
 
 @torch.no_grad()
-def test_the_last_step_equals_a_bidirectional_lstm() -> None:
+def test_last_step_equals_a_bidirectional_lstm() -> None:
     torch.manual_seed(0)
     blstm = LastStepBlstm(4, 6)
     windows = torch.randn(3, 20, 4)
@@ -90,7 +90,7 @@ def test_the_last_step_equals_a_bidirectional_lstm() -> None:
     seed=st.integers(0, 99),
 )
 @torch.inference_mode()
-def test_streaming_and_whole_clips_equal_the_literal_window(
+def test_streaming_and_clips_equal_the_explicit_window(
     attention: str, backbone: str, earlier: int, length: int, seed: int
 ) -> None:
     name, *pooling = attention.split()
@@ -107,7 +107,7 @@ def test_streaming_and_whole_clips_equal_the_literal_window(
 
 
 @torch.inference_mode()
-def test_a_long_stream_does_not_drift() -> None:
+def test_long_stream_does_not_drift() -> None:
     network = build(TINY.model_copy(update={"attention": "scam"}))
     clip = torch.randn(64, 1, 16, 16)[torch.arange(10_000) % 61]
     for force in stream(network, clip):
@@ -135,7 +135,7 @@ def test_batches_are_independent() -> None:
         assert_same(network(clip[None])[0], forces)
 
 
-def test_the_full_size_network_fits_the_paper() -> None:
+def test_full_size_network_matches_the_paper() -> None:
     network = ForceNetwork(NetworkConfig(attention="ssam"))
     assert network.blstm.forward_lstm.hidden_size == 256
     assert network.dense.out_features == 1024
@@ -146,7 +146,7 @@ def test_the_full_size_network_fits_the_paper() -> None:
 
 @pytest.mark.parametrize("backbone", SIZES)
 @pytest.mark.parametrize("attention", ["ssam", "scam", "se", "cbam"])
-def test_every_parameter_learns(attention: str, backbone: str) -> None:
+def test_every_parameter_has_a_gradient(attention: str, backbone: str) -> None:
     size = SIZES[backbone]
     choices = {"attention": attention, "backbone": backbone, "size": size}
     network = build(NetworkConfig.model_validate(TINY.model_dump() | choices)).train()
@@ -158,7 +158,7 @@ def test_every_parameter_learns(attention: str, backbone: str) -> None:
         assert parameter.grad.isfinite().all(), name
 
 
-def test_attention_to_the_newest_map_alone_keeps_no_maps() -> None:
+def test_attention_without_earlier_frames_keeps_no_maps() -> None:
     frame = torch.zeros(1, 1, 16, 16)
     for attention in ("none", "se", "cbam"):
         network = build(TINY.model_copy(update={"attention": attention, "earlier_frames": 2}))
@@ -183,12 +183,12 @@ def test_attention_to_the_newest_map_alone_keeps_no_maps() -> None:
         ({"backbone": "vit"}, "backbone"),
     ],
 )
-def test_what_does_not_go_together_is_refused(choices: dict[str, object], message: str) -> None:
+def test_inconsistent_config_is_refused(choices: dict[str, object], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
         NetworkConfig.model_validate(choices)
 
 
-def test_cost_is_that_of_the_layers_added_up() -> None:
+def test_cost_is_the_sum_over_layers() -> None:
     channels, side, convolutions, weights = [1, 16, 32, 64, 128, 256], 64, 0, 0
     for inputs, outputs in pairwise(channels):
         pair = 9 * (inputs + outputs) * outputs

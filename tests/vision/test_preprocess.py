@@ -23,7 +23,7 @@ def stream(preprocess: Preprocess, frames: np.ndarray) -> list[np.ndarray]:
     return [image for frame in frames for image in normaliser.push(frame)]
 
 
-def test_shrink_cuts_the_region_then_resizes() -> None:
+def test_downscale_crops_then_resizes() -> None:
     gray = np.arange(40 * 60, dtype=np.uint16).reshape(40, 60).astype(np.uint8)
     expected = cv2.resize(gray[4:36, 8:40], (16, 16), interpolation=cv2.INTER_AREA)
     np.testing.assert_array_equal(downscale(gray, (8, 4, 32, 32), 16), expected)
@@ -31,18 +31,18 @@ def test_shrink_cuts_the_region_then_resizes() -> None:
 
 
 @pytest.mark.parametrize("region", [(-1, 0, 8, 8), (0, 0, 61, 8), (0, 33, 8, 8), (0, 0, 0, 8)])
-def test_a_region_beyond_the_frame_is_named(region: tuple[int, int, int, int]) -> None:
+def test_region_beyond_the_frame_is_refused(region: tuple[int, int, int, int]) -> None:
     with pytest.raises(ConfigError, match=r"vision\.region.*60x40"):
         downscale(np.zeros((40, 60), np.uint8), region, 16)
 
 
 @pytest.mark.parametrize("frame", [np.zeros((8, 8, 3), np.uint8), np.zeros((8, 8), np.float32)])
-def test_a_frame_that_is_no_gray_image_is_refused(frame: np.ndarray) -> None:
+def test_frame_that_is_not_gray_bytes_is_refused(frame: np.ndarray) -> None:
     with pytest.raises(DataError, match="uint8"):
         downscale(frame, None, 16)
 
 
-def test_size_must_suit_the_backbone() -> None:
+def test_size_must_fit_the_backbone() -> None:
     with pytest.raises(ValidationError):
         Preprocess(size=20)
 
@@ -57,7 +57,7 @@ def test_streaming_and_batches_agree(frames: np.ndarray) -> None:
 
 
 @given(st.integers(0, 99), st.floats(0.5, 0.9), st.floats(0, 20))
-def test_gain_and_offset_of_the_light_make_no_difference(seed: int, gain: float, offset: float) -> None:
+def test_gain_and_offset_of_the_image_have_no_effect(seed: int, gain: float, offset: float) -> None:
     gray = 255 * torch.rand(1, 2, 16, 16, generator=torch.Generator().manual_seed(seed))
     plain = Preprocess(size=16, reference=False)
     lit = normalise(gain * gray + offset, gray, plain)
@@ -65,7 +65,7 @@ def test_gain_and_offset_of_the_light_make_no_difference(seed: int, gain: float,
 
 
 @given(images(7))
-def test_magnitude_is_blind_to_what_a_lamp_on_the_other_side_changes(frames: np.ndarray) -> None:
+def test_magnitude_ignores_the_sign_of_the_difference(frames: np.ndarray) -> None:
     magnitude = Preprocess(size=16, magnitude=True)
     np.testing.assert_allclose(stream(magnitude, frames), stream(magnitude, 255 - frames), atol=1e-4)
 
@@ -75,7 +75,7 @@ def test_magnitude_needs_a_reference() -> None:
         Preprocess(reference=False, magnitude=True)
 
 
-def test_a_flat_frame_gives_zeros_and_faint_noise_stays_faint() -> None:
+def test_flat_frame_gives_zeros_and_faint_noise_is_not_amplified() -> None:
     frame = np.full((16, 16), 90, np.uint8)
     (flat,) = stream(Preprocess(size=16, reference=False), frame[None])
     assert not flat.any()
@@ -84,7 +84,7 @@ def test_a_flat_frame_gives_zeros_and_faint_noise_stays_faint() -> None:
     assert np.abs(faint).max() <= 1
 
 
-def test_the_reference_is_the_mean_of_the_first_frames() -> None:
+def test_reference_is_mean_of_first_frames() -> None:
     rng = np.random.default_rng(0)
     frames = rng.integers(0, 256, (6, 16, 16), np.uint8)
     normaliser = Normaliser(SMALL)

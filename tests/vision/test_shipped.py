@@ -8,7 +8,7 @@ from gripper_force.jobs.simulate import plan, simulate
 
 
 @pytest.mark.parametrize("moving", ["false", "true"])
-def test_the_shipped_network_sees_force_whatever_passes_behind(moving: str, tmp_path: Path) -> None:
+def test_shipped_network_tolerates_a_moving_background(moving: str, tmp_path: Path) -> None:
     config = load_config(None, [f"sim.moving_background={moving}"])
     list(simulate(plan("tap", 4, 903_000), tmp_path, config, jobs=1))
     result = evaluate(tmp_path)

@@ -197,7 +197,7 @@ def test_different_exposure_is_refused_or_reported(profile: Path, tmp_path: Path
 
 def test_profile_with_missing_or_wrong_weights_is_refused(profile: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copy(profile, tmp_path / "copy.yaml"))
-    with pytest.raises(ConfigError, match="lacks its other half"):
+    with pytest.raises(ConfigError, match="belongs to the object profile"):
         grasp(run(tmp_path, f"calibration.object={copy}"))
     weights_path(copy).write_bytes(b"something else")
     with pytest.raises(ConfigError, match="does not belong to"):
