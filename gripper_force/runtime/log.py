@@ -1,11 +1,11 @@
-"""The one format: a run is an MCAP file of protobuf messages, one topic a record type.
+"""Logs: a run is an MCAP file of protobuf messages, with one topic per record type.
 
 The protobuf schemas are made from the dataclasses of `gripper_force.types` when this module is imported, so
-records and schemas can't drift apart and no generated file is kept. Images are ``foxglove.RawImage``;
-Foxglove and Rerun show every topic without knowing this project.
+records and schemas always agree and there are no generated files. Images are ``foxglove.RawImage``. Foxglove and
+Rerun show every topic without knowing this project.
 
-A chunk is closed, and handed to the operating system, at least every 0.1 s of log time: a killed run loses
-no more than that. Format: https://mcap.dev/spec
+A chunk is closed and passed to the operating system at least every 0.1 s of log time, so a killed run loses no
+more than that. Format: https://mcap.dev/spec
 """
 
 import contextlib
@@ -56,7 +56,7 @@ _DAMAGE: Final = (
     ValueError,
     OverflowError,
 )
-"""What the decoders let out on damaged bytes."""
+"""Exceptions of the decoders on damaged bytes."""
 
 _FIELD_TYPES: Final = {
     int: FieldDescriptorProto.TYPE_INT64,
@@ -72,7 +72,7 @@ C = TypeVar("C", bound=Record)
 
 @dataclass(frozen=True, slots=True)
 class _Codec:
-    """How one record type travels."""
+    """Encoding of one record type."""
 
     topic: str
     schema_name: str
@@ -164,7 +164,7 @@ _TYPE_OF_TOPIC: Final = {codec.topic: record_type for record_type, codec in _COD
 
 
 def _log_ns(record: Record) -> int:
-    """When the record could first be known."""
+    """Time at which the record was first available."""
     match record:
         case Frame():
             return record.received_ns
@@ -178,14 +178,14 @@ class LogWriter:
     """Writes a log. One thread alone may use it.
 
     Args:
-        path: A new file; its folder is made if need be.
+        path: A new file; its folder is made if it does not exist.
         config: The run's configuration as YAML.
         metadata: Versions, digests and other facts.
-        wrap_file: What the bytes pass on their way to the file.
+        wrap_file: Wraps the opened file.
 
     Attributes:
-        failed: Whether the disk failed; nothing more is written then.
-        waiting: Records of the open chunk, which are lost where the disk fails.
+        failed: True once the disk has failed; nothing more is written then.
+        waiting: Number of records in the open chunk, which are lost if the disk fails.
 
     Raises:
         LogError: The file exists already, or can't be written (every method).
@@ -209,7 +209,7 @@ class LogWriter:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = wrap_file(path.open("xb"))
         except OSError as error:
-            there = "it exists already, and a log is never overwritten; move it away, or name another folder"
+            there = "it exists already, and a log is never overwritten; move it away, or set log.directory"
             reason = there if path.exists() else error.strerror
             raise LogError(f"can't write the log {path}: {reason}") from error
         self._writer = Writer(self._file)
@@ -244,7 +244,7 @@ class LogWriter:
             if not 0 <= log_ns < 2**64:
                 raise ValueError(f"its time is {log_ns} ns")
             sequence = record.seq if isinstance(record, Frame) else 0
-            if not 0 <= sequence < 2**32:  # found out later, it would spoil the chunk
+            if not 0 <= sequence < 2**32:  # detected later, it would damage the chunk
                 raise ValueError(f"its sequence number is {sequence}")
             channel = self._channels.get(record_type) or self._register(record_type)
             self._writer.add_message(channel, log_ns, data, publish_time=log_ns, sequence=sequence)
@@ -299,7 +299,7 @@ class LogWriter:
 
 @dataclass(frozen=True, slots=True)
 class _Chunk:
-    """Where a complete chunk lies."""
+    """Position and times of a complete chunk."""
 
     offset: int
     length: int
@@ -308,7 +308,7 @@ class _Chunk:
 
 
 class LogReader:
-    """Reads a log, its own or one cut short.
+    """Reads a log, complete or truncated.
 
     Args:
         path: The file.
@@ -345,12 +345,12 @@ class LogReader:
 
     @property
     def start_ns(self) -> int:
-        """Log time of the first record; 0 in an empty log."""
+        """Log time of the first record in nanoseconds; 0 for an empty log."""
         return min((chunk.start_ns for chunk in self._chunks), default=0)
 
     @property
     def duration_ns(self) -> int:
-        """Log time from the first record to the last."""
+        """Log time from the first record to the last in nanoseconds."""
         return max((chunk.end_ns for chunk in self._chunks), default=0) - self.start_ns
 
     @overload
@@ -363,7 +363,7 @@ class LogReader:
     def records(self, *types: type[Record]) -> Iterator[Record]: ...
 
     def records(self, *types: type[Any]) -> Iterator[Any]:
-        """The records of the given types, or all of them, in the order they were written.
+        """Yields the records of the given types, or all of them, in the order in which they were written.
 
         Raises:
             LogError: A chunk is damaged (without ``recover``; with it the records end there), or a topic is
@@ -384,8 +384,8 @@ class LogReader:
         with self.path.open("rb") as file:
             for chunk in self._chunks:
                 file.seek(chunk.offset)
-                whole = _modest(Chunk.read(_stream(file.read(chunk.length))))
-                for item in breakup_chunk(whole, validate_crc=True):
+                chunk_data = _checked(Chunk.read(_stream(file.read(chunk.length))))
+                for item in breakup_chunk(chunk_data, validate_crc=True):
                     if isinstance(item, McapMessage):
                         if item.channel_id not in codecs:
                             raise ValueError("a message before its channel")
@@ -414,10 +414,10 @@ class LogReader:
         return record_type
 
     def _scan(self, file: BinaryIO) -> None:
-        """Walks the records' framing, which is cheap, and notes what is whole."""
+        """Reads the framing of the records, and keeps the positions of complete ones."""
         magic = file.read(len(_MAGIC))
         if not _MAGIC.startswith(magic):
-            raise LogError(f"{self.path} is no MCAP file")
+            raise LogError(f"{self.path} is not an MCAP file; pass a log that gripper-force wrote")
         size = self.path.stat().st_size
         with contextlib.suppress(*_DAMAGE):
             while file.tell() + _FRAMING.size <= size:
@@ -452,8 +452,8 @@ class LogReader:
         )
 
 
-def _modest(chunk: Chunk) -> Chunk:
-    """The chunk, once it is known that unpacking it takes no more memory than it says, and not much."""
+def _checked(chunk: Chunk) -> Chunk:
+    """Returns the chunk after a check that unpacking it takes the stated and a limited amount of memory."""
     match chunk.compression:
         case "zstd":
             size = zstandard.frame_content_size(chunk.data)

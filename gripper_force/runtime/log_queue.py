@@ -1,4 +1,4 @@
-"""What a run writes down, without ever waiting for the disk or ending for its sake."""
+"""Queue in front of the log, so that a run neither waits for the disk nor ends because of it."""
 
 import queue
 import threading
@@ -10,23 +10,23 @@ from gripper_force.runtime.log import LogWriter
 from gripper_force.types import Record
 
 ROOM: Final = 4096
-"""Records that may wait for the disk: some three seconds of a run."""
+"""Records that may wait for the disk: about three seconds of a run."""
 
-_PATIENCE_S: Final = 10.0
+_TIMEOUT_S: Final = 10.0
 
 
 class LogQueue:
-    """Hands records to a log and counts those that are lost.
+    """Passes records to a log and counts lost ones.
 
-    In real time a thread writes, and where the disk is so slow that the queue is full, records are dropped.
-    In lockstep the caller writes, and the clock stands still meanwhile.
+    In real time a thread writes; if the disk is so slow that the queue is full, records are dropped. In lockstep
+    the caller writes, while the clock stands still.
 
     Args:
-        log: The log; the log_queue closes it.
-        lockstep: Whether time waits.
+        log: The log; the queue closes it.
+        lockstep: True if the clock is simulated.
 
     Attributes:
-        lost: Records that are missing from the log.
+        lost: Number of records missing from the log.
     """
 
     def __init__(self, log: LogWriter, *, lockstep: bool) -> None:
@@ -48,22 +48,22 @@ class LogQueue:
         self._do(lambda: self._log.attach(name, data, media_type))
 
     def close(self) -> None:
-        """Writes what waits and completes the log. May be called twice."""
+        """Writes the waiting records and completes the log. May be called twice."""
         if self._thread is not None:
             try:
-                self._queue.put(None, timeout=_PATIENCE_S)
-                self._thread.join(_PATIENCE_S)
+                self._queue.put(None, timeout=_TIMEOUT_S)
+                self._thread.join(_TIMEOUT_S)
             except queue.Full:
-                pass  # the thread has not moved all that time
+                pass  # the thread is blocked
             if self._thread.is_alive():
                 self.lost += self._queue.qsize()
-                self._error = f"the disk has not taken the last records within {_PATIENCE_S:g} s"
+                self._error = f"the disk did not take the last records within {_TIMEOUT_S:g} s"
                 return  # the log is still the thread's
             self._thread = None
         self._count(self._log.close)
 
     def raise_losses(self) -> None:
-        """Tells of losses, which must not end a run, once it has ended.
+        """Reports lost records after the run, because they must not end it.
 
         Raises:
             LogError: Records are missing from the log.
@@ -71,7 +71,7 @@ class LogQueue:
         if self._error:
             raise LogError(
                 f"{self._error}; the run went on, and its log lacks {self.lost} records: free some space, or "
-                "set log.directory elsewhere"
+                "set another log.directory"
             )
 
     def _do(self, write: Callable[[], None]) -> None:
@@ -93,7 +93,9 @@ class LogQueue:
             write()
         except LogError as error:
             self._lose(str(error))
-        except Exception as error:  # a thread that ended here would lose all that follows, in silence
+        except (
+            Exception
+        ) as error:  # if the thread ended here, all later records would be lost without a message
             self._lose(f"{type(error).__name__}: {error}")
 
     def _lose(self, why: str) -> None:

@@ -258,7 +258,7 @@ def test_a_damaged_chunk_ends_the_recovered_records(tmp_path: Path) -> None:
 def test_what_is_no_log_is_refused(tmp_path: Path, recover: bool) -> None:
     text = tmp_path / "notes.txt"
     text.write_text("hello, this is text")
-    with pytest.raises(LogError, match=r"notes\.txt is no MCAP file"):
+    with pytest.raises(LogError, match=r"notes\.txt is not an MCAP file"):
         LogReader(text, recover=recover)
     with pytest.raises(LogError, match=r"can't read the log .*missing\.mcap: No such file"):
         LogReader(tmp_path / "missing.mcap", recover=recover)

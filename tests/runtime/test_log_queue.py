@@ -99,13 +99,13 @@ def test_a_slow_disk_keeps_nobody_waiting(gate: Gate, path: Path) -> None:
 def test_a_disk_that_hangs_does_not_keep_the_run_from_ending(
     gate: Gate, monkeypatch: pytest.MonkeyPatch, count: int
 ) -> None:
-    monkeypatch.setattr(recorder_module, "_PATIENCE_S", 0.05)
+    monkeypatch.setattr(recorder_module, "_TIMEOUT_S", 0.05)
     gate.opened.clear()
     log_queue = LogQueue(gate, lockstep=False)  # type: ignore[arg-type]
     for event in events(count):
         log_queue.write(event)
     log_queue.close()
-    with pytest.raises(LogError, match="has not taken the last records"):
+    with pytest.raises(LogError, match="did not take the last records"):
         log_queue.raise_losses()
     gate.opened.set()
     monkeypatch.undo()

@@ -15,7 +15,7 @@ def news(watch: LoadCellMonitor, period_ms: int, valid: range, until_ms: int) ->
 
 def test_silence_is_told_once_and_its_end() -> None:
     told = news(LoadCellMonitor(), 5, range(1000, 1500), 2000)
-    assert told == [(1045, "no sound sample; nothing to compare with"), (1500, "sound samples again")]
+    assert told == [(1045, "no valid samples, so nothing to compare with"), (1500, "valid samples again")]
 
 
 def test_a_slow_cell_is_not_silent() -> None:
@@ -26,7 +26,7 @@ def test_rejected_samples_do_not_break_the_silence() -> None:
     watch = LoadCellMonitor()
     assert news(watch, 5, range(0), 1000) == []
     bad = LoadCellSample(1100 * NS_PER_MS, 1.0, 1.0, valid=False)
-    assert watch.update(1100 * NS_PER_MS, [bad]) == "no sound sample; nothing to compare with"
+    assert watch.update(1100 * NS_PER_MS, [bad]) == "no valid samples, so nothing to compare with"
 
 
 def test_counts_that_rise_are_told_once_a_second_and_at_the_end() -> None:
