@@ -1,8 +1,8 @@
 """The force network of Shin et al. 2019: backbone, attention, average pooling, BLSTM, two dense layers.
 
-- Every frame passes the backbone once, also while streaming. The state keeps the maps of the last n frames, and
-  the LSTM's state in each of the next 20 windows. A frame then takes one matrix product of 20 rows; computing
-  a window from its start would take 20 products in sequence. The results are equal.
+- Every frame passes the backbone once, also while streaming. The state keeps the maps of the last n frames,
+  and the LSTM's state in each of the next 20 windows. A frame then takes one matrix product of 20 rows;
+  computing a window from its start would take 20 products in sequence. The results are equal.
 - Frames before the first count as copies of the first. The paper does not define them; a gripper at rest
   before contact gives such frames.
 - The backward LSTM is read at the last step, as in the authors' public code. There it has processed one

@@ -18,20 +18,20 @@ RNG = np.random.default_rng(0)
 def scene(seed: int) -> Gray:
     """Returns a smooth image with sensor noise."""
     y, x = np.mgrid[:128, :128] / 128
-    picture = 110 + 60 * np.sin(6 * x) * np.cos(4 * y) + np.random.default_rng(seed).normal(0, 3, (128, 128))
-    return picture.round().astype(np.uint8)
+    image = 110 + 60 * np.sin(6 * x) * np.cos(4 * y) + np.random.default_rng(seed).normal(0, 3, (128, 128))
+    return image.round().astype(np.uint8)
 
 
-def look(plausibility: FrameChecks, gray: Gray) -> None:
-    plausibility.check(downscale(gray, None, 64))
+def check(checks: FrameChecks, gray: Gray) -> None:
+    checks.check(downscale(gray, None, 64))
 
 
 def test_frames_of_a_grasp_pass(fused_log: Path) -> None:
     frames = [frame.gray for frame in LogReader(fused_log).records(Frame)]
     assert len(frames) > 50
-    plausibility = FrameChecks()
+    checks = FrameChecks()
     for gray in frames:
-        look(plausibility, gray)
+        check(checks, gray)
 
 
 FAULTS: dict[str, Callable[[Gray], Gray]] = {
@@ -45,21 +45,21 @@ FAULTS: dict[str, Callable[[Gray], Gray]] = {
 
 @pytest.mark.parametrize("what", FAULTS)
 def test_implausible_frame_is_refused_and_the_next_good_one_passes(what: str) -> None:
-    plausibility = FrameChecks()
+    checks = FrameChecks()
     for seed in range(5):
-        look(plausibility, scene(seed))
+        check(checks, scene(seed))
     with pytest.raises(DataError, match=what.strip()):
-        look(plausibility, FAULTS[what](scene(4)))
-    look(plausibility, scene(6))
+        check(checks, FAULTS[what](scene(4)))
+    check(checks, scene(6))
 
 
 def test_covered_lens_is_refused_from_the_first_frame() -> None:
     with pytest.raises(DataError, match="lens"):
-        look(FrameChecks(), np.full((128, 128), 3, np.uint8))
+        check(FrameChecks(), np.full((128, 128), 3, np.uint8))
 
 
 @given(st.floats(0.75, 1.3), st.integers(-6, 6))
 def test_moderate_light_change_and_shift_pass(gain: float, shift: int) -> None:
-    plausibility = FrameChecks()
-    look(plausibility, scene(0))
-    look(plausibility, np.clip(np.roll(scene(1), shift, 1) * gain, 0, 255).astype(np.uint8))
+    checks = FrameChecks()
+    check(checks, scene(0))
+    check(checks, np.clip(np.roll(scene(1), shift, 1) * gain, 0, 255).astype(np.uint8))

@@ -172,13 +172,13 @@ def test_attention_without_earlier_frames_keeps_no_maps() -> None:
 @pytest.mark.parametrize(
     ("choices", "message"),
     [
-        ({"backbone": "resnet18", "size": 48}, "size 48 .* resnet18: take a multiple of 32"),
-        ({"size": 24}, "size 24 .* vgg: take a multiple of 16"),
+        ({"backbone": "resnet18", "size": 48}, "size 48 .* resnet18; use a multiple of 32"),
+        ({"size": 24}, "size 24 .* vgg; use a multiple of 16"),
         (
             {"attention": "se", "pooling": "gap"},
-            "a choice of ssam and scam: with the attention se leave",
+            "needs the attention ssam or scam, not se; leave",
         ),
-        ({"attention": "none", "pooling": "gap"}, "with the attention none"),
+        ({"attention": "none", "pooling": "gap"}, "ssam or scam, not none"),
         ({"attention": "eca"}, "attention"),
         ({"backbone": "vit"}, "backbone"),
     ],

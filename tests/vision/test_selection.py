@@ -1,4 +1,3 @@
-from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from gripper_force.errors import ConfigError
 from gripper_force.vision import selection, step_benchmark
 from gripper_force.vision.model_files import read_model
 from gripper_force.vision.selection import Choice, candidates, pareto_front, resolve_auto, select
-from gripper_force.vision.step_benchmark import Candidate, cache_key, engine_version
+from gripper_force.vision.step_benchmark import Candidate, engine_version
 
 AUTO = VisionConfig(checkpoint="auto", engine="auto")
 SLOW = Candidate("default", "torch", "float32", 1, 6.0, 8.0, 0.18)
@@ -102,21 +101,6 @@ def test_engine_of_another_package_is_measured_and_not_cached(
     (candidate,) = candidates(other)
     assert (candidate.checkpoint, candidate.engine) == ("tiny", "unversioned_engines:OtherEngine")
     assert not cache.exists()
-
-
-def test_version_is_of_the_package_that_holds_the_engine(monkeypatch: pytest.MonkeyPatch) -> None:
-    point = metadata.EntryPoint("other", "numpy:ndarray", "gripper_force.engines")
-    assert engine_version("torch") == metadata.version("torch")
-    assert engine_version("numpy.no_engine:Engine") == metadata.version("numpy")
-    assert engine_version("no_such_package:Engine") == engine_version(":Engine") == ""
-    monkeypatch.setattr(step_benchmark, "registered", lambda _group: {"other": point})
-    assert engine_version("other") == ""  # this entry point belongs to no distribution
-
-
-def test_key_names_file_engine_settings_and_machine(tiny_checkpoint: Path) -> None:
-    model = read_model(tiny_checkpoint)
-    key = cache_key(model, "torch", "float32", 2)
-    assert key.startswith(f"{model.digest[:16]} .safetensors torch {engine_version('torch')} float32 2 ")
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"a": {"b": 1}}'])

@@ -1,0 +1,64 @@
+from collections.abc import Iterator
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+from gripper_force.vision import step_benchmark
+from gripper_force.vision.engines import open_engine
+from gripper_force.vision.model_files import read_model
+from gripper_force.vision.step_benchmark import (
+    Candidate,
+    cache_key,
+    engine_version,
+    read_cache,
+    step_times_ms,
+    update_cache,
+)
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    engine_version.cache_clear()
+    yield tmp_path / "gripper-force" / "engines.json"
+    engine_version.cache_clear()
+
+
+def test_version_is_of_the_package_that_holds_the_engine(monkeypatch: pytest.MonkeyPatch) -> None:
+    point = metadata.EntryPoint("other", "numpy:ndarray", "gripper_force.engines")
+    assert engine_version("torch") == metadata.version("torch")
+    assert engine_version("numpy.no_engine:Engine") == metadata.version("numpy")
+    assert engine_version("no_such_package:Engine") == engine_version(":Engine") == ""
+    monkeypatch.setattr(step_benchmark, "registered", lambda _group: {"other": point})
+    assert engine_version("other") == ""  # this entry point belongs to no distribution
+
+
+def test_key_names_file_engine_settings_and_machine(tiny_checkpoint: Path) -> None:
+    model = read_model(tiny_checkpoint)
+    key = cache_key(model, "torch", "float32", 2)
+    assert key.startswith(f"{model.digest[:16]} .safetensors torch {engine_version('torch')} float32 2 ")
+
+
+def test_cache_keeps_earlier_measurements(cache: Path) -> None:
+    slow = Candidate("default", "torch", "float32", 1, 6.0, 8.0, 0.18)
+    fast = Candidate("default", "openvino", "bfloat16", 2, 1.0, 1.5, 0.19)
+    assert read_cache() == {}
+    update_cache({"a": slow})
+    update_cache({"b": fast})
+    assert read_cache() == {"a": slow, "b": fast}
+    assert [path.name for path in cache.parent.iterdir()] == ["engines.json"]
+
+
+def test_unwritable_cache_is_ignored(cache: Path) -> None:
+    cache.parent.write_text("")
+    update_cache({"a": Candidate("default", "torch", "float32", 1, 6.0, 8.0, 0.18)})
+    assert read_cache() == {}
+
+
+def test_99th_percentile_is_not_below_the_median(
+    tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(step_benchmark, "_STEPS", 5)
+    p50_ms, p99_ms = step_times_ms(open_engine(read_model(tiny_checkpoint)))
+    assert 0 < p50_ms <= p99_ms
