@@ -143,7 +143,7 @@ def touch_numbers(force_n: Floats) -> npt.NDArray[np.int64]:
 
 @dataclass(slots=True)
 class _RecordCollector:
-    """What a log's records contain beside images: times of the frames, and records of the press."""
+    """Data of a log other than its images: times of the frames, and records of the press."""
 
     frame_t_ns: list[int] = field(default_factory=list)
     transport_ns: list[int] = field(default_factory=list)

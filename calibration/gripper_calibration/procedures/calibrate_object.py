@@ -132,7 +132,6 @@ def calibrate_object(
             calibration.
         LogError: A log can't be read.
         CheckpointError: The network can't be read.
-        CheckpointError: The network can't be read.
         DeviceError: A device failed. The servo was stopped as configured, and completed touches are kept.
 
     Example:
