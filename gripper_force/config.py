@@ -317,7 +317,7 @@ class CalibrationConfig(Section):
 
 
 class LogConfig(Section):
-    """Where runs are written."""
+    """Output of runs."""
 
     directory: Path = Field(Path("runs"), description="folder of logs and reports")
     report: bool = Field(True, description="write a report (PNG and HTML) after each run")

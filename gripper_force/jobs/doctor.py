@@ -8,7 +8,6 @@ import re
 import time
 from collections.abc import Iterable, Iterator
 from importlib import import_module
-from importlib.metadata import version
 from pathlib import Path
 from typing import Final
 
@@ -75,14 +74,13 @@ def _network(config: Config) -> Iterator[Check]:
     if not config.uses_vision:
         yield Check("network", "step", "not needed: no camera or no checkpoint", None)
         return
-    from gripper_force.vision.selection import ENGINE_PACKAGES
+    from gripper_force.vision.step_benchmark import engine_version
 
     config, model, _ = resolve_vision(config)
     estimator = make_estimator(ResolvedConfig(config, model))
     assert estimator is not None  # the configuration has vision
     vision = config.vision
-    known = ENGINE_PACKAGES.get(vision.engine)
-    package = "third party" if known is None else f"{known} {version(known)}"
+    package = f"{vision.engine} {engine_version(vision.engine)}".strip()
     threads = f"{vision.precision}, {vision.threads} of {os.cpu_count()} threads"
     yield Check("network", vision.engine, f"{package}, {threads}", True)
     cpu = Path("/proc/cpuinfo").read_text(encoding="utf-8")

@@ -4,7 +4,7 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 from gripper_force.config import BudgetConfig, VisionConfig
 from gripper_force.errors import ConfigError
@@ -19,9 +19,6 @@ from gripper_force.vision.step_benchmark import (
     step_times_ms,
     update_cache,
 )
-
-ENGINE_PACKAGES: Final = {engine: engine for engine in ENGINES}
-"""Package that each built-in engine needs."""
 
 
 @dataclass(frozen=True, slots=True)
