@@ -27,7 +27,11 @@ def check(config: ConfigPath = None, set_: Overrides = None, as_json: AsJson = F
 
     run = resolve(load_settings(config, set_, {}))
     run.check_target(run.config.target_n)
-    result: dict[str, Any] = {"ok": True, "choice": run.choice, "notes": [text for _, text in run.notes]}
+    result: dict[str, Any] = {
+        "ok": True,
+        "choices": list(run.choices),
+        "notes": [text for _, text in run.notes],
+    }
     console.show(result, as_json, lambda _: console.out.print("\n".join(["ok", *result["notes"]])))
 
 

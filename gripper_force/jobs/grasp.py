@@ -181,7 +181,7 @@ def grasp_and_release(session: Session, target_n: float, progress: Progress = no
 
 def _report_phase(progress: Progress, status: GraspStatus, begin_ns: int) -> None:
     parts = (f"{(status.t_ns - begin_ns) / NS_PER_S:8.2f} s", status.phase, status.outcome, status.reason)
-    progress(" ".join(part for part in parts if part))
+    progress("  ".join(part for part in parts if part))
 
 
 def trials(config: Config, count: int, jobs: int) -> Iterator[Summary]:
@@ -253,8 +253,8 @@ def summarise(path: Path) -> Summary:
 
 
 def _choices(metadata: Mapping[str, str], events: list[Event]) -> list[str]:
-    if choice := metadata.get("choice"):
-        return [choice]
+    if "choices" in metadata:
+        return metadata["choices"].splitlines()
     return [event.text for event in events if event.text.startswith(_CHOICE_EVENT)]
 
 

@@ -168,7 +168,12 @@ def resolve_replay(config: Config) -> ResolvedConfig:
         CheckpointError: The network's file cannot be read.
     """
     config, model, choice = resolve_vision(config)
-    return ResolvedConfig(config, model, read_correction(config, read_profiles(config), model), choice=choice)
+    return ResolvedConfig(
+        config,
+        model,
+        read_correction(config, read_profiles(config), model),
+        choices=(choice,) if choice else (),
+    )
 
 
 def run_again(reader: LogReader, run: ResolvedConfig) -> Replayed:

@@ -39,7 +39,7 @@ class ResolvedConfig:
         correction: The object profile's correction of estimates, or None.
         target_limits_n: Largest calibrated force by profile.
         notes: Facts for the log: unit and sentence.
-        choice: The network that ``auto`` chose and why; empty if nothing was left to choose.
+        choices: What was chosen for each ``auto``, and why.
     """
 
     config: Config
@@ -47,7 +47,7 @@ class ResolvedConfig:
     correction: Correction | None = None
     target_limits_n: Mapping[str, float] = field(default_factory=dict)
     notes: tuple[tuple[str, str], ...] = ()
-    choice: str = ""
+    choices: tuple[str, ...] = ()
 
     def check_target(self, target_n: float) -> None:
         """Raises `RequestError` if a target is beyond the force limit or a profile's calibrated range."""
@@ -111,7 +111,7 @@ def resolve(config: Config, *, vision: bool = True) -> ResolvedConfig:
         correction,
         profiles.target_limits_n,
         tuple((unit, text) for unit, text in notes if text),
-        choice,
+        tuple(text for text in (choice, detail) if text),
     )
 
 

@@ -357,7 +357,7 @@ def _metadata(run: ResolvedConfig, devices: Devices) -> dict[str, str]:
         "set": f"{config.object}-{config.seed}",
         "clock": config.clock,
         "checkpoint": run.model.digest if run.model else "",
-        "choice": run.choice,
+        "choices": "\n".join(run.choices),
         "python": sys.version.split()[0],
         **{f"version {name}": metadata.version(name) for name in packages},
         **devices.notes,

@@ -37,7 +37,7 @@ class Choice:
 
     def __str__(self) -> str:
         """Returns the choice as a sentence."""
-        return f"took {self.candidate} ({self.reason} of {self.tested} candidates)"
+        return f"chose {self.candidate} ({self.reason} of {self.tested} candidates)"
 
 
 @lru_cache

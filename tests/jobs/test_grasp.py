@@ -39,7 +39,7 @@ def test_a_summary_says_what_was_taken_for_auto(quick: list[str], tmp_path: Path
         "log.report=false",
     ]
     (taken,) = grasp_module.grasp(load_config(None, [*quick, *overrides]))["taken"]
-    assert taken.startswith("took sim.detail=medium")
+    assert taken.startswith("chose sim.detail=medium")
 
 
 def test_what_was_not_measured_is_none(fused_log: Path, tmp_path: Path) -> None:

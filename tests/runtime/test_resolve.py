@@ -46,11 +46,11 @@ def test_a_run_that_only_records_has_no_network() -> None:
 
 
 def test_auto_becomes_a_network_and_an_engine_with_the_reason() -> None:
-    assert resolve(Config()).choice == ""
+    assert resolve(Config()).choices == ()
     run = resolve(load_config(None, ["vision.checkpoint=auto"]))
     assert "auto" not in (run.config.vision.checkpoint, run.config.vision.engine)
-    assert run.config.vision.checkpoint in run.choice
-    assert ("vision", run.choice) in run.notes
+    assert run.config.vision.checkpoint in run.choices[0]
+    assert ("vision", run.choices[0]) in run.notes
 
 
 def test_the_level_of_detail_is_chosen_before_devices_open() -> None:
@@ -67,7 +67,7 @@ def test_resolving_again_changes_nothing() -> None:
 def test_a_resolved_configuration_is_frozen() -> None:
     run = ResolvedConfig(Config())
     with pytest.raises(FrozenInstanceError):
-        run.choice = "x"  # type: ignore[misc]
+        run.choices = ("x",)  # type: ignore[misc]
 
 
 @pytest.mark.parametrize(

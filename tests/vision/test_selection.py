@@ -83,7 +83,7 @@ def test_measurements_are_cached(cache: Path, tiny_checkpoint: Path, monkeypatch
     assert isinstance(choice, Choice)
     assert choice.tested == len(first)
     assert (resolved.engine, resolved.threads) == ("torch", choice.candidate.threads)
-    assert str(choice).startswith("took ")
+    assert str(choice).startswith("chose ")
 
 
 def test_engine_of_another_package_is_measured_and_not_cached(

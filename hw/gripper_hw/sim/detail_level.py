@@ -69,7 +69,7 @@ def select_level(levels: Levels, budget: BudgetConfig, name: str) -> tuple[str, 
     selected = max(candidates, key=lambda detail: levels[detail]["speed"])
     return (
         selected,
-        f"took sim.detail={selected} ({_describe(levels[selected])}), the fastest that meets {budget_text}",
+        f"chose sim.detail={selected} ({_describe(levels[selected])}), the fastest that meets {budget_text}",
     )
 
 

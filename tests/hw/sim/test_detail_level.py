@@ -33,7 +33,7 @@ def test_fastest_level_within_budget_is_selected(
     if fits and (error_n, speed) != (None, None):
         taken, why = select_level(levels, budget, "tube")
         assert levels[taken]["speed"] == max(fits)
-        assert why.startswith(f"took sim.detail={taken} ")
+        assert why.startswith(f"chose sim.detail={taken} ")
     else:
         with pytest.raises(ConfigError):
             select_level(levels, budget, "tube")
@@ -78,7 +78,7 @@ def test_rig_simulates_selected_level_and_gives_the_reason(quick: list[str]) -> 
     config, reason = SimulatedRig.resolve(load_config(None, overrides))
     with closing(SimulatedRig(config)) as rig:
         assert rig.scene.detail == "medium"
-    assert "took sim.detail=medium" in reason
+    assert "chose sim.detail=medium" in reason
     assert "budget.sim_error_n=0.05" in reason
 
 
@@ -91,5 +91,5 @@ def test_rig_resolves_level(quick: list[str]) -> None:
     config = load_config(None, [*quick, "sim.detail=auto", "budget.sim_error_n=0.05"])
     resolved, reason = SimulatedRig.resolve(config)
     assert resolved.sim.detail == "medium"
-    assert reason.startswith("took sim.detail=medium ")
+    assert reason.startswith("chose sim.detail=medium ")
     assert SimulatedRig.resolve(resolved) == (resolved, "")
