@@ -25,7 +25,7 @@ from rich.progress import track
 
 from gripper_calibration import touch_logs as logs
 from gripper_calibration.fits.object_fit import fit_correction
-from gripper_calibration.procedures.calibrate_object import calibrate, touch
+from gripper_calibration.procedures.calibrate_object import calibrate_object, record_touches
 from gripper_force.config import Config, load_config
 from gripper_force.errors import DataError
 from gripper_force.jobs.grasp import grasp
@@ -55,9 +55,9 @@ def errors(kind: str, number: int, out: Path) -> list[dict[str, Any]]:
     if kept.exists():
         rows: list[dict[str, Any]] = json.loads(kept.read_text())
         return rows
-    paths = list(touch(configure(kind, number, out), TOUCHES, None, out / f"{kind}-{number}"))
+    paths = list(record_touches(configure(kind, number, out), TOUCHES, None, out / f"{kind}-{number}"))
     checkpoint = load_checkpoint()
-    touches = logs.join({path: logs.read_one(path, checkpoint) for path in paths}).touches
+    touches = logs.join({path: logs.read_log(path, checkpoint) for path in paths}).touches
     test = touches.only(touches.numbers[-TESTED:])
     rng = np.random.default_rng(number)
     before_n = float(np.abs(test.estimate_n - test.force_n).mean())
@@ -80,7 +80,7 @@ def errors(kind: str, number: int, out: Path) -> list[dict[str, Any]]:
                     "after_n": float(error_n.mean()),
                     "within": float(within.mean()),
                     "half_width_n": float(fitted.interval.half_width_n(5.0)),
-                    "gated": float((fitted.arrays.ood_score(test.features) > fitted.gate).mean()),
+                    "gated": float((fitted.arrays.ood_score(test.features) > fitted.ood_limit).mean()),
                 }
             )
     kept.write_text(json.dumps(rows))
@@ -106,8 +106,8 @@ def profile_of(kind: str, number: int, out: Path) -> str:
     path = out / f"{kind}-{number}.yaml"
     if not path.exists():
         config = configure(kind, number, out)
-        touched = list(touch(config, PROFILE, None, out / f"{kind}-{number}"))
-        calibrate(config, kind, touched, path, lambda _: None)
+        touched = list(record_touches(config, PROFILE, None, out / f"{kind}-{number}"))
+        calibrate_object(config, kind, logs=touched, out=path)
     return str(path)
 
 

@@ -134,7 +134,8 @@ def gaussian_process(training: list[Clip], test: list[Clip], preprocess: Preproc
 
     def kernel(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         apart = np.square(a).sum(1)[:, None] + np.square(b).sum(1) - 2 * a @ b.T
-        return np.exp(-apart / (2 * LENGTH**2)) + LINEAR / COMPONENTS * a @ b.T
+        similar: np.ndarray = np.exp(-apart / (2 * LENGTH**2)) + LINEAR / COMPONENTS * a @ b.T
+        return similar
 
     pictures = np.concatenate([look(clip)[clip.valid] for clip in training])
     forces_n = np.concatenate([clip.forces_n[clip.valid] for clip in training])
@@ -183,7 +184,8 @@ def _beside_best_line(trials: list[Touches]) -> np.ndarray:
         np.concatenate([getattr(t, of) for t in trials]) for of in ("estimate_n", "force_n")
     )
     sides = np.stack([estimate_n, np.ones_like(estimate_n)], 1)
-    return np.abs(sides @ np.linalg.lstsq(sides, force_n)[0] - force_n)
+    error_n: np.ndarray = np.abs(sides @ np.linalg.lstsq(sides, force_n)[0] - force_n)
+    return error_n
 
 
 def _as_it_is(touches: Touches) -> np.ndarray:

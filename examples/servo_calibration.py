@@ -10,6 +10,7 @@ import argparse
 from gripper_calibration.fits.servo_fit import Nominal, fit_servo
 from gripper_calibration.procedures.calibrate_servo import measure
 from gripper_force.config import load_config
+from gripper_force.interfaces import no_progress
 from gripper_hw.dynamixel.control_table import load_model
 from gripper_hw.sim.objects import BLOCK_WIDTH_M
 from gripper_hw.sim.scene import draw_scene
@@ -27,7 +28,7 @@ def main() -> None:
         config = load_config(
             None, ["object=block", "camera.backend=none", "sim.detail=coarse", f"seed={seed}"]
         )
-        presses, passes = measure(config, BLOCK_WIDTH_M, lambda _step, _force_n: None)
+        presses, passes = measure(config, BLOCK_WIDTH_M, no_progress)
         gripper = config.gripper
         fit = fit_servo(presses, passes, Nominal(gripper.pinion_radius_m, gripper.open_width_m))
         scene, radius_m = draw_scene("block", seed, config.sim), gripper.pinion_radius_m

@@ -74,7 +74,7 @@ def tiny_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
             network.out.weight *= 1000  # what a frame changes would else be lost in the noise
             for _ in range(2):
                 seen, _ = network.step(torch.zeros(1, 1, 32, 32), None)
-                network.out.bias -= seen.force_n.mean() / 20
+                network.out.bias.sub_(seen.force_n.mean() / 20)
     path = tmp_path_factory.mktemp("checkpoint") / "tiny.safetensors"
     save_checkpoint(path, networks, header)
     return path

@@ -19,7 +19,8 @@ def scene(seed: int) -> Gray:
     """A smooth picture with a sensor's noise."""
     y, x = np.mgrid[:128, :128] / 128
     picture = 110 + 60 * np.sin(6 * x) * np.cos(4 * y) + np.random.default_rng(seed).normal(0, 3, (128, 128))
-    return picture.round().astype(np.uint8)
+    gray: Gray = picture.round().astype(np.uint8)
+    return gray
 
 
 def look(plausibility: FrameChecks, gray: Gray) -> None:

@@ -7,8 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from click.testing import Result
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from gripper_calibration.procedures import calibrate_object as job
 from gripper_calibration.procedures.calibrate_object import calibrate_object, record_touches
@@ -57,7 +56,7 @@ def test_touches_that_are_there_are_not_done_again(touched: list[Path], folder: 
     asked: list[str] = []
     config = load_config(None, QUICK)
     touched[1].unlink()
-    again = list(record_touches(config, 3, 6.0, folder / "touches", prompt=asked.append))
+    again = list(record_touches(config, 3, 6.0, folder / "touches", prompt=lambda text: asked.append(text)))
     assert again == touched
     assert asked == ["Put the object down for touch 2"]
 
@@ -81,7 +80,10 @@ def test_a_profile_tells_of_the_object_and_halves_the_error(profile: Path) -> No
 def test_a_grasp_with_it_is_corrected_and_replays_bit_for_bit(profile: Path, tmp_path: Path) -> None:
     alone = grasp(run(tmp_path))
     known = grasp(run(tmp_path, f"calibration.object={profile}"))
-    assert known["estimate_mae_n"]["visual"] < 0.7 * alone["estimate_mae_n"]["visual"]
+    alone_n, known_n = (summary["estimate_mae_n"]["visual"] for summary in (alone, known))
+    assert alone_n is not None
+    assert known_n is not None
+    assert known_n < 0.7 * alone_n
     log = Path(known["log"])
     assert LogReader(log).metadata["profile"] == read_object(profile).weights
     assert replay(log).identical

@@ -113,6 +113,7 @@ def test_the_matrix_summarises_each_row(matrix: list[faults.RowSummary]) -> None
     bus, disk = matrix
     assert (bus["row"], bus["runs"], bus["ok"]) == ("bus: adapter unplugged", 1, 1)
     assert bus["results"] == {"DeviceLostError": 1}
+    assert bus["worst_ms"] is not None
     assert bus["worst_ms"] <= 20.0
     assert disk["lost_records"] > 100
     assert disk["results"] == {"held": 1}

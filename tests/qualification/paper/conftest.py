@@ -47,8 +47,9 @@ def estimates() -> Estimates:
     rng = np.random.default_rng(1)
 
     def noise_n(count: int) -> np.ndarray:
-        drawn = rng.normal(0, 0.05, count)
-        return drawn - drawn.mean()
+        drawn: np.ndarray = rng.normal(0, 0.05, count)
+        drawn -= drawn.mean()
+        return drawn
 
     frames = np.full((FRAMES, 32, 32), 100, np.uint8)
     clips = [
