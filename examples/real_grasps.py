@@ -134,7 +134,8 @@ def gaussian_process(training: list[Clip], test: list[Clip], preprocess: Preproc
 
     def kernel(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         distance2 = np.square(a).sum(1)[:, None] + np.square(b).sum(1) - 2 * a @ b.T
-        return np.exp(-distance2 / (2 * LENGTH**2)) + LINEAR / COMPONENTS * a @ b.T
+        covariance: np.ndarray = np.exp(-distance2 / (2 * LENGTH**2)) + LINEAR / COMPONENTS * a @ b.T
+        return covariance
 
     images = np.concatenate([images_of(clip)[clip.valid] for clip in training])
     forces_n = np.concatenate([clip.forces_n[clip.valid] for clip in training])
@@ -185,7 +186,8 @@ def _best_line_errors(trials: list[Touches]) -> np.ndarray:
         np.concatenate([getattr(t, of) for t in trials]) for of in ("estimate_n", "force_n")
     )
     design = np.stack([estimate_n, np.ones_like(estimate_n)], 1)
-    return np.abs(design @ np.linalg.lstsq(design, force_n)[0] - force_n)
+    error_n: np.ndarray = np.abs(design @ np.linalg.lstsq(design, force_n)[0] - force_n)
+    return error_n
 
 
 def _uncorrected(touches: Touches) -> np.ndarray:

@@ -1,5 +1,6 @@
 """Shared fixtures."""
 
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -15,6 +16,10 @@ from gripper_force.runtime import process
 from gripper_force.runtime.log import LogWriter
 from gripper_force.types import NS_PER_MS, Frame, LoadCellSample
 from gripper_force.vision.preprocess import Preprocess
+
+# A shell that runs the tests in the background makes every process ignore Ctrl-C; tests send it.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # A machine may be busy: how long an example takes says nothing about what it tests.
 settings.register_profile("unhurried", deadline=None)
@@ -74,7 +79,7 @@ def tiny_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
             network.out.weight *= 1000  # what a frame changes would else be lost in the noise
             for _ in range(2):
                 seen, _ = network.step(torch.zeros(1, 1, 32, 32), None)
-                network.out.bias -= seen.force_n.mean() / 20
+                network.out.bias.sub_(seen.force_n.mean() / 20)
     path = tmp_path_factory.mktemp("checkpoint") / "tiny.safetensors"
     save_checkpoint(path, networks, header)
     return path

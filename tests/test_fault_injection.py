@@ -39,7 +39,7 @@ class Two:
 
 
 def faults(unit: str, kind: str, at_s: float = 1.0, for_s: float = 1.0) -> Faults:
-    return Faults([FaultConfig(unit=unit, kind=kind, at_s=at_s, for_s=for_s)])  # type: ignore[arg-type]
+    return Faults([FaultConfig(unit=unit, kind=kind, at_s=at_s, for_s=for_s)])
 
 
 @pytest.mark.parametrize("unit", FAULTS)
@@ -88,7 +88,9 @@ def test_ok_ends_a_fault() -> None:
 def test_estimator_fails_as_configured(kind: str) -> None:
     clock = Clock()
     estimator = FaultyEstimator(Two(), faults("estimator", kind), clock, lockstep=True)
-    assert estimator.update(GRAY).force_n == 2.0
+    sound = estimator.update(GRAY)
+    assert sound is not None
+    assert sound.force_n == 2.0
     clock.t_ns = 1_500_000_000
 
     def outcome() -> object:
@@ -111,7 +113,9 @@ def test_estimator_fails_as_configured(kind: str) -> None:
         case "wrong":
             assert seen == pytest.approx([2.0 * 2 / 3] * 6)
     clock.t_ns = 2_000_000_000
-    assert estimator.update(GRAY).force_n == 2.0
+    sound = estimator.update(GRAY)
+    assert sound is not None
+    assert sound.force_n == 2.0
 
 
 def test_estimator_blocks_in_real_time() -> None:

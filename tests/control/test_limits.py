@@ -65,7 +65,7 @@ def test_non_finite_is_refused(bad, where):
     name = ("goal position", "goal current", "force estimate", "friction estimate", "motor force")[where]
     with pytest.raises(NonFiniteError, match=name):
         Limits(CONFIG, FINE, 1.0).apply(
-            ServoCommand(0, values[0], values[1]), *values[2:], 0.005, may_rise=True
+            ServoCommand(0, values[0], values[1]), values[2], values[3], values[4], 0.005, may_rise=True
         )
 
 

@@ -22,7 +22,7 @@ def test_simc_of_a_slow_plant_has_the_integral_time_of_the_rule():
 
 
 def test_a_plant_without_lag_gets_an_integral():
-    assert simc(Plant(1.0, 0.0, 0.1)) == Gains(0.0, pytest.approx(5.0))
+    assert simc(Plant(1.0, 0.0, 0.1)) == Gains(0.0, pytest.approx(5.0))  # type: ignore[arg-type]
 
 
 @given(st.floats(0.1, 10), st.floats(0.0, 0.5), st.floats(0.005, 0.2))

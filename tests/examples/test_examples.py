@@ -41,7 +41,7 @@ def write(path: Path, keys: dict[str, object]) -> Path:
 
 
 def start(name: str, *arguments: object) -> "subprocess.Popen[str]":
-    command = [sys.executable, "-u", EXAMPLES / name, *map(str, arguments)]
+    command = [sys.executable, "-u", str(EXAMPLES / name), *map(str, arguments)]
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 

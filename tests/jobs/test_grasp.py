@@ -1,15 +1,16 @@
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from gripper_force.config import Config, config_from_text, load_config
 from gripper_force.jobs import grasp as grasp_module
-from gripper_force.jobs.grasp import overall, summarise, trials
+from gripper_force.jobs.grasp import Summary, overall, summarise, trials
 from gripper_force.runtime.log import LogReader, LogWriter
 from gripper_force.types import LoadCellSample, VisualForce
 
@@ -22,6 +23,7 @@ def test_a_summary_is_what_the_log_says(fused_log: Path) -> None:
     assert summary["result"] in {"held", "timeout"}
     assert summary["loop_hz"] == pytest.approx(200.0)
     assert summary["peak_n"] == max(s.force_n for s in log.records(LoadCellSample))
+    assert summary["load_cell_mean_n"] is not None
     assert summary["steady_error_n"] == summary["load_cell_mean_n"] - 3.0
     times = [v.compute_ms for v in log.records(VisualForce)]
     assert summary["estimator_p50_ms"] == pytest.approx(np.percentile(times, 50))
@@ -72,7 +74,7 @@ def test_a_run_that_ended_before_anything_was_interrupted(tmp_path: Path) -> Non
     assert (summary["result"], summary["object"], summary["loop_hz"]) == ("interrupted", "tube", None)
 
 
-def result(target_n: float, error_n: float | None, **more: Any) -> dict[str, Any]:
+def result(target_n: float, error_n: float | None, **more: Any) -> Summary:
     some = {
         "result": "held",
         "object": "tube",
@@ -84,7 +86,7 @@ def result(target_n: float, error_n: float | None, **more: Any) -> dict[str, Any
         "estimator_p50_ms": 5.0,
         "estimate_mae_n": {"visual": None, "current": 0.3, "fused": 0.1, "floor": 0.05},
     }
-    return some | more
+    return cast("Summary", some | more)
 
 
 def test_trials_are_summed_up_by_their_share_of_the_target() -> None:
@@ -128,7 +130,12 @@ def here(_count: int) -> Iterator[SimpleNamespace]:
 def test_trials_are_drawn_from_the_seed(monkeypatch: pytest.MonkeyPatch) -> None:
     ran: list[Config] = []
     monkeypatch.setattr(grasp_module, "process_pool", here)
-    monkeypatch.setattr(grasp_module, "grasp", lambda config: ran.append(config) or {})
+
+    def noted(config: Config) -> dict[str, Any]:
+        ran.append(config)
+        return {}
+
+    monkeypatch.setattr(grasp_module, "grasp", noted)
 
     def plan(seed: int) -> list[tuple[str, float, int]]:
         ran.clear()
@@ -144,7 +151,7 @@ def test_trials_are_drawn_from_the_seed(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_a_log_is_never_overwritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(grasp_module.time, "strftime", lambda _: "20260101-120000")
+    monkeypatch.setattr(time, "strftime", lambda _: "20260101-120000")
     config = load_config(None, [f"log.directory={tmp_path}", "object=tube", "target_n=2.5", "seed=7"])
     paths = []
     for _ in range(3):

@@ -24,7 +24,7 @@ def test_bins_use_measured_force() -> None:
 
 
 @pytest.mark.parametrize(("predicted", "measured"), [([], []), ([1.0], [1.0, 2.0]), ([[1.0]], [[1.0]])])
-def test_series_must_match(predicted: list, measured: list) -> None:
+def test_series_must_match(predicted: list[float], measured: list[float]) -> None:
     with pytest.raises(ValueError, match="one length"):
         metrics.mae(predicted, measured)
 

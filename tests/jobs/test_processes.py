@@ -1,6 +1,7 @@
 import os
 import signal
 import time
+from concurrent.futures import Future
 from multiprocessing import active_children
 
 import pytest
@@ -19,7 +20,7 @@ def test_ctrl_c_is_the_parents_affair() -> None:
 
 
 def test_an_interruption_breaks_off_what_runs_and_what_waits() -> None:
-    waiting = []
+    waiting: list[Future[None]] = []
 
     def interrupted() -> None:
         with process_pool(1) as pool:

@@ -88,7 +88,7 @@ def test_another_checkpoint_estimates_otherwise(
     tiny = load_checkpoint(tiny_checkpoint)
     with torch.no_grad():
         for network in tiny.networks:
-            network.out.bias += 0.05
+            network.out.bias.add_(0.05)
     other = tmp_path / "other.safetensors"
     save_checkpoint(other, tiny.networks, tiny.header)
     first, second = replay(fused_log), replay(fused_log, str(other))

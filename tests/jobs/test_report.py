@@ -7,7 +7,9 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 from mcap.records import Chunk, McapRecord
+from mcap.stream_reader import breakup_chunk
 
 from gripper_force.config import config_from, dump_config
 from gripper_force.errors import LogError
@@ -15,7 +17,7 @@ from gripper_force.jobs import report as report_module
 from gripper_force.jobs.report import pictures as pictures_module
 from gripper_force.jobs.report import write_report
 from gripper_force.jobs.report.data import SOURCES, Run, histogram, read_run
-from gripper_force.jobs.report.figure import CSS_COLOURS
+from gripper_force.jobs.report.figure import CSS_COLOURS, draw
 from gripper_force.jobs.report.pictures import FrameSampler, Picture, overlay
 from gripper_force.runtime import log as log_module
 from gripper_force.runtime.log import LogReader, LogWriter
@@ -175,11 +177,12 @@ def test_report_is_written_next_to_log_or_into_folder(grasp: Path, page: str) ->
 
 
 def test_log_is_read_once(grasp: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    decode, times_ns = log_module.breakup_chunk, []
+    times_ns = []
 
     def count(chunk: Chunk, **options: bool) -> list[McapRecord]:
         times_ns.append(chunk.message_start_time)
-        return decode(chunk, **options)
+        records: list[McapRecord] = breakup_chunk(chunk, **options)
+        return records
 
     monkeypatch.setattr(log_module, "breakup_chunk", count)
     write_report(grasp, tmp_path)
@@ -187,8 +190,13 @@ def test_log_is_read_once(grasp: Path, tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_figure_is_drawn_once(grasp: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    draw, drawn = report_module.draw, []
-    monkeypatch.setattr(report_module, "draw", lambda *given: drawn.append(draw(*given)) or drawn[-1])
+    drawn = []
+
+    def kept(run: Run, pictures: list[Picture]) -> Figure:
+        drawn.append(draw(run, pictures))
+        return drawn[-1]
+
+    monkeypatch.setattr(report_module, "draw", kept)
     write_report(grasp, tmp_path)
     assert len(drawn) == 1
 
@@ -236,7 +244,8 @@ def test_time_zero_is_the_first_request(grasp: Path) -> None:
     assert [(span.phase, round(span.start_s, 2)) for span in run.phases] == [
         (phase, round(start_s - 0.5, 2)) for start_s, phase in PHASES[1:]
     ]
-    assert (run.begin_s, run.end_s) == (pytest.approx(-0.5), pytest.approx(5.5, abs=0.06))
+    assert run.begin_s == pytest.approx(-0.5)
+    assert run.end_s == pytest.approx(5.5, abs=0.06)
     assert run.score is not None
     assert run.score.overshoot_n == pytest.approx(0.4, abs=0.15)
 
@@ -266,7 +275,8 @@ def test_pointer_areas_lie_over_the_charts(page: str) -> None:
     assert [name for name, *_ in areas] == ["forces", "errors"]
     tops, bottoms = [], []
     for _, begin_s, end_s, style in areas:
-        assert (float(begin_s), float(end_s)) == (pytest.approx(-0.5), pytest.approx(5.5, abs=0.06))
+        assert float(begin_s) == pytest.approx(-0.5)
+        assert float(end_s) == pytest.approx(5.5, abs=0.06)
         box = {key: float(value) for key, value in re.findall(r"(\w+):([\d.]+)%", style)}
         assert 0 < box["left"] < 10
         assert 90 < box["left"] + box["width"] <= 100
@@ -375,7 +385,7 @@ def test_overlay_colours_only_where_attention_is() -> None:
     image = overlay(np.full((64, 64), 100, np.uint8), attention)
     warmth = image[:, :, 0].astype(int) - image[:, :, 2]
     y, x = np.unravel_index(warmth.argmax(), warmth.shape)
-    assert (y // 8, x // 8) == (1, 6)
+    assert (int(y) // 8, int(x) // 8) == (1, 6)
     assert (image[40:, :20] == 100).all()
 
 

@@ -1,4 +1,5 @@
 import sys
+from collections.abc import Mapping
 from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,7 +20,7 @@ def config(quick: list[str]) -> Config:
     return load_config(None, quick)
 
 
-def changed(config: Config, **sections: dict[str, object]) -> Config:
+def changed(config: Config, **sections: Mapping[str, object]) -> Config:
     parts = {name: getattr(config, name).model_copy(update=update) for name, update in sections.items()}
     return config.model_copy(update=parts)
 
@@ -188,7 +189,7 @@ def test_a_third_party_backend_is_opened_with_its_options(
     monkeypatch.setitem(sys.modules, "own_devices", sys.modules[__name__])
     section = {"backend": "own_devices:OwnLoadCell", "options": {"gain": 3}}
     with open_devices(changed(config, load_cell=section)) as devices:
-        assert type(devices.load_cell).__name__ == "OwnLoadCell"
+        assert isinstance(devices.load_cell, OwnLoadCell)
         assert devices.load_cell.options == {"gain": 3}
         assert devices.load_cell.clock is devices.clock
 
@@ -200,7 +201,7 @@ def test_a_registered_backend_is_opened_by_its_name(config: Config, monkeypatch:
         "gripper_force.plugins.entry_points", lambda group: EntryPoints([point]).select(group=group)
     )
     with open_devices(changed(config, load_cell={"backend": "mine"})) as devices:
-        assert type(devices.load_cell).__name__ == "OwnLoadCell"
+        assert isinstance(devices.load_cell, OwnLoadCell)
     with (
         pytest.raises(ConfigError, match=r"did you mean 'mine'.*phidget, mine or package"),
         open_devices(changed(config, load_cell={"backend": "mines"})),

@@ -20,7 +20,7 @@ from gripper_force.control.limits import largest_target_n
 from gripper_force.runtime import gripper as gripper_module
 from gripper_force.runtime.log import LogReader
 from gripper_hw.dynamixel.pty_server import PtyServer, serve_virtual_servo
-from gripper_hw.dynamixel.virtual import VirtualBus, find_bus
+from gripper_hw.dynamixel.virtual import VirtualBus, find_bus, unregister_bus
 
 Open = Callable[..., gf.Gripper]
 
@@ -127,7 +127,8 @@ def test_move_positions_the_jaws_and_names_an_obstacle(simulated: Open) -> None:
     assert gripper.move(0.08) == pytest.approx(0.08, abs=0.001)
     assert gripper.state.outcome == gf.Outcome.MOVED
     assert gripper.move(0.01) > 0.03
-    assert gripper.state.outcome == gf.Outcome.BLOCKED
+    blocked = gripper.state
+    assert blocked.outcome == gf.Outcome.BLOCKED
     assert gripper.force_n < 1.5
     assert gripper.grasp(3.0).held
 
@@ -303,17 +304,17 @@ class Recorded:
     def __init__(self, ended: list[int]) -> None:
         import gripper_hw.sim.simulated_rig as rig
 
-        self._rig, self._before = rig, rig.unregister_bus
+        self._patch = pytest.MonkeyPatch()
 
         def unregister(name: str) -> None:
             if (found := find_bus(name)) is not None:
                 ended.append(found.servos[0].get("torque_enable"))
-            self._before(name)
+            unregister_bus(name)
 
-        rig.unregister_bus = unregister
+        self._patch.setattr(rig, "unregister_bus", unregister)
 
     def close(self) -> None:
-        self._rig.unregister_bus = self._before
+        self._patch.undo()
 
 
 @settings(max_examples=8)

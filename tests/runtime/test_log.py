@@ -32,7 +32,12 @@ from gripper_force.types import (
 )
 
 TIMES = st.integers(0, 2**63 - 1)
-BY_TYPE = {int: TIMES, float: st.floats(), str: st.text(), bool: st.booleans()}
+BY_TYPE: dict[Any, st.SearchStrategy[Any]] = {
+    int: TIMES,
+    float: st.floats(),
+    str: st.text(),
+    bool: st.booleans(),
+}
 SCALAR_TYPES = [kind for kind in get_args(Record) if kind is not Frame]
 
 

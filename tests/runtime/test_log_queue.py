@@ -1,5 +1,6 @@
 import threading
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import pytest
@@ -127,19 +128,24 @@ def test_a_record_that_does_not_fit_is_lost_alone(path: Path, lockstep: bool) ->
 
 def test_records_of_a_chunk_that_is_not_written_count_as_lost(path: Path) -> None:
     class Full:
-        def __init__(self, file: object) -> None:
+        def __init__(self, file: BinaryIO) -> None:
             self.file, self.is_full = file, False
 
         def write(self, data: bytes) -> int:
             if self.is_full:
                 raise OSError(28, "No space left on device")
-            return self.file.write(data)  # type: ignore[attr-defined, no-any-return]
+            return self.file.write(data)
 
         def __getattr__(self, name: str) -> object:
             return getattr(self.file, name)
 
     files: list[Full] = []
-    log = LogWriter(path, config="", metadata={}, wrap_file=lambda f: files.append(Full(f)) or files[0])  # type: ignore[arg-type, func-returns-value]
+
+    def wrap(file: BinaryIO) -> BinaryIO:
+        files.append(Full(file))
+        return files[0]  # type: ignore[return-value]
+
+    log = LogWriter(path, config="", metadata={}, wrap_file=wrap)
     log_queue = LogQueue(log, lockstep=True)
     for i in range(10):
         log_queue.write(Event(i, "test", "kept"))

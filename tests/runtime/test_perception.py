@@ -1,19 +1,13 @@
 import threading
 import time
 from collections import deque
-from typing import NamedTuple
 
 import numpy as np
 import pytest
 
 from gripper_force.errors import DataError
 from gripper_force.runtime.perception import LockstepPerception, ProcessedFrame, ThreadedPerception
-from gripper_force.types import NS_PER_MS, Frame, Gray
-
-
-class Guess(NamedTuple):
-    force_n: float
-    std_n: float
+from gripper_force.types import NS_PER_MS, ForceEstimate, Frame, Gray
 
 
 class FakeEstimator:
@@ -25,11 +19,11 @@ class FakeEstimator:
         self.error = error
         self.at = at
 
-    def update(self, gray: Gray) -> Guess | None:
+    def update(self, gray: Gray) -> ForceEstimate | None:
         self.count += 1
         if self.error is not None and self.count == self.at:
             raise self.error
-        return Guess(float(self.count), 0.5) if self.count > self.references else None
+        return ForceEstimate(float(self.count), 0.5) if self.count > self.references else None
 
 
 class Hand:

@@ -95,6 +95,7 @@ def test_cbam_is_equations_1_to_3_of_its_paper(stack: Tensor) -> None:
 def test_wap_over_positions_is_initialised_as_average() -> None:
     module = ChannelAttention(C, 0, positions=H * W, reduction=2, pooling="wap")
     x = torch.randn(1, C, H, W)
+    assert module.pool is not None
     torch.testing.assert_close(x.flatten(2) @ module.pool, x.mean((2, 3)))
 
 

@@ -3,7 +3,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from gripper_force.vision.backbones import Mobile, ResNet18, Vgg
+from gripper_force.vision.backbones import Mobile, ResNet18, Vgg, _InvertedResidual, _Residual
 from gripper_force.vision.header import STRIDES
 
 
@@ -14,6 +14,8 @@ def convolved(x: Tensor, pair: nn.Module, stride: int = 1) -> Tensor:
     assert isinstance(norm, nn.BatchNorm2d)
     padding = convolution.weight.shape[-1] // 2
     x = F.conv2d(x, convolution.weight, stride=stride, padding=padding, groups=convolution.groups)
+    assert norm.running_mean is not None
+    assert norm.running_var is not None
     mean, var, scale, shift = (
         t[:, None, None] for t in (norm.running_mean, norm.running_var, norm.weight, norm.bias)
     )
@@ -23,6 +25,8 @@ def convolved(x: Tensor, pair: nn.Module, stride: int = 1) -> Tensor:
 def drawn(network: nn.Module) -> nn.Module:
     for module in network.modules():
         if isinstance(module, nn.BatchNorm2d):
+            assert module.running_mean is not None
+            assert module.running_var is not None
             nn.init.normal_(module.running_mean, std=0.1)
             nn.init.uniform_(module.running_var, 0.5, 1.5)
             nn.init.uniform_(module.weight, 0.5, 1.5)
@@ -47,7 +51,7 @@ def test_width_scales_the_channels(make: type[Vgg | ResNet18 | Mobile], full: in
     assert make(width=1.0).out_channels == full
     half = make(width=0.5)
     assert half.out_channels == full // 2
-    side = STRIDES[make.__name__.lower()]
+    side = STRIDES[make.__name__.lower()]  # type: ignore[index]
     maps = half(torch.randn(2, 1, side, 3 * side))
     assert maps.shape == (2, full // 2, 1, 3)
     assert maps.min() >= 0
@@ -72,6 +76,7 @@ def test_resnet_has_the_18_layers_of_its_paper() -> None:
     frames = torch.randn(2, 1, 64, 96, dtype=torch.float64)
     x = F.max_pool2d(F.relu(convolved(frames, resnet.stem, 2)), 3, 2, 1)
     for i, block in enumerate(resnet.blocks):
+        assert isinstance(block, _Residual)
         stride = 2 if i in (2, 4, 6) else 1
         shortcut = x if stride == 1 else convolved(x, block.shortcut, 2)
         x = F.relu(convolved(F.relu(convolved(x, block.first, stride)), block.second) + shortcut)
@@ -94,9 +99,12 @@ def test_mobile_is_inverted_residuals() -> None:
     frames = torch.randn(2, 1, 32, 48, dtype=torch.float64)
     x = F.relu6(convolved(frames, mobile.stem, 2))
     for i, block in enumerate(mobile.blocks):
+        assert isinstance(block, _InvertedResidual)
         inner = F.relu6(convolved(x, block.widen))
         assert inner.shape[1] == 4 * x.shape[1]
-        assert block.filter[0].groups == inner.shape[1], "one filter for each channel"
+        (filters, _) = block.filter
+        assert isinstance(filters, nn.Conv2d)
+        assert filters.groups == inner.shape[1], "one filter for each channel"
         narrow = convolved(F.relu6(convolved(inner, block.filter, 1 if i % 2 else 2)), block.narrow)
         x = narrow + x if i % 2 else narrow
     x = F.relu6(convolved(x, mobile.last))

@@ -19,7 +19,8 @@ def scene(seed: int) -> Gray:
     """Returns a smooth image with sensor noise."""
     y, x = np.mgrid[:128, :128] / 128
     image = 110 + 60 * np.sin(6 * x) * np.cos(4 * y) + np.random.default_rng(seed).normal(0, 3, (128, 128))
-    return image.round().astype(np.uint8)
+    gray: Gray = image.round().astype(np.uint8)
+    return gray
 
 
 def check(checks: FrameChecks, gray: Gray) -> None:

@@ -21,6 +21,8 @@ def build(config: NetworkConfig, seed: int = 0) -> ForceNetwork:
     network = ForceNetwork(config)
     for module in network.modules():
         if isinstance(module, nn.BatchNorm2d):
+            assert module.running_mean is not None
+            assert module.running_var is not None
             nn.init.normal_(module.running_mean, std=0.1)
             nn.init.uniform_(module.running_var, 0.5, 1.5)
             nn.init.uniform_(module.weight, 0.5, 1.5)
@@ -35,9 +37,9 @@ def as_torch_blstm(blstm: LastStepBlstm) -> nn.LSTM:
     for name, weight in blstm.forward_lstm.named_parameters():
         getattr(full, name).data.copy_(weight)
     keep = torch.cat([torch.arange(hidden), torch.arange(2 * hidden, 4 * hidden)])  # in, (forget,) cell, out
-    full.weight_ih_l0_reverse.data[keep] = blstm.backward_linear.weight
-    full.bias_ih_l0_reverse.data[keep] = blstm.backward_linear.bias
-    full.bias_hh_l0_reverse.data.zero_()
+    full.get_parameter("weight_ih_l0_reverse").data[keep] = blstm.backward_linear.weight
+    full.get_parameter("bias_ih_l0_reverse").data[keep] = blstm.backward_linear.bias
+    full.get_parameter("bias_hh_l0_reverse").data.zero_()
     return full
 
 
@@ -53,7 +55,8 @@ def literal(network: ForceNetwork, frames: Tensor) -> Tensor:
             excited, _ = network.attention(torch.cat(maps[t - seen : t + 1], dim=1), maps[t])
         vectors.append(excited.mean((2, 3)))
     states, _ = as_torch_blstm(network.blstm)(torch.stack(vectors, dim=1))
-    return network.out(torch.tanh(network.dense(states[:, -1])))[0, 0] * config.label_scale_n
+    forces: Tensor = network.out(torch.tanh(network.dense(states[:, -1])))
+    return forces[0, 0] * config.label_scale_n
 
 
 def history(network: ForceNetwork, clip: Tensor, t: int) -> Tensor:
@@ -152,7 +155,7 @@ def test_every_parameter_has_a_gradient(attention: str, backbone: str) -> None:
     network = build(NetworkConfig.model_validate(TINY.model_dump() | choices)).train()
     with torch.autocast("cpu", torch.bfloat16):
         forces = network(torch.randn(2, 3, 1, size, size))
-    forces.square().mean().backward()  # type: ignore[no-untyped-call]
+    forces.square().mean().backward()
     for name, parameter in network.named_parameters():
         assert parameter.grad is not None, name
         assert parameter.grad.isfinite().all(), name

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from gripper_force.config import BudgetConfig, VisionConfig
 from gripper_force.errors import ConfigError
 from gripper_force.vision import selection, step_benchmark
+from gripper_force.vision.header import SHIPPED
 from gripper_force.vision.model_files import read_model
 from gripper_force.vision.selection import Choice, candidates, pareto_front, resolve_auto, select
 from gripper_force.vision.step_benchmark import Candidate, engine_version
@@ -116,7 +117,7 @@ def test_damaged_cache_is_measured_again(
 def test_precision_is_only_chosen_together_with_the_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
     if find_spec("openvino") is None:
         pytest.skip("openvino is not installed: pip install 'gripper-force[engines]'")
-    monkeypatch.setattr(selection, "SHIPPED", {"default": selection.SHIPPED["default"]})
+    monkeypatch.setattr(selection, "SHIPPED", {"default": SHIPPED["default"]})
 
     def precisions(vision: VisionConfig) -> set[str]:
         return {setting.precision for setting in selection._settings(vision)}

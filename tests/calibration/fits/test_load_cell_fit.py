@@ -1,3 +1,5 @@
+from collections.abc import Callable
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -89,9 +91,11 @@ def test_spikes_and_invalid_readings_are_rejected() -> None:
         ),
     ],
 )
-def test_unusable_rests_are_refused_with_a_message(change: object, sentence: str) -> None:
+def test_unusable_rests_are_refused_with_a_message(
+    change: Callable[[Rest, Rest, Rest], tuple[Rest, Rest, Rest]], sentence: str
+) -> None:
     with pytest.raises(DataError, match=sentence) as caught:
-        fit_load_cell(*change(*rests(2)), FORCE_N)  # type: ignore[operator]
+        fit_load_cell(*change(*rests(2)), FORCE_N)
     assert "\n" not in str(caught.value)
 
 
@@ -114,7 +118,9 @@ def odd_rests(draw: st.DrawFn) -> Rest:
     step = draw(st.sampled_from([0.0, 0.1, -0.1]))
     flat = draw(numbers)
     raw = draw(arrays(np.float64, count, elements=numbers) | st.just(np.full(count, flat)))
-    return Rest(step * np.arange(count), raw, draw(arrays(np.bool_, count)) | draw(st.booleans()))
+    return Rest(
+        step * np.arange(count, dtype=np.float64), raw, draw(arrays(np.bool_, count)) | draw(st.booleans())
+    )
 
 
 @settings(max_examples=100, deadline=None)

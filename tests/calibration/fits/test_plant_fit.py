@@ -32,7 +32,7 @@ def test_gain_and_lag_are_recovered_with_any_friction(gain: float, lag_s: float,
 
 
 def test_weak_presses_give_no_plant() -> None:
-    still = PressSeries(np.arange(100) * 0.005, np.full(100, 2.0), np.full(100, 1.0))
+    still = PressSeries(np.arange(100, dtype=np.float64) * 0.005, np.full(100, 2.0), np.full(100, 1.0))
     assert fit_plant([], 0.04) is None
     assert fit_plant([still], 0.04) is None
     assert fit_plant([pressed(0.01, 0.03, 0.0)], 0.04) is None

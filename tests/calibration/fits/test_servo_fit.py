@@ -168,7 +168,9 @@ def odd_presses(draw: st.DrawFn) -> ServoPress:
     if draw(st.booleans()):
         ramp = np.concatenate([np.linspace(0, 9, count // 2), np.linspace(9, 0, count - count // 2)])
         columns[1] = ramp
-    return ServoPress(draw(st.sampled_from([0.03, 0.06])), np.arange(count) / 100, *columns, turn=count // 2)
+    current_a, force_n, closing_rad = columns
+    gauge_m = draw(st.sampled_from([0.03, 0.06]))
+    return ServoPress(gauge_m, np.arange(count) / 100, current_a, force_n, closing_rad, turn=count // 2)
 
 
 @st.composite

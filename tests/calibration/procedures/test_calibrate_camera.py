@@ -87,7 +87,9 @@ def test_command_writes_profile_reference_and_report(tmp_path: Path) -> None:
     assert found.lag_ms.low < 0 < found.lag_ms.high
     assert found.delay_ms.value == pytest.approx(result["use_ms"] + 500 / 30 + found.lag_ms.value, abs=1.0)
     assert result["touches"] == 4
-    assert cv2.imread(str(tmp_path / found.reference)).shape == (128, 128, 3)
+    reference = cv2.imread(str(tmp_path / found.reference))
+    assert reference is not None
+    assert reference.shape == (128, 128, 3)
     assert cv2.imread(result["report"]) is not None
     config = load_config(None, [f"calibration.rig={rig}"])
     assert config.vision.region == found.region

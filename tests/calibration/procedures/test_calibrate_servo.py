@@ -31,7 +31,7 @@ def config_of(*overrides: str) -> Config:
 def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("rig") / "rig.yaml"
     asked: list[str] = []
-    result = calibrate_servo(config_of(), [0.03], path, prompt=asked.append)
+    result = calibrate_servo(config_of(), [0.03], path, prompt=lambda text: asked.append(text))
     assert asked == ["Put the load cell with its width of 30 mm between the open jaws"]
     assert Path(result.report).stat().st_size > 20_000
     assert (result.presses, result.passes) == (6, 12)
@@ -105,12 +105,16 @@ def test_failures_are_named_and_leave_the_torque_off(
 ) -> None:
     buses: list[VirtualBus | None] = []
 
-    def progress(_step: str, _force_n: float) -> None:
+    def progress(text: str, steps: int = 1) -> None:
         buses.append(find_bus("rig"))
 
     with pytest.raises(kind, match=sentence) as caught:
         calibrate_servo(
-            config_of(*overrides), [gauge_m], tmp_path / "rig.yaml", prompt=lambda _: None, progress=progress
+            config_of(*overrides),
+            [gauge_m],
+            tmp_path / "rig.yaml",
+            prompt=lambda text: None,
+            progress=progress,
         )
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
@@ -141,7 +145,7 @@ def test_profile_with_another_load_cell_scale_is_refused(tmp_path: Path) -> None
         ConfigError,
         match=r".* has [\d.]+ N per raw unit for this load cell, but load_cell\.n_per_raw is None",
     ):
-        calibrate_servo(config_of(), [0.03], rig, prompt=lambda _: None)
+        calibrate_servo(config_of(), [0.03], rig, prompt=lambda text: None)
 
 
 def test_without_a_terminal_the_command_is_refused(tmp_path: Path) -> None:

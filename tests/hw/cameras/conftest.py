@@ -43,7 +43,7 @@ def take() -> Take:
     return take
 
 
-class HostSensor(dai.node.ThreadedHostNode):  # type: ignore[misc]
+class HostSensor(dai.node.ThreadedHostNode):
     """Gives 100 images per second while plugged in."""
 
     def __init__(self, plugged: threading.Event, gray: Gray, colour: bool, exposure_us: int) -> None:

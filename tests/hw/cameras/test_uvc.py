@@ -1,6 +1,7 @@
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import pytest
@@ -37,9 +38,14 @@ def test_region_beyond_image_is_refused(make_uvc: MakeUvc) -> None:
 
 def test_exposure_and_gain_are_set_in_driver_units(make_uvc: MakeUvc) -> None:
     camera = make_uvc(exposure_us=8000, gain=20)
-    captures = []
+    captures: list[Any] = []
     open_capture = camera._open_capture
-    camera._open_capture = lambda path: captures.append(open_capture(path)) or captures[-1]
+
+    def kept(path: str) -> Any:
+        captures.append(open_capture(path))
+        return captures[-1]
+
+    camera._open_capture = kept
     camera.start()
     camera.close()
     assert captures[0].controls == {

@@ -218,7 +218,12 @@ def test_stop_with_hold_keeps_the_goals_and_disarms_the_watchdog(setup):
 def test_nothing_is_sent_for_a_non_finite_goal(setup):
     setup.servo.start()
     sent: list[bytes] = []
-    setup.bus.transact = lambda data: sent.append(data) or b""
+
+    def transact(data: bytes) -> bytes:
+        sent.append(data)
+        return b""
+
+    setup.bus.transact = transact
     for command in (goals(float("nan")), goals(0.1, float("inf"))):
         with pytest.raises(NonFiniteError, match="nothing was sent"):
             setup.servo.write(command)

@@ -98,10 +98,9 @@ def test_values_outside_the_range_are_refused_and_the_bounds_accepted(name):
     servo = VirtualServo(1, COMPLETE)
     servo.set("operating_mode", CURRENT_BASED_POSITION_MODE)
     register = REGISTERS[name]
-    for bound, beyond in (
-        (register.range[0], register.range[0] - 1),
-        (register.range[1], register.range[1] + 1),
-    ):
+    assert register.range is not None
+    low, high = register.range
+    for bound, beyond in ((low, low - 1), (high, high + 1)):
         assert write(servo, name, bound) is Error.NONE
         assert servo.get(name) == bound
         try:

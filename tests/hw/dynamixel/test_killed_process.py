@@ -79,10 +79,12 @@ def kill_both(quick: list[str], tmp_path: Path) -> None:
         ports, children = [], []
         for number in SIGNALS:
             served = stack.enter_context(process("virtual-servo", "--json"))
+            assert served.stdout is not None
             ports.append(json.loads(served.stdout.readline())["port"])
             folder = tmp_path / number.name
             children.append(stack.enter_context(process(*grasp(ports[-1], folder, quick))))
         for child in children:
+            assert child.stderr is not None
             if not any("approach" in line for line in child.stderr):
                 check_busy(child)
         time.sleep(1.0)  # of motion
@@ -100,6 +102,8 @@ def kill_both(quick: list[str], tmp_path: Path) -> None:
 
 
 def check_busy(child: subprocess.Popen[str]) -> None:
+    assert child.stdout is not None
+    assert child.stderr is not None
     said = child.stdout.read() + child.stderr.read()
     assert any(sentence in said for sentence in ("no valid reply", "watchdog tripped")), said
     raise BusyError(said)

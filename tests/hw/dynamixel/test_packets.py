@@ -13,7 +13,7 @@ stuffy = st.lists(st.sampled_from([b"\xff", b"\xff\xff\xfd", b"\xfd", b"\x00", b
 contents = st.binary(max_size=60) | stuffy
 
 
-class Tap(dynamixel_sdk.PortHandler):
+class Tap(dynamixel_sdk.PortHandler):  # type: ignore[misc]
     """Records the bytes that the SDK sends."""
 
     def __init__(self) -> None:

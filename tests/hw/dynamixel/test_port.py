@@ -4,6 +4,7 @@ import pty
 import resource
 import threading
 import tty
+from typing import Any
 
 import dynamixel_sdk as sdk
 import pytest
@@ -64,7 +65,7 @@ def test_closed_port_raises_device_lost(endpoint):
 
 
 def test_drain_discards_an_earlier_reply(endpoint):
-    port = open_port(endpoint.port, 1_000_000, 250.0)
+    port: Any = open_port(endpoint.port, 1_000_000, 250.0)
     port.writePort(PING)
     port.setPacketTimeoutMillis(100.0)
     port.drain()
@@ -74,7 +75,7 @@ def test_drain_discards_an_earlier_reply(endpoint):
 
 
 def test_read_of_negative_length_is_empty(endpoint):
-    port = open_port(endpoint.port, 1_000_000, 250.0)
+    port: Any = open_port(endpoint.port, 1_000_000, 250.0)
     port.writePort(PING)
     port.setPacketTimeoutMillis(1000.0)
     assert port.readPort(1) == b"\xff"
@@ -100,7 +101,7 @@ def test_works_with_file_descriptors_above_1024(endpoint, tmp_path):
 
 
 def test_reply_may_arrive_in_pieces(endpoint):
-    port = open_port(endpoint.port, 1_000_000, 100.0)
+    port: Any = open_port(endpoint.port, 1_000_000, 100.0)
     port.writePort(PING)
     port.setPacketTimeout(14)
     found = b""
@@ -132,7 +133,7 @@ def test_timeout_includes_both_packets_and_the_margin(deaf_port):
 def test_endless_stream_of_bytes_is_abandoned():
     master, slave = pty.openpty()
     tty.setraw(slave)
-    port = open_port(os.ttyname(slave), 1_000_000, 4.0)
+    port: Any = open_port(os.ttyname(slave), 1_000_000, 4.0)
     done = threading.Event()
 
     def babble():

@@ -165,7 +165,9 @@ def test_current_limit_above_the_models_is_refused():
 def test_spec_contains_the_models_data_and_needs_no_port():
     config = ServoConfig(port="virtual:nobody", model="XC330-T288")
     assert DynamixelServo.spec(config) == ServoSpec(
-        nm_per_a=pytest.approx(0.92 / 0.80), current_step_a=0.001, voltage_range_v=(6.5, 12.0)
+        nm_per_a=pytest.approx(0.92 / 0.80),  # type: ignore[arg-type]
+        current_step_a=0.001,
+        voltage_range_v=(6.5, 12.0),
     )
     with pytest.raises(ConfigError, match=r"unknown servo\.model 'AX-12'"):
         DynamixelServo.spec(ServoConfig(model="AX-12"))

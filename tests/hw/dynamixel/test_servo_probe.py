@@ -7,7 +7,7 @@ import pytest
 
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DeviceError, DeviceNotFoundError
-from gripper_force.jobs.checks import SetupResult
+from gripper_force.jobs.checks import RegisterChange, SetupResult
 from gripper_hw.dynamixel.control_table import REGISTERS, load_model
 from gripper_hw.dynamixel.firmware import OVERLOAD_ERROR
 from gripper_hw.dynamixel.packets import Instruction
@@ -155,9 +155,18 @@ def test_lockstep_clock_with_a_real_servo_is_a_problem(endpoint):
 # Setup.
 
 
+def never(servo: str, changes: list[RegisterChange]) -> bool:
+    pytest.fail(f"asked to change {changes} of {servo}")
+
+
 def test_setup_writes_nothing_if_declined(endpoint):
-    asked = []
-    result = setup(config_of(endpoint), lambda *question: bool(asked.append(question)))
+    asked: list[tuple[str, list[RegisterChange]]] = []
+
+    def declined(servo: str, changes: list[RegisterChange]) -> bool:
+        asked.append((servo, changes))
+        return False
+
+    result = setup(config_of(endpoint), declined)
     ((servo, changes),) = asked
     assert servo == "servo 1"
     assert [(c.register, c.old, c.new) for c in changes] == [
@@ -184,7 +193,7 @@ def test_setup_writes_the_listed_changes_so_that_start_does_not(endpoint):
     writes = [packet for packet in endpoint.packets() if packet.instruction == Instruction.WRITE]
     assert writes
     assert all(int.from_bytes(packet.params[:2], "little") >= 64 for packet in writes)
-    assert setup(config_of(endpoint), pytest.fail) == SetupResult(1, [], applied=False)
+    assert setup(config_of(endpoint), never) == SetupResult(1, [], applied=False)
 
 
 def test_setup_overwrites_registers_of_another_program(endpoint):
@@ -199,11 +208,11 @@ def test_setup_overwrites_registers_of_another_program(endpoint):
 def test_setup_refuses_while_torque_is_on(endpoint):
     endpoint.bus.servos[0].set("torque_enable", 1)
     with pytest.raises(DeviceError, match="servo 1 has torque on, so nothing was changed"):
-        setup(config_of(endpoint), pytest.fail)
+        setup(config_of(endpoint), never)
     assert not written(endpoint)
 
 
 def test_setup_refuses_another_model(endpoint):
     with pytest.raises(ConfigError, match="not the configured XL330-M288"):
-        setup(config_of(endpoint, model="XL330-M288"), pytest.fail)
+        setup(config_of(endpoint, model="XL330-M288"), never)
     assert not written(endpoint)

@@ -220,7 +220,11 @@ def test_stale_incomplete_packet_is_discarded():
 
 def test_plant_is_advanced_before_each_packet():
     servo = VirtualServo(1, MODEL)
-    bus = VirtualBus([servo], lambda: 0, before_packet=lambda: servo.control(0, 0.5, 0.0))
+
+    def advance() -> None:
+        servo.control(0, 0.5, 0.0)
+
+    bus = VirtualBus([servo], lambda: 0, before_packet=advance)
     data = answers(bus, frame(1, Instruction.READ, struct.pack("<HH", POSITION, 4)))[0].params[1:]
     assert int.from_bytes(data, "little") == 2374
 

@@ -71,7 +71,7 @@ def test_frames_of_all_three_lengths_are_parsed(frame: tuple[bytes, str, bytes])
     ],
 )
 def test_number_formats_of_indicators_are_parsed(line: bytes, raw: float) -> None:
-    assert parse_cas(line) == Reading(pytest.approx(raw))
+    assert parse_cas(line) == Reading(pytest.approx(raw))  # type: ignore[arg-type]
 
 
 def test_overload_without_number_is_saturation() -> None:

@@ -78,7 +78,8 @@ def ramp(rise: float, top_n: float) -> Floats:
 
 
 def wave(period: float, top_n: float) -> Floats:
-    return top_n * np.sin(np.pi * np.arange(60) / period) ** 2
+    forces_n: Floats = top_n * np.sin(np.pi * np.arange(60) / period) ** 2
+    return forces_n
 
 
 @given(

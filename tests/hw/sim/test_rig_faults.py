@@ -56,7 +56,7 @@ class Source:
 
 
 def faults(unit: str, kind: str) -> Faults:
-    return Faults([FaultConfig(unit=unit, kind=kind, at_s=1.0, for_s=1.0)])  # type: ignore[arg-type]
+    return Faults([FaultConfig(unit=unit, kind=kind, at_s=1.0, for_s=1.0)])
 
 
 def frames_of(kind: str) -> list[tuple[int, Frame]]:

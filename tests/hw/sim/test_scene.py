@@ -75,7 +75,7 @@ def test_seed_places_the_same_object_on_the_same_rig(own: int, seed: int, other:
 
 def test_object_seed_draws_texture_and_rig_seed_draws_table() -> None:
     def textures(**seeds: int) -> dict[str, bytes]:
-        return scene_mjcf(draw_scene("tube", 1, SimConfig(**seeds)), GripperConfig())[1]  # type: ignore[arg-type]
+        return scene_mjcf(draw_scene("tube", 1, SimConfig(**seeds)), GripperConfig())[1]
 
     plain, other_object, other_rig = textures(), textures(object_seed=2), textures(rig_seed=2)
     assert plain["table.png"] == other_object["table.png"] != other_rig["table.png"]

@@ -213,7 +213,8 @@ def test_exception_of_thread_is_raised_by_check(make_rig: MakeRig, monkeypatch: 
         raise MemoryError("no more")
 
     error = error_of_patched_rig(
-        make_rig, lambda rig: monkeypatch.setattr(rig.load_cell._world, "advance_to", fail)
+        make_rig,
+        lambda rig: monkeypatch.setattr(rig.load_cell._world, "advance_to", fail),  # type: ignore[attr-defined]
     )
     assert isinstance(error, MemoryError)
 

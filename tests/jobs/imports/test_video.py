@@ -269,7 +269,9 @@ def test_large_times_give_no_tare() -> None:
 
 def test_tare_needs_quiet_unloaded_start() -> None:
     t_s = np.arange(60) / RATE_HZ
-    assert estimate_tare(t_s, grip() + 0.55) == (pytest.approx(0.55), "")
+    tare_n, note = estimate_tare(t_s, grip() + 0.55)
+    assert tare_n == pytest.approx(0.55)
+    assert note == ""
     for force_n, reason in [
         (grip() + np.interp(t_s, [0, 0.3], [0, 3]), "contact may be near"),
         (grip()[::-1] + np.interp(np.arange(60), [0, 40], [10, 0]), "contact may be near"),

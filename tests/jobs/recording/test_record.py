@@ -14,6 +14,7 @@ from gripper_force.interfaces import Devices, LoadCell
 from gripper_force.jobs.dataset import load_clip
 from gripper_force.jobs.recording import record as module
 from gripper_force.jobs.recording.record import RecordingPlan, record
+from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log import LogReader
 from gripper_force.types import Frame, GraspStatus, LoadCellSample, Phase, Request, RequestKind
 from gripper_force.vision.preprocess import Preprocess
@@ -42,7 +43,9 @@ def test_set_is_a_log_for_training(config: Config, tmp_path: Path) -> None:
     progress: list[str] = []
     prompts: list[str] = []
     plan = RecordingPlan(1, 2, 5.0, degrees=10, lux=350)
-    (path,) = record(config, plan, tmp_path, lambda text, steps=1: progress.append(text), prompts.append)
+    (path,) = record(
+        config, plan, tmp_path, lambda text, steps=1: progress.append(text), lambda text: prompts.append(text)
+    )
     assert list(tmp_path.rglob("*.*")) == [path]
     assert path == tmp_path / "train" / "stapler-10deg-350lux-01.mcap"
     log = LogReader(path)
@@ -61,7 +64,8 @@ def test_set_is_a_log_for_training(config: Config, tmp_path: Path) -> None:
     assert all(1 <= r.target_n <= 5 for r in requests if r.kind == RequestKind.GRASP)
     assert sum(frame.received_ns < requests[0].t_ns for frame in log.records(Frame)) >= 10
     last = list(log.records(GraspStatus))[-1]
-    assert (last.phase, last.width_m) == (Phase.OPEN, pytest.approx(used.gripper.open_width_m, abs=0.004))
+    assert last.phase == Phase.OPEN
+    assert last.width_m == pytest.approx(used.gripper.open_width_m, abs=0.004)
     clip = load_clip(path, Preprocess(size=32), None)
     assert clip.valid.all()
     assert clip.forces_n[:10].max() < 0.1
@@ -155,7 +159,6 @@ def test_jaws_open_after_fault_if_configured(config: Config, tmp_path: Path) -> 
 @pytest.fixture
 def change_load_cell(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[float], float]], None]:
     """Returns a function that replaces the readings of the rig's load cell."""
-    open_devices = module.open_devices
 
     class Changed:
         def __init__(self, cell: LoadCell, change: Callable[[float], float]) -> None:

@@ -38,15 +38,14 @@ def test_set_without_lag(log: Path) -> None:
     one, overall = result.sets[0], result.overall
     assert (one.object, one.set, one.touches) == ("stapler", "stapler-01", 3)
     assert one.camera_hz == pytest.approx(30, rel=0.02)
-    assert (one.frames_lost, one.samples_rejected, one.load_cell_hz) == (
-        0,
-        0,
-        pytest.approx(200, 0.02),
-    )
+    assert (one.frames_lost, one.samples_rejected) == (0, 0)
+    assert one.load_cell_hz == pytest.approx(200, 0.02)
     assert sum(one.histogram.values()) == one.frames
     assert max(one.histogram) == int(one.peak_n)
     assert overall.histogram == {n: 2 * count for n, count in one.histogram.items()}
     assert (overall.frames, overall.touches) == (2 * one.frames, 6)
+    assert overall.lag_ms is not None
+    assert overall.lag_spread_ms is not None
     assert abs(overall.lag_ms) < 6
     assert overall.lag_spread_ms < 6
     assert result.warnings == []
@@ -59,6 +58,8 @@ def test_late_camera_timestamps_are_detected(log: Path, tmp_path: Path) -> None:
 
     before = summarise([log]).overall
     result = summarise([changed(log, tmp_path / "late.mcap", late)])
+    assert before.lag_ms is not None
+    assert result.overall.lag_ms is not None
     assert result.overall.lag_ms - before.lag_ms == pytest.approx(20, abs=2)
     assert result.overall.camera_lag_ms == pytest.approx(20, abs=4)
     (warning,) = result.warnings

@@ -1,10 +1,10 @@
+import time
 from pathlib import Path
 
 import pytest
 import torch
 
 from gripper_force.jobs.dataset import Clip
-from gripper_force.jobs.training import trainer as trainer_module
 from gripper_force.jobs.training.batches import Batches
 from gripper_force.jobs.training.parallel import Ranks
 from gripper_force.jobs.training.recipe import TrainConfig
@@ -26,7 +26,7 @@ def gradients(
         squared_error(network, inputs, forces_n, valid, network.config.context)
         / valid[:, network.config.context :].sum()
     )
-    loss.backward()  # type: ignore[no-untyped-call]
+    loss.backward()
     return loss.item(), [p.grad.clone() for p in network.parameters() if p.grad is not None]
 
 
@@ -99,7 +99,7 @@ def test_time_budget_ends_training(
     clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_recipe: TrainConfig
 ) -> None:
     seconds = iter(range(10_000))
-    monkeypatch.setattr(trainer_module.time, "monotonic", lambda: float(next(seconds)))
+    monkeypatch.setattr(time, "monotonic", lambda: float(next(seconds)))
     learning_rates = []
     update = Trainer._update
 

@@ -57,7 +57,7 @@ def main() -> None:
         losses.append(loss.item())
         return loss
 
-    Trainer._update = spying  # type: ignore[method-assign]
+    Trainer._update = spying  # type: ignore[assignment, method-assign]
     clips = [clip(seed) for seed in range(6)]
     train(CONFIG, clips, folder / "whole.safetensors")
     whole, losses = losses, []

@@ -39,6 +39,7 @@ def test_every_recipe_is_trained_for_its_time_and_saved(clips: list[Clip], tmp_p
 
 def test_an_interrupted_comparison_keeps_its_points(clips: list[Clip], tmp_path: Path) -> None:
     training = learn(lambda _: clips, 1.0, KEYS, tmp_path)
+    assert isinstance(training, Generator)
     point = next(training)
     assert isinstance(training, Generator)
     training.close()
