@@ -100,7 +100,9 @@ def test_setup_shows_and_asks(sets: list[str], options: tuple[str, ...], answer:
 def test_setup_ends_with_a_sentence(sets: list[str]) -> None:
     assert run("--setup", *sets, answer="n").stdout.endswith("servo 1: unchanged\n")
     assert run("--setup", "--yes", *sets).stdout == "servo 1: written and read back\n"
-    assert "the question was not answered, so nothing was written to servo 1" in str(run("--setup", *sets).exception)
+    assert "the question was not answered, so nothing was written to servo 1" in str(
+        run("--setup", *sets).exception
+    )
     odd = ["--set", "servo.port=/dev/nowhere"]
     assert "no port /dev/nowhere" in str(run("--setup", *sets, *odd).exception)
 
