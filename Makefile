@@ -23,7 +23,7 @@ test: setup-dev
 
 docs: setup-dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
-	@echo open build/site/index.html
+	@echo open build/site/library.html
 
 format: setup-dev
 	$(BIN)/ruff check --fix .
