@@ -3,7 +3,7 @@ from gripper_force.types import NS_PER_MS, NS_PER_S, LoadCellSample
 
 
 def news(watch: LoadCellMonitor, period_ms: int, valid: range, until_ms: int) -> list[tuple[int, str]]:
-    """What is said, and when, of a cell whose samples are sound at some times and missing at others."""
+    """Warnings about a load cell whose samples are valid at some times and missing at others."""
     told = []
     for t_ms in range(0, until_ms, 5):
         sound = t_ms % period_ms == 0 and t_ms not in valid
