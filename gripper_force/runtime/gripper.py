@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import itertools
 import math
 import queue
+import sys
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -25,11 +26,13 @@ from gripper_force.types import NS_PER_S, EstimateSource, Frame, LoadCellSample,
 GRIPPING: Final = (Phase.CONTACT, Phase.RAMP, Phase.HOLD)
 """Phases in which the jaws press on an object."""
 
+_NO_OBJECT: Final = "no object is gripped"
+
 _RELEASE_S: Final = 6.0
 """Longest wait for open jaws: the controller's own limit of 5 s, and some slack."""
 
-_JOIN_S: Final = 10.0
-"""Longest wait for the end of the control thread; the servo's Bus Watchdog acts much earlier."""
+_JOIN_S: Final = 25.0
+"""Longest wait for the end of the control thread, which may wait 20 s for a disk that does not answer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +103,7 @@ class _Request(NamedTuple):
     number: int
     target_n: float = 0.0
     width_m: float = 0.0
+    needs_object: bool = False
 
 
 def open_gripper(
@@ -177,13 +181,16 @@ class Gripper:
         self._numbers = itertools.count(1)
         self._changed = threading.Condition()
         self._closing = threading.Event()
-        self._run, self._signals = ExitStack(), ExitStack()
+        self._run, self._signals = contextlib.ExitStack(), contextlib.ExitStack()
         self._thread: threading.Thread | None = None
         self._session: Session | None = None
         # Written by the thread that runs the control cycle:
         self._state: GripperState | None = None
         self._result: GraspResult | None = None
         self._newest: _Request | None = None
+        self._postponed: _Request | None = None
+        self._stop_number = 0  # requests with a lower number are older than the newest stop
+        self._ended = False  # the control thread
         self._refusal = ""
         self._hold_cycles = self._vision_cycles = 0
         self._error: BaseException | None = None
@@ -214,12 +221,7 @@ class Gripper:
             RequestError: The force is out of range, or the gripper is at fault and needs a release first.
             DeviceError: A device failed.
         """
-        self._opened().run.check_target(force_n)
-        request = self._submit(RequestKind.GRASP, target_n=force_n)
-        if not wait:
-            return None
-        self._wait(request, lambda state: state.outcome != Outcome.NONE)
-        return self._result
+        return self._grip(force_n, wait=wait, needs_object=False)
 
     @overload
     def set_force(self, force_n: float) -> GraspResult: ...
@@ -242,8 +244,8 @@ class Gripper:
             DeviceError: A device failed.
         """
         if self.state.phase not in GRIPPING:
-            raise RequestError(f"no object is gripped (phase {self.state.phase}); call grasp first")
-        return self.grasp(force_n, wait=True) if wait else self.grasp(force_n, wait=False)
+            raise RequestError(f"{_NO_OBJECT} (phase {self.state.phase}); call grasp first")
+        return self._grip(force_n, wait=wait, needs_object=True)
 
     def move(self, width_m: float, *, wait: bool = True) -> float:
         """Moves the jaws to a width, and lets go of an object if one is gripped.
@@ -293,6 +295,7 @@ class Gripper:
         resets it. With ``background=False`` the stop takes effect in the next `step`.
         """
         if self._session is not None:
+            self._stop_number = next(self._numbers)
             self._session.stop_soon()
 
     # The control cycle in the caller's thread.
@@ -328,7 +331,7 @@ class Gripper:
         if self._background:
             end_s = time.monotonic() + seconds
             with self._changed:
-                while (left_s := end_s - time.monotonic()) > 0 and self._error is None:
+                while (left_s := end_s - time.monotonic()) > 0 and self._error is None and not self._ended:
                     self._changed.wait(left_s)
             self._raise_error()
             return
@@ -384,7 +387,7 @@ class Gripper:
         self._close(error)
 
     def _open(self) -> None:
-        atexit.register(self.close)  # for a program that ends without closing the gripper
+        atexit.register(self._close_at_exit)  # for a program that ends without closing the gripper
         try:
             if self._background:
                 self._signals.enter_context(deferred_signals(_interrupt))
@@ -400,11 +403,16 @@ class Gripper:
             self._close(error)
             raise
 
+    def _close_at_exit(self) -> None:
+        """Closes a gripper that the program forgot. The exception that ended the program is the cause."""
+        # An interactive interpreter keeps every exception there, also those that the user has handled.
+        self._close(None if hasattr(sys, "ps1") else getattr(sys, "last_value", None))
+
     def _close(self, error: BaseException | None) -> None:
         if self._closed:
             return
         self._closed = True
-        atexit.unregister(self.close)
+        atexit.unregister(self._close_at_exit)
         with self._signals:
             if self._thread is None:
                 # An error of an earlier step ends the run as a fault even if the caller has handled it.
@@ -422,8 +430,8 @@ class Gripper:
                 error.with_traceback(trace)  # without the frames of the control thread
             if self._thread.is_alive():
                 raise DeviceTimeoutError(
-                    f"the control thread did not end within {_JOIN_S:g} s, and the servo's Bus Watchdog has "
-                    "stopped the servo; check the cables, and see what `gripper-force doctor` says"
+                    f"the control thread did not end within {_JOIN_S:g} s; if it did not stop the servo, the "
+                    "servo's Bus Watchdog did; check cables and disk, and see what `gripper-force doctor` says"
                 )
             if not self._error_was_raised:
                 self._raise_error()
@@ -440,9 +448,11 @@ class Gripper:
                     raise self._end_error  # noqa: TRY301
         except BaseException as error:
             if error is not self._end_error:
-                with self._changed:
-                    self._error = error
-                    self._changed.notify_all()
+                self._error = error
+        finally:
+            with self._changed:
+                self._ended = True
+                self._changed.notify_all()
 
     def _start(self, session: Session) -> None:
         self.config = session.run.config
@@ -450,15 +460,27 @@ class Gripper:
         self._publish(session, session.wait_for_reference(), None)
 
     def _cycle(self, session: Session) -> GripperState:
-        try:
-            request = self._requests.get_nowait()
-        except queue.Empty:
+        request, self._postponed = self._postponed or self._next_request(), None
+        if request is not None and session.stop_is_pending and request.number > self._stop_number:
+            self._postponed, request = request, None  # the stop came first
+        if request is None:
             return self._publish(session, session.cycle(), None)
+        if request.number < self._stop_number:  # the stop overrides it
+            return self._publish(session, session.cycle(), request)
+        if request.needs_object and self.state.phase not in GRIPPING:
+            return self._publish(session, session.cycle(), request, _NO_OBJECT)
         self._hold_cycles = self._vision_cycles = 0
         decision = session.cycle(request.kind, request.target_n, request.width_m)
         return self._publish(session, decision, request)
 
-    def _publish(self, session: Session, decision: Decision, request: _Request | None) -> GripperState:
+    def _next_request(self) -> _Request | None:
+        with contextlib.suppress(queue.Empty):
+            return self._requests.get_nowait()
+        return None
+
+    def _publish(
+        self, session: Session, decision: Decision, request: _Request | None, refusal: str = ""
+    ) -> GripperState:
         """Makes the cycle's result visible to other threads, and wakes them if something changed."""
         status, estimate, servo = decision.status, decision.estimate, session.servo_state
         assert servo is not None  # the cycle has read it
@@ -490,7 +512,7 @@ class Gripper:
                 if changed and state.outcome != Outcome.NONE:
                     self._result = self._result_of(state)
                 if request is not None:
-                    self._newest, self._refusal = request, decision.refusal
+                    self._newest, self._refusal = request, refusal or decision.refusal
                 self._changed.notify_all()
         return state
 
@@ -506,9 +528,19 @@ class Gripper:
             raise RequestError("the gripper is closed; open it again with open_gripper")
         return self._session
 
-    def _submit(self, kind: RequestKind, *, target_n: float = 0.0, width_m: float = 0.0) -> _Request:
+    def _grip(self, force_n: float, *, wait: bool, needs_object: bool) -> GraspResult | None:
+        self._opened().run.check_target(force_n)
+        request = self._submit(RequestKind.GRASP, target_n=force_n, needs_object=needs_object)
+        if not wait:
+            return None
+        self._wait(request, lambda state: state.outcome != Outcome.NONE)
+        return self._result
+
+    def _submit(
+        self, kind: RequestKind, *, target_n: float = 0.0, width_m: float = 0.0, needs_object: bool = False
+    ) -> _Request:
         self._opened()
-        request = _Request(kind, next(self._numbers), target_n, width_m)
+        request = _Request(kind, next(self._numbers), target_n, width_m, needs_object)
         self._requests.put(request)
         return request
 
@@ -524,12 +556,14 @@ class Gripper:
                     return
                 continue
             with self._changed:
-                if self._error is None and not self._is_finished(request, is_done):
+                if not self._ended and self._error is None and not self._is_finished(request, is_done):
                     left_s = end_s - time.monotonic()
                     if left_s <= 0:
                         return
                     self._changed.wait(None if left_s == math.inf else left_s)
             self._raise_error()
+            if self._ended and not self._is_finished(request, is_done):
+                raise RequestError(f"the gripper was closed before the {request.kind} request was done")
 
     def _is_finished(self, request: _Request, is_done: Callable[[GripperState], bool]) -> bool:
         newest = self._newest

@@ -112,5 +112,6 @@ def deferred_signals(interrupt: Callable[[], None]) -> Iterator[None]:
     try:
         yield
     finally:
-        for number, handler in zip(signals, before, strict=True):
-            signal.signal(number, handler)
+        if threading.current_thread() is threading.main_thread():
+            for number, handler in zip(signals, before, strict=True):
+                signal.signal(number, handler)

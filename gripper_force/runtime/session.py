@@ -127,6 +127,11 @@ class Session:
         """Makes the next cycle a stop, before any other request. Any thread or signal handler may call it."""
         self._stop.set()
 
+    @property
+    def stop_is_pending(self) -> bool:
+        """True if a stop was requested and no cycle has handled it."""
+        return self._stop.is_set()
+
     def interrupt(self) -> None:
         """Makes the next cycle raise `KeyboardInterrupt` before it accesses the servo.
 
@@ -210,7 +215,7 @@ class Session:
     def close(self) -> None:
         """Turns torque off, or holds, as configured, and logs the load cell's last samples."""
         config = self.run.config
-        hold = config.control.on_fault if self.failed else config.on_exit
+        hold = config.control.on_fault if self.failed or self.stop_is_pending else config.on_exit
         try:
             if self._armed:
                 self._devices.servo.stop(hold=hold == "hold")

@@ -460,6 +460,35 @@ def test_the_callers_exception_ends_the_run_and_keeps_its_traceback(
     )
 
 
+def test_close_ends_a_call_that_waits(real_time: Open) -> None:
+    gripper = real_time("control.approach_speed_m_s=0.005")
+    raised: list[BaseException] = []
+
+    def grasp() -> None:
+        try:
+            gripper.grasp(3.0)
+        except gf.RequestError as error:
+            raised.append(error)
+
+    waiting = threading.Thread(target=grasp)
+    waiting.start()
+    while gripper.state.phase != gf.Phase.APPROACH:
+        gripper.sleep(0.01)
+    gripper.close()
+    waiting.join(20.0)
+    assert not waiting.is_alive()
+    assert "closed before the grasp request was done" in str(raised[0])
+
+
+@pytest.mark.parametrize("background", [True, False])
+def test_a_stop_just_before_the_end_counts(real_time: Open, server: PtyServer, background: bool) -> None:
+    gripper = real_time("on_exit=hold", background=background)
+    gripper.move(0.06)
+    gripper.stop()
+    gripper.close()
+    assert torque(server) == 0
+
+
 def test_a_control_thread_that_hangs_is_an_error(real_time: Open, monkeypatch: pytest.MonkeyPatch) -> None:
     gripper = real_time()
     monkeypatch.setattr(gripper_module, "_JOIN_S", 0.0)
@@ -493,6 +522,8 @@ def test_a_program_that_forgets_to_close_leaves_no_torque(
 ) -> None:
     sets = [*quick, "clock=realtime", f"servo.port={server.device_path}", "load_cell.backend=none"]
     sets += ["servo.bus_watchdog_ms=2540", "servo.reply_margin_ms=500"]
+    if ending == "raise":
+        sets += ["on_exit=hold"]  # which is not for exceptions
     with subprocess.Popen(
         [sys.executable, "-c", PROGRAM, ending, *sets],
         stdout=subprocess.PIPE,
@@ -507,6 +538,38 @@ def test_a_program_that_forgets_to_close_leaves_no_torque(
     assert process.returncode == code, said
     assert torque(server) == 0
     assert server.bus.servos[0].get("hardware_error_status") == 0
+
+
+# The order of requests.
+
+
+def phases(gripper: gf.Gripper, steps: int = 20) -> set[gf.Phase]:
+    return {gripper.step().phase for _ in range(steps)}
+
+
+def test_a_change_of_force_after_a_release_does_not_close_the_jaws(simulated: Open) -> None:
+    gripper = simulated()
+    gripper.grasp(3.0)
+    gripper.release(wait=False)
+    gripper.set_force(2.0, wait=False)
+    assert phases(gripper) <= {gf.Phase.RELEASE, gf.Phase.OPEN}
+
+
+def test_a_stop_overrides_every_older_request(simulated: Open) -> None:
+    gripper = simulated()
+    gripper.grasp(3.0, wait=False)
+    gripper.release(wait=False)
+    gripper.grasp(5.0, wait=False)
+    gripper.stop()
+    assert phases(gripper) == {gf.Phase.FAULT}
+
+
+def test_a_release_after_a_stop_resets_it(simulated: Open) -> None:
+    gripper = simulated()
+    gripper.grasp(3.0)
+    gripper.stop()
+    assert gripper.release() > 0.08
+    assert gripper.state.phase == gf.Phase.OPEN
 
 
 # Nothing of the process is changed without permission.
