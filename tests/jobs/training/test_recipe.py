@@ -30,7 +30,7 @@ def test_keys_of_a_recipe_can_be_set() -> None:
 @pytest.mark.parametrize(
     ("overrides", "reason"),
     [
-        (["backbone=resnet18", "preprocess.size=48"], "resnet18: take a multiple of 32"),
+        (["backbone=resnet18", "preprocess.size=48"], "backbone resnet18; use a multiple of 32"),
         (["attentions=[]"], "attentions"),
         (["windows=separate"], "short_share only applies to shared windows"),
         (["short_frames=30"], "short_frames 30 is more than clip_frames 22"),
