@@ -1,5 +1,7 @@
 """Process-wide settings, which belong to the program and are changed only with its permission."""
 
+from __future__ import annotations
+
 import os
 import signal
 import sys
@@ -7,10 +9,14 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from types import FrameType
 from typing import Final
 
 PRIORITY: Final = 10
 """Real-time priority of the control loop: above every ordinary thread, below the kernel's own threads."""
+
+_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
+"""Signals that end a run."""
 
 _SWITCH_INTERVAL_S: Final = 2e-4
 """Python's default lets a computing thread delay the control thread by 5 ms."""
@@ -27,6 +33,8 @@ class ProcessOptions:
 
 
 _allowed = ProcessOptions()
+_interrupts: list[Callable[[], None]] = []  # of the open grippers, the newest last
+_earlier_handlers: dict[int, signal._HANDLER] = {}
 
 
 def own_process(
@@ -102,16 +110,40 @@ def real_time_priority() -> Iterator[str]:
 def deferred_signals(interrupt: Callable[[], None]) -> Iterator[None]:
     """Calls ``interrupt`` on SIGINT and SIGTERM instead of raising at once, if the program allows it.
 
-    An exception in the middle of a bus transaction would leave the transaction incomplete.
+    An exception in the middle of a bus transaction would leave the transaction incomplete. Of several open
+    grippers, the newest is interrupted.
     """
     if not _allowed.signals or threading.current_thread() is not threading.main_thread():
         yield  # only the main thread can set handlers
         return
-    signals = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, lambda *_: interrupt()) for number in signals]
+    for number in _SIGNALS:
+        if signal.getsignal(number) is not _handle_signal:
+            _earlier_handlers[number] = signal.signal(number, _handle_signal)
+    _interrupts.append(interrupt)
     try:
         yield
     finally:
-        if threading.current_thread() is threading.main_thread():
-            for number, handler in zip(signals, before, strict=True):
-                signal.signal(number, handler)
+        _interrupts.remove(interrupt)
+        if not _interrupts and threading.current_thread() is threading.main_thread():
+            _restore_handlers()
+
+
+def _handle_signal(number: int, frame: FrameType | None) -> None:
+    newest = _interrupts[-1:]  # a copy, because another thread may close the gripper now
+    if newest:
+        newest[0]()
+        return
+    # The last gripper was closed in another thread, which could not restore the handlers.
+    _restore_handlers()
+    earlier = _earlier_handlers[number]
+    if callable(earlier):
+        earlier(number, frame)
+    elif earlier == signal.SIG_DFL:
+        signal.signal(number, earlier)
+        signal.raise_signal(number)
+
+
+def _restore_handlers() -> None:
+    for number in _SIGNALS:
+        if signal.getsignal(number) is _handle_signal:
+            signal.signal(number, _earlier_handlers[number])

@@ -598,3 +598,37 @@ def test_a_program_may_ask_for_signals_and_timing(real_time: Open) -> None:
     timer.join()
     assert sys.getswitchinterval() == pytest.approx(before)
     assert signal.getsignal(signal.SIGTERM) == handler
+
+
+CLOSED_IN_A_THREAD = """
+import signal, sys, threading
+import gripper_force as gf
+
+gf.own_process()
+gripper = gf.open_gripper(overrides=sys.argv[2:])
+thread = threading.Thread(target=gripper.close)
+thread.start()
+thread.join()
+try:
+    signal.raise_signal(signal.Signals(int(sys.argv[1])))
+finally:
+    print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)
+"""
+
+
+@pytest.mark.parametrize("background", [False, True])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_work_as_before_once_another_thread_has_closed_the_gripper(
+    quick: list[str], server: PtyServer, number: signal.Signals, background: bool
+) -> None:
+    real = ["clock=realtime", f"servo.port={server.device_path}", "load_cell.backend=none"]
+    sets = [*quick, *(real if background else [])]
+    done = subprocess.run(
+        [sys.executable, "-c", CLOSED_IN_A_THREAD, str(int(number)), *sets],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == -number, done.stderr
+    assert done.stdout == ("True\n" if number == signal.SIGINT else "")

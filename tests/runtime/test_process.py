@@ -1,9 +1,12 @@
 import os
+import signal
 import threading
+from contextlib import ExitStack
+from types import FrameType
 
 import pytest
 
-from gripper_force.runtime.process import PRIORITY, real_time_priority
+from gripper_force.runtime.process import PRIORITY, deferred_signals, real_time_priority
 
 
 def policy() -> int:
@@ -33,3 +36,70 @@ def test_where_it_is_not_allowed_it_says_what_to_do(monkeypatch: pytest.MonkeyPa
     with real_time_priority() as refusal:
         assert "limits.conf" in refusal
     assert policy() == os.SCHED_OTHER
+
+
+def in_another_thread(stack: ExitStack) -> None:
+    thread = threading.Thread(target=stack.close)
+    thread.start()
+    thread.join()
+
+
+@pytest.mark.usefixtures("own_process")
+def test_a_signal_after_an_end_in_another_thread_is_handled_as_before() -> None:
+    before, calls = signal.getsignal(signal.SIGINT), list[str]()
+    stack = ExitStack()
+    stack.enter_context(deferred_signals(lambda: calls.append("ended")))
+    in_another_thread(stack)
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+    assert calls == []
+    assert signal.getsignal(signal.SIGINT) == before
+
+
+@pytest.mark.usefixtures("own_process")
+def test_the_handlers_return_when_the_next_gripper_is_closed() -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    stack = ExitStack()
+    stack.enter_context(deferred_signals(lambda: None))
+    in_another_thread(stack)
+    calls: list[str] = []
+    with deferred_signals(lambda: calls.append("next")):
+        signal.raise_signal(signal.SIGTERM)
+    assert calls == ["next"]
+    assert signal.getsignal(signal.SIGTERM) == before
+
+
+@pytest.mark.usefixtures("own_process")
+def test_grippers_may_close_in_any_order() -> None:
+    before, calls = signal.getsignal(signal.SIGINT), list[str]()
+    first, second = ExitStack(), ExitStack()
+    first.enter_context(deferred_signals(lambda: calls.append("first")))
+    second.enter_context(deferred_signals(lambda: calls.append("second")))
+    first.close()
+    signal.raise_signal(signal.SIGINT)
+    second.close()
+    assert calls == ["second"]
+    assert signal.getsignal(signal.SIGINT) == before
+
+
+@pytest.mark.usefixtures("own_process")
+def test_a_handler_that_the_program_sets_meanwhile_stays() -> None:
+    before, calls = signal.getsignal(signal.SIGINT), list[int]()
+    stack = ExitStack()
+    stack.enter_context(deferred_signals(lambda: None))
+    ours = signal.getsignal(signal.SIGINT)
+    assert callable(ours)
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        calls.append(number)
+        ours(number, frame)
+
+    try:
+        signal.signal(signal.SIGINT, handle)
+        stack.close()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        assert calls == [signal.SIGINT]
+        assert signal.getsignal(signal.SIGINT) == handle
+    finally:
+        signal.signal(signal.SIGINT, before)
