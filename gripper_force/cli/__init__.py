@@ -2,7 +2,8 @@
 
 Every command takes ``--set key.path=value`` and ``--json``. With ``--json`` one JSON object goes to stdout;
 progress and messages always go to stderr. Exit code 2: bad input or a failed run, with a one-line message on
-stderr. Exit code 1: the command ran, but the result is bad.
+stderr. Exit code 1: the command ran, but the result is bad. Exit code 128 + n: signal n ended it, e.g. 130 for
+Ctrl-C.
 
 A command imports what it needs when it runs, so that ``gripper-force --help`` answers at once.
 """
@@ -10,7 +11,6 @@ A command imports what it needs when it runs, so that ``gripper-force --help`` a
 import json
 import signal
 import sys
-from types import FrameType
 from typing import Annotated, NoReturn
 
 import typer
@@ -49,10 +49,12 @@ _INTERRUPTED = 130
 
 def main() -> NoReturn:
     """Runs a command, and turns every foreseen failure into a one-line message and an exit code."""
-    from gripper_force.runtime.process import own_process
+    from gripper_force.runtime import process
 
-    own_process()
-    signal.signal(signal.SIGTERM, _raise_interrupt)
+    process.own_process()
+    for number in process.SIGNALS:
+        if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup sets it
+            signal.signal(number, process.raise_interrupt)
     try:
         app(prog_name="gripper-force")
     except GripperError as error:
@@ -63,6 +65,7 @@ def main() -> NoReturn:
     except SystemExit as end:
         if end.code == _INTERRUPTED:  # typer's exit code after a KeyboardInterrupt
             console.err.print("interrupted; the run was stopped as configured", soft_wrap=True)
+            sys.exit(process.interrupt_exit_code())
         raise
     sys.exit(0)
 
@@ -81,7 +84,3 @@ def _options(
     ] = False,
 ) -> None:
     """Gripper force control from camera images: run, calibrate, replay."""
-
-
-def _raise_interrupt(_signal: int, _frame: FrameType | None) -> None:
-    raise KeyboardInterrupt

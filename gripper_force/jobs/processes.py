@@ -30,5 +30,6 @@ def process_pool(count: int) -> Iterator[ProcessPoolExecutor]:
 
 def _start_process(options: ProcessOptions) -> None:
     own_process(**{**asdict(options), "signals": False})
-    # A terminal sends Ctrl-C to every process; tracebacks of all would hide the parent's message.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # A terminal sends these to every process; the parent handles them, and then terminates its children.
+    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
+        signal.signal(number, signal.SIG_IGN)

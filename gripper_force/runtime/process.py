@@ -5,18 +5,20 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import termios
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from errno import EIO
 from types import FrameType
-from typing import Final
+from typing import Final, NoReturn
 
 PRIORITY: Final = 10
 """Real-time priority of the control loop: above every ordinary thread, below the kernel's own threads."""
 
-_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
-"""Signals that end a run."""
+SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
+"""Signals that end a run: Ctrl-C, a request to end, the loss of the terminal (ssh), and Ctrl-\\."""
 
 _SWITCH_INTERVAL_S: Final = 2e-4
 """Python's default lets a computing thread delay the control thread by 5 ms."""
@@ -35,6 +37,7 @@ class ProcessOptions:
 _allowed = ProcessOptions()
 _interrupts: list[Callable[[], None]] = []  # of the open grippers, the newest last
 _earlier_handlers: dict[int, signal._HANDLER] = {}
+_received: list[int] = []  # signals since the first gripper was opened
 
 
 def own_process(
@@ -50,8 +53,9 @@ def own_process(
     whose main purpose is the gripper.
 
     Args:
-        signals: Ctrl-C (SIGINT) and SIGTERM end a run between two control cycles. A second one ends it at
-            once. Handlers are set only while a gripper is open, and only by the main thread.
+        signals: Ctrl-C (SIGINT), SIGTERM, the loss of the terminal (SIGHUP) and SIGQUIT end a run
+            between two control cycles. A second Ctrl-C ends it at once. Handlers are set only while a gripper
+            is open, and only by the main thread. A signal that the program ignores stays ignored.
         switch_interval: Python switches threads every 0.2 ms in real time, so that a computing thread delays
             the control loop less.
         real_time_priority: The thread of the control loop gets real-time priority, if the kernel allows it.
@@ -108,7 +112,7 @@ def real_time_priority() -> Iterator[str]:
 
 @contextmanager
 def deferred_signals(interrupt: Callable[[], None]) -> Iterator[None]:
-    """Calls ``interrupt`` on SIGINT and SIGTERM instead of raising at once, if the program allows it.
+    """Calls ``interrupt`` on a signal of `SIGNALS` instead of raising at once, if the program allows it.
 
     An exception in the middle of a bus transaction would leave the transaction incomplete. Of several open
     grippers, the newest is interrupted.
@@ -116,8 +120,10 @@ def deferred_signals(interrupt: Callable[[], None]) -> Iterator[None]:
     if not _allowed.signals or threading.current_thread() is not threading.main_thread():
         yield  # only the main thread can set handlers
         return
-    for number in _SIGNALS:
-        if signal.getsignal(number) is not _handle_signal:
+    if not _interrupts:
+        _received.clear()
+    for number in SIGNALS:
+        if signal.getsignal(number) not in (_handle_signal, signal.SIG_IGN):
             _earlier_handlers[number] = signal.signal(number, _handle_signal)
     _interrupts.append(interrupt)
     try:
@@ -128,10 +134,29 @@ def deferred_signals(interrupt: Callable[[], None]) -> Iterator[None]:
             _restore_handlers()
 
 
+def raise_interrupt(number: int, _frame: FrameType | None) -> NoReturn:
+    """Handles a signal of `SIGNALS` while no gripper is open.
+
+    Raises:
+        KeyboardInterrupt: Always.
+    """
+    _receive(number)
+    raise KeyboardInterrupt
+
+
+def interrupt_exit_code() -> int:
+    """Returns 128 plus the number of the first signal that ended the run, as shells do; 130 for Ctrl-C."""
+    return 128 + (_received or [signal.SIGINT])[0]
+
+
 def _handle_signal(number: int, frame: FrameType | None) -> None:
     newest = _interrupts[-1:]  # a copy, because another thread may close the gripper now
     if newest:
-        newest[0]()
+        is_first = not _received
+        _receive(number)
+        # A lost connection sends SIGHUP twice: once from the kernel, once from the shell.
+        if is_first or number == signal.SIGINT:
+            newest[0]()
         return
     # The last gripper was closed in another thread, which could not restore the handlers.
     _restore_handlers()
@@ -144,6 +169,24 @@ def _handle_signal(number: int, frame: FrameType | None) -> None:
 
 
 def _restore_handlers() -> None:
-    for number in _SIGNALS:
+    for number in SIGNALS:
         if signal.getsignal(number) is _handle_signal:
             signal.signal(number, _earlier_handlers[number])
+
+
+def _receive(number: int) -> None:
+    _received.append(number)
+    if number == signal.SIGHUP:
+        _discard_output_to_lost_terminal()
+
+
+def _discard_output_to_lost_terminal() -> None:
+    """Connects standard streams whose terminal is gone to ``/dev/null``: otherwise every output would raise."""
+    for stream in range(3):
+        try:
+            termios.tcgetattr(stream)
+        except termios.error as error:
+            if error.args[0] == EIO:
+                null = os.open(os.devnull, os.O_RDWR)
+                os.dup2(null, stream)
+                os.close(null)

@@ -9,14 +9,15 @@ import pytest
 from gripper_force.jobs.processes import process_pool
 
 
-def interrupted_itself() -> int:
-    os.kill(os.getpid(), signal.SIGINT)
+def interrupted_itself(number: signal.Signals) -> int:
+    os.kill(os.getpid(), number)
     return 7
 
 
-def test_ctrl_c_is_the_parents_affair() -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP, signal.SIGQUIT])
+def test_signals_of_the_terminal_are_the_parents_affair(number: signal.Signals) -> None:
     with process_pool(1) as pool:
-        assert pool.submit(interrupted_itself).result() == 7
+        assert pool.submit(interrupted_itself, number).result() == 7
 
 
 def test_an_interruption_breaks_off_what_runs_and_what_waits() -> None:

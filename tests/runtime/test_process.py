@@ -6,7 +6,7 @@ from types import FrameType
 
 import pytest
 
-from gripper_force.runtime.process import PRIORITY, deferred_signals, real_time_priority
+from gripper_force.runtime.process import PRIORITY, deferred_signals, interrupt_exit_code, real_time_priority
 
 
 def policy() -> int:
@@ -103,3 +103,26 @@ def test_a_handler_that_the_program_sets_meanwhile_stays() -> None:
         assert signal.getsignal(signal.SIGINT) == handle
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("own_process")
+def test_only_a_second_ctrl_c_interrupts_again() -> None:
+    calls: list[str] = []
+    with deferred_signals(lambda: calls.append("interrupt")):
+        for number in (signal.SIGHUP, signal.SIGHUP, signal.SIGTERM, signal.SIGQUIT):
+            signal.raise_signal(number)
+        assert len(calls) == 1
+        signal.raise_signal(signal.SIGINT)
+    assert len(calls) == 2
+    assert interrupt_exit_code() == 128 + signal.SIGHUP
+
+
+@pytest.mark.usefixtures("own_process")
+def test_an_ignored_signal_stays_ignored() -> None:
+    before, calls = signal.signal(signal.SIGHUP, signal.SIG_IGN), list[str]()
+    try:
+        with deferred_signals(lambda: calls.append("interrupt")):
+            signal.raise_signal(signal.SIGHUP)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert calls == []

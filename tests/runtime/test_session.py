@@ -1,5 +1,7 @@
 import dataclasses
 import math
+import os
+import pty
 import re
 import signal
 import subprocess
@@ -23,6 +25,7 @@ from gripper_force.jobs.grasp import grasp_and_release, run_grasp
 from gripper_force.runtime import session as session_module
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.process import SIGNALS
 from gripper_force.runtime.resolve import ResolvedConfig, resolve
 from gripper_force.runtime.session import Session, open_run, open_session
 from gripper_force.types import (
@@ -493,7 +496,7 @@ def test_stop_soon_leads_to_fault_within_a_cycle(open_rig: tuple[ExitStack, Open
 
 
 @pytest.mark.usefixtures("own_process")
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", SIGNALS)
 def test_a_signal_waits_for_the_end_of_the_cycle(
     open_rig: tuple[ExitStack, OpenRig], tmp_path: Path, number: signal.Signals
 ) -> None:
@@ -586,7 +589,7 @@ main()
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", SIGNALS)
 def test_a_signal_ends_the_command_with_torque_off_and_a_whole_log(
     quick: list[str], tmp_path: Path, number: signal.Signals
 ) -> None:
@@ -600,13 +603,47 @@ def test_a_signal_ends_the_command_with_torque_off_and_a_whole_log(
         while "hold" not in said.read_text() and process.poll() is None:
             time.sleep(0.01)
         process.send_signal(number)
-        assert process.wait(timeout=60) == 130, said.read_text()
+        assert process.wait(timeout=60) == 128 + number, said.read_text()
     assert said.read_text().splitlines()[-1].startswith("interrupted")
     assert "Traceback" not in said.read_text()
     assert (tmp_path / "stdout").read_text() == "torque 0\n"
     (path,) = tmp_path.glob("*.mcap")
     assert events(path)[-1] == "KeyboardInterrupt: the run was interrupted"
     assert list(LogReader(path).records(GraspStatus))[-1].phase == Phase.HOLD
+
+
+LOGIN = """
+import fcntl, termios
+
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)  # this terminal controls the session, as after a login
+"""
+
+
+@pytest.mark.parametrize(("on_exit", "torque"), [("release", 0), ("hold", 1)])
+def test_a_lost_connection_ends_the_command_as_configured(
+    quick: list[str], tmp_path: Path, on_exit: str, torque: int
+) -> None:
+    sets = [*quick, f"log.directory={tmp_path}", "control.hold_s=100000", f"on_exit={on_exit}"]
+    arguments = [part for assignment in sets for part in ("--set", assignment)]
+    master, slave = pty.openpty()
+    with (tmp_path / "stdout").open("w") as out:
+        process = subprocess.Popen(
+            [sys.executable, "-c", LOGIN + GRASP, "grasp", *arguments],
+            stdin=slave,
+            stdout=out,
+            stderr=slave,
+            start_new_session=True,
+        )
+    os.close(slave)
+    said = b""
+    while b"hold" not in said:
+        said += os.read(master, 4096)
+    os.close(master)  # the kernel sends SIGHUP, and output to the terminal fails
+    process.send_signal(signal.SIGHUP)  # so does the shell
+    assert process.wait(timeout=60) == 128 + signal.SIGHUP
+    assert (tmp_path / "stdout").read_text() == f"torque {torque}\n"
+    (path,) = tmp_path.glob("*.mcap")
+    assert events(path)[-1] == "KeyboardInterrupt: the run was interrupted"
 
 
 FULL_DISK = """
