@@ -1,9 +1,11 @@
 """Serves a virtual bus at a pseudo-terminal for any Dynamixel client, with a simple motor model."""
 
 import contextlib
+import fcntl
 import os
 import pty
 import select
+import termios
 import threading
 import time
 import tty
@@ -15,6 +17,7 @@ from gripper_hw.dynamixel.control_table import load_model
 from gripper_hw.dynamixel.firmware import VirtualServo
 from gripper_hw.dynamixel.virtual import VirtualBus
 
+_IDLE_S: Final = 1.0
 _STEP_NS: Final = 500_000  # integration step
 _MAX_CATCH_UP_NS: Final = 250_000_000  # bounds the time to compute after a long pause
 
@@ -62,9 +65,13 @@ class PtyServer:
             for handle in (self._master, self._slave, self._wake_read, self._wake_write):
                 handles.callback(os.close, handle)
             while True:
-                ready, _, _ = select.select([self._master, self._wake_read], [], [])
+                ready, _, _ = select.select([self._master, self._wake_read], [], [], _IDLE_S)
                 if self._wake_read in ready:
                     return
+                if not ready:
+                    # A serial port's exclusive mode ends with the process that set it. This one's would stay.
+                    fcntl.ioctl(self._slave, termios.TIOCNXCL)
+                    continue
                 reply = self.bus.transact(os.read(self._master, 4096))
                 with contextlib.suppress(BlockingIOError):  # like a real bus, it does not wait for readers
                     os.write(self._master, reply)

@@ -1,16 +1,21 @@
+import fcntl
 import os
+import termios
 import threading
+import time
+from contextlib import suppress
 from pathlib import Path
 
 import dynamixel_sdk as sdk
 import pytest
 
-from gripper_force.errors import ConfigError
+from gripper_force.errors import ConfigError, DeviceError
 from gripper_hw.dynamixel.control_table import load_model
 from gripper_hw.dynamixel.firmware import VirtualServo
 from gripper_hw.dynamixel.packets import Instruction, frame
 from gripper_hw.dynamixel.pty_server import BenchMotor, PtyServer, serve_virtual_servo
 from gripper_hw.dynamixel.virtual import VirtualBus
+from gripper_hw.serial_line import open_line
 
 PACKETS = sdk.PacketHandler(2.0)
 MODEL = load_model("XM430-W350")
@@ -24,6 +29,18 @@ def test_vendors_port_finds_the_servos_of_consecutive_clients():
             port.openPort()
             assert PACKETS.ping(port, id_) == (1200, sdk.COMM_SUCCESS, 0)
             port.closePort()
+
+
+def test_exclusive_mode_ends_some_time_after_its_program_was_killed():
+    with serve_virtual_servo("XL330-M288") as server:
+        killed = os.open(server.device_path, os.O_RDWR | os.O_NOCTTY)
+        fcntl.ioctl(killed, termios.TIOCEXCL)
+        os.close(killed)
+        while True:
+            with suppress(DeviceError):
+                open_line(server.device_path, 57_600, unit="servo", timeout_s=0).close()
+                break
+            time.sleep(0.01)
 
 
 def test_served_motor_moves():
