@@ -44,12 +44,12 @@ if TYPE_CHECKING:
     from gripper_force.interfaces import ServoSpec as ServoSpec
     from gripper_force.jobs.evaluate import evaluate as evaluate
     from gripper_force.jobs.replay import replay as replay
-    from gripper_force.runtime.gripper import GraspResult as GraspResult
     from gripper_force.runtime.gripper import Gripper as Gripper
-    from gripper_force.runtime.gripper import GripperState as GripperState
     from gripper_force.runtime.gripper import open_gripper as open_gripper
     from gripper_force.runtime.log import LogReader as LogReader
     from gripper_force.runtime.process import own_process as own_process
+    from gripper_force.runtime.state import GraspResult as GraspResult
+    from gripper_force.runtime.state import GripperState as GripperState
     from gripper_force.types import EstimateSource as EstimateSource
     from gripper_force.types import Event as Event
     from gripper_force.types import ForceEstimate as ForceEstimate
@@ -90,9 +90,10 @@ _MODULES = {
     "gripper_force.interfaces": ("BusStats", "Camera", "Clock", "LoadCell", "Progress", "Servo", "ServoSpec"),
     "gripper_force.jobs.evaluate": ("evaluate",),
     "gripper_force.jobs.replay": ("replay",),
-    "gripper_force.runtime.gripper": ("GraspResult", "Gripper", "GripperState", "open_gripper"),
+    "gripper_force.runtime.gripper": ("Gripper", "open_gripper"),
     "gripper_force.runtime.log": ("LogReader",),
     "gripper_force.runtime.process": ("own_process",),
+    "gripper_force.runtime.state": ("GraspResult", "GripperState"),
     "gripper_force.types": (
         "EstimateSource",
         "Event",

@@ -153,7 +153,9 @@ def test_the_code_that_an_embedding_program_reaches_is_small() -> None:
     real = [path for name, path in sensors.items() if name not in ("simulated", "playback")]
     drivers = [*backends.SERVOS.values(), *real, *ENGINES.values()]
     assert 6_000 < lines(drivers) <= 12_000
-    assert lines([*drivers, *backends.CAMERAS.values(), *backends.LOAD_CELLS.values()]) <= 13_000
+    assert (
+        lines([*drivers, *backends.CAMERAS.values(), *backends.LOAD_CELLS.values()]) <= 13_500
+    )  # with the simulated rig
 
 
 def _file(module: str) -> Path:

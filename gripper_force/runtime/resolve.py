@@ -66,6 +66,15 @@ class ResolvedConfig:
                     "with; request less, or calibrate with larger forces"
                 )
 
+    def check_width(self, width_m: float) -> None:
+        """Raises `RequestError` if a width is outside the travel of the jaws."""
+        open_width_m = self.config.gripper.open_width_m
+        if not 0 <= width_m <= open_width_m:
+            raise RequestError(
+                f"a width of {1e3 * width_m:g} mm is outside 0 to {1e3 * open_width_m:g} mm, the travel of the "
+                "jaws; request a width in metres within gripper.open_width_m"
+            )
+
 
 def resolve(config: Config, *, vision: bool = True) -> ResolvedConfig:
     """Resolves a configuration: rig and object profile, ``auto``, budgets, servo data, level of detail.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from importlib import metadata
 from pathlib import Path
@@ -77,12 +77,14 @@ class Session:
         controller: GraspController,
         perception: Perception,
         log_queue: LogQueue | None,
+        raise_if_cancelled: Callable[[], None],
     ) -> None:
         self.run, self._devices = run, devices
         self._controller, self._perception, self._log_queue = controller, perception, log_queue
         self._period_ns = round(NS_PER_S / run.config.control.rate_hz)
         self._due_ns = 0
         self._stop = threading.Event()
+        self._raise_if_cancelled = raise_if_cancelled
         self._interrupted = False
         self._counter_monitors = {unit: CounterMonitor() for unit in ("servo", "camera", "load_cell")}
         self._load_cell_monitor = LoadCellMonitor()
@@ -102,11 +104,12 @@ class Session:
         return 0 if self._log_queue is None else self._log_queue.lost
 
     def start(self) -> None:
-        """Starts the sensors and arms the servo."""
-        for sensor in (self._devices.camera, self._devices.load_cell):
-            if sensor is not None:
-                sensor.start()
-        self._devices.servo.start()  # if this raises, it has turned torque off itself
+        """Starts the sensors and arms the servo, unless the run is interrupted or cancelled before."""
+        for device in (self._devices.camera, self._devices.load_cell, self._devices.servo):
+            self.raise_if_interrupted()
+            self._raise_if_cancelled()
+            if device is not None:
+                device.start()  # a servo that raises has turned torque off itself
         self._armed = True
         self._perception.start()
         self._due_ns = self._devices.clock.now_ns()
@@ -119,6 +122,7 @@ class Session:
         while last_ns - start_ns < (
             _VISION_WAIT_NS if with_vision and not self.has_vision else _REFERENCE_NS
         ):
+            self._raise_if_cancelled()
             decision = self.cycle()
             last_ns = decision.status.t_ns
         return decision
@@ -210,7 +214,7 @@ class Session:
         """Logs the exception that ended the run. Only an `Exception` marks the run as failed."""
         self._error = error
         self.failed |= isinstance(error, Exception)
-        self._log(Event(self._devices.clock.now_ns(), "session", f"{type(error).__name__}: {error}"))
+        self.log_event("session", f"{type(error).__name__}: {error}")
 
     def close(self) -> None:
         """Turns torque off, or holds, as configured, and logs the load cell's last samples."""
@@ -227,6 +231,10 @@ class Session:
         finally:
             self._perception.close()
         self._log_sensors(self._devices.clock.now_ns(), at_end=True)
+
+    def log_event(self, unit: str, text: str) -> None:
+        """Logs one sentence about a unit, such as ``control``."""
+        self._log(Event(self._devices.clock.now_ns(), unit, text))
 
     def attach(self, name: str, data: bytes, media_type: str) -> None:
         """Adds a file to the log."""
@@ -266,24 +274,39 @@ class Session:
 
 
 @contextmanager
-def open_run(config: Config | ResolvedConfig, path: Path | None, *, vision: bool = True) -> Iterator[Session]:
+def open_run(
+    config: Config | ResolvedConfig,
+    path: Path | None,
+    *,
+    vision: bool = True,
+    raise_if_cancelled: Callable[[], None] = lambda: None,
+) -> Iterator[Session]:
     """Resolves a configuration, opens its devices and opens a session on them.
 
     Args:
         config: The run, resolved or not.
         path: Log to write; None: no log.
         vision: False for a run that only records frames.
+        raise_if_cancelled: See `open_session`.
 
     Raises:
         GripperError: Something is missing or inconsistent, or a device failed.
     """
     run = config if isinstance(config, ResolvedConfig) else resolve(config, vision=vision)
-    with open_devices(run.config) as devices, open_session(run, devices, path) as session:
+    with (
+        open_devices(run.config) as devices,
+        open_session(run, devices, path, raise_if_cancelled) as session,
+    ):
         yield session
 
 
 @contextmanager
-def open_session(run: ResolvedConfig, devices: Devices, path: Path | None) -> Iterator[Session]:
+def open_session(
+    run: ResolvedConfig,
+    devices: Devices,
+    path: Path | None,
+    raise_if_cancelled: Callable[[], None] = lambda: None,
+) -> Iterator[Session]:
     """Opens a session, and at the end stops the servo as configured and closes the log.
 
     A session without a single cycle leaves no log.
@@ -292,6 +315,8 @@ def open_session(run: ResolvedConfig, devices: Devices, path: Path | None) -> It
         run: The resolved configuration.
         devices: Its devices.
         path: Log to write; None: no log.
+        raise_if_cancelled: Raises if the run is to end already. Called before each device starts, the servo
+            last, and in each cycle of `Session.wait_for_reference`.
 
     Raises:
         GripperError: A device failed.
@@ -301,7 +326,8 @@ def open_session(run: ResolvedConfig, devices: Devices, path: Path | None) -> It
     estimator = make_estimator(run)
     with ExitStack() as stack:
         log_queue = None if path is None else _open_log(run, devices, path)
-        session = Session(run, devices, controller, _perception(run.config, devices, estimator), log_queue)
+        perception = _perception(run.config, devices, estimator)
+        session = Session(run, devices, controller, perception, log_queue, raise_if_cancelled)
         if path is not None and log_queue is not None:
             stack.callback(_discard_unused, session, path)
             stack.callback(log_queue.close)

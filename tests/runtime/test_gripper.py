@@ -17,8 +17,10 @@ from hypothesis import strategies as st
 
 import gripper_force as gf
 from gripper_force.control.limits import largest_target_n
-from gripper_force.runtime import gripper as gripper_module
+from gripper_force.runtime import control_loop
+from gripper_force.runtime.control_loop import ControlLoop
 from gripper_force.runtime.log import LogReader
+from gripper_hw.dynamixel.packets import Instruction, Parser
 from gripper_hw.dynamixel.pty_server import PtyServer, serve_virtual_servo
 from gripper_hw.dynamixel.virtual import VirtualBus, find_bus, unregister_bus
 
@@ -171,17 +173,19 @@ def test_vision_share_counts_the_hold(quick_vision: list[str]) -> None:
 @pytest.mark.parametrize("target_n", [0.0, -1.0, 9.1, math.nan, math.inf])
 def test_a_force_out_of_range_is_refused(simulated: Open, target_n: float) -> None:
     gripper = simulated()
-    with pytest.raises(gf.RequestError, match="target of"):
-        gripper.grasp(target_n)
+    for wait in (True, False):
+        with pytest.raises(gf.RequestError, match="target of"):
+            gripper.grasp(target_n, wait=wait)
     assert gripper.step().phase == gf.Phase.OPEN
 
 
 @pytest.mark.parametrize("width_m", [-0.001, 0.2, math.nan, math.inf])
 def test_a_width_out_of_range_is_refused(simulated: Open, width_m: float) -> None:
-    with pytest.raises(
-        gf.RequestError, match=r"the move request was refused: the width .* is outside 0 to 92 mm"
-    ):
-        simulated().move(width_m)
+    gripper = simulated()
+    for wait in (True, False):
+        with pytest.raises(gf.RequestError, match=r"a width of .* is outside 0 to 92 mm"):
+            gripper.move(width_m, wait=wait)
+    assert gripper.step().phase == gf.Phase.OPEN
 
 
 def test_force_is_only_set_on_a_gripped_object(simulated: Open) -> None:
@@ -205,7 +209,15 @@ def test_a_closed_gripper_refuses(simulated: Open) -> None:
     gripper = simulated()
     gripper.close()
     gripper.close()
-    for call in (gripper.step, gripper.release, lambda: gripper.grasp(2.0), lambda: gripper.move(0.05)):
+    calls: list[Callable[[], object]] = [
+        gripper.step,
+        gripper.release,
+        lambda: gripper.grasp(2.0),
+        lambda: gripper.move(0.05),
+        lambda: gripper.move(0.05, wait=False),
+        lambda: gripper.grasp(2.0, wait=False),
+    ]
+    for call in calls:
         with pytest.raises(gf.RequestError, match="closed"):
             call()
 
@@ -491,13 +503,12 @@ def test_a_stop_just_before_the_end_counts(real_time: Open, server: PtyServer, b
 
 def test_a_control_thread_that_hangs_is_an_error(real_time: Open, monkeypatch: pytest.MonkeyPatch) -> None:
     gripper = real_time()
-    monkeypatch.setattr(gripper_module, "_JOIN_S", 0.0)
-    monkeypatch.setattr(gripper._closing, "is_set", lambda: False)
+    monkeypatch.setattr(control_loop, "_END_S", 0.0)
+    monkeypatch.setattr(gripper._loop._closing, "is_set", lambda: False)
     with pytest.raises(gf.DeviceTimeoutError, match="control thread did not end"):
         gripper.close()
     monkeypatch.undo()
-    assert gripper._thread is not None
-    gripper._thread.join()
+    gripper.close()
 
 
 PROGRAM = """
@@ -570,6 +581,197 @@ def test_a_release_after_a_stop_resets_it(simulated: Open) -> None:
     gripper.stop()
     assert gripper.release() > 0.08
     assert gripper.state.phase == gf.Phase.OPEN
+
+
+def test_a_refused_move_leaves_the_waiting_grasp_alone(real_time: Open) -> None:
+    gripper = real_time("control.approach_speed_m_s=0.05")
+    results: list[gf.GraspResult] = []
+    waiting = threading.Thread(target=lambda: results.append(gripper.grasp(3.0)))
+    waiting.start()
+    while gripper.state.phase != gf.Phase.APPROACH:
+        gripper.sleep(0.01)
+    with pytest.raises(gf.RequestError, match="a width of 1000 mm is outside"):
+        gripper.move(1.0)
+    waiting.join()
+    assert [result.outcome for result in results] == [gf.Outcome.NO_OBJECT]
+
+
+def test_what_a_stop_refuses_raises_at_once(simulated: Open) -> None:
+    gripper = simulated()
+    gripper.stop()
+    before = gripper.state
+    calls: list[Callable[..., object]] = [gripper.grasp, gripper.set_force, gripper.move]
+    for call in calls:
+        with pytest.raises(gf.RequestError, match="refused: stopped or in fault; call release first"):
+            call(0.05, wait=False)
+    assert gripper.state is before
+    gripper.release(wait=False)
+    gripper.grasp(3.0, wait=False)  # which the release makes possible
+    assert gf.Phase.APPROACH in phases(gripper)
+
+
+def test_a_fault_whose_cause_persists_refuses_each_request_on_its_own(simulated: Open) -> None:
+    gripper = simulated()
+    bus().servos[0].set_conditions(temperature_c=78)
+    assert gripper.step().phase == gf.Phase.FAULT
+    gripper.release(wait=False)
+    with pytest.raises(gf.RequestError, match="the grasp request was refused: stopped or in fault"):
+        gripper.grasp(3.0)
+    with pytest.raises(gf.RequestError, match="the release request was refused: the servo is at 78 C"):
+        gripper.release()
+    bus().servos[0].set_conditions(temperature_c=30)
+    gripper.release()
+    assert gripper.grasp(3.0).held
+
+
+def test_a_later_refusal_is_in_the_log(simulated: Open, tmp_path: Path) -> None:
+    gripper = simulated(log=tmp_path / "run.mcap")
+    gripper.grasp(3.0)
+    gripper.release(wait=False)
+    gripper.set_force(2.0, wait=False)
+    phases(gripper)
+    gripper.close()
+    events = [event.text for event in LogReader(tmp_path / "run.mcap").records(gf.Event)]
+    assert "refused 'grasp': no object is gripped" in events
+
+
+# The end of a run that is still being opened.
+
+
+class SlowCamera:
+    """A camera whose start takes until the program ends the run, as that of a camera that boots."""
+
+    supports_lockstep = True
+    end: Callable[[], None]  # ends the run while the camera starts
+
+    def __init__(self, config: gf.CameraConfig, clock: gf.Clock) -> None:
+        pass
+
+    def start(self) -> None:
+        SlowCamera.end()
+
+    def newest(self) -> gf.Frame | None:
+        return None
+
+    def counts(self) -> dict[str, int]:
+        return {}
+
+    def close(self) -> None:
+        pass
+
+
+SLOW_CAMERA = f"camera.backend={__name__}:SlowCamera"
+
+
+@pytest.fixture
+def opening(monkeypatch: pytest.MonkeyPatch) -> list[ControlLoop]:
+    """The control loops that are being opened. A program gets the gripper once it is open."""
+    found: list[ControlLoop] = []
+    open_loop = ControlLoop.open
+
+    def register(loop: ControlLoop) -> None:
+        found.append(loop)
+        open_loop(loop)
+
+    monkeypatch.setattr(ControlLoop, "open", register)
+    return found
+
+
+@pytest.fixture
+def armed(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
+    """The writes to a servo's Torque Enable that turn torque on."""
+    writes: list[bytes] = []
+    transact = VirtualBus.transact
+
+    def listen(served: VirtualBus, data: bytes) -> bytes:
+        writes.extend(
+            packet.params
+            for packet in Parser().feed(data)
+            if packet.instruction == Instruction.WRITE and packet.params == b"\x40\x00\x01"
+        )
+        return transact(served, data)
+
+    monkeypatch.setattr(VirtualBus, "transact", listen)
+    return writes
+
+
+def ctrl_c() -> None:
+    main = threading.main_thread().ident
+    assert main is not None
+    signal.pthread_kill(main, signal.SIGINT)
+
+
+def wait_until_closing(opening: list[ControlLoop]) -> None:
+    while not opening[0]._closing.is_set():
+        time.sleep(0.001)
+
+
+@pytest.mark.parametrize("permission", ["library_process", "own_process"])
+def test_ctrl_c_while_the_gripper_is_opened_leaves_torque_off(
+    real_time: Open,
+    opening: list[ControlLoop],
+    armed: list[bytes],
+    monkeypatch: pytest.MonkeyPatch,
+    request: pytest.FixtureRequest,
+    permission: str,
+) -> None:
+    request.getfixturevalue(permission)
+
+    def end() -> None:
+        ctrl_c()
+        wait_until_closing(opening)
+
+    monkeypatch.setattr(SlowCamera, "end", end, raising=False)
+    with pytest.raises(KeyboardInterrupt):
+        real_time(SLOW_CAMERA)
+    assert "control" not in {thread.name for thread in threading.enumerate()}
+    assert armed == []
+    real_time()
+    assert len(armed) == 1
+
+
+def test_closing_in_another_thread_while_the_gripper_is_opened_leaves_torque_off(
+    real_time: Open, opening: list[ControlLoop], armed: list[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closing: list[threading.Thread] = []
+
+    def end() -> None:
+        closing.append(threading.Thread(target=opening[0].close, args=(None,)))
+        closing[0].start()
+        wait_until_closing(opening)
+
+    monkeypatch.setattr(SlowCamera, "end", end, raising=False)
+    with pytest.raises(gf.RequestError, match="closed while it was being opened"):
+        real_time(SLOW_CAMERA)
+    closing[0].join()
+    assert armed == []
+
+
+@pytest.mark.usefixtures("own_process")
+def test_a_signal_before_the_servo_starts_leaves_torque_off(
+    simulated: Open, armed: list[bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(SlowCamera, "end", lambda: signal.raise_signal(signal.SIGTERM), raising=False)
+    with pytest.raises(KeyboardInterrupt, match="the run was interrupted"):
+        simulated(SLOW_CAMERA)
+    assert armed == []
+
+
+def test_ctrl_c_during_the_first_frames_ends_the_run(
+    real_time: Open, server: PtyServer, opening: list[ControlLoop], tmp_path: Path
+) -> None:
+    def end(answer: bytes) -> bytes:
+        if torque(server):
+            server.bus.tamper = None
+            ctrl_c()
+            wait_until_closing(opening)
+        return answer
+
+    server.bus.tamper = end
+    with pytest.raises(KeyboardInterrupt):
+        real_time(log=tmp_path / "run.mcap")
+    assert torque(server) == 0
+    assert len(list(LogReader(tmp_path / "run.mcap").records(gf.GraspStatus))) <= 1
 
 
 # Nothing of the process is changed without permission.

@@ -1,0 +1,211 @@
+"""The control loop of a live gripper: its session, its thread, and the requests it handles."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import sys
+import threading
+from pathlib import Path
+from typing import Final
+
+from gripper_force.config import Config
+from gripper_force.control.state_machine import Decision
+from gripper_force.errors import DeviceTimeoutError, RequestError
+from gripper_force.runtime.process import deferred_signals
+from gripper_force.runtime.requests import CLOSED, PendingRequest, RequestQueue
+from gripper_force.runtime.resolve import ResolvedConfig, resolve
+from gripper_force.runtime.session import Session, open_run
+from gripper_force.runtime.state import GRIPPING, GraspResult, GripperState, StateTracker
+from gripper_force.types import NS_PER_S, RequestKind
+
+_END_S: Final = 25.0
+"""Longest wait for the end of the control thread, which may wait 20 s for a disk that does not answer."""
+
+
+class ControlLoop:
+    """Runs one session from its opening to its end, in a background thread or in the caller's thread.
+
+    The caller's thread resolves the configuration. The thread of the control cycle then opens the devices,
+    unless the loop was closed meanwhile: a servo is not armed after that.
+
+    Attributes:
+        session: The session.
+        state: State after the newest control cycle.
+    """
+
+    def __init__(self, config: Config, log: Path | None, *, background: bool) -> None:
+        self._config, self._log = config, log
+        self._background = background
+        self._requests, self._tracker = RequestQueue(), StateTracker()
+        self._resources = contextlib.ExitStack()  # of the caller's thread
+        self._thread: threading.Thread | None = None
+        # Written by the thread that runs the control cycle; the first two exist once the loop is open:
+        self.session: Session
+        self.state: GripperState
+        self._error: BaseException | None = None
+        self._opened, self._ended = threading.Event(), threading.Event()
+        # Written by the caller's thread:
+        self._closing = threading.Event()
+        self._end_error: BaseException | None = None
+        self._error_was_raised = False
+
+    def open(self) -> None:
+        """Resolves the configuration, opens the session, and runs its first cycles."""
+        atexit.register(self._close_at_exit)  # for a program that ends without closing the gripper
+        try:
+            if self._background:
+                self._open_thread()
+            else:
+                run = open_run(resolve(self._config), self._log)
+                self._start(self._resources.enter_context(run))
+        except BaseException as error:
+            self._error, self._error_was_raised = error, True
+            self.close(error)
+            raise
+
+    def request(self, request: PendingRequest) -> GraspResult | None:
+        """Submits a request. Returns the result of an awaited one; where no thread runs the cycle, it does."""
+        self._raise_error()
+        self._requests.submit(request)
+        if not request.is_awaited:
+            return None
+        while self._thread is None and not request.result.done():
+            self.step()
+        request.result.exception()  # waits
+        self._raise_error()
+        return request.result.result()
+
+    def stop(self) -> None:
+        """Stops the gripper in the next cycle that reads the servo, before any other request."""
+        self._requests.stop(self.session.stop_soon)
+
+    def step(self) -> GripperState:
+        """Runs one cycle in the caller's thread."""
+        if self._background:
+            raise RequestError("a background thread runs the control cycle; open with background=False")
+        self._raise_error()
+        if self._closing.is_set():
+            raise RequestError(CLOSED)
+        try:
+            return self._cycle(self.session)
+        except BaseException as error:
+            self._error, self._error_was_raised = error, True
+            raise
+
+    def sleep(self, seconds: float) -> None:
+        """Waits for a time on the run's clock, and runs the cycle where no thread does."""
+        if self._background:
+            self._ended.wait(seconds)
+            self._raise_error()
+            return
+        end_ns = self.state.t_ns + round(seconds * NS_PER_S)
+        while self.step().t_ns < end_ns:
+            pass
+
+    def close(self, error: BaseException | None) -> None:
+        """Ends the session, with the exception of the caller's code if there is one. May be called again."""
+        if not self._closing.is_set():
+            self._end_error = error
+            self._closing.set()
+        if self._thread is None:
+            self._requests.close()
+            atexit.unregister(self._close_at_exit)
+            # An error of an earlier step ends the run as a fault even if the caller has handled it.
+            cause = self._error if error is None else error
+            if cause is None:
+                self._resources.close()
+            else:
+                self._resources.__exit__(type(cause), cause, cause.__traceback__)
+            return
+        with self._resources:
+            trace = None if error is None else error.__traceback__
+            if not self._ended.wait(_END_S):
+                raise DeviceTimeoutError(
+                    f"the control thread did not end within {_END_S:g} s; if it did not stop the servo, the "
+                    "servo's Bus Watchdog did; check cables and disk, and see what `gripper-force doctor` says"
+                )
+            self._thread.join()
+            atexit.unregister(self._close_at_exit)
+            if error is not None:
+                error.with_traceback(trace)  # without the frames of the control thread
+            if not self._error_was_raised:
+                self._raise_error()
+
+    def _close_at_exit(self) -> None:
+        """Closes a gripper that the program forgot. The exception that ended the program is the cause."""
+        # An interactive interpreter keeps every exception there, also those that the user has handled.
+        self.close(None if hasattr(sys, "ps1") else getattr(sys, "last_value", None))
+
+    def _raise_error(self) -> None:
+        if self._error is not None:
+            self._error_was_raised = True
+            raise self._error
+
+    # The background thread.
+
+    def _open_thread(self) -> None:
+        self._resources.enter_context(deferred_signals(_interrupt))
+        run = resolve(self._config)
+        self._thread = threading.Thread(target=self._run_thread, args=(run,), name="control", daemon=True)
+        self._thread.start()
+        self._opened.wait()
+        self._raise_error()
+        if self._end_error is not None:
+            raise self._end_error
+
+    def _run_thread(self, run: ResolvedConfig) -> None:
+        try:
+            with open_run(run, self._log, raise_if_cancelled=self._raise_if_closing) as session:
+                self._start(session)
+                while not self._closing.is_set():
+                    self._cycle(session)
+                if self._end_error is not None:  # the run ends with the caller's exception
+                    raise self._end_error  # noqa: TRY301
+        except BaseException as error:
+            if error is not self._end_error:
+                self._error = error
+        finally:
+            self._requests.close()
+            self._opened.set()
+            self._ended.set()
+
+    def _raise_if_closing(self) -> None:
+        if self._closing.is_set():
+            if self._end_error is None:
+                self._end_error = RequestError("the gripper was closed while it was being opened")
+            raise self._end_error
+
+    # The control cycle.
+
+    def _start(self, session: Session) -> None:
+        self._publish(session, session.wait_for_reference())
+        self.session = session
+        self._opened.set()
+
+    def _cycle(self, session: Session) -> GripperState:
+        request = self._requests.next()
+        if request is None or request.kind == RequestKind.STOP:  # the session was told to stop
+            return self._publish(session, session.cycle(), request)
+        if request.needs_object and self.state.phase not in GRIPPING:
+            refusal = "no object is gripped"
+            session.log_event("control", f"refused 'grasp': {refusal}")
+            return self._publish(session, session.cycle(), request, refusal)
+        decision = session.cycle(request.kind, request.target_n, request.width_m)
+        return self._publish(session, decision, request, decision.refusal)
+
+    def _publish(
+        self, session: Session, decision: Decision, request: PendingRequest | None = None, refusal: str = ""
+    ) -> GripperState:
+        """Makes the cycle's result visible to other threads, and ends the calls that waited for it."""
+        assert session.servo_state is not None  # the cycle has read it
+        starts = request is not None and request.kind != RequestKind.STOP and not refusal
+        self.state, result = self._tracker.update(
+            decision, session.servo_state, session.last_load_cell_sample, restart=starts
+        )
+        self._requests.finish_cycle(request, refusal, self.state, result)
+        return self.state
+
+
+def _interrupt() -> None:
+    raise KeyboardInterrupt

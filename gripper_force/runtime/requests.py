@@ -1,0 +1,150 @@
+"""Requests to a gripper: their order, their refusals, and the result that each caller waits for."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from typing import Final
+
+from gripper_force.errors import RequestError
+from gripper_force.runtime.state import GRIPPING, GraspResult, GripperState
+from gripper_force.types import NS_PER_S, Outcome, Phase, RequestKind
+
+CLOSED: Final = "the gripper is closed; open it again with open_gripper"
+
+_RELEASE_NS: Final = 6 * NS_PER_S
+"""Longest wait for open jaws: the controller's own limit of 5 s, and some slack."""
+
+
+@dataclass(eq=False, slots=True)
+class PendingRequest:
+    """A request whose result is not known yet.
+
+    Attributes:
+        kind: What is requested.
+        target_n: Target force of a grasp.
+        width_m: Width of a move.
+        needs_object: True for a change of force, which must not close the jaws on nothing.
+        is_awaited: True if a caller waits for the result.
+        start_ns: Time of the cycle that handled it.
+        result: The result, or the `RequestError` of this request alone.
+    """
+
+    kind: RequestKind
+    target_n: float = 0.0
+    width_m: float = 0.0
+    needs_object: bool = False
+    is_awaited: bool = False
+    start_ns: int = 0
+    result: Future[GraspResult] = field(default_factory=Future)
+
+    def is_done(self, state: GripperState) -> bool:
+        """Returns True if the cycle with this state has ended the request."""
+        if self.kind == RequestKind.RELEASE:
+            return state.phase != Phase.RELEASE or state.t_ns - self.start_ns > _RELEASE_NS
+        return state.outcome != Outcome.NONE
+
+    def fail(self, text: str) -> None:
+        """Raises `RequestError` in the call that waits."""
+        self.result.set_exception(RequestError(text))
+
+
+class RequestQueue:
+    """Requests of all threads, in the order in which the control cycle handles them.
+
+    A newer request of another kind replaces the one that callers wait for; a refused one replaces none. A
+    stop overrides all older requests, which end with its outcome. Requests after it are handled after it.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.RLock()  # a signal handler may stop the gripper
+        self._queued: list[PendingRequest] = []
+        self._started: list[PendingRequest] = []  # only those that a caller waits for
+        self._phase = Phase.OPEN
+        self._is_closed = False
+
+    def submit(self, request: PendingRequest) -> None:
+        """Adds a request, unless it is known to be refused.
+
+        Raises:
+            RequestError: The gripper is closed or at fault, or no object is gripped.
+        """
+        with self._lock:
+            if self._is_closed:
+                raise RequestError(CLOSED)
+            if request.kind != RequestKind.RELEASE and self._will_be_at_fault():
+                raise RequestError(
+                    f"the {request.kind} request was refused: stopped or in fault; call release first"
+                )
+            if request.needs_object and self._phase not in GRIPPING:
+                raise RequestError(f"no object is gripped (phase {self._phase}); call grasp first")
+            self._queued.append(request)
+
+    def stop(self, stop_soon: Callable[[], None]) -> None:
+        """Overrides all requests so far. ``stop_soon`` makes the next cycle a stop, before any later request."""
+        with self._lock:
+            self._queued.append(PendingRequest(RequestKind.STOP))
+            stop_soon()
+
+    def next(self) -> PendingRequest | None:
+        """Returns the request of the next cycle: the newest stop, or else the oldest request."""
+        with self._lock:
+            stops = [request for request in self._queued if request.kind == RequestKind.STOP]
+            if stops:
+                return stops[-1]
+            return self._queued[0] if self._queued else None
+
+    def finish_cycle(
+        self, request: PendingRequest | None, refusal: str, state: GripperState, result: GraspResult
+    ) -> None:
+        """Ends the requests that a cycle has refused, replaced or brought to a result.
+
+        Args:
+            request: The request that the cycle handled, from `next`.
+            refusal: Reason why it was refused, or an empty text.
+            state: State after the cycle.
+            result: Result for the requests that end with this state.
+        """
+        with self._lock:
+            self._phase = state.phase
+            if request is not None and not self._is_closed:
+                self._start(request, refusal, state.t_ns)
+            for started in self._started:
+                if started.is_done(state):
+                    started.result.set_result(result)
+            self._started = [started for started in self._started if not started.result.done()]
+
+    def close(self) -> None:
+        """Ends every request. Later ones are refused."""
+        with self._lock:
+            self._is_closed = True
+            for request in self._queued + self._started:
+                request.fail(f"the gripper was closed before the {request.kind} request was done")
+            self._queued, self._started = [], []
+
+    def _will_be_at_fault(self) -> bool:
+        at_fault = self._phase == Phase.FAULT
+        for request in self._queued:
+            if request.kind in (RequestKind.STOP, RequestKind.RELEASE):
+                at_fault = request.kind == RequestKind.STOP
+        return at_fault
+
+    def _start(self, request: PendingRequest, refusal: str, t_ns: int) -> None:
+        index = self._queued.index(request)
+        overridden = self._queued[:index]  # none, unless the request is a stop
+        del self._queued[: index + 1]
+        self._started += [older for older in overridden if older.is_awaited]
+        if refusal:
+            request.fail(f"the {request.kind} request was refused: {refusal}")
+        elif request.kind != RequestKind.STOP:
+            self._replace(request)
+            request.start_ns = t_ns
+            self._started += [request] if request.is_awaited else []
+
+    def _replace(self, request: PendingRequest) -> None:
+        for older in self._started:
+            if older.kind != request.kind:
+                older.fail(f"the {older.kind} request was replaced by a {request.kind} request")
+        self._started = [older for older in self._started if older.kind == request.kind]
