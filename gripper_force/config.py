@@ -51,6 +51,13 @@ class ServoConfig(Section):
     )
     retries: int = Field(2, ge=0, le=10, description="retries after a timeout or a corrupt reply")
     reply_margin_ms: Positive = Field(3.0, description="how late a reply may be before a retry")
+    homing_offset: int = Field(
+        0,
+        ge=-1_044_479,
+        le=1_044_479,
+        description="Homing Offset register in ticks, for which gripper.open_position_rad was found; a servo "
+        "with another one is refused",
+    )
 
 
 class GripperConfig(Section):
@@ -65,6 +72,12 @@ class GripperConfig(Section):
     )
     current_step_a: Positive | None = Field(
         None, description="resolution of the goal current; None: value of the servo model"
+    )
+    position_loop_a_per_rad: Positive | None = Field(
+        None, description="motor current per radian of position error; None: value of the servo model"
+    )
+    position_loop_gain_per_s: Positive | None = Field(
+        None, description="speed without load per radian of position error; None: value of the servo model"
     )
     friction_n: NonNegative = Field(0.95, description="Coulomb friction of one jaw while closing")
     damping_n_s_m: NonNegative = Field(14.5, description="viscous friction of one jaw, including the motor")

@@ -55,11 +55,17 @@ class ServoSpec:
         nm_per_a: Torque constant at the horn by the vendor's table: a prior, to be calibrated.
         current_step_a: Resolution of the goal current.
         voltage_range_v: Least and greatest supply voltage.
+        position_loop_a_per_rad: Motor current per radian between goal and present position, or None if unknown.
+        position_loop_gain_per_s: Speed without load per radian between goal and present position, or None.
+        position_range_rad: Positions that the servo reports after it was powered on, or None if any.
     """
 
     nm_per_a: float
     current_step_a: float
     voltage_range_v: tuple[float, float]
+    position_loop_a_per_rad: float | None = None
+    position_loop_gain_per_s: float | None = None
+    position_range_rad: tuple[float, float] | None = None
 
 
 class Servo(Protocol):

@@ -77,6 +77,9 @@ _CLOSED_M = 0.002
 _OPEN_M = 0.003
 """Distance from the open width at which the jaws count as open."""
 
+_START_SPARE_M = 0.004
+"""Distance outside the travel at which a run may start: the error of the configured open position."""
+
 _AT_WIDTH_M = 0.0005
 """Distance from the requested width at which a move has arrived: six times what Coulomb friction and the
 servo's proportional gain leave (80 um)."""
@@ -163,6 +166,24 @@ class GraspController:
     def margins(self) -> dict[str, Margin]:
         """Gains and phase margin of each control loop."""
         return self._loop.margins
+
+    def start_problem(self, servo: ServoState) -> str:
+        """Returns why the jaws cannot start at a position, or an empty text.
+
+        Outside their travel, the first command would move them without a request.
+        """
+        width_m, open_width_m = (
+            self._transmission.width_m(servo.position_rad),
+            self._transmission.open_width_m,
+        )
+        if not is_sound(servo) or -_START_SPARE_M <= width_m <= open_width_m + _START_SPARE_M:
+            return ""
+        return (
+            f"the servo starts at {servo.position_rad:.3f} rad, where the jaws would be {1e3 * width_m:.1f} mm "
+            f"apart, outside their travel of 0 to {1e3 * open_width_m:g} mm; nothing has moved. Check the "
+            "horn, gripper.open_position_rad, closing_sign and open_width_m, and servo.homing_offset; a servo "
+            "that is off by a turn needs a power cycle"
+        )
 
     def step(
         self, t_ns: int, servo: ServoState, visual: VisualForce | None, request: Request | None

@@ -93,6 +93,7 @@ def resolve(config: Config, *, vision: bool = True) -> ResolvedConfig:
     config, model, choice = resolve_vision(config)
     config, detail = resolve_simulation(config)
     spec = load_servo_class(config).spec(config.servo)
+    _check_travel(config.gripper, spec)
     profiles = read_profiles(config)
     config = config.model_copy(
         update={
@@ -171,8 +172,29 @@ def make_controller(config: Config) -> GraspController:
 
 
 def _complete_gripper(gripper: GripperConfig, spec: ServoSpec) -> GripperConfig:
-    known = {"nm_per_a": spec.nm_per_a, "current_step_a": spec.current_step_a}
+    known = {
+        "nm_per_a": spec.nm_per_a,
+        "current_step_a": spec.current_step_a,
+        "position_loop_a_per_rad": spec.position_loop_a_per_rad,
+        "position_loop_gain_per_s": spec.position_loop_gain_per_s,
+    }
     return gripper.model_copy(update={k: v for k, v in known.items() if getattr(gripper, k) is None})
+
+
+def _check_travel(gripper: GripperConfig, spec: ServoSpec) -> None:
+    """Raises if the travel leaves the turn in which the servo reports its position after power-on."""
+    if spec.position_range_rad is None:
+        return
+    low_rad, high_rad = spec.position_range_rad
+    transmission = Transmission.from_config(gripper, spec.nm_per_a)
+    open_rad, closed_rad = transmission.open_position_rad, transmission.closed_position_rad
+    if min(open_rad, closed_rad) < low_rad or max(open_rad, closed_rad) > high_rad:
+        raise ConfigError(
+            f"the jaws' travel from {open_rad:.2f} rad (open) to {closed_rad:.2f} rad (closed) leaves the "
+            f"servo's turn, {low_rad:.2f} to {high_rad:.2f} rad: after power-on the position would be off by a "
+            "turn; check gripper.open_position_rad, closing_sign, open_width_m and pinion_radius_m, or mount "
+            "the horn so that the travel lies within the turn"
+        )
 
 
 def _complete_control(control: ControlConfig, spec: ServoSpec) -> ControlConfig:

@@ -104,15 +104,26 @@ class Session:
         return 0 if self._log_queue is None else self._log_queue.lost
 
     def start(self) -> None:
-        """Starts the sensors and arms the servo, unless the run is interrupted or cancelled before."""
-        for device in (self._devices.camera, self._devices.load_cell, self._devices.servo):
-            self.raise_if_interrupted()
-            self._raise_if_cancelled()
-            if device is not None:
-                device.start()  # a servo that raises has turned torque off itself
+        """Starts the sensors and arms the servo, unless the run is interrupted or cancelled before.
+
+        Raises:
+            DeviceError: A device does not start, or the jaws are outside their travel.
+        """
+        for sensor in (self._devices.camera, self._devices.load_cell):
+            self._raise_if_ended()
+            if sensor is not None:
+                sensor.start()
+        self._raise_if_ended()
+        state = self._devices.servo.start()  # if it raises, it has turned torque off itself
         self._armed = True
+        if problem := self._controller.start_problem(state):
+            raise DeviceError(problem)
         self._perception.start()
         self._due_ns = self._devices.clock.now_ns()
+
+    def _raise_if_ended(self) -> None:
+        self.raise_if_interrupted()
+        self._raise_if_cancelled()
 
     def wait_for_reference(self) -> Decision:
         """Runs cycles until the reference frames are taken and, with vision, an estimate exists."""

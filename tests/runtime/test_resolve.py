@@ -29,9 +29,24 @@ def test_servo_data_fill_in_what_is_left_open() -> None:
 
 
 def test_configured_values_are_kept() -> None:
-    given = ["gripper.nm_per_a=1.5", "gripper.current_step_a=0.001", "control.voltage_limits_v=[11, 13]"]
+    given = [
+        "gripper.nm_per_a=1.5",
+        "gripper.current_step_a=0.001",
+        "gripper.position_loop_a_per_rad=4",
+        "gripper.position_loop_gain_per_s=20",
+        "control.voltage_limits_v=[11, 13]",
+    ]
     config = load_config(None, [*NO_SENSORS, *given])
     assert resolve(config).config == config
+
+
+@pytest.mark.parametrize(
+    "key", ["open_position_rad=1.0", "open_position_rad=-1.0", "open_width_m=0.3", "pinion_radius_m=0.01"]
+)
+def test_a_travel_outside_the_servos_turn_is_refused(key: str) -> None:
+    sign = -1 if key.endswith("-1.0") else 1
+    with pytest.raises(ConfigError, match=r"leaves the servo's turn.*open_position_rad"):
+        resolve(load_config(None, [*NO_SENSORS, f"gripper.{key}", f"gripper.closing_sign={sign}"]))
 
 
 @pytest.mark.parametrize("key", ["camera.backend=none", "vision.checkpoint=none"])

@@ -400,6 +400,28 @@ def test_hold_does_not_release_at_the_end_of_a_grasp(quick: list[str], tmp_path:
     assert list(LogReader(path).records(GraspStatus))[-1].phase == Phase.HOLD
 
 
+@pytest.mark.parametrize("open_position_rad", [0.3, 0.7, -0.3])
+def test_jaws_outside_their_travel_are_refused_before_anything_moves(
+    quick: list[str], tmp_path: Path, open_position_rad: float
+) -> None:
+    believed = [*quick, f"gripper.open_position_rad={open_position_rad}"]
+    if open_position_rad < 0:
+        believed.append("gripper.closing_sign=-1")
+    settings = resolve(load_config(None, quick))
+    with open_devices(settings.config) as devices:
+        bus = virtual.find_bus("rig")
+        assert bus is not None
+        run = resolve(load_config(None, believed))
+        with (
+            pytest.raises(DeviceError, match=r"outside their travel.*gripper\.open_position_rad"),
+            open_session(run, devices, tmp_path / "run.mcap"),
+        ):
+            pass
+        assert not bus.servos[0].get("torque_enable")
+        assert bus.servos[0].get("goal_current") == 0
+    assert not (tmp_path / "run.mcap").exists()
+
+
 def test_a_servo_that_does_not_start_is_not_stopped_and_leaves_no_log(
     open_rig: tuple[ExitStack, OpenRig], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -14,6 +14,7 @@ TICKS_PER_REV: Final = 4096
 ZERO_TICK: Final = 2048  # the middle of the turn is 0 rad
 VELOCITY_UNIT_RAD_S: Final = 0.229 * 2 * math.pi / 60  # 0.229 rpm
 WATCHDOG_UNIT_MS: Final = 20
+FULL_PWM: Final = 885  # 100 % duty
 CURRENT_BASED_POSITION_MODE: Final = 5
 
 _TICKS_PER_RAD: Final = TICKS_PER_REV / (2 * math.pi)
@@ -106,6 +107,16 @@ class ServoModel:
     def nm_per_a(self) -> float:
         """Torque constant at the horn, stall torque over stall current: a prior, to be calibrated."""
         return self.stall_torque_nm / self.stall_current_a
+
+    @property
+    def no_load_rad_s(self) -> float:
+        """Speed without load at the nominal voltage."""
+        return self.no_load_rpm * 2 * math.pi / 60
+
+    @property
+    def position_loop_per_rad(self) -> float:
+        """Duty per radian between goal and present position, with the factory's position gain."""
+        return self.initial["position_p_gain"] / 128 / FULL_PWM * _TICKS_PER_RAD
 
     @property
     def max_current_a(self) -> float:

@@ -10,6 +10,7 @@ from enum import IntEnum
 from typing import Final
 
 from gripper_hw.dynamixel.control_table import (
+    FULL_PWM,
     REGISTERS,
     TICKS_PER_REV,
     VELOCITY_UNIT_RAD_S,
@@ -35,7 +36,6 @@ OVERLOAD_ERROR: Final = 0x20
 CURRENT_LOOP_S: Final = 0.002  # time constant
 REBOOT_NS: Final = 200_000_000  # no replies for this time
 
-_FULL_PWM: Final = 885  # 100 % duty
 _RAD_S_TO_TICKS: Final = TICKS_PER_REV / (2 * math.pi)
 _LAST_ADDRESS: Final = REGISTERS["present_temperature"].address
 
@@ -76,7 +76,7 @@ class VirtualServo:
         self._pointer_at = _pointers(model.indirect_windows(firmware))
         self._memory = bytearray(max(self._register_at) + 1)
         self._stall_a = model.stall_current_a
-        self._no_load_rad_s = model.no_load_rpm * 2 * math.pi / 60
+        self._no_load_rad_s = model.no_load_rad_s
         self._position_rad = 0.0
         self._velocity_rad_s = 0.0
         self._current_a = 0.0
@@ -349,12 +349,12 @@ class VirtualServo:
         self._goal_current_a = self.get("goal_current") * self.model.current_unit_a
         self._goal_velocity = self.get("goal_velocity")
         self._goal_position = self.get("goal_position")
-        self._goal_pwm = self.get("goal_pwm") / _FULL_PWM
-        self._pwm_limit = self.get("pwm_limit") / _FULL_PWM
-        self._velocity_p = self.get("velocity_p_gain") / 128 / _FULL_PWM
-        self._position_p = self.get("position_p_gain") / 128 / _FULL_PWM
-        self._position_i = self.get("position_i_gain") / 65536 * 1000 / _FULL_PWM
-        self._position_d = self.get("position_d_gain") / 16 / 1000 / _FULL_PWM
+        self._goal_pwm = self.get("goal_pwm") / FULL_PWM
+        self._pwm_limit = self.get("pwm_limit") / FULL_PWM
+        self._velocity_p = self.get("velocity_p_gain") / 128 / FULL_PWM
+        self._position_p = self.get("position_p_gain") / 128 / FULL_PWM
+        self._position_i = self.get("position_i_gain") / 65536 * 1000 / FULL_PWM
+        self._position_d = self.get("position_d_gain") / 16 / 1000 / FULL_PWM
 
     def _refresh(self) -> None:
         """Writes the last measurements into the present registers, quantised."""
@@ -363,7 +363,7 @@ class VirtualServo:
             ("present_position", self._ticks()),
             ("present_velocity", velocity),
             ("present_current", round(self._present_current_a / self.model.current_unit_a)),
-            ("present_pwm", round(self._pwm * _FULL_PWM)),
+            ("present_pwm", round(self._pwm * FULL_PWM)),
             ("present_input_voltage", round(self._voltage_v * 10)),
             ("present_temperature", max(0, round(self._temperature_c))),
             ("realtime_tick", (self._t_ns or 0) // 1_000_000 % 32768),

@@ -27,6 +27,7 @@ from gripper_hw.dynamixel.control_table import (
     REGISTERS,
     VELOCITY_UNIT_RAD_S,
     WATCHDOG_UNIT_MS,
+    ZERO_TICK,
     IndirectWindow,
     check_model_number,
     load_model,
@@ -258,6 +259,13 @@ class DynamixelBus:
                 f"servo {id_} reports {hardware_error_text(hardware_error)}; remove the cause, then "
                 "power-cycle or reboot it"
             )
+        homing_offset = self._transport.get(id_, "homing_offset")
+        if homing_offset != self._config.homing_offset:
+            raise DeviceError(
+                f"servo {id_} has Homing Offset {homing_offset}, but servo.homing_offset is "
+                f"{self._config.homing_offset}: every configured angle would be off by the difference; set "
+                "servo.homing_offset if gripper.open_position_rad was found with it, or the register back"
+            )
         for name, value in self.settings.items():
             if not REGISTERS[name].eeprom or self._transport.get(id_, name) != value:  # limits EEPROM wear
                 self._transport.set(id_, name, value)
@@ -345,10 +353,14 @@ class DynamixelServo:
             ConfigError: The model is unknown, or has no current control.
         """
         model = load_model(config.model)
+        offset_rad = rad_from_ticks(ZERO_TICK + config.homing_offset)
         return ServoSpec(
             nm_per_a=model.nm_per_a,
             current_step_a=model.current_unit_a,
             voltage_range_v=model.voltage_range_v,
+            position_loop_a_per_rad=model.position_loop_per_rad * model.stall_current_a,
+            position_loop_gain_per_s=model.position_loop_per_rad * model.no_load_rad_s,
+            position_range_rad=(offset_rad - math.pi, offset_rad + math.pi),
         )
 
     @property

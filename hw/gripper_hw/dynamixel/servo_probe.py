@@ -117,6 +117,12 @@ class _Inspection:
         yield judged(unit, "hardware error", text if error else "none", not error, advice)
         advice = "it still holds; the next run turns torque off first"
         yield judged(unit, "torque", "on" if torque else "off", not torque, advice, harmless=True)
+        offset, expected = self.transport.get(id_, "homing_offset"), self._config.homing_offset
+        advice = (
+            f"a run refuses it: set servo.homing_offset={offset} if gripper.open_position_rad was found with "
+            "it, or set the register back with DYNAMIXEL Wizard"
+        )
+        yield judged(unit, "homing offset", f"{offset} ticks", offset == expected, advice)
         for name, new in self._expected.items():
             if name in _ALWAYS_LISTED or values[name] != new:
                 same, text = values[name] == new, self._text(name, values[name])

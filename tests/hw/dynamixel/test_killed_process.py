@@ -50,7 +50,9 @@ def grasp(port: str, folder: Path, quick: list[str]) -> list[str]:
         "load_cell.backend": "none",
         "servo.reply_margin_ms": STARVED_MS,
         "servo.bus_watchdog_ms": 2 * STARVED_MS,
-        "gripper.open_width_m": 2.0,  # far enough for 40 s of motion
+        "gripper.pinion_radius_m": 0.04,
+        "gripper.open_width_m": 0.2,
+        "control.approach_speed_m_s": 0.005,  # 20 s of motion
         "control.timeout_s": 60,
         "log.directory": folder,
         "log.report": "false",

@@ -34,6 +34,9 @@ MODEL = load_model("XM430-W350")
 MS = 1_000_000
 
 
+DUTY_PER_RAD = 900 / 128 / 885 * 4096 / math.tau  # position gain of an XC330 by its manual
+
+
 def drive(endpoint, **config) -> DynamixelServo:
     return DynamixelServo(endpoint.config(**config), lambda: endpoint.now_ns)
 
@@ -168,9 +171,24 @@ def test_spec_contains_the_models_data_and_needs_no_port():
         nm_per_a=pytest.approx(0.92 / 0.80),  # type: ignore[arg-type]
         current_step_a=0.001,
         voltage_range_v=(6.5, 12.0),
+        position_loop_a_per_rad=pytest.approx(0.80 * DUTY_PER_RAD),  # type: ignore[arg-type]
+        position_loop_gain_per_s=pytest.approx(65 * math.tau / 60 * DUTY_PER_RAD),  # type: ignore[arg-type]
+        position_range_rad=(-math.pi, math.pi),
     )
+    offset = DynamixelServo.spec(config.model_copy(update={"homing_offset": 2048}))
+    assert offset.position_range_rad == pytest.approx((0.0, math.tau))
     with pytest.raises(ConfigError, match=r"unknown servo\.model 'AX-12'"):
         DynamixelServo.spec(ServoConfig(model="AX-12"))
+
+
+def test_another_homing_offset_is_refused_with_torque_off(make_memory_endpoint):
+    endpoint = make_memory_endpoint(VirtualServo(1, MODEL))
+    endpoint.bus.servos[0].set("homing_offset", 1024)
+    with pytest.raises(DeviceError, match=r"Homing Offset 1024.*servo\.homing_offset is 0"):
+        drive(endpoint).start()
+    assert not endpoint.bus.servos[0].get("torque_enable")
+    drive(endpoint, homing_offset=1024).start()
+    assert endpoint.bus.servos[0].get("torque_enable")
 
 
 def test_old_firmware_is_refused_with_torque_off(make_memory_endpoint):

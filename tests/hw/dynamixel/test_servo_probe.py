@@ -52,6 +52,7 @@ def test_factory_settings_pass_and_nothing_is_written(endpoint):
         "model": "XM430-W350, firmware 52",
         "hardware error": "none",
         "torque": "off",
+        "homing offset": "0 ticks",
         "return delay time": "500 us",
         "current limit": "3.209 A",
         "operating mode": "3 (position)",
@@ -59,6 +60,13 @@ def test_factory_settings_pass_and_nothing_is_written(endpoint):
     }
     assert found["servo 1", "return delay time"].advice == "a run sets 0 us; so does doctor --setup"
     assert {packet.instruction for packet in endpoint.packets()} == READS
+
+
+def test_another_homing_offset_is_a_problem(endpoint):
+    endpoint.bus.servos[0].set("homing_offset", 1024)
+    check = rows(endpoint)["servo 1", "homing offset"]
+    assert check.ok is False
+    assert "set servo.homing_offset=1024" in check.advice
 
 
 def test_running_servo_is_not_changed(endpoint):
