@@ -89,6 +89,13 @@ class GripperConfig(Section):
         description="relative standard deviation of the true torque constant from nm_per_a (uniform within "
         "+-10 % is 0.058)",
     )
+    gain_bound: float = Field(
+        1.4,
+        ge=1.0,
+        le=3.0,
+        description="largest plausible ratio of the true torque constant to nm_per_a, which the force limit "
+        "allows for; 1.1 after calibrate servo",
+    )
 
 
 class CameraConfig(Section):
@@ -203,11 +210,12 @@ class ControlConfig(Section):
         "fused", description="feedback of the force loop: vision fused with motor current, or one of them"
     )
     force_limit_n: float = Field(
-        10.0,
+        14.0,
         gt=0,
         le=HARD_FORCE_LIMIT_N,
         allow_inf_nan=False,
-        description="above this force the current is reduced, and after 0.25 s the grasp ends as a fault",
+        description="above this force the current is reduced, and after 0.25 s the grasp ends as a fault; "
+        "the largest target is 0.9 / gripper.gain_bound of it",
     )
     approach_speed_m_s: Positive = Field(0.025, description="closing speed of one jaw before contact")
     approach_force_n: Positive = Field(0.5, description="largest grip force before contact")
@@ -220,7 +228,15 @@ class ControlConfig(Section):
     )
     vision_age_ms: Positive = Field(100.0, description="frame age above which an estimate is rejected")
     vision_std_n: Positive = Field(1.5, description="standard deviation above which an estimate is rejected")
+    min_object_width_m: NonNegative = Field(
+        0.002, description="width below which closed jaws hold nothing; less than the thinnest object"
+    )
     slip_width_m: Positive = Field(0.004, description="closing of the jaws during hold that counts as slip")
+    on_slip: Literal["regrip", "hold", "open"] = Field(
+        "regrip",
+        description="after the object has left the jaws: regrip: close again, and open if there is nothing; "
+        "hold: keep the width; open: open the jaws",
+    )
     on_fault: Literal["limp", "hold", "open"] = Field(
         "limp",
         description="after a fault or stop: limp: torque off; hold: keep the grip with a force that can only "

@@ -38,6 +38,7 @@ class Outcome(StrEnum):
     NONE = ""
     HELD = "held"
     NO_OBJECT = "no_object"
+    STUCK = "stuck"
     SLIP = "slip"
     TIMEOUT = "timeout"
     FAULT = "fault"

@@ -12,6 +12,10 @@ from gripper_force.types import EstimateSource, FusedForce
 _RAMP_S = 0.4
 """Acceleration time of the ramp: longer than a quarter oscillation period of the softest object."""
 
+_WAIT_SHARE = 0.2
+_WAIT_N = 0.2
+"""Ramp and integral wait while the motor force falls short by more than this share of the reference and this force."""
+
 _FORWARD_DEADBAND = 0.25
 _REVERSE_DEADBAND = 0.5
 """Deadband of the hold as shares of the tolerance: in the last direction of motion, and against it."""
@@ -83,14 +87,23 @@ class ForceLoop:
         self._profile.start(self.reference_n, self._ramp_n_s)
         self._rising = target_n >= self.reference_n
 
-    def step(self, dt_s: float, target_n: float, estimate: FusedForce) -> float:
-        """Runs one cycle and returns the motor force at each jaw."""
+    def step(self, dt_s: float, target_n: float, estimate: FusedForce, *, shortfall_n: float = 0.0) -> float:
+        """Runs one cycle and returns the motor force at each jaw.
+
+        Args:
+            dt_s: Time since the last cycle.
+            target_n: Target force.
+            estimate: The force estimate.
+            shortfall_n: Commanded less measured motor force. Ramp and integral wait while it is large: the
+                jaws close on a soft object as fast as they may.
+        """
         ramping = self.reference_n != target_n
-        reference_n = self._profile.step(target_n, dt_s)
+        waits = shortfall_n > _WAIT_SHARE * self.reference_n + _WAIT_N
+        reference_n = self._profile.step(target_n, 0.0 if waits else dt_s)
         error_n = 0.0
         # A constant motor force holds a constant contact force. The current alone carries no new information
         # on friction, so it is not fed back.
-        if not ramping and estimate.source != EstimateSource.CURRENT:
+        if not ramping and not waits and estimate.source != EstimateSource.CURRENT:
             error_n = self._beyond_deadband(reference_n - estimate.force_n, tolerance_n(target_n))
             self._trim_n += self._gains.integral_s * error_n * dt_s
         elif ramping and not self._vision_alone:

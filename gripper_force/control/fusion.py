@@ -33,6 +33,9 @@ cycles."""
 _FREE_FLOOR_N = 0.08
 """Standard deviation of friction under load after free travel: viscous friction, variation with position."""
 
+_FREE_CYCLES = (10, 40)
+"""Least and greatest number of cycles of free travel that prove friction. Later ones may press a soft object."""
+
 _VISION_FLOOR_N = 0.05
 """Lower limit of the standard deviation of a visual estimate, whatever it claims."""
 
@@ -97,7 +100,16 @@ class Fusion:
         self._friction_n = self._transmission.friction_n
         self._friction_n2 = (self._transmission.friction_std * self._friction_n) ** 2
         self._opening_variance_n2 = 0.0
+        self._free_cycles, self._free_sum_n = 0, 0.0
         self.reset_variance()
+
+    @property
+    def measured_friction_n(self) -> float:
+        """Friction that the free travel of this grasp proves; 0 without enough of it."""
+        if self._free_cycles < _FREE_CYCLES[0]:
+            return 0.0
+        mean_n = self._free_sum_n / self._free_cycles
+        return max(mean_n - 2 * _FREE_NOISE_N / math.sqrt(self._free_cycles), 0.0)
 
     def reset_variance(self) -> None:
         """Resets the bias variance to its prior.
@@ -173,6 +185,9 @@ class Fusion:
         self._history.append((servo.t_ns, self._current_n))
 
     def _learn_friction(self) -> None:
+        if self._free_cycles < _FREE_CYCLES[1]:
+            self._free_cycles += 1
+            self._free_sum_n += self._motor_force_n
         gain = self._friction_n2 / (self._friction_n2 + _FREE_NOISE_N**2)
         self._friction_n = max(self._friction_n + gain * (self._motor_force_n - self._friction_n), 0.0)
         self._friction_n2 = _combined_variance_n2(self._friction_n2, _FREE_NOISE_N**2)

@@ -13,9 +13,9 @@ _RISE_FACTOR = 4.0
 _OVER_FORCE_CEILING = 0.95
 """Until the grasp ends, the current stays below this share of a current that caused an over-force."""
 
-_CEILING_SHARE = 0.95
-"""Share of the force limit that sets the current ceiling. The torque constant is known to 10 %, so that the
-force exceeds its limit by 5 % at most, whatever vision estimates."""
+_CEILING_SHARE = 1.04
+"""Share of the force limit that sets the current ceiling, for the largest torque constant. The force exceeds its
+limit by 5 % at most, whatever vision estimates."""
 
 _OVER_FORCE_FACTOR = 0.85
 """Factor on the goal current in each cycle with too much force: half within 25 ms at 200 Hz."""
@@ -24,9 +24,9 @@ _TARGET_SHARE = 0.9
 """Largest target as a share of the force limit: a tenth is left for overshoot."""
 
 
-def largest_target_n(force_limit_n: float) -> float:
-    """Returns the largest target force that is allowed with a force limit."""
-    return _TARGET_SHARE * force_limit_n
+def largest_target_n(force_limit_n: float, gain_bound: float) -> float:
+    """Returns the largest target force that is allowed with a force limit and a bound on the torque constant."""
+    return _TARGET_SHARE * force_limit_n / gain_bound
 
 
 class Limits:
@@ -66,7 +66,7 @@ class Limits:
         Args:
             command: The controller's command.
             force_n: Estimated contact force.
-            friction_n: Friction force known to reduce the motor force.
+            friction_n: Friction known to reduce the motor force; in a grip only what this grasp measured.
             motor_force_n: Present motor force, by the motor current.
             dt_s: Time since the last command.
             may_rise: True if the goal current may exceed the last one.
@@ -104,7 +104,8 @@ class Limits:
     def ceiling_a(self, friction_n: float) -> float:
         """Returns the largest current that the force limit and the servo's current limit allow."""
         max_friction_n = (1 + 3 * self._transmission.friction_std) * self._transmission.friction_n
-        max_n = _CEILING_SHARE * self._force_limit_n + min(max(friction_n, 0.0), max_friction_n)
+        limit_n = _CEILING_SHARE * self._force_limit_n / self._transmission.gain_bound
+        max_n = limit_n + min(max(friction_n, 0.0), max_friction_n)
         return min(self._current_limit_a, abs(self._transmission.current_a(max_n)))
 
     def _quantise(self, wanted_a: float, ceiling_a: float) -> float:

@@ -4,10 +4,13 @@ import dataclasses
 from dataclasses import dataclass
 
 from gripper_force.config import ControlConfig
+from gripper_force.control.approach import ACCELERATION_S, Approach, Progress
 from gripper_force.control.force_loop import ForceLoop, Margin, tolerance_n
 from gripper_force.control.fusion import Fusion
 from gripper_force.control.limits import Limits, largest_target_n
 from gripper_force.control.safety import Safety, is_sound
+from gripper_force.control.slip import SlipMonitor
+from gripper_force.control.speed_limit import PositionLoop, SpeedLimit
 from gripper_force.control.trajectory import TrapezoidalProfile
 from gripper_force.control.transmission import Transmission
 from gripper_force.types import (
@@ -28,51 +31,23 @@ from gripper_force.types import (
 MAX_CYCLE_S = 0.05
 """Longest cycle time that is used, so that a late cycle does not cause a jump of the command."""
 
-_IMPACT_M_S_PER_N = 0.010
-"""Approach speed of one jaw per newton of target: on the stiffest object, impact stays below the target."""
+_HOLD_SPEED_SHARE = 0.5
+"""Largest closing speed during hold, as a share of the approach speed."""
 
-_CONTACT_SHARE = 0.25
-"""Largest contact force before contact is detected, as a share of the target."""
-
-_ACCELERATION_S = 0.1
-"""Time in which the jaws reach full speed."""
-
-_SPEED_GAIN_N_S_M = 10.0
-_SPEED_INTEGRAL_N_M = 40.0
-"""Proportional and integral gain of the approach speed loop. With 1.3 kg of motor and jaw, half of a speed
-error is corrected after 40 ms; on stalled jaws the motor force rises by 1 N/s."""
+_TRAVEL_SPEED_SHARE = 2.0
+"""Speed of a release or move, as a share of the approach speed."""
 
 _LEAD_M = 0.004
-"""Largest lead of the goal over one jaw in free travel, so that jaws that were held back do not jump."""
+"""Largest lead of the profile over one jaw in free travel, so that jaws that were held back do not jump."""
 
 _GOAL_OFFSET_M = 0.010
-"""Distance of each jaw's goal inside the object, so that the current limit alone sets the force."""
-
-_STALLED_SHARE = 0.1
-_SLOWED_SHARE = 0.6
-"""Shares of the approach speed below which the jaws count as stalled, or as slowed."""
-
-_VISUAL_CONTACT_N = 0.4
-"""Visual or fused estimate above which slowed jaws count as in contact."""
-
-_STEADY_SHARE = 0.2
-_STEADY_S = 0.1
-"""The speed counts as steady within this share of the wanted speed, from this time after the acceleration."""
-
-_START_UP_S = 0.6
-"""If the jaws have not moved within this time, they already touch the object."""
-
-_DEBOUNCE_S = 0.05
-"""Time for which the signs of contact must persist."""
+"""Distance of each jaw's goal inside the object, before the speed limit: the current limit sets the force."""
 
 _DWELL_S = 0.12
 """Time in contact before the ramp: the impact decays and vision catches up."""
 
 _SETTLE_FILTER_S = 0.25
 """Time constant of the filter on the force error that decides on `held`: vision alone is noisy."""
-
-_CLOSED_M = 0.002
-"""Width below which the jaws hold nothing."""
 
 _OPEN_M = 0.003
 """Distance from the open width at which the jaws count as open."""
@@ -86,10 +61,6 @@ servo's proportional gain leave (80 um)."""
 
 _MOVE_SPARE_S = 1.0
 """Time a move may take beyond its speed profile before an obstacle is reported."""
-
-_COLLAPSE_SHARE = 0.5
-_COLLAPSE_S = 0.1
-"""A force below this share of the target, for this time, is a slip."""
 
 _GRIPPING = (Phase.CONTACT, Phase.RAMP, Phase.HOLD)
 
@@ -129,19 +100,30 @@ class GraspController:
     *A hot servo* holds less force, and an event reports it.
 
     *The outcome* stays until the next grasp or move. After ``held`` it may become ``slip``. The controller
-    opens the jaws without a request only after ``no_object``. After ``slip`` or ``timeout`` it continues. It
-    never releases because of a width.
+    opens the jaws without a request after ``no_object`` and ``stuck``. When the object has left the jaws, it
+    does what ``on_slip`` says. After another ``slip``, and after ``timeout``, it continues.
+
+    *Speed.* Every command passes `SpeedLimit`, so the jaws are never much faster than the phase allows.
     """
 
-    def __init__(self, config: ControlConfig, transmission: Transmission, current_limit_a: float) -> None:
+    def __init__(
+        self,
+        config: ControlConfig,
+        transmission: Transmission,
+        current_limit_a: float,
+        position_loop: PositionLoop | None = None,
+    ) -> None:
         self._config = config
         self._transmission = transmission
         self._fusion = Fusion(config, transmission)
         self._loop = ForceLoop(config, transmission)
         self._limits = Limits(config, transmission, current_limit_a)
+        self._speed_limit = SpeedLimit(transmission, position_loop)
         self._safety = Safety(config)
-        self._travel = TrapezoidalProfile(_ACCELERATION_S)
-        self._largest_target_n = largest_target_n(config.force_limit_n)
+        self._approach = Approach(config, transmission)
+        self._slip = SlipMonitor(config)
+        self._travel = TrapezoidalProfile(ACCELERATION_S)
+        self._largest_target_n = largest_target_n(config.force_limit_n, transmission.gain_bound)
         self._free_motor_force_n = config.approach_force_n + transmission.friction_n
         self._phase, self._outcome, self._reason = Phase.OPEN, Outcome.NONE, ""
         self._estimate = FusedForce(
@@ -151,14 +133,14 @@ class GraspController:
         self._width_m: float | None = None
         self._goal_width_m = transmission.open_width_m
         self._motor_force_n = self._free_motor_force_n
-        self._target_n = self._speed_m_s = self._held_width_m = 0.0
+        self._servo: ServoState | None = None
+        self._target_n = self._held_width_m = 0.0
         self._move_width_m = transmission.open_width_m
         self._move_time_s = 0.0
         self._move_opens = False
         self._grasp_ns = 0
-        self._phase_s = self._condition_s = self._settled_s = 0.0
-        self._error_n = self._speed_integral_n = 0.0
-        self._has_moved = self._was_over_force = False
+        self._phase_s = self._settled_s = self._error_n = 0.0
+        self._was_over_force = False
         self._goal_current_a = self._measured_motor_force_n = 0.0
         self._derating = 1.0
 
@@ -237,10 +219,12 @@ class GraspController:
         width_m = self._transmission.width_m(servo.position_rad)
         if self._width_m is None:  # nothing moves before the first request
             self._goal_width_m = width_m
-        self._width_m = width_m
+        self._width_m, self._servo = width_m, servo
         self._measured_motor_force_n = self._transmission.force_n(servo.current_a)
         closing_m_s = self._transmission.closing_m_s(servo.velocity_rad_s)
-        is_free = self._moves_freely(closing_m_s)
+        is_free = self._phase == Phase.APPROACH and self._approach.moves_freely(
+            closing_m_s, self._measured_motor_force_n
+        )
         self._estimate, fusion_events = self._fusion.step(
             t_ns, servo, visual, free=is_free, opening=self._is_opening
         )
@@ -288,7 +272,7 @@ class GraspController:
 
     def _enter(self, phase: Phase, reason: str) -> None:
         self._phase, self._reason = phase, reason
-        self._phase_s = self._condition_s = self._settled_s = 0.0
+        self._phase_s = self._settled_s = 0.0
 
     def _set_outcome(self, outcome: Outcome, reason: str) -> None:
         self._outcome, self._reason = outcome, reason
@@ -303,9 +287,7 @@ class GraspController:
             return
         self._fusion.restart()
         self._limits.reset()
-        self._speed_m_s = min(self._config.approach_speed_m_s, _IMPACT_M_S_PER_N * target_n)
-        self._has_moved = False
-        self._speed_integral_n = 0.0
+        self._approach.start(self._present_width_m, target_n)
         self._enter(Phase.APPROACH, f"grasp with {target_n:g} N requested")
 
     def _start_release(self, reason: str) -> None:
@@ -317,12 +299,13 @@ class GraspController:
         self._start_travel()
         distance_m = width_m - self._present_width_m
         self._move_width_m, self._move_opens = width_m, distance_m > 0
-        rate_m_s = 2 * self._config.approach_speed_m_s
-        self._move_time_s = abs(distance_m) / rate_m_s + _ACCELERATION_S + _MOVE_SPARE_S
+        rate_m_s = _TRAVEL_SPEED_SHARE * self._config.approach_speed_m_s
+        self._move_time_s = abs(distance_m) / rate_m_s + ACCELERATION_S + _MOVE_SPARE_S
         self._enter(Phase.MOVE, f"move to {1e3 * width_m:.1f} mm requested")
 
     def _start_travel(self) -> None:
-        self._travel.start(self._present_width_m, 2 * self._config.approach_speed_m_s)
+        speed_m_s = _TRAVEL_SPEED_SHARE * self._config.approach_speed_m_s
+        self._travel.start(self._present_width_m, speed_m_s)
         self._limits.reset()
 
     def _enter_fault(self) -> None:
@@ -345,16 +328,23 @@ class GraspController:
         return (
             self._phase == Phase.RELEASE
             or (self._phase == Phase.MOVE and self._move_opens)
+            or (self._phase == Phase.APPROACH and self._approach.is_backing_off)
             or self._opens_at_fault
         )
 
     @property
-    def _derated_target_n(self) -> float:
-        return self._target_n * self._derating
+    def _speed_m_s(self) -> float:
+        """Largest speed of one jaw in the present phase."""
+        full_m_s = self._config.approach_speed_m_s
+        if self._is_opening or self._phase in (Phase.MOVE, Phase.OPEN):
+            return _TRAVEL_SPEED_SHARE * full_m_s
+        if self._phase == Phase.APPROACH:
+            return self._approach.speed_m_s
+        return full_m_s if self._phase in (Phase.CONTACT, Phase.RAMP) else _HOLD_SPEED_SHARE * full_m_s
 
     @property
-    def _contact_limit_n(self) -> float:
-        return min(self._config.approach_force_n, _CONTACT_SHARE * self._target_n)
+    def _derated_target_n(self) -> float:
+        return self._target_n * self._derating
 
     @property
     def _present_width_m(self) -> float:
@@ -369,11 +359,12 @@ class GraspController:
                 self._run_approach(dt_s, width_m, closing_m_s)
             case Phase.CONTACT if self._phase_s >= _DWELL_S:
                 self._loop.start(self._estimate.force_n, self._derated_target_n)
+                self._slip.start()
                 self._enter(Phase.RAMP, "contact has settled")
             case Phase.RAMP:
-                self._run_ramp(dt_s, width_m)
+                self._run_ramp(dt_s, width_m, closing_m_s)
             case Phase.HOLD:
-                self._run_hold(dt_s, width_m)
+                self._run_hold(dt_s, width_m, closing_m_s)
             case Phase.RELEASE:
                 self._run_release(dt_s, width_m)
             case Phase.MOVE:
@@ -388,58 +379,49 @@ class GraspController:
     def _run_approach(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
         # The goal position leads far enough that the goal current alone drives the jaws. A goal that moved in
         # steps with the jaws would cause a current ripple, and the current is sampled at one phase of it.
-        self._goal_width_m = max(width_m - 2 * _LEAD_M, 0.0)
-        self._motor_force_n = self._approach_motor_force_n(dt_s, closing_m_s)
-        self._has_moved |= closing_m_s > _SLOWED_SHARE * self._speed_m_s or self._phase_s > _START_UP_S
-        if width_m < _CLOSED_M:
-            self._set_outcome(Outcome.NO_OBJECT, "closed without contact")
-            self._start_release(self._reason)
-        elif self._persists(self._detects_contact(closing_m_s), _DEBOUNCE_S, dt_s):
-            self._fusion.reset_variance()
-            self._enter(Phase.CONTACT, f"contact at {width_m * 1e3:.1f} mm")
-
-    def _approach_motor_force_n(self, dt_s: float, closing_m_s: float) -> float:
-        """Speed loop whose motor force is limited to friction, damping and the contact limit."""
-        wanted_m_s = self._speed_m_s * min(self._phase_s / _ACCELERATION_S, 1.0)
-        speed_error_m_s = wanted_m_s - closing_m_s
-        damping_n_s_m = self._transmission.damping_n_s_m
-        unlimited_n = (
-            self._transmission.friction_n + damping_n_s_m * wanted_m_s + _SPEED_GAIN_N_S_M * speed_error_m_s
+        self._goal_width_m = max(width_m - 2 * _GOAL_OFFSET_M, 0.0)
+        progress = self._approach.step(
+            dt_s, width_m, closing_m_s, self._measured_motor_force_n, self._estimate
         )
-        # Force that the current estimate counts as contact and vision does not is friction, too.
-        friction_n = self._estimate.friction_n - self._estimate.bias_n + 2 * self._estimate.std_n
-        max_n = friction_n + self._contact_limit_n + damping_n_s_m * max(closing_m_s, 0.0)
-        self._speed_integral_n += _SPEED_INTEGRAL_N_M * speed_error_m_s * dt_s
-        self._speed_integral_n = min(max(self._speed_integral_n, -unlimited_n), max_n - unlimited_n)
-        return unlimited_n + self._speed_integral_n
+        self._motor_force_n = self._approach.motor_force_n
+        match progress:
+            case Progress.BACKING_OFF:
+                self._goal_width_m = min(self._approach.back_off_width_m, self._transmission.open_width_m)
+            case Progress.CONTACT:
+                self._fusion.reset_variance()
+                self._enter(Phase.CONTACT, f"contact at {width_m * 1e3:.1f} mm")
+            case Progress.CLOSED:
+                self._end_approach(Outcome.NO_OBJECT, "closed without contact")
+            case Progress.STUCK:
+                self._end_approach(
+                    Outcome.STUCK,
+                    f"the jaws do not move at {width_m * 1e3:.1f} mm; check for an obstacle, and that "
+                    "gripper.friction_n is not too small",
+                )
 
-    def _moves_freely(self, closing_m_s: float) -> bool:
-        """Returns True if the jaws move freely at a steady speed: the motor force is then friction."""
-        if self._phase != Phase.APPROACH or self._phase_s < _ACCELERATION_S + _STEADY_S:
-            return False
-        return abs(closing_m_s - self._speed_m_s) < _STEADY_SHARE * self._speed_m_s
+    def _end_approach(self, outcome: Outcome, reason: str) -> None:
+        self._set_outcome(Outcome.SLIP if self._outcome == Outcome.SLIP else outcome, reason)
+        self._start_release(reason)
 
-    def _detects_contact(self, closing_m_s: float) -> bool:
-        if not self._has_moved:
-            return False
-        pressing = self._estimate.current_n + self._estimate.bias_n > 0.5 * self._contact_limit_n
-        stalled = closing_m_s < _STALLED_SHARE * self._speed_m_s
-        visual = (
-            self._estimate.source != EstimateSource.CURRENT and self._estimate.force_n > _VISUAL_CONTACT_N
+    def _run_ramp(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
+        shortfall_n = self._motor_force_n - self._measured_motor_force_n
+        self._motor_force_n = self._loop.step(
+            dt_s, self._derated_target_n, self._estimate, shortfall_n=shortfall_n
         )
-        return (stalled and pressing) or (visual and closing_m_s < _SLOWED_SHARE * self._speed_m_s)
-
-    def _run_ramp(self, dt_s: float, width_m: float) -> None:
-        self._motor_force_n = self._loop.step(dt_s, self._derated_target_n, self._estimate)
-        if width_m < _CLOSED_M:
+        if width_m < self._config.min_object_width_m and self._outcome == Outcome.NONE:
             self._set_outcome(Outcome.NO_OBJECT, "closed while the force was to rise")
             self._start_release(self._reason)
+        elif lost := self._slip.is_lost(dt_s, width_m, closing_m_s, shortfall_n, self._loop.reference_n):
+            self._handle_loss(width_m, lost)
         elif self._loop.reference_n == self._derated_target_n:
             self._error_n = self._estimate.force_n - self._derated_target_n
             self._enter(Phase.HOLD, f"at {self._derated_target_n:g} N")
 
-    def _run_hold(self, dt_s: float, width_m: float) -> None:
-        self._motor_force_n = self._loop.step(dt_s, self._derated_target_n, self._estimate)
+    def _run_hold(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
+        shortfall_n = self._motor_force_n - self._measured_motor_force_n
+        self._motor_force_n = self._loop.step(
+            dt_s, self._derated_target_n, self._estimate, shortfall_n=shortfall_n
+        )
         error_n = self._estimate.force_n - self._derated_target_n
         self._error_n += (error_n - self._error_n) * dt_s / (dt_s + _SETTLE_FILTER_S)
         is_near = abs(self._error_n) <= tolerance_n(self._derated_target_n)
@@ -447,21 +429,28 @@ class GraspController:
         if self._outcome == Outcome.NONE and self._settled_s >= self._config.settle_s:
             self._held_width_m = width_m
             self._set_outcome(Outcome.HELD, f"{self._estimate.force_n:.2f} N for {self._settled_s:.2f} s")
-        collapsed = self._persists(
-            self._estimate.force_n < _COLLAPSE_SHARE * self._derated_target_n, _COLLAPSE_S, dt_s
-        )
-        if self._outcome in (Outcome.NONE, Outcome.HELD) and (slip := self._slip_reason(width_m, collapsed)):
+        if lost := self._slip.is_lost(dt_s, width_m, closing_m_s, shortfall_n, self._loop.reference_n):
+            self._handle_loss(width_m, lost)
+            return
+        closed_m = self._held_width_m - width_m if self._outcome == Outcome.HELD else 0.0
+        slip = self._slip.has_slipped(dt_s, self._estimate.force_n, self._derated_target_n, closed_m)
+        if slip and self._outcome in (Outcome.NONE, Outcome.HELD):
             self._set_outcome(Outcome.SLIP, slip)
 
-    def _slip_reason(self, width_m: float, collapsed: bool) -> str:
-        if collapsed:
-            return f"the force fell to {self._estimate.force_n:.2f} N"
-        if width_m < _CLOSED_M:
-            return "the jaws closed"
-        closed_m = self._held_width_m - width_m
-        if self._outcome == Outcome.HELD and closed_m > self._config.slip_width_m:
-            return f"the jaws closed by {closed_m * 1e3:.1f} mm"
-        return ""
+    def _handle_loss(self, width_m: float, reason: str) -> None:
+        """Does what ``on_slip`` says once the object has left the jaws."""
+        if self._outcome in (Outcome.NONE, Outcome.HELD):
+            self._set_outcome(Outcome.SLIP, reason)
+        match self._config.on_slip:
+            case "open":
+                self._start_release(reason)
+            case "hold":
+                self._start_travel()
+                self._move_width_m, self._move_opens = width_m, False
+                self._enter(Phase.MOVE, reason)
+            case "regrip":
+                self._approach.start(width_m, self._target_n)
+                self._enter(Phase.APPROACH, reason)
 
     def _run_release(self, dt_s: float, width_m: float) -> None:
         self._motor_force_n = self._free_motor_force_n
@@ -490,10 +479,6 @@ class GraspController:
         if t_ns - self._grasp_ns > self._config.timeout_s * NS_PER_S:
             self._set_outcome(Outcome.TIMEOUT, f"not held within {self._config.timeout_s:g} s")
 
-    def _persists(self, condition: bool, time_s: float, dt_s: float) -> bool:
-        self._condition_s = self._condition_s + dt_s if condition else 0.0
-        return self._condition_s >= time_s
-
     # Outputs.
 
     def _limit_command(self, t_ns: int, dt_s: float) -> tuple[ServoCommand, bool]:
@@ -504,7 +489,9 @@ class GraspController:
         )
         may_rise = self._phase != Phase.FAULT or self._opens_at_fault
         force_n, friction_n = self._estimate.force_n, self._estimate.friction_n
-        return self._limits.apply(
+        if self._phase in _GRIPPING:  # friction that is smaller than believed would be force
+            friction_n = min(friction_n, self._fusion.measured_friction_n)
+        command, is_over = self._limits.apply(
             wanted,
             force_n,
             friction_n,
@@ -513,6 +500,9 @@ class GraspController:
             may_rise=may_rise,
             opening=self._is_opening,
         )
+        if self._servo is not None:
+            command = self._speed_limit.apply(command, self._servo, self._speed_m_s)
+        return command, is_over
 
     def _status(self, t_ns: int) -> GraspStatus:
         return GraspStatus(

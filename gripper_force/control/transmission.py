@@ -24,6 +24,7 @@ class Transmission:
         current_step_a: Resolution of the servo's goal current; 0 if unknown.
         friction_std: Standard deviation of true friction, as a share of `friction_n`.
         gain_std: Standard deviation of the true torque constant, as a share of the nominal.
+        gain_bound: Largest plausible ratio of the true torque constant to the nominal.
     """
 
     pinion_radius_m: float
@@ -36,6 +37,7 @@ class Transmission:
     current_step_a: float = 0.0
     friction_std: float = 0.25
     gain_std: float = 0.06
+    gain_bound: float = 1.4
 
     @classmethod
     def from_config(
@@ -54,6 +56,7 @@ class Transmission:
             current_step_a=current_step_a,
             friction_std=gripper.friction_std,
             gain_std=gripper.gain_std,
+            gain_bound=gripper.gain_bound,
         )
 
     @property

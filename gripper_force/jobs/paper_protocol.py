@@ -240,7 +240,7 @@ def _set_config(config: Config, task: SetPlan, seed: int, lux: int, rng: np.rand
     control = config.control.model_copy(
         update={
             "feedback": "current",
-            "force_limit_n": 1.2 * PEAK_N,
+            "force_limit_n": 1.2 * PEAK_N * config.gripper.gain_bound,
             # Four touches in the paper's 500 frames leave 0.8 s for each.
             "approach_speed_m_s": 0.2,
             "approach_force_n": 1.5,

@@ -98,8 +98,8 @@ class Gripper:
         """Closes the jaws on an object and holds it with a force. If an object is held, changes the force.
 
         Args:
-            force_n: Target force, in newtons: more than 0 and at most 90 % of ``control.force_limit_n``, and
-                at most what the profiles were calibrated with.
+            force_n: Target force, in newtons: more than 0, at most 0.9 times ``control.force_limit_n`` over
+                ``gripper.gain_bound``, and at most what the profiles were calibrated with.
             wait: False returns at once; `state` shows the progress.
 
         Returns:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from gripper_force.config import Config, ControlConfig, GripperConfig
 from gripper_force.control.limits import largest_target_n
+from gripper_force.control.speed_limit import PositionLoop
 from gripper_force.control.state_machine import MAX_CYCLE_S, GraspController
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import ConfigError, RequestError
@@ -51,13 +52,15 @@ class ResolvedConfig:
 
     def check_target(self, target_n: float) -> None:
         """Raises `RequestError` if a target is beyond the force limit or a profile's calibrated range."""
-        limit_n = self.config.control.force_limit_n
+        limit_n, gain_bound = self.config.control.force_limit_n, self.config.gripper.gain_bound
+        largest_n = largest_target_n(limit_n, gain_bound)
         if not (math.isfinite(target_n) and target_n > 0):
             raise RequestError(f"a target of {target_n} N is not a positive force; request more than 0 N")
-        if target_n > largest_target_n(limit_n):
+        if target_n > largest_n:
             raise RequestError(
-                f"a target of {target_n:g} N is too close to control.force_limit_n {limit_n:g} N; request at "
-                f"most {largest_target_n(limit_n):g} N, or raise the limit"
+                f"a target of {target_n:g} N is too close to control.force_limit_n {limit_n:g} N with "
+                f"gripper.gain_bound {gain_bound:g}; request at most {largest_n:.4g} N, raise the limit, or "
+                "lower the bound after calibrate servo"
             )
         for name, most_n in self.target_limits_n.items():
             if target_n > most_n:
@@ -168,7 +171,10 @@ def make_controller(config: Config) -> GraspController:
     if gripper.nm_per_a is None:
         raise ConfigError("gripper.nm_per_a is not set: this configuration was never resolved for a servo")
     transmission = Transmission.from_config(gripper, gripper.nm_per_a, gripper.current_step_a or 0.0)
-    return GraspController(config.control, transmission, config.servo.current_limit_a)
+    loop = None
+    if gripper.position_loop_a_per_rad is not None and gripper.position_loop_gain_per_s is not None:
+        loop = PositionLoop(gripper.position_loop_a_per_rad, gripper.position_loop_gain_per_s)
+    return GraspController(config.control, transmission, config.servo.current_limit_a, loop)
 
 
 def _complete_gripper(gripper: GripperConfig, spec: ServoSpec) -> GripperConfig:

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Final, cast
 
 from gripper_force.config import Config, dump_config
 from gripper_force.control.state_machine import Decision, GraspController, is_open
-from gripper_force.errors import DeviceError, GripperError
+from gripper_force.errors import DeviceError, DeviceTimeoutError, GripperError
 from gripper_force.fault_injection import Faults, FaultyEstimator, FaultyFile
 from gripper_force.interfaces import Devices
 from gripper_force.runtime.backends import open_devices
@@ -27,6 +27,7 @@ from gripper_force.runtime.perception import Estimator, LockstepPerception, Perc
 from gripper_force.runtime.process import deferred_signals, real_time_settings
 from gripper_force.runtime.resolve import ResolvedConfig, make_controller, make_estimator, resolve
 from gripper_force.types import (
+    NS_PER_MS,
     NS_PER_S,
     Event,
     Frame,
@@ -47,6 +48,9 @@ _VISION_WAIT_NS: Final = 2 * NS_PER_S
 
 _REFERENCE_NS: Final = NS_PER_S // 10
 """Every run starts with frames without contact, so that its log can be replayed with vision."""
+
+_GAP_CYCLES: Final = 2.5
+"""A gap between two readings that is longer than this many cycles is logged."""
 
 _OPENING_NS: Final = 5 * NS_PER_S
 """Longest time in which the jaws open."""
@@ -172,7 +176,7 @@ class Session:
             width_m: Width of a move request.
 
         Raises:
-            DeviceError: The servo is lost or does not answer.
+            DeviceError: The servo is lost, or does not answer for as long as its watchdog waits.
             KeyboardInterrupt: See `interrupt`.
             GripperError: A sensor or the simulated world failed, or the first frames gave no estimate.
         """
@@ -193,7 +197,7 @@ class Session:
             if processed.problem not in ("", self._problem):
                 log(Event(processed.frame.received_ns, "vision", f"no estimate: {processed.problem}"))
             self._problem = processed.problem
-        state = self.servo_state = devices.servo.read()
+        state = self.servo_state = self._read_servo()
         request = self._request(state.t_ns, kind, target_n, width_m)
         decision = self._controller.step(state.t_ns, state, visual, request)
         devices.servo.write(decision.command)
@@ -209,6 +213,28 @@ class Session:
             log(event)
         self._log_sensors(state.t_ns)
         return decision
+
+    def _read_servo(self) -> ServoState:
+        """Reads the servo, again if it does not answer, for as long as its watchdog waits.
+
+        Meanwhile the last command stands, which was within the limits.
+        """
+        clock, patience_ns = self._devices.clock, self.run.config.servo.bus_watchdog_ms * NS_PER_MS
+        while True:
+            try:
+                state = self._devices.servo.read()
+            except DeviceTimeoutError:
+                next_ns = clock.now_ns() + self._period_ns
+                if self.servo_state is None or next_ns - self.servo_state.t_ns > patience_ns:
+                    raise
+                clock.sleep_until_ns(next_ns)
+                self.raise_if_interrupted()
+            else:
+                if self.servo_state is not None:
+                    gap_ns = state.t_ns - self.servo_state.t_ns
+                    if gap_ns > _GAP_CYCLES * self._period_ns:
+                        self._log(Event(state.t_ns, "servo", f"no answer for {gap_ns / NS_PER_MS:.0f} ms"))
+                return state
 
     def release(self) -> GraspStatus:
         """Opens the jaws and returns the last status. An object that catches on them can keep them closed."""

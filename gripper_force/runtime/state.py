@@ -17,7 +17,7 @@ class GraspResult:
     """Result of a grasp or of a change of force.
 
     Attributes:
-        outcome: ``held``, ``no_object``, ``slip``, ``timeout`` or ``fault`` (an `Outcome`).
+        outcome: ``held``, ``no_object``, ``stuck``, ``slip``, ``timeout`` or ``fault`` (an `Outcome`).
         force_n: Estimated contact force when the outcome was reached, in newtons.
         std_n: Standard deviation of this estimate, in newtons.
         width_m: Distance between the jaws, in metres.

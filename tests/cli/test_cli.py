@@ -234,7 +234,7 @@ def test_a_published_database_is_imported_and_its_damage_told(run: Run, tmp_path
         (["--set", "seed=x"], "configuration key 'seed'"),
         (["--object", "egg"], "no simulated object 'egg'; there are sponge, paper_cup, tube, stapler"),
         (["--feedback", "guess"], "configuration key 'control.feedback'"),
-        (["--target-n", "13"], "a target of 13 N is too close to control.force_limit_n 10 N"),
+        (["--target-n", "13"], "a target of 13 N is too close to control.force_limit_n 14 N"),
         (
             ["--set", "camera.backend=oak9"],
             "unknown camera.backend 'oak9' (did you mean 'oak'?); use none, simulated",

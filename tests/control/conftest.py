@@ -14,6 +14,7 @@ from gripper_force.control.transmission import Transmission
 from gripper_force.qualification.loop_margin.analytic_plant import (
     CYCLE_NS,
     NOISE_A,
+    POSITION_LOOP,
     Gripper,
     SimulatedVision,
     transmission_of,
@@ -59,7 +60,7 @@ class Run:
 
     def __post_init__(self) -> None:
         self.rng = np.random.default_rng(self.seed)
-        self.controller = GraspController(self.config, self.transmission, current_limit_a=1.2)
+        self.controller = GraspController(self.config, self.transmission, 1.2, POSITION_LOOP)
         self.t_ns = 0
 
     def go(self, time_s: float, kind: str = "", target_n: float = 0.0, width_m: float = 0.0) -> "Run":

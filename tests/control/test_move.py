@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gripper_force.control.state_machine import GraspController
+from gripper_force.qualification.loop_margin.analytic_plant import POSITION_LOOP
 from gripper_force.types import Request
 
 OPEN_M = 0.092
@@ -213,7 +214,7 @@ def test_late_cycle_does_not_make_the_goal_jump(make_run):
 def test_goal_positions_follow_the_closing_direction(make_run, transmission, closing_sign):
     rig = replace(transmission, closing_sign=closing_sign)
     run = make_run(plant=FAR)
-    controller = GraspController(run.config, rig, 1.2)
+    controller = GraspController(run.config, rig, 1.2, POSITION_LOOP)
     servo = replace(run.plant.read(0, 0.0), position_rad=rig.position_rad(0.08))
     controller.step(0, servo, None, Request(0, "move", width_m=0.04))
     for cycle in range(1, 40):
@@ -223,5 +224,5 @@ def test_goal_positions_follow_the_closing_direction(make_run, transmission, clo
 
 def test_same_inputs_give_identical_decisions(drawn_run, transmission):
     run = drawn_run(3).move(0.07, 1.0).grasp(4.0, 4.0).move(0.09, 2.0).move(0.01, 2.0)
-    again = GraspController(run.config, transmission, 1.2)
+    again = GraspController(run.config, transmission, 1.2, POSITION_LOOP)
     assert [again.step(*inputs) for inputs in run.inputs] == run.decisions

@@ -357,7 +357,7 @@ def test_any_sequence_of_requests_keeps_the_limit_and_ends_without_torque(
             for _ in range(150):
                 state = gripper.step()
                 assert state.load_cell_n is None or state.load_cell_n < limit_n * 1.05
-                assert state.reference_n <= largest_target_n(limit_n)
+                assert state.reference_n <= largest_target_n(limit_n, gripper.config.gripper.gain_bound)
     assert ended == [0]
 
 

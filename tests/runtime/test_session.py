@@ -234,7 +234,7 @@ def test_progress_tells_each_phase_once(quick: list[str], tmp_path: Path) -> Non
 
 
 def test_a_target_over_the_limit_is_refused_before_anything_moves(quick: list[str], tmp_path: Path) -> None:
-    with pytest.raises(RequestError, match=r"a target of 13 N is too close to control\.force_limit_n 10 N"):
+    with pytest.raises(RequestError, match=r"a target of 13 N is too close to control\.force_limit_n 14 N"):
         run_grasp(load_config(None, [*quick, "target_n=13"]), tmp_path / "run.mcap")
     assert not list(tmp_path.iterdir())
 
@@ -448,6 +448,39 @@ def test_a_servo_that_can_not_be_stopped_is_told(open_rig: tuple[ExitStack, Open
     rig.bus.tamper = lambda _: None
     with pytest.raises(DeviceError, match="no valid reply"):
         run.close()
+
+
+@pytest.mark.parametrize("watchdog_ms", [40, 100])
+def test_silence_within_the_watchdogs_time_keeps_the_grip(
+    open_rig: tuple[ExitStack, OpenRig], tmp_path: Path, watchdog_ms: int
+) -> None:
+    run, begin = open_rig
+    rig = begin(f"servo.bus_watchdog_ms={watchdog_ms}")
+    rig.grip()
+    before = rig.session.cycle()
+    end_ns = before.status.t_ns + (watchdog_ms - 10) * 1_000_000
+    rig.bus.tamper = lambda answer: answer if rig.devices.clock.now_ns() > end_ns else None
+    after = rig.session.cycle()
+    rig.bus.tamper = None
+    assert after.status.t_ns > end_ns
+    assert after.status.phase == before.status.phase
+    assert after.command.goal_current_a == pytest.approx(before.command.goal_current_a, abs=0.01)
+    run.close()
+    assert any(re.fullmatch(r"no answer for \d+ ms", text) for text in events(tmp_path / "run.mcap"))
+
+
+def test_longer_silence_ends_the_run(open_rig: tuple[ExitStack, OpenRig]) -> None:
+    run, begin = open_rig
+    rig = begin()
+    rig.grip()
+    start_ns = rig.session.cycle().status.t_ns
+    rig.bus.tamper = lambda _: None
+    with pytest.raises(DeviceTimeoutError, match="no valid reply"):
+        rig.session.cycle()
+    assert 30_000_000 <= rig.devices.clock.now_ns() - start_ns <= 45_000_000
+    rig.bus.tamper = None
+    run.close()
+    assert rig.is_off()
 
 
 def test_bus_retries_are_logged(open_rig: tuple[ExitStack, OpenRig], tmp_path: Path) -> None:

@@ -200,7 +200,7 @@ def measure(
         jaws.tare()
         jaws.step_name = "closing on the gauge"
         contact_rad = jaws.close_on_gauge(gauge_m)
-        peak_n = _PEAK_SHARE * largest_target_n(config.control.force_limit_n)
+        peak_n = _PEAK_SHARE * largest_target_n(config.control.force_limit_n, config.gripper.gain_bound)
         presses = []
         for number, (rate_n_s, share) in enumerate(PRESSES, start=1):
             jaws.step_name = f"{1e3 * gauge_m:g} mm, press {number} of {len(PRESSES)}"

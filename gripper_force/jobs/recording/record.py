@@ -190,11 +190,11 @@ def _checked(config: Config, plan: RecordingPlan) -> tuple[Config, float]:
             f"object {config.object!r} can't be part of a file name; use letters, digits, spaces and _ . + -"
         )
     limit_n = config.control.force_limit_n
-    max_n = largest_target_n(limit_n)
+    max_n = largest_target_n(limit_n, config.gripper.gain_bound)
     peak_n = min(PEAK_N, max_n) if plan.peak_n is None else plan.peak_n
     if not _MIN_PEAK_N < peak_n <= max_n:
         raise ConfigError(
-            f"peaks of up to {peak_n:g} N are not within {_MIN_PEAK_N:g} to {max_n:g} N, the range for "
+            f"peaks of up to {peak_n:g} N are not within {_MIN_PEAK_N:g} to {max_n:.4g} N, the range for "
             f"control.force_limit_n {limit_n:g} N; set another --peak-n or limit"
         )
     control = config.control.model_copy(update={"feedback": "current"})

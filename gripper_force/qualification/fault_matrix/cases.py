@@ -43,6 +43,10 @@ class FaultCase:
 _CYCLE_MS: Final = 5.0
 """Control cycle at 200 Hz."""
 
+_SILENCE_MS: Final = 60.0
+"""Time of servo.bus_watchdog_ms, 40 ms, after which a servo that does not answer ends the run, with the tries and
+a cycle."""
+
 _TWO_FRAMES_MS: Final = 2e3 / 60 + _CYCLE_MS
 """Two frame periods at 60 Hz, and a cycle."""
 
@@ -53,15 +57,15 @@ ROWS: Final = (
     FaultCase("process stopped", "process", "SIGSTOP", Expected.WATCHDOG, 60.0),
     FaultCase("control loop blocked", "clock", "stuck", Expected.STOP, None, 0.5),
     FaultCase("bus: adapter unplugged", "bus", "off", Expected.STOP, 20.0),
-    FaultCase("bus: answers corrupted", "bus", "garbage", Expected.STOP, 20.0),
-    FaultCase("bus: answers with another id", "bus", "wrong", Expected.STOP, 20.0),
-    FaultCase("bus: answers too late", "bus", "slow", Expected.STOP, 20.0),
-    FaultCase("bus: answers one request behind", "bus", "delayed", Expected.STOP, 20.0),
+    FaultCase("bus: answers corrupted", "bus", "garbage", Expected.STOP, _SILENCE_MS),
+    FaultCase("bus: answers with another id", "bus", "wrong", Expected.STOP, _SILENCE_MS),
+    FaultCase("bus: answers too late", "bus", "slow", Expected.STOP, _SILENCE_MS),
+    FaultCase("bus: answers one request behind", "bus", "delayed", Expected.STOP, _SILENCE_MS),
     FaultCase("bus: half of the answers lost", "bus", "intermittent", Expected.STOP_OR_CARRY_ON, None),
     FaultCase("servo: hardware error", "servo", "wrong", Expected.STOP, _CYCLE_MS),
     FaultCase("servo: watchdog at -1", "servo", "stuck", Expected.STOP, _CYCLE_MS),
-    FaultCase("servo: power lost", "servo", "off", Expected.STOP, 20.0),
-    FaultCase("servo: brownout, RAM reset", "servo", "intermittent", Expected.STOP, 20.0),
+    FaultCase("servo: power lost", "servo", "off", Expected.STOP, _SILENCE_MS),
+    FaultCase("servo: brownout, RAM reset", "servo", "intermittent", Expected.STOP, _SILENCE_MS),
     FaultCase("camera: no frames", "camera", "off", Expected.CURRENT_ALONE, _TWO_FRAMES_MS),
     FaultCase("camera: frozen image", "camera", "stuck", Expected.CURRENT_ALONE, _TWO_FRAMES_MS),
     FaultCase("camera: 5 frames a second", "camera", "slow", Expected.CURRENT_ALONE, _TWO_FRAMES_MS),

@@ -42,6 +42,9 @@ from gripper_force.types import (
 LIMIT_SHARE: Final = 1.25
 """Force limit of each run over its target; a limit far above the target would never act."""
 
+_GAIN_BOUND: Final = 1.1
+"""The simulated torque constant is within 10 % of the configured one."""
+
 TOLERANCE: Final = 0.05
 """Share by which a peak may exceed the force limit."""
 
@@ -233,6 +236,7 @@ def _draw(config: Config, index: int) -> Config:
             "target_n": target_n,
             "seed": config.seed + index,
             "control": config.control.model_copy(update={"force_limit_n": LIMIT_SHARE * target_n}),
+            "gripper": config.gripper.model_copy(update={"gain_bound": _GAIN_BOUND}),
         }
     )
 

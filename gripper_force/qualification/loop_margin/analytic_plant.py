@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from gripper_force.config import GripperConfig
+from gripper_force.control.speed_limit import PositionLoop
 from gripper_force.control.transmission import Transmission
 from gripper_force.types import NS_PER_MS, NS_PER_S, ServoCommand, ServoState, VisualForce
 
@@ -25,6 +26,10 @@ _TICK_RAD: Final = 2 * math.pi / 4096
 _NO_LOAD_RAD_S: Final = 4.8
 _VELOCITY_STEP_RAD_S: Final = 0.024
 _PWM_PER_TICK: Final = 800 / 128 / 885
+
+_DUTY_PER_RAD: Final = _PWM_PER_TICK / _TICK_RAD
+POSITION_LOOP: Final = PositionLoop(_STALL_A * _DUTY_PER_RAD, _NO_LOAD_RAD_S * _DUTY_PER_RAD)
+"""Position loop of the simulated servo."""
 
 NOISE_A: Final = 0.003
 """Standard deviation of the measured current in one reading."""

@@ -26,6 +26,7 @@ from gripper_force.control.tuning import Gains
 from gripper_force.qualification.loop_margin.analytic_plant import (
     CYCLE_NS,
     NOISE_A,
+    POSITION_LOOP,
     Gripper,
     SimulatedVision,
     transmission_of,
@@ -46,9 +47,10 @@ SEARCH_RANGE: Final = {"vision": (0.3, 8.0), "fused": (1.0, 30.0)}
 
 _PRESS_N: Final = 9.0
 _PRESS_S: Final = 7.0
-_APPROACH_M_S: Final = (
-    0.005  # at more, the impact on a stiff object leaves more force than the ramp starts with
-)
+_APPROACH_M_S: Final = 0.025
+"""Approach speed of the presses, which also bounds the speed of the ramp. A lower one would be identified as lag of a
+soft object, and a higher one leaves more force on a stiff object than the ramp starts with."""
+
 _TARGET_N: Final = 20.0
 _OPEN_WIDTH_M: Final = 1.0  # room for the softest object
 _TIME_S: Final = 10.0
@@ -83,7 +85,7 @@ def identify(config: Config, truth: Gripper) -> IdentifiedPlant:
     for seed in range(3):
         rng = np.random.default_rng([config.seed, 43, seed])
         gripper = replace(truth)
-        controller = GraspController(control, truth.transmission, config.servo.current_limit_a)
+        controller = GraspController(control, truth.transmission, config.servo.current_limit_a, POSITION_LOOP)
         request: Request | None = Request(0, RequestKind.GRASP, min(_PRESS_N, 0.02 * truth.stiffness_n_m))
         rows: list[tuple[float, float, float]] = []
         for cycle, noise in enumerate(rng.standard_normal(round(_PRESS_S / _CYCLE_S)).tolist()):

@@ -16,6 +16,7 @@ from gripper_force.control.state_machine import GraspController
 from gripper_force.qualification.loop_margin.analytic_plant import (
     CYCLE_NS,
     NOISE_A,
+    POSITION_LOOP,
     Gripper,
     SimulatedVision,
     transmission_of,
@@ -69,7 +70,7 @@ def grasp(config: Config, truth: Gripper, delay_s: float, seed: int) -> Trial:
     """Runs one grasp with the unmodified controller and judges it."""
     control, rig = config.control, truth.transmission
     wanted_n, gripper = target_n(truth.stiffness_n_m), replace(truth)
-    controller = GraspController(control, rig, config.servo.current_limit_a)
+    controller = GraspController(control, rig, config.servo.current_limit_a, POSITION_LOOP)
     request: Request | None = Request(0, RequestKind.GRASP, wanted_n)
     vision = SimulatedVision(delay_s, _VISION_NOISE_N)
     rng = np.random.default_rng([config.seed, 45, seed])
@@ -94,7 +95,7 @@ def grasp(config: Config, truth: Gripper, delay_s: float, seed: int) -> Trial:
     elif peak_to_peak_n > 2 * tolerance_n(wanted_n):
         verdict = Verdict.RINGS
     elif (
-        decision.status.outcome in (Outcome.NO_OBJECT, Outcome.SLIP, Outcome.FAULT)
+        decision.status.outcome in (Outcome.NO_OBJECT, Outcome.STUCK, Outcome.SLIP, Outcome.FAULT)
         or error_share > _LOST_SHARE
     ):
         verdict = Verdict.LOSES

@@ -107,7 +107,7 @@ def test_existing_sets_are_kept(config: Config, tmp_path: Path) -> None:
         (
             [],
             RecordingPlan(1, peak_n=12.0),
-            r"up to 12 N are not within 1 to 9 N, the range for control\.force_limit_n 10 N",
+            r"up to 12 N are not within 1 to 9 N, the range for control\.force_limit_n 14 N",
         ),
         ([], RecordingPlan(1, peak_n=0.5), "up to 0.5 N are not within 1 to 9 N"),
     ],
@@ -231,6 +231,6 @@ def test_interrupted_recording_stops_servo_and_keeps_complete_sets(config: Confi
 
 def test_peak_follows_force_limit() -> None:
     _, peak_n = module._checked(load_config(None, ["control.force_limit_n=5"]), RecordingPlan(1))
-    assert peak_n == pytest.approx(4.5)
+    assert peak_n == pytest.approx(4.5 / 1.4)
     _, peak_n = module._checked(load_config(None, ["control.force_limit_n=20"]), RecordingPlan(1))
     assert np.isclose(peak_n, 12)

@@ -1,0 +1,64 @@
+"""Detection of an object that leaves the jaws."""
+
+from gripper_force.config import ControlConfig
+
+_FREE_SPEED_SHARE = 0.2
+_SHORTFALL_SHARE = 0.5
+_SHORTFALL_N = 0.2
+_FREE_S = 0.015
+"""Jaws that close faster than this share of the approach speed, while the motor force falls short of its goal
+by this share of the reference and by this force, for this time, press on nothing."""
+
+_COLLAPSE_SHARE = 0.5
+_COLLAPSE_S = 0.1
+"""A force below this share of the target, for this time, is a slip."""
+
+
+class SlipMonitor:
+    """Watches the jaws of a grip."""
+
+    def __init__(self, config: ControlConfig) -> None:
+        self._config = config
+        self.start()
+
+    def start(self) -> None:
+        """Starts at the beginning of a grip."""
+        self._free_s = self._collapsed_s = 0.0
+
+    def is_lost(
+        self, dt_s: float, width_m: float, closing_m_s: float, shortfall_n: float, reference_n: float
+    ) -> str:
+        """Returns why there is nothing between the jaws, or an empty text.
+
+        On an object the motor reaches its goal current. Jaws in free motion do not: the speed limit keeps the
+        servo's voltage too low for it.
+
+        Args:
+            dt_s: Time since the last cycle.
+            width_m: Distance between the jaws.
+            closing_m_s: Closing speed of one jaw.
+            shortfall_n: Commanded less measured motor force at each jaw.
+            reference_n: Wanted contact force.
+        """
+        runs = closing_m_s > _FREE_SPEED_SHARE * self._config.approach_speed_m_s
+        runs = runs and shortfall_n > max(_SHORTFALL_SHARE * reference_n, _SHORTFALL_N)
+        self._free_s = self._free_s + dt_s if runs else 0.0
+        if self._free_s >= _FREE_S:
+            return "the jaws close without resistance"
+        return "the jaws closed" if width_m < self._config.min_object_width_m else ""
+
+    def has_slipped(self, dt_s: float, force_n: float, target_n: float, closed_m: float) -> str:
+        """Returns why the object slips, or an empty text.
+
+        Args:
+            dt_s: Time since the last cycle.
+            force_n: Estimated contact force.
+            target_n: Target force.
+            closed_m: Closing of the jaws since the object was held.
+        """
+        self._collapsed_s = self._collapsed_s + dt_s if force_n < _COLLAPSE_SHARE * target_n else 0.0
+        if self._collapsed_s >= _COLLAPSE_S:
+            return f"the force fell to {force_n:.2f} N"
+        if closed_m > self._config.slip_width_m:
+            return f"the jaws closed by {closed_m * 1e3:.1f} mm"
+        return ""

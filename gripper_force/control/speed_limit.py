@@ -1,0 +1,59 @@
+"""Limit on the speed of the jaws that holds whatever friction and torque constant are."""
+
+from dataclasses import dataclass, replace
+
+from gripper_force.control.transmission import Transmission
+from gripper_force.types import ServoCommand, ServoState
+
+_SPARE = 1.3
+"""Lead over the one that the wanted speed, or the goal current, needs. It is the largest steady speed over the
+wanted one."""
+
+_UNKNOWN_LEAD_M = 0.002
+"""Lead of one jaw with a servo whose position loop is unknown."""
+
+_OVERSPEED = 1.4
+"""Measured over wanted speed above which the servo brakes."""
+
+
+@dataclass(frozen=True, slots=True)
+class PositionLoop:
+    """Position loop inside the servo: it sets a voltage in proportion to the distance from the goal.
+
+    Attributes:
+        a_per_rad: Current of the motor at rest per radian of distance.
+        gain_per_s: Speed of the motor without load per radian of distance.
+    """
+
+    a_per_rad: float
+    gain_per_s: float
+
+
+class SpeedLimit:
+    """Keeps the goal position so close to the present position that the servo cannot be too fast.
+
+    The servo's position loop sets the motor's voltage in proportion to that lead, and back-EMF bounds the speed
+    at this voltage. So the limit holds inside the servo, between two cycles, too. The lead is never shorter
+    than the goal current needs at rest: the current alone sets the force of a grip.
+    """
+
+    def __init__(self, transmission: Transmission, loop: PositionLoop | None) -> None:
+        self._transmission, self._loop = transmission, loop
+
+    def apply(self, command: ServoCommand, servo: ServoState, speed_m_s: float) -> ServoCommand:
+        """Returns the command with a goal position whose lead keeps the speed of one jaw to ``speed_m_s``."""
+        distance_rad = command.goal_position_rad - servo.position_rad
+        moving_m_s = self._transmission.closing_m_s(servo.velocity_rad_s)
+        ahead = distance_rad * servo.velocity_rad_s > 0
+        if ahead and abs(moving_m_s) > _OVERSPEED * speed_m_s:
+            return replace(command, goal_position_rad=servo.position_rad)
+        lead_rad = self._lead_rad(command.goal_current_a, speed_m_s)
+        bounded_rad = min(max(distance_rad, -lead_rad), lead_rad)
+        return replace(command, goal_position_rad=servo.position_rad + bounded_rad)
+
+    def _lead_rad(self, goal_current_a: float, speed_m_s: float) -> float:
+        rad_per_m = 1 / abs(self._transmission.closing_m_s(1.0))
+        if self._loop is None:
+            return _UNKNOWN_LEAD_M * rad_per_m
+        moving_rad = speed_m_s * rad_per_m / self._loop.gain_per_s
+        return _SPARE * max(moving_rad, goal_current_a / self._loop.a_per_rad)
