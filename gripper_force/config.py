@@ -39,7 +39,10 @@ class ServoConfig(Section):
 
     backend: str = Field("dynamixel", description=f"dynamixel, {_BACKEND} (gripper_force.servos)")
     options: Options = Field({}, description="keys of a third-party servo backend")
-    model: str = Field("XM430-W350", description="XM430-W350, XM430-W210, XL330-M288 or XC330-T288")
+    model: str = Field(
+        "XM430-W350",
+        description="model, e.g. XM430-W350 or XC330-T288-T, or the path of a YAML file (docs/servos.md)",
+    )
     port: str = Field(
         "virtual:rig", description="device path, or virtual:NAME for a simulated bus in this process"
     )

@@ -1,14 +1,17 @@
-"""Control table of X-series servos and data of each model, from ``servos/*.yaml``."""
+"""Control table of X-series servos and data of each model, from ``servos/*.yaml`` or a file of one's own."""
 
 import math
-from dataclasses import dataclass
+import re
 from functools import cache
 from importlib import resources
-from typing import Any, Final, NamedTuple, TypedDict
+from pathlib import Path
+from typing import Any, Final, NamedTuple, Self, TypedDict
 
 import yaml
+from pydantic import Field, model_validator
 
 from gripper_force.errors import ConfigError
+from gripper_force.schema import Positive, Section, Tree, merged, read_tree, validated
 
 TICKS_PER_REV: Final = 4096
 ZERO_TICK: Final = 2048  # the middle of the turn is 0 rad
@@ -16,6 +19,7 @@ VELOCITY_UNIT_RAD_S: Final = 0.229 * 2 * math.pi / 60  # 0.229 rpm
 WATCHDOG_UNIT_MS: Final = 20
 FULL_PWM: Final = 885  # 100 % duty
 CURRENT_BASED_POSITION_MODE: Final = 5
+CYCLE_WINDOW_BYTES: Final = 20  # of indirect data that a cycle reads and writes
 
 _TICKS_PER_RAD: Final = TICKS_PER_REV / (2 * math.pi)
 _FOLDER: Final = resources.files("gripper_hw.dynamixel") / "servos"
@@ -71,12 +75,11 @@ class IndirectWindow(NamedTuple):
     length: int
 
 
-@dataclass(frozen=True)
-class ServoModel:
+class ServoModel(Section):
     """Data of one model, from its manual.
 
     Attributes:
-        name: The vendor's name, without the connector's ``-T`` or ``-R``.
+        name: The vendor's name, without the connector's ``-T`` or ``-R``, or the stem of one's own file.
         number: Model Number, register 0.
         current_unit_a: Unit of all current registers.
         stall_torque_nm: Stall torque at the horn, at the nominal voltage.
@@ -85,23 +88,48 @@ class ServoModel:
         nominal_voltage_v: Supply voltage of the three values above.
         voltage_range_v: Lowest and highest supply voltage.
         operating_modes: Values that Operating Mode accepts.
-        min_firmware: First firmware that supports Fast Sync Read.
+        fast_sync_read_firmware: First firmware that supports Fast Sync Read.
         indirect: First firmware to the indirect windows from that version on, in order of firmware.
-        initial: Factory settings that depend on the model, by register name.
+        initial: Factory settings that depend on the model, by register name; null for a register it lacks.
     """
 
     name: str
-    number: int
-    current_unit_a: float
-    stall_torque_nm: float
-    stall_current_a: float
-    no_load_rpm: float
-    nominal_voltage_v: float
-    voltage_range_v: tuple[float, float]
+    number: int = Field(ge=0, le=0xFFFF)
+    current_unit_a: Positive
+    stall_torque_nm: Positive
+    stall_current_a: Positive
+    no_load_rpm: Positive
+    nominal_voltage_v: Positive
+    voltage_range_v: tuple[Positive, Positive]
     operating_modes: tuple[int, ...]
-    min_firmware: int
+    fast_sync_read_firmware: int = Field(ge=0)
     indirect: dict[int, tuple[IndirectWindow, ...]]
-    initial: dict[str, int]
+    initial: dict[str, int | None]
+
+    @model_validator(mode="after")
+    def _is_usable(self) -> Self:
+        low_v, high_v = self.voltage_range_v
+        if not low_v < high_v:
+            raise ValueError("voltage_range_v must be the lowest and the highest supply voltage")
+        if CURRENT_BASED_POSITION_MODE not in self.operating_modes:
+            raise ValueError(
+                "operating_modes lacks 5, the current-based position mode, so it can't hold a force"
+            )
+        if 0 not in self.indirect or not all(self.indirect.values()):
+            raise ValueError("indirect needs at least one window, and an entry for firmware 0")
+        if any(windows[0].length < CYCLE_WINDOW_BYTES for windows in self.indirect.values()):
+            raise ValueError(
+                f"the first indirect window must have {CYCLE_WINDOW_BYTES} bytes, which a cycle needs"
+            )
+        for name, value in self.initial.items():
+            if name not in REGISTERS:
+                raise ValueError(f"initial names an unknown register {name!r}")
+            if value is not None and not 0 <= value < 1 << 8 * REGISTERS[name].size:
+                raise ValueError(f"initial.{name} = {value} does not fit the register")
+        for name in ("current_limit", "position_p_gain"):
+            if not self.initial.get(name):
+                raise ValueError(f"initial.{name} is missing or 0")
+        return self
 
     @property
     def nm_per_a(self) -> float:
@@ -116,12 +144,16 @@ class ServoModel:
     @property
     def position_loop_per_rad(self) -> float:
         """Duty per radian between goal and present position, with the factory's position gain."""
-        return self.initial["position_p_gain"] / 128 / FULL_PWM * _TICKS_PER_RAD
+        return self.setting("position_p_gain") / 128 / FULL_PWM * _TICKS_PER_RAD
 
     @property
     def max_current_a(self) -> float:
         """Highest Current Limit."""
-        return self.initial["current_limit"] * self.current_unit_a
+        return self.setting("current_limit") * self.current_unit_a
+
+    def setting(self, name: str) -> int:
+        """Returns the factory setting of a register, 0 if the model lacks it."""
+        return self.initial.get(name, REGISTERS[name].initial) or 0
 
     def indirect_windows(self, firmware: int) -> tuple[IndirectWindow, ...]:
         """Returns the indirect windows of this model with ``firmware``."""
@@ -144,25 +176,38 @@ def model_names() -> tuple[str, ...]:
     return tuple(sorted(name.removesuffix(".yaml") for name in files if name != _SHARED))
 
 
-@cache
 def load_model(name: str) -> ServoModel:
-    """Loads a model by its name.
+    """Loads a model.
+
+    Args:
+        name: The vendor's name, with or without the connector's ``-T`` or ``-R``, or the path of a YAML file
+            with the keys of `ServoModel` (without ``name``). With ``like: MODEL`` it states only what differs
+            from that model.
 
     Raises:
-        ConfigError: The model is unknown, or has no current control.
+        ConfigError: The model is unknown or has no current control, or the file is wrong.
     """
+    if Path(name).suffix in (".yaml", ".yml"):
+        return _model(Path(name).stem, read_tree(Path(name), "servo model"), name)
+    return _shipped_model(re.sub("-[TR]$", "", name))
+
+
+@cache
+def _shipped_model(name: str) -> ServoModel:
     if name in _shared()["without_current_control"]:
         raise ConfigError(_no_current_control(name))
     if name not in model_names():
-        raise ConfigError(f"unknown servo.model {name!r}; use one of {', '.join(model_names())}")
-    tree = _load(f"{name}.yaml")
-    for key in ("operating_modes", "voltage_range_v"):
-        tree[key] = tuple(tree[key])
-    tree["indirect"] = {
-        first: tuple(IndirectWindow(*window) for window in windows)
-        for first, windows in sorted(tree["indirect"].items())
-    }
-    return ServoModel(name=name, **tree)
+        raise ConfigError(
+            f"unknown servo.model {name!r}; use one of {', '.join(model_names())}, or the path of a YAML file"
+        )
+    return _model(name, _load(f"{name}.yaml"), name)
+
+
+def _model(name: str, tree: Tree, where: str) -> ServoModel:
+    if "like" in tree:
+        base = _shipped_model(re.sub("-[TR]$", "", str(tree.pop("like"))))
+        tree = merged(base.model_dump(), tree)
+    return validated(ServoModel, tree | {"name": name}, where, "servo model")
 
 
 def check_model_number(model: ServoModel, number: int, label: str) -> None:

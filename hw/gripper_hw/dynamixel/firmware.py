@@ -170,6 +170,11 @@ class VirtualServo:
         """Records an instruction packet to any servo."""
         self._last_packet_ns = t_ns
 
+    def answers_group_read(self, *, fast: bool) -> bool:
+        """Returns True if the servo answers a sync or bulk read; older firmware ignores the fast ones."""
+        known = not fast or self.get("firmware_version") >= self.model.fast_sync_read_firmware
+        return known and self.get("status_return_level") > 0
+
     def read(self, address: int, size: int) -> tuple[Error, bytes]:
         """Reads bytes from a defined address on; gaps between registers read 0."""
         if size == 0 or address + size > len(self._memory) or address not in self._register_at:
@@ -399,7 +404,7 @@ def _registers_of(model: ServoModel, windows: tuple[IndirectWindow, ...]) -> tup
         registers.append(Register(pointer, 2, "rw", False, "", data, (64, max_address)))
         registers.append(Register(data, 1, "rw", False, "", 0, None))
     return tuple(
-        register._replace(range=(0, model.initial["current_limit"]))
+        register._replace(range=(0, model.setting("current_limit")))
         if register.address == REGISTERS["current_limit"].address
         else register
         for register in registers

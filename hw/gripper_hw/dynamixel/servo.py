@@ -1,6 +1,7 @@
 """Dynamixel servos in current-based position mode, over the vendor's unmodified SDK.
 
 A cycle is one fast sync read and one sync write for all servos of a bus, both through indirect addresses.
+Servos with older firmware are read by a plain sync read.
 Registers: https://emanual.robotis.com/docs/en/dxl/x/xm430-w350/.
 """
 
@@ -60,6 +61,8 @@ _VOLTAGE_UNIT_V: Final = 0.1  # unit of Present Input Voltage
 
 _MAX_TRAVEL_RAD: Final = 255 * 2 * math.pi  # Goal Position accepts 256 turns either way; one turn less
 _TORQUE_OFF_TRIES: Final = 5
+MIN_FIRMWARE: Final = 38
+"""The first firmware with Drive Mode and Bus Watchdog."""
 _HARDWARE_ERRORS: Final = {
     0x01: "input voltage",
     0x04: "overheating",
@@ -119,7 +122,7 @@ class DynamixelBus:
             "profile_acceleration": 0,
             "profile_velocity": 0,
             # Gains left by another program could make the position loop oscillate within the current limit.
-            "position_p_gain": self.model.initial["position_p_gain"],
+            "position_p_gain": self.model.setting("position_p_gain"),
             "position_i_gain": 0,
             "position_d_gain": 0,
             "feedforward_1st_gain": 0,
@@ -167,7 +170,12 @@ class DynamixelBus:
             DeviceTimeoutError: No valid reply after every retry.
             DeviceLostError: The port is gone.
         """
-        t_ns, blocks = self._transport.sync_read(self.ids, self._data_address, _READ_BLOCK.size)
+        t_ns, blocks = self._transport.sync_read(
+            self.ids,
+            self._data_address,
+            _READ_BLOCK.size,
+            fast=min(self.firmware, default=0) >= self.model.fast_sync_read_firmware,
+        )
         self.stats.cycles += 1
         return tuple(
             self._decode_state(t_ns, id_, block) for id_, block in zip(self.ids, blocks, strict=True)
@@ -232,10 +240,10 @@ class DynamixelBus:
     def _read_firmware(self, id_: int) -> int:
         self._transport.enable_replies(id_)
         firmware = self._transport.get(id_, "firmware_version")
-        if firmware < self.model.min_firmware:
+        if firmware < MIN_FIRMWARE:
             raise DeviceError(
-                f"{self._label(id_)} has firmware {firmware}, which lacks Fast Sync Read; update it to "
-                f"{self.model.min_firmware} or newer with DYNAMIXEL Wizard"
+                f"{self._label(id_)} has firmware {firmware}, which lacks the Bus Watchdog; update it to "
+                f"{MIN_FIRMWARE} or newer with DYNAMIXEL Wizard"
             )
         return firmware
 

@@ -18,7 +18,7 @@ from gripper_hw.dynamixel.control_table import (
     model_names,
 )
 from gripper_hw.dynamixel.port import VIRTUAL_PREFIX
-from gripper_hw.dynamixel.servo import CYCLE_BYTES, DynamixelBus, hardware_error_text
+from gripper_hw.dynamixel.servo import CYCLE_BYTES, MIN_FIRMWARE, DynamixelBus, hardware_error_text
 from gripper_hw.dynamixel.transport import Transport
 
 _SYSFS: Final = Path("/sys/bus/usb-serial/devices")
@@ -102,8 +102,8 @@ class _Inspection:
         id_ = config.servo.id
         unit = f"servo {id_}"
         check_model_number(self.model, number, f"the servo with id {id_} on {config.servo.port}")
-        supported = firmware >= self.model.min_firmware
-        advice = f"update it to {self.model.min_firmware} or newer with DYNAMIXEL Wizard"
+        supported = firmware >= MIN_FIRMWARE
+        advice = f"update it to {MIN_FIRMWARE} or newer with DYNAMIXEL Wizard"
         yield judged(unit, "model", f"{self.model.name}, firmware {firmware}", supported, advice)
         try:
             values = self._values(id_)
@@ -131,7 +131,10 @@ class _Inspection:
         if not supported:
             return
         start = REGISTERS["present_current"].address  # any address, but as many bytes as a cycle reads
-        median_ms, p99_ms = time_ms(lambda: self.transport.sync_read((id_,), start, CYCLE_BYTES), _CYCLES)
+        fast = firmware >= self.model.fast_sync_read_firmware
+        median_ms, p99_ms = time_ms(
+            lambda: self.transport.sync_read((id_,), start, CYCLE_BYTES, fast=fast), _CYCLES
+        )
         found = f"median {median_ms:.2f} ms, p99 {p99_ms:.2f} ms of {_CYCLES} reads"
         rate_hz, lockstep = config.control.rate_hz, config.clock == "lockstep"
         advice = f"longer than a cycle at control.rate_hz={rate_hz:g}: close other programs, or lower it"

@@ -147,25 +147,42 @@ class Transport:
         found, _ = self._packets.broadcastPing(self._port)
         return {id_: (number, firmware) for id_, (number, firmware) in found.items()}
 
-    def sync_read(self, ids: Sequence[int], address: int, size: int) -> tuple[int, list[bytes]]:
-        """Reads ``size`` bytes of each servo by one fast sync read.
+    def sync_read(
+        self, ids: Sequence[int], address: int, size: int, *, fast: bool = True
+    ) -> tuple[int, list[bytes]]:
+        """Reads ``size`` bytes of each servo in one transaction.
+
+        Args:
+            ids: Servos to read.
+            address: Address of the first byte.
+            size: Number of bytes.
+            fast: True: a fast sync read, to which all servos reply in one packet. False: a sync read, to
+                which each servo replies with its own packet, for older firmware.
 
         Returns:
             Time of the request in ns, and the bytes in the order of ``ids``.
         """
+        description = "a fast sync read" if fast else "a sync read"
 
         def attempt() -> tuple[int, tuple[int, list[bytes]]]:
             t_ns = self._clock_ns()
             requested = self._padded_size(size)
-            sent = self._packets.syncReadTx(self._port, address, requested, ids, len(ids), True)
+            result = self._packets.syncReadTx(self._port, address, requested, ids, len(ids), fast)
+            blocks = []
+            if not fast:
+                for id_ in ids:
+                    result, reply = self._receive(result, id_, 1 + requested)
+                    result = _check_result(description, result, reply[0] if reply else 0)
+                    blocks.append(reply[1 : 1 + size])
+                return result, (t_ns, blocks)
             step = requested + 4  # error number and id before a servo's data, CRC after it
-            result, reply = self._receive(sent, BROADCAST_ID, step * len(ids) - 2)
+            result, reply = self._receive(result, BROADCAST_ID, step * len(ids) - 2)
             if result == COMM_SUCCESS and reply[1::step] != bytes(ids):
                 result = COMM_RX_CORRUPT
             starts = range(2, len(reply), step)
             return result, (t_ns, [reply[start : start + size] for start in starts])
 
-        return self._transact("a fast sync read", attempt)
+        return self._transact(description, attempt)
 
     def sync_write(self, address: int, blocks: dict[int, bytes]) -> None:
         """Writes one block per servo, by id. All blocks have the same size; no servo replies."""

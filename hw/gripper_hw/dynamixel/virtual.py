@@ -95,15 +95,16 @@ class VirtualBus:
     def _group_read(self, packet: Packet, online: dict[int, VirtualServo]) -> bytes:
         """Each servo replies after the one before it, so a missing servo silences all that follow."""
         reads = _GROUP_READS[packet.instruction](packet.params)
+        fast = packet.instruction in (Instruction.FAST_SYNC_READ, Instruction.FAST_BULK_READ)
         blocks = []
         for id_, address, size in reads:
-            if id_ not in online or online[id_].get("status_return_level") == 0:
+            if id_ not in online or not online[id_].answers_group_read(fast=fast):
                 break
             error, data = online[id_].read(address, size)
             blocks.append((id_, error | _alert(online[id_]), data))
-        if packet.instruction in (Instruction.SYNC_READ, Instruction.BULK_READ):
-            return b"".join(status(*block) for block in blocks)
-        return _fast_status(blocks, 1 + sum(size + 4 for _, _, size in reads))
+        if fast:
+            return _fast_status(blocks, 1 + sum(size + 4 for _, _, size in reads))
+        return b"".join(status(*block) for block in blocks)
 
 
 def _fast_status(blocks: list[tuple[int, int, bytes]], length: int) -> bytes:

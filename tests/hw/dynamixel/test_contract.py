@@ -60,9 +60,9 @@ class ServoSetup:
         raise AssertionError(state)
 
 
-def in_memory(stack: ExitStack, model_name: str) -> ServoSetup:
+def in_memory(stack: ExitStack, model_name: str, firmware: int = 52) -> ServoSetup:
     model = load_model(model_name)
-    motor = BenchMotor(VirtualServo(1, model))
+    motor = BenchMotor(VirtualServo(1, model, firmware))
     now_ns = [77 * STEP_NS]
     bus = VirtualBus([motor.servo], lambda: now_ns[0], before_packet=lambda: motor.advance(now_ns[0]))
     register_bus("contract", bus)
@@ -93,10 +93,12 @@ def in_the_rig(stack: ExitStack, quick: list[str]) -> ServoSetup:
     )
 
 
-@pytest.fixture(params=[*model_names(), "pty", "rig"])
+@pytest.fixture(params=[*model_names(), "firmware 44", "pty", "rig"])
 def setup(request: pytest.FixtureRequest, quick: list[str]) -> Iterator[ServoSetup]:
     with ExitStack() as stack:
         match request.param:
+            case "firmware 44":
+                setup = in_memory(stack, "XM430-W350", 44)
             case "pty":
                 setup = behind_a_pty(stack)
             case "rig":

@@ -69,6 +69,11 @@ def test_initial_values_match_the_model(model):
     assert read(servo, "return_delay_time") == 250
 
 
+def test_register_that_a_model_lacks_is_absent():
+    assert VirtualServo(1, load_model("XM540-W150")).read(65, 1) == (Error.NONE, b"\0")
+    assert VirtualServo(1, load_model("XW540-T140")).read(65, 1)[0] is Error.ACCESS
+
+
 @pytest.mark.parametrize("name", [name for name, register in REGISTERS.items() if register.access == "r"])
 def test_read_only_registers_refuse_writes(name):
     assert write(VirtualServo(1, MODEL), name, 0) is Error.ACCESS

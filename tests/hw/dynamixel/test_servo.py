@@ -192,9 +192,9 @@ def test_another_homing_offset_is_refused_with_torque_off(make_memory_endpoint):
 
 
 def test_old_firmware_is_refused_with_torque_off(make_memory_endpoint):
-    endpoint = make_memory_endpoint(VirtualServo(1, MODEL, firmware=44))
+    endpoint = make_memory_endpoint(VirtualServo(1, MODEL, firmware=37))
     endpoint.bus.servos[0].set("torque_enable", 1)
-    with pytest.raises(DeviceError, match=r"firmware 44.*update it to 45"):
+    with pytest.raises(DeviceError, match=r"firmware 37.*Bus Watchdog.*update it to 38"):
         drive(endpoint).start()
     assert endpoint.bus.servos[0].get("torque_enable") == 0
 
@@ -271,6 +271,25 @@ def test_cycle_uses_the_models_indirect_data(make_memory_endpoint, model, firmwa
     assert 13 <= int.from_bytes(read.params[2:4], "little") <= 20
     assert write.params[:4] == struct.pack("<HH", data + 13, 6)
     assert servo.firmware == firmware
+
+
+@pytest.mark.parametrize(("firmwares", "fast"), [((45, 52), True), ((44, 52), False), ((44, 38), False)])
+def test_old_firmware_is_read_by_a_plain_sync_read(make_endpoint, firmwares, fast):
+    servos = [VirtualServo(id_, MODEL, firmware) for id_, firmware in zip((3, 5), firmwares, strict=True)]
+    endpoint = make_endpoint(*servos)
+    for servo in servos:
+        servo.control(0, 0.1 * servo.id, 0.0)
+    bus = DynamixelBus(endpoint.config(), (5, 3))
+    bus.start()
+    endpoint.received.clear()
+    states = [bus.read() for _ in range(10)]
+    bus.close()
+    assert {(packet.instruction, packet.params[4:]) for packet in endpoint.packets()} == {
+        (Instruction.FAST_SYNC_READ if fast else Instruction.SYNC_READ, b"\x05\x03")
+    }
+    for state in states:
+        assert [reply.position_rad for reply in state] == pytest.approx([0.5, 0.3], abs=1e-3)
+    assert (bus.stats.retries, bus.stats.cycles) == (0, 12)
 
 
 # The cycle.
@@ -504,5 +523,5 @@ def test_unplugged_bus_raises_at_once(started):
 def test_cycle_fits_the_indirect_data_of_every_model():
     for name in control_table.model_names():
         model = load_model(name)
-        assert model.indirect_windows(model.min_firmware)[0].length >= 20
+        assert model.indirect_windows(38)[0].length >= 20
         assert model.indirect_windows(99)[0].length >= 20

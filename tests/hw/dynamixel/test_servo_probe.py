@@ -88,10 +88,16 @@ def test_hardware_error_is_a_problem(endpoint):
 
 
 def test_old_firmware_is_a_problem_and_its_cycle_is_not_measured(make_endpoint):
-    found = rows(make_endpoint(VirtualServo(1, MODEL, firmware=44)))
+    found = rows(make_endpoint(VirtualServo(1, MODEL, firmware=37)))
     assert found["servo 1", "model"].ok is False
-    assert "update it to 45 or newer" in found["servo 1", "model"].advice
+    assert "update it to 38 or newer" in found["servo 1", "model"].advice
     assert ("servo 1", "bus cycle") not in found
+
+
+def test_cycle_of_firmware_without_fast_sync_read_is_measured(make_endpoint):
+    found = rows(make_endpoint(VirtualServo(1, MODEL, firmware=44)))
+    assert found["servo 1", "model"].ok
+    assert ("servo 1", "bus cycle") in found
 
 
 def test_servo_without_replies_is_distinguished_from_a_missing_one(endpoint):

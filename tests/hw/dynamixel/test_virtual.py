@@ -289,6 +289,16 @@ def test_accepted_write_can_be_read_back(address, data):
         assert bytes(servo.read(0, 120)[1]) == bytes(VirtualServo(1, MODEL).read(0, 120)[1])
 
 
+@pytest.mark.parametrize("model", ["XM430-W350", "XL330-M288"])
+def test_firmware_without_fast_sync_read_ignores_it(model):
+    first = load_model(model).fast_sync_read_firmware
+    request = frame(BROADCAST_ID, Instruction.FAST_SYNC_READ, b"\x06\x00\x01\x00\x01")
+    replies = [
+        VirtualBus([VirtualServo(1, load_model(model), n)]).transact(request) for n in (first - 1, first)
+    ]
+    assert [len(reply) for reply in replies] == [0, 13]
+
+
 def test_bus_names_are_unique(bus):
     register_bus("a", bus)
     register_bus("a", bus)
