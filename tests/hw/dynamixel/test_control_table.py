@@ -12,7 +12,6 @@ from gripper_hw.dynamixel.control_table import (
     ticks_from_rad,
 )
 
-
 # Written again by hand from the manual's pages: a slip in one place does not pass in the other.
 VENDOR = [
     ("XM430-W350", 1020, 2.69e-3, 1193, 1.78, (10.0, 14.8), 800),
