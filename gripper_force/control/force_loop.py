@@ -12,6 +12,12 @@ from gripper_force.types import EstimateSource, FusedForce
 _RAMP_S = 0.4
 """Acceleration time of the ramp: longer than a quarter oscillation period of the softest object."""
 
+_LOWERING_S = 0.15
+_LOWERING_RAMP_S = 0.15
+_RETURN_S = 0.05
+"""Lowering: the fall takes the sum of the first two, the first at full rate. After it the motor force returns to the
+closing side of friction in the third, which stops the jaws: later, their inertia carries them too far."""
+
 _WAIT_SHARE = 0.2
 _WAIT_N = 0.2
 """Ramp and integral wait while the motor force falls short by more than this share of the reference and this force."""
@@ -49,8 +55,15 @@ class ForceLoop:
     the last direction of motion and wide against it: stuck jaws must overcome twice the friction before they
     reverse, and a loop that reverses on noise has a limit cycle.
 
+    *Lowering.* Friction holds jaws that are to open. So the motor force falls to the reference less friction,
+    which opens them until the contact force is the reference, and then returns to the closing side of
+    friction, which stops them there.
+
     The motor force never leaves the range that friction and gearing make plausible for the reference,
     whatever the estimate is; that limits the integral too.
+
+    Attributes:
+        is_lowering: True from a lower target until the jaws are at rest at it.
     """
 
     def __init__(self, config: ControlConfig, transmission: Transmission) -> None:
@@ -69,7 +82,7 @@ class ForceLoop:
         self._ramp_n_s = config.ramp_n_s
         self._profile = TrapezoidalProfile(_RAMP_S)
         self._trim_n = 0.0
-        self._rising = True
+        self._rising, self._side, self.is_lowering = True, 1.0, False
 
     @property
     def reference_n(self) -> float:
@@ -78,14 +91,19 @@ class ForceLoop:
 
     def start(self, force_n: float, target_n: float) -> None:
         """Starts a ramp at the present force."""
-        self._profile.start(force_n, self._ramp_n_s)
         self._trim_n = 0.0
-        self._rising = target_n >= force_n
+        self._start(force_n, target_n)
 
     def retarget(self, target_n: float) -> None:
         """Starts a ramp at the present reference and keeps the trim."""
-        self._profile.start(self.reference_n, self._ramp_n_s)
-        self._rising = target_n >= self.reference_n
+        self._start(self.reference_n, target_n)
+
+    def _start(self, force_n: float, target_n: float) -> None:
+        self._rising, self.is_lowering = True, target_n < force_n
+        self._side = -1.0 if self.is_lowering else 1.0
+        self._profile = TrapezoidalProfile(_LOWERING_RAMP_S if self.is_lowering else _RAMP_S)
+        rate_n_s = (force_n - target_n) / _LOWERING_S if self.is_lowering else self._ramp_n_s
+        self._profile.start(force_n, rate_n_s)
 
     def step(self, dt_s: float, target_n: float, estimate: FusedForce, *, shortfall_n: float = 0.0) -> float:
         """Runs one cycle and returns the motor force at each jaw.
@@ -98,18 +116,21 @@ class ForceLoop:
                 jaws close on a soft object as fast as they may.
         """
         ramping = self.reference_n != target_n
+        if self.is_lowering and not ramping:
+            self._side = min(self._side + 2 * dt_s / _RETURN_S, 1.0)
+            self.is_lowering = self._side < 1.0
         waits = shortfall_n > _WAIT_SHARE * self.reference_n + _WAIT_N
         reference_n = self._profile.step(target_n, 0.0 if waits else dt_s)
         error_n = 0.0
         # A constant motor force holds a constant contact force. The current alone carries no new information
         # on friction, so it is not fed back.
-        if not ramping and not waits and estimate.source != EstimateSource.CURRENT:
+        if not (ramping or waits or self.is_lowering) and estimate.source != EstimateSource.CURRENT:
             error_n = self._beyond_deadband(reference_n - estimate.force_n, tolerance_n(target_n))
             self._trim_n += self._gains.integral_s * error_n * dt_s
         elif ramping and not self._vision_alone:
             self._trim_n = -estimate.bias_n
         friction_n = estimate.friction_n
-        feedforward_n = reference_n + friction_n * (1.0 if self._rising else _REVERSED_FRICTION_SHARE)
+        feedforward_n = reference_n + friction_n * (self._side if self._rising else _REVERSED_FRICTION_SHARE)
         margin_n = 3 * self._transmission.bias_std_n(reference_n) + friction_n
         low_n, high_n = max(reference_n - margin_n, 0.0), reference_n + margin_n
         self._trim_n = min(max(self._trim_n, low_n - feedforward_n), high_n - feedforward_n)

@@ -49,6 +49,13 @@ OBSERVER_LAG_S = math.sqrt(_FRAME_NOISE_N**2 / (_FRAME_HZ * _OPENING_DRIFT_N2_S)
 """Lag of the bias while the jaws are stuck and about to open: the square root of noise over drift of the
 steady-state filter, 0.13 s."""
 
+_LOWERED_SHARE = 0.4
+"""Standard deviation of the current estimate after the force was lowered, as a share of friction: inertia carries
+the jaws to anywhere within it."""
+
+_LOWERING_LAG_SHARE = 0.1
+"""Lag of the motor force while the force is lowered, as a share of the plant's."""
+
 _GATE = 3.29
 """Innovation gate in standard deviations: 0.1 % of good estimates are rejected (chi-square, 10.8)."""
 
@@ -101,6 +108,7 @@ class Fusion:
         self._friction_n2 = (self._transmission.friction_std * self._friction_n) ** 2
         self._opening_variance_n2 = 0.0
         self._free_cycles, self._free_sum_n = 0, 0.0
+        self._was_lowering = self._has_lowered = False
         self.reset_variance()
 
     @property
@@ -127,6 +135,7 @@ class Fusion:
         *,
         free: bool = False,
         opening: bool = False,
+        lowering: bool = False,
     ) -> tuple[FusedForce, tuple[Event, ...]]:
         """Runs one cycle.
 
@@ -137,11 +146,19 @@ class Fusion:
             free: True if the jaws move without contact: the force is zero and the motor force is friction.
             opening: True if the jaws are opening. Until friction reverses, motor current says little about
                 the contact force.
+            lowering: True while the force falls to a lower target. The motor force then changes faster than
+                vision follows, and the difference of the two is not updated. Afterwards the motor current says
+                less than before.
 
         Returns:
             The estimate, and an event if vision drops out or returns.
         """
-        self._opening_variance_n2 = self._friction_n**2 if opening else 0.0
+        self._has_lowered = (self._has_lowered or lowering) and not free
+        unknown_n = self._friction_n * (1.0 if opening else _LOWERED_SHARE if self._has_lowered else 0.0)
+        self._opening_variance_n2 = unknown_n**2
+        if self._was_lowering and not lowering:
+            self.reset_variance()
+        self._was_lowering = lowering
         self._predict(servo, free)
         self._variance_n2 = max(self._variance_n2, self._opening_variance_n2)
         if visual is not None and visual.t_ns > self._newest_visual_ns and self._feedback != "current":
@@ -160,7 +177,9 @@ class Fusion:
         dt_s = 0.0
         if self._history:
             dt_s = max(servo.t_ns - self._history[-1][0], 0) / NS_PER_S
-            self._motor_force_n += (motor_force_n - self._motor_force_n) * dt_s / (dt_s + self._lag_s)
+            # Play keeps the lowest motor force, which the lag of a steady hold would hide.
+            lag_s = _LOWERING_LAG_SHARE * self._lag_s if self._was_lowering else self._lag_s
+            self._motor_force_n += (motor_force_n - self._motor_force_n) * dt_s / (dt_s + lag_s)
         else:
             self._motor_force_n = motor_force_n
         if free:
@@ -202,6 +221,8 @@ class Fusion:
             return f"it is {age_ns / NS_PER_MS:.0f} ms old"
         if visual.std_n > self._std_limit_n:
             return f"its standard deviation is {visual.std_n:.2f} N"
+        if self._was_lowering:
+            return ""
         claimed_n2 = max(visual.std_n, _VISION_FLOOR_N) ** 2
         current_n = self._current_at(visual.t_ns)
         difference_n = visual.force_n - current_n

@@ -226,7 +226,12 @@ class GraspController:
             closing_m_s, self._measured_motor_force_n
         )
         self._estimate, fusion_events = self._fusion.step(
-            t_ns, servo, visual, free=is_free, opening=self._is_opening
+            t_ns,
+            servo,
+            visual,
+            free=is_free,
+            opening=self._is_opening,
+            lowering=self._phase in (Phase.RAMP, Phase.HOLD) and self._loop.is_lowering,
         )
         return [*fusion_events, *self._derate(t_ns, servo.temperature_c)]
 
@@ -406,14 +411,17 @@ class GraspController:
     def _run_ramp(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
         shortfall_n = self._motor_force_n - self._measured_motor_force_n
         self._motor_force_n = self._loop.step(
-            dt_s, self._derated_target_n, self._estimate, shortfall_n=shortfall_n
+            dt_s,
+            self._derated_target_n,
+            self._estimate,
+            shortfall_n=shortfall_n,
         )
         if width_m < self._config.min_object_width_m and self._outcome == Outcome.NONE:
             self._set_outcome(Outcome.NO_OBJECT, "closed while the force was to rise")
             self._start_release(self._reason)
         elif lost := self._slip.is_lost(dt_s, width_m, closing_m_s, shortfall_n, self._loop.reference_n):
             self._handle_loss(width_m, lost)
-        elif self._loop.reference_n == self._derated_target_n:
+        elif self._loop.reference_n == self._derated_target_n and not self._loop.is_lowering:
             self._error_n = self._estimate.force_n - self._derated_target_n
             self._enter(Phase.HOLD, f"at {self._derated_target_n:g} N")
 

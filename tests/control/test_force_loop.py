@@ -91,7 +91,33 @@ def test_retarget_starts_at_the_present_reference(loop, transmission):
     ramp(loop, 4.0)
     loop.retarget(2.0)
     assert loop.reference_n == 4.0
-    assert ramp(loop, 2.0) == pytest.approx(2.0 + 0.25 * transmission.friction_n)
+    loop.retarget(6.0)
+    assert ramp(loop, 6.0) == pytest.approx(6.0 + transmission.friction_n)
+
+
+def test_lowering_falls_below_friction_and_returns(loop, transmission):
+    ramp(loop, 4.0)
+    loop.retarget(2.0)
+    forces_n, lowered = [], []
+    for _ in range(100):
+        forces_n.append(loop.step(0.005, 2.0, estimate(loop.reference_n)))
+        lowered.append(loop.is_lowering)
+    assert min(forces_n) == pytest.approx(2.0 - transmission.friction_n, abs=0.25)
+    assert forces_n[-1] == pytest.approx(2.0 + transmission.friction_n)
+    assert lowered.index(False) * 0.005 < 0.4
+    assert not any(lowered[lowered.index(False) :])
+
+
+def test_ramp_and_integral_wait_while_the_motor_force_falls_short(loop):
+    loop.start(0.5, 4.0)
+    for _ in range(20):
+        loop.step(0.005, 4.0, estimate(loop.reference_n), shortfall_n=0.0)
+    before_n = loop.reference_n
+    for _ in range(20):
+        loop.step(0.005, 4.0, estimate(loop.reference_n), shortfall_n=before_n)
+    assert loop.reference_n == before_n
+    held_n = ramp(loop, 4.0)
+    assert loop.step(0.005, 4.0, estimate(3.0), shortfall_n=2.0) == pytest.approx(held_n)
 
 
 def test_vision_alone_waits_for_the_ramp(transmission):

@@ -257,6 +257,26 @@ def test_retarget_without_letting_go(make_run):
     assert run.last.status.outcome == "held"
 
 
+@pytest.mark.parametrize("feedback", ["fused", "current"])
+@pytest.mark.parametrize(("before_n", "target_n"), [(5.0, 2.0), (8.0, 4.0)])
+def test_lower_target_is_reached_within_half_a_second(drawn_run, feedback, before_n, target_n):
+    errors_n = []
+    for seed in range(8):
+        run = drawn_run(seed, feedback=feedback)
+        run.plant.gain = run.vision.gain = 1.0  # errors of the sensors are not errors of the manoeuvre
+        run.grasp(before_n, 5.0).grasp(target_n, 0.5)
+        errors_n.append(abs(run.plant.force_n - target_n))
+        assert run.last.status.phase == "hold"
+        assert "slip" not in [status.outcome for status in run.statuses]
+    assert np.median(errors_n) < 0.08 * target_n
+    assert max(errors_n) < 0.25 * target_n
+
+
+def test_vision_removes_the_rest_of_a_lowering(make_run):
+    run = make_run(plant={"stiffness_n_m": 600.0}).grasp(5.0, 5.0).grasp(2.0, 4.0)
+    assert run.plant.force_n == pytest.approx(2.0, abs=0.1)
+
+
 def test_new_target_in_contact_is_used(make_run):
     run = make_run().to_phase("contact").grasp(2.0, 4.0)
     assert run.plant.force_n == pytest.approx(2.0, abs=0.1)
