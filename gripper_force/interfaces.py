@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from gripper_force.types import Frame, LoadCellSample, ServoCommand, ServoState
 
@@ -66,6 +66,31 @@ class ServoSpec:
     position_loop_a_per_rad: float | None = None
     position_loop_gain_per_s: float | None = None
     position_range_rad: tuple[float, float] | None = None
+
+
+class Lock(Protocol):
+    """A lock such as `threading.Lock`."""
+
+    def acquire(self, *, timeout: float) -> bool:
+        """Waits up to ``timeout`` seconds for the lock, and returns whether it was acquired."""
+        ...
+
+    def release(self) -> None:
+        """Releases the lock."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class SharedPort:
+    """An open port that another part of the program uses, too.
+
+    Attributes:
+        handler: A ``dynamixel_sdk.PortHandler``, or an object with the same methods.
+        lock: Held by whoever uses the port, for one transaction: a request and its replies.
+    """
+
+    handler: Any
+    lock: Lock
 
 
 class Servo(Protocol):

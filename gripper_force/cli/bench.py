@@ -103,7 +103,7 @@ def bus(
     set_: NoOverrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure a cycle of the servo bus: the driver, a plain SDK loop, and bare bytes."""
+    """Measure a cycle of the servo bus: the driver alone and beside an arm, a plain SDK loop, bare bytes."""
     from gripper_force.qualification.bench import bus_bench
 
     _reject_overrides("bus", set_)

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from gripper_force.config import CameraConfig, Config, LoadCellConfig
 from gripper_force.errors import ConfigError
-from gripper_force.interfaces import Clock, Devices
+from gripper_force.interfaces import Clock, Devices, SharedPort
 from gripper_force.plugins import load_class
 from gripper_force.types import NS_PER_S
 
@@ -79,17 +79,23 @@ def resolve_simulation(config: Config) -> tuple[Config, str]:
 
 
 @contextmanager
-def open_devices(config: Config) -> Iterator[Devices]:
+def open_devices(config: Config, port: SharedPort | None = None) -> Iterator[Devices]:
     """Opens the configured devices and closes all of them at the end, whatever happens.
 
     Args:
         config: A resolved configuration (see `gripper_force.runtime.resolve`).
+        port: Port of the servo that other code uses, too; None: ``servo.port`` is opened.
 
     Raises:
         ConfigError: A backend is unknown, or two cannot be combined.
         DeviceNotFoundError: A device is missing.
         SimulationError: The simulated scene cannot be built.
     """
+    if port is not None and (config.servo.backend not in SERVOS or config.servo.port.startswith("virtual:")):
+        raise ConfigError(
+            f"a shared port works with servo.backend=dynamixel and a real servo.port, not with "
+            f"{config.servo.backend} and {config.servo.port}; set servo.port to the device path of the port"
+        )
     with ExitStack() as stack:
         rig: Any = None
         if is_simulated(config):
@@ -108,7 +114,8 @@ def open_devices(config: Config) -> Iterator[Devices]:
         clock: Clock = rig.clock if rig is not None else MonotonicClock()
         camera = _open_sensor(stack, "camera", CAMERAS, config.camera, rig, config, clock)
         load_cell = _open_sensor(stack, "load_cell", LOAD_CELLS, config.load_cell, rig, config, clock)
-        servo = load_servo_class(config)(config.servo, clock.now_ns)
+        shared = () if port is None else (port,)
+        servo = load_servo_class(config)(config.servo, clock.now_ns, *shared)
         stack.callback(servo.close)
         if rig is not None:
             rig.start()

@@ -12,6 +12,7 @@ from typing import Final
 from gripper_force.config import Config
 from gripper_force.control.state_machine import Decision
 from gripper_force.errors import DeviceTimeoutError, RequestError
+from gripper_force.interfaces import SharedPort
 from gripper_force.runtime.process import deferred_signals
 from gripper_force.runtime.requests import CLOSED, PendingRequest, RequestQueue
 from gripper_force.runtime.resolve import ResolvedConfig, resolve
@@ -34,8 +35,10 @@ class ControlLoop:
         state: State after the newest control cycle.
     """
 
-    def __init__(self, config: Config, log: Path | None, *, background: bool) -> None:
-        self._config, self._log = config, log
+    def __init__(
+        self, config: Config, log: Path | None, *, background: bool, port: SharedPort | None = None
+    ) -> None:
+        self._config, self._log, self._port = config, log, port
         self._background = background
         self._requests, self._tracker = RequestQueue(), StateTracker()
         self._resources = contextlib.ExitStack()  # of the caller's thread
@@ -57,7 +60,7 @@ class ControlLoop:
             if self._background:
                 self._open_thread()
             else:
-                run = open_run(resolve(self._config), self._log)
+                run = open_run(resolve(self._config), self._log, port=self._port)
                 self._start(self._resources.enter_context(run))
         except BaseException as error:
             self._error, self._error_was_raised = error, True
@@ -156,7 +159,9 @@ class ControlLoop:
 
     def _run_thread(self, run: ResolvedConfig) -> None:
         try:
-            with open_run(run, self._log, raise_if_cancelled=self._raise_if_closing) as session:
+            with open_run(
+                run, self._log, raise_if_cancelled=self._raise_if_closing, port=self._port
+            ) as session:
                 self._start(session)
                 while not self._closing.is_set():
                     self._cycle(session)

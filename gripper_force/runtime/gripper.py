@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import TracebackType
-from typing import Literal, Self, overload
+from typing import Any, Literal, Self, overload
 
 from gripper_force.config import Config, Overrides, load_config
 from gripper_force.errors import ConfigError
+from gripper_force.interfaces import Lock, SharedPort
 from gripper_force.runtime.control_loop import ControlLoop
 from gripper_force.runtime.requests import PendingRequest
 from gripper_force.runtime.state import GraspResult, GripperState
@@ -20,6 +21,8 @@ def open_gripper(
     log: str | Path | None = None,
     overrides: Overrides | None = None,
     background: bool | None = None,
+    port: Any = None,
+    port_lock: Lock | None = None,
 ) -> Gripper:
     """Opens the configured gripper, arms its servo, and waits for the first frames.
 
@@ -38,9 +41,15 @@ def open_gripper(
         overrides: Configuration keys to change: ``{"control.rate_hz": 100}`` or ``["control.rate_hz=100"]``.
         background: True: a thread runs the control cycle. False: the caller does, with `Gripper.step`.
             None: True in real time, False in lockstep.
+        port: A port that is already open and that other code uses, too, such as an arm's program: a
+            ``dynamixel_sdk.PortHandler`` or an object with the same methods. Packets are sent only to
+            ``servo.id``, and the port is neither configured nor closed. None: opens ``servo.port``.
+        port_lock: Lock of a shared port, such as a `threading.Lock`. Every user of the port holds it for one
+            transaction, a request and its replies.
 
     Raises:
-        ConfigError: A key, value, profile or backend is wrong, or ``background`` is True in lockstep.
+        ConfigError: A key, value, profile or backend is wrong, ``background`` is True in lockstep, or a port
+            is given without a lock.
         DeviceError: A device is missing, in use, or does not answer.
         SimulationError: The simulated scene cannot be built.
         LogError: The log cannot be written.
@@ -58,8 +67,11 @@ def open_gripper(
         )
     if background is None:
         background = not lockstep
+    if (port is None) != (port_lock is None):
+        raise ConfigError("a shared port needs port and port_lock; pass both to open_gripper")
+    shared = None if port is None or port_lock is None else SharedPort(port, port_lock)
     path = None if log is None else Path(log)
-    loop = ControlLoop(settings, path, background=background)
+    loop = ControlLoop(settings, path, background=background, port=shared)
     loop.open()
     return Gripper(loop, path)
 

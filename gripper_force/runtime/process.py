@@ -20,7 +20,7 @@ PRIORITY: Final = 10
 SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 """Signals that end a run: Ctrl-C, a request to end, the loss of the terminal (ssh), and Ctrl-\\."""
 
-_SWITCH_INTERVAL_S: Final = 2e-4
+SWITCH_INTERVAL_S: Final = 2e-4
 """Python's default lets a computing thread delay the control thread by 5 ms."""
 
 
@@ -80,7 +80,7 @@ def real_time_settings() -> Iterator[str]:
     with ExitStack() as stack:
         if _allowed.switch_interval:
             stack.callback(sys.setswitchinterval, sys.getswitchinterval())
-            sys.setswitchinterval(_SWITCH_INTERVAL_S)
+            sys.setswitchinterval(SWITCH_INTERVAL_S)
         yield stack.enter_context(real_time_priority()) if _allowed.real_time_priority else ""
 
 

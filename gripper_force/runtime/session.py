@@ -18,7 +18,7 @@ from gripper_force.config import Config, dump_config
 from gripper_force.control.state_machine import Decision, GraspController, is_open
 from gripper_force.errors import DeviceError, DeviceTimeoutError, GripperError
 from gripper_force.fault_injection import Faults, FaultyEstimator, FaultyFile
-from gripper_force.interfaces import Devices
+from gripper_force.interfaces import Devices, SharedPort
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log import LogWriter
 from gripper_force.runtime.log_queue import LogQueue
@@ -317,6 +317,7 @@ def open_run(
     *,
     vision: bool = True,
     raise_if_cancelled: Callable[[], None] = lambda: None,
+    port: SharedPort | None = None,
 ) -> Iterator[Session]:
     """Resolves a configuration, opens its devices and opens a session on them.
 
@@ -325,13 +326,14 @@ def open_run(
         path: Log to write; None: no log.
         vision: False for a run that only records frames.
         raise_if_cancelled: See `open_session`.
+        port: See `open_devices`.
 
     Raises:
         GripperError: Something is missing or inconsistent, or a device failed.
     """
     run = config if isinstance(config, ResolvedConfig) else resolve(config, vision=vision)
     with (
-        open_devices(run.config) as devices,
+        open_devices(run.config, port) as devices,
         open_session(run, devices, path, raise_if_cancelled) as session,
     ):
         yield session

@@ -1,4 +1,4 @@
-"""Cost of a servo bus cycle: the driver, a plain loop of the vendor's SDK, and bare bytes."""
+"""Cost of a servo bus cycle: the driver alone and beside an arm, a plain loop of the SDK, and bare bytes."""
 
 import multiprocessing
 import os
@@ -6,9 +6,12 @@ import pty
 import select
 import signal
 import struct
+import sys
+import threading
 import time
 import tty
 from collections.abc import Callable, Iterator, MutableSequence, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -18,6 +21,8 @@ import numpy as np
 from dynamixel_sdk import GroupSyncRead, GroupSyncWrite, PacketHandler, PortHandler
 
 from gripper_force.config import ServoConfig
+from gripper_force.interfaces import SharedPort
+from gripper_force.runtime.process import SWITCH_INTERVAL_S
 from gripper_force.types import NS_PER_MS, NS_PER_S, ServoCommand
 from gripper_hw.dynamixel.control_table import REGISTERS, load_model
 from gripper_hw.dynamixel.firmware import VirtualServo
@@ -32,6 +37,8 @@ BUS_SETTINGS: Final = tuple(
 
 _MODEL: Final = "XM430-W350"
 _IDS: Final = (1, 2)
+_ARM_IDS: Final = (11, 12, 13, 14, 15, 16)
+_WITH_ARM: Final = "driver, arm"
 _RATE_HZ: Final = 200
 _TURN: Final = 50
 """Cycles of one client before the next client's turn."""
@@ -57,8 +64,10 @@ class BusCost:
     """Cost of a cycle, a read of two servos and a write of their goals, for one client at one setting.
 
     Attributes:
-        client: ``driver``; ``plain SDK``, GroupSyncRead and GroupSyncWrite over the SDK's own port, as in its
-            examples; or ``bare bytes``, precomputed packets, which shows the cost of this machine's I/O.
+        client: ``driver``; ``driver, arm``, the driver on a port that it shares with another thread, which reads
+            and writes the six servos of an arm once per cycle, until both are done; ``plain SDK``,
+            GroupSyncRead and GroupSyncWrite over the SDK's own port, as in its examples; or ``bare bytes``,
+            precomputed packets, which shows the cost of this machine's I/O.
         baud_rate: Bits per second.
         latency_ms: Latency of the adapter, see `BUS_SETTINGS`.
         line_ms: Time of the line alone: transmission of the bytes, and the latency.
@@ -106,8 +115,9 @@ def bus_cost(baud_rate: int, latency_ms: float, cycles: int) -> tuple[BusCost, .
     with _line(baud_rate, latency_ms) as (paths, sent), ExitStack() as stack:
         clients = {
             "driver": stack.enter_context(_driver(paths[0], baud_rate)),
-            "plain SDK": stack.enter_context(_plain_sdk(paths[1], baud_rate)),
-            "bare bytes": stack.enter_context(_bare_bytes(paths[2])),
+            _WITH_ARM: stack.enter_context(_driver_and_arm(paths[1], baud_rate)),
+            "plain SDK": stack.enter_context(_plain_sdk(paths[2], baud_rate)),
+            "bare bytes": stack.enter_context(_bare_bytes(paths[3])),
         }
         turns = [(name, min(_TURN, cycles - done)) for done in range(0, cycles, _TURN) for name in clients]
         times_ns: dict[str, list[int]] = {name: [] for name in clients}
@@ -120,7 +130,8 @@ def bus_cost(baud_rate: int, latency_ms: float, cycles: int) -> tuple[BusCost, .
             shares[name].append(_cpu_share(clients[name], count))
     costs = []
     for name, count in zip(clients, bytes_, strict=True):
-        line_ms = _wire_ns(count, baud_rate) / cycles / NS_PER_MS + latency_ms
+        replies = 2 if name == _WITH_ARM else 1  # each after the latency
+        line_ms = _wire_ns(count, baud_rate) / cycles / NS_PER_MS + replies * latency_ms
         p50_ms, p99_ms = (float(ms) for ms in np.percentile(times_ns[name], (50, 99)) / NS_PER_MS)
         share = float(np.median(shares[name]))
         costs.append(BusCost(name, baud_rate, latency_ms, line_ms, p50_ms, p99_ms, share))
@@ -128,11 +139,11 @@ def bus_cost(baud_rate: int, latency_ms: float, cycles: int) -> tuple[BusCost, .
 
 
 @contextmanager
-def _driver(path: str, baud_rate: int) -> Iterator[Cycle]:
+def _driver(path: str, baud_rate: int, port: SharedPort | None = None) -> Iterator[Cycle]:
     config = ServoConfig(
         model=_MODEL, port=path, baud_rate=baud_rate, bus_watchdog_ms=2540, reply_margin_ms=_REPLY_MARGIN_MS
     )
-    bus = DynamixelBus(config, _IDS)
+    bus = DynamixelBus(config, _IDS, port=port)
 
     def cycle() -> None:
         bus.write([ServoCommand(state.t_ns, state.position_rad, 0.1) for state in bus.read()])
@@ -146,30 +157,66 @@ def _driver(path: str, baud_rate: int) -> Iterator[Cycle]:
 
 
 @contextmanager
+def _driver_and_arm(path: str, baud_rate: int) -> Iterator[Cycle]:
+    """Client that runs a cycle of the gripper and, in another thread, one of an arm, on one port."""
+    lock = threading.Lock()
+    with (
+        _sdk_port(path, baud_rate) as handler,
+        _driver(path, baud_rate, SharedPort(handler, lock)) as gripper_cycle,
+        ThreadPoolExecutor(1) as thread,
+        ExitStack() as stack,
+    ):
+        stack.callback(sys.setswitchinterval, sys.getswitchinterval())
+        sys.setswitchinterval(SWITCH_INTERVAL_S)  # as a program that calls `own_process`
+        arm_cycle = _sdk_cycle(handler, _ARM_IDS, lock)
+
+        def cycle() -> None:
+            arm = thread.submit(arm_cycle)
+            gripper_cycle()
+            arm.result()
+
+        yield cycle
+
+
+@contextmanager
 def _plain_sdk(path: str, baud_rate: int) -> Iterator[Cycle]:
-    port, packets = PortHandler(path), PacketHandler(2.0)
-    port.setBaudRate(baud_rate)
+    with _sdk_port(path, baud_rate) as handler:
+        yield _sdk_cycle(handler, _IDS, threading.Lock())
+
+
+@contextmanager
+def _sdk_port(path: str, baud_rate: int) -> Iterator[PortHandler]:
+    handler = PortHandler(path)
+    handler.setBaudRate(baud_rate)
+    try:
+        yield handler
+    finally:
+        handler.closePort()
+
+
+def _sdk_cycle(handler: PortHandler, ids: Sequence[int], lock: threading.Lock) -> Cycle:
+    """Reads and writes servos as the SDK's examples do."""
+    packets = PacketHandler(2.0)
     current, velocity, position, goal = (
         REGISTERS[name]
         for name in ("present_current", "present_velocity", "present_position", "goal_position")
     )
-    reader = GroupSyncRead(port, packets, current.address, current.size + velocity.size + position.size)
-    writer = GroupSyncWrite(port, packets, goal.address, goal.size)
-    for id_ in _IDS:
+    reader = GroupSyncRead(handler, packets, current.address, current.size + velocity.size + position.size)
+    writer = GroupSyncWrite(handler, packets, goal.address, goal.size)
+    for id_ in ids:
         reader.addParam(id_)
         writer.addParam(id_, bytes(goal.size))
 
     def cycle() -> None:
-        reader.txRxPacket()
-        for id_ in _IDS:
+        with lock:
+            reader.txRxPacket()
+        for id_ in ids:
             ticks = [reader.getData(id_, r.address, r.size) for r in (current, velocity, position)][-1]
             writer.changeParam(id_, goal.encode(ticks))
-        writer.txPacket()
+        with lock:
+            writer.txPacket()
 
-    try:
-        yield cycle
-    finally:
-        port.closePort()
+    return cycle
 
 
 @contextmanager
@@ -219,9 +266,9 @@ def _wire_ns(count: int, baud_rate: int) -> float:
 
 @contextmanager
 def _line(baud_rate: int, latency_ms: float) -> Iterator[tuple[list[str], Sequence[int]]]:
-    """Serves a virtual bus to three clients. Yields their paths, and the bytes on the wire for each."""
+    """Serves a virtual bus to four clients. Yields their paths, and the bytes on the wire for each."""
     context = multiprocessing.get_context("spawn")
-    sent: MutableSequence[int] = context.RawArray("q", 3)
+    sent: MutableSequence[int] = context.RawArray("q", 4)
     here, there = context.Pipe()
     process = context.Process(target=_serve, args=(there, sent, baud_rate, latency_ms), daemon=True)
     process.start()
@@ -235,7 +282,7 @@ def _line(baud_rate: int, latency_ms: float) -> Iterator[tuple[list[str], Sequen
 
 def _serve(parent: Connection, sent: MutableSequence[int], baud_rate: int, latency_ms: float) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C, and then closes the pipe
-    bus = VirtualBus(VirtualServo(id_, load_model(_MODEL)) for id_ in _IDS)
+    bus = VirtualBus(VirtualServo(id_, load_model(_MODEL)) for id_ in (*_IDS, *_ARM_IDS))
     clients = {}
     paths = []
     for i in range(len(sent)):

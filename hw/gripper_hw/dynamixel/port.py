@@ -1,6 +1,6 @@
-"""Ports for the vendor's SDK: a serial port, or a virtual bus (see `memory_port`).
+"""Ports for the vendor's SDK: a serial port, a port of the caller's, or a virtual bus (see `memory_port`).
 
-Both raise `DeviceLostError` once the other end is gone. The SDK's own port would report "busy" forever.
+All raise `DeviceLostError` once the other end is gone. The SDK's own port would report "busy" forever.
 """
 
 import contextlib
@@ -8,18 +8,24 @@ import os
 import select
 import termios
 import time
-from collections.abc import Iterable
-from typing import Final, NoReturn, Protocol
+from collections.abc import Callable, Iterable
+from typing import Any, Final, NoReturn, Protocol, TypeVar
 
 import serial
 from dynamixel_sdk import PortHandler
 
-from gripper_force.errors import ConfigError, DeviceLostError
+from gripper_force.errors import ConfigError, DeviceError, DeviceLostError
 from gripper_hw.serial_line import open_line
 
 VIRTUAL_PREFIX: Final = "virtual:"
 
 _MAX_REPLY_BYTES: Final = 4096  # a scan of all ids; more means that the other end never stops sending
+
+
+_POLL_S: Final = 5e-5
+"""Pause between two looks for bytes at a caller's port, which does not wait for them."""
+
+_T = TypeVar("_T")
 
 
 class Port(Protocol):
@@ -161,3 +167,77 @@ class SerialPort(PortHandler):  # type: ignore[misc]
         raise DeviceLostError(
             f"the servo's port {self.port_name} is gone ({error}); check cable and power, then start again"
         ) from error
+
+
+class BorrowedPort:
+    """A port of the caller's, an SDK `PortHandler` or the like. Never configures or closes it."""
+
+    def __init__(self, name: str, handler: Any, reply_margin_ms: float) -> None:
+        """Checks that the port is open.
+
+        Args:
+            name: Name for messages.
+            handler: The caller's port.
+            reply_margin_ms: Reply timeout beyond the transmission time; the SDK's own is 34 ms.
+
+        Raises:
+            DeviceError: The port is not open.
+        """
+        if not getattr(handler, "is_open", True):
+            raise DeviceError(f"the shared port {name} is not open; call its openPort() first")
+        self._name, self._handler = name, handler
+        self._reply_margin_ms = reply_margin_ms
+        self._sent_bytes = 0
+
+    @property
+    def is_using(self) -> bool:
+        """True during a transaction."""
+        return bool(self._handler.is_using)
+
+    @is_using.setter
+    def is_using(self, value: bool) -> None:
+        self._handler.is_using = value
+
+    def closePort(self) -> None:  # noqa: N802
+        """Does nothing: the caller closes the port."""
+
+    def clearPort(self) -> None:  # noqa: N802
+        """Discards received bytes."""
+        self._call(self._handler.clearPort)
+
+    def writePort(self, packet: Iterable[int]) -> int:  # noqa: N802
+        """Sends a packet and returns the number of bytes accepted."""
+        data = bytes(packet)
+        self._sent_bytes = len(data)
+        return self._call(lambda: int(self._handler.writePort(data)))
+
+    def readPort(self, length: int) -> bytes:  # noqa: N802
+        """Returns up to ``length`` received bytes."""
+        data = self._call(lambda: bytes(self._handler.readPort(length)))
+        if not data:
+            time.sleep(_POLL_S)
+        return data
+
+    def setPacketTimeout(self, packet_length: int) -> None:  # noqa: N802
+        """Starts the timeout: time of the request and a reply of ``packet_length`` bytes, plus margin."""
+        wire_ms = 10_000.0 / self._handler.getBaudRate() * (packet_length + self._sent_bytes)
+        self._handler.setPacketTimeoutMillis(wire_ms + self._reply_margin_ms)
+
+    def isPacketTimeout(self) -> bool:  # noqa: N802
+        """True once the reply timeout has passed."""
+        return bool(self._handler.isPacketTimeout())
+
+    def drain(self) -> None:
+        """Discards received bytes until the reply timeout ends."""
+        while not self.isPacketTimeout():
+            self.readPort(_MAX_REPLY_BYTES)
+
+    def _call(self, action: Callable[[], _T]) -> _T:
+        try:
+            return action()
+        except (OSError, termios.error, AttributeError, TypeError) as error:  # closed: `ser` is None
+            self.is_using = False
+            raise DeviceLostError(
+                f"the shared port {self._name} is gone or closed ({error}); check cable and power, keep it open "
+                "as long as the gripper, then start again"
+            ) from error

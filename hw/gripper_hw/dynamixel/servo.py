@@ -21,7 +21,7 @@ from gripper_force.errors import (
     HardwareFaultError,
     NonFiniteError,
 )
-from gripper_force.interfaces import BusStats, ServoSpec
+from gripper_force.interfaces import BusStats, ServoSpec, SharedPort
 from gripper_force.types import ServoCommand, ServoState
 from gripper_hw.dynamixel.control_table import (
     CURRENT_BASED_POSITION_MODE,
@@ -35,7 +35,7 @@ from gripper_hw.dynamixel.control_table import (
     rad_from_ticks,
     ticks_from_rad,
 )
-from gripper_hw.dynamixel.transport import Transport
+from gripper_hw.dynamixel.transport import PortLockedError, Transport
 
 _READ_FIELDS: Final = {  # name: bytes
     "present_current": 2,
@@ -82,9 +82,13 @@ class DynamixelBus:
     """
 
     def __init__(
-        self, config: ServoConfig, ids: Sequence[int], clock_ns: Callable[[], int] = time.monotonic_ns
+        self,
+        config: ServoConfig,
+        ids: Sequence[int],
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+        port: SharedPort | None = None,
     ) -> None:
-        """Checks the configuration; `start` opens the port.
+        """Checks the configuration; `start` opens the port, unless a shared one is given.
 
         Raises:
             ConfigError: The model is unknown, has no current control, or allows less than
@@ -99,7 +103,7 @@ class DynamixelBus:
         self.ids = tuple(ids)
         self.firmware: tuple[int, ...] = ()
         self._config = config
-        self._transport = Transport(config, clock_ns)
+        self._transport = Transport(config, clock_ns, port)
         self._current_limit = math.floor(config.current_limit_a / self.model.current_unit_a)
         self._watchdog_setting = math.ceil(config.bus_watchdog_ms / WATCHDOG_UNIT_MS)
         self._expected_watchdog = 0
@@ -228,6 +232,8 @@ class DynamixelBus:
         label = self._label(id_)
         try:
             number = self._transport.ping(id_)
+        except PortLockedError:
+            raise
         except DeviceTimeoutError as error:
             raise DeviceNotFoundError(
                 f"{label} does not answer at {self._config.baud_rate} baud; "
@@ -348,9 +354,14 @@ class DynamixelBus:
 class DynamixelServo:
     """The gripper's servo: one id of a `DynamixelBus` (see `gripper_force.interfaces.Servo`)."""
 
-    def __init__(self, config: ServoConfig, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
-        """Checks the configuration; `start` opens the port. Raises the errors of `DynamixelBus`."""
-        self._bus = DynamixelBus(config, (config.id,), clock_ns)
+    def __init__(
+        self,
+        config: ServoConfig,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+        port: SharedPort | None = None,
+    ) -> None:
+        """Creates the bus; see `DynamixelBus`."""
+        self._bus = DynamixelBus(config, (config.id,), clock_ns, port)
         self.model = self._bus.model
 
     @staticmethod

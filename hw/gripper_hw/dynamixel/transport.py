@@ -3,6 +3,7 @@
 Protocol 2.0: https://emanual.robotis.com/docs/en/dxl/protocol2/.
 """
 
+import threading
 import time
 from collections.abc import Callable, Sequence
 from typing import Final, TypeVar
@@ -18,10 +19,10 @@ from dynamixel_sdk.protocol2_packet_handler import (
 
 from gripper_force.config import ServoConfig
 from gripper_force.errors import DeviceError, DeviceTimeoutError
-from gripper_force.interfaces import BusStats
+from gripper_force.interfaces import BusStats, Lock, SharedPort
 from gripper_hw.dynamixel.control_table import REGISTERS
 from gripper_hw.dynamixel.packets import BROADCAST_ID
-from gripper_hw.dynamixel.port import Port, open_port
+from gripper_hw.dynamixel.port import BorrowedPort, Port, open_port
 
 _READ_LENGTHS: Final = 8
 """A read requests 0 to 7 bytes more than it needs, in turn, so that a late reply to one of the seven previous
@@ -44,6 +45,10 @@ _ERRORS: Final = {
 _T = TypeVar("_T")
 
 
+class PortLockedError(DeviceTimeoutError):
+    """The other user of a shared port did not release its lock in time; nothing was sent."""
+
+
 class Transport:
     """Complete transactions with the servos on one port.
 
@@ -55,9 +60,17 @@ class Transport:
         stats: Counters since construction.
     """
 
-    def __init__(self, config: ServoConfig, clock_ns: Callable[[], int] = time.monotonic_ns) -> None:
-        """Stores the configuration; `open` opens the port."""
+    def __init__(
+        self,
+        config: ServoConfig,
+        clock_ns: Callable[[], int] = time.monotonic_ns,
+        shared: SharedPort | None = None,
+    ) -> None:
+        """Stores the configuration; `open` opens the port, or takes the shared one."""
         self.stats = BusStats()
+        self._shared = shared
+        self._lock: Lock = threading.Lock() if shared is None else shared.lock
+        self._lock_timeout_s = config.bus_watchdog_ms / 1e3 / (config.retries + 1)
         self._config = config
         self._clock_ns = clock_ns
         self._packets = PacketHandler(2.0)
@@ -73,9 +86,12 @@ class Transport:
         Raises:
             ConfigError: The SDK does not support the baud rate.
             DeviceNotFoundError: The port does not exist.
-            DeviceError: The port is in use.
+            DeviceError: The port is in use, or a shared port is not open.
         """
         margin_ms = self._config.reply_margin_ms if reply_margin_ms is None else reply_margin_ms
+        if self._shared is not None:
+            self._port = BorrowedPort(self._config.port, self._shared.handler, margin_ms)
+            return
         self._port = open_port(self._config.port, self._config.baud_rate, margin_ms)
 
     def close(self) -> None:
@@ -204,20 +220,33 @@ class Transport:
                 f"the servo's port {self._config.port} is not open, so {description} was not sent; "
                 "call start() first"
             )
+        sent = False
         for number in range(self._config.retries + 1):
             self.stats.retries += number > 0
-            self._port.is_using = False  # an interrupted transaction leaves it set
-            try:
-                result, value = attempt()
-            except IndexError:  # raised by the SDK for replies that are too short
-                result = COMM_RX_CORRUPT
-            if result == COMM_SUCCESS:
-                return value
-            if result == COMM_RX_CORRUPT:
-                self.stats.corrupt += 1
-            else:
+            if not self._lock.acquire(timeout=self._lock_timeout_s):
                 self.stats.timeouts += 1
-            self._port.drain()  # the rest of a corrupt reply would collide with the next request
+                continue
+            sent = True
+            try:
+                self._port.is_using = False  # an interrupted transaction leaves it set
+                try:
+                    result, value = attempt()
+                except IndexError:  # raised by the SDK for replies that are too short
+                    result = COMM_RX_CORRUPT
+                if result == COMM_SUCCESS:
+                    return value
+                if result == COMM_RX_CORRUPT:
+                    self.stats.corrupt += 1
+                else:
+                    self.stats.timeouts += 1
+                self._port.drain()  # the rest of a corrupt reply would collide with the next request
+            finally:
+                self._lock.release()
+        if not sent:
+            raise PortLockedError(
+                f"{description} was not sent on {self._config.port}: its lock was not free for "
+                f"{self._config.bus_watchdog_ms} ms; let its other user hold it for one transaction only"
+            )
         raise DeviceTimeoutError(
             f"no valid reply to {description} on {self._config.port} after {self._config.retries + 1} tries; "
             "check cable, power, and that the adapter's latency timer is below servo.reply_margin_ms"

@@ -1,15 +1,17 @@
 """Servo contract, run on every model in memory, on one behind a pty, and on the simulated rig's servo."""
 
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 
 import pytest
+from dynamixel_sdk import PortHandler
 
 from gripper_force.config import ServoConfig, load_config
 from gripper_force.errors import DeviceError, DeviceTimeoutError, NonFiniteError
-from gripper_force.interfaces import ServoSpec
+from gripper_force.interfaces import ServoSpec, SharedPort
 from gripper_force.testing.servo_contract import ServoContract
 from gripper_force.types import NS_PER_MS, ServoCommand, ServoState
 from gripper_hw.dynamixel.control_table import load_model, model_names
@@ -32,11 +34,14 @@ class ServoSetup:
     config: ServoConfig
     now_ns: Callable[[], int]
     wait: Callable[[], None]
+    port: SharedPort | None = None
     servo: DynamixelServo = field(init=False)
     second_servo: DynamixelServo = field(init=False)
 
     def __post_init__(self) -> None:
-        self.servo, self.second_servo = (DynamixelServo(self.config, self.now_ns) for _ in range(2))
+        self.servo, self.second_servo = (
+            DynamixelServo(self.config, self.now_ns, self.port) for _ in range(2)
+        )
 
     @property
     def firmware(self) -> VirtualServo:
@@ -81,6 +86,15 @@ def behind_a_pty(stack: ExitStack) -> ServoSetup:
     return ServoSetup(server.bus, config, time.monotonic_ns, lambda: time.sleep(1e-3))
 
 
+def on_a_shared_port(stack: ExitStack) -> ServoSetup:
+    setup = behind_a_pty(stack)
+    handler = PortHandler(setup.config.port)
+    assert handler.openPort()
+    stack.callback(handler.closePort)
+    port = SharedPort(handler, threading.Lock())
+    return ServoSetup(setup.bus, setup.config, setup.now_ns, setup.wait, port)
+
+
 def in_the_rig(stack: ExitStack, quick: list[str]) -> ServoSetup:
     config = load_config(None, quick)
     rig = SimulatedRig(config)
@@ -93,7 +107,7 @@ def in_the_rig(stack: ExitStack, quick: list[str]) -> ServoSetup:
     )
 
 
-@pytest.fixture(params=[*model_names(), "firmware 44", "pty", "rig"])
+@pytest.fixture(params=[*model_names(), "firmware 44", "pty", "shared port", "rig"])
 def setup(request: pytest.FixtureRequest, quick: list[str]) -> Iterator[ServoSetup]:
     with ExitStack() as stack:
         match request.param:
@@ -101,6 +115,8 @@ def setup(request: pytest.FixtureRequest, quick: list[str]) -> Iterator[ServoSet
                 setup = in_memory(stack, "XM430-W350", 44)
             case "pty":
                 setup = behind_a_pty(stack)
+            case "shared port":
+                setup = on_a_shared_port(stack)
             case "rig":
                 setup = in_the_rig(stack, quick)
             case _:
@@ -124,8 +140,8 @@ class TestDynamixelServo(ServoContract):
         return DynamixelServo.spec(config)
 
     @pytest.fixture
-    def second_servo(self, setup: ServoSetup) -> DynamixelServo:
-        return setup.second_servo
+    def second_servo(self, setup: ServoSetup) -> DynamixelServo | None:
+        return setup.second_servo if setup.port is None else None
 
     @pytest.fixture
     def now_ns(self, setup: ServoSetup) -> Callable[[], int]:
@@ -174,6 +190,8 @@ def test_calls_on_a_closed_port_name_it(setup, call):
 
 
 def test_port_in_use_is_named(setup):
+    if setup.port is not None:
+        pytest.skip("a shared port may have several users")
     setup.servo.start()
     with pytest.raises(DeviceError, match="in use"):
         setup.second_servo.start()

@@ -13,7 +13,7 @@ def test_bench_bus_prints_a_table_and_json(monkeypatch: pytest.MonkeyPatch) -> N
     call = ["bench", "bus", "--cycles", "2"]
     assert "plain SDK" in CliRunner().invoke(cli.app, call).stdout
     printed = json.loads(CliRunner().invoke(cli.app, [*call, "--json"]).stdout)
-    assert [cost["client"] for cost in printed["bus"]] == ["driver", "plain SDK", "bare bytes"]
+    assert [cost["client"] for cost in printed["bus"]] == ["driver", "driver, arm", "plain SDK", "bare bytes"]
     assert {"load", "cores"} < set(printed)
 
 
@@ -24,8 +24,14 @@ def test_bench_bus_rejects_configuration_keys() -> None:
 
 def test_cycle_takes_at_least_the_time_of_its_bytes_on_the_line() -> None:
     cycles, baud_rate, latency_ms = 4, 57_600, 5.0
-    ours, theirs, bare = bus_cost(baud_rate, latency_ms, cycles)
-    assert [c.client for c in (ours, theirs, bare)] == ["driver", "plain SDK", "bare bytes"]
+    ours, shared, theirs, bare = bus_cost(baud_rate, latency_ms, cycles)
+    assert [c.client for c in (ours, shared, theirs, bare)] == [
+        "driver",
+        "driver, arm",
+        "plain SDK",
+        "bare bytes",
+    ]
+    assert shared.line_ms > 2 * ours.line_ms - latency_ms
     for cost in (ours, theirs, bare):
         assert (cost.baud_rate, cost.latency_ms) == (baud_rate, latency_ms)
         assert latency_ms < cost.line_ms
