@@ -154,7 +154,7 @@ def test_the_code_that_an_embedding_program_reaches_is_small() -> None:
     drivers = [*backends.SERVOS.values(), *real, *ENGINES.values()]
     assert 6_000 < lines(drivers) <= 12_000
     assert (
-        lines([*drivers, *backends.CAMERAS.values(), *backends.LOAD_CELLS.values()]) <= 13_700
+        lines([*drivers, *backends.CAMERAS.values(), *backends.LOAD_CELLS.values()]) <= 13_900
     )  # with the simulated rig
 
 
