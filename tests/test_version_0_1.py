@@ -11,12 +11,14 @@ LOG = Path(__file__).parent / "data" / "version_0_1.mcap"
 """``grasp --object stapler --target-n 2 --seed 7 --feedback current --set camera.backend=none`` by version 0.1."""
 
 
-def test_a_log_replays_identically() -> None:
+def test_a_log_is_replayed_by_todays_controller() -> None:
     reader = gf.LogReader(LOG)
     assert reader.metadata["version gripper-force"] == "0.1.0"
     result = gf.replay(LOG)
-    assert result.identical is True
-    assert result.changed == {"goal_current_a": 0.0, "fused_n": 0.0}
+    assert not result.identical  # the speed limit and the approach came later
+    assert "version 0.1.0 wrote the log" in result.note
+    assert 0 < result.changed["goal_current_a"] < 0.1
+    assert result.changed["fused_n"] < 0.5
 
 
 def test_a_log_is_summarised() -> None:

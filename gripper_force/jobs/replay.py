@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from gripper_force import __version__
 from gripper_force.config import Config, Overrides, config_from_text
 from gripper_force.control.state_machine import Decision
 from gripper_force.errors import DataError
@@ -253,7 +254,10 @@ def _has_faulty_estimates(config: Config) -> bool:
 
 
 def _note(reader: LogReader, run: ResolvedConfig) -> str:
-    """Returns the reason why the estimates cannot equal the logged ones, or an empty text."""
+    """Returns the reason why estimates or decisions may differ from the logged ones, or an empty text."""
+    wrote = reader.metadata.get("version gripper-force", "")
+    if wrote != __version__:
+        return f"version {wrote or 'unknown'} wrote the log, this is {__version__}: its controller may decide otherwise"
     used = reader.metadata.get("checkpoint", "")
     if run.model is None or used == "":
         return ""
