@@ -188,8 +188,15 @@ class VisionConfig(Section):
     )
 
 
-_DEFAULT_PLANT: Final = (1.0, 60.0, 60.0)
-"""Gain, lag in ms and delay in ms of an unidentified plant; slower than every object measured so far."""
+_DEFAULT_FRAME_HZ: Final = 60.0
+_TIMEOUT_FRAMES: Final = 2.7
+_MAX_LATENCY_MS: Final = 100.0 - 1e3 / _DEFAULT_FRAME_HZ
+"""Limits on missing and late estimates: 45 ms without one, and an age of 100 ms, at 60 frames per second."""
+
+_DEFAULT_PLANT: Final = (1.0, 60.0)
+_DEFAULT_LATENCY_MS: Final = 60.0 - 0.5e3 / _DEFAULT_FRAME_HZ
+"""Gain, lag in ms, and delay in ms without the wait for a frame, of an unidentified plant; slower than every object
+measured so far."""
 
 
 class BudgetConfig(Section):
@@ -226,10 +233,16 @@ class ControlConfig(Section):
     settle_s: Positive = Field(1.0, description="time within tolerance after which a grasp counts as held")
     hold_s: NonNegative = Field(1.5, description="time for which `grasp` holds before it releases")
     timeout_s: Positive = Field(8.0, description="time after which a grasp that is not held has timed out")
-    vision_timeout_ms: Positive = Field(
-        45.0, description="time without an estimate after which vision drops out (two frames at 60 Hz)"
+    vision_rate_hz: Positive | None = Field(
+        None, description="estimates per second that the loop is tuned for; None: camera.rate_hz"
     )
-    vision_age_ms: Positive = Field(100.0, description="frame age above which an estimate is rejected")
+    vision_timeout_ms: Positive | None = Field(
+        None, description="time without an estimate after which vision drops out; None: 2.7 frame periods"
+    )
+    vision_age_ms: Positive | None = Field(
+        None,
+        description="frame age above which an estimate is rejected; None: 83 ms and a frame period",
+    )
     vision_std_n: Positive = Field(1.5, description="standard deviation above which an estimate is rejected")
     min_object_width_m: NonNegative = Field(
         0.002, description="width below which closed jaws hold nothing; less than the thinnest object"
@@ -261,7 +274,8 @@ class ControlConfig(Section):
     plant_delay_ms: Positive | None = Field(
         None,
         description="delay from contact force to estimate (exposure to use, plus half a frame); None: from "
-        "the object profile, or 60. With feedback=vision at least 60 is used, and a lag of at most 60",
+        "the object profile, or 52 and half a frame period. With feedback=vision at least this default is "
+        "used, and a lag of at most 60",
     )
 
     @model_validator(mode="after")
@@ -275,16 +289,37 @@ class ControlConfig(Section):
         return self
 
     @property
+    def frame_hz(self) -> float:
+        """Estimates per second; 60 where nothing is known."""
+        return _DEFAULT_FRAME_HZ if self.vision_rate_hz is None else self.vision_rate_hz
+
+    @property
+    def timeout_ms(self) -> float:
+        """Time without an estimate after which vision drops out."""
+        return (
+            _TIMEOUT_FRAMES * 1e3 / self.frame_hz
+            if self.vision_timeout_ms is None
+            else self.vision_timeout_ms
+        )
+
+    @property
+    def max_age_ms(self) -> float:
+        """Frame age above which an estimate is rejected."""
+        return _MAX_LATENCY_MS + 1e3 / self.frame_hz if self.vision_age_ms is None else self.vision_age_ms
+
+    @property
     def plant(self) -> tuple[float, float, float]:
         """Gain, lag in s and delay in s of the force loop's plant; the defaults where nothing is known."""
         given = (self.plant_gain, self.plant_lag_ms, self.plant_delay_ms)
+        default_delay_ms = _DEFAULT_LATENCY_MS + 0.5e3 / self.frame_hz
+        defaults = (*_DEFAULT_PLANT, default_delay_ms)
         gain, lag_ms, delay_ms = (
-            default if value is None else value for value, default in zip(given, _DEFAULT_PLANT, strict=True)
+            default if value is None else value for value, default in zip(given, defaults, strict=True)
         )
         if self.feedback == "vision":
             # A press does not excite the oscillation of the jaws on the object's spring, and feedback from
             # vision alone would amplify it. So the loop is never tuned faster than for the default plant.
-            lag_ms, delay_ms = min(lag_ms, _DEFAULT_PLANT[1]), max(delay_ms, _DEFAULT_PLANT[2])
+            lag_ms, delay_ms = min(lag_ms, _DEFAULT_PLANT[1]), max(delay_ms, default_delay_ms)
         return gain, lag_ms * 1e-3, delay_ms * 1e-3
 
 

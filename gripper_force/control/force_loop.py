@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from gripper_force.config import ControlConfig
-from gripper_force.control.fusion import OBSERVER_LAG_S
+from gripper_force.control.fusion import observer_lag_s
 from gripper_force.control.trajectory import TrapezoidalProfile
 from gripper_force.control.transmission import Transmission
 from gripper_force.control.tuning import Gains, Plant, phase_margin_deg, simc
@@ -70,7 +70,7 @@ class ForceLoop:
         gain, lag_s, delay_s = config.plant
         # The current follows jaws that move at once. The force of stuck jaws is observed by vision alone,
         # through the filter. For an integral controller the lags are additional delay.
-        stuck = Plant(gain, 0.0, delay_s + lag_s + OBSERVER_LAG_S)
+        stuck = Plant(gain, 0.0, delay_s + lag_s + observer_lag_s(config.frame_hz))
         plants = {"hold": stuck, "vision": Plant(gain, lag_s, delay_s)}
         self.margins = {
             name: Margin(gains := simc(plant), phase_margin_deg(plant, gains))

@@ -42,13 +42,6 @@ _VISION_FLOOR_N = 0.05
 _FRAME_NOISE_N = 0.15
 """Standard deviation from frame to frame of a still scene. The rest of the claimed error is constant."""
 
-_FRAME_HZ = 60.0
-"""Assumed frame rate."""
-
-OBSERVER_LAG_S = math.sqrt(_FRAME_NOISE_N**2 / (_FRAME_HZ * _OPENING_DRIFT_N2_S))
-"""Lag of the bias while the jaws are stuck and about to open: the square root of noise over drift of the
-steady-state filter, 0.13 s."""
-
 _LOWERED_SHARE = 0.4
 """Standard deviation of the current estimate after the force was lowered, as a share of friction: inertia carries
 the jaws to anywhere within it."""
@@ -59,8 +52,17 @@ _LOWERING_LAG_SHARE = 0.1
 _GATE = 3.29
 """Innovation gate in standard deviations: 0.1 % of good estimates are rejected (chi-square, 10.8)."""
 
-_REENTRY = 20
-"""Consecutive rejected estimates on the same side after which the filter accepts them (1/3 s at 60 Hz)."""
+_REENTRY_S = 1 / 3
+_MIN_REENTRY = 4
+"""Time, and least number of consecutive rejected estimates on the same side, after which the filter accepts them."""
+
+
+def observer_lag_s(frame_hz: float) -> float:
+    """Returns the lag of the bias while the jaws are stuck and about to open: 0.13 s at 60 frames per second.
+
+    It is the square root of noise over drift of the steady-state filter.
+    """
+    return math.sqrt(_FRAME_NOISE_N**2 / (frame_hz * _OPENING_DRIFT_N2_S))
 
 
 class Fusion:
@@ -77,18 +79,19 @@ class Fusion:
     plant's lag: one low-pass with that lag serves both. Vision is compared with the filtered current at its
     capture time.
 
-    Without vision for `ControlConfig.vision_timeout_ms` the source is the current alone, with the last bias
+    Without vision for `ControlConfig.timeout_ms` the source is the current alone, with the last bias
     and a growing variance.
     """
 
     def __init__(self, config: ControlConfig, transmission: Transmission) -> None:
         self._feedback = config.feedback
-        self._timeout_ns = round(config.vision_timeout_ms * NS_PER_MS)
-        self._max_age_ns = round(config.vision_age_ms * NS_PER_MS)
+        self._timeout_ns = round(config.timeout_ms * NS_PER_MS)
+        self._max_age_ns = round(config.max_age_ms * NS_PER_MS)
         _, self._lag_s, _ = config.plant
         self._std_limit_n = config.vision_std_n
+        self._reentry = max(round(_REENTRY_S * config.frame_hz), _MIN_REENTRY)
         self._transmission = transmission
-        cycles = math.ceil(config.rate_hz * config.vision_age_ms / 1e3) + 2
+        cycles = math.ceil(config.rate_hz * config.max_age_ms / 1e3) + 2
         self._history: deque[tuple[int, float]] = deque(maxlen=cycles)  # covers the age of any accepted frame
         self._motor_force_n = 0.0
         self._current_n = 0.0
@@ -231,7 +234,7 @@ class Fusion:
             return f"it differs from the motor current by {difference_n:.2f} N"
         if abs(innovation_n) > _GATE * math.sqrt(self._variance_n2 + claimed_n2):
             self._rejected = _count_rejections(self._rejected, innovation_n)
-            if abs(self._rejected) < _REENTRY:
+            if abs(self._rejected) < self._reentry:
                 return f"it jumps by {innovation_n:.2f} N"
             self._variance_n2 = self._prior_n2(current_n)
         self._rejected = 0

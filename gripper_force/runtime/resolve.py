@@ -101,7 +101,7 @@ def resolve(config: Config, *, vision: bool = True) -> ResolvedConfig:
     config = config.model_copy(
         update={
             "gripper": _complete_gripper(config.gripper, spec),
-            "control": with_plant(_complete_control(config.control, spec), profiles),
+            "control": with_plant(_complete_control(config, spec), profiles),
         }
     )
     correction = read_correction(config, profiles, model)
@@ -203,12 +203,14 @@ def _check_travel(gripper: GripperConfig, spec: ServoSpec) -> None:
         )
 
 
-def _complete_control(control: ControlConfig, spec: ServoSpec) -> ControlConfig:
-    if control.voltage_limits_v is not None:
-        return control
+def _complete_control(config: Config, spec: ServoSpec) -> ControlConfig:
     low_v, high_v = spec.voltage_range_v
-    limits_v = (low_v - _SUPPLY_TOLERANCE_V, high_v + _SUPPLY_TOLERANCE_V)
-    return control.model_copy(update={"voltage_limits_v": limits_v})
+    control = config.control
+    known = {
+        "voltage_limits_v": (low_v - _SUPPLY_TOLERANCE_V, high_v + _SUPPLY_TOLERANCE_V),
+        "vision_rate_hz": config.camera.rate_hz,
+    }
+    return control.model_copy(update={k: v for k, v in known.items() if getattr(control, k) is None})
 
 
 def _check_rate(config: Config) -> None:

@@ -272,6 +272,15 @@ def test_lower_target_is_reached_within_half_a_second(drawn_run, feedback, befor
     assert max(errors_n) < 0.25 * target_n
 
 
+@pytest.mark.parametrize("rate_hz", [5.0, 10.0, 15.0, 20.0, 30.0, 90.0])
+def test_vision_stays_in_use_at_any_frame_rate(make_run, rate_hz):
+    run = make_run(vision={"rate_hz": rate_hz}, vision_rate_hz=rate_hz).grasp(4.0, 6.0)
+    assert not [text for text in run.texts if "ms old" in text or "no new estimate" in text]
+    assert "vision in use" in [text for text in run.texts if "vision" in text][-1]
+    assert run.last.status.outcome == "held"
+    assert run.plant.force_n == pytest.approx(4.0, abs=0.2)
+
+
 def test_vision_removes_the_rest_of_a_lowering(make_run):
     run = make_run(plant={"stiffness_n_m": 600.0}).grasp(5.0, 5.0).grasp(2.0, 4.0)
     assert run.plant.force_n == pytest.approx(2.0, abs=0.1)

@@ -28,6 +28,17 @@ def test_servo_data_fill_in_what_is_left_open() -> None:
     make_controller(config)
 
 
+@pytest.mark.parametrize("rate_hz", [5.0, 20.0, 60.0, 90.0])
+def test_the_controller_knows_the_cameras_rate(rate_hz: float) -> None:
+    control = resolve(
+        load_config(None, [f"camera.rate_hz={rate_hz}", "vision.checkpoint=none"])
+    ).config.control
+    assert control.frame_hz == rate_hz
+    assert 2 < control.timeout_ms * rate_hz / 1e3 < 3
+    assert control.max_age_ms == pytest.approx(100 + 1e3 / rate_hz - 1e3 / 60)
+    assert control.plant[2] == pytest.approx(0.060 + 0.5 / rate_hz - 0.5 / 60)
+
+
 def test_configured_values_are_kept() -> None:
     given = [
         "gripper.nm_per_a=1.5",
@@ -35,6 +46,7 @@ def test_configured_values_are_kept() -> None:
         "gripper.position_loop_a_per_rad=4",
         "gripper.position_loop_gain_per_s=20",
         "control.voltage_limits_v=[11, 13]",
+        "control.vision_rate_hz=25",
     ]
     config = load_config(None, [*NO_SENSORS, *given])
     assert resolve(config).config == config

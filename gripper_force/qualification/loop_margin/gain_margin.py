@@ -19,7 +19,7 @@ import numpy.typing as npt
 from gripper_calibration.fits.plant_fit import PressSeries, fit_plant
 from gripper_force.config import Config, ControlConfig
 from gripper_force.control.force_loop import ForceLoop
-from gripper_force.control.fusion import OBSERVER_LAG_S, Fusion
+from gripper_force.control.fusion import Fusion, observer_lag_s
 from gripper_force.control.limits import Limits
 from gripper_force.control.state_machine import GraspController
 from gripper_force.control.tuning import Gains
@@ -131,7 +131,7 @@ def margin_with_inertia(gains: Gains, plant: IdentifiedPlant, truth: Gripper, de
 
 def margin_by_rule(gains: Gains, plant: IdentifiedPlant, delay_s: float) -> float:
     """Returns the margin of the fused hold by its tuning: integral control, all lags as delay."""
-    total_s = plant.lag_s + delay_s + FRAME_S / 2 + OBSERVER_LAG_S
+    total_s = plant.lag_s + delay_s + FRAME_S / 2 + observer_lag_s(1 / FRAME_S)
     return math.pi / 2 / (gains.integral_s * plant.gain * total_s)
 
 

@@ -66,7 +66,7 @@ def _frame_checks(config: Config, frames: list[Frame]) -> Iterator[Check]:
         advice = "set camera.rate_hz to the measured rate, shorten camera.exposure_us, or add light"
         yield judged("camera", "rate", found, fast_enough, advice)
     latency_ms = float(np.median([frame.received_ns - frame.t_ns for frame in frames])) / NS_PER_MS
-    limit_ms = config.control.vision_timeout_ms
+    limit_ms = config.control.timeout_ms
     found = f"median {latency_ms:.1f} ms from exposure to use"
     advice = (
         f"every estimate would be older than control.vision_timeout_ms={limit_ms:g}: shorten the exposure"
