@@ -140,12 +140,19 @@ def object_(
     as_json: AsJson = False,
 ) -> None:
     """Calibrate an object by touching it with the load cell in place. Ctrl-C uses the touches so far."""
+    from gripper_calibration.fits.interval_fit import MIN_TOUCHES
     from gripper_calibration.procedures import calibrate_object as job
 
     settings = load_settings(config, set_, {"object": name, "seed": seed})
     logs = _touches(settings, touches, peak_n, folder, pause) if logs is None else job.find_logs(logs)
     with console.bar("calibrating", len(logs) + 2) as progress:
         result = job.calibrate_object(settings, name, logs=logs, out=out, progress=progress)
+    if result.mae_after_n is None:
+        console.err.print(
+            f"a test of the correction on touches outside its fit needs at least {MIN_TOUCHES} touches; "
+            f"{job.TOUCHES} are recommended",
+            soft_wrap=True,
+        )
     console.show(result.as_dict(), as_json, object_table)
 
 
