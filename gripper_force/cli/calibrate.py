@@ -131,6 +131,10 @@ def object_(
     out: Annotated[
         Path | None, typer.Option(help="Profile to write. Default: NAME.yaml in your folder of profiles.")
     ] = None,
+    fresh: Annotated[
+        bool,
+        typer.Option("--fresh", help="Move existing touches to a folder beside, and record all of them anew."),
+    ] = False,
     pause: Annotated[
         bool, typer.Option("--pause", help="Wait for Enter before each touch, to place the object anew.")
     ] = False,
@@ -143,8 +147,15 @@ def object_(
     from gripper_calibration.fits.interval_fit import MIN_TOUCHES
     from gripper_calibration.procedures import calibrate_object as job
 
+    if fresh and logs is not None:
+        raise ConfigError("--fresh records touches anew and --from records none; leave out one of them")
     settings = load_settings(config, set_, {"object": name, "seed": seed})
-    logs = _touches(settings, touches, peak_n, folder, pause) if logs is None else job.find_logs(logs)
+    folder = folder or job.default_folder(name)
+    if logs is None:
+        _tell_existing(settings, touches, folder, fresh)
+        logs = _touches(settings, touches, peak_n, folder, pause)
+    else:
+        logs = job.find_logs(logs)
     with console.bar("calibrating", len(logs) + 2) as progress:
         result = job.calibrate_object(settings, name, logs=logs, out=out, progress=progress)
     if result.mae_after_n is None:
@@ -156,15 +167,28 @@ def object_(
     console.show(result.as_dict(), as_json, object_table)
 
 
+def _tell_existing(settings: "Config", touches: int, folder: Path, fresh: bool) -> None:
+    """Names the touches that are used again, or with ``fresh`` moves them away."""
+    from gripper_calibration.procedures import calibrate_object as job
+
+    if fresh:
+        if (moved := job.move_away(settings, folder)) is not None:
+            console.err.print(f"the earlier touches are now in {moved}", soft_wrap=True)
+        return
+    paths = job.touch_paths(settings, touches, folder)
+    if existing := [str(number) for number, path in enumerate(paths, 1) if path.exists()]:
+        console.err.print(
+            f"{len(existing)} of {touches} touches exist already in {folder} and are used: number "
+            f"{', '.join(existing)}; --fresh records all of them anew",
+            soft_wrap=True,
+        )
+
+
 def _touches(
-    settings: "Config", touches: int, peak_n: float | None, folder: Path | None, pause: bool
+    settings: "Config", touches: int, peak_n: float | None, folder: Path, pause: bool
 ) -> list[Path]:
     from gripper_calibration.procedures import calibrate_object as job
 
-    existing = sum(path.exists() for path in job.touch_paths(settings, touches, folder))
-    if existing:
-        where = folder or job.default_folder(settings.object)
-        console.err.print(f"{existing} of {touches} touches exist already in {where} and are used")
     paths: list[Path] = []
     with console.err.status("touching") as status:
         prompt = _prompt(False, status) if pause else None

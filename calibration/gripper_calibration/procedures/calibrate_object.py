@@ -1,5 +1,6 @@
 """Calibration of an object: touches with the load cell in place, or logs of them, into an object profile."""
 
+import re
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -196,6 +197,36 @@ def record_touches(
 def touch_paths(config: Config, touches: int, folder: Path | None = None) -> list[Path]:
     """Returns the paths of the logs that `record_touches` writes, in order."""
     return _plan(touches, None).paths(config, folder or default_folder(config.object))
+
+
+def move_away(config: Config, folder: Path) -> Path | None:
+    """Moves the logs of an object's earlier touches to a new folder beside theirs.
+
+    Args:
+        config: The configuration; its ``object`` selects the logs.
+        folder: Folder of the logs.
+
+    Returns:
+        The new folder; None if there are no such logs.
+
+    Raises:
+        DataError: The logs can't be moved.
+    """
+    first = touch_paths(config, 1, folder)[0]
+    stem = first.stem.removesuffix("01")
+    logs = [path for path in folder.glob("*.mcap") if re.fullmatch(rf"{re.escape(stem)}\d\d+", path.stem)]
+    if not logs:
+        return None
+    number = 1
+    while (beside := folder.with_name(f"{folder.name}-old-{number}")).exists():
+        number += 1
+    try:
+        beside.mkdir()
+        for path in logs:
+            path.rename(beside / path.name)
+    except OSError as error:
+        raise DataError(f"can't move the touches in {folder} to {beside}: {error}; move them yourself") from error
+    return beside
 
 
 def find_logs(paths: Sequence[Path]) -> list[Path]:

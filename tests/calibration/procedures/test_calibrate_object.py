@@ -274,7 +274,34 @@ def test_interrupted_command_calibrates_and_continues_later(
     assert "Put the object between the jaws for touch 3, then press Enter" in stopped.stderr
     finished = by_hand(tmp_path, monkeypatch, Terminal(1, interrupt))
     assert json.loads(finished.stdout)["touches"] == 3
-    assert "2 of 3 touches exist already" in " ".join(finished.stderr.split())
+    assert "2 of 3 touches exist already" in finished.stderr
+    assert "and are used: number 1, 2; --fresh records all of them anew" in finished.stderr
+
+
+def test_fresh_touches_replace_the_earlier_ones(touched: list[Path], tmp_path: Path) -> None:
+    folder, other = tmp_path / "touches", tmp_path / "touches" / "stapler-large-01.mcap"
+    folder.mkdir()
+    earlier = Path(shutil.copy(touched[0], folder))
+    other.touch()
+    (tmp_path / "touches-old-1").mkdir()
+    content = earlier.read_bytes()
+    keys = [part for key in QUICK[1:] for part in ("--set", key)]
+    given = ["calibrate", "object", "stapler", "--touches", "1", "--peak-n", "4", "--json", "--fresh", *keys]
+    result = CliRunner().invoke(
+        app, [*given, "--folder", str(folder), "--out", str(tmp_path / "it.yaml")], catch_exceptions=False
+    )
+    assert result.exit_code == 0, result.stderr
+    moved = tmp_path / "touches-old-2"
+    assert f"the earlier touches are now in {moved}" in result.stderr
+    assert (moved / earlier.name).read_bytes() == content
+    assert earlier.read_bytes() != content
+    assert other.exists()
+
+
+def test_fresh_touches_and_given_logs_exclude_each_other(touched: list[Path]) -> None:
+    result = CliRunner().invoke(app, ["calibrate", "object", "stapler", "--fresh", "--from", str(touched[0])])
+    assert isinstance(result.exception, ConfigError)
+    assert "leave out one of them" in str(result.exception)
 
 
 def test_closed_terminal_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
