@@ -443,12 +443,15 @@ Overrides = Sequence[str | tuple[str, Any]] | Mapping[str, Any]
 """Assignments ``key.path=value`` with YAML values, or pairs or a mapping of key paths and values."""
 
 
-def load_config(path: str | Path | None = None, overrides: Overrides | None = None) -> Config:
+def load_config(
+    path: str | Path | None = None, overrides: Overrides | None = None, *, new_rig: bool = False
+) -> Config:
     """Loads a configuration from defaults, a rig profile, a YAML file and overrides, in that order.
 
     Args:
         path: YAML file; None: defaults.
         overrides: Assignments such as ``["control.rate_hz=100"]``, or ``{"control.rate_hz": 100}``.
+        new_rig: True if ``calibration.rig`` may name a file that does not exist, because it is yet to be written.
 
     Raises:
         ConfigError: A file, key or value is wrong. The message names it.
@@ -460,7 +463,9 @@ def load_config(path: str | Path | None = None, overrides: Overrides | None = No
             f"{path} is a {tree['format']} file, not a configuration; pass a rig profile with --set "
             f"calibration.rig={path}, or an object profile with --profile {path}"
         )
-    return _with_overrides(lambda given: merged(_rig_settings(given, where), given), tree, where, overrides)
+    return _with_overrides(
+        lambda given: merged(_rig_settings(given, where, new_rig), given), tree, where, overrides
+    )
 
 
 def config_from(tree: Tree, where: str) -> Config:
@@ -518,10 +523,11 @@ def _with_overrides(
         raise
 
 
-def _rig_settings(tree: Tree, where: str) -> Tree:
-    """Settings of the rig profile that the tree names."""
+def _rig_settings(tree: Tree, where: str, new_rig: bool = False) -> Tree:
+    """Settings of the rig profile that the tree names; none if it is new and does not exist."""
     section = tree.get("calibration")
     if not isinstance(section, dict) or section.get("rig") is None:
         return {}
     calibration = validated(Config, {"calibration": section}, where).calibration
-    return read_rig(calibration.rig).settings() if calibration.rig is not None else {}
+    rig = calibration.rig
+    return {} if rig is None or (new_rig and not rig.exists()) else read_rig(rig).settings()

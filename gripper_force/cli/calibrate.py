@@ -20,7 +20,12 @@ if TYPE_CHECKING:
 app = typer.Typer(no_args_is_help=True, help="Calibrate the load cell, the servo, the camera, or an object.")
 
 RigPath = Annotated[
-    Path, typer.Option("--rig", help="Rig profile to write; only the calibrated section is replaced.")
+    Path | None,
+    typer.Option(
+        "--rig",
+        help="Rig profile to write; only the calibrated section is replaced. Default: calibration.rig, or "
+        "rig.yaml.",
+    ),
 ]
 
 
@@ -28,7 +33,7 @@ RigPath = Annotated[
 def load_cell(
     mass_kg: Annotated[float | None, typer.Option(help="Known mass to put on the load cell.")] = None,
     force_n: Annotated[float | None, typer.Option(help="Its weight in newtons, instead of the mass.")] = None,
-    rig: RigPath = Path("rig.yaml"),
+    rig: RigPath = None,
     seconds: Annotated[float, typer.Option(min=1, help="Duration of the readings of each load.")] = 10.0,
     yes: Annotated[
         bool, typer.Option("--yes", help="Do not wait for Enter: continue when the reading is at rest.")
@@ -43,10 +48,10 @@ def load_cell(
     if (mass_kg is None) == (force_n is None):
         raise ConfigError("pass the load that is put on the load cell: either --mass-kg or --force-n")
     weight_n = force_n if force_n is not None else (mass_kg or 0.0) * job.STANDARD_GRAVITY_M_S2
-    settings = load_settings(config, set_, {})
+    settings, path = _rig_settings(config, set_, {}, rig)
     with console.err.status("reading") as status:
         result = job.calibrate_load_cell(
-            settings, weight_n, rig, prompt=_prompt(yes, status), seconds=seconds, progress=_progress(status)
+            settings, weight_n, path, prompt=_prompt(yes, status), seconds=seconds, progress=_progress(status)
         )
     _show_rig(result, as_json)
 
@@ -59,7 +64,7 @@ def servo(
             help="Width of the load cell between the jaws. A second width also gives the pinion's radius."
         ),
     ],
-    rig: RigPath = Path("rig.yaml"),
+    rig: RigPath = None,
     yes: Annotated[
         bool, typer.Option("--yes", help="Do not wait for Enter: the load cell is in place.")
     ] = False,
@@ -70,12 +75,12 @@ def servo(
     """Calibrate a servo's torque, friction and jaw geometry by pressing the load cell."""
     from gripper_calibration.procedures import calibrate_servo as job
 
-    settings = load_settings(config, set_, {})
+    settings, path = _rig_settings(config, set_, {}, rig)
     with console.err.status("moving") as status:
         result = job.calibrate_servo(
             settings,
             [width / 1e3 for width in gauge_mm],
-            rig,
+            path,
             prompt=_prompt(yes, status),
             progress=_progress(status),
         )
@@ -84,7 +89,7 @@ def servo(
 
 @app.command("camera")
 def camera(
-    rig: RigPath = Path("rig.yaml"),
+    rig: RigPath = None,
     region: Annotated[
         str | None,
         typer.Option(help="Region of interest of the frame: left,top,width,height. Default: by markers."),
@@ -103,11 +108,11 @@ def camera(
     """Calibrate a camera's region of interest, exposure and lag by touching a compliant object."""
     from gripper_calibration.procedures import calibrate_camera as job
 
-    settings = load_settings(config, set_, {"object": object_, "seed": seed})
+    settings, path = _rig_settings(config, set_, {"object": object_, "seed": seed}, rig)
     with console.err.status("capturing") as status:
         result = job.calibrate_camera(
             settings,
-            rig,
+            path,
             region=None if region is None else _region(region),
             exposures_us=exposure_us or job.EXPOSURES_US,
             touches=touches,
@@ -133,7 +138,9 @@ def object_(
     ] = None,
     fresh: Annotated[
         bool,
-        typer.Option("--fresh", help="Move existing touches to a folder beside, and record all of them anew."),
+        typer.Option(
+            "--fresh", help="Move existing touches to a folder beside, and record all of them anew."
+        ),
     ] = False,
     pause: Annotated[
         bool, typer.Option("--pause", help="Wait for Enter before each touch, to place the object anew.")
@@ -184,9 +191,7 @@ def _tell_existing(settings: "Config", touches: int, folder: Path, fresh: bool) 
         )
 
 
-def _touches(
-    settings: "Config", touches: int, peak_n: float | None, folder: Path, pause: bool
-) -> list[Path]:
+def _touches(settings: "Config", touches: int, peak_n: float | None, folder: Path, pause: bool) -> list[Path]:
     from gripper_calibration.procedures import calibrate_object as job
 
     paths: list[Path] = []
@@ -202,6 +207,26 @@ def _touches(
                 raise
             console.err.print(f"stopped after {len(paths)} of {touches} touches; calibrating with these")
     return paths
+
+
+def _rig_settings(
+    config: Path | None, set_: list[str] | None, options: dict[str, Any], rig: Path | None
+) -> "tuple[Config, Path]":
+    """Loads the configuration of a command that writes a rig profile, which need not exist yet.
+
+    Returns:
+        The configuration, and the rig profile to write.
+    """
+    from gripper_force.profiles.rig_profile import read_rig
+
+    settings = load_settings(config, set_, options, new_rig=True)
+    named = settings.calibration.rig
+    if named is not None and not named.exists():
+        if rig is not None and rig.resolve() != named.resolve():
+            read_rig(named)  # raises: this command does not write it
+        calibration = settings.calibration.model_copy(update={"rig": None})
+        settings = settings.model_copy(update={"calibration": calibration})
+    return settings, rig or named or Path("rig.yaml")
 
 
 def _show_rig(result: Any, as_json: bool) -> None:

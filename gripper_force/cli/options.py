@@ -19,8 +19,12 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on s
 Jobs = Annotated[int, typer.Option(min=1, help="Processes to use.")]
 
 
-def load_settings(path: Path | None, overrides: list[str] | None, options: dict[str, Any]) -> "Config":
+def load_settings(
+    path: Path | None, overrides: list[str] | None, options: dict[str, Any], *, new_rig: bool = False
+) -> "Config":
     """Loads the configuration of a command; its own options override ``--set``.
+
+    With ``new_rig`` the rig profile need not exist yet, because the command writes it.
 
     Raises:
         ConfigError: A file, key or value is wrong. The sentence names it.
@@ -28,4 +32,4 @@ def load_settings(path: Path | None, overrides: list[str] | None, options: dict[
     from gripper_force.config import load_config
 
     given = [(key, value) for key, value in options.items() if value is not None]
-    return load_config(path, [*(overrides or []), *given])
+    return load_config(path, [*(overrides or []), *given], new_rig=new_rig)

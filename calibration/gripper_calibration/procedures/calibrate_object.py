@@ -225,7 +225,9 @@ def move_away(config: Config, folder: Path) -> Path | None:
         for path in logs:
             path.rename(beside / path.name)
     except OSError as error:
-        raise DataError(f"can't move the touches in {folder} to {beside}: {error}; move them yourself") from error
+        raise DataError(
+            f"can't move the touches in {folder} to {beside}: {error}; move them yourself"
+        ) from error
     return beside
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from gripper_calibration.procedures import calibrate_servo as procedure
 from gripper_calibration.procedures.calibrate_servo import calibrate_servo
 from gripper_force.cli import app
 from gripper_force.cli.output.calibrate import rig_table
@@ -21,6 +22,16 @@ from gripper_hw.dynamixel.virtual import VirtualBus, find_bus
 from gripper_hw.sim.scene import draw_scene
 
 QUICK = ["object=block", "sim.detail=coarse", "seed=7"]
+
+MADE_UP = LoadCellCalibration(
+    date=datetime(2026, 1, 2, tzinfo=UTC),
+    sensor="simulated",
+    tare_raw=CalibratedValue(value=0.0),
+    n_per_raw=CalibratedValue(value=2.0, low=1.9, high=2.1),
+    force_n=(0.0, 10.0),
+    noise_n=0.01,
+    drift_n_min=CalibratedValue(value=0.0),
+)
 
 
 def config_of(*overrides: str) -> Config:
@@ -129,21 +140,35 @@ def test_table_shows_values_with_intervals(capsys: pytest.CaptureFixture[str]) -
 
 def test_profile_with_another_load_cell_scale_is_refused(tmp_path: Path) -> None:
     rig = tmp_path / "rig.yaml"
-    cell = LoadCellCalibration(
-        date=datetime(2026, 1, 2, tzinfo=UTC),
-        sensor="simulated",
-        tare_raw=CalibratedValue(value=0.0),
-        n_per_raw=CalibratedValue(value=2.0, low=1.9, high=2.1),
-        force_n=(0.0, 10.0),
-        noise_n=0.01,
-        drift_n_min=CalibratedValue(value=0.0),
-    )
-    update_rig(rig, cell)
+    update_rig(rig, MADE_UP)
     with pytest.raises(
         ConfigError,
         match=r".* has [\d.]+ N per raw unit for this load cell, but load_cell\.n_per_raw is None",
     ):
         calibrate_servo(config_of(), [0.03], rig, prompt=lambda text: None)
+
+
+def test_rig_profile_in_the_configuration_is_written_though_it_does_not_exist(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[Config, Path]] = []
+
+    def noted(config: Config, _gauges_m: list[float], rig: Path, **_more: Any) -> None:
+        asked.append((config, rig))
+        raise DataError("noted")
+
+    monkeypatch.setattr(procedure, "calibrate_servo", noted)
+    named, other = tmp_path / "named.yaml", tmp_path / "other.yaml"
+    arguments = ["calibrate", "servo", "--gauge-mm", "30", "--yes", "--set", f"calibration.rig={named}"]
+    for more in ([], ["--rig", str(named)]):
+        assert str(CliRunner().invoke(app, [*arguments, *more]).exception) == "noted"
+    assert [(config.calibration.rig, rig) for config, rig in asked] == [(None, named)] * 2
+    end = CliRunner().invoke(app, [*arguments, "--rig", str(other)])
+    assert isinstance(end.exception, ConfigError)
+    assert str(named) in str(end.exception)
+    update_rig(named, MADE_UP)
+    CliRunner().invoke(app, [*arguments, "--rig", str(other)])
+    assert (asked[-1][0].calibration.rig, asked[-1][1]) == (named, other)
 
 
 def test_without_a_terminal_the_command_is_refused(tmp_path: Path) -> None:
