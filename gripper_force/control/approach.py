@@ -55,7 +55,7 @@ _BACK_OFF_SPARE_S = 0.5
 they close again: jaws that already touched an object then travel to it."""
 
 
-class Progress(Enum):
+class ApproachState(Enum):
     """Result of one cycle of an approach."""
 
     CLOSING = auto()
@@ -120,7 +120,7 @@ class Approach:
 
     def step(
         self, dt_s: float, width_m: float, closing_m_s: float, measured_n: float, estimate: FusedForce
-    ) -> Progress:
+    ) -> ApproachState:
         """Runs one cycle: sets `motor_force_n`, and returns how far the approach is.
 
         Args:
@@ -137,33 +137,33 @@ class Approach:
         self._drive(dt_s, closing_m_s, estimate)
         self._has_moved |= closing_m_s > _SLOWED_SHARE * self.speed_m_s
         if width_m < self._config.min_object_width_m:
-            return Progress.CLOSED
+            return ApproachState.CLOSED
         has_travelled = self._start_m - width_m > _TRAVEL_M
         is_contact = has_travelled and self._detects_contact(closing_m_s, estimate)
         self._contact_s = self._contact_s + dt_s if is_contact else 0.0
         if self._contact_s >= _DEBOUNCE_S:
-            return Progress.CONTACT
+            return ApproachState.CONTACT
         stands = self._at_limit and closing_m_s < _STALLED_SHARE * self.speed_m_s
         self._stuck_s = self._stuck_s + dt_s if stands and not has_travelled else 0.0
         if self._stuck_s < _STUCK_S:
-            return Progress.CLOSING
+            return ApproachState.CLOSING
         if self._has_backed_off:
-            return Progress.STUCK
+            return ApproachState.STUCK
         self._has_backed_off = self.is_backing_off = True
         self._begin(width_m)
-        return Progress.BACKING_OFF
+        return ApproachState.BACKING_OFF
 
-    def _step_back(self, width_m: float) -> Progress:
+    def _step_back(self, width_m: float) -> ApproachState:
         self.motor_force_n = self._config.approach_force_n + self._transmission.friction_n
         opened_m = width_m - self._start_m
         is_late = self._time_s > _BACK_OFF_SPARE_S + 0.5 * _BACK_OFF_M / self.speed_m_s
         if opened_m < 0.9 * _BACK_OFF_M and not is_late:
-            return Progress.BACKING_OFF
+            return ApproachState.BACKING_OFF
         self.is_backing_off = False
         if opened_m < _TRAVEL_M:
-            return Progress.STUCK
+            return ApproachState.STUCK
         self._begin(width_m)
-        return Progress.CLOSING
+        return ApproachState.CLOSING
 
     @property
     def back_off_width_m(self) -> float:

@@ -4,7 +4,7 @@ import dataclasses
 from dataclasses import dataclass
 
 from gripper_force.config import ControlConfig
-from gripper_force.control.approach import ACCELERATION_S, Approach, Progress
+from gripper_force.control.approach import ACCELERATION_S, Approach, ApproachState
 from gripper_force.control.force_loop import ForceLoop, Margin, tolerance_n
 from gripper_force.control.fusion import Fusion
 from gripper_force.control.limits import Limits, largest_target_n
@@ -390,14 +390,14 @@ class GraspController:
         )
         self._motor_force_n = self._approach.motor_force_n
         match progress:
-            case Progress.BACKING_OFF:
+            case ApproachState.BACKING_OFF:
                 self._goal_width_m = min(self._approach.back_off_width_m, self._transmission.open_width_m)
-            case Progress.CONTACT:
+            case ApproachState.CONTACT:
                 self._fusion.reset_variance()
                 self._enter(Phase.CONTACT, f"contact at {width_m * 1e3:.1f} mm")
-            case Progress.CLOSED:
+            case ApproachState.CLOSED:
                 self._end_approach(Outcome.NO_OBJECT, "closed without contact")
-            case Progress.STUCK:
+            case ApproachState.STUCK:
                 self._end_approach(
                     Outcome.STUCK,
                     f"the jaws do not move at {width_m * 1e3:.1f} mm; check for an obstacle, and that "

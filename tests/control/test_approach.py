@@ -1,7 +1,7 @@
 import pytest
 
 from gripper_force.config import ControlConfig
-from gripper_force.control.approach import Approach, Progress
+from gripper_force.control.approach import Approach, ApproachState
 from gripper_force.types import EstimateSource, FusedForce
 
 START_M = 0.09
@@ -20,7 +20,7 @@ def approach(transmission):
 
 def run(approach, cycles, width_m=START_M, closing_m_s=0.0, sensed=None):
     """Steps with constant readings until the progress changes. Returns it."""
-    before = Progress.BACKING_OFF if approach.is_backing_off else Progress.CLOSING
+    before = ApproachState.BACKING_OFF if approach.is_backing_off else ApproachState.CLOSING
     for _ in range(cycles):
         progress = approach.step(
             0.005, width_m, closing_m_s, approach.motor_force_n, sensed or estimate(current_n=0.5)
@@ -31,37 +31,37 @@ def run(approach, cycles, width_m=START_M, closing_m_s=0.0, sensed=None):
 
 
 def test_standstill_without_travel_backs_off_and_is_stuck(approach):
-    assert run(approach, 400) is Progress.BACKING_OFF
+    assert run(approach, 400) is ApproachState.BACKING_OFF
     assert approach.back_off_width_m == pytest.approx(START_M + 0.004)
-    assert run(approach, 400) is Progress.STUCK
+    assert run(approach, 400) is ApproachState.STUCK
 
 
 def test_standstill_after_a_back_off_is_stuck(approach):
-    assert run(approach, 400) is Progress.BACKING_OFF
-    assert run(approach, 400, START_M + 0.004) is Progress.CLOSING
-    assert run(approach, 400, START_M + 0.004) is Progress.STUCK
+    assert run(approach, 400) is ApproachState.BACKING_OFF
+    assert run(approach, 400, START_M + 0.004) is ApproachState.CLOSING
+    assert run(approach, 400, START_M + 0.004) is ApproachState.STUCK
 
 
 def test_standstill_after_travel_is_contact(approach):
-    assert run(approach, 40, START_M - 0.001, 0.025, estimate()) is Progress.CLOSING
-    assert run(approach, 40, START_M - 0.002) is Progress.CONTACT
+    assert run(approach, 40, START_M - 0.001, 0.025, estimate()) is ApproachState.CLOSING
+    assert run(approach, 40, START_M - 0.002) is ApproachState.CONTACT
 
 
 def test_contact_after_a_back_off(approach):
-    assert run(approach, 400) is Progress.BACKING_OFF
-    assert run(approach, 400, START_M + 0.004) is Progress.CLOSING
-    assert run(approach, 400, START_M) is Progress.CONTACT
+    assert run(approach, 400) is ApproachState.BACKING_OFF
+    assert run(approach, 400, START_M + 0.004) is ApproachState.CLOSING
+    assert run(approach, 400, START_M) is ApproachState.CONTACT
 
 
 def test_jaws_that_still_speed_up_are_not_in_contact(approach):
     seen = estimate(force_n=2.0, source=EstimateSource.FUSED)
-    assert run(approach, 40, START_M - 0.002, 0.01, seen) is Progress.CLOSING
-    assert run(approach, 1, START_M - 0.002, 0.025, seen) is Progress.CLOSING
-    assert run(approach, 40, START_M - 0.003, 0.01, seen) is Progress.CONTACT
+    assert run(approach, 40, START_M - 0.002, 0.01, seen) is ApproachState.CLOSING
+    assert run(approach, 1, START_M - 0.002, 0.025, seen) is ApproachState.CLOSING
+    assert run(approach, 40, START_M - 0.003, 0.01, seen) is ApproachState.CONTACT
 
 
 def test_closed_jaws(approach):
-    assert run(approach, 1, 0.0019, 0.025, estimate()) is Progress.CLOSED
+    assert run(approach, 1, 0.0019, 0.025, estimate()) is ApproachState.CLOSED
 
 
 def test_too_much_motor_force_decays_within_a_tenth_of_a_second(transmission):
