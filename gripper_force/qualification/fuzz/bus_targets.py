@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Final
 
 from gripper_force.config import ServoConfig
-from gripper_force.qualification.fuzz.fuzzer import Target
+from gripper_force.qualification.fuzz.target import Target
 from gripper_force.types import NS_PER_MS, ServoCommand
 from gripper_hw.dynamixel.control_table import load_model
 from gripper_hw.dynamixel.packets import HEADER, STATUS, Instruction, Parser, crc16, frame, status

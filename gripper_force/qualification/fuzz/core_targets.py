@@ -46,7 +46,7 @@ from gripper_force.profiles.rig_profile import (
     RigProfile,
     ServoCalibration,
 )
-from gripper_force.qualification.fuzz.fuzzer import Target
+from gripper_force.qualification.fuzz.target import Target
 from gripper_force.runtime.log import LogReader, LogWriter
 from gripper_force.runtime.resolve import make_controller
 from gripper_force.schema import dump

@@ -22,6 +22,8 @@ from typing import Any, Final, TypedDict
 
 from gripper_force.errors import ConfigError, GripperError
 from gripper_force.interfaces import Progress, no_progress
+from gripper_force.qualification.fuzz import bus_targets, core_targets, load_cell_targets
+from gripper_force.qualification.fuzz.target import Target
 from gripper_force.types import NS_PER_S
 
 HANG_S: Final = 30.0
@@ -61,27 +63,6 @@ _WORDS: Final = (
     *(b"null", b"true", b"2001-99-99", b"\xd9\xa3", b"\xf0\x9f\xa6\xbe", b"[" * 2000, b"x" * 300),
 )
 _DIGITS: Final = re.compile(rb"[+-]?\d+(?:\.\d*)?")
-
-
-@dataclass(frozen=True)
-class Target:
-    """One reader of input.
-
-    Attributes:
-        name: Name in reports and in ``--only``.
-        examples: Returns valid inputs to damage, the same in every process.
-        feed: Reads an input. The path is a scratch file for readers of files.
-        weight: Share of the inputs, relative to other targets.
-        words: Byte strings with a meaning in this format.
-        repair: Makes a damaged input pass its checksums; applied to half of the inputs.
-    """
-
-    name: str
-    examples: Callable[[], Sequence[bytes]]
-    feed: Callable[[bytes, Path], object]
-    weight: float = 1.0
-    words: tuple[bytes, ...] = ()
-    repair: Callable[[bytes], bytes] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,8 +113,6 @@ class FuzzReport(TypedDict):
 
 def all_targets() -> list[Target]:
     """All targets of the project."""
-    from gripper_force.qualification.fuzz import bus_targets, core_targets, load_cell_targets
-
     return [*core_targets.TARGETS, *bus_targets.TARGETS, *load_cell_targets.TARGETS]
 
 

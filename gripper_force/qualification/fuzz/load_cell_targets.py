@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from gripper_force.qualification.fuzz.fuzzer import Target
+from gripper_force.qualification.fuzz.target import Target
 from gripper_force.types import NS_PER_MS
 from gripper_hw.load_cells.line_formats import MAX_LINE_BYTES, PARSERS, LineSplitter, Reading
 from gripper_hw.load_cells.screening import SampleValidator

@@ -34,7 +34,7 @@ from gripper_force.qualification.loop_margin.gain_margin import (
 )
 from gripper_force.qualification.loop_margin.grid import FULL, Field, Grid, Margins, Trial, Trials, Verdict
 from gripper_force.qualification.loop_margin.maps import draw_margins, draw_verdicts
-from gripper_force.qualification.numerics.suite import NumericalCase
+from gripper_force.qualification.numerics.numerical_case import NumericalCase
 from gripper_force.types import NS_PER_S, EstimateSource, Outcome, Request, RequestKind
 
 _TARGET_N: Final = 4.0

@@ -22,7 +22,7 @@ from gripper_force.control.fusion import Fusion
 from gripper_force.control.state_machine import GraspController
 from gripper_force.control.transmission import Transmission
 from gripper_force.qualification.loop_margin.analytic_plant import CYCLE_NS, transmission_of
-from gripper_force.qualification.numerics.suite import NumericalCase
+from gripper_force.qualification.numerics.numerical_case import NumericalCase
 from gripper_force.types import NS_PER_MS, NS_PER_S, Request, RequestKind, ServoState, VisualForce
 
 CYCLES: Final = 1_000_000

@@ -10,7 +10,7 @@ from gripper_calibration.fits.object_fit import fit_correction
 from gripper_calibration.fits.ridge import PENALTIES, Ridge
 from gripper_calibration.fits.touches import Floats, Touches
 from gripper_force.profiles.correction import Features
-from gripper_force.qualification.numerics.suite import NumericalCase
+from gripper_force.qualification.numerics.numerical_case import NumericalCase
 
 _FRAMES: Final = 20
 _FEATURES: Final = 30

@@ -30,6 +30,7 @@ from gripper_force.qualification.numerics.adversarial_networks import (
     saved,
     scaled,
 )
+from gripper_force.qualification.numerics.numerical_case import NumericalCase
 from gripper_force.qualification.numerics.reference import (
     ENGINE_VARIANTS,
     EPS,
@@ -38,7 +39,6 @@ from gripper_force.qualification.numerics.reference import (
     Float64Result,
     ReferenceEnsemble,
 )
-from gripper_force.qualification.numerics.suite import NumericalCase
 from gripper_force.runtime.perception import FrameProcessor
 from gripper_force.types import NS_PER_MS, Frame, Gray, VisualForce
 from gripper_force.vision.checkpoint import load_checkpoint

@@ -3,38 +3,13 @@
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, TypedDict
 
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError
 from gripper_force.interfaces import Progress, no_progress
-
-
-@dataclass(frozen=True, slots=True)
-class NumericalCase:
-    """One hard case.
-
-    Attributes:
-        case: Name of the case.
-        detail: Inputs, and what the figure is compared with.
-        figure: Measured value. NaN exceeds any bound.
-        bound: Largest allowed figure; infinite if the case is informative only.
-        unit: Unit of both.
-        ok: True if the figure is within its bound.
-    """
-
-    case: str
-    detail: str
-    figure: float
-    bound: float
-    unit: str = ""
-    ok: bool = field(init=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "ok", bool(self.figure <= self.bound))
-
+from gripper_force.qualification.numerics.numerical_case import NumericalCase
 
 Part = Callable[[Config, Path | None], Iterator[NumericalCase]]
 """Yields the cases of a part, and draws its maps into a folder, if one is given."""

@@ -14,12 +14,13 @@ from typer.testing import CliRunner
 from gripper_force import cli
 from gripper_force.errors import ConfigError
 from gripper_force.qualification.fuzz import fuzzer as fuzzing
-from gripper_force.qualification.fuzz.fuzzer import Target, all_targets, fuzz, input_of, mutate
+from gripper_force.qualification.fuzz.fuzzer import all_targets, fuzz, input_of, mutate
+from gripper_force.qualification.fuzz.target import Target
 
 PLANTED = """
 import os, time, zlib
 from gripper_force.errors import DataError
-from gripper_force.qualification.fuzz.fuzzer import Target
+from gripper_force.qualification.fuzz.target import Target
 
 def read(data, path):
     path.write_bytes(data)

@@ -7,6 +7,7 @@ import torch
 from gripper_force.config import Config
 from gripper_force.jobs.dataset import Clip
 from gripper_force.qualification.numerics import network_cases as suite
+from gripper_force.qualification.numerics.numerical_case import NumericalCase
 from gripper_force.qualification.numerics.reference import (
     ENGINE_VARIANTS,
     ROUNDING,
@@ -14,7 +15,6 @@ from gripper_force.qualification.numerics.reference import (
     Float64Result,
     ReferenceEnsemble,
 )
-from gripper_force.qualification.numerics.suite import NumericalCase
 from gripper_force.vision import estimator
 from gripper_force.vision.engines import Engine, Floats, Step
 from gripper_force.vision.frame_checks import FrameChecks

@@ -10,7 +10,8 @@ from gripper_force import cli
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError
 from gripper_force.qualification.numerics import suite as numerics
-from gripper_force.qualification.numerics.suite import NumericalCase, markdown, run
+from gripper_force.qualification.numerics.numerical_case import NumericalCase
+from gripper_force.qualification.numerics.suite import markdown, run
 
 PAGE = Path(__file__).parents[3] / "docs/stability.md"
 
