@@ -147,7 +147,7 @@ def resolve_vision(config: Config) -> tuple[Config, Model | None, str]:
     if "auto" in (config.vision.checkpoint, config.vision.engine):
         from gripper_force.vision.selection import resolve_auto
 
-        vision, choice = resolve_auto(config.vision, config.budget)
+        vision, choice = resolve_auto(config.vision, config.budget, set_threads=allowed().torch_threads)
         config = config.model_copy(update={"vision": vision})
     return config, read_model(config.vision.checkpoint), "" if choice is None else str(choice)
 

@@ -19,7 +19,7 @@ from gripper_force.errors import CheckpointError, ConfigError, DataError
 from gripper_force.types import Gray
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.engines import Engine, Floats, Step, open_engine
-from gripper_force.vision.engines.pytorch import TorchEngine
+from gripper_force.vision.engines.pytorch import TorchEngine, restored_threads
 from gripper_force.vision.ensemble_step import FRAME, EnsembleStep, state_names
 from gripper_force.vision.header import EXPORTED, KEY, Header, Model, Residual, exported_metadata
 from gripper_force.vision.preprocess import Normaliser
@@ -78,7 +78,8 @@ def export(model: Model, path: Path, frames: Sequence[Gray] | None = None) -> Ex
         raise ConfigError(f"int8 is exported to OpenVINO only, not to {path}; name a file that ends in .xml")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(dir=path.parent) as folder, _quiet(), _one_thread():
+        with TemporaryDirectory(dir=path.parent) as folder, _quiet(), restored_threads():
+            torch.set_num_threads(1)  # the rounding of sums depends on the number of threads
             made = Path(folder) / path.name
             (_openvino if path.suffix == ".xml" else _onnx)(model, made, frames)
             errors = _check(model, made, frames)
@@ -265,14 +266,3 @@ def _quiet() -> Iterator[None]:
     finally:
         for name, level in levels.items():
             logging.getLogger(name).setLevel(level)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Runs PyTorch on one thread: the rounding of sums depends on the number of threads."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)

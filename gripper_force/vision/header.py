@@ -8,7 +8,7 @@ from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
-from gripper_force.errors import CheckpointError
+from gripper_force.errors import CheckpointError, ConfigError
 from gripper_force.schema import Finite, NonNegative, Positive, Section
 from gripper_force.vision.preprocess import Preprocess
 
@@ -143,6 +143,15 @@ class Model:
     path: Path
     header: Header
     digest: str
+
+
+def check_not_exported(model: Model) -> None:
+    """Raises `ConfigError` if the model's file was exported, and so only runs in another engine."""
+    if model.path.suffix in EXPORTED:
+        raise ConfigError(
+            f"{model.path} was exported for another engine; set vision.engine={EXPORTED[model.path.suffix]}, "
+            "or set vision.checkpoint to the checkpoint that it was exported from"
+        )
 
 
 def read_checkpoint(source: str | Path) -> tuple[Path, bytes, Header]:

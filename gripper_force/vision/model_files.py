@@ -13,6 +13,7 @@ from gripper_force.vision.header import (
     KEY,
     SHIPPED,
     Model,
+    check_not_exported,
     digest_of,
     header_from,
     read_checkpoint,
@@ -64,15 +65,6 @@ def exported_file(model: Model, suffix: str) -> Path:
 
         export(model, path)
     return path
-
-
-def check_not_exported(model: Model) -> None:
-    """Raises `ConfigError` if the model's file was exported, and so only runs in another engine."""
-    if model.path.suffix in EXPORTED:
-        raise ConfigError(
-            f"{model.path} was exported for another engine; set vision.engine={EXPORTED[model.path.suffix]}, "
-            "or set vision.checkpoint to the checkpoint that it was exported from"
-        )
 
 
 def cache_folder() -> Path:

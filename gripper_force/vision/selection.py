@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple, get_args
@@ -41,12 +42,15 @@ class Choice:
 
 
 @lru_cache
-def resolve_auto(vision: VisionConfig, budget: BudgetConfig) -> tuple[VisionConfig, Choice | None]:
+def resolve_auto(
+    vision: VisionConfig, budget: BudgetConfig, *, set_threads: bool = False
+) -> tuple[VisionConfig, Choice | None]:
     """Replaces ``auto`` in a configuration. Measures the candidates that this machine has not measured yet.
 
     Args:
         vision: The configuration.
         budget: Limits that the choice must keep.
+        set_threads: See `candidates`.
 
     Returns:
         The configuration without ``auto``, and the choice; None if there was no ``auto``.
@@ -56,7 +60,7 @@ def resolve_auto(vision: VisionConfig, budget: BudgetConfig) -> tuple[VisionConf
     """
     if vision.checkpoint == "none" or "auto" not in (vision.checkpoint, vision.engine):
         return vision, None
-    choice = select(candidates(vision), budget)
+    choice = select(candidates(vision, set_threads=set_threads), budget)
     keys = ("checkpoint", "engine", "precision", "threads")
     return vision.model_copy(update={key: getattr(choice.candidate, key) for key in keys}), choice
 
@@ -95,15 +99,25 @@ def pareto_front(tested: Sequence[Candidate]) -> list[Candidate]:
     return front
 
 
-def candidates(vision: VisionConfig) -> list[Candidate]:
-    """Returns all candidates for a configuration with ``auto``, from the cache or measured now."""
+def candidates(vision: VisionConfig, *, set_threads: bool = False) -> list[Candidate]:
+    """Returns all candidates for a configuration with ``auto``, from the cache or measured now.
+
+    Args:
+        vision: The configuration.
+        set_threads: Measures PyTorch with several thread counts. They are one setting of the whole process,
+            which is restored afterwards. Otherwise PyTorch is measured with the present setting only.
+    """
     known = read_cache()
     found = []
-    for setting in _settings(vision):
+    for setting in _settings(vision, set_threads):
         key = cache_key(*setting)
         if key not in known:
             model, engine, precision, threads = setting
-            p50_ms, p99_ms = step_times_ms(open_engine(model, engine, precision, threads))
+            keeps_threads = engine == "torch" and not set_threads
+            with _restored_threads(engine):
+                p50_ms, p99_ms = step_times_ms(
+                    open_engine(model, engine, precision, None if keeps_threads else threads)
+                )
             mae_n = model.header.metrics.get("mae_n", float("inf"))
             known[key] = Candidate(_name(model), engine, precision, threads, p50_ms, p99_ms, mae_n)
             if engine_version(engine):  # without a version, a measurement could outlive an update
@@ -124,7 +138,7 @@ class _Setting(NamedTuple):
     threads: int
 
 
-def _settings(vision: VisionConfig) -> Iterator[_Setting]:
+def _settings(vision: VisionConfig, set_threads: bool) -> Iterator[_Setting]:
     sources = list(SHIPPED) if vision.checkpoint == "auto" else [vision.checkpoint]
     cores = os.cpu_count() or 1
     for source in sources:
@@ -132,13 +146,33 @@ def _settings(vision: VisionConfig) -> Iterator[_Setting]:
         for engine in installed() if vision.engine == "auto" else [vision.engine]:
             if model.path.suffix in EXPORTED and engine != EXPORTED[model.path.suffix]:
                 continue
-            threads = [t for t in (1, 2, 4, 8) if t <= cores] if vision.engine == "auto" else [vision.threads]
+            if engine == "torch" and not set_threads:
+                threads = [_own_threads()]
+            else:
+                threads = (
+                    [t for t in (1, 2, 4, 8) if t <= cores] if vision.engine == "auto" else [vision.threads]
+                )
             any_precision = vision.checkpoint == "auto" and engine == "openvino"
             for precision in get_args(Precision) if any_precision else [vision.precision]:
                 if precision != "float32" and engine in ENGINES and engine != "openvino":
                     continue
                 for count in threads:
                     yield _Setting(model, engine, precision, count)
+
+
+def _own_threads() -> int:
+    """Returns PyTorch's present thread count."""
+    import torch
+
+    return torch.get_num_threads()
+
+
+def _restored_threads(engine: str) -> AbstractContextManager[object]:
+    if engine != "torch":
+        return nullcontext()
+    from gripper_force.vision.engines.pytorch import restored_threads
+
+    return restored_threads()
 
 
 def _name(model: Model) -> str:

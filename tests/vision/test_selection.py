@@ -1,13 +1,16 @@
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 from gripper_force.config import BudgetConfig, VisionConfig
 from gripper_force.errors import ConfigError
 from gripper_force.vision import selection, step_benchmark
+from gripper_force.vision.engines import Engine, open_engine
 from gripper_force.vision.header import SHIPPED
 from gripper_force.vision.model_files import read_model
 from gripper_force.vision.selection import Choice, candidates, pareto_front, resolve_auto, select
@@ -74,17 +77,43 @@ def test_config_without_auto_is_unchanged(cache: Path) -> None:
 def test_measurements_are_cached(cache: Path, tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     vision = VisionConfig(checkpoint=str(tiny_checkpoint), engine="auto")
     monkeypatch.setattr(selection, "installed", lambda: ["torch"])
-    first = candidates(vision)
+    first = candidates(vision, set_threads=True)
     assert {candidate.engine for candidate in first} == {"torch"}
     assert len({candidate.threads for candidate in first}) == len(first)
     assert cache.exists()
     monkeypatch.setattr(selection, "open_engine", None)  # a second measurement would call it
-    assert candidates(vision) == first
-    resolved, choice = resolve_auto(vision, BudgetConfig())
+    assert candidates(vision, set_threads=True) == first
+    resolved, choice = resolve_auto(vision, BudgetConfig(), set_threads=True)
     assert isinstance(choice, Choice)
     assert choice.tested == len(first)
     assert (resolved.engine, resolved.threads) == ("torch", choice.candidate.threads)
     assert str(choice).startswith("chose ")
+
+
+@pytest.mark.parametrize("set_threads", [False, True])
+def test_torch_threads_are_the_programs_own(
+    tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch, set_threads: bool
+) -> None:
+    monkeypatch.setattr(selection, "installed", lambda: ["torch"])
+    monkeypatch.setattr("os.cpu_count", lambda: 4)
+    used = []
+
+    def open_and_note(*arguments: Any) -> Engine:
+        engine = open_engine(*arguments)
+        used.append(torch.get_num_threads())
+        return engine
+
+    monkeypatch.setattr(selection, "open_engine", open_and_note)
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(3)
+        found = candidates(
+            VisionConfig(checkpoint=str(tiny_checkpoint), engine="auto"), set_threads=set_threads
+        )
+        assert torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(before)
+    assert used == [candidate.threads for candidate in found] == ([1, 2, 4] if set_threads else [3])
 
 
 def test_engine_of_another_package_is_measured_and_not_cached(
@@ -120,7 +149,7 @@ def test_precision_is_only_chosen_together_with_the_checkpoint(monkeypatch: pyte
     monkeypatch.setattr(selection, "SHIPPED", {"default": SHIPPED["default"]})
 
     def precisions(vision: VisionConfig) -> set[str]:
-        return {setting.precision for setting in selection._settings(vision)}
+        return {setting.precision for setting in selection._settings(vision, set_threads=True)}
 
     assert precisions(VisionConfig(engine="auto")) == {"float32"}
     assert precisions(AUTO) == {"float32", "bfloat16"}

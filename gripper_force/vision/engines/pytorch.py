@@ -1,13 +1,15 @@
 """PyTorch on the CPU (https://pytorch.org)."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
 import torch
 
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
 from gripper_force.vision.engines import Engine, Floats, Precision, Step
 from gripper_force.vision.ensemble_step import ATTENTION, EnsembleStep
-from gripper_force.vision.header import Model
-from gripper_force.vision.model_files import check_not_exported
+from gripper_force.vision.header import Model, check_not_exported
 
 
 class TorchEngine(Engine):
@@ -48,3 +50,13 @@ class TorchEngine(Engine):
             np.asarray(tensor.numpy(), np.float32) for tensor in outputs[:first_state]
         )
         return Step(forces_n, features, attention[0] if self._has_attention else None)
+
+
+@contextmanager
+def restored_threads() -> Iterator[None]:
+    """Restores PyTorch's thread count, a setting of the whole process, at the end."""
+    threads = torch.get_num_threads()
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
