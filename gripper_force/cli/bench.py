@@ -81,8 +81,8 @@ def estimator(
         status.update("measuring")
         rows = estimator_bench.bench(
             checkpoints or list(SHIPPED),
-            lambda model: load_clips(data, model.header.preprocess, workers=jobs, quiet=True),
-            lambda model: load_clips(scale_on, model.header.preprocess, workers=jobs, quiet=True),
+            lambda model: load_clips(data, model.header.preprocess, workers=jobs),
+            lambda model: load_clips(scale_on, model.header.preprocess, workers=jobs),
             threads or sorted({1, CORES}),
             console.line,
         )

@@ -24,10 +24,10 @@ out = Console(highlight=False)
 
 
 @contextmanager
-def bar(label: str, total: int) -> "Iterator[Progress]":
-    """Shows a progress bar on stderr and gives its `Progress` callback."""
+def bar(label: str, total: int, *, hidden: bool = False) -> "Iterator[Progress]":
+    """Shows a progress bar on stderr, unless it is hidden, and gives its `Progress` callback."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with ProgressBar(*columns, TextColumn("{task.fields[note]}"), console=err) as shown:
+    with ProgressBar(*columns, TextColumn("{task.fields[note]}"), console=err, disable=hidden) as shown:
         task = shown.add_task(label, total=total, note="")
         yield lambda text, steps=1: shown.update(task, advance=steps, note=text)
 

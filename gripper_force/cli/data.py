@@ -154,7 +154,8 @@ def import_video(
     region = load_settings(None, set_, {}).vision.region
 
     if video.is_dir():
-        summaries = job.import_folder(video, folder, region=region, align=align)
+        with console.bar("importing", len(job.find_recordings(video))) as progress:
+            summaries = job.import_folder(video, folder, region=region, align=align, progress=progress)
     elif forces is None:
         raise DataError(f"{video} needs its load-cell table; add it: import video CLIP.avi FORCES.csv")
     else:

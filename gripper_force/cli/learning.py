@@ -38,18 +38,34 @@ def train(
     as_json: AsJson = False,
 ) -> None:
     """Train the force network on logs; under `torchrun`, in several processes."""
-    from gripper_force.jobs.dataset import load_clips
+    from gripper_force.jobs.dataset import find_logs, load_clips
     from gripper_force.jobs.training.recipe import recipe as named
+    from gripper_force.jobs.training.train import PROGRESS_STEPS
     from gripper_force.jobs.training.train import train as job
     from gripper_force.vision.checkpoint import load_checkpoint
 
     settings = named(recipe, set_)
     quiet = os.environ.get("RANK", "0") != "0"  # only the first process of torchrun prints
-    clips = load_clips(data, settings.preprocess, workers=jobs, quiet=quiet)
+    logs, unseen_logs = find_logs(data), find_logs(validation) if validation else []
+    with console.bar("reading logs", len(logs) + len(unseen_logs), hidden=quiet) as progress:
+        clips = load_clips(logs, settings.preprocess, workers=jobs, progress=progress)
+        unseen = (
+            load_clips(unseen_logs, settings.preprocess, workers=jobs, progress=progress)
+            if unseen_logs
+            else None
+        )
     clips = [clip for clip in clips if clip.object not in (hold_out or [])]
-    unseen = load_clips(validation, settings.preprocess, workers=jobs, quiet=quiet) if validation else None
     start = load_checkpoint(init) if init else None
-    result = job(settings, clips, checkpoint, validation_clips=unseen, init=start, resume=resume)
+    with console.bar("training", PROGRESS_STEPS * len(settings.attentions), hidden=quiet) as progress:
+        result = job(
+            settings,
+            clips,
+            checkpoint,
+            validation_clips=unseen,
+            init=start,
+            resume=resume,
+            progress=progress,
+        )
     metrics = result.header.metrics
     if not quiet:
         console.show({"checkpoint": str(checkpoint), "digest": result.digest, **metrics}, as_json)
@@ -70,10 +86,20 @@ def evaluate(
     as_json: AsJson = False,
 ) -> None:
     """Compare a checkpoint's estimates with the load cell, over all logs of a folder."""
+    from gripper_force.jobs.dataset import find_logs
     from gripper_force.jobs.evaluate import evaluate as job
 
     settings = load_settings(None, set_, {"vision.checkpoint": checkpoint, "calibration.object": profile})
-    result = job(data, settings.vision.checkpoint, objects=only or (), config=settings, workers=jobs)
+    logs = find_logs(data)
+    with console.bar("evaluating", 2 * len(logs)) as progress:
+        result = job(
+            logs,
+            settings.vision.checkpoint,
+            objects=only or (),
+            config=settings,
+            workers=jobs,
+            progress=progress,
+        )
     console.show(result, as_json, errors_table)
 
 
@@ -94,14 +120,17 @@ def export(
     as_json: AsJson = False,
 ) -> None:
     """Export a network for another engine, and compare it with PyTorch."""
-    from gripper_force.jobs.dataset import load_clips
+    from gripper_force.jobs.dataset import find_logs, load_clips
     from gripper_force.vision.export import export as job
     from gripper_force.vision.model_files import read_model
 
     model = read_model(load_settings(None, set_, {"vision.checkpoint": checkpoint}).vision.checkpoint)
     frames = None
     if int8 is not None:
-        frames = [clip.frames for clip in load_clips(int8, model.header.preprocess, workers=jobs)]
+        logs = find_logs(int8)
+        with console.bar("reading logs", len(logs)) as progress:
+            clips = load_clips(logs, model.header.preprocess, workers=jobs, progress=progress)
+        frames = [clip.frames for clip in clips]
     with console.err.status("exporting"):
         errors = job(model, out, frames)
     console.show({"file": str(out), "digest": model.digest, "off_torch_n": errors}, as_json)

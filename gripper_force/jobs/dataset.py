@@ -4,6 +4,7 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,11 +12,10 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 import numpy.typing as npt
-from rich.console import Console
-from rich.progress import track
 
 from gripper_force.config import Config, config_from_text
 from gripper_force.errors import DataError
+from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.processes import process_pool
 from gripper_force.runtime.log import LogReader
 from gripper_force.types import NS_PER_MS, Frame, Gray, LoadCellSample, Record
@@ -58,22 +58,36 @@ class Clip:
         return self.forces_n if math.isnan(self.stiffness) else self.forces_n / np.float32(self.stiffness)
 
 
+def find_logs(source: Path | Sequence[Path]) -> list[Path]:
+    """Returns the logs of a folder, or the given logs, sorted by path.
+
+    Args:
+        source: A folder, searched for ``*.mcap``, or the logs themselves.
+
+    Raises:
+        DataError: There are no logs.
+    """
+    paths = sorted(source.rglob("*.mcap")) if isinstance(source, Path) else sorted(source)
+    if not paths:
+        raise DataError(f"no logs (*.mcap) in {source}; record, simulate or import some")
+    return paths
+
+
 def load_clips(
     source: Path | Sequence[Path],
     preprocess: "Preprocess",
     region: "Region | None" = None,
     workers: int = 1,
-    *,
-    quiet: bool = False,
+    progress: Progress = no_progress,
 ) -> list[Clip]:
-    """Reads logs in parallel processes, with a progress bar on stderr.
+    """Reads logs in parallel processes.
 
     Args:
-        source: A folder, searched for ``*.mcap``, or the logs themselves.
+        source: See `find_logs`.
         preprocess: Determines the size that frames are downscaled to.
         region: Region of interest in pixels; None for the one in each log's configuration.
         workers: Number of processes; 1 reads in this process.
-        quiet: Show no progress bar.
+        progress: Called after each log.
 
     Returns:
         One clip per log, sorted by path.
@@ -82,15 +96,15 @@ def load_clips(
         DataError: There are no logs, or a log has no frames or no labels.
         LogError: A log can't be read.
     """
-    paths = sorted(source.rglob("*.mcap")) if isinstance(source, Path) else sorted(source)
-    if not paths:
-        raise DataError(f"no logs (*.mcap) in {source}; record, simulate or import some")
+    paths = find_logs(source)
     read = partial(load_clip, preprocess=preprocess, region=region)
-    console = Console(stderr=True, quiet=quiet)
-    if workers == 1:  # starting a process takes seconds
-        return list(track(map(read, paths), "reading logs", len(paths), console=console))
-    with process_pool(workers) as pool:
-        return list(track(pool.map(read, paths), "reading logs", len(paths), console=console))
+    clips = []
+    # Starting a process takes seconds.
+    with nullcontext() if workers == 1 else process_pool(workers) as pool:
+        for clip in map(read, paths) if pool is None else pool.map(read, paths):
+            clips.append(clip)
+            progress(f"read {clip.name}")
+    return clips
 
 
 def split_by(

@@ -1,6 +1,6 @@
 """Evaluation of a checkpoint on recordings that training has not seen."""
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -9,11 +9,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
-from rich.console import Console
-from rich.progress import track
 
 from gripper_force.config import Config
 from gripper_force.errors import DataError
+from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import CONTACT_N, Clip, check_size, load_clips, stiffness_floor_n
 from gripper_force.profiles.apply import read_correction, read_profiles
@@ -79,10 +78,11 @@ def evaluate(
     objects: Collection[str] = (),
     config: Config | None = None,
     workers: int = 1,
+    progress: Progress = no_progress,
 ) -> Evaluation:
     """Compares a checkpoint's estimates with the load cell, over logs that training has not seen.
 
-    Every frame gets the estimate that a run would give. Progress is shown on stderr.
+    Every frame gets the estimate that a run would give.
 
     Example:
         >>> result = evaluate(Path("data/test"), "small")  # doctest: +SKIP
@@ -98,6 +98,7 @@ def evaluate(
         config: Its ``vision.region`` replaces the region in each log's own configuration, and its camera and
             ``calibration.on_mismatch`` apply to profiles. Default: the defaults.
         workers: Processes that read the logs.
+        progress: Called twice for each log: after reading and after evaluating it.
 
     Returns:
         The errors over all frames with a load-cell force, by object, and by measured force.
@@ -110,10 +111,11 @@ def evaluate(
     """
     config = Config() if config is None else config
     loaded = load_checkpoint(checkpoint)
-    clips = load_clips(logs, loaded.header.preprocess, config.vision.region, workers=workers)
-    clips = [clip for clip in clips if not objects or clip.object in objects]
-    if not clips:
+    clips = load_clips(logs, loaded.header.preprocess, config.vision.region, workers, progress)
+    chosen = [clip for clip in clips if not objects or clip.object in objects]
+    if not chosen:
         raise DataError(f"no log in {logs} is of {', '.join(objects)}; choose among the logs' own objects")
+    progress("", len(clips) - len(chosen))
     calibration = config.calibration
     if profile is not None:
         calibration = calibration.model_copy(update={"object": profile})
@@ -122,13 +124,14 @@ def evaluate(
         own = config.model_copy(update={"object": clip.object, "calibration": calibration})
         return read_correction(own, read_profiles(own), loaded)
 
-    return evaluate_clips(loaded, clips, None if calibration.object is None else correction)
+    return evaluate_clips(loaded, chosen, None if calibration.object is None else correction, progress)
 
 
 def evaluate_clips(
     checkpoint: Checkpoint,
     clips: Sequence[Clip],
     correction: Callable[[Clip], Correction | None] | None = None,
+    progress: Progress = no_progress,
 ) -> Evaluation:
     """Compares a checkpoint's estimates with the load cell, over clips.
 
@@ -136,23 +139,30 @@ def evaluate_clips(
         checkpoint: The ensemble, computed on a GPU if there is one; with corrections, on the CPU.
         clips: Recordings, downscaled to the checkpoint's size.
         correction: Returns the correction for a clip's object.
+        progress: Called after each clip.
 
     Raises:
         DataError: There are no clips, no labels, or frames of another size.
     """
     if correction is None:
-        means_n = [members_n.mean(0) for members_n in estimates(checkpoint, clips)]
+        means_n = [members_n.mean(0) for members_n in estimates(checkpoint, clips, progress)]
     else:
-        means_n = [_corrected_n(checkpoint, clip, correction(clip)) for clip in _with_progress(clips)]
+        means_n = []
+        for clip in clips:
+            means_n.append(_corrected_n(checkpoint, clip, correction(clip)))
+            progress(f"evaluated {clip.name}")
     return compare(clips, means_n, checkpoint.header.preprocess.lead_in)
 
 
-def estimates(checkpoint: Checkpoint, clips: Sequence[Clip]) -> list[npt.NDArray[np.float32]]:
+def estimates(
+    checkpoint: Checkpoint, clips: Sequence[Clip], progress: Progress = no_progress
+) -> list[npt.NDArray[np.float32]]:
     """Returns each member's estimate for each frame, from which any ensemble of members can be formed.
 
     Args:
         checkpoint: The networks, computed on a GPU if there is one.
         clips: Recordings, downscaled to the checkpoint's size.
+        progress: Called after each clip.
 
     Returns:
         Forces in N of each clip, (members, T).
@@ -164,7 +174,10 @@ def estimates(checkpoint: Checkpoint, clips: Sequence[Clip]) -> list[npt.NDArray
     preprocess = checkpoint.header.preprocess
     check_size(clips, preprocess)
     networks = [network.to(device) for network in checkpoint.networks]
-    forces_n = [predict(networks, preprocess, clip.frames, device) for clip in _with_progress(clips)]
+    forces_n = []
+    for clip in clips:
+        forces_n.append(predict(networks, preprocess, clip.frames, device))
+        progress(f"evaluated {clip.name}")
     for network in networks:
         network.cpu()
     return forces_n
@@ -178,10 +191,6 @@ def _corrected_n(
     forces_n, read_out = features(checkpoint.networks, preprocess, clip.frames)
     mean_n = forces_n.mean(0)
     return mean_n if correction is None else correction.force_n(mean_n, read_out).astype(np.float32)
-
-
-def _with_progress(clips: Sequence[Clip]) -> Iterable[Clip]:
-    return track(clips, "evaluating", console=Console(stderr=True))
 
 
 def ridge_baseline(train_clips: Sequence[Clip], test_clips: Sequence[Clip]) -> Evaluation:

@@ -1,5 +1,6 @@
 from collections.abc import Iterator
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -75,13 +76,19 @@ def test_estimates_equal_the_streaming_estimators(checkpoint: Checkpoint) -> Non
     assert sum(b.frames for b in result.per_bin) == result.frames
 
 
-def test_logs_are_evaluated_like_their_clips(few_logs: Path, tiny_checkpoint: Path) -> None:
+def test_logs_are_evaluated_like_their_clips(
+    few_logs: Path, tiny_checkpoint: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     checkpoint = load_checkpoint(tiny_checkpoint)
     expected = evaluate_clips(checkpoint, load_clips(few_logs, checkpoint.header.preprocess))
     assert expected.frames == 3 * 57
+    assert capsys.readouterr() == ("", "")
     for logs in (few_logs, sorted(few_logs.iterdir())):
-        result = evaluate(logs, tiny_checkpoint, objects=["disc"])
+        progress = Mock()
+        result = evaluate(logs, tiny_checkpoint, objects=["disc"], progress=progress)
         assert (result.mae_n, result.per_bin) == (expected.mae_n, expected.per_bin)
+        steps = [call.args[1] if len(call.args) > 1 else 1 for call in progress.call_args_list]
+        assert sum(steps) == 2 * len(list(few_logs.iterdir()))
     with pytest.raises(DataError, match="is of cup"):
         evaluate(few_logs, tiny_checkpoint, objects=["cup"])
 

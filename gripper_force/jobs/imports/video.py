@@ -16,11 +16,10 @@ from typing import Final
 import cv2
 import numpy as np
 import numpy.typing as npt
-from rich.console import Console
-from rich.progress import track
 
 from gripper_force.config import Config, dump_config
 from gripper_force.errors import DataError, LogError
+from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.recording.lag import force_lag_s
 from gripper_force.runtime.log import LogWriter
 from gripper_force.spikes import find_spikes
@@ -87,30 +86,32 @@ class ForceTable:
 
 
 def import_folder(
-    folder: Path, out: Path, *, region: Region | None = None, align: bool = True
+    folder: Path,
+    out: Path,
+    *,
+    region: Region | None = None,
+    align: bool = True,
+    progress: Progress = no_progress,
 ) -> list[ImportSummary]:
-    """Imports every recording of a folder into ``out/<recording>.mcap``, with a progress bar on stderr.
+    """Imports every recording of a folder into ``out/<recording>.mcap``.
 
     Args:
         folder: Folder with recordings, see above.
         out: Folder for the logs.
         region: As for `import_video`.
         align: As for `import_video`.
+        progress: Called after each recording.
 
     Raises:
         DataError: There is no recording, or one lacks its table or is not usable.
         LogError: A log exists already or can't be written.
     """
-    pairs = list(_recordings(folder))
-    if not pairs:
-        raise DataError(
-            f"{folder} holds no recordings; it needs X.avi with X.csv, or folders with one of each"
-        )
-    steps = track(pairs, "importing", console=Console(stderr=True))
-    return [
-        import_video(v, f, out / f"{name}.mcap", name=name, region=region, align=align)
-        for name, v, f in steps
-    ]
+    summaries = []
+    for name, video, forces in find_recordings(folder):
+        log = out / f"{name}.mcap"
+        summaries.append(import_video(video, forces, log, name=name, region=region, align=align))
+        progress(name)
+    return summaries
 
 
 def import_video(
@@ -310,8 +311,21 @@ def write_recording(
     return spikes
 
 
+def find_recordings(folder: Path) -> list[tuple[str, Path, Path]]:
+    """Returns name, video and table of each recording of a folder, by name.
+
+    Raises:
+        DataError: There is no recording, or one lacks its table.
+    """
+    found = list(_recordings(folder))
+    if not found:
+        raise DataError(
+            f"{folder} holds no recordings; it needs X.avi with X.csv, or folders with one of each"
+        )
+    return found
+
+
 def _recordings(folder: Path) -> Iterator[tuple[str, Path, Path]]:
-    """Yields name, video and table of each recording, by name."""
     if not folder.is_dir():
         raise DataError(f"{folder} is not a folder; check the path")
     for entry in sorted(folder.iterdir()):

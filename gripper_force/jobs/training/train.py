@@ -12,10 +12,9 @@ from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from gripper_force.errors import CheckpointError, ConfigError
+from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import Clip, check_size, digest, split_by
 from gripper_force.jobs.training.batches import Batches
@@ -27,6 +26,9 @@ from gripper_force.vision.header import RESIDUAL_HALF_N, Header, Residual
 
 STATE_EVERY_S: Final = 60.0
 """Time between two saved states: an interrupted training loses no more than this."""
+
+PROGRESS_STEPS: Final = 100
+"""Steps of progress that the training of one network reports."""
 
 RESIDUAL_PRIOR: Final = 20
 """Weight of the error over all forces, in frames, in the stated error at one force."""
@@ -40,6 +42,7 @@ def train(
     validation_clips: Sequence[Clip] | None = None,
     init: Checkpoint | None = None,
     resume: bool = False,
+    progress: Progress = no_progress,
 ) -> Checkpoint:
     """Trains an ensemble and writes its checkpoint, together with all processes that `torchrun` started.
 
@@ -54,6 +57,7 @@ def train(
             ``clips``.
         init: Checkpoint with the initial weights; None for random weights.
         resume: Continue an interrupted training from its saved states.
+        progress: Called with the training error; `PROGRESS_STEPS` for each network in total.
 
     Returns:
         The checkpoint as written.
@@ -71,7 +75,7 @@ def train(
     check_size([*training, *held_out], config.preprocess)
     states = [out.with_suffix(f".{i}.state") for i in range(len(config.attentions))]
     with joined(config.device) as ranks:
-        networks = [t.network for t in _trained(config, training, states, init, resume, ranks)]
+        networks = [t.network for t in _trained(config, training, states, init, resume, ranks, progress)]
         if ranks.first:
             forces_n, measured_n = estimates(held_out, networks, config.preprocess, ranks.device)
             header = Header(
@@ -99,6 +103,7 @@ def _trained(
     init: Checkpoint | None,
     resume: bool,
     ranks: Ranks,
+    progress: Progress,
 ) -> list[Trainer]:
     if ranks.count > config.clips:
         raise ConfigError(
@@ -115,28 +120,27 @@ def _trained(
     start = init.digest if init is not None else ""
     identity = f"{config.model_dump_json(exclude={'device', 'compile'})} {digest(clips)} {start}"
     trainers = []
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[loss]}"))
-    console = Console(stderr=True, quiet=not ranks.first)
-    with Progress(*columns, TimeRemainingColumn(), console=console) as progress:
-        for member, state in enumerate(states):
-            trainer = Trainer(config, member, batches, ranks)
-            trainers.append(trainer)
-            if init is not None:
-                trainer.load_weights(init.networks[member])
-            if resume:
-                trainer.restore(state, identity)
-            ranks.check_equal(f"{identity} {trainer.done}", "recipes, data or states")
-            task = progress.add_task(config.attentions[member], total=1.0, loss="")
-            saved = time.monotonic()
-            for rmse_n in trainer.steps():
-                progress.update(task, completed=min(1.0, trainer.done), loss=f"RMSE {rmse_n:.3f} N")
-                if ranks.first and time.monotonic() - saved > STATE_EVERY_S:
-                    trainer.save(state, identity)
-                    saved = time.monotonic()
-            progress.update(task, completed=1.0)
-            trainer.network.eval()
-            if ranks.first:
+    for member, state in enumerate(states):
+        trainer = Trainer(config, member, batches, ranks)
+        trainers.append(trainer)
+        if init is not None:
+            trainer.load_weights(init.networks[member])
+        if resume:
+            trainer.restore(state, identity)
+        ranks.check_equal(f"{identity} {trainer.done}", "recipes, data or states")
+        saved = time.monotonic()
+        reported = 0
+        for rmse_n in trainer.steps():
+            done = int(PROGRESS_STEPS * min(1.0, trainer.done))
+            progress(f"{config.attentions[member]}: RMSE {rmse_n:.3f} N", done - reported)
+            reported = done
+            if ranks.first and time.monotonic() - saved > STATE_EVERY_S:
                 trainer.save(state, identity)
+                saved = time.monotonic()
+        progress(f"{config.attentions[member]}: done", PROGRESS_STEPS - reported)
+        trainer.network.eval()
+        if ranks.first:
+            trainer.save(state, identity)
     return trainers
 
 

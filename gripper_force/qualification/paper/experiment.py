@@ -1,8 +1,6 @@
 """Trains the networks of the requested models with each seed, and estimates the test sets with each."""
 
-import contextlib
 import functools
-import io
 import json
 from collections.abc import Iterable, Sequence
 from concurrent.futures import as_completed
@@ -215,17 +213,11 @@ def _train(scale: Scale, net: str, seed: int, data: Path, out: Path, workers: in
     if not torch.cuda.is_available():
         torch.set_num_threads(1)
     path = checkpoint_path(out, net, seed)
-    with _quiet():
-        training, testing = (_cached_clips(data, side, scale, workers) for side in ("train", "test"))
-        checkpoint = load_checkpoint(str(path)) if path.exists() else None
-        checkpoint = checkpoint or train(scale.recipe(net, seed), training, path, resume=True)
-        forces_n = estimates(checkpoint, testing)
+    training, testing = (_cached_clips(data, side, scale, workers) for side in ("train", "test"))
+    checkpoint = load_checkpoint(str(path)) if path.exists() else None
+    checkpoint = checkpoint or train(scale.recipe(net, seed), training, path, resume=True)
+    forces_n = estimates(checkpoint, testing)
     labelled = [force_n[0, _labelled(scale, clip)] for force_n, clip in zip(forces_n, testing, strict=True)]
     unfinished = path.with_suffix(".part.npy")
     np.save(unfinished, np.concatenate(labelled).astype(np.float64), allow_pickle=False)
     unfinished.rename(_estimates_path(out, net, seed))
-
-
-def _quiet() -> contextlib.redirect_stderr[io.StringIO]:
-    """Context that hides the progress bars of a worker process."""
-    return contextlib.redirect_stderr(io.StringIO())
