@@ -1,5 +1,6 @@
 """Calibration of a servo: torque, friction and jaw geometry, with the load cell's body as a gauge."""
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,11 +13,11 @@ import numpy as np
 from gripper_calibration.fits.servo_fit import FreePass, Nominal, ServoFit, ServoPress, fit_servo
 from gripper_calibration.plots.servo_plot import draw
 from gripper_force.config import Config
-from gripper_force.control.limits import largest_target_n
+from gripper_force.control.limits import Limits, largest_target_n
 from gripper_force.control.safety import Safety
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import ConfigError, DataError, DeviceError
-from gripper_force.interfaces import Devices, Progress, Prompt, no_progress
+from gripper_force.interfaces import Devices, LoadCell, Progress, Prompt, no_progress
 from gripper_force.profiles.rig_profile import (
     CalibratedValue,
     RigProfile,
@@ -41,6 +42,14 @@ _APPROACH_M_S: Final = 0.008
 _CONTACT_N: Final = 0.5
 _NO_CONTACT_N: Final = 0.2
 _REST_S: Final = 0.5
+_TARE_SAMPLES: Final = 5
+_MAX_TARE_S: Final = 3.0
+_OVERSHOOT_SHARE: Final = 0.05
+"""The first press is so slow that the force rises by at most this share until a sample shows it."""
+_PLAUSIBLE_RATIO: Final = 1.4
+"""Largest ratio between the measured and the expected torque constant, either way; see gripper.gain_bound."""
+_LEAST_SHARE: Final = 0.7
+"""Least share of the peak force that a press at the current ceiling must reach."""
 _MAX_TARE_N: Final = 1.0
 _CLEARANCE_M: Final = 0.005
 _BRAKE_RAD: Final = 0.3
@@ -49,7 +58,10 @@ _SPEED_UP_S: Final = 0.1
 _START_FACTOR: Final = 1.6
 _MIN_SPEED_RAD_S: Final = 0.15
 _MAX_PASS_S: Final = 4.0
-_SILENT_NS: Final = NS_PER_S
+_FIRST_SAMPLE_NS: Final = 5 * NS_PER_S
+"""Longest wait for the first sample: boards that reset when their port is opened are silent for 1.6 s."""
+_SILENT_NS: Final = 3 * NS_PER_S // 2
+"""Longest silence during a motion. At 10 samples/s, a sample waits 0.3 s for those that show if it is a spike."""
 _BEYOND_RAD: Final = 1.0
 """Distance of the goal beyond the contact, so that only the current limits the force."""
 
@@ -129,6 +141,7 @@ def calibrate_servo(
         presses += new_presses
         passes += new_passes
     fit = fit_servo(presses, passes, given)
+    _check_plausible(fit, config)
     found = _section(fit, config)
     update_rig(rig, found)
     report = rig.with_name(f"{rig.stem}-servo.png")
@@ -145,6 +158,19 @@ def calibrate_servo(
         rig=rig,
         report=report,
     )
+
+
+def _check_plausible(fit: ServoFit, config: Config) -> None:
+    """Raises `DataError` if the torque constant is far from the expected one: the load cell may be mis-scaled."""
+    expected, found = config.gripper.nm_per_a, fit.nm_per_a.value
+    assert expected is not None
+    if not 1 / _PLAUSIBLE_RATIO < found / expected < _PLAUSIBLE_RATIO:
+        raise DataError(
+            f"the presses give a torque constant of {found:.3g} Nm/A, {found / expected:.2f} times the expected "
+            f"{expected:.3g}: calibrate the load cell with weights again (load_cell.n_per_raw), and check "
+            "servo.model and gripper.pinion_radius_m; if the gripper is really so, set gripper.nm_per_a to "
+            f"{found:.3g} and start again"
+        )
 
 
 def _scale_share(known: RigProfile, config: Config, rig: Path) -> float:
@@ -206,7 +232,7 @@ def measure(
             jaws.step_name = f"{1e3 * gauge_m:g} mm, press {number} of {len(PRESSES)}"
             if number > 1:
                 jaws.close_on_gauge(gauge_m)
-            presses.append(jaws.press(gauge_m, rate_n_s, share * peak_n))
+            presses.append(jaws.press(gauge_m, contact_rad, rate_n_s, share, peak_n))
             jaws.back_off(contact_rad)
         jaws.step_name = f"{1e3 * gauge_m:g} mm, free travel"
         friction_a = float(np.median([_friction_a(press) for press in presses]))
@@ -230,11 +256,31 @@ def _torque_on(config: Config, devices: Devices, progress: Progress) -> Iterator
     """Gives jaws under torque, and turns torque off at every end."""
     assert devices.load_cell is not None
     devices.load_cell.start()
+    _wait_for_sample(devices)
     state = devices.servo.start()  # if this raises, it has turned torque off itself
     try:
         yield _Jaws(config, devices, state, progress)
     finally:
         devices.servo.stop(hold=False)
+
+
+def _wait_for_sample(devices: Devices) -> None:
+    """Returns once the load cell has given a valid sample."""
+    cell, clock = devices.load_cell, devices.clock
+    assert cell is not None
+    begin_ns = clock.now_ns()
+    while not any(sample.valid for sample in cell.drain()):
+        if clock.now_ns() - begin_ns > _FIRST_SAMPLE_NS:
+            raise DataError(
+                f"the load cell has given no valid sample for {_FIRST_SAMPLE_NS / NS_PER_S:g} s "
+                f"(rejected: {_rejected(cell)}); check its wiring, calibrate it first with "
+                "`calibrate load-cell`, and run `gripper-force doctor`"
+            )
+        clock.sleep_until_ns(clock.now_ns() + round(NS_PER_S / _RATE_HZ))
+
+
+def _rejected(cell: LoadCell) -> str:
+    return ", ".join(f"{n} {name}" for name, n in cell.counts().items() if n) or "none"
 
 
 class _Jaws:
@@ -250,6 +296,11 @@ class _Jaws:
             gripper, gripper.nm_per_a or 0.0, gripper.current_step_a or 0.0
         )
         self._safety = Safety(config.control)
+        # Whatever the load cell reads, the motor cannot exceed the force limit.
+        limits = Limits(config.control, self._nominal, config.servo.current_limit_a)
+        self._ceiling_a = limits.ceiling_a(math.inf)
+        self._full_a: float | None = None  # current at the peak of the first press
+        self._max_age_s = 0.0  # of the newest force sample
         self._period_ns = round(NS_PER_S / _RATE_HZ)
         self._due_ns = devices.clock.now_ns()
         self._sample_ns = self._due_ns
@@ -286,13 +337,12 @@ class _Jaws:
                 f"stopped in {self.step_name}: {self._safety.reason}; remove the cause and start again"
             )
         if state.t_ns - self._sample_ns > _SILENT_NS:
-            counts = ", ".join(f"{n} {name}" for name, n in self._cell.counts().items() if n)
             raise DeviceError(
                 f"the load cell has given no valid sample for {_SILENT_NS / NS_PER_S:g} s in "
-                f"{self.step_name} (rejected: {counts or 'none'}); check its wiring, calibrate it first, and "
+                f"{self.step_name} (rejected: {_rejected(self._cell)}); check its wiring, calibrate it first, and "
                 "run `gripper-force doctor`"
             )
-        self._goal_a = min(max(current_a, 0.0), self._config.servo.current_limit_a)
+        self._goal_a = min(max(current_a, 0.0), self._ceiling_a)
         devices.servo.write(ServoCommand(self._due_ns, self._sign * goal_rad, self._goal_a))
         if state.t_ns - self._reported_ns > NS_PER_S // 5:
             self._reported_ns = state.t_ns
@@ -306,12 +356,16 @@ class _Jaws:
         """Takes the load cell's reading at rest as zero force."""
         goal_rad = self.closing_rad
         mark = len(self._forces)
-        for _ in range(round(_REST_S * _RATE_HZ)):
+        for i in range(round(_MAX_TARE_S * _RATE_HZ)):
             self.cycle(goal_rad, self._moving_current_a())
+            self._max_age_s = max(self._max_age_s, (self.state.t_ns - self._sample_ns) / NS_PER_S)
+            if i > _REST_S * _RATE_HZ and len(self._forces) >= mark + _TARE_SAMPLES:
+                break
         rest_n = np.array([force for _, force in self._forces[mark:]])
-        if len(rest_n) < 3:
+        if len(rest_n) < _TARE_SAMPLES:
             raise DataError(
-                "the load cell gives no valid sample at rest; calibrate it first with `calibrate load-cell`"
+                f"the load cell gave {len(rest_n)} valid samples in {_MAX_TARE_S:g} s at rest; it needs "
+                f"{_TARE_SAMPLES}: check its wiring and its rate, and run `gripper-force doctor`"
             )
         self._tare_n = float(np.mean(rest_n))
         if abs(self._tare_n) > _MAX_TARE_N:
@@ -342,26 +396,37 @@ class _Jaws:
             )
         return self.closing_rad
 
-    def press(self, gauge_m: float, rate_n_s: float, peak_n: float) -> ServoPress:
-        """Raises the current until the peak force is measured, then lowers it until the force is gone."""
+    def press(
+        self, gauge_m: float, contact_rad: float, rate_n_s: float, share: float, full_n: float
+    ) -> ServoPress:
+        """Raises the current up to a share of the full force, then lowers it until the force is gone.
+
+        The first press ends at the measured force. Later ones also end at the current of the first, because
+        the samples of a slow load cell come too late to end a fast press.
+        """
+        peak_n = share * full_n
+        if self._full_a is None and self._max_age_s > 0:
+            rate_n_s = min(rate_n_s, _OVERSHOOT_SHARE * peak_n / self._max_age_s)
+        last_a = math.inf if self._full_a is None else share * self._full_a
         step_a = abs(self._nominal.current_a(rate_n_s)) / _RATE_HZ
         max_a = 1.5 * abs(self._nominal.current_a(peak_n + self._nominal.friction_n))
         current_a = abs(self.state.current_a)
         for _ in range(round(_REST_S * _RATE_HZ)):  # lets the force of the impact fade
             self.cycle(self.closing_rad + _BEYOND_RAD, current_a)
         first, mark = len(self._states), len(self._forces)
-        while self.force_n < peak_n:
-            if current_a > min(max_a, self._config.servo.current_limit_a):
-                raise DataError(
-                    f"{current_a:.2f} A give {self.force_n:.1f} N instead of {peak_n:.1f} N; check that the load "
-                    "cell lies in the path of the force, its scale, and servo.current_limit_a"
-                )
+        while self.force_n < peak_n and current_a < last_a:
+            if current_a > min(max_a, self._ceiling_a):
+                break
             current_a += step_a
             self.cycle(self.closing_rad + _BEYOND_RAD, current_a)
+        if self._full_a is None:
+            self._wait_for_force(peak_n, current_a)
+            self._full_a = current_a / share
         turn = len(self._states) - first
         while self.force_n > _NO_CONTACT_N and current_a > -max_a:
             current_a -= step_a
-            self.cycle(self.closing_rad + np.sign(current_a) * _BEYOND_RAD, abs(current_a))
+            goal_rad = self.closing_rad + _BEYOND_RAD if current_a > 0 else self._clear_of(contact_rad)
+            self.cycle(goal_rad, abs(current_a))
         states, forces = self._states[first:], self._forces[mark:]
         t_ns = np.array([state.t_ns for state in states])
         if len(forces) < 2:
@@ -378,9 +443,24 @@ class _Jaws:
             turn=turn,
         )
 
+    def _wait_for_force(self, peak_n: float, current_a: float) -> None:
+        """Raises `DataError` if the current gives much less than the peak force, by samples as new as the current."""
+        for _ in range(round(self._max_age_s * _RATE_HZ)):
+            if self.force_n >= peak_n:
+                return
+            self.cycle(self.closing_rad + _BEYOND_RAD, current_a)
+        if self.force_n < _LEAST_SHARE * peak_n:
+            raise DataError(
+                f"{current_a:.2f} A give {self.force_n:.1f} N instead of {peak_n:.1f} N; check that the load "
+                "cell lies in the path of the force, its scale, and servo.current_limit_a"
+            )
+
     def back_off(self, contact_rad: float) -> None:
         """Moves away from the gauge."""
-        self._move_to(contact_rad - 2 * _CLEARANCE_M / self._nominal.pinion_radius_m)
+        self._move_to(self._clear_of(contact_rad))
+
+    def _clear_of(self, contact_rad: float) -> float:
+        return contact_rad - 2 * _CLEARANCE_M / self._nominal.pinion_radius_m
 
     def travel(self, friction_a: float, speed_m_s: float, contact_rad: float) -> list[FreePass]:
         """Opens and closes under a constant current. A pass in which the jaws stick is left out."""

@@ -31,11 +31,11 @@ def _frames() -> list[bytes]:
 
 
 def _read_lines(parse: Callable[[bytes], Reading | None], data: bytes, _path: Path) -> None:
-    splitter, validator = LineSplitter(), SampleValidator(100.0, -1e-3, noisy=True)
+    splitter, validator = LineSplitter(), SampleValidator(100.0, -1e-3)
     for t_ns, at in enumerate(range(0, len(data), _PIECE)):
         for line in splitter.feed(data[at : at + _PIECE]):
             if (reading := parse(line)) is not None:
-                validator.add(t_ns * NS_PER_MS, reading.raw, saturated=reading.saturated)
+                validator.add(t_ns * NS_PER_MS, *reading)
         validator.take(t_ns * NS_PER_MS)
     assert len(splitter._partial) <= MAX_LINE_BYTES + _PIECE
 
@@ -45,7 +45,7 @@ def _readings() -> list[bytes]:
 
 
 def _validate(data: bytes, _path: Path) -> None:
-    validator = SampleValidator(0.5, 2.0, noisy=True)
+    validator = SampleValidator(0.5, 2.0)
     taken = 0
     complete = data[: len(data) // _SAMPLE.size * _SAMPLE.size]
     for raw, t_ns in _SAMPLE.iter_unpack(complete):

@@ -12,7 +12,9 @@ HX711_MIN: Final = -0x800000
 HX711_MAX: Final = 0x7FFFFF
 """Limits of the 24-bit converter; it gives one of these two if its input is out of range."""
 
-_HX711: Final = re.compile(rb"\s*(?:\d+,)?([+-]?\d{1,8})\s*")
+_HX711: Final = re.compile(
+    rb"\s*(?:\d+,|[A-Za-z][A-Za-z ]*[:= ])?\s*([+-]?\d{1,8})(\.\d*)?\s*(?:[A-Za-z]{1,3})?\s*"
+)
 _CAS: Final = re.compile(rb"(?:(ST|US|OL),(?:GS|NT),(?:..,)?)?(.{8})(?: ?(kg|g | g))?", re.DOTALL)
 _CAS_LENGTHS: Final = frozenset({8, 16, 20})
 _DECIMAL: Final = re.compile(rb" *([+-]?) *(\d+\.?\d*|\.\d+) *")
@@ -25,22 +27,32 @@ class Reading(NamedTuple):
     Attributes:
         raw: The reading in the sensor's unit; NaN if the line has no number.
         saturated: True if the sensor reports that it is beyond its range.
+        rounded: True if the reading is rounded, so that it may stay the same at rest. Counts of a converter
+            always vary.
     """
 
     raw: float
     saturated: bool = False
+    rounded: bool = False
 
 
 def parse_hx711(line: bytes) -> Reading | None:
-    """Parses ``<raw>`` or ``<micros>,<raw>`` in counts, as boards with an HX711 converter send them.
+    """Parses a line of a board with an HX711 converter.
 
-    See https://cdn.sparkfun.com/datasheets/Sensors/ForceFlex/hx711_english.pdf for the counts.
+    It is ``<raw>`` or ``<micros>,<raw>`` in counts, or a value that the board has scaled, such as ``12.34``,
+    with or without a name before it and a unit behind it: ``Weight: 12.34 g``. The unit is not converted:
+    `load_cell.n_per_raw` is newtons per unit of the value. See
+    https://cdn.sparkfun.com/datasheets/Sensors/ForceFlex/hx711_english.pdf for the counts.
 
     Returns:
         The reading, or None if the line is not valid.
     """
     found = _HX711.fullmatch(line)
-    if found is None or not HX711_MIN <= (raw := int(found[1])) <= HX711_MAX:
+    if found is None:
+        return None
+    if found[2] is not None:
+        return Reading(float(found[1] + found[2]), rounded=True)
+    if not HX711_MIN <= (raw := int(found[1])) <= HX711_MAX:
         return None
     return Reading(float(raw), saturated=raw in (HX711_MIN, HX711_MAX))
 
@@ -61,9 +73,9 @@ def parse_cas(line: bytes) -> Reading | None:
     state, data, unit = found.groups()
     number = _DECIMAL.fullmatch(data)
     if number is None:
-        return Reading(math.nan, saturated=True) if state == b"OL" else None
+        return Reading(math.nan, saturated=True, rounded=True) if state == b"OL" else None
     raw = float(number[1] + number[2]) * _KG[unit.strip() if unit else b"kg"]
-    return Reading(raw, saturated=state == b"OL")
+    return Reading(raw, saturated=state == b"OL", rounded=True)
 
 
 PARSERS: Final[dict[str, Callable[[bytes], Reading | None]]] = {"hx711": parse_hx711, "cas": parse_cas}

@@ -37,7 +37,7 @@ class PhidgetLoadCell(LiveLoadCell):
     """
 
     def __init__(self, config: LoadCellConfig, clock: Clock) -> None:
-        super().__init__(config, clock, unit_n=math.nan, noisy=True)
+        super().__init__(config, clock, unit_n=math.nan)
         if not MIN_RATE_HZ <= config.rate_hz <= MAX_RATE_HZ:
             raise ConfigError(
                 f"load_cell.rate_hz={config.rate_hz:g} is out of a Phidget bridge's range; "

@@ -60,13 +60,11 @@ class SampleValidator:
     Args:
         tare_raw: Reading without load.
         n_per_raw: Newtons per unit of the reading; NaN if unknown.
-        noisy: True if the readings are a converter's, which always vary. A weighing indicator rounds, so its
-            reading may stay the same.
     """
 
-    def __init__(self, tare_raw: float, n_per_raw: float, *, noisy: bool) -> None:
+    def __init__(self, tare_raw: float, n_per_raw: float) -> None:
         self.stats = LoadCellStats()
-        self._tare_raw, self._n_per_raw, self._noisy = tare_raw, n_per_raw, noisy
+        self._tare_raw, self._n_per_raw = tare_raw, n_per_raw
         self._added: deque[LoadCellSample] = deque(maxlen=_MAX_UNTAKEN)
         self._waiting: list[LoadCellSample] = []
         self._previous_n: deque[float] = deque(maxlen=HAMPEL_HALF_WINDOW)
@@ -74,8 +72,16 @@ class SampleValidator:
         self._last_ns = self._same_since_ns = self._same_count = 0
         self._rejected: deque[bool] = deque(maxlen=DOUBT_WINDOW_SAMPLES)
 
-    def add(self, t_ns: int, raw: float, *, saturated: bool = False) -> None:
-        """Adds a reading received at ``t_ns``."""
+    def add(self, t_ns: int, raw: float, saturated: bool = False, rounded: bool = False) -> None:
+        """Adds a reading received at ``t_ns``.
+
+        Args:
+            t_ns: Time of the reading.
+            raw: The reading.
+            saturated: True if the sensor reports that it is beyond its range.
+            rounded: True if the reading may stay the same, as a weighing indicator's does. A converter's
+                always varies.
+        """
         if raw != self._last_raw or t_ns - self._last_ns > MAX_WAIT_NS:
             self._same_since_ns, self._same_count = t_ns, 0
         self._same_count += 1
@@ -84,7 +90,7 @@ class SampleValidator:
         valid = False
         if saturated:
             self.stats.saturated += 1
-        elif self._noisy and self._same_count > STUCK_SAMPLES and t_ns - self._same_since_ns > STUCK_NS:
+        elif not rounded and self._same_count > STUCK_SAMPLES and t_ns - self._same_since_ns > STUCK_NS:
             self.stats.stuck += 1
         elif not math.isfinite(force_n):
             self.stats.not_finite += 1
@@ -136,13 +142,12 @@ class LiveLoadCell:
         config: The load cell section of the configuration.
         clock: The run's clock, which must be the host's.
         unit_n: Newtons per unit of the reading if ``load_cell.n_per_raw`` is not set; NaN if unknown.
-        noisy: See `SampleValidator`.
     """
 
-    def __init__(self, config: LoadCellConfig, clock: Clock, *, unit_n: float, noisy: bool) -> None:
+    def __init__(self, config: LoadCellConfig, clock: Clock, *, unit_n: float) -> None:
         self._config, self._clock = config, clock
         n_per_raw = unit_n if config.n_per_raw is None else config.n_per_raw
-        self._validator = SampleValidator(config.tare_raw, n_per_raw, noisy=noisy)
+        self._validator = SampleValidator(config.tare_raw, n_per_raw)
 
     @property
     def stats(self) -> LoadCellStats:
@@ -160,5 +165,5 @@ class LiveLoadCell:
         """Number of rejected samples and faults since construction, by cause (see `LoadCellStats`)."""
         return self._validator.counts()
 
-    def _add(self, raw: float, *, saturated: bool = False) -> None:
-        self._validator.add(self._clock.now_ns(), raw, saturated=saturated)
+    def _add(self, raw: float, saturated: bool = False, rounded: bool = False) -> None:
+        self._validator.add(self._clock.now_ns(), raw, saturated, rounded)

@@ -35,9 +35,8 @@ class SerialLoadCell(LiveLoadCell):
     """
 
     def __init__(self, config: LoadCellConfig, clock: Clock) -> None:
-        in_counts = config.format == "hx711"  # else in kg
-        unit_n = math.nan if in_counts else STANDARD_GRAVITY_M_S2
-        super().__init__(config, clock, unit_n=unit_n, noisy=in_counts)
+        in_kg = config.format == "cas"
+        super().__init__(config, clock, unit_n=STANDARD_GRAVITY_M_S2 if in_kg else math.nan)
         if config.port is None:
             raise ConfigError(
                 "load_cell.backend=serial needs load_cell.port; set it to one of /dev/serial/by-id"
@@ -89,7 +88,7 @@ class SerialLoadCell(LiveLoadCell):
                     if (reading := self._parse(line)) is None:
                         self.stats.unreadable += 1
                     else:
-                        self._add(reading.raw, saturated=reading.saturated)
+                        self._add(*reading)
         finally:
             with self._lock:
                 self._port = None

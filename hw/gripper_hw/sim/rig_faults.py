@@ -94,7 +94,7 @@ class FaultyLoadCell:
     def __init__(self, cell: LoadCell, faults: Faults, clock: Clock, seed: int) -> None:
         self._cell, self._faults, self._clock = cell, faults, clock
         self._rng = np.random.default_rng([seed, 5])
-        self._validator = SampleValidator(0.0, 1.0, noisy=True)
+        self._validator = SampleValidator(0.0, 1.0)
         self._delayed: deque[LoadCellSample] = deque()
         self._last_n = 0.0
         self._next_ns = 0

@@ -1,5 +1,6 @@
 """Servo calibration on the simulated rig, with known friction and torque."""
 
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,12 @@ from gripper_force.errors import ConfigError, DataError, DeviceError, RequestErr
 from gripper_force.jobs.grasp import run_grasp
 from gripper_force.profiles.rig_profile import CalibratedValue, LoadCellCalibration, read_rig, update_rig
 from gripper_force.runtime.log import LogReader
-from gripper_force.types import Event
+from gripper_force.types import Event, LoadCellSample
 from gripper_hw.dynamixel.control_table import load_model
 from gripper_hw.dynamixel.virtual import VirtualBus, find_bus
+from gripper_hw.load_cells.screening import SampleValidator
 from gripper_hw.sim.scene import draw_scene
+from gripper_hw.sim.simulated_rig import SimulatedLoadCell
 
 QUICK = ["object=block", "sim.detail=coarse", "seed=7"]
 
@@ -96,14 +99,14 @@ def test_profile_of_another_servo_is_refused_or_reported(rig: Path, tmp_path: Pa
         (["load_cell.backend=none"], 0.03, ConfigError, "calibrate servo needs a load cell"),
         ([], 0.09, ConfigError, "a gauge of 90 mm does not fit between jaws that open to 92 mm"),
         ([], 0.06, DataError, "the jaws met the gauge of 60 mm at a width of 30 mm"),
-        (["faults=[{unit: load_cell, kind: 'off'}]"], 0.03, DataError, "no valid sample at rest"),
-        (["faults=[{unit: load_cell, kind: wrong}]"], 0.03, DataError, "no valid sample at rest"),
+        (["faults=[{unit: load_cell, kind: 'off'}]"], 0.03, DataError, "no valid sample for 5 s"),
+        (["faults=[{unit: load_cell, kind: wrong}]"], 0.03, DataError, "no valid sample for 5 s"),
         (["gripper.closing_sign=-1"], 0.03, DataError, "the jaws closed without a force on the load cell"),
         (
             ["faults=[{unit: load_cell, kind: stuck, at_s: 1}]"],
             0.03,
             DeviceError,
-            "no valid sample for 1 s in closing on the gauge",
+            "no valid sample for 1.5 s in closing on the gauge",
         ),
         (["faults=[{unit: servo, kind: wrong, at_s: 3}]"], 0.03, DeviceError, "hardware error"),
         (["servo.current_limit_a=0.15"], 0.03, DataError, r"[\d.]+ A give [\d.]+ N instead of [\d.]+ N"),
@@ -128,6 +131,63 @@ def test_failures_are_named_and_leave_the_torque_off(
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
     assert all(bus is not None and bus.servos[0].get("torque_enable") == 0 for bus in buses)
+
+
+@pytest.fixture
+def true_force_n(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """True forces of the simulated world, one for each reading of the servo."""
+    forces_n: list[float] = []
+    drain = SimulatedLoadCell.drain
+
+    def noted(cell: SimulatedLoadCell) -> list[LoadCellSample]:
+        forces_n.append(cell._world.force_n)
+        return drain(cell)
+
+    monkeypatch.setattr(SimulatedLoadCell, "drain", noted)
+    return forces_n
+
+
+def test_slow_load_cell_that_is_silent_at_first_is_enough(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, true_force_n: list[float]
+) -> None:
+    """As of a board with an HX711 at 10 samples/s, which resets when its port is opened."""
+    noted = SimulatedLoadCell.drain
+    validators: dict[int, SampleValidator] = {}
+
+    def drain(cell: SimulatedLoadCell) -> list[LoadCellSample]:
+        validator = validators.setdefault(id(cell), SampleValidator(0.0, 1.0))
+        now_ns = cell._start_ns + cell._world.t_ns
+        for sample in noted(cell):
+            if sample.t_ns > cell._start_ns + 1_600_000_000:
+                validator.add(sample.t_ns, sample.force_n)
+        return validator.take(now_ns)
+
+    monkeypatch.setattr(SimulatedLoadCell, "drain", drain)
+    config = config_of("load_cell.rate_hz=10")
+    calibrate_servo(config, [0.03], tmp_path / "rig.yaml", prompt=lambda text: None)
+    found = read_rig(tmp_path / "rig.yaml").servo
+    assert found is not None
+    scene = draw_scene("block", config.seed, config.sim)
+    assert about(found.nm_per_a, load_model(found.model).nm_per_a * scene.nm_per_a, 0.05)
+    assert max(true_force_n) < config.control.force_limit_n
+
+
+@pytest.mark.parametrize("scale", [0.05, 0.3, 0.6])
+def test_load_cell_with_a_wrong_scale_cannot_raise_the_force_above_its_limit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, true_force_n: list[float], scale: float
+) -> None:
+    noted = SimulatedLoadCell.drain
+
+    def drain(cell: SimulatedLoadCell) -> list[LoadCellSample]:
+        return [replace(sample, force_n=scale * sample.force_n) for sample in noted(cell)]
+
+    monkeypatch.setattr(SimulatedLoadCell, "drain", drain)
+    config = config_of()
+    with pytest.raises(
+        DataError, match=r"the jaws closed without a force|A give .* N instead of|0.6\d times the expected"
+    ):
+        calibrate_servo(config, [0.03], tmp_path / "rig.yaml", prompt=lambda text: None)
+    assert max(true_force_n) < 1.05 * config.control.force_limit_n
 
 
 def test_table_shows_values_with_intervals(capsys: pytest.CaptureFixture[str]) -> None:

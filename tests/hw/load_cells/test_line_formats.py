@@ -49,7 +49,20 @@ def test_counts_are_parsed_with_and_without_board_time(raw: int, micros: int | N
     assert parse_hx711(line.encode()) == Reading(raw, saturated=raw in (HX711_MIN, HX711_MAX))
 
 
-@pytest.mark.parametrize("line", [b"", b"8388608", b"-8388609", b"1.5", b"1,2,3", b"12 34", b"ready", b"1_0"])
+def test_scaled_values_of_boards_are_parsed() -> None:
+    for line, raw in [
+        (b"12.34\r", 12.34),
+        (b"Weight: -0.50 g", -0.5),
+        (b"HX reading: 12.34", 12.34),
+        (b"Load cell = 3.1 N", 3.1),
+    ]:
+        assert parse_hx711(line) == Reading(raw, rounded=True)
+    assert parse_hx711(b"Reading: 4711") == Reading(4711.0)
+
+
+@pytest.mark.parametrize(
+    "line", [b"", b"8388608", b"-8388609", b"1,2,3", b"12 34", b"ready", b"1_0", b"1.2.3"]
+)
 def test_invalid_hx711_line_gives_no_reading(line: bytes) -> None:
     assert parse_hx711(line) is None
 
@@ -57,7 +70,7 @@ def test_invalid_hx711_line_gives_no_reading(line: bytes) -> None:
 @given(frames())
 def test_frames_of_all_three_lengths_are_parsed(frame: tuple[bytes, str, bytes]) -> None:
     line, state, number = frame
-    assert parse_cas(line) == Reading(float(number), saturated=state == "OL")
+    assert parse_cas(line) == Reading(float(number), saturated=state == "OL", rounded=True)
 
 
 @pytest.mark.parametrize(
@@ -71,7 +84,7 @@ def test_frames_of_all_three_lengths_are_parsed(frame: tuple[bytes, str, bytes])
     ],
 )
 def test_number_formats_of_indicators_are_parsed(line: bytes, raw: float) -> None:
-    assert parse_cas(line) == Reading(pytest.approx(raw))  # type: ignore[arg-type]
+    assert parse_cas(line) == Reading(pytest.approx(raw), rounded=True)  # type: ignore[arg-type]
 
 
 def test_overload_without_number_is_saturation() -> None:

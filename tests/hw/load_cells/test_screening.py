@@ -25,20 +25,25 @@ Floats = npt.NDArray[np.float64]
 
 
 def validated(
-    validator: SampleValidator, raws: npt.ArrayLike, every: int = 1, period_ns: int = PERIOD_NS
+    validator: SampleValidator,
+    raws: npt.ArrayLike,
+    every: int = 1,
+    period_ns: int = PERIOD_NS,
+    *,
+    rounded: bool = False,
 ) -> list[LoadCellSample]:
     """Adds readings, takes samples after every few of them, and takes the rest at the end."""
     t_ns, taken = START_NS, []
     for i, raw in enumerate(np.asarray(raws, np.float64)):
         t_ns += period_ns
-        validator.add(t_ns, float(raw))
+        validator.add(t_ns, float(raw), rounded=rounded)
         if i % every == 0:
             taken += validator.take(t_ns)
     return taken + validator.take(t_ns + MAX_WAIT_NS + 1)
 
 
-def calibrated(*, noisy: bool = True) -> SampleValidator:
-    return SampleValidator(0.0, 1.0, noisy=noisy)
+def calibrated() -> SampleValidator:
+    return SampleValidator(0.0, 1.0)
 
 
 raw_readings = st.floats(-1e9, 1e9) | st.sampled_from([math.nan, math.inf, -math.inf])
@@ -50,7 +55,7 @@ batches = st.integers(1, 9)
 def test_every_reading_is_returned_once_in_order_and_unchanged(
     readings: list[tuple[float, bool]], every: int, tare_raw: float, n_per_raw: float
 ) -> None:
-    validator, taken = SampleValidator(tare_raw, n_per_raw, noisy=True), []
+    validator, taken = SampleValidator(tare_raw, n_per_raw), []
     for i, (raw, saturated) in enumerate(readings):
         validator.add(i * PERIOD_NS, raw, saturated=saturated)
         if i % every == 0:
@@ -66,7 +71,7 @@ def test_every_reading_is_returned_once_in_order_and_unchanged(
 
 @given(st.lists(st.floats(0.0, 60.0), max_size=40), batches)
 def test_live_samples_are_checked_like_recorded_ones(forces_n: list[float], every: int) -> None:
-    taken = validated(calibrated(noisy=False), forces_n, every)
+    taken = validated(calibrated(), forces_n, every, rounded=True)
     expected = ~find_spikes(np.array(forces_n)) if forces_n else np.array([])
     assume((~expected.astype(bool)).sum() <= MAX_REJECTED_SHARE * DOUBT_WINDOW_SAMPLES)
     assert [s.valid for s in taken] == list(expected)
@@ -95,7 +100,7 @@ def test_smooth_forces_are_never_rejected(
     force_n: Floats, every: int, n_per_raw: float, tare_raw: float
 ) -> None:
     taken = validated(
-        SampleValidator(tare_raw, n_per_raw, noisy=False), force_n / n_per_raw + tare_raw, every
+        SampleValidator(tare_raw, n_per_raw), force_n / n_per_raw + tare_raw, every, rounded=True
     )
     assert all(s.valid for s in taken)
     assert [s.force_n for s in taken] == pytest.approx(list(force_n), abs=1e-5)
@@ -113,8 +118,8 @@ def test_only_the_spike_within_a_hold_is_rejected(index: int, height_n: float, s
 def test_a_wide_dip_below_zero_is_rejected() -> None:
     force_n = np.full(60, 2.0)
     force_n[20:28] = [-3, -20, -60, -70, -70, -50, -10, -4]
-    validator = calibrated(noisy=False)
-    invalid = [i for i, s in enumerate(validated(validator, force_n)) if not s.valid]
+    validator = calibrated()
+    invalid = [i for i, s in enumerate(validated(validator, force_n, rounded=True)) if not s.valid]
     assert invalid == list(range(20, 28))
     assert validator.stats.spikes == 8
 
@@ -155,7 +160,7 @@ def test_most_samples_among_garbage_are_rejected() -> None:
 
 
 def test_constant_reading_of_indicator_is_valid() -> None:
-    assert all(s.valid for s in validated(calibrated(noisy=False), np.full(3 * RATE_HZ, 0.135)))
+    assert all(s.valid for s in validated(calibrated(), np.full(3 * RATE_HZ, 0.135), rounded=True))
 
 
 def test_same_reading_after_gap_is_not_stuck() -> None:
@@ -174,7 +179,7 @@ def test_saturated_reading_is_kept_and_next_spike_is_detected() -> None:
 
 
 def test_without_scale_all_samples_are_invalid() -> None:
-    validator = SampleValidator(0.0, math.nan, noisy=True)
+    validator = SampleValidator(0.0, math.nan)
     taken = validated(validator, np.arange(10))
     assert [s.raw for s in taken] == list(range(10))
     assert not any(s.valid for s in taken)
