@@ -63,10 +63,41 @@ class ServoConfig(Section):
     )
 
 
-class GripperConfig(Section):
-    """Transmission from the servo to the jaws: one pinion drives two racks."""
+class LinkageConfig(Section):
+    """Geometry between the servo's horn and the jaws. Closing angles are from the open jaws."""
 
-    pinion_radius_m: Positive = Field(0.020, description="travel of one jaw per radian of the servo")
+    kind: Literal["rack", "crank_slider", "four_bar", "finger", "table"] = Field(
+        "rack",
+        description="rack: one pinion, two racks; crank_slider: two rods on one crank disc; four_bar: fingers "
+        "on the rockers; finger: one finger on the horn, against a fixed one; table: measured",
+    )
+    crank_m: Positive | None = Field(None, description="crank_slider, four_bar: length of the crank")
+    rod_m: Positive | None = Field(None, description="crank_slider, four_bar: length of the rod or coupler")
+    offset_m: Finite = Field(0.0, description="crank_slider: distance of the rail from the crank's axis")
+    rocker_m: Positive | None = Field(None, description="four_bar: length of the rocker")
+    base_m: Positive | None = Field(None, description="four_bar: distance between the two fixed pivots")
+    finger_m: Positive | None = Field(
+        None, description="four_bar, finger: distance from the finger's pivot to its tip"
+    )
+    open_crank_rad: Finite = Field(
+        0.0,
+        description="crank angle with open jaws; crank_slider: from the perpendicular of the rail, four_bar: "
+        "from the base line",
+    )
+    open_finger_rad: Finite = Field(
+        0.0,
+        description="four_bar, finger: angle of the open finger from the direction in which it points closed",
+    )
+    table: tuple[tuple[Finite, Finite], ...] = Field(
+        (), description="table: rows of closing angle (rad) and width (m), from the open jaws on"
+    )
+
+
+class GripperConfig(Section):
+    """Transmission from the servo to the jaws."""
+
+    linkage: LinkageConfig = Field(LinkageConfig(), description="geometry; see docs/grippers.md")
+    pinion_radius_m: Positive = Field(0.020, description="rack: travel of one jaw per radian of the servo")
     closing_sign: Literal[-1, 1] = Field(1, description="-1 if a falling servo position closes the jaws")
     open_position_rad: Finite = Field(0.0, description="servo angle with open jaws")
     open_width_m: Positive = Field(0.092, description="distance between the open jaws")

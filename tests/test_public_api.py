@@ -155,7 +155,7 @@ def test_the_code_that_an_embedding_program_reaches_is_small() -> None:
 
     simulated = {name for name in reached if name.startswith(SIMULATED)}
     assert len(simulated) > len(SIMULATED)
-    assert 6_000 < sum(map(_lines, reached - simulated)) <= 11_500
+    assert 6_000 < sum(map(_lines, reached - simulated)) <= 12_000
     assert sum(map(_lines, simulated)) <= 2_600
 
 

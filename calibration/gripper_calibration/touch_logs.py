@@ -194,7 +194,9 @@ def _presses(records: _RecordCollector, config: Config) -> tuple[list[PressSerie
     for begin, end in zip(edges[::2], edges[1::2], strict=True):
         states = records.states[begin:end]
         t_s = np.array([state.t_ns for state in states]) / NS_PER_S
-        motor_force_n = np.array([transmission.force_n(state.current_a) for state in states])
+        motor_force_n = np.array(
+            [transmission.force_n(state.current_a, state.position_rad) for state in states]
+        )
         widths_m.append(np.array([transmission.width_m(state.position_rad) for state in states]))
         presses.append(
             PressSeries(t_s, motor_force_n - transmission.friction_n, np.interp(t_s, sample_s, sample_n))

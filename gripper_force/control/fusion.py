@@ -175,8 +175,10 @@ class Fusion:
 
     def _predict(self, servo: ServoState, free: bool) -> None:
         before_n = self._current_n
-        damping_n = self._transmission.damping_n_s_m * self._transmission.closing_m_s(servo.velocity_rad_s)
-        motor_force_n = self._transmission.force_n(servo.current_a) - damping_n
+        damping_n = self._transmission.damping_n_s_m * self._transmission.closing_m_s(
+            servo.velocity_rad_s, servo.position_rad
+        )
+        motor_force_n = self._transmission.force_n(servo.current_a, servo.position_rad) - damping_n
         dt_s = 0.0
         if self._history:
             dt_s = max(servo.t_ns - self._history[-1][0], 0) / NS_PER_S

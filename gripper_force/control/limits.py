@@ -40,7 +40,7 @@ class Limits:
     def __init__(self, config: ControlConfig, transmission: Transmission, current_limit_a: float) -> None:
         self._transmission, self._current_limit_a = transmission, current_limit_a
         self._force_limit_n = config.force_limit_n
-        self._rise_a_s = abs(transmission.current_a(_RISE_FACTOR * config.ramp_n_s))
+        self._rise_n_s = _RISE_FACTOR * config.ramp_n_s
         self._step_a = transmission.current_step_a
         ends = (transmission.open_position_rad, transmission.closed_position_rad)
         self._low_rad, self._high_rad = min(ends), max(ends)
@@ -56,6 +56,7 @@ class Limits:
         force_n: float,
         friction_n: float,
         motor_force_n: float,
+        present_rad: float,
         dt_s: float,
         *,
         may_rise: bool,
@@ -68,6 +69,7 @@ class Limits:
             force_n: Estimated contact force.
             friction_n: Friction known to reduce the motor force; in a grip only what this grasp measured.
             motor_force_n: Present motor force, by the motor current.
+            present_rad: Present servo angle.
             dt_s: Time since the last command.
             may_rise: True if the goal current may exceed the last one.
             opening: True if the jaws are to open; the current is then not lowered for a force over its limit.
@@ -78,8 +80,8 @@ class Limits:
         Raises:
             NonFiniteError: A number of the command or of the estimate is not finite.
         """
-        self._refuse_non_finite(command, force_n, friction_n, motor_force_n)
-        ceiling_a = min(self.ceiling_a(friction_n), self._over_force_ceiling_a)
+        self._refuse_non_finite(command, force_n, friction_n, motor_force_n, present_rad)
+        ceiling_a = min(self.ceiling_a(friction_n, present_rad), self._over_force_ceiling_a)
         if not may_rise:
             ceiling_a = min(ceiling_a, self._last_a)
         over = force_n > self._force_limit_n
@@ -90,7 +92,8 @@ class Limits:
             lowers = motor_force_n > self._force_limit_n - friction_n
             ceiling_a = min(ceiling_a, (_OVER_FORCE_FACTOR if lowers else 1.0) * self._last_a)
         self._over = over
-        rise_a_s = self._rise_a_s / (1.0 if self._over_force_ceiling_a == math.inf else _RISE_FACTOR)
+        rise_a_s = abs(self._transmission.current_a(self._rise_n_s, present_rad))
+        rise_a_s /= 1.0 if self._over_force_ceiling_a == math.inf else _RISE_FACTOR
         wanted_a = min(max(command.goal_current_a, 0.0), self._unrounded_a + rise_a_s * dt_s, ceiling_a)
         self._unrounded_a = wanted_a
         self._last_a = self._quantise(wanted_a, ceiling_a)
@@ -101,12 +104,12 @@ class Limits:
         """Removes the ceiling that an over-force set. Called at the start and the end of a grasp."""
         self._over_force_ceiling_a = math.inf
 
-    def ceiling_a(self, friction_n: float) -> float:
-        """Returns the largest current that the force limit and the servo's current limit allow."""
+    def ceiling_a(self, friction_n: float, present_rad: float) -> float:
+        """Returns the largest current that the force limit and the servo's current limit allow at a servo angle."""
         max_friction_n = (1 + 3 * self._transmission.friction_std) * self._transmission.friction_n
         limit_n = _CEILING_SHARE * self._force_limit_n / self._transmission.gain_bound
         max_n = limit_n + min(max(friction_n, 0.0), max_friction_n)
-        return min(self._current_limit_a, abs(self._transmission.current_a(max_n)))
+        return min(self._current_limit_a, abs(self._transmission.current_a(max_n, present_rad)))
 
     def _quantise(self, wanted_a: float, ceiling_a: float) -> float:
         if self._step_a == 0:
@@ -121,7 +124,7 @@ class Limits:
 
     @staticmethod
     def _refuse_non_finite(
-        command: ServoCommand, force_n: float, friction_n: float, motor_force_n: float
+        command: ServoCommand, force_n: float, friction_n: float, motor_force_n: float, present_rad: float
     ) -> None:
         numbers = {
             "goal position": command.goal_position_rad,
@@ -129,6 +132,7 @@ class Limits:
             "force estimate": force_n,
             "friction estimate": friction_n,
             "motor force": motor_force_n,
+            "servo position": present_rad,
         }
         for name, number in numbers.items():
             if not math.isfinite(number):

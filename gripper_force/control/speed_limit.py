@@ -43,16 +43,16 @@ class SpeedLimit:
     def apply(self, command: ServoCommand, servo: ServoState, speed_m_s: float) -> ServoCommand:
         """Returns the command with a goal position whose lead keeps the speed of one jaw to ``speed_m_s``."""
         distance_rad = command.goal_position_rad - servo.position_rad
-        moving_m_s = self._transmission.closing_m_s(servo.velocity_rad_s)
+        moving_m_s = self._transmission.closing_m_s(servo.velocity_rad_s, servo.position_rad)
         ahead = distance_rad * servo.velocity_rad_s > 0
         if ahead and abs(moving_m_s) > _OVERSPEED * speed_m_s:
             return replace(command, goal_position_rad=servo.position_rad)
-        lead_rad = self._lead_rad(command.goal_current_a, speed_m_s)
+        lead_rad = self._lead_rad(command.goal_current_a, servo.position_rad, speed_m_s)
         bounded_rad = min(max(distance_rad, -lead_rad), lead_rad)
         return replace(command, goal_position_rad=servo.position_rad + bounded_rad)
 
-    def _lead_rad(self, goal_current_a: float, speed_m_s: float) -> float:
-        rad_per_m = 1 / abs(self._transmission.closing_m_s(1.0))
+    def _lead_rad(self, goal_current_a: float, position_rad: float, speed_m_s: float) -> float:
+        rad_per_m = 1 / self._transmission.jaw_m_per_rad(position_rad)
         if self._loop is None:
             return _UNKNOWN_LEAD_M * rad_per_m
         moving_rad = speed_m_s * rad_per_m / self._loop.gain_per_s

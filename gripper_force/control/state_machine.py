@@ -191,7 +191,8 @@ class GraspController:
         if request is not None and refusal:
             events.append(Event(t_ns, "control", f"refused {str(request.kind)!r}: {refusal}"))
         if self._width_m is not None:
-            self._run_phase(t_ns, dt_s, self._width_m, self._transmission.closing_m_s(servo.velocity_rad_s))
+            closing_m_s = self._transmission.closing_m_s(servo.velocity_rad_s, self._present_rad)
+            self._run_phase(t_ns, dt_s, self._width_m, closing_m_s)
         command, is_over = self._limit_command(t_ns, dt_s)
         self._goal_current_a = command.goal_current_a
         if is_over and not self._was_over_force:
@@ -220,8 +221,8 @@ class GraspController:
         if self._width_m is None:  # nothing moves before the first request
             self._goal_width_m = width_m
         self._width_m, self._servo = width_m, servo
-        self._measured_motor_force_n = self._transmission.force_n(servo.current_a)
-        closing_m_s = self._transmission.closing_m_s(servo.velocity_rad_s)
+        self._measured_motor_force_n = self._transmission.force_n(servo.current_a, servo.position_rad)
+        closing_m_s = self._transmission.closing_m_s(servo.velocity_rad_s, servo.position_rad)
         is_free = self._phase == Phase.APPROACH and self._approach.moves_freely(
             closing_m_s, self._measured_motor_force_n
         )
@@ -354,6 +355,11 @@ class GraspController:
     @property
     def _present_width_m(self) -> float:
         return self._goal_width_m if self._width_m is None else self._width_m
+
+    @property
+    def _present_rad(self) -> float:
+        """Servo angle of the last sound reading."""
+        return self._transmission.open_position_rad if self._servo is None else self._servo.position_rad
 
     # Phases.
 
@@ -493,7 +499,7 @@ class GraspController:
         wanted = ServoCommand(
             t_ns,
             self._transmission.position_rad(self._goal_width_m),
-            abs(self._transmission.current_a(self._motor_force_n)),
+            abs(self._transmission.current_a(self._motor_force_n, self._present_rad)),
         )
         may_rise = self._phase != Phase.FAULT or self._opens_at_fault
         force_n, friction_n = self._estimate.force_n, self._estimate.friction_n
@@ -504,6 +510,7 @@ class GraspController:
             force_n,
             friction_n,
             self._measured_motor_force_n,
+            self._present_rad,
             dt_s,
             may_rise=may_rise,
             opening=self._is_opening,

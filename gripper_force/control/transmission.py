@@ -1,9 +1,10 @@
-"""Conversion of servo angle and motor current to jaw width and jaw force: one pinion drives two racks."""
+"""Conversion of servo angle and motor current to jaw width and jaw force."""
 
 import math
 from dataclasses import dataclass
 
 from gripper_force.config import GripperConfig
+from gripper_force.control.linkage import Linkage, make_linkage
 
 
 @dataclass(frozen=True, slots=True)
@@ -11,14 +12,14 @@ class Transmission:
     """Nominal kinematics and statics of the gripper.
 
     Forces are motor forces at each jaw, *before* friction: while closing, the contact force is
-    ``force_n - friction_n``. Positive closes.
+    ``force_n - friction_n``. Positive closes. By virtual work, the force is the torque over the decrease of the
+    width per radian; with one moving finger it acts at its tip.
 
     Attributes:
-        pinion_radius_m: Pitch radius of the pinion.
+        linkage: Geometry between the horn and the jaws.
         closing_sign: Sign of the servo's rotation that closes the jaws.
         open_position_rad: Servo angle with the jaws open.
-        open_width_m: Distance between the open jaws.
-        n_per_a: Motor force at each jaw per ampere.
+        nm_per_a: Torque at the horn per ampere.
         friction_n: Coulomb friction at each jaw.
         damping_n_s_m: Viscous friction at each jaw.
         current_step_a: Resolution of the servo's goal current; 0 if unknown.
@@ -27,11 +28,10 @@ class Transmission:
         gain_bound: Largest plausible ratio of the true torque constant to the nominal.
     """
 
-    pinion_radius_m: float
+    linkage: Linkage
     closing_sign: int
     open_position_rad: float
-    open_width_m: float
-    n_per_a: float
+    nm_per_a: float
     friction_n: float
     damping_n_s_m: float
     current_step_a: float = 0.0
@@ -43,14 +43,17 @@ class Transmission:
     def from_config(
         cls, gripper: GripperConfig, servo_nm_per_a: float, current_step_a: float = 0.0
     ) -> "Transmission":
-        """Returns the transmission of a configured gripper; its torque constant defaults to the servo's."""
+        """Returns the transmission of a configured gripper; its torque constant defaults to the servo's.
+
+        Raises:
+            ConfigError: The jaws cannot close with this geometry.
+        """
         nm_per_a = servo_nm_per_a if gripper.nm_per_a is None else gripper.nm_per_a
         return cls(
-            pinion_radius_m=gripper.pinion_radius_m,
+            linkage=make_linkage(gripper),
             closing_sign=gripper.closing_sign,
             open_position_rad=gripper.open_position_rad,
-            open_width_m=gripper.open_width_m,
-            n_per_a=nm_per_a / (2 * gripper.pinion_radius_m),
+            nm_per_a=nm_per_a,
             friction_n=gripper.friction_n,
             damping_n_s_m=gripper.damping_n_s_m,
             current_step_a=current_step_a,
@@ -60,32 +63,46 @@ class Transmission:
         )
 
     @property
+    def open_width_m(self) -> float:
+        """Distance between the open jaws."""
+        return self.linkage.width_m(0.0)
+
+    @property
     def closed_position_rad(self) -> float:
         """Servo angle with the jaws closed."""
         return self.position_rad(0.0)
 
     def width_m(self, position_rad: float) -> float:
         """Returns the distance between the jaws at a servo angle."""
-        closing_rad = self.closing_sign * (position_rad - self.open_position_rad)
-        return self.open_width_m - 2 * self.pinion_radius_m * closing_rad
+        return self.linkage.width_m(self._closing_rad(position_rad))
 
     def position_rad(self, width_m: float) -> float:
         """Returns the servo angle at a distance between the jaws."""
-        closing_rad = (self.open_width_m - width_m) / (2 * self.pinion_radius_m)
-        return self.open_position_rad + self.closing_sign * closing_rad
+        return self.open_position_rad + self.closing_sign * self.linkage.closing_rad(width_m)
 
-    def closing_m_s(self, velocity_rad_s: float) -> float:
-        """Returns the closing speed of one jaw."""
-        return self.closing_sign * self.pinion_radius_m * velocity_rad_s
+    def jaw_m_per_rad(self, position_rad: float) -> float:
+        """Returns half of the width's decrease per radian at a servo angle."""
+        return self.linkage.jaw_m_per_rad(self._closing_rad(position_rad))
 
-    def force_n(self, current_a: float) -> float:
+    def n_per_a(self, position_rad: float) -> float:
+        """Returns the motor force at each jaw per ampere at a servo angle."""
+        return self.nm_per_a / (2 * self.jaw_m_per_rad(position_rad))
+
+    def closing_m_s(self, velocity_rad_s: float, position_rad: float) -> float:
+        """Returns half of the speed at which the width falls: the closing speed of one of two jaws."""
+        return self.closing_sign * self.jaw_m_per_rad(position_rad) * velocity_rad_s
+
+    def force_n(self, current_a: float, position_rad: float) -> float:
         """Returns the motor force at each jaw for a signed motor current."""
-        return self.closing_sign * self.n_per_a * current_a
+        return self.closing_sign * self.n_per_a(position_rad) * current_a
 
-    def current_a(self, force_n: float) -> float:
+    def current_a(self, force_n: float, position_rad: float) -> float:
         """Returns the signed motor current for a motor force at each jaw."""
-        return self.closing_sign * force_n / self.n_per_a
+        return self.closing_sign * force_n / self.n_per_a(position_rad)
 
     def bias_std_n(self, force_n: float) -> float:
         """Returns the standard deviation of the contact force about the current estimate."""
         return math.hypot(self.friction_std * self.friction_n, self.gain_std * force_n)
+
+    def _closing_rad(self, position_rad: float) -> float:
+        return self.closing_sign * (position_rad - self.open_position_rad)

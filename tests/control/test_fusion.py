@@ -38,7 +38,7 @@ class Bench:
         for _ in range(round(time_s * 200)):
             t_s = self.t_ns / 1e9
             servo = ServoState(
-                self.t_ns, 0.0, 0.0, self.transmission.current_a(motor_force_n(t_s)), 30.0, 12.0, 0
+                self.t_ns, 0.0, 0.0, self.transmission.current_a(motor_force_n(t_s), 0.0), 30.0, 12.0, 0
             )
             visual = None
             if seen_n is not None and self.t_ns // (5 * MS) % 3 == 0:
@@ -206,7 +206,7 @@ def test_a_gripper_without_friction(transmission):
 
 def test_estimate_before_the_first_reading_is_compared_with_the_oldest_current(transmission):
     fusion = Fusion(ControlConfig(), transmission)
-    servo = ServoState(50 * MS, 0.0, 0.0, transmission.current_a(1.0), 30.0, 12.0, 0)
+    servo = ServoState(50 * MS, 0.0, 0.0, transmission.current_a(1.0, 0.0), 30.0, 12.0, 0)
     estimate, _ = fusion.step(50 * MS, servo, VisualForce(10 * MS, 50 * MS, 0, 0.3, 0.1, 1.0))
     assert estimate.source == "fused"
     assert 0.0 < estimate.bias_n < 0.3 - estimate.current_n

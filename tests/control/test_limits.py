@@ -40,11 +40,11 @@ def test_no_output_ever_leaves_the_limits(cycles, transmission, limit_a):
     for position_rad, current_a, force_n, friction_n, motor_force_n, dt_s, may_rise, opens in cycles:
         wanted = ServoCommand(0, position_rad, current_a)
         out, over = limits.apply(
-            wanted, force_n, friction_n, motor_force_n, dt_s, may_rise=may_rise, opening=opens
+            wanted, force_n, friction_n, motor_force_n, 0.0, dt_s, may_rise=may_rise, opening=opens
         )
         believed_n = min(max(friction_n, 0.0), 2 * transmission.friction_n)
         cap_n = 1.05 * CONFIG.force_limit_n / transmission.gain_bound + believed_n
-        cap_a = min(limit_a, cap_n / transmission.n_per_a)
+        cap_a = min(limit_a, cap_n / transmission.n_per_a(0.0))
         assert 0.0 <= out.goal_current_a <= cap_a
         low, high = sorted((transmission.open_position_rad, transmission.closed_position_rad))
         assert low <= out.goal_position_rad <= high
@@ -53,20 +53,27 @@ def test_no_output_ever_leaves_the_limits(cycles, transmission, limit_a):
             assert out.goal_current_a <= last_a
         if over and not opens and motor_force_n > CONFIG.force_limit_n - friction_n:
             assert out.goal_current_a <= 0.85 * last_a
-        rise_a = 4 * CONFIG.ramp_n_s / transmission.n_per_a * dt_s + 1.5 * transmission.current_step_a
+        rise_a = 4 * CONFIG.ramp_n_s / transmission.n_per_a(0.0) * dt_s + 1.5 * transmission.current_step_a
         assert out.goal_current_a <= last_a + rise_a + 1e-12
         last_a = out.goal_current_a
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("where", [0, 1, 2, 3, 4])
+@pytest.mark.parametrize("where", range(6))
 def test_non_finite_is_refused(bad, where):
-    values = [0.0, 0.0, 0.0, 0.0, 0.0]
+    values = [0.0] * 6
     values[where] = bad
-    name = ("goal position", "goal current", "force estimate", "friction estimate", "motor force")[where]
+    names = ("goal position", "goal current", "force estimate", "friction estimate", "motor force")
+    name = (*names, "servo position")[where]
     with pytest.raises(NonFiniteError, match=name):
         Limits(CONFIG, FINE, 1.0).apply(
-            ServoCommand(0, values[0], values[1]), values[2], values[3], values[4], 0.005, may_rise=True
+            ServoCommand(0, values[0], values[1]),
+            values[2],
+            values[3],
+            values[4],
+            values[5],
+            0.005,
+            may_rise=True,
         )
 
 
@@ -76,7 +83,7 @@ def test_rounding_keeps_the_mean_current(wanted_a):
     limits = Limits(CONFIG, COARSE, 1.0)
     given_a = []
     for _ in range(600):
-        out, _ = limits.apply(ServoCommand(0, 0.0, wanted_a), 0.0, 0.95, 0.0, 0.05, may_rise=True)
+        out, _ = limits.apply(ServoCommand(0, 0.0, wanted_a), 0.0, 0.95, 0.0, 0.0, 0.05, may_rise=True)
         given_a.append(out.goal_current_a)
     tail = given_a[-500:]
     assert sum(tail) / 500 == pytest.approx(wanted_a, abs=COARSE.current_step_a / 400)
@@ -87,9 +94,9 @@ def test_over_force_halves_within_five_cycles():
     limits = Limits(CONFIG, FINE, 1.0)
     wanted = ServoCommand(0, 0.0, 0.2)
     for _ in range(100):
-        limits.apply(wanted, 5.0, 0.95, 6.0, 0.005, may_rise=True)
+        limits.apply(wanted, 5.0, 0.95, 6.0, 0.0, 0.005, may_rise=True)
     for _ in range(5):
-        out, over = limits.apply(wanted, 15.0, 0.95, 16.0, 0.005, may_rise=True)
+        out, over = limits.apply(wanted, 15.0, 0.95, 16.0, 0.0, 0.005, may_rise=True)
     assert over
     assert out.goal_current_a < 0.1
 
@@ -99,9 +106,9 @@ def test_over_force_halves_within_five_cycles():
 def test_ceiling_keeps_the_force_limit_for_any_torque_constant(bound, share, believed_n, limit_n):
     gain = 1.0 + share * (bound - 1.0)
     rig = replace(FINE, gain_bound=bound)
-    ceiling_a = Limits(ControlConfig(force_limit_n=limit_n), rig, 99.0).ceiling_a(believed_n)
+    ceiling_a = Limits(ControlConfig(force_limit_n=limit_n), rig, 99.0).ceiling_a(believed_n, 0.0)
     friction_n = gain * believed_n  # measured in free travel, with the believed torque constant
-    assert gain * rig.force_n(ceiling_a) - friction_n <= 1.05 * limit_n
+    assert gain * rig.force_n(ceiling_a, 0.0) - friction_n <= 1.05 * limit_n
 
 
 def test_current_that_caused_an_over_force_is_not_reached_again():
@@ -110,7 +117,7 @@ def test_current_that_caused_an_over_force_is_not_reached_again():
 
     def run(force_n, cycles=100):
         return [
-            limits.apply(wanted, force_n, 0.95, force_n + 1, 0.005, may_rise=True)[0].goal_current_a
+            limits.apply(wanted, force_n, 0.95, force_n + 1, 0.0, 0.005, may_rise=True)[0].goal_current_a
             for _ in range(cycles)
         ]
 
@@ -124,9 +131,9 @@ def test_current_that_caused_an_over_force_is_not_reached_again():
 def test_force_kept_up_by_friction_does_not_lower_the_current_further():
     limits = Limits(CONFIG, FINE, 1.0)
     for _ in range(100):
-        limits.apply(ServoCommand(0, 0.0, 0.2), 5.0, 0.95, 6.0, 0.005, may_rise=True)
+        limits.apply(ServoCommand(0, 0.0, 0.2), 5.0, 0.95, 6.0, 0.0, 0.005, may_rise=True)
     for _ in range(50):
-        out, over = limits.apply(ServoCommand(0, 0.0, 0.3), 14.1, 0.95, 13.0, 0.005, may_rise=True)
+        out, over = limits.apply(ServoCommand(0, 0.0, 0.3), 14.1, 0.95, 13.0, 0.0, 0.005, may_rise=True)
     assert over
     assert out.goal_current_a == pytest.approx(0.95 * 0.2)
 

@@ -21,7 +21,7 @@ PHASES = ("open", "approach", "contact", "ramp", "hold", "release", "move")
 def motor_limit_a(run):
     """Goal current of the approach force plus friction, on the servo's grid."""
     rig = run.transmission
-    return (run.config.approach_force_n + rig.friction_n) / rig.n_per_a + rig.current_step_a
+    return (run.config.approach_force_n + rig.friction_n) / rig.n_per_a(0.0) + rig.current_step_a
 
 
 @pytest.mark.parametrize("width_m", [0.0905, 0.085, 0.06, 0.02, 0.005])

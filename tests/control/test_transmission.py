@@ -18,25 +18,25 @@ def test_width_and_position_are_inverse(sign, width_m, open_rad):
 @given(signs, st.floats(-20, 20))
 def test_force_and_current_are_inverse(sign, force_n):
     gripper = Transmission.from_config(GripperConfig(closing_sign=sign), 1.78)
-    assert gripper.force_n(gripper.current_a(force_n)) == pytest.approx(force_n)
+    assert gripper.force_n(gripper.current_a(force_n, 0.3), 0.3) == pytest.approx(force_n)
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_signs_follow_the_closing_direction(sign):
     gripper = Transmission.from_config(GripperConfig(closing_sign=sign), 1.78)
-    assert gripper.current_a(1.0) * sign > 0
+    assert gripper.current_a(1.0, 0.0) * sign > 0
     assert (gripper.closed_position_rad - gripper.open_position_rad) * sign > 0
-    assert gripper.closing_m_s(sign * 1.0) == pytest.approx(gripper.pinion_radius_m)
+    assert gripper.closing_m_s(sign * 1.0, 0.0) == pytest.approx(GripperConfig().pinion_radius_m)
     assert gripper.width_m(gripper.open_position_rad) == gripper.open_width_m
 
 
 def test_two_racks_share_the_torque():
     gripper = Transmission.from_config(GripperConfig(pinion_radius_m=0.01), 2.0)
-    assert gripper.force_n(1.0) == pytest.approx(2.0 / (2 * 0.01))
+    assert gripper.force_n(1.0, 0.0) == pytest.approx(2.0 / (2 * 0.01))
 
 
 def test_configured_torque_constant_overrides_the_servos():
-    assert Transmission.from_config(GripperConfig(nm_per_a=1.0), 2.0).n_per_a == pytest.approx(25.0)
+    assert Transmission.from_config(GripperConfig(nm_per_a=1.0), 2.0).n_per_a(0.0) == pytest.approx(25.0)
 
 
 def test_uncertainty_grows_with_force():

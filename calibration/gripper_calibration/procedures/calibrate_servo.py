@@ -12,8 +12,9 @@ import numpy as np
 
 from gripper_calibration.fits.servo_fit import FreePass, Nominal, ServoFit, ServoPress, fit_servo
 from gripper_calibration.plots.servo_plot import draw
-from gripper_force.config import Config
+from gripper_force.config import Config, GripperConfig
 from gripper_force.control.limits import Limits, largest_target_n
+from gripper_force.control.linkage import make_linkage
 from gripper_force.control.safety import Safety
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import ConfigError, DataError, DeviceError
@@ -129,7 +130,7 @@ def calibrate_servo(
             )
     known = read_rig(rig) if rig.exists() else RigProfile()
     given = Nominal(
-        config.gripper.pinion_radius_m, config.gripper.open_width_m, _scale_share(known, config, rig)
+        _reference_m_per_rad(config.gripper), config.gripper.open_width_m, _scale_share(known, config, rig)
     )
     config = config.model_copy(update={"camera": config.camera.model_copy(update={"backend": "none"})})
     config = resolve(config, vision=False).config
@@ -196,7 +197,11 @@ def _section(fit: ServoFit, config: Config) -> ServoCalibration:
         nm_per_a=fit.nm_per_a,
         friction_n=fit.friction_n,
         damping_n_s_m=fit.damping_n_s_m,
-        pinion_radius_m=fit.pinion_radius_m,
+        pinion_radius_m=(
+            fit.pinion_radius_m
+            if config.gripper.linkage.kind == "rack"
+            else CalibratedValue(value=config.gripper.pinion_radius_m)
+        ),
         open_position_rad=opening.model_copy(
             update={"value": sign * opening.value, "low": ends[0], "high": ends[-1]}
         ),
@@ -235,8 +240,9 @@ def measure(
             presses.append(jaws.press(gauge_m, contact_rad, rate_n_s, share, peak_n))
             jaws.back_off(contact_rad)
         jaws.step_name = f"{1e3 * gauge_m:g} mm, free travel"
-        friction_a = float(np.median([_friction_a(press) for press in presses]))
-        passes = [one for speed in SPEEDS_M_S for one in jaws.travel(friction_a, speed, contact_rad)]
+        n_per_a = (config.gripper.nm_per_a or 0.0) / (2 * _reference_m_per_rad(config.gripper))
+        friction_n = n_per_a * float(np.median([_friction_a(press) for press in presses]))
+        passes = [one for speed in SPEEDS_M_S for one in jaws.travel(friction_n, speed, contact_rad)]
     return presses, passes
 
 
@@ -283,6 +289,28 @@ def _rejected(cell: LoadCell) -> str:
     return ", ".join(f"{n} {name}" for name, n in cell.counts().items() if n) or "none"
 
 
+def _reference_m_per_rad(gripper: GripperConfig) -> float:
+    """Travel of one jaw per radian with half-open jaws: the fit reduces every linkage to this pinion."""
+    linkage = make_linkage(gripper)
+    return linkage.jaw_m_per_rad(linkage.closing_rad(gripper.open_width_m / 2))
+
+
+def _reduce(transmission: Transmission, states: Sequence[ServoState]) -> FreePass:
+    """Converts readings to those of a rack and pinion with the same widths, speeds and forces at the jaws."""
+    half_m = transmission.open_width_m / 2
+    reference_m_per_rad = transmission.jaw_m_per_rad(transmission.position_rad(half_m))
+    sign, open_rad = transmission.closing_sign, transmission.closing_sign * transmission.open_position_rad
+    at_rad = [state.position_rad for state in states]
+    closed_m = transmission.open_width_m - np.array([transmission.width_m(one) for one in at_rad])
+    share = np.array([transmission.jaw_m_per_rad(one) for one in at_rad]) / reference_m_per_rad
+    return FreePass(
+        t_s=np.array([state.t_ns / NS_PER_S for state in states]),
+        current_a=sign * np.array([state.current_a for state in states]) / share,
+        closing_rad=open_rad + closed_m / (2 * reference_m_per_rad),
+        closing_rad_s=sign * np.array([state.velocity_rad_s for state in states]) * share,
+    )
+
+
 class _Jaws:
     """Moves the jaws cycle by cycle, and records servo and load cell. Positive angles close the jaws."""
 
@@ -296,9 +324,7 @@ class _Jaws:
             gripper, gripper.nm_per_a or 0.0, gripper.current_step_a or 0.0
         )
         self._safety = Safety(config.control)
-        # Whatever the load cell reads, the motor cannot exceed the force limit.
-        limits = Limits(config.control, self._nominal, config.servo.current_limit_a)
-        self._ceiling_a = limits.ceiling_a(math.inf)
+        self._limits = Limits(config.control, self._nominal, config.servo.current_limit_a)
         self._full_a: float | None = None  # current at the peak of the first press
         self._max_age_s = 0.0  # of the newest force sample
         self._period_ns = round(NS_PER_S / _RATE_HZ)
@@ -316,6 +342,19 @@ class _Jaws:
     @property
     def closing_rad(self) -> float:
         return self._sign * self.state.position_rad
+
+    @property
+    def _ceiling_a(self) -> float:
+        """Largest current: whatever the load cell reads, the motor cannot exceed the force limit."""
+        return self._limits.ceiling_a(math.inf, self.state.position_rad)
+
+    @property
+    def _jaw_m_per_rad(self) -> float:
+        return self._nominal.jaw_m_per_rad(self.state.position_rad)
+
+    def _current_a(self, force_n: float) -> float:
+        """Size of the motor current for a motor force at each jaw, at the present angle."""
+        return abs(self._nominal.current_a(force_n, self.state.position_rad))
 
     def cycle(self, goal_rad: float, current_a: float) -> None:
         """Runs one bus cycle with a goal angle and a current limit."""
@@ -377,7 +416,7 @@ class _Jaws:
 
     def close_on_gauge(self, gauge_m: float) -> float:
         """Closes slowly until the load cell measures contact. Returns the angle."""
-        speed_rad = _APPROACH_M_S / self._nominal.pinion_radius_m / _RATE_HZ
+        speed_rad = _APPROACH_M_S / self._jaw_m_per_rad / _RATE_HZ
         goal_rad = self.closing_rad
         end_rad = self._sign * self._nominal.closed_position_rad
         while self.force_n < _CONTACT_N:
@@ -408,8 +447,8 @@ class _Jaws:
         if self._full_a is None and self._max_age_s > 0:
             rate_n_s = min(rate_n_s, _OVERSHOOT_SHARE * peak_n / self._max_age_s)
         last_a = math.inf if self._full_a is None else share * self._full_a
-        step_a = abs(self._nominal.current_a(rate_n_s)) / _RATE_HZ
-        max_a = 1.5 * abs(self._nominal.current_a(peak_n + self._nominal.friction_n))
+        step_a = self._current_a(rate_n_s) / _RATE_HZ
+        max_a = 1.5 * self._current_a(peak_n + self._nominal.friction_n)
         current_a = abs(self.state.current_a)
         for _ in range(round(_REST_S * _RATE_HZ)):  # lets the force of the impact fade
             self.cycle(self.closing_rad + _BEYOND_RAD, current_a)
@@ -434,12 +473,13 @@ class _Jaws:
                 "the load cell gave fewer than two valid samples during a press; run `gripper-force doctor`"
             )
         force_ns, force_n = np.array(forces).T
+        reduced = _reduce(self._nominal, states)
         return ServoPress(
             gauge_m=gauge_m,
             t_s=(t_ns - t_ns[0]) / NS_PER_S,
-            current_a=self._sign * np.array([state.current_a for state in states]),
+            current_a=reduced.current_a,
             force_n=np.interp(t_ns, force_ns, force_n),
-            closing_rad=self._sign * np.array([state.position_rad for state in states]),
+            closing_rad=reduced.closing_rad,
             turn=turn,
         )
 
@@ -460,47 +500,44 @@ class _Jaws:
         self._move_to(self._clear_of(contact_rad))
 
     def _clear_of(self, contact_rad: float) -> float:
-        return contact_rad - 2 * _CLEARANCE_M / self._nominal.pinion_radius_m
+        return contact_rad - 2 * _CLEARANCE_M / self._jaw_m_per_rad
 
-    def travel(self, friction_a: float, speed_m_s: float, contact_rad: float) -> list[FreePass]:
-        """Opens and closes under a constant current. A pass in which the jaws stick is left out."""
+    def travel(self, friction_n: float, speed_m_s: float, contact_rad: float) -> list[FreePass]:
+        """Opens and closes under a constant motor force. A pass in which the jaws stick is left out."""
         nominal = self._nominal
-        step_a = nominal.current_step_a
-        wanted_a = friction_a + abs(nominal.current_a(nominal.damping_n_s_m * speed_m_s))
-        current_a = round(wanted_a / step_a) * step_a
-        clear_rad = _CLEARANCE_M / nominal.pinion_radius_m
+        motor_force_n = friction_n + nominal.damping_n_s_m * speed_m_s
+        clear_rad = _CLEARANCE_M / self._jaw_m_per_rad
         ends = (self._sign * nominal.open_position_rad + clear_rad, contact_rad - clear_rad)
         passes = []
         for side, end_rad in ((-1, ends[0]), (1, ends[1])):
-            if (one := self._pass(side, end_rad, current_a)) is not None:
+            if (one := self._pass(side, end_rad, motor_force_n)) is not None:
                 passes.append(one)
         return passes
 
-    def _pass(self, side: int, end_rad: float, current_a: float) -> FreePass | None:
+    def _pass(self, side: int, end_rad: float, motor_force_n: float) -> FreePass | None:
         """One pass, without its acceleration; None if the jaws stuck."""
         for _ in range(round(_MAX_PASS_S * _RATE_HZ)):
             if side * self._sign * self.state.velocity_rad_s > _MIN_SPEED_RAD_S:
                 break
-            self.cycle(end_rad, _START_FACTOR * current_a)
+            self.cycle(end_rad, _START_FACTOR * self._whole_steps_a(motor_force_n))
         first = len(self._states) + round(_SPEED_UP_S * _RATE_HZ)
         for _ in range(round(_MAX_PASS_S * _RATE_HZ)):
-            self.cycle(end_rad, current_a)
+            self.cycle(end_rad, self._whole_steps_a(motor_force_n))
             if side * (end_rad - self.closing_rad) < _BRAKE_RAD:
                 break
         states = self._states[first:]
         self._move_to(end_rad)
         if len(states) < _RATE_HZ / 10 or abs(states[-1].velocity_rad_s) < _MIN_SPEED_RAD_S:
             return None
-        return FreePass(
-            t_s=np.array([state.t_ns / NS_PER_S for state in states]),
-            current_a=self._sign * np.array([state.current_a for state in states]),
-            closing_rad=self._sign * np.array([state.position_rad for state in states]),
-            closing_rad_s=self._sign * np.array([state.velocity_rad_s for state in states]),
-        )
+        return _reduce(self._nominal, states)
+
+    def _whole_steps_a(self, motor_force_n: float) -> float:
+        step_a = self._nominal.current_step_a
+        return round(self._current_a(motor_force_n) / step_a) * step_a
 
     def _move_to(self, goal_rad: float) -> None:
         """Moves at a constant low speed, and rests at the goal."""
-        speed_rad = 4 * _APPROACH_M_S / self._nominal.pinion_radius_m / _RATE_HZ
+        speed_rad = 4 * _APPROACH_M_S / self._jaw_m_per_rad / _RATE_HZ
         next_rad = self.closing_rad
         while abs(goal_rad - next_rad) > speed_rad:
             next_rad += float(np.copysign(speed_rad, goal_rad - next_rad))
@@ -510,4 +547,4 @@ class _Jaws:
 
     def _moving_current_a(self) -> float:
         """Current that moves the jaws against twice the nominal friction, and presses with little more."""
-        return abs(self._nominal.current_a(2 * self._nominal.friction_n + _CONTACT_N))
+        return self._current_a(2 * self._nominal.friction_n + _CONTACT_N)

@@ -99,13 +99,14 @@ class Gripper:
         stiffness_n_m, stiffening_n_m2 = self.stiffness_n_m, self.stiffening_n_m2
         contact_m, play_m, (low_m, high_m) = self.contact_m, self.play_m, self.stops_m
         damping_n_s_m, mass_kg, friction_n = self.damping_n_s_m, self.mass_kg, self.friction_n
-        n_per_a, radius_m = self.gain * self.transmission.n_per_a, self.transmission.pinion_radius_m
+        open_rad = self.transmission.open_position_rad
+        n_per_a, radius_m = self.gain * self.transmission.n_per_a(open_rad), self._radius_m
         x_m, v_m_s, jaw_m, current_a = self.x_m, self.v_m_s, self.jaw_m, self.current_a
         deepest_m = self.deepest_m
         limit_a = command.goal_current_a
         if self.step_a:
             limit_a = round(limit_a / self.step_a) * self.step_a
-        goal_m = self.transmission.closing_m_s(command.goal_position_rad)
+        goal_m = self.transmission.closing_m_s(command.goal_position_rad, open_rad)
         pwm_per_m = _PWM_PER_TICK / (_TICK_RAD * radius_m)
         steps = math.ceil(time_s / self._step_s)
         dt_s = time_s / steps
@@ -131,7 +132,7 @@ class Gripper:
 
     def read(self, t_ns: int, noise_a: float) -> ServoState:
         """Returns the servo's reading in the servo's own steps; ``noise_a`` is added to the current."""
-        radius_m = self.transmission.pinion_radius_m
+        radius_m = self._radius_m
         measured_a = self.current_a + noise_a
         return ServoState(
             t_ns=t_ns,
@@ -142,6 +143,10 @@ class Gripper:
             voltage_v=12.0,
             hardware_error=0,
         )
+
+    @property
+    def _radius_m(self) -> float:
+        return self.transmission.jaw_m_per_rad(self.transmission.open_position_rad)
 
     @property
     def _step_s(self) -> float:

@@ -21,6 +21,7 @@ from gripper_force.config import Config, ControlConfig
 from gripper_force.control.force_loop import ForceLoop
 from gripper_force.control.fusion import Fusion, observer_lag_s
 from gripper_force.control.limits import Limits
+from gripper_force.control.linkage import RackAndPinion
 from gripper_force.control.state_machine import GraspController
 from gripper_force.control.tuning import Gains
 from gripper_force.qualification.loop_margin.analytic_plant import (
@@ -94,7 +95,10 @@ def identify(config: Config, truth: Gripper) -> IdentifiedPlant:
             decision = controller.step(t_ns, servo, None, request)
             request = None
             if decision.status.phase in (Phase.RAMP, Phase.HOLD):
-                motor_force_n = truth.transmission.force_n(servo.current_a) - truth.transmission.friction_n
+                motor_force_n = (
+                    truth.transmission.force_n(servo.current_a, servo.position_rad)
+                    - truth.transmission.friction_n
+                )
                 rows.append((t_ns / NS_PER_S, motor_force_n, gripper.force_n))
             gripper.advance(decision.command, _CYCLE_S)
         presses.append(PressSeries(*(np.array(column) for column in zip(*rows, strict=True))))
@@ -169,7 +173,8 @@ def oscillation_decays(config: Config, truth: Gripper, feedback: str, delay_s: f
     """Returns True if an oscillation decays with ``factor`` times the loop gain while vision stays in use."""
     vision_alone = feedback == "vision"
     amplitude_n = AMPLITUDE_N if vision_alone else FUSED_AMPLITUDE_N
-    rig = replace(truth.transmission, open_width_m=_OPEN_WIDTH_M)
+    radius_m = truth.transmission.jaw_m_per_rad(truth.transmission.open_position_rad)
+    rig = replace(truth.transmission, linkage=RackAndPinion(radius_m, _OPEN_WIDTH_M))
     if vision_alone:
         rig = replace(rig, gain_std=0.5)
     given = {
@@ -188,7 +193,7 @@ def oscillation_decays(config: Config, truth: Gripper, feedback: str, delay_s: f
         transmission=rig,
         x_m=jaw_m + truth.play_m,
         jaw_m=jaw_m,
-        current_a=rig.current_a(_TARGET_N + rig.friction_n),
+        current_a=rig.current_a(_TARGET_N + rig.friction_n, rig.open_position_rad),
     )
     loop, fusion, limits = ForceLoop(control, rig), Fusion(control, rig), Limits(control, rig, 3.0)
     loop.start(_TARGET_N, _TARGET_N)
@@ -203,10 +208,16 @@ def oscillation_decays(config: Config, truth: Gripper, feedback: str, delay_s: f
         source = estimate.source
         motor_force_n = loop.step(_CYCLE_S, _TARGET_N, estimate)
         goal_rad = rig.position_rad(max(rig.width_m(servo.position_rad) - 0.02, 0.0))
-        wanted = ServoCommand(t_ns, goal_rad, abs(rig.current_a(motor_force_n)))
-        motor_n = rig.force_n(servo.current_a)
+        wanted = ServoCommand(t_ns, goal_rad, abs(rig.current_a(motor_force_n, servo.position_rad)))
+        motor_n = rig.force_n(servo.current_a, servo.position_rad)
         command, _ = limits.apply(
-            wanted, estimate.force_n, estimate.friction_n, motor_n, _CYCLE_S, may_rise=True
+            wanted,
+            estimate.force_n,
+            estimate.friction_n,
+            motor_n,
+            servo.position_rad,
+            _CYCLE_S,
+            may_rise=True,
         )
         forces_n.append(gripper.force_n)
         gripper.advance(command, _CYCLE_S)

@@ -113,7 +113,8 @@ class _Bounds:
         rig = truth.transmission
         most_friction_n = rig.friction_n * (1 + 3 * rig.friction_std)
         self._most_a = min(
-            config.servo.current_limit_a, (config.control.force_limit_n + most_friction_n) / rig.n_per_a
+            config.servo.current_limit_a,
+            (config.control.force_limit_n + most_friction_n) / rig.n_per_a(rig.open_position_rad),
         )
         self._low_rad, self._high_rad = sorted((rig.open_position_rad, rig.closed_position_rad))
 

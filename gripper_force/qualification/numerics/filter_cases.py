@@ -219,11 +219,13 @@ def worst_n(control: ControlConfig, gripper: GripperConfig, inputs: Iterator[Inp
     worst = 0.0
     with localcontext(prec=_DIGITS):
         for t_ns, motor_force_n, visual in inputs:
-            servo = _servo(t_ns, transmission.current_a(motor_force_n))
+            servo = _servo(t_ns, transmission.current_a(motor_force_n, 0.0))
             found, _ = tested.step(t_ns, servo, visual)
             if not (math.isfinite(found.force_n) and math.isfinite(found.std_n)):
                 return math.inf
-            force_n, std_n = reference.step(t_ns, transmission.force_n(servo.current_a), visual)
+            force_n, std_n = reference.step(
+                t_ns, transmission.force_n(servo.current_a, servo.position_rad), visual
+            )
             for number, true in ((found.force_n, force_n), (found.std_n, std_n)):
                 worst = max(worst, float(abs(Decimal(number) - true) / max(true, Decimal(1))))
     return worst
@@ -299,7 +301,7 @@ def _count_shifted(control: ControlConfig, gripper: GripperConfig, by_ns: int, s
     original, shifted = Fusion(control, transmission), Fusion(control, transmission)
     different = 0
     for t_ns, motor_force_n, visual in _ragged(np.random.default_rng([seed, 41])):
-        current_a = transmission.current_a(motor_force_n)
+        current_a = transmission.current_a(motor_force_n, 0.0)
         later = visual and replace(visual, t_ns=visual.t_ns + by_ns, ready_ns=visual.ready_ns + by_ns)
         one, _ = original.step(t_ns, _servo(t_ns, current_a), visual)
         other, _ = shifted.step(t_ns + by_ns, _servo(t_ns + by_ns, current_a), later)
@@ -315,7 +317,7 @@ def _effect_of_refused_n(
     with_bad, without_bad = Fusion(control, transmission), Fusion(control, transmission)
     worst = 0.0
     for number, (t_ns, motor_force_n, visual) in enumerate(_steady(np.random.default_rng([seed, 42]), 4000)):
-        servo = _servo(t_ns, transmission.current_a(motor_force_n))
+        servo = _servo(t_ns, transmission.current_a(motor_force_n, 0.0))
         bad = visual is not None and number % 2 == 1
         changed = replace(visual, force_n=force_n, std_n=std_n) if visual and bad else visual
         found, _ = with_bad.step(t_ns, servo, changed)

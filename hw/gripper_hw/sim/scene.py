@@ -170,6 +170,11 @@ def _draw(object_name: str, seed: int, config: SimConfig) -> Scene:
     )
 
 
+def horn_dynamics(scene: Scene, pinion_radius_m: float) -> tuple[float, float, float, float]:
+    """Returns the rotor's inertia in kg m2, damping in Nm s and friction in Nm, and the rails' friction in Nm."""
+    return 1e-3, scene.servo_damping_nm_s, scene.servo_friction_nm, 2 * pinion_radius_m * scene.jaw_friction_n
+
+
 def scene_mjcf(
     scene: Scene, gripper: GripperConfig, *, textured: bool = True
 ) -> tuple[str, dict[str, bytes]]:
@@ -193,6 +198,7 @@ def scene_mjcf(
     template = Template(
         resources.files(__package__).joinpath("assets/gripper.xml").read_text(encoding="utf-8")
     )
+    inertia, damping, friction_nm, rail_friction_nm = horn_dynamics(scene, gripper.pinion_radius_m)
     text = template.substitute(
         object=scene.object,
         timestep_s=model.timestep_s,
@@ -218,9 +224,9 @@ def scene_mjcf(
         finger_x=_FINGER_X_M[scene.tool],
         grip_height=_text([model.grip_height_m]),
         rail_height=_text([model.grip_height_m + 0.085]),
-        rotor_inertia=1e-3,
-        servo_damping=scene.servo_damping_nm_s,
-        friction_nm=scene.servo_friction_nm + 2 * gripper.pinion_radius_m * scene.jaw_friction_n,
+        rotor_inertia=inertia,
+        servo_damping=damping,
+        friction_nm=friction_nm + rail_friction_nm,
         hard_friction=_HARD_FRICTION,
         backlash_m=scene.backlash_m,
         pinion_radius_m=gripper.pinion_radius_m,

@@ -9,10 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from gripper_force.config import GripperConfig
+from gripper_force.control.linkage import Linkage, RackAndPinion, make_linkage
 from gripper_force.errors import SimulationError
 from gripper_force.types import NS_PER_S
 from gripper_hw.sim.engine import mujoco, new_renderer
-from gripper_hw.sim.scene import Scene, scene_mjcf
+from gripper_hw.sim.scene import Scene, horn_dynamics, scene_mjcf
 from gripper_hw.sim.surroundings import Surroundings
 
 _MAX_PENETRATION_M = 0.004
@@ -116,6 +117,10 @@ class World:
         self.step_ns = round(self._model.opt.timestep * NS_PER_S)
         servo = self._model.joint("servo")
         self._qpos, self._dof = int(servo.qposadr[0]), int(servo.dofadr[0])
+        # The scene has a pinion; another linkage acts between the horn and this pinion.
+        linkage = make_linkage(gripper)
+        self._linkage = None if isinstance(linkage, RackAndPinion) else linkage
+        self._pinion = RackAndPinion(gripper.pinion_radius_m, gripper.open_width_m)
         self._left = int(self._model.sensor("left_force").adr[0]) + 1
         self._right = int(self._model.sensor("right_force").adr[0]) + 1
         self._periodic_calls: list[_PeriodicCall] = []
@@ -145,10 +150,12 @@ class World:
         data = self._data
         while self.t_ns + self.step_ns <= t_ns:
             noise_a = float(self._rng.normal(0.0, _CURRENT_NOISE_A))
-            current_a = self._motor.control(
-                self.t_ns, float(data.qpos[self._qpos]), float(data.qvel[self._dof]), noise_a
-            )
-            data.ctrl[0] = self._nm_per_a * current_a
+            position_rad, velocity_rad_s = float(data.qpos[self._qpos]), float(data.qvel[self._dof])
+            ratio = 1.0
+            if self._linkage is not None:
+                position_rad, ratio = self._horn(self._linkage, position_rad)
+            current_a = self._motor.control(self.t_ns, position_rad, ratio * velocity_rad_s, noise_a)
+            data.ctrl[0] = ratio * self._nm_per_a * current_a
             try:
                 mujoco.mj_step(self._model, data)
             except mujoco.FatalError as error:
@@ -160,6 +167,19 @@ class World:
                 if periodic.due_ns <= self.t_ns:
                     periodic.due_ns += periodic.period_ns
                     periodic.call(self.t_ns)
+
+    def _horn(self, linkage: Linkage, pinion_rad: float) -> tuple[float, float]:
+        """Returns the horn's angle and its rotation per rotation of the pinion.
+
+        The rotor's inertia and friction act on the pinion through this ratio, by virtual work.
+        """
+        horn_rad = linkage.closing_rad(self._pinion.width_m(pinion_rad))
+        ratio = self._pinion.radius_m / linkage.jaw_m_per_rad(horn_rad)
+        inertia, damping, friction_nm, rail_friction_nm = horn_dynamics(self._scene, self._pinion.radius_m)
+        self._model.dof_armature[self._dof] = inertia * ratio**2
+        self._model.dof_damping[self._dof] = damping * ratio**2
+        self._model.dof_frictionloss[self._dof] = friction_nm * ratio + rail_friction_nm
+        return horn_rad, ratio
 
     def render(self, side_px: int) -> npt.NDArray[np.uint8]:
         """Renders the present state, (side_px, side_px, 3) uint8. Raises `SimulationError` without EGL."""

@@ -138,7 +138,7 @@ def test_log_is_read_once_with_the_results_of_separate_reads(
     (press,), (width_m,) = recorded.presses, recorded.width_m
     assert np.array_equal(press.t_s, np.array([state.t_ns for state in states]) / NS_PER_S)
     assert width_m.tolist() == [transmission.width_m(state.position_rad) for state in states]
-    motor_force_n = np.array([transmission.force_n(state.current_a) for state in states])
+    motor_force_n = np.array([transmission.force_n(state.current_a, state.position_rad) for state in states])
     assert np.array_equal(press.motor_force_n, motor_force_n - transmission.friction_n)
     assert recorded.delay_s >= delay_s + 0.5 / config.camera.rate_hz
 

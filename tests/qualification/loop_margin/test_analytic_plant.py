@@ -20,7 +20,7 @@ def press(gripper: Gripper, motor_force_n: float, time_s: float = 3.0) -> Grippe
     """Applies a constant motor force, far from the goal position."""
     goal_rad = RIG.position_rad(0.0)
     for _ in range(round(time_s / 0.005)):
-        gripper.advance(ServoCommand(0, goal_rad, RIG.current_a(motor_force_n)), 0.005)
+        gripper.advance(ServoCommand(0, goal_rad, RIG.current_a(motor_force_n, 0.0)), 0.005)
     return gripper
 
 
@@ -63,7 +63,7 @@ def test_goal_current_is_quantised() -> None:
     coarse, fine = (Gripper(RIG, step_a=step_a, friction_n=0.0, contact_m=0.0) for step_a in (0.01, 0.0))
     asked_a = 0.104
     for gripper in (coarse, fine):
-        press(gripper, RIG.force_n(asked_a))
+        press(gripper, RIG.force_n(asked_a, 0.0))
     assert coarse.current_a == pytest.approx(0.10)
     assert fine.current_a == pytest.approx(asked_a)
 

@@ -1,0 +1,123 @@
+"""Contract of every linkage, and the errors of impossible geometry."""
+
+import math
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gripper_force.config import GripperConfig, LinkageConfig, load_config
+from gripper_force.control.linkage import RackAndPinion, make_linkage
+from gripper_force.control.transmission import Transmission
+from gripper_force.errors import ConfigError
+
+GRIPPERS = {
+    path.stem: load_config(path).gripper
+    for path in sorted((Path(__file__).parents[2] / "examples/grippers").glob("*.yaml"))
+}
+GRIPPERS["table"] = GripperConfig(
+    linkage=LinkageConfig(
+        kind="table", table=((0.0, 0.092), (0.5, 0.075), (1.0, 0.052), (1.5, 0.030), (2.0, 0.012))
+    )
+)
+
+grippers = st.sampled_from(sorted(GRIPPERS))
+
+
+def transmission_of(name: str, **changes: Any) -> Transmission:
+    return Transmission.from_config(GRIPPERS[name].model_copy(update=changes), 1.78)
+
+
+@given(grippers, st.sampled_from([-1, 1]), st.floats(-0.2, 1.2), st.floats(-5, 5))
+def test_width_and_position_are_inverse(name: str, sign: int, share: float, open_rad: float) -> None:
+    one = transmission_of(name, closing_sign=sign, open_position_rad=open_rad)
+    width_m = share * one.open_width_m
+    assert one.width_m(one.position_rad(width_m)) == pytest.approx(width_m, abs=1e-9)
+
+
+@pytest.mark.parametrize("name", GRIPPERS)
+def test_the_ends_are_open_and_closed(name: str) -> None:
+    one = transmission_of(name)
+    assert one.width_m(one.open_position_rad) == pytest.approx(one.open_width_m, abs=1e-9)
+    assert one.width_m(one.closed_position_rad) == pytest.approx(0.0, abs=1e-6)
+
+
+@given(grippers, st.sampled_from([-1, 1]), st.floats(0.02, 0.98), st.floats(0.01, 1.0))
+def test_force_and_speed_follow_from_virtual_work(
+    name: str, sign: int, share: float, current_a: float
+) -> None:
+    one = transmission_of(name, closing_sign=sign)
+    at_rad = one.position_rad(share * one.open_width_m)
+    step_rad = 1e-3
+    closed_m = one.width_m(at_rad - sign * step_rad) - one.width_m(at_rad + sign * step_rad)
+    force_n = one.force_n(sign * current_a, at_rad)
+    assert force_n * closed_m == pytest.approx(1.78 * current_a * 2 * step_rad, rel=2e-3)
+    assert one.closing_m_s(sign * 2.0, at_rad) == pytest.approx(2.0 * closed_m / (4 * step_rad), rel=2e-3)
+    assert one.current_a(force_n, at_rad) == pytest.approx(sign * current_a)
+
+
+@pytest.mark.parametrize("name", GRIPPERS)
+def test_width_falls_throughout_and_beyond_the_ends(name: str) -> None:
+    linkage = make_linkage(GRIPPERS[name])
+    end_rad = linkage.closing_rad(0.0)
+    widths_m = [linkage.width_m(end_rad * i / 100) for i in range(-10, 111)]
+    assert all(after < before for before, after in pairwise(widths_m))
+
+
+def test_crank_slider_follows_its_geometry() -> None:
+    """Compared with the triangle of crank, rod and rail, at every tenth of a radian."""
+    linkage = make_linkage(GRIPPERS["viperx_aloha"])
+
+    def jaw_m(angle_rad: float) -> float:
+        x_m, y_m = 0.022 * math.sin(angle_rad), 0.022 * math.cos(angle_rad)
+        return x_m + math.sqrt(0.036**2 - y_m**2)
+
+    for tenth in range(17):
+        closing_rad = tenth / 10
+        width_m = 0.072 - 2 * (jaw_m(1.10) - jaw_m(1.10 - closing_rad))
+        assert linkage.width_m(closing_rad) == pytest.approx(width_m, abs=2e-7)
+
+
+def test_parallelogram_turns_its_finger_as_its_crank() -> None:
+    config = LinkageConfig(
+        kind="four_bar", crank_m=0.02, rod_m=0.04, rocker_m=0.02, base_m=0.04, finger_m=0.06,
+        open_crank_rad=1.9, open_finger_rad=0.6,
+    )  # fmt: skip
+    linkage = make_linkage(GripperConfig(linkage=config, open_width_m=0.06))
+    for closing_rad in (0.1, 0.3, 0.5):
+        width_m = 0.06 - 2 * 0.06 * (math.sin(0.6) - math.sin(0.6 - closing_rad))
+        assert linkage.width_m(closing_rad) == pytest.approx(width_m, abs=1e-6)
+
+
+def test_table_passes_through_its_rows() -> None:
+    linkage = make_linkage(GRIPPERS["table"])
+    for closing_rad, width_m in GRIPPERS["table"].linkage.table:
+        assert linkage.width_m(closing_rad) == pytest.approx(width_m, abs=1e-5)
+
+
+def test_default_is_a_rack_and_pinion() -> None:
+    assert make_linkage(GripperConfig()) == RackAndPinion(0.02, 0.092)
+
+
+CRANK = {"kind": "crank_slider", "crank_m": 0.022, "rod_m": 0.036, "open_crank_rad": 1.1}
+
+
+@pytest.mark.parametrize(
+    ("keys", "open_width_m", "message"),
+    [
+        ({"kind": "crank_slider", "rod_m": 0.036}, 0.05, r"needs gripper\.linkage\.crank_m"),
+        (CRANK, 0.09, r"closes by 8\d\.\d mm at most, less than gripper\.open_width_m 90 mm"),
+        (CRANK | {"open_crank_rad": 1.57}, 0.08, "near its dead centre"),
+        (CRANK | {"rod_m": 0.01}, 0.05, "mm at most"),
+        ({"kind": "finger", "finger_m": 0.03, "open_finger_rad": 0.5}, 0.09, "closes by"),
+        ({"kind": "table", "table": ((0, 0.05), (1, 0.02))}, 0.05, "three or more rows"),
+        ({"kind": "table", "table": ((0, 0.05), (1, 0.02), (2, 0.03))}, 0.05, "widths fall"),
+        ({"kind": "table", "table": ((0, 0.05), (1, 0.02), (2, 0.01))}, 0.06, "open_width_m"),
+    ],
+)
+def test_impossible_geometry_is_refused(keys: dict[str, Any], open_width_m: float, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        make_linkage(GripperConfig(linkage=LinkageConfig(**keys), open_width_m=open_width_m))
