@@ -8,7 +8,7 @@ import typer
 
 from gripper_force.cli import console
 from gripper_force.cli.options import AsJson, ConfigPath, Overrides, load_settings
-from gripper_force.cli.output.calibrate import object_table, rig_table
+from gripper_force.cli.output.calibrate import jaws_table, object_table, rig_table
 from gripper_force.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -17,7 +17,9 @@ if TYPE_CHECKING:
     from gripper_force.config import Config
     from gripper_force.interfaces import Progress, Prompt
 
-app = typer.Typer(no_args_is_help=True, help="Calibrate the load cell, the servo, the camera, or an object.")
+app = typer.Typer(
+    no_args_is_help=True, help="Calibrate the jaws, the load cell, the servo, the camera, or an object."
+)
 
 RigPath = Annotated[
     Path | None,
@@ -54,6 +56,24 @@ def load_cell(
             settings, weight_n, path, prompt=_prompt(yes, status), seconds=seconds, progress=_progress(status)
         )
     _show_rig(result, as_json)
+
+
+@app.command("jaws")
+def jaws(
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Do not wait for Enter: the jaws are empty and open.")
+    ] = False,
+    config: ConfigPath = None,
+    set_: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Find the ends, the closing direction and the friction of empty jaws, and propose the configuration."""
+    from gripper_calibration.procedures.calibrate_jaws import calibrate_jaws as job
+
+    settings = load_settings(config, set_, {})
+    with console.err.status("moving") as status:
+        result = job(settings, prompt=_prompt(yes, status), progress=_progress(status))
+    console.show(result, as_json, jaws_table)
 
 
 @app.command("servo")

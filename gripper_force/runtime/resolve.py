@@ -171,10 +171,14 @@ def make_controller(config: Config) -> GraspController:
     if gripper.nm_per_a is None:
         raise ConfigError("gripper.nm_per_a is not set: this configuration was never resolved for a servo")
     transmission = Transmission.from_config(gripper, gripper.nm_per_a, gripper.current_step_a or 0.0)
-    loop = None
-    if gripper.position_loop_a_per_rad is not None and gripper.position_loop_gain_per_s is not None:
-        loop = PositionLoop(gripper.position_loop_a_per_rad, gripper.position_loop_gain_per_s)
-    return GraspController(config.control, transmission, config.servo.current_limit_a, loop)
+    return GraspController(config.control, transmission, config.servo.current_limit_a, position_loop(gripper))
+
+
+def position_loop(gripper: GripperConfig) -> PositionLoop | None:
+    """Returns the position loop of a complete configuration's servo, or None if it is unknown."""
+    if gripper.position_loop_a_per_rad is None or gripper.position_loop_gain_per_s is None:
+        return None
+    return PositionLoop(gripper.position_loop_a_per_rad, gripper.position_loop_gain_per_s)
 
 
 def _complete_gripper(gripper: GripperConfig, spec: ServoSpec) -> GripperConfig:

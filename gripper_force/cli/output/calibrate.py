@@ -1,14 +1,30 @@
 """Tables of calibrations of a rig and of an object."""
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from gripper_force.cli.console import number, pairs
+from gripper_force.cli.console import number, out, pairs
+
+if TYPE_CHECKING:
+    from gripper_calibration.procedures.calibrate_jaws import JawsResult
 
 
 def rig_table(r: dict[str, Any]) -> None:
     """Prints the calibrated values of a rig, each with its 95 % interval."""
     pairs({name: _found(value) for name, value in r.items()})
+
+
+def jaws_table(r: "JawsResult") -> None:
+    """Prints the ends and the friction of the jaws, and the proposed configuration."""
+    pairs(
+        {
+            "ends": f"{r.open_end_rad:.3f} rad open, {r.closed_end_rad:.3f} rad closed, "
+            f"repeated within {r.repeat_rad:.3f} rad",
+            "breakaway friction": f"{r.breakaway_n[0]:.2f} N closing, {r.breakaway_n[1]:.2f} N opening",
+            "running friction": f"{r.running_n[0]:.2f} N closing, {r.running_n[1]:.2f} N opening",
+        }
+    )
+    out.print(f"\nput this into your configuration:\n{r.yaml}", end="")
 
 
 def _found(value: Any) -> Any:

@@ -25,6 +25,9 @@ _SHELL_CONTACT = 'solref=".005 1" solimp=".95 .99 .001"'
 BLOCK_WIDTH_M = 0.030
 """Width of the gauge ``block`` between the jaws."""
 
+NO_OBJECT = "none"
+"""Name of the scene without an object."""
+
 GAUGES = frozenset({"block"})
 """Objects with exact dimensions: no size or stiffness is drawn for them."""
 
@@ -55,7 +58,7 @@ def build_object(name: str, detail: Detail, size: float, stiffness: float) -> Ob
     """Builds an object.
 
     Args:
-        name: A key of `OBJECTS`.
+        name: A key of `OBJECTS`, or `NO_OBJECT`.
         detail: Level of detail.
         size: Factor on all lengths. Material moduli are scaled inversely, so that the force at a given travel
             of the jaws does not change.
@@ -64,10 +67,14 @@ def build_object(name: str, detail: Detail, size: float, stiffness: float) -> Ob
     Raises:
         ConfigError: The object does not exist.
     """
+    if name == NO_OBJECT:
+        return ObjectModel("", _SOFT_CONTACT, None, 0.025, 0.0025)
     try:
         builder = OBJECTS[name]
     except KeyError:
-        raise ConfigError(f"no simulated object {name!r}; there are {', '.join(OBJECTS)}") from None
+        raise ConfigError(
+            f"no simulated object {name!r}; there are {', '.join([*OBJECTS, NO_OBJECT])}"
+        ) from None
     return builder(detail, size, stiffness)
 
 

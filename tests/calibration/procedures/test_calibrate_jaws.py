@@ -1,0 +1,130 @@
+"""Homing on the simulated rig, whose ends, closing direction and friction are known."""
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+import gripper_force as gf
+from gripper_calibration.procedures import calibrate_jaws as procedure
+from gripper_calibration.procedures.calibrate_jaws import JawsResult, calibrate_jaws
+from gripper_force.cli import app
+from gripper_force.config import Config, load_config
+from gripper_force.errors import DataError, DeviceError
+from gripper_force.types import ServoState
+from gripper_hw.dynamixel.servo import DynamixelServo
+from gripper_hw.dynamixel.virtual import VirtualBus, find_bus
+from gripper_hw.sim import simulated_rig
+from gripper_hw.sim.scene import Scene, draw_scene
+
+# The simulated jaws stop 1 mm before they meet, and 4 mm beyond the nominal open position.
+OPEN_END_RAD = -0.004 / 0.020
+CLOSED_END_RAD = (0.046 - 0.001) / 0.020
+
+
+def config_of(*overrides: str) -> Config:
+    return load_config(None, ["object=none", "sim.detail=coarse", *overrides])
+
+
+def home(*overrides: str) -> JawsResult:
+    asked: list[str] = []
+    result = calibrate_jaws(config_of(*overrides), prompt=lambda text: asked.append(text))
+    assert asked == ["Take everything from between the jaws and open them by hand"]
+    return result
+
+
+WRONG = ("gripper.closing_sign=-1", "gripper.open_position_rad=2", "gripper.friction_n=0.3")
+
+
+@pytest.mark.parametrize("overrides", [(), WRONG], ids=["right", "wrong"])
+def test_ends_direction_and_friction_are_found_with_any_configuration(overrides: tuple[str, ...]) -> None:
+    result = home("seed=3", *overrides)
+    scene = draw_scene("none", 3, config_of().sim)
+    friction_n = (scene.servo_friction_nm / 0.040 + scene.jaw_friction_n) / scene.nm_per_a
+    assert result.closing_sign == 1
+    assert result.open_end_rad == pytest.approx(OPEN_END_RAD, abs=0.06)
+    assert result.closed_end_rad == pytest.approx(CLOSED_END_RAD, abs=0.06)
+    assert result.friction_n == pytest.approx(friction_n, rel=0.12)
+    for breakaway_n, running_n in zip(result.breakaway_n, result.running_n, strict=True):
+        assert running_n < breakaway_n < 1.5 * running_n
+    assert result.open_width_m == pytest.approx(0.100, abs=0.003)
+
+
+def test_its_proposal_makes_a_grasp_possible() -> None:
+    proposed = yaml.safe_load(home("seed=3", *WRONG).yaml)["gripper"]
+    overrides = [f"gripper.{key}={value}" for key, value in proposed.items()]
+    config = load_config(
+        None, ["object=sponge", "sim.detail=coarse", "camera.backend=none", "seed=3", *overrides]
+    )
+    with gf.open_gripper(config) as gripper:
+        assert gripper.grasp(3.0).outcome == "held"
+
+
+def test_friction_beyond_the_configured_one_is_overcome(monkeypatch: pytest.MonkeyPatch) -> None:
+    def rough(*arguments: Any) -> Scene:
+        scene = draw_scene(*arguments)
+        return replace(scene, servo_friction_nm=4 * scene.servo_friction_nm)
+
+    monkeypatch.setattr(simulated_rig, "draw_scene", rough)
+    result = home("seed=3")
+    assert result.friction_n > 2.0
+    assert result.closed_end_rad == pytest.approx(CLOSED_END_RAD, abs=0.06)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["object=block"], "the jaws move by 1.* rad between their ends, but the configured geometry has 2"),
+        (["object=sponge"], "nothing lies between"),
+    ],
+)
+def test_contradictory_travel_is_refused(overrides: list[str], message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        home(*overrides)
+
+
+def test_half_open_jaws_are_refused() -> None:
+    with pytest.raises(DataError, match="the jaws were not open at the start"):
+        procedure._check_ends(1.0, 0.0, 2.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("breakaway_n", "running_n", "message"),
+    [
+        ((1.0, 1.0), (0.9, 0.2), "a cable or a weight"),
+        ((0.1, 1.0), (0.9, 0.9), "begin to move"),
+    ],
+)
+def test_contradictory_friction_is_refused(
+    breakaway_n: tuple[float, float], running_n: tuple[float, float], message: str
+) -> None:
+    with pytest.raises(DataError, match=message):
+        procedure._check_friction(breakaway_n, running_n)
+
+
+def test_device_failure_turns_torque_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    buses: list[VirtualBus | None] = []
+    read = DynamixelServo.read
+
+    def hot(servo: DynamixelServo) -> ServoState:
+        buses[:] = [find_bus("rig")]
+        return replace(read(servo), temperature_c=99.0)
+
+    monkeypatch.setattr(DynamixelServo, "read", hot)
+    with pytest.raises(DeviceError, match="the servo is at 99 C"):
+        home()
+    assert buses[0] is not None
+    assert buses[0].servos[0].get("torque_enable") == 0
+
+
+def test_command_prints_the_configuration() -> None:
+    call = ["calibrate", "jaws", "--yes", "--set", "object=none", "--set", "sim.detail=coarse"]
+    done = CliRunner().invoke(app, call)
+    assert done.exit_code == 0
+    assert "closing_sign: 1" in done.stdout
+    found = json.loads(CliRunner().invoke(app, [*call, "--json"]).stdout)
+    assert found["closing_sign"] == 1
+    assert found["open_width_m"] > 0.09
