@@ -7,7 +7,7 @@ Configuration, which are stored without effect, and the backup of the control ta
 
 import math
 from enum import IntEnum
-from typing import Final
+from typing import Final, Literal
 
 from gripper_hw.dynamixel.control_table import (
     FULL_PWM,
@@ -64,6 +64,9 @@ class VirtualServo:
         model: Model of the servo.
         tripped: True after a Bus Watchdog trip, until 0 is written to the watchdog: the goals are read-only.
         silent_until_ns: End of a reboot; before this time the servo ignores all packets.
+        on_watchdog: What a Bus Watchdog trip does in the position modes, which the vendor does not document: the
+            motor goes ``limp``, holds the present position (``brake``), follows its last goals on (``continue``),
+            or runs away by the Homing Offset; see docs/decisions/0021-what-a-watchdog-trip-does.md.
         excess_current_ratio: Fault: motor current beyond the commanded one, as a fraction of it.
     """
 
@@ -91,6 +94,9 @@ class VirtualServo:
         self._pending_write: tuple[int, bytes] | None = None
         self.silent_until_ns = 0
         self.excess_current_ratio = 0.0
+        self.on_watchdog: Literal["limp", "brake", "continue", "run away"] = "limp"
+        self.tripped = False
+        self._homing_ticks = 0
         self._reset(eeprom=True)
         self._store("firmware_version", firmware)
         self._store("id", id)
@@ -104,8 +110,7 @@ class VirtualServo:
         """Runs one step of the firmware.
 
         In the position modes the position PID sets a voltage, so back-EMF damps the motion; mode 5 limits the
-        resulting current to Goal Current. The reaction of a real servo in mode 5 to a watchdog trip is not
-        documented: this one turns the motor current off.
+        resulting current to Goal Current.
 
         Args:
             t_ns: Time of the step.
@@ -121,7 +126,9 @@ class VirtualServo:
         self._position_rad = position_rad
         self._velocity_rad_s = velocity_rad_s
         self.check_watchdog(t_ns)
-        if self._torque_on and not self.tripped:
+        if self.tripped and self.on_watchdog == "run away":
+            self._goal_position = self._ticks() - self._homing_ticks
+        if self._torque_on and not (self.tripped and self.on_watchdog == "limp"):
             target_a = self._target_current_a(dt_s)
             self._current_a += (target_a - self._current_a) * -math.expm1(-dt_s / CURRENT_LOOP_S)
             motor_a = self._current_a * (1 + self.excess_current_ratio)
@@ -348,6 +355,8 @@ class VirtualServo:
         self._torque_on = self.get("torque_enable") == 1
         watchdog = self.get("bus_watchdog")
         self._watchdog_ns = max(0, watchdog) * WATCHDOG_UNIT_MS * 1_000_000
+        if watchdog < 0 and not self.tripped and self.on_watchdog == "brake":
+            self._store("goal_position", self._ticks())
         self.tripped = watchdog < 0
         self._homing_ticks = self.get("homing_offset")
         self._current_limit_a = self.get("current_limit") * self.model.current_unit_a

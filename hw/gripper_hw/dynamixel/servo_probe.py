@@ -123,6 +123,18 @@ class _Inspection:
             "it, or set the register back with DYNAMIXEL Wizard"
         )
         yield judged(unit, "homing offset", f"{offset} ticks", offset == expected, advice)
+        if offset == expected != 0:
+            advice = (
+                "some firmware moves the motor after a watchdog trip with a Homing Offset (DynamixelSDK issue 584): "
+                "set it to 0 with DYNAMIXEL Wizard, and gripper.open_position_rad anew"
+            )
+            yield judged(unit, "watchdog", "may move the jaws", False, advice, harmless=True)
+        if "330" in self.model.name:
+            advice = (
+                "firmware 51 of 330-size servos was seen to keep turning after a trip in current control: update "
+                "it, and try it once: stop a grasp with kill -9"
+            )
+            yield judged(unit, "watchdog", "unproven on this model", False, advice, harmless=True)
         for name, new in self._expected.items():
             if name in _ALWAYS_LISTED or values[name] != new:
                 same, text = values[name] == new, self._text(name, values[name])

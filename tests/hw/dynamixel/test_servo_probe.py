@@ -69,6 +69,13 @@ def test_another_homing_offset_is_a_problem(endpoint):
     assert "set servo.homing_offset=1024" in check.advice
 
 
+def test_configured_homing_offset_is_a_warning(endpoint):
+    endpoint.bus.servos[0].set("homing_offset", 1024)
+    check = rows(endpoint, homing_offset=1024)["servo 1", "watchdog"]
+    assert "issue 584" in check.advice
+    assert check.ok
+
+
 def test_running_servo_is_not_changed(endpoint):
     servo = DynamixelServo(endpoint.config(), lambda: endpoint.now_ns)
     servo.start()
