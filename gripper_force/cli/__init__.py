@@ -62,8 +62,8 @@ def main() -> NoReturn:
         if "--json" in sys.argv:
             sys.stdout.write(json.dumps({"error": str(error)}) + "\n")
         sys.exit(2)
-    except SystemExit as end:
-        if end.code == _INTERRUPTED:  # typer's exit code after a KeyboardInterrupt
+    except (SystemExit, KeyboardInterrupt) as end:  # the latter while typer starts or ends
+        if isinstance(end, KeyboardInterrupt) or end.code == _INTERRUPTED:  # typer's code after an interrupt
             console.err.print("interrupted; the run was stopped as configured", soft_wrap=True)
             sys.exit(process.interrupt_exit_code())
         raise

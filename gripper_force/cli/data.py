@@ -1,5 +1,6 @@
 """Commands that make logs: `simulate`, `record`, `import video` and `import database`."""
 
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -84,9 +85,10 @@ def simulate(
     made = 0
     with console.bar("simulating", len(names)) as progress:
         progress("", sum((folder / name).exists() for name in names))
-        for path in job.simulate(plans, folder, settings, jobs):
-            made += 1
-            progress(path.name)
+        with closing(job.simulate(plans, folder, settings, jobs)) as paths:
+            for path in paths:
+                made += 1
+                progress(path.name)
     console.show({"logs": len(names), "made": made, "folder": str(folder)}, as_json)
 
 

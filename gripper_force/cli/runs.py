@@ -2,6 +2,7 @@
 
 import signal
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -65,13 +66,21 @@ def grasp(
         raise ConfigError(
             "--trials uses all four objects with drawn targets; leave out --object and --target-n"
         )
-    results = []
+    results: list[job.Summary] = []
+    interrupt: KeyboardInterrupt | None = None
     with console.bar("grasping", trials) as progress:
-        for one in job.trials(settings, trials, jobs):
-            results.append(one)
-            progress(f"{one['object']} {one['target_n']:.1f} N: {one['result']}")
-    summary = job.overall(results, settings.control.force_limit_n)
-    console.show({"trials": results, "summary": summary}, as_json, trials_table)
+        try:
+            with closing(job.trials(settings, trials, jobs)) as finished:
+                for one in finished:
+                    results.append(one)
+                    progress(f"{one['object']} {one['target_n']:.1f} N: {one['result']}")
+        except KeyboardInterrupt as end:
+            interrupt = end
+    if results:
+        summary = job.overall(results, settings.control.force_limit_n)
+        console.show({"trials": results, "summary": summary}, as_json, trials_table)
+    if interrupt is not None:
+        raise interrupt
 
 
 def replay(

@@ -2,7 +2,7 @@
 
 import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Generator, Mapping
 from pathlib import Path
 from typing import Any, Final, TypedDict
 
@@ -184,7 +184,7 @@ def _report_phase(progress: Progress, status: GraspStatus, begin_ns: int) -> Non
     progress("  ".join(part for part in parts if part))
 
 
-def trials(config: Config, count: int, jobs: int) -> Iterator[Summary]:
+def trials(config: Config, count: int, jobs: int) -> Generator[Summary, None, None]:
     """Runs grasps of all four paper objects in turn, with targets and seeds drawn from ``config.seed``.
 
     Args:

@@ -1,35 +1,191 @@
 """Process pools for independent jobs, which end at once and quietly on an interrupt."""
 
+import atexit
+import os
 import signal
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+import threading
+import traceback
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
-from multiprocessing import active_children, get_context
+from multiprocessing import get_context, parent_process, resource_tracker
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
+from multiprocessing.reduction import ForkingPickler
+from queue import Empty, SimpleQueue
+from typing import Any, Final
 
+from gripper_force.errors import GripperError
 from gripper_force.runtime.process import ProcessOptions, allowed, own_process
+
+_TERMINAL_SIGNALS: Final = (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
+"""A terminal sends these to every process. The parent handles them, and then kills its children."""
+
+_THREAD_S: Final = 1.0
+"""Longest wait for a thread whose process was killed: an interrupt can leave a future locked."""
+
+_Job = tuple[Future[Any], Callable[..., Any], tuple[Any, ...], dict[str, Any]]
 
 
 @contextmanager
-def process_pool(count: int) -> Iterator[ProcessPoolExecutor]:
-    """Opens a pool of processes. If the block ends with an exception, running jobs are terminated.
+def process_pool(count: int) -> Iterator[Executor]:
+    """Opens a pool of processes. If the block ends with an exception, running jobs are killed.
 
-    The processes may change the same process-wide settings as this one (see `own_process`).
+    The processes may change the same process-wide settings as this one (see `own_process`). They ignore the
+    terminal's signals, and end when this process does, even if it is killed.
+
+    Args:
+        count: Largest number of processes. Each is started when a job first needs it.
+
+    Yields:
+        An executor. If a process dies, the result of its job raises `GripperError`.
     """
-    others = set(active_children())
-    pool = ProcessPoolExecutor(count, get_context("spawn"), _start_process, (allowed(),))
+    pool = _ProcessPool(count)
     try:
         yield pool
-    except BaseException:
-        for child in set(active_children()) - others:
-            child.terminate()
-        raise
+        pool.shutdown()
     finally:
-        pool.shutdown(cancel_futures=True)
+        pool.end()
 
 
-def _start_process(options: ProcessOptions) -> None:
+class _ProcessPool(Executor):
+    """One thread for each process starts it, sends it jobs and receives their results.
+
+    `concurrent.futures.ProcessPoolExecutor` starts processes in the thread that submits. There, Ctrl-C can
+    interrupt the start, and a process that is killed while it sends a result blocks the pool forever. Here,
+    Ctrl-C can't interrupt a thread, and no two processes share a pipe. The threads are daemons: none delays
+    the end of the program.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self._jobs: SimpleQueue[_Job | None] = SimpleQueue()
+        self._threads: list[threading.Thread] = []
+        self._lock = threading.Lock()
+        self._processes: list[SpawnProcess] = []
+        self._is_closed = False
+        atexit.register(
+            self._kill
+        )  # for a pool that was never closed, such as that of an unfinished generator
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Queues a job, and returns its future."""
+        future: Future[Any] = Future()
+        self._jobs.put((future, fn, args, kwargs))
+        if len(self._threads) < self._count:
+            thread = threading.Thread(target=self._run_jobs, name="process-pool", daemon=True)
+            self._threads.append(thread)
+            thread.start()
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """Lets each process end after the jobs that were submitted."""
+        for _ in self._threads:
+            self._jobs.put(None)
+        for thread in self._threads:
+            thread.join()
+
+    def end(self) -> None:
+        """Kills all processes that still run. A further interrupt does not prevent this."""
+        if self._is_closed:  # also while Python ends, when no thread can start
+            return
+        thread = threading.Thread(target=self._kill, name="process-pool-end")
+        thread.start()
+        thread.join()
+
+    def _kill(self) -> None:
+        atexit.unregister(self._kill)
+        with self._lock:  # no process is half-started
+            self._is_closed = True
+        for process in self._processes:
+            process.kill()
+        for process in self._processes:
+            process.join()
+        with suppress(Empty):
+            while True:
+                if (job := self._jobs.get_nowait()) is not None:
+                    job[0].cancel()
+        for _ in self._threads:
+            self._jobs.put(None)
+        for thread in self._threads:
+            thread.join(_THREAD_S)
+
+    def _run_jobs(self) -> None:
+        process, connection = None, None
+        while (job := self._jobs.get()) is not None:
+            future, *call = job
+            if not future.set_running_or_notify_cancel():
+                continue
+            try:
+                if connection is None:
+                    process, connection = self._start()
+                connection.send_bytes(ForkingPickler.dumps(call))
+                succeeded, result = connection.recv()
+            except (EOFError, ConnectionError):
+                code = None
+                if process is not None:
+                    process.join()
+                    code = process.exitcode
+                connection = None
+                future.set_exception(GripperError(f"a worker process ended with code {code}; run it again"))
+            except Exception as error:
+                future.set_exception(error)
+            else:
+                if succeeded:
+                    future.set_result(result)
+                else:
+                    future.set_exception(result)
+            del job, future, call
+        if process is not None and connection is not None:
+            connection.close()
+            process.join()
+
+    def _start(self) -> tuple[SpawnProcess, Connection]:
+        """Starts a process that the terminal's signals do not reach, from its first instruction on."""
+        resource_tracker.ensure_running()  # the first call unblocks SIGINT
+        signal.pthread_sigmask(
+            signal.SIG_BLOCK, _TERMINAL_SIGNALS
+        )  # of this thread, inherited by the process
+        context = get_context("spawn")
+        ours, theirs = context.Pipe()
+        process = context.Process(target=_serve, args=(theirs, allowed()))
+        with self._lock:
+            if self._is_closed:
+                raise EOFError
+            process.start()
+            self._processes.append(process)
+        theirs.close()
+        return process, ours
+
+
+def _serve(connection: Connection, options: ProcessOptions) -> None:
+    """Runs jobs in a process of the pool, until the parent closes the connection."""
     own_process(**{**asdict(options), "signals": False})
-    # A terminal sends these to every process; the parent handles them, and then terminates its children.
-    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT):
+    for number in _TERMINAL_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _TERMINAL_SIGNALS)
+    threading.Thread(target=_end_with_parent, name="end-with-parent", daemon=True).start()
+    while True:
+        try:
+            data = connection.recv_bytes()
+        except (EOFError, ConnectionError):
+            return
+        connection.send_bytes(_answer(data))
+
+
+def _answer(data: bytes) -> Any:
+    """Runs a pickled job. Returns the pickled pair of success and result, or of failure and exception."""
+    try:
+        function, args, kwargs = ForkingPickler.loads(data)
+        return ForkingPickler.dumps((True, function(*args, **kwargs)))
+    except Exception as error:
+        error.add_note(f"in a worker process:\n{traceback.format_exc()}")
+        return ForkingPickler.dumps((False, error))
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

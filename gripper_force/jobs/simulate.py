@@ -9,7 +9,7 @@ make the data that one is trained on.
 `gripper_force.jobs.paper_protocol` makes the sets of the paper's protocol.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,7 +90,7 @@ def plan(kind: Kind, count: int, first_seed: int, objects: tuple[str, ...] = OBJ
     return [SimulationPlan(kind, objects[i % len(objects)], first_seed + i) for i in range(count)]
 
 
-def simulate(plans: Sequence[Plan], out: Path, config: Config, jobs: int) -> Iterator[Path]:
+def simulate(plans: Sequence[Plan], out: Path, config: Config, jobs: int) -> Generator[Path, None, None]:
     """Makes the logs that do not exist yet, in several processes, and yields each once it is complete.
 
     Args:

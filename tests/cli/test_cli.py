@@ -336,6 +336,31 @@ def test_interrupted_trials_end_without_a_word_from_each_process(sets: list[str]
     assert "interrupted" in said
 
 
+def test_an_interrupt_at_any_time_ends_trials(sets: list[str], tmp_path: Path) -> None:
+    program = (
+        "import sys; from gripper_force.cli import main; print('ready', file=sys.stderr, flush=True); main()"
+    )
+    command = [sys.executable, "-c", program, "grasp", "--json", "--trials", "400", "--jobs", "2", *sets]
+    for delay_s in np.random.default_rng(5).uniform(0.05, 6.0, 4):
+        with subprocess.Popen(
+            command,
+            cwd=tmp_path,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        ) as child:
+            assert child.stderr is not None
+            assert child.stderr.readline() == "ready\n"
+            time.sleep(delay_s)
+            os.killpg(child.pid, signal.SIGINT)
+            out, said = child.communicate(timeout=60)  # until no process holds the pipes
+        assert (child.returncode, "Traceback" in said) == (130, False), said
+        if out:
+            result = json.loads(out)
+            assert result["summary"]["trials"] == len(result["trials"]) > 0
+
+
 def test_a_protocol_and_its_scale_are_known_by_name(run: Run) -> None:
     assert "no protocol 'shin'; use shin2019" in run("simulate", "--protocol", "shin").err
     unknown = run("simulate", "--protocol", "shin2019", "--scale", "huge")

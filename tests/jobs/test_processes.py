@@ -1,11 +1,15 @@
 import os
 import signal
+import subprocess
+import sys
 import time
 from concurrent.futures import Future
 from multiprocessing import active_children
+from pathlib import Path
 
 import pytest
 
+from gripper_force.errors import DataError, GripperError
 from gripper_force.jobs.processes import process_pool
 
 
@@ -34,3 +38,86 @@ def test_an_interruption_breaks_off_what_runs_and_what_waits() -> None:
     assert len(waiting) == 3
     assert all(future.done() for future in waiting)
     assert active_children() == []
+
+
+def raise_error() -> None:
+    raise DataError("no such log")
+
+
+def test_an_error_is_raised_with_the_place_where_it_happened() -> None:
+    with process_pool(1) as pool:
+        with pytest.raises(DataError, match="no such log") as caught:
+            pool.submit(raise_error).result()
+        assert "in raise_error" in caught.value.__notes__[0]
+        assert pool.submit(os.getpid).result() != os.getpid()
+
+
+def test_results_are_in_order_and_the_processes_end() -> None:
+    with process_pool(2) as pool:
+        assert list(pool.map(abs, range(-20, 0))) == list(range(20, 0, -1))
+        assert 1 <= len(active_children()) <= 2
+    assert active_children() == []
+
+
+def test_a_process_that_dies_is_an_error_and_is_replaced() -> None:
+    with process_pool(1) as pool:
+        with pytest.raises(GripperError, match="ended with code -9"):
+            pool.submit(kill_itself).result()
+        assert pool.submit(abs, -3).result() == 3
+
+
+def kill_itself() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def large_result() -> bytes:
+    return bytes(1 << 28)
+
+
+def test_an_interruption_while_results_are_sent_ends_at_once() -> None:
+    def interrupted() -> None:
+        with process_pool(2) as pool:
+            assert len(list(pool.map(abs, range(2)))) == 2
+            for _ in range(20):
+                pool.submit(large_result)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert active_children() == []
+
+
+FORGETFUL = """
+import os, sys, time
+from gripper_force.errors import DataError, GripperError
+from gripper_force.jobs.processes import process_pool
+
+def jobs():
+    with process_pool(1) as pool:
+        yield pool.submit(os.getpid).result()
+        pool.submit(time.sleep, 3600).result()
+
+running = jobs()
+print(next(running), flush=True)
+if sys.argv[1] == "killed":
+    os.kill(os.getpid(), 9)
+if sys.argv[1] == "exit":
+    sys.modules["kept"] = running  # the generator is never closed
+"""
+
+
+@pytest.mark.parametrize("ending", ["killed", "exit"])
+def test_no_process_outlives_its_parent(ending: str) -> None:
+    command = [sys.executable, "-c", FORGETFUL, ending]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stderr) == (-9 if ending == "killed" else 0, "")
+    while is_running(int(done.stdout)):
+        time.sleep(0.01)
+
+
+def is_running(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except (FileNotFoundError, ProcessLookupError):
+        return False
+    return state != "Z"

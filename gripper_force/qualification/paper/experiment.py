@@ -4,6 +4,7 @@ import functools
 import json
 from collections.abc import Iterable, Sequence
 from concurrent.futures import as_completed
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -105,8 +106,9 @@ def missing_logs(scale: Scale, data: Path) -> int:
 def simulate_missing(scale: Scale, data: Path, jobs: int, progress: Progress) -> None:
     """Simulates the logs of the protocol that do not exist yet. Raises as `simulate.simulate` does."""
     config = load_config(None, [f"camera.rate_hz={RATE_HZ}"])
-    for path in simulate(plan_protocol(scale.protocol), data, config, jobs):
-        progress(path.name)
+    with closing(simulate(plan_protocol(scale.protocol), data, config, jobs)) as paths:
+        for path in paths:
+            progress(path.name)
 
 
 def run(scale: Scale, models: Iterable[str], data: Path, out: Path, jobs: int, progress: Progress) -> Test:
