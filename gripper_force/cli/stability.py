@@ -7,7 +7,13 @@ import typer
 
 from gripper_force.cli import console
 from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, load_settings
-from gripper_force.cli.output.stability import faults_table, fuzz_table, numerics_tables, soak_table
+from gripper_force.cli.output.stability import (
+    faults_table,
+    fuzz_table,
+    numerics_tables,
+    search_table,
+    soak_table,
+)
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -73,6 +79,27 @@ def faults(
     ok = all(row["ok"] == row["runs"] for row in rows)
     console.show({"rows": rows, "ok": ok}, as_json, faults_table)
     _exit(ok)
+
+
+@app.command("search")
+def search(
+    cases: Annotated[int, typer.Option(min=1, help="Drawn plants and wrong configurations.")] = 10_000,
+    resume: Annotated[bool, typer.Option(help="Continue an interrupted search.")] = False,
+    seed: Seed = None,
+    jobs: Jobs = CORES,
+    config: ConfigPath = None,
+    set_: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Search wrong configurations for unsafe grasps, on an analytic plant. Exit code 1 if one is found."""
+    from gripper_force.qualification import safety_search
+
+    settings = load_settings(config, set_, {"seed": seed})
+    keep = settings.log.directory / "search.jsonl"
+    with console.bar("searching", cases) as progress:
+        report = safety_search.search(settings, cases, jobs, keep, resume=resume, progress=progress)
+    console.show(report, as_json, search_table)
+    _exit(report["ok"])
 
 
 @app.command("fuzz")

@@ -14,6 +14,7 @@ from gripper_force.control.speed_limit import PositionLoop, SpeedLimit
 from gripper_force.control.trajectory import TrapezoidalProfile
 from gripper_force.control.transmission import Transmission
 from gripper_force.types import (
+    NS_PER_MS,
     NS_PER_S,
     EstimateSource,
     Event,
@@ -48,6 +49,15 @@ _DWELL_S = 0.12
 
 _SETTLE_FILTER_S = 0.25
 """Time constant of the filter on the force error that decides on `held`: vision alone is noisy."""
+
+_LET_GO_S = 0.3
+"""Time in which the motor force of a grip falls to that of free travel after a release. A sudden fall would let a
+springy object push the jaws open at four times the wanted speed."""
+
+_SEEN_FILTER_S = 0.3
+_UNSEEN_SHARE = 0.15
+"""A grip counts as held only if the filtered visual estimate is at least this share of the target. Otherwise the jaws
+may press on an end stop, which the motor current cannot tell from an object."""
 
 _OPEN_M = 0.003
 """Distance from the open width at which the jaws count as open."""
@@ -141,6 +151,9 @@ class GraspController:
         self._grasp_ns = 0
         self._phase_s = self._settled_s = self._error_n = 0.0
         self._was_over_force = False
+        self._let_go_n = 0.0
+        self._seen_n: float | None = None
+        self._seen_ns = 0
         self._goal_current_a = self._measured_motor_force_n = 0.0
         self._derating = 1.0
 
@@ -234,7 +247,27 @@ class GraspController:
             opening=self._is_opening,
             lowering=self._phase in (Phase.RAMP, Phase.HOLD) and self._loop.is_lowering,
         )
+        self._note_vision(t_ns, visual)
         return [*fusion_events, *self._derate(t_ns, servo.temperature_c)]
+
+    def _note_vision(self, t_ns: int, visual: VisualForce | None) -> None:
+        """Filters what vision estimates, also where fusion rejects it because the motor current differs."""
+        if t_ns - self._seen_ns > (self._config.timeout_ms + self._config.max_age_ms) * NS_PER_MS:
+            self._seen_n = None
+        if visual is None or visual.t_ns <= self._seen_ns or self._config.feedback == "current":
+            return
+        # A comparison with NaN is false.
+        if not (abs(visual.force_n) <= 1e9 and 0 <= visual.std_n <= self._config.vision_std_n):
+            return
+        dt_s = (visual.t_ns - self._seen_ns) / NS_PER_S
+        before_n = visual.force_n if self._seen_n is None else self._seen_n
+        self._seen_n = before_n + (visual.force_n - before_n) * dt_s / (dt_s + _SEEN_FILTER_S)
+        self._seen_ns = visual.t_ns
+
+    @property
+    def _is_unseen(self) -> bool:
+        """True if the camera, which is in use, sees next to no force."""
+        return self._seen_n is not None and self._seen_n < _UNSEEN_SHARE * self._derated_target_n
 
     def _derate(self, t_ns: int, temperature_c: float) -> list[Event]:
         """Lowers the target force of a hot servo, before the servo shuts down."""
@@ -310,6 +343,7 @@ class GraspController:
         self._enter(Phase.MOVE, f"move to {1e3 * width_m:.1f} mm requested")
 
     def _start_travel(self) -> None:
+        self._let_go_n = self._motor_force_n if self._phase in _GRIPPING else 0.0
         speed_m_s = _TRAVEL_SPEED_SHARE * self._config.approach_speed_m_s
         self._travel.start(self._present_width_m, speed_m_s)
         self._limits.reset()
@@ -440,7 +474,7 @@ class GraspController:
         self._error_n += (error_n - self._error_n) * dt_s / (dt_s + _SETTLE_FILTER_S)
         is_near = abs(self._error_n) <= tolerance_n(self._derated_target_n)
         self._settled_s = self._settled_s + dt_s if is_near else 0.0
-        if self._outcome == Outcome.NONE and self._settled_s >= self._config.settle_s:
+        if self._outcome == Outcome.NONE and self._settled_s >= self._config.settle_s and not self._is_unseen:
             self._held_width_m = width_m
             self._set_outcome(Outcome.HELD, f"{self._estimate.force_n:.2f} N for {self._settled_s:.2f} s")
         if lost := self._slip.is_lost(dt_s, width_m, closing_m_s, shortfall_n, self._loop.reference_n):
@@ -466,8 +500,14 @@ class GraspController:
                 self._approach.start(width_m, self._target_n)
                 self._enter(Phase.APPROACH, reason)
 
+    @property
+    def _travel_force_n(self) -> float:
+        """Motor force of a release or move: that of free travel, and at first what remains of a grip."""
+        remaining_n = self._let_go_n * (1 - self._phase_s / _LET_GO_S)
+        return max(self._free_motor_force_n, remaining_n)
+
     def _run_release(self, dt_s: float, width_m: float) -> None:
-        self._motor_force_n = self._free_motor_force_n
+        self._motor_force_n = self._travel_force_n
         open_width_m = self._transmission.open_width_m
         self._goal_width_m = self._travel.step(open_width_m, dt_s)
         self._goal_width_m = self._travel.value = min(self._goal_width_m, width_m + 2 * _LEAD_M)
@@ -477,7 +517,7 @@ class GraspController:
                 self._enter(Phase.OPEN, "open")
 
     def _run_move(self, dt_s: float, width_m: float) -> None:
-        self._motor_force_n = self._free_motor_force_n
+        self._motor_force_n = self._travel_force_n
         goal_width_m = self._travel.step(self._move_width_m, dt_s)
         self._goal_width_m = min(max(goal_width_m, width_m - 2 * _LEAD_M), width_m + 2 * _LEAD_M)
         self._travel.value = self._goal_width_m
@@ -491,7 +531,14 @@ class GraspController:
 
     def _check_timeout(self, t_ns: int) -> None:
         if t_ns - self._grasp_ns > self._config.timeout_s * NS_PER_S:
-            self._set_outcome(Outcome.TIMEOUT, f"not held within {self._config.timeout_s:g} s")
+            reason = f"not held within {self._config.timeout_s:g} s"
+            if self._is_unseen:
+                reason += (
+                    f": the camera sees {self._seen_n:.1f} N. The jaws may press on an end stop: check "
+                    "gripper.open_width_m with `calibrate jaws`. If there is an object, calibrate it, or set "
+                    "control.feedback=current"
+                )
+            self._set_outcome(Outcome.TIMEOUT, reason)
 
     # Outputs.
 

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from gripper_force.qualification.fault_matrix.matrix import MatrixReport
     from gripper_force.qualification.fuzz.fuzzer import FuzzReport
     from gripper_force.qualification.numerics.suite import NumericsReport
+    from gripper_force.qualification.safety_search import SearchReport
     from gripper_force.qualification.soak import SoakReport
 
 
@@ -62,6 +63,28 @@ def faults_table(r: "MatrixReport") -> None:
     for row in r["rows"]:
         for seed, failure in row["failures"].items():
             out.print(f"[bold red]{row['row']}[/], seed {seed}: {escape(failure)}", soft_wrap=True)
+
+
+def search_table(r: "SearchReport") -> None:
+    """Prints the violations of each statement, and its worst cases."""
+    for name, cases in r["worst"].items():
+        found = r["violations"][name]
+        colour = "bold red" if found else "green"
+        out.print(f"{name}: [{colour}]{found} of {r['cases']}[/]")
+        for case in cases:
+            drawn = ", ".join(f"{key} {number(value)}" for key, value in case["drawn"].items())
+            out.print(
+                f"  case {case['index']}, {case['outcome']}: {case['force_share']:.2f} of the force limit, "
+                f"{case['speed_share']:.2f} of the speed\n    [dim]{escape(drawn)}[/]",
+                soft_wrap=True,
+            )
+    pairs(
+        {
+            "end stops held by motor current alone": r["held_stops"],
+            "outcomes": ", ".join(f"{n} {name}" for name, n in r["outcomes"].items()),
+            "seed": r["seed"],
+        }
+    )
 
 
 def soak_table(r: "SoakReport") -> None:

@@ -1,0 +1,391 @@
+"""Random search for wrong configurations and plants with which a grasp is not safe.
+
+Every case draws a plant and what the configuration wrongly believes of it, grasps, and releases. Three statements
+must hold: the contact force stays within the force limit and 5 %, jaws without contact are never faster than 1.5
+times the configured speed, and a grasp is never ``held`` on nothing for longer than 0.1 s. With motor current alone
+an end stop cannot be told from a rigid object. So such cases are counted, but are no violations; `calibrate jaws`
+prevents them.
+"""
+
+import json
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Final, TypedDict
+
+import numpy as np
+
+from gripper_force.config import Config, ControlConfig
+from gripper_force.control.limits import largest_target_n
+from gripper_force.control.linkage import RackAndPinion
+from gripper_force.control.state_machine import GraspController
+from gripper_force.errors import DataError
+from gripper_force.interfaces import Progress, no_progress
+from gripper_force.jobs.processes import process_pool
+from gripper_force.qualification.loop_margin.analytic_plant import (
+    CYCLE_NS,
+    NOISE_A,
+    POSITION_LOOP,
+    Gripper,
+    SimulatedVision,
+    transmission_of,
+)
+from gripper_force.types import NS_PER_S, Outcome, Phase, Request, RequestKind, ServoCommand, ServoState
+
+FORCE_SHARE: Final = 1.05
+SPEED_SHARE: Final = 1.5
+NOTHING_SHARE: Final = 0.05
+"""Contact force as a share of the target below which the jaws hold nothing."""
+
+WORST: Final = 5
+"""Cases listed for each statement."""
+
+_GRASP_S: Final = 5.0
+_RELEASE_S: Final = 1.5
+_TRAVEL_SHARE: Final = 2.0
+"""Speed of a release as a share of the approach speed."""
+
+_CHUNK: Final = 20
+_REACTION_S: Final = 0.1
+"""Time in which a grasp may still count as held after the object has left."""
+
+_GONE_M: Final = 1.0
+_STOP_M: Final = 0.0455
+
+
+@dataclass(frozen=True, slots=True)
+class Draw:
+    """One case: the plant, and what the controller wrongly believes of it.
+
+    Attributes:
+        target_n: Requested force.
+        feedback: As ``control.feedback``.
+        on_slip: As ``control.on_slip``.
+        friction: True friction over the configured one.
+        gain: True torque constant over the configured one.
+        stiffness_n_m: Stiffness of the object at one jaw.
+        mass_kg: Mass of a jaw with its half of the rotor.
+        damping_n_s_m: Viscous friction.
+        play_m: Gear play in each direction.
+        contact_m: Travel of a jaw at which it meets the object; 1 m without an object.
+        leaves_s: Time at which the object leaves the jaws; infinite for never.
+        start_m: Error of the configured open position, as travel of a jaw.
+        sign: -1 if the configured closing direction is wrong.
+        width: Configured open width over the true one.
+        camera_hz: Frames per second.
+        vision_gain: Visual estimate over true force.
+        vision_noise_n: Its noise.
+        seed: Seed of the noise.
+    """
+
+    target_n: float
+    feedback: str
+    on_slip: str
+    friction: float
+    gain: float
+    stiffness_n_m: float
+    mass_kg: float
+    damping_n_s_m: float
+    play_m: float
+    contact_m: float
+    leaves_s: float
+    start_m: float
+    sign: int
+    width: float
+    camera_hz: float
+    vision_gain: float
+    vision_noise_n: float
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class CaseResult:
+    """Outcome of one case.
+
+    Attributes:
+        index: Number of the case.
+        outcome: Last outcome of the grasp, or ``refused`` if the run did not start.
+        force_share: Largest contact force over the force limit.
+        speed_share: Largest speed without contact over the configured one.
+        held_nothing: True if the outcome was ``held`` without contact force, although a camera was in use.
+        held_stop: True if it was, on an end stop, by motor current alone.
+    """
+
+    index: int
+    outcome: str
+    force_share: float
+    speed_share: float
+    held_nothing: bool
+    held_stop: bool
+
+    @property
+    def ok(self) -> bool:
+        """True if the three statements hold."""
+        return self.force_share <= FORCE_SHARE and self.speed_share <= SPEED_SHARE and not self.held_nothing
+
+
+class WorstCase(TypedDict):
+    """A case with what was drawn for it. An infinite time is null."""
+
+    index: int
+    outcome: str
+    force_share: float
+    speed_share: float
+    held_nothing: bool
+    held_stop: bool
+    drawn: dict[str, float | str | None]
+
+
+class SearchReport(TypedDict):
+    """Result of `search`.
+
+    Attributes:
+        ok: True if there are no violations.
+        cases: Number of cases.
+        seed: Seed of all draws.
+        outcomes: Number of cases by outcome.
+        violations: Number of violations by statement.
+        held_stops: Number of end stops that were taken for an object by motor current alone.
+        worst: The worst cases by statement.
+    """
+
+    ok: bool
+    cases: int
+    seed: int
+    outcomes: dict[str, int]
+    violations: dict[str, int]
+    held_stops: int
+    worst: dict[str, list[WorstCase]]
+
+
+def draw(config: ControlConfig, gain_bound: float, seed: int, index: int) -> Draw:
+    """Draws a case. The same arguments give the same case."""
+    rng = np.random.default_rng([seed, 50, index])
+
+    def between(low: float, high: float) -> float:
+        return float(rng.uniform(low, high))
+
+    def log_between(low: float, high: float) -> float:
+        return math.exp(between(math.log(low), math.log(high)))
+
+    def rarely(share: float, value: float, otherwise: float) -> float:
+        return value if rng.uniform() < share else otherwise
+
+    return Draw(
+        target_n=between(0.5, largest_target_n(config.force_limit_n, gain_bound)),
+        feedback=str(rng.choice(["fused", "current", "vision"])),
+        on_slip=str(rng.choice(["regrip", "hold", "open"])),
+        friction=log_between(0.3, 5.0),
+        gain=between(0.7, 1.4),
+        stiffness_n_m=log_between(200.0, 30_000.0),
+        mass_kg=between(0.8, 1.5),
+        damping_n_s_m=between(8.0, 16.0),
+        play_m=between(0.0002, 0.0004),
+        contact_m=rarely(0.2, _GONE_M, between(0.002, 0.043)),
+        leaves_s=rarely(0.25, between(0.5, _GRASP_S), math.inf),
+        start_m=rarely(0.3, between(-0.02, 0.02), 0.0),
+        sign=int(rarely(0.1, -1, 1)),
+        width=rarely(0.3, between(0.8, 1.2), 1.0),
+        camera_hz=between(5.0, 60.0),
+        vision_gain=log_between(0.4, 2.5),
+        vision_noise_n=between(0.03, 0.3),
+        seed=int(rng.integers(2**31)),
+    )
+
+
+def run_case(config: Config, seed: int, index: int) -> CaseResult:
+    """Grasps and releases with one drawn plant, in closed loop with the unmodified controller."""
+    drawn = draw(config.control, config.gripper.gain_bound, seed, index)
+    truth = transmission_of(config.gripper)
+    radius_m = truth.jaw_m_per_rad(truth.open_position_rad)
+    believed = replace(truth, linkage=RackAndPinion(radius_m, drawn.width * truth.open_width_m))
+    control = config.control.model_copy(
+        update={
+            "feedback": drawn.feedback,
+            "on_slip": drawn.on_slip,
+            "vision_rate_hz": drawn.camera_hz,
+        }
+    )
+    plant = Gripper(
+        truth,
+        stiffness_n_m=drawn.stiffness_n_m,
+        gain=drawn.gain,
+        friction_n=drawn.friction * truth.friction_n,
+        damping_n_s_m=drawn.damping_n_s_m,
+        play_m=drawn.play_m,
+        mass_kg=drawn.mass_kg,
+        contact_m=drawn.contact_m,
+        stops_m=(0.0, _STOP_M),
+    )
+    controller = GraspController(control, believed, config.servo.current_limit_a, POSITION_LOOP)
+    run = _Run(plant, controller, drawn, drawn.start_m / radius_m, control)
+    if controller.start_problem(run.read(0, 0.0)):
+        return CaseResult(index, "refused", 0.0, 0.0, held_nothing=False, held_stop=False)
+    run.go(_GRASP_S, Request(0, RequestKind.GRASP, drawn.target_n))
+    run.go(_RELEASE_S, Request(run.t_ns, RequestKind.RELEASE))
+    return CaseResult(
+        index,
+        str(run.outcome),
+        run.peak_n / control.force_limit_n,
+        run.speed_share,
+        run.held_nothing and drawn.feedback != "current",
+        run.held_nothing and drawn.feedback == "current",
+    )
+
+
+class _Run:
+    """A closed loop whose servo angle has another zero and sign than the controller believes."""
+
+    def __init__(
+        self,
+        plant: Gripper,
+        controller: GraspController,
+        drawn: Draw,
+        offset_rad: float,
+        control: ControlConfig,
+    ) -> None:
+        self._plant, self._controller, self._drawn = plant, controller, drawn
+        self._offset_rad, self._speed_m_s = offset_rad, control.approach_speed_m_s
+        self._rng = np.random.default_rng(drawn.seed)
+        self._vision = SimulatedVision(
+            0.035 + 0.5 / drawn.camera_hz, drawn.vision_noise_n, drawn.camera_hz, drawn.vision_gain
+        )
+        self.t_ns = 0
+        self.outcome: str = Outcome.NONE
+        self.peak_n = self.speed_share = 0.0
+        self.held_nothing = False
+        self._nothing_s = 0.0
+
+    def read(self, t_ns: int, noise: float) -> ServoState:
+        state = self._plant.read(t_ns, NOISE_A * noise)
+        sign = self._drawn.sign
+        return replace(
+            state,
+            position_rad=sign * state.position_rad + self._offset_rad,
+            velocity_rad_s=sign * state.velocity_rad_s,
+            current_a=sign * state.current_a,
+        )
+
+    def go(self, time_s: float, request: Request | None) -> None:
+        for servo_noise, vision_noise in self._rng.standard_normal(
+            (round(time_s * NS_PER_S / CYCLE_NS), 2)
+        ).tolist():
+            plant = self._plant
+            if self.t_ns >= self._drawn.leaves_s * NS_PER_S and plant.contact_m < _GONE_M:
+                plant.contact_m, plant.deepest_m = _GONE_M, 0.0
+            servo = self.read(self.t_ns, servo_noise)
+            visual = self._vision.sample(self.t_ns, plant.force_n, vision_noise)
+            decision = self._controller.step(self.t_ns, servo, visual, request)
+            request = None
+            command = decision.command
+            goal_rad = self._drawn.sign * (command.goal_position_rad - self._offset_rad)
+            plant.advance(ServoCommand(self.t_ns, goal_rad, command.goal_current_a), CYCLE_NS / NS_PER_S)
+            self.t_ns += CYCLE_NS
+            outcome = decision.status.outcome
+            grips_nothing = plant.force_n < NOTHING_SHARE * self._drawn.target_n
+            claims = outcome == Outcome.HELD and decision.status.phase in (Phase.RAMP, Phase.HOLD)
+            self._nothing_s = self._nothing_s + CYCLE_NS / NS_PER_S if claims and grips_nothing else 0.0
+            self.held_nothing |= self._nothing_s > _REACTION_S
+            self.outcome = outcome
+            self.peak_n = max(self.peak_n, plant.peak_n)
+            if plant.force_n == 0.0:
+                # The jaws also open before they approach again; a wrong sign exchanges the directions.
+                opens = self._drawn.sign * plant.v_m_s < 0
+                travels = decision.status.phase not in (Phase.APPROACH, Phase.CONTACT, Phase.RAMP, Phase.HOLD)
+                limit_m_s = self._speed_m_s * (_TRAVEL_SHARE if opens or travels else 1.0)
+                self.speed_share = max(self.speed_share, abs(plant.v_m_s) / limit_m_s)
+
+
+def search(
+    config: Config,
+    cases: int,
+    jobs: int,
+    keep: Path,
+    *,
+    resume: bool = False,
+    progress: Progress = no_progress,
+) -> SearchReport:
+    """Runs the cases 0 to ``cases`` - 1 of the configuration's seed.
+
+    Args:
+        config: Gripper and control; the seed of all draws.
+        cases: Number of cases.
+        jobs: Processes.
+        keep: File for the results, one line each.
+        resume: True to continue from the results in that file.
+        progress: Called after each case.
+
+    Raises:
+        DataError: The file can't be read or written, or is of another configuration or seed.
+    """
+    results = _read(keep, config) if resume else {}
+    missing = [index for index in range(cases) if index not in results]
+    progress("", min(len(results), cases))
+    try:
+        keep.parent.mkdir(parents=True, exist_ok=True)
+        with keep.open("w", encoding="utf-8") as file:
+            file.write(json.dumps(_identity(config)) + "\n")
+            for result in results.values():
+                file.write(json.dumps(asdict(result)) + "\n")
+            with process_pool(jobs) as pool:
+                run = partial(run_case, config, config.seed)
+                for result in pool.map(run, missing, chunksize=_CHUNK):
+                    results[result.index] = result
+                    file.write(json.dumps(asdict(result)) + "\n")
+                    file.flush()
+                    progress(f"case {result.index}")
+    except OSError as error:
+        raise DataError(f"can't write {keep} ({error}); set log.directory to a writable folder") from error
+    return _report(config, [results[index] for index in range(cases)])
+
+
+def _identity(config: Config) -> dict[str, object]:
+    sections = {
+        name: getattr(config, name).model_dump(mode="json") for name in ("control", "gripper", "servo")
+    }
+    return {"seed": config.seed, **sections}
+
+
+def _read(keep: Path, config: Config) -> dict[int, CaseResult]:
+    if not keep.exists():
+        return {}
+    try:
+        first, *lines = keep.read_text(encoding="utf-8").splitlines()
+        identity = json.loads(first)
+        complete = [line for line in lines if line.endswith("}")]  # the last may be cut
+        results = [CaseResult(**json.loads(line)) for line in complete]
+    except (OSError, ValueError, TypeError) as error:
+        raise DataError(f"can't read {keep} ({error}); start again without --resume") from error
+    if identity != _identity(config):
+        raise DataError(f"{keep} is of another configuration or seed; start again without --resume")
+    return {result.index: result for result in results}
+
+
+def _report(config: Config, results: list[CaseResult]) -> SearchReport:
+    statements: dict[str, tuple[Callable[[CaseResult], float], Callable[[CaseResult], bool]]] = {
+        "force": (lambda r: r.force_share, lambda r: r.force_share > FORCE_SHARE),
+        "speed": (lambda r: r.speed_share, lambda r: r.speed_share > SPEED_SHARE),
+        "held nothing": (lambda r: float(r.held_nothing), lambda r: r.held_nothing),
+    }
+
+    def worst_cases(name: str) -> Iterator[WorstCase]:
+        key, _ = statements[name]
+        for result in sorted(results, key=key, reverse=True)[:WORST]:
+            if name == "held nothing" and not result.held_nothing:
+                return
+            drawn = asdict(draw(config.control, config.gripper.gain_bound, config.seed, result.index))
+            finite = {k: None if v == math.inf else v for k, v in drawn.items()}
+            yield {**asdict(result), "drawn": finite}  # type: ignore[typeddict-item]
+
+    return {
+        "ok": all(result.ok for result in results),
+        "cases": len(results),
+        "seed": config.seed,
+        "outcomes": dict(Counter(result.outcome for result in results).most_common()),
+        "violations": {name: sum(bad(r) for r in results) for name, (_, bad) in statements.items()},
+        "held_stops": sum(result.held_stop for result in results),
+        "worst": {name: list(worst_cases(name)) for name in statements},
+    }

@@ -1,0 +1,114 @@
+"""Random search for unsafe grasps."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from gripper_force.cli import app
+from gripper_force.config import Config, load_config
+from gripper_force.control.limits import Limits
+from gripper_force.control.speed_limit import SpeedLimit
+from gripper_force.control.state_machine import GraspController
+from gripper_force.errors import DataError
+from gripper_force.qualification import safety_search
+from gripper_force.qualification.safety_search import SearchReport, draw, run_case, search
+from gripper_force.types import ServoCommand
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> Config:
+    return load_config(None, [f"log.directory={tmp_path}"])
+
+
+def results(config: Config, first: int, last: int) -> list[safety_search.CaseResult]:
+    return [run_case(config, config.seed, index) for index in range(first, last)]
+
+
+def test_the_first_cases_hold_all_three_statements(config: Config) -> None:
+    found = results(config, 0, 40)
+    assert all(result.ok for result in found)
+    assert {"held", "refused", "no_object", "stuck"} <= {result.outcome for result in found}
+    assert found == results(config, 0, 40)
+
+
+def test_draws_cover_what_can_be_wrong(config: Config) -> None:
+    drawn = [draw(config.control, config.gripper.gain_bound, 0, index) for index in range(300)]
+    assert min(one.friction for one in drawn) < 0.4
+    assert max(one.friction for one in drawn) > 4.0
+    assert {one.sign for one in drawn} == {-1, 1}
+    assert {one.feedback for one in drawn} == {"fused", "current", "vision"}
+    assert any(one.width > 1.1 for one in drawn)
+    assert any(one.start_m > 0.01 for one in drawn)
+    assert any(one.leaves_s < 3 for one in drawn)
+
+
+# Each defect is planted into the controller, and the search must find it.
+
+
+def test_a_current_beyond_its_limit_is_found(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    apply = Limits.apply
+
+    def doubled(*arguments: Any, **options: Any) -> tuple[ServoCommand, bool]:
+        command, over = apply(*arguments, **options)
+        return replace(command, goal_current_a=2 * command.goal_current_a), over
+
+    monkeypatch.setattr(Limits, "apply", doubled)
+    assert any(result.force_share > 1.05 for result in results(config, 0, 60))
+
+
+def test_a_missing_speed_limit_is_found(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(SpeedLimit, "apply", lambda _self, command, _servo, _speed: command)
+    assert any(result.speed_share > 1.5 for result in results(config, 0, 40))
+
+
+def test_a_grip_on_nothing_is_found(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(GraspController, "_is_unseen", property(lambda _self: False))
+    wrong = [
+        i
+        for i in range(1000)
+        if (one := draw(config.control, 1.4, 0, i)).width > 1.05 and one.contact_m == 1 and one.sign == 1
+    ]
+    found = [run_case(config, 0, i) for i in wrong]
+    assert any(result.held_nothing for result in found)
+    assert any(result.held_stop for result in found)
+
+
+def test_search_continues_where_it_was_interrupted(
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keep = tmp_path / "search.jsonl"
+    whole = search(config, 6, 1, keep)
+    lines = keep.read_text().splitlines(keepends=True)
+    keep.write_text("".join(lines[:4]) + lines[4][:20])  # the last line is cut
+    counts: list[int] = []
+
+    def progress(text: str, steps: int = 1) -> None:
+        counts.append(steps)
+
+    again: SearchReport = search(config, 6, 1, keep, resume=True, progress=progress)
+    assert again == whole
+    assert counts[0] == 3
+    assert sum(counts) == 6
+    other = config.model_copy(update={"seed": 1})
+    with pytest.raises(DataError, match="another configuration or seed"):
+        search(other, 6, 1, keep, resume=True)
+
+
+def test_command_reports_violations_with_exit_code_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def run(*_: Any, **__: Any) -> SearchReport:
+        return found
+
+    config = load_config(None, [])
+    bad = replace(run_case(config, 0, 3), force_share=1.2)
+    found = safety_search._report(config, [run_case(config, 0, 2), bad])
+    assert (found["ok"], found["violations"]["force"], found["worst"]["force"][0]["index"]) == (False, 1, 3)
+    monkeypatch.setattr(safety_search, "search", run)
+    call = ["stability", "search", "--cases", "2", "--set", f"log.directory={tmp_path}"]
+    done = CliRunner().invoke(app, call)
+    assert done.exit_code == 1
+    assert "force: 1 of 2" in done.stdout
+    assert json.loads(CliRunner().invoke(app, [*call, "--json"]).stdout)["violations"]["force"] == 1
