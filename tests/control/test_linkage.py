@@ -11,8 +11,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from gripper_force.config import ControlConfig, GripperConfig, LinkageConfig, load_config
-from gripper_force.control.linkage import RackAndPinion, make_linkage
 from gripper_force.control.limits import Limits
+from gripper_force.control.linkage import RackAndPinion, make_linkage
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import ConfigError
 from gripper_force.types import ServoCommand
