@@ -18,6 +18,10 @@ _EXCESS_SHARE = 0.15
 _EXCESS_S = 0.02
 """A motor current above its goal by more than this share and offset, for longer than this, is a fault."""
 
+_BACK_DRIVEN_RAD_S = 0.05
+"""Speed against the current above which the horn is back-driven: somebody pulls the jaws. Such a motor brakes, and its
+back-EMF may raise the current above the goal (decision 21). Two steps of an X-series servo's Present Velocity."""
+
 _MIN_DERATING = 0.6
 """Share of the target force at the temperature limit: a third of the heat."""
 
@@ -52,7 +56,10 @@ class Safety:
         """
         self._over_s = self._over_s + dt_s if over_force else 0.0
         excess = abs(servo.current_a) > (1 + _EXCESS_SHARE) * goal_current_a + _EXCESS_A
-        self._excess_s = self._excess_s + dt_s if excess else 0.0
+        if not excess:
+            self._excess_s = 0.0
+        elif not _is_back_driven(servo):
+            self._excess_s += dt_s
         self._cause = self._find_fault(servo)
         if is_sound(servo):
             self._last = servo
@@ -100,6 +107,10 @@ class Safety:
     def _jumps(before: ServoState, now: ServoState) -> bool:
         time_s = max(now.t_ns - before.t_ns, 0) / NS_PER_S
         return abs(now.position_rad - before.position_rad) > _JUMP_RAD + _JUMP_RAD_S * time_s
+
+
+def _is_back_driven(servo: ServoState) -> bool:
+    return servo.current_a * servo.velocity_rad_s < 0 and abs(servo.velocity_rad_s) > _BACK_DRIVEN_RAD_S
 
 
 def is_sound(servo: ServoState) -> bool:
