@@ -30,15 +30,12 @@ HARD_FORCE_LIMIT_N: Final = 70.0
 
 _BACKEND: Final = "or package.module:Class, or a name that an installed package registers"
 
-Options = dict[str, Any]
-"""Keys of a third-party backend; the project does not check them."""
-
 
 class ServoConfig(Section):
     """The servo and its bus."""
 
     backend: str = Field("dynamixel", description=f"dynamixel, {_BACKEND} (gripper_force.servos)")
-    options: Options = Field({}, description="keys of a third-party servo backend")
+    options: Tree = Field({}, description="keys of a third-party servo backend")
     model: str = Field(
         "XM430-W350",
         description="model, e.g. XM430-W350 or XC330-T288-T, or the path of a YAML file (docs/servos.md)",
@@ -138,7 +135,7 @@ class CameraConfig(Section):
     backend: str = Field(
         "simulated", description=f"simulated, oak, uvc, playback, none, {_BACKEND} (gripper_force.cameras)"
     )
-    options: Options = Field({}, description="keys of a third-party camera backend")
+    options: Tree = Field({}, description="keys of a third-party camera backend")
     rate_hz: Positive = Field(60.0, description="requested frames per second")
     path: Path | None = Field(None, description="playback: the log to play")
     speed: Literal["recorded", "full"] = Field("recorded", description="playback: speed")
@@ -169,7 +166,7 @@ class LoadCellConfig(Section):
         "simulated",
         description=f"simulated, playback, serial, phidget, none, {_BACKEND} (gripper_force.load_cells)",
     )
-    options: Options = Field({}, description="keys of a third-party load cell backend")
+    options: Tree = Field({}, description="keys of a third-party load cell backend")
     rate_hz: Positive = Field(
         200.0, description="simulated, phidget (at most 122): samples per second; serial boards set their own"
     )

@@ -1,9 +1,9 @@
 """The `bench` commands: speed, memory and error of parts of the product on this machine."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -218,7 +218,7 @@ def _reject_overrides(command: str, overrides: list[str] | None) -> None:
         raise ConfigError(f"bench {command} uses no configuration; leave out --set {overrides[0]}")
 
 
-def _show(result: dict[str, Any], as_json: bool, table: Callable[[], None]) -> None:
+def _show(result: Mapping[str, object], as_json: bool, table: Callable[[], None]) -> None:
     """Prints a result with the load of this machine."""
     load = os.getloadavg()[0]
 

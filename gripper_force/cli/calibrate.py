@@ -1,6 +1,7 @@
 """The commands that calibrate a rig and objects."""
 
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -191,7 +192,7 @@ def object_(
             f"{job.TOUCHES} are recommended",
             soft_wrap=True,
         )
-    console.show(result.as_dict(), as_json, object_table)
+    console.show(result.as_dict(), as_json, lambda _: object_table(result))
 
 
 def _tell_existing(settings: "Config", touches: int, folder: Path, fresh: bool) -> None:
@@ -230,7 +231,7 @@ def _touches(settings: "Config", touches: int, peak_n: float | None, folder: Pat
 
 
 def _rig_settings(
-    config: Path | None, set_: list[str] | None, options: dict[str, Any], rig: Path | None
+    config: Path | None, set_: list[str] | None, options: Mapping[str, object], rig: Path | None
 ) -> "tuple[Config, Path]":
     """Loads the configuration of a command that writes a rig profile, which need not exist yet.
 

@@ -3,7 +3,7 @@
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -68,14 +68,14 @@ def jsonable(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def number(value: Any, unit: str = "", digits: int = 3) -> str:
+def number(value: object, unit: str = "", digits: int = 3) -> str:
     """Formats a figure with its unit; a dash for a missing value."""
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return "-"
     return f"{value:.{digits}f}{unit}" if isinstance(value, float) else f"{value}{unit}"
 
 
-def pairs(values: dict[str, Any]) -> None:
+def pairs(values: Mapping[str, object]) -> None:
     """Prints names and values."""
     table = Table(box=None, show_header=False, pad_edge=False)
     for name, value in values.items():

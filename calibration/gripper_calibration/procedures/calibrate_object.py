@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -78,7 +78,7 @@ class ObjectCalibration:
         """Coverage of the profile's interval: the share of frames of new touches within it."""
         return self.profile.interval.coverage
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """Returns the result as the command prints it: the profile's keys and those of the calibration."""
         return {
             **self.profile.model_dump(mode="json"),
