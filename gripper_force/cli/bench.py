@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from gripper_force.cli import console
-from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, load_settings
+from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, Page, load_settings
 from gripper_force.cli.output.bench import (
     bus_table,
     commands_table,
@@ -25,7 +25,6 @@ app = typer.Typer(no_args_is_help=True, help="Measure speed, memory and error on
 NoOverrides = Annotated[
     list[str] | None, typer.Option("--set", help="Not allowed: this command uses no configuration.")
 ]
-Page = Annotated[Path | None, typer.Option("--write", help="Markdown page to write the table into.")]
 Folder = Annotated[Path, typer.Option("--out", help="Folder for the results.")]
 
 

@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -15,6 +15,9 @@ from gripper_force.errors import ConfigError
 if TYPE_CHECKING:
     from rich.status import Status
 
+    from gripper_calibration.procedures.calibrate_camera import CameraResult
+    from gripper_calibration.procedures.calibrate_load_cell import LoadCellResult
+    from gripper_calibration.procedures.calibrate_servo import ServoResult
     from gripper_force.config import Config
     from gripper_force.interfaces import Progress, Prompt
 
@@ -250,11 +253,10 @@ def _rig_settings(
     return settings, rig or named or Path("rig.yaml")
 
 
-def _show_rig(result: Any, as_json: bool) -> None:
+def _show_rig(result: "LoadCellResult | ServoResult | CameraResult", as_json: bool) -> None:
     """Shows the calibrated section of the rig profile and what else was measured, as one level of keys."""
     values = console.jsonable(result)
-    section = result.calibration.model_dump(mode="json")
-    console.show({**section, **{k: v for k, v in values.items() if k != "calibration"}}, as_json, rig_table)
+    console.show(values.pop("calibration") | values, as_json, rig_table)
 
 
 def _region(text: str) -> tuple[int, int, int, int]:

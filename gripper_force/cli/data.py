@@ -2,7 +2,7 @@
 
 from contextlib import closing
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -52,7 +52,7 @@ def simulate(
     from gripper_force.jobs import paper_protocol
     from gripper_force.jobs import simulate as job
 
-    plans: list[Any]
+    plans: list[job.Plan]
     if protocol is None:
         if scale is not None:
             raise ConfigError(

@@ -18,6 +18,7 @@ Overrides = Annotated[
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
 Jobs = Annotated[int, typer.Option(min=1, help="Processes to use.")]
+Page = Annotated[Path | None, typer.Option("--write", help="Markdown page to write the table into.")]
 
 
 def load_settings(
