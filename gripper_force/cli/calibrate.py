@@ -163,11 +163,11 @@ def object_(
     fresh: Annotated[
         bool,
         typer.Option(
-            "--fresh", help="Move existing touches to a folder beside, and record all of them anew."
+            "--fresh", help="Move existing touches to a folder beside, and record all of them again."
         ),
     ] = False,
     pause: Annotated[
-        bool, typer.Option("--pause", help="Wait for Enter before each touch, to place the object anew.")
+        bool, typer.Option("--pause", help="Wait for Enter before each touch, to place the object again.")
     ] = False,
     config: ConfigPath = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the touches, and of a simulated scene.")] = None,
@@ -179,7 +179,7 @@ def object_(
     from gripper_calibration.procedures import calibrate_object as job
 
     if fresh and logs is not None:
-        raise ConfigError("--fresh records touches anew and --from records none; leave out one of them")
+        raise ConfigError("--fresh records touches and --from records none; leave out one of them")
     settings = load_settings(config, set_, {"object": name, "seed": seed})
     folder = folder or job.default_folder(name)
     if logs is None:
@@ -210,7 +210,7 @@ def _tell_existing(settings: "Config", touches: int, folder: Path, fresh: bool) 
     if existing := [str(number) for number, path in enumerate(paths, 1) if path.exists()]:
         console.err.print(
             f"{len(existing)} of {touches} touches exist already in {folder} and are used: number "
-            f"{', '.join(existing)}; --fresh records all of them anew",
+            f"{', '.join(existing)}; --fresh records all of them again",
             soft_wrap=True,
         )
 

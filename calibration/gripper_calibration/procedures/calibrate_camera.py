@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 
 from gripper_calibration.fits.camera_fit import (
+    CameraLag,
     ExposureCandidate,
     Markers,
-    TouchLag,
     estimate_lag,
     find_markers,
     region_around,
@@ -79,7 +79,7 @@ class CameraObservation:
     markers: list[Markers]
     widest: Gray
     widest_markers: Markers
-    touches: list[TouchLag]
+    touches: list[CameraLag]
     use_ms: float
     rate_hz: float
 
@@ -238,7 +238,7 @@ def _touch_lags(
     samples: list[LoadCellSample],
     statuses: list[GraspStatus],
     release_times_ns: list[int],
-) -> list[TouchLag]:
+) -> list[CameraLag]:
     frame_s = np.array([frame.t_ns for frame in frames]) / NS_PER_S
     images = np.stack([downscale(frame.gray, region, _SMALL_PX) for frame in frames])
     valid = sorted((s for s in samples if s.valid), key=lambda sample: sample.t_ns)
@@ -253,7 +253,7 @@ def _touch_lags(
     for release_s, camera_s, correlation_s in zip(releases_s, by_servo_s, by_force_s, strict=True):
         cell_lag_s = load_cell_lag_s(cell_s, force_n, servo_s, width_m, release_s)
         release_n = float(np.interp(release_s, cell_s, force_n))
-        touches.append(TouchLag(release_n, 1e3 * (float(camera_s) - cell_lag_s), 1e3 * float(correlation_s)))
+        touches.append(CameraLag(release_n, 1e3 * (float(camera_s) - cell_lag_s), 1e3 * float(correlation_s)))
     return touches
 
 

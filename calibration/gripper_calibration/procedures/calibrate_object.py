@@ -119,7 +119,7 @@ def calibrate_object(
         peak_n: Largest force of a touch in N; None for what the force limit permits, up to 12 N.
         folder: Folder of the touches' logs; None for ``data/touches/NAME``.
         out: Profile to write, ``*.yaml``; None for ``NAME.yaml`` in the user's folder of profiles.
-        prompt: Called before each touch, so that a person can place the object anew; None for no pause.
+        prompt: Called before each touch, so that a person can place the object again; None for no pause.
         progress: Called during the touches, with one step for each touch, and after them, with one step for each
             log read and two for the fit.
 
@@ -168,7 +168,7 @@ def record_touches(
 ) -> Iterator[Path]:
     """Touches the configured object with random peak forces, one log each. Existing logs are kept.
 
-    A simulated object and rig stay the same; the object is placed anew for each touch.
+    A simulated object and rig stay the same; the object is placed again for each touch.
 
     Args:
         config: The configuration.

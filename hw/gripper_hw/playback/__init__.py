@@ -40,7 +40,7 @@ class _PlaybackDevice:
             self._shift_ns = self._clock.now_ns() - self._log.start_ns
 
     def counts(self) -> dict[str, int]:
-        """Empty: playback loses nothing; faults of the recording are in its records."""
+        """Returns an empty mapping: playback loses nothing; faults of the recording are in its records."""
         return {}
 
     def _log_now_ns(self) -> int:
