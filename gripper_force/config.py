@@ -5,7 +5,7 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any, Final, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, PositiveInt, model_validator
 
 from gripper_force.errors import ConfigError
 from gripper_force.fault_config import FaultConfig
@@ -142,6 +142,22 @@ class CameraConfig(Section):
     device: int | str | None = Field(
         None, description="oak: id or address (None: the only one); uvc: index, /dev path or name"
     )
+    sensor: str | None = Field(
+        None,
+        description="oak: socket (CAM_B) or name (OV7251); None: the mono sensor on the lowest socket, else the "
+        "colour sensor there",
+    )
+    resolution_px: tuple[PositiveInt, PositiveInt] | None = Field(
+        None,
+        description="width and height of the sensor image; oak: a mode of the sensor (None: its largest of at "
+        "most 1280x800 that reaches rate_hz); uvc: None: 640x480, if available",
+    )
+    fourcc: str | None = Field(
+        None,
+        pattern="^[ -~]{4}$",
+        description="uvc: pixel format, e.g. MJPG, which most webcams need for 60 frames per second, or YUYV; "
+        "None: chosen by OpenCV",
+    )
     region: tuple[int, int, int, int] | None = Field(
         None,
         description="oak, uvc: region of the sensor image as left, top, width, height in pixels; its central "
@@ -152,11 +168,30 @@ class CameraConfig(Section):
         4000, gt=0, description="exposure time; None: automatic (simulated camera: as 4000)"
     )
     gain: int | None = Field(
-        None, ge=0, description="oak: ISO (None: 100); uvc: in the driver's unit (None: unchanged)"
+        None,
+        ge=0,
+        description="oak: ISO (None: 100); uvc: in the driver's unit (None: unchanged); needs exposure_us",
+    )
+    lens_position: int | None = Field(
+        None,
+        ge=0,
+        description="focus of a lens with autofocus, which is off; larger is nearer; oak: 0 to 255, needed by "
+        "such a lens; uvc: in the driver's unit (None: unchanged)",
+    )
+    white_balance_k: int | None = Field(
+        None,
+        ge=1000,
+        le=12_000,
+        description="colour temperature of the white balance of a colour camera, which is not automatic; oak: "
+        "None: 5000; uvc: None: unchanged",
     )
     timeout_ms: Positive = Field(
         250.0, description="oak, uvc: age of the newest frame after which the camera counts as lost"
     )
+
+
+CAMERA_OTHER_KEYS: Final = {"options", "path", "speed", "device", "timeout_ms"}
+"""Keys of the camera on which the look of its images does not depend."""
 
 
 class LoadCellConfig(Section):
@@ -460,9 +495,7 @@ class Config(Section):
 
     def camera_settings(self) -> Tree:
         """Camera keys and values that an object profile is bound to."""
-        camera = self.camera.model_dump(
-            mode="json", include={"backend", "rate_hz", "region", "side_px", "exposure_us", "gain"}
-        )
+        camera = self.camera.model_dump(mode="json", exclude=CAMERA_OTHER_KEYS)
         settings = {f"camera.{key}": value for key, value in camera.items()}
         return {**settings, "vision.region": self.vision.region and list(self.vision.region)}
 

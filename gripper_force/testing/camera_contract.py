@@ -121,6 +121,18 @@ class CameraContract(SensorContract):
         counts.append(camera.counts())
         check_counts(counts)
 
+    def test_settings_are_numbers_or_texts(self, camera: Camera, wait: Callable[[float], None]) -> None:
+        """``settings``, which is optional, maps keys to numbers or texts, before ``start`` and while capturing."""
+        settings = getattr(camera, "settings", None)
+        if settings is None:
+            pytest.skip("the camera has no method settings")
+        found = [settings()]
+        camera.start()
+        _take(camera, 2, wait)
+        found.append(settings())
+        for values in found:
+            assert all(type(key) is str and type(value) in (int, float, str) for key, value in values.items())
+
     # Start and close.
 
     def test_second_start_has_no_effect(self, camera: Camera, wait: Callable[[float], None]) -> None:

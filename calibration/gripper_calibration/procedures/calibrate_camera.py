@@ -22,7 +22,7 @@ from gripper_calibration.fits.camera_fit import (
     usable_touches,
 )
 from gripper_calibration.plots.camera_plot import draw
-from gripper_force.config import Config
+from gripper_force.config import CAMERA_OTHER_KEYS, Config
 from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
 from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.recording.lag import camera_lags_s, load_cell_lag_s
@@ -161,6 +161,7 @@ def calibrate_camera(
         side_px=camera.side_px,
         rate_hz=camera.rate_hz,
         gain=camera.gain,
+        image=camera.model_dump(mode="json", exclude=CAMERA_OTHER_KEYS | set(CameraCalibration.model_fields)),
         exposure_us=selected.exposure_us,
         mean=selected.mean,
         clipped=selected.clipped,
