@@ -50,6 +50,11 @@ _DWELL_S = 0.12
 _SETTLE_FILTER_S = 0.25
 """Time constant of the filter on the force error that decides on `held`: vision alone is noisy."""
 
+_LET_GO_S = 0.3
+"""Time in which the largest motor force of a grip falls to that of free travel after a release. With less motor
+force at once, the servo could not brake the jaws, and a springy object pushed them open at four times the wanted
+speed."""
+
 _SEEN_FILTER_S = 0.3
 _UNSEEN_SHARE = 0.15
 """A grip counts as held only if the filtered visual estimate is at least this share of the target. Otherwise the jaws
@@ -147,6 +152,7 @@ class GraspController:
         self._grasp_ns = 0
         self._phase_s = self._settled_s = self._error_n = 0.0
         self._was_over_force = False
+        self._let_go_n = 0.0
         self._seen_n: float | None = None
         self._seen_ns = 0
         self._goal_current_a = self._measured_motor_force_n = 0.0
@@ -338,6 +344,7 @@ class GraspController:
         self._enter(Phase.MOVE, f"move to {1e3 * width_m:.1f} mm requested")
 
     def _start_travel(self) -> None:
+        self._let_go_n = self._motor_force_n if self._phase in _GRIPPING else 0.0
         speed_m_s = _TRAVEL_SPEED_SHARE * self._config.approach_speed_m_s
         self._travel.start(self._present_width_m, speed_m_s)
         self._limits.reset()
@@ -494,10 +501,19 @@ class GraspController:
                 self._approach.start(width_m, self._target_n)
                 self._enter(Phase.APPROACH, reason)
 
+    @property
+    def _travel_force_n(self) -> float:
+        """Motor force of a release or move: that of free travel, and at first what remains of a grip."""
+        remaining_n = self._let_go_n * (1 - self._phase_s / _LET_GO_S)
+        return max(self._free_motor_force_n, remaining_n)
+
     def _run_release(self, dt_s: float, width_m: float) -> None:
-        self._motor_force_n = self._free_motor_force_n
+        self._motor_force_n = self._travel_force_n
         open_width_m = self._transmission.open_width_m
         self._goal_width_m = self._travel.step(open_width_m, dt_s)
+        if self._let_go_n and self._phase_s < _LET_GO_S:
+            # Without acceleration time: the start of the opening is sharp, which shows the sensors' lag.
+            self._goal_width_m = open_width_m
         self._goal_width_m = self._travel.value = min(self._goal_width_m, width_m + 2 * _LEAD_M)
         if is_open(open_width_m, width_m):
             self._goal_width_m = open_width_m
@@ -505,7 +521,7 @@ class GraspController:
                 self._enter(Phase.OPEN, "open")
 
     def _run_move(self, dt_s: float, width_m: float) -> None:
-        self._motor_force_n = self._free_motor_force_n
+        self._motor_force_n = self._travel_force_n
         goal_width_m = self._travel.step(self._move_width_m, dt_s)
         self._goal_width_m = min(max(goal_width_m, width_m - 2 * _LEAD_M), width_m + 2 * _LEAD_M)
         self._travel.value = self._goal_width_m
