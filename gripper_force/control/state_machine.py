@@ -50,15 +50,19 @@ _DWELL_S = 0.12
 _SETTLE_FILTER_S = 0.25
 """Time constant of the filter on the force error that decides on `held`: vision alone is noisy."""
 
-_LET_GO_S = 0.3
+_LET_GO_S = 0.6
 """Time in which the largest motor force of a grip falls to that of free travel after a release. With less motor
 force at once, the servo could not brake the jaws, and a springy object pushed them open at four times the wanted
 speed."""
 
-_SEEN_FILTER_S = 0.3
+_LET_GO_LEAD_S = 0.03
+"""Time in which the lead of the goal position reaches its full length after a release. With a full lead at once, the
+motor would add to the force of a springy object."""
+
+_SEEN_FILTER_S = 0.1
 _UNSEEN_SHARE = 0.15
-"""A grip counts as held only if the filtered visual estimate is at least this share of the target. Otherwise the jaws
-may press on an end stop, which the motor current cannot tell from an object."""
+"""A grip counts as held only while the filtered visual estimate is at least this share of the target. Otherwise the
+jaws may press on an end stop or be held by friction, which the motor current cannot tell from an object."""
 
 _OPEN_M = 0.003
 """Distance from the open width at which the jaws count as open."""
@@ -474,15 +478,20 @@ class GraspController:
         error_n = self._estimate.force_n - self._derated_target_n
         self._error_n += (error_n - self._error_n) * dt_s / (dt_s + _SETTLE_FILTER_S)
         is_near = abs(self._error_n) <= tolerance_n(self._derated_target_n)
-        self._settled_s = self._settled_s + dt_s if is_near else 0.0
-        if self._outcome == Outcome.NONE and self._settled_s >= self._config.settle_s and not self._is_unseen:
+        self._settled_s = self._settled_s + dt_s if is_near and not self._is_unseen else 0.0
+        if self._outcome == Outcome.NONE and self._settled_s >= self._config.settle_s:
             self._held_width_m = width_m
             self._set_outcome(Outcome.HELD, f"{self._estimate.force_n:.2f} N for {self._settled_s:.2f} s")
-        if lost := self._slip.is_lost(dt_s, width_m, closing_m_s, shortfall_n, self._loop.reference_n):
+        lost = self._slip.is_lost(dt_s, width_m, closing_m_s, shortfall_n, self._loop.reference_n)
+        if not lost and self._outcome == Outcome.HELD:
+            lost = self._slip.has_receded(width_m, closing_m_s, self._motor_force_n)
+        if lost:
             self._handle_loss(width_m, lost)
             return
         closed_m = self._held_width_m - width_m if self._outcome == Outcome.HELD else 0.0
         slip = self._slip.has_slipped(dt_s, self._estimate.force_n, self._derated_target_n, closed_m)
+        if not slip and self._outcome == Outcome.HELD and self._is_unseen:
+            slip = f"the camera sees only {self._seen_n:.1f} N; friction or an end stop may hold the jaws"
         if slip and self._outcome in (Outcome.NONE, Outcome.HELD):
             self._set_outcome(Outcome.SLIP, slip)
 
@@ -511,10 +520,12 @@ class GraspController:
         self._motor_force_n = self._travel_force_n
         open_width_m = self._transmission.open_width_m
         self._goal_width_m = self._travel.step(open_width_m, dt_s)
+        lead_m = 2 * _LEAD_M
         if self._let_go_n and self._phase_s < _LET_GO_S:
-            # Without acceleration time: the start of the opening is sharp, which shows the sensors' lag.
+            # The object drives the jaws: their start is sharp, which shows the lag of the sensors.
             self._goal_width_m = open_width_m
-        self._goal_width_m = self._travel.value = min(self._goal_width_m, width_m + 2 * _LEAD_M)
+            lead_m *= min(self._phase_s / _LET_GO_LEAD_S, 1.0)
+        self._goal_width_m = self._travel.value = min(self._goal_width_m, width_m + lead_m)
         if is_open(open_width_m, width_m):
             self._goal_width_m = open_width_m
             if self._phase == Phase.RELEASE:
