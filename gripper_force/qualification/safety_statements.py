@@ -47,8 +47,8 @@ class SafetyStatements:
     def observe(
         self,
         dt_s: float,
-        phase: Phase,
-        outcome: Outcome,
+        phase: str,
+        outcome: str,
         *,
         force_n: float,
         object_n: float,

@@ -119,13 +119,6 @@ class RowSummary(TypedDict):
     live_results: dict[str, int]
 
 
-class MatrixReport(TypedDict):
-    """All rows; ``ok`` is True if every grasp had the expected reaction."""
-
-    rows: list[RowSummary]
-    ok: bool
-
-
 def run_matrix(
     config: Config,
     seeds: int,

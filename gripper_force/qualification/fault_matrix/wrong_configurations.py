@@ -5,6 +5,7 @@ range. The statements of `safety_statements` must hold for the simulated world, 
 measures.
 """
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ import numpy as np
 from gripper_force.config import Config, config_from
 from gripper_force.control.limits import largest_target_n
 from gripper_force.control.state_machine import is_open
-from gripper_force.errors import ConfigError, DeviceError, GripperError, SimulationError
+from gripper_force.errors import ConfigError, DeviceError, GripperError
 from gripper_force.interfaces import Devices, Progress, WorldState, no_progress
 from gripper_force.jobs.grasp import TRIAL_OBJECTS, TRIAL_TARGETS_N
 from gripper_force.jobs.processes import process_pool
@@ -121,7 +122,7 @@ def _between(low: float, high: float, share: float) -> float:
 
 
 def _log_between(low: float, high: float, share: float) -> float:
-    return round(low * (high / low) ** share, 4)
+    return round(low * math.exp(share * math.log(high / low)), 4)
 
 
 WRONG_CASES: Final = (
@@ -199,7 +200,7 @@ class WrongSummary(TypedDict):
     live_held_nothing: int
 
 
-def run_wrong_configurations(
+def run_rows(
     config: Config,
     seeds: int,
     live_seeds: int,
@@ -220,7 +221,7 @@ def run_wrong_configurations(
         keep: File for the outcomes, written one by one.
         resume: True to continue from the outcomes in that file.
         rows: Rows of the table.
-        progress: Called after each grasp with the row's name; see `count_wrong`.
+        progress: Called after each grasp with the row's name; see `count_grasps`.
 
     Yields:
         The summary of each row, in order.
@@ -255,8 +256,8 @@ def run_wrong_configurations(
             yield _summary(row, outcomes, end(live, f"{row.name}, in real time"))
 
 
-def count_wrong(seeds: int, live_seeds: int, rows: Sequence[WrongCase] = WRONG_CASES) -> int:
-    """Number of grasps of `run_wrong_configurations`."""
+def count_grasps(seeds: int, live_seeds: int, rows: Sequence[WrongCase] = WRONG_CASES) -> int:
+    """Number of grasps of `run_rows`."""
     return len(rows) * (seeds + min(live_seeds, seeds))
 
 
@@ -406,7 +407,7 @@ def _text(keys: Mapping[str, Any]) -> str:
     return ", ".join(f"{key}={value}" for key, value in keys.items())
 
 
-def wrong_markdown(summaries: Sequence[WrongSummary]) -> str:
+def markdown(summaries: Sequence[WrongSummary]) -> str:
     """Markdown table of the wrong configurations. Each pair of figures is lockstep, real time."""
     head = (
         "| wrong | right answers | as expected | results in lockstep | results in real time "
