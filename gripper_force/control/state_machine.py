@@ -159,6 +159,7 @@ class GraspController:
         self._let_go_n = 0.0
         self._seen_n: float | None = None
         self._seen_ns = 0
+        self._has_seen = self._has_unsure = False
         self._goal_current_a = self._measured_motor_force_n = 0.0
         self._derating = 1.0
 
@@ -263,7 +264,9 @@ class GraspController:
             return
         # A comparison with NaN is false.
         if not (abs(visual.force_n) <= 1e9 and 0 <= visual.std_n <= self._config.vision_std_n):
+            self._has_unsure |= self._phase in _GRIPPING
             return
+        self._has_seen |= self._phase in _GRIPPING
         dt_s = (visual.t_ns - self._seen_ns) / NS_PER_S
         before_n = visual.force_n if self._seen_n is None else self._seen_n
         self._seen_n = before_n + (visual.force_n - before_n) * dt_s / (dt_s + _SEEN_FILTER_S)
@@ -271,8 +274,15 @@ class GraspController:
 
     @property
     def _is_unseen(self) -> bool:
-        """True if the camera, which is in use, sees next to no force."""
-        return self._seen_n is not None and self._seen_n < _UNSEEN_SHARE * self._derated_target_n
+        """True if the camera sees next to no force, or has been too uncertain throughout this grip."""
+        if self._seen_n is None:
+            return self._has_unsure and not self._has_seen
+        return self._seen_n < _UNSEEN_SHARE * self._derated_target_n
+
+    @property
+    def _sight(self) -> str:
+        """The visual estimate in words."""
+        return "is uncertain" if self._seen_n is None else f"sees only {self._seen_n:.1f} N"
 
     def _derate(self, t_ns: int, temperature_c: float) -> list[Event]:
         """Lowers the target force of a hot servo, before the servo shuts down."""
@@ -438,6 +448,7 @@ class GraspController:
             case ApproachState.BACKING_OFF:
                 self._goal_width_m = min(self._approach.back_off_width_m, self._transmission.open_width_m)
             case ApproachState.CONTACT:
+                self._has_seen = self._has_unsure = False
                 self._fusion.reset_variance()
                 self._enter(Phase.CONTACT, f"contact at {width_m * 1e3:.1f} mm")
             case ApproachState.CLOSED:
@@ -491,7 +502,7 @@ class GraspController:
         closed_m = self._held_width_m - width_m if self._outcome == Outcome.HELD else 0.0
         slip = self._slip.has_slipped(dt_s, self._estimate.force_n, self._derated_target_n, closed_m)
         if not slip and self._outcome == Outcome.HELD and self._is_unseen:
-            slip = f"the camera sees only {self._seen_n:.1f} N; friction or an end stop may hold the jaws"
+            slip = f"the camera {self._sight}; friction or an end stop may hold the jaws"
         if slip and self._outcome in (Outcome.NONE, Outcome.HELD):
             self._set_outcome(Outcome.SLIP, slip)
 
@@ -549,7 +560,7 @@ class GraspController:
             reason = f"not held within {self._config.timeout_s:g} s"
             if self._is_unseen:
                 reason += (
-                    f": the camera sees {self._seen_n:.1f} N. The jaws may press on an end stop: check "
+                    f": the camera {self._sight}. The jaws may press on an end stop: check "
                     "gripper.open_width_m with `calibrate jaws`. If there is an object, calibrate it, or set "
                     "control.feedback=current"
                 )

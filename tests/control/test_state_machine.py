@@ -165,6 +165,12 @@ def test_object_that_leaves_jaws_on_an_end_stop_is_a_slip_with_a_camera(make_run
     assert any("the camera sees only" in reason for reason in run.reasons)
 
 
+def test_camera_that_is_uncertain_throughout_a_grip_prevents_held(make_run):
+    run = make_run(vision={"noise_n": 2.0}, timeout_s=3.0).grasp(2.0, 4.0)
+    assert run.last.status.outcome == "timeout"
+    assert any("the camera is uncertain" in reason for reason in run.reasons)
+
+
 def test_springy_object_cannot_push_the_jaws_open_fast(make_run):
     run = make_run(plant={"stiffness_n_m": 300.0, "mass_kg": 0.8, "friction_n": 0.3}).grasp(8.0, 5.0)
     run.go(0.005, "release")
