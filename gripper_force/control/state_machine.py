@@ -12,7 +12,7 @@ from gripper_force.control.safety import Safety, is_sound
 from gripper_force.control.slip import SlipMonitor
 from gripper_force.control.speed_limit import PositionLoop, SpeedLimit
 from gripper_force.control.trajectory import TrapezoidalProfile
-from gripper_force.control.transmission import Transmission
+from gripper_force.control.transmission import GOAL_OFFSET_M, Transmission
 from gripper_force.types import (
     NS_PER_MS,
     NS_PER_S,
@@ -40,9 +40,6 @@ _TRAVEL_SPEED_SHARE = 2.0
 
 _LEAD_M = 0.004
 """Largest lead of the profile over one jaw in free travel, so that jaws that were held back do not jump."""
-
-_GOAL_OFFSET_M = 0.010
-"""Distance of each jaw's goal inside the object, before the speed limit: the current limit sets the force."""
 
 _DWELL_S = 0.12
 """Time in contact before the ramp: the impact decays and vision catches up."""
@@ -432,14 +429,14 @@ class GraspController:
             case Phase.FAULT if self._opens_at_fault:
                 self._run_release(dt_s, width_m)
         if self._phase in _GRIPPING:
-            self._goal_width_m = max(width_m - 2 * _GOAL_OFFSET_M, 0.0)
+            self._goal_width_m = width_m - 2 * GOAL_OFFSET_M
         if self._phase in (Phase.APPROACH, *_GRIPPING) and self._outcome == Outcome.NONE:
             self._check_timeout(t_ns)
 
     def _run_approach(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
         # The goal position leads far enough that the goal current alone drives the jaws. A goal that moved in
         # steps with the jaws would cause a current ripple, and the current is sampled at one phase of it.
-        self._goal_width_m = max(width_m - 2 * _GOAL_OFFSET_M, 0.0)
+        self._goal_width_m = width_m - 2 * GOAL_OFFSET_M
         progress = self._approach.step(
             dt_s, width_m, closing_m_s, self._measured_motor_force_n, self._estimate
         )
@@ -495,7 +492,7 @@ class GraspController:
             self._set_outcome(Outcome.HELD, f"{self._estimate.force_n:.2f} N for {self._settled_s:.2f} s")
         lost = self._slip.is_lost(dt_s, width_m, closing_m_s, shortfall_n, self._loop.reference_n)
         if not lost and self._outcome == Outcome.HELD:
-            lost = self._slip.has_receded(width_m, closing_m_s, self._motor_force_n)
+            lost = self._slip.has_receded(width_m, self._held_width_m, closing_m_s, self._motor_force_n)
         if lost:
             self._handle_loss(width_m, lost)
             return
