@@ -58,6 +58,10 @@ def trials_table(r: dict[str, Any]) -> None:
     out.print(table)
     summary = dict(r["summary"])
     errors = summary.pop("estimate_mae_n")
+    if summary["peak_n"] is None:
+        pairs({key: value for key, value in summary.items() if value is not None})
+        out.print("No load cell: force errors, overshoot and peaks can't be measured.")
+        return
     pairs(summary)
     table = Table("MAE over the run, N", "vision", "current", "fused", "floor", box=None)
     for name, e in errors.items():
