@@ -51,7 +51,7 @@ class Safety:
             True if the latch tripped in this cycle.
         """
         self._over_s = self._over_s + dt_s if over_force else 0.0
-        excess = abs(servo.current_a) > (1 + _EXCESS_SHARE) * goal_current_a + _EXCESS_A
+        excess = is_excess(servo.current_a, goal_current_a)
         self._excess_s = self._excess_s + dt_s if excess else 0.0
         self._cause = self._find_fault(servo)
         if is_sound(servo):
@@ -100,6 +100,11 @@ class Safety:
     def _jumps(before: ServoState, now: ServoState) -> bool:
         time_s = max(now.t_ns - before.t_ns, 0) / NS_PER_S
         return abs(now.position_rad - before.position_rad) > _JUMP_RAD + _JUMP_RAD_S * time_s
+
+
+def is_excess(current_a: float, goal_current_a: float) -> bool:
+    """Returns True if a motor takes more current than its goal allows."""
+    return abs(current_a) > (1 + _EXCESS_SHARE) * goal_current_a + _EXCESS_A
 
 
 def is_sound(servo: ServoState) -> bool:

@@ -20,7 +20,7 @@ from gripper_force.types import NS_PER_MS, NS_PER_S, Frame, Gray, LoadCellSample
 from gripper_hw.dynamixel.control_table import load_model
 from gripper_hw.dynamixel.virtual import VirtualBus, VirtualServo, register_bus, unregister_bus
 from gripper_hw.sim.detail_level import resolve_detail
-from gripper_hw.sim.scene import Scene, draw_scene
+from gripper_hw.sim.scene import Scene, draw_scene, draw_second_finger
 from gripper_hw.sim.surroundings import Surroundings
 from gripper_hw.sim.world import World
 
@@ -159,18 +159,30 @@ class SimulatedLoadCell:
 
 
 class _LockedMotor:
-    """The virtual servo's firmware as the world's motor: holds the bus's lock and applies wire faults."""
+    """The virtual servo's firmware as the world's motor: holds the bus's lock and applies wire faults.
+
+    A mirrored servo turns the other way than the finger that it drives.
+    """
 
     def __init__(
-        self, servo: VirtualServo, lock: AbstractContextManager[object], faults: "WireFaults | None"
+        self,
+        servo: VirtualServo,
+        lock: AbstractContextManager[object],
+        faults: "WireFaults | None",
+        *,
+        mirrored: bool = False,
     ) -> None:
         self._servo, self._lock, self._faults = servo, lock, faults
+        self._sign = -1 if mirrored else 1
 
     def control(self, t_ns: int, position_rad: float, velocity_rad_s: float, current_noise_a: float) -> float:
         with self._lock:
             if self._faults is not None:
                 self._faults.update(t_ns)
-            return self._servo.control(t_ns, position_rad, velocity_rad_s, current_noise_a)
+            sign = self._sign
+            return sign * self._servo.control(
+                t_ns, sign * position_rad, sign * velocity_rad_s, current_noise_a
+            )
 
 
 class SimulatedRig:
@@ -209,8 +221,8 @@ class SimulatedRig:
         self._config = config
         self.scene = draw_scene(config.object, config.seed, config.sim)
         model = load_model(config.servo.model)
-        servo = VirtualServo(config.servo.id, model)
-        bus = VirtualBus([servo], self._bus_time_ns)
+        servos = [VirtualServo(id_, model) for id_ in config.servo.ids]
+        bus = VirtualBus(servos, self._bus_time_ns)
         self._lockstep = config.clock == "lockstep"
         start_ns = 0 if self._lockstep else time.monotonic_ns()
         faults = Faults(config.faults, start_ns)
@@ -219,9 +231,19 @@ class SimulatedRig:
             from gripper_hw.dynamixel.bus_faults import WireFaults
 
             wire = WireFaults(bus, faults, config.seed)
-        motor = _LockedMotor(servo, bus.lock, wire)
-        textured = config.camera.backend == "simulated"
-        self._world = World(self.scene, config.gripper, motor, model.nm_per_a, config.seed, textured=textured)
+        motors = [_LockedMotor(servo, bus.lock, wire, mirrored=servo is not servos[0]) for servo in servos]
+        self._second: Scene | None = None
+        if len(servos) > 1:
+            self._second = draw_second_finger(self.scene, config.seed, config.sim)
+        self._world = World(
+            self.scene,
+            config.gripper,
+            motors[0],
+            model.nm_per_a,
+            config.seed,
+            textured=config.camera.backend == "simulated",
+            second=None if self._second is None else (motors[1], self._second),
+        )
         self._exposure_ms = config.sim.exposure_ms * _relative_exposure(config)
         clock: Clock = LockstepClock(self._world) if self._lockstep else MonotonicClock()
         self.clock: Clock = clock
@@ -275,7 +297,8 @@ class SimulatedRig:
 
     def notes(self) -> dict[str, str]:
         """Facts for the log: the scene's parameters and the exposure."""
-        return {"scene": json.dumps(asdict(self.scene)), "exposure_ms": str(self._exposure_ms)}
+        second = {} if self._second is None else {"second finger": json.dumps(asdict(self._second))}
+        return {"scene": json.dumps(asdict(self.scene)), "exposure_ms": str(self._exposure_ms), **second}
 
     def render_under_light(self, lux: float) -> tuple[Camera, dict[str, str]]:
         """Returns a camera of this world with the images of a rig of this ``sim.lux``, and its notes."""
