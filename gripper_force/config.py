@@ -485,7 +485,7 @@ class Config(Section):
     calibration: CalibrationConfig = CalibrationConfig()
     log: LogConfig = LogConfig()
     faults: tuple[FaultConfig, ...] = Field(
-        (), description="faults to inject into simulated devices: unit, kind, at_s, for_s"
+        (), description="faults to inject into simulated devices: unit, kind, at_s, for_s, id"
     )
 
     @model_validator(mode="after")
@@ -494,6 +494,10 @@ class Config(Section):
             raise ValueError(
                 "gripper.linkage.kind=finger has one moving finger, but servo.second.id names the servo of a "
                 "second one; set the kind to fingers"
+            )
+        if strange := {fault.id for fault in self.faults} - {None, *self.servo.ids}:
+            raise ValueError(
+                f"a fault has the id {strange.pop()}, but no servo of the gripper has it; correct it"
             )
         return self
 

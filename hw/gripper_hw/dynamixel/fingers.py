@@ -60,19 +60,29 @@ class FingerPair:
         self._way, self._furthest_rad = 0.0, 0.0  # direction of the lead, and how far the mean has come
         self._goals_a = (0.0, 0.0)
 
-    def start(self, states: Sequence[ServoState]) -> None:
-        """Checks the fingers before torque is turned on. Raises `DeviceError` if they are not equally far open."""
-        first, second = self._aligned(states)
-        difference_rad = second.position_rad - first.position_rad
+    def difference_rad(self, first_rad: float, second_rad: float) -> float:
+        """Returns by how much the second finger's closing angle exceeds the first's, at two servo positions."""
+        return self._sign * (second_rad - self._config.offset_rad) - first_rad
+
+    def start_problem(self, first_rad: float, second_rad: float) -> str:
+        """Returns why two servo positions are no start, or an empty text."""
+        difference_rad = abs(self.difference_rad(first_rad, second_rad))
         most_rad = self._config.max_difference_rad / 2
-        if abs(difference_rad) > most_rad:
-            offset_rad = states[1].position_rad - self._sign * states[0].position_rad
-            raise DeviceError(
-                f"the fingers are {abs(difference_rad):.2f} rad apart at the start, more than the {most_rad:g} rad "
-                "that servo.second.max_difference_rad allows; nothing has moved. Open both equally far by hand, or, "
-                f"if they are, set servo.second.offset_rad={offset_rad:.3f} and check servo.second.mirrored"
-            )
-        self._states, self._kept_half_rad, self._way = (first, second), difference_rad / 2, 0.0
+        if difference_rad <= most_rad:
+            return ""
+        return (
+            f"the fingers are {difference_rad:.2f} rad apart, more than the {most_rad:g} rad, half of "
+            "servo.second.max_difference_rad, that a start allows; open both equally far by hand, or, if they are, set "
+            f"servo.second.offset_rad={second_rad - self._sign * first_rad:.3f} and check servo.second.mirrored"
+        )
+
+    def start(self, states: Sequence[ServoState]) -> None:
+        """Begins with a first pair of states. Raises `DeviceError` if the fingers are not equally far open."""
+        first_rad, second_rad = (state.position_rad for state in states)
+        if problem := self.start_problem(first_rad, second_rad):
+            raise DeviceError(problem)
+        self._states, self._way = self._aligned(states), 0.0
+        self._kept_half_rad = self.difference_rad(first_rad, second_rad) / 2
         self._goals_a = (0.0, 0.0)
 
     def combine(self, states: Sequence[ServoState]) -> ServoState:
