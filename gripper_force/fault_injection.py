@@ -39,13 +39,7 @@ class Faults:
         return any(fault.unit == unit for fault, _, _ in self._faults)
 
     def active(self, unit: str, t_ns: int, servo_id: int | None = None) -> str:
-        """Returns the kind of the unit's fault at a time, or ``ok``. The last one listed has priority.
-
-        Args:
-            unit: The unit.
-            t_ns: The time.
-            servo_id: Id of the servo whose fault it is, if the unit is one of servos.
-        """
+        """Returns the kind of the fault of a unit, or of one servo, or ``ok``. The last one listed has priority."""
         for fault, begin_ns, end_ns in reversed(self._faults):
             if fault.unit == unit and begin_ns <= t_ns < end_ns and fault.id in (None, servo_id):
                 return fault.kind

@@ -403,27 +403,14 @@ class DynamixelServo:
         """Counters of retries and losses."""
         return self._bus.stats
 
-    @property
-    def firmware(self) -> int | None:
-        """Firmware version, the older one of two; None before `start`."""
-        return min(self._bus.firmware, default=None)
-
     def start(self) -> ServoState:
-        """Configures the servo and turns torque on; raises the errors of `DynamixelBus.start`.
-
-        Raises:
-            DeviceError: Two fingers are not equally far open.
-        """
+        """Turns torque on; raises the errors of `DynamixelBus.start`, and of `FingerPair.start`."""
         if self._pair is None:
             return self._bus.start()[0]
         return self._pair.combine(self._bus.start(self._pair.start))
 
     def read(self) -> ServoState:
-        """Reads the state in one transaction; raises the errors of `DynamixelBus.read`.
-
-        Raises:
-            HardwareFaultError: Two fingers differ by more than ``servo.second.max_difference_rad``.
-        """
+        """Reads the state in one transaction; raises those of `DynamixelBus.read` and `FingerPair.combine`."""
         states = self._bus.read()
         return states[0] if self._pair is None else self._pair.combine(states)
 
@@ -432,15 +419,12 @@ class DynamixelServo:
         self._bus.write((command,) if self._pair is None else self._pair.split(command))
 
     def stop(self, *, hold: bool) -> None:
-        """Turns torque off, or holds; raises the errors of `DynamixelBus.stop`.
-
-        If one of two servos cannot hold, torque off is tried on both: one finger alone would push the object away.
-        """
+        """Turns torque off, or holds; raises the errors of `DynamixelBus.stop`."""
         try:
             self._bus.stop(hold=hold)
         except DeviceError:
-            if hold and self._pair is not None:
-                with suppress(DeviceError):  # the earlier error is the one to report
+            if hold and self._pair is not None:  # one finger alone would push the object away
+                with suppress(DeviceError):
                     self._bus.stop(hold=False)
             raise
 
