@@ -2,7 +2,7 @@
 
 The objects differ from those in training in stiffness (up to 50 %, training 5 %), size (up to 10 %, training
 4 %) and texture; a fifth one, a ball, is of another kind. Each object is touched many times on one rig, and
-put down anew each time. The last touches are used for testing only.
+placed again each time. The last touches are used for testing only.
 
     python examples/calibration_check.py                # error and interval by number of touches
     python examples/calibration_check.py --grasps 40    # grasps with a profile of 8 touches, and without
@@ -87,7 +87,7 @@ def errors(kind: str, number: int, out: Path) -> list[dict[str, Any]]:
                     "after_n": float(error_n.mean()),
                     "within": float(within.mean()),
                     "half_width_n": float(fitted.interval.half_width_n(5.0)),
-                    "gated": float((fitted.arrays.ood_score(test.features) > fitted.ood_limit).mean()),
+                    "rejected": float((fitted.arrays.ood_score(test.features) > fitted.ood_limit).mean()),
                 }
             )
     kept.write_text(json.dumps(rows))
@@ -123,14 +123,14 @@ def errors_table(rows: list[dict[str, Any]]) -> None:
     print("|---|---|---|---|---|---|---|---|")
     for count in COUNTS:
         part = [row for row in rows if row["touches"] == count]
-        keys = ("before_n", "after_n", "within", "half_width_n", "gated", "refused")
+        keys = ("before_n", "after_n", "within", "half_width_n", "rejected", "refused")
         known = {key: [row[key] for row in part if key in row] for key in keys}
         mean = {key: float(np.mean(values)) if values else 0.0 for key, values in known.items()}
         refused = len(known["refused"])
         print(
             f"| {count} | {mean['before_n']:.3f} | {mean['after_n']:.3f} | "
             f"{mean['before_n'] / mean['after_n']:.1f} | {100 * mean['within']:.0f} % | "
-            f"{mean['half_width_n']:.2f} N | {100 * mean['gated']:.1f} % | {refused} of {len(part)} |"
+            f"{mean['half_width_n']:.2f} N | {100 * mean['rejected']:.1f} % | {refused} of {len(part)} |"
         )
     print("\n| object | before | " + " | ".join(f"{count} touches" for count in COUNTS) + " |")
     print("|---|---|" + "---|" * len(COUNTS))

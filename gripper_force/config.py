@@ -5,7 +5,7 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any, Final, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, PositiveInt, model_validator
 
 from gripper_force.errors import ConfigError
 from gripper_force.fault_config import FaultConfig
@@ -29,9 +29,6 @@ HARD_FORCE_LIMIT_N: Final = 70.0
 """Upper bound of control.force_limit_n: the lowest limit that is quoted for a clamped finger."""
 
 _BACKEND: Final = "or package.module:Class, or a name that an installed package registers"
-
-Options = dict[str, Any]
-"""Keys of a third-party backend; the project does not check them."""
 
 
 class SecondServoConfig(Section):
@@ -59,7 +56,7 @@ class ServoConfig(Section):
     """The servo and its bus."""
 
     backend: str = Field("dynamixel", description=f"dynamixel, {_BACKEND} (gripper_force.servos)")
-    options: Options = Field({}, description="keys of a third-party servo backend")
+    options: Tree = Field({}, description="keys of a third-party servo backend")
     model: str = Field(
         "XM430-W350",
         description="model, e.g. XM430-W350 or XC330-T288-T, or the path of a YAML file (docs/servos.md)",
@@ -175,12 +172,28 @@ class CameraConfig(Section):
     backend: str = Field(
         "simulated", description=f"simulated, oak, uvc, playback, none, {_BACKEND} (gripper_force.cameras)"
     )
-    options: Options = Field({}, description="keys of a third-party camera backend")
+    options: Tree = Field({}, description="keys of a third-party camera backend")
     rate_hz: Positive = Field(60.0, description="requested frames per second")
     path: Path | None = Field(None, description="playback: the log to play")
     speed: Literal["recorded", "full"] = Field("recorded", description="playback: speed")
     device: int | str | None = Field(
         None, description="oak: id or address (None: the only one); uvc: index, /dev path or name"
+    )
+    sensor: str | None = Field(
+        None,
+        description="oak: socket (CAM_B) or name (OV7251); None: the mono sensor on the lowest socket, else the "
+        "colour sensor there",
+    )
+    resolution_px: tuple[PositiveInt, PositiveInt] | None = Field(
+        None,
+        description="width and height of the sensor image; oak: a mode of the sensor (None: its largest of at "
+        "most 1280x800 that reaches rate_hz); uvc: None: 640x480, if available",
+    )
+    fourcc: str | None = Field(
+        None,
+        pattern="^[ -~]{4}$",
+        description="uvc: pixel format, e.g. MJPG, which most webcams need for 60 frames per second, or YUYV; "
+        "None: chosen by OpenCV",
     )
     region: tuple[int, int, int, int] | None = Field(
         None,
@@ -192,11 +205,30 @@ class CameraConfig(Section):
         4000, gt=0, description="exposure time; None: automatic (simulated camera: as 4000)"
     )
     gain: int | None = Field(
-        None, ge=0, description="oak: ISO (None: 100); uvc: in the driver's unit (None: unchanged)"
+        None,
+        ge=0,
+        description="oak: ISO (None: 100); uvc: in the driver's unit (None: unchanged); needs exposure_us",
+    )
+    lens_position: int | None = Field(
+        None,
+        ge=0,
+        description="focus of a lens with autofocus, which is off; larger is nearer; oak: 0 to 255, needed by "
+        "such a lens; uvc: in the driver's unit (None: unchanged)",
+    )
+    white_balance_k: int | None = Field(
+        None,
+        ge=1000,
+        le=12_000,
+        description="colour temperature of the white balance of a colour camera, which is not automatic; oak: "
+        "None: 5000; uvc: None: unchanged",
     )
     timeout_ms: Positive = Field(
         250.0, description="oak, uvc: age of the newest frame after which the camera counts as lost"
     )
+
+
+CAMERA_OTHER_KEYS: Final = {"options", "path", "speed", "device", "timeout_ms"}
+"""Keys of the camera on which the look of its images does not depend."""
 
 
 class LoadCellConfig(Section):
@@ -206,7 +238,7 @@ class LoadCellConfig(Section):
         "simulated",
         description=f"simulated, playback, serial, phidget, none, {_BACKEND} (gripper_force.load_cells)",
     )
-    options: Options = Field({}, description="keys of a third-party load cell backend")
+    options: Tree = Field({}, description="keys of a third-party load cell backend")
     rate_hz: Positive = Field(
         200.0, description="simulated, phidget (at most 122): samples per second; serial boards set their own"
     )
@@ -513,9 +545,7 @@ class Config(Section):
 
     def camera_settings(self) -> Tree:
         """Camera keys and values that an object profile is bound to."""
-        camera = self.camera.model_dump(
-            mode="json", include={"backend", "rate_hz", "region", "side_px", "exposure_us", "gain"}
-        )
+        camera = self.camera.model_dump(mode="json", exclude=CAMERA_OTHER_KEYS)
         settings = {f"camera.{key}": value for key, value in camera.items()}
         return {**settings, "vision.region": self.vision.region and list(self.vision.region)}
 

@@ -134,7 +134,11 @@ class Servo(Protocol):
 
 
 class Camera(Protocol):
-    """A gray camera. With the class attribute ``supports_lockstep = True`` it follows simulated time."""
+    """A gray camera. With the class attribute ``supports_lockstep = True`` it follows simulated time.
+
+    A method ``settings() -> dict[str, float | str]`` is optional: the settings in force by key of the section
+    ``camera``, for ``doctor`` and the log.
+    """
 
     def start(self) -> None:
         """Opens the device and starts to capture."""

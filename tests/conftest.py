@@ -10,6 +10,7 @@ import torch
 from hypothesis import settings
 
 from gripper_force.config import dump_config, load_config
+from gripper_force.interfaces import Clock
 from gripper_force.jobs.dataset import Clip
 from gripper_force.jobs.training.recipe import TrainConfig
 from gripper_force.runtime import process
@@ -101,6 +102,25 @@ def fused_log(quick_vision: list[str], tmp_path_factory: pytest.TempPathFactory)
     path = tmp_path_factory.mktemp("fused") / "grasp.mcap"
     run_grasp(load_config(None, quick_vision), path)
     return path
+
+
+class ManualClock:
+    """A clock that only a sleep advances."""
+
+    def __init__(self) -> None:
+        self._t_ns = 0
+
+    def now_ns(self) -> int:
+        return self._t_ns
+
+    def sleep_until_ns(self, t_ns: int) -> None:
+        self._t_ns = max(self._t_ns, t_ns)
+
+
+@pytest.fixture
+def clock() -> Clock:
+    """A clock at 0 that only a sleep advances."""
+    return ManualClock()
 
 
 @pytest.fixture(autouse=True)

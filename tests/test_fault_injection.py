@@ -12,20 +12,10 @@ from gripper_force.config import config_from, load_config
 from gripper_force.errors import ConfigError
 from gripper_force.fault_config import FAULTS, FaultConfig
 from gripper_force.fault_injection import Faults, FaultyEstimator, FaultyFile
+from gripper_force.interfaces import Clock
 
 KINDS = ("off", "stuck", "garbage", "wrong", "slow", "delayed", "intermittent")
 GRAY = np.zeros((4, 4), np.uint8)
-
-
-@dataclass
-class Clock:
-    t_ns: int = 0
-
-    def now_ns(self) -> int:
-        return self.t_ns
-
-    def sleep_until_ns(self, t_ns: int) -> None:
-        self.t_ns = max(self.t_ns, t_ns)
 
 
 @dataclass
@@ -85,13 +75,12 @@ def test_ok_ends_a_fault() -> None:
 
 
 @pytest.mark.parametrize("kind", FAULTS["estimator"])
-def test_estimator_fails_as_configured(kind: str) -> None:
-    clock = Clock()
+def test_estimator_fails_as_configured(kind: str, clock: Clock) -> None:
     estimator = FaultyEstimator(Two(), faults("estimator", kind), clock, lockstep=True)
     sound = estimator.update(GRAY)
     assert sound is not None
     assert sound.force_n == 2.0
-    clock.t_ns = 1_500_000_000
+    clock.sleep_until_ns(1_500_000_000)
 
     def outcome() -> object:
         try:
@@ -112,24 +101,24 @@ def test_estimator_fails_as_configured(kind: str) -> None:
             assert not any(math.isfinite(force) for force in seen)  # type: ignore[arg-type]
         case "wrong":
             assert seen == pytest.approx([2.0 * 2 / 3] * 6)
-    clock.t_ns = 2_000_000_000
+    clock.sleep_until_ns(2_000_000_000)
     sound = estimator.update(GRAY)
     assert sound is not None
     assert sound.force_n == 2.0
 
 
-def test_estimator_blocks_in_real_time() -> None:
-    clock = Clock(1_200_000_000)
+def test_estimator_blocks_in_real_time(clock: Clock) -> None:
+    clock.sleep_until_ns(1_200_000_000)
     FaultyEstimator(Two(), faults("estimator", "stuck"), clock, lockstep=False).update(GRAY)
-    assert clock.t_ns == 2_000_000_000
+    assert clock.now_ns() == 2_000_000_000
 
 
 @pytest.mark.parametrize("kind", FAULTS["disk"])
-def test_disk_fails_as_configured(kind: str) -> None:
-    clock, raw = Clock(), io.BytesIO()
+def test_disk_fails_as_configured(kind: str, clock: Clock) -> None:
+    raw = io.BytesIO()
     file = FaultyFile(raw, faults("disk", kind), clock, lockstep=False)
     file.write(b"before")
-    clock.t_ns = 1_100_000_000
+    clock.sleep_until_ns(1_100_000_000)
     failures = []
     for _ in range(4):
         try:
@@ -142,7 +131,7 @@ def test_disk_fails_as_configured(kind: str) -> None:
             assert raw.getvalue() == b"before" + 4 * b"12"
         case "slow":
             assert failures == []
-            assert clock.t_ns == 1_300_000_000
+            assert clock.now_ns() == 1_300_000_000
         case "intermittent":
             assert failures == [errno.EIO] * 2
     file.flush()

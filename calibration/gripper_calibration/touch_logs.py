@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,7 @@ from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import CONTACT_N, read_clip
 from gripper_force.jobs.metrics import lag_s
 from gripper_force.runtime.log import LogReader
+from gripper_force.schema import Tree
 from gripper_force.types import NS_PER_S, Frame, GraspStatus, LoadCellSample, Phase, Record, ServoState
 from gripper_force.vision.batch_inference import features
 from gripper_force.vision.checkpoint import Checkpoint
@@ -39,11 +40,11 @@ class TouchRecording:
     """
 
     touches: Touches
-    camera: dict[str, Any]
+    camera: Tree
     presses: list[PressSeries]
     width_m: list[Floats]
     delay_s: float
-    source: dict[str, Any]
+    source: dict[str, str | float | None]
 
     @property
     def has_contact(self) -> bool:
@@ -172,7 +173,7 @@ def _record_types(config: Config) -> list[type[Record]]:
     return types if config.gripper.nm_per_a is None else [*types, ServoState, GraspStatus]
 
 
-def _label_source(config: Config) -> dict[str, Any]:
+def _label_source(config: Config) -> dict[str, str | float | None]:
     """Settings that the forces depend on. The tare is not among them: it drifts and is renewed."""
     cell = config.load_cell
     return {"object": config.object, "load cell": cell.sensor, "load_cell.n_per_raw": cell.n_per_raw}

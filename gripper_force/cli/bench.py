@@ -1,14 +1,14 @@
 """The `bench` commands: speed, memory and error of parts of the product on this machine."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from gripper_force.cli import console
-from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, load_settings
+from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, Page, load_settings
 from gripper_force.cli.output.bench import (
     bus_table,
     commands_table,
@@ -25,7 +25,6 @@ app = typer.Typer(no_args_is_help=True, help="Measure speed, memory and error on
 NoOverrides = Annotated[
     list[str] | None, typer.Option("--set", help="Not allowed: this command uses no configuration.")
 ]
-Page = Annotated[Path | None, typer.Option("--write", help="Markdown page to write the table into.")]
 Folder = Annotated[Path, typer.Option("--out", help="Folder for the results.")]
 
 
@@ -218,7 +217,7 @@ def _reject_overrides(command: str, overrides: list[str] | None) -> None:
         raise ConfigError(f"bench {command} uses no configuration; leave out --set {overrides[0]}")
 
 
-def _show(result: dict[str, Any], as_json: bool, table: Callable[[], None]) -> None:
+def _show(result: Mapping[str, object], as_json: bool, table: Callable[[], None]) -> None:
     """Prints a result with the load of this machine."""
     load = os.getloadavg()[0]
 

@@ -1,8 +1,9 @@
 """The commands that calibrate a rig and objects."""
 
 import sys
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -14,6 +15,9 @@ from gripper_force.errors import ConfigError
 if TYPE_CHECKING:
     from rich.status import Status
 
+    from gripper_calibration.procedures.calibrate_camera import CameraResult
+    from gripper_calibration.procedures.calibrate_load_cell import LoadCellResult
+    from gripper_calibration.procedures.calibrate_servo import ServoResult
     from gripper_force.config import Config
     from gripper_force.interfaces import Progress, Prompt
 
@@ -159,11 +163,11 @@ def object_(
     fresh: Annotated[
         bool,
         typer.Option(
-            "--fresh", help="Move existing touches to a folder beside, and record all of them anew."
+            "--fresh", help="Move existing touches to a folder beside, and record all of them again."
         ),
     ] = False,
     pause: Annotated[
-        bool, typer.Option("--pause", help="Wait for Enter before each touch, to place the object anew.")
+        bool, typer.Option("--pause", help="Wait for Enter before each touch, to place the object again.")
     ] = False,
     config: ConfigPath = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the touches, and of a simulated scene.")] = None,
@@ -175,7 +179,7 @@ def object_(
     from gripper_calibration.procedures import calibrate_object as job
 
     if fresh and logs is not None:
-        raise ConfigError("--fresh records touches anew and --from records none; leave out one of them")
+        raise ConfigError("--fresh records touches and --from records none; leave out one of them")
     settings = load_settings(config, set_, {"object": name, "seed": seed})
     folder = folder or job.default_folder(name)
     if logs is None:
@@ -191,7 +195,7 @@ def object_(
             f"{job.TOUCHES} are recommended",
             soft_wrap=True,
         )
-    console.show(result.as_dict(), as_json, object_table)
+    console.show(result.as_dict(), as_json, lambda _: object_table(result))
 
 
 def _tell_existing(settings: "Config", touches: int, folder: Path, fresh: bool) -> None:
@@ -206,7 +210,7 @@ def _tell_existing(settings: "Config", touches: int, folder: Path, fresh: bool) 
     if existing := [str(number) for number, path in enumerate(paths, 1) if path.exists()]:
         console.err.print(
             f"{len(existing)} of {touches} touches exist already in {folder} and are used: number "
-            f"{', '.join(existing)}; --fresh records all of them anew",
+            f"{', '.join(existing)}; --fresh records all of them again",
             soft_wrap=True,
         )
 
@@ -230,7 +234,7 @@ def _touches(settings: "Config", touches: int, peak_n: float | None, folder: Pat
 
 
 def _rig_settings(
-    config: Path | None, set_: list[str] | None, options: dict[str, Any], rig: Path | None
+    config: Path | None, set_: list[str] | None, options: Mapping[str, object], rig: Path | None
 ) -> "tuple[Config, Path]":
     """Loads the configuration of a command that writes a rig profile, which need not exist yet.
 
@@ -249,11 +253,10 @@ def _rig_settings(
     return settings, rig or named or Path("rig.yaml")
 
 
-def _show_rig(result: Any, as_json: bool) -> None:
+def _show_rig(result: "LoadCellResult | ServoResult | CameraResult", as_json: bool) -> None:
     """Shows the calibrated section of the rig profile and what else was measured, as one level of keys."""
     values = console.jsonable(result)
-    section = result.calibration.model_dump(mode="json")
-    console.show({**section, **{k: v for k, v in values.items() if k != "calibration"}}, as_json, rig_table)
+    console.show(values.pop("calibration") | values, as_json, rig_table)
 
 
 def _region(text: str) -> tuple[int, int, int, int]:

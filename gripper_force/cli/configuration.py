@@ -1,7 +1,6 @@
 """Commands for configuration files: show, check, schema."""
 
 import sys
-from typing import Any
 
 import typer
 
@@ -27,12 +26,9 @@ def check(config: ConfigPath = None, set_: Overrides = None, as_json: AsJson = F
 
     run = resolve(load_settings(config, set_, {}))
     run.check_target(run.config.target_n)
-    result: dict[str, Any] = {
-        "ok": True,
-        "choices": list(run.choices),
-        "notes": [text for _, text in run.notes],
-    }
-    console.show(result, as_json, lambda _: console.out.print("\n".join(["ok", *result["notes"]])))
+    notes = [text for _, text in run.notes]
+    result = {"ok": True, "choices": list(run.choices), "notes": notes}
+    console.show(result, as_json, lambda _: console.out.print("\n".join(["ok", *notes])))
 
 
 @app.command()

@@ -3,10 +3,10 @@
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rich.console import Console
 from rich.markup import escape
@@ -21,6 +21,8 @@ if TYPE_CHECKING:  # --help loads no NumPy
 
 err = Console(stderr=True, highlight=False)
 out = Console(highlight=False)
+
+T = TypeVar("T")
 
 
 @contextmanager
@@ -37,7 +39,7 @@ def line(text: str, steps: int = 1) -> None:
     err.print(f"[dim]{escape(text)}[/]", soft_wrap=True)
 
 
-def show(result: Any, as_json: bool, render: Callable[[Any], object] | None = None) -> None:
+def show(result: T, as_json: bool, render: Callable[[T], object] | None = None) -> None:
     """Prints a result as one JSON object, or for a person: with ``render``, or as names and values.
 
     Args:
@@ -48,7 +50,7 @@ def show(result: Any, as_json: bool, render: Callable[[Any], object] | None = No
     if as_json:
         sys.stdout.write(json.dumps(jsonable(result), allow_nan=False) + "\n")
     elif render is None:
-        pairs(result)
+        pairs(jsonable(result))
     else:
         render(result)
 
@@ -68,14 +70,14 @@ def jsonable(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def number(value: Any, unit: str = "", digits: int = 3) -> str:
+def number(value: object, unit: str = "", digits: int = 3) -> str:
     """Formats a figure with its unit; a dash for a missing value."""
     if value is None or (isinstance(value, float) and not math.isfinite(value)):
         return "-"
     return f"{value:.{digits}f}{unit}" if isinstance(value, float) else f"{value}{unit}"
 
 
-def pairs(values: dict[str, Any]) -> None:
+def pairs(values: Mapping[str, object]) -> None:
     """Prints names and values."""
     table = Table(box=None, show_header=False, pad_edge=False)
     for name, value in values.items():

@@ -2,7 +2,7 @@
 
 from contextlib import closing
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -52,7 +52,7 @@ def simulate(
     from gripper_force.jobs import paper_protocol
     from gripper_force.jobs import simulate as job
 
-    plans: list[Any]
+    plans: list[job.Plan]
     if protocol is None:
         if scale is not None:
             raise ConfigError(
@@ -163,7 +163,7 @@ def import_video(
     else:
         log = folder / f"{video.stem}.mcap"
         summaries = [job.import_video(video, forces, log, object_name=object_, region=region, align=align)]
-    console.show({"logs": summaries}, as_json, imports_table)
+    console.show({"logs": summaries}, as_json, lambda _: imports_table(summaries))
 
 
 @import_app.command("database")
@@ -195,4 +195,5 @@ def import_database(
                 )
             )
             progress(path.name)
-    console.show({"environments": rows, "ignored": ignored}, as_json, database_table)
+    result = {"environments": rows, "ignored": ignored}
+    console.show(result, as_json, lambda _: database_table(rows, ignored))

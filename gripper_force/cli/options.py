@@ -1,8 +1,9 @@
 """Options that commands share, and the configuration they give."""
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -17,10 +18,11 @@ Overrides = Annotated[
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
 Jobs = Annotated[int, typer.Option(min=1, help="Processes to use.")]
+Page = Annotated[Path | None, typer.Option("--write", help="Markdown page to write the table into.")]
 
 
 def load_settings(
-    path: Path | None, overrides: list[str] | None, options: dict[str, Any], *, new_rig: bool = False
+    path: Path | None, overrides: list[str] | None, options: Mapping[str, object], *, new_rig: bool = False
 ) -> "Config":
     """Loads the configuration of a command; its own options override ``--set``.
 

@@ -78,7 +78,8 @@ def grasp(
             interrupt = end
     if results:
         summary = job.overall(results, settings.control.force_limit_n)
-        console.show({"trials": results, "summary": summary}, as_json, trials_table)
+        printed = {"trials": results, "summary": summary}
+        console.show(printed, as_json, lambda _: trials_table(results, summary))
     if interrupt is not None:
         raise interrupt
 
@@ -127,7 +128,7 @@ def doctor(
     with console.err.status("checking"):
         checks = list(job.doctor(settings))
     ok = all(check.ok is not False for check in checks)
-    console.show({"checks": checks, "ok": ok}, as_json, checks_table)
+    console.show({"checks": checks, "ok": ok}, as_json, lambda _: checks_table(checks))
     if not ok:
         raise typer.Exit(1)
 

@@ -1,12 +1,13 @@
 """The `stability` commands: hard numerical cases, faults, malformed input and long use."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypedDict, TypeVar
 
 import typer
 
 from gripper_force.cli import console
-from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, load_settings
+from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, Page, load_settings
 from gripper_force.cli.output.stability import (
     faults_table,
     fuzz_table,
@@ -19,6 +20,13 @@ app = typer.Typer(
     no_args_is_help=True,
     help="Test with hard numerical cases, faults, malformed input and long use. Exit code 1 on a failure.",
 )
+
+
+class _Report(TypedDict):
+    ok: bool
+
+
+R = TypeVar("R", bound=_Report)
 
 Seed = Annotated[int | None, typer.Option(min=0, help="Seed of all random draws. Default: the key seed.")]
 
@@ -50,15 +58,14 @@ def numerics(
     if write is not None:
         for name, rows in report["parts"].items():
             write_between(write, name, markdown(rows))
-    console.show(report, as_json, numerics_tables)
-    _exit(report["ok"])
+    _show(report, as_json, numerics_tables)
 
 
 @app.command("faults")
 def faults(
     seeds: Annotated[int, typer.Option(min=1, help="Grasps of each row.")] = 20,
     live: Annotated[int, typer.Option(min=0, help="Of these, grasps repeated in real time.")] = 2,
-    write: Annotated[Path | None, typer.Option(help="Markdown page to write the table into.")] = None,
+    write: Page = None,
     resume: Annotated[bool, typer.Option(help="Continue an interrupted matrix.")] = False,
     seed: Seed = None,
     jobs: Jobs = CORES,
@@ -67,7 +74,12 @@ def faults(
     as_json: AsJson = False,
 ) -> None:
     """Inject a fault into each part during a grasp. Exit code 1 if a reaction is not as expected."""
-    from gripper_force.qualification.fault_matrix.matrix import count_grasps, markdown, run_matrix
+    from gripper_force.qualification.fault_matrix.matrix import (
+        MatrixReport,
+        count_grasps,
+        markdown,
+        run_matrix,
+    )
     from gripper_force.qualification.markdown_blocks import write_between
 
     settings = load_settings(config, set_, {"seed": seed})
@@ -76,9 +88,8 @@ def faults(
         rows = list(run_matrix(settings, seeds, live, jobs, keep, resume=resume, progress=progress))
     if write is not None:
         write_between(write, "matrix", markdown(rows))
-    ok = all(row["ok"] == row["runs"] for row in rows)
-    console.show({"rows": rows, "ok": ok}, as_json, faults_table)
-    _exit(ok)
+    report: MatrixReport = {"rows": rows, "ok": all(row["ok"] == row["runs"] for row in rows)}
+    _show(report, as_json, faults_table)
 
 
 @app.command("search")
@@ -98,8 +109,7 @@ def search(
     keep = settings.log.directory / "search.jsonl"
     with console.bar("searching", cases) as progress:
         report = safety_search.search(settings, cases, jobs, keep, resume=resume, progress=progress)
-    console.show(report, as_json, search_table)
-    _exit(report["ok"])
+    _show(report, as_json, search_table)
 
 
 @app.command("fuzz")
@@ -123,8 +133,7 @@ def fuzz(
     settings = load_settings(config, set_, {"seed": seed})
     with console.bar("fuzzing", cases) as progress:
         report = fuzzer.fuzz(cases, settings.seed, jobs, folder, progress, only=only)
-    console.show(report, as_json, fuzz_table)
-    _exit(report["ok"])
+    _show(report, as_json, fuzz_table)
 
 
 @app.command("soak")
@@ -141,10 +150,11 @@ def soak(
     settings = load_settings(config, ["sim.detail=coarse", *(set_ or [])], {"seed": seed})
     with console.bar("soaking", round(seconds)) as progress:
         report = soak_test.soak(settings, seconds, progress)
-    console.show(report, as_json, soak_table)
-    _exit(report["ok"])
+    _show(report, as_json, soak_table)
 
 
-def _exit(ok: bool) -> None:
-    if not ok:
+def _show(report: R, as_json: bool, table: Callable[[R], None]) -> None:
+    """Prints a report. Exit code 1 if it is not ok."""
+    console.show(report, as_json, table)
+    if not report["ok"]:
         raise typer.Exit(1)

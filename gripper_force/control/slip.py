@@ -6,8 +6,15 @@ _FREE_SPEED_SHARE = 0.2
 _SHORTFALL_SHARE = 0.5
 _SHORTFALL_N = 0.2
 _FREE_S = 0.015
+_FREE_FILTER_S = 0.015
 """Jaws that close faster than this share of the approach speed, while the motor force falls short of its goal
-by this share of the reference and by this force, for this time, press on nothing."""
+by this share of the reference and by this force, for this time, press on nothing. Speed and shortfall are filtered:
+the speed limit brakes jaws without resistance in every second cycle."""
+
+_RECEDED_M = 0.0005
+_RECEDED_FORCE_N = 0.1
+"""A hold has lost its object if the jaws close by this much in one motion and the motor force has not risen by this
+much since they were last at rest. Against an object they would need more force."""
 
 _COLLAPSE_SHARE = 0.5
 _COLLAPSE_S = 0.1
@@ -24,6 +31,8 @@ class SlipMonitor:
     def start(self) -> None:
         """Starts at the beginning of a grip."""
         self._free_s = self._collapsed_s = 0.0
+        self._closing_m_s = self._shortfall_n = 0.0
+        self._rest: tuple[float, float] | None = None
 
     def is_lost(
         self, dt_s: float, width_m: float, closing_m_s: float, shortfall_n: float, reference_n: float
@@ -40,12 +49,37 @@ class SlipMonitor:
             shortfall_n: Commanded less measured motor force at each jaw.
             reference_n: Wanted contact force.
         """
-        runs = closing_m_s > _FREE_SPEED_SHARE * self._config.approach_speed_m_s
-        runs = runs and shortfall_n > max(_SHORTFALL_SHARE * reference_n, _SHORTFALL_N)
+        share = dt_s / (dt_s + _FREE_FILTER_S)
+        self._closing_m_s += (closing_m_s - self._closing_m_s) * share
+        self._shortfall_n += (shortfall_n - self._shortfall_n) * share
+        runs = self._moves(self._closing_m_s)
+        runs = runs and self._shortfall_n > max(_SHORTFALL_SHARE * reference_n, _SHORTFALL_N)
         self._free_s = self._free_s + dt_s if runs else 0.0
         if self._free_s >= _FREE_S:
             return "the jaws close without resistance"
         return "the jaws closed" if width_m < self._config.min_object_width_m else ""
+
+    def has_receded(self, width_m: float, closing_m_s: float, motor_force_n: float) -> str:
+        """Returns why a held object is no longer there, or an empty text. To be called in each cycle after ``held``.
+
+        It finds the loss of a small force, for which the motor need not fall short.
+
+        Args:
+            width_m: Distance between the jaws.
+            closing_m_s: Closing speed of one jaw.
+            motor_force_n: Commanded motor force at each jaw.
+        """
+        if not self._moves(closing_m_s):
+            self._rest = width_m, motor_force_n
+        if self._rest is None:
+            return ""
+        rest_m, rest_n = self._rest
+        if rest_m - width_m > _RECEDED_M and motor_force_n - rest_n < _RECEDED_FORCE_N:
+            return "the jaws close without more motor force"
+        return ""
+
+    def _moves(self, closing_m_s: float) -> bool:
+        return closing_m_s > _FREE_SPEED_SHARE * self._config.approach_speed_m_s
 
     def has_slipped(self, dt_s: float, force_n: float, target_n: float, closed_m: float) -> str:
         """Returns why the object slips, or an empty text.

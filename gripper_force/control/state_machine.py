@@ -50,10 +50,19 @@ _DWELL_S = 0.12
 _SETTLE_FILTER_S = 0.25
 """Time constant of the filter on the force error that decides on `held`: vision alone is noisy."""
 
-_SEEN_FILTER_S = 0.3
+_LET_GO_S = 0.6
+"""Time in which the largest motor force of a grip falls to that of free travel after a release. With less motor
+force at once, the servo could not brake the jaws, and a springy object pushed them open at four times the wanted
+speed."""
+
+_LET_GO_LEAD_S = 0.03
+"""Time in which the lead of the goal position reaches its full length after a release. With a full lead at once, the
+motor would add to the force of a springy object."""
+
+_SEEN_FILTER_S = 0.1
 _UNSEEN_SHARE = 0.15
-"""A grip counts as held only if the filtered visual estimate is at least this share of the target. Otherwise the jaws
-may press on an end stop, which the motor current cannot tell from an object."""
+"""A grip counts as held only while the filtered visual estimate is at least this share of the target. Otherwise the
+jaws may press on an end stop or be held by friction, which the motor current cannot tell from an object."""
 
 _OPEN_M = 0.003
 """Distance from the open width at which the jaws count as open."""
@@ -147,6 +156,7 @@ class GraspController:
         self._grasp_ns = 0
         self._phase_s = self._settled_s = self._error_n = 0.0
         self._was_over_force = False
+        self._let_go_n = 0.0
         self._seen_n: float | None = None
         self._seen_ns = 0
         self._goal_current_a = self._measured_motor_force_n = 0.0
@@ -338,6 +348,7 @@ class GraspController:
         self._enter(Phase.MOVE, f"move to {1e3 * width_m:.1f} mm requested")
 
     def _start_travel(self) -> None:
+        self._let_go_n = self._motor_force_n if self._phase in _GRIPPING else 0.0
         speed_m_s = _TRAVEL_SPEED_SHARE * self._config.approach_speed_m_s
         self._travel.start(self._present_width_m, speed_m_s)
         self._limits.reset()
@@ -467,15 +478,20 @@ class GraspController:
         error_n = self._estimate.force_n - self._derated_target_n
         self._error_n += (error_n - self._error_n) * dt_s / (dt_s + _SETTLE_FILTER_S)
         is_near = abs(self._error_n) <= tolerance_n(self._derated_target_n)
-        self._settled_s = self._settled_s + dt_s if is_near else 0.0
-        if self._outcome == Outcome.NONE and self._settled_s >= self._config.settle_s and not self._is_unseen:
+        self._settled_s = self._settled_s + dt_s if is_near and not self._is_unseen else 0.0
+        if self._outcome == Outcome.NONE and self._settled_s >= self._config.settle_s:
             self._held_width_m = width_m
             self._set_outcome(Outcome.HELD, f"{self._estimate.force_n:.2f} N for {self._settled_s:.2f} s")
-        if lost := self._slip.is_lost(dt_s, width_m, closing_m_s, shortfall_n, self._loop.reference_n):
+        lost = self._slip.is_lost(dt_s, width_m, closing_m_s, shortfall_n, self._loop.reference_n)
+        if not lost and self._outcome == Outcome.HELD:
+            lost = self._slip.has_receded(width_m, closing_m_s, self._motor_force_n)
+        if lost:
             self._handle_loss(width_m, lost)
             return
         closed_m = self._held_width_m - width_m if self._outcome == Outcome.HELD else 0.0
         slip = self._slip.has_slipped(dt_s, self._estimate.force_n, self._derated_target_n, closed_m)
+        if not slip and self._outcome == Outcome.HELD and self._is_unseen:
+            slip = f"the camera sees only {self._seen_n:.1f} N; friction or an end stop may hold the jaws"
         if slip and self._outcome in (Outcome.NONE, Outcome.HELD):
             self._set_outcome(Outcome.SLIP, slip)
 
@@ -494,18 +510,29 @@ class GraspController:
                 self._approach.start(width_m, self._target_n)
                 self._enter(Phase.APPROACH, reason)
 
+    @property
+    def _travel_force_n(self) -> float:
+        """Motor force of a release or move: that of free travel, and at first what remains of a grip."""
+        remaining_n = self._let_go_n * (1 - self._phase_s / _LET_GO_S)
+        return max(self._free_motor_force_n, remaining_n)
+
     def _run_release(self, dt_s: float, width_m: float) -> None:
-        self._motor_force_n = self._free_motor_force_n
+        self._motor_force_n = self._travel_force_n
         open_width_m = self._transmission.open_width_m
         self._goal_width_m = self._travel.step(open_width_m, dt_s)
-        self._goal_width_m = self._travel.value = min(self._goal_width_m, width_m + 2 * _LEAD_M)
+        lead_m = 2 * _LEAD_M
+        if self._let_go_n and self._phase_s < _LET_GO_S:
+            # The object drives the jaws: their start is sharp, which shows the lag of the sensors.
+            self._goal_width_m = open_width_m
+            lead_m *= min(self._phase_s / _LET_GO_LEAD_S, 1.0)
+        self._goal_width_m = self._travel.value = min(self._goal_width_m, width_m + lead_m)
         if is_open(open_width_m, width_m):
             self._goal_width_m = open_width_m
             if self._phase == Phase.RELEASE:
                 self._enter(Phase.OPEN, "open")
 
     def _run_move(self, dt_s: float, width_m: float) -> None:
-        self._motor_force_n = self._free_motor_force_n
+        self._motor_force_n = self._travel_force_n
         goal_width_m = self._travel.step(self._move_width_m, dt_s)
         self._goal_width_m = min(max(goal_width_m, width_m - 2 * _LEAD_M), width_m + 2 * _LEAD_M)
         self._travel.value = self._goal_width_m

@@ -75,7 +75,7 @@ def keep_only(config: Config, unit: Literal["servo", "camera", "load_cell"]) -> 
 
 
 def gather(devices: Devices, take: Callable[[], Iterable[T]]) -> list[T]:
-    """Collects what a sensor gives within one second from its first item on. May be empty."""
+    """Collects the items of a sensor for one second from the first one on. May be empty."""
     clock, items = devices.clock, list[T]()
     end_ns = clock.now_ns() + _FIRST_NS
     while (now_ns := clock.now_ns()) < end_ns:

@@ -18,6 +18,7 @@ from gripper_force.jobs.score import score_grasp
 from gripper_force.runtime.log import LogReader
 from gripper_force.runtime.resolve import resolve
 from gripper_force.runtime.session import Session, open_run
+from gripper_force.schema import Tree
 from gripper_force.types import (
     NS_PER_S,
     Event,
@@ -289,7 +290,7 @@ def overall(results: list[Summary], force_limit_n: float) -> Overall:
     }
 
 
-def _trial(tree: dict[str, Any]) -> Summary:
+def _trial(tree: Tree) -> Summary:
     return grasp(config_from(tree, "trials"))
 
 

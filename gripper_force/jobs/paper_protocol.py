@@ -35,7 +35,7 @@ TEST_SETS: Final = (13, 14, 15)
 
 
 @dataclass(frozen=True, slots=True)
-class Scale:
+class ProtocolScale:
     """Part of the protocol.
 
     Attributes:
@@ -50,8 +50,8 @@ class Scale:
 
 
 SCALES: Final = {
-    "full": Scale((0, 10, 20, 30), tuple(range(1, 16)), (350, 550, 750)),
-    "small": Scale((0, 30), (1, 2, 3, 4, 5, 6, 7, 8, 14, 15), (550,)),
+    "full": ProtocolScale((0, 10, 20, 30), tuple(range(1, 16)), (350, 550, 750)),
+    "small": ProtocolScale((0, 30), (1, 2, 3, 4, 5, 6, 7, 8, 14, 15), (550,)),
 }
 """Scales by name. A log that is in both is the same in both."""
 

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from gripper_force.errors import ConfigError
-from gripper_force.schema import Finite, NonNegative, Positive, Section, dump, read_section, write_all
+from gripper_force.schema import Finite, NonNegative, Positive, Section, Tree, dump, read_section, write_all
 
 FORMAT: Final = "gripper-force-object/1"
 
@@ -115,7 +115,7 @@ class ObjectProfile(Section):
     object: str
     date: date
     checkpoint: str
-    camera: dict[str, Any]
+    camera: Tree
     touches: Annotated[int, Field(ge=1)]
     frames: Annotated[int, Field(ge=1)]
     force_n: Positive
@@ -135,7 +135,7 @@ class ObjectProfile(Section):
             return {("ood_limit" if key == "gate" else key): value for key, value in tree.items()}
         return tree
 
-    def mismatches(self, checkpoint: str, camera: dict[str, Any]) -> list[str]:
+    def mismatches(self, checkpoint: str, camera: Tree) -> list[str]:
         """Returns the differences between the calibration and a run, as text.
 
         Args:

@@ -1,7 +1,7 @@
 """Rig profile: calibration of one rig by `gripper-force calibrate load-cell`, `servo` and `camera`."""
 
 from pathlib import Path
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import AwareDatetime, Field, model_validator
 
@@ -113,6 +113,7 @@ class CameraCalibration(Section):
         side_px: Side of the frames.
         rate_hz: Frame rate.
         gain: Gain.
+        image: The other keys of the camera on which its images depend; none in profiles of version 0.1.
         exposure_us: Exposure at which the image is neither dark nor clipped.
         mean: Mean gray value at that exposure.
         clipped: Share of clipped pixels at that exposure.
@@ -129,6 +130,7 @@ class CameraCalibration(Section):
     side_px: int
     rate_hz: Positive
     gain: int | None
+    image: dict[str, Any] = Field({})
     exposure_us: int
     mean: NonNegative
     clipped: NonNegative
@@ -140,9 +142,9 @@ class CameraCalibration(Section):
 
     def mismatches(self, camera: Tree) -> list[str]:
         """Returns the differences between the calibration and a run's section ``camera``, as text."""
-        mine = self.model_dump(mode="json")
-        keys = ("backend", "side_px", "rate_hz", "gain", "exposure_us")
-        return [f"camera.{key} {mine[key]}, not {camera[key]}" for key in keys if mine[key] != camera[key]]
+        named = {"backend", "side_px", "rate_hz", "gain", "exposure_us"}
+        mine = {**self.model_dump(mode="json", include=named), **self.image}
+        return [f"camera.{key} {mine[key]}, not {camera[key]}" for key in mine if mine[key] != camera[key]]
 
 
 class RigProfile(Section):

@@ -78,6 +78,14 @@ def resolve_simulation(config: Config) -> tuple[Config, str]:
     return resolved
 
 
+def with_camera_rate(config: Config) -> Config:
+    """Sets ``camera.rate_hz`` to that of the log, if the camera plays one. Raises `GripperError` if it can't."""
+    if config.camera.backend != "playback":
+        return config
+    camera = load_class("cameras", CAMERAS, "playback", "camera.backend").resolve(config.camera)
+    return config.model_copy(update={"camera": camera})
+
+
 @contextmanager
 def open_devices(config: Config, port: SharedPort | None = None) -> Iterator[Devices]:
     """Opens the configured devices and closes all of them at the end, whatever happens.

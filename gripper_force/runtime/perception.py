@@ -106,7 +106,7 @@ class LockstepPerception:
         self._under_way: deque[tuple[int, ProcessedFrame]] = deque()
 
     def start(self) -> None:
-        """Does nothing: there is no thread."""
+        """Has no effect: there is no thread."""
 
     def poll(self) -> list[ProcessedFrame]:
         """Returns the frames that became ready since the last call, oldest first."""
@@ -121,7 +121,7 @@ class LockstepPerception:
         return ready
 
     def close(self) -> None:
-        """Does nothing: there is no thread."""
+        """Has no effect: there is no thread."""
 
 
 class ThreadedPerception:

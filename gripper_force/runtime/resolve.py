@@ -15,7 +15,7 @@ from gripper_force.control.transmission import Transmission
 from gripper_force.errors import ConfigError, RequestError
 from gripper_force.interfaces import ServoSpec
 from gripper_force.profiles.apply import read_correction, read_profiles, rig_mismatches, with_plant
-from gripper_force.runtime.backends import load_servo_class, resolve_simulation
+from gripper_force.runtime.backends import load_servo_class, resolve_simulation, with_camera_rate
 from gripper_force.runtime.process import allowed
 
 if TYPE_CHECKING:  # a run without vision imports none of these
@@ -93,6 +93,7 @@ def resolve(config: Config, *, vision: bool = True) -> ResolvedConfig:
     if not vision:
         config = config.model_copy(update={"vision": config.vision.model_copy(update={"checkpoint": "none"})})
     _check_rate(config)
+    config = with_camera_rate(config)
     config, model, choice = resolve_vision(config)
     config, detail = resolve_simulation(config)
     spec = load_servo_class(config).spec(config.servo)

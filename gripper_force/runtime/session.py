@@ -6,6 +6,7 @@ time; `gripper_force.jobs.replay` feeds the same controller from a log, in the o
 
 from __future__ import annotations
 
+import json
 import sys
 import threading
 from collections.abc import Callable, Iterator
@@ -254,7 +255,7 @@ class Session:
         self.log_event("session", f"{type(error).__name__}: {error}")
 
     def close(self) -> None:
-        """Turns torque off, or holds, as configured, and logs the load cell's last samples."""
+        """Turns torque off, or holds, as configured, and logs the camera's settings and the last samples."""
         config = self.run.config
         hold = config.control.on_fault if self.failed or self.stop_is_pending else config.on_exit
         try:
@@ -267,6 +268,8 @@ class Session:
             raise type(first)(f"{first}; and the servo could not be stopped: {second}") from first
         finally:
             self._perception.close()
+            if (settings := getattr(self._devices.camera, "settings", None)) is not None:
+                self.attach("camera.json", json.dumps(settings()).encode(), "application/json")
         self._log_sensors(self._devices.clock.now_ns(), at_end=True)
 
     def log_event(self, unit: str, text: str) -> None:

@@ -7,5 +7,6 @@ pytest.register_assert_rewrite(
     f"{__name__}.camera_contract",
     f"{__name__}.engine_contract",
     f"{__name__}.load_cell_contract",
+    f"{__name__}.sensor_contract",
     f"{__name__}.servo_contract",
 )

@@ -11,28 +11,23 @@ The camera must deliver frames while the tests wait. If it needs help to do so (
 override ``wait`` too.
 """
 
-import time
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 
 import pytest
 
-from gripper_force.errors import DeviceError
-from gripper_force.interfaces import Camera
+from gripper_force.interfaces import Camera, Clock
+from gripper_force.testing.sensor_contract import SensorContract, check_counts, check_second_object, collect
 from gripper_force.types import NS_PER_S, Frame
 
-_TIMEOUT_S = 60.0
-"""Longest time on the host's clock until the wanted frames must be there."""
-
-_POLL_S = 0.002
 _SLOW_PERIODS = 5
 """Frame periods between two calls of a slow reader."""
 
 
-class CameraContract:
+class CameraContract(SensorContract):
     """Contract tests of a camera.
 
-    Override the fixture `camera`; override `now_ns` and `wait` if the camera is not on the host's clock, and
+    Override the fixture `camera`; override `clock` if the camera is not on the host's clock, and
     `second_camera` to test a second user of the same device.
     """
 
@@ -45,16 +40,6 @@ class CameraContract:
     def second_camera(self) -> Camera | None:
         """Another object for the same device, not started; None skips its test."""
         return None
-
-    @pytest.fixture
-    def now_ns(self) -> Callable[[], int]:
-        """The clock of the frames' times."""
-        return time.monotonic_ns
-
-    @pytest.fixture
-    def wait(self) -> Callable[[float], None]:
-        """Lets this many seconds pass for the camera. Override it to make the device produce frames."""
-        return time.sleep
 
     @pytest.fixture(autouse=True)
     def _close(self, camera: Camera, second_camera: Camera | None) -> Iterator[None]:
@@ -82,7 +67,7 @@ class CameraContract:
         assert min(shape) > 0
 
     def test_times_and_numbers_increase(
-        self, camera: Camera, now_ns: Callable[[], int], wait: Callable[[float], None]
+        self, camera: Camera, clock: Clock, wait: Callable[[float], None]
     ) -> None:
         """Times and ``seq`` increase from frame to frame, and ``t_ns <= received_ns <= now``."""
         camera.start()
@@ -90,7 +75,7 @@ class CameraContract:
         for _ in range(8):
             (frame,) = _take(camera, 1, wait)
             frames.append(frame)
-            assert frame.t_ns <= frame.received_ns <= now_ns()
+            assert frame.t_ns <= frame.received_ns <= clock.now_ns()
         for older, newer in pairwise(frames):
             assert older.t_ns < newer.t_ns
             assert older.received_ns < newer.received_ns
@@ -134,11 +119,19 @@ class CameraContract:
         counts.append(camera.counts())
         camera.close()
         counts.append(camera.counts())
-        for count in counts:
-            assert all(type(cause) is str and type(number) is int for cause, number in count.items())
-            assert all(number >= 0 for number in count.values())
-        for older, newer in pairwise(counts):
-            assert all(newer.get(cause, 0) >= number for cause, number in older.items())
+        check_counts(counts)
+
+    def test_settings_are_numbers_or_texts(self, camera: Camera, wait: Callable[[float], None]) -> None:
+        """``settings``, which is optional, maps keys to numbers or texts, before ``start`` and while capturing."""
+        settings = getattr(camera, "settings", None)
+        if settings is None:
+            pytest.skip("the camera has no method settings")
+        found = [settings()]
+        camera.start()
+        _take(camera, 2, wait)
+        found.append(settings())
+        for values in found:
+            assert all(type(key) is str and type(value) in (int, float, str) for key, value in values.items())
 
     # Start and close.
 
@@ -170,27 +163,9 @@ class CameraContract:
         self, camera: Camera, second_camera: Camera | None, wait: Callable[[float], None]
     ) -> None:
         """A second object for the same device works too, or its ``start`` raises `DeviceError`."""
-        if second_camera is None:
-            pytest.skip("the fixture second_camera is not overridden")
-        camera.start()
-        _take(camera, 1, wait)
-        try:
-            second_camera.start()
-        except DeviceError:
-            pass
-        else:
-            _take(second_camera, 2, wait)
-        _take(camera, 2, wait)
+        check_second_object(camera, second_camera, lambda one, count: _take(one, count, wait))
 
 
 def _take(camera: Camera, count: int, wait: Callable[[float], None]) -> list[Frame]:
     """Waits for ``count`` frames and returns them."""
-    frames: list[Frame] = []
-    deadline_s = time.monotonic() + _TIMEOUT_S
-    while len(frames) < count:
-        assert time.monotonic() < deadline_s, f"{len(frames)} of {count} frames within {_TIMEOUT_S:g} s"
-        if (frame := camera.newest()) is None:
-            wait(_POLL_S)
-        else:
-            frames.append(frame)
-    return frames
+    return collect(lambda: [] if (frame := camera.newest()) is None else [frame], count, wait)

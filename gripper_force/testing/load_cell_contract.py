@@ -12,27 +12,19 @@ of the vendor's library), override ``wait`` too.
 """
 
 import math
-import time
 from collections.abc import Callable, Iterator
-from itertools import pairwise
 
 import pytest
 
-from gripper_force.errors import DeviceError
-from gripper_force.interfaces import LoadCell
-from gripper_force.types import LoadCellSample
-
-_TIMEOUT_S = 60.0
-"""Longest time on the host's clock until the wanted samples must be there."""
-
-_POLL_S = 0.01
+from gripper_force.interfaces import Clock, LoadCell
+from gripper_force.testing.sensor_contract import SensorContract, check_counts, check_second_object, collect
 
 
-class LoadCellContract:
+class LoadCellContract(SensorContract):
     """Contract tests of a load cell.
 
-    Override the fixture `load_cell`; override `now_ns` and `wait` if the load cell is not on the host's
-    clock, and `second_load_cell` to test a second user of the same device.
+    Override the fixture `load_cell`; override `clock` if the load cell is not on the host's clock, and
+    `second_load_cell` to test a second user of the same device.
     """
 
     @pytest.fixture
@@ -44,16 +36,6 @@ class LoadCellContract:
     def second_load_cell(self) -> LoadCell | None:
         """Another object for the same device, not started; None skips its test."""
         return None
-
-    @pytest.fixture
-    def now_ns(self) -> Callable[[], int]:
-        """The clock of the samples' times."""
-        return time.monotonic_ns
-
-    @pytest.fixture
-    def wait(self) -> Callable[[float], None]:
-        """Lets this many seconds pass for the load cell. Override it to make the device produce samples."""
-        return time.sleep
 
     @pytest.fixture(autouse=True)
     def _close(self, load_cell: LoadCell, second_load_cell: LoadCell | None) -> Iterator[None]:
@@ -70,26 +52,23 @@ class LoadCellContract:
         assert load_cell.drain() == []
 
     def test_samples_are_in_order_and_returned_once(
-        self, load_cell: LoadCell, now_ns: Callable[[], int], wait: Callable[[float], None]
+        self, load_cell: LoadCell, clock: Clock, wait: Callable[[float], None]
     ) -> None:
         """Times increase within and across calls of ``drain``, and lie between ``start`` and now."""
-        start_ns = now_ns()
+        start_ns = clock.now_ns()
         load_cell.start()
         times_ns: list[int] = []
-        deadline_s = time.monotonic() + _TIMEOUT_S
-        while len(times_ns) < 50:
-            assert time.monotonic() < deadline_s, f"{len(times_ns)} of 50 samples within {_TIMEOUT_S:g} s"
-            wait(_POLL_S)
+        for _ in range(25):
+            times_ns += [sample.t_ns for sample in collect(load_cell.drain, 2, wait)]
             times_ns += [sample.t_ns for sample in load_cell.drain()]
-            times_ns += [sample.t_ns for sample in load_cell.drain()]
-            assert max(times_ns, default=start_ns) <= now_ns()
+            assert times_ns[-1] <= clock.now_ns()
         assert times_ns[0] >= start_ns
         assert times_ns == sorted(set(times_ns))
 
     def test_values_have_their_types(self, load_cell: LoadCell, wait: Callable[[float], None]) -> None:
         """Force and reading are floats; the force of a valid sample is finite."""
         load_cell.start()
-        for sample in _collect(load_cell, 20, wait):
+        for sample in collect(load_cell.drain, 20, wait):
             assert type(sample.t_ns) is int
             assert isinstance(sample.force_n, float)
             assert isinstance(sample.raw, float)
@@ -99,7 +78,7 @@ class LoadCellContract:
     def test_drain_is_empty_between_samples(self, load_cell: LoadCell, wait: Callable[[float], None]) -> None:
         """``drain`` does not wait for the next sample: called in a fast loop, it returns an empty list."""
         load_cell.start()
-        _collect(load_cell, 1, wait)
+        collect(load_cell.drain, 1, wait)
         assert not all(load_cell.drain() for _ in range(50))
 
     def test_counts_are_not_negative_and_never_decrease(
@@ -108,15 +87,11 @@ class LoadCellContract:
         """``counts`` maps causes to numbers, before ``start``, while sampling and after ``close``."""
         counts = [load_cell.counts()]
         load_cell.start()
-        _collect(load_cell, 5, wait)
+        collect(load_cell.drain, 5, wait)
         counts.append(load_cell.counts())
         load_cell.close()
         counts.append(load_cell.counts())
-        for count in counts:
-            assert all(type(cause) is str and type(number) is int for cause, number in count.items())
-            assert all(number >= 0 for number in count.values())
-        for older, newer in pairwise(counts):
-            assert all(newer.get(cause, 0) >= number for cause, number in older.items())
+        check_counts(counts)
 
     # Start and close.
 
@@ -124,17 +99,17 @@ class LoadCellContract:
         """``start`` may be called twice; each sample is still returned once."""
         load_cell.start()
         load_cell.start()
-        times_ns = [sample.t_ns for sample in _collect(load_cell, 10, wait)]
+        times_ns = [sample.t_ns for sample in collect(load_cell.drain, 10, wait)]
         assert times_ns == sorted(set(times_ns))
 
     def test_no_new_sample_after_close(
-        self, load_cell: LoadCell, now_ns: Callable[[], int], wait: Callable[[float], None]
+        self, load_cell: LoadCell, clock: Clock, wait: Callable[[float], None]
     ) -> None:
         """``close`` may be called twice; after it ``drain`` returns at most samples from before it."""
         load_cell.start()
-        _collect(load_cell, 20, wait)
+        collect(load_cell.drain, 20, wait)
         load_cell.close()
-        closed_ns = now_ns()
+        closed_ns = clock.now_ns()
         load_cell.close()
         wait(0.1)
         assert all(sample.t_ns <= closed_ns for sample in load_cell.drain())
@@ -149,25 +124,4 @@ class LoadCellContract:
         self, load_cell: LoadCell, second_load_cell: LoadCell | None, wait: Callable[[float], None]
     ) -> None:
         """A second object for the same device works too, or its ``start`` raises `DeviceError`."""
-        if second_load_cell is None:
-            pytest.skip("the fixture second_load_cell is not overridden")
-        load_cell.start()
-        _collect(load_cell, 1, wait)
-        try:
-            second_load_cell.start()
-        except DeviceError:
-            pass
-        else:
-            _collect(second_load_cell, 2, wait)
-        _collect(load_cell, 2, wait)
-
-
-def _collect(load_cell: LoadCell, count: int, wait: Callable[[float], None]) -> list[LoadCellSample]:
-    """Waits for at least ``count`` samples and returns them."""
-    samples: list[LoadCellSample] = []
-    deadline_s = time.monotonic() + _TIMEOUT_S
-    while len(samples) < count:
-        assert time.monotonic() < deadline_s, f"{len(samples)} of {count} samples within {_TIMEOUT_S:g} s"
-        samples += load_cell.drain()
-        wait(_POLL_S)
-    return samples
+        check_second_object(load_cell, second_load_cell, lambda one, count: collect(one.drain, count, wait))

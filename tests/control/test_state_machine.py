@@ -148,6 +148,34 @@ def test_slip_after_held_is_reported_within_50_ms(make_run, friction_n):
     assert fastest_m_s < 1.5 * run.config.approach_speed_m_s
 
 
+def test_lost_object_of_a_small_force_is_a_slip_soon(make_run):
+    """Friction and damping need most of the motor force, so that it need not fall short."""
+    run = make_run(plant={"friction_n": 0.3, "damping_n_s_m": 8.8}).grasp(0.6, 5.0)
+    assert run.last.status.outcome == "held"
+    _, reported_s = lose_object(run)
+    assert reported_s <= 0.1
+
+
+def test_object_that_leaves_jaws_on_an_end_stop_is_a_slip_with_a_camera(make_run):
+    run = make_run(plant={"stiffness_n_m": 300.0, "stops_m": (0.0, 0.020)}).grasp(1.0, 5.0)
+    assert run.last.status.outcome == "held"
+    run.plant.stops_m = (0.0, run.plant.x_m)
+    _, reported_s = lose_object(run)
+    assert reported_s <= 0.5
+    assert any("the camera sees only" in reason for reason in run.reasons)
+
+
+def test_springy_object_cannot_push_the_jaws_open_fast(make_run):
+    run = make_run(plant={"stiffness_n_m": 300.0, "mass_kg": 0.8, "friction_n": 0.3}).grasp(8.0, 5.0)
+    run.go(0.005, "release")
+    fastest_m_s = 0.0
+    for _ in range(300):
+        run.go(0.005)
+        fastest_m_s = max(fastest_m_s, -run.plant.v_m_s)
+    assert run.last.status.phase == "open"
+    assert fastest_m_s < 1.5 * 2 * run.config.approach_speed_m_s
+
+
 def test_after_a_slip_the_jaws_grip_again(make_run):
     run = make_run(on_slip="regrip").grasp(4.0, 4.0)
     lose_object(run, 0.004, 4.0)

@@ -45,6 +45,13 @@ def start(name: str, *arguments: object) -> "subprocess.Popen[str]":
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
+def run_beside_examples(*arguments: str | Path) -> "subprocess.CompletedProcess[str]":
+    """Runs Python with the examples on its path."""
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(EXAMPLES), os.environ.get("PYTHONPATH", "")])}
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, env=env, timeout=120, check=False)
+
+
 def test_embed_fits_on_a_page() -> None:
     assert len((EXAMPLES / "embed.py").read_text().splitlines()) <= 25
 
@@ -104,15 +111,7 @@ with gf.open_gripper(overrides=overrides) as gripper:
 
 
 def test_own_camera_in_real_time(server: PtyServer) -> None:
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(EXAMPLES), os.environ.get("PYTHONPATH", "")])}
-    done = subprocess.run(
-        [sys.executable, "-c", OWN_CAMERA_IN_REAL_TIME, server.device_path],
-        capture_output=True,
-        text=True,
-        env=env,
-        timeout=120,
-        check=False,
-    )
+    done = run_beside_examples("-c", OWN_CAMERA_IN_REAL_TIME, server.device_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout == "frames True\n"
 
@@ -128,13 +127,5 @@ def test_own_camera_satisfies_the_contract(tmp_path: Path) -> None:
         "        return own_camera.PatternCamera(gf.CameraConfig(), MonotonicClock())\n"
     )
     (tmp_path / "test_own.py").write_text(program)
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(EXAMPLES), os.environ.get("PYTHONPATH", "")])}
-    done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", tmp_path / "test_own.py"],
-        capture_output=True,
-        text=True,
-        env=env,
-        timeout=120,
-        check=False,
-    )
+    done = run_beside_examples("-m", "pytest", "-q", "-p", "no:cacheprovider", tmp_path / "test_own.py")
     assert done.returncode == 0, done.stdout

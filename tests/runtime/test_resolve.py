@@ -2,11 +2,14 @@ import math
 from dataclasses import FrozenInstanceError
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError, RequestError
+from gripper_force.runtime.log import LogWriter
 from gripper_force.runtime.resolve import ResolvedConfig, make_controller, make_estimator, resolve
+from gripper_force.types import NS_PER_S, Frame
 from gripper_hw.dynamixel.servo import DynamixelServo
 
 NO_SENSORS = ["camera.backend=none", "load_cell.backend=none"]
@@ -37,6 +40,17 @@ def test_the_controller_knows_the_cameras_rate(rate_hz: float) -> None:
     assert 2 < control.timeout_ms * rate_hz / 1e3 < 3
     assert control.max_age_ms == pytest.approx(100 + 1e3 / rate_hz - 1e3 / 60)
     assert control.plant[2] == pytest.approx(0.060 + 0.5 / rate_hz - 0.5 / 60)
+
+
+def test_the_rate_of_a_log_is_that_of_its_frames(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with LogWriter(path, config="", metadata={}) as log:
+        for seq in range(10):
+            t_ns = seq * NS_PER_S // 25
+            log.write(Frame(t_ns, t_ns, seq, np.zeros((8, 8), np.uint8)))
+    keys = ["camera.backend=playback", f"camera.path={path}", "vision.checkpoint=none"]
+    config = resolve(load_config(None, keys)).config
+    assert config.camera.rate_hz == config.control.frame_hz == 25
 
 
 def test_configured_values_are_kept() -> None:

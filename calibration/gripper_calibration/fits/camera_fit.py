@@ -70,7 +70,7 @@ class ExposureCandidate:
 
 
 @dataclass(frozen=True, slots=True)
-class TouchLag:
+class CameraLag:
     """Lag of the camera's timestamps in one touch.
 
     Attributes:
@@ -145,7 +145,7 @@ def region_around(markers_by_image: Sequence[Markers], width: int, height: int) 
     return left, top, side, side
 
 
-def estimate_lag(touches: Sequence[TouchLag]) -> CalibratedValue:
+def estimate_lag(touches: Sequence[CameraLag]) -> CalibratedValue:
     """Returns the median lag in ms, with a 95 % interval from the scatter and the error of the method.
 
     Raises:
@@ -165,7 +165,7 @@ def estimate_lag(touches: Sequence[TouchLag]) -> CalibratedValue:
     return CalibratedValue(value=value, low=value - half_ms, high=value + half_ms)
 
 
-def usable_touches(touches: Sequence[TouchLag]) -> list[TouchLag]:
+def usable_touches(touches: Sequence[CameraLag]) -> list[CameraLag]:
     """Returns the touches that are strong enough to estimate the lag from, and determine it."""
     largest_n = max((touch.force_n for touch in touches), default=0.0)
     return [t for t in touches if t.force_n >= _MIN_FORCE_SHARE * largest_n and np.isfinite(t.lag_ms)]

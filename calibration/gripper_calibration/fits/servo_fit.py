@@ -230,12 +230,7 @@ def _sliding_rows(presses: Sequence[ServoPress]) -> Floats:
     """Samples in which the jaws slide, (N, 7): force, current, angle, side, rate, gauge, number of the press."""
     rows = []
     for number, press in enumerate(presses):
-        plausible = (
-            _plausible(press.current_a)
-            & _plausible(press.force_n)
-            & _plausible(press.closing_rad)
-            & _plausible(press.t_s)
-        )
+        plausible = _plausible(press.current_a, press.force_n, press.closing_rad, press.t_s)
         for side, part in ((1.0, slice(0, press.turn)), (-1.0, slice(press.turn, None))):
             slid = plausible[part] & _slides(press.force_n[part], side)
             if slid.sum() < _MIN_ROWS:
@@ -276,12 +271,7 @@ def _fit_travel(
         )
     rows, clusters = [], []
     for number, one in enumerate(passes):
-        plausible = (
-            _plausible(one.t_s)
-            & _plausible(one.current_a)
-            & _plausible(one.closing_rad)
-            & _plausible(one.closing_rad_s)
-        )
+        plausible = _plausible(one.t_s, one.current_a, one.closing_rad, one.closing_rad_s)
         for part in np.array_split(np.flatnonzero(plausible), _WINDOWS):
             if len(part) < 2 or not (span_s := one.t_s[part[-1]] - one.t_s[part[0]]) > 0:
                 continue
@@ -386,9 +376,10 @@ def _least_squares(data: Regression) -> Floats:
     return np.asarray(beta / scale, np.float64)
 
 
-def _plausible(values: Floats) -> Bools:
-    """True for finite values of a plausible size."""
-    return np.asarray(np.abs(values) < _MAX_VALUE, np.bool_)
+def _plausible(*values: Floats) -> Bools:
+    """True, (N,), for samples of which all values, (N,) each, are finite and of a plausible size."""
+    plausible: Bools = np.all(np.abs(values) < _MAX_VALUE, axis=0)
+    return plausible
 
 
 def _slope(x: Floats, y: Floats) -> float:

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Polygon, Rectangle
 
-from gripper_calibration.fits.camera_fit import ExposureCandidate, Markers, TouchLag, usable_touches
+from gripper_calibration.fits.camera_fit import CameraLag, ExposureCandidate, Markers, usable_touches
 from gripper_calibration.plots.style import DATA, FIT, GRAY, OTHER, label_axes, saved_figure, value_text
 from gripper_force.profiles.rig_profile import CameraCalibration
 from gripper_force.types import Gray
@@ -19,7 +19,7 @@ def draw(
     markers: Markers,
     candidates: Sequence[ExposureCandidate],
     images: Sequence[Gray],
-    touches: Sequence[TouchLag],
+    touches: Sequence[CameraLag],
     path: Path,
 ) -> None:
     """Draws the candidate exposures, the region and markers, and the lag of each touch.
@@ -64,7 +64,7 @@ def draw(
         _plot_lags(right, calibration, touches)
 
 
-def _plot_lags(axes: Axes, calibration: CameraCalibration, touches: Sequence[TouchLag]) -> None:
+def _plot_lags(axes: Axes, calibration: CameraCalibration, touches: Sequence[CameraLag]) -> None:
     used = usable_touches(touches)
     unused = [touch for touch in touches if touch not in used]
     lag = calibration.lag_ms

@@ -10,7 +10,7 @@ from gripper_calibration.plots.style import DATA, FIT, GRAY, OTHER, label_axes, 
 
 
 def draw(fit: ServoFit, presses: Sequence[ServoPress], path: Path) -> None:
-    """Draws the presses with both branches of the fit, residuals against force, and free travel_plot.
+    """Draws the presses with both branches of the fit, residuals against force, and free travel.
 
     Args:
         fit: The result.

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 
 from gripper_calibration.fits.camera_fit import (
+    CameraLag,
     ExposureCandidate,
     Markers,
-    TouchLag,
     estimate_lag,
     find_markers,
     region_around,
@@ -22,7 +22,7 @@ from gripper_calibration.fits.camera_fit import (
     usable_touches,
 )
 from gripper_calibration.plots.camera_plot import draw
-from gripper_force.config import Config
+from gripper_force.config import CAMERA_OTHER_KEYS, Config
 from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
 from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.recording.lag import camera_lags_s, load_cell_lag_s
@@ -79,7 +79,7 @@ class CameraObservation:
     markers: list[Markers]
     widest: Gray
     widest_markers: Markers
-    touches: list[TouchLag]
+    touches: list[CameraLag]
     use_ms: float
     rate_hz: float
 
@@ -161,6 +161,7 @@ def calibrate_camera(
         side_px=camera.side_px,
         rate_hz=camera.rate_hz,
         gain=camera.gain,
+        image=camera.model_dump(mode="json", exclude=CAMERA_OTHER_KEYS | set(CameraCalibration.model_fields)),
         exposure_us=selected.exposure_us,
         mean=selected.mean,
         clipped=selected.clipped,
@@ -238,7 +239,7 @@ def _touch_lags(
     samples: list[LoadCellSample],
     statuses: list[GraspStatus],
     release_times_ns: list[int],
-) -> list[TouchLag]:
+) -> list[CameraLag]:
     frame_s = np.array([frame.t_ns for frame in frames]) / NS_PER_S
     images = np.stack([downscale(frame.gray, region, _SMALL_PX) for frame in frames])
     valid = sorted((s for s in samples if s.valid), key=lambda sample: sample.t_ns)
@@ -253,7 +254,7 @@ def _touch_lags(
     for release_s, camera_s, correlation_s in zip(releases_s, by_servo_s, by_force_s, strict=True):
         cell_lag_s = load_cell_lag_s(cell_s, force_n, servo_s, width_m, release_s)
         release_n = float(np.interp(release_s, cell_s, force_n))
-        touches.append(TouchLag(release_n, 1e3 * (float(camera_s) - cell_lag_s), 1e3 * float(correlation_s)))
+        touches.append(CameraLag(release_n, 1e3 * (float(camera_s) - cell_lag_s), 1e3 * float(correlation_s)))
     return touches
 
 

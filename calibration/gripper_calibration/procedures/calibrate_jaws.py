@@ -45,7 +45,7 @@ _INSET_M: Final = 0.001
 """Distance of the proposed open width from the end."""
 
 _PLACES: Final = (0.3, 0.5, 0.7)
-"""Where friction is measured, as shares of the travel."""
+"""Places at which friction is measured, as shares of the travel."""
 
 _RISE_N_S: Final = 1.0
 _MOVED_RAD: Final = 0.01
@@ -199,7 +199,7 @@ def _proposal(config: Config, open_rad: float, closed_rad: float, sign: int) -> 
 
 @contextmanager
 def _torque_on(config: Config, devices: Devices, progress: Progress) -> Iterator["_EmptyJaws"]:
-    """Gives jaws under torque, and turns torque off at every end."""
+    """Yields jaws under torque, and turns torque off at every end."""
     state = devices.servo.start()  # if this raises, it has turned torque off itself
     try:
         yield _EmptyJaws(config, devices, state, progress)

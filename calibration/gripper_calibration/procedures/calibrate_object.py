@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from hashlib import sha256
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -78,7 +78,7 @@ class ObjectCalibration:
         """Coverage of the profile's interval: the share of frames of new touches within it."""
         return self.profile.interval.coverage
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """Returns the result as the command prints it: the profile's keys and those of the calibration."""
         return {
             **self.profile.model_dump(mode="json"),
@@ -119,7 +119,7 @@ def calibrate_object(
         peak_n: Largest force of a touch in N; None for what the force limit permits, up to 12 N.
         folder: Folder of the touches' logs; None for ``data/touches/NAME``.
         out: Profile to write, ``*.yaml``; None for ``NAME.yaml`` in the user's folder of profiles.
-        prompt: Called before each touch, so that a person can place the object anew; None for no pause.
+        prompt: Called before each touch, so that a person can place the object again; None for no pause.
         progress: Called during the touches, with one step for each touch, and after them, with one step for each
             log read and two for the fit.
 
@@ -168,7 +168,7 @@ def record_touches(
 ) -> Iterator[Path]:
     """Touches the configured object with random peak forces, one log each. Existing logs are kept.
 
-    A simulated object and rig stay the same; the object is placed anew for each touch.
+    A simulated object and rig stay the same; the object is placed again for each touch.
 
     Args:
         config: The configuration.

@@ -266,7 +266,7 @@ def _friction_a(press: ServoPress) -> float:
 
 @contextmanager
 def _torque_on(config: Config, devices: Devices, progress: Progress) -> Iterator["_Jaws"]:
-    """Gives jaws under torque, and turns torque off at every end."""
+    """Yields jaws under torque, and turns torque off at every end."""
     assert devices.load_cell is not None
     devices.load_cell.start()
     _wait_for_sample(devices)

@@ -1,15 +1,17 @@
 """Tables of calibrations of a rig and of an object."""
 
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 from gripper_force.cli.console import number, out, pairs
 
 if TYPE_CHECKING:
     from gripper_calibration.procedures.calibrate_jaws import JawsResult
+    from gripper_calibration.procedures.calibrate_object import ObjectCalibration
 
 
-def rig_table(r: dict[str, Any]) -> None:
+def rig_table(r: Mapping[str, object]) -> None:
     """Prints the calibrated values of a rig, each with its 95 % interval."""
     pairs({name: _found(value) for name, value in r.items()})
 
@@ -27,7 +29,7 @@ def jaws_table(r: "JawsResult") -> None:
     out.print(f"\nput this into your configuration:\n{r.yaml}", end="")
 
 
-def _found(value: Any) -> Any:
+def _found(value: object) -> object:
     if isinstance(value, list):
         return ", ".join(f"{item:.5g}" for item in value)
     if not isinstance(value, dict):
@@ -37,30 +39,30 @@ def _found(value: Any) -> Any:
     return f"{value['value']:.6g} ({value['low']:.6g} to {value['high']:.6g})"
 
 
-def object_table(r: dict[str, Any]) -> None:
+def object_table(r: "ObjectCalibration") -> None:
     """Prints an object's profile."""
-    after_n = r["after_n"]
-    interval, plant = r["interval"], r["plant"]
+    profile, after_n = r.profile, r.mae_after_n
+    interval, plant = profile.interval, profile.plant
     pairs(
         {
-            "object": r["object"],
-            "touches": f"{r['touches']} with {r['frames']} frames, up to {r['force_n']:.1f} N",
+            "object": profile.object,
+            "touches": f"{profile.touches} with {profile.frames} frames, up to {profile.force_n:.1f} N",
             **(
                 {}
-                if (at := r["crushed_at_n"]) is None
+                if (at := r.crushed_at_n) is None
                 else {"crushed": f"the object stayed narrower after {at:.1f} N"}
             ),
-            "error before": number(r["before_n"], "N"),
+            "error before": number(r.mae_before_n, "N"),
             "error after": "unknown with so few touches" if after_n is None else number(after_n, "N"),
-            "correction": r["correction"],
-            "interval": f"{100 * interval['coverage']:.0f} % within {interval['base_n']:.2f} N at 0 N, "
-            f"{math.hypot(interval['base_n'], 5 * interval['share']):.2f} N at 5 N",
-            "stiffness": number(r["stiffness_n_m"], "N/m", 0),
+            "correction": r.correction,
+            "interval": f"{100 * interval.coverage:.0f} % within {interval.base_n:.2f} N at 0 N, "
+            f"{math.hypot(interval.base_n, 5 * interval.share):.2f} N at 5 N",
+            "stiffness": number(profile.stiffness_n_m, "N/m", 0),
             "loop": "unknown: these logs hold no servo"
             if plant is None
-            else f"gain {plant['gain']:.2f}, lag {plant['lag_ms']:.0f} ms, delay {plant['delay_ms']:.0f} ms, "
-            f"phase margin {plant['phase_margin_deg']:.0f} degrees",
-            "profile": str(r["profile"]),
-            "report": str(r["report"]),
+            else f"gain {plant.gain:.2f}, lag {plant.lag_ms:.0f} ms, delay {plant.delay_ms:.0f} ms, "
+            f"phase margin {plant.phase_margin_deg:.0f} degrees",
+            "profile": str(r.profile_path),
+            "report": str(r.report_path),
         }
     )

@@ -1,6 +1,7 @@
 """Tables of recorded and imported sets."""
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from rich.markup import escape
 from rich.table import Column, Table
@@ -8,6 +9,8 @@ from rich.table import Column, Table
 from gripper_force.cli.console import number, out
 
 if TYPE_CHECKING:  # --help loads no NumPy
+    from gripper_force.jobs.imports.database import EnvironmentSummary
+    from gripper_force.jobs.imports.video import ImportSummary
     from gripper_force.jobs.recording.summary import RecordingSummary
 
 
@@ -42,29 +45,29 @@ def _lag(lag_ms: float | None, spread_ms: float | None) -> str:
     return number(lag_ms, digits=1) + ("" if spread_ms is None else f" ± {spread_ms:.1f}")
 
 
-def imports_table(r: dict[str, Any]) -> None:
+def imports_table(logs: "Sequence[ImportSummary]") -> None:
     """Prints the results of `import video`."""
     table = Table("log", "frames", "without force", "spikes", "tare N", "lag ms", box=None)
-    for row in r["logs"]:
+    for row in logs:
         figures = (number(row.tare_n, digits=3), f"{1e3 * row.force_lag_s:.0f}")
         counts = (str(getattr(row, name)) for name in ("frames", "frames_without_force", "spikes_rejected"))
         table.add_row(row.log.name, *counts, *figures)
     out.print(table)
-    for row in r["logs"]:
+    for row in logs:
         if row.tare_note:
             note = f"no tare: {row.tare_note}"
             out.print(f"[yellow]{escape(row.log.name)}[/] {escape(note)}", soft_wrap=True)
 
 
-def database_table(r: dict[str, Any]) -> None:
+def database_table(environments: "Sequence[EnvironmentSummary]", ignored: Sequence[str]) -> None:
     """Prints the results of `import database`, and the problems found."""
     columns = ("object", "degrees", "lux", "logs", "kept", "touches", "frames", "spikes_rejected")
     table = Table("folder", *(name.removesuffix("_rejected") for name in columns), box=None)
-    for row in r["environments"]:
+    for row in environments:
         table.add_row(row.folder, *(str(getattr(row, name)) for name in columns))
     out.print(table)
-    for row in r["environments"]:
+    for row in environments:
         for problem in row.problems:
             out.print(f"[yellow]{escape(row.folder)}[/] {escape(problem)}", soft_wrap=True)
-    if r["ignored"]:
-        out.print(f"[yellow]not imported[/] {escape(', '.join(r['ignored']))}", soft_wrap=True)
+    if ignored:
+        out.print(f"[yellow]not imported[/] {escape(', '.join(ignored))}", soft_wrap=True)

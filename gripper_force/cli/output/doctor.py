@@ -1,6 +1,6 @@
 """Tables of `doctor`: checks, and register changes."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.markup import escape
 from rich.table import Table
@@ -8,14 +8,14 @@ from rich.table import Table
 from gripper_force.cli.console import err, out
 
 if TYPE_CHECKING:  # --help loads no NumPy
-    from gripper_force.jobs.checks import RegisterChange, SetupResult
+    from gripper_force.jobs.checks import Check, RegisterChange, SetupResult
 
 
-def checks_table(r: dict[str, Any]) -> None:
+def checks_table(checks: "list[Check]") -> None:
     """Prints the checks and the suggested fixes."""
     marks = {True: "[green]ok[/]", False: "[bold red]problem[/]", None: "-"}
     table = Table(box=None, show_header=False, pad_edge=False)
-    for check in r["checks"]:
+    for check in checks:
         advice = f"\n[yellow]{escape(check.advice)}[/]" if check.advice else ""
         style = "dim" if check.ok is None else ""
         table.add_row(marks[check.ok], check.unit, check.name, escape(check.found) + advice, style=style)

@@ -1,6 +1,7 @@
 """Tables of a grasp, of trials, of a replay, and of errors of estimates."""
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from rich.table import Table
 
@@ -8,7 +9,7 @@ from gripper_force.cli.console import number, out, pairs
 
 if TYPE_CHECKING:  # --help loads neither NumPy nor PyTorch
     from gripper_force.jobs.evaluate import Evaluation
-    from gripper_force.jobs.grasp import Summary
+    from gripper_force.jobs.grasp import Overall, Summary
     from gripper_force.jobs.metrics import ForceBin
     from gripper_force.jobs.replay import ReplayResult
 
@@ -39,12 +40,12 @@ def grasp_table(r: "Summary") -> None:
     )
 
 
-def trials_table(r: dict[str, Any]) -> None:
+def trials_table(trials: "Sequence[Summary]", summary: "Overall") -> None:
     """Prints the figures of each trial and over all trials."""
     table = Table(
         "object", "target N", "load cell N", "error %", "overshoot N", "settle s", "result", box=None
     )
-    for t in r["trials"]:
+    for t in trials:
         error = None if t["steady_error_n"] is None else 100 * t["steady_error_n"] / t["target_n"]
         table.add_row(
             t["object"],
@@ -56,11 +57,9 @@ def trials_table(r: dict[str, Any]) -> None:
             t["result"],
         )
     out.print(table)
-    summary = dict(r["summary"])
-    errors = summary.pop("estimate_mae_n")
-    pairs(summary)
+    pairs({key: value for key, value in summary.items() if key != "estimate_mae_n"})
     table = Table("MAE over the run, N", "vision", "current", "fused", "floor", box=None)
-    for name, e in errors.items():
+    for name, e in summary["estimate_mae_n"].items():
         table.add_row(name, *(number(e[key]) for key in ("visual", "current", "fused", "floor")))
     out.print(table)
 

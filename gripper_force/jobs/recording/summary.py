@@ -4,7 +4,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypedDict
 
 import numpy as np
 import numpy.typing as npt
@@ -143,6 +143,15 @@ def summarise(paths: Sequence[Path]) -> RecordingSummary:
     return RecordingSummary(sets, overall, _warnings(overall))
 
 
+class _LagMedians(TypedDict):
+    """The fields of `Totals` about lag."""
+
+    lag_ms: float | None
+    lag_spread_ms: float | None
+    camera_lag_ms: float | None
+    load_cell_lag_ms: float | None
+
+
 def _summary(path: Path) -> SetSummary:
     reader = LogReader(path)
     config = config_from_text(reader.config, str(path))
@@ -214,13 +223,12 @@ def releases_ns(requests: list[Request]) -> list[int]:
     ]
 
 
-def _lag_medians(lags: list[TouchLag]) -> dict[str, Any]:
-    """Returns the fields of `Totals` about lag."""
+def _lag_medians(lags: list[TouchLag]) -> _LagMedians:
     strongest_n = max((lag.force_n for lag in lags), default=0.0)
     strong = [lag for lag in lags if lag.force_n >= _STRONG_SHARE * strongest_n]
     known = [lag for lag in strong if np.isfinite(lag.lag_ms)]
     if not known:
-        return dict.fromkeys(("lag_ms", "lag_spread_ms", "camera_lag_ms", "load_cell_lag_ms"))
+        return {"lag_ms": None, "lag_spread_ms": None, "camera_lag_ms": None, "load_cell_lag_ms": None}
     low_ms, high_ms = np.percentile([lag.lag_ms for lag in known], [16, 84])
     return {
         "lag_ms": float(np.median([lag.lag_ms for lag in known])),

@@ -62,7 +62,7 @@ def touch(
 
 
 def ramp(session: TouchSession, target_n: float, timeout_s: float) -> float:
-    """Presses until a force is reached or has failed. Returns the width in metres at first contact."""
+    """Presses until the force is reached, the grasp fails or time is up. Returns the width in m at first contact."""
     status = session.cycle(RequestKind.GRASP, target_n).status
     contact_m = status.width_m
     end_ns = status.t_ns + round(timeout_s * NS_PER_S)

@@ -1,17 +1,17 @@
 """Training recipes: all keys, and recipes by name."""
 
-from typing import Annotated, Any, Final, Literal, Self
+from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
 from gripper_force.errors import ConfigError
-from gripper_force.schema import NonNegative, Positive, Section, section_from
+from gripper_force.schema import NonNegative, Positive, Section, Tree, section_from
 from gripper_force.vision.header import Attention, BackboneName, Count, NetworkConfig, Pooling
 from gripper_force.vision.preprocess import Preprocess
 
 Share = Annotated[float, Field(ge=0, le=1)]
 
-RECIPES: Final[dict[str, dict[str, Any]]] = {
+RECIPES: Final[dict[str, Tree]] = {
     "short_clips": {},
     "shin2019": {
         "preprocess": {"size": 128, "reference": False},

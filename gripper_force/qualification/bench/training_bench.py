@@ -4,7 +4,7 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from matplotlib import rc_context
@@ -19,14 +19,14 @@ from gripper_force.jobs.training.batches import Batches
 from gripper_force.jobs.training.parallel import joined
 from gripper_force.jobs.training.recipe import RECIPES, TrainConfig
 from gripper_force.jobs.training.trainer import Trainer, estimates
-from gripper_force.schema import section_from
+from gripper_force.schema import Tree, section_from
 from gripper_force.vision.preprocess import Preprocess
 
 Load = Callable[[Preprocess], list[Clip]]
 
 PAPER: Final = "paper"
 
-COMPARED: Final[dict[str, dict[str, Any]]] = {
+COMPARED: Final[dict[str, Tree]] = {
     "short clips, a tenth": {},
     "short clips": {},
     "dense windows": {"clips": 3, "clip_frames": 88, "short_share": 0.0},

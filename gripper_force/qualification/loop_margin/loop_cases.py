@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -188,10 +188,16 @@ def _map_row(config: Config, truth: Gripper, feedback: str, factor: float, trial
 def _sweep(config: Config, truth: Gripper, grid: Grid) -> dict[tuple[float, ...], Trial]:
     trials = {}
     for seed, values in enumerate(product(*grid.sweep.values())):
-        changed: dict[str, Any] = dict(zip(grid.sweep, values, strict=True))
-        delay_s = changed.pop("delay_s")
-        changed["friction_n"] *= truth.transmission.friction_n
-        trials[values] = grasp(config, replace(truth, **changed), delay_s, seed)
+        at = dict(zip(grid.sweep, values, strict=True))
+        gripper = replace(
+            truth,
+            stiffness_n_m=at["stiffness_n_m"],
+            gain=at["gain"],
+            friction_n=at["friction_n"] * truth.transmission.friction_n,
+            play_m=at["play_m"],
+            step_a=at["step_a"],
+        )
+        trials[values] = grasp(config, gripper, at["delay_s"], seed)
     return trials
 
 

@@ -9,10 +9,10 @@ import math
 import sys
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import asdict, replace
 from decimal import Decimal, localcontext
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -333,14 +333,13 @@ def _count_bad_commands(control: ControlConfig, gripper: GripperConfig, current_
     bad = 0
     for name in ("position_rad", "velocity_rad_s", "current_a", "temperature_c", "voltage_v"):
         for extreme in (math.nan, math.inf, -math.inf, sys.float_info.max):
-            changed: dict[str, Any] = {name: extreme}
             controller = GraspController(control, transmission, current_limit_a)
             request: Request | None = Request(0, RequestKind.GRASP, 4.0)
             for cycle in range(400):
                 t_ns = cycle * CYCLE_NS
                 servo = replace(_servo(t_ns, 0.03), position_rad=min(0.001 * cycle, 0.3))
                 if cycle % 10 == 9:
-                    servo = replace(servo, **changed)
+                    servo = ServoState(**(asdict(servo) | {name: extreme}))
                 command = controller.step(t_ns, servo, None, request).command
                 request = None
                 ends = sorted((transmission.open_position_rad, transmission.closed_position_rad))

@@ -1,14 +1,14 @@
 """Networks that the paper's tables compare, and their training at each scale."""
 
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Final, Literal
 
 from pydantic import Field
 
 from gripper_force.jobs.training.recipe import TrainConfig
-from gripper_force.schema import Section
+from gripper_force.schema import Section, Tree
 from gripper_force.vision.preprocess import Preprocess
 
-NETS: Final[dict[str, dict[str, Any]]] = {
+NETS: Final[dict[str, Tree]] = {
     "plain": {"attentions": ("none",)},
     "ssam-0": {"attentions": ("ssam",), "earlier_frames": 0},
     "scam-0": {"attentions": ("scam",), "earlier_frames": 0},

@@ -1,6 +1,6 @@
 """Diagnostics of cameras for `doctor`: lists them, and measures rate and latency of the configured one."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,10 @@ _SYSFS = Path("/sys")
 _LUXONIS_USB_ID = "03e7"
 _USB3_MBPS = 5000
 """Speed of the slowest USB 3 link."""
+
+_CONTROLS = ("exposure_us", "gain", "lens_position", "white_balance_k")
+_SETTING_TOLERANCE = 0.1
+"""Largest relative difference between a configured and a reported value: devices round to their own steps."""
 
 _MIN_RATE_SHARE = 0.9
 """Lowest measured rate that passes, as a share of ``camera.rate_hz``."""
@@ -43,9 +47,29 @@ def probe(config: Config, sysfs: Path = _SYSFS) -> Iterator[Check]:
             return [] if (frame := camera.newest()) is None else [frame]
 
         frames = gather(devices, take)
+        if (settings := getattr(camera, "settings", None)) is not None:
+            yield _settings_check(config, settings())
         if config.camera.backend == "oak":  # a device is listed as USB 2 until it is opened
             yield from _usb_checks(sysfs / "bus/usb/devices")
     yield from _frame_checks(config, frames)
+
+
+def _settings_check(config: Config, settings: Mapping[str, float | str]) -> Check:
+    """Shows the settings in force, and whether those that are configured are among them."""
+    shown = ", ".join(
+        f"{key} {value:g}" if isinstance(value, float | int) else f"{key} {value}"
+        for key, value in settings.items()
+    )
+    differing = [
+        key
+        for key, value in settings.items()
+        if key in _CONTROLS
+        and (wanted := getattr(config.camera, key)) is not None
+        and isinstance(value, float | int)
+        and abs(value - wanted) > _SETTING_TOLERANCE * wanted
+    ]
+    advice = f"the device does not keep {', '.join(f'camera.{key}' for key in differing)}: set what it can do"
+    return judged("camera", "settings", shown, not differing, advice)
 
 
 def _frame_checks(config: Config, frames: list[Frame]) -> Iterator[Check]:

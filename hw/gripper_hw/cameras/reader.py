@@ -3,7 +3,6 @@
 import atexit
 import threading
 from abc import ABC, abstractmethod
-from collections import deque
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import NamedTuple
@@ -18,9 +17,6 @@ _FIRST_FRAME_TIMEOUT_NS = 5 * NS_PER_S
 
 _REOPEN_PERIOD_S = 0.5
 """Pause between two attempts to open a lost camera."""
-
-_RATE_FRAMES = 120
-"""Frames over which the rate is measured."""
 
 
 class RawFrame(NamedTuple):
@@ -37,6 +33,9 @@ class RawFrame(NamedTuple):
     gray: Gray
 
 
+Settings = dict[str, float | str]
+"""Camera settings in force, by key of the section ``camera``."""
+
 ReadFrame = Callable[[], RawFrame | None]
 """Waits a short time for the next frame; returns None if none came. Raises `DeviceError`."""
 
@@ -47,25 +46,30 @@ class BackgroundCamera(ABC):
     Args:
         config: The camera section of the configuration.
         clock: The run's clock, which must be the host's.
+
+    Raises:
+        ConfigError: ``camera.gain`` is set, but the exposure is automatic.
     """
 
     def __init__(self, config: CameraConfig, clock: Clock) -> None:
+        if config.gain is not None and config.exposure_us is None:
+            raise ConfigError(
+                "camera.gain is set, but camera.exposure_us=null makes exposure and gain automatic; set both, "
+                "or none"
+            )
         self._losses = 0
+        self._settings: Settings = {}
         self._config, self._clock = config, clock
         self._newest: Frame | None = None
         self._next_seq = 0
-        self._times_ns: deque[int] = deque(maxlen=_RATE_FRAMES)
         self._lock = threading.Lock()
         self._failure: Exception | None = None
         self._ready, self._stop = threading.Event(), threading.Event()
         self._thread: threading.Thread | None = None
 
-    @property
-    def rate_hz_measured(self) -> float:
-        """Rate of the last frames, to compare with ``camera.rate_hz``; 0 before the second frame."""
-        with self._lock:
-            times_ns = list(self._times_ns)
-        return (len(times_ns) - 1) * NS_PER_S / (times_ns[-1] - times_ns[0]) if len(times_ns) > 1 else 0.0
+    def settings(self) -> Settings:
+        """Settings in force as the device reports them; empty before `start`."""
+        return dict(self._settings)
 
     def start(self) -> None:
         """Opens the device and returns after the first frame.
@@ -130,8 +134,6 @@ class BackgroundCamera(ABC):
             raw = self._next_frame(read, _FIRST_FRAME_TIMEOUT_NS)
             # A reopened camera counts from 0 again; frame numbers must keep rising.
             seq_offset = max(0, self._next_seq - raw.seq) if raw is not None else 0
-            with self._lock:
-                self._times_ns.clear()
             try:
                 while raw is not None:
                     self._store(raw, seq_offset)
@@ -157,7 +159,6 @@ class BackgroundCamera(ABC):
         self._next_seq = frame.seq + 1
         with self._lock:
             self._newest = frame
-            self._times_ns.append(frame.t_ns)
         self._ready.set()
 
 

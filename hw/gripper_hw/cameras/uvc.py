@@ -1,8 +1,10 @@
 """Driver for USB cameras (UVC) by Video4Linux2 and OpenCV.
 
-Controls: https://docs.kernel.org/userspace-api/media/v4l/ext-ctrls-camera.html
+Controls: https://docs.kernel.org/userspace-api/media/v4l/ext-ctrls-camera.html and control.html there.
+OpenCV's names: https://github.com/opencv/opencv/blob/4.x/modules/videoio/src/cap_v4l.cpp
 """
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import count
@@ -15,7 +17,7 @@ from gripper_force.config import CameraConfig
 from gripper_force.errors import ConfigError, DeviceError, DeviceLostError, DeviceNotFoundError
 from gripper_force.interfaces import Clock
 from gripper_force.types import NS_PER_MS, NS_PER_S, Gray
-from gripper_hw.cameras.reader import BackgroundCamera, RawFrame, ReadFrame, crop_square
+from gripper_hw.cameras.reader import BackgroundCamera, RawFrame, ReadFrame, Settings, crop_square
 
 _SYSFS = Path("/sys/class/video4linux")
 _BUFFERS = 2
@@ -30,6 +32,17 @@ _EXPOSURE_UNIT_US = 100
 _TOLERANCE = 0.1
 """Largest relative difference between a control's set and read value: drivers round to their own steps."""
 
+_NOT_SUPPORTED = -1.0
+"""Value of a control that the device does not have."""
+
+_CONTROLS = (
+    ("exposure_us", cv2.CAP_PROP_EXPOSURE, _EXPOSURE_UNIT_US, cv2.CAP_PROP_AUTO_EXPOSURE, _EXPOSURE_MANUAL),
+    ("gain", cv2.CAP_PROP_GAIN, 1, None, 0),
+    ("lens_position", cv2.CAP_PROP_FOCUS, 1, cv2.CAP_PROP_AUTOFOCUS, 0),
+    ("white_balance_k", cv2.CAP_PROP_WB_TEMPERATURE, 1, cv2.CAP_PROP_AUTO_WB, 0),
+)
+"""Key, its control and unit, and the control of its automatic function with the value that turns it off."""
+
 _MAX_FRAME_AGE_NS = 10 * NS_PER_S
 """A frame that seems older, or from the future, has a timestamp of another clock."""
 
@@ -39,7 +52,7 @@ def _open_v4l2(path: str) -> Any:
 
 
 class UvcCamera(BackgroundCamera):
-    """A USB camera with locked exposure, at the driver's default size (640x480 if available).
+    """A USB camera whose exposure, focus and white balance do not change during a run.
 
     The driver timestamps a frame when its first packet arrives, at the end of the exposure. OpenCV does not
     pass on the driver's frame number, so received frames are counted. If a camera hangs while connected,
@@ -51,7 +64,7 @@ class UvcCamera(BackgroundCamera):
         open_capture: Opens a path as ``cv2.VideoCapture``; tests open a video file.
 
     Raises:
-        ConfigError: ``camera.device`` is not set.
+        ConfigError: ``camera.device`` is not set, or ``camera.gain`` without an exposure.
     """
 
     def __init__(
@@ -75,21 +88,18 @@ class UvcCamera(BackgroundCamera):
                     f"cannot open {path} as a camera; check that no other program uses it, "
                     "and that this user may read it (group video)"
                 )
-            capture.set(cv2.CAP_PROP_BUFFERSIZE, _BUFFERS)
-            capture.set(cv2.CAP_PROP_FPS, self._config.rate_hz)
-            if self._config.exposure_us is not None:
-                _lock_exposure(capture, path, self._config.exposure_us, self._config.gain)
-            numbers = count()
+            fourcc, size_px = _set_format(capture, path, self._config)
+            # Some drivers lose what was set before the stream began, and still read it back:
+            # https://github.com/patjak/facetimehd/pull/329
+            controls = _set_controls(capture, path, self._config)
+            self._settings = {"fourcc": fourcc, "resolution_px": size_px, **controls}
+            numbers = count(1)  # the first image told the size
             yield lambda: self._read(capture, path, next(numbers))
         finally:
             capture.release()
 
     def _read(self, capture: Any, path: Path, seq: int) -> RawFrame:
-        received, image = capture.read()
-        if not received:
-            raise DeviceLostError(
-                f"{path} gives no frames; check its cable, and that no other program uses it"
-            )
+        image = _image(capture, path)
         stamp_ns = round(capture.get(cv2.CAP_PROP_POS_MSEC) * NS_PER_MS)
         if not 0 <= self._clock.now_ns() - stamp_ns < _MAX_FRAME_AGE_NS:
             raise DeviceError(
@@ -132,17 +142,68 @@ def find_device(device: int | str, sysfs: Path = _SYSFS) -> Path:
     )
 
 
-def _lock_exposure(capture: Any, path: Path, exposure_us: int, gain: int | None) -> None:
-    controls = [
-        ("automatic exposure off", cv2.CAP_PROP_AUTO_EXPOSURE, _EXPOSURE_MANUAL),
-        (f"an exposure of {exposure_us} us", cv2.CAP_PROP_EXPOSURE, max(1, exposure_us // _EXPOSURE_UNIT_US)),
-    ]
-    if gain is not None:
-        controls.append((f"a gain of {gain}", cv2.CAP_PROP_GAIN, gain))
-    for what, control, value in controls:
-        capture.set(control, value)
-        if abs((got := capture.get(control)) - value) > _TOLERANCE * value:
-            raise DeviceError(
-                f"{path} refuses {what}: it was set to {value} and reads {got:g}; v4l2-ctl -L lists allowed "
-                "values, and camera.exposure_us=null leaves the exposure automatic"
-            )
+def _set_format(capture: Any, path: Path, config: CameraConfig) -> tuple[str, str]:
+    """Sets pixel format, size and rate, in this order, and returns format and size. Raises `DeviceError`.
+
+    Each limits the next. Where the device does not have one, driver and OpenCV take another without an error.
+    """
+    capture.set(cv2.CAP_PROP_BUFFERSIZE, _BUFFERS)
+    if config.fourcc is not None:
+        capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*config.fourcc))
+    if config.resolution_px is not None:
+        capture.set(cv2.CAP_PROP_FRAME_WIDTH, config.resolution_px[0])
+        capture.set(cv2.CAP_PROP_FRAME_HEIGHT, config.resolution_px[1])
+    capture.set(cv2.CAP_PROP_FPS, config.rate_hz)
+    height, width = _image(capture, path).shape[:2]
+    code, rate_hz = int(capture.get(cv2.CAP_PROP_FOURCC)), capture.get(cv2.CAP_PROP_FPS)
+    fourcc = (code & 0xFFFFFFFF).to_bytes(4, "little").decode("latin-1")
+    rate_known = 0 < rate_hz < math.inf
+    wrong = {
+        "fourcc": config.fourcc not in (None, fourcc),
+        "resolution_px": config.resolution_px not in (None, (width, height)),
+        "rate_hz": rate_known and abs(rate_hz - config.rate_hz) > _TOLERANCE * config.rate_hz,
+    }
+    if any(wrong.values()):
+        keys = ", ".join(f"camera.{key}={getattr(config, key)}" for key in wrong if wrong[key])
+        raise DeviceError(
+            f"{path} refuses {keys} and gives {rate_hz:g} frames per second of {width}x{height} pixels in {fourcc}; "
+            f"v4l2-ctl -d {path} --list-formats-ext lists what it has, and MJPG is usually faster than YUYV"
+        )
+    return fourcc, f"{width}x{height}"
+
+
+def _set_controls(capture: Any, path: Path, config: CameraConfig) -> Settings:
+    """Turns off what is automatic, then sets what is configured; returns what the device has. Raises `DeviceError`."""
+    settings: Settings = {}
+    for key, control, unit, automatic, off in _CONTROLS:
+        value = getattr(config, key)
+        if key == "exposure_us" and value is None:
+            settings[key] = "automatic"
+            continue
+        steps = []
+        if automatic is not None and capture.get(automatic) != _NOT_SUPPORTED:
+            steps.append((automatic, off, 1, f"to stop automatic camera.{key}"))
+        if value is not None:
+            steps.append((control, value, unit, f"camera.{key}"))
+        for one, wanted, one_unit, what in steps:
+            capture.set(one, round(wanted / one_unit))
+            if abs((got := capture.get(one)) * one_unit - wanted) > _TOLERANCE * wanted:
+                read = (
+                    "no such control"
+                    if got == _NOT_SUPPORTED
+                    else f"{wanted} was set, {got * one_unit:g} is read"
+                )
+                raise DeviceError(
+                    f"{path} refuses {what}: {read}; set another value, or null (v4l2-ctl -d {path} -L lists its "
+                    "controls and their ranges)"
+                )
+        if (got := capture.get(control)) != _NOT_SUPPORTED:
+            settings[key] = got * unit
+    return settings
+
+
+def _image(capture: Any, path: Path) -> Any:
+    received, image = capture.read()
+    if not received:
+        raise DeviceLostError(f"{path} gives no frames; check its cable, and that no other program uses it")
+    return image

@@ -199,7 +199,7 @@ class BorrowedPort:
         self._handler.is_using = value
 
     def closePort(self) -> None:  # noqa: N802
-        """Does nothing: the caller closes the port."""
+        """Has no effect: the caller closes the port."""
 
     def clearPort(self) -> None:  # noqa: N802
         """Discards received bytes."""

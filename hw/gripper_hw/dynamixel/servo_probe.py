@@ -140,7 +140,7 @@ class _Inspection:
         if offset == expected != 0:
             advice = (
                 "some firmware moves the motor after a watchdog trip with a Homing Offset (DynamixelSDK issue 584): "
-                "set it to 0 with DYNAMIXEL Wizard, and gripper.open_position_rad anew"
+                "set it to 0 with DYNAMIXEL Wizard, and measure gripper.open_position_rad again"
             )
             yield judged(unit, "watchdog", "may move the jaws", False, advice, harmless=True)
         if "330" in self.model.name:

@@ -17,9 +17,9 @@ STUCK_SAMPLES: Final = 10
 """A converter always has noise, so a reading that stays identical for longer than this time and for more
 samples than this is stuck."""
 
-DOUBT_WINDOW_SAMPLES: Final = 20
+REJECTION_WINDOW_SAMPLES: Final = 20
 MAX_REJECTED_SHARE: Final = 0.4
-"""If more than this share of the last samples was rejected, all samples are rejected."""
+"""Share of rejected samples among the last ones above which all samples are rejected."""
 
 MAX_WAIT_NS: Final = NS_PER_S
 """Longest wait of a sample for those after it. At 10 samples/s, the slowest HX711, they take 0.3 s."""
@@ -70,7 +70,7 @@ class SampleValidator:
         self._previous_n: deque[float] = deque(maxlen=HAMPEL_HALF_WINDOW)
         self._last_raw = math.nan
         self._last_ns = self._same_since_ns = self._same_count = 0
-        self._rejected: deque[bool] = deque(maxlen=DOUBT_WINDOW_SAMPLES)
+        self._rejected: deque[bool] = deque(maxlen=REJECTION_WINDOW_SAMPLES)
 
     def add(self, t_ns: int, raw: float, saturated: bool = False, rounded: bool = False) -> None:
         """Adds a reading received at ``t_ns``.
@@ -115,7 +115,7 @@ class SampleValidator:
                     self.stats.spikes += 1
                     taken[i] = replace(sample, valid=False)
             self._rejected.append(not taken[i].valid)
-            if taken[i].valid and sum(self._rejected) > MAX_REJECTED_SHARE * DOUBT_WINDOW_SAMPLES:
+            if taken[i].valid and sum(self._rejected) > MAX_REJECTED_SHARE * REJECTION_WINDOW_SAMPLES:
                 self.stats.doubtful += 1
                 taken[i] = replace(sample, valid=False)
         return taken

@@ -6,12 +6,13 @@ call returns the next data, with times as recorded.
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import islice
 
 from gripper_force.config import CameraConfig, LoadCellConfig
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.interfaces import Clock
 from gripper_force.runtime.log import LogReader
-from gripper_force.types import Frame, LoadCellSample
+from gripper_force.types import NS_PER_S, Frame, LoadCellSample
 
 
 class _PlaybackDevice:
@@ -40,11 +41,15 @@ class _PlaybackDevice:
             self._shift_ns = self._clock.now_ns() - self._log.start_ns
 
     def counts(self) -> dict[str, int]:
-        """Empty: playback loses nothing; faults of the recording are in its records."""
+        """Returns an empty mapping: playback loses nothing; faults of the recording are in its records."""
         return {}
 
     def _log_now_ns(self) -> int:
         return self._clock.now_ns() - self._shift_ns
+
+
+_RATE_FRAMES = 120
+"""Frames over which the rate of a log is measured."""
 
 
 class PlaybackCamera(_PlaybackDevice):
@@ -75,6 +80,18 @@ class PlaybackCamera(_PlaybackDevice):
             raise DataError(
                 f"{config.path} holds no camera frames to play; choose another log, or camera.backend=none"
             )
+
+    @staticmethod
+    def resolve(config: CameraConfig) -> CameraConfig:
+        """Replaces ``rate_hz`` by the frame rate of the log. Raises `LogError` if the log cannot be read."""
+        if config.path is None:  # the constructor refuses it
+            return config
+        frames = list(islice(LogReader(config.path).records(Frame), _RATE_FRAMES))
+        span_ns = frames[-1].t_ns - frames[0].t_ns if frames else 0
+        if span_ns <= 0:
+            return config
+        rate_hz = (frames[-1].seq - frames[0].seq) * NS_PER_S / span_ns
+        return config.model_copy(update={"rate_hz": round(rate_hz, 2)})
 
     def newest(self) -> Frame | None:
         """Returns the newest frame that was not returned yet, or None. Never blocks. Raises `LogError`."""

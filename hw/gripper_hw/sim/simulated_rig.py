@@ -101,7 +101,7 @@ class SimulatedCamera:
         return frame
 
     def counts(self) -> dict[str, int]:
-        """Empty: without injected faults nothing is lost or rejected."""
+        """Returns an empty mapping: without injected faults nothing is lost or rejected."""
         return {}
 
     def close(self) -> None:
@@ -143,7 +143,7 @@ class SimulatedLoadCell:
         return [self._samples.popleft() for _ in range(len(self._samples))]
 
     def counts(self) -> dict[str, int]:
-        """Empty: without injected faults nothing is lost or rejected."""
+        """Returns an empty mapping: without injected faults nothing is lost or rejected."""
         return {}
 
     def close(self) -> None:

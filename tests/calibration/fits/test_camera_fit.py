@@ -6,9 +6,9 @@ from hypothesis import strategies as st
 
 from gripper_calibration.fits.camera_fit import (
     METHOD_ERROR_MS,
+    CameraLag,
     ExposureCandidate,
     Markers,
-    TouchLag,
     estimate_lag,
     find_markers,
     region_around,
@@ -112,8 +112,8 @@ def test_clipped_or_dark_images_are_refused(gray: int) -> None:
         select_exposure([candidate])
 
 
-def touches(*lags_ms: float, force_n: float = 5.0) -> list[TouchLag]:
-    return [TouchLag(force_n, lag_ms, lag_ms + 20) for lag_ms in lags_ms]
+def touches(*lags_ms: float, force_n: float = 5.0) -> list[CameraLag]:
+    return [CameraLag(force_n, lag_ms, lag_ms + 20) for lag_ms in lags_ms]
 
 
 @given(st.lists(st.floats(-150, 150), min_size=3, max_size=30))

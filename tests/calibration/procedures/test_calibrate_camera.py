@@ -113,6 +113,10 @@ def test_different_camera_is_refused_or_reported(tmp_path: Path) -> None:
     why = "with camera.side_px 128, not 64; camera.exposure_us 4000, not 500; calibrate again"
     with pytest.raises(ConfigError, match=why):
         mismatches(another)
+    with pytest.raises(
+        ConfigError, match=r"camera\.resolution_px None, not \[640, 400\]; camera\.lens_position None"
+    ):
+        mismatches(load_config(None, [*named, "camera.resolution_px=[640, 400]", "camera.lens_position=90"]))
     warned = load_config(None, [*named, "camera.exposure_us=500", "calibration.on_mismatch=warn"])
     assert mismatches(warned) == ["camera.exposure_us 4000, not 500"]
     assert mismatches(load_config(None, [*named, "camera.backend=none"])) == []

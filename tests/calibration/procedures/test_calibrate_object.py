@@ -275,7 +275,7 @@ def test_interrupted_command_calibrates_and_continues_later(
     finished = by_hand(tmp_path, monkeypatch, Terminal(1, interrupt))
     assert json.loads(finished.stdout)["touches"] == 3
     assert "2 of 3 touches exist already" in finished.stderr
-    assert "and are used: number 1, 2; --fresh records all of them anew" in finished.stderr
+    assert "and are used: number 1, 2; --fresh records all of them again" in finished.stderr
 
 
 def test_fresh_touches_replace_the_earlier_ones(touched: list[Path], tmp_path: Path) -> None:

@@ -49,6 +49,28 @@ def test_rate_below_configured_is_a_problem(
     assert "set camera.rate_hz to the measured rate" in rate.advice
 
 
+def test_settings_in_force_are_shown(
+    make_uvc: Callable[..., uvc.UvcCamera], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(uvc, "UvcCamera", lambda section, clock: make_uvc(exposure_us=8000))
+    settings = rows(REAL | {"camera": {"backend": "uvc", "device": 0, "exposure_us": 8000}})["settings"]
+    assert settings.ok is True
+    shown = (
+        "fourcc YUYV, resolution_px 320x240, exposure_us 8000, gain 8, lens_position 35, white_balance_k 4300"
+    )
+    assert settings.found == shown
+
+
+def test_setting_that_the_device_does_not_keep_is_a_problem(
+    make_oak: Callable[..., oak.OakCamera], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gray = np.random.default_rng(0).integers(0, 256, (800, 1280), np.uint8)
+    monkeypatch.setattr(oak, "OakCamera", lambda section, clock: make_oak(gray, exposure_us=4000, gain=100))
+    settings = rows(REAL | {"camera": {"backend": "oak", "exposure_us": 4000, "gain": 1600}})["settings"]
+    assert (settings.ok, "exposure_us 4000, gain 100" in settings.found) == (False, True)
+    assert "does not keep camera.gain:" in settings.advice
+
+
 def test_usb_speed_of_oak_is_shown(
     make_oak: Callable[..., oak.OakCamera], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -11,11 +11,11 @@ import pytest
 
 from gripper_force.config import Config, LoadCellConfig, load_config
 from gripper_force.errors import DeviceError
-from gripper_force.interfaces import LoadCell
+from gripper_force.interfaces import Clock, LoadCell
 from gripper_force.runtime.backends import LOAD_CELLS, MonotonicClock
 from gripper_force.runtime.log import LogWriter
 from gripper_force.testing.load_cell_contract import LoadCellContract
-from gripper_force.types import NS_PER_MS, NS_PER_S, LoadCellSample
+from gripper_force.types import NS_PER_MS, LoadCellSample
 from gripper_hw.load_cells.phidget import PhidgetLoadCell
 from gripper_hw.load_cells.serial import SerialLoadCell
 from gripper_hw.playback import PlaybackLoadCell
@@ -56,12 +56,8 @@ class TestSimulatedLoadCell(NumberedContract):
         return rig.load_cell
 
     @pytest.fixture
-    def now_ns(self, rig: SimulatedRig) -> Callable[[], int]:
-        return rig.clock.now_ns
-
-    @pytest.fixture
-    def wait(self, rig: SimulatedRig) -> Callable[[float], None]:
-        return lambda seconds: rig.clock.sleep_until_ns(rig.clock.now_ns() + round(seconds * NS_PER_S))
+    def clock(self, rig: SimulatedRig) -> Clock:
+        return rig.clock
 
     def number(self, sample: LoadCellSample) -> int:
         return sample.t_ns // PERIOD_NS

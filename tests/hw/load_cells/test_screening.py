@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from gripper_force.spikes import HAMPEL_HALF_WINDOW, find_spikes
 from gripper_force.types import NS_PER_S, LoadCellSample
 from gripper_hw.load_cells.screening import (
-    DOUBT_WINDOW_SAMPLES,
     MAX_REJECTED_SHARE,
     MAX_WAIT_NS,
+    REJECTION_WINDOW_SAMPLES,
     STUCK_NS,
     STUCK_SAMPLES,
     SampleValidator,
@@ -73,7 +73,7 @@ def test_every_reading_is_returned_once_in_order_and_unchanged(
 def test_live_samples_are_checked_like_recorded_ones(forces_n: list[float], every: int) -> None:
     taken = validated(calibrated(), forces_n, every, rounded=True)
     expected = ~find_spikes(np.array(forces_n)) if forces_n else np.array([])
-    assume((~expected.astype(bool)).sum() <= MAX_REJECTED_SHARE * DOUBT_WINDOW_SAMPLES)
+    assume((~expected.astype(bool)).sum() <= MAX_REJECTED_SHARE * REJECTION_WINDOW_SAMPLES)
     assert [s.valid for s in taken] == list(expected)
 
 
@@ -153,7 +153,7 @@ def test_most_samples_among_garbage_are_rejected() -> None:
     )
     validator = calibrated()
     taken = validated(validator, raws)
-    accepted = [i for i, s in enumerate(taken) if s.valid and 30 + DOUBT_WINDOW_SAMPLES <= i < 225]
+    accepted = [i for i, s in enumerate(taken) if s.valid and 30 + REJECTION_WINDOW_SAMPLES <= i < 225]
     assert len(accepted) < 175 / 3
     assert validator.stats.doubtful > 50
     assert all(s.valid for s in taken[260:])

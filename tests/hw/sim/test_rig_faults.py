@@ -8,23 +8,13 @@ import pytest
 
 from gripper_force.fault_config import FAULTS, FaultConfig
 from gripper_force.fault_injection import Faults
+from gripper_force.interfaces import Clock
 from gripper_force.types import NS_PER_MS, NS_PER_S, Frame, LoadCellSample
 from gripper_hw.sim.rig_faults import FaultyCamera, FaultyClock, FaultyLoadCell
 
 FRAME_NS = NS_PER_S // 50
 SAMPLE_NS = NS_PER_S // 200
 BEGIN_NS, END_NS = NS_PER_S, 2 * NS_PER_S
-
-
-@dataclass
-class Clock:
-    t_ns: int = 0
-
-    def now_ns(self) -> int:
-        return self.t_ns
-
-    def sleep_until_ns(self, t_ns: int) -> None:
-        self.t_ns = max(self.t_ns, t_ns)
 
 
 @dataclass
@@ -42,11 +32,11 @@ class Source:
     def newest(self) -> Frame:
         self.seq += 1
         gray = self.rng.integers(60, 120, (8, 8), np.uint8)
-        return Frame(self.clock.t_ns - 15 * NS_PER_MS, self.clock.t_ns, self.seq, gray)
+        return Frame(self.clock.now_ns() - 15 * NS_PER_MS, self.clock.now_ns(), self.seq, gray)
 
     def drain(self) -> list[LoadCellSample]:
         force_n = 3.0 + float(self.rng.normal(0, 0.01))
-        return [LoadCellSample(self.clock.t_ns, force_n, force_n)]
+        return [LoadCellSample(self.clock.now_ns(), force_n, force_n)]
 
     def close(self) -> None:
         self.closed += 1
@@ -59,24 +49,23 @@ def faults(unit: str, kind: str) -> Faults:
     return Faults([FaultConfig(unit=unit, kind=kind, at_s=1.0, for_s=1.0)])
 
 
-def frames_of(kind: str) -> list[tuple[int, Frame]]:
+def frames_of(kind: str, clock: Clock) -> list[tuple[int, Frame]]:
     """Three seconds of frames with the time at which each was returned."""
-    clock = Clock()
     camera = FaultyCamera(Source(clock), faults("camera", kind), clock, seed=1)
     camera.start()
     given = []
-    while clock.t_ns < 3 * NS_PER_S:
-        clock.t_ns += FRAME_NS
+    while clock.now_ns() < 3 * NS_PER_S:
+        clock.sleep_until_ns(clock.now_ns() + FRAME_NS)
         if (frame := camera.newest()) is not None:
-            given.append((clock.t_ns, frame))
+            given.append((clock.now_ns(), frame))
     camera.close()
     camera.close()
     return given
 
 
 @pytest.mark.parametrize("kind", FAULTS["camera"])
-def test_camera_fails_as_configured_and_recovers(kind: str) -> None:
-    given = frames_of(kind)
+def test_camera_fails_as_configured_and_recovers(kind: str, clock: Clock) -> None:
+    given = frames_of(kind, clock)
     during = [frame for t_ns, frame in given if BEGIN_NS <= t_ns < END_NS]
     before = [frame for t_ns, frame in given if t_ns < BEGIN_NS]
     assert len(before) == 49
@@ -100,21 +89,20 @@ def test_camera_fails_as_configured_and_recovers(kind: str) -> None:
             assert 2 <= len(during) <= 22
 
 
-def samples_of(kind: str) -> list[LoadCellSample]:
-    clock = Clock()
+def samples_of(kind: str, clock: Clock) -> list[LoadCellSample]:
     cell = FaultyLoadCell(Source(clock), faults("load_cell", kind), clock, seed=1)
     cell.start()
     taken = []
-    while clock.t_ns < 4 * NS_PER_S:
-        clock.t_ns += SAMPLE_NS
+    while clock.now_ns() < 4 * NS_PER_S:
+        clock.sleep_until_ns(clock.now_ns() + SAMPLE_NS)
         taken += cell.drain()
     cell.close()
     return taken
 
 
 @pytest.mark.parametrize("kind", FAULTS["load_cell"])
-def test_load_cell_fails_as_configured_and_recovers(kind: str) -> None:
-    samples = samples_of(kind)
+def test_load_cell_fails_as_configured_and_recovers(kind: str, clock: Clock) -> None:
+    samples = samples_of(kind, clock)
     assert all(a.t_ns < b.t_ns or kind == "delayed" for a, b in pairwise(samples))
     during = [s for s in samples if BEGIN_NS <= s.t_ns < END_NS]
     accepted = [s for s in during if s.valid]
@@ -141,8 +129,8 @@ def test_load_cell_fails_as_configured_and_recovers(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", FAULTS["clock"])
-def test_clock_fails_as_configured(kind: str) -> None:
-    clock, real_time = Clock(), time.time
+def test_clock_fails_as_configured(kind: str, clock: Clock) -> None:
+    real_time = time.time
     faulty = FaultyClock(clock, faults("clock", kind))
     faulty.sleep_until_ns(BEGIN_NS - 1)
     assert faulty.now_ns() == BEGIN_NS - 1
@@ -160,9 +148,9 @@ def test_clock_fails_as_configured(kind: str) -> None:
     assert time.time is real_time
 
 
-def test_close_restores_the_wall_clock() -> None:
+def test_close_restores_the_wall_clock(clock: Clock) -> None:
     real_time = time.time
-    faulty = FaultyClock(Clock(), faults("clock", "wrong"))
+    faulty = FaultyClock(clock, faults("clock", "wrong"))
     faulty.sleep_until_ns(BEGIN_NS + 1)
     assert time.time is not real_time
     faulty.close()
