@@ -176,13 +176,7 @@ def _draw(object_name: str, seed: int, config: SimConfig) -> Scene:
 
 
 def draw_second_finger(scene: Scene, seed: int, config: SimConfig) -> Scene:
-    """Returns a scene with another motor, gears and rail: those of a second finger with its own servo.
-
-    Args:
-        scene: The scene, with those of the first finger.
-        seed: See `draw_scene`.
-        config: See `draw_scene`.
-    """
+    """Returns a scene with motor, gears and rail of a second finger; ``seed`` and ``config`` as for `draw_scene`."""
     rig_seed = seed if config.rig_seed is None else config.rig_seed
     other = _draw(scene.object, rig_seed + _SECOND_FINGER_SEEDS, config)
     return replace(scene, **{name: getattr(other, name) for name in _FINGER_PARAMETERS})
@@ -218,10 +212,8 @@ def scene_mjcf(
     template = Template(
         resources.files(__package__).joinpath("assets/gripper.xml").read_text(encoding="utf-8")
     )
-    radius_m = gripper.pinion_radius_m
-    inertia, damping, friction_nm, rail_friction_nm = horn_dynamics(
-        scene, radius_m, rails=2 if second is None else 1
-    )
+    radius_m, rails = gripper.pinion_radius_m, 2 if second is None else 1
+    inertia, damping, friction_nm, rail_friction_nm = horn_dynamics(scene, radius_m, rails)
     text = template.substitute(
         object=scene.object,
         timestep_s=model.timestep_s,
@@ -277,9 +269,8 @@ def _second_horn(scene: Scene, radius_m: float, height_m: float) -> str:
 
 
 def _second_rack(scene: Scene, radius_m: float) -> str:
-    backlash_m = scene.backlash_m
     return (
-        f'<fixed name="second_rack" range="-{backlash_m} {backlash_m}" solreflimit=".004 1">'
+        f'<fixed name="second_rack" range="-{scene.backlash_m} {scene.backlash_m}" solreflimit=".004 1">'
         f'<joint joint="left" coef="1"/><joint joint="second_servo" coef="-{radius_m}"/></fixed>'
     )
 

@@ -159,9 +159,9 @@ class SimulatedLoadCell:
 
 
 class _LockedMotor:
-    """The virtual servo's firmware as the world's motor: holds the bus's lock and applies wire faults.
+    """A virtual servo's firmware as the world's motor: holds the bus's lock and applies wire faults.
 
-    A mirrored servo turns the other way than the finger that it drives.
+    With ``sign`` -1 it is mirrored: it turns the other way than the finger that it drives.
     """
 
     def __init__(
@@ -169,20 +169,16 @@ class _LockedMotor:
         servo: VirtualServo,
         lock: AbstractContextManager[object],
         faults: "WireFaults | None",
-        *,
-        mirrored: bool = False,
+        sign: int,
     ) -> None:
-        self._servo, self._lock, self._faults = servo, lock, faults
-        self._sign = -1 if mirrored else 1
+        self._servo, self._lock, self._faults, self._sign = servo, lock, faults, sign
 
     def control(self, t_ns: int, position_rad: float, velocity_rad_s: float, current_noise_a: float) -> float:
         with self._lock:
             if self._faults is not None:
                 self._faults.update(t_ns)
-            sign = self._sign
-            return sign * self._servo.control(
-                t_ns, sign * position_rad, sign * velocity_rad_s, current_noise_a
-            )
+            state = self._sign * position_rad, self._sign * velocity_rad_s
+            return self._sign * self._servo.control(t_ns, *state, current_noise_a)
 
 
 class SimulatedRig:
@@ -231,10 +227,10 @@ class SimulatedRig:
             from gripper_hw.dynamixel.bus_faults import WireFaults
 
             wire = WireFaults(bus, faults, config.seed)
-        motors = [_LockedMotor(servo, bus.lock, wire, mirrored=servo is not servos[0]) for servo in servos]
-        self._second: Scene | None = None
-        if len(servos) > 1:
-            self._second = draw_second_finger(self.scene, config.seed, config.sim)
+        motors = [
+            _LockedMotor(servo, bus.lock, wire, sign) for servo, sign in zip(servos, (1, -1), strict=False)
+        ]
+        self._second = draw_second_finger(self.scene, config.seed, config.sim) if len(servos) > 1 else None
         self._world = World(
             self.scene,
             config.gripper,

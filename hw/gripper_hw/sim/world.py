@@ -110,8 +110,7 @@ class World:
         step_s: float | None = None,
         second: tuple[Motor, Scene] | None = None,
     ) -> None:
-        second_scene = None if second is None else second[1]
-        text, assets = scene_mjcf(scene, gripper, textured=textured, second=second_scene)
+        text, assets = scene_mjcf(scene, gripper, textured=textured, second=second and second[1])
         try:
             self._model: Any = mujoco.MjModel.from_xml_string(text, assets)
         except ValueError as error:
@@ -131,15 +130,8 @@ class World:
         self.step_ns = round(self._model.opt.timestep * NS_PER_S)
         drives = {"servo": (motor, scene)} | ({} if second is None else {"second_servo": second})
         self._drives = [
-            _Drive(
-                motor=one,
-                scene=its_scene,
-                nm_per_a=nm_per_a * its_scene.nm_per_a,
-                rails=2 // len(drives),
-                qpos=int(self._model.joint(name).qposadr[0]),
-                dof=int(self._model.joint(name).dofadr[0]),
-            )
-            for name, (one, its_scene) in drives.items()
+            _Drive(one, of, nm_per_a * of.nm_per_a, 2 // len(drives), *self._addresses(name))
+            for name, (one, of) in drives.items()
         ]
         # The scene has pinions; another linkage acts between a horn and its pinion.
         linkage = make_linkage(gripper)
@@ -192,6 +184,9 @@ class World:
                 if periodic.due_ns <= self.t_ns:
                     periodic.due_ns += periodic.period_ns
                     periodic.call(self.t_ns)
+
+    def _addresses(self, joint: str) -> tuple[int, int]:
+        return int(self._model.joint(joint).qposadr[0]), int(self._model.joint(joint).dofadr[0])
 
     def _horn(self, linkage: Linkage, drive: "_Drive", pinion_rad: float) -> tuple[float, float]:
         """Returns the horn's angle and its rotation per rotation of the pinion.
