@@ -31,6 +31,27 @@ HARD_FORCE_LIMIT_N: Final = 70.0
 _BACKEND: Final = "or package.module:Class, or a name that an installed package registers"
 
 
+class SecondServoConfig(Section):
+    """The servo of the second finger, of the same model and on the same bus as the first one's."""
+
+    id: int | None = Field(
+        None, ge=0, le=252, description="id of the second finger's servo; None: one servo drives both jaws"
+    )
+    mirrored: bool = Field(
+        True, description="true if it turns the other way than the first servo while the jaws close"
+    )
+    offset_rad: Finite = Field(
+        0.0,
+        description="its angle while the first servo stands at 0 rad and both fingers are equally far open; a "
+        "start with fingers that differ says which value makes them equal",
+    )
+    max_difference_rad: Positive = Field(
+        0.5,
+        description="difference between the closing angles of the fingers above which the run ends as a fault; "
+        "a run starts within half of it",
+    )
+
+
 class ServoConfig(Section):
     """The servo and its bus."""
 
@@ -58,15 +79,28 @@ class ServoConfig(Section):
         description="Homing Offset register in ticks, for which gripper.open_position_rad was found; a servo "
         "with another one is refused",
     )
+    second: SecondServoConfig = SecondServoConfig()
+
+    @model_validator(mode="after")
+    def _check_ids(self) -> Self:
+        if self.second.id == self.id:
+            raise ValueError(f"second.id {self.id} is servo.id, too; give each servo its own id")
+        return self
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        """Ids of the gripper's servos: one, or one for each finger."""
+        return (self.id,) if self.second.id is None else (self.id, self.second.id)
 
 
 class LinkageConfig(Section):
     """Geometry between the servo's horn and the jaws. Closing angles are from the open jaws."""
 
-    kind: Literal["rack", "crank_slider", "four_bar", "finger", "table"] = Field(
+    kind: Literal["rack", "crank_slider", "four_bar", "finger", "fingers", "table"] = Field(
         "rack",
         description="rack: one pinion, two racks; crank_slider: two rods on one crank disc; four_bar: fingers "
-        "on the rockers; finger: one finger on the horn, against a fixed one; table: measured",
+        "on the rockers; finger: one finger on the horn, against a fixed one; fingers: two such fingers, on "
+        "geared horns or on two servos; table: measured",
     )
     crank_m: Positive | None = Field(None, description="crank_slider, four_bar: length of the crank")
     rod_m: Positive | None = Field(None, description="crank_slider, four_bar: length of the rod or coupler")
@@ -74,7 +108,7 @@ class LinkageConfig(Section):
     rocker_m: Positive | None = Field(None, description="four_bar: length of the rocker")
     base_m: Positive | None = Field(None, description="four_bar: distance between the two fixed pivots")
     finger_m: Positive | None = Field(
-        None, description="four_bar, finger: distance from the finger's pivot to its tip"
+        None, description="four_bar, finger, fingers: distance from a finger's pivot to its tip"
     )
     open_crank_rad: Finite = Field(
         0.0,
@@ -83,7 +117,8 @@ class LinkageConfig(Section):
     )
     open_finger_rad: Finite = Field(
         0.0,
-        description="four_bar, finger: angle of the open finger from the direction in which it points closed",
+        description="four_bar, finger, fingers: angle of an open finger from the direction in which it points "
+        "closed",
     )
     table: tuple[tuple[Finite, Finite], ...] = Field(
         (), description="table: rows of closing angle (rad) and width (m), from the open jaws on"
@@ -99,7 +134,9 @@ class GripperConfig(Section):
     open_position_rad: Finite = Field(0.0, description="servo angle with open jaws")
     open_width_m: Positive = Field(0.092, description="distance between the open jaws")
     nm_per_a: Positive | None = Field(
-        None, description="torque constant at the horn; None: value of the servo model"
+        None,
+        description="torque constant at the horn, of both servos together if there are two; None: value of the "
+        "servo model",
     )
     current_step_a: Positive | None = Field(
         None, description="resolution of the goal current; None: value of the servo model"
@@ -490,8 +527,21 @@ class Config(Section):
     calibration: CalibrationConfig = CalibrationConfig()
     log: LogConfig = LogConfig()
     faults: tuple[FaultConfig, ...] = Field(
-        (), description="faults to inject into simulated devices: unit, kind, at_s, for_s"
+        (), description="faults to inject into simulated devices: unit, kind, at_s, for_s, id"
     )
+
+    @model_validator(mode="after")
+    def _check_fingers(self) -> Self:
+        if self.gripper.linkage.kind == "finger" and len(self.servo.ids) > 1:
+            raise ValueError(
+                "gripper.linkage.kind=finger has one moving finger, but servo.second.id names the servo of a "
+                "second one; set the kind to fingers"
+            )
+        if strange := {fault.id for fault in self.faults} - {None, *self.servo.ids}:
+            raise ValueError(
+                f"a fault has the id {strange.pop()}, but no servo of the gripper has it; correct it"
+            )
+        return self
 
     @property
     def profile(self) -> str | None:

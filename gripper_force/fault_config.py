@@ -75,10 +75,15 @@ class FaultConfig(Section):
     ]
     at_s: NonNegative = Field(0.0, description="start, seconds after the start of the run")
     for_s: Annotated[float, Field(gt=0)] = Field(float("inf"), description="duration in seconds")
+    id: int | None = Field(
+        None, description="servo, plant: id of the only servo that has the fault; None: every one on the bus"
+    )
 
     @model_validator(mode="after")
     def _is_supported(self) -> Self:
         if self.kind != "ok" and self.kind not in FAULTS[self.unit]:
             known = ", ".join(("ok", *FAULTS[self.unit]))
             raise ValueError(f"unit {self.unit} has no fault kind {self.kind}; choose one of {known}")
+        if self.id is not None and self.unit not in ("servo", "plant"):
+            raise ValueError(f"unit {self.unit} has no id; leave it out")
         return self

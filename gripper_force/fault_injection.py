@@ -38,10 +38,10 @@ class Faults:
         """Returns True if the unit has a fault at any time."""
         return any(fault.unit == unit for fault, _, _ in self._faults)
 
-    def active(self, unit: str, t_ns: int) -> str:
-        """Returns the kind of the unit's fault at a time, or ``ok``. The last one listed has priority."""
+    def active(self, unit: str, t_ns: int, servo_id: int | None = None) -> str:
+        """Returns the kind of the fault of a unit, or of one servo, or ``ok``. The last one listed has priority."""
         for fault, begin_ns, end_ns in reversed(self._faults):
-            if fault.unit == unit and begin_ns <= t_ns < end_ns:
+            if fault.unit == unit and begin_ns <= t_ns < end_ns and fault.id in (None, servo_id):
                 return fault.kind
         return "ok"
 

@@ -171,7 +171,7 @@ def virtual_servo(
     from gripper_hw.dynamixel.pty_server import serve_virtual_servo
 
     servo = load_settings(None, set_, {"servo.model": model}).servo
-    servo_ids = ids or [servo.id]
+    servo_ids = ids or list(servo.ids)
     with serve_virtual_servo(servo.model, servo_ids) as server:
         console.show({"port": server.device_path, "model": servo.model, "ids": servo_ids}, as_json)
         sys.stdout.flush()

@@ -127,7 +127,7 @@ def make_linkage(gripper: GripperConfig) -> Linkage:
             closed_m = _crank_slider(config)
         case "four_bar":
             closed_m = _four_bar(config)
-        case "finger":
+        case "finger" | "fingers":
             closed_m = _finger(config)
         case "table":
             closed_m = _table(config, gripper.open_width_m)
@@ -221,9 +221,10 @@ def _four_bar(config: LinkageConfig) -> Callable[[float], float]:
 
 
 def _finger(config: LinkageConfig) -> Callable[[float], float]:
-    """One finger on the horn that closes against a fixed one."""
+    """One finger on the horn that closes against a fixed one, or two fingers that turn alike."""
     finger_m, start_rad = _length(config, "finger_m"), config.open_finger_rad
-    return lambda closing_rad: finger_m * (math.sin(start_rad) - math.sin(start_rad - closing_rad))
+    reach_m = finger_m if config.kind == "finger" else 2 * finger_m
+    return lambda closing_rad: reach_m * (math.sin(start_rad) - math.sin(start_rad - closing_rad))
 
 
 def _table(config: LinkageConfig, open_width_m: float) -> Callable[[float], float]:

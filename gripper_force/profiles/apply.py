@@ -91,8 +91,10 @@ def rig_mismatches(config: Config, profiles: Profiles) -> list[str]:
     """
     if profiles.rig is None:
         return []
+    servo = config.servo
+    model = servo.model if len(servo.ids) == 1 else f"two {servo.model}"  # whose torque is another
     mismatches = profiles.rig.mismatches(
-        config.servo.model, config.load_cell.sensor, config.camera.model_dump(mode="json")
+        model, config.load_cell.sensor, config.camera.model_dump(mode="json")
     )
     _refuse(config, f"rig profile {profiles.rig_path}", mismatches)
     return mismatches

@@ -26,6 +26,9 @@ GRIPPERS["table"] = GripperConfig(
         kind="table", table=((0.0, 0.092), (0.5, 0.075), (1.0, 0.052), (1.5, 0.030), (2.0, 0.012))
     )
 )
+GRIPPERS["fingers"] = GripperConfig(
+    linkage=LinkageConfig(kind="fingers", finger_m=0.06, open_finger_rad=0.6), open_width_m=0.065
+)
 
 grippers = st.sampled_from(sorted(GRIPPERS))
 
@@ -39,6 +42,16 @@ def test_width_and_position_are_inverse(name: str, sign: int, share: float, open
     one = transmission_of(name, closing_sign=sign, open_position_rad=open_rad)
     width_m = share * one.open_width_m
     assert one.width_m(one.position_rad(width_m)) == pytest.approx(width_m, abs=1e-9)
+
+
+def test_two_fingers_close_twice_as_far_as_one() -> None:
+    two = GRIPPERS["fingers"]
+    one = two.model_copy(
+        update={"linkage": two.linkage.model_copy(update={"kind": "finger"}), "open_width_m": 0.0325}
+    )
+    for closing_rad in (0.0, 0.2, 0.5):
+        widths_m = [make_linkage(gripper).width_m(closing_rad) for gripper in (one, two)]
+        assert widths_m[1] == pytest.approx(2 * widths_m[0], abs=1e-6)
 
 
 @pytest.mark.parametrize("name", GRIPPERS)

@@ -114,10 +114,17 @@ def calibrate_servo(
         progress: Called with the step and the force a few times per second.
 
     Raises:
-        ConfigError: There is no load cell, a gauge does not fit, or the profile can't be read or written.
+        ConfigError: There is no load cell, a gauge does not fit, there are two servos, or the profile can't be read
+            or written.
         DeviceError: A device failed. The servo has no torque.
         DataError: The jaws met nothing, or the readings are not sufficient for a calibration.
     """
+    if len(config.servo.ids) > 1:
+        raise ConfigError(
+            "calibrate servo moves the jaws with small constant currents, at which two servos do not stay in step; "
+            "with servo.second, hold a load cell with `grasp`, and scale gripper.nm_per_a by the measured over the "
+            "target force"
+        )
     if config.load_cell.backend == "none":
         raise ConfigError(
             "calibrate servo needs a load cell, but load_cell.backend is none; set the backend of yours"

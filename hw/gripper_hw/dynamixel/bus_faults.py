@@ -30,9 +30,11 @@ class WireFaults:
             seed: Seed for which replies are lost and how they are corrupted.
         """
         self._bus = bus
-        self._wire, self._servo, self._plant = (
-            _ActiveFault(faults, unit) for unit in ("bus", "servo", "plant")
-        )
+        self._wire = _ActiveFault(faults, "bus")
+        self._of_servos = [
+            (servo, _ActiveFault(faults, "servo", servo.id), _ActiveFault(faults, "plant", servo.id))
+            for servo in bus.servos
+        ]
         self._random = random.Random(seed)
         self._delayed: deque[bytes] = deque()
         bus.before_packet = lambda: self.update(bus.clock_ns())
@@ -41,14 +43,13 @@ class WireFaults:
 
     def update(self, t_ns: int) -> None:
         """Applies the active faults to the servos. Call it with the bus's lock held."""
-        kind, plant = self._servo.at(t_ns), self._plant.at(t_ns)
-        excess_ratio = _EXCESS_PER_S * (t_ns - self._plant.since_ns) / NS_PER_S if plant == "wrong" else 0.0
-        is_cut = kind == "off" or (
-            kind == "intermittent" and (t_ns - self._servo.since_ns) % _CUT_PERIOD_NS < _CUT_NS
-        )
-        for servo in self._bus.servos:
-            servo.excess_current_ratio = excess_ratio
-            if is_cut:
+        for servo, fault, plant in self._of_servos:
+            kind, is_excess = fault.at(t_ns), plant.at(t_ns) == "wrong"
+            since_s = (t_ns - plant.since_ns) / NS_PER_S
+            servo.excess_current_ratio = _EXCESS_PER_S * since_s if is_excess else 0.0
+            if kind == "off" or (
+                kind == "intermittent" and (t_ns - fault.since_ns) % _CUT_PERIOD_NS < _CUT_NS
+            ):
                 _cut_power(servo, t_ns)
             elif kind == "stuck":
                 servo.set("bus_watchdog", -1)
@@ -77,19 +78,19 @@ class WireFaults:
 
 
 class _ActiveFault:
-    """Active fault of one unit.
+    """Active fault of one unit, or of one servo.
 
     Attributes:
         since_ns: Time at which it became active.
     """
 
-    def __init__(self, faults: Faults, unit: str) -> None:
+    def __init__(self, faults: Faults, unit: str, servo_id: int | None = None) -> None:
         self.since_ns = 0
-        self._faults, self._unit, self._kind = faults, unit, "ok"
+        self._faults, self._unit, self._servo_id, self._kind = faults, unit, servo_id, "ok"
 
     def at(self, t_ns: int) -> str:
         """Returns its kind, ``ok`` without a fault."""
-        kind = self._faults.active(self._unit, self._faults.start_ns + t_ns)
+        kind = self._faults.active(self._unit, self._faults.start_ns + t_ns, self._servo_id)
         if kind != self._kind:
             self._kind, self.since_ns = kind, t_ns
         return kind

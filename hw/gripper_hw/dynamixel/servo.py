@@ -35,6 +35,7 @@ from gripper_hw.dynamixel.control_table import (
     rad_from_ticks,
     ticks_from_rad,
 )
+from gripper_hw.dynamixel.fingers import FingerPair
 from gripper_hw.dynamixel.transport import PortLockedError, Transport
 
 _READ_FIELDS: Final = {  # name: bytes
@@ -133,10 +134,15 @@ class DynamixelBus:
             "feedforward_2nd_gain": 0,
         }
 
-    def start(self) -> tuple[ServoState, ...]:
+    def start(
+        self, check: Callable[[tuple[ServoState, ...]], None] = lambda states: None
+    ) -> tuple[ServoState, ...]:
         """Opens the port, configures the servos, and turns torque on at the present position with no current.
 
         On an error, torque off is tried on every servo of the right model that was reached.
+
+        Args:
+            check: Called with the states before and after torque is turned on; raises if it must be off.
 
         Raises:
             DeviceNotFoundError: The port does not exist, or a servo does not answer.
@@ -158,10 +164,13 @@ class DynamixelBus:
             for id_ in self.ids:
                 self._configure(id_, window)
             self._data_address = window.data
-            for id_, state in zip(self.ids, self.read(), strict=True):
+            states = self.read()
+            check(states)
+            for id_, state in zip(self.ids, states, strict=True):
                 self._enable_torque(id_, state)
             self._expected_watchdog = self._watchdog_setting
             states = self.read()
+            check(states)
             undo.pop_all()
         return states
 
@@ -235,9 +244,10 @@ class DynamixelBus:
         except PortLockedError:
             raise
         except DeviceTimeoutError as error:
+            key = "servo.second.id" if id_ == self._config.second.id else "servo.id"
             raise DeviceNotFoundError(
                 f"{label} does not answer at {self._config.baud_rate} baud; "
-                "check its power, servo.id and servo.baud_rate"
+                f"check its power, {key} and servo.baud_rate"
             ) from error
         if number != self.model.number:  # a late reply can be mistaken for a ping's, not for a read's
             number = self._transport.get(id_, "model_number")
@@ -352,7 +362,7 @@ class DynamixelBus:
 
 
 class DynamixelServo:
-    """The gripper's servo: one id of a `DynamixelBus` (see `gripper_force.interfaces.Servo`)."""
+    """The gripper's servo, or its two, one per finger, as one (see `gripper_force.interfaces.Servo`)."""
 
     def __init__(
         self,
@@ -361,25 +371,31 @@ class DynamixelServo:
         port: SharedPort | None = None,
     ) -> None:
         """Creates the bus; see `DynamixelBus`."""
-        self._bus = DynamixelBus(config, (config.id,), clock_ns, port)
+        self._bus = DynamixelBus(config, config.ids, clock_ns, port)
         self.model = self._bus.model
+        self._pair = FingerPair(config, self.model) if len(config.ids) > 1 else None
 
     @staticmethod
     def spec(config: ServoConfig) -> ServoSpec:
         """Returns the data of the configured model, without opening the port.
+
+        The torque of two servos is that of both together, by their mean angle and mean current.
 
         Raises:
             ConfigError: The model is unknown, or has no current control.
         """
         model = load_model(config.model)
         offset_rad = rad_from_ticks(ZERO_TICK + config.homing_offset)
+        range_rad = (offset_rad - math.pi, offset_rad + math.pi)
+        if len(config.ids) > 1:
+            range_rad = FingerPair(config, model).range_rad(*range_rad)
         return ServoSpec(
-            nm_per_a=model.nm_per_a,
+            nm_per_a=len(config.ids) * model.nm_per_a,
             current_step_a=model.current_unit_a,
             voltage_range_v=model.voltage_range_v,
             position_loop_a_per_rad=model.position_loop_per_rad * model.stall_current_a,
             position_loop_gain_per_s=model.position_loop_per_rad * model.no_load_rad_s,
-            position_range_rad=(offset_rad - math.pi, offset_rad + math.pi),
+            position_range_rad=range_rad,
         )
 
     @property
@@ -387,26 +403,30 @@ class DynamixelServo:
         """Counters of retries and losses."""
         return self._bus.stats
 
-    @property
-    def firmware(self) -> int | None:
-        """Firmware version; None before `start`."""
-        return self._bus.firmware[0] if self._bus.firmware else None
-
     def start(self) -> ServoState:
-        """Configures the servo and turns torque on; raises the errors of `DynamixelBus.start`."""
-        return self._bus.start()[0]
+        """Turns torque on; raises the errors of `DynamixelBus.start`, and of `FingerPair.start`."""
+        if self._pair is None:
+            return self._bus.start()[0]
+        return self._pair.combine(self._bus.start(self._pair.start))
 
     def read(self) -> ServoState:
-        """Reads the state in one transaction; raises the errors of `DynamixelBus.read`."""
-        return self._bus.read()[0]
+        """Reads the state in one transaction; raises those of `DynamixelBus.read` and `FingerPair.combine`."""
+        states = self._bus.read()
+        return states[0] if self._pair is None else self._pair.combine(states)
 
     def write(self, command: ServoCommand) -> None:
         """Writes the goals in one transaction; raises the errors of `DynamixelBus.write`."""
-        self._bus.write((command,))
+        self._bus.write((command,) if self._pair is None else self._pair.split(command))
 
     def stop(self, *, hold: bool) -> None:
         """Turns torque off, or holds; raises the errors of `DynamixelBus.stop`."""
-        self._bus.stop(hold=hold)
+        try:
+            self._bus.stop(hold=hold)
+        except DeviceError:
+            if hold and self._pair is not None:  # one finger alone would push the object away
+                with suppress(DeviceError):
+                    self._bus.stop(hold=False)
+            raise
 
     def close(self) -> None:
         """Releases the port. Does not change the torque. May be called twice."""

@@ -1,6 +1,6 @@
 """Diagnostics of serial ports and servos: model, registers and cycle time. Also the setup of a servo."""
 
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import Final
@@ -8,7 +8,7 @@ from typing import Final
 from serial.tools import list_ports
 
 from gripper_force.config import Config, ServoConfig
-from gripper_force.errors import DeviceError, DeviceTimeoutError, GripperError
+from gripper_force.errors import ConfigError, DeviceError, DeviceTimeoutError, GripperError
 from gripper_force.jobs.checks import Check, Confirm, RegisterChange, SetupResult, judged, keep_only, time_ms
 from gripper_force.runtime.backends import open_devices
 from gripper_hw.dynamixel.control_table import (
@@ -16,7 +16,9 @@ from gripper_hw.dynamixel.control_table import (
     check_model_number,
     load_model,
     model_names,
+    rad_from_ticks,
 )
+from gripper_hw.dynamixel.fingers import FingerPair
 from gripper_hw.dynamixel.port import VIRTUAL_PREFIX
 from gripper_hw.dynamixel.servo import CYCLE_BYTES, MIN_FIRMWARE, DynamixelBus, hardware_error_text
 from gripper_hw.dynamixel.transport import Transport
@@ -64,17 +66,24 @@ def probe(config: Config, sysfs: Path = _SYSFS) -> Iterator[Check]:
             yield judged("servo", "latency timer", f"{latency_ms} ms", fast, advice)
         found = inspection.transport.scan()
         for id_, (number, firmware) in sorted(found.items()):
-            if id_ != servo.id:
+            if id_ not in servo.ids:
                 yield Check(f"servo {id_}", "model", f"{_model_name(number)}, firmware {firmware}", None)
-        if servo.id in found:
-            yield from inspection.checks(config, *found[servo.id])
+        ready = True
+        for id_ in servo.ids:
+            if id_ in found:
+                ready &= yield from inspection.checks(id_, *found[id_])
+        missing = [id_ for id_ in servo.ids if id_ not in found]
+        if not missing:
+            if ready:
+                yield from inspection.common_checks(config, min(found[id_][1] for id_ in servo.ids))
             return
     answered = ", ".join(str(id_) for id_ in sorted(found)) or "none"
     found_text = f"no answer at {servo.baud_rate} baud (ids that answer: {answered})"
-    advice = "check power, cable and servo.id"
-    if rate := _other_baud_rate(servo):
-        advice = f"it answers at {rate} baud: set servo.baud_rate={rate}"
-    yield Check(f"servo {servo.id}", "model", found_text, False, advice)
+    for id_ in missing:
+        advice = f"check power, cable and {'servo.id' if id_ == servo.id else 'servo.second.id'}"
+        if rate := _other_baud_rate(servo, id_):
+            advice = f"it answers at {rate} baud: set servo.baud_rate={rate}"
+        yield Check(f"servo {id_}", "model", found_text, False, advice)
 
 
 def setup(config: Config, confirm: Confirm) -> SetupResult:
@@ -83,6 +92,11 @@ def setup(config: Config, confirm: Confirm) -> SetupResult:
     Raises:
         GripperError: See `gripper_force.jobs.doctor.setup`.
     """
+    if len(config.servo.ids) > 1:
+        raise ConfigError(
+            "doctor --setup sets up one servo at a time; pass --set servo.second.id=null, and then "
+            f"--set servo.id={config.servo.second.id} as well"
+        )
     with _opened(config) as inspection:
         return inspection.set_up(config.servo.id, confirm)
 
@@ -95,13 +109,13 @@ class _Inspection:
         self.model = bus.model
         self.transport = Transport(config)
         self._config = config
+        self._pair = FingerPair(config, self.model) if len(config.ids) > 1 else None
         self._expected = bus.settings | {"bus_watchdog": 0}  # a start writes them while torque is off
 
-    def checks(self, config: Config, number: int, firmware: int) -> Iterator[Check]:
-        """Checks the configured servo."""
-        id_ = config.servo.id
+    def checks(self, id_: int, number: int, firmware: int) -> Generator[Check, None, bool]:
+        """Checks a servo of the gripper. Returns True if `common_checks` can follow."""
         unit = f"servo {id_}"
-        check_model_number(self.model, number, f"the servo with id {id_} on {config.servo.port}")
+        check_model_number(self.model, number, f"the servo with id {id_} on {self._config.port}")
         supported = firmware >= MIN_FIRMWARE
         advice = f"update it to {MIN_FIRMWARE} or newer with DYNAMIXEL Wizard"
         yield judged(unit, "model", f"{self.model.name}, firmware {firmware}", supported, advice)
@@ -112,7 +126,7 @@ class _Inspection:
         except DeviceTimeoutError:
             advice = "its Status Return Level may be 0, which a run corrects; otherwise check the cable"
             yield Check(unit, "registers", "it answers a ping, but no read", False, advice)
-            return
+            return False
         text, advice = hardware_error_text(error), "remove the cause, then power-cycle or reboot it"
         yield judged(unit, "hardware error", text if error else "none", not error, advice)
         advice = "it still holds; the next run turns torque off first"
@@ -140,12 +154,21 @@ class _Inspection:
                 same, text = values[name] == new, self._text(name, values[name])
                 advice = f"a run sets {self._text(name, new)}; so does doctor --setup"
                 yield judged(unit, name.replace("_", " "), text, same, advice, harmless=True)
-        if not supported:
-            return
+        return supported
+
+    def common_checks(self, config: Config, firmware: int) -> Iterator[Check]:
+        """Checks the servos of the gripper together; ``firmware`` is the oldest."""
+        ids = config.servo.ids
+        unit = f"servo {' and '.join(map(str, ids))}"
+        if self._pair is not None:
+            positions_rad = [rad_from_ticks(self.transport.get(id_, "present_position")) for id_ in ids]
+            difference_rad = abs(self._pair.difference_rad(*positions_rad))
+            advice = self._pair.start_problem(*positions_rad).rpartition("; ")[2]
+            yield judged(unit, "fingers", f"{difference_rad:.3f} rad apart", not advice, advice)
         start = REGISTERS["present_current"].address  # any address, but as many bytes as a cycle reads
         fast = firmware >= self.model.fast_sync_read_firmware
         median_ms, p99_ms = time_ms(
-            lambda: self.transport.sync_read((id_,), start, CYCLE_BYTES, fast=fast), _CYCLES
+            lambda: self.transport.sync_read(ids, start, CYCLE_BYTES, fast=fast), _CYCLES
         )
         found = f"median {median_ms:.2f} ms, p99 {p99_ms:.2f} ms of {_CYCLES} reads"
         rate_hz, lockstep = config.control.rate_hz, config.clock == "lockstep"
@@ -204,7 +227,7 @@ def _open(transport: Transport, servo: ServoConfig) -> None:
     transport.open(max(_MIN_REPLY_MARGIN_MS, servo.reply_margin_ms))
 
 
-def _other_baud_rate(servo: ServoConfig) -> int | None:
+def _other_baud_rate(servo: ServoConfig, id_: int) -> int | None:
     if servo.port.startswith(VIRTUAL_PREFIX):
         return None
     for rate in _BAUD_RATES:
@@ -213,7 +236,7 @@ def _other_baud_rate(servo: ServoConfig) -> int | None:
         other = servo.model_copy(update={"baud_rate": rate, "retries": 0})
         with suppress(GripperError), closing(Transport(other)) as transport:
             _open(transport, other)
-            transport.ping(servo.id)
+            transport.ping(id_)
             return rate
     return None
 

@@ -19,10 +19,15 @@ LUX_LEVELS = (350.0, 550.0, 750.0)
 # MuJoCo's default friction is soft: under a constant force it creeps, and vanishes within three seconds. All
 # friction acts at the horn, because on light jaws friction this hard makes the pads chatter.
 _HARD_FRICTION = 'solreffriction=".005 1" solimpfriction=".997 .999 .001"'
+_COUPLING = '<equality><joint joint1="left" joint2="right" solref=".004 1"/></equality>'
 _PAD_HALF_THICKNESS_M = 0.004
 _ROD_RADIUS_M = 0.012
 _FINGER_X_M = {"pads": 0.009, "rods": 0.022}
 """Distance of the finger behind the centre of a pad, by tool."""
+
+_SECOND_FINGER_SEEDS = 50_000_000
+_FINGER_PARAMETERS = ("nm_per_a", "servo_friction_nm", "servo_damping_nm_s", "jaw_friction_n", "backlash_m")
+"""What each finger with a servo of its own has of its own; the first seed of the second one's."""
 
 BACKGROUND_OBJECTS = 4
 """Number of objects that move behind the grasped object in a scene with a moving background."""
@@ -184,13 +189,21 @@ def true_gripper(config: Config) -> GripperConfig:
     return config.gripper if width_m is None else config.gripper.model_copy(update={"open_width_m": width_m})
 
 
-def horn_dynamics(scene: Scene, pinion_radius_m: float) -> tuple[float, float, float, float]:
-    """Returns the rotor's inertia in kg m2, damping in Nm s and friction in Nm, and the rails' friction in Nm."""
-    return 1e-3, scene.servo_damping_nm_s, scene.servo_friction_nm, 2 * pinion_radius_m * scene.jaw_friction_n
+def draw_second_finger(scene: Scene, seed: int, config: SimConfig) -> Scene:
+    """Returns a scene with motor, gears and rail of a second finger; ``seed`` and ``config`` as for `draw_scene`."""
+    rig_seed = seed if config.rig_seed is None else config.rig_seed
+    other = _draw(scene.object, rig_seed + _SECOND_FINGER_SEEDS, config)
+    return replace(scene, **{name: getattr(other, name) for name in _FINGER_PARAMETERS})
+
+
+def horn_dynamics(scene: Scene, pinion_radius_m: float, rails: int) -> tuple[float, float, float, float]:
+    """Returns the rotor's inertia in kg m2, damping in Nm s and friction in Nm, and its rails' friction in Nm."""
+    rail_friction_nm = rails * pinion_radius_m * scene.jaw_friction_n
+    return 1e-3, scene.servo_damping_nm_s, scene.servo_friction_nm, rail_friction_nm
 
 
 def scene_mjcf(
-    scene: Scene, gripper: GripperConfig, *, textured: bool = True
+    scene: Scene, gripper: GripperConfig, *, textured: bool = True, second: Scene | None = None
 ) -> tuple[str, dict[str, bytes]]:
     """Returns the MJCF text of a scene, and its assets by file name.
 
@@ -198,6 +211,7 @@ def scene_mjcf(
         scene: The scene.
         gripper: The gripper's geometry.
         textured: False for blank textures, if the scene is never rendered.
+        second: Motor, gears and rail of the left finger (see `draw_second_finger`); None: one servo drives both.
 
     Raises:
         ConfigError: The object does not exist, or the tool is not suitable for it.
@@ -212,7 +226,8 @@ def scene_mjcf(
     template = Template(
         resources.files(__package__).joinpath("assets/gripper.xml").read_text(encoding="utf-8")
     )
-    inertia, damping, friction_nm, rail_friction_nm = horn_dynamics(scene, gripper.pinion_radius_m)
+    radius_m, rails = gripper.pinion_radius_m, 2 if second is None else 1
+    inertia, damping, friction_nm, rail_friction_nm = horn_dynamics(scene, radius_m, rails)
     text = template.substitute(
         object=scene.object,
         timestep_s=model.timestep_s,
@@ -243,7 +258,11 @@ def scene_mjcf(
         friction_nm=friction_nm + rail_friction_nm,
         hard_friction=_HARD_FRICTION,
         backlash_m=scene.backlash_m,
-        pinion_radius_m=gripper.pinion_radius_m,
+        pinion_radius_m=radius_m,
+        coupling=_COUPLING if second is None else "",
+        second_horn="" if second is None else _second_horn(second, radius_m, model.grip_height_m + 0.085),
+        second_rack="" if second is None else _second_rack(second, radius_m),
+        second_motor="" if second is None else '<motor name="second_servo" joint="second_servo"/>',
     )
     if not textured:
         return text, dict.fromkeys(re.findall(r'file="(.+?)"', text), _BLANK_PNG)
@@ -251,6 +270,23 @@ def scene_mjcf(
 
     images = draw_textures(model.texture, scene.texture_seed, scene.table_seed)
     return text, images | (draw_markers() if scene.markers else {})
+
+
+def _second_horn(scene: Scene, radius_m: float, height_m: float) -> str:
+    inertia, damping, friction_nm, rail_friction_nm = horn_dynamics(scene, radius_m, rails=1)
+    return (
+        f'<body name="second_horn" pos="-.03 0 {_text([height_m])}"><joint name="second_servo" type="hinge" '
+        f'axis="0 -1 0" armature="{inertia}" damping="{damping}" frictionloss="{friction_nm + rail_friction_nm}" '
+        f'{_HARD_FRICTION}/><geom type="cylinder" size=".012 .006" euler="90 0 0" material="steel" contype="0" '
+        'conaffinity="0" mass=".005"/></body>'
+    )
+
+
+def _second_rack(scene: Scene, radius_m: float) -> str:
+    return (
+        f'<fixed name="second_rack" range="-{scene.backlash_m} {scene.backlash_m}" solreflimit=".004 1">'
+        f'<joint joint="left" coef="1"/><joint joint="second_servo" coef="-{radius_m}"/></fixed>'
+    )
 
 
 def _tool(scene: Scene, side: int) -> str:

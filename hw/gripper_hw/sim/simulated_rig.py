@@ -21,7 +21,7 @@ from gripper_force.types import NS_PER_MS, NS_PER_S, Frame, Gray, LoadCellSample
 from gripper_hw.dynamixel.control_table import load_model
 from gripper_hw.dynamixel.virtual import VirtualBus, VirtualServo, register_bus, unregister_bus
 from gripper_hw.sim.detail_level import resolve_detail
-from gripper_hw.sim.scene import Scene, draw_scene, true_gripper
+from gripper_hw.sim.scene import Scene, draw_scene, draw_second_finger, true_gripper
 from gripper_hw.sim.surroundings import Surroundings
 from gripper_hw.sim.world import World
 
@@ -160,18 +160,26 @@ class SimulatedLoadCell:
 
 
 class _LockedMotor:
-    """The virtual servo's firmware as the world's motor: holds the bus's lock and applies wire faults."""
+    """A virtual servo's firmware as the world's motor: holds the bus's lock and applies wire faults.
+
+    With ``sign`` -1 it is mirrored: it turns the other way than the finger that it drives.
+    """
 
     def __init__(
-        self, servo: VirtualServo, lock: AbstractContextManager[object], faults: "WireFaults | None"
+        self,
+        servo: VirtualServo,
+        lock: AbstractContextManager[object],
+        faults: "WireFaults | None",
+        sign: int,
     ) -> None:
-        self._servo, self._lock, self._faults = servo, lock, faults
+        self._servo, self._lock, self._faults, self._sign = servo, lock, faults, sign
 
     def control(self, t_ns: int, position_rad: float, velocity_rad_s: float, current_noise_a: float) -> float:
         with self._lock:
             if self._faults is not None:
                 self._faults.update(t_ns)
-            return self._servo.control(t_ns, position_rad, velocity_rad_s, current_noise_a)
+            state = self._sign * position_rad, self._sign * velocity_rad_s
+            return self._sign * self._servo.control(t_ns, *state, current_noise_a)
 
 
 class SimulatedRig:
@@ -210,8 +218,8 @@ class SimulatedRig:
         self._config = config
         self.scene = draw_scene(config.object, config.seed, config.sim)
         model = load_model(config.servo.model)
-        servo = VirtualServo(config.servo.id, model)
-        bus = VirtualBus([servo], self._bus_time_ns)
+        servos = [VirtualServo(id_, model) for id_ in config.servo.ids]
+        bus = VirtualBus(servos, self._bus_time_ns)
         self._lockstep = config.clock == "lockstep"
         start_ns = 0 if self._lockstep else time.monotonic_ns()
         faults = Faults(config.faults, start_ns)
@@ -220,10 +228,18 @@ class SimulatedRig:
             from gripper_hw.dynamixel.bus_faults import WireFaults
 
             wire = WireFaults(bus, faults, config.seed)
-        motor = _LockedMotor(servo, bus.lock, wire)
-        textured = config.camera.backend == "simulated"
+        motors = [
+            _LockedMotor(servo, bus.lock, wire, sign) for servo, sign in zip(servos, (1, -1), strict=False)
+        ]
+        self._second = draw_second_finger(self.scene, config.seed, config.sim) if len(servos) > 1 else None
         self._world = World(
-            self.scene, true_gripper(config), motor, model.nm_per_a, config.seed, textured=textured
+            self.scene,
+            true_gripper(config),
+            motors[0],
+            model.nm_per_a,
+            config.seed,
+            textured=config.camera.backend == "simulated",
+            second=None if self._second is None else (motors[1], self._second),
         )
         self._exposure_ms = config.sim.exposure_ms * _relative_exposure(config)
         clock: Clock = LockstepClock(self._world) if self._lockstep else MonotonicClock()
@@ -284,7 +300,8 @@ class SimulatedRig:
 
     def notes(self) -> dict[str, str]:
         """Facts for the log: the scene's parameters and the exposure."""
-        return {"scene": json.dumps(asdict(self.scene)), "exposure_ms": str(self._exposure_ms)}
+        second = {} if self._second is None else {"second finger": json.dumps(asdict(self._second))}
+        return {"scene": json.dumps(asdict(self.scene)), "exposure_ms": str(self._exposure_ms), **second}
 
     def render_under_light(self, lux: float) -> tuple[Camera, dict[str, str]]:
         """Returns a camera of this world with the images of a rig of this ``sim.lux``, and its notes."""

@@ -59,6 +59,18 @@ class Motor(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class _Drive:
+    """A servo in the world: its firmware and its place in MuJoCo's arrays."""
+
+    motor: Motor
+    scene: Scene
+    nm_per_a: float
+    rails: int
+    qpos: int
+    dof: int
+
+
 @dataclass
 class _PeriodicCall:
     period_ns: int
@@ -77,6 +89,7 @@ class World:
         seed: Seed of the current noise.
         textured: False for blank textures, if the world is never rendered.
         step_s: Time step in place of the scene's, to study its effect.
+        second: Motor of the left finger and its scene (see `draw_second_finger`); None: one servo drives both.
 
     Attributes:
         t_ns: Simulated time.
@@ -99,8 +112,9 @@ class World:
         *,
         textured: bool = True,
         step_s: float | None = None,
+        second: tuple[Motor, Scene] | None = None,
     ) -> None:
-        text, assets = scene_mjcf(scene, gripper, textured=textured)
+        text, assets = scene_mjcf(scene, gripper, textured=textured, second=second and second[1])
         try:
             self._model: Any = mujoco.MjModel.from_xml_string(text, assets)
         except ValueError as error:
@@ -115,13 +129,15 @@ class World:
                 f"take one above 0 and at most {1e3 * _MAX_STEP_S:g} ms"
             )
         self._data: Any = mujoco.MjData(self._model)
-        self._scene, self._motor, self._surroundings = scene, motor, Surroundings(scene)
-        self._nm_per_a = nm_per_a * scene.nm_per_a
+        self._scene, self._surroundings = scene, Surroundings(scene)
         self._rng = np.random.default_rng([seed, 1])
         self.step_ns = round(self._model.opt.timestep * NS_PER_S)
-        servo = self._model.joint("servo")
-        self._qpos, self._dof = int(servo.qposadr[0]), int(servo.dofadr[0])
-        # The scene has a pinion; another linkage acts between the horn and this pinion.
+        drives = {"servo": (motor, scene)} | ({} if second is None else {"second_servo": second})
+        self._drives = [
+            _Drive(one, of, nm_per_a * of.nm_per_a, 2 // len(drives), *self._addresses(name))
+            for name, (one, of) in drives.items()
+        ]
+        # The scene has pinions; another linkage acts between a horn and its pinion.
         linkage = make_linkage(gripper)
         self._linkage = None if isinstance(linkage, RackAndPinion) else linkage
         self._pinion = RackAndPinion(gripper.pinion_radius_m, gripper.open_width_m)
@@ -148,8 +164,9 @@ class World:
 
     @property
     def closing_m_s(self) -> float:
-        """Speed of the pinion as travel of one jaw, positive while it closes."""
-        return self._pinion.radius_m * float(self._data.qvel[self._dof])
+        """Speed of the faster pinion as travel of one jaw, positive while it closes."""
+        speeds_rad_s = [float(self._data.qvel[drive.dof]) for drive in self._drives]
+        return self._pinion.radius_m * max(speeds_rad_s, key=abs)
 
     def remove_object(self) -> None:
         """Moves the object out of the jaws at once."""
@@ -164,13 +181,14 @@ class World:
         """Simulates up to a time. Raises `SimulationError` if the state becomes implausible."""
         data = self._data
         while self.t_ns + self.step_ns <= t_ns:
-            noise_a = float(self._rng.normal(0.0, _CURRENT_NOISE_A))
-            position_rad, velocity_rad_s = float(data.qpos[self._qpos]), float(data.qvel[self._dof])
-            ratio = 1.0
-            if self._linkage is not None:
-                position_rad, ratio = self._horn(self._linkage, position_rad)
-            current_a = self._motor.control(self.t_ns, position_rad, ratio * velocity_rad_s, noise_a)
-            data.ctrl[0] = ratio * self._nm_per_a * current_a
+            for i, drive in enumerate(self._drives):
+                noise_a = float(self._rng.normal(0.0, _CURRENT_NOISE_A))
+                position_rad, velocity_rad_s = float(data.qpos[drive.qpos]), float(data.qvel[drive.dof])
+                ratio = 1.0
+                if self._linkage is not None:
+                    position_rad, ratio = self._horn(self._linkage, drive, position_rad)
+                current_a = drive.motor.control(self.t_ns, position_rad, ratio * velocity_rad_s, noise_a)
+                data.ctrl[i] = ratio * drive.nm_per_a * current_a
             try:
                 mujoco.mj_step(self._model, data)
             except mujoco.FatalError as error:
@@ -183,17 +201,22 @@ class World:
                     periodic.due_ns += periodic.period_ns
                     periodic.call(self.t_ns)
 
-    def _horn(self, linkage: Linkage, pinion_rad: float) -> tuple[float, float]:
+    def _addresses(self, joint: str) -> tuple[int, int]:
+        return int(self._model.joint(joint).qposadr[0]), int(self._model.joint(joint).dofadr[0])
+
+    def _horn(self, linkage: Linkage, drive: "_Drive", pinion_rad: float) -> tuple[float, float]:
         """Returns the horn's angle and its rotation per rotation of the pinion.
 
         The rotor's inertia and friction act on the pinion through this ratio, by virtual work.
         """
         horn_rad = linkage.closing_rad(self._pinion.width_m(pinion_rad))
         ratio = self._pinion.radius_m / linkage.jaw_m_per_rad(horn_rad)
-        inertia, damping, friction_nm, rail_friction_nm = horn_dynamics(self._scene, self._pinion.radius_m)
-        self._model.dof_armature[self._dof] = inertia * ratio**2
-        self._model.dof_damping[self._dof] = damping * ratio**2
-        self._model.dof_frictionloss[self._dof] = friction_nm * ratio + rail_friction_nm
+        inertia, damping, friction_nm, rail_friction_nm = horn_dynamics(
+            drive.scene, self._pinion.radius_m, drive.rails
+        )
+        self._model.dof_armature[drive.dof] = inertia * ratio**2
+        self._model.dof_damping[drive.dof] = damping * ratio**2
+        self._model.dof_frictionloss[drive.dof] = friction_nm * ratio + rail_friction_nm
         return horn_rad, ratio
 
     def render(self, side_px: int) -> npt.NDArray[np.uint8]:
@@ -234,7 +257,7 @@ class World:
             )
         if data.ncon and (depth := -float(data.contact.dist.min())) > _MAX_PENETRATION_M:
             raise SimulationError(self._failure_text(f"a pad is {depth * 1e3:.1f} mm deep in the object"))
-        if (slip := abs(float(data.ten_length[0]))) > _MAX_RACK_SLIP_M:
+        if (slip := float(np.abs(data.ten_length).max())) > _MAX_RACK_SLIP_M:
             raise SimulationError(
                 self._failure_text(f"the rack has slipped {slip * 1e3:.1f} mm on its pinion")
             )

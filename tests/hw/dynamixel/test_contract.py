@@ -1,5 +1,5 @@
 """Servo contract, run on every model in memory, on old firmware, on a model of one's own, behind a pty, on a port
-shared with another program, and on the simulated rig's servo."""
+shared with another program, on the simulated rig's servo, and on two servos as one."""
 
 import threading
 import time
@@ -67,18 +67,28 @@ class ServoSetup:
         raise AssertionError(state)
 
 
-def in_memory(stack: ExitStack, model_name: str, firmware: int = 52) -> ServoSetup:
+def in_memory(
+    stack: ExitStack, model_name: str, firmware: int = 52, ids: tuple[int, ...] = (1,)
+) -> ServoSetup:
     model = load_model(model_name)
-    motor = BenchMotor(VirtualServo(1, model, firmware))
+    motors = [BenchMotor(VirtualServo(id_, model, firmware)) for id_ in ids]
     now_ns = [77 * STEP_NS]
-    bus = VirtualBus([motor.servo], lambda: now_ns[0], before_packet=lambda: motor.advance(now_ns[0]))
+
+    def advance() -> None:
+        for motor in motors:
+            motor.advance(now_ns[0])
+
+    bus = VirtualBus((motor.servo for motor in motors), lambda: now_ns[0], before_packet=advance)
     register_bus("contract", bus)
     stack.callback(unregister_bus, "contract")
 
     def wait() -> None:
         now_ns[0] += STEP_NS
 
-    config = ServoConfig.model_validate({"model": model_name, "port": "virtual:contract"} | GENEROUS)
+    second = {"id": ids[1]} if len(ids) > 1 else {}
+    config = ServoConfig.model_validate(
+        {"model": model_name, "port": "virtual:contract", "second": second} | GENEROUS
+    )
     return ServoSetup(bus, config, lambda: now_ns[0], wait)
 
 
@@ -113,7 +123,18 @@ OLD_FIRMWARE = {"firmware 44": ("XM430-W350", 44), "firmware 45": ("XL330-M288",
 """The last firmware without Fast Sync Read; that of the XL330 also has its indirect data at another address."""
 
 
-@pytest.fixture(params=[*model_names(), *OLD_FIRMWARE, "model of one's own", "pty", "shared port", "rig"])
+@pytest.fixture(
+    params=[
+        *model_names(),
+        *OLD_FIRMWARE,
+        "model of one's own",
+        "pty",
+        "shared port",
+        "rig",
+        "two",
+        "rig of two",
+    ]
+)
 def setup(request: pytest.FixtureRequest, quick: list[str], tmp_path: Path) -> Iterator[ServoSetup]:
     with ExitStack() as stack:
         match request.param:
@@ -129,6 +150,10 @@ def setup(request: pytest.FixtureRequest, quick: list[str], tmp_path: Path) -> I
                 setup = on_a_shared_port(stack)
             case "rig":
                 setup = in_the_rig(stack, quick)
+            case "two":
+                setup = in_memory(stack, "XM430-W350", ids=(1, 2))
+            case "rig of two":
+                setup = in_the_rig(stack, [*quick, "servo.second.id=2"])
             case _:
                 setup = in_memory(stack, request.param)
         stack.callback(setup.servo.close)
@@ -163,7 +188,11 @@ class TestDynamixelServo(ServoContract):
 
     @pytest.fixture
     def torque_on(self, setup: ServoSetup) -> Callable[[], bool]:
-        return lambda: setup.registers("torque_enable") == (1,)
+        def is_on() -> bool:
+            (value,) = {servo.get("torque_enable") for servo in setup.bus.servos}  # both or none
+            return value == 1
+
+        return is_on
 
 
 # Tests that need the virtual bus.

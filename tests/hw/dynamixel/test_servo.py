@@ -260,7 +260,6 @@ def test_register_that_does_not_keep_its_value_is_reported(memory_endpoint):
 def test_cycle_uses_the_models_indirect_data(make_memory_endpoint, model, firmware, data):
     endpoint = make_memory_endpoint(VirtualServo(1, load_model(model), firmware))
     servo = drive(endpoint, model=model, current_limit_a=0.9)
-    assert servo.firmware is None
     servo.start()
     endpoint.received.clear()
     servo.read()
@@ -270,7 +269,7 @@ def test_cycle_uses_the_models_indirect_data(make_memory_endpoint, model, firmwa
     assert (read.params[:2], read.params[4:]) == (struct.pack("<H", data), b"\x01")
     assert 13 <= int.from_bytes(read.params[2:4], "little") <= 20
     assert write.params[:4] == struct.pack("<HH", data + 13, 6)
-    assert servo.firmware == firmware
+    assert servo._bus.firmware == (firmware,)
 
 
 @pytest.mark.parametrize(("firmwares", "fast"), [((45, 52), True), ((44, 52), False), ((44, 38), False)])

@@ -137,6 +137,33 @@ def test_missing_servo_check_lists_the_ids_that_answer(make_endpoint):
     assert check.advice == "check power, cable and servo.id"
 
 
+def test_both_servos_of_two_fingers_are_checked(make_endpoint):
+    endpoint = make_endpoint(VirtualServo(1, MODEL), VirtualServo(2, MODEL))
+    found = rows(endpoint, second={"id": 2})
+    assert not [check for check in found.values() if check.ok is False]
+    assert {unit for unit, name in found if name == "torque"} == {"servo 1", "servo 2"}
+    assert found["servo 1 and 2", "fingers"].found == "0.000 rad apart"
+    assert "of 200 reads" in found["servo 1 and 2", "bus cycle"].found
+    reads = [packet for packet in endpoint.packets() if packet.instruction == Instruction.FAST_SYNC_READ]
+    assert {packet.params[4:] for packet in reads} == {b"\x01\x02"}
+    with pytest.raises(ConfigError, match=r"one servo at a time.*servo\.id=2"):
+        setup(config_of(endpoint, second={"id": 2}), never)
+
+
+def test_fingers_that_a_run_refuses_are_a_problem(make_endpoint):
+    endpoint = make_endpoint(VirtualServo(1, MODEL), VirtualServo(2, MODEL))
+    check = rows(endpoint, second={"id": 2, "offset_rad": 0.3})["servo 1 and 2", "fingers"]
+    assert (check.found, check.ok) == ("0.300 rad apart", False)
+    assert "set servo.second.offset_rad=0.000" in check.advice
+
+
+def test_a_missing_second_servo_is_named_by_its_key(make_endpoint):
+    endpoint = make_endpoint(VirtualServo(1, MODEL))
+    found = rows(endpoint, reply_margin_ms=20.0, second={"id": 2})
+    assert found["servo 1", "torque"].ok
+    assert found["servo 2", "model"].advice == "check power, cable and servo.second.id"
+
+
 def test_servo_at_another_baud_rate_is_found(endpoint):
     fd = os.open(endpoint.port, os.O_RDWR | os.O_NOCTTY)
     endpoint.bus.tamper = lambda answer: answer if termios.tcgetattr(fd)[4] == termios.B57600 else None

@@ -1,0 +1,251 @@
+"""Grasps with two servos, one per finger, in the simulated world: forces and speeds of each finger, and faults."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+import gripper_force as gf
+from gripper_calibration.procedures.calibrate_jaws import calibrate_jaws
+from gripper_calibration.procedures.calibrate_servo import calibrate_servo
+from gripper_force.config import Config, SimConfig, load_config
+from gripper_force.errors import ConfigError, GripperError, HardwareFaultError
+from gripper_force.profiles.rig_profile import read_rig
+from gripper_force.runtime.resolve import resolve
+from gripper_force.types import NS_PER_MS, NS_PER_S
+from gripper_hw.dynamixel.virtual import VirtualBus, find_bus
+from gripper_hw.sim import simulated_rig
+from gripper_hw.sim.scene import draw_scene, draw_second_finger
+from gripper_hw.sim.world import World
+
+EXAMPLE = Path(__file__).parents[3] / "examples/grippers/two_servos.yaml"
+RADIUS_M = 0.020
+
+
+@dataclass
+class Trace:
+    """The world of a run, and every 5 ms time, closing angles, angular speeds and contact forces of both fingers."""
+
+    world: World
+    rows: list[tuple[float, ...]]
+    bus: VirtualBus | None = None
+
+    def column(self, *columns: int) -> npt.NDArray[np.float64]:
+        return np.array(self.rows)[:, columns]
+
+    @property
+    def torque(self) -> list[int]:
+        assert self.bus is not None
+        return [servo.get("torque_enable") for servo in self.bus.servos]
+
+    @property
+    def apart_rad(self) -> npt.NDArray[np.float64]:
+        return np.abs(np.diff(self.column(1, 2), axis=1)[:, 0])
+
+
+@pytest.fixture
+def trace(monkeypatch: pytest.MonkeyPatch) -> Trace:
+    found = Trace.__new__(Trace)
+
+    class Traced(World):
+        def __init__(self, *args: Any, **keys: Any) -> None:
+            super().__init__(*args, **keys)
+            found.world, found.rows, found.bus = self, [], None
+            self.call_every(5 * NS_PER_MS, self._note)
+
+        def _note(self, t_ns: int) -> None:
+            data = self._data
+            found.bus = found.bus or find_bus("rig")
+            angles_rad = [float(data.qpos[drive.qpos]) for drive in self._drives]
+            speeds_rad_s = [float(data.qvel[drive.dof]) for drive in self._drives]
+            forces_n = [abs(float(data.sensordata[at])) for at in (self._right, self._left)]
+            found.rows.append((t_ns / NS_PER_S, *angles_rad, *speeds_rad_s, *forces_n))
+
+    monkeypatch.setattr(simulated_rig, "World", Traced)
+    return found
+
+
+def config_of(*sets: str) -> Config:
+    return load_config(EXAMPLE, ["object=block", "sim.detail=coarse", "camera.backend=none", *sets])
+
+
+def fix_object(trace: Trace, x_m: float) -> None:
+    """Screws the block to the table beside the middle."""
+    model = trace.world._model
+    joint = model.joint("self_centre")
+    model.jnt_stiffness[joint.id], model.dof_damping[joint.dofadr[0]] = 2e4, 200.0
+    model.body("object").pos[0] = x_m
+
+
+@contextmanager
+def gripper_of(config: Config) -> Iterator[gf.Gripper]:
+    with gf.open_gripper(config) as gripper:
+        yield gripper
+
+
+# Force and speed.
+
+
+@pytest.mark.parametrize("seed", [0, 1, 4])
+@pytest.mark.parametrize("name", ["block", "sponge"])
+def test_fingers_stay_in_step_and_press_a_free_object_alike(trace: Trace, name: str, seed: int) -> None:
+    """The drawn friction of the fingers differs by up to 50 %."""
+    config = config_of(f"object={name}", f"seed={seed}")
+    with gripper_of(config) as gripper:
+        assert gripper.grasp(3.0).outcome == "held"
+        held_n = np.array(trace.column(5, 6)[-100:])
+        gripper.release()
+    assert trace.torque == [0, 0]
+    assert np.median(held_n, axis=0) == pytest.approx([3.0, 3.0], abs=0.6)
+    assert trace.apart_rad.max() < 0.2
+    closing = trace.column(3, 4)[trace.column(5, 6).max(axis=1) == 0]
+    assert RADIUS_M * closing.max() < 1.5 * config.control.approach_speed_m_s
+
+
+def test_two_rotary_fingers_hold_by_their_linkage(trace: Trace) -> None:
+    linkage = "gripper.linkage={kind: fingers, finger_m: 0.06, open_finger_rad: 0.6}"
+    sets = (linkage, "gripper.open_width_m=0.065", "gripper.friction_n=0.75", "gripper.damping_n_s_m=5")
+    with gripper_of(config_of(*sets, "seed=2")) as gripper:
+        assert gripper.grasp(5.0).outcome == "held"
+        held_n = trace.column(5, 6)[-100:]
+        gripper.release()
+    assert np.median(held_n, axis=0) == pytest.approx([5.0, 5.0], abs=0.5)
+
+
+@pytest.mark.parametrize("x_m", [0.0, 0.002, -0.004])
+@pytest.mark.parametrize("seed", [0, 2])
+def test_a_fixed_object_beside_the_middle_is_pressed_by_both_alike(
+    trace: Trace, x_m: float, seed: int
+) -> None:
+    """The first finger waits at the object with the force of the approach, and the other one comes to it."""
+    config = config_of(f"seed={seed}")
+    with gripper_of(config) as gripper:
+        fix_object(trace, x_m)
+        assert gripper.grasp(5.0).outcome == "held"
+        gripper.release()
+    forces_n = trace.column(5, 6)
+    both = int(np.argmax(forces_n.min(axis=1) > 0))  # the first time
+    assert forces_n[:both].max() < 3.0  # the impact, which friction keeps
+    # Motors and friction of the fingers differ by up to 8 % and 0.7 N.
+    assert forces_n.max(axis=0) == pytest.approx([5.0, 5.0], abs=1.0)
+    assert RADIUS_M * trace.column(3, 4)[:both].max() < 1.5 * config.control.approach_speed_m_s
+
+
+@pytest.mark.parametrize("push_n", [6.0, -6.0])
+def test_a_held_object_resists_a_push_beyond_friction(trace: Trace, push_n: float) -> None:
+    """Friction of both fingers is 3.5 N."""
+    with gripper_of(config_of("seed=1")) as gripper:
+        gripper.grasp(5.0)
+        before_rad = trace.column(1, 2)[-1]
+        world = trace.world
+        body = int(world._model.joint("self_centre").id)
+        world._data.xfrc_applied[int(world._model.jnt_bodyid[body]), 0] = push_n
+        for _ in range(300):
+            gripper.step()
+        assert np.abs(trace.column(1, 2)[-1] - before_rad).max() * RADIUS_M < 0.0025
+        assert gripper.step().outcome == "held"
+
+
+# Faults.
+
+
+@pytest.mark.parametrize("joint", ["servo", "second_servo"])
+@pytest.mark.parametrize("target_n", [0.5, 5.0])
+def test_a_blocked_finger_is_a_fault_and_never_a_grip(trace: Trace, joint: str, target_n: float) -> None:
+    with (
+        pytest.raises(HardwareFaultError, match="max_difference_rad"),
+        gripper_of(config_of("seed=1")) as gripper,
+    ):
+        model = trace.world._model
+        model.dof_frictionloss[model.joint(joint).dofadr[0]] = 20.0
+        gripper.grasp(target_n)
+    assert trace.torque == [0, 0]
+    assert trace.column(5, 6).max() == 0
+
+
+def test_a_wrong_direction_is_a_fault(trace: Trace) -> None:
+    sets = ("seed=1", "servo.second.mirrored=false")
+    with pytest.raises(GripperError), gripper_of(config_of(*sets)) as gripper:
+        gripper.grasp(5.0)
+    assert trace.torque == [0, 0]
+    assert trace.column(5, 6).max() == 0
+
+
+def test_a_wrong_offset_is_refused_before_anything_moves(trace: Trace) -> None:
+    with pytest.raises(GripperError, match=r"servo\.second\.offset_rad=-?0\.000"):  # noqa: SIM117
+        with gripper_of(config_of("servo.second.offset_rad=0.3")):
+            pass
+    assert np.abs(trace.column(1, 2)).max() < 1e-3 if trace.rows else True
+
+
+@pytest.mark.parametrize("on_fault", ["limp", "hold"])
+@pytest.mark.parametrize("kind", ["off", "stuck", "wrong", "intermittent"])
+@pytest.mark.parametrize("id_", [1, 2])
+def test_a_fault_of_one_servo_ends_with_torque_off_or_no_current_on_both(
+    trace: Trace, id_: int, kind: str, on_fault: str
+) -> None:
+    """One finger alone cannot hold, whatever the configuration says."""
+    fault = f"faults=[{{unit: servo, kind: {kind}, id: {id_}, at_s: 2.6}}]"
+    ends_well = (kind, on_fault) == ("wrong", "limp")
+    with (
+        nullcontext() if ends_well else pytest.raises(GripperError),
+        gripper_of(config_of("seed=1", fault, f"control.on_fault={on_fault}")) as gripper,
+    ):
+        gripper.grasp(5.0)
+        for _ in range(300):
+            result = gripper.step()
+        assert result.outcome == "fault"
+        assert trace.bus is not None
+        assert [servo.get("goal_current") for servo in trace.bus.servos] == [0, 0]
+    bus = trace.bus
+    assert bus is not None
+    live = [servo for servo in bus.servos if not (kind in ("off", "intermittent") and servo.id == id_)]
+    assert all(not servo.get("torque_enable") or not servo.get("goal_current") for servo in live)
+    assert trace.column(5, 6).max() < 6.0
+
+
+# The scene and the calibrations.
+
+
+def test_the_second_finger_has_a_motor_of_its_own() -> None:
+    config = SimConfig(detail="coarse")
+    scene = draw_scene("block", 3, config)
+    second = draw_second_finger(scene, 3, config)
+    assert second == draw_second_finger(scene, 3, config) != scene
+    assert (second.nm_per_a, second.servo_friction_nm) != (scene.nm_per_a, scene.servo_friction_nm)
+    assert (second.size, second.lux, second.offset_m) == (scene.size, scene.lux, scene.offset_m)
+    exact = SimConfig(detail="coarse", randomise=False)
+    scene = draw_scene("block", 3, exact)
+    assert draw_second_finger(scene, 3, exact) == scene
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_calibrate_jaws_finds_the_mean_friction(seed: int) -> None:
+    config = config_of("object=none", f"seed={seed}")
+    result = calibrate_jaws(config, prompt=lambda text: None)
+    scene = draw_scene("none", seed, config.sim)
+    both = (scene, draw_second_finger(scene, seed, config.sim))
+    true_n = np.mean([one.servo_friction_nm / RADIUS_M + one.jaw_friction_n for one in both])
+    assert result.closing_sign == 1
+    assert result.friction_n == pytest.approx(true_n, rel=0.15)
+
+
+def test_calibrate_servo_refuses_two(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="two servos do not stay in step"):
+        calibrate_servo(config_of(), [0.03], tmp_path / "rig.yaml", prompt=lambda text: None)
+
+
+def test_a_rig_profile_of_one_servo_is_refused(tmp_path: Path) -> None:
+    """Its torque constant is half of that of both."""
+    rig = tmp_path / "rig.yaml"
+    calibrate_servo(
+        load_config(None, ["object=block", "sim.detail=coarse"]), [0.03], rig, prompt=lambda text: None
+    )
+    assert read_rig(rig).servo is not None
+    with pytest.raises(ConfigError, match="made with servo XM430-W350, not two XM430-W350"):
+        resolve(config_of(f"calibration.rig={rig}"))
