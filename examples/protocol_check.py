@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gripper_force.jobs.dataset import CONTACT_N, load_clip
-from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import NS_PER_S, Frame, ServoState
 from gripper_force.vision.preprocess import Preprocess
 

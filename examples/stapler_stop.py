@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from gripper_force.jobs.dataset import load_clips
 from gripper_force.jobs.evaluate import estimates
-from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import GraspStatus, LoadCellSample
 from gripper_force.vision.checkpoint import load_checkpoint
 

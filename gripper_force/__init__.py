@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from gripper_force.jobs.replay import replay as replay
     from gripper_force.runtime.gripper import Gripper as Gripper
     from gripper_force.runtime.gripper import open_gripper as open_gripper
-    from gripper_force.runtime.log import LogReader as LogReader
+    from gripper_force.runtime.log_reader import LogReader as LogReader
     from gripper_force.runtime.process import own_process as own_process
     from gripper_force.runtime.state import GraspResult as GraspResult
     from gripper_force.runtime.state import GripperState as GripperState
@@ -91,7 +91,7 @@ _MODULES = {
     "gripper_force.jobs.evaluate": ("evaluate",),
     "gripper_force.jobs.replay": ("replay",),
     "gripper_force.runtime.gripper": ("Gripper", "open_gripper"),
-    "gripper_force.runtime.log": ("LogReader",),
+    "gripper_force.runtime.log_reader": ("LogReader",),
     "gripper_force.runtime.process": ("own_process",),
     "gripper_force.runtime.state": ("GraspResult", "GripperState"),
     "gripper_force.types": (

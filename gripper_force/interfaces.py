@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, Protocol
 
 from gripper_force.types import Frame, LoadCellSample, ServoCommand, ServoState
 
@@ -226,6 +226,8 @@ class Devices:
             lux, and that camera's notes; None without a simulated world.
         observe_world: Makes a simulated world call a function with its true state after each of its steps, in
             its thread; None without a simulated world.
+        wrap_estimator: Makes an estimator fail as the key `faults` says; None without such a fault.
+        wrap_file: The same for the log's file.
     """
 
     clock: Clock
@@ -238,3 +240,5 @@ class Devices:
     notes: dict[str, str] = field(default_factory=dict)
     render_under_light: Callable[[float], tuple[Camera, dict[str, str]]] | None = None
     observe_world: Callable[[Callable[[WorldState], None]], None] | None = None
+    wrap_estimator: Callable[[Any], Any] | None = None
+    wrap_file: Callable[[BinaryIO], BinaryIO] | None = None

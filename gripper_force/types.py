@@ -1,7 +1,7 @@
 """Frozen records exchanged between the parts of the project, in SI units, with the unit in the name.
 
 Time is the host's monotonic clock in integer nanoseconds (``t_ns``); in lockstep it is the simulated clock.
-Every record but `Frame` is written to a log field by field (see `gripper_force.runtime.log`), so a field's
+Every record but `Frame` is written to a log field by field (see `gripper_force.runtime.log_codecs`), so a field's
 type is ``int``, ``float``, ``bool`` or ``str``.
 """
 

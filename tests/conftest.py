@@ -14,7 +14,7 @@ from gripper_force.interfaces import Clock
 from gripper_force.jobs.dataset import Clip
 from gripper_force.jobs.training.recipe import TrainConfig
 from gripper_force.runtime import process
-from gripper_force.runtime.log import LogWriter
+from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import NS_PER_MS, Frame, LoadCellSample
 from gripper_force.vision.preprocess import Preprocess
 

@@ -15,7 +15,7 @@ from gripper_force.control.transmission import Transmission
 from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import CONTACT_N, read_clip
 from gripper_force.jobs.metrics import lag_s
-from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.schema import Tree
 from gripper_force.types import NS_PER_S, Frame, GraspStatus, LoadCellSample, Phase, Record, ServoState
 from gripper_force.vision.batch_inference import features

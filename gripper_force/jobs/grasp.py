@@ -16,7 +16,7 @@ from gripper_force.jobs.dataset import stiffness_floor_n, stiffness_of
 from gripper_force.jobs.processes import process_pool
 from gripper_force.jobs.replay import compare
 from gripper_force.jobs.score import score_grasp
-from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import resolve
 from gripper_force.runtime.session import Session, open_run
 from gripper_force.schema import Tree

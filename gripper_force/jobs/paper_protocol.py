@@ -18,7 +18,8 @@ from gripper_force.interfaces import Camera
 from gripper_force.jobs.recording.touches import touch, wait
 from gripper_force.jobs.simulate import OBJECTS, PEAK_N
 from gripper_force.runtime.backends import open_devices
-from gripper_force.runtime.log import LogReader, LogWriter
+from gripper_force.runtime.log_reader import LogReader
+from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.runtime.resolve import resolve
 from gripper_force.runtime.session import Session, open_session
 from gripper_force.schema import Tree

@@ -16,7 +16,7 @@ from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import CONTACT_N, label_frames
 from gripper_force.jobs.metrics import ForceBin
 from gripper_force.profiles.apply import read_correction, read_profiles
-from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.perception import FrameProcessor
 from gripper_force.runtime.resolve import ResolvedConfig, make_controller, make_estimator, resolve_vision
 from gripper_force.types import (

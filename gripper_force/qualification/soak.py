@@ -14,7 +14,7 @@ import numpy as np
 from gripper_force.config import Config
 from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.grasp import TRIAL_OBJECTS, TRIAL_TARGETS_N, grasp
-from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import NS_PER_S
 
 WARM_UP: Final = 5

@@ -138,6 +138,8 @@ def open_devices(config: Config, port: SharedPort | None = None) -> Iterator[Dev
             notes=rig.notes() if rig is not None else {},
             render_under_light=rig.render_under_light if rig is not None else None,
             observe_world=rig.observe_world if rig is not None else None,
+            wrap_estimator=rig.wrap_estimator if rig is not None else None,
+            wrap_file=rig.wrap_file if rig is not None else None,
         )
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Final
 
 from gripper_force.errors import LogError
-from gripper_force.runtime.log import LogWriter
+from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import Record
 
 ROOM: Final = 4096

@@ -13,16 +13,15 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Final, cast
+from typing import TYPE_CHECKING, Any, Final
 
 from gripper_force.config import Config, dump_config
 from gripper_force.control.state_machine import Decision, GraspController, is_open
 from gripper_force.errors import DeviceError, DeviceTimeoutError, GripperError
-from gripper_force.fault_injection import Faults, FaultyEstimator, FaultyFile
 from gripper_force.interfaces import Devices, SharedPort
 from gripper_force.runtime.backends import open_devices
-from gripper_force.runtime.log import LogWriter
 from gripper_force.runtime.log_queue import LogQueue
+from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.runtime.monitors import CounterMonitor, LoadCellMonitor
 from gripper_force.runtime.perception import Estimator, LockstepPerception, Perception, ThreadedPerception
 from gripper_force.runtime.process import deferred_signals, real_time_settings
@@ -398,23 +397,15 @@ def _interruptible(session: Session) -> Iterator[None]:
 
 
 def _open_log(run: ResolvedConfig, devices: Devices, path: Path) -> LogQueue:
-    faults, clock, lockstep = Faults(run.config.faults, devices.start_ns), devices.clock, devices.lockstep
-
-    def wrap_file(file: BinaryIO) -> BinaryIO:
-        return (
-            cast(BinaryIO, FaultyFile(file, faults, clock, lockstep=lockstep)) if faults.has("disk") else file
-        )
-
     log = LogWriter(
-        path, config=dump_config(run.config), metadata=_metadata(run, devices), wrap_file=wrap_file
+        path, config=dump_config(run.config), metadata=_metadata(run, devices), wrap_file=devices.wrap_file
     )
-    return LogQueue(log, lockstep=lockstep)
+    return LogQueue(log, lockstep=devices.lockstep)
 
 
 def _perception(config: Config, devices: Devices, estimator: Estimator | None) -> Perception:
-    faults = Faults(config.faults, devices.start_ns)
-    if estimator is not None and faults.has("estimator"):
-        estimator = FaultyEstimator(estimator, faults, devices.clock, lockstep=devices.lockstep)
+    if estimator is not None and devices.wrap_estimator is not None:
+        estimator = devices.wrap_estimator(estimator)
     if devices.lockstep:
         return LockstepPerception(devices.camera, estimator, devices.clock, config.vision.lockstep_compute_ms)
     return ThreadedPerception(devices.camera, estimator, devices.clock)

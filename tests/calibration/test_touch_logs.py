@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from gripper_calibration.touch_logs import join, read_log, touch_numbers
 from gripper_force.errors import DataError
-from gripper_force.runtime.log import LogWriter
+from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import NS_PER_S, Frame, LoadCellSample
 from gripper_force.vision.checkpoint import load_checkpoint
 

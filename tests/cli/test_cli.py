@@ -19,7 +19,7 @@ from gripper_force.cli import console
 from gripper_force.cli.options import load_settings
 from gripper_force.errors import ConfigError
 from gripper_force.runtime import process
-from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.log_reader import LogReader
 from gripper_hw.dynamixel.control_table import load_model
 from gripper_hw.dynamixel.firmware import VirtualServo
 from gripper_hw.dynamixel.pty_server import BenchMotor, PtyServer

@@ -10,7 +10,7 @@ import gripper_force as gf
 from gripper_calibration.procedures.calibrate_servo import calibrate_servo
 from gripper_force.config import ServoConfig, load_config
 from gripper_force.profiles.rig_profile import read_rig
-from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import NS_PER_S, GraspStatus, LoadCellSample, Phase
 from gripper_hw.dynamixel.control_table import load_model
 from gripper_hw.sim.scene import draw_scene

@@ -7,7 +7,7 @@ import pytest
 from gripper_force.config import Config, dump_config
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs.dataset import NEAR_NS, Clip, digest, label_frames, load_clip, load_clips, split_by
-from gripper_force.runtime.log import LogWriter
+from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import NS_PER_MS, Frame, LoadCellSample
 from gripper_force.vision.preprocess import Preprocess, downscale
 

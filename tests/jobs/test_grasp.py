@@ -11,7 +11,8 @@ from gripper_force.errors import ConfigError, DeviceError, RequestError
 from gripper_force.interfaces import Progress
 from gripper_force.jobs import grasp as grasp_module
 from gripper_force.jobs.grasp import Summary, exclusive_device, overall, summarise, trials
-from gripper_force.runtime.log import LogReader, LogWriter
+from gripper_force.runtime.log_reader import LogReader
+from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import LoadCellSample, VisualForce
 
 

@@ -9,7 +9,7 @@ from gripper_force.errors import ConfigError, SimulationError
 from gripper_force.jobs import paper_protocol as module
 from gripper_force.jobs.paper_protocol import SetPlan, make_set, plan_protocol
 from gripper_force.jobs.simulate import OBJECTS, simulate
-from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import Frame, GraspStatus, LoadCellSample, Phase, Record
 
 

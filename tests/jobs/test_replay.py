@@ -11,7 +11,8 @@ from gripper_force.errors import CheckpointError, DataError, LogError
 from gripper_force.jobs.grasp import run_grasp
 from gripper_force.jobs.metrics import bias, mae, rmse
 from gripper_force.jobs.replay import replay
-from gripper_force.runtime.log import LogReader, LogWriter
+from gripper_force.runtime.log_reader import LogReader
+from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import (
     FusedForce,
     GraspStatus,

@@ -19,8 +19,9 @@ from gripper_force.jobs.report import write_report
 from gripper_force.jobs.report.data import SOURCES, Run, histogram, read_run
 from gripper_force.jobs.report.figure import CSS_COLOURS, draw
 from gripper_force.jobs.report.pictures import FrameSampler, Picture, overlay
-from gripper_force.runtime import log as log_module
-from gripper_force.runtime.log import LogReader, LogWriter
+from gripper_force.runtime import log_reader as log_reader_module
+from gripper_force.runtime.log_reader import LogReader
+from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import (
     NS_PER_MS,
     NS_PER_S,
@@ -184,7 +185,7 @@ def test_log_is_read_once(grasp: Path, tmp_path: Path, monkeypatch: pytest.Monke
         records: list[McapRecord] = breakup_chunk(chunk, **options)
         return records
 
-    monkeypatch.setattr(log_module, "breakup_chunk", count)
+    monkeypatch.setattr(log_reader_module, "breakup_chunk", count)
     write_report(grasp, tmp_path)
     assert len(times_ns) == len(set(times_ns)) > 50
 

@@ -15,7 +15,7 @@ from gripper_force.jobs.simulate import (
     plan,
     simulate,
 )
-from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import Frame, GraspStatus, LoadCellSample, Phase
 
 

@@ -11,7 +11,7 @@ from gripper_force import cli
 from gripper_force.config import Config
 from gripper_force.qualification import soak as soaking
 from gripper_force.qualification.soak import WARM_UP, Growth, Sample, measure_growth, soak
-from gripper_force.runtime.log import LogWriter
+from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import NS_PER_S, Event
 
 

@@ -19,7 +19,7 @@ import gripper_force as gf
 from gripper_force.control.limits import largest_target_n
 from gripper_force.runtime import control_loop
 from gripper_force.runtime.control_loop import ControlLoop
-from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.log_reader import LogReader
 from gripper_hw.dynamixel.packets import Instruction, Parser
 from gripper_hw.dynamixel.pty_server import PtyServer, serve_virtual_servo
 from gripper_hw.dynamixel.virtual import VirtualBus, find_bus, unregister_bus

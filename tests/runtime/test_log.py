@@ -18,7 +18,9 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
 from gripper_force.errors import LogError
-from gripper_force.runtime.log import _CODECS, CHUNK_NS, LogReader, LogWriter
+from gripper_force.runtime.log_codecs import CODECS
+from gripper_force.runtime.log_reader import LogReader
+from gripper_force.runtime.log_writer import CHUNK_NS, LogWriter
 from gripper_force.types import (
     NS_PER_MS,
     Event,
@@ -320,7 +322,7 @@ def test_a_log_of_another_program_is_refused(tmp_path: Path) -> None:
 def test_a_chunk_that_lies_is_refused(
     tmp_path: Path, kind: CompressionType, old: bytes, new: bytes, why: str
 ) -> None:
-    path, codec = tmp_path / "run.mcap", _CODECS[Frame]
+    path, codec = tmp_path / "run.mcap", CODECS[Frame]
     with path.open("wb") as file:
         writer = Writer(file, compression=kind, enable_crcs=False)
         writer.start()

@@ -7,8 +7,9 @@ import pytest
 
 from gripper_force.errors import LogError
 from gripper_force.runtime import log_queue as recorder_module
-from gripper_force.runtime.log import LogReader, LogWriter
 from gripper_force.runtime.log_queue import LogQueue
+from gripper_force.runtime.log_reader import LogReader
+from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import Event, Frame, Record
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError, RequestError
-from gripper_force.runtime.log import LogWriter
+from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.runtime.resolve import ResolvedConfig, make_controller, make_estimator, resolve
 from gripper_force.types import NS_PER_S, Frame
 from gripper_hw.dynamixel.servo import DynamixelServo

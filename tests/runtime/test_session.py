@@ -24,7 +24,7 @@ from gripper_force.interfaces import Camera, Devices
 from gripper_force.jobs.grasp import grasp_and_release, run_grasp
 from gripper_force.runtime import session as session_module
 from gripper_force.runtime.backends import open_devices
-from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.process import SIGNALS
 from gripper_force.runtime.resolve import ResolvedConfig, resolve
 from gripper_force.runtime.session import Session, open_run, open_session

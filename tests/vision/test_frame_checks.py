@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gripper_force.errors import DataError
-from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import Frame, Gray
 from gripper_force.vision.frame_checks import FrameChecks
 from gripper_force.vision.preprocess import downscale

@@ -30,7 +30,7 @@ from gripper_force.jobs.recording.record import RecordingPlan, record
 from gripper_force.jobs.recording.summary import releases_ns
 from gripper_force.profiles.rig_profile import CalibratedValue, CameraCalibration, read_rig, update_rig
 from gripper_force.runtime.backends import open_devices
-from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import ResolvedConfig, make_estimator, resolve, resolve_vision
 from gripper_force.types import (
     NS_PER_MS,

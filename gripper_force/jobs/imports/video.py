@@ -21,7 +21,7 @@ from gripper_force.config import Config, dump_config
 from gripper_force.errors import DataError, LogError
 from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.recording.lag import force_lag_s
-from gripper_force.runtime.log import LogWriter
+from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.spikes import find_spikes
 from gripper_force.types import NS_PER_S, Frame, Gray, LoadCellSample
 from gripper_force.vision.preprocess import Region, downscale

@@ -25,7 +25,7 @@ from gripper_force.interfaces import Devices, Progress, Prompt, no_progress
 from gripper_force.jobs.dataset import CONTACT_N
 from gripper_force.jobs.recording.touches import touch
 from gripper_force.runtime.backends import open_devices
-from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import ResolvedConfig, resolve
 from gripper_force.runtime.session import Session, open_session
 from gripper_force.types import (

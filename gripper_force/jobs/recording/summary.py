@@ -13,7 +13,7 @@ from gripper_force.config import config_from_text
 from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import label_frames
 from gripper_force.jobs.recording.lag import camera_lags_s, load_cell_lag_s
-from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import NS_PER_S, Frame, GraspStatus, LoadCellSample, Request, RequestKind
 from gripper_force.vision.preprocess import downscale
 

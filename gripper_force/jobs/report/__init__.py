@@ -8,7 +8,7 @@ from gripper_force.jobs.report.data import read_run
 from gripper_force.jobs.report.figure import draw, to_svg
 from gripper_force.jobs.report.page import render
 from gripper_force.jobs.report.pictures import FrameSampler
-from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.log_reader import LogReader
 
 __all__ = ["ReportPaths", "write_report"]
 

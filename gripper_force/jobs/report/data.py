@@ -11,7 +11,7 @@ import numpy.typing as npt
 from gripper_force.config import Config, config_from_text
 from gripper_force.errors import DataError
 from gripper_force.jobs.score import GraspScore, score_grasp
-from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import (
     NS_PER_MS,
     NS_PER_S,

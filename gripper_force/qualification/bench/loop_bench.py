@@ -25,7 +25,8 @@ from gripper_force.jobs.grasp import run_grasp
 from gripper_force.jobs.replay import resolve_replay, run_again
 from gripper_force.qualification.bench.startup_bench import LONG_TIMEOUTS
 from gripper_force.runtime.backends import MonotonicClock, load_servo_class
-from gripper_force.runtime.log import LogReader, LogWriter
+from gripper_force.runtime.log_reader import LogReader
+from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.runtime.resolve import resolve
 from gripper_force.runtime.session import open_session
 from gripper_force.types import NS_PER_MS, NS_PER_S, Frame, RequestKind, ServoCommand, ServoState, VisualForce

@@ -18,7 +18,7 @@ import numpy as np
 
 from gripper_force.config import Config, dump_config
 from gripper_force.errors import GripperError
-from gripper_force.runtime.log import LogWriter
+from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import NS_PER_S, Frame
 from gripper_hw.dynamixel.pty_server import serve_virtual_servo
 

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from gripper_force.config import Config
 from gripper_force.qualification.fault_matrix.cases import Expected, FaultCase
-from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import (
     NS_PER_MS,
     NS_PER_S,

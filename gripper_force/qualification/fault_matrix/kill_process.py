@@ -14,7 +14,7 @@ import numpy as np
 
 from gripper_force.config import Config, dump_config
 from gripper_force.errors import DeviceTimeoutError, LogError
-from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import NS_PER_MS, NS_PER_S
 from gripper_hw.dynamixel.pty_server import PtyServer
 from gripper_hw.dynamixel.virtual import find_bus

@@ -25,7 +25,7 @@ from gripper_force.qualification.fault_matrix.judge import FaultFreeGrasp, Grasp
 from gripper_force.qualification.fault_matrix.kill_process import kill_trial
 from gripper_force.qualification.fault_matrix.outcome_file import OutcomeFile
 from gripper_force.runtime.backends import open_devices
-from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import resolve
 from gripper_force.runtime.session import open_session
 from gripper_force.types import (

@@ -47,7 +47,8 @@ from gripper_force.profiles.rig_profile import (
     ServoCalibration,
 )
 from gripper_force.qualification.fuzz.target import Target
-from gripper_force.runtime.log import LogReader, LogWriter
+from gripper_force.runtime.log_reader import LogReader
+from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.runtime.resolve import make_controller
 from gripper_force.schema import dump
 from gripper_force.types import (

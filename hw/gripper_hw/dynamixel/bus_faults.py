@@ -4,11 +4,11 @@ import random
 from collections import deque
 from typing import Final
 
-from gripper_force.fault_injection import Faults
 from gripper_force.types import NS_PER_MS, NS_PER_S
 from gripper_hw.dynamixel.firmware import OVERLOAD_ERROR, REBOOT_NS, VirtualServo
 from gripper_hw.dynamixel.packets import BROADCAST_ID, crc16
 from gripper_hw.dynamixel.virtual import VirtualBus
+from gripper_hw.fault_injection import Faults
 
 # As `gripper_force.fault_config.FAULTS` describes them.
 _DELAY_REQUESTS: Final = {"delayed": 1, "slow": 3}

@@ -11,7 +11,7 @@ from itertools import islice
 from gripper_force.config import CameraConfig, LoadCellConfig
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.interfaces import Clock
-from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import NS_PER_S, Frame, LoadCellSample
 
 

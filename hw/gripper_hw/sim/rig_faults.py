@@ -8,9 +8,9 @@ from unittest import mock
 
 import numpy as np
 
-from gripper_force.fault_injection import Faults
 from gripper_force.interfaces import Camera, Clock, LoadCell
 from gripper_force.types import NS_PER_MS, NS_PER_S, Frame, LoadCellSample
+from gripper_hw.fault_injection import Faults
 from gripper_hw.load_cells.screening import SampleValidator
 
 # The values of the fault kinds of `FAULTS`, in the order of its units: camera, load cell, clock.

@@ -7,19 +7,20 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import asdict
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, SimulationError
-from gripper_force.fault_injection import Faults
 from gripper_force.interfaces import Camera, Clock, LoadCell, WorldState
 from gripper_force.runtime.backends import MonotonicClock
 from gripper_force.types import NS_PER_MS, NS_PER_S, Frame, Gray, LoadCellSample
 from gripper_hw.dynamixel.control_table import load_model
 from gripper_hw.dynamixel.virtual import VirtualBus, VirtualServo, register_bus, unregister_bus
+from gripper_hw.fault_injection import Faults, FaultyEstimator, FaultyFile
 from gripper_hw.sim.detail_level import resolve_detail
 from gripper_hw.sim.scene import Scene, draw_scene, draw_second_finger, true_gripper
 from gripper_hw.sim.surroundings import Surroundings
@@ -197,6 +198,8 @@ class SimulatedRig:
         camera: The simulated camera, with its faults.
         load_cell: The simulated load cell, with its faults.
         start_ns: Start of the run on its clock.
+        wrap_estimator: Makes an estimator fail as configured; None without such a fault.
+        wrap_file: The same for the log's file.
 
     Raises:
         ConfigError: ``servo.port`` is not virtual or already in use, ``sim.detail`` is not resolved, or the
@@ -246,6 +249,8 @@ class SimulatedRig:
         self.clock: Clock = clock
         self.camera: Camera = SimulatedCamera(self._world, self.scene, config, clock, start_ns)
         self.load_cell: LoadCell = SimulatedLoadCell(self._world, config, start_ns)
+        self.wrap_estimator: Callable[[Any], Any] | None = None
+        self.wrap_file: Callable[[BinaryIO], BinaryIO] | None = None
         self._closing = ExitStack()
         if config.faults:
             self._wrap_in_faults(faults, config.seed)
@@ -286,6 +291,15 @@ class SimulatedRig:
             self.camera = FaultyCamera(self.camera, faults, clock, seed)
         if faults.has("load_cell"):
             self.load_cell = FaultyLoadCell(self.load_cell, faults, clock, seed)
+        if faults.has("estimator"):
+            self.wrap_estimator = partial(
+                FaultyEstimator, faults=faults, clock=self.clock, lockstep=self._lockstep
+            )
+        if faults.has("disk"):
+            self.wrap_file = cast(
+                Callable[[BinaryIO], BinaryIO],
+                partial(FaultyFile, faults=faults, clock=self.clock, lockstep=self._lockstep),
+            )
 
     def start(self) -> None:
         """Starts the world's thread; in lockstep the clock advances the world instead."""

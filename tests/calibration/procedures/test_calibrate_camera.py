@@ -16,7 +16,8 @@ from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
 from gripper_force.jobs.recording.record import RecordingPlan, record
 from gripper_force.profiles.apply import read_profiles, rig_mismatches
 from gripper_force.profiles.rig_profile import read_rig
-from gripper_force.runtime.log import LogReader, LogWriter
+from gripper_force.runtime.log_reader import LogReader
+from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import NS_PER_MS, Frame
 
 QUICK = ["object=stapler", "sim.detail=coarse", "vision.checkpoint=none", "seed=2", "camera.rate_hz=30"]

@@ -23,7 +23,7 @@ from gripper_force.jobs.dataset import load_clip
 from gripper_force.jobs.grasp import grasp
 from gripper_force.jobs.replay import replay
 from gripper_force.profiles.object_profile import read_object, weights_path
-from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import resolve
 from gripper_force.types import NS_PER_S, Event, Frame, GraspStatus, LoadCellSample, Phase, ServoState
 from gripper_force.vision.batch_inference import features

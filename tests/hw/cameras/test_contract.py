@@ -15,7 +15,7 @@ from gripper_force.config import CameraConfig, Config, load_config
 from gripper_force.errors import ConfigError
 from gripper_force.interfaces import Camera, Clock
 from gripper_force.runtime.backends import CAMERAS, MonotonicClock
-from gripper_force.runtime.log import LogWriter
+from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.testing.camera_contract import CameraContract
 from gripper_force.types import NS_PER_MS, Frame
 from gripper_hw.cameras.oak import OakCamera

@@ -10,7 +10,7 @@ import pytest
 from gripper_force.config import CameraConfig, load_config
 from gripper_force.errors import ConfigError, DeviceError, DeviceNotFoundError
 from gripper_force.runtime.backends import MonotonicClock
-from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.session import open_run
 from gripper_force.types import NS_PER_MS, Frame
 from gripper_hw.cameras import uvc

@@ -16,7 +16,6 @@ from gripper_force.errors import (
     HardwareFaultError,
 )
 from gripper_force.fault_config import FAULTS, FaultConfig
-from gripper_force.fault_injection import Faults
 from gripper_force.runtime.backends import open_devices
 from gripper_force.types import NS_PER_MS, ServoCommand
 from gripper_hw.dynamixel.bus_faults import WireFaults
@@ -24,6 +23,7 @@ from gripper_hw.dynamixel.control_table import load_model, rad_from_ticks
 from gripper_hw.dynamixel.firmware import OVERLOAD_ERROR, REBOOT_NS
 from gripper_hw.dynamixel.servo import DynamixelServo
 from gripper_hw.dynamixel.virtual import VirtualBus, VirtualServo, register_bus, unregister_bus
+from gripper_hw.fault_injection import Faults
 
 MODEL = load_model("XM430-W350")
 CYCLE_NS = 5 * NS_PER_MS

@@ -19,7 +19,6 @@ from gripper_force.errors import (
     HardwareFaultError,
 )
 from gripper_force.fault_config import FaultConfig
-from gripper_force.fault_injection import Faults
 from gripper_force.types import NS_PER_MS, ServoCommand, ServoState
 from gripper_hw.dynamixel.bus_faults import WireFaults
 from gripper_hw.dynamixel.control_table import VELOCITY_UNIT_RAD_S, load_model
@@ -29,6 +28,7 @@ from gripper_hw.dynamixel.packets import Instruction
 from gripper_hw.dynamixel.pty_server import BenchMotor
 from gripper_hw.dynamixel.servo import DynamixelServo
 from gripper_hw.dynamixel.virtual import VirtualBus, VirtualServo, register_bus, unregister_bus
+from gripper_hw.fault_injection import Faults
 
 MODEL = load_model("XM430-W350")
 CYCLE_NS = 5 * NS_PER_MS

@@ -12,7 +12,7 @@ from pathlib import Path
 import dynamixel_sdk as sdk
 import pytest
 
-from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import NS_PER_MS, ServoCommand, ServoState
 from gripper_hw.dynamixel.control_table import REGISTERS
 from gripper_hw.dynamixel.packets import Error

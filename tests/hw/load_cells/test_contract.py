@@ -13,7 +13,7 @@ from gripper_force.config import Config, LoadCellConfig, load_config
 from gripper_force.errors import DeviceError
 from gripper_force.interfaces import Clock, LoadCell
 from gripper_force.runtime.backends import LOAD_CELLS, MonotonicClock
-from gripper_force.runtime.log import LogWriter
+from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.testing.load_cell_contract import LoadCellContract
 from gripper_force.types import NS_PER_MS, LoadCellSample
 from gripper_hw.load_cells.phidget import PhidgetLoadCell

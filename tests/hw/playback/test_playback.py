@@ -7,7 +7,8 @@ import pytest
 from gripper_force.config import CameraConfig, LoadCellConfig
 from gripper_force.errors import DataError, LogError
 from gripper_force.interfaces import Camera, LoadCell
-from gripper_force.runtime.log import LogReader, LogWriter
+from gripper_force.runtime.log_reader import LogReader
+from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import NS_PER_MS, Event, Frame, LoadCellSample
 from gripper_hw.playback import PlaybackCamera, PlaybackLoadCell
 

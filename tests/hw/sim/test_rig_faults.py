@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from gripper_force.fault_config import FAULTS, FaultConfig
-from gripper_force.fault_injection import Faults
 from gripper_force.interfaces import Clock
 from gripper_force.types import NS_PER_MS, NS_PER_S, Frame, LoadCellSample
+from gripper_hw.fault_injection import Faults
 from gripper_hw.sim.rig_faults import FaultyCamera, FaultyClock, FaultyLoadCell
 
 FRAME_NS = NS_PER_S // 50

@@ -19,7 +19,7 @@ from gripper_force.jobs.imports.database import (
     read_table,
 )
 from gripper_force.jobs.paper_protocol import TOUCHES
-from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import Frame, LoadCellSample
 from gripper_force.vision.preprocess import Preprocess
 

@@ -16,7 +16,8 @@ from gripper_force.jobs.imports.video import (
     object_of,
     read_forces,
 )
-from gripper_force.runtime.log import LogReader, LogWriter
+from gripper_force.runtime.log_reader import LogReader
+from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import Frame, LoadCellSample, Record
 
 RATE_HZ = 30.0

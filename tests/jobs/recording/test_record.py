@@ -15,7 +15,7 @@ from gripper_force.jobs.dataset import load_clip
 from gripper_force.jobs.recording import record as module
 from gripper_force.jobs.recording.record import RecordingPlan, record
 from gripper_force.runtime.backends import open_devices
-from gripper_force.runtime.log import LogReader
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import Frame, GraspStatus, LoadCellSample, Phase, Request, RequestKind
 from gripper_force.vision.preprocess import Preprocess
 from gripper_hw.dynamixel import virtual

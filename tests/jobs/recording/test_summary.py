@@ -10,7 +10,8 @@ from gripper_force.errors import DataError
 from gripper_force.jobs.recording import summary as module
 from gripper_force.jobs.recording.record import RecordingPlan, record
 from gripper_force.jobs.recording.summary import summarise
-from gripper_force.runtime.log import LogReader, LogWriter
+from gripper_force.runtime.log_reader import LogReader
+from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import NS_PER_MS, Frame, LoadCellSample, Record
 
 Change = Callable[[Iterator[Record]], Iterable[Record]]

@@ -9,7 +9,7 @@ from gripper_force.jobs.simulate import OBJECTS
 from gripper_force.qualification.paper.experiment import Test as Estimates
 from gripper_force.qualification.paper.experiment import networks
 from gripper_force.qualification.paper.models import MODELS
-from gripper_force.runtime.log import LogWriter
+from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import Frame, LoadCellSample
 
 FRAMES = 30

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from gripper_force.config import config_from, load_config
 from gripper_force.errors import ConfigError
 from gripper_force.fault_config import FAULTS, FaultConfig
-from gripper_force.fault_injection import Faults, FaultyEstimator, FaultyFile
 from gripper_force.interfaces import Clock
+from gripper_hw.fault_injection import Faults, FaultyEstimator, FaultyFile
 
 KINDS = ("off", "stuck", "garbage", "wrong", "slow", "delayed", "intermittent")
 GRAY = np.zeros((4, 4), np.uint8)

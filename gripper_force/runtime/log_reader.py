@@ -1,0 +1,234 @@
+"""Reader of logs, complete or truncated."""
+
+import contextlib
+import dataclasses
+import struct
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any, BinaryIO, Final, TypeVar, overload
+
+import zstandard
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from google.protobuf.message import DecodeError
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
+from mcap.records import Message as McapMessage
+from mcap.stream_reader import breakup_chunk
+
+from gripper_force.errors import LogError
+from gripper_force.runtime.log_codecs import CODECS, CONFIG_NAME, METADATA_NAME, TYPE_OF_TOPIC, Codec
+from gripper_force.types import NS_PER_S, Frame, Record
+
+_MAGIC: Final = b"\x89MCAP0\r\n"
+_FRAMING: Final = struct.Struct("<BQ")
+_TIMES: Final = struct.Struct("<QQ")
+_MAX_CHUNK: Final = 1 << 28
+_DAMAGE: Final = (
+    McapError,
+    DecodeError,
+    zstandard.ZstdError,
+    struct.error,
+    ValueError,
+    OverflowError,
+)
+"""Exceptions of the decoders on damaged bytes."""
+
+A = TypeVar("A", bound=Record)
+B = TypeVar("B", bound=Record)
+C = TypeVar("C", bound=Record)
+
+
+@dataclass(frozen=True, slots=True)
+class _Chunk:
+    """Position and times of a complete chunk."""
+
+    offset: int
+    length: int
+    start_ns: int
+    end_ns: int
+
+
+class LogReader:
+    """Reads a log, complete or truncated.
+
+    Args:
+        path: The file.
+        recover: Read what is whole of a file that is cut short or damaged.
+
+    Attributes:
+        config: The run's configuration as YAML.
+        metadata: Versions, digests and other facts.
+        attachments: Files by name, the configuration among them.
+        complete: False where the file ends before its footer.
+
+    Raises:
+        LogError: The file is missing, no MCAP, not of this project, or (without ``recover``) cut short.
+    """
+
+    def __init__(self, path: Path, *, recover: bool = False) -> None:
+        self.path = path
+        self.complete = False
+        self.metadata: dict[str, str] = {}
+        self.attachments: dict[str, bytes] = {}
+        self._recover = recover
+        self._chunks: list[_Chunk] = []
+        try:
+            with path.open("rb") as file:
+                self._scan(file)
+        except OSError as error:
+            raise LogError(f"can't read the log {path}: {error.strerror}") from error
+        if not (self.complete or recover):
+            raise LogError(self._loss())
+        if CONFIG_NAME not in self.attachments:
+            why = "it holds no configuration" if self.complete else "it is cut before its configuration"
+            raise LogError(f"{path} can't be used: {why}, so gripper-force did not write it whole")
+        self.config = self.attachments[CONFIG_NAME].decode(errors="replace")
+
+    @property
+    def start_ns(self) -> int:
+        """Log time of the first record in nanoseconds; 0 for an empty log."""
+        return min((chunk.start_ns for chunk in self._chunks), default=0)
+
+    @property
+    def duration_ns(self) -> int:
+        """Log time from the first record to the last in nanoseconds."""
+        return max((chunk.end_ns for chunk in self._chunks), default=0) - self.start_ns
+
+    @overload
+    def records(self, a: type[A], /) -> Iterator[A]: ...
+    @overload
+    def records(self, a: type[A], b: type[B], /) -> Iterator[A | B]: ...
+    @overload
+    def records(self, a: type[A], b: type[B], c: type[C], /) -> Iterator[A | B | C]: ...
+    @overload
+    def records(self, *types: type[Record]) -> Iterator[Record]: ...
+
+    def records(self, *types: type[Any]) -> Iterator[Any]:
+        """Yields the records of the given types, or all of them, in the order in which they were written.
+
+        Raises:
+            LogError: A chunk is damaged (without ``recover``; with it the records end there), or a topic is
+                not as this version writes it.
+        """
+        try:
+            for channel, message in self._messages(frozenset(types or CODECS)):
+                yield channel.decode(message)
+        except OSError as error:
+            raise LogError(f"can't read the log {self.path}: {error.strerror}") from error
+        except _DAMAGE as error:
+            if not self._recover:
+                raise LogError(f"{self.path} is damaged ({error}); --recover reads it up to there") from error
+
+    def _messages(self, wanted: frozenset[type[Record]]) -> Iterator[tuple[Codec, McapMessage]]:
+        schemas: dict[int, Schema] = {}
+        codecs: dict[int, Codec | None] = {}
+        with self.path.open("rb") as file:
+            for chunk in self._chunks:
+                file.seek(chunk.offset)
+                chunk_data = _checked(Chunk.read(_stream(file.read(chunk.length))))
+                for item in breakup_chunk(chunk_data, validate_crc=True):
+                    if isinstance(item, McapMessage):
+                        if item.channel_id not in codecs:
+                            raise ValueError("a message before its channel")
+                        codec = codecs[item.channel_id]
+                        if codec is not None:
+                            yield codec, item
+                    elif isinstance(item, Schema):
+                        schemas[item.id] = item
+                    elif isinstance(item, Channel):
+                        record_type = self._record_type(item, schemas.get(item.schema_id))
+                        codecs[item.id] = CODECS[record_type] if record_type in wanted else None
+
+    def _record_type(self, channel: Channel, schema: Schema | None) -> type[Record]:
+        record_type = TYPE_OF_TOPIC.get(channel.topic)
+        if record_type is None or schema is None or schema.encoding != "protobuf":
+            raise LogError(f"{self.path} holds the topic {channel.topic}, which gripper-force doesn't know")
+        codec = CODECS[record_type]
+        # Foxglove and protobuf keep foxglove.RawImage compatible; our own records must agree field by field.
+        if schema.name != codec.schema_name or (
+            record_type is not Frame and not _is_readable(_fields(schema.data), record_type)
+        ):
+            raise LogError(
+                f"{self.path} holds {channel.topic} as another version of gripper-force wrote it; "
+                f"read it with that version{_version(self.metadata)}"
+            )
+        return record_type
+
+    def _scan(self, file: BinaryIO) -> None:
+        """Reads the framing of the records, and keeps the positions of complete ones."""
+        magic = file.read(len(_MAGIC))
+        if not _MAGIC.startswith(magic):
+            raise LogError(f"{self.path} is not an MCAP file; pass a log that gripper-force wrote")
+        size = self.path.stat().st_size
+        with contextlib.suppress(*_DAMAGE):
+            while file.tell() + _FRAMING.size <= size:
+                opcode, length = _FRAMING.unpack(file.read(_FRAMING.size))
+                start = file.tell()
+                if start + length > size:
+                    return
+                self._note(file, opcode, start, length)
+                file.seek(start + length)
+                if opcode == Opcode.FOOTER:
+                    self.complete = file.read() == _MAGIC
+                    return
+
+    def _note(self, file: BinaryIO, opcode: int, start: int, length: int) -> None:
+        if opcode == Opcode.CHUNK:
+            start_ns, end_ns = _TIMES.unpack(file.read(_TIMES.size))
+            self._chunks.append(_Chunk(start, length, start_ns, end_ns))
+        elif opcode == Opcode.ATTACHMENT:
+            attachment = Attachment.read(_stream(file.read(length)))
+            self.attachments[attachment.name] = attachment.data
+        elif opcode == Opcode.METADATA:
+            metadata = Metadata.read(_stream(file.read(length)))
+            if metadata.name == METADATA_NAME:
+                self.metadata = metadata.metadata
+
+    def _loss(self) -> str:
+        self._recover = True
+        count = sum(1 for _ in self.records())
+        return (
+            f"{self.path} is cut short or damaged: {count} records ({self.duration_ns / NS_PER_S:.2f} s) "
+            "can be recovered, --recover reads them"
+        )
+
+
+def _checked(chunk: Chunk) -> Chunk:
+    """Returns the chunk after a check that unpacking it takes the stated and a limited amount of memory."""
+    match chunk.compression:
+        case "zstd":
+            size = zstandard.frame_content_size(chunk.data)
+        case "":
+            size = len(chunk.data)
+        case other:
+            raise ValueError(f"a chunk is compressed as {other!r}")
+    if size != chunk.uncompressed_size or size > _MAX_CHUNK:
+        raise ValueError(f"a chunk says that it holds {chunk.uncompressed_size} bytes, and holds {size}")
+    return chunk
+
+
+def _stream(data: bytes) -> ReadDataStream:
+    return ReadDataStream(BytesIO(data))
+
+
+def _fields(schema: bytes) -> list[tuple[str, int, int]]:
+    files = FileDescriptorSet.FromString(schema).file
+    return [(f.name, f.number, f.type) for file in files for m in file.message_type for f in m.field]
+
+
+def _is_readable(fields: list[tuple[str, int, int]], record_type: type[Record]) -> bool:
+    """Returns True if the fields are those of the record, or lack only later ones whose default is zero."""
+    known = _fields(CODECS[record_type].schema)
+    missing = known[len(fields) :]
+    defaults = {field.name: field.default for field in dataclasses.fields(record_type)}
+    return fields == known[: len(fields)] and all(
+        defaults[name] in (0.0, "", False) for name, _, _ in missing
+    )
+
+
+def _version(metadata: Mapping[str, str]) -> str:
+    return f" ({metadata['version']})" if "version" in metadata else ""
