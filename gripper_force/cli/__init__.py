@@ -8,6 +8,7 @@ Ctrl-C.
 A command imports what it needs when it runs, so that ``gripper-force --help`` answers at once.
 """
 
+import gc
 import json
 import signal
 import sys
@@ -69,6 +70,7 @@ def main() -> NoReturn:
             interrupted = isinstance(end, KeyboardInterrupt) or process.is_interrupted()
         if interrupted:
             console.err.print("interrupted; the run was stopped as configured", soft_wrap=True)
+            gc.freeze()  # Python would search all of PyTorch's objects for garbage, up to 2 s long
             sys.exit(process.interrupt_exit_code())
         raise
     sys.exit(0)
