@@ -465,6 +465,16 @@ class SimConfig(Section):
     moving_background: bool = Field(False, description="things that move behind the object")
     camera_latency_ms: NonNegative = Field(15.0, description="time from mid-exposure to the frame")
     exposure_ms: Positive = Field(4.0, description="exposure at camera.exposure_us 4000")
+    friction: Positive | None = Field(
+        None,
+        description="true friction of motor and rails over that of the default rig; None: drawn, 0.7 to 1.3",
+    )
+    gain: Positive | None = Field(
+        None, description="true torque constant over the servo model's; None: drawn, 0.92 to 1.08"
+    )
+    open_width_m: Positive | None = Field(
+        None, description="true distance between the open jaws; None: gripper.open_width_m"
+    )
 
 
 class CalibrationConfig(Section):

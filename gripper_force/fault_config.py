@@ -22,6 +22,7 @@ FAULTS: Final[dict[str, dict[str, str]]] = {
         "intermittent": "half of the replies are lost",
     },
     "plant": {
+        "off": "the object leaves the jaws for good, whatever the duration",
         "wrong": "motor current exceeds its goal, by another 50 % every second",
     },
     "camera": {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from gripper_force.types import Frame, LoadCellSample, ServoCommand, ServoState
 
@@ -192,6 +192,23 @@ class Clock(Protocol):
         ...
 
 
+class WorldState(NamedTuple):
+    """True state of a simulated world, which no device measures.
+
+    Attributes:
+        t_ns: Time on the run's clock.
+        force_n: Grip force: mean of the normal forces on the two jaws.
+        closing_m_s: Speed of the drive as travel of one jaw, positive while it closes. Within the gear play a jaw
+            can be faster for some milliseconds.
+        has_object: False if there is no object, or it has left the jaws.
+    """
+
+    t_ns: int
+    force_n: float
+    closing_m_s: float
+    has_object: bool
+
+
 @dataclass(slots=True)
 class Devices:
     """The devices of a run, opened by `gripper_force.runtime.backends.open_devices`.
@@ -207,6 +224,8 @@ class Devices:
         notes: Facts about the devices for the log, such as the scene's parameters or a serial number.
         render_under_light: Returns another camera of the same simulated world under another light, given in
             lux, and that camera's notes; None without a simulated world.
+        observe_world: Makes a simulated world call a function with its true state after each of its steps, in
+            its thread; None without a simulated world.
     """
 
     clock: Clock
@@ -218,3 +237,4 @@ class Devices:
     check: Callable[[], None]
     notes: dict[str, str] = field(default_factory=dict)
     render_under_light: Callable[[float], tuple[Camera, dict[str, str]]] | None = None
+    observe_world: Callable[[Callable[[WorldState], None]], None] | None = None

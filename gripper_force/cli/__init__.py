@@ -62,8 +62,12 @@ def main() -> NoReturn:
         if "--json" in sys.argv:
             sys.stdout.write(json.dumps({"error": str(error)}) + "\n")
         sys.exit(2)
-    except (SystemExit, KeyboardInterrupt) as end:  # the latter while typer starts or ends
-        if isinstance(end, KeyboardInterrupt) or end.code == _INTERRUPTED:  # typer's code after an interrupt
+    except BaseException as end:
+        if isinstance(end, SystemExit):
+            interrupted = end.code == _INTERRUPTED  # typer's code after an interrupt
+        else:  # native code, such as pydantic's, can turn an interrupt into an exception of its own
+            interrupted = isinstance(end, KeyboardInterrupt) or process.is_interrupted()
+        if interrupted:
             console.err.print("interrupted; the run was stopped as configured", soft_wrap=True)
             sys.exit(process.interrupt_exit_code())
         raise

@@ -1,6 +1,5 @@
 """The commands that calibrate a rig and objects."""
 
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
     from gripper_calibration.procedures.calibrate_load_cell import LoadCellResult
     from gripper_calibration.procedures.calibrate_servo import ServoResult
     from gripper_force.config import Config
-    from gripper_force.interfaces import Progress, Prompt
+    from gripper_force.interfaces import Progress
 
 app = typer.Typer(
     no_args_is_help=True, help="Calibrate the jaws, the load cell, the servo, the camera, or an object."
@@ -57,7 +56,12 @@ def load_cell(
     settings, path = _rig_settings(config, set_, {}, rig)
     with console.err.status("reading") as status:
         result = job.calibrate_load_cell(
-            settings, weight_n, path, prompt=_prompt(yes, status), seconds=seconds, progress=_progress(status)
+            settings,
+            weight_n,
+            path,
+            prompt=console.prompt(yes, status),
+            seconds=seconds,
+            progress=_progress(status),
         )
     _show_rig(result, as_json)
 
@@ -76,7 +80,7 @@ def jaws(
 
     settings = load_settings(config, set_, {})
     with console.err.status("moving") as status:
-        result = job(settings, prompt=_prompt(yes, status), progress=_progress(status))
+        result = job(settings, prompt=console.prompt(yes, status), progress=_progress(status))
     console.show(result, as_json, jaws_table)
 
 
@@ -105,7 +109,7 @@ def servo(
             settings,
             [width / 1e3 for width in gauge_mm],
             path,
-            prompt=_prompt(yes, status),
+            prompt=console.prompt(yes, status),
             progress=_progress(status),
         )
     _show_rig(result, as_json)
@@ -220,7 +224,7 @@ def _touches(settings: "Config", touches: int, peak_n: float | None, folder: Pat
 
     paths: list[Path] = []
     with console.err.status("touching") as status:
-        prompt = _prompt(False, status) if pause else None
+        prompt = console.prompt(False, status) if pause else None
         try:
             for path in job.record_touches(
                 settings, touches, peak_n, folder, prompt=prompt, progress=_progress(status)
@@ -269,23 +273,3 @@ def _region(text: str) -> tuple[int, int, int, int]:
 
 def _progress(status: "Status") -> "Progress":
     return lambda text, steps=1: status.update(text)
-
-
-def _prompt(yes: bool, status: "Status") -> "Prompt":
-    """Returns a prompt that waits for Enter, or with ``yes`` only prints."""
-
-    def prompt(text: str) -> None:
-        if yes:
-            console.err.print(text, soft_wrap=True)
-            return
-        if not sys.stdin.isatty():
-            raise ConfigError(
-                f"this needs a person at a terminal: {text}; run it in a terminal, or pass --yes if it is done"
-            )
-        status.stop()
-        console.err.print(f"{text}, then press Enter ", end="", soft_wrap=True)
-        if not sys.stdin.readline():  # the terminal was closed, or Ctrl-D
-            raise ConfigError(f"no answer to this: {text}; run it again and press Enter")
-        status.start()
-
-    return prompt

@@ -14,10 +14,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemaini
 from rich.progress import Progress as ProgressBar
 from rich.table import Table
 
-from gripper_force.errors import GripperError
+from gripper_force.errors import ConfigError, GripperError
 
 if TYPE_CHECKING:  # --help loads no NumPy
-    from gripper_force.interfaces import Progress
+    from rich.status import Status
+
+    from gripper_force.interfaces import Progress, Prompt
 
 err = Console(stderr=True, highlight=False)
 out = Console(highlight=False)
@@ -37,6 +39,34 @@ def bar(label: str, total: int, *, hidden: bool = False) -> "Iterator[Progress]"
 def line(text: str, steps: int = 1) -> None:
     """Prints a line on stderr for each report of progress."""
     err.print(f"[dim]{escape(text)}[/]", soft_wrap=True)
+
+
+def prompt(yes: bool, status: "Status | None" = None) -> "Prompt":
+    """Returns a prompt that waits for Enter, or with ``yes`` only prints. Meanwhile ``status`` is hidden."""
+
+    def ask(text: str) -> None:
+        if yes:
+            err.print(text, soft_wrap=True)
+            return
+        if not sys.stdin.isatty():
+            raise ConfigError(
+                f"this needs a person at a terminal: {text}; run it in a terminal, or pass --yes if it is done"
+            )
+        if status is not None:
+            status.stop()
+        err.print(f"{text}, then press Enter ", end="", soft_wrap=True)
+        answer = ""
+        try:
+            answer = sys.stdin.readline()
+        finally:
+            if not answer:  # Ctrl-C, Ctrl-D, or the terminal was closed
+                err.print()
+        if not answer:
+            raise ConfigError(f"no answer to this: {text}; run it again and press Enter")
+        if status is not None:
+            status.start()
+
+    return ask
 
 
 def show(result: T, as_json: bool, render: Callable[[T], object] | None = None) -> None:

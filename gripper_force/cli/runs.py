@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gripper_force.cli import console
-from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, load_settings
+from gripper_force.cli.options import CORES, AsJson, ConfigPath, Overrides, load_settings
 from gripper_force.cli.output.doctor import changes_table, checks_table, setup_line
 from gripper_force.cli.output.runs import grasp_table, replay_table, trials_table
-from gripper_force.errors import ConfigError
+from gripper_force.errors import ConfigError, GripperError
+from gripper_force.interfaces import Progress, Prompt, no_progress
 
 if TYPE_CHECKING:
     from gripper_force.jobs.checks import RegisterChange
@@ -30,9 +31,24 @@ def grasp(
         str | None, typer.Option(help="Object profile: a name or a path; own: the one named like the object.")
     ] = None,
     trials: Annotated[
-        int, typer.Option(min=0, help="Number of grasps of the four paper objects, with targets of 1 to 8 N.")
+        int,
+        typer.Option(
+            min=0,
+            help="Number of grasps, with statistics: of --object, or in simulation of the four paper objects in "
+            "turn; with --target-n, or targets of 1 to 8 N.",
+        ),
     ] = 0,
-    jobs: Jobs = CORES,
+    jobs: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help=f"Processes for simulated trials. A real device has one.  [default: {CORES}]",
+        ),
+    ] = None,
+    yes: Annotated[
+        bool,
+        typer.Option("--yes", help="Do not wait for Enter before each trial with a real device."),
+    ] = False,
 ) -> None:
     """Grasp with a target force and report the error. Exit code 1 if nothing was held."""
     from gripper_force.jobs import grasp as job
@@ -62,26 +78,38 @@ def grasp(
         if result["result"] != "held":
             raise typer.Exit(1)
         return
-    if object_ is not None or target_n is not None:
-        raise ConfigError(
-            "--trials uses all four objects with drawn targets; leave out --object and --target-n"
+    device = job.exclusive_device(settings)
+    objects = (settings.object,) if device or object_ is not None else job.TRIAL_OBJECTS
+    jobs = jobs or (1 if device else CORES)
+    prompt: Prompt | None = None
+    lines: Progress = no_progress
+    if device and jobs == 1:
+        pause = not yes and sys.stdin.isatty()
+        console.err.print(
+            f"only one process can open {device}, so the trials follow one another, all of them of the object "
+            f"{settings.object}" + ("" if pause else ", without a pause"),
+            soft_wrap=True,
         )
+        prompt, lines = (console.prompt(yes) if pause else None), console.line
     results: list[job.Summary] = []
-    interrupt: KeyboardInterrupt | None = None
-    with console.bar("grasping", trials) as progress:
+    failure: BaseException | None = None
+    with console.bar("grasping", trials, hidden=bool(device)) as progress:
         try:
-            with closing(job.trials(settings, trials, jobs)) as finished:
+            running = job.trials(
+                settings, trials, jobs, objects=objects, target_n=target_n, prompt=prompt, progress=lines
+            )
+            with closing(running) as finished:
                 for one in finished:
                     results.append(one)
                     progress(f"{one['object']} {one['target_n']:.1f} N: {one['result']}")
-        except KeyboardInterrupt as end:
-            interrupt = end
-    if results:
+        except (KeyboardInterrupt, GripperError) as end:
+            failure = end
+    if results and not (as_json and isinstance(failure, GripperError)):
         summary = job.overall(results, settings.control.force_limit_n)
         printed = {"trials": results, "summary": summary}
         console.show(printed, as_json, lambda _: trials_table(results, summary))
-    if interrupt is not None:
-        raise interrupt
+    if failure is not None:
+        raise failure
 
 
 def replay(

@@ -1,20 +1,24 @@
 """The `stability` commands: hard numerical cases, faults, malformed input and long use."""
 
 from collections.abc import Callable
+from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, TypedDict, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypedDict, TypeVar
 
 import typer
 
 from gripper_force.cli import console
 from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, Page, load_settings
 from gripper_force.cli.output.stability import (
-    faults_table,
+    faults_tables,
     fuzz_table,
     numerics_tables,
     search_table,
     soak_table,
 )
+
+if TYPE_CHECKING:
+    from gripper_force.cli.output.stability import FaultsReport
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -61,10 +65,29 @@ def numerics(
     _show(report, as_json, numerics_tables)
 
 
+class Table(StrEnum):
+    """Tables of `stability faults`."""
+
+    FAULTS = "faults"
+    WRONG = "wrong"
+
+
 @app.command("faults")
 def faults(
+    table: Annotated[
+        list[Table] | None,
+        typer.Option(
+            help="Only this table: faults (a part fails), wrong (the configuration is wrong). Repeatable. "
+            "Default: both."
+        ),
+    ] = None,
     seeds: Annotated[int, typer.Option(min=1, help="Grasps of each row.")] = 20,
-    live: Annotated[int, typer.Option(min=0, help="Of these, grasps repeated in real time.")] = 2,
+    live: Annotated[
+        int | None,
+        typer.Option(
+            min=0, help="Of these, grasps repeated in real time. Default: 2 with faults, all when wrong."
+        ),
+    ] = None,
     write: Page = None,
     resume: Annotated[bool, typer.Option(help="Continue an interrupted matrix.")] = False,
     seed: Seed = None,
@@ -73,23 +96,38 @@ def faults(
     set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Inject a fault into each part during a grasp. Exit code 1 if a reaction is not as expected."""
-    from gripper_force.qualification.fault_matrix.matrix import (
-        MatrixReport,
-        count_grasps,
-        markdown,
-        run_matrix,
-    )
+    """Break each part and each configuration during grasps. Exit code 1 if a reaction is not as expected."""
+    from gripper_force.qualification.fault_matrix import matrix, wrong_configurations
     from gripper_force.qualification.markdown_blocks import write_between
 
     settings = load_settings(config, set_, {"seed": seed})
-    keep = settings.log.directory / "faults.jsonl"
-    with console.bar("injecting faults", count_grasps(seeds, live)) as progress:
-        rows = list(run_matrix(settings, seeds, live, jobs, keep, resume=resume, progress=progress))
-    if write is not None:
-        write_between(write, "matrix", markdown(rows))
-    report: MatrixReport = {"rows": rows, "ok": all(row["ok"] == row["runs"] for row in rows)}
-    _show(report, as_json, faults_table)
+    report: FaultsReport = {"rows": [], "wrong": [], "ok": True}
+    if Table.FAULTS in (table or Table):
+        live_faults = 2 if live is None else live
+        keep = settings.log.directory / "faults.jsonl"
+        with console.bar("injecting faults", matrix.count_grasps(seeds, live_faults)) as progress:
+            report["rows"] = list(
+                matrix.run_matrix(settings, seeds, live_faults, jobs, keep, resume=resume, progress=progress)
+            )
+        if write is not None:
+            write_between(write, "matrix", matrix.markdown(report["rows"]))
+    if Table.WRONG in (table or Table):
+        live_wrong = seeds if live is None else live
+        keep = settings.log.directory / "wrong.jsonl"
+        with console.bar(
+            "wrong configurations", wrong_configurations.count_grasps(seeds, live_wrong)
+        ) as progress:
+            report["wrong"] = list(
+                wrong_configurations.run_rows(
+                    settings, seeds, live_wrong, jobs, keep, resume=resume, progress=progress
+                )
+            )
+        if write is not None:
+            write_between(write, "wrong", wrong_configurations.markdown(report["wrong"]))
+    report["ok"] = all(row["ok"] == row["runs"] for row in report["rows"]) and all(
+        row["ok"] == row["runs"] and row["live_ok"] == row["live_runs"] for row in report["wrong"]
+    )
+    _show(report, as_json, faults_tables)
 
 
 @app.command("search")

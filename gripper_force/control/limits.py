@@ -42,8 +42,7 @@ class Limits:
         self._force_limit_n = config.force_limit_n
         self._rise_n_s = _RISE_FACTOR * config.ramp_n_s
         self._step_a = transmission.current_step_a
-        ends = (transmission.open_position_rad, transmission.closed_position_rad)
-        self._low_rad, self._high_rad = min(ends), max(ends)
+        self._low_rad, self._high_rad = transmission.goal_range_rad
         self._over_force_ceiling_a = math.inf
         self._unrounded_a = 0.0
         self._rounding_a = 0.0

@@ -19,6 +19,9 @@ _INTERVALS: Final = 512
 """Intervals of the table that a linkage is evaluated with: its widths are exact to 0.1 um."""
 
 _SEARCH_STEP_RAD: Final = 0.01
+_LARGEST_ANGLE_RAD: Final = 255 * 2 * math.pi
+"""Largest closing angle: a Dynamixel's multi-turn range."""
+
 _DIFFERENCE_RAD: Final = 1e-5
 
 _LEAST_SHARE: Final = 0.1
@@ -133,10 +136,16 @@ def make_linkage(gripper: GripperConfig) -> Linkage:
 
 def _tabulate(closed_m: Callable[[float], float], open_width_m: float) -> TabulatedLinkage:
     """Tabulates a decrease of the width by closing angle, up to the closed jaws."""
+    if math.isnan(closed_m(0.0)):
+        raise ConfigError(
+            "gripper.linkage cannot be assembled with open jaws: its lengths do not meet; check them and "
+            "gripper.linkage.open_crank_rad"
+        )
     end_rad = 0.0
     while (reached_m := closed_m(end_rad)) < open_width_m:
         end_rad += _SEARCH_STEP_RAD
-        if not closed_m(end_rad) > reached_m:  # also not a number: the rod is too short
+        # Also not a number: the rod is too short.
+        if not closed_m(end_rad) > reached_m or end_rad > _LARGEST_ANGLE_RAD:
             raise ConfigError(
                 f"gripper.linkage closes by {1e3 * reached_m:.1f} mm at most, less than gripper.open_width_m "
                 f"{1e3 * open_width_m:g} mm; check the lengths and the angle of the open jaws"
@@ -194,6 +203,8 @@ def _four_bar(config: LinkageConfig) -> Callable[[float], float]:
     def rocker_rad(angle_rad: float) -> float:
         x_m, y_m = crank_m * math.cos(angle_rad) - base_m, crank_m * math.sin(angle_rad)
         diagonal_m = math.hypot(x_m, y_m)
+        if diagonal_m == 0:
+            return math.nan
         cosine = (diagonal_m**2 + rocker_m**2 - coupler_m**2) / (2 * diagonal_m * rocker_m)
         if not -1 <= cosine <= 1:
             return math.nan

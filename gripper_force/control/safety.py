@@ -18,6 +18,10 @@ _EXCESS_SHARE = 0.15
 _EXCESS_S = 0.02
 """A motor current above its goal by more than this share and offset, for longer than this, is a fault."""
 
+_BACK_DRIVEN_RAD_S = 0.05
+"""Speed against the current above which the horn is back-driven: somebody pulls the jaws. Such a motor brakes, and its
+back-EMF may raise the current above the goal (decision 21). Two steps of an X-series servo's Present Velocity."""
+
 _MIN_DERATING = 0.6
 """Share of the target force at the temperature limit: a third of the heat."""
 
@@ -51,8 +55,7 @@ class Safety:
             True if the latch tripped in this cycle.
         """
         self._over_s = self._over_s + dt_s if over_force else 0.0
-        excess = is_excess(servo.current_a, goal_current_a)
-        self._excess_s = self._excess_s + dt_s if excess else 0.0
+        self._excess_s = self._excess_s + dt_s if is_excess(servo, goal_current_a) else 0.0
         self._cause = self._find_fault(servo)
         if is_sound(servo):
             self._last = servo
@@ -102,9 +105,12 @@ class Safety:
         return abs(now.position_rad - before.position_rad) > _JUMP_RAD + _JUMP_RAD_S * time_s
 
 
-def is_excess(current_a: float, goal_current_a: float) -> bool:
-    """Returns True if a motor takes more current than its goal allows."""
-    return abs(current_a) > (1 + _EXCESS_SHARE) * goal_current_a + _EXCESS_A
+def is_excess(servo: ServoState, goal_current_a: float) -> bool:
+    """Returns True if a motor takes more current than its goal allows, and is not back-driven."""
+    back_driven = (
+        servo.current_a * servo.velocity_rad_s < 0 and abs(servo.velocity_rad_s) > _BACK_DRIVEN_RAD_S
+    )
+    return not back_driven and abs(servo.current_a) > (1 + _EXCESS_SHARE) * goal_current_a + _EXCESS_A
 
 
 def is_sound(servo: ServoState) -> bool:

@@ -59,18 +59,21 @@ class SlipMonitor:
             return "the jaws close without resistance"
         return "the jaws closed" if width_m < self._config.min_object_width_m else ""
 
-    def has_receded(self, width_m: float, closing_m_s: float, motor_force_n: float) -> str:
+    def has_receded(
+        self, width_m: float, held_width_m: float, closing_m_s: float, motor_force_n: float
+    ) -> str:
         """Returns why a held object is no longer there, or an empty text. To be called in each cycle after ``held``.
 
         It finds the loss of a small force, for which the motor need not fall short.
 
         Args:
             width_m: Distance between the jaws.
+            held_width_m: The same when the object was held. Jaws that were pulled open may close to it.
             closing_m_s: Closing speed of one jaw.
             motor_force_n: Commanded motor force at each jaw.
         """
         if not self._moves(closing_m_s):
-            self._rest = width_m, motor_force_n
+            self._rest = min(width_m, held_width_m), motor_force_n
         if self._rest is None:
             return ""
         rest_m, rest_n = self._rest

@@ -12,7 +12,7 @@ from gripper_force.control.safety import Safety, is_sound
 from gripper_force.control.slip import SlipMonitor
 from gripper_force.control.speed_limit import PositionLoop, SpeedLimit
 from gripper_force.control.trajectory import TrapezoidalProfile
-from gripper_force.control.transmission import Transmission
+from gripper_force.control.transmission import GOAL_OFFSET_M, Transmission
 from gripper_force.types import (
     NS_PER_MS,
     NS_PER_S,
@@ -40,9 +40,6 @@ _TRAVEL_SPEED_SHARE = 2.0
 
 _LEAD_M = 0.004
 """Largest lead of the profile over one jaw in free travel, so that jaws that were held back do not jump."""
-
-_GOAL_OFFSET_M = 0.010
-"""Distance of each jaw's goal inside the object, before the speed limit: the current limit sets the force."""
 
 _DWELL_S = 0.12
 """Time in contact before the ramp: the impact decays and vision catches up."""
@@ -159,6 +156,7 @@ class GraspController:
         self._let_go_n = 0.0
         self._seen_n: float | None = None
         self._seen_ns = 0
+        self._has_seen = self._has_unsure = False
         self._goal_current_a = self._measured_motor_force_n = 0.0
         self._derating = 1.0
 
@@ -263,7 +261,9 @@ class GraspController:
             return
         # A comparison with NaN is false.
         if not (abs(visual.force_n) <= 1e9 and 0 <= visual.std_n <= self._config.vision_std_n):
+            self._has_unsure |= self._phase in _GRIPPING
             return
+        self._has_seen |= self._phase in _GRIPPING
         dt_s = (visual.t_ns - self._seen_ns) / NS_PER_S
         before_n = visual.force_n if self._seen_n is None else self._seen_n
         self._seen_n = before_n + (visual.force_n - before_n) * dt_s / (dt_s + _SEEN_FILTER_S)
@@ -271,8 +271,15 @@ class GraspController:
 
     @property
     def _is_unseen(self) -> bool:
-        """True if the camera, which is in use, sees next to no force."""
-        return self._seen_n is not None and self._seen_n < _UNSEEN_SHARE * self._derated_target_n
+        """True if the camera sees next to no force, or has been too uncertain throughout this grip."""
+        if self._seen_n is None:
+            return self._has_unsure and not self._has_seen
+        return self._seen_n < _UNSEEN_SHARE * self._derated_target_n
+
+    @property
+    def _sight(self) -> str:
+        """The visual estimate in words."""
+        return "is uncertain" if self._seen_n is None else f"sees only {self._seen_n:.1f} N"
 
     def _derate(self, t_ns: int, temperature_c: float) -> list[Event]:
         """Lowers the target force of a hot servo, before the servo shuts down."""
@@ -422,14 +429,14 @@ class GraspController:
             case Phase.FAULT if self._opens_at_fault:
                 self._run_release(dt_s, width_m)
         if self._phase in _GRIPPING:
-            self._goal_width_m = max(width_m - 2 * _GOAL_OFFSET_M, 0.0)
+            self._goal_width_m = width_m - 2 * GOAL_OFFSET_M
         if self._phase in (Phase.APPROACH, *_GRIPPING) and self._outcome == Outcome.NONE:
             self._check_timeout(t_ns)
 
     def _run_approach(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
         # The goal position leads far enough that the goal current alone drives the jaws. A goal that moved in
         # steps with the jaws would cause a current ripple, and the current is sampled at one phase of it.
-        self._goal_width_m = max(width_m - 2 * _GOAL_OFFSET_M, 0.0)
+        self._goal_width_m = width_m - 2 * GOAL_OFFSET_M
         progress = self._approach.step(
             dt_s, width_m, closing_m_s, self._measured_motor_force_n, self._estimate
         )
@@ -438,6 +445,7 @@ class GraspController:
             case ApproachState.BACKING_OFF:
                 self._goal_width_m = min(self._approach.back_off_width_m, self._transmission.open_width_m)
             case ApproachState.CONTACT:
+                self._has_seen = self._has_unsure = False
                 self._fusion.reset_variance()
                 self._enter(Phase.CONTACT, f"contact at {width_m * 1e3:.1f} mm")
             case ApproachState.CLOSED:
@@ -484,14 +492,14 @@ class GraspController:
             self._set_outcome(Outcome.HELD, f"{self._estimate.force_n:.2f} N for {self._settled_s:.2f} s")
         lost = self._slip.is_lost(dt_s, width_m, closing_m_s, shortfall_n, self._loop.reference_n)
         if not lost and self._outcome == Outcome.HELD:
-            lost = self._slip.has_receded(width_m, closing_m_s, self._motor_force_n)
+            lost = self._slip.has_receded(width_m, self._held_width_m, closing_m_s, self._motor_force_n)
         if lost:
             self._handle_loss(width_m, lost)
             return
         closed_m = self._held_width_m - width_m if self._outcome == Outcome.HELD else 0.0
         slip = self._slip.has_slipped(dt_s, self._estimate.force_n, self._derated_target_n, closed_m)
         if not slip and self._outcome == Outcome.HELD and self._is_unseen:
-            slip = f"the camera sees only {self._seen_n:.1f} N; friction or an end stop may hold the jaws"
+            slip = f"the camera {self._sight}; friction or an end stop may hold the jaws"
         if slip and self._outcome in (Outcome.NONE, Outcome.HELD):
             self._set_outcome(Outcome.SLIP, slip)
 
@@ -549,7 +557,7 @@ class GraspController:
             reason = f"not held within {self._config.timeout_s:g} s"
             if self._is_unseen:
                 reason += (
-                    f": the camera sees {self._seen_n:.1f} N. The jaws may press on an end stop: check "
+                    f": the camera {self._sight}. The jaws may press on an end stop: check "
                     "gripper.open_width_m with `calibrate jaws`. If there is an object, calibrate it, or set "
                     "control.feedback=current"
                 )

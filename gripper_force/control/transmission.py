@@ -6,6 +6,10 @@ from dataclasses import dataclass
 from gripper_force.config import GripperConfig
 from gripper_force.control.linkage import Linkage, make_linkage
 
+GOAL_OFFSET_M = 0.010
+"""Distance of each jaw's goal inside the object, before the speed limit: the goal current sets the force. So the goal
+may lie this far beyond the closed jaws, or the servo could not press on a thin object."""
+
 
 @dataclass(frozen=True, slots=True)
 class Transmission:
@@ -71,6 +75,12 @@ class Transmission:
     def closed_position_rad(self) -> float:
         """Servo angle with the jaws closed."""
         return self.position_rad(0.0)
+
+    @property
+    def goal_range_rad(self) -> tuple[float, float]:
+        """Lowest and highest goal position: from the open jaws to `GOAL_OFFSET_M` beyond the closed ones."""
+        ends = (self.open_position_rad, self.position_rad(-2 * GOAL_OFFSET_M))
+        return min(ends), max(ends)
 
     def width_m(self, position_rad: float) -> float:
         """Returns the distance between the jaws at a servo angle."""

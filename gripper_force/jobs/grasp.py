@@ -2,15 +2,16 @@
 
 import time
 from collections import defaultdict
-from collections.abc import Generator, Mapping
+from collections.abc import Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, TypedDict
 
 import numpy as np
 
 from gripper_force.config import Config, config_from, config_from_text
-from gripper_force.errors import DataError
-from gripper_force.interfaces import Progress, no_progress
+from gripper_force.control.limits import largest_target_n
+from gripper_force.errors import ConfigError, DataError, DeviceError
+from gripper_force.interfaces import Progress, Prompt, no_progress
 from gripper_force.jobs.dataset import stiffness_floor_n, stiffness_of
 from gripper_force.jobs.processes import process_pool
 from gripper_force.jobs.replay import compare
@@ -88,19 +89,19 @@ class Summary(_Score):
 
 
 class Overall(TypedDict):
-    """Figures over all trials."""
+    """Figures over all trials; None for a figure without a value, such as an error without a load cell."""
 
     trials: int
     held: int
     median_error_percent: float | None
     p90_error_percent: float | None
     median_error_n: float | None
-    good_percent: float
+    good_percent: float | None
     median_overshoot_percent: float | None
     max_overshoot_percent: float | None
     median_settle_s: float | None
     peak_n: float | None
-    over_limit: int
+    over_limit: int | None
     estimator_p50_ms: float | None
     estimate_mae_n: dict[str, dict[str, float | None]]
 
@@ -185,34 +186,87 @@ def _report_phase(progress: Progress, status: GraspStatus, begin_ns: int) -> Non
     progress("  ".join(part for part in parts if part))
 
 
-def trials(config: Config, count: int, jobs: int) -> Generator[Summary, None, None]:
-    """Runs grasps of all four paper objects in turn, with targets and seeds drawn from ``config.seed``.
+def exclusive_device(config: Config) -> str:
+    """Returns key and value of a device that only one process can open, or an empty text."""
+    servo = config.servo
+    if servo.backend != "dynamixel":
+        return f"servo.backend={servo.backend}"
+    if not servo.port.startswith("virtual:"):
+        return f"servo.port={servo.port}"
+    for unit, backend in (("camera", config.camera.backend), ("load_cell", config.load_cell.backend)):
+        if backend not in ("none", "simulated", "playback"):
+            return f"{unit}.backend={backend}"
+    return ""
+
+
+def trials(
+    config: Config,
+    count: int,
+    jobs: int,
+    *,
+    objects: Sequence[str] = TRIAL_OBJECTS,
+    target_n: float | None = None,
+    prompt: Prompt | None = None,
+    progress: Progress = no_progress,
+) -> Generator[Summary, None, None]:
+    """Runs grasps of the objects in turn, with targets and seeds drawn from ``config.seed``.
 
     Args:
         config: Everything else.
         count: Number of grasps.
-        jobs: Processes. The results of lockstep runs do not depend on it.
+        jobs: Processes; 1: the grasps run in this process. The results of lockstep runs do not depend on it.
+        objects: Names of the objects.
+        target_n: Target force of each grasp; None: drawn from 1 to 8 N, or to what the limits permit.
+        prompt: Called before each grasp, so that a person can place the object; None for no pause.
+        progress: Called before each grasp and at each change of phase, if ``jobs`` is 1.
 
     Yields:
         The summary of each grasp, in order.
+
+    Raises:
+        ConfigError: Several processes can't open a device at the same time.
+        RequestError: The target, or the smallest that is drawn, is beyond a limit.
+        DeviceError: A grasp with a real device ended with a fault: nothing moves until a person has looked.
+        GripperError: A grasp failed.
     """
-    resolve(config)  # measures what `auto` needs once, and not in each process
+    device = exclusive_device(config)
+    if device and jobs > 1:
+        raise ConfigError(f"only one process can open {device}, not {jobs}; leave out --jobs, or set it to 1")
+    least_n, most_n = TRIAL_TARGETS_N
+    largest_n = {}
+    for name in objects:
+        run = resolve(config.model_copy(update={"object": name}))  # measures what `auto` needs once, here
+        run.check_target(least_n if target_n is None else target_n)
+        limit_n = largest_target_n(run.config.control.force_limit_n, run.config.gripper.gain_bound)
+        largest_n[name] = min(most_n, limit_n, *run.target_limits_n.values())
     rng = np.random.default_rng([config.seed, 20])
     quiet = config.log.model_copy(update={"report": False})  # `replay LOG --report` draws any of them later
-    plan = [
-        config.model_copy(
-            update={
-                "object": TRIAL_OBJECTS[i % len(TRIAL_OBJECTS)],
-                "target_n": round(float(rng.uniform(*TRIAL_TARGETS_N)), 3),
-                "seed": config.seed + i,
-                "log": quiet,
-            }
-        )
-        for i in range(count)
-    ]
-    trees = [trial.model_dump(mode="json") for trial in plan]
-    with process_pool(jobs) as pool:
-        yield from pool.map(_trial, trees)
+    plan = []
+    for i in range(count):
+        name = objects[i % len(objects)]
+        drawn_n = min(round(float(rng.uniform(least_n, largest_n[name])), 3), largest_n[name])
+        update = {
+            "object": name,
+            "target_n": drawn_n if target_n is None else target_n,
+            "seed": config.seed + i,
+            "log": quiet,
+        }
+        plan.append(config.model_copy(update=update))
+    if jobs > 1:
+        with process_pool(jobs) as pool:
+            yield from pool.map(_trial, [trial.model_dump(mode="json") for trial in plan])
+        return
+    for number, trial in enumerate(plan, 1):
+        if prompt is not None:
+            prompt(f"Put the {trial.object} between the jaws for trial {number} of {count}")
+        progress(f"trial {number} of {count}: {trial.object}, {trial.target_n:g} N")
+        result = grasp(trial, progress)
+        yield result
+        if device and result["result"] == Outcome.FAULT:
+            raise DeviceError(
+                f"trial {number} of {count} ended with a fault, so no further one was run; look at the gripper, "
+                f"and at the fault with: gripper-force replay {result['log']} --report"
+            )
 
 
 def summarise(path: Path) -> Summary:
@@ -267,19 +321,19 @@ def overall(results: list[Summary], force_limit_n: float) -> Overall:
     share = error_n / target_n
     good = (share <= WITHIN_SHARE) | (error_n <= WITHIN_N)
     overshoot = np.array([r["overshoot_n"] for r in scored]) / target_n
-    peaks = [r["peak_n"] for r in results if r["peak_n"] is not None]
+    peaks = [r["peak_n"] for r in results if r["peak_n"] is not None]  # empty without a load cell
     return {
         "trials": len(results),
         "held": sum(r["result"] == Outcome.HELD for r in results),
         "median_error_percent": _percentile(100 * share, 50),
         "p90_error_percent": _percentile(100 * share, 90),
         "median_error_n": _percentile(error_n, 50),
-        "good_percent": 100 * int(good.sum()) / len(results),
+        "good_percent": 100 * int(good.sum()) / len(results) if peaks else None,
         "median_overshoot_percent": _percentile(100 * overshoot, 50),
         "max_overshoot_percent": _percentile(100 * overshoot, 100),
         "median_settle_s": _percentile([r["settle_s"] for r in scored if r["settle_s"] is not None], 50),
         "peak_n": max(peaks, default=None),
-        "over_limit": sum(peak > force_limit_n for peak in peaks),
+        "over_limit": sum(peak > force_limit_n for peak in peaks) if peaks else None,
         "estimator_p50_ms": _percentile(
             [r["estimator_p50_ms"] for r in results if r["estimator_p50_ms"]], 50
         ),

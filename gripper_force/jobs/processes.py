@@ -55,7 +55,7 @@ class _ProcessPool(Executor):
     `concurrent.futures.ProcessPoolExecutor` starts processes in the thread that submits. There, Ctrl-C can
     interrupt the start, and a process that is killed while it sends a result blocks the pool forever. Here,
     Ctrl-C can't interrupt a thread, and no two processes share a pipe. The threads are daemons: none delays
-    the end of the program.
+    the end of the program. docs/decisions/0022 has the libraries that were tried.
     """
 
     def __init__(self, count: int) -> None:
@@ -122,13 +122,16 @@ class _ProcessPool(Executor):
                     process, connection = self._start()
                 connection.send_bytes(ForkingPickler.dumps(call))
                 succeeded, result = connection.recv()
-            except (EOFError, ConnectionError):
+            except (EOFError, OSError):  # the latter if it died in the middle of a message
                 code = None
                 if process is not None:
                     process.join()
                     code = process.exitcode
                 connection = None
-                future.set_exception(GripperError(f"a worker process ended with code {code}; run it again"))
+                how = "was killed, perhaps for lack of memory; use fewer --jobs"
+                if code != -signal.SIGKILL:
+                    how = f"ended with code {code}; run it again"
+                future.set_exception(GripperError(f"a worker process {how}"))
             except Exception as error:
                 future.set_exception(error)
             else:

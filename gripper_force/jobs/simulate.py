@@ -104,8 +104,9 @@ def simulate(plans: Sequence[Plan], out: Path, config: Config, jobs: int) -> Gen
     """
     out.mkdir(parents=True, exist_ok=True)
     missing = [p for p in plans if not all((out / name).exists() for name in p.names)]
+    tree = config.model_dump(mode="json")
     with process_pool(jobs) as pool:
-        futures = [pool.submit(p.make, out, config.model_dump(mode="json")) for p in missing]
+        futures = [pool.submit(p.make, out, tree) for p in missing]
         for future in as_completed(futures):
             yield from future.result()
 

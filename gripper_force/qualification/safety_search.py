@@ -1,11 +1,8 @@
 """Random search for wrong configurations and plants with which a grasp is not safe.
 
-Every case draws a plant and what the configuration wrongly believes of it, grasps, and releases. Three statements
-must hold: the contact force stays within the force limit and 5 %, jaws without contact are never faster than 1.5
-times the configured speed, and a grasp is never ``held`` on nothing for longer than 0.1 s. Where friction or an end
-stop keeps the jaws still, only the camera can tell, which may take 0.5 s and two frame periods. With motor current
-alone an end stop cannot be told from a rigid object. So such cases are counted, but are no violations; `calibrate
-jaws` prevents them.
+Every case draws a plant and what the configuration wrongly believes of it, grasps, and releases. The statements of
+`safety_statements` must hold. With motor current alone an end stop cannot be told from a rigid object. So such cases
+are counted, but are no violations; `calibrate jaws` prevents them.
 """
 
 import json
@@ -34,31 +31,15 @@ from gripper_force.qualification.loop_margin.analytic_plant import (
     SimulatedVision,
     transmission_of,
 )
-from gripper_force.types import NS_PER_S, Outcome, Phase, Request, RequestKind, ServoCommand, ServoState
-
-FORCE_SHARE: Final = 1.05
-SPEED_SHARE: Final = 1.5
-NOTHING_SHARE: Final = 0.05
-"""Contact force as a share of the target below which the jaws hold nothing."""
+from gripper_force.qualification.safety_statements import FORCE_SHARE, SPEED_SHARE, SafetyStatements
+from gripper_force.types import NS_PER_S, Outcome, Request, RequestKind, ServoCommand, ServoState
 
 WORST: Final = 5
 """Cases listed for each statement."""
 
 _GRASP_S: Final = 5.0
 _RELEASE_S: Final = 1.5
-_TRAVEL_SHARE: Final = 2.0
-"""Speed of a release as a share of the approach speed."""
-
 _CHUNK: Final = 20
-_REACTION_S: Final = 0.1
-_CAMERA_REACTION_S: Final = 0.5
-_CAMERA_REACTION_FRAMES: Final = 2
-"""Time in which a grasp may still count as held after the object has left. Jaws that friction or an end stop holds do
-not move: only the camera shows the loss, after the second time and two frame periods."""
-
-_STANDS_M_S: Final = 0.003
-"""Speed below which a jaw counts as standing still: slow creep of friction."""
-
 _GONE_M: Final = 1.0
 _STOP_M: Final = 0.0455
 
@@ -233,13 +214,14 @@ def run_case(config: Config, seed: int, index: int) -> CaseResult:
         return CaseResult(index, "refused", 0.0, 0.0, held_nothing=False, held_stop=False)
     run.go(_GRASP_S, Request(0, RequestKind.GRASP, drawn.target_n))
     run.go(_RELEASE_S, Request(run.t_ns, RequestKind.RELEASE))
+    shown = run.statements
     return CaseResult(
         index,
         str(run.outcome),
-        run.peak_n / control.force_limit_n,
-        run.speed_share,
-        run.held_nothing and drawn.feedback != "current",
-        run.held_nothing and drawn.feedback == "current",
+        shown.force_share,
+        shown.speed_share,
+        shown.held_nothing and drawn.feedback != "current",
+        shown.held_nothing and drawn.feedback == "current",
     )
 
 
@@ -255,16 +237,14 @@ class _Run:
         control: ControlConfig,
     ) -> None:
         self._plant, self._controller, self._drawn = plant, controller, drawn
-        self._offset_rad, self._speed_m_s = offset_rad, control.approach_speed_m_s
+        self._offset_rad = offset_rad
         self._rng = np.random.default_rng(drawn.seed)
         self._vision = SimulatedVision(
             0.035 + 0.5 / drawn.camera_hz, drawn.vision_noise_n, drawn.camera_hz, drawn.vision_gain
         )
         self.t_ns = 0
         self.outcome: str = Outcome.NONE
-        self.peak_n = self.speed_share = 0.0
-        self.held_nothing = False
-        self._nothing_s = 0.0
+        self.statements = SafetyStatements(control, drawn.target_n, drawn.sign)
 
     def read(self, t_ns: int, noise: float) -> ServoState:
         state = self._plant.read(t_ns, NOISE_A * noise)
@@ -291,22 +271,16 @@ class _Run:
             goal_rad = self._drawn.sign * (command.goal_position_rad - self._offset_rad)
             plant.advance(ServoCommand(self.t_ns, goal_rad, command.goal_current_a), CYCLE_NS / NS_PER_S)
             self.t_ns += CYCLE_NS
-            outcome = decision.status.outcome
-            grips_nothing = plant.force_n < NOTHING_SHARE * self._drawn.target_n
-            claims = outcome == Outcome.HELD and decision.status.phase in (Phase.RAMP, Phase.HOLD)
-            self._nothing_s = self._nothing_s + CYCLE_NS / NS_PER_S if claims and grips_nothing else 0.0
-            frames_s = _CAMERA_REACTION_FRAMES / self._drawn.camera_hz
-            stands = abs(plant.v_m_s) < _STANDS_M_S
-            reaction_s = _CAMERA_REACTION_S + frames_s if stands else _REACTION_S
-            self.held_nothing |= self._nothing_s > reaction_s
-            self.outcome = outcome
-            self.peak_n = max(self.peak_n, plant.peak_n)
-            if plant.force_n == 0.0:
-                # The jaws also open before they approach again; a wrong sign exchanges the directions.
-                opens = self._drawn.sign * plant.v_m_s < 0
-                travels = decision.status.phase not in (Phase.APPROACH, Phase.CONTACT, Phase.RAMP, Phase.HOLD)
-                limit_m_s = self._speed_m_s * (_TRAVEL_SHARE if opens or travels else 1.0)
-                self.speed_share = max(self.speed_share, abs(plant.v_m_s) / limit_m_s)
+            self.outcome = decision.status.outcome
+            self.statements.observe(
+                CYCLE_NS / NS_PER_S,
+                decision.status.phase,
+                decision.status.outcome,
+                force_n=plant.force_n,
+                object_n=plant.force_n,
+                peak_n=plant.peak_n,
+                closing_m_s=plant.v_m_s,
+            )
 
 
 def search(

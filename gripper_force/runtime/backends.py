@@ -137,6 +137,7 @@ def open_devices(config: Config, port: SharedPort | None = None) -> Iterator[Dev
             check=rig.check if rig is not None else lambda: None,
             notes=rig.notes() if rig is not None else {},
             render_under_light=rig.render_under_light if rig is not None else None,
+            observe_world=rig.observe_world if rig is not None else None,
         )
 
 

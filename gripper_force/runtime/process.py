@@ -149,6 +149,11 @@ def interrupt_exit_code() -> int:
     return 128 + (_received or [signal.SIGINT])[0]
 
 
+def is_interrupted() -> bool:
+    """Returns True if a signal of `SIGNALS` has been received, so that a run ends."""
+    return bool(_received)
+
+
 def _handle_signal(number: int, frame: FrameType | None) -> None:
     newest = _interrupts[-1:]  # a copy, because another thread may close the gripper now
     if newest:

@@ -18,7 +18,12 @@ from gripper_force import cli
 from gripper_force.cli import console
 from gripper_force.cli.options import load_settings
 from gripper_force.errors import ConfigError
+from gripper_force.runtime import process
 from gripper_force.runtime.log import LogReader
+from gripper_hw.dynamixel.control_table import load_model
+from gripper_hw.dynamixel.firmware import VirtualServo
+from gripper_hw.dynamixel.pty_server import BenchMotor, PtyServer
+from gripper_hw.dynamixel.virtual import VirtualBus
 
 
 class Done(NamedTuple):
@@ -127,6 +132,80 @@ def test_trials_print_each_and_a_summary(run: Run, sets: list[str]) -> None:
     assert trial["object"] == "sponge"
     assert result["summary"]["trials"] == 1
     assert result["summary"]["median_error_percent"] is not None
+
+
+def test_trials_of_one_object(run: Run, sets: list[str]) -> None:
+    result = run(
+        "grasp", "--json", "--trials", 2, "--object", "tube", "--target-n", 2, "--jobs", 1, *sets
+    ).json()
+    assert [(t["object"], t["target_n"], t["seed"]) for t in result["trials"]] == [
+        ("tube", 2, 0),
+        ("tube", 2, 1),
+    ]
+    assert list(result["summary"]["estimate_mae_n"]) == ["all", "tube"]
+
+
+@pytest.fixture
+def port_options(sets: list[str]) -> Iterator[list[str]]:
+    """Options of a servo at a serial port, whose jaws meet an object."""
+    motor = BenchMotor(VirtualServo(1, load_model("XM430-W350")), contact_rad=1.5)
+    bus = VirtualBus([motor.servo], before_packet=lambda: motor.advance(time.monotonic_ns()))
+    with PtyServer(bus) as server:
+        values = (
+            "clock=realtime",
+            f"servo.port={server.device_path}",
+            "servo.reply_margin_ms=300",  # a machine may be busy
+            "servo.bus_watchdog_ms=2000",
+            "control.rate_hz=50",
+            "load_cell.backend=none",
+            "object=mug",
+        )
+        yield [*sets, *(part for value in values for part in ("--set", value))]
+
+
+class Terminal:
+    """Stands in for standard input at a terminal, and gives these answers."""
+
+    def __init__(self, *answers: str) -> None:
+        self.answers = list(answers)
+
+    def isatty(self) -> bool:
+        return True
+
+    def readline(self) -> str:
+        return self.answers.pop(0)
+
+
+def test_trials_at_one_port_follow_one_another_and_wait_for_the_object(
+    run: Run, port_options: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    terminal = Terminal("\n", "\n")
+    monkeypatch.setattr(sys, "stdin", terminal)
+    done = run("grasp", "--trials", 2, *port_options)
+    assert (done.code, terminal.answers) == (0, []), done.err
+    assert "only one process can open servo.port=/dev/pts/" in done.err
+    for number in (1, 2):
+        assert f"Put the mug between the jaws for trial {number} of 2, then press Enter" in done.err
+    assert done.out.count("mug") == done.out.count(" held ") == 2
+    assert "No load cell: force errors, overshoot and peaks can't be measured." in done.out
+
+
+def test_finished_trials_are_shown_if_a_later_one_fails(
+    run: Run, port_options: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "stdin", Terminal("\n", ""))  # Ctrl-D
+    done = run("grasp", "--trials", 2, "--object", "cup", *port_options)
+    assert done.code == 2
+    assert done.out.count("cup") == 1
+    assert "no answer to this: Put the cup between the jaws for trial 2 of 2" in done.err
+
+
+def test_without_a_terminal_trials_do_not_wait(run: Run, port_options: list[str], tmp_path: Path) -> None:
+    done = run("grasp", "--json", "--trials", 2, "--target-n", 3, *port_options)
+    assert [trial["result"] for trial in done.json()["trials"]] == ["held", "held"]
+    assert "without a pause" in done.err
+    assert done.json()["summary"]["good_percent"] is None
+    assert len(list((tmp_path / "runs").glob("*-mug-3N-*.mcap"))) == 2
 
 
 def test_replay_prints_one_json_object(run: Run, fused_log: Path) -> None:
@@ -253,7 +332,10 @@ def test_a_published_database_is_imported_and_its_damage_told(run: Run, tmp_path
             "there is no port /dev/ttyUSB7",
         ),
         (["--set", "servo.model=XW999"], "XW999"),
-        (["--trials", "2", "--object", "tube"], "leave out --object and --target-n"),
+        (
+            ["--trials", "2", "--jobs", "2", "--set", "servo.port=/dev/ttyUSB7"],
+            "only one process can open servo.port=/dev/ttyUSB7, not 2; leave out --jobs",
+        ),
         (["--config", "gone.yaml"], "can't read the configuration gone.yaml"),
         (["--set", "camera.backend=simulated", "--set", "vision.checkpoint=gone"], "no checkpoint at gone"),
     ],
@@ -336,12 +418,17 @@ def test_interrupted_trials_end_without_a_word_from_each_process(sets: list[str]
     assert "interrupted" in said
 
 
-def test_an_interrupt_at_any_time_ends_trials(sets: list[str], tmp_path: Path) -> None:
+@pytest.mark.parametrize("to", ["group", "command"])
+@pytest.mark.parametrize("name", ["grasp", "simulate"])
+def test_an_interrupt_at_any_time_ends_a_command_and_its_processes(
+    name: str, to: str, sets: list[str], tmp_path: Path
+) -> None:
     program = (
         "import sys; from gripper_force.cli import main; print('ready', file=sys.stderr, flush=True); main()"
     )
-    command = [sys.executable, "-c", program, "grasp", "--json", "--trials", "400", "--jobs", "2", *sets]
-    for delay_s in np.random.default_rng(5).uniform(0.05, 6.0, 4):
+    options = {"grasp": ("--trials", "400"), "simulate": ("--presses", "400")}
+    command = [sys.executable, "-c", program, name, "--json", *options[name], "--jobs", "2", *sets]
+    for delay_s in np.random.default_rng(5).uniform(0.05, 6.0, 2):
         with subprocess.Popen(
             command,
             cwd=tmp_path,
@@ -353,12 +440,36 @@ def test_an_interrupt_at_any_time_ends_trials(sets: list[str], tmp_path: Path) -
             assert child.stderr is not None
             assert child.stderr.readline() == "ready\n"
             time.sleep(delay_s)
-            os.killpg(child.pid, signal.SIGINT)
+            if to == "group":  # as a terminal does
+                os.killpg(child.pid, signal.SIGINT)
+            else:
+                child.send_signal(signal.SIGINT)
             out, said = child.communicate(timeout=60)  # until no process holds the pipes
         assert (child.returncode, "Traceback" in said) == (130, False), said
         if out:
             result = json.loads(out)
             assert result["summary"]["trials"] == len(result["trials"]) > 0
+
+
+def test_an_interrupt_that_became_another_error_is_an_interrupt(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def converted(*_: object) -> None:
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(60)
+        except KeyboardInterrupt as interrupt:
+            raise ValueError("error in a callback") from interrupt
+
+    handler = signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(process, "_received", [])
+    monkeypatch.setattr("gripper_force.jobs.grasp.grasp", converted)
+    try:
+        done = run("grasp")
+    finally:
+        signal.signal(signal.SIGINT, handler)
+    assert done.code == 130
+    assert "interrupted" in done.err
 
 
 def test_a_protocol_and_its_scale_are_known_by_name(run: Run) -> None:

@@ -46,7 +46,7 @@ def test_no_output_ever_leaves_the_limits(cycles, transmission, limit_a):
         cap_n = 1.05 * CONFIG.force_limit_n / transmission.gain_bound + believed_n
         cap_a = min(limit_a, cap_n / transmission.n_per_a(0.0))
         assert 0.0 <= out.goal_current_a <= cap_a
-        low, high = sorted((transmission.open_position_rad, transmission.closed_position_rad))
+        low, high = transmission.goal_range_rad
         assert low <= out.goal_position_rad <= high
         assert over == (force_n > CONFIG.force_limit_n)
         if (over and not opens) or not may_rise:

@@ -1,18 +1,21 @@
 """Contract of every linkage, and the errors of impossible geometry."""
 
 import math
-from itertools import pairwise
+from collections.abc import Callable
+from itertools import accumulate, pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
-from hypothesis import given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from gripper_force.config import GripperConfig, LinkageConfig, load_config
+from gripper_force.config import ControlConfig, GripperConfig, LinkageConfig, load_config
+from gripper_force.control.limits import Limits
 from gripper_force.control.linkage import RackAndPinion, make_linkage
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import ConfigError
+from gripper_force.types import ServoCommand
 
 GRIPPERS = {
     path.stem: load_config(path).gripper
@@ -115,7 +118,107 @@ def test_default_is_a_rack_and_pinion() -> None:
     assert make_linkage(GripperConfig()) == RackAndPinion(0.02, 0.092)
 
 
+Draw = Callable[[st.SearchStrategy[float]], float]
+
+
+def drawn_finger(draw: Draw) -> tuple[dict[str, Any], float]:
+    finger_m, open_rad = draw(st.floats(0.02, 0.2)), draw(st.floats(0.1, 1.5))
+    keys = {"finger_m": finger_m, "open_finger_rad": open_rad}
+    return keys, draw(st.floats(0.1, 1.1)) * finger_m * math.sin(open_rad)
+
+
+def drawn_crank_slider(draw: Draw) -> tuple[dict[str, Any], float]:
+    crank_m = draw(st.floats(0.005, 0.05))
+    keys = {
+        "crank_m": crank_m,
+        "rod_m": draw(st.floats(0.8, 4.0)) * crank_m,
+        "offset_m": draw(st.floats(-0.8, 0.8)) * crank_m,
+        "open_crank_rad": draw(st.floats(-0.5, 1.6)),
+    }
+    return keys, draw(st.floats(0.1, 3.0)) * crank_m
+
+
+def drawn_four_bar(draw: Draw) -> tuple[dict[str, Any], float]:
+    keys = {key: draw(st.floats(0.01, 0.05)) for key in ("crank_m", "rod_m", "rocker_m", "base_m")}
+    keys |= {"finger_m": draw(st.floats(0.02, 0.1)), "open_crank_rad": draw(st.floats(0.3, 2.8))}
+    keys |= {"open_finger_rad": draw(st.floats(0.1, 1.2))}
+    return keys, draw(st.floats(0.1, 1.5)) * keys["finger_m"]
+
+
+def drawn_table(draw: Draw) -> tuple[dict[str, Any], float]:
+    steps = [(draw(st.floats(0.1, 1.0)), draw(st.floats(0.005, 0.03))) for _ in range(5)]
+    angles_rad = accumulate((step[0] for step in steps[:-1]), initial=0.0)
+    closed_m = list(accumulate((step[1] for step in steps[:-1]), initial=0.0))
+    open_width_m = closed_m[-1] + steps[-1][1]
+    rows = tuple((a, open_width_m - b) for a, b in zip(angles_rad, closed_m, strict=True))
+    return {"table": rows}, open_width_m
+
+
+def drawn_rack(draw: Draw) -> tuple[dict[str, Any], float]:
+    return {}, draw(st.floats(0.01, 0.2))
+
+
+KINDS = {
+    "rack": drawn_rack,
+    "crank_slider": drawn_crank_slider,
+    "four_bar": drawn_four_bar,
+    "finger": drawn_finger,
+    "table": drawn_table,
+}
+
+
+def test_every_kind_is_drawn() -> None:
+    assert set(KINDS) == set(get_args(LinkageConfig.model_fields["kind"].annotation))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@settings(max_examples=50)
+@given(data=st.data())
+def test_any_geometry_is_refused_or_has_all_properties_of_a_linkage(kind: str, data: st.DataObject) -> None:
+    keys, open_width_m = KINDS[kind](data.draw)
+    config = GripperConfig(linkage=LinkageConfig(kind=kind, **keys), open_width_m=open_width_m)
+    try:
+        linkage = make_linkage(config)
+    except ConfigError:
+        assume(False)
+    end_rad = linkage.closing_rad(0.0)
+    assert (linkage.width_m(0.0), linkage.width_m(end_rad)) == pytest.approx((open_width_m, 0.0), abs=1e-6)
+    for share in (-0.1, 0.03, 0.35, 0.5, 0.77, 0.97, 1.1):
+        at_rad, step_rad = share * end_rad, 0.002 * end_rad
+        assert linkage.closing_rad(linkage.width_m(at_rad)) == pytest.approx(at_rad, abs=1e-6 * end_rad)
+        derivative = (linkage.width_m(at_rad - step_rad) - linkage.width_m(at_rad + step_rad)) / (
+            2 * step_rad
+        )
+        assert 2 * linkage.jaw_m_per_rad(at_rad) == pytest.approx(derivative, rel=0.02)
+        assert derivative > 0
+
+
+@given(
+    grippers,
+    st.sampled_from([-1, 1]),
+    st.floats(0, 1),
+    st.floats(-1e3, 1e3),
+    st.floats(0, 1e3),
+)
+def test_no_linkage_leaves_its_travel_or_the_force_limit(
+    name: str, sign: int, share: float, goal_rad: float, goal_a: float
+) -> None:
+    one, control = transmission_of(name, closing_sign=sign), ControlConfig()
+    at_rad = one.position_rad(share * one.open_width_m)
+    wanted = ServoCommand(0, goal_rad, goal_a)
+    command, _ = Limits(control, one, 1e3).apply(wanted, 0.0, 0.0, 0.0, at_rad, 60.0, may_rise=True)
+    low_rad, high_rad = one.goal_range_rad
+    assert low_rad <= command.goal_position_rad <= high_rad
+    force_n = one.force_n(sign * command.goal_current_a, at_rad)
+    assert force_n * one.gain_bound <= 1.05 * control.force_limit_n
+
+
 CRANK = {"kind": "crank_slider", "crank_m": 0.022, "rod_m": 0.036, "open_crank_rad": 1.1}
+
+FOUR_BAR = {
+    "kind": "four_bar", "crank_m": 0.02, "rod_m": 0.04, "rocker_m": 0.022, "base_m": 0.04, "finger_m": 0.06,
+    "open_crank_rad": 1.9, "open_finger_rad": 0.6,
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -126,6 +229,13 @@ CRANK = {"kind": "crank_slider", "crank_m": 0.022, "rod_m": 0.036, "open_crank_r
         (CRANK | {"open_crank_rad": 1.57}, 0.08, "near its dead centre"),
         (CRANK | {"rod_m": 0.01}, 0.05, "mm at most"),
         ({"kind": "finger", "finger_m": 0.03, "open_finger_rad": 0.5}, 0.09, "closes by"),
+        ({"kind": "crank_slider", "crank_m": 0.022}, 0.05, r"needs gripper\.linkage\.rod_m"),
+        ({"kind": "finger"}, 0.05, r"needs gripper\.linkage\.finger_m"),
+        (FOUR_BAR | {"rocker_m": None}, 0.05, r"needs gripper\.linkage\.rocker_m"),
+        (CRANK | {"open_crank_rad": 0.0, "rod_m": 0.01}, 0.05, "cannot be assembled"),
+        (FOUR_BAR | {"rod_m": 0.2}, 0.05, "cannot be assembled"),
+        (FOUR_BAR | {"base_m": 0.02, "open_crank_rad": 0.0}, 0.05, "cannot be assembled"),
+        ({"kind": "table", "table": ((0, 0.05), (1, 0.049999), (2, 0.049998))}, 0.05, "mm at most"),
         ({"kind": "table", "table": ((0, 0.05), (1, 0.02))}, 0.05, "three or more rows"),
         ({"kind": "table", "table": ((0, 0.05), (1, 0.02), (2, 0.03))}, 0.05, "widths fall"),
         ({"kind": "table", "table": ((0, 0.05), (1, 0.02), (2, 0.01))}, 0.06, "open_width_m"),

@@ -98,6 +98,26 @@ def test_motor_current_above_its_goal_trips():
     assert "takes 0.150 A" in safety.reason
 
 
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_motor_that_is_back_driven_may_draw_more_than_its_goal(sign):
+    safety = Safety(CONFIG)
+    pulled, still = (
+        replace(WELL, current_a=sign * 0.3, velocity_rad_s=-sign * rad_s) for rad_s in (0.3, 0.03)
+    )
+    assert not any(check(safety, pulled) for _ in range(100))
+    assert any(check(safety, still) for _ in range(6))
+
+
+@given(st.integers(1, 5))
+def test_pulling_at_a_motor_with_too_much_current_does_not_hide_it(pulled_cycles):
+    safety = Safety(CONFIG)
+    pulled = replace(WELL, current_a=0.3, velocity_rad_s=-0.3)
+    for _ in range(3):
+        check(safety, replace(WELL, current_a=0.3))
+    assert not any(check(safety, pulled) for _ in range(pulled_cycles))
+    assert any(check(safety, replace(WELL, current_a=0.3)) for _ in range(2))
+
+
 @given(st.floats(-40, 120), st.floats(0, 20))
 def test_a_hotter_servo_never_holds_more(temperature_c, hotter_c):
     safety = Safety(CONFIG)

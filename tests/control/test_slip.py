@@ -53,12 +53,12 @@ def test_closed_jaws_hold_nothing():
     assert not thin.is_lost(0.005, 0.0003, 0.0, 0.0, 4.0)
 
 
-def receding(monitor, *, motor_force_n, speed_m_s=0.01, rest=True):
+def receding(monitor, *, motor_force_n, speed_m_s=0.01, rest_m=0.05):
     """Jaws at rest, then closing by 1 mm of width in 50 ms, with a motor force that rises to ``motor_force_n``."""
-    found = [monitor.has_receded(0.05, 0.0, 0.5)] if rest else []
+    found = [monitor.has_receded(rest_m, 0.05, 0.0, 0.5)] if rest_m else []
     for cycle in range(1, 11):
-        width_m, share = 0.05 - 2 * speed_m_s * 0.005 * cycle, cycle / 10
-        found.append(monitor.has_receded(width_m, speed_m_s, 0.5 + share * (motor_force_n - 0.5)))
+        width_m, share = (rest_m or 0.05) - 2 * speed_m_s * 0.005 * cycle, cycle / 10
+        found.append(monitor.has_receded(width_m, 0.05, speed_m_s, 0.5 + share * (motor_force_n - 0.5)))
     return [text for text in found if text]
 
 
@@ -71,7 +71,11 @@ def test_jaws_that_close_with_more_motor_force_still_hold():
 
 
 def test_jaws_that_have_not_been_at_rest_yet_still_close_on_the_object():
-    assert not receding(SlipMonitor(CONFIG), motor_force_n=0.5, rest=False)
+    assert not receding(SlipMonitor(CONFIG), motor_force_n=0.5, rest_m=0.0)
+
+
+def test_jaws_that_return_after_a_pull_still_hold():
+    assert not receding(SlipMonitor(CONFIG), motor_force_n=0.5, rest_m=0.051)
 
 
 def test_creep_of_a_soft_object_is_no_loss():

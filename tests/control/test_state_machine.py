@@ -165,6 +165,12 @@ def test_object_that_leaves_jaws_on_an_end_stop_is_a_slip_with_a_camera(make_run
     assert any("the camera sees only" in reason for reason in run.reasons)
 
 
+def test_camera_that_is_uncertain_throughout_a_grip_prevents_held(make_run):
+    run = make_run(vision={"noise_n": 2.0}, timeout_s=3.0).grasp(2.0, 4.0)
+    assert run.last.status.outcome == "timeout"
+    assert any("the camera is uncertain" in reason for reason in run.reasons)
+
+
 def test_springy_object_cannot_push_the_jaws_open_fast(make_run):
     run = make_run(plant={"stiffness_n_m": 300.0, "mass_kg": 0.8, "friction_n": 0.3}).grasp(8.0, 5.0)
     run.go(0.005, "release")
@@ -536,10 +542,21 @@ def test_command_is_within_limits_for_any_input(transmission, inputs, feedback):
         if is_sound(servo):
             position_rad = servo.position_rad
         if position_rad is not None:
-            low_rad = min(position_rad, transmission.open_position_rad)
-            high_rad = max(position_rad, transmission.closed_position_rad)
+            low_rad = min(position_rad, transmission.goal_range_rad[0])
+            high_rad = max(position_rad, transmission.goal_range_rad[1])
             assert low_rad <= command.goal_position_rad <= high_rad
             assert abs(command.goal_position_rad - position_rad) < 0.11  # 2 mm of one jaw
         assert math.isfinite(decision.estimate.force_n)
         if request is not None and request.kind == "stop":
             assert decision.status.phase == "fault"
+
+
+def test_paper_is_gripped_with_the_full_force(make_run):
+    """The servo's position loop needs a goal beyond the closed jaws: 0.2 mm is too short a lead for its current."""
+    run = make_run(
+        plant={"contact_m": 0.04585, "stops_m": (0.0, 0.046), "stiffness_n_m": 2e5, "play_m": 0.0},
+        min_object_width_m=0.0001,
+        feedback="current",
+    ).grasp(9.0)
+    assert run.last.status.outcome == "held"
+    assert run.plant.force_n == pytest.approx(9.0, abs=0.5)

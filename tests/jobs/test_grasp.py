@@ -1,16 +1,16 @@
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from gripper_force.config import Config, config_from_text, load_config
+from gripper_force.control.limits import largest_target_n
+from gripper_force.errors import ConfigError, DeviceError, RequestError
+from gripper_force.interfaces import Progress
 from gripper_force.jobs import grasp as grasp_module
-from gripper_force.jobs.grasp import Summary, overall, summarise, trials
+from gripper_force.jobs.grasp import Summary, exclusive_device, overall, summarise, trials
 from gripper_force.runtime.log import LogReader, LogWriter
 from gripper_force.types import LoadCellSample, VisualForce
 
@@ -116,27 +116,25 @@ def test_estimates_are_averaged_by_object() -> None:
 def test_trials_without_any_figure_still_sum_up() -> None:
     nothing = result(4.0, None, overshoot_n=None, settle_s=None, estimator_p50_ms=None, peak_n=None)
     summary = overall([nothing], force_limit_n=12.0)
-    assert summary["good_percent"] == 0
+    assert summary["good_percent"] is summary["over_limit"] is None
     assert summary["median_error_percent"] is None
     assert summary["peak_n"] is None
 
 
-@contextmanager
-def here(_count: int) -> Iterator[SimpleNamespace]:
-    """Stands in for a pool of processes."""
-    yield SimpleNamespace(map=map)
+@pytest.fixture
+def ran(monkeypatch: pytest.MonkeyPatch) -> list[Config]:
+    """The configurations of grasps, none of which is done. One of the object ``broken`` ends with a fault."""
+    configs: list[Config] = []
+
+    def note(config: Config, _progress: Progress) -> dict[str, Any]:
+        configs.append(config)
+        return {"result": "fault" if config.object == "broken" else "held", "log": "runs/it.mcap"}
+
+    monkeypatch.setattr(grasp_module, "grasp", note)
+    return configs
 
 
-def test_trials_are_drawn_from_the_seed(monkeypatch: pytest.MonkeyPatch) -> None:
-    ran: list[Config] = []
-    monkeypatch.setattr(grasp_module, "process_pool", here)
-
-    def noted(config: Config) -> dict[str, Any]:
-        ran.append(config)
-        return {}
-
-    monkeypatch.setattr(grasp_module, "grasp", noted)
-
+def test_trials_are_drawn_from_the_seed(ran: list[Config]) -> None:
     def plan(seed: int) -> list[tuple[str, float, int]]:
         ran.clear()
         list(trials(load_config(None, [f"seed={seed}"]), 6, jobs=1))
@@ -148,6 +146,57 @@ def test_trials_are_drawn_from_the_seed(monkeypatch: pytest.MonkeyPatch) -> None
     assert all(1 <= target_n <= 8 for _, target_n, _ in first)
     assert plan(40) == first
     assert [t for _, t, _ in plan(41)] != [t for _, t, _ in first]
+
+
+def test_targets_are_within_the_force_limit(ran: list[Config]) -> None:
+    list(trials(load_config(None, ["control.force_limit_n=5"]), 40, jobs=1))
+    largest_n = largest_target_n(5.0, ran[0].gripper.gain_bound)
+    assert largest_n / 2 < max(config.target_n for config in ran) <= largest_n
+    with pytest.raises(RequestError, match="a target of 1 N is too close to "):
+        next(trials(load_config(None, ["control.force_limit_n=1"]), 1, jobs=1))
+
+
+def test_trials_of_one_object_with_one_target_are_unseen_scenes(ran: list[Config]) -> None:
+    list(trials(load_config(None, []), 3, jobs=1, objects=["tube"], target_n=2.5))
+    assert [(c.object, c.target_n, c.seed) for c in ran] == [("tube", 2.5, seed) for seed in range(3)]
+
+
+REAL = ["clock=realtime", "servo.port=/dev/ttyUSB7", "camera.backend=none", "load_cell.backend=none"]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "device"),
+    [
+        ([], ""),
+        (["camera.backend=none", "load_cell.backend=playback"], ""),
+        (["camera.backend=oak"], "camera.backend=oak"),
+        (["load_cell.backend=serial"], "load_cell.backend=serial"),
+        (["servo.backend=package.module:Servo"], "servo.backend=package.module:Servo"),
+        (REAL, "servo.port=/dev/ttyUSB7"),
+    ],
+)
+def test_a_device_that_only_one_process_can_open_is_named(overrides: list[str], device: str) -> None:
+    assert exclusive_device(load_config(None, overrides)) == device
+
+
+def test_several_processes_are_refused_with_a_real_device() -> None:
+    with pytest.raises(ConfigError, match="only one process can open"):
+        next(trials(load_config(None, REAL), 2, jobs=2))
+
+
+def test_after_a_fault_of_a_real_gripper_nothing_moves(ran: list[Config]) -> None:
+    running = trials(load_config(None, REAL), 3, jobs=1, objects=["mug", "broken"])
+    assert [next(running)["result"] for _ in range(2)] == ["held", "fault"]
+    with pytest.raises(DeviceError, match="trial 2 of 3 ended with a fault"):
+        next(running)
+    assert len(ran) == 2
+
+
+def test_a_person_places_the_object_before_each_trial(ran: list[Config]) -> None:
+    asked: list[tuple[int, str]] = []
+    config = load_config(None, REAL)
+    list(trials(config, 2, jobs=1, objects=["mug"], prompt=lambda text: asked.append((len(ran), text))))
+    assert asked == [(n, f"Put the mug between the jaws for trial {n + 1} of 2") for n in range(2)]
 
 
 def test_a_log_is_never_overwritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,10 +1,13 @@
+import gc
 import os
 import signal
+import struct
 import subprocess
 import sys
 import time
 from concurrent.futures import Future
 from multiprocessing import active_children
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import pytest
@@ -61,13 +64,22 @@ def test_results_are_in_order_and_the_processes_end() -> None:
 
 def test_a_process_that_dies_is_an_error_and_is_replaced() -> None:
     with process_pool(1) as pool:
-        with pytest.raises(GripperError, match="ended with code -9"):
-            pool.submit(kill_itself).result()
-        assert pool.submit(abs, -3).result() == 3
+        for job in (kill_itself, send_half_a_result_and_die):
+            with pytest.raises(GripperError, match="was killed, perhaps for lack of memory"):
+                pool.submit(job).result()
+            assert pool.submit(abs, -3).result() == 3
+        with pytest.raises(GripperError, match="ended with code 7"):
+            pool.submit(os._exit, 7).result()
 
 
 def kill_itself() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
+
+
+def send_half_a_result_and_die() -> None:
+    (connection,) = (found for found in gc.get_objects() if isinstance(found, Connection))
+    os.write(connection.fileno(), struct.pack("!i", 1000) + b"half")  # multiprocessing's header: the length
+    kill_itself()
 
 
 def large_result() -> bytes:

@@ -110,6 +110,7 @@ def closed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         rig = device("rig")
         rig.clock, rig.start_ns, rig.check, rig.notes = MonotonicClock(), 0, lambda: None, dict
         rig.camera, rig.load_cell, rig.render_under_light = device("camera"), device("load cell"), None
+        rig.observe_world = None
         return rig
 
     monkeypatch.setattr(backends, "load_servo_class", lambda _: lambda *_: device("servo"))

@@ -57,7 +57,12 @@ def trials_table(trials: "Sequence[Summary]", summary: "Overall") -> None:
             t["result"],
         )
     out.print(table)
-    pairs({key: value for key, value in summary.items() if key != "estimate_mae_n"})
+    plain = {key: value for key, value in summary.items() if key != "estimate_mae_n"}
+    if summary["peak_n"] is None:
+        pairs({key: value for key, value in plain.items() if value is not None})
+        out.print("No load cell: force errors, overshoot and peaks can't be measured.")
+        return
+    pairs(plain)
     table = Table("MAE over the run, N", "vision", "current", "fused", "floor", box=None)
     for name, e in summary["estimate_mae_n"].items():
         table.add_row(name, *(number(e[key]) for key in ("visual", "current", "fused", "floor")))

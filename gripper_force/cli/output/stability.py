@@ -1,6 +1,6 @@
 """Tables of the `stability` commands."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypedDict
 
 from rich.markup import escape
 from rich.table import Table
@@ -8,11 +8,20 @@ from rich.table import Table
 from gripper_force.cli.console import number, out, pairs
 
 if TYPE_CHECKING:
-    from gripper_force.qualification.fault_matrix.matrix import MatrixReport
+    from gripper_force.qualification.fault_matrix.matrix import RowSummary
+    from gripper_force.qualification.fault_matrix.wrong_configurations import WrongSummary
     from gripper_force.qualification.fuzz.fuzzer import FuzzReport
     from gripper_force.qualification.numerics.suite import NumericsReport
     from gripper_force.qualification.safety_search import SearchReport
     from gripper_force.qualification.soak import SoakReport
+
+
+class FaultsReport(TypedDict):
+    """Rows of both tables; ``ok`` is True if every grasp had an expected reaction."""
+
+    rows: "list[RowSummary]"
+    wrong: "list[WrongSummary]"
+    ok: bool
 
 
 def fuzz_table(r: "FuzzReport") -> None:
@@ -43,12 +52,19 @@ def numerics_tables(r: "NumericsReport") -> None:
         out.print()
 
 
-def faults_table(r: "MatrixReport") -> None:
-    """Prints the fault matrix."""
+def faults_tables(r: FaultsReport) -> None:
+    """Prints the fault matrix and the wrong configurations."""
+    if r["rows"]:
+        _faults_table(r["rows"])
+    if r["wrong"]:
+        _wrong_table(r["wrong"])
+
+
+def _faults_table(rows: "list[RowSummary]") -> None:
     table = Table(
         "fault", "expected", "as expected", "worst ms", "within ms", "live ms", "peak over limit", box=None
     )
-    for row in r["rows"]:
+    for row in rows:
         colour = "green" if row["ok"] == row["runs"] else "bold red"
         table.add_row(
             row["row"],
@@ -60,9 +76,30 @@ def faults_table(r: "MatrixReport") -> None:
             f"{100 * row['peak_over_limit']:+.1f} %",
         )
     out.print(table)
-    for row in r["rows"]:
+    for row in rows:
         for seed, failure in row["failures"].items():
             out.print(f"[bold red]{row['row']}[/], seed {seed}: {escape(failure)}", soft_wrap=True)
+
+
+def _wrong_table(rows: "list[WrongSummary]") -> None:
+    table = Table(
+        "wrong", "as expected", "live", "force over limit", "speed over configured", "on nothing", box=None
+    )
+    for row in rows:
+        colour = "green" if row["ok"] == row["runs"] else "bold red"
+        live = "green" if row["live_ok"] == row["live_runs"] else "bold red"
+        table.add_row(
+            row["row"],
+            f"[{colour}]{row['ok']} of {row['runs']}[/]",
+            f"[{live}]{row['live_ok']} of {row['live_runs']}[/]" if row["live_runs"] else "-",
+            number(max(row["force_share"], row["live_force_share"] or 0.0), digits=2),
+            number(max(row["speed_share"], row["live_speed_share"] or 0.0), digits=2),
+            str(row["held_nothing"] + row["live_held_nothing"]),
+        )
+    out.print(table)
+    for row in rows:
+        for grasp, failure in row["failures"].items():
+            out.print(f"[bold red]{row['row']}[/], {escape(grasp)}: {escape(failure)}", soft_wrap=True)
 
 
 def search_table(r: "SearchReport") -> None:

@@ -5,8 +5,6 @@ hold. It is compared with the same grasp without the fault. Rows that kill or st
 processes in real time.
 """
 
-import hashlib
-import json
 import signal
 import tempfile
 from collections import Counter
@@ -17,15 +15,15 @@ from typing import Any, Final, NotRequired, TypedDict
 
 import numpy as np
 
-from gripper_force import __version__
-from gripper_force.config import Config, config_from, dump_config
-from gripper_force.errors import DataError, GripperError, LogError
+from gripper_force.config import Config, config_from
+from gripper_force.errors import GripperError, LogError
 from gripper_force.interfaces import Devices, Progress, no_progress
 from gripper_force.jobs.grasp import TRIAL_OBJECTS, TRIAL_TARGETS_N, grasp_and_release
 from gripper_force.jobs.processes import process_pool
 from gripper_force.qualification.fault_matrix.cases import ROWS, FaultCase
 from gripper_force.qualification.fault_matrix.judge import FaultFreeGrasp, Grasp, judge
 from gripper_force.qualification.fault_matrix.kill_process import kill_trial
+from gripper_force.qualification.fault_matrix.outcome_file import OutcomeFile
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log import LogReader
 from gripper_force.runtime.resolve import resolve
@@ -121,38 +119,6 @@ class RowSummary(TypedDict):
     live_results: dict[str, int]
 
 
-class MatrixReport(TypedDict):
-    """All rows; ``ok`` is True if every grasp had the expected reaction."""
-
-    rows: list[RowSummary]
-    ok: bool
-
-
-class _OutcomeFile:
-    """File that takes each outcome at once, so that an interrupted matrix can be continued."""
-
-    def __init__(self, path: Path, config: Config, resume: bool) -> None:
-        self._path = path
-        self._digest = hashlib.sha256(f"{__version__} {dump_config(config)}".encode()).hexdigest()
-        self.outcomes: dict[str, Outcome] = {}
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            if not (resume and path.exists()):
-                path.write_text("", encoding="utf-8")
-            for line in path.read_text(encoding="utf-8").splitlines():
-                digest, key, outcome = json.loads(line)
-                self.outcomes[key] = outcome
-                if digest != self._digest:
-                    raise DataError(f"{path} was made with another configuration; run without --resume")
-        except (OSError, ValueError, TypeError) as error:
-            raise DataError(f"can't continue with {path}: {error}; run without --resume") from error
-
-    def add(self, key: str, outcome: Outcome) -> Outcome:
-        with self._path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps([self._digest, key, outcome]) + "\n")
-        return outcome
-
-
 def run_matrix(
     config: Config,
     seeds: int,
@@ -185,7 +151,7 @@ def run_matrix(
     """
     drawn = [_draw(config, i).model_dump(mode="json") for i in range(seeds)]
     simulated = [row for row in rows if row.unit != "process"]
-    file = _OutcomeFile(keep, config, resume)
+    file = OutcomeFile[Outcome](keep, config, resume=resume)
     with process_pool(jobs) as pool:
 
         def begin(row: FaultCase, index: int, clock: str) -> Callable[[], Outcome]:

@@ -116,7 +116,7 @@ class _Bounds:
             config.servo.current_limit_a,
             (config.control.force_limit_n + most_friction_n) / rig.n_per_a(rig.open_position_rad),
         )
-        self._low_rad, self._high_rad = sorted((rig.open_position_rad, rig.closed_position_rad))
+        self._low_rad, self._high_rad = rig.goal_range_rad
 
     def contains(self, current_a: float, position_rad: float) -> bool:
         """Returns True if a command is within the limits; a non-finite one is not."""

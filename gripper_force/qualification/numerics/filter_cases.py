@@ -342,7 +342,7 @@ def _count_bad_commands(control: ControlConfig, gripper: GripperConfig, current_
                     servo = ServoState(**(asdict(servo) | {name: extreme}))
                 command = controller.step(t_ns, servo, None, request).command
                 request = None
-                ends = sorted((transmission.open_position_rad, transmission.closed_position_rad))
+                ends = transmission.goal_range_rad
                 bad += not (
                     0 <= command.goal_current_a <= current_limit_a
                     and ends[0] <= command.goal_position_rad <= ends[1]

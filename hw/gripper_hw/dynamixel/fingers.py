@@ -101,13 +101,16 @@ class FingerPair:
                 f"than servo.second.max_difference_rad {self._config.max_difference_rad:g}; check that both move "
                 "freely and that the object is in the middle, then start again"
             )
-        currents_a = (first.current_a, second.current_a)
-        excess_a = [a for a, goal_a in zip(currents_a, self._goals_a, strict=True) if is_excess(a, goal_a)]
+        excess_a = [
+            state.current_a
+            for state, goal_a in zip(self._states, self._goals_a, strict=True)
+            if is_excess(state, goal_a)
+        ]
         return ServoState(
             t_ns=first.t_ns,
             position_rad=(first.position_rad + second.position_rad) / 2,
             velocity_rad_s=(first.velocity_rad_s + second.velocity_rad_s) / 2,
-            current_a=max(excess_a, key=abs) if excess_a else sum(currents_a) / 2,
+            current_a=max(excess_a, key=abs) if excess_a else (first.current_a + second.current_a) / 2,
             temperature_c=max(first.temperature_c, second.temperature_c),
             voltage_v=min(first.voltage_v, second.voltage_v),
             hardware_error=first.hardware_error | second.hardware_error,

@@ -67,6 +67,9 @@ class VirtualServo:
         on_watchdog: What a Bus Watchdog trip does in the position modes, which the vendor does not document: the
             motor goes ``limp``, holds the present position (``brake``), follows its last goals on (``continue``),
             or runs away by the Homing Offset; see docs/decisions/0021-what-a-watchdog-trip-does.md.
+        reverses_voltage: True if the current loop may reverse the voltage that the operating mode wants. If not, it
+            can only lower it to zero, and a motor that is turned against it draws more than its goal current. The
+            vendor does not document it.
         excess_current_ratio: Fault: motor current beyond the commanded one, as a fraction of it.
     """
 
@@ -93,6 +96,7 @@ class VirtualServo:
         self._last_packet_ns = 0
         self._pending_write: tuple[int, bytes] | None = None
         self.silent_until_ns = 0
+        self.reverses_voltage = True
         self.excess_current_ratio = 0.0
         self.on_watchdog: Literal["limp", "brake", "continue", "run away"] = "limp"
         self.tripped = False
@@ -315,7 +319,11 @@ class VirtualServo:
                 limit_a = min(limit_a, abs(self._goal_current_a))
         bound = self._pwm_limit if mode == PWM_MODE else min(self._pwm_limit, abs(self._goal_pwm))
         self._pwm = max(-bound, min(bound, self._pwm))
-        return max(-limit_a, min(limit_a, self._stall_a * (self._pwm - back_emf)))
+        target_a = max(-limit_a, min(limit_a, self._stall_a * (self._pwm - back_emf)))
+        if self.reverses_voltage:
+            return target_a
+        at_no_voltage_a = -self._stall_a * back_emf
+        return max(target_a, at_no_voltage_a) if self._pwm >= 0 else min(target_a, at_no_voltage_a)
 
     def _position_pid(self, dt_s: float) -> float:
         error = self._goal_position - self._ticks()

@@ -9,7 +9,7 @@ from string import Template
 import numpy as np
 import numpy.typing as npt
 
-from gripper_force.config import GripperConfig, SimConfig
+from gripper_force.config import Config, GripperConfig, SimConfig
 from gripper_force.errors import ConfigError
 from gripper_hw.sim.objects import GAUGES, PADS_ONLY, ObjectModel, build_object
 
@@ -120,6 +120,14 @@ def draw_scene(object_name: str, seed: int, config: SimConfig) -> Scene:
         return _draw(object_name, seed if other_seed is None else other_seed, config)
 
     placement, grasped, rig = draw(None), draw(config.object_seed), draw(config.rig_seed)
+    if config.gain is not None:
+        rig = replace(rig, nm_per_a=config.gain)
+    if config.friction is not None:
+        rig = replace(
+            rig,
+            servo_friction_nm=config.friction * Scene.servo_friction_nm,
+            jaw_friction_n=config.friction * Scene.jaw_friction_n,
+        )
     exact = object_name in GAUGES
     return replace(
         rig,
@@ -173,6 +181,12 @@ def _draw(object_name: str, seed: int, config: SimConfig) -> Scene:
         # This varies more than the jaws' travel under force, so that travel alone does not give the force.
         rod_length_m=0.020 + (float(rng.uniform(-0.003, 0.003)) if config.tool == "rods" else 0.0),
     )
+
+
+def true_gripper(config: Config) -> GripperConfig:
+    """Returns the simulated gripper's geometry, which can differ from what the controller believes."""
+    width_m = config.sim.open_width_m
+    return config.gripper if width_m is None else config.gripper.model_copy(update={"open_width_m": width_m})
 
 
 def draw_second_finger(scene: Scene, seed: int, config: SimConfig) -> Scene:

@@ -4,6 +4,7 @@ import json
 import threading
 import time
 from collections import deque
+from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import asdict
 from typing import TYPE_CHECKING
@@ -14,13 +15,13 @@ import numpy.typing as npt
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, SimulationError
 from gripper_force.fault_injection import Faults
-from gripper_force.interfaces import Camera, Clock, LoadCell
+from gripper_force.interfaces import Camera, Clock, LoadCell, WorldState
 from gripper_force.runtime.backends import MonotonicClock
 from gripper_force.types import NS_PER_MS, NS_PER_S, Frame, Gray, LoadCellSample
 from gripper_hw.dynamixel.control_table import load_model
 from gripper_hw.dynamixel.virtual import VirtualBus, VirtualServo, register_bus, unregister_bus
 from gripper_hw.sim.detail_level import resolve_detail
-from gripper_hw.sim.scene import Scene, draw_scene, draw_second_finger
+from gripper_hw.sim.scene import Scene, draw_scene, draw_second_finger, true_gripper
 from gripper_hw.sim.surroundings import Surroundings
 from gripper_hw.sim.world import World
 
@@ -233,7 +234,7 @@ class SimulatedRig:
         self._second = draw_second_finger(self.scene, config.seed, config.sim) if len(servos) > 1 else None
         self._world = World(
             self.scene,
-            config.gripper,
+            true_gripper(config),
             motors[0],
             model.nm_per_a,
             config.seed,
@@ -269,9 +270,15 @@ class SimulatedRig:
         return resolve_detail(config)
 
     def _wrap_in_faults(self, faults: Faults, seed: int) -> None:
+        def remove_object(t_ns: int) -> None:
+            if faults.active("plant", faults.start_ns + t_ns) == "off":
+                self._world.remove_object()
+
         from gripper_hw.sim.rig_faults import FaultyCamera, FaultyClock, FaultyLoadCell
 
         clock = self.clock
+        if faults.has("plant"):
+            self._world.call_every(self._world.step_ns, remove_object)
         if faults.has("clock"):
             self.clock = faulty = FaultyClock(clock, faults)
             self._closing.callback(faulty.close)
@@ -302,6 +309,15 @@ class SimulatedRig:
         scene = draw_scene(config.object, config.seed, config.sim)
         camera = SimulatedCamera(self._world, scene, config, self.clock, self.start_ns)
         return camera, {**self.notes(), "scene": json.dumps(asdict(scene))}
+
+    def observe_world(self, call: Callable[[WorldState], None]) -> None:
+        """Calls a function with the true state after each step of the world, in the world's thread."""
+
+        def observe(t_ns: int) -> None:
+            world = self._world
+            call(WorldState(t_ns + self.start_ns, world.force_n, world.closing_m_s, world.has_object))
+
+        self._world.call_every(self._world.step_ns, observe)
 
     def close(self) -> None:
         """Stops the world and unregisters its bus. May be called twice."""

@@ -20,14 +20,14 @@ def probe(config: Config) -> Iterator[Check]:
         return
     from gripper_hw.dynamixel.control_table import load_model
     from gripper_hw.dynamixel.firmware import VirtualServo
-    from gripper_hw.sim.scene import draw_scene
+    from gripper_hw.sim.scene import draw_scene, true_gripper
     from gripper_hw.sim.simulated_rig import SimulatedRig
     from gripper_hw.sim.world import World
 
     model = load_model("XM430-W350")
     config, _ = SimulatedRig.resolve(config)
     scene = draw_scene(config.object, config.seed, config.sim)
-    world = World(scene, config.gripper, VirtualServo(1, model), model.nm_per_a, config.seed)
+    world = World(scene, true_gripper(config), VirtualServo(1, model), model.nm_per_a, config.seed)
 
     def step_and_render() -> None:
         world.advance_to(world.t_ns + world.step_ns)  # without a step, `render` returns the last image

@@ -13,6 +13,7 @@ from gripper_force.control.linkage import Linkage, RackAndPinion, make_linkage
 from gripper_force.errors import SimulationError
 from gripper_force.types import NS_PER_S
 from gripper_hw.sim.engine import mujoco, new_renderer
+from gripper_hw.sim.objects import NO_OBJECT
 from gripper_hw.sim.scene import Scene, horn_dynamics, scene_mjcf
 from gripper_hw.sim.surroundings import Surroundings
 
@@ -30,6 +31,8 @@ _MAX_STEP_S = 0.004
 """At 8 ms a tube presses with 22 N instead of 12 N, without any warning of MuJoCo."""
 
 _CURRENT_NOISE_A = 0.003
+_AWAY_M = (1.0, 0.0, 0.0)
+"""Where an object is that has left the jaws: out of the picture."""
 
 # In software rendering, each of these costs more than all the rest of a 128x128 image.
 _DISABLED_RENDER_FLAGS = (
@@ -92,6 +95,7 @@ class World:
         t_ns: Simulated time.
         step_ns: Time step of the physics.
         force_n: Grip force: mean of the normal forces on the two pads.
+        has_object: False if there is no object, or it has left the jaws.
 
     Raises:
         ConfigError: The object does not exist, or the tool is not suitable for it.
@@ -144,6 +148,7 @@ class World:
         self._image: tuple[int, npt.NDArray[np.uint8]] | None = None
         self.t_ns = 0
         self.force_n = 0.0
+        self.has_object = scene.object != NO_OBJECT
         mujoco.mj_forward(self._model, self._data)
         self.call_every(_CHECK_PERIOD_NS, self._check_state)
 
@@ -156,6 +161,17 @@ class World:
     def iterations(self) -> int:
         """Number of iterations of the solver in the last step."""
         return int(self._data.solver_niter.sum())
+
+    @property
+    def closing_m_s(self) -> float:
+        """Speed of the faster pinion as travel of one jaw, positive while it closes."""
+        speeds_rad_s = [float(self._data.qvel[drive.dof]) for drive in self._drives]
+        return self._pinion.radius_m * max(speeds_rad_s, key=abs)
+
+    def remove_object(self) -> None:
+        """Moves the object out of the jaws at once."""
+        self._model.body_pos[self._model.body("object").id] = _AWAY_M
+        self.has_object = False
 
     def call_every(self, period_ns: int, call: Callable[[int], None]) -> None:
         """Registers ``call(t_ns)`` for each multiple of a period, rounded up to the next physics step."""

@@ -1,10 +1,12 @@
-"""Servo contract, run on every model in memory, on one behind a pty, on the simulated rig's servo, and on two as one."""
+"""Servo contract, run on every model in memory, on old firmware, on a model of one's own, behind a pty, on a port
+shared with another program, on the simulated rig's servo, and on two servos as one."""
 
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import pytest
 from dynamixel_sdk import PortHandler
@@ -117,12 +119,31 @@ def in_the_rig(stack: ExitStack, quick: list[str]) -> ServoSetup:
     )
 
 
-@pytest.fixture(params=[*model_names(), "firmware 44", "pty", "shared port", "rig", "two", "rig of two"])
-def setup(request: pytest.FixtureRequest, quick: list[str]) -> Iterator[ServoSetup]:
+OLD_FIRMWARE = {"firmware 44": ("XM430-W350", 44), "firmware 45": ("XL330-M288", 45)}
+"""The last firmware without Fast Sync Read; that of the XL330 also has its indirect data at another address."""
+
+
+@pytest.fixture(
+    params=[
+        *model_names(),
+        *OLD_FIRMWARE,
+        "model of one's own",
+        "pty",
+        "shared port",
+        "rig",
+        "two",
+        "rig of two",
+    ]
+)
+def setup(request: pytest.FixtureRequest, quick: list[str], tmp_path: Path) -> Iterator[ServoSetup]:
     with ExitStack() as stack:
         match request.param:
-            case "firmware 44":
-                setup = in_memory(stack, "XM430-W350", 44)
+            case "firmware 44" | "firmware 45":
+                setup = in_memory(stack, *OLD_FIRMWARE[request.param])
+            case "model of one's own":
+                path = tmp_path / "geared.yaml"
+                path.write_text("like: XM430-W350-R\nstall_torque_nm: 8.2\nno_load_rpm: 23\n")
+                setup = in_memory(stack, str(path))
             case "pty":
                 setup = behind_a_pty(stack)
             case "shared port":

@@ -34,6 +34,17 @@ def test_configured_values_are_not_drawn() -> None:
 
 
 @pytest.mark.parametrize("randomise", [True, False])
+def test_true_friction_and_torque_constant_change_nothing_else(randomise: bool) -> None:
+    config = SimConfig(randomise=randomise)
+    before = draw_scene("tube", 3, config)
+    after = draw_scene("tube", 3, config.model_copy(update={"friction": 3.0, "gain": 1.4}))
+    assert (after.servo_friction_nm, after.jaw_friction_n) == pytest.approx((0.09, 0.6))
+    assert after.nm_per_a == 1.4
+    drawn = {key: getattr(before, key) for key in ("servo_friction_nm", "jaw_friction_n", "nm_per_a")}
+    assert replace(after, **drawn) == before
+
+
+@pytest.mark.parametrize("randomise", [True, False])
 def test_yaw_and_lux_change_nothing_else(randomise: bool) -> None:
     config = SimConfig(randomise=randomise, lux=550)
     asked = SimConfig(randomise=randomise, lux=350, yaw_deg=20)

@@ -3,12 +3,14 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError, SimulationError
+from gripper_force.interfaces import WorldState
 from gripper_force.types import NS_PER_MS, NS_PER_S, Frame, LoadCellSample, ServoCommand, ServoState
 from gripper_hw.dynamixel.servo import DynamixelServo
 from gripper_hw.dynamixel.virtual import find_bus
@@ -232,3 +234,30 @@ def test_light_sets_brightness_and_noise_sets_variance() -> None:
     assert np.diff(grays(550, 0.03)).std() > 2 * np.diff(grays(550, 0.0)).std()
     assert grays(550, 0.0)[16, 16] > 1.02 * grays(550, 0.0)[0, 0]  # the lens darkens the corners
     assert grays(1e6, 0.0).max() == 255
+
+
+def test_the_true_state_is_observed_at_each_step(make_rig: MakeRig) -> None:
+    fault = "faults=[{unit: plant, kind: off, at_s: 0.3}]"
+    rig = make_rig(fault, "gripper.open_width_m=0.06")  # near the object
+    seen: list[WorldState] = []
+    rig.observe_world(seen.append)
+    squeeze(rig)
+    steps_ns = {after.t_ns - before.t_ns for before, after in pairwise(seen)}
+    assert len(steps_ns) == 1
+    assert max(state.closing_m_s for state in seen) > 0.01
+    before, after = ([s for s in seen if s.has_object is there] for there in (True, False))
+    assert after[0].t_ns == pytest.approx(300 * NS_PER_MS, abs=max(steps_ns))
+    assert max(s.force_n for s in before) > 1.0
+    assert after[1].force_n == 0.0
+
+
+def test_the_true_open_width_is_not_the_believed_one(make_rig: MakeRig) -> None:
+    def contact_rad(*keys: str) -> float:
+        states, _, samples = squeeze(make_rig("sim.randomise=false", *keys))
+        return states[next(i for i, s in enumerate(samples) if s.force_n > 0.5)].position_rad
+
+    radius_m = 0.02
+    wide, narrow = (contact_rad("sim.open_width_m=" + width) for width in ("0.074", "0.068"))
+    assert wide - narrow == pytest.approx(0.003 / radius_m, abs=0.02)
+    believed = contact_rad("sim.open_width_m=0.068", "gripper.open_width_m=0.08")
+    assert believed == narrow

@@ -184,3 +184,22 @@ def test_missing_egl_names_the_packages(lacks: str, tmp_path: Path) -> None:
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == f"error: {NO_EGL}\n"
     assert "apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri" in NO_EGL
+
+
+@pytest.mark.parametrize("name", ["sponge", "paper_cup", "tube", "stapler", "ball", "block"])
+def test_an_object_that_leaves_presses_no_more(make_world: Callable[..., World], name: str) -> None:
+    world = make_world(Current(0.13, brake_a_s=0.02), object=name)
+    world.advance_to(2500 * NS_PER_MS)
+    assert world.has_object
+    assert world.force_n > 2.0
+    world.remove_object()
+    world.advance_to(world.t_ns + 2 * world.step_ns)
+    assert world.force_n == 0.0
+    assert not world.has_object
+    assert world.closing_m_s > 0.0
+    world.advance_to(world.t_ns + 500 * NS_PER_MS)  # the jaws meet
+    assert world.force_n > 2.0
+
+
+def test_a_scene_without_object_has_none(make_world: Callable[..., World]) -> None:
+    assert not make_world(Current(0.0), object="none").has_object

@@ -1,0 +1,88 @@
+"""Three statements that hold for every grasp, whatever the configuration wrongly says.
+
+The contact force stays within the force limit and 5 %. Jaws without contact are never faster than 1.5 times the
+configured speed. A grasp is never ``held`` on nothing for longer than 0.1 s; jaws that friction or an end stop keeps
+still do not show that their object is gone, and the camera takes up to 0.5 s and two frame periods. All three are
+about the true plant.
+"""
+
+from typing import Final
+
+from gripper_force.config import ControlConfig
+from gripper_force.types import Outcome, Phase
+
+FORCE_SHARE: Final = 1.05
+SPEED_SHARE: Final = 1.5
+NOTHING_SHARE: Final = 0.05
+"""Contact force as a share of the target below which the jaws hold nothing."""
+
+REACTION_S: Final = 0.1
+"""Time in which a grasp may still count as held after the object has left."""
+
+STILL_REACTION_S: Final = 0.5
+STILL_REACTION_FRAMES: Final = 2
+"""The same for jaws that stand still: this time and this many frame periods."""
+
+_STILL_M_S: Final = 0.003
+"""Speed below which a jaw stands still: friction creeps."""
+
+_TRAVEL_SHARE: Final = 2.0
+"""Speed of a release as a share of the approach speed."""
+
+_GRASPING: Final = (Phase.APPROACH, Phase.CONTACT, Phase.RAMP, Phase.HOLD)
+
+
+class SafetyStatements:
+    """What one grasp shows about the three statements.
+
+    Args:
+        control: The configured force limit and speed.
+        target_n: Requested force.
+        sign: -1 if the configured closing direction is wrong.
+
+    Attributes:
+        force_share: Largest contact force over the force limit.
+        speed_share: Largest speed of a jaw without contact over the configured one.
+        held_nothing: True if the grasp counted as held without contact force.
+    """
+
+    def __init__(self, control: ControlConfig, target_n: float, sign: int = 1) -> None:
+        self._limit_n, self._speed_m_s = control.force_limit_n, control.approach_speed_m_s
+        self._nothing_n, self._sign = NOTHING_SHARE * target_n, sign
+        self._still_reaction_s = STILL_REACTION_S + STILL_REACTION_FRAMES / control.frame_hz
+        self._nothing_s = 0.0
+        self.force_share = self.speed_share = 0.0
+        self.held_nothing = False
+
+    def observe(
+        self,
+        dt_s: float,
+        phase: str,
+        outcome: str,
+        *,
+        force_n: float,
+        object_n: float,
+        peak_n: float,
+        closing_m_s: float,
+    ) -> None:
+        """Takes one step of the plant.
+
+        Args:
+            dt_s: Length of the step.
+            phase: Phase of the controller.
+            outcome: Outcome of the grasp so far.
+            force_n: Contact force at the end of the step.
+            object_n: Contact force on an object.
+            peak_n: Largest contact force in the step.
+            closing_m_s: Speed of a jaw, positive while it closes.
+        """
+        claims = outcome == Outcome.HELD and phase in (Phase.RAMP, Phase.HOLD)
+        self._nothing_s = self._nothing_s + dt_s if claims and object_n < self._nothing_n else 0.0
+        is_still = abs(closing_m_s) < _STILL_M_S
+        self.held_nothing |= self._nothing_s > (self._still_reaction_s if is_still else REACTION_S)
+        self.force_share = max(self.force_share, peak_n / self._limit_n)
+        if force_n == 0.0:
+            # The jaws also open before they approach again; a wrong sign exchanges the directions.
+            opens = self._sign * closing_m_s < 0
+            limit_m_s = self._speed_m_s * (_TRAVEL_SHARE if opens or phase not in _GRASPING else 1.0)
+            self.speed_share = max(self.speed_share, abs(closing_m_s) / limit_m_s)

@@ -1,0 +1,186 @@
+"""Rows with wrong configurations, in lockstep and on motor current alone where no camera is needed."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from gripper_force.cli import app
+from gripper_force.config import config_from, load_config
+from gripper_force.control.limits import Limits
+from gripper_force.control.slip import SlipMonitor
+from gripper_force.control.speed_limit import SpeedLimit
+from gripper_force.qualification.fault_matrix.wrong_configurations import (
+    WRONG_CASES,
+    WrongCase,
+    WrongOutcome,
+    count_grasps,
+    draw,
+    markdown,
+    run_rows,
+    run_wrong,
+)
+from gripper_force.types import ServoCommand
+
+STAPLER = 3
+"""Number of a grasp of the cheapest object."""
+
+NO_CAMERA = ["camera.backend=none", "vision.checkpoint=none", "control.feedback=current"]
+FAST = load_config(None, ["sim.detail=coarse", *NO_CAMERA])
+
+
+def row(name: str, **keys: Any) -> WrongCase:
+    """The row of that name, with these keys instead of drawn ones, where given."""
+    found = next(row for row in WRONG_CASES if row.name.startswith(name))
+    changed = {key.replace("__", "."): value for key, value in keys.items()}
+    return replace(found, keys=lambda *_: changed) if keys else found
+
+
+def outcome(case: WrongCase, index: int = STAPLER) -> WrongOutcome:
+    return run_wrong(*draw(FAST, case, index), case.expected)
+
+
+def leaving(at_s: float) -> WrongCase:
+    fault = {"unit": "plant", "kind": "off", "at_s": at_s}
+    return row("object leaves", faults=[fault], control__settle_s=0.2)
+
+
+# Rows.
+
+
+@pytest.mark.parametrize(("friction", "result"), [(0.3, "held"), (1.5, "held"), (5.0, "stuck")])
+def test_wrong_friction_is_held_or_stuck(friction: float, result: str) -> None:
+    found = outcome(row("friction", sim__friction=friction))
+    assert found["failure"] == ""
+    assert found["result"] == result
+    assert (found["force_share"] > 0.5) == (result == "held")
+
+
+@pytest.mark.parametrize(("open_position_rad", "result"), [(0.8, "refused"), (-0.8, "held")])
+def test_wrong_start_is_refused_or_safe(open_position_rad: float, result: str) -> None:
+    found = outcome(row("start", gripper__open_position_rad=open_position_rad))
+    assert found["failure"] == ""
+    assert found["result"] == result
+    assert (found["speed_share"] > 0) == (result == "held")  # after a refusal nothing moves
+
+
+@pytest.mark.parametrize("index", [2, STAPLER])
+def test_an_object_that_leaves_is_a_slip(index: int) -> None:
+    found = outcome(leaving(2.4), index)
+    assert found["failure"] == ""
+    assert found["result"] == "slip"
+    assert found["force_share"] > 0.2
+
+
+def test_other_rows_without_camera_are_as_expected() -> None:
+    for name in ("torque constant", "load cell", "open width: "):
+        assert outcome(row(name))["failure"] == ""
+
+
+# A row can fail: each defect is planted, and the row must find it.
+
+
+def test_a_missing_speed_limit_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(SpeedLimit, "apply", lambda _self, command, _servo, _speed: command)
+    monkeypatch.setattr(SlipMonitor, "has_receded", lambda *_: "")  # it reacts before the jaws are fast
+    found = outcome(leaving(2.4))
+    assert found["speed_share"] > 1.5
+    assert "times as fast as configured" in found["failure"]
+
+
+def test_a_current_beyond_its_limit_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    apply = Limits.apply
+
+    def doubled(*arguments: Any, **options: Any) -> tuple[ServoCommand, bool]:
+        command, over = apply(*arguments, **options)
+        return replace(command, goal_current_a=2.5 * command.goal_current_a), over
+
+    monkeypatch.setattr(Limits, "apply", doubled)
+    assert "% over the limit" in outcome(row("torque constant", sim__gain=1.4))["failure"]
+
+
+def test_a_torque_constant_beyond_the_configured_bound_is_found() -> None:
+    assert "% over the limit" in outcome(row("torque constant", sim__gain=2.5))["failure"]
+
+
+def test_an_end_stop_that_is_held_is_found() -> None:
+    # On motor current alone, jaws that close on each other are taken for an object.
+    keys = {"object": "none", "sim__open_width_m": 0.092, "gripper__open_width_m": 0.104}
+    found = outcome(row("open width, no object", **keys))
+    assert found["held_nothing"]
+    assert "held on nothing; the result is held" in found["failure"]
+
+
+# The table.
+
+
+@pytest.mark.parametrize("case", WRONG_CASES, ids=lambda case: case.name)
+def test_draws_cover_the_range_with_every_object(case: WrongCase) -> None:
+    config = load_config()
+    trees = [draw(config, case, index)[0] for index in range(20)]
+    assert trees == [draw(config, case, index)[0] for index in range(20)]
+    configs = [config_from(tree, "test") for tree in trees]
+    assert len({c.target_n for c in configs}) == 20
+    assert {c.uses_vision for c in configs} == {"fused": {True}, "current": {False}}.get(
+        case.feedback, {True, False}
+    )
+    if "friction" in case.name:
+        assert {c.object for c in configs if c.sim.friction == 5.0} == {c.object for c in configs}
+        assert min(c.sim.friction or 0 for c in configs) == 0.3
+
+
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("wrong") / "wrong.jsonl"
+
+
+def test_a_table_runs_in_both_clocks_and_continues(kept: Path) -> None:
+    rows = (row("friction", object="stapler", sim__friction=5.0), row("closing", object="none"))
+    names: list[str] = []
+
+    def progress(text: str, steps: int = 1) -> None:
+        names.append(text)
+
+    stuck, empty = run_rows(FAST, 2, 1, 1, kept, rows=rows, progress=progress)
+    assert len(names) == count_grasps(2, 1, rows) == 6
+    assert (stuck["runs"], stuck["ok"], stuck["results"]) == (2, 2, {"stuck": 2})
+    assert (stuck["live_runs"], stuck["live_ok"], stuck["live_results"]) == (1, 1, {"stuck": 1})
+    assert empty["results"] == {"no_object": 2}
+    lines = kept.read_text().splitlines()
+    kept.write_text("\n".join(lines[:-1]) + "\n")
+    assert next(iter(run_rows(FAST, 2, 1, 1, kept, resume=True, rows=rows))) == stuck
+    assert "| friction: 0.3 to 5 times | held, stuck, timeout | 2 of 2, 1 of 1 | stuck 2 | stuck 1 |" in (
+        markdown([stuck, empty])
+    )
+
+
+def test_the_command_reports_a_row_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from gripper_force.qualification.fault_matrix import wrong_configurations
+
+    case = row("friction", object="stapler", sim__friction=5.0)
+    summary = next(
+        iter(run_rows(FAST, 1, 0, 1, tmp_path / "w.jsonl", rows=[replace(case, expected=("held",))]))
+    )
+    ((grasp, failure),) = summary["failures"].items()
+    assert failure == "the result is stuck"
+    repeated = load_config(None, [*NO_CAMERA, "sim.detail=coarse", *grasp.split(", ")])
+    assert repeated == config_from(draw(FAST, case, 0)[0], "test")
+    monkeypatch.setattr(wrong_configurations, "run_rows", lambda *_, **__: [summary])
+    page = tmp_path / "page.md"
+    page.write_text("<!-- wrong -->\n<!-- end of wrong -->\n")
+    call = [
+        "stability",
+        "faults",
+        "--table",
+        "wrong",
+        "--set",
+        f"log.directory={tmp_path}",
+        "--write",
+        str(page),
+    ]
+    done = CliRunner().invoke(app, call)
+    assert done.exit_code == 1
+    assert "sim.friction=5.0, clock=lockstep: the result is stuck" in done.stdout
+    assert "| friction: 0.3 to 5 times |" in page.read_text()
