@@ -55,7 +55,10 @@ class Safety:
             True if the latch tripped in this cycle.
         """
         self._over_s = self._over_s + dt_s if over_force else 0.0
-        self._excess_s = self._excess_s + dt_s if is_excess(servo, goal_current_a) else 0.0
+        if not is_excess(servo.current_a, goal_current_a):
+            self._excess_s = 0.0
+        elif not is_back_driven(servo):
+            self._excess_s += dt_s
         self._cause = self._find_fault(servo)
         if is_sound(servo):
             self._last = servo
@@ -105,12 +108,14 @@ class Safety:
         return abs(now.position_rad - before.position_rad) > _JUMP_RAD + _JUMP_RAD_S * time_s
 
 
-def is_excess(servo: ServoState, goal_current_a: float) -> bool:
-    """Returns True if a motor takes more current than its goal allows, and is not back-driven."""
-    back_driven = (
-        servo.current_a * servo.velocity_rad_s < 0 and abs(servo.velocity_rad_s) > _BACK_DRIVEN_RAD_S
-    )
-    return not back_driven and abs(servo.current_a) > (1 + _EXCESS_SHARE) * goal_current_a + _EXCESS_A
+def is_excess(current_a: float, goal_current_a: float) -> bool:
+    """Returns True if a motor current is more than its goal allows."""
+    return abs(current_a) > (1 + _EXCESS_SHARE) * goal_current_a + _EXCESS_A
+
+
+def is_back_driven(servo: ServoState) -> bool:
+    """Returns True if the horn turns against its motor."""
+    return servo.current_a * servo.velocity_rad_s < 0 and abs(servo.velocity_rad_s) > _BACK_DRIVEN_RAD_S
 
 
 def is_sound(servo: ServoState) -> bool:
