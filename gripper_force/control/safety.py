@@ -109,12 +109,12 @@ class Safety:
 
 
 def is_excess(current_a: float, goal_current_a: float) -> bool:
-    """Returns True if a motor current is more than its goal allows."""
+    """Returns True if a motor takes more current than its goal allows."""
     return abs(current_a) > (1 + _EXCESS_SHARE) * goal_current_a + _EXCESS_A
 
 
 def is_back_driven(servo: ServoState) -> bool:
-    """Returns True if the horn turns against its motor."""
+    """Returns True if the horn is turned against the motor."""
     return servo.current_a * servo.velocity_rad_s < 0 and abs(servo.velocity_rad_s) > _BACK_DRIVEN_RAD_S
 
 

@@ -304,7 +304,7 @@ def test_excess_motor_current_is_measured_and_ends_with_torque_off():
 
 # The simulated rig.
 
-PAIRS = [(unit, kind) for unit in ("bus", "servo", "plant") for kind in FAULTS[unit]]
+PAIRS = [(unit, kind) for unit in ("bus", "servo") for kind in FAULTS[unit]] + [("plant", "wrong")]
 
 
 @contextmanager
