@@ -163,6 +163,7 @@ KINDS = {
     "crank_slider": drawn_crank_slider,
     "four_bar": drawn_four_bar,
     "finger": drawn_finger,
+    "fingers": drawn_finger,
     "table": drawn_table,
 }
 
