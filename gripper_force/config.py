@@ -501,7 +501,7 @@ class LogConfig(Section):
 
 
 class Config(Section):
-    """A whole run."""
+    """A whole run. `load_config` makes it; built directly, a wrong value is a ``pydantic.ValidationError``."""
 
     object: str = Field(
         "sponge",
@@ -623,6 +623,10 @@ def _upgraded(tree: Tree) -> Tree:
 
 
 def _assign_all(tree: Tree, overrides: Overrides | None) -> None:
+    if isinstance(overrides, str):
+        raise ConfigError(
+            f"overrides are a list or a mapping; pass [{overrides!r}] instead of the text alone"
+        )
     for item in overrides.items() if isinstance(overrides, Mapping) else overrides or ():
         if isinstance(item, str):
             assign(tree, item)
@@ -640,7 +644,7 @@ def _with_overrides(
         return config_from(complete(changed), where)
     except ConfigError:
         config_from(complete(tree), where)
-        config_from(complete(changed), "--set")
+        config_from(complete(changed), "overrides" if isinstance(overrides, Mapping) else "--set")
         raise
 
 

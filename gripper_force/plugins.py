@@ -5,9 +5,12 @@ from difflib import get_close_matches
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from operator import attrgetter
-from typing import Any
+from typing import Any, Final
 
 from gripper_force.errors import ConfigError
+
+_METHODS: Final = {"servos": "spec", "cameras": "newest", "load_cells": "drain", "engines": "step"}
+"""A method of each interface, which tells its classes from others before one is called."""
 
 
 def load_class(
@@ -35,7 +38,9 @@ def load_class(
         install = f"pip install 'gripper-force[{extra}]'" if extra and name in builtin else "install it"
         raise ConfigError(f"{key}={name} needs {error.name}, which is not installed; {install}") from error
     except (ImportError, ValueError, TypeError) as error:  # the last two: an empty or relative name
-        raise ConfigError(f"{key}={name}: can't import {module_name!r}: {error}") from error
+        raise ConfigError(
+            f"{key}={name}: can't import {module_name!r}: {error}; name it as package.module:Class"
+        ) from error
     try:
         found: Any = attrgetter(attribute)(module)
     except AttributeError as error:
@@ -44,6 +49,11 @@ def load_class(
         ) from error
     if not callable(found):
         raise ConfigError(f"{key}={name}: {target} is not a class; name a class")
+    if group in _METHODS and not hasattr(found, _METHODS[group]):
+        raise ConfigError(
+            f"{key}={name}: {target} has no method {_METHODS[group]!r}; name a class with the methods of the "
+            "interface (docs/api.md)"
+        )
     return found
 
 

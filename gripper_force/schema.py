@@ -39,7 +39,8 @@ def read_tree(path: Path, what: str = "configuration") -> Tree:
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, ValueError) as error:
-        raise ConfigError(f"can't read the {what} {path}: {error}") from error
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ConfigError(f"can't read the {what} {path}: {reason}; name a YAML file") from error
     return tree_from(text, str(path), what)
 
 
@@ -66,7 +67,7 @@ def assign(tree: Tree, assignment: str) -> None:
 
 def assign_value(tree: Tree, key: str, value: Any) -> None:
     """Assigns a value to a key path in a tree. Raises `ConfigError`."""
-    *parents, leaf = key.split(".")
+    *parents, leaf = str(key).split(".")
     for parent in parents:
         tree = tree.setdefault(parent, {})
         if not isinstance(tree, dict):

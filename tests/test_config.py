@@ -152,7 +152,7 @@ def test_an_assignment_that_is_none_is_refused(tmp_path: Path, assignment: str, 
         (b"a: 2001-99-99", "month must be"),
         (b"a: " + b"[" * 2000, "can't read the configuration .*recursion"),
         (b"\xff\xfe\x00", "can't read the configuration"),
-        (None, "can't read the configuration .*No such file"),
+        (None, "can't read the configuration .*: No such file or directory; name a YAML file"),
     ],
 )
 def test_a_file_that_is_no_configuration_is_named(tmp_path: Path, data: bytes | None, sentence: str) -> None:
@@ -163,6 +163,19 @@ def test_a_file_that_is_no_configuration_is_named(tmp_path: Path, data: bytes | 
         load_config(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "sentence"),
+    [
+        ({"control.rate": 5}, r"unknown configuration key 'control\.rate' \(from overrides\); did you mean"),
+        ({5: 5}, "unknown configuration key '5' "),
+        ("seed=1", r"pass \['seed=1'\] instead"),
+    ],
+)
+def test_wrong_overrides_are_named(overrides: Any, sentence: str) -> None:
+    with pytest.raises(ConfigError, match=sentence):
+        load_config(None, overrides)
 
 
 def test_an_empty_file_changes_nothing(tmp_path: Path) -> None:

@@ -36,6 +36,17 @@ def test_finds_builtin_registered_and_named_classes() -> None:
 
 
 @pytest.mark.parametrize(
+    ("group", "method"),
+    [("servos", "spec"), ("cameras", "newest"), ("load_cells", "drain"), ("engines", "step")],
+)
+def test_a_class_of_another_kind_is_refused(group: str, method: str) -> None:
+    with pytest.raises(
+        ConfigError, match=rf"^x\.backend=pathlib:Path: pathlib:Path has no method '{method}'"
+    ):
+        load_class(group, {}, "pathlib:Path", "x.backend")
+
+
+@pytest.mark.parametrize(
     ("name", "message"),
     [
         (
@@ -50,7 +61,7 @@ def test_finds_builtin_registered_and_named_classes() -> None:
         ("gone", r"needs no_such_package, which is not installed; install it"),
         ("pathlib:Paht", r"the module pathlib has no attribute 'Paht'; name one of its classes"),
         ("pathlib:", r"the module pathlib has no attribute ''"),
-        (":Path", r"can't import ''"),
+        (":Path", r"can't import ''.*; name it as package\.module:Class"),
         (".a:Path", r"can't import '\.a'"),
         ("math:pi", r"math:pi is not a class; name a class"),
     ],

@@ -1,5 +1,6 @@
 """The public names, what importing them costs, and how much code an embedding program can reach."""
 
+import ast
 import inspect
 import json
 import subprocess
@@ -94,6 +95,17 @@ def test_every_public_name_has_a_docstring(name: str) -> None:
     if inspect.isfunction(value):
         assert "Raises:" in text or name == "own_process"
         assert all(parameter in text for parameter in inspect.signature(value).parameters)
+
+
+def test_no_docstring_begins_with_a_question_word() -> None:
+    for root in ("gripper_force", "hw", "calibration", "examples"):
+        for path in (ROOT / root).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+                    first = (ast.get_docstring(node) or " ").split(" ")[0]
+                    assert first not in ("What", "How", "Whether", "Where"), (
+                        f"{path}: {ast.get_docstring(node)}"
+                    )
 
 
 def modules_after(code: str, *arguments: str) -> set[str]:

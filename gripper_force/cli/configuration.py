@@ -21,11 +21,14 @@ def show(config: ConfigPath = None, set_: Overrides = None, as_json: AsJson = Fa
 
 @app.command()
 def check(config: ConfigPath = None, set_: Overrides = None, as_json: AsJson = False) -> None:
-    """Check keys, values, profiles, backends and budgets without opening a device."""
-    from gripper_force.runtime.resolve import resolve
+    """Check keys, values, profiles, backends, network and budgets without opening a device."""
+    from gripper_force.runtime.backends import check_devices
+    from gripper_force.runtime.resolve import make_estimator, resolve
 
     run = resolve(load_settings(config, set_, {}))
     run.check_target(run.config.target_n)
+    check_devices(run.config)
+    make_estimator(run)
     notes = [text for _, text in run.notes]
     result = {"ok": True, "choices": list(run.choices), "notes": notes}
     console.show(result, as_json, lambda _: console.out.print("\n".join(["ok", *notes])))

@@ -58,7 +58,7 @@ class Clip:
         return self.forces_n if math.isnan(self.stiffness) else self.forces_n / np.float32(self.stiffness)
 
 
-def find_logs(source: Path | Sequence[Path]) -> list[Path]:
+def find_logs(source: str | Path | Sequence[str | Path]) -> list[Path]:
     """Returns the logs of a folder, or the given logs, sorted by path.
 
     Args:
@@ -67,14 +67,16 @@ def find_logs(source: Path | Sequence[Path]) -> list[Path]:
     Raises:
         DataError: There are no logs.
     """
-    paths = sorted(source.rglob("*.mcap")) if isinstance(source, Path) else sorted(source)
+    paths = sorted(
+        Path(source).rglob("*.mcap") if isinstance(source, str | Path) else (Path(path) for path in source)
+    )
     if not paths:
         raise DataError(f"no logs (*.mcap) in {source}; record, simulate or import some")
     return paths
 
 
 def load_clips(
-    source: Path | Sequence[Path],
+    source: str | Path | Sequence[str | Path],
     preprocess: "Preprocess",
     region: "Region | None" = None,
     workers: int = 1,

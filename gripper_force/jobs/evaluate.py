@@ -71,7 +71,7 @@ class Evaluation:
 
 
 def evaluate(
-    logs: Path | Sequence[Path],
+    logs: str | Path | Sequence[str | Path],
     checkpoint: str | Path = "default",
     *,
     profile: str | None = None,
@@ -85,7 +85,7 @@ def evaluate(
     Every frame gets the estimate that a run would give.
 
     Example:
-        >>> result = evaluate(Path("data/test"), "small")  # doctest: +SKIP
+        >>> result = evaluate("data/test", "small")  # doctest: +SKIP
         >>> result.mae_n, result.per_object["sponge"].contact_mae_n  # doctest: +SKIP
 
     Args:

@@ -1,6 +1,6 @@
 """Random search for wrong configurations and plants with which a grasp is not safe.
 
-Every case draws a plant and what the configuration wrongly believes of it, grasps, and releases. The statements of
+Every case draws a plant and a configuration that is wrong about it, grasps, and releases. The statements of
 `safety_statements` must hold. With motor current alone an end stop cannot be told from a rigid object. So such cases
 are counted, but are no violations; `calibrate jaws` prevents them.
 """
@@ -46,7 +46,7 @@ _STOP_M: Final = 0.0455
 
 @dataclass(frozen=True, slots=True)
 class Draw:
-    """One case: the plant, and what the controller wrongly believes of it.
+    """One case: the plant, and the wrong configuration of it.
 
     Attributes:
         target_n: Requested force.

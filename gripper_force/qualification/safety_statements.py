@@ -33,7 +33,7 @@ _GRASPING: Final = (Phase.APPROACH, Phase.CONTACT, Phase.RAMP, Phase.HOLD)
 
 
 class SafetyStatements:
-    """What one grasp shows about the three statements.
+    """Observes one grasp for the three statements: its largest force and speed, and a hold on nothing.
 
     Args:
         control: The configured force limit and speed.

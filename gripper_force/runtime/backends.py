@@ -86,6 +86,42 @@ def with_camera_rate(config: Config) -> Config:
     return config.model_copy(update={"camera": camera})
 
 
+def check_devices(config: Config, port: SharedPort | None = None) -> None:
+    """Checks that the configured backends exist and go together, without opening one. Raises `ConfigError`."""
+    if port is not None and (config.servo.backend not in SERVOS or config.servo.port.startswith("virtual:")):
+        raise ConfigError(
+            f"a shared port works with servo.backend=dynamixel and a real servo.port, not with "
+            f"{config.servo.backend} and {config.servo.port}; set servo.port to the device path of the port"
+        )
+    if is_simulated(config):
+        if not config.servo.port.startswith("virtual:"):
+            raise ConfigError(
+                f"servo.port {config.servo.port!r} is not virtual, but a simulated camera or load cell needs "
+                "the simulated servo; set camera.backend and load_cell.backend to real devices or none, or "
+                "set servo.port to virtual:rig"
+            )
+    else:
+        if config.clock == "lockstep":
+            raise ConfigError(
+                f"clock=lockstep needs a simulated servo, but servo.port is {config.servo.port!r}; set "
+                "clock=realtime, or servo.port=virtual:rig"
+            )
+        if config.faults:
+            raise ConfigError(
+                "faults are injected into simulated devices only, but servo.port is "
+                f"{config.servo.port!r}; set servo.port=virtual:rig, or faults=[]"
+            )
+    load_servo_class(config)
+    sensors = (("camera", CAMERAS, config.camera), ("load_cell", LOAD_CELLS, config.load_cell))
+    for unit, builtin, section in sensors:
+        if section.backend not in ("none", "simulated"):
+            backend = load_class(f"{unit}s", builtin, section.backend, f"{unit}.backend")
+            if config.clock == "lockstep" and not getattr(backend, "supports_lockstep", False):
+                raise ConfigError(
+                    f"{unit}.backend={section.backend} cannot follow simulated time; set clock=realtime"
+                )
+
+
 @contextmanager
 def open_devices(config: Config, port: SharedPort | None = None) -> Iterator[Devices]:
     """Opens the configured devices and closes all of them at the end, whatever happens.
@@ -99,29 +135,15 @@ def open_devices(config: Config, port: SharedPort | None = None) -> Iterator[Dev
         DeviceNotFoundError: A device is missing.
         SimulationError: The simulated scene cannot be built.
     """
-    if port is not None and (config.servo.backend not in SERVOS or config.servo.port.startswith("virtual:")):
-        raise ConfigError(
-            f"a shared port works with servo.backend=dynamixel and a real servo.port, not with "
-            f"{config.servo.backend} and {config.servo.port}; set servo.port to the device path of the port"
-        )
+    check_devices(config, port)
     with ExitStack() as stack:
         rig: Any = None
         if is_simulated(config):
             rig = _rig_class()(config)
             stack.callback(rig.close)
-        elif config.clock == "lockstep":
-            raise ConfigError(
-                f"clock=lockstep needs a simulated servo, but servo.port is {config.servo.port!r}; set "
-                "clock=realtime, or servo.port=virtual:rig"
-            )
-        if config.faults and rig is None:
-            raise ConfigError(
-                f"faults are injected into simulated devices only, but servo.port is {config.servo.port!r}; "
-                "set servo.port=virtual:rig, or faults=[]"
-            )
         clock: Clock = rig.clock if rig is not None else MonotonicClock()
-        camera = _open_sensor(stack, "camera", CAMERAS, config.camera, rig, config, clock)
-        load_cell = _open_sensor(stack, "load_cell", LOAD_CELLS, config.load_cell, rig, config, clock)
+        camera = _open_sensor(stack, "camera", CAMERAS, config.camera, rig, clock)
+        load_cell = _open_sensor(stack, "load_cell", LOAD_CELLS, config.load_cell, rig, clock)
         shared = () if port is None else (port,)
         servo = load_servo_class(config)(config.servo, clock.now_ns, *shared)
         stack.callback(servo.close)
@@ -166,7 +188,6 @@ def _open_sensor(
     builtin: dict[str, str],
     section: CameraConfig | LoadCellConfig,
     rig: Any,
-    config: Config,
     clock: Clock,
 ) -> Any:
     if section.backend == "none":
@@ -174,11 +195,6 @@ def _open_sensor(
     if section.backend == "simulated":
         device = getattr(rig, unit)
     else:
-        backend = load_class(f"{unit}s", builtin, section.backend, f"{unit}.backend")
-        if config.clock == "lockstep" and not getattr(backend, "supports_lockstep", False):
-            raise ConfigError(
-                f"{unit}.backend={section.backend} cannot follow simulated time; set clock=realtime"
-            )
-        device = backend(section, clock)
+        device = load_class(f"{unit}s", builtin, section.backend, f"{unit}.backend")(section, clock)
     stack.callback(device.close)
     return device

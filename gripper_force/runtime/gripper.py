@@ -56,7 +56,7 @@ def open_gripper(
     """
     if isinstance(config, Config):
         if overrides:
-            raise ConfigError("overrides need a file or the defaults; change the Config itself instead")
+            raise ConfigError("overrides change a file or the defaults; pass them to load_config instead")
         settings = config
     else:
         settings = load_config(config, overrides)
@@ -162,7 +162,7 @@ class Gripper:
             DeviceError: A device failed.
         """
         self._run.check_width(width_m)
-        self._loop.request(PendingRequest(RequestKind.MOVE, width_m=width_m, is_awaited=wait))
+        self._loop.request(PendingRequest(RequestKind.MOVE, width_m=float(width_m), is_awaited=wait))
         return self.width_m
 
     def release(self, *, wait: bool = True) -> float:
@@ -263,5 +263,7 @@ class Gripper:
     def _grip(self, force_n: float, *, wait: bool, needs_object: bool = False) -> GraspResult | None:
         self._run.check_target(force_n)
         return self._loop.request(
-            PendingRequest(RequestKind.GRASP, target_n=force_n, needs_object=needs_object, is_awaited=wait)
+            PendingRequest(
+                RequestKind.GRASP, target_n=float(force_n), needs_object=needs_object, is_awaited=wait
+            )
         )

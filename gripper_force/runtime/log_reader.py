@@ -69,8 +69,8 @@ class LogReader:
         LogError: The file is missing, no MCAP, not of this project, or (without ``recover``) cut short.
     """
 
-    def __init__(self, path: Path, *, recover: bool = False) -> None:
-        self.path = path
+    def __init__(self, path: str | Path, *, recover: bool = False) -> None:
+        self.path = path = Path(path)
         self.complete = False
         self.metadata: dict[str, str] = {}
         self.attachments: dict[str, bytes] = {}
@@ -80,7 +80,7 @@ class LogReader:
             with path.open("rb") as file:
                 self._scan(file)
         except OSError as error:
-            raise LogError(f"can't read the log {path}: {error.strerror}") from error
+            raise LogError(f"can't read the log {path}: {error.strerror}; check the path") from error
         if not (self.complete or recover):
             raise LogError(self._loss())
         if CONFIG_NAME not in self.attachments:

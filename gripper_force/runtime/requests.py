@@ -46,6 +46,10 @@ class PendingRequest:
             return state.phase != Phase.RELEASE or state.t_ns - self.start_ns > _RELEASE_NS
         return state.outcome != Outcome.NONE
 
+    def is_like(self, other: PendingRequest) -> bool:
+        """Returns True if the two requests differ only in force or width."""
+        return (self.kind, self.needs_object) == (other.kind, other.needs_object)
+
     def fail(self, text: str) -> None:
         """Raises `RequestError` in the call that waits."""
         self.result.set_exception(RequestError(text))
@@ -54,7 +58,8 @@ class PendingRequest:
 class RequestQueue:
     """Requests of all threads, in the order in which the control cycle handles them.
 
-    A newer request of another kind replaces the one that callers wait for; a refused one replaces none. A
+    A newer request of another kind replaces the one that callers wait for; a refused one replaces none. One
+    that waits for a cycle, and no caller for it, is dropped for a newer one of the same kind. A
     stop overrides all older requests, which end with its outcome. Requests after it are handled after it.
     """
 
@@ -80,6 +85,9 @@ class RequestQueue:
                 )
             if request.needs_object and self._phase not in GRIPPING:
                 raise RequestError(f"no object is gripped (phase {self._phase}); call grasp first")
+            # Requests faster than the cycle would be handled later and later. The first may be handled now.
+            if self._queued[1:] and not self._queued[-1].is_awaited and self._queued[-1].is_like(request):
+                del self._queued[-1]
             self._queued.append(request)
 
     def stop(self, stop_soon: Callable[[], None]) -> None:

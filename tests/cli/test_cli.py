@@ -94,6 +94,21 @@ def test_the_command_line_answers_without_what_is_heavy() -> None:
     assert not heavy & set(done.stdout.split())
 
 
+@pytest.mark.parametrize(
+    ("assignment", "message"),
+    [
+        ("camera.backend=oakk", "unknown camera.backend 'oakk' (did you mean 'oak'?)"),
+        ("load_cell.backend=no_such_package:Cell", "needs no_such_package, which is not installed"),
+        ("vision.engine=torhc", "unknown vision.engine 'torhc' (did you mean 'torch'?)"),
+        ("servo.port=/dev/ttyUSB0", "'/dev/ttyUSB0' is not virtual, but a simulated camera or load cell"),
+    ],
+)
+def test_config_check_finds_what_a_run_would_refuse(run: Run, assignment: str, message: str) -> None:
+    done = run("config", "check", "--set", assignment)
+    assert done.code == 2
+    assert message in done.err
+
+
 GRASP_KEYS = {"result", "object", "target_n", "load_cell_mean_n", "steady_error_n", "overshoot_n", "settle_s"}
 GRASP_KEYS |= {"estimator_p50_ms", "estimator_p99_ms", "loop_hz", "log", "report"}
 ERROR_KEYS = {"mae_n", "rmse_n", "bias_n", "per_object", "per_bin", "frames"}

@@ -83,7 +83,7 @@ def test_logs_are_evaluated_like_their_clips(
     expected = evaluate_clips(checkpoint, load_clips(few_logs, checkpoint.header.preprocess))
     assert expected.frames == 3 * 57
     assert capsys.readouterr() == ("", "")
-    for logs in (few_logs, sorted(few_logs.iterdir())):
+    for logs in (str(few_logs), sorted(few_logs.iterdir())):
         progress = Mock()
         result = evaluate(logs, tiny_checkpoint, objects=["disc"], progress=progress)
         assert (result.mae_n, result.per_bin) == (expected.mae_n, expected.per_bin)

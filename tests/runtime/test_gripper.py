@@ -11,6 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -229,7 +230,7 @@ def test_lockstep_has_no_background_thread(quick: list[str]) -> None:
 
 def test_overrides_do_not_go_with_a_config(quick: list[str]) -> None:
     config = gf.load_config(None, quick)
-    with pytest.raises(gf.ConfigError, match="overrides need a file"):
+    with pytest.raises(gf.ConfigError, match="pass them to load_config"):
         gf.open_gripper(config, overrides=["seed=1"])
     with gf.open_gripper(config) as gripper:
         assert gripper.config.object == "stapler"
@@ -412,6 +413,23 @@ def test_a_gripper_is_used_from_threads_other_than_the_main_one(real_time: Open)
     thread.start()
     thread.join()
     assert results == [pytest.approx(0.06, abs=0.001)]
+
+
+def test_numpy_numbers_become_floats(simulated: Open, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    numbers: list[Any] = [np.float32(3.3), np.array(2.0), np.float32(0.07)]
+    with simulated(log=path) as gripper:
+        gripper.grasp(numbers[0])
+        assert type(gripper.state.reference_n) is float
+        gripper.set_force(numbers[1])
+        assert type(gripper.state.reference_n) is float
+        gripper.move(numbers[2])
+    requests = list(gf.LogReader(str(path)).records(gf.Request))
+    assert [(r.kind, r.target_n or r.width_m) for r in requests] == [
+        ("grasp", float(numbers[0])),
+        ("grasp", 2.0),
+        ("move", float(numbers[2])),
+    ]
 
 
 def test_asyncio(real_time: Open) -> None:

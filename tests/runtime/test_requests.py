@@ -226,3 +226,32 @@ def test_every_request_ends_once_and_none_after_the_stop_that_overrides_it(names
             assert made not in older_than_a_stop
     cycle.queue.close()
     assert all(request.result.done() for request in requests)
+
+
+def test_of_requests_faster_than_the_cycle_the_newest_counts(cycle: Cycle) -> None:
+    cycle.run(Phase.HOLD)
+    requests = [cycle.submit(RequestKind.GRASP, needs_object=True, wait=False) for _ in range(9)]
+    handled = cycle.queue.next()  # a cycle begins
+    newest = cycle.submit(RequestKind.GRASP, needs_object=True, wait=False)
+    assert handled is requests[0]
+    assert cycle.run(Phase.HOLD) is handled
+    assert cycle.run(Phase.HOLD) is newest
+    assert cycle.queue.next() is None
+
+
+@pytest.mark.parametrize(
+    ("kind", "needs_object", "wait"),
+    [
+        (RequestKind.GRASP, True, False),  # may be refused
+        (RequestKind.GRASP, False, True),  # a caller waits for it
+        (RequestKind.MOVE, False, False),
+    ],
+)
+def test_other_requests_are_all_handled(
+    cycle: Cycle, kind: RequestKind, needs_object: bool, wait: bool
+) -> None:
+    cycle.run(Phase.HOLD)
+    first = cycle.submit(RequestKind.RELEASE, wait=False)
+    second = cycle.submit(kind, needs_object=needs_object, wait=wait)
+    third = cycle.submit(RequestKind.GRASP, wait=False)
+    assert [cycle.run(Phase.HOLD) for _ in range(4)] == [first, second, third, None]

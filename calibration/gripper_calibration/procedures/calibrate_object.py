@@ -97,11 +97,11 @@ def calibrate_object(
     config: Config,
     name: str,
     *,
-    logs: Sequence[Path] | None = None,
+    logs: Sequence[str | Path] | None = None,
     touches: int = TOUCHES,
     peak_n: float | None = None,
-    folder: Path | None = None,
-    out: Path | None = None,
+    folder: str | Path | None = None,
+    out: str | Path | None = None,
     prompt: Prompt | None = None,
     progress: Progress = no_progress,
 ) -> ObjectCalibration:
@@ -138,20 +138,21 @@ def calibrate_object(
     Example:
         ::
 
-            config = gripper_force.load_config(Path("my.yaml"))
+            config = gripper_force.load_config("my.yaml")
             result = gripper_force.calibrate_object(config, "mug", touches=8)
             print(result.profile_path, result.mae_before_n, result.mae_after_n)
     """
-    out = out or user_folder() / f"{name}.yaml"
+    out = user_folder() / f"{name}.yaml" if out is None else Path(out)
     check_place(out)
     if logs is None:
         named = config.model_copy(update={"object": name})
         paths = []
-        for path in record_touches(named, touches, peak_n, folder, prompt=prompt, progress=progress):
+        place = None if folder is None else Path(folder)
+        for path in record_touches(named, touches, peak_n, place, prompt=prompt, progress=progress):
             paths.append(path)
             progress(f"touch {len(paths)} of {touches}")
     else:
-        paths = find_logs(logs)
+        paths = find_logs([Path(path) for path in logs])
     if not paths:
         raise DataError(f"there is no log to calibrate {name!r} from; record touches of it first")
     return _fit_and_write(config, name, paths, out, progress)

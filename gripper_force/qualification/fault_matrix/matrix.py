@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from statistics import median
-from typing import Any, Final, NotRequired, TypedDict
+from typing import Final, NotRequired, TypedDict
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import resolve
 from gripper_force.runtime.session import open_session
+from gripper_force.schema import Tree
 from gripper_force.types import (
     NS_PER_MS,
     NS_PER_S,
@@ -207,7 +208,7 @@ def _draw(config: Config, index: int) -> Config:
     )
 
 
-def _run_without_fault(tree: dict[str, Any]) -> FaultFreeGrasp:
+def _run_without_fault(tree: Tree) -> FaultFreeGrasp:
     config = config_from(tree, "stability")
     with tempfile.TemporaryDirectory() as folder:
         run = _grasp(config, Path(folder))
@@ -223,7 +224,7 @@ def _run_without_fault(tree: dict[str, Any]) -> FaultFreeGrasp:
 
 
 def _run_with_fault(
-    tree: dict[str, Any], fault_free: FaultFreeGrasp, row: FaultCase, clock: str = "lockstep"
+    tree: Tree, fault_free: FaultFreeGrasp, row: FaultCase, clock: str = "lockstep"
 ) -> Outcome:
     config = config_from(tree, "stability")
     rng = np.random.default_rng([config.seed, 31])
@@ -284,7 +285,7 @@ def _peak_after(devices: Devices) -> float:
     return max((sample.force_n for sample in samples if sample.valid), default=0.0)
 
 
-def _run_process_row(tree: dict[str, Any], row: FaultCase) -> Outcome:
+def _run_process_row(tree: Tree, row: FaultCase) -> Outcome:
     config = config_from(tree, "stability")
     with tempfile.TemporaryDirectory() as folder:
         try:

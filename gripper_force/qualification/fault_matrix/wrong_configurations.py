@@ -1,4 +1,4 @@
-"""Grasps with wrong configurations: the true rig differs from what the controller believes of it.
+"""Grasps with wrong configurations: the true rig differs from the configured one.
 
 Each row is wrong in one way, by an amount that is drawn for each grasp; half of the grasps are at an end of the
 range. The statements of `safety_statements` must hold for the simulated world, whose true force and speed no device

@@ -106,6 +106,8 @@ def open_engine(
     """
     if precision not in get_args(Precision):
         raise ConfigError(f"unknown vision.precision {precision!r}; use {' or '.join(get_args(Precision))}")
+    if threads is not None and threads < 1:
+        raise ConfigError(f"vision.threads {threads} is not positive; use at least 1, or None")
     if precision != "float32" and engine in ENGINES and engine != "openvino":
         raise ConfigError(f"vision.engine={engine} computes in float32 only; {precision} needs openvino")
     engine_class = load_class("engines", ENGINES, engine, "vision.engine", extra="engines")

@@ -213,7 +213,10 @@ def register_bus(name: str, bus: VirtualBus) -> None:
         ConfigError: The name is taken.
     """
     if _buses.setdefault(name, bus) is not bus:
-        raise ConfigError(f"another virtual bus is already registered as {name!r}; unregister it first")
+        raise ConfigError(
+            f"servo.port=virtual:{name} is in use in this process; close the gripper that has it, or name another "
+            "port, such as virtual:second"
+        )
 
 
 def unregister_bus(name: str) -> None:

@@ -202,18 +202,12 @@ class SimulatedRig:
         wrap_file: The same for the log's file.
 
     Raises:
-        ConfigError: ``servo.port`` is not virtual or already in use, ``sim.detail`` is not resolved, or the
-            object does not exist.
+        ConfigError: ``servo.port`` is already in use, ``sim.detail`` is not resolved, or the object does not
+            exist.
         SimulationError: The scene cannot be built.
     """
 
     def __init__(self, config: Config) -> None:
-        if not config.servo.port.startswith("virtual:"):
-            raise ConfigError(
-                f"servo.port {config.servo.port!r} is not virtual, but a simulated camera or load cell needs "
-                "the simulated servo; set camera.backend and load_cell.backend to real devices or none, or "
-                "set servo.port to virtual:rig"
-            )
         if config.sim.detail == "auto":
             raise ConfigError(
                 "sim.detail is still auto; resolve the configuration with SimulatedRig.resolve first"

@@ -80,7 +80,9 @@ def test_missing_touches_are_recorded_and_then_fitted(touched: list[Path], tmp_p
         out=tmp_path / "it.yaml",
         progress=lambda _text, steps_done=1: steps.append(steps_done),
     )
-    same = calibrate_object(load_config(), "stapler", logs=touched[:2], out=tmp_path / "same.yaml")
+    same = calibrate_object(
+        load_config(), "stapler", logs=[*map(str, touched[:2])], out=str(tmp_path / "same.yaml")
+    )
     assert result.profile.weights == same.profile.weights
     assert result.profile == read_object(result.profile_path)
     assert result.mae_after_n is None

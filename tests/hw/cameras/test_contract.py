@@ -49,7 +49,7 @@ class TestSimulatedCamera(CameraContract):
         self, config: Config, camera: Camera, wait: Callable[[float], None], take: Take
     ) -> None:
         camera.start()
-        with pytest.raises(ConfigError, match="already registered"):
+        with pytest.raises(ConfigError, match="is in use in this process"):
             SimulatedRig(config)
         take(camera, 2, lambda: wait(0.002))
 

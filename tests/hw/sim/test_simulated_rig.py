@@ -168,11 +168,6 @@ def test_servo_watchdog_counts_simulated_time(make_rig: MakeRig) -> None:
     servo.close()
 
 
-def test_real_port_is_refused(quick: list[str]) -> None:
-    with pytest.raises(ConfigError, match=r"'/dev/ttyUSB0' is not virtual"):
-        SimulatedRig(load_config(None, [*quick, "servo.port=/dev/ttyUSB0"]))
-
-
 def test_unknown_object_is_refused_and_leaves_no_bus(quick: list[str]) -> None:
     with pytest.raises(ConfigError, match="no simulated object 'egg'; there are sponge"):
         SimulatedRig(load_config(None, [*quick, "object=egg"]))
