@@ -18,9 +18,14 @@ from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import NS_PER_MS, Frame, LoadCellSample
 from gripper_force.vision.preprocess import Preprocess
 
-# A shell that runs the tests in the background makes every process ignore Ctrl-C; tests send it.
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+# A shell that runs the tests in the background, or nohup, makes every process ignore these signals; tests send them.
+for _number, _handler in (
+    (signal.SIGINT, signal.default_int_handler),
+    (signal.SIGQUIT, signal.SIG_DFL),
+    (signal.SIGHUP, signal.SIG_DFL),
+):
+    if signal.getsignal(_number) is signal.SIG_IGN:
+        signal.signal(_number, _handler)
 
 # A machine may be busy: how long an example takes says nothing about what it tests.
 settings.register_profile("unhurried", deadline=None)

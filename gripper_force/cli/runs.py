@@ -13,9 +13,9 @@ from gripper_force.cli.options import CORES, AsJson, ConfigPath, Overrides, load
 from gripper_force.cli.output.doctor import changes_table, checks_table, setup_line
 from gripper_force.cli.output.runs import grasp_table, replay_table, trials_table
 from gripper_force.errors import ConfigError, GripperError
-from gripper_force.interfaces import Progress, Prompt, no_progress
 
 if TYPE_CHECKING:
+    from gripper_force.interfaces import Progress, Prompt
     from gripper_force.jobs.checks import RegisterChange
 
 
@@ -51,6 +51,7 @@ def grasp(
     ] = False,
 ) -> None:
     """Grasp with a target force and report the error. Exit code 1 if nothing was held."""
+    from gripper_force.interfaces import no_progress
     from gripper_force.jobs import grasp as job
 
     settings = load_settings(

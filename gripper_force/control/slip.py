@@ -13,8 +13,8 @@ the speed limit brakes jaws without resistance in every second cycle."""
 
 _RECEDED_M = 0.0005
 _RECEDED_FORCE_N = 0.1
-"""A hold has lost its object if the jaws close by this much in one motion and the motor force has not risen by this
-much since they were last at rest. Against an object they would need more force."""
+"""A hold has lost its object if the jaws close by this much in one motion and the motor force is within this of that
+at their last rest. Against an object they would need more force."""
 
 _COLLAPSE_SHARE = 0.5
 _COLLAPSE_S = 0.1
@@ -77,7 +77,7 @@ class SlipMonitor:
         if self._rest is None:
             return ""
         rest_m, rest_n = self._rest
-        if rest_m - width_m > _RECEDED_M and motor_force_n - rest_n < _RECEDED_FORCE_N:
+        if rest_m - width_m > _RECEDED_M and abs(motor_force_n - rest_n) < _RECEDED_FORCE_N:
             return "the jaws close without more motor force"
         return ""
 

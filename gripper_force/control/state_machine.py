@@ -52,6 +52,13 @@ _LET_GO_S = 0.6
 force at once, the servo could not brake the jaws, and a springy object pushed them open at four times the wanted
 speed."""
 
+_BEYOND_SHARE = 1.0
+_BEYOND_N = 1.5
+"""Excess of the visual estimate over the target, the larger of the two, that no object explains."""
+
+_PROVEN_SHARE = 0.5
+"""The motor current proves a grip if it exceeds friction by this share of the target."""
+
 _LET_GO_LEAD_S = 0.03
 """Time in which the lead of the goal position reaches its full length after a release. With a full lead at once, the
 motor would add to the force of a springy object."""
@@ -271,15 +278,22 @@ class GraspController:
 
     @property
     def _is_unseen(self) -> bool:
-        """True if the camera sees next to no force, or has been too uncertain throughout this grip."""
+        """True if the camera does not confirm a grip.
+
+        It sees next to no force, has been too uncertain throughout this grip, or sees far more than the target
+        while friction may hold the jaws: a network can give any force for an empty scene.
+        """
+        target_n = self._derated_target_n
         if self._seen_n is None:
             return self._has_unsure and not self._has_seen
-        return self._seen_n < _UNSEEN_SHARE * self._derated_target_n
+        by_friction = self._motor_force_n - self._estimate.friction_n < _PROVEN_SHARE * target_n
+        beyond_n = max(_BEYOND_SHARE * target_n, _BEYOND_N)
+        return self._seen_n < _UNSEEN_SHARE * target_n or (by_friction and self._seen_n - target_n > beyond_n)
 
     @property
     def _sight(self) -> str:
         """The visual estimate in words."""
-        return "is uncertain" if self._seen_n is None else f"sees only {self._seen_n:.1f} N"
+        return "is uncertain" if self._seen_n is None else f"sees {self._seen_n:.1f} N"
 
     def _derate(self, t_ns: int, temperature_c: float) -> list[Event]:
         """Lowers the target force of a hot servo, before the servo shuts down."""

@@ -14,8 +14,7 @@ from typer.testing import CliRunner, Result
 from gripper_calibration import touch_logs
 from gripper_calibration.procedures import calibrate_object as job
 from gripper_calibration.procedures.calibrate_object import calibrate_object, record_touches
-from gripper_force.cli import app
-from gripper_force.cli import calibrate as cli_calibrate
+from gripper_force.cli import app, console
 from gripper_force.config import Config, config_from_text, load_config
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import ConfigError, DataError, RequestError
@@ -259,7 +258,7 @@ def interrupt() -> str:
 
 
 def by_hand(folder: Path, monkeypatch: pytest.MonkeyPatch, terminal: Terminal) -> Result:
-    monkeypatch.setattr(cli_calibrate, "sys", SimpleNamespace(stdin=terminal))
+    monkeypatch.setattr(console, "sys", SimpleNamespace(stdin=terminal))
     keys = [part for key in QUICK[1:] for part in ("--set", key)]
     given = ["calibrate", "object", "stapler", "--touches", "3", "--peak-n", "6", "--pause", "--json", *keys]
     return CliRunner().invoke(

@@ -49,8 +49,10 @@ def test_served_motor_moves():
         port.openPort()
         PACKETS.write4ByteTxRx(port, 1, 116, 2100)
         PACKETS.write1ByteTxRx(port, 1, 64, 1)
+        ticks = 0
         for _ in range(100_000):
-            ticks = PACKETS.read4ByteTxRx(port, 1, 132)[0]
+            with suppress(IndexError):  # what the library makes of a late answer on a busy machine
+                ticks = PACKETS.read4ByteTxRx(port, 1, 132)[0]
             if ticks > 2090:
                 break
         port.closePort()

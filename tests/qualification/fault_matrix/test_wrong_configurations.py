@@ -28,7 +28,8 @@ STAPLER = 3
 """Number of a grasp of the cheapest object."""
 
 NO_CAMERA = ["camera.backend=none", "vision.checkpoint=none", "control.feedback=current"]
-FAST = load_config(None, ["sim.detail=coarse", *NO_CAMERA])
+FAST = load_config(None, ["sim.detail=coarse", "servo.bus_watchdog_ms=2540", *NO_CAMERA])
+"""Without camera, and with a watchdog that a busy machine does not trip."""
 
 
 def row(name: str, **keys: Any) -> WrongCase:
