@@ -32,19 +32,26 @@ def train(
         Path | None,
         typer.Option(help="Logs to measure the checkpoint's error on. Default: sets held out of DATA."),
     ] = None,
-    init: Annotated[str | None, typer.Option(help="Checkpoint with the initial weights.")] = None,
+    init: Annotated[
+        str | None,
+        typer.Option(help="Checkpoint to continue: its weights, and its keys where none are set."),
+    ] = None,
     resume: Annotated[bool, typer.Option(help="Continue an interrupted training.")] = False,
     jobs: Jobs = CORES,
     as_json: AsJson = False,
 ) -> None:
     """Train the force network on logs; under `torchrun`, in several processes."""
     from gripper_force.jobs.dataset import find_logs, load_clips
+    from gripper_force.jobs.training.recipe import continued
     from gripper_force.jobs.training.recipe import recipe as named
     from gripper_force.jobs.training.train import PROGRESS_STEPS
     from gripper_force.jobs.training.train import train as job
     from gripper_force.vision.checkpoint import load_checkpoint
 
     settings = named(recipe, set_)
+    start = load_checkpoint(init) if init else None
+    if start is not None:
+        settings = continued(settings, start.header)
     quiet = os.environ.get("RANK", "0") != "0"  # only the first process of torchrun prints
     logs, unseen_logs = find_logs(data), find_logs(validation) if validation else []
     with console.bar("reading logs", len(logs) + len(unseen_logs), hidden=quiet) as progress:
@@ -55,7 +62,6 @@ def train(
             else None
         )
     clips = [clip for clip in clips if clip.object not in (hold_out or [])]
-    start = load_checkpoint(init) if init else None
     with console.bar("training", PROGRESS_STEPS * len(settings.attentions), hidden=quiet) as progress:
         result = job(
             settings,

@@ -13,13 +13,14 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from gripper_force.errors import CheckpointError, ConfigError
+from gripper_force.errors import ConfigError
 from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import Clip, check_size, digest, split_by
 from gripper_force.jobs.training.batches import Batches
 from gripper_force.jobs.training.parallel import Ranks, joined
 from gripper_force.jobs.training.recipe import TrainConfig as TrainConfig
+from gripper_force.jobs.training.recipe import continued
 from gripper_force.jobs.training.trainer import Trainer, estimates
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from gripper_force.vision.header import RESIDUAL_HALF_N, Header, Residual
@@ -55,7 +56,8 @@ def train(
         out: Checkpoint to write. All processes read it, so all machines need access to it.
         validation_clips: Clips to measure the checkpoint's stated error on; None for sets held out of
             ``clips``.
-        init: Checkpoint with the initial weights; None for random weights.
+        init: Checkpoint with the initial weights, whose networks and preprocessing replace those that the
+            recipe leaves unset; None for random weights.
         resume: Continue an interrupted training from its saved states.
         progress: Called with the training error; `PROGRESS_STEPS` for each network in total.
 
@@ -67,8 +69,11 @@ def train(
             size.
         NonFiniteError: The training diverged.
         CheckpointError: A state belongs to another recipe or other data, or a file can't be written.
-        ConfigError: The processes can't train together, for example because their recipes differ.
+        ConfigError: The recipe sets a key in which ``init`` differs, or the processes can't train together,
+            for example because their recipes differ.
     """
+    if init is not None:
+        config = continued(config, init.header)
     training, held_out = clips, validation_clips
     if held_out is None:
         training, held_out = split_by(clips, "set", config.validation, config.seed)
@@ -111,11 +116,6 @@ def _trained(
         )
     if ranks.count > 1 and config.compile:
         raise ConfigError("compile does not work with several processes; set compile=false")
-    shapes = [config.network(member) for member in range(len(config.attentions))]
-    if init is not None and [network.config for network in init.networks] != shapes:
-        raise CheckpointError(
-            "the initial checkpoint has other networks than this recipe; use one trained with this recipe"
-        )
     batches = Batches(clips, config, ranks)
     start = init.digest if init is not None else ""
     identity = f"{config.model_dump_json(exclude={'device', 'compile'})} {digest(clips)} {start}"

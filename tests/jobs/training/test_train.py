@@ -130,6 +130,27 @@ def test_state_of_another_training_raises(
         train(small_recipe, clips, out, resume=True)
 
 
+def test_command_continues_a_checkpoint(few_logs: Path, tiny_checkpoint: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.safetensors"
+    call = ["train", str(few_logs), "--init", str(tiny_checkpoint), "--out", str(out), "--jobs", "1"]
+    call += ["--set", "steps=1", "--set", "clips=2", "--set", "device=cpu", "--json"]
+    done = CliRunner().invoke(cli.app, call)
+    assert done.exit_code == 0, done.output
+    start, result = load_checkpoint(tiny_checkpoint), load_checkpoint(out)
+    assert result.header.members == start.header.members
+    assert result.header.preprocess == start.header.preprocess
+    # One step changes each weight by no more than the learning rate; a new network has far smaller weights.
+    before, after = (checkpoint.networks[0].out.weight for checkpoint in (start, result))
+    assert before.abs().max() > 100
+    torch.testing.assert_close(after, before, rtol=1e-3, atol=0.01)
+    assert result.digest != start.digest
+    out.unlink()
+    refused = CliRunner().invoke(cli.app, [*call, "--recipe", "shin2019"]).exception
+    assert isinstance(refused, ConfigError)
+    assert "preprocess.size=128" in str(refused)
+    assert not out.exists()
+
+
 def test_divergence_raises(clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig) -> None:
     clips[0].forces_n[:] = clips[1].forces_n[:] = clips[2].forces_n[:] = np.inf
     with pytest.raises(NonFiniteError, match="ssam diverged"):
