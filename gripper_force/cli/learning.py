@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -44,8 +45,9 @@ def train(
     from gripper_force.jobs.dataset import find_logs, load_clips
     from gripper_force.jobs.training.recipe import continued
     from gripper_force.jobs.training.recipe import recipe as named
-    from gripper_force.jobs.training.train import PROGRESS_STEPS
+    from gripper_force.jobs.training.train import PROGRESS_STEPS, state_paths
     from gripper_force.jobs.training.train import train as job
+    from gripper_force.runtime import process
     from gripper_force.vision.checkpoint import load_checkpoint
 
     settings = named(recipe, set_)
@@ -62,19 +64,43 @@ def train(
             else None
         )
     clips = [clip for clip in clips if clip.object not in (hold_out or [])]
-    with console.bar("training", PROGRESS_STEPS * len(settings.attentions), hidden=quiet) as progress:
-        result = job(
-            settings,
-            clips,
-            checkpoint,
-            validation_clips=unseen,
-            init=start,
-            resume=resume,
-            progress=progress,
-        )
-    metrics = result.header.metrics
-    if not quiet:
-        console.show({"checkpoint": str(checkpoint), "digest": result.digest, **metrics}, as_json)
+    warnings: list[str] = []
+    states = state_paths(settings, checkpoint)
+    before = [] if resume else _saved(states)  # of an earlier training
+    try:
+        with console.bar("training", PROGRESS_STEPS * len(settings.attentions), hidden=quiet) as progress:
+            result = job(
+                settings,
+                clips,
+                checkpoint,
+                validation_clips=unseen,
+                init=start,
+                resume=resume,
+                progress=progress,
+                warn=warnings.append,
+            )
+    except BaseException as end:
+        interrupted = isinstance(end, KeyboardInterrupt) or process.is_interrupted()
+        if interrupted and not quiet and _saved(states) != before:
+            console.err.print("the training was saved; add --resume to the same command to continue it")
+        raise
+    if quiet:
+        return
+    for text in warnings:
+        console.warn(text)
+    found = {"checkpoint": str(checkpoint), "digest": result.digest, **result.header.metrics}
+    console.show({**found, "warnings": warnings}, as_json, lambda _: console.pairs(found))
+    console.err.print(
+        f"next: gripper-force evaluate FOLDER --checkpoint {shlex.quote(str(checkpoint))}, with logs that were "
+        "not used for training",
+        soft_wrap=True,
+        markup=False,
+    )
+
+
+def _saved(states: list[Path]) -> list[tuple[Path, int]]:
+    """Returns the existing states of a training, with their times."""
+    return [(state, state.stat().st_mtime_ns) for state in states if state.exists()]
 
 
 def evaluate(

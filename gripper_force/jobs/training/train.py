@@ -6,7 +6,7 @@ draws short clips from many recordings instead of long ones from a few.
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -44,6 +44,7 @@ def train(
     init: Checkpoint | None = None,
     resume: bool = False,
     progress: Progress = no_progress,
+    warn: Callable[[str], None] = lambda _: None,
 ) -> Checkpoint:
     """Trains an ensemble and writes its checkpoint, together with all processes that `torchrun` started.
 
@@ -60,6 +61,7 @@ def train(
             recipe leaves unset; None for random weights.
         resume: Continue an interrupted training from its saved states.
         progress: Called with the training error; `PROGRESS_STEPS` for each network in total.
+        warn: Called with a sentence if the training was too short to draw a clip from each recording.
 
     Returns:
         The checkpoint as written.
@@ -78,11 +80,14 @@ def train(
     if held_out is None:
         training, held_out = split_by(clips, "set", config.validation, config.seed)
     check_size([*training, *held_out], config.preprocess)
-    states = [out.with_suffix(f".{i}.state") for i in range(len(config.attentions))]
+    states = state_paths(config, out)
     with joined(config.device) as ranks:
-        networks = [t.network for t in _trained(config, training, states, init, resume, ranks, progress)]
+        networks = [
+            t.network for t in _trained(config, training, states, init, resume, ranks, progress, warn)
+        ]
         if ranks.first:
             forces_n, measured_n = estimates(held_out, networks, config.preprocess, ranks.device)
+            mean_n = np.concatenate([clip.forces_n[clip.valid] for clip in training]).mean()
             header = Header(
                 members=tuple(network.config for network in networks),
                 preprocess=config.preprocess,
@@ -92,6 +97,7 @@ def train(
                     "mae_n": metrics.mae(forces_n, measured_n),
                     "rmse_n": metrics.rmse(forces_n, measured_n),
                     "bias_n": metrics.bias(forces_n, measured_n),
+                    "constant_mae_n": metrics.mae(np.full_like(measured_n, mean_n), measured_n),
                 },
             )
             save_checkpoint(out, networks, header)
@@ -99,6 +105,11 @@ def train(
                 state.unlink()
         ranks.wait()
         return load_checkpoint(out)
+
+
+def state_paths(config: TrainConfig, out: Path) -> list[Path]:
+    """Returns the files in which a training saves its states, one for each member."""
+    return [out.with_suffix(f".{i}.state") for i in range(len(config.attentions))]
 
 
 def _trained(
@@ -109,6 +120,7 @@ def _trained(
     resume: bool,
     ranks: Ranks,
     progress: Progress,
+    warn: Callable[[str], None],
 ) -> list[Trainer]:
     if ranks.count > config.clips:
         raise ConfigError(
@@ -141,6 +153,12 @@ def _trained(
         trainer.network.eval()
         if ranks.first:
             trainer.save(state, identity)
+    if unseen := int(batches.unseen.sum()):
+        length = next(key for key in ("minutes", "epochs", "steps") if getattr(config, key) is not None)
+        warn(
+            f"the training was too short: it drew no clip from {unseen} of its {len(clips)} recordings; "
+            f"increase {length}"
+        )
     return trainers
 
 
