@@ -14,6 +14,14 @@ from gripper_force.cli.output.paper import paper_tables
 from gripper_force.cli.output.runs import errors_table
 from gripper_force.errors import ConfigError
 
+ContactStarts = Annotated[
+    bool,
+    typer.Option(
+        "--include-contact-starts",
+        help="Also use logs that start in contact, whose first frames are no reference.",
+    ),
+]
+
 
 def train(
     data: Annotated[Path, typer.Argument(help="Folder with logs.")],
@@ -38,11 +46,12 @@ def train(
         typer.Option(help="Checkpoint to continue: its weights, and its keys where none are set."),
     ] = None,
     resume: Annotated[bool, typer.Option(help="Continue an interrupted training.")] = False,
+    include_contact_starts: ContactStarts = False,
     jobs: Jobs = CORES,
     as_json: AsJson = False,
 ) -> None:
     """Train the force network on logs; under `torchrun`, in several processes."""
-    from gripper_force.jobs.dataset import find_logs, load_clips
+    from gripper_force.jobs.dataset import find_logs, load_clips, without_contact_starts
     from gripper_force.jobs.training.recipe import continued
     from gripper_force.jobs.training.recipe import recipe as named
     from gripper_force.jobs.training.train import PROGRESS_STEPS, state_paths
@@ -64,6 +73,14 @@ def train(
             else None
         )
     clips = [clip for clip in clips if clip.object not in (hold_out or [])]
+    left_out = 0
+    if not include_contact_starts:
+        loaded = len(clips) + len(unseen or [])
+        clips = without_contact_starts(clips, settings.preprocess)
+        unseen = without_contact_starts(unseen, settings.preprocess) if unseen else unseen
+        left_out = loaded - len(clips) - len(unseen or [])
+        if not quiet:
+            _warn_left_out(left_out, loaded)
     warnings: list[str] = []
     states = state_paths(settings, checkpoint)
     before = [] if resume else _saved(states)  # of an earlier training
@@ -89,13 +106,22 @@ def train(
     for text in warnings:
         console.warn(text)
     found = {"checkpoint": str(checkpoint), "digest": result.digest, **result.header.metrics}
-    console.show({**found, "warnings": warnings}, as_json, lambda _: console.pairs(found))
+    console.show(
+        {**found, "left_out": left_out, "warnings": warnings}, as_json, lambda _: console.pairs(found)
+    )
     console.err.print(
         f"next: gripper-force evaluate FOLDER --checkpoint {shlex.quote(str(checkpoint))}, with logs that were "
         "not used for training",
         soft_wrap=True,
         markup=False,
     )
+
+
+def _warn_left_out(left_out: int, logs: int) -> None:
+    if left_out:
+        console.warn(
+            f"left out {left_out} of {logs} logs, which start in contact; add --include-contact-starts to use them"
+        )
 
 
 def _saved(states: list[Path]) -> list[tuple[Path, int]]:
@@ -113,6 +139,7 @@ def evaluate(
     only: Annotated[
         list[str] | None, typer.Option("--object", help="Use only logs of this object. Repeatable.")
     ] = None,
+    include_contact_starts: ContactStarts = False,
     jobs: Jobs = CORES,
     set_: Overrides = None,
     as_json: AsJson = False,
@@ -129,9 +156,11 @@ def evaluate(
             settings.vision.checkpoint,
             objects=only or (),
             config=settings,
+            include_contact_starts=include_contact_starts,
             workers=jobs,
             progress=progress,
         )
+    _warn_left_out(result.left_out, len(logs))
     console.show(result, as_json, errors_table)
 
 

@@ -214,6 +214,33 @@ def test_command_continues_a_checkpoint(few_logs: Path, tiny_checkpoint: Path, t
     assert not out.exists()
 
 
+def test_command_leaves_out_logs_that_start_in_contact(
+    few_logs: Path, loaded_log: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out.safetensors"
+    free, every = (
+        load_clips(logs, Preprocess(size=16))
+        for logs in (sorted(set(few_logs.glob("*.mcap")) - {loaded_log}), few_logs)
+    )
+    call = ["train", str(few_logs), "--out", str(out), "--jobs", "1", "--json"]
+    keys = ["preprocess.size=16", "attentions=[none]", "width=0.25", "steps=1", "device=cpu"]
+    call += [part for key in keys for part in ("--set", key)]
+    for options, left_out, clips in (
+        ([], 1, free),
+        (["--include-contact-starts"], 0, every),
+        (["--set", "preprocess.reference=false"], 0, every),
+    ):
+        done = CliRunner().invoke(cli.app, [*call, *options])
+        assert json.loads(done.stdout)["left_out"] == left_out
+        assert ("left out 1 of 4 logs, which start in contact" in done.stderr) == bool(left_out)
+        assert load_checkpoint(out).header.data_digest == digest(clips)
+    (tmp_path / "unseen").mkdir()
+    (tmp_path / "unseen" / loaded_log.name).symlink_to(loaded_log)
+    refused = CliRunner().invoke(cli.app, [*call, "--validation", str(tmp_path / "unseen")]).exception
+    assert isinstance(refused, DataError)
+    assert "all 1 recordings start in contact" in str(refused)
+
+
 def test_divergence_raises(clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig) -> None:
     clips[0].forces_n[:] = clips[1].forces_n[:] = clips[2].forces_n[:] = np.inf
     with pytest.raises(NonFiniteError, match="ssam diverged"):
@@ -240,7 +267,7 @@ def test_command_takes_a_recipe(few_logs: Path, tmp_path: Path) -> None:
     call = ["train", str(few_logs), "--recipe", "shin2019", "--out", str(out), "--jobs", "1", *sets, "--json"]
     told = json.loads(CliRunner().invoke(cli.app, call).stdout)
     figures = {"mae_n", "rmse_n", "bias_n", "constant_mae_n"}
-    assert set(told) == {"checkpoint", "digest", "warnings", *figures}
+    assert set(told) == {"checkpoint", "digest", "left_out", "warnings", *figures}
     header = load_checkpoint(out).header
     assert [member.attention for member in header.members] == ["cbam"]
     assert not header.preprocess.reference
