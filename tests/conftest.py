@@ -2,6 +2,7 @@
 
 import signal
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -191,10 +192,23 @@ def clips(press: Callable[..., Clip]) -> list[Clip]:
 @pytest.fixture
 def few_logs(clips: list[Clip], tmp_path: Path) -> Path:
     """Three of the clips as logs in a folder."""
-    config = dump_config(load_config(None, ["object=disc"]))
     for clip in clips[:3]:
-        with LogWriter(tmp_path / f"logs/{clip.name}.mcap", config=config, metadata={"set": clip.set}) as log:
-            for i, (gray, force_n) in enumerate(zip(clip.frames, clip.forces_n.tolist(), strict=True)):
-                log.write(Frame(i * 20 * NS_PER_MS, i * 20 * NS_PER_MS, i, gray))
-                log.write(LoadCellSample(i * 20 * NS_PER_MS, force_n, force_n, True))
+        _write_log(clip, tmp_path / "logs")
     return tmp_path / "logs"
+
+
+@pytest.fixture
+def loaded_log(few_logs: Path, press: Callable[..., Clip]) -> Path:
+    """One more log in the folder of `few_logs`, which starts in contact."""
+    clip = press(7)
+    return _write_log(replace(clip, frames=clip.frames[20:], forces_n=clip.forces_n[20:]), few_logs)
+
+
+def _write_log(clip: Clip, folder: Path) -> Path:
+    path = folder / f"{clip.name}.mcap"
+    config = dump_config(load_config(None, ["object=disc"]))
+    with LogWriter(path, config=config, metadata={"set": clip.set}) as log:
+        for i, (gray, force_n) in enumerate(zip(clip.frames, clip.forces_n.tolist(), strict=True)):
+            log.write(Frame(i * 20 * NS_PER_MS, i * 20 * NS_PER_MS, i, gray))
+            log.write(LoadCellSample(i * 20 * NS_PER_MS, force_n, force_n, True))
+    return path

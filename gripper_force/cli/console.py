@@ -41,6 +41,11 @@ def line(text: str, steps: int = 1) -> None:
     err.print(f"[dim]{escape(text)}[/]", soft_wrap=True)
 
 
+def warn(text: str) -> None:
+    """Prints a warning on stderr."""
+    err.print(f"[yellow]warning:[/] {escape(text)}", soft_wrap=True)
+
+
 def prompt(yes: bool, status: "Status | None" = None) -> "Prompt":
     """Returns a prompt that waits for Enter, or with ``yes`` only prints. Meanwhile ``status`` is hidden."""
 

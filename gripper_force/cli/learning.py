@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -12,6 +13,14 @@ from gripper_force.cli.options import CORES, AsJson, Jobs, Overrides, load_setti
 from gripper_force.cli.output.paper import paper_tables
 from gripper_force.cli.output.runs import errors_table
 from gripper_force.errors import ConfigError
+
+ContactStarts = Annotated[
+    bool,
+    typer.Option(
+        "--include-contact-starts",
+        help="Also use logs that start in contact, whose first frames are no reference.",
+    ),
+]
 
 
 def train(
@@ -32,19 +41,28 @@ def train(
         Path | None,
         typer.Option(help="Logs to measure the checkpoint's error on. Default: sets held out of DATA."),
     ] = None,
-    init: Annotated[str | None, typer.Option(help="Checkpoint with the initial weights.")] = None,
+    init: Annotated[
+        str | None,
+        typer.Option(help="Checkpoint to continue: its weights, and its keys where none are set."),
+    ] = None,
     resume: Annotated[bool, typer.Option(help="Continue an interrupted training.")] = False,
+    include_contact_starts: ContactStarts = False,
     jobs: Jobs = CORES,
     as_json: AsJson = False,
 ) -> None:
     """Train the force network on logs; under `torchrun`, in several processes."""
-    from gripper_force.jobs.dataset import find_logs, load_clips
+    from gripper_force.jobs.dataset import find_logs, load_clips, without_contact_starts
+    from gripper_force.jobs.training.recipe import continued
     from gripper_force.jobs.training.recipe import recipe as named
-    from gripper_force.jobs.training.train import PROGRESS_STEPS
+    from gripper_force.jobs.training.train import PROGRESS_STEPS, state_paths
     from gripper_force.jobs.training.train import train as job
+    from gripper_force.runtime import process
     from gripper_force.vision.checkpoint import load_checkpoint
 
     settings = named(recipe, set_)
+    start = load_checkpoint(init) if init else None
+    if start is not None:
+        settings = continued(settings, start.header)
     quiet = os.environ.get("RANK", "0") != "0"  # only the first process of torchrun prints
     logs, unseen_logs = find_logs(data), find_logs(validation) if validation else []
     with console.bar("reading logs", len(logs) + len(unseen_logs), hidden=quiet) as progress:
@@ -55,20 +73,60 @@ def train(
             else None
         )
     clips = [clip for clip in clips if clip.object not in (hold_out or [])]
-    start = load_checkpoint(init) if init else None
-    with console.bar("training", PROGRESS_STEPS * len(settings.attentions), hidden=quiet) as progress:
-        result = job(
-            settings,
-            clips,
-            checkpoint,
-            validation_clips=unseen,
-            init=start,
-            resume=resume,
-            progress=progress,
+    left_out = 0
+    if not include_contact_starts:
+        loaded = len(clips) + len(unseen or [])
+        clips = without_contact_starts(clips, settings.preprocess)
+        unseen = without_contact_starts(unseen, settings.preprocess) if unseen else unseen
+        left_out = loaded - len(clips) - len(unseen or [])
+        if not quiet:
+            _warn_left_out(left_out, loaded)
+    warnings: list[str] = []
+    states = state_paths(settings, checkpoint)
+    before = [] if resume else _saved(states)  # of an earlier training
+    try:
+        with console.bar("training", PROGRESS_STEPS * len(settings.attentions), hidden=quiet) as progress:
+            result = job(
+                settings,
+                clips,
+                checkpoint,
+                validation_clips=unseen,
+                init=start,
+                resume=resume,
+                progress=progress,
+                warn=warnings.append,
+            )
+    except BaseException as end:
+        interrupted = isinstance(end, KeyboardInterrupt) or process.is_interrupted()
+        if interrupted and not quiet and _saved(states) != before:
+            console.err.print("the training was saved; add --resume to the same command to continue it")
+        raise
+    if quiet:
+        return
+    for text in warnings:
+        console.warn(text)
+    found = {"checkpoint": str(checkpoint), "digest": result.digest, **result.header.metrics}
+    console.show(
+        {**found, "left_out": left_out, "warnings": warnings}, as_json, lambda _: console.pairs(found)
+    )
+    console.err.print(
+        f"next: gripper-force evaluate FOLDER --checkpoint {shlex.quote(str(checkpoint))}, with logs that were "
+        "not used for training",
+        soft_wrap=True,
+        markup=False,
+    )
+
+
+def _warn_left_out(left_out: int, logs: int) -> None:
+    if left_out:
+        console.warn(
+            f"left out {left_out} of {logs} logs, which start in contact; add --include-contact-starts to use them"
         )
-    metrics = result.header.metrics
-    if not quiet:
-        console.show({"checkpoint": str(checkpoint), "digest": result.digest, **metrics}, as_json)
+
+
+def _saved(states: list[Path]) -> list[tuple[Path, int]]:
+    """Returns the existing states of a training, with their times."""
+    return [(state, state.stat().st_mtime_ns) for state in states if state.exists()]
 
 
 def evaluate(
@@ -81,6 +139,7 @@ def evaluate(
     only: Annotated[
         list[str] | None, typer.Option("--object", help="Use only logs of this object. Repeatable.")
     ] = None,
+    include_contact_starts: ContactStarts = False,
     jobs: Jobs = CORES,
     set_: Overrides = None,
     as_json: AsJson = False,
@@ -97,9 +156,11 @@ def evaluate(
             settings.vision.checkpoint,
             objects=only or (),
             config=settings,
+            include_contact_starts=include_contact_starts,
             workers=jobs,
             progress=progress,
         )
+    _warn_left_out(result.left_out, len(logs))
     console.show(result, as_json, errors_table)
 
 

@@ -109,6 +109,33 @@ def load_clips(
     return clips
 
 
+def starts_in_contact(forces_n: npt.NDArray[np.floating], reference_frames: int) -> bool:
+    """Returns True if one of a recording's reference frames shows contact, so that they are no reference.
+
+    Args:
+        forces_n: Load-cell force at each frame, (T,); 0 without a label.
+        reference_frames: Number of reference frames.
+    """
+    return bool((forces_n[:reference_frames] > CONTACT_N).any())
+
+
+def without_contact_starts(clips: Sequence[Clip], preprocess: "Preprocess") -> list[Clip]:
+    """Returns the clips that do not start in contact; all clips if no reference is subtracted.
+
+    Raises:
+        DataError: No clip is left.
+    """
+    if not preprocess.reference:
+        return list(clips)
+    kept = [clip for clip in clips if not starts_in_contact(clip.forces_n, preprocess.reference_frames)]
+    if clips and not kept:
+        raise DataError(
+            f"all {len(clips)} recordings start in contact (more than {CONTACT_N} N), so their first frames are no "
+            "reference; record them again from open jaws, or add --include-contact-starts"
+        )
+    return kept
+
+
 def split_by(
     clips: Sequence[Clip], key: Literal["object", "set"], fraction: float, seed: int = 0
 ) -> tuple[list[Clip], list[Clip]]:

@@ -1,7 +1,7 @@
 """Evaluation of a checkpoint on recordings that training has not seen."""
 
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -14,7 +14,14 @@ from gripper_force.config import Config
 from gripper_force.errors import DataError
 from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs import metrics
-from gripper_force.jobs.dataset import CONTACT_N, Clip, check_size, load_clips, stiffness_floor_n
+from gripper_force.jobs.dataset import (
+    CONTACT_N,
+    Clip,
+    check_size,
+    load_clips,
+    stiffness_floor_n,
+    without_contact_starts,
+)
 from gripper_force.profiles.apply import read_correction, read_profiles
 from gripper_force.profiles.correction import Correction
 from gripper_force.vision.batch_inference import features, predict
@@ -59,6 +66,7 @@ class Evaluation:
         frames: Frames with a label.
         per_object: Errors by object.
         per_bin: Errors by measured force, in bins of 1 N.
+        left_out: Logs that were left out because they start in contact.
     """
 
     mae_n: float
@@ -68,6 +76,7 @@ class Evaluation:
     frames: int
     per_object: dict[str, ObjectErrors]
     per_bin: list[metrics.ForceBin]
+    left_out: int = 0
 
 
 def evaluate(
@@ -77,6 +86,7 @@ def evaluate(
     profile: str | None = None,
     objects: Collection[str] = (),
     config: Config | None = None,
+    include_contact_starts: bool = False,
     workers: int = 1,
     progress: Progress = no_progress,
 ) -> Evaluation:
@@ -97,6 +107,8 @@ def evaluate(
         objects: Only logs of these objects are used; empty for all.
         config: Its ``vision.region`` replaces the region in each log's own configuration, and its camera and
             ``calibration.on_mismatch`` apply to profiles. Default: the defaults.
+        include_contact_starts: Also use logs that start in contact. Their reference frames are wrong, and so
+            are the estimates.
         workers: Processes that read the logs.
         progress: Called twice for each log: after reading and after evaluating it.
 
@@ -104,7 +116,8 @@ def evaluate(
         The errors over all frames with a load-cell force, by object, and by measured force.
 
     Raises:
-        DataError: There are no logs, none of these objects, or a log has no frames or no labels.
+        DataError: There are no logs, none of these objects, a log has no frames or no labels, or all start in
+            contact.
         LogError: A log can't be read.
         CheckpointError: The checkpoint can't be read.
         ConfigError: The profile can't be read, or belongs to another checkpoint or camera.
@@ -115,7 +128,8 @@ def evaluate(
     chosen = [clip for clip in clips if not objects or clip.object in objects]
     if not chosen:
         raise DataError(f"no log in {logs} is of {', '.join(objects)}; choose among the logs' own objects")
-    progress("", len(clips) - len(chosen))
+    used = chosen if include_contact_starts else without_contact_starts(chosen, loaded.header.preprocess)
+    progress("", len(clips) - len(used))
     calibration = config.calibration
     if profile is not None:
         calibration = calibration.model_copy(update={"object": profile})
@@ -124,7 +138,8 @@ def evaluate(
         own = config.model_copy(update={"object": clip.object, "calibration": calibration})
         return read_correction(own, read_profiles(own), loaded)
 
-    return evaluate_clips(loaded, chosen, None if calibration.object is None else correction, progress)
+    result = evaluate_clips(loaded, used, None if calibration.object is None else correction, progress)
+    return replace(result, left_out=len(chosen) - len(used))
 
 
 def evaluate_clips(

@@ -112,7 +112,8 @@ class Header(Section):
         preprocess: Preparation of frames.
         residuals: Error by estimated force, measured on validation data, in order of rising force.
         data_digest: SHA-256 of the training set.
-        metrics: Metrics on the validation data, such as ``mae_n``.
+        metrics: Metrics on the validation data, such as ``mae_n``; ``constant_mae_n`` is that of the mean force
+            of the training data, for comparison.
     """
 
     members: tuple[NetworkConfig, ...]

@@ -519,6 +519,14 @@ def test_logs_can_be_made_of_one_object(run: Run, tmp_path: Path) -> None:
     assert (unknown.code, "no simulated object 'pencil'" in unknown.err) == (2, True)
 
 
+def test_an_imported_recording_that_starts_in_contact_is_named(run: Run, tmp_path: Path) -> None:
+    video, table = write_recording(tmp_path)
+    rows = table.read_text().splitlines()
+    rows[1] = "0,0.0,2.5"
+    table.write_text("\n".join(rows))
+    assert "touch.mcap starts in contact" in run("import", "video", video, table).out
+
+
 def test_a_video_needs_its_table(run: Run, tmp_path: Path) -> None:
     video, table = write_recording(tmp_path)
     table.unlink()

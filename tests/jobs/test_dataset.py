@@ -6,7 +6,18 @@ import pytest
 
 from gripper_force.config import Config, dump_config
 from gripper_force.errors import ConfigError, DataError
-from gripper_force.jobs.dataset import NEAR_NS, Clip, digest, label_frames, load_clip, load_clips, split_by
+from gripper_force.jobs.dataset import (
+    CONTACT_N,
+    NEAR_NS,
+    Clip,
+    digest,
+    label_frames,
+    load_clip,
+    load_clips,
+    split_by,
+    starts_in_contact,
+    without_contact_starts,
+)
 from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import NS_PER_MS, Frame, LoadCellSample
 from gripper_force.vision.preprocess import Preprocess, downscale
@@ -146,3 +157,22 @@ def test_digest_changes_with_every_part() -> None:
     other_label.forces_n[1] = 1
     assert digest([base]) == digest([clip("b", "cup", "s")])
     assert len({digest([base]), digest([other_label]), digest([base, base])}) == 3
+
+
+@pytest.mark.parametrize(("frame", "in_contact"), [(0, True), (3, True), (4, False)])
+def test_start_in_contact_is_judged_at_the_reference_frames(frame: int, in_contact: bool) -> None:
+    forces_n = np.zeros(9, np.float32)
+    forces_n[frame] = 1.01 * CONTACT_N
+    assert starts_in_contact(forces_n, 4) == in_contact
+    forces_n[frame] = 0.99 * CONTACT_N
+    assert not starts_in_contact(forces_n, 4)
+
+
+def test_clips_that_start_in_contact_are_left_out() -> None:
+    free, loaded = clip("a", "cup", "s"), clip("b", "cup", "t")
+    free.forces_n[:], loaded.forces_n[:] = 0, 1
+    assert without_contact_starts([free, loaded], SMALL) == [free]
+    without_reference = SMALL.model_copy(update={"reference": False})
+    assert without_contact_starts([free, loaded], without_reference) == [free, loaded]
+    with pytest.raises(DataError, match="all 1 recordings start in contact"):
+        without_contact_starts([loaded], SMALL)

@@ -1,3 +1,4 @@
+import json
 from collections.abc import Iterator
 from pathlib import Path
 from unittest.mock import Mock
@@ -5,7 +6,9 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
+from typer.testing import CliRunner
 
+from gripper_force import cli
 from gripper_force.config import load_config
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs.dataset import Clip, load_clips
@@ -91,6 +94,25 @@ def test_logs_are_evaluated_like_their_clips(
         assert sum(steps) == 2 * len(list(few_logs.iterdir()))
     with pytest.raises(DataError, match="is of cup"):
         evaluate(few_logs, tiny_checkpoint, objects=["cup"])
+
+
+def test_logs_that_start_in_contact_are_left_out(
+    few_logs: Path, tiny_checkpoint: Path, loaded_log: Path
+) -> None:
+    without = evaluate(few_logs, tiny_checkpoint)
+    assert (without.frames, without.left_out) == (3 * 57, 1)
+    every = evaluate(few_logs, tiny_checkpoint, include_contact_starts=True)
+    assert (every.frames, every.left_out) == (3 * 57 + 37, 0)
+    progress = Mock()
+    evaluate(few_logs, tiny_checkpoint, progress=progress)
+    assert sum(call.args[1] if len(call.args) > 1 else 1 for call in progress.call_args_list) == 2 * 4
+    with pytest.raises(DataError, match="all 1 recordings start in contact"):
+        evaluate([loaded_log], tiny_checkpoint)
+    call = ["evaluate", str(few_logs), "--checkpoint", str(tiny_checkpoint), "--jobs", "1"]
+    assert "left out 1 of 4 logs, which start in contact" in CliRunner().invoke(cli.app, call).stderr
+    included = CliRunner().invoke(cli.app, [*call, "--include-contact-starts", "--json"])
+    assert "left out" not in included.stderr
+    assert json.loads(included.stdout)["frames"] == every.frames
 
 
 def test_profile_of_another_checkpoint_raises(few_logs: Path, tiny_checkpoint: Path) -> None:

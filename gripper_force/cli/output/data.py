@@ -57,6 +57,9 @@ def imports_table(logs: "Sequence[ImportSummary]") -> None:
         if row.tare_note:
             note = f"no tare: {row.tare_note}"
             out.print(f"[yellow]{escape(row.log.name)}[/] {escape(note)}", soft_wrap=True)
+        if row.starts_in_contact:
+            note = "starts in contact, so its first frames are no reference; train and evaluate leave it out"
+            out.print(f"[yellow]{escape(row.log.name)}[/] {note}", soft_wrap=True)
 
 
 def database_table(environments: "Sequence[EnvironmentSummary]", ignored: Sequence[str]) -> None:

@@ -161,6 +161,7 @@ def import_environment(
     parts = np.split(numbers, np.searchsorted(numbers, [first for first, _ in sets[1:]]))
     damaged: list[str] = []
     empty: list[str] = []
+    loaded: list[str] = []
     kept = frame_count = spikes = 0
     for i, (part, (_, touches)) in enumerate(zip(parts, sets, strict=True), start=1):
         log = out / split_of(i) / f"{folder.name}-{i:02d}.mcap"
@@ -180,7 +181,10 @@ def import_environment(
             continue
         samples = load_cell_samples([t_ns[n] for n in labelled], np.array([forces_n[n] for n in labelled]))
         own = {"set": log.stem, "split": split_of(i), "touches": str(touches)}
-        spikes += write_recording(log, config, {**metadata, **own}, frames, samples)
+        rejected, in_contact = write_recording(log, config, {**metadata, **own}, frames, samples)
+        spikes += rejected
+        if in_contact:
+            loaded.append(log.stem)
         frame_count += len(frames)
     return EnvironmentSummary(
         folder=folder.name,
@@ -196,6 +200,7 @@ def import_environment(
             *problems,
             *_problem("{} images can't be decoded and were left out", damaged),
             *_problem("{} sets have no image with a force and gave no log", empty),
+            *_problem("{} sets start in contact, and train and evaluate leave them out", loaded),
         ),
     )
 

@@ -20,11 +20,12 @@ import numpy.typing as npt
 from gripper_force.config import Config, dump_config
 from gripper_force.errors import DataError, LogError
 from gripper_force.interfaces import Progress, no_progress
+from gripper_force.jobs.dataset import label_frames, starts_in_contact
 from gripper_force.jobs.recording.lag import force_lag_s
 from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.spikes import find_spikes
 from gripper_force.types import NS_PER_S, Frame, Gray, LoadCellSample
-from gripper_force.vision.preprocess import Region, downscale
+from gripper_force.vision.preprocess import Preprocess, Region, downscale
 
 VIDEO_SUFFIXES: Final = frozenset({".avi", ".mp4", ".mkv", ".mov"})
 
@@ -56,6 +57,7 @@ class ImportSummary:
             `recording.lag.force_lag_s`.
         frames_without_force: Frames without a row in the table.
         forces_without_frame: Rows without a frame in the video.
+        starts_in_contact: True if the first frames show contact, so that they are no reference.
     """
 
     log: Path
@@ -68,6 +70,7 @@ class ImportSummary:
     force_lag_s: float
     frames_without_force: int
     forces_without_frame: int
+    starts_in_contact: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,7 +174,7 @@ def import_video(
         "tare_note": tare_note,
         "force_lag_s": f"{lag_s:.4f}",
     }
-    spikes = write_recording(out, Config(object=object_name), metadata, frames, samples, forces)
+    spikes, in_contact = write_recording(out, Config(object=object_name), metadata, frames, samples, forces)
     with_row = int(np.isin(np.arange(len(frames)), table.frame).sum())
     return ImportSummary(
         log=out,
@@ -184,6 +187,7 @@ def import_video(
         force_lag_s=lag_s,
         frames_without_force=len(frames) - with_row,
         forces_without_frame=len(samples) - with_row,
+        starts_in_contact=in_contact,
     )
 
 
@@ -278,7 +282,7 @@ def write_recording(
     frames: list[Frame],
     samples: list[LoadCellSample],
     table: Path | None = None,
-) -> int:
+) -> tuple[int, bool]:
     """Writes an imported recording as a log, which gets its name once it is complete.
 
     Args:
@@ -290,7 +294,8 @@ def write_recording(
         table: File of the forces, to attach; None without one.
 
     Returns:
-        Number of samples that are not valid, which is also noted in the log's metadata.
+        Number of samples that are not valid, and True if the recording starts in contact. Both are also noted
+        in the log's metadata.
 
     Raises:
         LogError: The log exists already or can't be written.
@@ -301,14 +306,16 @@ def write_recording(
     unfinished.unlink(missing_ok=True)
     spikes = sum(not sample.valid for sample in samples)
     records: list[Frame | LoadCellSample] = [*frames, *samples]
-    metadata = {**metadata, "spikes_rejected": str(spikes)}
+    forces_n, _ = label_frames(np.array([frame.t_ns for frame in frames], np.int64), samples, 0)
+    in_contact = starts_in_contact(forces_n, Preprocess().reference_frames)
+    metadata = {**metadata, "spikes_rejected": str(spikes), "starts_in_contact": str(in_contact).lower()}
     with LogWriter(unfinished, config=dump_config(config), metadata=metadata) as log:
         if table is not None:
             log.attach(table.name, table.read_bytes(), "text/csv")
         for record in sorted(records, key=lambda record: record.t_ns):
             log.write(record)
     unfinished.rename(out)
-    return spikes
+    return spikes, in_contact
 
 
 def find_recordings(folder: Path) -> list[tuple[str, Path, Path]]:

@@ -22,6 +22,9 @@ class Batches:
         config: The recipe.
         ranks: This process among those that train together.
 
+    Attributes:
+        unseen: Mask of the recordings from which no clip has been drawn, (recordings,) bool.
+
     Raises:
         DataError: A recording is too short for its reference frames, or no frame shows contact.
     """
@@ -40,6 +43,8 @@ class Batches:
         self._config = config
         self._device = ranks.device
         self._share = ranks.share
+        self.unseen = np.array([clip.valid.any() for clip in clips])
+        self._recording = np.repeat(np.arange(len(clips)), lengths)  # (N,)
         self._begin = np.repeat(np.cumsum([0, *lengths[:-1]]), lengths)  # (N,)
         frames = np.concatenate([clip.frames for clip in clips])  # (N, S, S)
         self._frames = torch.from_numpy(frames).to(self._device)
@@ -73,6 +78,7 @@ class Batches:
         config = self._config
         rng = np.random.default_rng((config.seed, step))
         ends = self._ends(rng, step, count)
+        self.unseen[self._recording[ends]] = False
         begin = self._begin[ends]
         # Frames before a recording's first are copies of it, as for the estimator.
         index = np.maximum(ends[:, None] + np.arange(1 - length, 1), begin[:, None])  # (B, T)

@@ -1,12 +1,21 @@
 """Training recipes: all keys, and recipes by name."""
 
+import json
 from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
 from gripper_force.errors import ConfigError
-from gripper_force.schema import NonNegative, Positive, Section, Tree, section_from
-from gripper_force.vision.header import Attention, BackboneName, Count, NetworkConfig, Pooling
+from gripper_force.schema import (
+    NonNegative,
+    Positive,
+    Section,
+    Tree,
+    assign_value,
+    section_from,
+    validated,
+)
+from gripper_force.vision.header import Attention, BackboneName, Count, Header, NetworkConfig, Pooling
 from gripper_force.vision.preprocess import Preprocess
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -159,3 +168,57 @@ def recipe(name: str, overrides: list[str] | None = None) -> TrainConfig:
     if name not in RECIPES:
         raise ConfigError(f"no recipe {name!r}; use one of {', '.join(RECIPES)}")
     return section_from(TrainConfig, overrides, RECIPES[name])
+
+
+def continued(config: TrainConfig, header: Header) -> TrainConfig:
+    """Returns a recipe that continues a checkpoint: its networks and preprocessing are the checkpoint's.
+
+    Args:
+        config: The recipe. Keys that it sets must be as in the checkpoint.
+        header: The checkpoint's header.
+
+    Raises:
+        ConfigError: The recipe sets a key to another value, or no recipe makes such a checkpoint.
+    """
+    tree = config.model_dump(exclude_unset=True)
+    differing: dict[str, tuple[object, object]] = {}
+    for key, value in _network_keys(header).items():
+        *parents, leaf = key.split(".")
+        section: Section = config.preprocess if parents else config
+        if leaf in section.model_fields_set and getattr(section, leaf) != value:
+            differing[key] = getattr(section, leaf), value
+        assign_value(tree, key, value)
+    if differing:
+        here, there = (
+            ", ".join(f"{key}={_shown(values[i])}" for key, values in differing.items()) for i in (0, 1)
+        )
+        raise ConfigError(
+            f"this recipe has {here}, but the initial checkpoint has {there}, which training can't change; "
+            f"set {there}, or train without --init"
+        )
+    same = validated(TrainConfig, tree, "--init", "recipe")
+    for member, shape in enumerate(header.members):
+        own = same.network(member)
+        for key in NetworkConfig.model_fields:
+            if getattr(own, key) != getattr(shape, key):
+                raise ConfigError(
+                    f"network {member} of the initial checkpoint has {key}={_shown(getattr(shape, key))}, but a "
+                    f"recipe makes {key}={_shown(getattr(own, key))}; use a checkpoint that `train` made"
+                )
+    return same
+
+
+def _network_keys(header: Header) -> dict[str, object]:
+    """Returns the keys of a recipe that describe a checkpoint's networks and preprocessing."""
+    first = header.members[0]
+    found: dict[str, object] = {"attentions": tuple(member.attention for member in header.members)}
+    found |= {key: getattr(first, key) for key in ("earlier_frames", "backbone", "width", "hidden", "head")}
+    if sequential := [member for member in header.members if member.sequential]:
+        found["pooling"] = sequential[0].pooling  # no other attention has a choice
+    found |= {f"preprocess.{key}": value for key, value in header.preprocess.model_dump().items()}
+    return found
+
+
+def _shown(value: object) -> str:
+    """Returns a value as ``--set`` accepts it."""
+    return json.dumps(value, separators=(",", ":")).replace('"', "")

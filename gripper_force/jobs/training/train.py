@@ -6,20 +6,21 @@ draws short clips from many recordings instead of long ones from a few.
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
-from gripper_force.errors import CheckpointError, ConfigError
+from gripper_force.errors import ConfigError
 from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import Clip, check_size, digest, split_by
 from gripper_force.jobs.training.batches import Batches
 from gripper_force.jobs.training.parallel import Ranks, joined
 from gripper_force.jobs.training.recipe import TrainConfig as TrainConfig
+from gripper_force.jobs.training.recipe import continued
 from gripper_force.jobs.training.trainer import Trainer, estimates
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from gripper_force.vision.header import RESIDUAL_HALF_N, Header, Residual
@@ -43,6 +44,7 @@ def train(
     init: Checkpoint | None = None,
     resume: bool = False,
     progress: Progress = no_progress,
+    warn: Callable[[str], None] = lambda _: None,
 ) -> Checkpoint:
     """Trains an ensemble and writes its checkpoint, together with all processes that `torchrun` started.
 
@@ -55,9 +57,11 @@ def train(
         out: Checkpoint to write. All processes read it, so all machines need access to it.
         validation_clips: Clips to measure the checkpoint's stated error on; None for sets held out of
             ``clips``.
-        init: Checkpoint with the initial weights; None for random weights.
+        init: Checkpoint with the initial weights, whose networks and preprocessing replace those that the
+            recipe leaves unset; None for random weights.
         resume: Continue an interrupted training from its saved states.
         progress: Called with the training error; `PROGRESS_STEPS` for each network in total.
+        warn: Called with a sentence if the training was too short to draw a clip from each recording.
 
     Returns:
         The checkpoint as written.
@@ -67,17 +71,23 @@ def train(
             size.
         NonFiniteError: The training diverged.
         CheckpointError: A state belongs to another recipe or other data, or a file can't be written.
-        ConfigError: The processes can't train together, for example because their recipes differ.
+        ConfigError: The recipe sets a key in which ``init`` differs, or the processes can't train together,
+            for example because their recipes differ.
     """
+    if init is not None:
+        config = continued(config, init.header)
     training, held_out = clips, validation_clips
     if held_out is None:
         training, held_out = split_by(clips, "set", config.validation, config.seed)
     check_size([*training, *held_out], config.preprocess)
-    states = [out.with_suffix(f".{i}.state") for i in range(len(config.attentions))]
+    states = state_paths(config, out)
     with joined(config.device) as ranks:
-        networks = [t.network for t in _trained(config, training, states, init, resume, ranks, progress)]
+        networks = [
+            t.network for t in _trained(config, training, states, init, resume, ranks, progress, warn)
+        ]
         if ranks.first:
             forces_n, measured_n = estimates(held_out, networks, config.preprocess, ranks.device)
+            mean_n = np.concatenate([clip.forces_n[clip.valid] for clip in training]).mean()
             header = Header(
                 members=tuple(network.config for network in networks),
                 preprocess=config.preprocess,
@@ -87,6 +97,7 @@ def train(
                     "mae_n": metrics.mae(forces_n, measured_n),
                     "rmse_n": metrics.rmse(forces_n, measured_n),
                     "bias_n": metrics.bias(forces_n, measured_n),
+                    "constant_mae_n": metrics.mae(np.full_like(measured_n, mean_n), measured_n),
                 },
             )
             save_checkpoint(out, networks, header)
@@ -94,6 +105,11 @@ def train(
                 state.unlink()
         ranks.wait()
         return load_checkpoint(out)
+
+
+def state_paths(config: TrainConfig, out: Path) -> list[Path]:
+    """Returns the files in which a training saves its states, one for each member."""
+    return [out.with_suffix(f".{i}.state") for i in range(len(config.attentions))]
 
 
 def _trained(
@@ -104,6 +120,7 @@ def _trained(
     resume: bool,
     ranks: Ranks,
     progress: Progress,
+    warn: Callable[[str], None],
 ) -> list[Trainer]:
     if ranks.count > config.clips:
         raise ConfigError(
@@ -111,11 +128,6 @@ def _trained(
         )
     if ranks.count > 1 and config.compile:
         raise ConfigError("compile does not work with several processes; set compile=false")
-    shapes = [config.network(member) for member in range(len(config.attentions))]
-    if init is not None and [network.config for network in init.networks] != shapes:
-        raise CheckpointError(
-            "the initial checkpoint has other networks than this recipe; use one trained with this recipe"
-        )
     batches = Batches(clips, config, ranks)
     start = init.digest if init is not None else ""
     identity = f"{config.model_dump_json(exclude={'device', 'compile'})} {digest(clips)} {start}"
@@ -141,6 +153,12 @@ def _trained(
         trainer.network.eval()
         if ranks.first:
             trainer.save(state, identity)
+    if unseen := int(batches.unseen.sum()):
+        length = next(key for key in ("minutes", "epochs", "steps") if getattr(config, key) is not None)
+        warn(
+            f"the training was too short: it drew no clip from {unseen} of its {len(clips)} recordings; "
+            f"increase {length}"
+        )
     return trainers
 
 

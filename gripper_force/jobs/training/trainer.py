@@ -140,6 +140,7 @@ class Trainer:
         tensors = {f"network.{name}": t.contiguous() for name, t in self.network.state_dict().items()}
         for i, moments in self._optimizer.state_dict()["state"].items():
             tensors |= {f"optimizer.{i}.{name}": t.contiguous() for name, t in moments.items()}
+        tensors["batches.unseen"] = torch.from_numpy(self._batches.unseen)
         progress = {
             "step": str(self.step),
             "elapsed_s": str(self._elapsed_s),
@@ -186,6 +187,8 @@ class Trainer:
             part, name = key.split(".", 1)
             if part == "network":
                 weights[name] = tensor
+            elif part == "batches":
+                self._batches.unseen &= tensor.cpu().numpy()
             else:
                 number, name = name.split(".")
                 moments.setdefault(int(number), {})[name] = tensor

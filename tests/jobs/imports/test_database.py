@@ -328,3 +328,15 @@ def test_environment_without_usable_data_raises(environment: Path, tmp_path: Pat
     table.write_text("9000,0.5,0\n")
     with pytest.raises(DataError, match=r"holds no image that its test\.txt names, such as 9000\.jpg"):
         import_environment(environment, tmp_path / "out")
+
+
+def test_set_that_starts_in_contact_is_marked(tmp_path: Path) -> None:
+    forces_n = touches(5)
+    forces_n[:3] = 0.4
+    folder = write_environment(tmp_path / "db" / "sponge_0_50", forces_n)
+    row = import_environment(folder, tmp_path / "out")
+    assert row.problems == (
+        "1 sets start in contact, and train and evaluate leave them out, the first is sponge_0_50-01",
+    )
+    logs = [LogReader(path) for path in sorted((tmp_path / "out" / "train").iterdir())]
+    assert [log.metadata["starts_in_contact"] for log in logs] == ["true", "false"]

@@ -82,6 +82,26 @@ def test_log_holds_frames_and_samples_in_order_of_time(folder: Path, tmp_path: P
     assert all(s.valid for s in samples)
 
 
+@pytest.mark.parametrize("first_n", [0.0, 0.5])
+def test_recording_that_starts_in_contact_is_marked(first_n: float, folder: Path, tmp_path: Path) -> None:
+    forces_n = grip()
+    forces_n[0] += first_n
+    write_table(folder / "load_cell.csv", forces_n)
+    (summary,) = import_folder(tmp_path, tmp_path / "out")
+    assert summary.starts_in_contact == (first_n > 0)
+    assert LogReader(summary.log).metadata["starts_in_contact"] == ("true" if first_n else "false")
+
+
+def test_real_recordings_that_start_in_contact_are_found(real_grasps: Path, tmp_path: Path) -> None:
+    source = tmp_path / "source"
+    source.mkdir()
+    for recording in real_grasps.glob("*_foam_brick_[123]"):
+        (source / recording.name).symlink_to(recording)
+    loaded = [s.log.stem for s in import_folder(source, tmp_path / "out") if s.starts_in_contact]
+    days = ("2023-11-18", "2023-12-06")
+    assert loaded == [f"{day}_foam_brick_{trial}" for day in days for trial in (1, 2, 3)]
+
+
 def test_configuration_of_log_names_the_object(folder: Path, tmp_path: Path) -> None:
     (summary,) = import_folder(tmp_path, tmp_path / "out")
     assert config_from(yaml.safe_load(LogReader(summary.log).config), "the log").object == "foam_brick"

@@ -43,7 +43,7 @@ def test_checkpoint_holds_data_digest_and_metrics(
     assert [member.attention for member in header.members] == ["ssam", "scam"]
     assert header.preprocess == config.preprocess
     assert header.data_digest == digest(clips)
-    assert {"mae_n", "rmse_n", "bias_n"} == header.metrics.keys()
+    assert {"mae_n", "rmse_n", "bias_n", "constant_mae_n"} == header.metrics.keys()
     assert [r.force_n for r in header.residuals] == sorted(r.force_n for r in header.residuals)
     assert all(r.std_n > 0 for r in header.residuals)
     assert list(out.parent.iterdir()) == [out]
@@ -67,8 +67,10 @@ def test_validation_clips(clips: list[Clip], tmp_path: Path, small_recipe: Train
     out = tmp_path / "out.safetensors"
     checkpoint = train(small_recipe, clips[:-1], out, validation_clips=clips[-1:])
     forces_n = predict(checkpoint.networks, small_recipe.preprocess, clips[-1].frames)[0]
-    claimed = checkpoint.header.metrics["mae_n"]
-    assert claimed == pytest.approx(np.abs(forces_n - clips[-1].forces_n).mean(), rel=0.01)
+    claimed = checkpoint.header.metrics
+    assert claimed["mae_n"] == pytest.approx(np.abs(forces_n - clips[-1].forces_n).mean(), rel=0.01)
+    mean_n = np.mean([clip.forces_n for clip in clips[:-1]])
+    assert claimed["constant_mae_n"] == pytest.approx(np.abs(mean_n - clips[-1].forces_n).mean(), rel=1e-4)
     with pytest.raises(DataError, match="p5 has frames of 16 px"):
         train(
             small_recipe.model_copy(update={"preprocess": Preprocess(size=32)}),
@@ -114,6 +116,67 @@ def test_resumed_training_gives_the_same_result(
     assert not list(tmp_path.glob("*.state"))
 
 
+def test_training_too_short_for_all_recordings_warns(
+    clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_recipe: TrainConfig
+) -> None:
+    out = tmp_path / "out.safetensors"
+    one_clip = small_recipe.model_copy(update={"clips": 1, "short_share": 0.0})
+    warnings: list[str] = []
+    train(one_clip.model_copy(update={"steps": 1}), clips, out, validation_clips=clips, warn=warnings.append)
+    assert warnings == [
+        "the training was too short: it drew no clip from 5 of its 6 recordings; increase steps"
+    ]
+    train(small_recipe, clips, out, validation_clips=clips, warn=warnings.append)
+    assert len(warnings) == 1
+    config = one_clip.model_copy(update={"steps": 3})
+    train(config, clips, out, validation_clips=clips, warn=warnings.append)
+    monkeypatch.setattr(train_module, "STATE_EVERY_S", 0.0)
+    interrupt_step(monkeypatch, 2)
+    with pytest.raises(KeyboardInterrupt):
+        train(config, clips, out, validation_clips=clips)
+    train(config, clips, out, validation_clips=clips, resume=True, warn=warnings.append)
+    assert warnings[2] == warnings[1]  # it also counts the steps before the interruption
+
+
+def interrupt_step(monkeypatch: pytest.MonkeyPatch, step: int) -> None:
+    """Interrupts the training in one step, once."""
+    update = Trainer._update
+    steps = iter(range(1000))
+
+    def interrupted(trainer: Trainer) -> torch.Tensor:
+        if next(steps) == step:
+            raise KeyboardInterrupt
+        return update(trainer)
+
+    monkeypatch.setattr(Trainer, "_update", interrupted)
+
+
+def test_command_tells_what_to_do_next(
+    few_logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "out.safetensors"
+    call = ["train", str(few_logs), "--out", str(out), "--jobs", "1"]
+    keys = ["preprocess.size=16", "attentions=[none]", "steps=3", "clips=1", "short_share=0", "device=cpu"]
+    call += [part for key in keys for part in ("--set", key)]
+    interrupt_step(monkeypatch, 2)
+    assert "--resume" not in CliRunner().invoke(cli.app, call).stderr  # nothing is saved in the first minute
+    monkeypatch.setattr(train_module, "STATE_EVERY_S", 0.0)
+    interrupt_step(monkeypatch, 2)
+    assert "add --resume" in CliRunner().invoke(cli.app, call).stderr
+    monkeypatch.setattr(train_module, "STATE_EVERY_S", 60.0)
+    interrupt_step(monkeypatch, 0)
+    assert "--resume" not in CliRunner().invoke(cli.app, call).stderr  # the state is of the training before
+    interrupt_step(monkeypatch, 0)
+    assert "add --resume" in CliRunner().invoke(cli.app, [*call, "--resume"]).stderr
+    done = CliRunner().invoke(cli.app, [*call, "--resume"])
+    assert done.exit_code == 0
+    assert "constant_mae_n" in done.stdout
+    assert f"next: gripper-force evaluate FOLDER --checkpoint {out}" in done.stderr
+    short = CliRunner().invoke(cli.app, [*call, "--set", "steps=1", "--json"])
+    (warning,) = json.loads(short.stdout)["warnings"]
+    assert f"warning: {warning}" in short.stderr
+
+
 def test_state_of_another_training_raises(
     clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_recipe: TrainConfig
 ) -> None:
@@ -128,6 +191,54 @@ def test_state_of_another_training_raises(
     out.with_suffix(".0.state").write_bytes(b"damaged")
     with pytest.raises(CheckpointError, match="can't read"):
         train(small_recipe, clips, out, resume=True)
+
+
+def test_command_continues_a_checkpoint(few_logs: Path, tiny_checkpoint: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out.safetensors"
+    call = ["train", str(few_logs), "--init", str(tiny_checkpoint), "--out", str(out), "--jobs", "1"]
+    call += ["--set", "steps=1", "--set", "clips=2", "--set", "device=cpu", "--json"]
+    done = CliRunner().invoke(cli.app, call)
+    assert done.exit_code == 0, done.output
+    start, result = load_checkpoint(tiny_checkpoint), load_checkpoint(out)
+    assert result.header.members == start.header.members
+    assert result.header.preprocess == start.header.preprocess
+    # One step changes each weight by no more than the learning rate; a new network has far smaller weights.
+    before, after = (checkpoint.networks[0].out.weight for checkpoint in (start, result))
+    assert before.abs().max() > 100
+    torch.testing.assert_close(after, before, rtol=1e-3, atol=0.01)
+    assert result.digest != start.digest
+    out.unlink()
+    refused = CliRunner().invoke(cli.app, [*call, "--recipe", "shin2019"]).exception
+    assert isinstance(refused, ConfigError)
+    assert "preprocess.size=128" in str(refused)
+    assert not out.exists()
+
+
+def test_command_leaves_out_logs_that_start_in_contact(
+    few_logs: Path, loaded_log: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out.safetensors"
+    free, every = (
+        load_clips(logs, Preprocess(size=16))
+        for logs in (sorted(set(few_logs.glob("*.mcap")) - {loaded_log}), few_logs)
+    )
+    call = ["train", str(few_logs), "--out", str(out), "--jobs", "1", "--json"]
+    keys = ["preprocess.size=16", "attentions=[none]", "width=0.25", "steps=1", "device=cpu"]
+    call += [part for key in keys for part in ("--set", key)]
+    for options, left_out, clips in (
+        ([], 1, free),
+        (["--include-contact-starts"], 0, every),
+        (["--set", "preprocess.reference=false"], 0, every),
+    ):
+        done = CliRunner().invoke(cli.app, [*call, *options])
+        assert json.loads(done.stdout)["left_out"] == left_out
+        assert ("left out 1 of 4 logs, which start in contact" in done.stderr) == bool(left_out)
+        assert load_checkpoint(out).header.data_digest == digest(clips)
+    (tmp_path / "unseen").mkdir()
+    (tmp_path / "unseen" / loaded_log.name).symlink_to(loaded_log)
+    refused = CliRunner().invoke(cli.app, [*call, "--validation", str(tmp_path / "unseen")]).exception
+    assert isinstance(refused, DataError)
+    assert "all 1 recordings start in contact" in str(refused)
 
 
 def test_divergence_raises(clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig) -> None:
@@ -155,7 +266,8 @@ def test_command_takes_a_recipe(few_logs: Path, tmp_path: Path) -> None:
     sets = [part for key in keys for part in ("--set", key)]
     call = ["train", str(few_logs), "--recipe", "shin2019", "--out", str(out), "--jobs", "1", *sets, "--json"]
     told = json.loads(CliRunner().invoke(cli.app, call).stdout)
-    assert set(told) == {"checkpoint", "digest", "mae_n", "rmse_n", "bias_n"}
+    figures = {"mae_n", "rmse_n", "bias_n", "constant_mae_n"}
+    assert set(told) == {"checkpoint", "digest", "left_out", "warnings", *figures}
     header = load_checkpoint(out).header
     assert [member.attention for member in header.members] == ["cbam"]
     assert not header.preprocess.reference
