@@ -18,6 +18,12 @@ _RETURN_S = 0.05
 """Lowering: the fall takes the sum of the first two, the first at full rate. After it the motor force returns to the
 closing side of friction in the third, which stops the jaws: later, their inertia carries them too far."""
 
+_REPEAT_SHARE = 0.75
+_REPEAT_S = 0.2
+_REPEAT_WITHIN_S = 1.0
+"""A lowering that ends above the target by this share of the tolerance, for this time, is repeated once, if that shows
+soon. The integral would have to overcome twice the friction first, which takes seconds."""
+
 _WAIT_SHARE = 0.2
 _WAIT_N = 0.2
 """Ramp and integral wait while the motor force falls short by more than this share of the reference and this force."""
@@ -83,6 +89,7 @@ class ForceLoop:
         self._profile = TrapezoidalProfile(_RAMP_S)
         self._trim_n = 0.0
         self._rising, self._side, self.is_lowering = True, 1.0, False
+        self._repeat_s, self._high_s = 0.0, 0.0
 
     @property
     def reference_n(self) -> float:
@@ -91,11 +98,12 @@ class ForceLoop:
 
     def start(self, force_n: float, target_n: float) -> None:
         """Starts a ramp at the present force."""
-        self._trim_n = 0.0
+        self._trim_n, self._repeat_s = 0.0, 0.0
         self._start(force_n, target_n)
 
     def retarget(self, target_n: float) -> None:
         """Starts a ramp at the present reference and keeps the trim."""
+        self._repeat_s = _REPEAT_WITHIN_S if target_n < self.reference_n else 0.0
         self._start(self.reference_n, target_n)
 
     def _start(self, force_n: float, target_n: float) -> None:
@@ -115,6 +123,7 @@ class ForceLoop:
             shortfall_n: Commanded less measured motor force. Ramp and integral wait while it is large: the
                 jaws close on a soft object as fast as they may.
         """
+        self._repeat_lowering(dt_s, target_n, estimate)
         ramping = self.reference_n != target_n
         if self.is_lowering and not ramping:
             self._side = min(self._side + 2 * dt_s / _RETURN_S, 1.0)
@@ -136,6 +145,21 @@ class ForceLoop:
         self._trim_n = min(max(self._trim_n, low_n - feedforward_n), high_n - feedforward_n)
         motor_force_n = feedforward_n + self._trim_n + self._gains.proportional * error_n
         return min(max(motor_force_n, low_n), high_n)
+
+    def _repeat_lowering(self, dt_s: float, target_n: float, estimate: FusedForce) -> None:
+        """Lowers the force again if the camera shows that it has stayed too high."""
+        rests = (
+            not self.is_lowering
+            and self.reference_n == target_n
+            and estimate.source != EstimateSource.CURRENT
+        )
+        is_high = estimate.force_n - target_n > _REPEAT_SHARE * tolerance_n(target_n)
+        self._high_s = self._high_s + dt_s if rests and is_high else 0.0
+        if rests and self._repeat_s > 0:
+            self._repeat_s -= dt_s
+            if self._high_s > _REPEAT_S:
+                self._repeat_s = 0.0
+                self._start(estimate.force_n, target_n)
 
     def _beyond_deadband(self, error_n: float, band_n: float) -> float:
         forward_n = error_n if self._rising else -error_n

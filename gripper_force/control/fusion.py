@@ -202,6 +202,10 @@ class Fusion:
             if friction_n == 0 or free
             else 0.5 + (self._current_n - self._motor_force_n) / (2 * friction_n)
         )
+        if self._was_lowering and before_n > 0:  # the difference by the gearing falls with the force
+            gain_n2 = (self._transmission.gain_std * before_n) ** 2
+            share = gain_n2 / (gain_n2 + self._friction_n2 + _FREE_FLOOR_N**2)
+            self._difference_n *= 1 - share * (1 - self._current_n / before_n)
         drift_n2 = (_DRIFT_N2_S + _OPENING_DRIFT_N2_S * reversal) * dt_s
         # An unknown gain error g gives a bias of g * force: its variance grows with the square of the force.
         gain_n2 = self._transmission.gain_std**2 * abs(self._current_n**2 - before_n**2)
