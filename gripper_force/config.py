@@ -553,11 +553,6 @@ class Config(Section):
         """True if the run has a camera and a network."""
         return self.camera.backend != "none" and self.vision.checkpoint != "none"
 
-    @property
-    def controls_with_vision(self) -> bool:
-        """True if the force loop is to use visual estimates."""
-        return self.uses_vision and self.control.feedback != "current"
-
     def camera_settings(self) -> Tree:
         """Camera keys and values that an object profile is bound to."""
         camera = self.camera.model_dump(mode="json", exclude=CAMERA_OTHER_KEYS)

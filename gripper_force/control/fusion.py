@@ -6,9 +6,7 @@ estimates the difference.
 """
 
 import math
-import re
 from collections import deque
-from typing import Final
 
 from gripper_force.config import ControlConfig
 from gripper_force.control.transmission import Transmission
@@ -58,12 +56,6 @@ _REENTRY_S = 1 / 3
 _MIN_REENTRY = 4
 """Time, and least number of consecutive rejected estimates on the same side, after which the filter accepts them."""
 
-NO_NEW_ESTIMATE: Final = "no new estimate"
-"""Reason of a drop-out for which no estimate was rejected."""
-
-_INSTEAD: Final = "; using motor current alone"
-_DROP_OUT: Final = re.compile(f"vision (?:dropped out|is not used): (.*){_INSTEAD}")
-
 
 def observer_lag_s(frame_hz: float) -> float:
     """Returns the lag of the bias while the jaws are stuck and about to open: 0.13 s at 60 frames per second.
@@ -71,12 +63,6 @@ def observer_lag_s(frame_hz: float) -> float:
     It is the square root of noise over drift of the steady-state filter.
     """
     return math.sqrt(_FRAME_NOISE_N**2 / (frame_hz * _OPENING_DRIFT_N2_S))
-
-
-def drop_out_reason(text: str) -> str:
-    """Returns the reason in the text of an event that vision is not used, or an empty text for another event."""
-    found = _DROP_OUT.fullmatch(text)
-    return found[1] if found else ""
 
 
 class Fusion:
@@ -283,15 +269,16 @@ class Fusion:
     def _switch(self, t_ns: int) -> tuple[Event, ...]:
         fresh = self._used_ns is not None and t_ns - self._used_ns <= self._timeout_ns
         source = EstimateSource(self._feedback) if fresh else EstimateSource.CURRENT
+        news = "dropped out"
         if source == self._source:
             if not (self._is_silent and self._rejection):
                 return ()
-            self._is_silent = False
-            return (Event(t_ns, "vision", f"vision is not used: {self._rejection}{_INSTEAD}"),)
+            news = "is not used"
         self._source, self._is_silent = source, False
         if source != EstimateSource.CURRENT:
             return (Event(t_ns, "vision", f"vision in use; the force estimate is {source}"),)
-        return (Event(t_ns, "vision", f"vision dropped out: {self._rejection or NO_NEW_ESTIMATE}{_INSTEAD}"),)
+        reason = self._rejection or "no new estimate"
+        return (Event(t_ns, "vision", f"vision {news}: {reason}; using motor current alone"),)
 
     def _estimate(self, t_ns: int) -> FusedForce:
         share = 1 / (1 + self._variance_ratio)

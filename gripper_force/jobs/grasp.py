@@ -1,5 +1,6 @@
 """The main job: one grasp with its summary, or many trials with their statistics."""
 
+import math
 import time
 from collections import defaultdict
 from collections.abc import Generator, Mapping, Sequence
@@ -15,7 +16,13 @@ from gripper_force.interfaces import Progress, Prompt, no_progress
 from gripper_force.jobs.dataset import stiffness_floor_n, stiffness_of
 from gripper_force.jobs.processes import process_pool
 from gripper_force.jobs.replay import compare
-from gripper_force.jobs.score import LEAST_VISION_SHARE, VisionLoss, score_grasp, vision_in_hold
+from gripper_force.jobs.score import (
+    LEAST_VISION_SHARE,
+    VisionLoss,
+    controls_with_vision,
+    score_grasp,
+    vision_in_hold,
+)
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import resolve
 from gripper_force.runtime.session import Session, open_run
@@ -294,8 +301,8 @@ def summarise(path: Path) -> Summary:
     vision_s = (visuals[-1].t_ns - visuals[0].t_ns) / NS_PER_S if len(visuals) > 1 else 0.0
     config = config_from_text(reader.config, str(path))
     vision = vision_in_hold(statuses, records[FusedForce], visuals, records[Event])
-    shown = vision if config.controls_with_vision else None
-    expects_vision = config.controls_with_vision or config.control.feedback == "vision"
+    shown = vision if controls_with_vision(config) else None
+    expects_vision = controls_with_vision(config) or config.control.feedback == "vision"
     outcomes = [s.outcome for s in statuses if s.outcome != Outcome.NONE]
     span_s = (cycles_ns[-1] - cycles_ns[0]) / NS_PER_S if len(cycles_ns) > 1 else 0.0
     return {
@@ -370,8 +377,9 @@ def _trial(tree: Tree) -> Summary:
 
 
 def _mae_n(estimates: list[tuple[int, float]], cells: list[LoadCellSample]) -> float | None:
-    """Mean absolute error of an estimate over the whole run."""
-    figures = compare([t for t, _ in estimates], [f for _, f in estimates], cells)
+    """Mean absolute error of the finite estimates over the whole run."""
+    finite = [(t_ns, force_n) for t_ns, force_n in estimates if math.isfinite(force_n)]
+    figures = compare([t for t, _ in finite], [f for _, f in finite], cells)
     return None if figures is None else figures.mae_n
 
 

@@ -11,9 +11,8 @@ from typing import Final
 
 import numpy as np
 
-from gripper_force.control.fusion import NO_NEW_ESTIMATE, drop_out_reason
+from gripper_force.config import Config
 from gripper_force.errors import DataError
-from gripper_force.runtime.perception import NO_ESTIMATE
 from gripper_force.types import (
     NS_PER_S,
     EstimateSource,
@@ -56,6 +55,11 @@ class GraspScore:
 
 LEAST_VISION_SHARE: Final = 0.5
 """A grasp that is configured to use vision fell back if a smaller share of its hold used it."""
+
+_NO_ESTIMATE: Final = "no estimate: "
+_NO_NEW_ESTIMATE: Final = "no new estimate"
+_DROP_OUT: Final = re.compile("vision (?:dropped out|is not used): (.*); using motor current alone")
+"""Events of `runtime/session.py` and `control/fusion.py`."""
 
 _NUMBER: Final = re.compile(r"-?\d+(\.\d+)?")
 
@@ -128,6 +132,11 @@ def score_grasp(
     )
 
 
+def controls_with_vision(config: Config) -> bool:
+    """Returns True if the force loop of a run is to use visual estimates."""
+    return config.uses_vision and config.control.feedback != "current"
+
+
 def vision_in_hold(
     statuses: Sequence[GraspStatus],
     estimates: Sequence[FusedForce],
@@ -171,12 +180,13 @@ def _drop_out_reasons(visuals: Sequence[VisualForce], events: Sequence[Event]) -
     ready_ns = sorted(visual.ready_ns for visual in visuals)
     reasons, problem_ns, problem = [], 0, ""
     for event in sorted(events, key=lambda event: event.t_ns):
-        if event.text.startswith(NO_ESTIMATE):
-            problem_ns, problem = event.t_ns, event.text.removeprefix(NO_ESTIMATE)
-        elif reason := drop_out_reason(event.text):
+        if event.text.startswith(_NO_ESTIMATE):
+            problem_ns, problem = event.t_ns, event.text.removeprefix(_NO_ESTIMATE)
+        elif found := _DROP_OUT.fullmatch(event.text):
+            reason = found[1]
             # The controller does not know why a frame gave no estimate; the session does.
             recovered = bisect_right(ready_ns, event.t_ns) > bisect_right(ready_ns, problem_ns)
-            if reason == NO_NEW_ESTIMATE and problem and not recovered:
+            if reason == _NO_NEW_ESTIMATE and problem and not recovered:
                 reason = problem
             reasons.append((event.t_ns, reason))
     return reasons

@@ -4,16 +4,13 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Final, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from gripper_force.errors import GripperError
 from gripper_force.interfaces import Camera, Clock
 from gripper_force.types import NS_PER_MS, ForceEstimate, Frame, Gray, VisualForce
-
-NO_ESTIMATE: Final = "no estimate: "
-"""Start of the event that tells why a frame gave no estimate."""
 
 
 class Estimator(Protocol):

@@ -23,13 +23,7 @@ from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log_queue import LogQueue
 from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.runtime.monitors import CounterMonitor, LoadCellMonitor
-from gripper_force.runtime.perception import (
-    NO_ESTIMATE,
-    Estimator,
-    LockstepPerception,
-    Perception,
-    ThreadedPerception,
-)
+from gripper_force.runtime.perception import Estimator, LockstepPerception, Perception, ThreadedPerception
 from gripper_force.runtime.process import deferred_signals, real_time_settings
 from gripper_force.runtime.resolve import ResolvedConfig, make_controller, make_estimator, resolve
 from gripper_force.types import (
@@ -201,7 +195,7 @@ class Session:
                 log(visual)
                 self.has_vision = True
             if processed.problem not in ("", self._problem):
-                log(Event(processed.frame.received_ns, "vision", NO_ESTIMATE + processed.problem))
+                log(Event(processed.frame.received_ns, "vision", f"no estimate: {processed.problem}"))
             self._problem = processed.problem
         state = self.servo_state = self._read_servo()
         request = self._request(state.t_ns, kind, target_n, width_m)

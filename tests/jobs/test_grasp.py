@@ -87,18 +87,18 @@ def test_a_camera_that_stops_during_the_hold_costs_vision_the_rest_of_it(
     quick_vision: list[str], fused_log: Path, tmp_path: Path
 ) -> None:
     hold_ns = [s.t_ns for s in LogReader(fused_log).records(GraspStatus) if s.phase == "hold"]
-    assert summarise(fused_log)["vision_share"] == 1.0
     stop_s = (hold_ns[0] + 0.3 * NS_PER_S) / NS_PER_S
     fault = f"faults=[{{unit: camera, kind: off, at_s: {stop_s}}}]"
     summary = grasped([*quick_vision, fault], tmp_path)
     log = LogReader(Path(summary["log"]))
     hold_ns = [s.t_ns for s in log.records(GraspStatus) if s.phase == "hold"]
     held_s = (hold_ns[-1] - hold_ns[0]) / NS_PER_S + 0.005
-    (loss,) = summary["vision_losses"]
-    assert loss.reason == "no new estimate"
-    assert summary["vision_share"] == pytest.approx(1 - loss.time_s / held_s)
-    assert 0.3 < held_s - loss.time_s < 0.7  # until the last estimate is too old
-    assert summary["fell_back"] == (summary["vision_share"] < 0.5)
+    lost_s = sum(loss.time_s for loss in summary["vision_losses"])
+    assert "no new estimate" in [loss.reason for loss in summary["vision_losses"]]
+    share, without_fault = summary["vision_share"] or 0, summarise(fused_log)["vision_share"] or 0
+    assert share == pytest.approx(1 - lost_s / held_s)
+    assert 0 < share < without_fault
+    assert summary["fell_back"] == (share < 0.5)
 
 
 @pytest.mark.parametrize("feedback", ["vision", "fused"])
@@ -167,8 +167,8 @@ def test_trials_that_fell_back_are_not_scored_as_vision() -> None:
         assert (summary["trials"], summary["held"], summary["over_limit"]) == (2, 2, 1)
         return summary["median_error_percent"], summary["good_percent"], summary["fell_back"]
 
-    assert errors("vision") == (pytest.approx(10.0), 0.0, 1)
-    assert errors("fused") == (pytest.approx(5.0), 50.0, 1)
+    assert errors("vision") == pytest.approx((10.0, 0.0, 1))
+    assert errors("fused") == pytest.approx((5.0, 50.0, 1))
 
 
 def test_estimates_are_averaged_by_object() -> None:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from gripper_force.config import Config, config_from_text
 from gripper_force.errors import DataError
-from gripper_force.jobs.score import GraspScore, HoldVision, score_grasp, vision_in_hold
+from gripper_force.jobs.score import GraspScore, HoldVision, controls_with_vision, score_grasp, vision_in_hold
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import (
     NS_PER_MS,
@@ -181,7 +181,9 @@ def read_run(log: LogReader, on_frame: Callable[[Frame], None] = lambda frame: N
         target_n=target_n,
         outcome=next((s.outcome for s in reversed(status) if s.outcome), ""),
         score=_score(samples, status, target_n),
-        vision=vision_in_hold(status, fused, vision, records[Event]) if config.controls_with_vision else None,
+        vision=vision_in_hold(status, fused, vision, records[Event])
+        if controls_with_vision(config)
+        else None,
         forces=forces,
         errors=_errors(forces),
         reference=_series(zero_ns, ((s.t_ns, s.reference_n) for s in status)),
