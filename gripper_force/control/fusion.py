@@ -100,7 +100,8 @@ class Fusion:
         self._visual_n = 0.0
         self._visual_std_n = 0.0
         self._source = EstimateSource.CURRENT
-        self._rejection = "no estimate"
+        self._rejection = ""
+        self._is_silent = True
         self.restart()
 
     def restart(self) -> None:
@@ -154,7 +155,7 @@ class Fusion:
                 less than before.
 
         Returns:
-            The estimate, and an event if vision drops out or returns.
+            The estimate, and an event if vision drops out or returns, or if its first estimate is rejected.
         """
         self._has_lowered = (self._has_lowered or lowering) and not free
         unknown_n = self._friction_n * (1.0 if opening else _LOWERED_SHARE if self._has_lowered else 0.0)
@@ -272,13 +273,16 @@ class Fusion:
     def _switch(self, t_ns: int) -> tuple[Event, ...]:
         fresh = self._used_ns is not None and t_ns - self._used_ns <= self._timeout_ns
         source = EstimateSource(self._feedback) if fresh else EstimateSource.CURRENT
+        news = "dropped out"
         if source == self._source:
-            return ()
-        self._source = source
+            if not (self._is_silent and self._rejection):
+                return ()
+            news = "is not used"
+        self._source, self._is_silent = source, False
         if source != EstimateSource.CURRENT:
             return (Event(t_ns, "vision", f"vision in use; the force estimate is {source}"),)
-        reason = f": {self._rejection}" if self._rejection else ": no new estimate"
-        return (Event(t_ns, "vision", f"vision dropped out{reason}; using motor current alone"),)
+        reason = self._rejection or "no new estimate"
+        return (Event(t_ns, "vision", f"vision {news}: {reason}; using motor current alone"),)
 
     def _estimate(self, t_ns: int) -> FusedForce:
         share = 1 / (1 + self._variance_ratio)

@@ -1,5 +1,6 @@
 """The main job: one grasp with its summary, or many trials with their statistics."""
 
+import math
 import time
 from collections import defaultdict
 from collections.abc import Generator, Mapping, Sequence
@@ -15,7 +16,13 @@ from gripper_force.interfaces import Progress, Prompt, no_progress
 from gripper_force.jobs.dataset import stiffness_floor_n, stiffness_of
 from gripper_force.jobs.processes import process_pool
 from gripper_force.jobs.replay import compare
-from gripper_force.jobs.score import score_grasp
+from gripper_force.jobs.score import (
+    LEAST_VISION_SHARE,
+    VisionLoss,
+    controls_with_vision,
+    score_grasp,
+    vision_in_hold,
+)
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import resolve
 from gripper_force.runtime.session import Session, open_run
@@ -56,6 +63,10 @@ class Summary(_Score):
         object: Name of the object.
         target_n: Target force.
         seed: Seed of the run.
+        feedback: Configured feedback: ``fused``, ``current`` or ``vision``.
+        vision_share: Share of the hold's cycles that used vision, 0 to 1; None without a hold or without vision.
+        vision_losses: Reasons why it was not used in the hold, and their durations, the longest first.
+        fell_back: True if the feedback includes vision, but less than half of the hold used it.
         load_cell_mean_n: Mean of the load cell during the hold.
         steady_error_n: That mean, less the target.
         overshoot_n: Highest force above the target.
@@ -76,6 +87,10 @@ class Summary(_Score):
     object: str
     target_n: float
     seed: int
+    feedback: str
+    vision_share: float | None
+    vision_losses: list[VisionLoss]
+    fell_back: bool
     peak_n: float | None
     estimator_p50_ms: float | None
     estimator_p99_ms: float | None
@@ -89,10 +104,14 @@ class Summary(_Score):
 
 
 class Overall(TypedDict):
-    """Figures over all trials; None for a figure without a value, such as an error without a load cell."""
+    """Figures over all trials; None for a figure without a value, such as an error without a load cell.
+
+    Errors, overshoot and settling time leave out the trials with the feedback ``vision`` that fell back.
+    """
 
     trials: int
     held: int
+    fell_back: int
     median_error_percent: float | None
     p90_error_percent: float | None
     median_error_n: float | None
@@ -281,6 +300,9 @@ def summarise(path: Path) -> Summary:
     compute_ms = [visual.compute_ms for visual in visuals]
     vision_s = (visuals[-1].t_ns - visuals[0].t_ns) / NS_PER_S if len(visuals) > 1 else 0.0
     config = config_from_text(reader.config, str(path))
+    vision = vision_in_hold(statuses, records[FusedForce], visuals, records[Event])
+    shown = vision if controls_with_vision(config) else None
+    expects_vision = controls_with_vision(config) or config.control.feedback == "vision"
     outcomes = [s.outcome for s in statuses if s.outcome != Outcome.NONE]
     span_s = (cycles_ns[-1] - cycles_ns[0]) / NS_PER_S if len(cycles_ns) > 1 else 0.0
     return {
@@ -288,6 +310,10 @@ def summarise(path: Path) -> Summary:
         "object": config.object,
         "target_n": config.target_n,
         "seed": config.seed,
+        "feedback": config.control.feedback,
+        "vision_share": None if shown is None else shown.share,
+        "vision_losses": [] if shown is None else shown.losses,
+        "fell_back": expects_vision and vision is not None and vision.share < LEAST_VISION_SHARE,
         **_score(cells, statuses, config.target_n),
         "peak_n": max((c.force_n for c in cells if c.valid), default=None),
         "estimator_p50_ms": _percentile(compute_ms, 50),
@@ -315,7 +341,8 @@ def _choices(metadata: Mapping[str, str], events: list[Event]) -> list[str]:
 
 def overall(results: list[Summary], force_limit_n: float) -> Overall:
     """Computes the figures over all trials."""
-    scored = [r for r in results if r["steady_error_n"] is not None]
+    counted = [r for r in results if not (r["fell_back"] and r["feedback"] == "vision")]
+    scored = [r for r in counted if r["steady_error_n"] is not None]
     error_n = np.array([abs(r["steady_error_n"] or 0.0) for r in scored])
     target_n = np.array([r["target_n"] for r in scored])
     share = error_n / target_n
@@ -325,10 +352,11 @@ def overall(results: list[Summary], force_limit_n: float) -> Overall:
     return {
         "trials": len(results),
         "held": sum(r["result"] == Outcome.HELD for r in results),
+        "fell_back": sum(r["fell_back"] for r in results),
         "median_error_percent": _percentile(100 * share, 50),
         "p90_error_percent": _percentile(100 * share, 90),
         "median_error_n": _percentile(error_n, 50),
-        "good_percent": 100 * int(good.sum()) / len(results) if peaks else None,
+        "good_percent": 100 * int(good.sum()) / len(counted) if peaks and counted else None,
         "median_overshoot_percent": _percentile(100 * overshoot, 50),
         "max_overshoot_percent": _percentile(100 * overshoot, 100),
         "median_settle_s": _percentile([r["settle_s"] for r in scored if r["settle_s"] is not None], 50),
@@ -349,8 +377,9 @@ def _trial(tree: Tree) -> Summary:
 
 
 def _mae_n(estimates: list[tuple[int, float]], cells: list[LoadCellSample]) -> float | None:
-    """Mean absolute error of an estimate over the whole run."""
-    figures = compare([t for t, _ in estimates], [f for _, f in estimates], cells)
+    """Mean absolute error of the finite estimates over the whole run."""
+    finite = [(t_ns, force_n) for t_ns, force_n in estimates if math.isfinite(force_n)]
+    figures = compare([t for t, _ in finite], [f for _, f in finite], cells)
     return None if figures is None else figures.mae_n
 
 

@@ -1,13 +1,28 @@
-"""Score of a grasp, measured by the load cell."""
+"""Score of a grasp, measured by the load cell, and the use of vision in its hold."""
 
 import math
+import re
+from bisect import bisect_right
+from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
 
 import numpy as np
 
+from gripper_force.config import Config
 from gripper_force.errors import DataError
-from gripper_force.types import NS_PER_S, GraspStatus, LoadCellSample, Phase
+from gripper_force.types import (
+    NS_PER_S,
+    EstimateSource,
+    Event,
+    FusedForce,
+    GraspStatus,
+    LoadCellSample,
+    Phase,
+    VisualForce,
+)
 
 STEADY_S = 1.0
 """Last part of the hold, over which the force is averaged."""
@@ -36,6 +51,38 @@ class GraspScore:
     steady_error_n: float
     overshoot_n: float
     settle_s: float
+
+
+LEAST_VISION_SHARE: Final = 0.5
+"""A grasp that is configured to use vision fell back if a smaller share of its hold used it."""
+
+_NO_ESTIMATE: Final = "no estimate: "
+_NO_NEW_ESTIMATE: Final = "no new estimate"
+_DROP_OUT: Final = re.compile("vision (?:dropped out|is not used): (.*); using motor current alone")
+"""Events of `runtime/session.py` and `control/fusion.py`."""
+
+_NUMBER: Final = re.compile(r"-?\d+(\.\d+)?")
+
+
+@dataclass(frozen=True, slots=True)
+class VisionLoss:
+    """Reason why vision was not used in a part of the hold, and the duration of that part."""
+
+    reason: str
+    time_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class HoldVision:
+    """Use of vision in the hold.
+
+    Attributes:
+        share: Share of the control cycles of the hold in which vision was used, 0 to 1.
+        losses: Parts of the hold without vision by reason, the longest first.
+    """
+
+    share: float
+    losses: list[VisionLoss]
 
 
 def score_grasp(
@@ -83,6 +130,66 @@ def score_grasp(
         overshoot_n=max(peak_n - target_n, 0.0),
         settle_s=float(t_s[first_inside]) if first_inside < len(t_s) else math.nan,
     )
+
+
+def controls_with_vision(config: Config) -> bool:
+    """Returns True if the force loop of a run is to use visual estimates."""
+    return config.uses_vision and config.control.feedback != "current"
+
+
+def vision_in_hold(
+    statuses: Sequence[GraspStatus],
+    estimates: Sequence[FusedForce],
+    visuals: Sequence[VisualForce],
+    events: Sequence[Event],
+) -> HoldVision | None:
+    """Computes the use of vision in the hold of the last grasp of a run; None without a hold.
+
+    Reasons that differ in their numbers only count as one, with the numbers of the longest.
+
+    Args:
+        statuses: States of the controller in order of time.
+        estimates: Fused estimates, one per cycle.
+        visuals: Visual estimates.
+        events: Events of the run.
+    """
+    held_ns = [s.t_ns for s in statuses if s.phase == Phase.HOLD]
+    if not held_ns:
+        return None
+    start_ns = _start_ns(_GRASP_PHASES, statuses, held_ns[-1])
+    sources = {estimate.t_ns: estimate.source for estimate in estimates}
+    reasons = _drop_out_reasons(visuals, events)
+    cycles = used = 0
+    lost_s: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
+    for status, after in pairwise([*statuses, statuses[-1]]):
+        if status.phase != Phase.HOLD or status.t_ns < start_ns:
+            continue
+        cycles += 1
+        if sources.get(status.t_ns, EstimateSource.CURRENT) != EstimateSource.CURRENT:
+            used += 1
+            continue
+        before = bisect_right(reasons, status.t_ns, key=lambda entry: entry[0])
+        reason = reasons[before - 1][1] if before else "no estimate was used"
+        lost_s[_NUMBER.sub("", reason)][reason] += (after.t_ns - status.t_ns) / NS_PER_S
+    losses = [VisionLoss(max(same, key=same.__getitem__), sum(same.values())) for same in lost_s.values()]
+    return HoldVision(used / cycles, sorted(losses, key=lambda loss: -loss.time_s))
+
+
+def _drop_out_reasons(visuals: Sequence[VisualForce], events: Sequence[Event]) -> list[tuple[int, str]]:
+    """Returns time and reason of each drop-out, in order of time."""
+    ready_ns = sorted(visual.ready_ns for visual in visuals)
+    reasons, problem_ns, problem = [], 0, ""
+    for event in sorted(events, key=lambda event: event.t_ns):
+        if event.text.startswith(_NO_ESTIMATE):
+            problem_ns, problem = event.t_ns, event.text.removeprefix(_NO_ESTIMATE)
+        elif found := _DROP_OUT.fullmatch(event.text):
+            reason = found[1]
+            # The controller does not know why a frame gave no estimate; the session does.
+            recovered = bisect_right(ready_ns, event.t_ns) > bisect_right(ready_ns, problem_ns)
+            if reason == _NO_NEW_ESTIMATE and problem and not recovered:
+                reason = problem
+            reasons.append((event.t_ns, reason))
+    return reasons
 
 
 def _start_ns(phases: tuple[Phase, ...], statuses: Sequence[GraspStatus], end_ns: int) -> int:

@@ -148,6 +148,18 @@ def test_bad_vision_drops_out_with_its_reason(bench, seen_n, std_n, latency_ms, 
     assert b.events[-1] == "vision in use; the force estimate is fused"
 
 
+def test_vision_that_is_rejected_from_the_start_has_one_event_with_its_reason(bench):
+    b = bench()
+    b.run(0.5, lambda _: 4.0, lambda _: 3.2, std_n=1.6)
+    assert b.events == ["vision is not used: its standard deviation is 1.60 N; using motor current alone"]
+    b.run(0.5, lambda _: 4.0, lambda _: 3.2)
+    b.run(0.5, lambda _: 4.0)
+    assert b.events[1:] == [
+        "vision in use; the force estimate is fused",
+        "vision dropped out: no new estimate; using motor current alone",
+    ]
+
+
 def test_not_finite_drops_out_in_the_same_cycle(bench):
     b = bench()
     b.run(1.0, lambda _: 4.0, lambda _: 3.2)

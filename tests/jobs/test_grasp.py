@@ -13,7 +13,7 @@ from gripper_force.jobs import grasp as grasp_module
 from gripper_force.jobs.grasp import Summary, exclusive_device, overall, summarise, trials
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.log_writer import LogWriter
-from gripper_force.types import LoadCellSample, VisualForce
+from gripper_force.types import NS_PER_S, GraspStatus, LoadCellSample, VisualForce
 
 
 def test_a_summary_is_what_the_log_says(fused_log: Path) -> None:
@@ -75,6 +75,55 @@ def test_a_run_that_ended_before_anything_was_interrupted(tmp_path: Path) -> Non
     assert (summary["result"], summary["object"], summary["loop_hz"]) == ("interrupted", "tube", None)
 
 
+def grasped(overrides: list[str], folder: Path) -> Summary:
+    options = ["log.report=false", f"log.directory={folder}"]
+    return grasp_module.grasp(load_config(None, [*overrides, *options]))
+
+
+NOT_FINITE = "faults=[{unit: estimator, kind: garbage, at_s: 0}]"
+
+
+def test_a_camera_that_stops_during_the_hold_costs_vision_the_rest_of_it(
+    quick_vision: list[str], fused_log: Path, tmp_path: Path
+) -> None:
+    hold_ns = [s.t_ns for s in LogReader(fused_log).records(GraspStatus) if s.phase == "hold"]
+    stop_s = (hold_ns[0] + 0.3 * NS_PER_S) / NS_PER_S
+    fault = f"faults=[{{unit: camera, kind: off, at_s: {stop_s}}}]"
+    summary = grasped([*quick_vision, fault], tmp_path)
+    log = LogReader(Path(summary["log"]))
+    hold_ns = [s.t_ns for s in log.records(GraspStatus) if s.phase == "hold"]
+    held_s = (hold_ns[-1] - hold_ns[0]) / NS_PER_S + 0.005
+    lost_s = sum(loss.time_s for loss in summary["vision_losses"])
+    assert "no new estimate" in [loss.reason for loss in summary["vision_losses"]]
+    share, without_fault = summary["vision_share"] or 0, summarise(fused_log)["vision_share"] or 0
+    assert share == pytest.approx(1 - lost_s / held_s)
+    assert 0 < share < without_fault
+    assert summary["fell_back"] == (share < 0.5)
+
+
+@pytest.mark.parametrize("feedback", ["vision", "fused"])
+def test_a_hold_without_vision_fell_back(quick_vision: list[str], tmp_path: Path, feedback: str) -> None:
+    summary = grasped([*quick_vision, NOT_FINITE, f"control.feedback={feedback}"], tmp_path)
+    assert (summary["feedback"], summary["vision_share"], summary["fell_back"]) == (feedback, 0.0, True)
+    assert [loss.reason for loss in summary["vision_losses"]] == ["it is not finite"]
+    assert summary["steady_error_n"] is not None
+    error = overall([summary], force_limit_n=12.0)["median_error_percent"]
+    assert (error is None) == (feedback == "vision")
+
+
+def test_motor_current_alone_has_no_share_of_vision(
+    quick: list[str], quick_vision: list[str], tmp_path: Path
+) -> None:
+    for overrides in (quick, [*quick_vision, "control.feedback=current"]):
+        summary = grasped(overrides, tmp_path)
+        assert (summary["vision_share"], summary["vision_losses"], summary["fell_back"]) == (None, [], False)
+
+
+def test_feedback_from_vision_without_a_camera_fell_back(quick: list[str], tmp_path: Path) -> None:
+    summary = grasped([*quick, "control.feedback=vision"], tmp_path)
+    assert (summary["vision_share"], summary["fell_back"]) == (None, True)
+
+
 def result(target_n: float, error_n: float | None, **more: Any) -> Summary:
     some = {
         "result": "held",
@@ -86,6 +135,8 @@ def result(target_n: float, error_n: float | None, **more: Any) -> Summary:
         "peak_n": 1.1 * target_n,
         "estimator_p50_ms": 5.0,
         "estimate_mae_n": {"visual": None, "current": 0.3, "fused": 0.1, "floor": 0.05},
+        "feedback": "fused",
+        "fell_back": False,
     }
     return cast("Summary", some | more)
 
@@ -104,6 +155,20 @@ def test_trials_are_summed_up_by_their_share_of_the_target() -> None:
     assert summary["median_error_n"] == pytest.approx(0.35)
     assert summary["max_overshoot_percent"] == pytest.approx(10.0)
     assert summary["peak_n"] == 12.5
+
+
+def test_trials_that_fell_back_are_not_scored_as_vision() -> None:
+    def errors(feedback: str) -> tuple[float | None, float | None, int]:
+        results = [
+            result(4.0, 0.4, feedback=feedback),
+            result(4.0, 0.0, feedback=feedback, fell_back=True, peak_n=13.0),
+        ]
+        summary = overall(results, force_limit_n=12.0)
+        assert (summary["trials"], summary["held"], summary["over_limit"]) == (2, 2, 1)
+        return summary["median_error_percent"], summary["good_percent"], summary["fell_back"]
+
+    assert errors("vision") == pytest.approx((10.0, 0.0, 1))
+    assert errors("fused") == pytest.approx((5.0, 50.0, 1))
 
 
 def test_estimates_are_averaged_by_object() -> None:

@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import re
 from html.parser import HTMLParser
@@ -19,6 +20,7 @@ from gripper_force.jobs.report import write_report
 from gripper_force.jobs.report.data import SOURCES, Run, histogram, read_run
 from gripper_force.jobs.report.figure import CSS_COLOURS, draw
 from gripper_force.jobs.report.pictures import FrameSampler, Picture, overlay
+from gripper_force.jobs.score import HoldVision, VisionLoss
 from gripper_force.runtime import log_reader as log_reader_module
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.log_writer import LogWriter
@@ -219,6 +221,19 @@ def test_headline_shows_target_result_and_latency(page: str) -> None:
     assert "Paper cup" in text
     assert "held" in text
     assert any(re.fullmatch(r"1\d\.\d / [34]\d\.\d", entry) for entry in text), "latency p50 / p99"
+
+
+def test_the_page_states_the_use_of_vision(page: str) -> None:
+    assert "vision used in 100 % of the hold" in Page(page).text
+
+
+def test_the_figure_states_why_vision_was_lost(grasp: Path) -> None:
+    run = dataclasses.replace(
+        read_run(LogReader(grasp)), vision=HoldVision(0.956, [VisionLoss("it is 70 ms old", 0.42)])
+    )
+    text = "vision used in 96 % of the hold\nvision lost for 0.4 s: it is 70 ms old"
+    assert draw(run, []).get_supxlabel() == text
+    assert draw(dataclasses.replace(run, vision=None), []).get_supxlabel() == ""
 
 
 def test_texts_of_log_are_escaped(page: str) -> None:

@@ -3,8 +3,8 @@ import math
 import pytest
 
 from gripper_force.errors import DataError
-from gripper_force.jobs.score import score_grasp
-from gripper_force.types import GraspStatus, LoadCellSample, Phase
+from gripper_force.jobs.score import score_grasp, vision_in_hold
+from gripper_force.types import Event, FusedForce, GraspStatus, LoadCellSample, Phase, VisualForce
 
 MS = 1_000_000
 
@@ -66,3 +66,64 @@ def test_run_without_hold_or_samples_raises():
         score_grasp(cell(lambda _: 1.0, 1), statuses(Phase.APPROACH), 4.0)
     with pytest.raises(DataError, match="load cell"):
         score_grasp(cell(lambda _: 1.0, 0.5), statuses(Phase.RAMP, Phase.HOLD), 4.0)
+
+
+def fused(states, is_used):
+    sources = ("fused" if is_used(i) else "current" for i in range(len(states)))
+    return [
+        FusedForce(s.t_ns, 1.0, 0.1, 1.0, 0.0, 0.0, source) for s, source in zip(states, sources, strict=True)
+    ]
+
+
+def rounded(used):
+    return round(used.share, 6), [(loss.reason, round(loss.time_s, 6)) for loss in used.losses]
+
+
+def told(*entries):
+    return [Event(10 * MS * cycle, "vision", text) for cycle, text in entries]
+
+
+def dropped(reason):
+    return f"vision dropped out: {reason}; using motor current alone"
+
+
+def test_no_hold_has_no_share_of_vision():
+    states = statuses(Phase.APPROACH)
+    assert vision_in_hold(states, fused(states, lambda _: True), [], []) is None
+
+
+def test_share_of_vision_counts_the_hold_of_the_last_grasp():
+    states = statuses(Phase.RAMP, Phase.HOLD, Phase.RELEASE, Phase.RAMP, Phase.HOLD, Phase.RELEASE)
+    used = vision_in_hold(
+        states, fused(states, lambda i: i >= 425), [], told((90, dropped("it is 70 ms old")))
+    )
+    assert rounded(used) == (0.75, [("it is 70 ms old", 0.25)])
+
+
+def test_losses_are_summed_by_reason_and_the_longest_comes_first():
+    states = statuses(Phase.RAMP, Phase.HOLD)
+    lost = {*range(100, 110), *range(120, 150), *range(160, 175)}
+    events = told(
+        (100, dropped("it jumps by -0.90 N")),
+        (110, "vision in use; the force estimate is fused"),
+        (120, dropped("it differs from the motor current by 1.20 N")),
+        (160, dropped("it jumps by 1.10 N")),
+    )
+    used = vision_in_hold(states, fused(states, lambda i: i not in lost), [], events)
+    losses = [("it differs from the motor current by 1.20 N", 0.3), ("it jumps by 1.10 N", 0.25)]
+    assert rounded(used) == (0.45, losses)
+
+
+@pytest.mark.parametrize(("ready_cycle", "reason"), [(120, "too dark"), (140, "no new estimate")])
+def test_a_frame_without_estimate_tells_why_there_was_no_new_one(ready_cycle, reason):
+    states = statuses(Phase.RAMP, Phase.HOLD)
+    visuals = [VisualForce(0, 10 * MS * ready_cycle, 0, 1.0, 0.1, 1.0)]
+    events = told((130, "no estimate: too dark"), (150, dropped("no new estimate")))
+    used = vision_in_hold(states, fused(states, lambda i: i < 150), visuals, events)
+    assert rounded(used) == (0.5, [(reason, 0.49)])
+
+
+def test_vision_that_was_never_used_is_a_loss_too():
+    states = statuses(Phase.HOLD, Phase.RELEASE)
+    used = vision_in_hold(states, fused(states, lambda _: False), [], [])
+    assert rounded(used) == (0.0, [("no estimate was used", 1.0)])

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from rich.table import Table
+from rich.table import Column, Table
 
 from gripper_force.cli.console import number, out, pairs
 
@@ -21,13 +21,14 @@ def grasp_table(r: "Summary") -> None:
         share = f" ({100 * r['steady_error_n'] / r['target_n']:+.1f} %)"
     pairs(
         {
-            "result": r["result"],
+            "result": r["result"] + (", fell back to motor current" if r["fell_back"] else ""),
             "object": r["object"],
             "target": number(r["target_n"], " N", 2),
             "load cell, mean": number(r["load_cell_mean_n"], " N"),
             "steady error": number(r["steady_error_n"], " N") + share,
             "overshoot": number(r["overshoot_n"], " N"),
             "settling time": number(r["settle_s"], " s", 2),
+            **_vision(r),
             "estimator p50, p99": f"{number(r['estimator_p50_ms'], '', 1)}, "
             f"{number(r['estimator_p99_ms'], '', 1)} ms",
             "control loop": number(r["loop_hz"], " Hz", 1),
@@ -40,11 +41,20 @@ def grasp_table(r: "Summary") -> None:
     )
 
 
+def _vision(r: "Summary") -> dict[str, str]:
+    if r["vision_share"] is None:
+        return {}
+    losses = "\n".join(f"for {loss.time_s:.1f} s: {loss.reason}" for loss in r["vision_losses"])
+    return {
+        "vision used": f"{100 * r['vision_share']:.0f} % of the hold",
+        **({"vision lost": losses} if losses else {}),
+    }
+
+
 def trials_table(trials: "Sequence[Summary]", summary: "Overall") -> None:
     """Prints the figures of each trial and over all trials."""
-    table = Table(
-        "object", "target N", "load cell N", "error %", "overshoot N", "settle s", "result", box=None
-    )
+    names = ("object", "target N", "load cell N", "error %", "overshoot N", "settle s", "vision %")
+    table = Table(*names, Column("result", no_wrap=True), box=None)
     for t in trials:
         error = None if t["steady_error_n"] is None else 100 * t["steady_error_n"] / t["target_n"]
         table.add_row(
@@ -54,9 +64,16 @@ def trials_table(trials: "Sequence[Summary]", summary: "Overall") -> None:
             number(error, digits=1),
             number(t["overshoot_n"], digits=2),
             number(t["settle_s"], digits=2),
-            t["result"],
+            number(None if t["vision_share"] is None else 100 * t["vision_share"], digits=0),
+            t["result"] + (", fell back" if t["fell_back"] else ""),
         )
     out.print(table)
+    if summary["fell_back"]:
+        left_out = any(t["fell_back"] and t["feedback"] == "vision" for t in trials)
+        out.print(
+            f"{summary['fell_back']} of {summary['trials']} trials fell back to motor current: less than half of "
+            f"their hold used vision. They {'are left out of' if left_out else 'count in'} the errors."
+        )
     plain = {key: value for key, value in summary.items() if key != "estimate_mae_n"}
     if summary["peak_n"] is None:
         pairs({key: value for key, value in plain.items() if value is not None})

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from gripper_force.config import Config, config_from_text
 from gripper_force.errors import DataError
-from gripper_force.jobs.score import GraspScore, score_grasp
+from gripper_force.jobs.score import GraspScore, HoldVision, controls_with_vision, score_grasp, vision_in_hold
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import (
     NS_PER_MS,
@@ -88,6 +88,7 @@ class Run:
         target_n: Target force of the last grasp request; None in a recording without a request.
         outcome: Last outcome; empty without one.
         score: Grasp compared with the load cell; None without a hold or a load cell.
+        vision: Use of vision in the hold; None without a hold or without vision.
         forces: Force by source; sources that the log lacks are absent.
         errors: Force minus the load cell's force, by source; only where the load cell gives valid samples.
         reference: Target force, shaped by the ramp.
@@ -108,6 +109,7 @@ class Run:
     target_n: float | None
     outcome: str
     score: GraspScore | None
+    vision: HoldVision | None
     forces: dict[str, Series]
     errors: dict[str, Series]
     reference: Series
@@ -167,9 +169,10 @@ def read_run(log: LogReader, on_frame: Callable[[Frame], None] = lambda frame: N
     forces = {source: series for source, series in forces.items() if len(series.t_s)}
     # An empty log still needs a time axis.
     end_s = (log.start_ns + max(log.duration_ns, NS_PER_MS) - zero_ns) / NS_PER_S
+    config = config_from_text(log.config, str(log.path))
     return Run(
         name=log.path.stem,
-        config=config_from_text(log.config, str(log.path)),
+        config=config,
         config_text=log.config,
         metadata=log.metadata,
         zero_ns=zero_ns,
@@ -178,6 +181,9 @@ def read_run(log: LogReader, on_frame: Callable[[Frame], None] = lambda frame: N
         target_n=target_n,
         outcome=next((s.outcome for s in reversed(status) if s.outcome), ""),
         score=_score(samples, status, target_n),
+        vision=vision_in_hold(status, fused, vision, records[Event])
+        if controls_with_vision(config)
+        else None,
         forces=forces,
         errors=_errors(forces),
         reference=_series(zero_ns, ((s.t_ns, s.reference_n) for s in status)),

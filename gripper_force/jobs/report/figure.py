@@ -50,6 +50,8 @@ CSS_COLOURS: Final = {
 _WIDTH_IN: Final = 10.0
 _TITLE_IN: Final = 0.3
 """Height of the title, which a page with its own heading leaves out."""
+_LINE_IN: Final = 0.18
+"""Height of a line of text below the charts."""
 
 _MAX_POINTS: Final = 2000
 """Points drawn per curve; more cannot be seen."""
@@ -94,7 +96,9 @@ def draw(run: Run, pictures: list[Picture]) -> Figure:
     }
     heights_in = {name: height for name, height in heights_in.items() if height}
     with rc_context(STYLE):
-        figure = Figure(figsize=(_WIDTH_IN, 0.5 + sum(heights_in.values())), layout="constrained")
+        lines = _vision_lines(run)
+        height_in = 0.5 + _LINE_IN * len(lines) + sum(heights_in.values())
+        figure = Figure(figsize=(_WIDTH_IN, height_in), layout="constrained")
         figure.suptitle(run.title, x=0.008, ha="left", fontsize=13, fontweight="bold")
         parts = figure.subfigures(len(heights_in), height_ratios=list(heights_in.values()), squeeze=False)
         for name, part in zip(heights_in, parts[:, 0], strict=True):
@@ -107,6 +111,7 @@ def draw(run: Run, pictures: list[Picture]) -> Figure:
             else:
                 for axes, picture in zip(part.subplots(1, len(pictures)), pictures, strict=True):
                     _frame(axes, picture)
+        figure.supxlabel("\n".join(lines), x=0.008, ha="left", fontsize=9, color=_SOFT)
     return figure
 
 
@@ -145,6 +150,13 @@ def thin(series: Series) -> Series:
         return series
     keep = np.linspace(0, len(series.t_s) - 1, _MAX_POINTS).astype(int)
     return Series(series.t_s[keep], series.value_n[keep])
+
+
+def _vision_lines(run: Run) -> list[str]:
+    if run.vision is None:
+        return []
+    losses = [f"vision lost for {loss.time_s:.1f} s: {loss.reason}" for loss in run.vision.losses]
+    return [f"vision used in {100 * run.vision.share:.0f} % of the hold", *losses]
 
 
 def _curves(part: SubFigure, run: Run) -> None:
