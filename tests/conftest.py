@@ -63,7 +63,7 @@ def tiny_checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two small networks that have learnt nothing, claim little, and say 0 N of a scene without contact."""
     import torch
 
-    from gripper_force.vision.checkpoint import save_checkpoint
+    from gripper_force.vision.checkpoint_writer import save_checkpoint
     from gripper_force.vision.header import Header, NetworkConfig, Residual
     from gripper_force.vision.network import ForceNetwork
     from gripper_force.vision.preprocess import Preprocess

@@ -19,7 +19,7 @@ _RETURN_S = 0.05
 closing side of friction in the third, which stops the jaws: later, their inertia carries them too far."""
 
 _REPEAT_SHARE = 0.75
-_REPEAT_S = 0.2
+_REPEAT_S = 0.5
 _REPEAT_WITHIN_S = 1.0
 """A lowering that ends above the target by this share of the tolerance, for this time, is repeated once, if that shows
 soon. The integral would have to overcome twice the friction first, which takes seconds."""
@@ -148,12 +148,9 @@ class ForceLoop:
 
     def _repeat_lowering(self, dt_s: float, target_n: float, estimate: FusedForce) -> None:
         """Lowers the force again if the camera shows that it has stayed too high."""
-        rests = (
-            not self.is_lowering
-            and self.reference_n == target_n
-            and estimate.source != EstimateSource.CURRENT
-        )
-        is_high = estimate.force_n - target_n > _REPEAT_SHARE * tolerance_n(target_n)
+        rests = not self.is_lowering and self.reference_n == target_n
+        excess_n = 0.0 if estimate.source == EstimateSource.CURRENT else estimate.force_n - target_n
+        is_high = excess_n > _REPEAT_SHARE * tolerance_n(target_n)
         self._high_s = self._high_s + dt_s if rests and is_high else 0.0
         if rests and self._repeat_s > 0:
             self._repeat_s -= dt_s

@@ -1,16 +1,15 @@
 """Checkpoints: one safetensors file per ensemble, with the weights and a header."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load, save
+from safetensors.torch import load
 from torch import Tensor
 
 from gripper_force.errors import CheckpointError
-from gripper_force.vision.header import FORMAT, Header, NetworkConfig, digest_of, read_checkpoint
+from gripper_force.vision.header import Header, NetworkConfig, digest_of, read_checkpoint
 from gripper_force.vision.network import ForceNetwork
 
 _RENAMED = {"blstm.onward.": "blstm.forward_lstm.", "blstm.backward_gates.": "blstm.backward_linear."}
@@ -30,29 +29,6 @@ class Checkpoint:
     networks: tuple[ForceNetwork, ...]
     header: Header
     digest: str
-
-
-def save_checkpoint(path: Path, networks: Sequence[ForceNetwork], header: Header) -> None:
-    """Writes an ensemble: matrices as float16 where its range allows, vectors as float32.
-
-    Half precision halves the file and changes the force by less than 1e-3 of its value.
-
-    Raises:
-        CheckpointError: The file can't be written.
-    """
-    tensors = {
-        f"{i}.{name}": _stored(tensor)
-        for i, network in enumerate(networks)
-        for name, tensor in network.state_dict().items()
-    }
-    data = save(tensors, metadata={FORMAT: header.model_dump_json()})
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(data)
-    except OSError as error:
-        raise CheckpointError(
-            f"can't write the checkpoint {path}: {error.strerror}; name another file"
-        ) from error
 
 
 def load_checkpoint(source: str | Path = "default") -> Checkpoint:
@@ -79,17 +55,6 @@ def _current_name(name: str) -> str:
     for old, new in _RENAMED.items():
         name = name.replace(old, new)
     return name
-
-
-def _stored(tensor: Tensor) -> Tensor:
-    full = tensor.detach().cpu().contiguous()
-    # Vectors take little space, and running variances can lie below the smallest float16.
-    if full.dim() < 2:
-        return full
-    half = full.half()
-    # float16 has eleven bits between 6e-5 and 65504, and loses them outside.
-    fits = (half - full).abs().max() <= full.abs().max() * 2**-11
-    return half if fits else full
 
 
 def _member(path: Path, index: int, config: NetworkConfig, tensors: dict[str, Tensor]) -> ForceNetwork:

@@ -22,7 +22,8 @@ from gripper_force.types import (
     ServoCommand,
     VisualForce,
 )
-from gripper_force.vision.checkpoint import load_checkpoint, save_checkpoint
+from gripper_force.vision.checkpoint import load_checkpoint
+from gripper_force.vision.checkpoint_writer import save_checkpoint
 
 
 def tampered(log: Path, path: Path, change: Callable[[Record], Record | None]) -> Path:

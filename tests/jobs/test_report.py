@@ -37,7 +37,8 @@ from gripper_force.types import (
     Request,
     VisualForce,
 )
-from gripper_force.vision.checkpoint import load_checkpoint, save_checkpoint
+from gripper_force.vision.checkpoint import load_checkpoint
+from gripper_force.vision.checkpoint_writer import save_checkpoint
 from gripper_force.vision.header import Header, NetworkConfig, Residual
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess

@@ -9,7 +9,8 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from gripper_force.errors import CheckpointError
-from gripper_force.vision.checkpoint import load_checkpoint, save_checkpoint
+from gripper_force.vision.checkpoint import load_checkpoint
+from gripper_force.vision.checkpoint_writer import save_checkpoint
 from gripper_force.vision.header import FORMAT, SHIPPED, Header, NetworkConfig, Residual
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess

@@ -22,7 +22,8 @@ from gripper_force.jobs.training.parallel import Ranks, joined
 from gripper_force.jobs.training.recipe import TrainConfig as TrainConfig
 from gripper_force.jobs.training.recipe import continued
 from gripper_force.jobs.training.trainer import Trainer, estimates
-from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
+from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
+from gripper_force.vision.checkpoint_writer import save_checkpoint
 from gripper_force.vision.header import RESIDUAL_HALF_N, Header, Residual
 
 STATE_EVERY_S: Final = 60.0

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from gripper_force.vision.backbones import Vgg
-from gripper_force.vision.checkpoint import save_checkpoint
+from gripper_force.vision.checkpoint_writer import save_checkpoint
 from gripper_force.vision.header import Header, Model, NetworkConfig, Residual
 from gripper_force.vision.model_files import read_model
 from gripper_force.vision.network import ForceNetwork

@@ -9,7 +9,8 @@ import torch
 
 from gripper_force.errors import CheckpointError, ConfigError
 from gripper_force.testing.engine_contract import EngineContract
-from gripper_force.vision.checkpoint import load_checkpoint, save_checkpoint
+from gripper_force.vision.checkpoint import load_checkpoint
+from gripper_force.vision.checkpoint_writer import save_checkpoint
 from gripper_force.vision.engines import ENGINES, Engine, Precision, open_engine
 from gripper_force.vision.header import Attention, Header, Model, NetworkConfig, Residual
 from gripper_force.vision.model_files import cache_folder, exported_file, read_model
