@@ -33,6 +33,7 @@ class Bench:
         noise=None,
         free=False,
         opening=False,
+        lowering=False,
     ):
         """`motor_force_n` and `seen_n` are functions of the time in seconds; `seen_n` is the visual force."""
         for _ in range(round(time_s * 200)):
@@ -45,7 +46,9 @@ class Bench:
                 capture_ns = self.t_ns - latency_ms * MS
                 force_n = seen_n(capture_ns / 1e9) + (noise.normal(0, std_n) if noise else 0.0)
                 visual = VisualForce(capture_ns, self.t_ns, self.t_ns, force_n, std_n, 10.0)
-            self.estimate, events = self.fusion.step(self.t_ns, servo, visual, free=free, opening=opening)
+            self.estimate, events = self.fusion.step(
+                self.t_ns, servo, visual, free=free, opening=opening, lowering=lowering
+            )
             self.events += [event.text for event in events]
             self.t_ns += 5 * MS
         return self.estimate
@@ -231,3 +234,19 @@ def test_vision_keeps_its_error_on_a_rig_with_a_wide_prior(transmission):
     ends = [b.run(1.0, lambda _: 4.0, lambda _: 3.4) for b in (loose, known)]
     assert ends[0].std_n == pytest.approx(ends[1].std_n, rel=1e-3)
     assert ends[0].std_n > 0.1
+
+
+def test_while_the_force_is_lowered_the_difference_by_the_gearing_falls_with_it(bench, transmission):
+    """A difference that the friction may cause stays."""
+    b = bench()
+    before = b.run(3.0, lambda _: 8.0 + transmission.friction_n, lambda _: 7.0)
+    after = b.run(0.3, lambda _: 2.0 - transmission.friction_n, lambda _: 7.0, lowering=True)
+    assert after.current_n == pytest.approx(2.0, abs=0.1)
+    assert 0.25 * before.bias_n > after.bias_n > 0.75 * before.bias_n
+
+
+def test_without_a_lowering_the_difference_stays(bench, transmission):
+    b = bench()
+    before = b.run(3.0, lambda _: 8.0 + transmission.friction_n, lambda _: 7.0)
+    after = b.run(0.3, lambda _: 2.0 - transmission.friction_n)
+    assert after.bias_n == pytest.approx(before.bias_n)

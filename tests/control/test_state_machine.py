@@ -316,7 +316,7 @@ def test_vision_stays_in_use_at_any_frame_rate(make_run, rate_hz):
 
 
 def test_vision_removes_the_rest_of_a_lowering(make_run):
-    run = make_run(plant={"stiffness_n_m": 600.0}).grasp(5.0, 5.0).grasp(2.0, 4.0)
+    run = make_run(plant={"stiffness_n_m": 600.0}).grasp(5.0, 5.0).grasp(2.0, 2.0)
     assert run.plant.force_n == pytest.approx(2.0, abs=0.1)
 
 
