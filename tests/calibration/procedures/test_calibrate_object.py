@@ -2,9 +2,9 @@
 
 import json
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -257,8 +257,18 @@ def interrupt() -> str:
     raise KeyboardInterrupt
 
 
+class SysWithTerminal:
+    """The module `sys` with another standard input."""
+
+    def __init__(self, terminal: Terminal) -> None:
+        self.stdin = terminal
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(sys, name)
+
+
 def by_hand(folder: Path, monkeypatch: pytest.MonkeyPatch, terminal: Terminal) -> Result:
-    monkeypatch.setattr(console, "sys", SimpleNamespace(stdin=terminal))
+    monkeypatch.setattr(console, "sys", SysWithTerminal(terminal))
     keys = [part for key in QUICK[1:] for part in ("--set", key)]
     given = ["calibrate", "object", "stapler", "--touches", "3", "--peak-n", "6", "--pause", "--json", *keys]
     return CliRunner().invoke(
