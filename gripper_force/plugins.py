@@ -49,7 +49,7 @@ def load_class(
         ) from error
     if not callable(found):
         raise ConfigError(f"{key}={name}: {target} is not a class; name a class")
-    if group in _METHODS and not hasattr(found, _METHODS[group]):
+    if isinstance(found, type) and group in _METHODS and not hasattr(found, _METHODS[group]):
         raise ConfigError(
             f"{key}={name}: {target} has no method {_METHODS[group]!r}; name a class with the methods of the "
             "interface (docs/api.md)"

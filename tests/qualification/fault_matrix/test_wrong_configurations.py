@@ -28,8 +28,10 @@ STAPLER = 3
 """Number of a grasp of the cheapest object."""
 
 NO_CAMERA = ["camera.backend=none", "vision.checkpoint=none", "control.feedback=current"]
-FAST = load_config(None, ["sim.detail=coarse", "servo.bus_watchdog_ms=2540", *NO_CAMERA])
+FAST_KEYS = ["sim.detail=coarse", "servo.bus_watchdog_ms=2540", *NO_CAMERA]
 """Without camera, and with a watchdog that a busy machine does not trip."""
+
+FAST = load_config(None, FAST_KEYS)
 
 
 def row(name: str, **keys: Any) -> WrongCase:
@@ -166,7 +168,7 @@ def test_the_command_reports_a_row_that_fails(tmp_path: Path, monkeypatch: pytes
     )
     ((grasp, failure),) = summary["failures"].items()
     assert failure == "the result is stuck"
-    repeated = load_config(None, [*NO_CAMERA, "sim.detail=coarse", *grasp.split(", ")])
+    repeated = load_config(None, [*FAST_KEYS, *grasp.split(", ")])
     assert repeated == config_from(draw(FAST, case, 0)[0], "test")
     monkeypatch.setattr(wrong_configurations, "run_rows", lambda *_, **__: [summary])
     page = tmp_path / "page.md"
