@@ -560,3 +560,12 @@ def test_paper_is_gripped_with_the_full_force(make_run):
     ).grasp(9.0)
     assert run.last.status.outcome == "held"
     assert run.plant.force_n == pytest.approx(9.0, abs=0.5)
+
+
+def test_camera_that_sees_far_too_much_does_not_confirm_jaws_that_friction_holds(make_run):
+    run = make_run(plant={"friction_n": 0.9}, vision={"gain": 1.4, "noise_n": 0.05}).grasp(0.8, 9.0)
+    assert run.last.status.outcome == "held"
+    run.plant.stiffness_n_m, run.vision.gain = 1e-3, 1e9  # nothing presses; the network gives any force
+    run.go(0.5)
+    assert run.last.status.outcome == "slip"
+    assert any("the camera sees" in reason for reason in run.reasons)

@@ -27,7 +27,7 @@ _FINGER_X_M = {"pads": 0.009, "rods": 0.022}
 
 _SECOND_FINGER_SEEDS = 50_000_000
 _FINGER_PARAMETERS = ("nm_per_a", "servo_friction_nm", "servo_damping_nm_s", "jaw_friction_n", "backlash_m")
-"""What each finger with a servo of its own has of its own; the first seed of the second one's."""
+"""Parameters that each finger with its own servo draws for itself; the first seed of the second finger."""
 
 BACKGROUND_OBJECTS = 4
 """Number of objects that move behind the grasped object in a scene with a moving background."""

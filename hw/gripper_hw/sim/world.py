@@ -32,7 +32,7 @@ _MAX_STEP_S = 0.004
 
 _CURRENT_NOISE_A = 0.003
 _AWAY_M = (1.0, 0.0, 0.0)
-"""Where an object is that has left the jaws: out of the picture."""
+"""Position of an object that has left the jaws, outside the image."""
 
 # In software rendering, each of these costs more than all the rest of a 128x128 image.
 _DISABLED_RENDER_FLAGS = (

@@ -99,7 +99,7 @@ def test_one_of_several_devices_must_be_named_by_id_or_address() -> None:
 def features(
     socket: str, name: str, kind: str, modes: dict[tuple[int, int], float], autofocus: bool = False
 ) -> dai.CameraFeatures:
-    """What a device reports about one sensor."""
+    """Features of one sensor as a device reports them."""
     sensor = dai.CameraFeatures()
     sensor.socket, sensor.sensorName = dai.CameraBoardSocket.__members__[socket], name
     sensor.supportedTypes = [dai.CameraSensorType.__members__[kind]]
