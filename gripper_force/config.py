@@ -226,6 +226,12 @@ class CameraConfig(Section):
         250.0, description="oak, uvc: age of the newest frame after which the camera counts as lost"
     )
 
+    @model_validator(mode="after")
+    def _check_lens(self) -> Self:
+        if self.backend == "oak" and (self.lens_position or 0) > 255:
+            raise ValueError(f"lens_position {self.lens_position} is above 255, the nearest focus of an OAK")
+        return self
+
 
 CAMERA_OTHER_KEYS: Final = {"options", "path", "speed", "device", "timeout_ms"}
 """Keys of the camera on which the look of its images does not depend."""

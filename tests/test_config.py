@@ -248,3 +248,11 @@ def test_overrides_may_be_a_mapping() -> None:
 
 def test_a_configuration_of_version_0_1_with_the_compiled_engine_is_read() -> None:
     assert config_from_text("vision: {engine: compiled}", "a log").vision.engine == "torch"
+
+
+def test_a_lens_position_that_an_oak_does_not_have_is_refused() -> None:
+    with pytest.raises(ConfigError, match="lens_position 999 is above 255, the nearest focus of an OAK"):
+        load_config(None, {"camera.backend": "oak", "camera.lens_position": 999})
+    assert (
+        load_config(None, {"camera.backend": "uvc", "camera.lens_position": 999}).camera.lens_position == 999
+    )

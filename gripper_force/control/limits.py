@@ -103,6 +103,11 @@ class Limits:
         """Removes the ceiling that an over-force set. Called at the start and the end of a grasp."""
         self._over_force_ceiling_a = math.inf
 
+    @property
+    def is_at_current_limit(self) -> bool:
+        """True if the servo's current limit, and no other limit, holds the goal current down."""
+        return self._unrounded_a >= self._current_limit_a
+
     def ceiling_a(self, friction_n: float, present_rad: float) -> float:
         """Returns the largest current that the force limit and the servo's current limit allow at a servo angle."""
         max_friction_n = (1 + 3 * self._transmission.friction_std) * self._transmission.friction_n

@@ -219,13 +219,8 @@ class GraspController:
         command, is_over = self._limit_command(t_ns, dt_s)
         self._goal_current_a = command.goal_current_a
         if is_over and not self._was_over_force:
-            events.append(
-                Event(
-                    t_ns,
-                    "control",
-                    f"{self._estimate.force_n:.2f} N is over the limit; goal current lowered",
-                )
-            )
+            text = f"{self._estimate.force_n:.2f} N is over the limit; goal current lowered"
+            events.append(Event(t_ns, "control", text))
         self._was_over_force = is_over
         return Decision(command, self._status(t_ns), self._estimate, tuple(events), refusal)
 
@@ -574,6 +569,10 @@ class GraspController:
                     f": the camera {self._sight}. The jaws may press on an end stop: check "
                     "gripper.open_width_m with `calibrate jaws`. If there is an object, calibrate it, or set "
                     "control.feedback=current"
+                )
+            elif self._limits.is_at_current_limit:
+                reason += (
+                    ": the motor current is at its limit; request less force, or check servo.current_limit_a"
                 )
             self._set_outcome(Outcome.TIMEOUT, reason)
 

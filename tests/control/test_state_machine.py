@@ -281,6 +281,14 @@ def test_timeout(make_run):
     assert run.last.status.phase == "hold"
 
 
+def test_timeout_at_the_current_limit_names_it(make_run):
+    run = make_run(timeout_s=2.0)
+    run.controller = GraspController(run.config, run.transmission, 0.1, POSITION_LOOP)
+    run.grasp(6.0, 4.0)
+    assert run.last.status.outcome == "timeout"
+    assert any("check servo.current_limit_a" in reason for reason in run.reasons)
+
+
 def test_retarget_without_letting_go(make_run):
     run = make_run().grasp(2.0, 4.0).grasp(5.0, 4.0)
     assert phases(run) == ["approach", "contact", "ramp", "hold", "ramp", "hold"]

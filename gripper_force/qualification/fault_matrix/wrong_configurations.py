@@ -128,7 +128,7 @@ def _log_between(low: float, high: float, share: float) -> float:
 
 WRONG_CASES: Final = (
     WrongCase("friction: 0.3 to 5 times", ("held", "stuck", "timeout"), _friction),
-    WrongCase("torque constant: 0.7 to 1.4 times", ("held", "timeout"), _gain),
+    WrongCase("torque constant: 0.7 to 1.4 times", ("held", "stuck", "timeout"), _gain),
     WrongCase("start: 16 mm outside to 16 mm inside", ("held", "timeout", REFUSED), _start, "fused"),
     WrongCase("closing direction", ("stuck", "timeout", "no_object", REFUSED), _sign, "fused"),
     WrongCase("open width: 0.8 to 1.2 times", ("held", "timeout"), _width, "fused"),

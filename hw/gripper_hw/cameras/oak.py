@@ -109,10 +109,10 @@ def set_controls(control: Any, sensor: Any, config: CameraConfig) -> None:
 
     name, position, colour_k = f"the sensor {_name(sensor)}", config.lens_position, config.white_balance_k
     if sensor.hasAutofocus:
-        if position is None or position > 255:
+        if position is None:
             raise DeviceError(
-                f"{name} has a lens with autofocus, which is off in a run, and camera.lens_position is "
-                f"{'null' if position is None else position}; set it to 0 (far) to 255 (near)"
+                f"{name} has a lens with autofocus, which is off in a run, and camera.lens_position is null; "
+                "set it to 0 (far) to 255 (near)"
             )
         control.setAutoFocusMode(dai.CameraControl.AutoFocusMode.OFF)
         control.setManualFocus(position)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from gripper_force.config import GripperConfig
 from gripper_force.control.linkage import Linkage, RackAndPinion, make_linkage
-from gripper_force.errors import SimulationError
+from gripper_force.errors import ConfigError, SimulationError
 from gripper_force.types import NS_PER_S
 from gripper_hw.sim.engine import mujoco, new_renderer
 from gripper_hw.sim.objects import NO_OBJECT
@@ -31,6 +31,7 @@ _MAX_STEP_S = 0.004
 """At 8 ms a tube presses with 22 N instead of 12 N, without any warning of MuJoCo."""
 
 _CURRENT_NOISE_A = 0.003
+_JAW_HALF_HEIGHT_M = 0.011
 _AWAY_M = (1.0, 0.0, 0.0)
 """Position of an object that has left the jaws, outside the image."""
 
@@ -98,7 +99,8 @@ class World:
         has_object: False if there is no object, or it has left the jaws.
 
     Raises:
-        ConfigError: The object does not exist, or the tool is not suitable for it.
+        ConfigError: The object does not exist, does not fit between the open jaws, or the tool is not suitable
+            for it.
         SimulationError: MuJoCo refuses the scene, or the time step is too long.
     """
 
@@ -150,6 +152,7 @@ class World:
         self.force_n = 0.0
         self.has_object = scene.object != NO_OBJECT
         mujoco.mj_forward(self._model, self._data)
+        self._check_fit(gripper.open_width_m)
         self.call_every(_CHECK_PERIOD_NS, self._check_state)
 
     @property
@@ -245,6 +248,16 @@ class World:
         """Moves the background objects. They have no contacts, so only the rendered positions change."""
         for i, position_m in enumerate(self._surroundings.positions_m(self.t_ns / NS_PER_S)):
             self._data.geom_xpos[self._model.geom(f"background_{i}").id] = position_m
+
+    def _check_fit(self, open_width_m: float) -> None:
+        # A shell has no contact with jaws inside it: its nodes at the jaws' height show that it is too wide.
+        x_m, _, z_m = self._data.flexvert_xpos.T
+        is_between = np.abs(z_m - self._data.body("left").xpos[2]) < _JAW_HALF_HEIGHT_M
+        if self._data.ncon or (np.abs(x_m[is_between]) > open_width_m / 2).any():
+            raise ConfigError(
+                f"the simulated object {self._scene.object!r} does not fit between jaws that open "
+                f"{1e3 * open_width_m:.0f} mm; take another object, another seed, or a larger gripper.open_width_m"
+            )
 
     def _check_state(self, _: int) -> None:
         """Raises `SimulationError` for an implausible state; the integrator `discrete` reports no error."""

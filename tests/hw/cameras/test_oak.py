@@ -222,7 +222,6 @@ def test_nothing_of_a_colour_sensor_is_automatic() -> None:
             {},
             r"IMX378 at CAM_A has a lens with autofocus.*lens_position is null; set it to 0 \(far\) to 255",
         ),
-        (COLOUR, {"lens_position": 256}, r"lens_position is 256; set it to 0 \(far\) to 255 \(near\)"),
         (
             LEFT,
             {"lens_position": 100},

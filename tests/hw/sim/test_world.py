@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from gripper_force.config import GripperConfig
-from gripper_force.errors import SimulationError
+from gripper_force.errors import ConfigError, SimulationError
 from gripper_force.types import NS_PER_MS
 from gripper_hw.sim.engine import NO_EGL, mujoco
 from gripper_hw.sim.scene import Scene
@@ -46,6 +46,15 @@ def make_world() -> Iterator[Callable[..., World]]:
     yield make
     for world in worlds:
         world.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "open_mm"), [("sponge", 40), ("stapler", 40), ("paper_cup", 36), ("block", 30)]
+)
+def test_object_wider_than_the_open_jaws_is_refused(name: str, open_mm: int) -> None:
+    gripper = GripperConfig(open_width_m=1e-3 * open_mm)
+    with pytest.raises(ConfigError, match=f"'{name}' does not fit between jaws that open {open_mm} mm"):
+        World(Scene(name, "coarse"), gripper, Current(0.0), NM_PER_A, 0)
 
 
 @pytest.mark.parametrize("gain", [0.9, 1.1])
