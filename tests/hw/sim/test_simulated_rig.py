@@ -233,7 +233,7 @@ def test_light_sets_brightness_and_noise_sets_variance() -> None:
 
 def test_the_true_state_is_observed_at_each_step(make_rig: MakeRig) -> None:
     fault = "faults=[{unit: plant, kind: off, at_s: 0.3}]"
-    rig = make_rig(fault, "gripper.open_width_m=0.06")  # near the object
+    rig = make_rig(fault, "gripper.open_width_m=0.066")  # near the object
     seen: list[WorldState] = []
     rig.observe_world(seen.append)
     squeeze(rig)
