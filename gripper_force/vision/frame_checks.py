@@ -1,11 +1,13 @@
 """Plausibility checks on camera frames.
 
-A network returns a force for any image, so flat, badly exposed or garbled frames are rejected first.
+A network returns a force for any image, so flat, badly exposed, garbled and disturbed frames are rejected first.
 """
 
 from typing import Final
 
+import cv2
 import numpy as np
+import numpy.typing as npt
 
 from gripper_force.errors import DataError
 from gripper_force.types import Gray
@@ -17,9 +19,44 @@ ROUGHNESS: Final = 2.5
 """Largest ratios of a frame to the first frame of the stream, in either direction. The extremes observed in
 presses are 1.15, 1.33 and 1.2 in simulation, and 1.06, 1.04 and 1.1 with a finger camera."""
 
+SHIFT: Final = 0.0086
+"""Largest shift of the still part of the image, as a share of its side."""
+
+ZOOM: Final = 0.014
+"""Largest change of its scale."""
+
+SLOPE: Final = 0.06
+"""Largest difference of the change of light between the middle and an edge, as a share of the mean brightness."""
+
+SHARPNESS: Final = 0.75
+"""Least fine detail of the still part of the image, as a share of the first frame's."""
+
+COVERED: Final = 0.15
+"""Largest share of the image that loses its fine detail. Flat jaws cover up to 0.125 in simulation."""
+
+_GRID: Final = 8
+"""Blocks along a side, in which fine detail is compared."""
+
+_SAMPLES: Final = 32
+"""Pixels along a side that the motion is fitted to."""
+
+_STEPS: Final = 6
+_SCALES: Final = (12.0, 3.0)
+"""Steps of the robust fit, and its scale in gray levels at the first and the last step."""
+
+Floats = npt.NDArray[np.float32]
+
 
 class FrameChecks:
-    """Compares brightness, contrast and roughness of each frame of a stream with the first frame's."""
+    """Compares each frame of a stream with the first one, which must show no contact.
+
+    Brightness, contrast and roughness are those of the whole frame. The other checks are for what disturbs a run:
+    the camera is moved, zoomed or refocused, the light comes from elsewhere, something covers the view. In a grasp
+    jaws and object move, but the rest of the image stays. So a change of the whole image, its shift, zoom and
+    change of light, is fitted robustly: what does not follow it gets no weight (M-estimator of Geman and McClure on
+    one step of Lucas and Kanade, IJCAI 1981; M. J. Black and P. Anandan, Computer Vision and Image Understanding 63
+    (1996) 75-104, doi:10.1006/cviu.1996.0006).
+    """
 
     def __init__(self) -> None:
         self._first: tuple[float, float, float] | None = None
@@ -31,8 +68,7 @@ class FrameChecks:
             small: Cropped and resized frame, (S, S) uint8.
 
         Raises:
-            DataError: The frame is flat, or its brightness, contrast or roughness are far from the first
-                frame's.
+            DataError: The frame is flat, or differs from the first frame by more than a grasp explains.
         """
         pixels = small.astype(np.float32)
         contrast = float(pixels.std())
@@ -45,6 +81,7 @@ class FrameChecks:
         roughness = float(np.abs(np.diff(pixels)).mean()) / contrast
         if self._first is None:
             self._first = brightness, contrast, roughness
+            self._begin(pixels)
         for name, now, first, most in zip(
             ("brightness", "contrast", "roughness"),
             (brightness, contrast, roughness),
@@ -57,3 +94,63 @@ class FrameChecks:
                     f"the image's {name} changed from {first:.3g} to {now:.3g} since the first frame; check "
                     "the camera and the light"
                 )
+        for change, most, cause in self.changes(pixels):
+            if change > most:
+                raise DataError(f"{cause} since the first frame; check the camera, its lens and the light")
+
+    def changes(self, pixels: Floats) -> list[tuple[float, float, str]]:
+        """Returns each measured change of a frame since the first one, its limit, and a clause that names it.
+
+        Args:
+            pixels: Cropped and resized frame, (S, S).
+        """
+        smooth = cv2.GaussianBlur(pixels, (0, 0), _SMOOTHING)
+        difference = _sampled(smooth - self._smooth)  # (N,)
+        change = np.zeros(self._directions.shape[1], np.float32)
+        for scale in np.geomspace(*_SCALES, _STEPS, dtype=np.float32):
+            weight = (1 + np.square((difference - self._directions @ change) / scale)) ** -2
+            weighted = self._directions.T * weight
+            change = np.linalg.solve(weighted @ self._directions + self._prior, weighted @ difference)
+        shift, zoom = float(np.hypot(*change[:2])), float(abs(change[2]))
+        slope = float(np.hypot(*change[5:])) / self._first[0] if self._first else 0.0
+        still = np.abs(difference - self._directions @ change) < 2 * _SCALES[1]
+        detail = _block_means(np.square(cv2.Laplacian(smooth, cv2.CV_32F)))
+        ratio = detail / (self._detail + 1)
+        kept = ratio[_block_means(still.reshape(_SAMPLES, -1).astype(np.float32)) > 0.7]
+        sharpness = float(np.median(kept)) if len(kept) else 1.0
+        covered = float((ratio < 0.3).mean())
+        return [
+            (shift, SHIFT, f"the camera's view moved by {shift:.1%} of its side"),
+            (zoom, ZOOM, f"the camera's view was zoomed by {zoom:.1%}"),
+            (slope, SLOPE, f"the light changed by {slope:.0%} more at one side than in the middle"),
+            (1 - sharpness, 1 - SHARPNESS, f"the image lost {1 - sharpness:.0%} of its fine detail"),
+            (covered, COVERED, f"{covered:.0%} of the image lost its detail, as if it was covered,"),
+        ]
+
+    def _begin(self, pixels: Floats) -> None:
+        """Prepares the comparison with the first frame."""
+        self._smooth = cv2.GaussianBlur(pixels, (0, 0), _SMOOTHING)
+        self._detail = _block_means(np.square(cv2.Laplacian(self._smooth, cv2.CV_32F)))
+        side = len(pixels)
+        y, x = np.meshgrid(*[np.linspace(-1, 1, side, dtype=np.float32)] * 2, indexing="ij")
+        # Gray levels per shift by one side, and per zoom about the middle.
+        right, down = (cv2.Sobel(self._smooth, cv2.CV_32F, *axis, scale=-side / 8) for axis in ((1, 0), (0, 1)))
+        parts = (right, down, (right * x + down * y) / 2, np.ones_like(x), self._smooth - self._smooth.mean(), x, y)
+        self._directions = np.stack([_sampled(part) for part in parts], axis=1)  # (N, 7)
+        # A direction that no texture shows stays at zero.
+        self._prior = np.diag(np.array([side**2] * 3 + [1] * 4, np.float32) * len(self._directions) / 400)
+
+
+_SMOOTHING: Final = 0.8
+"""Standard deviation of the smoothing against noise, in pixels."""
+
+
+def _sampled(image: Floats) -> Floats:
+    """Returns evenly spaced pixels, (N,)."""
+    step = len(image) // _SAMPLES
+    return image[step // 2 :: step, step // 2 :: step][:_SAMPLES, :_SAMPLES].ravel()
+
+
+def _block_means(image: Floats) -> Floats:
+    """Returns the means of the blocks of an image, (B, B)."""
+    return np.asarray(cv2.resize(image, (_GRID, _GRID), interpolation=cv2.INTER_AREA), np.float32)
