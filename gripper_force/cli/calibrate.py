@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gripper_force.cli import console
-from gripper_force.cli.options import AsJson, ConfigPath, Overrides, load_settings
+from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, load_settings
 from gripper_force.cli.output.calibrate import jaws_table, object_table, rig_table
 from gripper_force.errors import ConfigError
 
@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from gripper_force.interfaces import Progress
 
 app = typer.Typer(
-    no_args_is_help=True, help="Calibrate the jaws, the load cell, the servo, the camera, or an object."
+    no_args_is_help=True,
+    help="Calibrate the jaws, the load cell, the servo, the camera, an object, or a network's claimed errors.",
 )
 
 RigPath = Annotated[
@@ -200,6 +201,25 @@ def object_(
             soft_wrap=True,
         )
     console.show(result.as_dict(), as_json, lambda _: object_table(result))
+
+
+@app.command("network")
+def network(
+    data: Annotated[Path, typer.Argument(help="Folder with logs that were not used for training.")],
+    out: Annotated[Path, typer.Option("--out", help="Checkpoint to write; it may be the same file.")],
+    checkpoint: Annotated[str, typer.Option(help="Path of a checkpoint, or default or small.")] = "default",
+    jobs: Jobs = CORES,
+    as_json: AsJson = False,
+) -> None:
+    """Fit a network's out-of-distribution score and claimed errors to logs of what it knows."""
+    from gripper_force.jobs.dataset import find_logs
+    from gripper_force.jobs.training.ood_fit import calibrate_network
+
+    logs = find_logs(data)
+    with console.bar("calibrating", 2 * len(logs)) as progress:
+        model = calibrate_network(logs, out, checkpoint, workers=jobs, progress=progress)
+    fitted = model.model_dump(mode="json", exclude={"mean", "axes"})
+    console.show({"checkpoint": str(out), **fitted}, as_json)
 
 
 def _tell_existing(settings: "Config", touches: int, folder: Path, fresh: bool) -> None:

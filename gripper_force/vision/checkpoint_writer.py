@@ -24,7 +24,7 @@ def save_checkpoint(path: Path, networks: Sequence[ForceNetwork], header: Header
         for i, network in enumerate(networks)
         for name, tensor in network.state_dict().items()
     }
-    data = save(tensors, metadata={FORMAT: header.model_dump_json()})
+    data = save(tensors, metadata={FORMAT: header.model_dump_json(exclude_none=True)})
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
+import numpy.typing as npt
 
 from gripper_force.config import VisionConfig
 from gripper_force.errors import ConfigError, DataError, NonFiniteError
@@ -13,8 +14,9 @@ from gripper_force.profiles.object_profile import find_object, read_object
 from gripper_force.types import ForceEstimate, Gray
 from gripper_force.vision.engines import Engine, Floats, Precision, open_engine
 from gripper_force.vision.frame_checks import FrameChecks
-from gripper_force.vision.header import RESIDUAL_HALF_N, Model
+from gripper_force.vision.header import RESIDUAL_HALF_N, Header, Model
 from gripper_force.vision.model_files import read_model
+from gripper_force.vision.ood import OodScore
 from gripper_force.vision.preprocess import Normaliser, Region, downscale
 
 
@@ -27,8 +29,9 @@ class ForceEstimator:
 
     The estimate is the mean over the members of the ensemble, corrected by the object profile if there is
     one. Its standard deviation is that of the profile's interval. Without a profile, it combines the error
-    measured in validation at that force with half of the members' spread, as independent errors. It
-    grows with the distance to the forces seen in validation or calibration.
+    measured in validation at that force with half of the members' spread, as independent errors, and
+    grows with the frame's out-of-distribution score. It grows with the distance to the forces seen in
+    validation or calibration. The score is the object profile's, or without one the checkpoint's.
     """
 
     def __init__(
@@ -49,8 +52,7 @@ class ForceEstimator:
         self._engine = engine
         self._preprocess = engine.header.preprocess
         self._correction = correction
-        self._residual_forces = [residual.force_n for residual in engine.header.residuals]
-        self._residual_stds = [residual.std_n for residual in engine.header.residuals]
+        self._ood = None if engine.header.ood is None else OodScore(engine.header.ood)
         self.reset()
 
     @classmethod
@@ -121,7 +123,7 @@ class ForceEstimator:
 
         Raises:
             DataError: The frame is not a gray image of bytes, is implausible (see `FrameChecks`), or its
-                out-of-distribution score exceeds the limit of the object profile.
+                out-of-distribution score exceeds the limit of the object profile or of the checkpoint.
             ConfigError: The region of interest reaches beyond the frame.
             NonFiniteError: A network returned NaN or infinity.
         """
@@ -141,16 +143,34 @@ class ForceEstimator:
         force_n = sum(forces) / len(forces)
         if self._correction is not None:
             return _corrected(self._correction, force_n, step.features)
-        residual_n = float(np.interp(force_n, self._residual_forces, self._residual_stds))
-        # No error was measured at these forces.
-        least_n = self._residual_forces[0] - RESIDUAL_HALF_N
-        most_n = self._residual_forces[-1] + RESIDUAL_HALF_N
-        beyond_n = max(least_n - force_n, force_n - most_n, 0.0)
-        return ForceEstimate(force_n, math.hypot(residual_n + beyond_n, (max(forces) - min(forces)) / 2))
+        std_n = float(claimed_std_n(self._engine.header, step.forces_n[:, None])[0])
+        if self._ood is not None:
+            score = float(self._ood.score(step.features[None], [force_n])[0])
+            if score > 1:
+                raise DataError(
+                    f"the frame's out-of-distribution score is {score:.1f} times the network's limit: it shows what "
+                    "the network does not know; calibrate the object, or train a network with it"
+                )
+            std_n *= float(self._ood.std_factor(score))
+        return ForceEstimate(force_n, std_n)
 
     def attention_map(self) -> Floats | None:
         """Returns SSAM's attention map of the newest frame, (h, w) in 0..1; None without SSAM or a frame."""
         return self._attention
+
+
+def claimed_std_n(header: Header, forces_n: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+    """Returns the standard deviation that a checkpoint claims, (N,), for its members' forces (M, N).
+
+    It does not include the factor of the out-of-distribution score.
+    """
+    force_n = forces_n.mean(0, dtype=np.float64)
+    known_n = np.array([residual.force_n for residual in header.residuals])
+    residual_n = np.interp(force_n, known_n, [residual.std_n for residual in header.residuals])
+    # No error was measured beyond these forces.
+    beyond_n = np.abs(force_n - force_n.clip(known_n[0] - RESIDUAL_HALF_N, known_n[-1] + RESIDUAL_HALF_N))
+    std_n: npt.NDArray[np.float64] = np.hypot(residual_n + beyond_n, np.ptp(forces_n, axis=0) / 2)
+    return std_n
 
 
 def open_estimator(

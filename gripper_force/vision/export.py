@@ -243,7 +243,7 @@ def _replace_header(header: Header, path: Path) -> None:
     tree = ET.parse(path)  # noqa: S314 - written just before
     entry = tree.find(f"rt_info/{KEY}/header")
     assert entry is not None
-    entry.set("value", header.model_dump_json())
+    entry.set("value", header.model_dump_json(exclude_none=True))
     tree.write(path, encoding="utf-8", xml_declaration=True)
 
 

@@ -111,11 +111,13 @@ class FrameChecks:
             weight = (1 + np.square((difference - self._directions @ change) / scale)) ** -2
             weighted = self._directions.T * weight
             change = np.linalg.solve(weighted @ self._directions + self._prior, weighted @ difference)
+        still = np.abs(difference - self._directions @ change) < 2 * _SCALES[1]
+        if still.mean() < _STILL:  # nothing to compare with
+            change[:], still[:] = 0, False
         shift, zoom = float(np.hypot(*change[:2])), float(abs(change[2]))
         slope = float(np.hypot(*change[5:])) / self._first[0] if self._first else 0.0
-        still = np.abs(difference - self._directions @ change) < 2 * _SCALES[1]
         detail = _block_means(np.square(cv2.Laplacian(smooth, cv2.CV_32F)))
-        ratio = detail / (self._detail + 1)
+        ratio = (detail + _NOISE) / (self._detail + _NOISE)
         kept = ratio[_block_means(still.reshape(_SAMPLES, -1).astype(np.float32)) > 0.7]
         sharpness = float(np.median(kept)) if len(kept) else 1.0
         covered = float((ratio < 0.3).mean())
@@ -134,15 +136,31 @@ class FrameChecks:
         side = len(pixels)
         y, x = np.meshgrid(*[np.linspace(-1, 1, side, dtype=np.float32)] * 2, indexing="ij")
         # Gray levels per shift by one side, and per zoom about the middle.
-        right, down = (cv2.Sobel(self._smooth, cv2.CV_32F, *axis, scale=-side / 8) for axis in ((1, 0), (0, 1)))
-        parts = (right, down, (right * x + down * y) / 2, np.ones_like(x), self._smooth - self._smooth.mean(), x, y)
+        right, down = (
+            cv2.Sobel(self._smooth, cv2.CV_32F, *axis, scale=-side / 8) for axis in ((1, 0), (0, 1))
+        )
+        parts = (
+            right,
+            down,
+            (right * x + down * y) / 2,
+            np.ones_like(x),
+            self._smooth - self._smooth.mean(),
+            x,
+            y,
+        )
         self._directions = np.stack([_sampled(part) for part in parts], axis=1)  # (N, 7)
         # A direction that no texture shows stays at zero.
         self._prior = np.diag(np.array([side**2] * 3 + [1] * 4, np.float32) * len(self._directions) / 400)
 
 
+_STILL: Final = 0.25
+"""Least share of the image that must follow the fitted change. In presses it is 0.5 or more."""
+
 _SMOOTHING: Final = 0.8
 """Standard deviation of the smoothing against noise, in pixels."""
+
+_NOISE: Final = 1.0
+"""Fine detail that is only noise, in squared gray levels: a block without texture can lose none."""
 
 
 def _sampled(image: Floats) -> Floats:

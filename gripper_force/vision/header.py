@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final, Literal, Self
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Base64UrlBytes, Field, ValidationError, model_validator
 
 from gripper_force.errors import CheckpointError, ConfigError
 from gripper_force.schema import Finite, NonNegative, Positive, Section
@@ -104,6 +104,35 @@ class Residual(Section):
     std_n: NonNegative
 
 
+class OodLimit(Section):
+    """Out-of-distribution limit at one estimated force."""
+
+    force_n: Finite
+    limit: Positive
+
+
+class OodModel(Section):
+    """Model of the features of known frames, for the out-of-distribution score (see `gripper_force.vision.ood`).
+
+    Attributes:
+        network: The checkpoint's digest: SHA-256 of the file without this model, which can be added later.
+        mean: Mean of the features without contact, (F,) float32.
+        axes: Orthonormal basis of the subspace near which the features lie, (F, R) float16.
+        floor: Mean squared distance of features without contact from their mean.
+        limits: Highest score by estimated force at which a frame is used, in order of rising force.
+        std_base: Factor of the claimed standard deviation at score 0.
+        std_growth: Growth of that factor with the score, added as the root of the sum of squares.
+    """
+
+    network: str
+    mean: Base64UrlBytes
+    axes: Base64UrlBytes
+    floor: Positive
+    limits: Annotated[tuple[OodLimit, ...], Field(min_length=1)]
+    std_base: Positive
+    std_growth: NonNegative
+
+
 class Header(Section):
     """Metadata of a checkpoint.
 
@@ -114,6 +143,7 @@ class Header(Section):
         data_digest: SHA-256 of the training set.
         metrics: Metrics on the validation data, such as ``mae_n``; ``constant_mae_n`` is that of the mean force
             of the training data, for comparison.
+        ood: Model for the out-of-distribution score; None in checkpoints of earlier versions.
     """
 
     members: tuple[NetworkConfig, ...]
@@ -121,6 +151,7 @@ class Header(Section):
     residuals: tuple[Residual, ...]
     data_digest: str
     metrics: dict[str, float]
+    ood: OodModel | None = None
 
     @model_validator(mode="after")
     def _fits(self) -> "Header":
@@ -128,6 +159,10 @@ class Header(Section):
             raise ValueError("an ensemble needs at least one member and one residual")
         if any(member.size != self.preprocess.size for member in self.members):
             raise ValueError("preprocess.size and the size of every member must be equal")
+        if self.ood is not None:
+            features = sum(member.head for member in self.members)
+            if len(self.ood.mean) != 4 * features or not self.ood.axes or len(self.ood.axes) % (2 * features):
+                raise ValueError(f"ood.mean and ood.axes do not have {features} rows, one for each feature")
         return self
 
 
@@ -138,7 +173,7 @@ class Model:
     Attributes:
         path: The file.
         header: Its header.
-        digest: SHA-256 of the checkpoint: the file itself, or the one that it was exported from.
+        digest: Digest of the checkpoint, or of the one that it was exported from (see `digest_of`).
     """
 
     path: Path
@@ -198,12 +233,25 @@ def header_from(text: str, path: Path) -> Header:
 
 def exported_metadata(model: Model) -> dict[str, str]:
     """Returns the metadata of a file exported from a model."""
-    return {"header": model.header.model_dump_json(), "digest": model.digest}
+    return {"header": model.header.model_dump_json(exclude_none=True), "digest": model.digest}
 
 
-def digest_of(data: bytes) -> str:
-    """Returns the SHA-256 of a checkpoint's content."""
-    return hashlib.sha256(data).hexdigest()
+def digest_of(data: bytes, header: Header) -> str:
+    """Returns the digest of a checkpoint: SHA-256 of its content without the header's `OodModel`.
+
+    That model changes no force, so an object profile stays valid when it is added or fitted again.
+    """
+    return hashlib.sha256(data).hexdigest() if header.ood is None else header.ood.network
+
+
+def with_header(data: bytes, header: Header) -> bytes:
+    """Returns a checkpoint's content with another header. The weights stay bit for bit."""
+    length = int.from_bytes(data[:8], "little")
+    entries = json.loads(data[8 : 8 + length])
+    entries["__metadata__"] = {FORMAT: header.model_dump_json(exclude_none=True)}
+    text = json.dumps(entries, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    return len(text).to_bytes(8, "little") + text + data[8 + length :]
 
 
 def _metadata(data: bytes) -> dict[str, str]:

@@ -18,6 +18,7 @@ from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import Clip, check_size, digest, split_by
 from gripper_force.jobs.training.batches import Batches
+from gripper_force.jobs.training.ood_fit import MIN_LOGS, add_ood, fit_ood
 from gripper_force.jobs.training.parallel import Ranks, joined
 from gripper_force.jobs.training.recipe import TrainConfig as TrainConfig
 from gripper_force.jobs.training.recipe import continued
@@ -62,7 +63,8 @@ def train(
             recipe leaves unset; None for random weights.
         resume: Continue an interrupted training from its saved states.
         progress: Called with the training error; `PROGRESS_STEPS` for each network in total.
-        warn: Called with a sentence if the training was too short to draw a clip from each recording.
+        warn: Called with a sentence if the training was too short to draw a clip from each recording, or if
+            there are too few validation clips for an out-of-distribution score.
 
     Returns:
         The checkpoint as written.
@@ -102,6 +104,13 @@ def train(
                 },
             )
             save_checkpoint(out, networks, header)
+            if (ood := fit_ood(networks, header, held_out, ranks.device)) is None:
+                warn(
+                    f"the checkpoint has no out-of-distribution score, which needs {MIN_LOGS} validation logs that "
+                    "show contact; fit one with `gripper-force calibrate network`"
+                )
+            else:
+                add_ood(out, ood, out)
             for state in states:
                 state.unlink()
         ranks.wait()

@@ -1,0 +1,205 @@
+"""Fit of a checkpoint's out-of-distribution score and of its claimed deviation, on logs not trained on."""
+
+from base64 import urlsafe_b64encode
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize
+
+from gripper_force.errors import CheckpointError, DataError
+from gripper_force.interfaces import Progress, no_progress
+from gripper_force.jobs.dataset import CONTACT_N, Clip, check_size, load_clips, without_contact_starts
+from gripper_force.vision.batch_inference import features
+from gripper_force.vision.checkpoint import load_checkpoint
+from gripper_force.vision.estimator import claimed_std_n
+from gripper_force.vision.header import Header, OodLimit, OodModel, digest_of, read_checkpoint, with_header
+from gripper_force.vision.network import ForceNetwork
+from gripper_force.vision.ood import residual_share
+
+Floats = npt.NDArray[np.float64]
+
+DIMENSIONS: Final = 32
+"""Dimensions of the subspace near which the features of known frames lie."""
+
+REJECTED: Final = 0.02
+"""Share of the frames of left-out logs above the limit, at each force."""
+
+EDGES_N: Final = (0.5, 1.5, 3.0, 6.0)
+"""Edges between the bins of estimated force that have a limit each."""
+
+MIN_LOGS: Final = 8
+"""Fewer logs with contact do not show how logs differ."""
+
+_FOLDS: Final = 4
+_MAX_FRAMES: Final = 1500
+"""Frames for a subspace. Adjacent frames carry nearly the same data, and the cost is cubic."""
+
+
+class _Seen(NamedTuple):
+    """What the networks make of the labelled frames of one log."""
+
+    features: npt.NDArray[np.float32]  # (N, F)
+    estimate_n: Floats  # (N,)
+    std_n: Floats  # (N,), claimed without the score
+    force_n: Floats  # (N,)
+
+
+def fit_ood(
+    networks: Sequence[ForceNetwork],
+    header: Header,
+    clips: Sequence[Clip],
+    device: str = "cpu",
+    progress: Progress = no_progress,
+) -> OodModel | None:
+    """Fits the model with the logs in four parts: each part is scored by the subspace of the others.
+
+    Args:
+        networks: The members, in evaluation mode, on ``device``.
+        header: Their header; its ``ood`` is not used.
+        clips: Recordings that the networks were not trained on, of the kinds of objects and scenes they know.
+        device: Device of the networks.
+        progress: Called after each clip.
+
+    Returns:
+        The model, without the checkpoint's digest; None with fewer than `MIN_LOGS` logs that show contact.
+    """
+    check_size(clips, header.preprocess)
+    seen = []
+    for clip in clips:
+        forces_n, read_out = features(networks, header.preprocess, clip.frames, device)
+        used = clip.valid & (np.arange(len(clip.frames)) >= header.preprocess.lead_in)
+        if (clip.forces_n[used] > CONTACT_N).any():
+            std_n = claimed_std_n(header, forces_n[:, used])
+            force_n = clip.forces_n[used].astype(np.float64)
+            seen.append(_Seen(read_out[used], forces_n[:, used].mean(0).astype(np.float64), std_n, force_n))
+        progress(f"scored {clip.name}")
+    if len(seen) < MIN_LOGS:
+        return None
+    fold = np.random.default_rng(0).permutation(len(seen)) % _FOLDS
+    shares: list[Floats] = [np.empty(0)] * len(seen)
+    for part in range(_FOLDS):
+        subspace = _subspace([log for log, own in zip(seen, fold, strict=True) if own != part])
+        for i in np.flatnonzero(fold == part):
+            shares[i] = residual_share(seen[i].features, *subspace)
+    estimate_n, std_n, force_n = (
+        np.concatenate(values)
+        for values in zip(*((log.estimate_n, log.std_n, log.force_n) for log in seen), strict=True)
+    )
+    mean, axes, floor = _subspace(seen)
+    model = OodModel(
+        network="",
+        mean=_encoded(mean, np.float32),
+        axes=_encoded(axes, np.float16),
+        floor=floor,
+        limits=_limits(np.concatenate(shares), estimate_n),
+        std_base=1.0,
+        std_growth=0.0,
+    )
+    limit = np.interp(estimate_n, *zip(*((o.force_n, o.limit) for o in model.limits), strict=True))
+    score = np.concatenate(shares) / limit
+    used = (score <= 1) & (force_n > CONTACT_N)
+    base, growth = _std_factors(score[used], (estimate_n - force_n)[used] / std_n[used])
+    return model.model_copy(update={"std_base": base, "std_growth": growth})
+
+
+def add_ood(source: str | Path, model: OodModel, out: Path) -> None:
+    """Writes a checkpoint with a fitted model. The weights and the digest stay.
+
+    Args:
+        source: Path or name of the checkpoint.
+        model: The model.
+        out: Checkpoint to write; it may be the same file.
+
+    Raises:
+        CheckpointError: The checkpoint can't be read or written.
+    """
+    _, data, header = read_checkpoint(source)
+    model = model.model_copy(update={"network": digest_of(data, header)})
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_bytes(with_header(data, header.model_copy(update={"ood": model})))
+    except OSError as error:
+        raise CheckpointError(
+            f"can't write the checkpoint {out}: {error.strerror}; name another file"
+        ) from error
+
+
+def calibrate_network(
+    logs: Sequence[Path],
+    out: Path,
+    source: str | Path = "default",
+    *,
+    workers: int = 1,
+    progress: Progress = no_progress,
+) -> OodModel:
+    """Fits a checkpoint's out-of-distribution score and claimed deviation to logs, and writes the checkpoint.
+
+    Args:
+        logs: Logs that the checkpoint was not trained on, of the kinds of objects and scenes it knows. Logs that
+            start in contact are not used.
+        out: Checkpoint to write.
+        source: Path or name of the checkpoint. Its weights stay.
+        workers: Processes that read the logs.
+        progress: Called twice for each log.
+
+    Raises:
+        DataError: There are fewer than `MIN_LOGS` logs that show contact.
+        LogError: A log can't be read.
+        CheckpointError: The checkpoint can't be read or written.
+    """
+    checkpoint = load_checkpoint(source)
+    preprocess = checkpoint.header.preprocess
+    clips = without_contact_starts(load_clips(logs, preprocess, None, workers, progress), preprocess)
+    model = fit_ood(checkpoint.networks, checkpoint.header, clips, progress=progress)
+    if model is None:
+        raise DataError(
+            f"a score needs at least {MIN_LOGS} logs that show contact and were not trained on; simulate or record more"
+        )
+    add_ood(source, model, out)
+    return model
+
+
+def _subspace(logs: Sequence[_Seen]) -> tuple[Floats, Floats, float]:
+    """Returns the mean without contact (F,), the axes (F, R), and the spread without contact."""
+    read_out = np.concatenate([log.features for log in logs]).astype(np.float64)
+    free = np.concatenate([log.force_n for log in logs]) < CONTACT_N
+    if not free.any():
+        free[:] = True
+    mean = read_out[free].mean(0)
+    floor = max(float(np.square(read_out[free] - mean).sum(1).mean()), 1e-6)
+    step = -(-len(read_out) // _MAX_FRAMES)
+    deviation = read_out[::step] - mean
+    values, vectors = np.linalg.eigh(deviation @ deviation.T)  # rising
+    keep = np.flatnonzero(values > values[-1] * 1e-9)[-DIMENSIONS:]
+    return mean, deviation.T @ (vectors[:, keep] / np.sqrt(values[keep])), floor
+
+
+def _limits(share: Floats, estimate_n: Floats) -> tuple[OodLimit, ...]:
+    """Returns the limit of each bin of estimated force that has frames."""
+    bins = np.digitize(estimate_n, EDGES_N)
+    return tuple(
+        OodLimit(
+            force_n=float(np.median(estimate_n[bins == i])),
+            limit=max(float(np.quantile(share[bins == i], 1 - REJECTED)), 1e-6),
+        )
+        for i in np.unique(bins)
+    )
+
+
+def _std_factors(score: Floats, z: Floats) -> tuple[float, float]:
+    """Returns base and growth of the claimed deviation's factor: maximum likelihood of normal errors."""
+
+    def cost(log_factors: Floats) -> float:
+        variance = np.square(np.exp(log_factors[0])) + np.square(np.exp(log_factors[1]) * score)
+        return float((np.square(z) / variance + np.log(variance)).mean())
+
+    base, growth = np.exp(minimize(cost, np.array([0.0, -1.0]), method="Nelder-Mead").x)
+    return float(base), float(growth)
+
+
+def _encoded(values: Floats, dtype: type[np.floating]) -> bytes:
+    """Returns an array as the header's text: base64 of its bytes."""
+    return urlsafe_b64encode(values.astype(dtype).tobytes())
