@@ -14,6 +14,7 @@ from gripper_force.cli.output.bench import (
     commands_table,
     estimator_table,
     loop_table,
+    recognition_table,
     scene_table,
     startup_table,
     training_table,
@@ -129,6 +130,28 @@ def loop(
     with console.err.status(f"running for {2 * seconds:g} s"):
         costs, log = loop_bench.loop(seconds, set_ or [], config)
     _show({"loop": costs, "log": log}, as_json, lambda: loop_table(costs, log))
+
+
+@app.command("recognition")
+def recognition(
+    presses: Annotated[int, typer.Option(min=1, help="Simulated presses of each row.")] = 8,
+    write: Page = None,
+    folder: Folder = Path("runs/recognition"),
+    jobs: Jobs = CORES,
+    config: ConfigPath = None,
+    set_: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure which unknown objects, views and disturbances a network recognises. Continues if interrupted."""
+    from gripper_force.qualification import recognition as job
+    from gripper_force.qualification.markdown_blocks import write_between
+
+    settings = load_settings(config, set_, {})
+    with console.bar("recognition", presses * len(job.ROWS)) as progress:
+        rows = job.measure(settings, folder, presses, jobs, progress)
+    if write is not None:
+        write_between(write, "recognition", job.markdown(rows))
+    console.show({"rows": rows}, as_json, lambda _: recognition_table(rows))
 
 
 @app.command("startup")

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from gripper_force.qualification.bench.scene_bench import SceneCost
     from gripper_force.qualification.bench.startup_bench import Start
     from gripper_force.qualification.bench.training_bench import Point
+    from gripper_force.qualification.recognition import Figures
 
 
 def commands_table(costs: "Sequence[CommandCost]") -> None:
@@ -124,6 +125,16 @@ def estimator_table(costs: "Sequence[EstimatorCost]", ratios: "Ratios", plot: Pa
         )
     pairs({"*": "Pareto front: no other variant is both faster and more accurate"})
     pairs({"plot": str(plot), "results": str(file)})
+
+
+def recognition_table(rows: "Sequence[Figures]") -> None:
+    """Prints what a network recognises as unfamiliar."""
+    from gripper_force.qualification.recognition import HEADINGS, texts
+
+    table = Table("group", "row", *HEADINGS.values(), box=None)
+    for row in rows:
+        table.add_row(row["group"], row["name"], *texts(row))
+    out.print(table)
 
 
 def training_table(points: "Sequence[Point]", reached: Mapping[str, float | None], folder: Path) -> None:
