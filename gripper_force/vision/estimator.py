@@ -105,6 +105,8 @@ class ForceEstimator:
         self._frame_checks = FrameChecks()
         self._normaliser = Normaliser(self._preprocess)
         self._engine.reset()
+        if self._ood is not None:
+            self._ood.reset()
         self._attention: Floats | None = None
 
     @property
@@ -145,7 +147,7 @@ class ForceEstimator:
             return _corrected(self._correction, force_n, step.features)
         std_n = float(claimed_std_n(self._engine.header, step.forces_n[:, None])[0])
         if self._ood is not None:
-            score = float(self._ood.score(step.features[None], [force_n])[0])
+            score = float(self._ood.score(step.features[None], np.array([force_n]))[0])
             if score > 1:
                 raise DataError(
                     f"the frame's out-of-distribution score is {score:.1f} times the network's limit: it shows what "

@@ -105,9 +105,16 @@ class Residual(Section):
 
 
 class OodLimit(Section):
-    """Out-of-distribution limit at one estimated force."""
+    """Out-of-distribution limit at one estimated force.
+
+    Attributes:
+        force_n: The force.
+        typical: Median share of the residual in known frames.
+        limit: Highest smoothed ratio to ``typical`` at which a frame is used.
+    """
 
     force_n: Finite
+    typical: Positive
     limit: Positive
 
 
@@ -118,8 +125,8 @@ class OodModel(Section):
         network: The checkpoint's digest: SHA-256 of the file without this model, which can be added later.
         mean: Mean of the features without contact, (F,) float32.
         axes: Orthonormal basis of the subspace near which the features lie, (F, R) float16.
-        floor: Mean squared distance of features without contact from their mean.
-        limits: Highest score by estimated force at which a frame is used, in order of rising force.
+        floor: Squared distance from the mean that is added to a frame's.
+        limits: Limits, in order of rising force.
         std_base: Factor of the claimed standard deviation at score 0.
         std_growth: Growth of that factor with the score, added as the root of the sum of squares.
     """

@@ -1,11 +1,15 @@
-"""Out-of-distribution score of a frame: the part of its features that no known frame shows.
+"""Out-of-distribution score of a stream of frames: the part of their features that no known frame shows.
 
-The features of known frames lie near a linear subspace of few dimensions. The score is the squared distance of
-a frame's features from that subspace, as a share of their squared distance from the mean without contact. It
-thus compares what is unfamiliar in a frame with all that the frame shows, so one limit suits light and firm
-contacts better than the distance alone: the Q statistic of J. E. Jackson and G. S. Mudholkar, Technometrics 21
-(1979) 341-349, doi:10.1080/00401706.1979.10489779, which grows with the force. docs/decisions/0024 compares them.
+The features of known frames lie near a linear subspace of few dimensions. What counts is a frame's squared
+distance from that subspace, as a share of its squared distance from the mean without contact, over the median of
+known frames at that force. It compares what is unfamiliar in a frame with all that the frame shows; the distance
+alone, the Q statistic of J. E. Jackson and G. S. Mudholkar, Technometrics 21 (1979) 341-349,
+doi:10.1080/00401706.1979.10489779, grows with the force. An unknown object is unknown in all frames, so the
+logarithm is averaged over the last frames: single known frames vary as much as known and unknown objects differ.
+docs/decisions/0024 compares the scores.
 """
+
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +17,9 @@ import numpy.typing as npt
 from gripper_force.vision.header import OodModel
 
 Floats = npt.NDArray[np.float64]
+
+FRAMES: Final = 20
+"""Frames that the score is averaged over: a third of a second at 60 frames per second."""
 
 
 def residual_share(
@@ -37,22 +44,50 @@ def residual_share(
 
 
 class OodScore:
-    """Scores features with the model of a checkpoint."""
+    """Scores the frames of a stream with the model of a checkpoint."""
 
     def __init__(self, model: OodModel) -> None:
         self._mean = np.frombuffer(model.mean, np.float32)
         self._axes = np.frombuffer(model.axes, np.float16).reshape(len(self._mean), -1).astype(np.float32)
         self._floor = model.floor
-        self._forces_n = [limit.force_n for limit in model.limits]
-        self._limits = [limit.limit for limit in model.limits]
+        self._forces_n, self._typical, self._limit = np.array(
+            [(limit.force_n, limit.typical, limit.limit) for limit in model.limits]
+        ).T
         self._std = model.std_base, model.std_growth
+        self.reset()
 
-    def score(self, features: npt.NDArray[np.float32], estimate_n: npt.ArrayLike) -> Floats:
-        """Returns the score over its limit, (N,), for features (N, F) and estimates (N,); above 1 is rejected."""
+    def reset(self) -> None:
+        """Starts a new stream."""
+        self._smooth = Smooth()
+
+    def score(self, features: npt.NDArray[np.float32], estimates_n: Floats) -> Floats:
+        """Returns the score over its limit, (N,); above 1 a frame is rejected.
+
+        Args:
+            features: Features of the next frames of the stream, (N, F).
+            estimates_n: Their estimates, (N,).
+        """
         share = residual_share(features, self._mean, self._axes, self._floor)
-        return share / np.interp(estimate_n, self._forces_n, self._limits)
+        ratio = self._smooth.step(share / np.interp(estimates_n, self._forces_n, self._typical))
+        return ratio / np.interp(estimates_n, self._forces_n, self._limit)
 
     def std_factor(self, score: npt.ArrayLike) -> Floats:
         """Returns the factor of the claimed standard deviation, (N,), for scores over the limit (N,)."""
         base, growth = self._std
         return np.hypot(base, growth * np.asarray(score, np.float64))
+
+
+class Smooth:
+    """Geometric mean over the last frames, with weights that decay by 1/e in `FRAMES` frames."""
+
+    def __init__(self) -> None:
+        self._mean, self._weight = 0.0, 0.0
+
+    def step(self, ratios: Floats) -> Floats:
+        """Returns the mean up to each of the next ratios, (N,)."""
+        means = np.empty(len(ratios))
+        for i, value in enumerate(np.log(ratios.clip(1e-9))):
+            self._weight = self._weight * (1 - 1 / FRAMES) + 1
+            self._mean += (value - self._mean) / self._weight
+            means[i] = self._mean
+        return np.exp(means)

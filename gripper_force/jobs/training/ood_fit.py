@@ -17,14 +17,14 @@ from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.estimator import claimed_std_n
 from gripper_force.vision.header import Header, OodLimit, OodModel, digest_of, read_checkpoint, with_header
 from gripper_force.vision.network import ForceNetwork
-from gripper_force.vision.ood import residual_share
+from gripper_force.vision.ood import Smooth, residual_share
 
 Floats = npt.NDArray[np.float64]
 
 DIMENSIONS: Final = 32
 """Dimensions of the subspace near which the features of known frames lie."""
 
-REJECTED: Final = 0.02
+REJECTED: Final = 0.03
 """Share of the frames of left-out logs above the limit, at each force."""
 
 EDGES_N: Final = (0.5, 1.5, 3.0, 6.0)
@@ -34,7 +34,9 @@ MIN_LOGS: Final = 8
 """Fewer logs with contact do not show how logs differ."""
 
 _FOLDS: Final = 4
-_MAX_FRAMES: Final = 1500
+_FLOOR: Final = 0.05
+"""Floor as a share of the median squared distance in contact: without contact, the distances are noise."""
+_MAX_FRAMES: Final = 800
 """Frames for a subspace. Adjacent frames carry nearly the same data, and the cost is cubic."""
 
 
@@ -94,12 +96,13 @@ def fit_ood(
         mean=_encoded(mean, np.float32),
         axes=_encoded(axes, np.float16),
         floor=floor,
-        limits=_limits(np.concatenate(shares), estimate_n),
+        limits=_limits(shares, [log.estimate_n for log in seen]),
         std_base=1.0,
         std_growth=0.0,
     )
-    limit = np.interp(estimate_n, *zip(*((o.force_n, o.limit) for o in model.limits), strict=True))
-    score = np.concatenate(shares) / limit
+    score = np.concatenate(
+        [_ratios(model.limits, *log) for log in zip(shares, [log.estimate_n for log in seen], strict=True)]
+    ) / np.interp(estimate_n, [o.force_n for o in model.limits], [o.limit for o in model.limits])
     used = (score <= 1) & (force_n > CONTACT_N)
     base, growth = _std_factors(score[used], (estimate_n - force_n)[used] / std_n[used])
     return model.model_copy(update={"std_base": base, "std_growth": growth})
@@ -163,13 +166,14 @@ def calibrate_network(
 
 
 def _subspace(logs: Sequence[_Seen]) -> tuple[Floats, Floats, float]:
-    """Returns the mean without contact (F,), the axes (F, R), and the spread without contact."""
+    """Returns the mean without contact (F,), the axes (F, R), and the floor."""
     read_out = np.concatenate([log.features for log in logs]).astype(np.float64)
     free = np.concatenate([log.force_n for log in logs]) < CONTACT_N
     if not free.any():
         free[:] = True
     mean = read_out[free].mean(0)
-    floor = max(float(np.square(read_out[free] - mean).sum(1).mean()), 1e-6)
+    total = np.square(read_out - mean).sum(1)
+    floor = max(_FLOOR * float(np.median(total[~free] if (~free).any() else total)), 1e-6)
     step = -(-len(read_out) // _MAX_FRAMES)
     deviation = read_out[::step] - mean
     values, vectors = np.linalg.eigh(deviation @ deviation.T)  # rising
@@ -177,16 +181,30 @@ def _subspace(logs: Sequence[_Seen]) -> tuple[Floats, Floats, float]:
     return mean, deviation.T @ (vectors[:, keep] / np.sqrt(values[keep])), floor
 
 
-def _limits(share: Floats, estimate_n: Floats) -> tuple[OodLimit, ...]:
-    """Returns the limit of each bin of estimated force that has frames."""
+def _limits(shares: Sequence[Floats], estimates_n: Sequence[Floats]) -> tuple[OodLimit, ...]:
+    """Returns the limit of each bin of estimated force that has frames, for the frames of each log."""
+    share, estimate_n = np.concatenate(shares), np.concatenate(estimates_n)
     bins = np.digitize(estimate_n, EDGES_N)
-    return tuple(
+    kinds = [(i, bins == i) for i in np.unique(bins)]
+    typical = [
         OodLimit(
-            force_n=float(np.median(estimate_n[bins == i])),
-            limit=max(float(np.quantile(share[bins == i], 1 - REJECTED)), 1e-6),
+            force_n=float(np.median(estimate_n[own])),
+            typical=max(float(np.median(share[own])), 1e-9),
+            limit=1.0,
         )
-        for i in np.unique(bins)
+        for _, own in kinds
+    ]
+    ratio = np.concatenate([_ratios(typical, *log) for log in zip(shares, estimates_n, strict=True)])
+    return tuple(
+        limit.model_copy(update={"limit": float(np.quantile(ratio[own], 1 - REJECTED))})
+        for limit, (_, own) in zip(typical, kinds, strict=True)
     )
+
+
+def _ratios(limits: Sequence[OodLimit], share: Floats, estimate_n: Floats) -> Floats:
+    """Returns the smoothed ratio to the typical share, (N,), for the frames of one log."""
+    typical = np.interp(estimate_n, [limit.force_n for limit in limits], [limit.typical for limit in limits])
+    return Smooth().step(share / typical)
 
 
 def _std_factors(score: Floats, z: Floats) -> tuple[float, float]:
