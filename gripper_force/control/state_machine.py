@@ -65,8 +65,9 @@ motor would add to the force of a springy object."""
 
 _SEEN_FILTER_S = 0.1
 _UNSEEN_SHARE = 0.15
-"""A grip counts as held only while the filtered visual estimate is at least this share of the target. Otherwise the
-jaws may press on an end stop or be held by friction, which the motor current cannot tell from an object."""
+"""A grip counts as held only while the filtered visual estimate has risen by at least this share of the target since
+the jaws stopped. Otherwise they may press on an end stop or be held by friction, which the motor current cannot tell
+from an object."""
 
 _OPEN_M = 0.003
 """Distance from the open width at which the jaws count as open."""
@@ -162,7 +163,7 @@ class GraspController:
         self._was_over_force = False
         self._let_go_n = 0.0
         self._seen_n: float | None = None
-        self._seen_ns = 0
+        self._seen_ns, self._seen_before_n = 0, 0.0
         self._has_seen = self._has_unsure = False
         self._goal_current_a = self._measured_motor_force_n = 0.0
         self._derating = 1.0
@@ -275,20 +276,23 @@ class GraspController:
     def _is_unseen(self) -> bool:
         """True if the camera does not confirm a grip.
 
-        It sees next to no force, has been too uncertain throughout this grip, or sees far more than the target
-        while friction may hold the jaws: a network can give any force for an empty scene.
+        It sees next to no rise of the force, has been too uncertain throughout this grip, or sees far more than the
+        target while friction may hold the jaws: a network can give any force for an empty scene.
         """
         target_n = self._derated_target_n
         if self._seen_n is None:
             return self._has_unsure and not self._has_seen
         by_friction = self._motor_force_n - self._estimate.friction_n < _PROVEN_SHARE * target_n
         beyond_n = max(_BEYOND_SHARE * target_n, _BEYOND_N)
-        return self._seen_n < _UNSEEN_SHARE * target_n or (by_friction and self._seen_n - target_n > beyond_n)
+        rise_n = self._seen_n - self._seen_before_n
+        return rise_n < _UNSEEN_SHARE * target_n or (by_friction and self._seen_n - target_n > beyond_n)
 
     @property
     def _sight(self) -> str:
         """The visual estimate in words."""
-        return "is uncertain" if self._seen_n is None else f"sees {self._seen_n:.1f} N"
+        if self._seen_n is None:
+            return "is uncertain"
+        return f"sees {self._seen_n:.1f} N, and saw {self._seen_before_n:.1f} N before the contact"
 
     def _derate(self, t_ns: int, temperature_c: float) -> list[Event]:
         """Lowers the target force of a hot servo, before the servo shuts down."""
@@ -296,13 +300,8 @@ class GraspController:
         if self._derating == before or self._phase not in (Phase.RAMP, Phase.HOLD):
             return []
         self._loop.retarget(self._derated_target_n)
-        return [
-            Event(
-                t_ns,
-                "control",
-                f"the servo is at {temperature_c:.0f} C; holding {self._derated_target_n:.2f} N",
-            )
-        ]
+        text = f"the servo is at {temperature_c:.0f} C; holding {self._derated_target_n:.2f} N"
+        return [Event(t_ns, "control", text)]
 
     def _handle_request(self, t_ns: int, request: Request) -> str:
         """Handles a request. Returns the reason of a refusal, or an empty text."""
@@ -455,6 +454,7 @@ class GraspController:
                 self._goal_width_m = min(self._approach.back_off_width_m, self._transmission.open_width_m)
             case ApproachState.CONTACT:
                 self._has_seen = self._has_unsure = False
+                self._seen_before_n = max(self._seen_n or 0.0, 0.0)
                 self._fusion.reset_variance()
                 self._enter(Phase.CONTACT, f"contact at {width_m * 1e3:.1f} mm")
             case ApproachState.CLOSED:

@@ -165,6 +165,16 @@ def test_object_that_leaves_jaws_on_an_end_stop_is_a_slip_with_a_camera(make_run
     assert any("the camera sees" in reason for reason in run.reasons)
 
 
+def test_force_that_a_camera_sees_before_the_contact_confirms_no_grip(make_run):
+    """A network can take the moving jaws themselves for force."""
+    run = make_run(plant={"contact_m": 1.0, "stops_m": (0.0, 0.020)}, timeout_s=3.0)
+    sample = run.vision.sample
+    run.vision.sample = lambda t_ns, force_n, noise: sample(t_ns, 100.0 * run.plant.x_m, noise)
+    run.grasp(3.0, 4.0)
+    assert run.last.status.outcome == "timeout"
+    assert any("the camera sees" in reason and "before the contact" in reason for reason in run.reasons)
+
+
 def test_camera_that_is_uncertain_throughout_a_grip_prevents_held(make_run):
     run = make_run(vision={"noise_n": 2.0}, timeout_s=3.0).grasp(2.0, 4.0)
     assert run.last.status.outcome == "timeout"
@@ -268,7 +278,7 @@ def test_less_friction_than_configured_is_held(make_run, configured_n, target_n)
 
 def test_force_collapse_is_a_slip(make_run):
     run = make_run(feedback="vision").grasp(4.0, 5.0)
-    run.vision.gain = 0.0
+    run.vision.gain = 0.3
     run.spoil = lambda _, servo: replace(servo, current_a=0.0)  # the motor current drops too
     run.go(1.5)
     assert run.last.status.outcome == "slip"
