@@ -466,6 +466,27 @@ class SimConfig(Section):
     stiffness_spread: float = Field(
         0.05, ge=0, le=0.5, description="half-width of the uniform spread of the object's stiffness"
     )
+    stiffness_octaves: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="half-width in octaves of a further, log-uniform spread of the object's stiffness; "
+        "1: factors 0.5 to 2",
+    )
+    view_spread: float = Field(
+        1.0,
+        ge=0,
+        le=15,
+        description="factor on the ranges from which place, aim and field of view of the camera, and light are "
+        "drawn; 10: other mountings, lenses and zooms",
+    )
+    jaw_spread: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="spread of the jaws' looks, 0 to 1: width and height of the pads, width of the fingers, "
+        "brightness of both",
+    )
     markers: bool = Field(False, description="an ArUco marker on each finger, beside its pad")
     changing_light: bool = Field(False, description="light that changes slowly during a run, by up to 30 %")
     moving_background: bool = Field(False, description="things that move behind the object")

@@ -31,7 +31,11 @@ def simulate(
     ] = None,
     object_: Annotated[
         list[str] | None,
-        typer.Option("--object", help="Simulate this object. Repeatable.  [default: all four, in turn]"),
+        typer.Option(
+            "--object",
+            help="Simulate this object, or a group: training-kinds, held-out-kinds. Repeatable.  "
+            "[default: all four, in turn]",
+        ),
     ] = None,
     protocol: Annotated[
         str | None, typer.Option(help="shin2019: the paper's sets instead, in OUT/train and OUT/test.")
@@ -51,6 +55,7 @@ def simulate(
     """Simulate logs of random touches, for training and evaluation. Continues if it was interrupted."""
     from gripper_force.jobs import paper_protocol
     from gripper_force.jobs import simulate as job
+    from gripper_hw.sim.kinds import held_out_kinds, training_kinds
 
     plans: list[job.Plan]
     if protocol is None:
@@ -60,7 +65,12 @@ def simulate(
             )
         settings = load_settings(config, set_, {})
         seed, plans = 100_000 if first_seed is None else first_seed, []
-        objects = tuple(object_ or job.OBJECTS)
+        groups = {"training-kinds": training_kinds, "held-out-kinds": held_out_kinds}
+        objects = tuple(
+            name
+            for given in object_ or job.OBJECTS
+            for name in (groups[given]() if given in groups else (given,))
+        )
         plans += job.plan("press", 200 if presses is None else presses, seed, objects)
         plans += job.plan("tap", taps or 0, seed + len(plans), objects)
         plans += job.plan("grasp", 20 if grasps is None else grasps, seed + len(plans), objects)
