@@ -20,6 +20,12 @@ Pooling = Literal["wap", "gap"]
 STRIDES: Final[dict[BackboneName, int]] = {"vgg": 16, "resnet18": 32, "mobile": 16}
 """Ratio of the side of a frame to the side of each backbone's feature maps."""
 
+Quantity = Literal["force", "indentation", "contact"]
+"""Output of a network: force, travel of the jaws since contact, log-odds of contact."""
+
+INDENTATION_SCALE_M: Final = 0.02
+"""Travel of the jaws since contact at output 1."""
+
 Count = Annotated[int, Field(ge=1, le=100_000)]
 
 
@@ -38,6 +44,7 @@ class NetworkConfig(Section):
         hidden: Units of each direction of the BLSTM.
         head: Units of the dense layer.
         label_scale_n: Force at output 1 of the last layer.
+        outputs: Outputs of the last layer. A run reads the first, the force.
     """
 
     attention: Attention = "none"
@@ -51,9 +58,12 @@ class NetworkConfig(Section):
     hidden: Count = 256
     head: Count = 1024
     label_scale_n: Positive = 20.0
+    outputs: tuple[Quantity, ...] = ("force",)
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
+        if self.outputs[:1] != ("force",) or len(set(self.outputs)) < len(self.outputs):
+            raise ValueError(f"outputs are {self.outputs}; use each at most once, and force first")
         stride = STRIDES[self.backbone]
         if self.size % stride:
             raise ValueError(

@@ -43,6 +43,7 @@ def train(
     *,
     validation_clips: Sequence[Clip] | None = None,
     init: Checkpoint | None = None,
+    teacher: Checkpoint | None = None,
     resume: bool = False,
     progress: Progress = no_progress,
     warn: Callable[[str], None] = lambda _: None,
@@ -60,6 +61,7 @@ def train(
             ``clips``.
         init: Checkpoint with the initial weights, whose networks and preprocessing replace those that the
             recipe leaves unset; None for random weights.
+        teacher: Checkpoint whose estimates are learned beside the labels, by ``teacher_share``; None for none.
         resume: Continue an interrupted training from its saved states.
         progress: Called with the training error; `PROGRESS_STEPS` for each network in total.
         warn: Called with a sentence if the training was too short to draw a clip from each recording.
@@ -77,6 +79,15 @@ def train(
     """
     if init is not None:
         config = continued(config, init.header)
+    elif config.freeze_statistics:
+        raise ConfigError(
+            "freeze_statistics keeps those of an initial checkpoint; add --init, or set it to false"
+        )
+    if teacher is not None and teacher.header.preprocess != config.preprocess:
+        raise ConfigError(
+            f"the teacher sees frames prepared with {teacher.header.preprocess}, and this network with "
+            f"{config.preprocess}; set the same preprocess keys"
+        )
     training, held_out = clips, validation_clips
     if held_out is None:
         training, held_out = split_by(clips, "set", config.validation, config.seed)
@@ -84,7 +95,8 @@ def train(
     states = state_paths(config, out)
     with joined(config.device) as ranks:
         networks = [
-            t.network for t in _trained(config, training, states, init, resume, ranks, progress, warn)
+            t.network
+            for t in _trained(config, training, states, init, teacher, resume, ranks, progress, warn)
         ]
         if ranks.first:
             forces_n, measured_n = estimates(held_out, networks, config.preprocess, ranks.device)
@@ -118,6 +130,7 @@ def _trained(
     clips: Sequence[Clip],
     states: Sequence[Path],
     init: Checkpoint | None,
+    teacher: Checkpoint | None,
     resume: bool,
     ranks: Ranks,
     progress: Progress,
@@ -130,11 +143,11 @@ def _trained(
     if ranks.count > 1 and config.compile:
         raise ConfigError("compile does not work with several processes; set compile=false")
     batches = Batches(clips, config, ranks)
-    start = init.digest if init is not None else ""
+    start = " ".join(checkpoint.digest if checkpoint is not None else "" for checkpoint in (init, teacher))
     identity = f"{config.model_dump_json(exclude={'device', 'compile'})} {digest(clips)} {start}"
     trainers = []
     for member, state in enumerate(states):
-        trainer = Trainer(config, member, batches, ranks)
+        trainer = Trainer(config, member, batches, ranks, teacher.networks if teacher is not None else ())
         trainers.append(trainer)
         if init is not None:
             trainer.load_weights(init.networks[member])

@@ -22,10 +22,9 @@ def gradients(
 ) -> tuple[float, list[torch.Tensor]]:
     """Loss of the training on complete windows, and its gradients."""
     network.zero_grad()
-    loss = (
-        squared_error(network, inputs, forces_n, valid, network.config.context)
-        / valid[:, network.config.context :].sum()
-    )
+    first = network.config.context
+    known = valid[:, first:]
+    loss = squared_error(network(inputs, first), forces_n[:, first:], known) / known.sum()
     loss.backward()
     return loss.item(), [p.grad.clone() for p in network.parameters() if p.grad is not None]
 
@@ -130,7 +129,7 @@ def test_network_is_as_good_in_evaluation_mode_as_in_training(
     config = small_recipe.model_copy(update={"steps": 60, "clips": 8})
     train(config, clips, tmp_path / "out.safetensors")
     (network,) = load_checkpoint(tmp_path / "out.safetensors").networks
-    inputs, forces_n, _ = Batches(clips, config, Ranks("cpu")).batch(1000, 8, 22)
+    inputs, forces_n, *_ = Batches(clips, config, Ranks("cpu")).batch(1000, 8, 22)
     with torch.no_grad():
         evaluated = (network(inputs, 19) - forces_n[:, 19:]).abs().mean()
         trained = (network.train()(inputs, 19) - forces_n[:, 19:]).abs().mean()
