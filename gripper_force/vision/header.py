@@ -124,6 +124,9 @@ class Header(Section):
         data_digest: SHA-256 of the training set.
         metrics: Metrics on the validation data, such as ``mae_n``; ``constant_mae_n`` is that of the mean force
             of the training data, for comparison.
+        test_digest: SHA-256 of the forces that the residuals and metrics were measured on, if it is not the
+            training's own validation data. Metrics of two checkpoints compare if it is the same.
+        identity: SHA-256 of the file before its header was changed; see `digest_of`.
     """
 
     members: tuple[NetworkConfig, ...]
@@ -131,6 +134,8 @@ class Header(Section):
     residuals: tuple[Residual, ...]
     data_digest: str
     metrics: dict[str, float]
+    test_digest: str = ""
+    identity: str = ""
 
     @model_validator(mode="after")
     def _fits(self) -> "Header":
@@ -148,7 +153,7 @@ class Model:
     Attributes:
         path: The file.
         header: Its header.
-        digest: SHA-256 of the checkpoint: the file itself, or the one that it was exported from.
+        digest: Digest of the checkpoint (see `digest_of`): the file itself, or the one that it was exported from.
     """
 
     path: Path
@@ -211,9 +216,13 @@ def exported_metadata(model: Model) -> dict[str, str]:
     return {"header": model.header.model_dump_json(), "digest": model.digest}
 
 
-def digest_of(data: bytes) -> str:
-    """Returns the SHA-256 of a checkpoint's content."""
-    return hashlib.sha256(data).hexdigest()
+def digest_of(data: bytes, header: Header) -> str:
+    """Returns the digest by which object profiles know a checkpoint.
+
+    It is the SHA-256 of the file as the training wrote it. A changed header keeps it, because the estimates
+    that a profile corrects stay the same.
+    """
+    return header.identity or hashlib.sha256(data).hexdigest()
 
 
 def _metadata(data: bytes) -> dict[str, str]:

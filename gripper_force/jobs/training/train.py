@@ -4,14 +4,12 @@ The diversity of scenes limits this task, not the number of labels. So a step of
 draws short clips from many recordings instead of long ones from a few.
 """
 
-import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from gripper_force.errors import ConfigError
 from gripper_force.interfaces import Progress, no_progress
@@ -21,19 +19,17 @@ from gripper_force.jobs.training.batches import Batches
 from gripper_force.jobs.training.parallel import Ranks, joined
 from gripper_force.jobs.training.recipe import TrainConfig as TrainConfig
 from gripper_force.jobs.training.recipe import continued
-from gripper_force.jobs.training.trainer import Trainer, estimates
+from gripper_force.jobs.training.stated_errors import errors, estimates, residuals
+from gripper_force.jobs.training.trainer import Trainer
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
 from gripper_force.vision.checkpoint_writer import save_checkpoint
-from gripper_force.vision.header import RESIDUAL_HALF_N, Header, Residual
+from gripper_force.vision.header import Header
 
 STATE_EVERY_S: Final = 60.0
 """Time between two saved states: an interrupted training loses no more than this."""
 
 PROGRESS_STEPS: Final = 100
 """Steps of progress that the training of one network reports."""
-
-RESIDUAL_PRIOR: Final = 20
-"""Weight of the error over all forces, in frames, in the stated error at one force."""
 
 
 def train(
@@ -104,12 +100,10 @@ def train(
             header = Header(
                 members=tuple(network.config for network in networks),
                 preprocess=config.preprocess,
-                residuals=tuple(_residuals(forces_n, measured_n)),
+                residuals=residuals(forces_n, measured_n),
                 data_digest=digest(clips),
                 metrics={
-                    "mae_n": metrics.mae(forces_n, measured_n),
-                    "rmse_n": metrics.rmse(forces_n, measured_n),
-                    "bias_n": metrics.bias(forces_n, measured_n),
+                    **errors(forces_n, measured_n),
                     "constant_mae_n": metrics.mae(np.full_like(measured_n, mean_n), measured_n),
                 },
             )
@@ -174,15 +168,3 @@ def _trained(
             f"increase {length}"
         )
     return trainers
-
-
-def _residuals(forces_n: npt.NDArray[np.float32], measured_n: npt.NDArray[np.float32]) -> list[Residual]:
-    """Returns the root mean squared error in bins of 1 N of the estimate, the only force known in a run."""
-    squared = np.square(forces_n - measured_n)
-    newtons = np.floor(forces_n)
-    residuals = []
-    for newton in np.unique(newtons):
-        part = squared[newtons == newton]
-        variance = (part.sum() + RESIDUAL_PRIOR * squared.mean()) / (len(part) + RESIDUAL_PRIOR)
-        residuals.append(Residual(force_n=float(newton) + RESIDUAL_HALF_N, std_n=math.sqrt(variance)))
-    return residuals

@@ -5,8 +5,6 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
 import torch
 import torch.nn.functional as F
 from safetensors import SafetensorError, safe_open
@@ -14,14 +12,12 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from gripper_force.errors import CheckpointError, NonFiniteError
-from gripper_force.jobs.dataset import CONTACT_N, Clip
+from gripper_force.jobs.dataset import CONTACT_N
 from gripper_force.jobs.training.batches import Batch, Batches
 from gripper_force.jobs.training.parallel import Ranks, share_statistics
 from gripper_force.jobs.training.recipe import TrainConfig
-from gripper_force.vision.batch_inference import predict
 from gripper_force.vision.header import INDENTATION_SCALE_M
 from gripper_force.vision.network import ForceNetwork
-from gripper_force.vision.preprocess import Preprocess
 
 
 class Trainer:
@@ -268,11 +264,3 @@ def one_cycle(done: float, warmup: float) -> float:
 def step_decay(done: float) -> float:
     """Returns the learning rate as a share of its peak: a tenth per quarter (30 of the paper's 120 epochs)."""
     return float(0.1 ** math.floor(4 * done))
-
-
-def estimates(
-    clips: Sequence[Clip], networks: Sequence[ForceNetwork], preprocess: Preprocess, device: str
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """Returns the ensemble's and the measured forces in N, (N,) each, over all frames with a label."""
-    forces_n = [predict(networks, preprocess, clip.frames, device).mean(0)[clip.valid] for clip in clips]
-    return np.concatenate(forces_n), np.concatenate([clip.forces_n[clip.valid] for clip in clips])
