@@ -165,10 +165,13 @@ class Trainer:
         return total
 
     def load_weights(self, network: ForceNetwork) -> None:
-        """Copies the weights of another network of the same shape. Outputs that it lacks keep theirs."""
+        """Copies the weights of another network of the same shape. Outputs that it lacks start at 0.
+
+        Random ones would change the features that the force depends on, before they have learned anything.
+        """
         weights = network.state_dict()
         for name in ("out.weight", "out.bias"):
-            rows = self.network.state_dict()[name].clone()
+            rows = torch.zeros_like(self.network.state_dict()[name])
             for i, quantity in enumerate(self._config.outputs):
                 if quantity in network.config.outputs:
                     rows[i] = weights[name][network.config.outputs.index(quantity)]
