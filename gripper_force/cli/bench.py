@@ -11,6 +11,7 @@ from gripper_force.cli import console
 from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, Page, load_settings
 from gripper_force.cli.output.bench import (
     bus_table,
+    checkpoints_table,
     commands_table,
     estimator_table,
     loop_table,
@@ -210,6 +211,37 @@ def training(
     reached = training_bench.reached(points)
     result = {"points": points, "as_good_as_paper_min": reached, "folder": folder}
     _show(result, as_json, lambda: training_table(points, reached, folder))
+
+
+@app.command("checkpoints")
+def checkpoints(
+    data: Annotated[list[Path], typer.Argument(help="Folders with logs that were not used for training.")],
+    checkpoint: Annotated[
+        list[str], typer.Option(help="Path of a checkpoint, or default or small. Repeatable.")
+    ],
+    write: Annotated[
+        bool, typer.Option("--write", help="Write the errors into the checkpoints; their digests stay.")
+    ] = False,
+    jobs: Jobs = CORES,
+    as_json: AsJson = False,
+) -> None:
+    """Measure the errors of checkpoints on the same logs, so that `vision.checkpoint=auto` can compare them."""
+    from collections.abc import Sequence
+
+    from gripper_force.jobs.dataset import Clip, find_logs, load_clips, without_contact_starts
+    from gripper_force.jobs.training.stated_errors import state_errors
+    from gripper_force.vision.preprocess import Preprocess
+
+    logs = [path for folder in data for path in find_logs(folder)]
+
+    def read(preprocess: Preprocess) -> Sequence[Clip]:
+        with console.bar("reading logs", len(logs)) as progress:
+            return without_contact_starts(
+                load_clips(logs, preprocess, workers=jobs, progress=progress), preprocess
+            )
+
+    found = state_errors(checkpoint, read, write=write)
+    _show({"checkpoints": found}, as_json, lambda: checkpoints_table(found))
 
 
 def _reject_overrides(command: str, overrides: list[str] | None) -> None:

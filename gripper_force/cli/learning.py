@@ -24,7 +24,7 @@ ContactStarts = Annotated[
 
 
 def train(
-    data: Annotated[Path, typer.Argument(help="Folder with logs.")],
+    data: Annotated[list[Path], typer.Argument(help="Folders with logs.")],
     checkpoint: Annotated[Path, typer.Option("--out", help="Checkpoint to write.")] = Path(
         "force.safetensors"
     ),
@@ -45,6 +45,10 @@ def train(
         str | None,
         typer.Option(help="Checkpoint to continue: its weights, and its keys where none are set."),
     ] = None,
+    teacher: Annotated[
+        str | None,
+        typer.Option(help="Checkpoint whose estimates are learned beside the labels; see teacher_share."),
+    ] = None,
     resume: Annotated[bool, typer.Option(help="Continue an interrupted training.")] = False,
     include_contact_starts: ContactStarts = False,
     jobs: Jobs = CORES,
@@ -64,7 +68,8 @@ def train(
     if start is not None:
         settings = continued(settings, start.header)
     quiet = os.environ.get("RANK", "0") != "0"  # only the first process of torchrun prints
-    logs, unseen_logs = find_logs(data), find_logs(validation) if validation else []
+    logs = [path for folder in data for path in find_logs(folder)]
+    unseen_logs = find_logs(validation) if validation else []
     with console.bar("reading logs", len(logs) + len(unseen_logs), hidden=quiet) as progress:
         clips = load_clips(logs, settings.preprocess, workers=jobs, progress=progress)
         unseen = (
@@ -92,6 +97,7 @@ def train(
                 checkpoint,
                 validation_clips=unseen,
                 init=start,
+                teacher=load_checkpoint(teacher) if teacher else None,
                 resume=resume,
                 progress=progress,
                 warn=warnings.append,

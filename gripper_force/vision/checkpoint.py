@@ -23,7 +23,7 @@ class Checkpoint:
     Attributes:
         networks: The members, in evaluation mode, on the CPU, in float32.
         header: The file's header.
-        digest: SHA-256 of the file.
+        digest: Its digest; see `header.digest_of`.
     """
 
     networks: tuple[ForceNetwork, ...]
@@ -48,7 +48,7 @@ def load_checkpoint(source: str | Path = "default") -> Checkpoint:
             f"{path} is damaged or not a safetensors file: {error}; copy or train it again"
         ) from error
     networks = tuple(_member(path, i, config, tensors) for i, config in enumerate(header.members))
-    return Checkpoint(networks, header, digest_of(data))
+    return Checkpoint(networks, header, digest_of(data, header))
 
 
 def _current_name(name: str) -> str:

@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from safetensors.torch import save
+from safetensors.torch import load, save
 from torch import Tensor
 
 from gripper_force.errors import CheckpointError
-from gripper_force.vision.header import FORMAT, Header
+from gripper_force.vision.header import FORMAT, Header, digest_of, read_checkpoint
 from gripper_force.vision.network import ForceNetwork
 
 
@@ -24,6 +24,25 @@ def save_checkpoint(path: Path, networks: Sequence[ForceNetwork], header: Header
         for i, network in enumerate(networks)
         for name, tensor in network.state_dict().items()
     }
+    _write(path, tensors, header)
+
+
+def replace_header(path: Path, header: Header) -> None:
+    """Replaces a checkpoint's header, but keeps its weights and its digest.
+
+    Args:
+        path: The checkpoint.
+        header: The header to write. Its ``identity`` is ignored.
+
+    Raises:
+        CheckpointError: The file can't be read or written.
+    """
+    _, data, before = read_checkpoint(path)
+    identity = digest_of(data, before)
+    _write(path, load(data), header.model_copy(update={"identity": identity}))
+
+
+def _write(path: Path, tensors: dict[str, Tensor], header: Header) -> None:
     data = save(tensors, metadata={FORMAT: header.model_dump_json()})
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -20,6 +20,12 @@ Pooling = Literal["wap", "gap"]
 STRIDES: Final[dict[BackboneName, int]] = {"vgg": 16, "resnet18": 32, "mobile": 16}
 """Ratio of the side of a frame to the side of each backbone's feature maps."""
 
+Quantity = Literal["force", "indentation", "contact"]
+"""Output of a network: force, travel of the jaws since contact, log-odds of contact."""
+
+INDENTATION_SCALE_M: Final = 0.02
+"""Travel of the jaws since contact at output 1."""
+
 Count = Annotated[int, Field(ge=1, le=100_000)]
 
 
@@ -38,6 +44,7 @@ class NetworkConfig(Section):
         hidden: Units of each direction of the BLSTM.
         head: Units of the dense layer.
         label_scale_n: Force at output 1 of the last layer.
+        outputs: Outputs of the last layer. A run reads the first, the force.
     """
 
     attention: Attention = "none"
@@ -51,9 +58,12 @@ class NetworkConfig(Section):
     hidden: Count = 256
     head: Count = 1024
     label_scale_n: Positive = 20.0
+    outputs: tuple[Quantity, ...] = ("force",)
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
+        if self.outputs[:1] != ("force",) or len(set(self.outputs)) < len(self.outputs):
+            raise ValueError(f"outputs are {self.outputs}; use each at most once, and force first")
         stride = STRIDES[self.backbone]
         if self.size % stride:
             raise ValueError(
@@ -114,6 +124,9 @@ class Header(Section):
         data_digest: SHA-256 of the training set.
         metrics: Metrics on the validation data, such as ``mae_n``; ``constant_mae_n`` is that of the mean force
             of the training data, for comparison.
+        test_digest: SHA-256 of the forces that the residuals and metrics were measured on, if it is not the
+            training's own validation data. Metrics of two checkpoints compare if it is the same.
+        identity: SHA-256 of the file before its header was changed; see `digest_of`.
     """
 
     members: tuple[NetworkConfig, ...]
@@ -121,6 +134,8 @@ class Header(Section):
     residuals: tuple[Residual, ...]
     data_digest: str
     metrics: dict[str, float]
+    test_digest: str = ""
+    identity: str = ""
 
     @model_validator(mode="after")
     def _fits(self) -> "Header":
@@ -138,7 +153,7 @@ class Model:
     Attributes:
         path: The file.
         header: Its header.
-        digest: SHA-256 of the checkpoint: the file itself, or the one that it was exported from.
+        digest: Digest of the checkpoint (see `digest_of`): the file itself, or the one that it was exported from.
     """
 
     path: Path
@@ -201,9 +216,13 @@ def exported_metadata(model: Model) -> dict[str, str]:
     return {"header": model.header.model_dump_json(), "digest": model.digest}
 
 
-def digest_of(data: bytes) -> str:
-    """Returns the SHA-256 of a checkpoint's content."""
-    return hashlib.sha256(data).hexdigest()
+def digest_of(data: bytes, header: Header) -> str:
+    """Returns the digest by which object profiles know a checkpoint.
+
+    It is the SHA-256 of the file as the training wrote it. A changed header keeps it, because the estimates
+    that a profile corrects stay the same.
+    """
+    return header.identity or hashlib.sha256(data).hexdigest()
 
 
 def _metadata(data: bytes) -> dict[str, str]:

@@ -32,7 +32,7 @@ def read_model(source: str | Path) -> Model:
     """
     if str(source) in SHIPPED or Path(source).suffix not in EXPORTED:
         path, data, header = read_checkpoint(source)
-        return Model(path, header, digest_of(data))
+        return Model(path, header, digest_of(data, header))
     path = Path(source)
     if not path.is_file():
         raise CheckpointError(f"no network at {path}; make one with `gripper-force export`")

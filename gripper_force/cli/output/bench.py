@@ -126,6 +126,14 @@ def estimator_table(costs: "Sequence[EstimatorCost]", ratios: "Ratios", plot: Pa
     pairs({"plot": str(plot), "results": str(file)})
 
 
+def checkpoints_table(found: Mapping[str, Mapping[str, float]]) -> None:
+    """Prints the errors of checkpoints on the same logs."""
+    table = Table("checkpoint", "MAE N", "RMSE N", "bias N", box=None)
+    for name, errors in found.items():
+        table.add_row(name, *(number(errors[key]) for key in ("mae_n", "rmse_n", "bias_n")))
+    out.print(table)
+
+
 def training_table(points: "Sequence[Point]", reached: Mapping[str, float | None], folder: Path) -> None:
     """Prints the validation error of training recipes over time."""
     table = Table("recipe", "minutes", "steps", "MAE N", "RMSE N", box=None)

@@ -15,7 +15,15 @@ from gripper_force.schema import (
     section_from,
     validated,
 )
-from gripper_force.vision.header import Attention, BackboneName, Count, Header, NetworkConfig, Pooling
+from gripper_force.vision.header import (
+    Attention,
+    BackboneName,
+    Count,
+    Header,
+    NetworkConfig,
+    Pooling,
+    Quantity,
+)
 from gripper_force.vision.preprocess import Preprocess
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -81,6 +89,12 @@ class TrainConfig(Section):
         labels: ``measured``: forces of the load cell. ``nominal``: forces that a simulated object would have
             with exactly the nominal stiffness of its kind. Images show no more than that; the difference
             would be noise.
+        indentation_weight: Weight of the squared error of the indentation, the travel of the jaws since contact
+            over 20 mm, beside that of force / 20 N; 0 trains no such output.
+        contact_weight: Weight of the cross-entropy of contact; 0 trains no such output.
+        teacher_share: Share of a teacher's estimate (`--teacher`) in the force to learn; the rest is the label.
+        freeze_statistics: Keep the batch statistics of the initial checkpoint (`--init`), which few recordings
+            would replace by their own.
         contact_share: Share of clips that end in contact.
         force_share: Share of clips whose last frame is drawn evenly over force, because high forces are rare.
         shift_px: Largest shift of a clip.
@@ -115,6 +129,10 @@ class TrainConfig(Section):
     weight_decay: NonNegative = 0.01
     gradient_limit: Positive | None = 1.0
     labels: Literal["measured", "nominal"] = "measured"
+    indentation_weight: NonNegative = 0.0
+    contact_weight: NonNegative = 0.0
+    teacher_share: Share = 0.7
+    freeze_statistics: bool = False
     contact_share: Share = 0.3
     force_share: Share = 0.2
     shift_px: Annotated[int, Field(ge=0)] = 2
@@ -140,6 +158,13 @@ class TrainConfig(Section):
             )
         return self
 
+    @property
+    def outputs(self) -> tuple[Quantity, ...]:
+        """Outputs of the networks: force, and those with a weight."""
+        indentation: tuple[Quantity, ...] = ("indentation",) if self.indentation_weight else ()
+        contact: tuple[Quantity, ...] = ("contact",) if self.contact_weight else ()
+        return ("force", *indentation, *contact)
+
     def network(self, member: int) -> NetworkConfig:
         """Returns the configuration of one member."""
         attention = self.attentions[member]
@@ -152,6 +177,7 @@ class TrainConfig(Section):
             width=self.width,
             hidden=self.hidden,
             head=self.head,
+            outputs=self.outputs,
         )
 
 
@@ -199,7 +225,7 @@ def continued(config: TrainConfig, header: Header) -> TrainConfig:
     same = validated(TrainConfig, tree, "--init", "recipe")
     for member, shape in enumerate(header.members):
         own = same.network(member)
-        for key in NetworkConfig.model_fields:
+        for key in NetworkConfig.model_fields.keys() - {"outputs"}:  # `Trainer.load_weights` adds new ones
             if getattr(own, key) != getattr(shape, key):
                 raise ConfigError(
                     f"network {member} of the initial checkpoint has {key}={_shown(getattr(shape, key))}, but a "

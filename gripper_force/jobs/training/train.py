@@ -4,14 +4,12 @@ The diversity of scenes limits this task, not the number of labels. So a step of
 draws short clips from many recordings instead of long ones from a few.
 """
 
-import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from gripper_force.errors import ConfigError
 from gripper_force.interfaces import Progress, no_progress
@@ -21,19 +19,17 @@ from gripper_force.jobs.training.batches import Batches
 from gripper_force.jobs.training.parallel import Ranks, joined
 from gripper_force.jobs.training.recipe import TrainConfig as TrainConfig
 from gripper_force.jobs.training.recipe import continued
-from gripper_force.jobs.training.trainer import Trainer, estimates
+from gripper_force.jobs.training.stated_errors import errors, estimates, residuals
+from gripper_force.jobs.training.trainer import Trainer
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
 from gripper_force.vision.checkpoint_writer import save_checkpoint
-from gripper_force.vision.header import RESIDUAL_HALF_N, Header, Residual
+from gripper_force.vision.header import Header
 
 STATE_EVERY_S: Final = 60.0
 """Time between two saved states: an interrupted training loses no more than this."""
 
 PROGRESS_STEPS: Final = 100
 """Steps of progress that the training of one network reports."""
-
-RESIDUAL_PRIOR: Final = 20
-"""Weight of the error over all forces, in frames, in the stated error at one force."""
 
 
 def train(
@@ -43,6 +39,7 @@ def train(
     *,
     validation_clips: Sequence[Clip] | None = None,
     init: Checkpoint | None = None,
+    teacher: Checkpoint | None = None,
     resume: bool = False,
     progress: Progress = no_progress,
     warn: Callable[[str], None] = lambda _: None,
@@ -60,6 +57,7 @@ def train(
             ``clips``.
         init: Checkpoint with the initial weights, whose networks and preprocessing replace those that the
             recipe leaves unset; None for random weights.
+        teacher: Checkpoint whose estimates are learned beside the labels, by ``teacher_share``; None for none.
         resume: Continue an interrupted training from its saved states.
         progress: Called with the training error; `PROGRESS_STEPS` for each network in total.
         warn: Called with a sentence if the training was too short to draw a clip from each recording.
@@ -77,6 +75,15 @@ def train(
     """
     if init is not None:
         config = continued(config, init.header)
+    elif config.freeze_statistics:
+        raise ConfigError(
+            "freeze_statistics keeps those of an initial checkpoint; add --init, or set it to false"
+        )
+    if teacher is not None and teacher.header.preprocess != config.preprocess:
+        raise ConfigError(
+            f"the teacher sees frames prepared with {teacher.header.preprocess}, and this network with "
+            f"{config.preprocess}; set the same preprocess keys"
+        )
     training, held_out = clips, validation_clips
     if held_out is None:
         training, held_out = split_by(clips, "set", config.validation, config.seed)
@@ -84,7 +91,8 @@ def train(
     states = state_paths(config, out)
     with joined(config.device) as ranks:
         networks = [
-            t.network for t in _trained(config, training, states, init, resume, ranks, progress, warn)
+            t.network
+            for t in _trained(config, training, states, init, teacher, resume, ranks, progress, warn)
         ]
         if ranks.first:
             forces_n, measured_n = estimates(held_out, networks, config.preprocess, ranks.device)
@@ -92,12 +100,10 @@ def train(
             header = Header(
                 members=tuple(network.config for network in networks),
                 preprocess=config.preprocess,
-                residuals=tuple(_residuals(forces_n, measured_n)),
+                residuals=residuals(forces_n, measured_n),
                 data_digest=digest(clips),
                 metrics={
-                    "mae_n": metrics.mae(forces_n, measured_n),
-                    "rmse_n": metrics.rmse(forces_n, measured_n),
-                    "bias_n": metrics.bias(forces_n, measured_n),
+                    **errors(forces_n, measured_n),
                     "constant_mae_n": metrics.mae(np.full_like(measured_n, mean_n), measured_n),
                 },
             )
@@ -118,6 +124,7 @@ def _trained(
     clips: Sequence[Clip],
     states: Sequence[Path],
     init: Checkpoint | None,
+    teacher: Checkpoint | None,
     resume: bool,
     ranks: Ranks,
     progress: Progress,
@@ -130,11 +137,11 @@ def _trained(
     if ranks.count > 1 and config.compile:
         raise ConfigError("compile does not work with several processes; set compile=false")
     batches = Batches(clips, config, ranks)
-    start = init.digest if init is not None else ""
+    start = " ".join(checkpoint.digest if checkpoint is not None else "" for checkpoint in (init, teacher))
     identity = f"{config.model_dump_json(exclude={'device', 'compile'})} {digest(clips)} {start}"
     trainers = []
     for member, state in enumerate(states):
-        trainer = Trainer(config, member, batches, ranks)
+        trainer = Trainer(config, member, batches, ranks, teacher.networks if teacher is not None else ())
         trainers.append(trainer)
         if init is not None:
             trainer.load_weights(init.networks[member])
@@ -161,15 +168,3 @@ def _trained(
             f"increase {length}"
         )
     return trainers
-
-
-def _residuals(forces_n: npt.NDArray[np.float32], measured_n: npt.NDArray[np.float32]) -> list[Residual]:
-    """Returns the root mean squared error in bins of 1 N of the estimate, the only force known in a run."""
-    squared = np.square(forces_n - measured_n)
-    newtons = np.floor(forces_n)
-    residuals = []
-    for newton in np.unique(newtons):
-        part = squared[newtons == newton]
-        variance = (part.sum() + RESIDUAL_PRIOR * squared.mean()) / (len(part) + RESIDUAL_PRIOR)
-        residuals.append(Residual(force_n=float(newton) + RESIDUAL_HALF_N, std_n=math.sqrt(variance)))
-    return residuals

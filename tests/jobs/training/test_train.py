@@ -214,6 +214,36 @@ def test_command_continues_a_checkpoint(few_logs: Path, tiny_checkpoint: Path, t
     assert not out.exists()
 
 
+def test_command_takes_several_folders_and_a_teacher(
+    few_logs: Path, tiny_checkpoint: Path, tmp_path: Path
+) -> None:
+    other = tmp_path / "other"
+    other.mkdir()
+    moved = sorted(few_logs.glob("*.mcap"))[0]
+    moved.rename(other / moved.name)
+    out = tmp_path / "out.safetensors"
+    call = ["train", str(other), str(few_logs), "--out", str(out), "--jobs", "1", "--json"]
+    call += ["--teacher", str(tiny_checkpoint)]
+    keys = ["preprocess.size=32", "attentions=[none]", "width=0.25", "steps=1", "device=cpu"]
+    call += [part for key in keys for part in ("--set", key)]
+    done = CliRunner().invoke(cli.app, call)
+    assert done.exit_code == 0, done.output
+    folders = [load_clips(folder, Preprocess(size=32)) for folder in (other, few_logs)]
+    assert [len(folder) for folder in folders] == [1, 2]
+    assert load_checkpoint(out).header.data_digest == digest([*folders[0], *folders[1]])
+    other_size = CliRunner().invoke(cli.app, [*call, "--set", "preprocess.size=16"]).exception
+    assert isinstance(other_size, ConfigError)
+    assert "the teacher sees frames" in str(other_size)
+
+
+def test_frozen_statistics_need_an_initial_checkpoint(
+    clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig
+) -> None:
+    frozen = small_recipe.model_copy(update={"freeze_statistics": True})
+    with pytest.raises(ConfigError, match="add --init"):
+        train(frozen, clips, tmp_path / "out.safetensors")
+
+
 def test_command_leaves_out_logs_that_start_in_contact(
     few_logs: Path, loaded_log: Path, tmp_path: Path
 ) -> None:
