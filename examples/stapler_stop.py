@@ -4,9 +4,9 @@
     python examples/stapler_stop.py data/test
 
 Prints the travel of the jaws per newton by force, from the logs, and in the same bins the error of the
-network, of its output on the line that fits best within the bin, and of the best constant. Past the stop it also
-prints the correlation of the network's output with the force: a line that is better than the constant, and a
-positive correlation, show that the image still changes with the force there.
+network, of its output on the line that fits best within the bin (least squares), and of the best constant. Past the
+stop it also prints the correlation of the network's output with the force, within each log and over all: a positive
+correlation shows that the image still changes with the force there.
 """
 
 import argparse
