@@ -47,6 +47,13 @@ def simulate(
             "[default: full]"
         ),
     ] = None,
+    instances: Annotated[
+        str | None,
+        typer.Option(
+            help="With --protocol: same (one instance of each object and one rig in all sets, as in the paper) "
+            "or redrawn (for each set).  [default: same]"
+        ),
+    ] = None,
     jobs: Jobs = CORES,
     config: ConfigPath = None,
     set_: Overrides = None,
@@ -59,10 +66,11 @@ def simulate(
 
     plans: list[job.Plan]
     if protocol is None:
-        if scale is not None:
-            raise ConfigError(
-                "--scale only applies with --protocol; add --protocol shin2019, or omit --scale"
-            )
+        for name, value in (("--scale", scale), ("--instances", instances)):
+            if value is not None:
+                raise ConfigError(
+                    f"{name} only applies with --protocol; add --protocol shin2019, or omit {name}"
+                )
         settings = load_settings(config, set_, {})
         seed, plans = 100_000 if first_seed is None else first_seed, []
         groups = {"training-kinds": training_kinds, "held-out-kinds": held_out_kinds}
@@ -88,7 +96,7 @@ def simulate(
                 "them"
             )
         settings = load_settings(config, [f"camera.rate_hz={paper_protocol.RATE_HZ}", *(set_ or [])], {})
-        plans = list(paper_protocol.plan_protocol(scale or "full"))
+        plans = list(paper_protocol.plan_protocol(scale or "full", instances or "same"))
     else:
         raise ConfigError(f"no protocol {protocol!r}; use shin2019")
     names = [name for p in plans for name in p.names]

@@ -1,6 +1,7 @@
 """Commands for networks: `train`, `evaluate`, `export` and `reproduce`."""
 
 import json
+import math
 import os
 import shlex
 from pathlib import Path
@@ -206,16 +207,34 @@ def export(
 def reproduce(
     what: Annotated[str, typer.Argument(help="3, 4, 5, 6, 7, 8, 9, fig6, fig7, fig8, fig9, claims or all.")],
     scale: Annotated[
-        str, typer.Option(help="small (about two hours on two CPU cores) or full (for a GPU).")
+        str, typer.Option(help="small (about five minutes per network on one core) or full (for a GPU).")
     ] = "small",
+    instances: Annotated[
+        str,
+        typer.Option(
+            help="same: one instance of each object and one rig in all sets, as in the paper; redrawn: others "
+            "in each set."
+        ),
+    ] = "same",
+    steps: Annotated[
+        str | None,
+        typer.Option(help="Steps of training; several lengths with commas.  [default: 1100; 2000 at full]"),
+    ] = None,
+    seeds: Annotated[
+        int | None, typer.Option(help="Seeds with which each network is trained.  [default: 3]")
+    ] = None,
+    minutes: Annotated[
+        float | None,
+        typer.Option(help="Stop after this time, with the tables so far; run it again to continue.", min=0),
+    ] = None,
     data: Annotated[
         Path | None,
         typer.Option(help="Folder with logs in train/ and test/. Default: simulated."),
     ] = None,
     folder: Annotated[
-        Path | None,
+        Path,
         typer.Option("--out", help="Folder for the networks; existing ones are not trained again."),
-    ] = None,
+    ] = Path("runs/paper"),
     write: Annotated[
         Path | None,
         typer.Option(help="Markdown page to write tables and figures into, such as docs/paper.md."),
@@ -227,25 +246,43 @@ def reproduce(
     as_json: AsJson = False,
 ) -> None:
     """Reproduce the paper's tables and figures, with its numbers. Continues an interrupted run."""
+    import time
+
     from gripper_force.qualification.markdown_blocks import write_between
     from gripper_force.qualification.paper import paper_page as page
     from gripper_force.qualification.paper.models import SCALES, Scale
     from gripper_force.schema import section_from
 
+    end_s = math.inf if minutes is None else time.monotonic() + 60 * minutes
     names = page.expand_name(what)
     if scale not in SCALES:
         raise ConfigError(f"no scale {scale!r}; choose from {', '.join(SCALES)}")
-    settings = section_from(Scale, [*(f"{k}={json.dumps(v)}" for k, v in SCALES[scale]), *(set_ or [])])
-    folder = folder or Path("runs/paper") / scale
-    result, test = page.reproduce(names, settings, data, folder, jobs, console.bar)
+    options = [*(f"{k}={json.dumps(v)}" for k, v in SCALES[scale]), f"instances={instances}"]
+    options += [] if seeds is None else [f"seeds={seeds}"]
+    options += set_ or []
+    lengths = [f"steps={text}" for text in steps.split(",")] if steps else []
+    scales = [section_from(Scale, [*options, length]) for length in lengths] or [section_from(Scale, options)]
+    bar = console.bar if console.err.is_terminal else console.lines
+    result = page.reproduce(names, scales, data, folder, jobs, bar, end_s)
     pictures = write.with_suffix("") if write else folder
     pictures.mkdir(parents=True, exist_ok=True)
+    figures = {}
     for name, figure in result.figures.items():
-        figure.savefig(pictures / f"{name}.png")
+        if figure is not None:
+            figures[name] = str(pictures / page.picture_name(scale, scales[0], name))
+            figure.savefig(figures[name])
     if write is not None:
-        for place, text in page.markdown(result, scale, settings, test, pictures.name).items():
+        for place, text in page.markdown(result, scale, scales[0], pictures.name).items():
             write_between(write, place, text)
-    tables = list(result.tables.values())
-    figures = {name: str(pictures / f"{name}.png") for name in result.figures}
-    printed = {"tables": tables, "figures": figures}
+    tables = [table for made in result.tables.values() for table in made]
+    printed = {
+        "instances": scales[0].instances,
+        "steps": [one.steps for one in scales],
+        "seeds": scales[0].seeds,
+        "tables": tables,
+        "figures": figures,
+        "missing": result.missing,
+    }
     console.show(printed, as_json, lambda _: paper_tables(tables, figures))
+    if result.missing:
+        console.warn(f"{result.missing}; run the same command again to continue")
