@@ -1,13 +1,12 @@
 """Kinds of simulated objects as records: `kinds.yaml` has them, and one builder for each family makes a body."""
 
-from dataclasses import dataclass, fields
 from functools import cache
 from importlib import resources
 from typing import Literal
 
 import numpy as np
-import yaml
 
+from gripper_force.schema import Section, tree_from, validated
 from gripper_hw.sim.meshes import (
     SHELL_CONTACT,
     SOFT_CONTACT,
@@ -29,8 +28,7 @@ _GHOST = 'contype="0" conaffinity="0"'
 _RIGID = f'contype="0" conaffinity="1" condim="3" {SOFT_CONTACT}'
 
 
-@dataclass(frozen=True, slots=True)
-class ObjectKind:
+class ObjectKind(Section):
     """A kind of object.
 
     Attributes:
@@ -81,12 +79,10 @@ class ObjectKind:
 @cache
 def load_kinds() -> dict[str, ObjectKind]:
     """Returns the shipped kinds by name."""
-    records = yaml.safe_load(resources.files(__package__).joinpath("kinds.yaml").read_text(encoding="utf-8"))
-    sequences = {field.name for field in fields(ObjectKind) if "tuple" in str(field.type)}
+    text_ = resources.files(__package__).joinpath("kinds.yaml").read_text(encoding="utf-8")
+    records = tree_from(text_, "kinds.yaml", "kinds of objects")
     return {
-        name: ObjectKind(
-            name, **{key: tuple(value) if key in sequences else value for key, value in record.items()}
-        )
+        name: validated(ObjectKind, {"name": name, **record}, f"kinds.yaml, {name}", "kind of object")
         for name, record in records.items()
     }
 

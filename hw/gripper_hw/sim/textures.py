@@ -122,7 +122,8 @@ def _grid() -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
 def _bands(rng: np.random.Generator, across: npt.NDArray[np.float32]) -> npt.NDArray[np.floating]:
     """Returns 0 to 1: bands with soft edges; whole periods, so that the ends of a wall meet."""
     wave = np.sin(2 * np.pi * (int(rng.integers(5, 11)) * across + rng.uniform()))
-    return np.clip(0.5 + 4 * (wave - rng.uniform(-0.5, 0.5)), 0, 1)
+    bands: npt.NDArray[np.floating] = np.clip(0.5 + 4 * (wave - rng.uniform(-0.5, 0.5)), 0, 1)
+    return bands
 
 
 def _spots(rng: np.random.Generator, largest_px: int) -> npt.NDArray[np.floating]:

@@ -132,9 +132,9 @@ def test_stiffness_fills_its_spread(spread: float) -> None:
     ],
 )
 def test_wider_spread_changes_nothing_else(change: dict[str, float], drawn: set[str]) -> None:
-    before, after = (asdict(draw_scene("tube", 3, SimConfig(**keys))) for keys in ({}, change))  # type: ignore[arg-type]
+    before, after = (asdict(draw_scene("tube", 3, SimConfig(**keys))) for keys in ({}, change))
     assert {name for name in before if before[name] != after[name]} == drawn
-    fixed = SimConfig(object_seed=1, rig_seed=2, **change)  # type: ignore[arg-type]
+    fixed = SimConfig(object_seed=1, rig_seed=2, **change)
     first, again = (asdict(draw_scene("tube", seed, fixed)) for seed in (3, 4))
     assert {name for name in first if first[name] != again[name]} == {"offset_m", "yaw_deg"}
 

@@ -204,7 +204,7 @@ def test_a_rig_that_has_started_in_real_time_is_ready_to_render(make_rig: MakeRi
     rendered: list[int] = []
     world = rig._world
     render = world.render
-    world.render = lambda side_px: (rendered.append(side_px), render(side_px))[1]  # type: ignore[assignment, func-returns-value]
+    world.render = lambda side_px: (rendered.append(side_px), render(side_px))[1]  # type: ignore[method-assign, func-returns-value]
     rig.start()
     assert rendered
     assert world.t_ns > 0

@@ -85,7 +85,7 @@ def test_every_precision_and_window_mode_trains(
 @pytest.fixture
 def indented(clips: list[Clip]) -> list[Clip]:
     """The clips with the travel of the jaws, which is a square root of the force, for all but one."""
-    travels_m = [0.004 * np.sqrt(clip.forces_n) for clip in clips]
+    travels_m = [np.float32(0.004) * np.sqrt(clip.forces_n) for clip in clips]
     return [clips[0], *(replace(c, indentation_m=m) for c, m in zip(clips[1:], travels_m[1:], strict=True))]
 
 
@@ -152,8 +152,8 @@ def test_teacher_is_imitated(
     first = Trainer(config, 0, batches, Ranks("cpu"))
     list(first.steps())
     with torch.no_grad():
-        first.network.out.weight *= 2
-        first.network.out.bias *= 2
+        first.network.out.weight.mul_(2)
+        first.network.out.bias.mul_(2)
     teacher = first.network.requires_grad_(False)
     student = Trainer(config.model_copy(update={"seed": 7}), 0, batches, Ranks("cpu"), [teacher])
     list(student.steps())
