@@ -66,6 +66,10 @@ class Summary(_Score):
         feedback: Configured feedback: ``fused``, ``current`` or ``vision``.
         vision_share: Share of the hold's cycles that used vision, 0 to 1; None without a hold or without vision.
         vision_losses: Reasons why it was not used in the hold, and their durations, the longest first.
+        object_gain: Gain of the object by motor current (see `gripper_force.control.object_gain`); None if it is not
+            known.
+        object_gain_std: Its relative standard deviation.
+        object_gain_true: Stiffness of the simulated object over that of its kind; None for a real one.
         fell_back: True if the feedback includes vision, but less than half of the hold used it.
         load_cell_mean_n: Mean of the load cell during the hold.
         steady_error_n: That mean, less the target.
@@ -90,6 +94,9 @@ class Summary(_Score):
     feedback: str
     vision_share: float | None
     vision_losses: list[VisionLoss]
+    object_gain: float | None
+    object_gain_std: float | None
+    object_gain_true: float | None
     fell_back: bool
     peak_n: float | None
     estimator_p50_ms: float | None
@@ -304,6 +311,7 @@ def summarise(path: Path) -> Summary:
     shown = vision if controls_with_vision(config) else None
     expects_vision = controls_with_vision(config) or config.control.feedback == "vision"
     outcomes = [s.outcome for s in statuses if s.outcome != Outcome.NONE]
+    gains = [fused for fused in records[FusedForce] if fused.object_gain]
     span_s = (cycles_ns[-1] - cycles_ns[0]) / NS_PER_S if len(cycles_ns) > 1 else 0.0
     return {
         "result": outcomes[-1] if outcomes else "interrupted",
@@ -313,6 +321,9 @@ def summarise(path: Path) -> Summary:
         "feedback": config.control.feedback,
         "vision_share": None if shown is None else shown.share,
         "vision_losses": [] if shown is None else shown.losses,
+        "object_gain": gains[-1].object_gain if gains else None,
+        "object_gain_std": gains[-1].object_gain_std if gains else None,
+        "object_gain_true": stiffness_of(reader.metadata) if "scene" in reader.metadata else None,
         "fell_back": expects_vision and vision is not None and vision.share < LEAST_VISION_SHARE,
         **_score(cells, statuses, config.target_n),
         "peak_n": max((c.force_n for c in cells if c.valid), default=None),

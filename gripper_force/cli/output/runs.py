@@ -45,9 +45,15 @@ def _vision(r: "Summary") -> dict[str, str]:
     if r["vision_share"] is None:
         return {}
     losses = "\n".join(f"for {loss.time_s:.1f} s: {loss.reason}" for loss in r["vision_losses"])
+    gain = {}
+    if r["object_gain"] is not None:
+        true = "" if r["object_gain_true"] is None else f" (true: {r['object_gain_true']:.2f})"
+        percent = 100 * (r["object_gain_std"] or 0.0)
+        gain = {"object's gain": f"{r['object_gain']:.2f} +- {percent:.0f} %" + true}
     return {
         "vision used": f"{100 * r['vision_share']:.0f} % of the hold",
         **({"vision lost": losses} if losses else {}),
+        **gain,
     }
 
 
