@@ -489,7 +489,8 @@ class SimConfig(Section):
         None, description="true torque constant over the servo model's; None: drawn, 0.92 to 1.08"
     )
     stiffness: Positive | None = Field(
-        None, description="true stiffness of the object over that of its kind; None: drawn by stiffness_spread"
+        None,
+        description="true stiffness of the object over that of its kind; None: drawn by stiffness_spread",
     )
     open_width_m: Positive | None = Field(
         None, description="true distance between the open jaws; None: gripper.open_width_m"

@@ -125,7 +125,7 @@ class Fusion:
         """
         if new_object:
             self._gain.reset()
-        self._gain_event = self._gain.finish_grasp(counts=was_held)
+        self.end_grasp(was_held=was_held)
         self._applied_gain = self._gain.estimate() if self._learns_gain else None
         self._difference_n = 0.0
         self._variance_ratio = self._shared_n2 = self._slow_n = 0.0
@@ -144,6 +144,11 @@ class Fusion:
             return 0.0
         mean_n = self._free_sum_n / self._free_cycles
         return max(mean_n - 2 * _FREE_NOISE_N / math.sqrt(self._free_cycles), 0.0)
+
+    def end_grasp(self, *, was_held: bool) -> tuple[float, float] | None:
+        """Ends the present grasp, and returns the ratio that the object's gain rests on (see `ObjectGain.ratio`)."""
+        self._gain_event = self._gain.finish_grasp(counts=was_held)
+        return self._gain.ratio
 
     def reset_variance(self) -> None:
         """Resets the bias variance to its prior.

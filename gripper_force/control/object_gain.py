@@ -67,7 +67,7 @@ class ObjectGain:
         self._torque_n2 = torque_std**2
         self.reset()
         if known is not None:
-            self._add(math.log(known[0]), known[1] ** 2)
+            self.add(*known)
 
     def reset(self) -> None:
         """Forgets everything: the next grasp is of another object."""
@@ -114,6 +114,10 @@ class ObjectGain:
         self._add(ratio, variance)
         return text
 
+    def add(self, ratio: float, std: float) -> None:
+        """Adds the ratio of earlier grasps, with its relative standard deviation as for ``known``."""
+        self._add(math.log(ratio), std**2)
+
     def _add(self, ratio: float, variance: float) -> None:
         self._weight += 1 / variance
         self._weighted += ratio / variance
@@ -128,7 +132,7 @@ class ObjectGain:
 
     @property
     def ratio(self) -> tuple[float, float] | None:
-        """Ratio of all finished grasps and its relative standard deviation, as for ``known``; None without any."""
+        """Ratio of the finished grasps and its relative standard deviation, as for ``known``; None without any."""
         if not self._weight:
             return None
         return math.exp(self._weighted / self._weight), 1 / math.sqrt(self._weight)

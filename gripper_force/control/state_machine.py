@@ -172,6 +172,11 @@ class GraspController:
         """Gains and phase margin of each control loop."""
         return self._loop.margins
 
+    def end_grasps(self) -> tuple[float, float] | None:
+        """Ends the last grasp, and returns the ratio of all grasps (see `ObjectGain.ratio`); None without any."""
+        is_held = self._phase in _GRIPPING and self._outcome == Outcome.HELD
+        return self._fusion.end_grasp(was_held=self._was_held or is_held)
+
     def start_problem(self, servo: ServoState) -> str:
         """Returns why the jaws cannot start at a position, or an empty text.
 

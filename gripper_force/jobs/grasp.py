@@ -14,6 +14,7 @@ from gripper_force.control.limits import largest_target_n
 from gripper_force.errors import ConfigError, DataError, DeviceError
 from gripper_force.interfaces import Progress, Prompt, no_progress
 from gripper_force.jobs.dataset import stiffness_floor_n, stiffness_of
+from gripper_force.jobs.object_gain import learned_ratio
 from gripper_force.jobs.processes import process_pool
 from gripper_force.jobs.replay import compare
 from gripper_force.jobs.score import (
@@ -232,6 +233,7 @@ def trials(
     *,
     objects: Sequence[str] = TRIAL_OBJECTS,
     target_n: float | None = None,
+    same_object: bool = False,
     prompt: Prompt | None = None,
     progress: Progress = no_progress,
 ) -> Generator[Summary, None, None]:
@@ -243,6 +245,8 @@ def trials(
         jobs: Processes; 1: the grasps run in this process. The results of lockstep runs do not depend on it.
         objects: Names of the objects.
         target_n: Target force of each grasp; None: drawn from 1 to 8 N, or to what the limits permit.
+        same_object: Grasps one object with one gripper, in another place each time, and passes what was learned of
+            its gain from grasp to grasp.
         prompt: Called before each grasp, so that a person can place the object; None for no pause.
         progress: Called before each grasp and at each change of phase, if ``jobs`` is 1.
 
@@ -250,7 +254,8 @@ def trials(
         The summary of each grasp, in order.
 
     Raises:
-        ConfigError: Several processes can't open a device at the same time.
+        ConfigError: Several processes can't open a device at the same time, or pass on what was learned; or there
+            are several objects where one is to be grasped again.
         RequestError: The target, or the smallest that is drawn, is beyond a limit.
         DeviceError: A grasp with a real device ended with a fault: nothing moves until a person has looked.
         GripperError: A grasp failed.
@@ -258,6 +263,12 @@ def trials(
     device = exclusive_device(config)
     if device and jobs > 1:
         raise ConfigError(f"only one process can open {device}, not {jobs}; leave out --jobs, or set it to 1")
+    if same_object:
+        if jobs > 1 or len(objects) > 1:
+            raise ConfigError(
+                "grasps of the same object follow one another; pass one --object, and no --jobs but 1"
+            )
+        config = with_same_object(config)
     least_n, most_n = TRIAL_TARGETS_N
     largest_n = {}
     for name in objects:
@@ -282,17 +293,33 @@ def trials(
         with process_pool(jobs) as pool:
             yield from pool.map(_trial, [trial.model_dump(mode="json") for trial in plan])
         return
+    ratio = config.control.object_ratio
     for number, trial in enumerate(plan, 1):
         if prompt is not None:
             prompt(f"Put the {trial.object} between the jaws for trial {number} of {count}")
         progress(f"trial {number} of {count}: {trial.object}, {trial.target_n:g} N")
+        if same_object:
+            control = trial.control.model_copy(update={"object_ratio": ratio})
+            trial = trial.model_copy(update={"control": control})
         result = grasp(trial, progress)
+        if same_object:
+            ratio = learned_ratio(Path(result["log"]))
         yield result
         if device and result["result"] == Outcome.FAULT:
             raise DeviceError(
                 f"trial {number} of {count} ended with a fault, so no further one was run; look at the gripper, "
                 f"and at the fault with: gripper-force replay {result['log']} --report"
             )
+
+
+def with_same_object(config: Config) -> Config:
+    """Returns a configuration whose simulated object and gripper do not depend on the seed of the trial."""
+    sim = config.sim
+    update = {
+        "object_seed": config.seed if sim.object_seed is None else sim.object_seed,
+        "rig_seed": config.seed if sim.rig_seed is None else sim.rig_seed,
+    }
+    return config.model_copy(update={"sim": sim.model_copy(update=update)})
 
 
 def summarise(path: Path) -> Summary:

@@ -186,7 +186,9 @@ def read_run(log: LogReader, on_frame: Callable[[Frame], None] = lambda frame: N
         vision=vision_in_hold(status, fused, vision, records[Event])
         if controls_with_vision(config)
         else None,
-        object_gain=next(((f.object_gain, f.object_gain_std) for f in reversed(fused) if f.object_gain), None),
+        object_gain=next(
+            ((f.object_gain, f.object_gain_std) for f in reversed(fused) if f.object_gain), None
+        ),
         forces=forces,
         errors=_errors(forces),
         reference=_series(zero_ns, ((s.t_ns, s.reference_n) for s in status)),
