@@ -88,8 +88,7 @@ def save_gain(name: str, logs: Sequence[Path], out: Path | None = None) -> Saved
             "no log holds a grasp that was held for half a second with visual estimates; grasp the object with "
             "control.feedback=fused and control.learn_gain=true"
         )
-    torque_std = config_from_text(LogReader(logs[-1]).config, str(logs[-1])).gripper.gain_std
-    gain = ObjectGain(torque_std)
+    gain = ObjectGain(_torque_std(logs[-1]))
     for ratio in ratios:
         gain.add(*ratio)
     total, estimate = gain.ratio, gain.estimate()
@@ -100,6 +99,10 @@ def save_gain(name: str, logs: Sequence[Path], out: Path | None = None) -> Saved
     target = out or user_folder() / f"{source.stem}.yaml"
     write_object(target, profile.model_copy(update={"ratio": total}), weights_path(source).read_bytes())
     return SavedGain(profile.object, estimate.gain, estimate.std, *total, target)
+
+
+def _torque_std(path: Path) -> float:
+    return config_from_text(LogReader(path).config, str(path)).gripper.gain_std
 
 
 def gain_of(ratio: tuple[float, float] | None, torque_std: float) -> GainEstimate | None:
