@@ -51,9 +51,6 @@ inertia carries the jaws to anywhere within it."""
 _LOWERING_LAG_SHARE = 0.1
 """Lag of the motor force while the force is lowered, as a share of the plant's."""
 
-_TAKEN_UP = 0.25
-"""Largest reversal of the motor force, as a share of twice the friction, at which friction is surely taken up."""
-
 _GATE = 3.29
 """Innovation gate in standard deviations: 0.1 % of good estimates are rejected (chi-square, 10.8)."""
 
@@ -282,9 +279,11 @@ class Fusion:
         if self._learns_gain and (problem := self._gain.problem):
             return problem
         current_n = self._current_at(visual.t_ns)
-        if self._holds and self._learns_gain and self._reversal < _TAKEN_UP:
+        if self._holds and self._learns_gain:
             seen_n2 = max(visual.std_n**2 - (KIND_STD * visual.force_n) ** 2, _VISION_FLOOR_N**2)
-            self._gain.observe(current_n, visual.force_n, self._friction_n2 + _FREE_FLOOR_N**2 + seen_n2)
+            play_n = _INERTIA_SHARE * self._friction_n * self._reversal
+            unknown_n2 = self._friction_n2 + _FREE_FLOOR_N**2 + play_n**2
+            self._gain.observe(current_n, visual.force_n, unknown_n2 + seen_n2)
         self._shared_n2 = 0.0
         if (gain := self._applied_gain) is not None:
             force_n, std_n = gain.corrected(visual.force_n, visual.std_n)
