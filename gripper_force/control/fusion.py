@@ -85,9 +85,9 @@ class Fusion:
     plant's lag: one low-pass with that lag serves both. Vision is compared with the filtered current at its
     capture time. It is first multiplied by the object's gain, as far as earlier grasps have shown it.
 
-    The claimed error adds two parts that the filter does not weigh, because they do not last: the lag of the current
-    estimate while the force changes, and the friction that holds the jaws after the impact, until the force has
-    risen by as much.
+    The claimed error adds parts that the filter does not weigh, because they do not last: the lag of the current
+    estimate while the force changes, the friction that holds the jaws after the impact, until the force has risen by
+    as much, and the bias while vision contradicts the motor current that it was to correct.
 
     Without vision for `ControlConfig.timeout_ms` the source is the current alone, with the last bias
     and a growing variance.
@@ -131,6 +131,7 @@ class Fusion:
         self._difference_n = 0.0
         self._variance_ratio = self._shared_n2 = self._slow_n = 0.0
         self._impact_n: float | None = None
+        self._is_contradicted = False
         self._friction_n = self._transmission.friction_n
         self._friction_n2 = (self._transmission.friction_std * self._friction_n) ** 2
         self._opening_variance_n2 = 0.0
@@ -221,6 +222,8 @@ class Fusion:
         left_n = _INERTIA_SHARE * self._friction_n - max(self._current_n - self._impact_n, 0.0)
         held_n = max(left_n, 0.0) if gripping else 0.0
         self._passing_n2 = (self._current_n - self._slow_n) ** 2 + held_n**2
+        if self._is_contradicted:  # the bias came from estimates of the same network
+            self._passing_n2 += (self._difference_n / (1 + self._variance_ratio)) ** 2
 
     def _predict(self, servo: ServoState, free: bool) -> None:
         before_n = self._current_n
@@ -300,13 +303,14 @@ class Fusion:
         difference_n = visual.force_n - current_n
         innovation_n = difference_n - self._difference_n
         if abs(difference_n) > 3 * math.sqrt(self._prior_n2(current_n) + claimed_n2):
+            self._is_contradicted = True
             return f"it differs from the motor current by {difference_n:.2f} N"
         if abs(innovation_n) > _GATE * math.sqrt(self._variance_n2 + claimed_n2):
             self._rejected = _count_rejections(self._rejected, innovation_n)
             if abs(self._rejected) < self._reentry:
                 return f"it jumps by {innovation_n:.2f} N"
             self._variance_n2 = self._prior_n2(current_n)
-        self._rejected = 0
+        self._rejected, self._is_contradicted = 0, False
         self._correct(innovation_n, _FRAME_NOISE_N**2)
         # Errors that vision and motor current share do not make either of them better than the other.
         prior_n2 = self._prior_n2(current_n)

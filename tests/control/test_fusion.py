@@ -342,3 +342,14 @@ def test_after_an_impact_friction_may_hold_the_jaws_until_the_force_has_risen(be
     risen = b.run(1.0, lambda _: 1.5 + friction_n, gripping=True)
     assert impact.std_n > 0.2
     assert risen.std_n < 0.15
+
+
+def test_a_bias_from_vision_is_in_doubt_once_vision_contradicts_the_current(bench, transmission):
+    friction_n = transmission.friction_n
+    b = bench()
+    b.run(0.1, lambda _: friction_n, gripping=True)
+    agreed = b.run(1.9, lambda _: 2.0 + friction_n, lambda _: 1.5, gripping=True)
+    contradicted = b.run(1.0, lambda _: 2.0 + friction_n, lambda _: 7.0, gripping=True)
+    assert agreed.bias_n < -0.25
+    assert contradicted.source == "current"
+    assert contradicted.std_n > agreed.std_n + 0.1
