@@ -5,7 +5,7 @@ import pytest
 from gripper_force.errors import DataError
 from gripper_force.jobs import object_gain
 from gripper_force.jobs.object_gain import gain_of, learned_ratio, save_gain
-from gripper_force.profiles.object_profile import read_object, weights_path
+from gripper_force.profiles.object_profile import find_object, read_object, weights_path
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import FusedForce
 
@@ -28,7 +28,7 @@ def test_a_gain_is_saved_beside_the_correction(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(object_gain, "_torque_std", lambda path: 0.06)
     saved = save_gain("sponge", [log, log], tmp_path / "mine.yaml")
     assert saved.object_gain == pytest.approx(1.6, rel=0.03)
-    before, after = read_object(object_gain.find_object("sponge")), read_object(tmp_path / "mine.yaml")
+    before, after = read_object(find_object("sponge")), read_object(tmp_path / "mine.yaml")
     assert after.ratio == pytest.approx((1.6, 0.05 / 2**0.5))
     assert after.model_copy(update={"ratio": None}) == before
     assert weights_path(tmp_path / "mine.yaml").exists()

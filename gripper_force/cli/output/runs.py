@@ -74,7 +74,7 @@ def trials_table(trials: "Sequence[Summary]", summary: "Overall") -> None:
             number(t["overshoot_n"], digits=2),
             number(t["settle_s"], digits=2),
             number(None if t["vision_share"] is None else 100 * t["vision_share"], digits=0),
-            _gain(t),
+            number(t["object_gain"], digits=2),
             t["result"] + (", fell back" if t["fell_back"] else ""),
         )
     out.print(table)
