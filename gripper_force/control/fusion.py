@@ -365,7 +365,8 @@ class Fusion:
         if self._source == EstimateSource.VISION:
             force_n, std_n = self._visual_n, max(self._visual_std_n, _VISION_FLOOR_N)
         force_n = max(force_n, 0.0)
-        gain = self._gain.estimate(with_present=True) if self._learns_gain else None
+        shows_gain = self._learns_gain and not self._gain.problem
+        gain = self._gain.estimate(with_present=True) if shows_gain else None
         return FusedForce(
             t_ns=t_ns,
             force_n=force_n,
