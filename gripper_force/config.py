@@ -350,6 +350,16 @@ class ControlConfig(Section):
         description="frame age above which an estimate is rejected; None: 83 ms and a frame period",
     )
     vision_std_n: Positive = Field(1.5, description="standard deviation above which an estimate is rejected")
+    learn_gain: bool = Field(
+        True,
+        description="learn the object's gain (its stiffness over that of its kind) from motor current, from grasp to "
+        "grasp, and multiply visual estimates by it",
+    )
+    object_ratio: tuple[Positive, Positive] | None = Field(
+        None,
+        description="motor current over vision in earlier grasps of the object, and its relative standard deviation "
+        "without that of the torque constant; None: from the object profile, or unknown",
+    )
     min_object_width_m: NonNegative = Field(
         0.002, description="width below which closed jaws hold nothing; less than the thinnest object"
     )
@@ -498,6 +508,10 @@ class SimConfig(Section):
     )
     gain: Positive | None = Field(
         None, description="true torque constant over the servo model's; None: drawn, 0.92 to 1.08"
+    )
+    stiffness: Positive | None = Field(
+        None,
+        description="true stiffness of the object over that of its kind; None: drawn by stiffness_spread",
     )
     open_width_m: Positive | None = Field(
         None, description="true distance between the open jaws; None: gripper.open_width_m"

@@ -14,6 +14,7 @@ from gripper_force.cli.output.bench import (
     checkpoints_table,
     commands_table,
     estimator_table,
+    gain_table,
     loop_table,
     scene_table,
     startup_table,
@@ -95,6 +96,49 @@ def estimator(
     ratios = estimator_bench.ratios(rows)
     result = {"estimator": rows, "ratios": ratios, "plot": plot, "file": file}
     _show(result, as_json, lambda: estimator_table(rows, ratios, plot, file))
+
+
+@app.command("gain")
+def gain(
+    objects: Annotated[
+        list[str] | None,
+        typer.Option("--object", help="Kind of object. Repeatable. Default: the four paper objects."),
+    ] = None,
+    rounds: Annotated[int, typer.Option(min=1, help="Objects of each kind.")] = 1,
+    grasps: Annotated[
+        int, typer.Option(min=1, help="Grasps of each object, from which its gain is learned.")
+    ] = 3,
+    presses: Annotated[
+        int, typer.Option(min=1, help="Presses of each object, on which the error is measured.")
+    ] = 2,
+    folder: Folder = Path("runs/gain"),
+    config: ConfigPath = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the first object.")] = None,
+    set_: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure the error of vision on single simulated objects without and with the gain learned from grasps."""
+    from gripper_force.jobs.grasp import TRIAL_OBJECTS
+    from gripper_force.qualification.bench import gain_bench
+
+    settings = load_settings(config, set_, {"seed": seed})
+    kinds = objects or list(TRIAL_OBJECTS)
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = []
+    with console.err.status("grasping") as status:
+        running = gain_bench.bench(
+            settings,
+            kinds,
+            rounds=rounds,
+            grasps=grasps,
+            presses=presses,
+            folder=folder,
+            progress=lambda text, steps=1: status.update(text),
+        )
+        for row in running:
+            rows.append(row)
+            console.line(f"{row.object}: {row.mae_n:.3f} N, with the gain {row.learned_n:.3f} N")
+    _show({"objects": rows}, as_json, lambda: gain_table(rows))
 
 
 @app.command("bus")

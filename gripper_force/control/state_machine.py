@@ -164,7 +164,7 @@ class GraspController:
         self._let_go_n = 0.0
         self._seen_n: float | None = None
         self._seen_ns, self._seen_before_n = 0, 0.0
-        self._has_seen = self._has_unsure = False
+        self._has_seen = self._has_unsure = self._was_held = False
         self._goal_current_a = self._measured_motor_force_n = 0.0
         self._derating = 1.0
 
@@ -172,6 +172,11 @@ class GraspController:
     def margins(self) -> dict[str, Margin]:
         """Gains and phase margin of each control loop."""
         return self._loop.margins
+
+    def end_grasps(self) -> tuple[float, float] | None:
+        """Ends the last grasp, and returns the ratio of all grasps (see `ObjectGain.ratio`); None without any."""
+        is_held = self._phase in _GRIPPING and self._outcome == Outcome.HELD
+        return self._fusion.end_grasp(was_held=self._was_held or is_held)
 
     def start_problem(self, servo: ServoState) -> str:
         """Returns why the jaws cannot start at a position, or an empty text.
@@ -250,6 +255,8 @@ class GraspController:
             servo,
             visual,
             free=is_free,
+            gripping=self._phase in _GRIPPING,
+            holding=self._phase == Phase.HOLD,
             opening=self._is_opening,
             lowering=self._phase in (Phase.RAMP, Phase.HOLD) and self._loop.is_lowering,
         )
@@ -324,7 +331,9 @@ class GraspController:
         elif not 0 < request.target_n <= self._largest_target_n:
             return f"the target {request.target_n} N is outside 0 to {self._largest_target_n:g} N"
         else:
-            self._start_grasp(t_ns, request.target_n)
+            if request.new_object and self._phase in _GRIPPING:
+                return "an object is held; request a release before the grasp of a new one"
+            self._start_grasp(t_ns, request.target_n, new_object=request.new_object)
         return ""
 
     # Phase changes.
@@ -336,7 +345,7 @@ class GraspController:
     def _set_outcome(self, outcome: Outcome, reason: str) -> None:
         self._outcome, self._reason = outcome, reason
 
-    def _start_grasp(self, t_ns: int, target_n: float) -> None:
+    def _start_grasp(self, t_ns: int, target_n: float, *, new_object: bool) -> None:
         self._grasp_ns, self._target_n, self._outcome = t_ns, target_n, Outcome.NONE
         if self._phase == Phase.CONTACT:
             return
@@ -344,7 +353,8 @@ class GraspController:
             self._loop.retarget(self._derated_target_n)
             self._enter(Phase.RAMP, f"new target {target_n:g} N")
             return
-        self._fusion.restart()
+        self._fusion.restart(was_held=self._was_held, new_object=new_object)
+        self._was_held = False
         self._limits.reset()
         self._approach.start(self._present_width_m, target_n)
         self._enter(Phase.APPROACH, f"grasp with {target_n:g} N requested")
@@ -354,8 +364,8 @@ class GraspController:
         self._enter(Phase.RELEASE, reason)
 
     def _start_move(self, width_m: float) -> None:
-        self._outcome = Outcome.NONE
         self._start_travel()
+        self._outcome = Outcome.NONE
         distance_m = width_m - self._present_width_m
         self._move_width_m, self._move_opens = width_m, distance_m > 0
         rate_m_s = _TRAVEL_SPEED_SHARE * self._config.approach_speed_m_s
@@ -363,7 +373,9 @@ class GraspController:
         self._enter(Phase.MOVE, f"move to {1e3 * width_m:.1f} mm requested")
 
     def _start_travel(self) -> None:
-        self._let_go_n = self._motor_force_n if self._phase in _GRIPPING else 0.0
+        self._let_go_n = 0.0
+        if self._phase in _GRIPPING:
+            self._let_go_n, self._was_held = self._motor_force_n, self._outcome == Outcome.HELD
         speed_m_s = _TRAVEL_SPEED_SHARE * self._config.approach_speed_m_s
         self._travel.start(self._present_width_m, speed_m_s)
         self._limits.reset()

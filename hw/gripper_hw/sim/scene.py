@@ -137,6 +137,8 @@ def draw_scene(object_name: str, seed: int, config: SimConfig) -> Scene:
             servo_friction_nm=config.friction * Scene.servo_friction_nm,
             jaw_friction_n=config.friction * Scene.jaw_friction_n,
         )
+    if config.stiffness is not None:
+        grasped = replace(grasped, stiffness=config.stiffness)
     exact = object_name in GAUGES
     octaves = 0.0
     if config.randomise:
