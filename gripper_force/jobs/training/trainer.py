@@ -14,10 +14,11 @@ from torch import Tensor, nn
 
 from gripper_force.errors import CheckpointError, NonFiniteError
 from gripper_force.jobs.dataset import Clip
-from gripper_force.jobs.training.batches import Batches
+from gripper_force.jobs.training.batches import Batches, Replay
 from gripper_force.jobs.training.parallel import Ranks, share_statistics
 from gripper_force.jobs.training.recipe import TrainConfig
 from gripper_force.vision.batch_inference import predict
+from gripper_force.vision.checkpoint import Member
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess
 
@@ -36,7 +37,7 @@ class Trainer:
         step: Number of completed steps.
     """
 
-    def __init__(self, config: TrainConfig, member: int, batches: Batches, ranks: Ranks) -> None:
+    def __init__(self, config: TrainConfig, member: int, batches: Batches | Replay, ranks: Ranks) -> None:
         torch.manual_seed(config.seed + member)
         self._config = config
         self._batches = batches
@@ -55,6 +56,7 @@ class Trainer:
             fused=True,
         )
         self._forward = torch.compile(self.network) if config.compile else self.network
+        self._freeze_statistics = False
         self.step = 0
         self._elapsed_s = 0.0
         self._smoothed_rmse_n = math.nan
@@ -79,6 +81,9 @@ class Trainer:
             NonFiniteError: The training diverged.
         """
         self.network.train()
+        for module in self.network.modules():
+            if self._freeze_statistics and isinstance(module, nn.BatchNorm2d):
+                module.eval()
         began = time.monotonic() - self._elapsed_s
         while self.done < until:
             loss = self._update()
@@ -123,9 +128,10 @@ class Trainer:
         self._optimizer.step()
         return total
 
-    def load_weights(self, network: ForceNetwork) -> None:
-        """Copies the weights of another network of the same shape."""
-        self.network.load_state_dict(network.state_dict())
+    def start_from(self, member: Member) -> None:
+        """Copies the weights of a network of the same shape, and keeps its batch normalisation's statistics."""
+        self.network.load_state_dict(member.state_dict())
+        self._freeze_statistics = True
 
     def save(self, path: Path, identity: str) -> None:
         """Saves the state of the training.
