@@ -31,7 +31,7 @@ def train(
     recipe: Annotated[
         str,
         typer.Option(
-            help="short_clips (this project's), shin2019 (the paper's), or few: a Gaussian process, for a few recordings."
+            help="short_clips (this project's), shin2019 (the paper's), or few (a Gaussian process)."
         ),
     ] = "short_clips",
     set_: Annotated[
@@ -51,7 +51,7 @@ def train(
     replay: Annotated[
         Path | None,
         typer.Option(
-            help="Logs of an earlier training, of which replay_share of the clips are, so that their objects are not forgotten."
+            help="Logs of an earlier training; they are mixed in, so that their objects are not forgotten."
         ),
     ] = None,
     resume: Annotated[bool, typer.Option(help="Continue an interrupted training.")] = False,
@@ -93,7 +93,7 @@ def train(
     states = state_paths(settings, checkpoint)
     before = [] if resume else _saved(states)  # of an earlier training
     try:
-        with console.bar("training", PROGRESS_STEPS * len(settings.attentions), hidden=quiet) as progress:
+        with console.bar("training", PROGRESS_STEPS * max(1, len(states)), hidden=quiet) as progress:
             result = job(
                 settings,
                 clips,

@@ -18,9 +18,14 @@ from gripper_force.vision.kernel_regression import ForceProcess, matern, pooled
 from gripper_force.vision.preprocess import Preprocess
 
 GRID: Final = 32
+"""Largest side of an averaged frame; the side of the input is a multiple of it."""
+
 COMPONENTS: Final = 90
 POINTS: Final = 1500
 """Frames that a process keeps: memory and time of the fit grow with their square and cube."""
+
+PROGRESS_STEPS: Final = 100
+"""Steps of progress that the training of one member of an ensemble reports."""
 
 FOLDS: Final = 10
 FOLD_POINTS: Final = 750
@@ -83,7 +88,8 @@ def fit(clips: Sequence[Clip], preprocess: Preprocess, progress: Progress = no_p
     errors_n = np.zeros(len(settings))
     left_out: dict[int, list[npt.NDArray[np.float32]]] = {}
     unique = np.array(sorted(set(names)))
-    for number in range(min(FOLDS, len(unique))):
+    folds = min(FOLDS, len(unique))
+    for number in range(folds):
         held = set(unique[number::FOLDS])
         rest = [i for i, name in enumerate(names) if name not in held]
         fold = [i for i, name in enumerate(names) if name in held]
@@ -96,7 +102,8 @@ def fit(clips: Sequence[Clip], preprocess: Preprocess, progress: Progress = no_p
             errors_n[setting] += np.concatenate(
                 [np.abs(f - clips[i].forces_n)[clips[i].valid] for i, f in zip(fold, forces_n, strict=True)]
             ).mean()
-        progress(f"without {', '.join(sorted(held))}")
+        done = [PROGRESS_STEPS * count // folds for count in (number, number + 1)]
+        progress(f"without {', '.join(sorted(held))}", done[1] - done[0])
     best = int(errors_n.argmin())
     process = fitted(clips, preprocess, settings[best])
     return Fit(process, settings[best], [left_out[i][best] for i in range(len(clips))])
@@ -114,7 +121,7 @@ class _Data:
     def __init__(self, images: Sequence[Tensor], clips: Sequence[Clip], points: int = POINTS) -> None:
         every = torch.cat([x[torch.from_numpy(c.valid)] for x, c in zip(images, clips, strict=True)]).double()
         forces_n = np.concatenate([clip.forces_n[clip.valid] for clip in clips])
-        self._centre, spread = every.mean(0), every.std(0) + 1e-3 * every.std()
+        self._centre, spread = every.mean(0), every.std(0) + 1e-3 * every.std() + 1e-6
         centred = (every - self._centre) / spread
         axes = torch.linalg.eigh((centred.T @ centred).float())[1].flip(1)[:, :COMPONENTS].double()
         # Rounded as they are stored, so that the weights fit the stored numbers.
@@ -135,7 +142,9 @@ class _Data:
             covariance = matern(points, points, length) + slope * linear
             covariance.diagonal().add_(noise)
             weights = torch.cholesky_solve(self._forces_n[:, None], torch.linalg.cholesky(covariance))[:, 0]
-            config = ProcessConfig(size=size, grid=GRID, head=COMPONENTS, points=len(points), length=length)
+            config = ProcessConfig(
+                size=size, grid=_grid(size), head=COMPONENTS, points=len(points), length=length
+            )
             process = ForceProcess(config)
             process.load_state_dict(
                 {
@@ -147,6 +156,10 @@ class _Data:
                 }
             )
             yield process.eval()
+
+
+def _grid(size: int) -> int:
+    return max(side for side in range(1, GRID + 1) if size % side == 0)
 
 
 def _kept(forces_n: npt.NDArray[np.float32], points: int) -> npt.NDArray[np.int64]:
@@ -166,4 +179,5 @@ def _spread(frames: npt.NDArray[np.int64], most: int) -> npt.NDArray[np.int64]:
 @torch.inference_mode()
 def _images(clip: Clip, preprocess: Preprocess) -> Tensor:
     frames = torch.from_numpy(clip.frames)[None]
-    return pooled(normalise(frames, frames[:, : preprocess.reference_frames], preprocess)[0], GRID)
+    inputs = normalise(frames, frames[:, : preprocess.reference_frames], preprocess)[0]
+    return pooled(inputs, _grid(preprocess.size))

@@ -19,6 +19,7 @@ from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import Clip, check_size, digest, split_by
 from gripper_force.jobs.training import few
 from gripper_force.jobs.training.batches import Batches, Replay
+from gripper_force.jobs.training.few import PROGRESS_STEPS as PROGRESS_STEPS
 from gripper_force.jobs.training.parallel import Ranks, joined
 from gripper_force.jobs.training.recipe import TrainConfig as TrainConfig
 from gripper_force.jobs.training.recipe import continued
@@ -30,9 +31,6 @@ from gripper_force.vision.header import RESIDUAL_HALF_N, Header, Residual
 
 STATE_EVERY_S: Final = 60.0
 """Time between two saved states: an interrupted training loses no more than this."""
-
-PROGRESS_STEPS: Final = 100
-"""Steps of progress that the training of one network reports."""
 
 LEAST_STEPS: Final = 300
 """Fewer steps give a warning. A complete schedule of so many reaches about 1.6 times the error of a long one."""
