@@ -96,7 +96,7 @@ def fit(clips: Sequence[Clip], preprocess: Preprocess, progress: Progress = no_p
         data = _Data([images[i] for i in rest], [clips[i] for i in rest], FOLD_POINTS)
         scores = [data.features(images[i]) for i in fold]
         for setting, process in enumerate(data.processes(settings, preprocess.size)):
-            forces_n = [process.force_n(s).numpy() for s in scores]
+            forces_n = [process.force_n(part).numpy() for part in scores]
             for i, force_n in zip(fold, forces_n, strict=True):
                 left_out.setdefault(i, []).append(force_n)
             errors_n[setting] += np.concatenate(

@@ -89,7 +89,11 @@ def train(
                 "a Gaussian process is fitted to all its recordings at once; train it without --init and --replay, "
                 "on a folder with all recordings"
             )
-        return _fitted(config, clips, out, validation_clips, progress)
+        with joined("cpu") as ranks:
+            if ranks.first:
+                _fit(config, clips, out, validation_clips, progress)
+            ranks.wait()
+            return load_checkpoint(out)
     if init is not None:
         config = continued(config, init.header)
     training, held_out = clips, validation_clips
@@ -113,13 +117,13 @@ def train(
         return load_checkpoint(out)
 
 
-def _fitted(
+def _fit(
     config: TrainConfig,
     clips: Sequence[Clip],
     out: Path,
     validation_clips: Sequence[Clip] | None,
     progress: Progress,
-) -> Checkpoint:
+) -> None:
     """Fits a Gaussian process and writes its checkpoint. Its stated error is that on objects left out."""
     check_size([*clips, *(validation_clips or [])], config.preprocess)
     process, _, left_out_n = few.fit(clips, config.preprocess, progress)
@@ -133,7 +137,6 @@ def _fitted(
         for parts in (left_out_n, [clip.forces_n for clip in measured])
     )
     _save(out, [process], config, digest(clips), forces_n, measured_n, mean_n)
-    return load_checkpoint(out)
 
 
 def _save(
