@@ -58,6 +58,13 @@ all recipes, and there is no augmentation, weight decay or gradient clipping.
 """
 
 
+FITTED_AT_ONCE: Final = (
+    "a Gaussian process is fitted to all its recordings at once; train it without --init and --replay, on a folder "
+    "with all recordings"
+)
+"""Reason why a Gaussian process does not continue a checkpoint."""
+
+
 class TrainConfig(Section):
     """A training recipe.
 
@@ -200,6 +207,8 @@ def continued(config: TrainConfig, header: Header) -> TrainConfig:
     Raises:
         ConfigError: The recipe sets a key to another value, or no recipe makes such a checkpoint.
     """
+    if config.method == "process":
+        raise ConfigError(FITTED_AT_ONCE)
     if any(isinstance(member, ProcessConfig) for member in header.members):
         raise ConfigError(
             "the initial checkpoint is a Gaussian process, which training can't continue; train it again on all "

@@ -22,7 +22,7 @@ from gripper_force.jobs.training.batches import Batches, Replay
 from gripper_force.jobs.training.few import PROGRESS_STEPS as PROGRESS_STEPS
 from gripper_force.jobs.training.parallel import Ranks, joined
 from gripper_force.jobs.training.recipe import TrainConfig as TrainConfig
-from gripper_force.jobs.training.recipe import continued
+from gripper_force.jobs.training.recipe import FITTED_AT_ONCE, continued
 from gripper_force.jobs.training.trainer import Trainer, estimates
 from gripper_force.vision.batch_inference import predict
 from gripper_force.vision.checkpoint import Checkpoint, Member, load_checkpoint
@@ -85,10 +85,7 @@ def train(
     """
     if config.method == "process":
         if init is not None or replay_clips:
-            raise ConfigError(
-                "a Gaussian process is fitted to all its recordings at once; train it without --init and --replay, "
-                "on a folder with all recordings"
-            )
+            raise ConfigError(FITTED_AT_ONCE)
         with joined("cpu") as ranks:
             if ranks.first:
                 _fit(config, clips, out, validation_clips, progress)
