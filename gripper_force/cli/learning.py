@@ -79,7 +79,7 @@ def train(
             load_clips(logs, settings.preprocess, workers=jobs, progress=progress) if logs else []
             for logs in folders
         )
-    clips = [clip for clip in clips if clip.object not in (hold_out or [])]
+    clips, old = ([clip for clip in part if clip.object not in (hold_out or [])] for part in (clips, old))
     left_out = 0
     if not include_contact_starts:
         loaded = len(clips) + len(unseen) + len(old)

@@ -8,7 +8,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load
 from torch import Tensor
 
-from gripper_force.errors import CheckpointError
+from gripper_force.errors import CheckpointError, ConfigError
 from gripper_force.vision.header import Header, NetworkConfig, ProcessConfig, digest_of, read_checkpoint
 from gripper_force.vision.kernel_regression import ForceProcess
 from gripper_force.vision.network import ForceNetwork
@@ -33,6 +33,14 @@ class Checkpoint:
     networks: tuple[Member, ...]
     header: Header
     digest: str
+
+    @property
+    def force_networks(self) -> list[ForceNetwork]:
+        """The members, for callers that need a network's layers. Raises `ConfigError` for a Gaussian process."""
+        networks = [member for member in self.networks if isinstance(member, ForceNetwork)]
+        if len(networks) < len(self.networks):
+            raise ConfigError("the checkpoint is a Gaussian process; name a network, such as default")
+        return networks
 
 
 def load_checkpoint(source: str | Path = "default") -> Checkpoint:

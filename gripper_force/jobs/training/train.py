@@ -21,8 +21,8 @@ from gripper_force.jobs.training import few
 from gripper_force.jobs.training.batches import Batches, Replay
 from gripper_force.jobs.training.few import PROGRESS_STEPS as PROGRESS_STEPS
 from gripper_force.jobs.training.parallel import Ranks, joined
-from gripper_force.jobs.training.recipe import TrainConfig as TrainConfig
 from gripper_force.jobs.training.recipe import FITTED_AT_ONCE, continued
+from gripper_force.jobs.training.recipe import TrainConfig as TrainConfig
 from gripper_force.jobs.training.trainer import Trainer, estimates
 from gripper_force.vision.batch_inference import predict
 from gripper_force.vision.checkpoint import Checkpoint, Member, load_checkpoint
@@ -184,9 +184,8 @@ def _trained(
         )
     if ranks.count > 1 and config.compile:
         raise ConfigError("compile does not work with several processes; set compile=false")
-    batches: Batches | Replay = Batches(clips, config, ranks)
-    if replay_clips:
-        batches = Replay(batches, Batches(replay_clips, config, ranks), config.replay_share)
+    new = Batches(clips, config, ranks)
+    batches = Replay(new, Batches(replay_clips, config, ranks), config.replay_share) if replay_clips else new
     start = init.digest if init is not None else ""
     data = digest([*clips, *replay_clips])
     identity = f"{config.model_dump_json(exclude={'device', 'compile'})} {data} {start}"

@@ -92,7 +92,7 @@ def _make(
             case "fig7":
                 drawn[name] = paper_figures.force_over_time(test, [PROPOSED], "The proposed ensemble")
             case "fig8":
-                network = load_checkpoint(str(checkpoint_path(out, "ssam-1", 0))).networks[0]
+                network = load_checkpoint(str(checkpoint_path(out, "ssam-1", 0))).force_networks[0]
                 drawn[name] = paper_figures.attention(test, network, scale.recipe("ssam-1", 0).preprocess)
             case "fig9":
                 drawn[name] = paper_figures.force_over_time(
