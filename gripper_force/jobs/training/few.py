@@ -34,13 +34,15 @@ FOLD_POINTS: Final = 750
 CONTACT_POINTS: Final = 0.75
 """Share of these that are in contact, where there are as many."""
 
+SLOPE: Final = 10.0
+"""Weight of the linear kernel, with which a process extrapolates to larger forces."""
+
 LENGTHS: Final = (4.0, 8.0, 16.0)
-SLOPES: Final = (1.0, 10.0)
 NOISES: Final = (0.05, 0.2)
 """Settings to choose from.
 
-Length scale of the Matern kernel in standard deviations of the first component, weight of the linear kernel, and
-variance of the noise over that of the process.
+Length scale of the Matern kernel in standard deviations of the first component, and variance of the noise over that of
+the process.
 """
 
 
@@ -48,7 +50,6 @@ class Setting(NamedTuple):
     """Settings of a process, see `LENGTHS`."""
 
     length: float
-    slope: float
     noise: float
 
 
@@ -84,7 +85,7 @@ def fit(clips: Sequence[Clip], preprocess: Preprocess, progress: Progress = no_p
             f"the settings are chosen on recordings left out, but there is only one {key}; add logs"
         )
     images = [_images(clip, preprocess) for clip in clips]
-    settings = [Setting(*values) for values in itertools.product(LENGTHS, SLOPES, NOISES)]
+    settings = [Setting(*values) for values in itertools.product(LENGTHS, NOISES)]
     errors_n = np.zeros(len(settings))
     left_out: dict[int, list[npt.NDArray[np.float32]]] = {}
     unique = np.array(sorted(set(names)))
@@ -119,16 +120,16 @@ class _Data:
     """Recordings in the features of their own principal components, and the frames to keep."""
 
     def __init__(self, images: Sequence[Tensor], clips: Sequence[Clip], points: int = POINTS) -> None:
-        every = torch.cat([x[torch.from_numpy(c.valid)] for x, c in zip(images, clips, strict=True)]).double()
         forces_n = np.concatenate([clip.forces_n[clip.valid] for clip in clips])
-        self._centre, spread = every.mean(0), every.std(0) + 1e-3 * every.std() + 1e-6
-        centred = (every - self._centre) / spread
-        axes = torch.linalg.eigh((centred.T @ centred).float())[1].flip(1)[:, :COMPONENTS].double()
+        kept = _kept(forces_n, points)
+        every = torch.cat([x[torch.from_numpy(c.valid)] for x, c in zip(images, clips, strict=True)])
+        frames = every[torch.from_numpy(kept)]
+        self._centre, spread = frames.mean(0), frames.std(0) + 1e-3 * frames.std() + 1e-6
+        centred = (frames - self._centre) / spread
+        axes = torch.linalg.eigh(centred.T @ centred)[1].flip(1)[:, :COMPONENTS]
         # Rounded as they are stored, so that the weights fit the stored numbers.
         self._axes = (axes / (centred @ axes[:, 0]).std() / spread[:, None]).half().float()
-        self._centre = self._centre.float()
-        kept = _kept(forces_n, points)
-        self._points = self.features(every[kept].float()).half().float()
+        self._points = self.features(frames).half().float()
         self._forces_n = torch.from_numpy(forces_n[kept]).double()
 
     def features(self, images: Tensor) -> Tensor:
@@ -137,9 +138,9 @@ class _Data:
 
     def processes(self, settings: Sequence[Setting], size: int) -> Iterator[ForceProcess]:
         points = self._points.double()
-        linear = points @ points.T / COMPONENTS
-        for length, slope, noise in settings:
-            covariance = matern(points, points, length) + slope * linear
+        linear = SLOPE / COMPONENTS * points @ points.T
+        for length, noise in settings:
+            covariance = matern(points, points, length) + linear
             covariance.diagonal().add_(noise)
             weights = torch.cholesky_solve(self._forces_n[:, None], torch.linalg.cholesky(covariance))[:, 0]
             config = ProcessConfig(
@@ -152,7 +153,7 @@ class _Data:
                     "axes": self._axes,
                     "points": self._points,
                     "weights": weights.float(),
-                    "slope": (slope / COMPONENTS * points.T @ weights).float(),
+                    "slope": (SLOPE / COMPONENTS * points.T @ weights).float(),
                 }
             )
             yield process.eval()
