@@ -30,7 +30,10 @@ def train(
         "force.safetensors"
     ),
     recipe: Annotated[
-        str, typer.Option(help="short_clips (this project's) or shin2019 (the paper's).")
+        str,
+        typer.Option(
+            help="short_clips (this project's), shin2019 (the paper's), or few (a Gaussian process)."
+        ),
     ] = "short_clips",
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Set one key of the recipe: key=value. Repeatable.")
@@ -49,6 +52,12 @@ def train(
     teacher: Annotated[
         str | None,
         typer.Option(help="Checkpoint whose estimates are learned beside the labels; see teacher_share."),
+    ] = None,
+    replay: Annotated[
+        Path | None,
+        typer.Option(
+            help="Logs of an earlier training; they are mixed in, so that their objects are not forgotten."
+        ),
     ] = None,
     resume: Annotated[bool, typer.Option(help="Continue an interrupted training.")] = False,
     include_contact_starts: ContactStarts = False,
@@ -69,36 +78,38 @@ def train(
     if start is not None:
         settings = continued(settings, start.header)
     quiet = os.environ.get("RANK", "0") != "0"  # only the first process of torchrun prints
-    logs = [path for folder in data for path in find_logs(folder)]
-    unseen_logs = find_logs(validation) if validation else []
-    with console.bar("reading logs", len(logs) + len(unseen_logs), hidden=quiet) as progress:
-        clips = load_clips(logs, settings.preprocess, workers=jobs, progress=progress)
-        unseen = (
-            load_clips(unseen_logs, settings.preprocess, workers=jobs, progress=progress)
-            if unseen_logs
-            else None
+    folders = [
+        [path for folder in given for path in find_logs(folder)]
+        for given in (data, [validation] if validation else [], [replay] if replay else [])
+    ]
+    with console.bar("reading logs", sum(map(len, folders)), hidden=quiet) as progress:
+        clips, unseen, old = (
+            load_clips(logs, settings.preprocess, workers=jobs, progress=progress) if logs else []
+            for logs in folders
         )
-    clips = [clip for clip in clips if clip.object not in (hold_out or [])]
+    clips, old = ([clip for clip in part if clip.object not in (hold_out or [])] for part in (clips, old))
     left_out = 0
     if not include_contact_starts:
-        loaded = len(clips) + len(unseen or [])
-        clips = without_contact_starts(clips, settings.preprocess)
-        unseen = without_contact_starts(unseen, settings.preprocess) if unseen else unseen
-        left_out = loaded - len(clips) - len(unseen or [])
+        loaded = len(clips) + len(unseen) + len(old)
+        clips, unseen, old = (
+            without_contact_starts(part, settings.preprocess) for part in (clips, unseen, old)
+        )
+        left_out = loaded - len(clips) - len(unseen) - len(old)
         if not quiet:
             _warn_left_out(left_out, loaded)
     warnings: list[str] = []
     states = state_paths(settings, checkpoint)
     before = [] if resume else _saved(states)  # of an earlier training
     try:
-        with console.bar("training", PROGRESS_STEPS * len(settings.attentions), hidden=quiet) as progress:
+        with console.bar("training", PROGRESS_STEPS * max(1, len(states)), hidden=quiet) as progress:
             result = job(
                 settings,
                 clips,
                 checkpoint,
-                validation_clips=unseen,
+                validation_clips=unseen if validation else None,
                 init=start,
                 teacher=load_checkpoint(teacher) if teacher else None,
+                replay_clips=old,
                 resume=resume,
                 progress=progress,
                 warn=warnings.append,

@@ -7,11 +7,11 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from gripper_force.errors import CheckpointError
+from gripper_force.vision.checkpoint import Member
 from gripper_force.vision.header import FORMAT, Header, digest_of, read_checkpoint
-from gripper_force.vision.network import ForceNetwork
 
 
-def save_checkpoint(path: Path, networks: Sequence[ForceNetwork], header: Header) -> None:
+def save_checkpoint(path: Path, networks: Sequence[Member], header: Header) -> None:
     """Writes an ensemble: matrices as float16 where its range allows, vectors as float32.
 
     Half precision halves the file and changes the force by less than 1e-3 of its value.

@@ -91,6 +91,42 @@ class NetworkConfig(Section):
         return self.window - 1 + self.maps_kept
 
 
+class ProcessConfig(Section):
+    """Shape of a Gaussian process on single frames, see `kernel_regression`.
+
+    Attributes:
+        size: Side of the input in pixels.
+        grid: Side of the averaged frame.
+        head: Number of principal components.
+        points: Number of training frames that it keeps.
+        length: Length scale of its kernel, in standard deviations of the first component.
+        label_scale_n: Scale of the forces, as of a network.
+    """
+
+    size: Annotated[int, Field(ge=16, le=1024)]
+    grid: Annotated[int, Field(ge=1, le=128)]
+    head: Count
+    points: Count
+    length: Positive
+    label_scale_n: Positive = 20.0
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        if self.size % self.grid:
+            raise ValueError(f"size {self.size} is not a multiple of {self.grid}; use preprocess.size=64")
+        return self
+
+    @property
+    def attention(self) -> Attention:
+        """No attention."""
+        return "none"
+
+    @property
+    def context(self) -> int:
+        """Number of earlier frames that an estimate depends on: none."""
+        return 0
+
+
 EXPORTED: Final = {".xml": "openvino", ".onnx": "onnxruntime"}
 """Suffixes of exported files, and the engine that runs each."""
 
@@ -118,7 +154,7 @@ class Header(Section):
     """Metadata of a checkpoint.
 
     Attributes:
-        members: Shapes of the networks whose mean is the estimate.
+        members: Shapes of the networks, or of the Gaussian process, whose mean is the estimate.
         preprocess: Preparation of frames.
         residuals: Error by estimated force, measured on validation data, in order of rising force.
         data_digest: SHA-256 of the training set.
@@ -129,7 +165,7 @@ class Header(Section):
         identity: SHA-256 of the file before its header was changed; see `digest_of`.
     """
 
-    members: tuple[NetworkConfig, ...]
+    members: tuple[NetworkConfig | ProcessConfig, ...]
     preprocess: Preprocess
     residuals: tuple[Residual, ...]
     data_digest: str

@@ -147,3 +147,27 @@ class Batches:
         gain, gamma = (move(np.exp(part))[:, None, None, None] for part in light)  # (B, 1, 1, 1) each
         lit: Tensor = gain * (gray / 255) ** gamma + move(noise)[:, None, None, None] * grain[self._share]
         return lit.clamp_(0, 1) * 255
+
+
+class Replay:
+    """Batches of new recordings, mixed with those of an earlier training.
+
+    Attributes:
+        labels: Number of new frames with a label.
+        unseen: Mask of the new recordings from which no clip has been drawn, (recordings,) bool.
+    """
+
+    def __init__(self, new: Batches, old: Batches, share: float) -> None:
+        self._new, self._old, self._share = new, old, share
+        self.labels = new.labels
+        self.unseen = new.unseen
+
+    def batch(self, step: int, count: int, length: int) -> Batch:
+        """Draws the clips of one step, ``share`` of them from the earlier recordings; see `Batches.batch`."""
+        old = round(self._share * count)
+        parts = [
+            batches.batch(step, clips, length)
+            for batches, clips in ((self._new, count - old), (self._old, old))
+            if clips
+        ]
+        return Batch(*(torch.cat(part) for part in zip(*parts, strict=True)))

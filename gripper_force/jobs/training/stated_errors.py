@@ -12,10 +12,9 @@ import numpy.typing as npt
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import Clip
 from gripper_force.vision.batch_inference import predict
-from gripper_force.vision.checkpoint import load_checkpoint
+from gripper_force.vision.checkpoint import Member, load_checkpoint
 from gripper_force.vision.checkpoint_writer import replace_header
 from gripper_force.vision.header import RESIDUAL_HALF_N, SHIPPED, Residual
-from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess
 
 RESIDUAL_PRIOR: Final = 20
@@ -60,7 +59,7 @@ def state_errors(
 
 
 def estimates(
-    clips: Sequence[Clip], networks: Sequence[ForceNetwork], preprocess: Preprocess, device: str
+    clips: Sequence[Clip], networks: Sequence[Member], preprocess: Preprocess, device: str
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
     """Returns the ensemble's and the measured forces in N, (N,) each, over all frames with a label."""
     forces_n = [predict(networks, preprocess, clip.frames, device).mean(0)[clip.valid] for clip in clips]

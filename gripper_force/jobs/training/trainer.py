@@ -10,12 +10,14 @@ import torch.nn.functional as F
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
+from torch.nn.modules.batchnorm import _BatchNorm
 
 from gripper_force.errors import CheckpointError, NonFiniteError
 from gripper_force.jobs.dataset import CONTACT_N
-from gripper_force.jobs.training.batches import Batch, Batches
+from gripper_force.jobs.training.batches import Batch, Batches, Replay
 from gripper_force.jobs.training.parallel import Ranks, share_statistics
 from gripper_force.jobs.training.recipe import TrainConfig
+from gripper_force.vision.checkpoint import Member
 from gripper_force.vision.header import INDENTATION_SCALE_M
 from gripper_force.vision.network import ForceNetwork
 
@@ -39,9 +41,9 @@ class Trainer:
         self,
         config: TrainConfig,
         member: int,
-        batches: Batches,
+        batches: Batches | Replay,
         ranks: Ranks,
-        teacher: Sequence[ForceNetwork] = (),
+        teacher: Sequence[Member] = (),
     ) -> None:
         torch.manual_seed(config.seed + member)
         self._config = config
@@ -52,7 +54,7 @@ class Trainer:
         if config.epochs is not None:
             self._total_steps = math.ceil(config.epochs * batches.labels / config.clips)
         self.network = ForceNetwork(config.network(member)).to(ranks.device)
-        if ranks.count > 1 and not config.freeze_statistics:
+        if ranks.count > 1:
             share_statistics(self.network)
         self._optimizer = torch.optim.AdamW(
             self.network.parameters(),
@@ -62,6 +64,7 @@ class Trainer:
         )
         self._features = torch.compile(self.network.features) if config.compile else self.network.features
         self._teacher = [network.to(ranks.device) for network in teacher]
+        self._freeze_statistics = False
         self.step = 0
         self._elapsed_s = 0.0
         self._smoothed_rmse_n = math.nan
@@ -86,10 +89,9 @@ class Trainer:
             NonFiniteError: The training diverged.
         """
         self.network.train()
-        if self._config.freeze_statistics:
-            for module in self.network.modules():
-                if isinstance(module, nn.BatchNorm2d):
-                    module.eval()
+        for module in self.network.modules():
+            if self._freeze_statistics and isinstance(module, _BatchNorm):
+                module.eval()
         began = time.monotonic() - self._elapsed_s
         while self.done < until:
             loss = self._update()
@@ -164,17 +166,20 @@ class Trainer:
                 total = total + self._config.contact_weight * (entropy * batch.valid[:, first:]).sum()
         return total
 
-    def load_weights(self, network: ForceNetwork) -> None:
+    def start_from(self, network: ForceNetwork) -> None:
         """Copies the weights of another network of the same shape. Outputs that it lacks start at 0.
 
-        Random ones would change the features that the force depends on, before they have learned anything.
+        Random ones would change the features that the force depends on, before they have learned anything. The
+        statistics of its batch normalisation are kept, unless ``freeze_statistics`` is false.
         """
+        self._freeze_statistics = self._config.freeze_statistics is not False
         weights = network.state_dict()
+        before = network.config.outputs
         for name in ("out.weight", "out.bias"):
             rows = torch.zeros_like(self.network.state_dict()[name])
             for i, quantity in enumerate(self._config.outputs):
-                if quantity in network.config.outputs:
-                    rows[i] = weights[name][network.config.outputs.index(quantity)]
+                if quantity in before:
+                    rows[i] = weights[name][before.index(quantity)]
             weights[name] = rows
         self.network.load_state_dict(weights)
 

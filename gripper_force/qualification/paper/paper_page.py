@@ -116,7 +116,7 @@ def _figure(name: str, tests: Sequence[Test], data: Path | None, out: Path) -> F
             return paper_figures.force_over_time(test, [PROPOSED], "The proposed ensemble")
         case "fig9":
             return paper_figures.force_over_time(test, [BASELINE, PROPOSED], "Baseline and proposed")
-    network = load_checkpoint(str(checkpoint_path(out, data, test.scale, "ssam-1", 0))).networks[0]
+    network = load_checkpoint(str(checkpoint_path(out, data, test.scale, "ssam-1", 0))).force_networks[0]
     return paper_figures.attention(test, network, test.scale.recipe("ssam-1", 0).preprocess)
 
 

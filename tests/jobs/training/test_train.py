@@ -58,7 +58,8 @@ def test_every_network_trains(
     config = TrainConfig.model_validate({**small_recipe.model_dump(), **recipe, "preprocess": {"size": 32}})
     larger = [replace(clip, frames=clip.frames.repeat(2, axis=1).repeat(2, axis=2)) for clip in clips]
     checkpoint = train(config, larger, tmp_path / "out.safetensors")
-    (member,) = checkpoint.header.members
+    (network,) = checkpoint.force_networks
+    member = network.config
     assert (member.attention, member.backbone) == (attention, backbone)
     assert member.pooling == (pooling if attention in ("ssam", "scam") else "wap")
 
@@ -126,6 +127,7 @@ def test_training_too_short_for_all_recordings_warns(
     assert warnings == [
         "the training was too short: it drew no clip from 5 of its 6 recordings; increase steps"
     ]
+    monkeypatch.setattr(train_module, "LEAST_STEPS", 1)
     train(small_recipe, clips, out, validation_clips=clips, warn=warnings.append)
     assert len(warnings) == 1
     config = one_clip.model_copy(update={"steps": 3})
@@ -203,7 +205,7 @@ def test_command_continues_a_checkpoint(few_logs: Path, tiny_checkpoint: Path, t
     assert result.header.members == start.header.members
     assert result.header.preprocess == start.header.preprocess
     # One step changes each weight by no more than the learning rate; a new network has far smaller weights.
-    before, after = (checkpoint.networks[0].out.weight for checkpoint in (start, result))
+    before, after = (checkpoint.force_networks[0].out.weight for checkpoint in (start, result))
     assert before.abs().max() > 100
     torch.testing.assert_close(after, before, rtol=1e-3, atol=0.01)
     assert result.digest != start.digest

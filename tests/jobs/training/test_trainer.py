@@ -119,7 +119,7 @@ def test_new_outputs_leave_the_force_of_the_initial_network(
     ).network.eval()
     config = small_recipe.model_copy(update={"contact_weight": 1.0})
     trainer = Trainer(config, 0, Batches(indented, config, Ranks("cpu")), Ranks("cpu"))
-    trainer.load_weights(plain)
+    trainer.start_from(plain)
     inputs = torch.randn(2, 24, 1, 16, 16)
     with torch.no_grad():
         assert torch.equal(trainer.network.eval()(inputs, 19), plain(inputs, 19))
