@@ -4,7 +4,9 @@
     python examples/stapler_stop.py data/test
 
 Prints the travel of the jaws per newton by force, from the logs, and in the same bins the error of the
-network and of the best constant prediction per bin. Where the jaws no longer move, a camera sees no change.
+network, of its output on the line that fits best within the bin (least squares), and of the best constant. Past the
+stop it also prints the correlation of the network's output with the force, within each log and over all: a positive
+correlation shows that the image still changes with the force there.
 """
 
 import argparse
@@ -24,6 +26,9 @@ OBJECT = "stapler"
 EDGES_N = (1.0, 4.0, 8.0, 14.0)
 """Bins: soft, stiffer, and past the stop."""
 
+LEAST_FRAMES = 20
+"""Least number of frames or cycles of a log for a figure of that log."""
+
 _RISE_N = 0.05
 """Least rise of the force in 20 ms. While the force falls, friction keeps the jaws in place."""
 
@@ -40,7 +45,7 @@ def travel(paths: list[Path], low_n: float, high_n: float) -> Floats:
         force_n = np.interp(table[:, 0], cells[:, 0], cells[:, 1])
         rising = np.concatenate([np.zeros(4), force_n[4:] - force_n[:-4]]) > _RISE_N
         in_bin = rising & (force_n > low_n) & (force_n < high_n)
-        if in_bin.sum() >= 20 and np.ptp(force_n[in_bin]) > 1:
+        if in_bin.sum() >= LEAST_FRAMES and np.ptp(force_n[in_bin]) > 1:
             slopes.append(1e3 * np.polyfit(force_n[in_bin], table[in_bin, 1], 1)[0])
     return np.array(slopes)
 
@@ -60,21 +65,35 @@ def main() -> None:
     forces_n = [members_n.mean(0) for members_n in estimates(checkpoint, clips)]
     used = [clip.valid & (np.arange(len(clip.frames)) >= preprocess.lead_in) for clip in clips]
     measured_n = np.concatenate([clip.forces_n[t] for clip, t in zip(clips, used, strict=True)])
-    error_n = np.abs(np.concatenate([f[t] for f, t in zip(forces_n, used, strict=True)]) - measured_n)
-    is_stapler = np.concatenate(
-        [np.full(t.sum(), clip.object == OBJECT) for clip, t in zip(clips, used, strict=True)]
-    )
+    estimated_n = np.concatenate([f[t] for f, t in zip(forces_n, used, strict=True)])
+    error_n = np.abs(estimated_n - measured_n)
+    log = np.concatenate([np.full(t.sum(), i) for i, t in enumerate(used)])
+    is_stapler = np.array([clip.object == OBJECT for clip in clips])[log]
 
     pressed = [path for path, clip in zip(paths, clips, strict=True) if clip.object == OBJECT]
-    print(f"| {OBJECT}, N | travel mm/N | frames | network MAE N | best constant, MAE N |")
-    print("|---|---|---|---|---|")
+    print(
+        f"| {OBJECT}, N | travel mm/N | frames | network MAE N | on its best line, MAE N | constant, MAE N |"
+    )
+    print("|---|---|---|---|---|---|")
     for low, high in pairwise(EDGES_N):
         in_bin = is_stapler & (measured_n >= low) & (measured_n < high)
         constant_n = np.abs(measured_n[in_bin] - np.median(measured_n[in_bin])).mean()
         slope = np.median(travel(pressed, low, high))
-        figures = f"{in_bin.sum()} | {error_n[in_bin].mean():.2f} | {constant_n:.2f}"
+        line = np.polyfit(estimated_n[in_bin], measured_n[in_bin], 1)
+        line_n = np.abs(np.polyval(line, estimated_n[in_bin]) - measured_n[in_bin]).mean()
+        figures = f"{in_bin.sum()} | {error_n[in_bin].mean():.2f} | {line_n:.2f} | {constant_n:.2f}"
         print(f"| {low:g} to {high:g} | {slope:.2f} | {figures} |")
     past = is_stapler & (measured_n >= EDGES_N[-2])
+    by_log = [
+        np.corrcoef(estimated_n[frames], measured_n[frames])[0, 1]
+        for i in np.unique(log[past])
+        if (frames := past & (log == i)).sum() >= LEAST_FRAMES and np.ptp(measured_n[frames]) > 1
+    ]
+    print(
+        f"\nCorrelation of output and force from {EDGES_N[-2]:g} N on: {min(by_log):.2f} to {max(by_log):.2f} within "
+        f"{len(by_log)} logs with a range above 1 N, {np.corrcoef(estimated_n[past], measured_n[past])[0, 1]:.2f} "
+        "over all"
+    )
     rest_n = error_n[~past]
     replaced_n = (rest_n.sum() + past.sum() * constant_n) / len(error_n)
     print(

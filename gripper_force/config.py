@@ -350,6 +350,16 @@ class ControlConfig(Section):
         description="frame age above which an estimate is rejected; None: 83 ms and a frame period",
     )
     vision_std_n: Positive = Field(1.5, description="standard deviation above which an estimate is rejected")
+    learn_gain: bool = Field(
+        True,
+        description="learn the object's gain (its stiffness over that of its kind) from motor current, from grasp to "
+        "grasp, and multiply visual estimates by it",
+    )
+    object_ratio: tuple[Positive, Positive] | None = Field(
+        None,
+        description="motor current over vision in earlier grasps of the object, and its relative standard deviation "
+        "without that of the torque constant; None: from the object profile, or unknown",
+    )
     min_object_width_m: NonNegative = Field(
         0.002, description="width below which closed jaws hold nothing; less than the thinnest object"
     )
@@ -466,6 +476,27 @@ class SimConfig(Section):
     stiffness_spread: float = Field(
         0.05, ge=0, le=0.5, description="half-width of the uniform spread of the object's stiffness"
     )
+    stiffness_octaves: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="half-width in octaves of a further, log-uniform spread of the object's stiffness; "
+        "1: factors 0.5 to 2",
+    )
+    view_spread: float = Field(
+        1.0,
+        ge=0,
+        le=15,
+        description="factor on the ranges from which place, aim and field of view of the camera, and light are "
+        "drawn; 10: other mountings, lenses and zooms",
+    )
+    jaw_spread: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="spread of the jaws' looks, 0 to 1: width and height of the pads, width of the fingers, "
+        "brightness of both",
+    )
     markers: bool = Field(False, description="an ArUco marker on each finger, beside its pad")
     changing_light: bool = Field(False, description="light that changes slowly during a run, by up to 30 %")
     moving_background: bool = Field(False, description="things that move behind the object")
@@ -477,6 +508,10 @@ class SimConfig(Section):
     )
     gain: Positive | None = Field(
         None, description="true torque constant over the servo model's; None: drawn, 0.92 to 1.08"
+    )
+    stiffness: Positive | None = Field(
+        None,
+        description="true stiffness of the object over that of its kind; None: drawn by stiffness_spread",
     )
     open_width_m: Positive | None = Field(
         None, description="true distance between the open jaws; None: gripper.open_width_m"

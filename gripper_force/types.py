@@ -181,6 +181,9 @@ class FusedForce:
         bias_n: Correction that the filter adds to `current_n`.
         friction_n: Coulomb friction of one jaw, estimated during free travel.
         source: Sensors used (an `EstimateSource` value).
+        object_gain: Gain of the object, the factor on visual estimates, as far as motor current has shown it; 0 if it
+            has not.
+        object_gain_std: Its relative standard deviation.
     """
 
     t_ns: int
@@ -190,6 +193,8 @@ class FusedForce:
     bias_n: float
     friction_n: float
     source: str
+    object_gain: float = 0.0
+    object_gain_std: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,12 +206,15 @@ class Request:
         kind: A `RequestKind` value.
         target_n: Wanted grip force (grasp only).
         width_m: Wanted distance between the jaws (move only).
+        new_object: True if the object is another than in the grasps before (grasp only): the gain that was learned
+            is forgotten.
     """
 
     t_ns: int
     kind: str
     target_n: float = 0.0
     width_m: float = 0.0
+    new_object: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,8 +11,10 @@ from gripper_force.cli import console
 from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, Page, load_settings
 from gripper_force.cli.output.bench import (
     bus_table,
+    checkpoints_table,
     commands_table,
     estimator_table,
+    gain_table,
     loop_table,
     recognition_table,
     scene_table,
@@ -95,6 +97,49 @@ def estimator(
     ratios = estimator_bench.ratios(rows)
     result = {"estimator": rows, "ratios": ratios, "plot": plot, "file": file}
     _show(result, as_json, lambda: estimator_table(rows, ratios, plot, file))
+
+
+@app.command("gain")
+def gain(
+    objects: Annotated[
+        list[str] | None,
+        typer.Option("--object", help="Kind of object. Repeatable. Default: the four paper objects."),
+    ] = None,
+    rounds: Annotated[int, typer.Option(min=1, help="Objects of each kind.")] = 1,
+    grasps: Annotated[
+        int, typer.Option(min=1, help="Grasps of each object, from which its gain is learned.")
+    ] = 3,
+    presses: Annotated[
+        int, typer.Option(min=1, help="Presses of each object, on which the error is measured.")
+    ] = 2,
+    folder: Folder = Path("runs/gain"),
+    config: ConfigPath = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the first object.")] = None,
+    set_: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure the error of vision on single simulated objects without and with the gain learned from grasps."""
+    from gripper_force.jobs.grasp import TRIAL_OBJECTS
+    from gripper_force.qualification.bench import gain_bench
+
+    settings = load_settings(config, set_, {"seed": seed})
+    kinds = objects or list(TRIAL_OBJECTS)
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = []
+    with console.err.status("grasping") as status:
+        running = gain_bench.bench(
+            settings,
+            kinds,
+            rounds=rounds,
+            grasps=grasps,
+            presses=presses,
+            folder=folder,
+            progress=lambda text, steps=1: status.update(text),
+        )
+        for row in running:
+            rows.append(row)
+            console.line(f"{row.object}: {row.mae_n:.3f} N, with the gain {row.learned_n:.3f} N")
+    _show({"objects": rows}, as_json, lambda: gain_table(rows))
 
 
 @app.command("bus")
@@ -233,6 +278,37 @@ def training(
     reached = training_bench.reached(points)
     result = {"points": points, "as_good_as_paper_min": reached, "folder": folder}
     _show(result, as_json, lambda: training_table(points, reached, folder))
+
+
+@app.command("checkpoints")
+def checkpoints(
+    data: Annotated[list[Path], typer.Argument(help="Folders with logs that were not used for training.")],
+    checkpoint: Annotated[
+        list[str], typer.Option(help="Path of a checkpoint, or default or small. Repeatable.")
+    ],
+    write: Annotated[
+        bool, typer.Option("--write", help="Write the errors into the checkpoints; their digests stay.")
+    ] = False,
+    jobs: Jobs = CORES,
+    as_json: AsJson = False,
+) -> None:
+    """Measure the errors of checkpoints on the same logs, so that `vision.checkpoint=auto` can compare them."""
+    from collections.abc import Sequence
+
+    from gripper_force.jobs.dataset import Clip, find_logs, load_clips, without_contact_starts
+    from gripper_force.jobs.training.stated_errors import state_errors
+    from gripper_force.vision.preprocess import Preprocess
+
+    logs = [path for folder in data for path in find_logs(folder)]
+
+    def read(preprocess: Preprocess) -> Sequence[Clip]:
+        with console.bar("reading logs", len(logs)) as progress:
+            return without_contact_starts(
+                load_clips(logs, preprocess, workers=jobs, progress=progress), preprocess
+            )
+
+    found = state_errors(checkpoint, read, write=write)
+    _show({"checkpoints": found}, as_json, lambda: checkpoints_table(found))
 
 
 def _reject_overrides(command: str, overrides: list[str] | None) -> None:

@@ -222,6 +222,26 @@ def network(
     console.show({"checkpoint": str(out), **fitted}, as_json)
 
 
+@app.command("gain")
+def gain(
+    name: Annotated[str, typer.Argument(help="Object profile to add the gain to, by name or path.")],
+    logs: Annotated[
+        list[Path],
+        typer.Option("--from", help="Log of grasps of this object, or a folder of them. Repeatable."),
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="Profile to write. Default: NAME.yaml in your folder of profiles.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Save the object's gain, learned from motor current in grasps with the profile, to an object profile."""
+    from gripper_force.jobs.dataset import find_logs
+    from gripper_force.jobs.object_gain import save_gain
+
+    paths = [path for given in logs for path in (find_logs(given) if given.is_dir() else [given])]
+    console.show(save_gain(name, paths, out), as_json)
+
+
 def _tell_existing(settings: "Config", touches: int, folder: Path, fresh: bool) -> None:
     """Names the touches that are used again, or with ``fresh`` moves them away."""
     from gripper_calibration.procedures import calibrate_object as job

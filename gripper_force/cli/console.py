@@ -36,6 +36,19 @@ def bar(label: str, total: int, *, hidden: bool = False) -> "Iterator[Progress]"
         yield lambda text, steps=1: shown.update(task, advance=steps, note=text)
 
 
+@contextmanager
+def lines(label: str, total: int) -> "Iterator[Progress]":
+    """Like `bar` for a log file: prints a line on stderr for each report of progress."""
+    done = 0
+
+    def show(text: str, steps: int = 1) -> None:
+        nonlocal done
+        done += steps
+        line(f"{label}: {done} of {total}, {text}")
+
+    yield show
+
+
 def line(text: str, steps: int = 1) -> None:
     """Prints a line on stderr for each report of progress."""
     err.print(f"[dim]{escape(text)}[/]", soft_wrap=True)

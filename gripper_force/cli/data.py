@@ -31,7 +31,11 @@ def simulate(
     ] = None,
     object_: Annotated[
         list[str] | None,
-        typer.Option("--object", help="Simulate this object. Repeatable.  [default: all four, in turn]"),
+        typer.Option(
+            "--object",
+            help="Simulate this object, or a group: training-kinds, held-out-kinds. Repeatable.  "
+            "[default: all four, in turn]",
+        ),
     ] = None,
     protocol: Annotated[
         str | None, typer.Option(help="shin2019: the paper's sets instead, in OUT/train and OUT/test.")
@@ -43,6 +47,13 @@ def simulate(
             "[default: full]"
         ),
     ] = None,
+    instances: Annotated[
+        str | None,
+        typer.Option(
+            help="With --protocol: same (one instance of each object and one rig in all sets, as in the paper) "
+            "or redrawn (for each set).  [default: same]"
+        ),
+    ] = None,
     jobs: Jobs = CORES,
     config: ConfigPath = None,
     set_: Overrides = None,
@@ -51,16 +62,23 @@ def simulate(
     """Simulate logs of random touches, for training and evaluation. Continues if it was interrupted."""
     from gripper_force.jobs import paper_protocol
     from gripper_force.jobs import simulate as job
+    from gripper_hw.sim.kinds import held_out_kinds, training_kinds
 
     plans: list[job.Plan]
     if protocol is None:
-        if scale is not None:
-            raise ConfigError(
-                "--scale only applies with --protocol; add --protocol shin2019, or omit --scale"
-            )
+        for name, value in (("--scale", scale), ("--instances", instances)):
+            if value is not None:
+                raise ConfigError(
+                    f"{name} only applies with --protocol; add --protocol shin2019, or omit {name}"
+                )
         settings = load_settings(config, set_, {})
         seed, plans = 100_000 if first_seed is None else first_seed, []
-        objects = tuple(object_ or job.OBJECTS)
+        groups = {"training-kinds": training_kinds, "held-out-kinds": held_out_kinds}
+        objects = tuple(
+            name
+            for given in object_ or job.OBJECTS
+            for name in (groups[given]() if given in groups else (given,))
+        )
         plans += job.plan("press", 200 if presses is None else presses, seed, objects)
         plans += job.plan("tap", taps or 0, seed + len(plans), objects)
         plans += job.plan("grasp", 20 if grasps is None else grasps, seed + len(plans), objects)
@@ -78,7 +96,7 @@ def simulate(
                 "them"
             )
         settings = load_settings(config, [f"camera.rate_hz={paper_protocol.RATE_HZ}", *(set_ or [])], {})
-        plans = list(paper_protocol.plan_protocol(scale or "full"))
+        plans = list(paper_protocol.plan_protocol(scale or "full", instances or "same"))
     else:
         raise ConfigError(f"no protocol {protocol!r}; use shin2019")
     names = [name for p in plans for name in p.names]

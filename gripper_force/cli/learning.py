@@ -1,6 +1,7 @@
 """Commands for networks: `train`, `evaluate`, `export` and `reproduce`."""
 
 import json
+import math
 import os
 import shlex
 from pathlib import Path
@@ -24,12 +25,15 @@ ContactStarts = Annotated[
 
 
 def train(
-    data: Annotated[Path, typer.Argument(help="Folder with logs.")],
+    data: Annotated[list[Path], typer.Argument(help="Folders with logs.")],
     checkpoint: Annotated[Path, typer.Option("--out", help="Checkpoint to write.")] = Path(
         "force.safetensors"
     ),
     recipe: Annotated[
-        str, typer.Option(help="short_clips (this project's) or shin2019 (the paper's).")
+        str,
+        typer.Option(
+            help="short_clips (this project's), shin2019 (the paper's), or few (a Gaussian process)."
+        ),
     ] = "short_clips",
     set_: Annotated[
         list[str] | None, typer.Option("--set", help="Set one key of the recipe: key=value. Repeatable.")
@@ -44,6 +48,16 @@ def train(
     init: Annotated[
         str | None,
         typer.Option(help="Checkpoint to continue: its weights, and its keys where none are set."),
+    ] = None,
+    teacher: Annotated[
+        str | None,
+        typer.Option(help="Checkpoint whose estimates are learned beside the labels; see teacher_share."),
+    ] = None,
+    replay: Annotated[
+        Path | None,
+        typer.Option(
+            help="Logs of an earlier training; they are mixed in, so that their objects are not forgotten."
+        ),
     ] = None,
     resume: Annotated[bool, typer.Option(help="Continue an interrupted training.")] = False,
     include_contact_starts: ContactStarts = False,
@@ -64,34 +78,38 @@ def train(
     if start is not None:
         settings = continued(settings, start.header)
     quiet = os.environ.get("RANK", "0") != "0"  # only the first process of torchrun prints
-    logs, unseen_logs = find_logs(data), find_logs(validation) if validation else []
-    with console.bar("reading logs", len(logs) + len(unseen_logs), hidden=quiet) as progress:
-        clips = load_clips(logs, settings.preprocess, workers=jobs, progress=progress)
-        unseen = (
-            load_clips(unseen_logs, settings.preprocess, workers=jobs, progress=progress)
-            if unseen_logs
-            else None
+    folders = [
+        [path for folder in given for path in find_logs(folder)]
+        for given in (data, [validation] if validation else [], [replay] if replay else [])
+    ]
+    with console.bar("reading logs", sum(map(len, folders)), hidden=quiet) as progress:
+        clips, unseen, old = (
+            load_clips(logs, settings.preprocess, workers=jobs, progress=progress) if logs else []
+            for logs in folders
         )
-    clips = [clip for clip in clips if clip.object not in (hold_out or [])]
+    clips, old = ([clip for clip in part if clip.object not in (hold_out or [])] for part in (clips, old))
     left_out = 0
     if not include_contact_starts:
-        loaded = len(clips) + len(unseen or [])
-        clips = without_contact_starts(clips, settings.preprocess)
-        unseen = without_contact_starts(unseen, settings.preprocess) if unseen else unseen
-        left_out = loaded - len(clips) - len(unseen or [])
+        loaded = len(clips) + len(unseen) + len(old)
+        clips, unseen, old = (
+            without_contact_starts(part, settings.preprocess) for part in (clips, unseen, old)
+        )
+        left_out = loaded - len(clips) - len(unseen) - len(old)
         if not quiet:
             _warn_left_out(left_out, loaded)
     warnings: list[str] = []
     states = state_paths(settings, checkpoint)
     before = [] if resume else _saved(states)  # of an earlier training
     try:
-        with console.bar("training", PROGRESS_STEPS * len(settings.attentions), hidden=quiet) as progress:
+        with console.bar("training", PROGRESS_STEPS * max(1, len(states)), hidden=quiet) as progress:
             result = job(
                 settings,
                 clips,
                 checkpoint,
-                validation_clips=unseen,
+                validation_clips=unseen if validation else None,
                 init=start,
+                teacher=load_checkpoint(teacher) if teacher else None,
+                replay_clips=old,
                 resume=resume,
                 progress=progress,
                 warn=warnings.append,
@@ -200,16 +218,34 @@ def export(
 def reproduce(
     what: Annotated[str, typer.Argument(help="3, 4, 5, 6, 7, 8, 9, fig6, fig7, fig8, fig9, claims or all.")],
     scale: Annotated[
-        str, typer.Option(help="small (about two hours on two CPU cores) or full (for a GPU).")
+        str, typer.Option(help="small (about five minutes per network on one core) or full (for a GPU).")
     ] = "small",
+    instances: Annotated[
+        str,
+        typer.Option(
+            help="same: one instance of each object and one rig in all sets, as in the paper; redrawn: others "
+            "in each set."
+        ),
+    ] = "same",
+    steps: Annotated[
+        str | None,
+        typer.Option(help="Steps of training; several lengths with commas.  [default: 1100; 2000 at full]"),
+    ] = None,
+    seeds: Annotated[
+        int | None, typer.Option(help="Seeds with which each network is trained.  [default: 3]")
+    ] = None,
+    minutes: Annotated[
+        float | None,
+        typer.Option(help="Stop after this time, with the tables so far; run it again to continue.", min=0),
+    ] = None,
     data: Annotated[
         Path | None,
         typer.Option(help="Folder with logs in train/ and test/. Default: simulated."),
     ] = None,
     folder: Annotated[
-        Path | None,
+        Path,
         typer.Option("--out", help="Folder for the networks; existing ones are not trained again."),
-    ] = None,
+    ] = Path("runs/paper"),
     write: Annotated[
         Path | None,
         typer.Option(help="Markdown page to write tables and figures into, such as docs/paper.md."),
@@ -221,25 +257,43 @@ def reproduce(
     as_json: AsJson = False,
 ) -> None:
     """Reproduce the paper's tables and figures, with its numbers. Continues an interrupted run."""
+    import time
+
     from gripper_force.qualification.markdown_blocks import write_between
     from gripper_force.qualification.paper import paper_page as page
     from gripper_force.qualification.paper.models import SCALES, Scale
     from gripper_force.schema import section_from
 
+    end_s = math.inf if minutes is None else time.monotonic() + 60 * minutes
     names = page.expand_name(what)
     if scale not in SCALES:
         raise ConfigError(f"no scale {scale!r}; choose from {', '.join(SCALES)}")
-    settings = section_from(Scale, [*(f"{k}={json.dumps(v)}" for k, v in SCALES[scale]), *(set_ or [])])
-    folder = folder or Path("runs/paper") / scale
-    result, test = page.reproduce(names, settings, data, folder, jobs, console.bar)
+    options = [*(f"{k}={json.dumps(v)}" for k, v in SCALES[scale]), f"instances={instances}"]
+    options += [] if seeds is None else [f"seeds={seeds}"]
+    options += set_ or []
+    lengths = [f"steps={text}" for text in steps.split(",")] if steps else []
+    scales = [section_from(Scale, [*options, length]) for length in lengths] or [section_from(Scale, options)]
+    bar = console.bar if console.err.is_terminal else console.lines
+    result = page.reproduce(names, scales, data, folder, jobs, bar, end_s)
     pictures = write.with_suffix("") if write else folder
     pictures.mkdir(parents=True, exist_ok=True)
+    figures = {}
     for name, figure in result.figures.items():
-        figure.savefig(pictures / f"{name}.png")
+        if figure is not None:
+            figures[name] = str(pictures / page.picture_name(scale, scales[0], name))
+            figure.savefig(figures[name])
     if write is not None:
-        for place, text in page.markdown(result, scale, settings, test, pictures.name).items():
+        for place, text in page.markdown(result, scale, scales[0], pictures.name).items():
             write_between(write, place, text)
-    tables = list(result.tables.values())
-    figures = {name: str(pictures / f"{name}.png") for name in result.figures}
-    printed = {"tables": tables, "figures": figures}
+    tables = [table for made in result.tables.values() for table in made]
+    printed = {
+        "instances": scales[0].instances,
+        "steps": [one.steps for one in scales],
+        "seeds": scales[0].seeds,
+        "tables": tables,
+        "figures": figures,
+        "missing": result.missing,
+    }
     console.show(printed, as_json, lambda _: paper_tables(tables, figures))
+    if result.missing:
+        console.warn(f"{result.missing}; run the same command again to continue")

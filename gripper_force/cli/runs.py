@@ -38,6 +38,14 @@ def grasp(
             "turn; with --target-n, or targets of 1 to 8 N.",
         ),
     ] = 0,
+    same_object: Annotated[
+        bool,
+        typer.Option(
+            "--same-object",
+            help="With --trials: grasp one object again and again, each time in another place, and pass on what was "
+            "learned of its gain.",
+        ),
+    ] = False,
     jobs: Annotated[
         int | None,
         typer.Option(
@@ -80,8 +88,9 @@ def grasp(
             raise typer.Exit(1)
         return
     device = job.exclusive_device(settings)
-    objects = (settings.object,) if device or object_ is not None else job.TRIAL_OBJECTS
-    jobs = jobs or (1 if device else CORES)
+    one_object = device or same_object or object_ is not None
+    objects = (settings.object,) if one_object else job.TRIAL_OBJECTS
+    jobs = jobs or (1 if device or same_object else CORES)
     prompt: Prompt | None = None
     lines: Progress = no_progress
     if device and jobs == 1:
@@ -97,7 +106,14 @@ def grasp(
     with console.bar("grasping", trials, hidden=bool(device)) as progress:
         try:
             running = job.trials(
-                settings, trials, jobs, objects=objects, target_n=target_n, prompt=prompt, progress=lines
+                settings,
+                trials,
+                jobs,
+                objects=objects,
+                target_n=target_n,
+                same_object=same_object,
+                prompt=prompt,
+                progress=lines,
             )
             with closing(running) as finished:
                 for one in finished:

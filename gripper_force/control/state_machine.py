@@ -65,8 +65,9 @@ motor would add to the force of a springy object."""
 
 _SEEN_FILTER_S = 0.1
 _UNSEEN_SHARE = 0.15
-"""A grip counts as held only while the filtered visual estimate is at least this share of the target. Otherwise the
-jaws may press on an end stop or be held by friction, which the motor current cannot tell from an object."""
+"""A grip counts as held only while the filtered visual estimate has risen by at least this share of the target since
+the jaws stopped. Otherwise they may press on an end stop or be held by friction, which the motor current cannot tell
+from an object."""
 
 _OPEN_M = 0.003
 """Distance from the open width at which the jaws count as open."""
@@ -162,8 +163,8 @@ class GraspController:
         self._was_over_force = False
         self._let_go_n = 0.0
         self._seen_n: float | None = None
-        self._seen_ns = 0
-        self._has_seen = self._has_unsure = False
+        self._seen_ns, self._seen_before_n = 0, 0.0
+        self._has_seen = self._has_unsure = self._was_held = False
         self._goal_current_a = self._measured_motor_force_n = 0.0
         self._derating = 1.0
 
@@ -171,6 +172,11 @@ class GraspController:
     def margins(self) -> dict[str, Margin]:
         """Gains and phase margin of each control loop."""
         return self._loop.margins
+
+    def end_grasps(self) -> tuple[float, float] | None:
+        """Ends the last grasp, and returns the ratio of all grasps (see `ObjectGain.ratio`); None without any."""
+        is_held = self._phase in _GRIPPING and self._outcome == Outcome.HELD
+        return self._fusion.end_grasp(was_held=self._was_held or is_held)
 
     def start_problem(self, servo: ServoState) -> str:
         """Returns why the jaws cannot start at a position, or an empty text.
@@ -249,6 +255,8 @@ class GraspController:
             servo,
             visual,
             free=is_free,
+            gripping=self._phase in _GRIPPING,
+            holding=self._phase == Phase.HOLD,
             opening=self._is_opening,
             lowering=self._phase in (Phase.RAMP, Phase.HOLD) and self._loop.is_lowering,
         )
@@ -275,20 +283,23 @@ class GraspController:
     def _is_unseen(self) -> bool:
         """True if the camera does not confirm a grip.
 
-        It sees next to no force, has been too uncertain throughout this grip, or sees far more than the target
-        while friction may hold the jaws: a network can give any force for an empty scene.
+        It sees next to no rise of the force, has been too uncertain throughout this grip, or sees far more than the
+        target while friction may hold the jaws: a network can give any force for an empty scene.
         """
         target_n = self._derated_target_n
         if self._seen_n is None:
             return self._has_unsure and not self._has_seen
         by_friction = self._motor_force_n - self._estimate.friction_n < _PROVEN_SHARE * target_n
         beyond_n = max(_BEYOND_SHARE * target_n, _BEYOND_N)
-        return self._seen_n < _UNSEEN_SHARE * target_n or (by_friction and self._seen_n - target_n > beyond_n)
+        rise_n = self._seen_n - self._seen_before_n
+        return rise_n < _UNSEEN_SHARE * target_n or (by_friction and self._seen_n - target_n > beyond_n)
 
     @property
     def _sight(self) -> str:
         """The visual estimate in words."""
-        return "is uncertain" if self._seen_n is None else f"sees {self._seen_n:.1f} N"
+        if self._seen_n is None:
+            return "is uncertain"
+        return f"sees {self._seen_n:.1f} N, and saw {self._seen_before_n:.1f} N before the contact"
 
     def _derate(self, t_ns: int, temperature_c: float) -> list[Event]:
         """Lowers the target force of a hot servo, before the servo shuts down."""
@@ -296,13 +307,8 @@ class GraspController:
         if self._derating == before or self._phase not in (Phase.RAMP, Phase.HOLD):
             return []
         self._loop.retarget(self._derated_target_n)
-        return [
-            Event(
-                t_ns,
-                "control",
-                f"the servo is at {temperature_c:.0f} C; holding {self._derated_target_n:.2f} N",
-            )
-        ]
+        text = f"the servo is at {temperature_c:.0f} C; holding {self._derated_target_n:.2f} N"
+        return [Event(t_ns, "control", text)]
 
     def _handle_request(self, t_ns: int, request: Request) -> str:
         """Handles a request. Returns the reason of a refusal, or an empty text."""
@@ -325,7 +331,9 @@ class GraspController:
         elif not 0 < request.target_n <= self._largest_target_n:
             return f"the target {request.target_n} N is outside 0 to {self._largest_target_n:g} N"
         else:
-            self._start_grasp(t_ns, request.target_n)
+            if request.new_object and self._phase in _GRIPPING:
+                return "an object is held; request a release before the grasp of a new one"
+            self._start_grasp(t_ns, request.target_n, new_object=request.new_object)
         return ""
 
     # Phase changes.
@@ -337,7 +345,7 @@ class GraspController:
     def _set_outcome(self, outcome: Outcome, reason: str) -> None:
         self._outcome, self._reason = outcome, reason
 
-    def _start_grasp(self, t_ns: int, target_n: float) -> None:
+    def _start_grasp(self, t_ns: int, target_n: float, *, new_object: bool) -> None:
         self._grasp_ns, self._target_n, self._outcome = t_ns, target_n, Outcome.NONE
         if self._phase == Phase.CONTACT:
             return
@@ -345,7 +353,8 @@ class GraspController:
             self._loop.retarget(self._derated_target_n)
             self._enter(Phase.RAMP, f"new target {target_n:g} N")
             return
-        self._fusion.restart()
+        self._fusion.restart(was_held=self._was_held, new_object=new_object)
+        self._was_held = False
         self._limits.reset()
         self._approach.start(self._present_width_m, target_n)
         self._enter(Phase.APPROACH, f"grasp with {target_n:g} N requested")
@@ -355,8 +364,8 @@ class GraspController:
         self._enter(Phase.RELEASE, reason)
 
     def _start_move(self, width_m: float) -> None:
-        self._outcome = Outcome.NONE
         self._start_travel()
+        self._outcome = Outcome.NONE
         distance_m = width_m - self._present_width_m
         self._move_width_m, self._move_opens = width_m, distance_m > 0
         rate_m_s = _TRAVEL_SPEED_SHARE * self._config.approach_speed_m_s
@@ -364,7 +373,9 @@ class GraspController:
         self._enter(Phase.MOVE, f"move to {1e3 * width_m:.1f} mm requested")
 
     def _start_travel(self) -> None:
-        self._let_go_n = self._motor_force_n if self._phase in _GRIPPING else 0.0
+        self._let_go_n = 0.0
+        if self._phase in _GRIPPING:
+            self._let_go_n, self._was_held = self._motor_force_n, self._outcome == Outcome.HELD
         speed_m_s = _TRAVEL_SPEED_SHARE * self._config.approach_speed_m_s
         self._travel.start(self._present_width_m, speed_m_s)
         self._limits.reset()
@@ -455,6 +466,7 @@ class GraspController:
                 self._goal_width_m = min(self._approach.back_off_width_m, self._transmission.open_width_m)
             case ApproachState.CONTACT:
                 self._has_seen = self._has_unsure = False
+                self._seen_before_n = max(self._seen_n or 0.0, 0.0)
                 self._fusion.reset_variance()
                 self._enter(Phase.CONTACT, f"contact at {width_m * 1e3:.1f} mm")
             case ApproachState.CLOSED:

@@ -5,7 +5,7 @@ import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
@@ -14,11 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from gripper_force.config import Config, config_from_text
+from gripper_force.control.transmission import Transmission
 from gripper_force.errors import DataError
 from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.processes import process_pool
 from gripper_force.runtime.log_reader import LogReader
-from gripper_force.types import NS_PER_MS, Frame, Gray, LoadCellSample, Record
+from gripper_force.types import NS_PER_MS, Frame, Gray, LoadCellSample, Record, ServoState
 
 if TYPE_CHECKING:  # labels need no OpenCV
     from gripper_force.vision.preprocess import Preprocess, Region
@@ -42,6 +43,7 @@ class Clip:
         object: The object.
         set: Name of the set. A split keeps a set on one side, such as all light levels of one simulation.
         stiffness: Stiffness of a simulated object over the nominal one of its kind; NaN if unknown.
+        indentation_m: Travel of the jaws since first contact at each frame, (T,) float32; NaN if unknown.
     """
 
     frames: Gray
@@ -51,6 +53,12 @@ class Clip:
     object: str
     set: str
     stiffness: float = float("nan")
+    indentation_m: npt.NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+
+    def __post_init__(self) -> None:
+        """Makes the indentation unknown where none is given."""
+        if not len(self.indentation_m):
+            object.__setattr__(self, "indentation_m", np.full(len(self.frames), np.nan, np.float32))
 
     @property
     def nominal_n(self) -> npt.NDArray[np.float32]:
@@ -222,11 +230,39 @@ def label_frames(
     return np.where(valid, labels, 0.0).astype(np.float32), valid
 
 
+def indentations(
+    frame_t_ns: npt.NDArray[np.int64],
+    forces_n: npt.NDArray[np.float32],
+    states: Sequence[ServoState],
+    width_m: Callable[[float], float],
+) -> npt.NDArray[np.float32]:
+    """Returns the travel of the jaws at each frame since the first frame in contact; 0 while they are wider.
+
+    Args:
+        frame_t_ns: Middle of each exposure, (T,).
+        forces_n: Load-cell force at each frame, (T,); 0 without a label.
+        states: Servo states by rising time.
+        width_m: Maps the servo's angle to the distance between the jaws.
+
+    Returns:
+        Travel in m, (T,) float32; NaN without servo states around a frame, or if there is no contact.
+    """
+    contacts = np.flatnonzero(forces_n > CONTACT_N)
+    if not states or not len(contacts):
+        return np.full(len(frame_t_ns), np.nan, np.float32)
+    t_ns = [state.t_ns for state in states]
+    widths_m = np.interp(
+        frame_t_ns, t_ns, [width_m(state.position_rad) for state in states], left=np.nan, right=np.nan
+    )
+    travel_m: npt.NDArray[np.float64] = np.maximum(0.0, widths_m[contacts[0]] - widths_m)
+    return travel_m.astype(np.float32)
+
+
 def load_clip(path: Path, preprocess: "Preprocess", region: "Region | None") -> Clip:
     """Reads one log; see `load_clips`."""
     reader = LogReader(path)
     config = config_from_text(reader.config, str(path))
-    return read_clip(reader, config, reader.records(Frame, LoadCellSample), preprocess, region)
+    return read_clip(reader, config, reader.records(Frame, LoadCellSample, ServoState), preprocess, region)
 
 
 def read_clip(
@@ -241,7 +277,7 @@ def read_clip(
     Args:
         reader: The log.
         config: Its configuration.
-        records: Its records. All but frames and load-cell samples are ignored.
+        records: Its records. All but frames, load-cell samples and servo states are ignored.
         preprocess: Determines the size that frames are downscaled to.
         region: Region of interest in pixels; None for the one in the configuration.
 
@@ -256,23 +292,30 @@ def read_clip(
     small: list[Gray] = []
     t_ns: list[int] = []
     samples: list[LoadCellSample] = []
+    states: list[ServoState] = []
     for record in records:
         if isinstance(record, Frame):
             small.append(downscale(record.gray, region, preprocess.size))
             t_ns.append(record.t_ns)
         elif isinstance(record, LoadCellSample):
             samples.append(record)
+        elif isinstance(record, ServoState):
+            states.append(record)
     if not small:
         raise DataError(f"{path} holds no camera frames; remove it from the logs")
     samples.sort(key=lambda sample: sample.t_ns)
     exposure_ns = round(_positive(reader.metadata, "exposure_ms", float, 0.0) * NS_PER_MS)
-    forces_n, valid = label_frames(np.array(t_ns, np.int64), samples, exposure_ns)
+    frame_t_ns = np.array(t_ns, np.int64)
+    forces_n, valid = label_frames(frame_t_ns, samples, exposure_ns)
     if not valid.any():
         raise DataError(f"{path} holds no valid load-cell sample near any frame; remove it from the logs")
     name = path.stem
     set_ = reader.metadata.get("set", name)
     stiffness = stiffness_of(reader.metadata)
-    return Clip(np.stack(small), forces_n, valid, name, config.object, set_, stiffness)
+    travel_m = indentations(
+        frame_t_ns, forces_n, states, Transmission.from_config(config.gripper, servo_nm_per_a=1.0).width_m
+    )
+    return Clip(np.stack(small), forces_n, valid, name, config.object, set_, stiffness, travel_m)
 
 
 def stiffness_of(metadata: Mapping[str, str]) -> float:

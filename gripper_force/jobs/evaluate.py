@@ -22,7 +22,8 @@ from gripper_force.jobs.dataset import (
     stiffness_floor_n,
     without_contact_starts,
 )
-from gripper_force.profiles.apply import read_correction, read_profiles
+from gripper_force.jobs.object_gain import gain_of
+from gripper_force.profiles.apply import read_correction, read_profiles, with_object
 from gripper_force.profiles.correction import Correction
 from gripper_force.vision.batch_inference import features, predict
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
@@ -138,7 +139,13 @@ def evaluate(
         own = config.model_copy(update={"object": clip.object, "calibration": calibration})
         return read_correction(own, read_profiles(own), loaded)
 
-    result = evaluate_clips(loaded, used, None if calibration.object is None else correction, progress)
+    def gain(clip: Clip) -> float:
+        own = config.model_copy(update={"object": clip.object, "calibration": calibration})
+        ratio = with_object(own.control, read_profiles(own)).object_ratio
+        found = gain_of(ratio, config.gripper.gain_std)
+        return 1.0 if found is None else found.gain
+
+    result = evaluate_clips(loaded, used, None if calibration.object is None else correction, gain, progress)
     return replace(result, left_out=len(chosen) - len(used))
 
 
@@ -146,6 +153,7 @@ def evaluate_clips(
     checkpoint: Checkpoint,
     clips: Sequence[Clip],
     correction: Callable[[Clip], Correction | None] | None = None,
+    gain: Callable[[Clip], float] = lambda clip: 1.0,
     progress: Progress = no_progress,
 ) -> Evaluation:
     """Compares a checkpoint's estimates with the load cell, over clips.
@@ -154,6 +162,7 @@ def evaluate_clips(
         checkpoint: The ensemble, computed on a GPU if there is one; with corrections, on the CPU.
         clips: Recordings, downscaled to the checkpoint's size.
         correction: Returns the correction for a clip's object.
+        gain: Returns the gain of a clip's object.
         progress: Called after each clip.
 
     Raises:
@@ -166,7 +175,8 @@ def evaluate_clips(
         for clip in clips:
             means_n.append(_corrected_n(checkpoint, clip, correction(clip)))
             progress(f"evaluated {clip.name}")
-    return compare(clips, means_n, checkpoint.header.preprocess.lead_in)
+    scaled_n = [gain(clip) * mean_n for clip, mean_n in zip(clips, means_n, strict=True)]
+    return compare(clips, scaled_n, checkpoint.header.preprocess.lead_in)
 
 
 def estimates(

@@ -14,6 +14,7 @@ from gripper_force.control.limits import largest_target_n
 from gripper_force.errors import ConfigError, DataError, DeviceError
 from gripper_force.interfaces import Progress, Prompt, no_progress
 from gripper_force.jobs.dataset import stiffness_floor_n, stiffness_of
+from gripper_force.jobs.object_gain import learned_ratio
 from gripper_force.jobs.processes import process_pool
 from gripper_force.jobs.replay import compare
 from gripper_force.jobs.score import (
@@ -66,6 +67,10 @@ class Summary(_Score):
         feedback: Configured feedback: ``fused``, ``current`` or ``vision``.
         vision_share: Share of the hold's cycles that used vision, 0 to 1; None without a hold or without vision.
         vision_losses: Reasons why it was not used in the hold, and their durations, the longest first.
+        object_gain: Gain of the object by motor current (see `gripper_force.control.object_gain`); None if it is not
+            known.
+        object_gain_std: Its relative standard deviation.
+        object_gain_true: Stiffness of the simulated object over that of its kind; None for a real one.
         fell_back: True if the feedback includes vision, but less than half of the hold used it.
         load_cell_mean_n: Mean of the load cell during the hold.
         steady_error_n: That mean, less the target.
@@ -90,6 +95,9 @@ class Summary(_Score):
     feedback: str
     vision_share: float | None
     vision_losses: list[VisionLoss]
+    object_gain: float | None
+    object_gain_std: float | None
+    object_gain_true: float | None
     fell_back: bool
     peak_n: float | None
     estimator_p50_ms: float | None
@@ -225,6 +233,7 @@ def trials(
     *,
     objects: Sequence[str] = TRIAL_OBJECTS,
     target_n: float | None = None,
+    same_object: bool = False,
     prompt: Prompt | None = None,
     progress: Progress = no_progress,
 ) -> Generator[Summary, None, None]:
@@ -236,6 +245,8 @@ def trials(
         jobs: Processes; 1: the grasps run in this process. The results of lockstep runs do not depend on it.
         objects: Names of the objects.
         target_n: Target force of each grasp; None: drawn from 1 to 8 N, or to what the limits permit.
+        same_object: Grasps one object with one gripper, in another place each time, and passes what was learned of
+            its gain from grasp to grasp.
         prompt: Called before each grasp, so that a person can place the object; None for no pause.
         progress: Called before each grasp and at each change of phase, if ``jobs`` is 1.
 
@@ -243,7 +254,8 @@ def trials(
         The summary of each grasp, in order.
 
     Raises:
-        ConfigError: Several processes can't open a device at the same time.
+        ConfigError: Several processes can't open a device at the same time, or pass on what was learned; or there
+            are several objects where one is to be grasped again.
         RequestError: The target, or the smallest that is drawn, is beyond a limit.
         DeviceError: A grasp with a real device ended with a fault: nothing moves until a person has looked.
         GripperError: A grasp failed.
@@ -251,6 +263,12 @@ def trials(
     device = exclusive_device(config)
     if device and jobs > 1:
         raise ConfigError(f"only one process can open {device}, not {jobs}; leave out --jobs, or set it to 1")
+    if same_object:
+        if jobs > 1 or len(objects) > 1:
+            raise ConfigError(
+                "grasps of the same object follow one another; pass one --object, and no --jobs but 1"
+            )
+        config = with_same_object(config)
     least_n, most_n = TRIAL_TARGETS_N
     largest_n = {}
     for name in objects:
@@ -275,17 +293,33 @@ def trials(
         with process_pool(jobs) as pool:
             yield from pool.map(_trial, [trial.model_dump(mode="json") for trial in plan])
         return
+    ratio = config.control.object_ratio
     for number, trial in enumerate(plan, 1):
         if prompt is not None:
             prompt(f"Put the {trial.object} between the jaws for trial {number} of {count}")
         progress(f"trial {number} of {count}: {trial.object}, {trial.target_n:g} N")
+        if same_object:
+            control = trial.control.model_copy(update={"object_ratio": ratio})
+            trial = trial.model_copy(update={"control": control})
         result = grasp(trial, progress)
+        if same_object:
+            ratio = learned_ratio(Path(result["log"]))
         yield result
         if device and result["result"] == Outcome.FAULT:
             raise DeviceError(
                 f"trial {number} of {count} ended with a fault, so no further one was run; look at the gripper, "
                 f"and at the fault with: gripper-force replay {result['log']} --report"
             )
+
+
+def with_same_object(config: Config) -> Config:
+    """Returns a configuration whose simulated object and gripper do not depend on the seed of the trial."""
+    sim = config.sim
+    update = {
+        "object_seed": config.seed if sim.object_seed is None else sim.object_seed,
+        "rig_seed": config.seed if sim.rig_seed is None else sim.rig_seed,
+    }
+    return config.model_copy(update={"sim": sim.model_copy(update=update)})
 
 
 def summarise(path: Path) -> Summary:
@@ -304,6 +338,7 @@ def summarise(path: Path) -> Summary:
     shown = vision if controls_with_vision(config) else None
     expects_vision = controls_with_vision(config) or config.control.feedback == "vision"
     outcomes = [s.outcome for s in statuses if s.outcome != Outcome.NONE]
+    gains = [fused for fused in records[FusedForce] if fused.object_gain]
     span_s = (cycles_ns[-1] - cycles_ns[0]) / NS_PER_S if len(cycles_ns) > 1 else 0.0
     return {
         "result": outcomes[-1] if outcomes else "interrupted",
@@ -313,6 +348,9 @@ def summarise(path: Path) -> Summary:
         "feedback": config.control.feedback,
         "vision_share": None if shown is None else shown.share,
         "vision_losses": [] if shown is None else shown.losses,
+        "object_gain": gains[-1].object_gain if gains else None,
+        "object_gain_std": gains[-1].object_gain_std if gains else None,
+        "object_gain_true": stiffness_of(reader.metadata) if "scene" in reader.metadata else None,
         "fell_back": expects_vision and vision is not None and vision.share < LEAST_VISION_SHARE,
         **_score(cells, statuses, config.target_n),
         "peak_n": max((c.force_n for c in cells if c.valid), default=None),

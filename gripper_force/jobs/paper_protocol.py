@@ -3,12 +3,16 @@
 Sets of four touches with random peaks up to 12 N, for four objects, four angles and three light levels, 15
 times each, recorded by a camera with 149 frames/s. All light levels of a set share one physics simulation;
 the scene is rendered once under each.
+
+In the paper all sets show the same four objects before the same camera. So do the instances ``same``: only the
+object's place, the speed and the peaks differ between sets. With ``redrawn``, each set also has an object and a rig
+of its own.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal, get_args
 
 import numpy as np
 
@@ -23,7 +27,7 @@ from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.runtime.resolve import resolve
 from gripper_force.runtime.session import Session, open_session
 from gripper_force.schema import Tree
-from gripper_force.types import Frame, Gray
+from gripper_force.types import Frame, Gray, LoadCellSample
 
 RATE_HZ: Final = 149.0
 """Frame rate of the paper's camera."""
@@ -33,6 +37,12 @@ TOUCHES: Final = 4
 
 TEST_SETS: Final = (13, 14, 15)
 """Test sets of the 15 of each environment. The paper does not say which three it tested on."""
+
+
+Instances = Literal["same", "redrawn"]
+
+INSTANCES: Final[tuple[Instances, ...]] = get_args(Instances)
+"""Instances of object and rig: the same in all sets, as in the paper, or redrawn for each set."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +70,18 @@ _FIRST_SEED: Final = 700_000
 _PEAK_N: Final = 12.0
 """Largest force of the paper's touches."""
 
+_OVERSHOOT_N: Final = 0.75
+"""Largest load-cell force above `_PEAK_N`. A set with a higher one is drawn again."""
+
+_RAMP_N_S: Final = {"stapler": (30.0, 50.0)}
+"""Lowest and highest speed of the ramps of an object, if it differs from `_USUAL_RAMP_N_S`.
+
+The motor's inertia acts on the jaws like 2.5 kg. At 200 N/s they hit the stapler's stop with so much
+kinetic energy that a peak of 12 N becomes 16 N.
+"""
+
+_USUAL_RAMP_N_S: Final = (100.0, 300.0)
+
 _FREE_N: Final = 0.1
 """Largest load-cell force between two touches."""
 
@@ -78,6 +100,7 @@ class SetPlan:
         number: Number of the set among those of its object and angle, from 1.
         seed: Seed of the first draw of scene and peaks, the same for all light levels.
         lux: Light levels; each gives one log.
+        instance_seed: Seed of object and rig; None: ``seed``.
     """
 
     object: str
@@ -85,6 +108,7 @@ class SetPlan:
     number: int
     seed: int
     lux: tuple[int, ...]
+    instance_seed: int | None = None
 
     @property
     def split(self) -> str:
@@ -107,15 +131,18 @@ def split_of(number: int) -> str:
     return "test" if number in TEST_SETS else "train"
 
 
-def plan_protocol(scale: str) -> list[SetPlan]:
+def plan_protocol(scale: str, instances: str) -> list[SetPlan]:
     """Plans the sets of the protocol.
 
     Args:
         scale: A name of `SCALES`.
+        instances: One of `INSTANCES`.
 
     Raises:
-        ConfigError: The scale does not exist.
+        ConfigError: The scale or the instances do not exist.
     """
+    if instances not in INSTANCES:
+        raise ConfigError(f"no instances {instances!r} of the protocol; use one of {', '.join(INSTANCES)}")
     if scale not in SCALES:
         raise ConfigError(f"no scale {scale!r} of the protocol; use one of {', '.join(SCALES)}")
     full, part = SCALES["full"], SCALES[scale]
@@ -130,6 +157,7 @@ def plan_protocol(scale: str) -> list[SetPlan]:
             + number
             - 1,
             part.lux,
+            _FIRST_SEED if instances == "same" else None,
         )
         for number in part.numbers
         for degrees in part.degrees
@@ -150,7 +178,8 @@ def make_set(task: SetPlan, out: Path, config: Tree) -> list[Path]:
 
     Raises:
         ConfigError: The camera or the load cell is not simulated.
-        SimulationError: Every draw of the scene failed, reached no force, or caught the object on a pad.
+        SimulationError: Every draw of the scene failed, reached no force, overshot the peaks, or caught the
+            object on a pad.
     """
     paths = {lux: out / name for lux, name in zip(task.lux, task.names, strict=True)}
     paths = {lux: path for lux, path in paths.items() if not path.exists()}
@@ -192,6 +221,11 @@ def _run_set(config: Config, task: SetPlan, seed: int, logs: dict[int, Path]) ->
         devices.notes.update(protocol="shin2019", degrees=str(task.degrees), split=task.split, lux=str(first))
         with open_session(run, devices, logs[first]) as session:
             _touch_all(session, task, rng, config.control.timeout_s)
+    peak_n = max(sample.force_n for sample in LogReader(logs[first]).records(LoadCellSample))
+    if peak_n > _PEAK_N + _OVERSHOOT_N:
+        raise SimulationError(
+            f"a touch of {task.object!r} at {task.degrees} degrees reached {peak_n:.1f} N; use another seed"
+        )
     for lux, (_, notes), grays in zip(others, rendered, cameras.grays, strict=True):
         _copy_under_light(logs[first], logs[lux], lux, {**notes, "lux": str(lux)}, grays)
 
@@ -245,7 +279,7 @@ def _set_config(config: Config, task: SetPlan, seed: int, lux: int, rng: np.rand
             # Four touches in the paper's 500 frames leave 0.8 s for each.
             "approach_speed_m_s": 0.2,
             "approach_force_n": 1.5,
-            "ramp_n_s": float(rng.uniform(100.0, 300.0)),
+            "ramp_n_s": float(rng.uniform(*_RAMP_N_S.get(task.object, _USUAL_RAMP_N_S))),
         }
     )
     return config.model_copy(
@@ -256,7 +290,16 @@ def _set_config(config: Config, task: SetPlan, seed: int, lux: int, rng: np.rand
             "control": control,
             "vision": config.vision.model_copy(update={"checkpoint": "none"}),
             "sim": config.sim.model_copy(
-                update={"lux": float(lux), "yaw_deg": float(task.degrees), "tool": "rods"}  # as the paper's
+                update={
+                    "lux": float(lux),
+                    "yaw_deg": float(task.degrees),
+                    "tool": "rods",  # as the paper's
+                    "object_seed": task.instance_seed,
+                    "rig_seed": task.instance_seed,
+                    # What a camera can't see must not raise the peaks: the controller knows the motor exactly.
+                    "gain": 1.0,
+                    "friction": 1.0,
+                }
             ),
         }
     )

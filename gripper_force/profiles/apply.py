@@ -56,11 +56,13 @@ def read_profiles(config: Config) -> Profiles:
     )
 
 
-def with_plant(control: ControlConfig, profiles: Profiles) -> ControlConfig:
-    """Fills in the force loop's plant from the object profile, where the configuration leaves it open."""
-    if profiles.object is None or (plant := profiles.object.plant) is None:
+def with_object(control: ControlConfig, profiles: Profiles) -> ControlConfig:
+    """Fills in the plant and the object's ratio from the object profile, where the configuration leaves them open."""
+    if profiles.object is None:
         return control
-    known = {"plant_gain": plant.gain, "plant_lag_ms": plant.lag_ms, "plant_delay_ms": plant.delay_ms}
+    known: dict[str, object] = {"object_ratio": profiles.object.ratio}
+    if (plant := profiles.object.plant) is not None:
+        known |= {"plant_gain": plant.gain, "plant_lag_ms": plant.lag_ms, "plant_delay_ms": plant.delay_ms}
     return control.model_copy(update={k: v for k, v in known.items() if getattr(control, k) is None})
 
 

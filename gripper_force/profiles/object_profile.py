@@ -108,6 +108,8 @@ class ObjectProfile(Section):
         plant: The force loop's plant; None if the logs hold no servo.
         before_n: MAE of the network alone on these touches.
         after_n: MAE of the corrected estimate on each touch, with a correction fitted to the others.
+        ratio: Motor current over the corrected estimate in earlier grasps, and its relative standard deviation without
+            that of the torque constant (see `gripper_force.control.object_gain`); None if it was not learned.
         weights: SHA-256 of the file beside it.
     """
 
@@ -126,6 +128,7 @@ class ObjectProfile(Section):
     plant: LoopPlant | None = None
     before_n: NonNegative
     after_n: NonNegative | None = None
+    ratio: tuple[Positive, Positive] | None = None
     weights: str
 
     @model_validator(mode="before")

@@ -66,6 +66,7 @@ class Draw:
         camera_hz: Frames per second.
         vision_gain: Visual estimate over true force.
         vision_noise_n: Its noise.
+        motion_n: Force that the network sees in the motion of the jaws alone, once they are closed.
         seed: Seed of the noise.
     """
 
@@ -86,6 +87,7 @@ class Draw:
     camera_hz: float
     vision_gain: float
     vision_noise_n: float
+    motion_n: float
     seed: int
 
 
@@ -181,6 +183,7 @@ def draw(config: ControlConfig, gain_bound: float, seed: int, index: int) -> Dra
         vision_gain=log_between(0.4, 2.5),
         vision_noise_n=between(0.03, 0.3),
         seed=int(rng.integers(2**31)),
+        motion_n=rarely(0.3, between(0.0, 6.0), 0.0),
     )
 
 
@@ -264,7 +267,8 @@ class _Run:
             if self.t_ns >= self._drawn.leaves_s * NS_PER_S and plant.contact_m < _GONE_M:
                 plant.contact_m, plant.deepest_m = _GONE_M, 0.0
             servo = self.read(self.t_ns, servo_noise)
-            visual = self._vision.sample(self.t_ns, plant.force_n, vision_noise)
+            seen_n = plant.force_n + self._drawn.motion_n * plant.x_m / _STOP_M
+            visual = self._vision.sample(self.t_ns, seen_n, vision_noise)
             decision = self._controller.step(self.t_ns, servo, visual, request)
             request = None
             command = decision.command

@@ -196,7 +196,9 @@ class ControlLoop:
             refusal = "no object is gripped"
             session.log_event("control", f"refused 'grasp': {refusal}")
             return self._publish(session, session.cycle(), request, refusal)
-        decision = session.cycle(request.kind, request.target_n, request.width_m)
+        decision = session.cycle(
+            request.kind, request.target_n, request.width_m, new_object=request.new_object
+        )
         return self._publish(session, decision, request, decision.refusal)
 
     def _publish(

@@ -103,25 +103,30 @@ class Gripper:
     # Requests.
 
     @overload
-    def grasp(self, force_n: float, *, wait: Literal[True] = True) -> GraspResult: ...
+    def grasp(
+        self, force_n: float, *, wait: Literal[True] = True, new_object: bool = False
+    ) -> GraspResult: ...
     @overload
-    def grasp(self, force_n: float, *, wait: Literal[False]) -> None: ...
-    def grasp(self, force_n: float, *, wait: bool = True) -> GraspResult | None:
+    def grasp(self, force_n: float, *, wait: Literal[False], new_object: bool = False) -> None: ...
+    def grasp(self, force_n: float, *, wait: bool = True, new_object: bool = False) -> GraspResult | None:
         """Closes the jaws on an object and holds it with a force. If an object is held, changes the force.
 
         Args:
             force_n: Target force, in newtons: more than 0, at most 0.9 times ``control.force_limit_n`` over
                 ``gripper.gain_bound``, and at most what the profiles were calibrated with.
             wait: False returns at once; `state` shows the progress.
+            new_object: True if it is another object than in the grasps before: the gain that was learned of that
+                one is forgotten.
 
         Returns:
             The result once the outcome is known; None with ``wait=False``.
 
         Raises:
-            RequestError: The force is out of range, or the gripper is at fault and needs a release first.
+            RequestError: The force is out of range, the gripper is at fault and needs a release first, or
+                ``new_object`` is True while an object is held.
             DeviceError: A device failed.
         """
-        return self._grip(force_n, wait=wait)
+        return self._grip(force_n, wait=wait, new_object=new_object)
 
     @overload
     def set_force(self, force_n: float, *, wait: Literal[True] = True) -> GraspResult: ...
@@ -260,10 +265,16 @@ class Gripper:
     ) -> None:
         self._loop.close(error)
 
-    def _grip(self, force_n: float, *, wait: bool, needs_object: bool = False) -> GraspResult | None:
+    def _grip(
+        self, force_n: float, *, wait: bool, new_object: bool = False, needs_object: bool = False
+    ) -> GraspResult | None:
         self._run.check_target(force_n)
         return self._loop.request(
             PendingRequest(
-                RequestKind.GRASP, target_n=float(force_n), needs_object=needs_object, is_awaited=wait
+                RequestKind.GRASP,
+                target_n=float(force_n),
+                new_object=new_object,
+                needs_object=needs_object,
+                is_awaited=wait,
             )
         )

@@ -26,6 +26,7 @@ class PendingRequest:
         kind: What is requested.
         target_n: Target force of a grasp.
         width_m: Width of a move.
+        new_object: True for a grasp of another object than in the grasps before.
         needs_object: True for a change of force, which must not close the jaws on nothing.
         is_awaited: True if a caller waits for the result.
         start_ns: Time of the cycle that handled it.
@@ -35,6 +36,7 @@ class PendingRequest:
     kind: RequestKind
     target_n: float = 0.0
     width_m: float = 0.0
+    new_object: bool = False
     needs_object: bool = False
     is_awaited: bool = False
     start_ns: int = 0

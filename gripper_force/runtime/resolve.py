@@ -14,7 +14,7 @@ from gripper_force.control.state_machine import MAX_CYCLE_S, GraspController
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import ConfigError, RequestError
 from gripper_force.interfaces import ServoSpec
-from gripper_force.profiles.apply import read_correction, read_profiles, rig_mismatches, with_plant
+from gripper_force.profiles.apply import read_correction, read_profiles, rig_mismatches, with_object
 from gripper_force.runtime.backends import load_servo_class, resolve_simulation, with_camera_rate
 from gripper_force.runtime.process import allowed
 
@@ -102,7 +102,7 @@ def resolve(config: Config, *, vision: bool = True) -> ResolvedConfig:
     config = config.model_copy(
         update={
             "gripper": _complete_gripper(config.gripper, spec),
-            "control": with_plant(_complete_control(config, spec), profiles),
+            "control": with_object(_complete_control(config, spec), profiles),
         }
     )
     correction = read_correction(config, profiles, model)

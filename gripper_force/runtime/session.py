@@ -167,13 +167,21 @@ class Session:
             self._interrupted = False
             raise KeyboardInterrupt("the run was interrupted")
 
-    def cycle(self, kind: RequestKind | None = None, target_n: float = 0.0, width_m: float = 0.0) -> Decision:
+    def cycle(
+        self,
+        kind: RequestKind | None = None,
+        target_n: float = 0.0,
+        width_m: float = 0.0,
+        *,
+        new_object: bool = False,
+    ) -> Decision:
         """Waits for the next cycle and runs it: read, estimate, decide, write, log.
 
         Args:
             kind: A new request, or None to go on as before.
             target_n: Target force of a grasp request.
             width_m: Width of a move request.
+            new_object: True for the grasp of another object than in the grasps before.
 
         Raises:
             DeviceError: The servo is lost, or does not answer for as long as its watchdog waits.
@@ -198,7 +206,7 @@ class Session:
                 log(Event(processed.frame.received_ns, "vision", f"no estimate: {processed.problem}"))
             self._problem = processed.problem
         state = self.servo_state = self._read_servo()
-        request = self._request(state.t_ns, kind, target_n, width_m)
+        request = self._request(state.t_ns, kind, target_n, width_m, new_object)
         decision = self._controller.step(state.t_ns, state, visual, request)
         devices.servo.write(decision.command)
         self.cycles += 1
@@ -285,12 +293,12 @@ class Session:
             self._log_queue.write(record)
 
     def _request(
-        self, t_ns: int, kind: RequestKind | None, target_n: float, width_m: float
+        self, t_ns: int, kind: RequestKind | None, target_n: float, width_m: float, new_object: bool
     ) -> Request | None:
         if self._stop.is_set():
             self._stop.clear()
             return Request(t_ns, RequestKind.STOP)
-        return None if kind is None else Request(t_ns, kind, target_n, width_m)
+        return None if kind is None else Request(t_ns, kind, target_n, width_m, new_object)
 
     def _log_sensors(self, t_ns: int, *, at_end: bool = False) -> None:
         devices = self._devices

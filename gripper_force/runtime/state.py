@@ -23,6 +23,8 @@ class GraspResult:
         width_m: Distance between the jaws, in metres.
         vision_share: Share of the control cycles of the hold in which vision was used, 0 to 1.
         reason: The controller's reason for the outcome, one sentence.
+        object_gain: Gain of the object (its stiffness over that of its kind) by motor current; 0 if it is not known.
+        object_gain_std: Its relative standard deviation.
     """
 
     outcome: Outcome
@@ -31,6 +33,8 @@ class GraspResult:
     width_m: float
     vision_share: float
     reason: str
+    object_gain: float = 0.0
+    object_gain_std: float = 0.0
 
     @property
     def held(self) -> bool:
@@ -113,5 +117,14 @@ class StateTracker:
             load_cell_n=None if cell is None else cell.force_n,
         )
         share = self._vision_cycles / self._hold_cycles if self._hold_cycles else 0.0
-        result = GraspResult(state.outcome, state.force_n, state.std_n, state.width_m, share, state.reason)
+        result = GraspResult(
+            state.outcome,
+            state.force_n,
+            state.std_n,
+            state.width_m,
+            share,
+            state.reason,
+            estimate.object_gain,
+            estimate.object_gain_std,
+        )
         return state, result

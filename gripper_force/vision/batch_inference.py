@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from gripper_force.types import Gray
-from gripper_force.vision.network import ForceNetwork
+from gripper_force.vision.checkpoint import Member
 from gripper_force.vision.preprocess import DIFFERENCE_GAIN, FLAT_STD, Preprocess
 
 CHUNK = 256
@@ -41,7 +41,7 @@ def _standardise(frames: Tensor) -> Tensor:
 
 
 def predict(
-    networks: Sequence[ForceNetwork], preprocess: Preprocess, frames: Gray, device: str = "cpu"
+    networks: Sequence[Member], preprocess: Preprocess, frames: Gray, device: str = "cpu"
 ) -> npt.NDArray[np.float32]:
     """Estimates the force for every frame of one recording.
 
@@ -59,7 +59,7 @@ def predict(
 
 @torch.inference_mode()
 def features(
-    networks: Sequence[ForceNetwork], preprocess: Preprocess, frames: Gray, device: str = "cpu"
+    networks: Sequence[Member], preprocess: Preprocess, frames: Gray, device: str = "cpu"
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
     """Estimates the force for every frame, and returns the inputs of the members' last layers too.
 

@@ -8,9 +8,13 @@ from safetensors import SafetensorError
 from safetensors.torch import load
 from torch import Tensor
 
-from gripper_force.errors import CheckpointError
-from gripper_force.vision.header import Header, NetworkConfig, digest_of, read_checkpoint
+from gripper_force.errors import CheckpointError, ConfigError
+from gripper_force.vision.header import Header, NetworkConfig, ProcessConfig, digest_of, read_checkpoint
+from gripper_force.vision.kernel_regression import ForceProcess
 from gripper_force.vision.network import ForceNetwork
+
+Member = ForceNetwork | ForceProcess
+"""A member of an ensemble."""
 
 _RENAMED = {"blstm.onward.": "blstm.forward_lstm.", "blstm.backward_gates.": "blstm.backward_linear."}
 """Names of weights in checkpoints of version 0.1, and their present names."""
@@ -23,12 +27,20 @@ class Checkpoint:
     Attributes:
         networks: The members, in evaluation mode, on the CPU, in float32.
         header: The file's header.
-        digest: The file's digest (see `gripper_force.vision.header.digest_of`).
+        digest: Its digest; see `header.digest_of`.
     """
 
-    networks: tuple[ForceNetwork, ...]
+    networks: tuple[Member, ...]
     header: Header
     digest: str
+
+    @property
+    def force_networks(self) -> list[ForceNetwork]:
+        """The members, for callers that need a network's layers. Raises `ConfigError` for a Gaussian process."""
+        networks = [member for member in self.networks if isinstance(member, ForceNetwork)]
+        if len(networks) < len(self.networks):
+            raise ConfigError("the checkpoint is a Gaussian process; name a network, such as default")
+        return networks
 
 
 def load_checkpoint(source: str | Path = "default") -> Checkpoint:
@@ -57,10 +69,12 @@ def _current_name(name: str) -> str:
     return name
 
 
-def _member(path: Path, index: int, config: NetworkConfig, tensors: dict[str, Tensor]) -> ForceNetwork:
+def _member(
+    path: Path, index: int, config: NetworkConfig | ProcessConfig, tensors: dict[str, Tensor]
+) -> Member:
     prefix = f"{index}."
     with torch.device("meta"):  # a malformed header may claim any size; this allocates nothing
-        network = ForceNetwork(config)
+        network = ForceProcess(config) if isinstance(config, ProcessConfig) else ForceNetwork(config)
     dtypes = {name: tensor.dtype for name, tensor in network.state_dict().items()}
     own = {
         _current_name(name.removeprefix(prefix)): t for name, t in tensors.items() if name.startswith(prefix)
@@ -75,4 +89,6 @@ def _member(path: Path, index: int, config: NetworkConfig, tensors: dict[str, Te
         ) from error
     if not all(bool(tensor.isfinite().all()) for tensor in state.values()):
         raise CheckpointError(f"{path}: the weights of member {index} hold NaN or infinity; train it again")
-    return network.to_channels_last().eval().requires_grad_(False)
+    if isinstance(network, ForceNetwork):
+        network.to_channels_last()
+    return network.eval().requires_grad_(False)

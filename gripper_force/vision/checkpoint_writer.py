@@ -3,15 +3,15 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from safetensors.torch import save
+from safetensors.torch import load, save
 from torch import Tensor
 
 from gripper_force.errors import CheckpointError
-from gripper_force.vision.header import FORMAT, Header
-from gripper_force.vision.network import ForceNetwork
+from gripper_force.vision.checkpoint import Member
+from gripper_force.vision.header import FORMAT, Header, digest_of, read_checkpoint
 
 
-def save_checkpoint(path: Path, networks: Sequence[ForceNetwork], header: Header) -> None:
+def save_checkpoint(path: Path, networks: Sequence[Member], header: Header) -> None:
     """Writes an ensemble: matrices as float16 where its range allows, vectors as float32.
 
     Half precision halves the file and changes the force by less than 1e-3 of its value.
@@ -24,6 +24,26 @@ def save_checkpoint(path: Path, networks: Sequence[ForceNetwork], header: Header
         for i, network in enumerate(networks)
         for name, tensor in network.state_dict().items()
     }
+    _write(path, tensors, header)
+
+
+def replace_header(source: str | Path, header: Header, out: Path | None = None) -> None:
+    """Writes a checkpoint with another header. It keeps its weights, bit for bit, and its digest.
+
+    Args:
+        source: Path or name of the checkpoint.
+        header: The header to write. Its ``identity`` is ignored.
+        out: Checkpoint to write; None for the same file.
+
+    Raises:
+        CheckpointError: A file can't be read or written.
+    """
+    path, data, before = read_checkpoint(source)
+    identity = digest_of(data, before)
+    _write(out or path, load(data), header.model_copy(update={"identity": identity}))
+
+
+def _write(path: Path, tensors: dict[str, Tensor], header: Header) -> None:
     data = save(tensors, metadata={FORMAT: header.model_dump_json(exclude_none=True)})
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -6,7 +6,9 @@ from typing import Final
 import torch
 from torch import Tensor, nn
 
-from gripper_force.vision.header import NetworkConfig
+from gripper_force.vision.checkpoint import Member
+from gripper_force.vision.header import NetworkConfig, ProcessConfig
+from gripper_force.vision.kernel_regression import ForceProcess
 from gripper_force.vision.network import ForceNetwork, StreamState
 
 FRAME: Final = "frame"
@@ -23,7 +25,7 @@ class EnsembleStep(nn.Module):
     states.
     """
 
-    def __init__(self, networks: Sequence[ForceNetwork]) -> None:
+    def __init__(self, networks: Sequence[Member]) -> None:
         super().__init__()
         self.members = nn.ModuleList(networks)
         self._configs = [network.config for network in networks]
@@ -38,11 +40,20 @@ class EnsembleStep(nn.Module):
 
     def forward(self, frame: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
         """Runs all members on the next frame; shapes as in the class."""
-        forces, features, gates = [], [], []
+        forces: list[Tensor] = []
+        features: list[Tensor] = []
+        gates: list[Tensor | None] = []
         next_states: list[Tensor] = []
         inputs = list(state)
-        for config, member in zip(self._configs, self.members, strict=True):
+        for member in self.members:
+            if isinstance(member, ForceProcess):
+                output = member.step(frame)
+                forces.append(output.force_n)
+                features.append(output.features[0])
+                gates.append(None)
+                continue
             assert isinstance(member, ForceNetwork)
+            config = member.config
             # Without earlier frames there is no maps input: engines do not take tensors of size zero.
             maps = inputs.pop(0) if config.maps_kept else member.zero_state().maps
             output, state_after = member.step(frame, StreamState(maps, inputs.pop(0), inputs.pop(0)))
@@ -56,17 +67,21 @@ class EnsembleStep(nn.Module):
     def zero_states(self) -> list[Tensor]:
         """Returns states of zeros, in the order in which `forward` takes them."""
         states: list[Tensor] = []
-        for config, member in zip(self._configs, self.members, strict=True):
+        for member in self.members:
+            if isinstance(member, ForceProcess):
+                continue
             assert isinstance(member, ForceNetwork)
             state = member.zero_state()
-            states += state if config.maps_kept else state[1:]
+            states += state if member.config.maps_kept else state[1:]
         return states
 
 
-def state_names(members: Sequence[NetworkConfig]) -> list[str]:
+def state_names(members: Sequence[NetworkConfig | ProcessConfig]) -> list[str]:
     """Returns the names of an ensemble's states, in the order in which `EnsembleStep` takes them."""
     names = []
     for i, config in enumerate(members):
+        if isinstance(config, ProcessConfig):
+            continue
         names += [f"maps_{i}"] if config.maps_kept else []
         names += [f"hidden_{i}", f"cell_{i}"]
     return names

@@ -20,6 +20,12 @@ Pooling = Literal["wap", "gap"]
 STRIDES: Final[dict[BackboneName, int]] = {"vgg": 16, "resnet18": 32, "mobile": 16}
 """Ratio of the side of a frame to the side of each backbone's feature maps."""
 
+Quantity = Literal["force", "indentation", "contact"]
+"""Output of a network: force, travel of the jaws since contact, log-odds of contact."""
+
+INDENTATION_SCALE_M: Final = 0.02
+"""Travel of the jaws since contact at output 1."""
+
 Count = Annotated[int, Field(ge=1, le=100_000)]
 
 
@@ -38,6 +44,7 @@ class NetworkConfig(Section):
         hidden: Units of each direction of the BLSTM.
         head: Units of the dense layer.
         label_scale_n: Force at output 1 of the last layer.
+        outputs: Outputs of the last layer. A run reads the first, the force.
     """
 
     attention: Attention = "none"
@@ -51,9 +58,12 @@ class NetworkConfig(Section):
     hidden: Count = 256
     head: Count = 1024
     label_scale_n: Positive = 20.0
+    outputs: tuple[Quantity, ...] = ("force",)
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
+        if self.outputs[:1] != ("force",) or len(set(self.outputs)) < len(self.outputs):
+            raise ValueError(f"outputs are {self.outputs}; use each at most once, and force first")
         stride = STRIDES[self.backbone]
         if self.size % stride:
             raise ValueError(
@@ -79,6 +89,42 @@ class NetworkConfig(Section):
     def context(self) -> int:
         """Number of earlier frames that an estimate depends on."""
         return self.window - 1 + self.maps_kept
+
+
+class ProcessConfig(Section):
+    """Shape of a Gaussian process on single frames, see `kernel_regression`.
+
+    Attributes:
+        size: Side of the input in pixels.
+        grid: Side of the averaged frame.
+        head: Number of principal components.
+        points: Number of training frames that it keeps.
+        length: Length scale of its kernel, in standard deviations of the first component.
+        label_scale_n: Scale of the forces, as of a network.
+    """
+
+    size: Annotated[int, Field(ge=16, le=1024)]
+    grid: Annotated[int, Field(ge=1, le=128)]
+    head: Count
+    points: Count
+    length: Positive
+    label_scale_n: Positive = 20.0
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        if self.size % self.grid:
+            raise ValueError(f"size {self.size} is not a multiple of {self.grid}; use preprocess.size=64")
+        return self
+
+    @property
+    def attention(self) -> Attention:
+        """No attention."""
+        return "none"
+
+    @property
+    def context(self) -> int:
+        """Number of earlier frames that an estimate depends on: none."""
+        return 0
 
 
 EXPORTED: Final = {".xml": "openvino", ".onnx": "onnxruntime"}
@@ -122,7 +168,6 @@ class OodModel(Section):
     """Model of the features of known frames, for the out-of-distribution score (see `gripper_force.vision.ood`).
 
     Attributes:
-        network: The checkpoint's digest: SHA-256 of the file without this model, which can be added later.
         mean: Mean of the features without contact, (F,) float32.
         axes: Orthonormal basis of the subspace near which the features lie, (F, R) float16.
         floor: Squared distance from the mean that is added to a frame's.
@@ -131,7 +176,6 @@ class OodModel(Section):
         std_growth: Growth of that factor with the score, added as the root of the sum of squares.
     """
 
-    network: str
     mean: Base64UrlBytes
     axes: Base64UrlBytes
     floor: Positive
@@ -144,21 +188,26 @@ class Header(Section):
     """Metadata of a checkpoint.
 
     Attributes:
-        members: Shapes of the networks whose mean is the estimate.
+        members: Shapes of the networks, or of the Gaussian process, whose mean is the estimate.
         preprocess: Preparation of frames.
         residuals: Error by estimated force, measured on validation data, in order of rising force.
         data_digest: SHA-256 of the training set.
         metrics: Metrics on the validation data, such as ``mae_n``; ``constant_mae_n`` is that of the mean force
             of the training data, for comparison.
         ood: Model for the out-of-distribution score; None in checkpoints of earlier versions.
+        test_digest: SHA-256 of the forces that the residuals and metrics were measured on, if it is not the
+            training's own validation data. Metrics of two checkpoints compare if it is the same.
+        identity: SHA-256 of the file before its header was changed; see `digest_of`.
     """
 
-    members: tuple[NetworkConfig, ...]
+    members: tuple[NetworkConfig | ProcessConfig, ...]
     preprocess: Preprocess
     residuals: tuple[Residual, ...]
     data_digest: str
     metrics: dict[str, float]
     ood: OodModel | None = None
+    test_digest: str = ""
+    identity: str = ""
 
     @model_validator(mode="after")
     def _fits(self) -> "Header":
@@ -180,7 +229,7 @@ class Model:
     Attributes:
         path: The file.
         header: Its header.
-        digest: Digest of the checkpoint, or of the one that it was exported from (see `digest_of`).
+        digest: Digest of the checkpoint (see `digest_of`): the file itself, or the one that it was exported from.
     """
 
     path: Path
@@ -244,21 +293,12 @@ def exported_metadata(model: Model) -> dict[str, str]:
 
 
 def digest_of(data: bytes, header: Header) -> str:
-    """Returns the digest of a checkpoint: SHA-256 of its content without the header's `OodModel`.
+    """Returns the digest by which object profiles know a checkpoint.
 
-    That model changes no force, so an object profile stays valid when it is added or fitted again.
+    It is the SHA-256 of the file as the training wrote it. A changed header keeps it, because the estimates
+    that a profile corrects stay the same.
     """
-    return hashlib.sha256(data).hexdigest() if header.ood is None else header.ood.network
-
-
-def with_header(data: bytes, header: Header) -> bytes:
-    """Returns a checkpoint's content with another header. The weights stay bit for bit."""
-    length = int.from_bytes(data[:8], "little")
-    entries = json.loads(data[8 : 8 + length])
-    entries["__metadata__"] = {FORMAT: header.model_dump_json(exclude_none=True)}
-    text = json.dumps(entries, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 8)
-    return len(text).to_bytes(8, "little") + text + data[8 + length :]
+    return header.identity or hashlib.sha256(data).hexdigest()
 
 
 def _metadata(data: bytes) -> dict[str, str]:

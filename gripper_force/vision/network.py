@@ -112,7 +112,7 @@ class ForceNetwork(nn.Module):
         self.attention = _attention(config, channels)
         self.blstm = LastStepBlstm(channels, config.hidden)
         self.dense = nn.Linear(2 * config.hidden, config.head)
-        self.out = nn.Linear(config.head, 1)
+        self.out = nn.Linear(config.head, len(config.outputs))
         self.to_channels_last()
 
     def to_channels_last(self) -> Self:
@@ -156,8 +156,14 @@ class ForceNetwork(nn.Module):
     def force_n(self, features: Tensor) -> Tensor:
         """Applies the last layer: features (N, head) to forces in N, (N,)."""
         with torch.autocast(features.device.type, enabled=False):
-            force: Tensor = self.out(features).squeeze(1) * self.config.label_scale_n
-        return force
+            force = F.linear(features, self.out.weight[:1], self.out.bias[:1])
+        return force.squeeze(1) * self.config.label_scale_n
+
+    def outputs(self, features: Tensor) -> Tensor:
+        """Applies the last layer: features (N, head) to `NetworkConfig.outputs`, (N, outputs), not scaled."""
+        with torch.autocast(features.device.type, enabled=False):
+            out: Tensor = self.out(features)
+        return out
 
     def step(self, frame: Tensor, state: StreamState | None) -> tuple[Output, StreamState]:
         """Estimates the force for the next frame of a stream. Equals `forward` on the whole stream.

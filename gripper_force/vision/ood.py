@@ -69,7 +69,8 @@ class OodScore:
         """
         share = residual_share(features, self._mean, self._axes, self._floor)
         ratio = self._smooth.step(share / np.interp(estimates_n, self._forces_n, self._typical))
-        return ratio / np.interp(estimates_n, self._forces_n, self._limit)
+        score: Floats = ratio / np.interp(estimates_n, self._forces_n, self._limit)
+        return score
 
     def std_factor(self, score: npt.ArrayLike) -> Floats:
         """Returns the factor of the claimed standard deviation, (N,), for scores over the limit (N,)."""

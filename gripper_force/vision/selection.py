@@ -3,7 +3,7 @@
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple, get_args
 
@@ -111,6 +111,7 @@ def candidates(vision: VisionConfig, *, set_threads: bool = False) -> list[Candi
     found = []
     for setting in _settings(vision, set_threads):
         key = cache_key(*setting)
+        error_n = setting.model.header.metrics.get("mae_n", float("inf"))
         if key not in known:
             model, engine, precision, threads = setting
             keeps_threads = engine == "torch" and not set_threads
@@ -118,11 +119,11 @@ def candidates(vision: VisionConfig, *, set_threads: bool = False) -> list[Candi
                 p50_ms, p99_ms = step_times_ms(
                     open_engine(model, engine, precision, None if keeps_threads else threads)
                 )
-            mae_n = model.header.metrics.get("mae_n", float("inf"))
-            known[key] = Candidate(_name(model), engine, precision, threads, p50_ms, p99_ms, mae_n)
+            known[key] = Candidate(_name(model), engine, precision, threads, p50_ms, p99_ms, error_n)
             if engine_version(engine):  # without a version, a measurement could outlive an update
                 update_cache({key: known[key]})
-        found.append(known[key])
+        # A stated error can change without the digest, so it is not taken from the cache.
+        found.append(replace(known[key], error_n=error_n))
     return found
 
 

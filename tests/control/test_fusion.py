@@ -34,6 +34,8 @@ class Bench:
         free=False,
         opening=False,
         lowering=False,
+        gripping=False,
+        holding=False,
     ):
         """`motor_force_n` and `seen_n` are functions of the time in seconds; `seen_n` is the visual force."""
         for _ in range(round(time_s * 200)):
@@ -47,7 +49,14 @@ class Bench:
                 force_n = seen_n(capture_ns / 1e9) + (noise.normal(0, std_n) if noise else 0.0)
                 visual = VisualForce(capture_ns, self.t_ns, self.t_ns, force_n, std_n, 10.0)
             self.estimate, events = self.fusion.step(
-                self.t_ns, servo, visual, free=free, opening=opening, lowering=lowering
+                self.t_ns,
+                servo,
+                visual,
+                free=free,
+                gripping=gripping,
+                holding=holding,
+                opening=opening,
+                lowering=lowering,
             )
             self.events += [event.text for event in events]
             self.t_ns += 5 * MS
@@ -250,3 +259,97 @@ def test_without_a_lowering_the_difference_stays(bench, transmission):
     before = b.run(3.0, lambda _: 8.0 + transmission.friction_n, lambda _: 7.0)
     after = b.run(0.3, lambda _: 2.0 - transmission.friction_n)
     assert after.bias_n == pytest.approx(before.bias_n)
+
+
+def grip(bench, transmission, force_n, ratio, time_s=2.0, **options):
+    """One grasp: free travel, then a hold with a visual force that is too small by ``ratio``."""
+    friction_n = transmission.friction_n
+    bench.run(0.5, lambda _: friction_n, lambda _: 0.0)
+    bench.run(0.3, lambda _: friction_n, lambda _: 0.0, free=True)
+    bench.run(0.1, lambda _: force_n + friction_n, lambda _: force_n / ratio, gripping=True)
+    return bench.run(
+        time_s,
+        lambda _: force_n + friction_n,
+        lambda _: force_n / ratio,
+        gripping=True,
+        holding=True,
+        **options,
+    )
+
+
+def test_the_next_grasp_uses_the_gain_of_this_one(bench, transmission):
+    b = bench()
+    first = grip(b, transmission, 4.0, 2.0)
+    assert first.source == "current"  # vision differs too much
+    assert first.object_gain == pytest.approx(2.0, rel=0.1)
+    b.fusion.restart(was_held=True)
+    second = grip(b, transmission, 3.0, 2.0)
+    assert second.source == "fused"
+    assert second.force_n == pytest.approx(3.0, abs=0.1)
+    b.fusion.restart(was_held=True, new_object=True)
+    assert b.run(0.1, lambda _: 0.0, lambda _: 0.0).object_gain == 0.0
+
+
+def test_a_gain_counts_only_after_a_grasp_that_was_held(bench, transmission):
+    b = bench()
+    grip(b, transmission, 4.0, 2.0)
+    b.fusion.restart(was_held=False)
+    assert b.run(0.1, lambda _: 0.0, lambda _: 0.0).object_gain == 0.0
+
+
+def test_learning_can_be_off(bench, transmission):
+    b = bench(learn_gain=False, object_ratio=(2.0, 0.05))
+    estimate = grip(b, transmission, 4.0, 2.0)
+    b.fusion.restart(was_held=True)
+    assert (estimate.source, estimate.object_gain) == ("current", 0.0)
+    assert grip(b, transmission, 3.0, 2.0).source == "current"
+
+
+def test_an_implausible_gain_is_an_event_and_vision_is_not_used(bench, transmission):
+    b = bench(object_ratio=(5.0, 0.05))
+    estimate = grip(b, transmission, 4.0, 1.0)
+    assert estimate.source == "current"
+    assert b.events[0].startswith("vision is not used: motor current was 5.00 times the visual force")
+
+
+def test_what_vision_and_current_share_stays_in_the_claim(bench, transmission):
+    """After many grasps of a strange object, vision agrees with the current but has its torque constant's error."""
+    b = bench(object_ratio=(2.0, 0.01))
+    estimate = grip(b, transmission, 6.0, 2.0)
+    assert estimate.source == "fused"
+    assert estimate.std_n > 0.9 * transmission.gain_std * 6.0
+
+
+def test_a_changing_force_is_claimed_to_be_less_certain(bench, transmission):
+    friction_n = transmission.friction_n
+    b = bench(feedback="current")
+    b.run(0.1, lambda _: friction_n, gripping=True)
+    steady = b.run(1.9, lambda _: 1.0 + friction_n, gripping=True)
+    rising = b.run(0.5, lambda t: 1.0 + friction_n + 6 * (t - 2.0), gripping=True)
+    # The estimate lags by the time constant of its filter.
+    assert rising.std_n > steady.std_n + 0.15
+    held = b.run(1.0, lambda _: 4.0 + friction_n, gripping=True)
+    assert held.std_n < rising.std_n
+    assert held.friction_n == friction_n
+
+
+def test_after_an_impact_friction_may_hold_the_jaws_until_the_force_has_risen(bench, transmission):
+    friction_n = transmission.friction_n
+    b = bench(feedback="current")
+    b.run(0.5, lambda _: friction_n, free=True)
+    b.run(0.5, lambda _: 0.4 + friction_n)
+    impact = b.run(0.5, lambda _: 0.5 + friction_n, gripping=True)
+    risen = b.run(1.0, lambda _: 1.5 + friction_n, gripping=True)
+    assert impact.std_n > 0.2
+    assert risen.std_n < 0.15
+
+
+def test_a_bias_from_vision_is_in_doubt_once_vision_contradicts_the_current(bench, transmission):
+    friction_n = transmission.friction_n
+    b = bench()
+    b.run(0.1, lambda _: friction_n, gripping=True)
+    agreed = b.run(1.9, lambda _: 2.0 + friction_n, lambda _: 1.5, gripping=True)
+    contradicted = b.run(1.0, lambda _: 2.0 + friction_n, lambda _: 7.0, gripping=True)
+    assert agreed.bias_n < -0.25
+    assert contradicted.source == "current"
+    assert contradicted.std_n > agreed.std_n + 0.1

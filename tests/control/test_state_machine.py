@@ -165,6 +165,16 @@ def test_object_that_leaves_jaws_on_an_end_stop_is_a_slip_with_a_camera(make_run
     assert any("the camera sees" in reason for reason in run.reasons)
 
 
+def test_force_that_a_camera_sees_before_the_contact_confirms_no_grip(make_run):
+    """A network can take the moving jaws themselves for force."""
+    run = make_run(plant={"contact_m": 1.0, "stops_m": (0.0, 0.020)}, timeout_s=3.0)
+    sample = run.vision.sample
+    run.vision.sample = lambda t_ns, force_n, noise: sample(t_ns, 100.0 * run.plant.x_m, noise)
+    run.grasp(3.0, 4.0)
+    assert run.last.status.outcome == "timeout"
+    assert any("the camera sees" in reason and "before the contact" in reason for reason in run.reasons)
+
+
 def test_camera_that_is_uncertain_throughout_a_grip_prevents_held(make_run):
     run = make_run(vision={"noise_n": 2.0}, timeout_s=3.0).grasp(2.0, 4.0)
     assert run.last.status.outcome == "timeout"
@@ -268,7 +278,7 @@ def test_less_friction_than_configured_is_held(make_run, configured_n, target_n)
 
 def test_force_collapse_is_a_slip(make_run):
     run = make_run(feedback="vision").grasp(4.0, 5.0)
-    run.vision.gain = 0.0
+    run.vision.gain = 0.3
     run.spoil = lambda _, servo: replace(servo, current_a=0.0)  # the motor current drops too
     run.go(1.5)
     assert run.last.status.outcome == "slip"
@@ -577,3 +587,56 @@ def test_camera_that_sees_far_too_much_does_not_confirm_jaws_that_friction_holds
     run.go(0.5)
     assert run.last.status.outcome == "slip"
     assert any("the camera sees" in reason for reason in run.reasons)
+
+
+def regrip(run, target_n):
+    return run.go(2.0, "release").grasp(target_n, 5.0)
+
+
+def test_the_gain_of_a_strange_object_is_learned_over_grasps_and_replays_bit_for_bit(make_run, transmission):
+    run = make_run(vision={"gain": 0.5})
+    run.grasp(3.0, 6.0)
+    assert run.last.estimate.object_gain == pytest.approx(2.0, rel=0.15)
+    assert "fused" not in {decision.estimate.source for decision in run.decisions[-100:]}
+    regrip(run, 4.0)
+    assert run.last.status.outcome == "held"
+    assert run.last.estimate.source == "fused"
+    ratio = run.controller.end_grasps()
+    assert ratio[0] == pytest.approx(2.0, rel=0.1)
+    again = GraspController(run.config, transmission, 1.2, POSITION_LOOP)
+    assert [again.step(*inputs) for inputs in run.inputs] == run.decisions
+    assert again.end_grasps() == ratio
+
+
+def test_a_move_between_two_grasps_keeps_what_was_learned(make_run):
+    run = make_run(vision={"gain": 0.5}).grasp(3.0, 6.0).move(0.08, 2.0).grasp(4.0, 4.0)
+    assert run.last.estimate.source == "fused"
+
+
+def test_what_was_learned_of_one_object_is_forgotten_for_another(make_run):
+    run = make_run(vision={"gain": 0.5}).grasp(3.0, 6.0).go(2.0, "release")
+    run.inputs.clear()
+    decision = run.controller.step(
+        run.t_ns, run.plant.read(run.t_ns, 0.0), None, Request(run.t_ns, "grasp", 4.0, new_object=True)
+    )
+    assert decision.refusal == ""
+    assert decision.status.phase == "approach"
+    assert run.controller.end_grasps() is None
+
+
+def test_a_held_object_can_not_be_a_new_one(make_run):
+    run = make_run().grasp(3.0, 4.0)
+    servo = run.plant.read(run.t_ns, 0.0)
+    decision = run.controller.step(run.t_ns, servo, None, Request(run.t_ns, "grasp", 4.0, new_object=True))
+    assert "release before the grasp of a new one" in decision.refusal
+
+
+@pytest.mark.parametrize("end", ["stop", ""])
+def test_a_grasp_without_a_good_end_teaches_nothing(make_run, end):
+    run = make_run(vision={"gain": 0.5})
+    run.grasp(3.0, 6.0 if end else 1.5)
+    assert (run.last.status.outcome == "held") == bool(end)
+    if end:
+        run.go(0.05, end)
+    run.go(2.0, "release")
+    assert run.controller.end_grasps() is None

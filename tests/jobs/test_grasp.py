@@ -274,3 +274,19 @@ def test_a_log_is_never_overwritten(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         paths[-1].touch()
     assert paths[0].name == "20260101-120000-tube-2.5N-fused-seed7.mcap"
     assert [path.stem.removeprefix(paths[0].stem) for path in paths] == ["", "-2", "-3"]
+
+
+def test_grasps_of_the_same_object_pass_on_what_was_learned(
+    ran: list[Config], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(grasp_module, "learned_ratio", lambda path: (1.0 + 0.1 * len(ran), 0.05))
+    list(trials(load_config(overrides={"seed": 7}), 3, 1, objects=("tube",), same_object=True))
+    assert [one.seed for one in ran] == [7, 8, 9]
+    assert {(one.sim.object_seed, one.sim.rig_seed) for one in ran} == {(7, 7)}
+    assert [one.control.object_ratio for one in ran] == [None, (1.1, 0.05), (1.2, 0.05)]
+
+
+@pytest.mark.parametrize(("jobs", "objects"), [(2, ("tube",)), (1, ("tube", "sponge"))])
+def test_the_same_object_is_grasped_by_one_process(jobs: int, objects: tuple[str, ...]) -> None:
+    with pytest.raises(ConfigError, match="follow one another"):
+        list(trials(load_config(), 2, jobs, objects=objects, same_object=True))

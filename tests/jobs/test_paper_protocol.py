@@ -1,3 +1,4 @@
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -7,10 +8,11 @@ import pytest
 from gripper_force.config import Config, config_from_text, load_config
 from gripper_force.errors import ConfigError, SimulationError
 from gripper_force.jobs import paper_protocol as module
-from gripper_force.jobs.paper_protocol import SetPlan, make_set, plan_protocol
+from gripper_force.jobs.paper_protocol import INSTANCES, SetPlan, make_set, plan_protocol
 from gripper_force.jobs.simulate import OBJECTS, simulate
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import Frame, GraspStatus, LoadCellSample, Phase, Record
+from gripper_hw.sim.scene import Scene, draw_scene
 
 
 @pytest.fixture
@@ -25,8 +27,9 @@ def seeing(config: Config) -> Config:
     return config.model_copy(update={"camera": camera})
 
 
-def test_full_protocol_is_the_papers() -> None:
-    sets = plan_protocol("full")
+@pytest.mark.parametrize("instances", INSTANCES)
+def test_full_protocol_is_the_papers(instances: str) -> None:
+    sets = plan_protocol("full", instances)
     names = [name for one in sets for name in one.names]
     assert (len(sets), len(set(names)), len({one.seed for one in sets})) == (240, 720, 240)
     assert {one.degrees for one in sets} == {0, 10, 20, 30}
@@ -35,12 +38,63 @@ def test_full_protocol_is_the_papers() -> None:
     assert sum(one.split == "test" for one in sets) == 240 * 3 // 15
     assert "test/stapler-30-15-750.mcap" in names
     with pytest.raises(ConfigError, match="no scale 'huge' of the protocol; use one of full, small"):
-        plan_protocol("huge")
+        plan_protocol("huge", instances)
+    with pytest.raises(ConfigError, match="no instances 'other' of the protocol; use one of same, redrawn"):
+        plan_protocol("full", "other")
+
+
+def scenes(instances: str) -> dict[str, list[Scene]]:
+    """Scenes of the first draws of the small scale, by object."""
+    config = load_config(None)
+    found: dict[str, list[Scene]] = {}
+    for task in plan_protocol("small", instances):
+        made = module._set_config(config, task, task.seed, task.lux[0], np.random.default_rng(0))
+        found.setdefault(task.object, []).append(draw_scene(made.object, made.seed, made.sim))
+    return found
+
+
+def without_pose(scene: Scene) -> Scene:
+    return replace(scene, offset_m=(0.0, 0.0), yaw_deg=0.0)
+
+
+def test_same_instances_differ_only_in_their_pose() -> None:
+    for of_object in scenes("same").values():
+        assert len(set(of_object)) == len(of_object) == 20
+        assert len({without_pose(scene) for scene in of_object}) == 1
+
+
+def test_redrawn_instances_differ_in_object_and_rig() -> None:
+    for of_object in scenes("redrawn").values():
+        for key in ("size", "stiffness", "texture_seed", "camera_offset_m", "rod_length_m", "offset_m"):
+            assert len({getattr(scene, key) for scene in of_object}) == 20
+        assert {(scene.nm_per_a, scene.jaw_friction_n) for scene in of_object} == {(1.0, 0.2)}
+
+
+@pytest.mark.parametrize("instances", INSTANCES)
+def test_peaks_of_the_stapler_overshoot_little(seeing: Config, tmp_path: Path, instances: str) -> None:
+    task = next(
+        one for one in plan_protocol("small", instances) if one.object == "stapler" and one.number == 2
+    )
+    (path,) = make_set(task, tmp_path, seeing.model_dump(mode="json"))
+    assert 8.0 < max(s.force_n for s in LogReader(path).records(LoadCellSample)) <= 12.75
+
+
+def test_a_set_with_too_high_a_peak_is_refused(
+    seeing: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "_RAMP_N_S", {})
+    monkeypatch.setattr(module, "_USUAL_RAMP_N_S", (300.0, 300.0))
+    monkeypatch.setattr(module, "_MAX_DRAWS", 1)
+    task = SetPlan("stapler", 0, 1, 700_000, (550,), 700_000)
+    (tmp_path / "train").mkdir()
+    with pytest.raises(SimulationError, match=r"a touch of 'stapler' at 0 degrees reached 1\d\.\d N"):
+        make_set(task, tmp_path, seeing.model_dump(mode="json"))
+    assert not list(tmp_path.rglob("*.mcap"))
 
 
 def test_small_protocol_is_part_of_the_full_one() -> None:
-    full = {name: one.seed for one in plan_protocol("full") for name in one.names}
-    small = {name: one.seed for one in plan_protocol("small") for name in one.names}
+    full = {name: one.seed for one in plan_protocol("full", "same") for name in one.names}
+    small = {name: one.seed for one in plan_protocol("small", "same") for name in one.names}
     assert len(small) == 80
     assert sum(name.startswith("test/") for name in small) == 80 * 3 // 15
     assert small.items() <= full.items()
@@ -104,5 +158,5 @@ def test_protocol_needs_simulated_camera(config: Config, tmp_path: Path) -> None
     with pytest.raises(
         ConfigError, match=r"needs a simulated camera and load cell, but camera\.backend is 'none'"
     ):
-        make_set(plan_protocol("small")[0], tmp_path, config.model_dump(mode="json"))
+        make_set(plan_protocol("small", "same")[0], tmp_path, config.model_dump(mode="json"))
     assert not list(tmp_path.rglob("*.mcap"))

@@ -6,6 +6,7 @@ import pytest
 
 from gripper_force.config import load_config
 from gripper_force.errors import ConfigError
+from gripper_force.profiles.apply import read_profiles, with_object
 from gripper_force.profiles.object_profile import (
     Interval,
     LoopPlant,
@@ -46,6 +47,16 @@ def test_profile_round_trips(tmp_path: Path) -> None:
     write_object(tmp_path / "mug.yaml", profile(), b"weights")
     assert weights_path(tmp_path / "mug.yaml").read_bytes() == b"weights"
     assert read_object(tmp_path / "mug.yaml") == profile()
+
+
+def test_a_learned_ratio_round_trips_and_reaches_the_controller(tmp_path: Path) -> None:
+    path = tmp_path / "mug.yaml"
+    write_object(path, profile(ratio=(1.4, 0.05)), b"weights")
+    assert read_object(path).ratio == (1.4, 0.05)
+    config = load_config(overrides={"calibration.object": str(path)})
+    assert with_object(config.control, read_profiles(config)).object_ratio == (1.4, 0.05)
+    own = load_config(overrides={"calibration.object": str(path), "control.object_ratio": [0.9, 0.1]})
+    assert with_object(own.control, read_profiles(own)).object_ratio == (0.9, 0.1)
 
 
 def test_full_disk_keeps_both_files_of_the_old_profile(

@@ -79,7 +79,7 @@ def test_every_network_shape_round_trips(choices: dict[str, str], tmp_path: Path
     network = ForceNetwork(config).eval()
     whole = header(SSAM).model_copy(update={"members": (config,), "preprocess": Preprocess(size=32)})
     save_checkpoint(tmp_path / "one.safetensors", [network], whole)
-    (loaded,) = load_checkpoint(tmp_path / "one.safetensors").networks
+    (loaded,) = load_checkpoint(tmp_path / "one.safetensors").force_networks
     clip = torch.randn(1, 4, 1, 32, 32)
     torch.testing.assert_close(loaded(clip), network(clip), rtol=5e-3, atol=5e-3)
 
@@ -97,7 +97,7 @@ def test_values_beyond_half_precision_are_stored_as_float32(factor: float, tmp_p
     with torch.no_grad():
         network.dense.weight *= factor
     save_checkpoint(tmp_path / "one.safetensors", [network], header(SSAM))
-    (loaded,) = load_checkpoint(tmp_path / "one.safetensors").networks
+    (loaded,) = load_checkpoint(tmp_path / "one.safetensors").force_networks
     assert torch.equal(loaded.dense.weight, network.dense.weight)
     rounded, exact = (one.blstm.forward_lstm.get_parameter("weight_ih_l0") for one in (loaded, network))
     assert not torch.equal(rounded, exact)
@@ -153,7 +153,7 @@ def test_header_of_a_huge_network_allocates_nothing(file: Path) -> None:
 
 
 def test_loaded_network_outlives_its_file(file: Path) -> None:
-    weight = load_checkpoint(file).networks[0].out.bias
+    weight = load_checkpoint(file).force_networks[0].out.bias
     before = weight.clone()
     with file.open("r+b") as opened:
         opened.write(bytes(file.stat().st_size))

@@ -106,7 +106,7 @@ def test_no_attention_map_without_ssam(frames: np.ndarray) -> None:
 
 def test_nan_from_a_network_is_refused(frames: np.ndarray) -> None:
     checkpoint = ensemble("ssam", "scam")
-    checkpoint.networks[1].out.bias.fill_(torch.nan)
+    checkpoint.force_networks[1].out.bias.fill_(torch.nan)
     estimator = ForceEstimator(TorchEngine(checkpoint))
     with pytest.raises(NonFiniteError, match="nan"):
         run(estimator, frames)
@@ -115,8 +115,8 @@ def test_nan_from_a_network_is_refused(frames: np.ndarray) -> None:
 @pytest.mark.parametrize("force_n", [-150.0, -100.6, -100.4, 0.0, 100.4, 100.6, 1e30])
 def test_claimed_error_grows_beyond_validated_forces(frames: np.ndarray, force_n: float) -> None:
     checkpoint = ensemble("ssam")
-    checkpoint.networks[0].out.weight.zero_()
-    checkpoint.networks[0].out.bias.fill_(force_n / 20)
+    checkpoint.force_networks[0].out.weight.zero_()
+    checkpoint.force_networks[0].out.bias.fill_(force_n / 20)
     estimate = run(ForceEstimator(TorchEngine(checkpoint)), frames[:4])[3]
     assert estimate is not None
     known_n = {-100.6: 0.0, -100.4: 0.0, -150.0: 0.0, 0.0: 1.0}.get(force_n, 2.0)

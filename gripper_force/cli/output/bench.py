@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from gripper_force.qualification.bench.bus_bench import BusCost
     from gripper_force.qualification.bench.command_bench import CommandCost
     from gripper_force.qualification.bench.estimator_bench import EstimatorCost, Ratios
+    from gripper_force.qualification.bench.gain_bench import GainRow
     from gripper_force.qualification.bench.loop_bench import LogCost, LoopCost
     from gripper_force.qualification.bench.scene_bench import SceneCost
     from gripper_force.qualification.bench.startup_bench import Start
@@ -46,6 +47,25 @@ def scene_table(costs: "Sequence[SceneCost]") -> None:
         solver = (str(s.unknowns), f"{s.step_ms:g}", number(s.iterations, digits=1))
         figures = (number(s.speed, digits=1), number(s.error_n), number(s.worst_n))
         table.add_row(s.object, s.detail, *solver, *figures)
+    out.print(table)
+
+
+def gain_table(rows: "Sequence[GainRow]") -> None:
+    """Prints the errors of vision without and with the gain, of each object and on average."""
+    table = Table(
+        "object", "true gain", "gain", "+- %", "grasps held", "MAE N", "with gain N", "best N", box=None
+    )
+    for r in rows:
+        figures = (
+            number(r.stiffness, digits=2),
+            number(r.gain, digits=3),
+            number(100 * r.gain_std, digits=1),
+        )
+        errors = (number(value) for value in (r.mae_n, r.learned_n, r.perfect_n))
+        table.add_row(r.object, *figures, str(r.grasps), *errors)
+    columns = ([r.mae_n for r in rows], [r.learned_n for r in rows], [r.perfect_n for r in rows])
+    means = (number(sum(column) / len(rows)) for column in columns)
+    table.add_row("all", "", "", "", str(sum(r.grasps for r in rows)), *means)
     out.print(table)
 
 
@@ -134,6 +154,14 @@ def recognition_table(rows: "Sequence[Figures]") -> None:
     table = Table("group", "row", *HEADINGS.values(), box=None)
     for row in rows:
         table.add_row(row["group"], row["name"], *texts(row))
+    out.print(table)
+
+
+def checkpoints_table(found: Mapping[str, Mapping[str, float]]) -> None:
+    """Prints the errors of checkpoints on the same logs."""
+    table = Table("checkpoint", "MAE N", "RMSE N", "bias N", box=None)
+    for name, errors in found.items():
+        table.add_row(name, *(number(errors[key]) for key in ("mae_n", "rmse_n", "bias_n")))
     out.print(table)
 
 

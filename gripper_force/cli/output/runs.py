@@ -45,15 +45,24 @@ def _vision(r: "Summary") -> dict[str, str]:
     if r["vision_share"] is None:
         return {}
     losses = "\n".join(f"for {loss.time_s:.1f} s: {loss.reason}" for loss in r["vision_losses"])
+    gain = {} if r["object_gain"] is None else {"object's gain": _gain(r)}
     return {
         "vision used": f"{100 * r['vision_share']:.0f} % of the hold",
         **({"vision lost": losses} if losses else {}),
+        **gain,
     }
+
+
+def _gain(r: "Summary") -> str:
+    if r["object_gain"] is None:
+        return "-"
+    true = "" if r["object_gain_true"] is None else f" (true: {r['object_gain_true']:.2f})"
+    return f"{r['object_gain']:.2f} +- {100 * (r['object_gain_std'] or 0.0):.0f} %{true}"
 
 
 def trials_table(trials: "Sequence[Summary]", summary: "Overall") -> None:
     """Prints the figures of each trial and over all trials."""
-    names = ("object", "target N", "load cell N", "error %", "overshoot N", "settle s", "vision %")
+    names = ("object", "target N", "load cell N", "error %", "overshoot N", "settle s", "vision %", "gain")
     table = Table(*names, Column("result", no_wrap=True), box=None)
     for t in trials:
         error = None if t["steady_error_n"] is None else 100 * t["steady_error_n"] / t["target_n"]
@@ -65,6 +74,7 @@ def trials_table(trials: "Sequence[Summary]", summary: "Overall") -> None:
             number(t["overshoot_n"], digits=2),
             number(t["settle_s"], digits=2),
             number(None if t["vision_share"] is None else 100 * t["vision_share"], digits=0),
+            number(t["object_gain"], digits=2),
             t["result"] + (", fell back" if t["fell_back"] else ""),
         )
     out.print(table)

@@ -89,6 +89,7 @@ class Run:
         outcome: Last outcome; empty without one.
         score: Grasp compared with the load cell; None without a hold or a load cell.
         vision: Use of vision in the hold; None without a hold or without vision.
+        object_gain: Last gain of the object by motor current, and its relative standard deviation; None without one.
         forces: Force by source; sources that the log lacks are absent.
         errors: Force minus the load cell's force, by source; only where the load cell gives valid samples.
         reference: Target force, shaped by the ramp.
@@ -110,6 +111,7 @@ class Run:
     outcome: str
     score: GraspScore | None
     vision: HoldVision | None
+    object_gain: tuple[float, float] | None
     forces: dict[str, Series]
     errors: dict[str, Series]
     reference: Series
@@ -184,6 +186,9 @@ def read_run(log: LogReader, on_frame: Callable[[Frame], None] = lambda frame: N
         vision=vision_in_hold(status, fused, vision, records[Event])
         if controls_with_vision(config)
         else None,
+        object_gain=next(
+            ((f.object_gain, f.object_gain_std) for f in reversed(fused) if f.object_gain), None
+        ),
         forces=forces,
         errors=_errors(forces),
         reference=_series(zero_ns, ((s.t_ns, s.reference_n) for s in status)),

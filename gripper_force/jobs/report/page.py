@@ -67,6 +67,9 @@ def _cards(run: Run) -> list[tuple[str, str, str]]:
         if source in run.errors:
             mean_n = np.abs(run.errors[source].value_n).mean()
             cards.append((f"Mean error, {SOURCES[source].label}", f"{mean_n:.2f}", "N"))
+    if run.object_gain is not None:
+        gain, std = run.object_gain
+        cards.append(("Object's gain", f"{gain:.2f}", f"&plusmn; {100 * std:.0f} %"))
     if len(run.latency_ms):
         p50, p99 = np.percentile(run.latency_ms, [50, 99])
         cards.append(("Latency p50 / p99", f"{p50:.1f} / {p99:.1f}", "ms"))

@@ -1,6 +1,7 @@
 """Training batches: clips drawn from all recordings, with random shift, light and noise."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +13,22 @@ from gripper_force.jobs.dataset import CONTACT_N, Clip
 from gripper_force.jobs.training.parallel import Ranks
 from gripper_force.jobs.training.recipe import TrainConfig
 from gripper_force.vision.batch_inference import normalise
+
+
+class Batch(NamedTuple):
+    """Clips of one step.
+
+    Attributes:
+        inputs: Prepared frames, (B, T, 1, S, S).
+        forces_n: Forces to learn, (B, T).
+        valid: Mask of the frames with a label, (B, T).
+        indentation_m: Travel of the jaws since contact, (B, T); NaN if unknown.
+    """
+
+    inputs: Tensor
+    forces_n: Tensor
+    valid: Tensor
+    indentation_m: Tensor
 
 
 class Batches:
@@ -46,10 +63,12 @@ class Batches:
         self.unseen = np.array([clip.valid.any() for clip in clips])
         self._recording = np.repeat(np.arange(len(clips)), lengths)  # (N,)
         self._begin = np.repeat(np.cumsum([0, *lengths[:-1]]), lengths)  # (N,)
-        frames = np.concatenate([clip.frames for clip in clips])  # (N, S, S)
-        self._frames = torch.from_numpy(frames).to(self._device)
+        # Not joined to one tensor, which would take the memory twice.
+        self._frames = [torch.from_numpy(clip.frames).to(self._device) for clip in clips]  # (T, S, S) each
         self._labels = torch.from_numpy(forces_n).to(self._device)  # (N,)
         self._valid = torch.from_numpy(valid).to(self._device)  # (N,)
+        indentation_m = np.concatenate([clip.indentation_m for clip in clips])
+        self._indentation_m = torch.from_numpy(indentation_m).to(self._device)  # (N,)
         self._all = np.flatnonzero(valid)
         self._contact = np.flatnonzero(valid & (forces_n > CONTACT_N))
         if not len(self._contact):
@@ -64,16 +83,13 @@ class Batches:
         """Number of frames with a label."""
         return len(self._all)
 
-    def batch(self, step: int, count: int, length: int) -> tuple[Tensor, Tensor, Tensor]:
+    def batch(self, step: int, count: int, length: int) -> Batch:
         """Draws the clips of one step. They depend only on the seed and on these arguments.
 
         Args:
             step: Number of the step.
             count: Number of clips, B. With several processes each gets its share of them.
             length: Frames per clip, T.
-
-        Returns:
-            Inputs (B, T, 1, S, S), forces in N (B, T), and the mask of frames with a label (B, T).
         """
         config = self._config
         rng = np.random.default_rng((config.seed, step))
@@ -88,7 +104,7 @@ class Batches:
         leading, frames = gray[:, : lead.shape[1]], gray[:, lead.shape[1] :]
         inputs = normalise(frames, leading, config.preprocess)
         where = torch.from_numpy(index[self._share]).to(self._device)
-        return inputs, self._labels[where], self._valid[where]
+        return Batch(inputs, self._labels[where], self._valid[where], self._indentation_m[where])
 
     def _ends(self, rng: np.random.Generator, step: int, count: int) -> npt.NDArray[np.int64]:
         draws = rng.random(count)
@@ -124,8 +140,34 @@ class Batches:
         def move(array: npt.NDArray[np.generic]) -> Tensor:
             return torch.from_numpy(array[self._share]).to(self._device)
 
-        where, down, right = move(index), move(rows), move(columns)
-        gray = self._frames[where[:, :, None, None], down[:, None, :, None], right[:, None, None, :]]
+        where = index - self._begin[index]  # in their recording
+        recordings = self._recording[index[:, 0]]
+        parts = zip(recordings[self._share], move(where), move(rows), move(columns), strict=True)
+        gray = torch.stack([self._frames[r][t[:, None, None], y[:, None], x] for r, t, y, x in parts])
         gain, gamma = (move(np.exp(part))[:, None, None, None] for part in light)  # (B, 1, 1, 1) each
         lit: Tensor = gain * (gray / 255) ** gamma + move(noise)[:, None, None, None] * grain[self._share]
         return lit.clamp_(0, 1) * 255
+
+
+class Replay:
+    """Batches of new recordings, mixed with those of an earlier training.
+
+    Attributes:
+        labels: Number of new frames with a label.
+        unseen: Mask of the new recordings from which no clip has been drawn, (recordings,) bool.
+    """
+
+    def __init__(self, new: Batches, old: Batches, share: float) -> None:
+        self._new, self._old, self._share = new, old, share
+        self.labels = new.labels
+        self.unseen = new.unseen
+
+    def batch(self, step: int, count: int, length: int) -> Batch:
+        """Draws the clips of one step, ``share`` of them from the earlier recordings; see `Batches.batch`."""
+        old = round(self._share * count)
+        parts = [
+            batches.batch(step, clips, length)
+            for batches, clips in ((self._new, count - old), (self._old, old))
+            if clips
+        ]
+        return Batch(*(torch.cat(part) for part in zip(*parts, strict=True)))

@@ -9,13 +9,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import minimize
 
-from gripper_force.errors import CheckpointError, DataError
+from gripper_force.errors import DataError
 from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.dataset import CONTACT_N, Clip, check_size, load_clips, without_contact_starts
 from gripper_force.vision.batch_inference import features
 from gripper_force.vision.checkpoint import load_checkpoint
+from gripper_force.vision.checkpoint_writer import replace_header
 from gripper_force.vision.estimator import claimed_std_n
-from gripper_force.vision.header import Header, OodLimit, OodModel, digest_of, read_checkpoint, with_header
+from gripper_force.vision.header import Header, OodLimit, OodModel, read_checkpoint
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.ood import Smooth, residual_share
 
@@ -66,7 +67,7 @@ def fit_ood(
         progress: Called after each clip.
 
     Returns:
-        The model, without the checkpoint's digest; None with fewer than `MIN_LOGS` logs that show contact.
+        The model; None with fewer than `MIN_LOGS` logs that show contact.
     """
     check_size(clips, header.preprocess)
     seen = []
@@ -92,7 +93,6 @@ def fit_ood(
     )
     mean, axes, floor = _subspace(seen)
     model = OodModel(
-        network="",
         mean=_encoded(mean, np.float32),
         axes=_encoded(axes, np.float16),
         floor=floor,
@@ -119,15 +119,7 @@ def add_ood(source: str | Path, model: OodModel, out: Path) -> None:
     Raises:
         CheckpointError: The checkpoint can't be read or written.
     """
-    _, data, header = read_checkpoint(source)
-    model = model.model_copy(update={"network": digest_of(data, header)})
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_bytes(with_header(data, header.model_copy(update={"ood": model})))
-    except OSError as error:
-        raise CheckpointError(
-            f"can't write the checkpoint {out}: {error.strerror}; name another file"
-        ) from error
+    replace_header(source, read_checkpoint(source)[2].model_copy(update={"ood": model}), out)
 
 
 def calibrate_network(
@@ -156,7 +148,7 @@ def calibrate_network(
     checkpoint = load_checkpoint(source)
     preprocess = checkpoint.header.preprocess
     clips = without_contact_starts(load_clips(logs, preprocess, None, workers, progress), preprocess)
-    model = fit_ood(checkpoint.networks, checkpoint.header, clips, progress=progress)
+    model = fit_ood(checkpoint.force_networks, checkpoint.header, clips, progress=progress)
     if model is None:
         raise DataError(
             f"a score needs at least {MIN_LOGS} logs that show contact and were not trained on; simulate or record more"

@@ -15,7 +15,16 @@ from gripper_force.schema import (
     section_from,
     validated,
 )
-from gripper_force.vision.header import Attention, BackboneName, Count, Header, NetworkConfig, Pooling
+from gripper_force.vision.header import (
+    Attention,
+    BackboneName,
+    Count,
+    Header,
+    NetworkConfig,
+    Pooling,
+    ProcessConfig,
+    Quantity,
+)
 from gripper_force.vision.preprocess import Preprocess
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -39,18 +48,29 @@ RECIPES: Final[dict[str, Tree]] = {
         "noise": 0.0,
         "precision": "float32",
     },
+    "few": {"method": "process", "preprocess": {"size": 64, "magnitude": True}},
 }
 """Keys that each recipe sets; all others have `TrainConfig`'s defaults, which are ``short_clips``.
+
+``few`` fits a Gaussian process instead of training a network, for a few recordings, see `training.few`.
 
 ``shin2019`` follows section III-E of the paper. What the paper does not state: frames are standardised, as in
 all recipes, and there is no augmentation, weight decay or gradient clipping.
 """
 
 
+FITTED_AT_ONCE: Final = (
+    "a Gaussian process is fitted to all its recordings at once; train it without --init and --replay, on a folder "
+    "with all recordings"
+)
+"""Reason why a Gaussian process does not continue a checkpoint."""
+
+
 class TrainConfig(Section):
     """A training recipe.
 
     Attributes:
+        method: ``network``, or ``process`` for a Gaussian process, which uses no other key than ``preprocess``.
         attentions: Attention of each member of the ensemble.
         earlier_frames: Number of earlier frames n that SSAM and SCAM use.
         pooling: Pooling of SSAM and SCAM: weighted or global average.
@@ -81,18 +101,27 @@ class TrainConfig(Section):
         labels: ``measured``: forces of the load cell. ``nominal``: forces that a simulated object would have
             with exactly the nominal stiffness of its kind. Images show no more than that; the difference
             would be noise.
+        indentation_weight: Weight of the squared error of the indentation, the travel of the jaws since contact
+            over 20 mm, beside that of force / 20 N; 0 trains no such output.
+        contact_weight: Weight of the cross-entropy of contact; 0 trains no such output.
+        teacher_share: Share of a teacher's estimate (`--teacher`) in the force to learn; the rest is the label.
+        freeze_statistics: Keep the batch statistics of the initial checkpoint (`--init`), which few recordings
+            would replace by their own; None: true with ``--init``. False suits many scenes.
         contact_share: Share of clips that end in contact.
         force_share: Share of clips whose last frame is drawn evenly over force, because high forces are rare.
         shift_px: Largest shift of a clip.
         light: Standard deviation of the logarithm of gain and gamma, drawn per clip.
         noise: Largest standard deviation of pixel noise, as a fraction of full scale.
-        validation: Share of each object's sets that is held out to measure the checkpoint's error.
+        replay_share: Share of the clips that is drawn from the recordings of an earlier training, if there are any.
+        validation: Share of each object's sets that is held out to measure the checkpoint's error; of the objects,
+            if no object has two sets.
         seed: Seed of weights and draws.
         precision: Arithmetic of backbone and attention; all else, and all weights, are float32.
         device: Device to train on; ``auto`` uses CUDA if it is available.
         compile: Compile the network; faster only after some minutes on a GPU.
     """
 
+    method: Literal["network", "process"] = "network"
     attentions: Annotated[tuple[Attention, ...], Field(min_length=1)] = ("ssam", "scam")
     earlier_frames: Annotated[int, Field(ge=0, le=20)] = 1
     pooling: Pooling = "wap"
@@ -115,11 +144,16 @@ class TrainConfig(Section):
     weight_decay: NonNegative = 0.01
     gradient_limit: Positive | None = 1.0
     labels: Literal["measured", "nominal"] = "measured"
+    indentation_weight: NonNegative = 0.0
+    contact_weight: NonNegative = 0.0
+    teacher_share: Share = 0.7
+    freeze_statistics: bool | None = None
     contact_share: Share = 0.3
     force_share: Share = 0.2
     shift_px: Annotated[int, Field(ge=0)] = 2
     light: NonNegative = 0.2
     noise: NonNegative = 0.02
+    replay_share: Annotated[float, Field(ge=0, lt=1)] = 0.5
     validation: Annotated[float, Field(gt=0, lt=1)] = 0.1
     seed: Annotated[int, Field(ge=0)] = 0
     precision: Literal["float32", "bfloat16"] = "bfloat16"
@@ -128,6 +162,10 @@ class TrainConfig(Section):
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
+        if self.method == "process" and (unused := self.model_fields_set - {"method", "preprocess"}):
+            raise ValueError(
+                f"a Gaussian process has no {', '.join(sorted(unused))}; leave it out, or use recipe short_clips"
+            )
         try:
             self.network(0)
         except ValidationError as error:
@@ -139,6 +177,13 @@ class TrainConfig(Section):
                 f"short_frames {self.short_frames} is more than clip_frames {self.clip_frames}; reduce it"
             )
         return self
+
+    @property
+    def outputs(self) -> tuple[Quantity, ...]:
+        """Outputs of the networks: force, and those with a weight."""
+        indentation: tuple[Quantity, ...] = ("indentation",) if self.indentation_weight else ()
+        contact: tuple[Quantity, ...] = ("contact",) if self.contact_weight else ()
+        return ("force", *indentation, *contact)
 
     def network(self, member: int) -> NetworkConfig:
         """Returns the configuration of one member."""
@@ -152,6 +197,7 @@ class TrainConfig(Section):
             width=self.width,
             hidden=self.hidden,
             head=self.head,
+            outputs=self.outputs,
         )
 
 
@@ -180,6 +226,13 @@ def continued(config: TrainConfig, header: Header) -> TrainConfig:
     Raises:
         ConfigError: The recipe sets a key to another value, or no recipe makes such a checkpoint.
     """
+    if config.method == "process":
+        raise ConfigError(FITTED_AT_ONCE)
+    if any(isinstance(member, ProcessConfig) for member in header.members):
+        raise ConfigError(
+            "the initial checkpoint is a Gaussian process, which training can't continue; train it again on all "
+            "recordings with --recipe few, or name a network"
+        )
     tree = config.model_dump(exclude_unset=True)
     differing: dict[str, tuple[object, object]] = {}
     for key, value in _network_keys(header).items():
@@ -199,7 +252,7 @@ def continued(config: TrainConfig, header: Header) -> TrainConfig:
     same = validated(TrainConfig, tree, "--init", "recipe")
     for member, shape in enumerate(header.members):
         own = same.network(member)
-        for key in NetworkConfig.model_fields:
+        for key in NetworkConfig.model_fields.keys() - {"outputs"}:  # `Trainer.load_weights` adds new ones
             if getattr(own, key) != getattr(shape, key):
                 raise ConfigError(
                     f"network {member} of the initial checkpoint has {key}={_shown(getattr(shape, key))}, but a "
@@ -210,10 +263,11 @@ def continued(config: TrainConfig, header: Header) -> TrainConfig:
 
 def _network_keys(header: Header) -> dict[str, object]:
     """Returns the keys of a recipe that describe a checkpoint's networks and preprocessing."""
-    first = header.members[0]
-    found: dict[str, object] = {"attentions": tuple(member.attention for member in header.members)}
+    members = [member for member in header.members if isinstance(member, NetworkConfig)]
+    first = members[0]
+    found: dict[str, object] = {"attentions": tuple(member.attention for member in members)}
     found |= {key: getattr(first, key) for key in ("earlier_frames", "backbone", "width", "hidden", "head")}
-    if sequential := [member for member in header.members if member.sequential]:
+    if sequential := [member for member in members if member.sequential]:
         found["pooling"] = sequential[0].pooling  # no other attention has a choice
     found |= {f"preprocess.{key}": value for key, value in header.preprocess.model_dump().items()}
     return found

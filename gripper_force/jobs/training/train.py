@@ -4,7 +4,6 @@ The diversity of scenes limits this task, not the number of labels. So a step of
 draws short clips from many recordings instead of long ones from a few.
 """
 
-import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,24 +16,26 @@ from gripper_force.errors import ConfigError
 from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import Clip, check_size, digest, split_by
-from gripper_force.jobs.training.batches import Batches
+from gripper_force.jobs.training import few
+from gripper_force.jobs.training.batches import Batches, Replay
+from gripper_force.jobs.training.few import PROGRESS_STEPS as PROGRESS_STEPS
 from gripper_force.jobs.training.ood_fit import MIN_LOGS, add_ood, fit_ood
 from gripper_force.jobs.training.parallel import Ranks, joined
+from gripper_force.jobs.training.recipe import FITTED_AT_ONCE, continued
 from gripper_force.jobs.training.recipe import TrainConfig as TrainConfig
-from gripper_force.jobs.training.recipe import continued
-from gripper_force.jobs.training.trainer import Trainer, estimates
-from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
+from gripper_force.jobs.training.stated_errors import errors, estimates, residuals
+from gripper_force.jobs.training.trainer import Trainer
+from gripper_force.vision.batch_inference import predict
+from gripper_force.vision.checkpoint import Checkpoint, Member, load_checkpoint
 from gripper_force.vision.checkpoint_writer import save_checkpoint
-from gripper_force.vision.header import RESIDUAL_HALF_N, Header, Residual
+from gripper_force.vision.header import Header, read_checkpoint
+from gripper_force.vision.network import ForceNetwork
 
 STATE_EVERY_S: Final = 60.0
 """Time between two saved states: an interrupted training loses no more than this."""
 
-PROGRESS_STEPS: Final = 100
-"""Steps of progress that the training of one network reports."""
-
-RESIDUAL_PRIOR: Final = 20
-"""Weight of the error over all forces, in frames, in the stated error at one force."""
+LEAST_STEPS: Final = 300
+"""Fewer steps give a warning. A complete schedule of so many reaches about 1.6 times the error of a long one."""
 
 
 def train(
@@ -44,6 +45,8 @@ def train(
     *,
     validation_clips: Sequence[Clip] | None = None,
     init: Checkpoint | None = None,
+    teacher: Checkpoint | None = None,
+    replay_clips: Sequence[Clip] = (),
     resume: bool = False,
     progress: Progress = no_progress,
     warn: Callable[[str], None] = lambda _: None,
@@ -58,67 +61,136 @@ def train(
         clips: Training data.
         out: Checkpoint to write. All processes read it, so all machines need access to it.
         validation_clips: Clips to measure the checkpoint's stated error on; None for sets held out of
-            ``clips``.
+            ``clips``, or for objects if no object has two sets.
         init: Checkpoint with the initial weights, whose networks and preprocessing replace those that the
-            recipe leaves unset; None for random weights.
+            recipe leaves unset; None for random weights. Its batch normalisation keeps its statistics unless
+            ``freeze_statistics`` is false: a few recordings would change them more than the weights.
+        teacher: Checkpoint whose estimates are learned beside the labels, by ``teacher_share``; None for none.
+        replay_clips: Recordings of an earlier training, from which ``replay_share`` of each step's clips are
+            drawn, so that their objects are not forgotten.
         resume: Continue an interrupted training from its saved states.
         progress: Called with the training error; `PROGRESS_STEPS` for each network in total.
-        warn: Called with a sentence if the training was too short to draw a clip from each recording, or if
-            there are too few validation clips for an out-of-distribution score.
+        warn: Called with a sentence if the training was too short to draw a clip from each recording, or to
+            converge, or if there are too few validation clips for an out-of-distribution score.
 
     Returns:
         The checkpoint as written.
 
     Raises:
-        DataError: No object has two sets, no frame shows contact, or a recording is too short or of another
+        DataError: There is only one set, no frame shows contact, or a recording is too short or of another
             size.
         NonFiniteError: The training diverged.
         CheckpointError: A state belongs to another recipe or other data, or a file can't be written.
-        ConfigError: The recipe sets a key in which ``init`` differs, or the processes can't train together,
-            for example because their recipes differ.
+        ConfigError: The recipe sets a key in which ``init`` differs, ``init`` or ``replay_clips`` are given for
+            a Gaussian process, or the processes can't train together, for example because their recipes differ.
     """
+    if config.method == "process":
+        if init is not None or replay_clips:
+            raise ConfigError(FITTED_AT_ONCE)
+        with joined("cpu") as ranks:
+            if ranks.first:
+                _fit(config, clips, out, validation_clips, progress)
+            ranks.wait()
+            return load_checkpoint(out)
     if init is not None:
         config = continued(config, init.header)
+    elif config.freeze_statistics:
+        raise ConfigError(
+            "freeze_statistics keeps those of an initial checkpoint; add --init, or set it to false"
+        )
+    if teacher is not None and teacher.header.preprocess != config.preprocess:
+        raise ConfigError(
+            f"the teacher sees frames prepared with {teacher.header.preprocess}, and this network with "
+            f"{config.preprocess}; set the same preprocess keys"
+        )
     training, held_out = clips, validation_clips
     if held_out is None:
-        training, held_out = split_by(clips, "set", config.validation, config.seed)
-    check_size([*training, *held_out], config.preprocess)
+        repeated = len({clip.object for clip in clips}) < len({(clip.object, clip.set) for clip in clips})
+        training, held_out = split_by(clips, "set" if repeated else "object", config.validation, config.seed)
+    check_size([*training, *held_out, *replay_clips], config.preprocess)
     states = state_paths(config, out)
     with joined(config.device) as ranks:
         networks = [
-            t.network for t in _trained(config, training, states, init, resume, ranks, progress, warn)
+            t.network
+            for t in _trained(
+                config, training, states, init, teacher, replay_clips, resume, ranks, progress, warn
+            )
         ]
         if ranks.first:
             forces_n, measured_n = estimates(held_out, networks, config.preprocess, ranks.device)
             mean_n = np.concatenate([clip.forces_n[clip.valid] for clip in training]).mean()
-            header = Header(
-                members=tuple(network.config for network in networks),
-                preprocess=config.preprocess,
-                residuals=tuple(_residuals(forces_n, measured_n)),
-                data_digest=digest(clips),
-                metrics={
-                    "mae_n": metrics.mae(forces_n, measured_n),
-                    "rmse_n": metrics.rmse(forces_n, measured_n),
-                    "bias_n": metrics.bias(forces_n, measured_n),
-                    "constant_mae_n": metrics.mae(np.full_like(measured_n, mean_n), measured_n),
-                },
-            )
-            save_checkpoint(out, networks, header)
-            if (ood := fit_ood(networks, header, held_out, ranks.device)) is None:
-                warn(
-                    f"the checkpoint has no out-of-distribution score, which needs {MIN_LOGS} validation logs that "
-                    "show contact; fit one with `gripper-force calibrate network`"
-                )
-            else:
-                add_ood(out, ood, out)
+            _save(out, networks, config, digest([*clips, *replay_clips]), forces_n, measured_n, float(mean_n))
+            _add_ood(out, networks, held_out, ranks.device, warn)
             for state in states:
                 state.unlink()
         ranks.wait()
         return load_checkpoint(out)
 
 
+def _add_ood(
+    out: Path,
+    networks: Sequence[ForceNetwork],
+    clips: Sequence[Clip],
+    device: str,
+    warn: Callable[[str], None],
+) -> None:
+    if (ood := fit_ood(networks, read_checkpoint(out)[2], clips, device)) is not None:
+        add_ood(out, ood, out)
+    else:
+        warn(
+            f"the checkpoint has no out-of-distribution score, which needs {MIN_LOGS} validation logs that show "
+            "contact; fit one with `gripper-force calibrate network`"
+        )
+
+
+def _fit(
+    config: TrainConfig,
+    clips: Sequence[Clip],
+    out: Path,
+    validation_clips: Sequence[Clip] | None,
+    progress: Progress,
+) -> None:
+    """Fits a Gaussian process and writes its checkpoint. Its stated error is that on objects left out."""
+    check_size([*clips, *(validation_clips or [])], config.preprocess)
+    process, _, left_out_n = few.fit(clips, config.preprocess, progress)
+    measured, mean_n = validation_clips, float(np.concatenate([c.forces_n[c.valid] for c in clips]).mean())
+    if measured is None:
+        measured = clips
+    else:
+        left_out_n = [predict([process], config.preprocess, clip.frames)[0] for clip in measured]
+    forces_n, measured_n = (
+        np.concatenate([part[clip.valid] for part, clip in zip(parts, measured, strict=True)])
+        for parts in (left_out_n, [clip.forces_n for clip in measured])
+    )
+    _save(out, [process], config, digest(clips), forces_n, measured_n, mean_n)
+
+
+def _save(
+    out: Path,
+    networks: Sequence[Member],
+    config: TrainConfig,
+    data_digest: str,
+    forces_n: npt.NDArray[np.float32],
+    measured_n: npt.NDArray[np.float32],
+    mean_n: float,
+) -> None:
+    header = Header(
+        members=tuple(network.config for network in networks),
+        preprocess=config.preprocess,
+        residuals=residuals(forces_n, measured_n),
+        data_digest=data_digest,
+        metrics={
+            **errors(forces_n, measured_n),
+            "constant_mae_n": metrics.mae(np.full_like(measured_n, mean_n), measured_n),
+        },
+    )
+    save_checkpoint(out, networks, header)
+
+
 def state_paths(config: TrainConfig, out: Path) -> list[Path]:
-    """Returns the files in which a training saves its states, one for each member."""
+    """Returns the files in which a training saves its states, one for each network."""
+    if config.method == "process":
+        return []
     return [out.with_suffix(f".{i}.state") for i in range(len(config.attentions))]
 
 
@@ -127,6 +199,8 @@ def _trained(
     clips: Sequence[Clip],
     states: Sequence[Path],
     init: Checkpoint | None,
+    teacher: Checkpoint | None,
+    replay_clips: Sequence[Clip],
     resume: bool,
     ranks: Ranks,
     progress: Progress,
@@ -138,15 +212,17 @@ def _trained(
         )
     if ranks.count > 1 and config.compile:
         raise ConfigError("compile does not work with several processes; set compile=false")
-    batches = Batches(clips, config, ranks)
-    start = init.digest if init is not None else ""
-    identity = f"{config.model_dump_json(exclude={'device', 'compile'})} {digest(clips)} {start}"
+    new = Batches(clips, config, ranks)
+    batches = Replay(new, Batches(replay_clips, config, ranks), config.replay_share) if replay_clips else new
+    start = " ".join(checkpoint.digest if checkpoint is not None else "" for checkpoint in (init, teacher))
+    data = digest([*clips, *replay_clips])
+    identity = f"{config.model_dump_json(exclude={'device', 'compile'})} {data} {start}"
     trainers = []
     for member, state in enumerate(states):
-        trainer = Trainer(config, member, batches, ranks)
+        trainer = Trainer(config, member, batches, ranks, teacher.networks if teacher is not None else ())
         trainers.append(trainer)
         if init is not None:
-            trainer.load_weights(init.networks[member])
+            trainer.start_from(init.force_networks[member])
         if resume:
             trainer.restore(state, identity)
         ranks.check_equal(f"{identity} {trainer.done}", "recipes, data or states")
@@ -163,22 +239,16 @@ def _trained(
         trainer.network.eval()
         if ranks.first:
             trainer.save(state, identity)
-    if unseen := int(batches.unseen.sum()):
-        length = next(key for key in ("minutes", "epochs", "steps") if getattr(config, key) is not None)
+    unseen = int(batches.unseen.sum())
+    length = next(key for key in ("minutes", "epochs", "steps") if getattr(config, key) is not None)
+    if unseen:
         warn(
             f"the training was too short: it drew no clip from {unseen} of its {len(clips)} recordings; "
             f"increase {length}"
         )
+    elif (fewest := min(trainer.step for trainer in trainers)) < LEAST_STEPS:
+        warn(
+            f"the training made only {fewest} steps; a network needs at least {LEAST_STEPS}, so increase {length} or, "
+            "with a few recordings, use --recipe few"
+        )
     return trainers
-
-
-def _residuals(forces_n: npt.NDArray[np.float32], measured_n: npt.NDArray[np.float32]) -> list[Residual]:
-    """Returns the root mean squared error in bins of 1 N of the estimate, the only force known in a run."""
-    squared = np.square(forces_n - measured_n)
-    newtons = np.floor(forces_n)
-    residuals = []
-    for newton in np.unique(newtons):
-        part = squared[newtons == newton]
-        variance = (part.sum() + RESIDUAL_PRIOR * squared.mean()) / (len(part) + RESIDUAL_PRIOR)
-        residuals.append(Residual(force_n=float(newton) + RESIDUAL_HALF_N, std_n=math.sqrt(variance)))
-    return residuals

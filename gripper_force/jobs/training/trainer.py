@@ -2,24 +2,24 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
 import torch
+import torch.nn.functional as F
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
+from torch.nn.modules.batchnorm import _BatchNorm
 
 from gripper_force.errors import CheckpointError, NonFiniteError
-from gripper_force.jobs.dataset import Clip
-from gripper_force.jobs.training.batches import Batches
+from gripper_force.jobs.dataset import CONTACT_N
+from gripper_force.jobs.training.batches import Batch, Batches, Replay
 from gripper_force.jobs.training.parallel import Ranks, share_statistics
 from gripper_force.jobs.training.recipe import TrainConfig
-from gripper_force.vision.batch_inference import predict
+from gripper_force.vision.checkpoint import Member
+from gripper_force.vision.header import INDENTATION_SCALE_M
 from gripper_force.vision.network import ForceNetwork
-from gripper_force.vision.preprocess import Preprocess
 
 
 class Trainer:
@@ -30,13 +30,21 @@ class Trainer:
         member: Index of the member.
         batches: Training data.
         ranks: This process among those that train together.
+        teacher: Ensemble whose mean estimate is learned beside the labels, in evaluation mode; none if empty.
 
     Attributes:
         network: The network.
         step: Number of completed steps.
     """
 
-    def __init__(self, config: TrainConfig, member: int, batches: Batches, ranks: Ranks) -> None:
+    def __init__(
+        self,
+        config: TrainConfig,
+        member: int,
+        batches: Batches | Replay,
+        ranks: Ranks,
+        teacher: Sequence[Member] = (),
+    ) -> None:
         torch.manual_seed(config.seed + member)
         self._config = config
         self._batches = batches
@@ -54,7 +62,9 @@ class Trainer:
             weight_decay=config.weight_decay,
             fused=True,
         )
-        self._forward = torch.compile(self.network) if config.compile else self.network
+        self._features = torch.compile(self.network.features) if config.compile else self.network.features
+        self._teacher = [network.to(ranks.device) for network in teacher]
+        self._freeze_statistics = False
         self.step = 0
         self._elapsed_s = 0.0
         self._smoothed_rmse_n = math.nan
@@ -79,6 +89,9 @@ class Trainer:
             NonFiniteError: The training diverged.
         """
         self.network.train()
+        for module in self.network.modules():
+            if self._freeze_statistics and isinstance(module, _BatchNorm):
+                module.eval()
         began = time.monotonic() - self._elapsed_s
         while self.done < until:
             loss = self._update()
@@ -107,25 +120,68 @@ class Trainer:
         elif done < config.short_share:
             count, length = count * length // config.short_frames, config.short_frames
         first = length - 1 if config.windows == "separate" else min(window, length) - 1
-        inputs, forces_n, valid = self._batches.batch(self.step, count, length)
-        labels = valid[:, first:].sum()
+        batch = self._batches.batch(self.step, count, length)
+        labels = batch.valid[:, first:].sum()
         self._ranks.add_up([labels])
-        with torch.autocast(inputs.device.type, torch.bfloat16, enabled=config.precision == "bfloat16"):
-            error = squared_error(self._forward, inputs, forces_n, valid, first)
-        loss = error / self.network.config.label_scale_n**2 / labels.clamp_min(1)
+        with torch.autocast(batch.inputs.device.type, torch.bfloat16, enabled=config.precision == "bfloat16"):
+            features = self._features(batch.inputs, first)  # (B, T - first, head)
+            if self._teacher:
+                batch = batch._replace(forces_n=self._taught(batch, first))
+        force, *others = self.network.outputs(features.flatten(0, 1)).view(*features.shape[:2], -1).unbind(2)
+        scale_n = self.network.config.label_scale_n
+        error = squared_error(force * scale_n, batch.forces_n[:, first:], batch.valid[:, first:])
+        force_loss = error / scale_n**2 / labels.clamp_min(1)
+        loss = force_loss + self._other_losses(others, batch, first) / labels.clamp_min(1)
         self._optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
-        total = loss.detach()
+        total = force_loss.detach()
         self._ranks.add_up([*gradients, total])
         if config.gradient_limit is not None:
             nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_limit)
         self._optimizer.step()
         return total
 
-    def load_weights(self, network: ForceNetwork) -> None:
-        """Copies the weights of another network of the same shape."""
-        self.network.load_state_dict(network.state_dict())
+    @torch.no_grad()
+    def _taught(self, batch: Batch, first: int) -> Tensor:
+        """Returns the forces to learn, (B, T): labels mixed with the teacher's estimates from ``first`` on."""
+        taught_n = torch.stack([network(batch.inputs, first) for network in self._teacher]).mean(0)
+        forces_n = batch.forces_n.clone()
+        forces_n[:, first:].lerp_(taught_n.to(forces_n.dtype), self._config.teacher_share)
+        return forces_n
+
+    def _other_losses(self, outputs: Sequence[Tensor], batch: Batch, first: int) -> Tensor:
+        """Returns the weighted sum of the losses of the outputs but force, (B, T - first) each, over all frames."""
+        total = batch.forces_n.new_zeros(())
+        for quantity, output in zip(self._config.outputs[1:], outputs, strict=True):
+            if quantity == "indentation":
+                target = batch.indentation_m[:, first:] / INDENTATION_SCALE_M
+                known = target.isfinite()  # also without a load-cell sample
+                total = total + self._config.indentation_weight * squared_error(
+                    output, target.nan_to_num(), known
+                )
+            else:
+                touching = (batch.forces_n[:, first:] > CONTACT_N).to(output.dtype)
+                entropy = F.binary_cross_entropy_with_logits(output, touching, reduction="none")
+                total = total + self._config.contact_weight * (entropy * batch.valid[:, first:]).sum()
+        return total
+
+    def start_from(self, network: ForceNetwork) -> None:
+        """Copies the weights of another network of the same shape. Outputs that it lacks start at 0.
+
+        Random ones would change the features that the force depends on, before they have learned anything. The
+        statistics of its batch normalisation are kept, unless ``freeze_statistics`` is false.
+        """
+        self._freeze_statistics = self._config.freeze_statistics is not False
+        weights = network.state_dict()
+        before = network.config.outputs
+        for name in ("out.weight", "out.bias"):
+            rows = torch.zeros_like(self.network.state_dict()[name])
+            for i, quantity in enumerate(self._config.outputs):
+                if quantity in before:
+                    rows[i] = weights[name][before.index(quantity)]
+            weights[name] = rows
+        self.network.load_state_dict(weights)
 
     def save(self, path: Path, identity: str) -> None:
         """Saves the state of the training.
@@ -201,12 +257,9 @@ class Trainer:
         self._smoothed_rmse_n = float(progress["smooth_n"])
 
 
-def squared_error(
-    network: Callable[[Tensor, int], Tensor], inputs: Tensor, forces_n: Tensor, valid: Tensor, first: int
-) -> Tensor:
-    """Returns the sum of squared errors in N² over the frames with a label from ``first`` on."""
-    error_n = network(inputs, first) - forces_n[:, first:]
-    return (error_n.square() * valid[:, first:]).sum()
+def squared_error(estimates: Tensor, targets: Tensor, valid: Tensor) -> Tensor:
+    """Returns the sum of squared errors over the frames that ``valid`` marks; all (B, T)."""
+    return ((estimates - targets).square() * valid).sum()
 
 
 def one_cycle(done: float, warmup: float) -> float:
@@ -219,11 +272,3 @@ def one_cycle(done: float, warmup: float) -> float:
 def step_decay(done: float) -> float:
     """Returns the learning rate as a share of its peak: a tenth per quarter (30 of the paper's 120 epochs)."""
     return float(0.1 ** math.floor(4 * done))
-
-
-def estimates(
-    clips: Sequence[Clip], networks: Sequence[ForceNetwork], preprocess: Preprocess, device: str
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """Returns the ensemble's and the measured forces in N, (N,) each, over all frames with a label."""
-    forces_n = [predict(networks, preprocess, clip.frames, device).mean(0)[clip.valid] for clip in clips]
-    return np.concatenate(forces_n), np.concatenate([clip.forces_n[clip.valid] for clip in clips])

@@ -28,7 +28,7 @@ from gripper_force.types import NS_PER_MS
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.engines import Engine, Floats, Precision, open_engine
 from gripper_force.vision.export import export, inputs_of
-from gripper_force.vision.header import Model
+from gripper_force.vision.header import Model, NetworkConfig
 from gripper_force.vision.model_files import cache_folder, read_model
 from gripper_force.vision.selection import installed
 from gripper_force.vision.step_benchmark import Candidate, cache_key, update_cache
@@ -199,7 +199,9 @@ def _measure(
                 frames_s=1e9 / float(np.mean(taken_ns)),
                 least_ms=None
                 if engine.startswith(WINDOW)
-                else roofs[name, count].least_ms(model.header.members),
+                else roofs[name, count].least_ms(
+                    [m for m in model.header.members if isinstance(m, NetworkConfig)]
+                ),
                 memory_mb=None,
                 mae_n=errors[engine, name]["mae_n"],
                 rmse_n=errors[engine, name]["rmse_n"],
@@ -238,7 +240,7 @@ def _errors(engine: Engine, model: Model, clips: Sequence[Clip]) -> dict[str, fl
 def _in_turns(
     timed: dict[tuple[str, str], _Timed], model: Model, frames: Sequence[Floats]
 ) -> dict[tuple[str, str], list[int]]:
-    networks = load_checkpoint(model.path).networks
+    networks = load_checkpoint(model.path).force_networks
     context = max(member.context for member in model.header.members)
     clip = torch.from_numpy(np.stack(frames[: context + 1]))[None, :, None]  # (1, T, 1, S, S)
     plain = [deepcopy(network).to_channels_first() for network in networks]

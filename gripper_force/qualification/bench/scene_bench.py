@@ -11,7 +11,8 @@ import numpy.typing as npt
 from gripper_force.config import GripperConfig
 from gripper_force.types import NS_PER_MS, NS_PER_S
 from gripper_hw.sim.detail_level import write_table
-from gripper_hw.sim.objects import OBJECTS, Detail
+from gripper_hw.sim.meshes import Detail
+from gripper_hw.sim.objects import OBJECTS
 from gripper_hw.sim.scene import Scene
 from gripper_hw.sim.world import World
 

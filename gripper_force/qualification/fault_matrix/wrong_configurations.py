@@ -17,7 +17,7 @@ from gripper_force.config import Config, config_from
 from gripper_force.control.limits import largest_target_n
 from gripper_force.control.state_machine import is_open
 from gripper_force.errors import ConfigError, DeviceError, GripperError, SimulationError
-from gripper_force.interfaces import Devices, Progress, WorldState, no_progress
+from gripper_force.interfaces import Progress, WorldState, no_progress
 from gripper_force.jobs.grasp import TRIAL_OBJECTS, TRIAL_TARGETS_N
 from gripper_force.jobs.processes import process_pool
 from gripper_force.qualification.fault_matrix.outcome_file import OutcomeFile
@@ -139,6 +139,11 @@ WRONG_CASES: Final = (
     WrongCase("load cell: 10 to 200 samples/s", ("held",), _load_cell, "current"),
 )
 """Rows of the table, in the order of docs/reliability.md."""
+
+
+_Statuses = list[tuple[int, GraspStatus]]
+"""The status of each cycle, and the number of the world's states before it. In real time the world may lag behind
+the clock, so times do not show which states a command has caused."""
 
 
 class WrongOutcome(TypedDict):
@@ -309,14 +314,14 @@ def run_wrong(tree: Tree, keys: dict[str, Any], expected: Sequence[str]) -> Wron
 
 def _run_once(config: Config, keys: dict[str, Any], expected: Sequence[str]) -> WrongOutcome:
     world: list[WorldState] = []
-    statuses: list[GraspStatus] = []
+    statuses: _Statuses = []
     try:
         run = resolve(config)
         with open_devices(run.config) as devices:
             assert devices.observe_world is not None
             devices.observe_world(world.append)
             with open_session(run, devices, None) as session:
-                result = _grasp_and_release(session, devices, config.target_n, statuses)
+                result = _grasp_and_release(session, config.target_n, statuses, world)
             devices.clock.sleep_until_ns(devices.clock.now_ns() + _AFTER_NS)
     except GripperError as error:
         # A device that is lost, times out or fails has a subclass of DeviceError.
@@ -345,15 +350,18 @@ def _run_once(config: Config, keys: dict[str, Any], expected: Sequence[str]) -> 
 
 
 def _grasp_and_release(
-    session: Session, devices: Devices, target_n: float, statuses: list[GraspStatus]
+    session: Session, target_n: float, statuses: _Statuses, world: Sequence[WorldState]
 ) -> str:
     """Grasps, goes on after the outcome, releases, and returns the outcome. Adds each cycle's status."""
 
-    def cycle(kind: RequestKind | None = None, target_n: float = 0.0) -> GraspStatus:
-        statuses.append(session.cycle(kind, target_n).status)
-        return statuses[-1]
+    def add(status: GraspStatus) -> GraspStatus:
+        statuses.append((len(world), status))
+        return status
 
-    statuses.append(session.wait_for_reference().status)
+    def cycle(kind: RequestKind | None = None, target_n: float = 0.0) -> GraspStatus:
+        return add(session.cycle(kind, target_n).status)
+
+    add(session.wait_for_reference().status)
     status = cycle(RequestKind.GRASP, target_n)
     begin_ns = changed_ns = status.t_ns
     while status.t_ns - begin_ns < _LONGEST_NS and (
@@ -372,15 +380,15 @@ def _grasp_and_release(
 
 
 def _observed(
-    world: Sequence[WorldState], statuses: Sequence[GraspStatus], statements: SafetyStatements
+    world: Sequence[WorldState], statuses: _Statuses, statements: SafetyStatements
 ) -> SafetyStatements:
     """Passes each state of the world to the statements, with the phase and the outcome at that time."""
     following = iter(statuses)
     status, coming = None, next(following, None)
     t_ns = world[0].t_ns if world else 0
-    for state in world:
-        while coming is not None and coming.t_ns <= state.t_ns:
-            status, coming = coming, next(following, None)
+    for count, state in enumerate(world):
+        while coming is not None and coming[0] <= count:
+            status, coming = coming[1], next(following, None)
         statements.observe(
             (state.t_ns - t_ns) / NS_PER_S,
             Phase.OPEN if status is None else status.phase,

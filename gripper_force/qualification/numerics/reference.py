@@ -103,7 +103,9 @@ class ReferenceEnsemble:
 
     def __init__(self, model: Model, folder: Path) -> None:
         self.model = model
-        self.networks = [copy.deepcopy(network).double() for network in load_checkpoint(model.path).networks]
+        self.networks = [
+            copy.deepcopy(network).double() for network in load_checkpoint(model.path).force_networks
+        ]
         self.reported_n = math.nan
         self._folder = folder
 

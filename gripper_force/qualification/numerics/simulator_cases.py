@@ -15,7 +15,8 @@ from gripper_force.config import Config, GripperConfig
 from gripper_force.errors import SimulationError
 from gripper_force.qualification.numerics.numerical_case import NumericalCase
 from gripper_force.types import NS_PER_MS, NS_PER_S
-from gripper_hw.sim.objects import OBJECTS, Detail
+from gripper_hw.sim.meshes import Detail
+from gripper_hw.sim.objects import OBJECTS
 from gripper_hw.sim.scene import Scene
 from gripper_hw.sim.world import World
 

@@ -1,10 +1,13 @@
 """Trains the networks of the requested models with each seed, and estimates the test sets with each."""
 
 import functools
-import json
+import hashlib
+import math
+import time
 from collections.abc import Iterable, Sequence
+from concurrent.futures import TimeoutError as FutureTimeout
 from concurrent.futures import as_completed
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -19,12 +22,13 @@ from gripper_force.errors import DataError
 from gripper_force.interfaces import Progress
 from gripper_force.jobs.dataset import CONTACT_N, Clip, load_clips
 from gripper_force.jobs.evaluate import estimates
-from gripper_force.jobs.paper_protocol import RATE_HZ, plan_protocol
+from gripper_force.jobs.paper_protocol import RATE_HZ, SetPlan, plan_protocol
 from gripper_force.jobs.processes import process_pool
 from gripper_force.jobs.simulate import simulate
 from gripper_force.jobs.training.train import train
 from gripper_force.qualification.paper.models import MODELS, Scale
 from gripper_force.vision.checkpoint import load_checkpoint
+from gripper_force.vision.preprocess import Preprocess
 
 Floats = npt.NDArray[np.float64]
 
@@ -37,38 +41,49 @@ _MIN_SETS: Final = 6
 
 @dataclass(frozen=True, eq=False)
 class Test:
-    """Labelled frames of the test sets, and the estimates of each network.
+    """Labelled frames of the test sets, and the estimates of each trained network.
 
     Attributes:
+        scale: Size of the reproduction.
         clips: Test sets.
         measured_n: Load-cell forces, (N,).
         set: Number of each frame's set, (N,).
         object: Each frame's object, (N,).
-        estimates_n: Estimates by network and seed, (N,) each.
-        seeds: Number of seeds of each network.
+        estimates_n: Estimates by network and seed, (N,) each; without the networks that are not trained yet.
     """
 
+    scale: Scale
     clips: Sequence[Clip]
     measured_n: Floats
     set: npt.NDArray[np.int64]
     object: npt.NDArray[np.str_]
     estimates_n: dict[tuple[str, int], Floats]
-    seeds: int
+
+    def seeds_of(self, *models: str) -> list[int]:
+        """Seeds with which all networks of these models are trained; those of one ensemble must be different."""
+
+        def is_trained(model: str, seed: int) -> bool:
+            members = self._members(model, seed)
+            return len(set(members)) == len(members) and self.estimates_n.keys() >= set(members)
+
+        return [seed for seed in range(self.scale.seeds) if all(is_trained(model, seed) for model in models)]
+
+    def _members(self, model: str, seed: int) -> list[tuple[str, int]]:
+        return [(net, (seed + i) % self.scale.seeds) for i, net in enumerate(MODELS[model])]
 
     def estimate_n(self, model: str, seed: int) -> Floats:
         """Estimates of a model in N, (N,): the mean over its networks, with consecutive seeds."""
-        nets = MODELS[model]
-        members_n = [self.estimates_n[net, (seed + i) % self.seeds] for i, net in enumerate(nets)]
-        mean_n: Floats = np.mean(members_n, axis=0)
+        mean_n: Floats = np.mean([self.estimates_n[pair] for pair in self._members(model, seed)], axis=0)
         return mean_n
 
-    def absolute_n(self, model: str) -> Floats:
-        """Absolute errors in N, (seeds, N)."""
-        return np.abs([self.estimate_n(model, seed) - self.measured_n for seed in range(self.seeds)])
+    def absolute_n(self, model: str, *others: str) -> Floats:
+        """Absolute errors in N with each seed that the model and the others have, (seeds, N)."""
+        seeds = self.seeds_of(model, *others)
+        return np.abs([self.estimate_n(model, seed) - self.measured_n for seed in seeds])
 
-    def mae_n(self, model: str) -> Floats:
-        """MAE over all frames with each seed, (seeds,)."""
-        mean: Floats = self.absolute_n(model).mean(1)
+    def mae_n(self, model: str, *others: str) -> Floats:
+        """MAE over all frames with each seed that the model and the others have, (seeds,)."""
+        mean: Floats = self.absolute_n(model, *others).mean(1)
         return mean
 
     def rmse_n(self, model: str) -> Floats:
@@ -76,9 +91,9 @@ class Test:
         root: Floats = np.sqrt(np.square(self.absolute_n(model)).mean(1))
         return root
 
-    def mae_by_set_n(self, model: str) -> Floats:
-        """MAE of each test set, over its frames and all seeds, (sets,)."""
-        frame_n = self.absolute_n(model).mean(0)
+    def mae_by_set_n(self, model: str, *others: str) -> Floats:
+        """MAE of each test set, over its frames and all seeds that the model and the others have, (sets,)."""
+        frame_n = self.absolute_n(model, *others).mean(0)
         return np.array([frame_n[self.set == i].mean() for i in range(len(self.clips))])
 
     def p_value(self, model: str, other: str) -> float:
@@ -86,7 +101,7 @@ class Test:
 
         It is NaN with fewer than 6 sets.
         """
-        a, b = self.mae_by_set_n(model), self.mae_by_set_n(other)
+        a, b = self.mae_by_set_n(model, other), self.mae_by_set_n(other, model)
         if len(a) < _MIN_SETS or (a == b).all():
             return float("nan")
         return float(stats.wilcoxon(a, b).pvalue)
@@ -99,60 +114,90 @@ class Test:
 
 def missing_logs(scale: Scale, data: Path) -> int:
     """Number of logs of the protocol that do not exist yet."""
-    names = (name for plan in plan_protocol(scale.protocol) for name in plan.names)
+    names = (name for plan in _plans(scale) for name in plan.names)
     return sum(not (data / name).exists() for name in names)
 
 
-def simulate_missing(scale: Scale, data: Path, jobs: int, progress: Progress) -> None:
-    """Simulates the logs of the protocol that do not exist yet. Raises as `simulate.simulate` does."""
-    config = load_config(None, [f"camera.rate_hz={RATE_HZ}"])
-    with closing(simulate(plan_protocol(scale.protocol), data, config, jobs)) as paths:
-        for path in paths:
-            progress(path.name)
-
-
-def run(scale: Scale, models: Iterable[str], data: Path, out: Path, jobs: int, progress: Progress) -> Test:
-    """Trains the missing networks of the models, and estimates the test sets with each network.
+def simulate_missing(scale: Scale, data: Path, jobs: int, end_s: float, progress: Progress) -> None:
+    """Simulates the logs of the protocol that do not exist yet. Raises as `simulate.simulate` does.
 
     Args:
         scale: Size of the reproduction.
+        data: Folder for the logs.
+        jobs: Processes.
+        end_s: Time of `time.monotonic` after which no log is awaited.
+        progress: Called after each log.
+    """
+    config = load_config(None, [f"camera.rate_hz={RATE_HZ}"])
+    with closing(simulate(_plans(scale), data, config, jobs)) as paths:
+        for path in paths:
+            progress(path.name)
+            if time.monotonic() > end_s:
+                return
+
+
+def _plans(scale: Scale) -> list[SetPlan]:
+    return plan_protocol(scale.protocol, scale.instances)
+
+
+def run(
+    scales: Sequence[Scale],
+    models: Iterable[str],
+    data: Path,
+    out: Path,
+    jobs: int,
+    end_s: float,
+    progress: Progress,
+) -> list[Test]:
+    """Trains the missing networks of the models, and estimates the test sets with each network.
+
+    Args:
+        scales: Sizes of the reproduction, which differ only in their steps.
         models: Names in `MODELS`.
         data: Folder with the protocol's logs, in ``train`` and ``test``.
-        out: Folder for the checkpoints. Existing networks are not trained again, and interrupted trainings
-            continue.
-        jobs: Processes; on the CPU each trains with one thread.
-        progress: Called after each network.
+        out: Folder for the networks. Those of the same recipe and data are not trained again, and interrupted
+            trainings continue.
+        jobs: Processes; on the CPU each trains with one thread. A GPU trains one network after the other.
+        end_s: Time of `time.monotonic` at which training is interrupted.
+        progress: Called after each network, with its steps.
+
+    Returns:
+        The tests, one for each scale, with the estimates of all networks trained so far.
 
     Raises:
-        DataError: There are no logs of the protocol, or ``out`` holds networks of another scale or data.
-        CheckpointError: The folder holds networks trained on other data.
+        DataError: There are no logs of the protocol.
     """
-    _check_folder(scale, data, out)
-    # Ordered by seed, so that an interrupted run has all networks with the first seeds.
-    nets = [(net, seed) for seed in range(scale.seeds) for net in networks(models)]
-    missing = [pair for pair in nets if not _estimates_path(out, *pair).exists()]
-    for net, seed in set(nets) - set(missing):
-        progress(f"{net}, seed {seed}")
+    files = _Files(out, data, _digest(data))
+    # Ordered by length and seed, so that an interrupted run has all networks with the first seeds.
+    tasks = [
+        (scale, net, seed) for scale in scales for seed in range(scale.seeds) for net in networks(models)
+    ]
+    missing = [task for task in tasks if not files.estimates(*task).exists()]
+    for task in tasks:
+        if task not in missing:
+            progress(_text(task), task[0].steps)
     if missing:
-        count = min(jobs, len(missing))
-        reading = max(1, jobs // count)
-        with process_pool(count) as pool:
-            futures = {pool.submit(_train, scale, *pair, data, out, reading): pair for pair in missing}
-            for future in as_completed(futures):
-                future.result()
-                progress("{}, seed {}".format(*futures[future]))
-    clips = _clips(data, "test", scale, jobs)
-    keep = [_labelled(scale, clip) for clip in clips]
+        _train_all(missing, files, jobs, end_s, progress)
+    preprocess = scales[0].recipe(_ANY_NET, 0).preprocess
+    clips = _clips(files, "test", preprocess, jobs)
+    keep = [_labelled(clip, preprocess) for clip in clips]
     measured_n = np.concatenate([clip.forces_n[k] for clip, k in zip(clips, keep, strict=True)])
     counts = [int(k.sum()) for k in keep]
-    return Test(
-        clips=clips,
-        measured_n=measured_n.astype(np.float64),
-        set=np.repeat(np.arange(len(clips)), counts),
-        object=np.repeat([clip.object for clip in clips], counts),
-        estimates_n={pair: _load_estimates(_estimates_path(out, *pair), len(measured_n)) for pair in nets},
-        seeds=scale.seeds,
-    )
+    estimates_n: dict[Scale, dict[tuple[str, int], Floats]] = {scale: {} for scale in scales}
+    for scale, net, seed in tasks:
+        if (path := files.estimates(scale, net, seed)).exists():
+            estimates_n[scale][net, seed] = _load_estimates(path, len(measured_n))
+    return [
+        Test(
+            scale=scale,
+            clips=clips,
+            measured_n=measured_n.astype(np.float64),
+            set=np.repeat(np.arange(len(clips)), counts),
+            object=np.repeat([clip.object for clip in clips], counts),
+            estimates_n=estimates_n[scale],
+        )
+        for scale in scales
+    ]
 
 
 def networks(models: Iterable[str]) -> list[str]:
@@ -160,32 +205,73 @@ def networks(models: Iterable[str]) -> list[str]:
     return list(dict.fromkeys(net for model in models for net in MODELS[model]))
 
 
-def checkpoint_path(out: Path, net: str, seed: int) -> Path:
-    """Path of the checkpoint of a network."""
-    return out / f"{net}-{seed}.safetensors"
+def checkpoint_path(out: Path, data: Path, scale: Scale, net: str, seed: int) -> Path:
+    """Path of the checkpoint of a network that was trained on these data."""
+    return _Files(out, data, _digest(data)).checkpoint(scale, net, seed)
 
 
-def _estimates_path(out: Path, net: str, seed: int) -> Path:
-    return out / f"{net}-{seed}.npy"
+_Task = tuple[Scale, str, int]
+"""Scale, network and seed of a training."""
 
 
-def _check_folder(scale: Scale, data: Path, out: Path) -> None:
-    """Raises `DataError` if a folder has networks of another scale or data; marks an empty one."""
-    out.mkdir(parents=True, exist_ok=True)
-    mark = out / "made_of.json"
-    text = json.dumps([scale.model_dump(exclude={"seeds"}), str(data.resolve())])
-    begun = any(out.glob("*.safetensors")) or any(out.glob("*.state"))
-    if begun and not (mark.exists() and mark.read_text(encoding="utf-8") == text):
-        raise DataError(
-            f"{out} holds networks of another scale or other data; give another folder with --out"
-        )
-    mark.write_text(text, encoding="utf-8")
+def _text(task: _Task) -> str:
+    scale, net, seed = task
+    return f"{net}, seed {seed}, {scale.steps:,} steps"
 
 
-def _labelled(scale: Scale, clip: Clip) -> npt.NDArray[np.bool_]:
+@dataclass(frozen=True)
+class _Files:
+    """Files of the networks. Their names have a key of the recipe and the data, so that none is used for others."""
+
+    out: Path
+    data: Path
+    digest: str
+
+    def checkpoint(self, scale: Scale, net: str, seed: int) -> Path:
+        recipe = scale.recipe(net, seed).model_dump_json(exclude={"device", "compile"})
+        key = hashlib.sha256(f"{recipe} {self.digest}".encode()).hexdigest()
+        return self.out / f"{net}-{seed}-{key[:16]}.safetensors"
+
+    def estimates(self, scale: Scale, net: str, seed: int) -> Path:
+        return self.checkpoint(scale, net, seed).with_suffix(".npy")
+
+
+def _digest(data: Path) -> str:
+    """Returns the SHA-256 of all logs of train and test, with their names."""
+    sha = hashlib.sha256()
+    for side in ("train", "test"):
+        for path in _logs(data, side):
+            sha.update(f"{side}/{path.name}".encode())
+            with path.open("rb") as file:
+                sha.update(hashlib.file_digest(file, "sha256").digest())
+    return sha.hexdigest()
+
+
+def _logs(data: Path, side: str) -> list[Path]:
+    if paths := sorted((data / side).glob("*.mcap")):
+        return paths
+    raise DataError(f"no logs in {data / side}; simulate the paper's protocol or import its database first")
+
+
+def _train_all(tasks: Sequence[_Task], files: _Files, jobs: int, end_s: float, progress: Progress) -> None:
+    """Trains networks until all are done or time is up; one that is interrupted has saved its state."""
+    count = 1 if torch.cuda.is_available() else min(jobs, len(tasks))
+    reading = max(1, jobs // count)
+    begin_s, left, done = time.monotonic(), sum(scale.steps for scale, *_ in tasks), 0
+    with suppress(FutureTimeout), process_pool(count) as pool:
+        futures = {pool.submit(_train, task, files, reading): task for task in tasks}
+        timeout_s = None if end_s == math.inf else max(0.0, end_s - begin_s)
+        for future in as_completed(futures, timeout_s):
+            future.result()
+            steps = futures[future][0].steps
+            done, left = done + steps, left - steps
+            hours = (time.monotonic() - begin_s) / done * left / 3600
+            progress(f"{_text(futures[future])}; {hours:.1f} h left", steps)
+
+
+def _labelled(clip: Clip, preprocess: Preprocess) -> npt.NDArray[np.bool_]:
     """True for frames with a label for which a run gives an estimate, (T,)."""
-    lead_in = scale.recipe(_ANY_NET, 0).preprocess.lead_in
-    labelled: npt.NDArray[np.bool_] = clip.valid & (np.arange(len(clip.frames)) >= lead_in)
+    labelled: npt.NDArray[np.bool_] = clip.valid & (np.arange(len(clip.frames)) >= preprocess.lead_in)
     return labelled
 
 
@@ -198,28 +284,26 @@ def _load_estimates(path: Path, frames: int) -> Floats:
     return estimates_n
 
 
-def _clips(data: Path, side: str, scale: Scale, workers: int) -> list[Clip]:
-    folder = data / side
-    if not any(folder.glob("*.mcap")):
-        raise DataError(f"no logs in {folder}; simulate the paper's protocol or import its database first")
-    return load_clips(folder, scale.recipe(_ANY_NET, 0).preprocess, workers=workers)
-
-
 @functools.cache
-def _cached_clips(data: Path, side: str, scale: Scale, workers: int) -> list[Clip]:
-    """Clips cached in a worker process, as decoding the logs takes longer than a short training."""
-    return _clips(data, side, scale, workers)
+def _clips(files: _Files, side: str, preprocess: Preprocess, workers: int) -> list[Clip]:
+    """Clips, cached as decoding the logs takes longer than a short training."""
+    return load_clips(_logs(files.data, side), preprocess, workers=workers)
 
 
-def _train(scale: Scale, net: str, seed: int, data: Path, out: Path, workers: int) -> None:
+def _train(task: _Task, files: _Files, workers: int) -> None:
     if not torch.cuda.is_available():
         torch.set_num_threads(1)
-    path = checkpoint_path(out, net, seed)
-    training, testing = (_cached_clips(data, side, scale, workers) for side in ("train", "test"))
+    scale, net, seed = task
+    recipe = scale.recipe(net, seed)
+    path = files.checkpoint(scale, net, seed)
+    training, testing = (_clips(files, side, recipe.preprocess, workers) for side in ("train", "test"))
     checkpoint = load_checkpoint(str(path)) if path.exists() else None
-    checkpoint = checkpoint or train(scale.recipe(net, seed), training, path, resume=True)
+    checkpoint = checkpoint or train(recipe, training, path, resume=True)
     forces_n = estimates(checkpoint, testing)
-    labelled = [force_n[0, _labelled(scale, clip)] for force_n, clip in zip(forces_n, testing, strict=True)]
+    labelled = [
+        force_n[0, _labelled(clip, recipe.preprocess)]
+        for force_n, clip in zip(forces_n, testing, strict=True)
+    ]
     unfinished = path.with_suffix(".part.npy")
     np.save(unfinished, np.concatenate(labelled).astype(np.float64), allow_pickle=False)
-    unfinished.rename(_estimates_path(out, net, seed))
+    unfinished.rename(files.estimates(scale, net, seed))

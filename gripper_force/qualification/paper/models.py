@@ -4,6 +4,7 @@ from typing import Annotated, Final, Literal
 
 from pydantic import Field
 
+from gripper_force.jobs.paper_protocol import Instances
 from gripper_force.jobs.training.recipe import TrainConfig
 from gripper_force.schema import Section, Tree
 from gripper_force.vision.preprocess import Preprocess
@@ -64,6 +65,7 @@ class Scale(Section):
 
     Attributes:
         protocol: Scale of the simulated protocol that the networks are trained on.
+        instances: Instances of object and rig in the simulated sets.
         size: Side of the input in pixels.
         width: Multiplier of the backbone's channels.
         steps: Optimiser steps of each network.
@@ -71,6 +73,7 @@ class Scale(Section):
     """
 
     protocol: Literal["small", "full"] = "small"
+    instances: Instances = "same"
     size: Annotated[int, Field(ge=32, le=1024, multiple_of=32)] = 64
     width: Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)] = 0.5
     steps: Annotated[int, Field(ge=1)] = 1100

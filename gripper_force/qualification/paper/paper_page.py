@@ -1,8 +1,10 @@
 """Runs the requested reproductions and formats them for docs/paper.md."""
 
+import math
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -25,10 +27,19 @@ ProgressBar = Callable[[str, int], AbstractContextManager[Progress]]
 
 @dataclass(frozen=True, slots=True)
 class PaperResult:
-    """Tables and figures by name."""
+    """Tables and figures by name, and the estimates they are based on.
 
-    tables: dict[str, paper_tables.Table]
-    figures: dict[str, Figure]
+    Attributes:
+        tables: Tables, one for each length of training.
+        figures: Figures, of the longest training whose networks exist; None without them.
+        tests: Estimates, one for each length of training; empty if none were needed, or while logs are missing.
+        missing: What is still missing after the time limit, for a person; empty if all is done.
+    """
+
+    tables: dict[str, list[paper_tables.Table]]
+    figures: dict[str, Figure | None]
+    tests: list[Test]
+    missing: str
 
 
 def expand_name(name: str) -> tuple[str, ...]:
@@ -39,96 +50,112 @@ def expand_name(name: str) -> tuple[str, ...]:
 
 
 def reproduce(
-    names: Sequence[str], scale: Scale, data: Path | None, out: Path, jobs: int, bar: ProgressBar
-) -> tuple[PaperResult, Test | None]:
+    names: Sequence[str],
+    scales: Sequence[Scale],
+    data: Path | None,
+    out: Path,
+    jobs: int,
+    bar: ProgressBar,
+    end_s: float = math.inf,
+) -> PaperResult:
     """Makes tables and figures. First simulates the missing logs and trains the missing networks.
 
     Args:
         names: Keys of `paper_tables.MODELS_OF`.
-        scale: Size of the reproduction.
+        scales: Sizes of the reproduction, which differ only in their steps.
         data: Folder with logs in ``train`` and ``test``; None for simulated ones.
         out: Folder for the networks.
         jobs: Processes.
         bar: Shows progress.
-
-    Returns:
-        Tables and figures, and the estimates they are based on; None if they need none.
+        end_s: Time of `time.monotonic` at which simulation and training are interrupted.
 
     Raises:
         DataError: See `experiment.run`.
-        CheckpointError: See `experiment.run`.
     """
     models = list(dict.fromkeys(model for name in names for model in paper_tables.MODELS_OF[name]))
-    test = None
+    tests: list[Test] = []
+    missing = ""
     if models:
         if data is None:
-            data = Path("data/shin2019") / scale.protocol
-            missing = experiment.missing_logs(scale, data)
-            with bar("simulating", missing) as progress:
-                experiment.simulate_missing(scale, data, jobs, progress)
-        with bar("training", scale.seeds * len(experiment.networks(models))) as progress:
-            test = experiment.run(scale, models, data, out, jobs, progress)
-    with bar("timing", paper_tables.TIMED * ("7" in names)) as progress:
-        return _make(names, test, scale, out, progress), test
+            data = Path("data/shin2019") / scales[0].instances / scales[0].protocol
+            logs = experiment.missing_logs(scales[0], data)
+            with bar("simulating", logs) as progress:
+                experiment.simulate_missing(scales[0], data, jobs, end_s, progress)
+            if logs := experiment.missing_logs(scales[0], data):
+                return PaperResult({}, {}, [], f"{logs} logs are still missing")
+        nets = len(experiment.networks(models))
+        with bar("training", sum(scale.steps * scale.seeds for scale in scales) * nets) as progress:
+            tests = experiment.run(scales, models, data, out, jobs, end_s, progress)
+        if left := nets * sum(scale.seeds for scale in scales) - sum(len(test.estimates_n) for test in tests):
+            missing = f"{left} networks are not trained yet"
+    tables = {name: [_MAKERS[name](test) for test in tests] for name in names if name in _MAKERS}
+    if "7" in names:
+        with bar("timing", paper_tables.TIMED) as progress:
+            tables["7"] = [paper_tables.times(progress)]
+    figures = {name: _figure(name, tests, data, out) for name in names if name in _CAPTIONS}
+    return PaperResult(tables, figures, tests, missing)
 
 
-def _make(
-    names: Sequence[str], test: Test | None, scale: Scale, out: Path, progress: Progress
-) -> PaperResult:
-    made: dict[str, paper_tables.Table] = {}
-    drawn: dict[str, Figure] = {}
-    for name in names:
-        if name == "7":
-            made[name] = paper_tables.times(progress)
-            continue
-        assert test is not None
-        match name:
-            case "9":
-                made[name] = paper_tables.objects(test)
-            case "claims":
-                made[name] = paper_tables.claims(test)
-            case "fig6":
-                drawn[name] = paper_figures.error_by_force(test)
-            case "fig7":
-                drawn[name] = paper_figures.force_over_time(test, [PROPOSED], "The proposed ensemble")
-            case "fig8":
-                network = load_checkpoint(str(checkpoint_path(out, "ssam-1", 0))).networks[0]
-                drawn[name] = paper_figures.attention(test, network, scale.recipe("ssam-1", 0).preprocess)
-            case "fig9":
-                drawn[name] = paper_figures.force_over_time(
-                    test, [BASELINE, PROPOSED], "Baseline and proposed"
-                )
-            case _:
-                made[name] = paper_tables.comparison(test, name)
-    return PaperResult(made, drawn)
+_MAKERS: Final[dict[str, Callable[[Test], paper_tables.Table]]] = {
+    **{name: partial(paper_tables.comparison, name=name) for name in paper_tables.COMPARISONS},
+    "9": paper_tables.objects,
+    "claims": paper_tables.claims,
+}
 
 
-def markdown(
-    result: PaperResult, scale_name: str, scale: Scale, test: Test | None, pictures: str
-) -> dict[str, str]:
-    """Markdown by the name of its place in the page. The place of the scale's name describes its networks.
+def _figure(name: str, tests: Sequence[Test], data: Path | None, out: Path) -> Figure | None:
+    models = paper_tables.MODELS_OF[name]
+    measured = [test for test in tests if 0 in test.seeds_of(*models)]
+    if not measured or data is None:
+        return None
+    test = max(measured, key=lambda test: test.scale.steps)
+    match name:
+        case "fig6":
+            return paper_figures.error_by_force(test)
+        case "fig7":
+            return paper_figures.force_over_time(test, [PROPOSED], "The proposed ensemble")
+        case "fig9":
+            return paper_figures.force_over_time(test, [BASELINE, PROPOSED], "Baseline and proposed")
+    network = load_checkpoint(str(checkpoint_path(out, data, test.scale, "ssam-1", 0))).force_networks[0]
+    return paper_figures.attention(test, network, test.scale.recipe("ssam-1", 0).preprocess)
+
+
+def picture_name(scale_name: str, scale: Scale, figure: str) -> str:
+    """File name of a figure."""
+    return f"{scale.instances}-{scale_name}-{figure}.png"
+
+
+def markdown(result: PaperResult, scale_name: str, scale: Scale, pictures: str) -> dict[str, str]:
+    """Markdown by the name of its place in the page. The place ``INSTANCES SCALE`` describes the networks.
 
     Args:
         result: Tables and figures.
         scale_name: Key of `models.SCALES`.
         scale: Size of the reproduction.
-        test: Estimates, or None.
         pictures: Folder of the figures, relative to the page.
     """
-    made = {name: table.markdown() for name, table in result.tables.items()}
-    for name in result.figures:
-        made[name] = f"![{_CAPTIONS[name]}]({pictures}/{name}.png)\n*{_CAPTIONS[name]}*\n"
-    parts = {f"{scale_name} {name}": text for name, text in made.items()}
-    if test is not None:
+    place = f"{scale.instances} {scale_name}"
+    parts = {
+        f"{place} {name}": "\n".join(table.markdown() for table in tables)
+        for name, tables in result.tables.items()
+    }
+    for name, figure in result.figures.items():
+        caption = f"*{_CAPTIONS[name]}*"
+        picture = f"![{_CAPTIONS[name]}]({pictures}/{picture_name(scale_name, scale, name)})"
+        parts[f"{place} {name}"] = (
+            f"{caption}: not measured.\n" if figure is None else f"{picture}\n{caption}\n"
+        )
+    if result.tests:
+        test = result.tests[0]
         lines = [
-            f"Made by `gripper-force reproduce all --scale {scale_name}`:",
-            f"{scale.size}x{scale.size} pixels, width {scale.width:g}, {scale.steps} steps per network,",
-            f"{scale.seeds} seeds.",
+            f"Made by `gripper-force reproduce --scale {scale_name} --instances {scale.instances}`:",
+            f"{scale.size}x{scale.size} pixels, width {scale.width:g}.",
             f"Tested on {len(test.clips)} sets: {len(test.measured_n)} frames, of which",
             f"{100 * test.contact.mean():.0f} % in contact. MAE: mean ± s.d. over seeds. Ratio: MAE of the",
-            "baseline over that of the model. p: Wilcoxon's signed-rank test against the baseline, paired by test set.",
+            "baseline over that of the model. p: Wilcoxon's signed-rank test against the baseline, paired by test set,",
+            "of the errors averaged over the seeds.",
         ]
-        parts[scale_name] = " ".join(lines) + "\n"
+        parts[place] = " ".join(lines) + "\n"
     return parts
 
 

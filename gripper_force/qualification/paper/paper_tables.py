@@ -16,6 +16,9 @@ from gripper_force.vision.network import ForceNetwork
 
 Cell = str | float | None
 
+_UNMEASURED: Final = "not measured"
+"""Cell of a model whose networks are not trained yet."""
+
 
 @dataclass(frozen=True, slots=True)
 class Table:
@@ -156,24 +159,37 @@ MODELS_OF: Final[dict[str, tuple[str, ...]]] = {
 def comparison(test: Test, name: str) -> Table:
     """A table of `COMPARISONS`: errors over all test sets."""
     title, rows = COMPARISONS[name]
-    baseline_n = test.mae_n(BASELINE)
+    columns = ("model", "RMSE, paper", "MAE, paper", "ratio, paper", "RMSE N", "MAE N", "seeds", "ratio")
     cells: list[tuple[Cell, ...]] = []
     for row in rows:
-        mae_n = test.mae_n(row.model)
-        cells.append(
-            (
-                row.name or row.model,
-                _paper(row.rmse_n),
-                _paper(row.mae_n),
-                _percent(_BASELINE.mae_n, row.mae_n),
+        paper = _paper(row.rmse_n), _paper(row.mae_n), _percent(_BASELINE.mae_n, row.mae_n)
+        ours: tuple[Cell, ...] = (_UNMEASURED, *(None,) * 5)
+        if seeds := test.seeds_of(row.model):
+            ours = (
                 float(test.rmse_n(row.model).mean()),
-                _spread(mae_n),
-                _percent(float(baseline_n.mean()), float(mae_n.mean())),
-                None if row.model == BASELINE else _p(test.p_value(row.model, BASELINE)),
+                _spread(test.mae_n(row.model)),
+                _count(len(seeds), test.scale.seeds),
+                *_against_baseline(test, row.model),
             )
-        )
-    columns = ("model", "RMSE, paper", "MAE, paper", "ratio, paper", "RMSE N", "MAE N", "ratio", "p")
-    return Table(title, columns, tuple(cells))
+        cells.append((row.name or row.model, *paper, *ours))
+    return Table(_title(title, test), (*columns, "better", "p"), tuple(cells), _SEEDS_NOTE)
+
+
+_SEEDS_NOTE: Final = (
+    "Seeds: those with which the model was trained. Ratio, better and p: over the seeds that the baseline has too; "
+    "better: number of them with a lower MAE than the baseline."
+)
+
+
+def _against_baseline(test: Test, model: str) -> tuple[Cell, ...]:
+    """Returns ratio, number of better seeds and p-value."""
+    if not test.seeds_of(model, BASELINE):
+        return (None,) * 3
+    ours_n, theirs_n = test.mae_n(model, BASELINE), test.mae_n(BASELINE, model)
+    ratio = _percent(float(theirs_n.mean()), float(ours_n.mean()))
+    if model == BASELINE:
+        return ratio, None, None
+    return ratio, str(int((ours_n < theirs_n).sum())), _p(test.p_value(model, BASELINE))
 
 
 def objects(test: Test) -> Table:
@@ -181,29 +197,51 @@ def objects(test: Test) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for name, paper_n in OBJECTS.items():
         frames = test.object == name
-        ours_n = [float(test.absolute_n(model)[:, frames].mean()) for model in MODELS_OF["9"]]
-        for model, theirs, ours in zip(MODELS_OF["9"], paper_n, ours_n, strict=True):
-            ratio = _percent(ours_n[0], ours)
-            rows.append((name, model, _paper(theirs), _percent(paper_n[0], theirs), ours, ratio))
-    columns = ("object", "model", "MAE, paper", "ratio, paper", "MAE N", "ratio")
-    return Table("Table 9: objects", columns, tuple(rows))
+        for model, theirs in zip(MODELS_OF["9"], paper_n, strict=True):
+            ours: tuple[Cell, ...] = (_UNMEASURED, None, None)
+            if seeds := test.seeds_of(model):
+                ratio = None
+                if test.seeds_of(model, BASELINE):
+                    ours_n, baseline_n = (
+                        float(test.absolute_n(*pair)[:, frames].mean())
+                        for pair in ((model, BASELINE), (BASELINE, model))
+                    )
+                    ratio = _percent(baseline_n, ours_n)
+                by_seed_n = test.absolute_n(model)[:, frames].mean(1)
+                ours = (_spread(by_seed_n), _count(len(seeds), test.scale.seeds), ratio)
+            rows.append((name, model, _paper(theirs), _percent(paper_n[0], theirs), *ours))
+    columns = ("object", "model", "MAE, paper", "ratio, paper", "MAE N", "seeds", "ratio")
+    return Table(_title("Table 9: objects", test), columns, tuple(rows))
 
 
 def claims(test: Test) -> Table:
     """The paper's claims, each with a paired test over the test sets."""
-    rows = []
+    rows: list[tuple[Cell, ...]] = []
     for text, better, worse in _CLAIMS:
-        a, b = test.mae_by_set_n(better), test.mae_by_set_n(worse)
+        if not test.seeds_of(better, worse):
+            rows.append((text, _UNMEASURED, None, None, None))
+            continue
+        a, b = test.mae_by_set_n(better, worse), test.mae_by_set_n(worse, better)
+        won = test.mae_n(better, worse) < test.mae_n(worse, better)
         rows.append(
             (
                 text,
                 f"{100 * (1 - a.mean() / b.mean()):+.1f} %",
                 f"{int((a < b).sum())} of {len(a)}",
-                f"{int((test.mae_n(better) < test.mae_n(worse)).sum())} of {test.seeds}",
+                f"{int(won.sum())} of {len(won)}",
                 _p(test.p_value(better, worse)),
             )
         )
-    return Table("Claims", ("claim", "MAE reduction", "test sets", "seeds", "p"), tuple(rows))
+    columns = ("claim", "MAE reduction", "test sets", "seeds", "p")
+    return Table(_title("Claims", test), columns, tuple(rows))
+
+
+def _title(text: str, test: Test) -> str:
+    return f"{text} ({test.scale.steps:,} steps)"
+
+
+def _count(seeds: int, planned: int) -> str:
+    return str(seeds) if seeds == planned else f"{seeds} of {planned}"
 
 
 def times(progress: Progress) -> Table:

@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from gripper_force.config import Config, GripperConfig, SimConfig
 from gripper_force.errors import ConfigError
-from gripper_hw.sim.objects import GAUGES, PADS_ONLY, ObjectModel, build_object
+from gripper_hw.sim.meshes import ObjectModel
+from gripper_hw.sim.objects import GAUGES, PADS_ONLY, build_object
 
 LUX_LEVELS = (350.0, 550.0, 750.0)
 """The paper's three light levels."""
@@ -74,6 +75,10 @@ class Scene:
         jaw_friction_n: Coulomb friction of one rail; applied at the horn.
         backlash_m: Half of the gear play at the rack.
         rod_length_m: Length of a rod beyond its finger (tool ``rods`` only).
+        pad_half_m: Half of the depth and height of a pad (tool ``pads`` only).
+        finger_half_m: Half of the depth of a finger.
+        pad_gray: Brightness of the pads, 0 to 1.
+        finger_gray: Brightness of the fingers, 0 to 1.
         markers: True if each finger carries an ArUco marker.
         changing_light: True if the light varies over time.
         moving_background: True if objects move in the background.
@@ -101,6 +106,10 @@ class Scene:
     jaw_friction_n: float = 0.20
     backlash_m: float = 0.0003
     rod_length_m: float = 0.020
+    pad_half_m: tuple[float, float] = (0.012, 0.011)
+    finger_half_m: float = 0.008
+    pad_gray: float = 0.17
+    finger_gray: float = 0.78
     markers: bool = False
     changing_light: bool = False
     moving_background: bool = False
@@ -128,14 +137,22 @@ def draw_scene(object_name: str, seed: int, config: SimConfig) -> Scene:
             servo_friction_nm=config.friction * Scene.servo_friction_nm,
             jaw_friction_n=config.friction * Scene.jaw_friction_n,
         )
+    if config.stiffness is not None:
+        grasped = replace(grasped, stiffness=config.stiffness)
     exact = object_name in GAUGES
+    octaves = 0.0
+    if config.randomise:
+        # Keys that came later have random streams of their own, so that old scenes are drawn identically.
+        rig = _draw_jaws(rig, seed if config.rig_seed is None else config.rig_seed, config.jaw_spread)
+        own_seed = seed if config.object_seed is None else config.object_seed
+        octaves = config.stiffness_octaves * float(np.random.default_rng([own_seed, 21]).uniform(-1, 1))
     return replace(
         rig,
         markers=config.markers,
         changing_light=config.changing_light,
         moving_background=config.moving_background,
         size=1.0 if exact else grasped.size,
-        stiffness=1.0 if exact else grasped.stiffness,
+        stiffness=1.0 if exact else grasped.stiffness * 2.0**octaves,
         texture_seed=grasped.texture_seed,
         offset_m=placement.offset_m,
         yaw_deg=placement.yaw_deg,
@@ -152,10 +169,12 @@ def _draw(object_name: str, seed: int, config: SimConfig) -> Scene:
         return tuple(float(v) for v in rng.uniform(-1, 1, len(half_widths)) * half_widths)
 
     x, y = offsets(0.0015, 0.003)
-    # The camera is mounted on the gripper: only the mounting's precision and the lens vary.
-    camera = offsets(0.003, 0.003, 0.003)
-    target = offsets(0.0015, 0.0015, 0.0015)
-    light = offsets(0.15, 0.15, 0.15)
+    # The camera is mounted on the gripper: at a view_spread of 1 only the mounting's precision and the lens vary.
+    view = config.view_spread
+    ambient = min(view, 2.0)
+    camera = offsets(*[0.003 * view] * 3)
+    target = offsets(*[0.0015 * view] * 3)
+    light = offsets(*[min(0.15 * view, 0.45)] * 3)
     return Scene(
         object_name,
         config.detail,
@@ -166,10 +185,10 @@ def _draw(object_name: str, seed: int, config: SimConfig) -> Scene:
         yaw_deg=config.yaw_deg + float(rng.uniform(-4, 4)),
         camera_offset_m=(camera[0], camera[1], camera[2]),
         camera_target_offset_m=(target[0], target[1], target[2]),
-        camera_fovy_deg=float(rng.uniform(16.8, 17.2)),
-        lux=lux * float(rng.uniform(0.95, 1.05)),
+        camera_fovy_deg=float(rng.uniform(17.0 - 0.2 * view, 17.0 + 0.2 * view)),
+        lux=lux * float(rng.uniform(1 - min(0.05 * view, 0.4), 1 + min(0.05 * view, 0.4))),
         light_direction=(-0.40 + light[0], 0.55 + light[1], -0.75 + light[2]),
-        light_ambient=float(rng.uniform(0.22, 0.38)),
+        light_ambient=float(rng.uniform(0.22 - 0.08 * (ambient - 1), 0.38 + 0.08 * (ambient - 1))),
         texture_seed=(texture_seed := int(rng.integers(2**31))),
         table_seed=texture_seed,
         shot_noise=float(rng.uniform(0.012, 0.024)),
@@ -180,6 +199,22 @@ def _draw(object_name: str, seed: int, config: SimConfig) -> Scene:
         backlash_m=float(rng.uniform(0.0002, 0.0004)),
         # This varies more than the jaws' travel under force, so that travel alone does not give the force.
         rod_length_m=0.020 + (float(rng.uniform(-0.003, 0.003)) if config.tool == "rods" else 0.0),
+    )
+
+
+def _draw_jaws(rig: Scene, seed: int, spread: float) -> Scene:
+    depth, height, finger, pad_gray, finger_gray = spread * np.random.default_rng([seed, 20]).uniform(
+        -1, 1, 5
+    )
+    return replace(
+        rig,
+        pad_half_m=(
+            Scene.pad_half_m[0] * float(1 + 0.3 * depth),
+            Scene.pad_half_m[1] * float(1 + 0.3 * height),
+        ),
+        finger_half_m=Scene.finger_half_m * float(1 + 0.4 * finger),
+        pad_gray=Scene.pad_gray + float(pad_gray * 0.15 if pad_gray < 0 else pad_gray * 0.65),
+        finger_gray=Scene.finger_gray + float(finger_gray * (0.6 if finger_gray < 0 else 0.2)),
     )
 
 
@@ -247,6 +282,9 @@ def scene_mjcf(
         background=_background(scene),
         left_tool=_tool(scene, -1),
         right_tool=_tool(scene, 1),
+        finger_half=_text([scene.finger_half_m]),
+        pad_rgb=_text(np.array([0.16, 0.17, 0.19]) * scene.pad_gray / Scene.pad_gray),
+        finger_rgb=_text(np.array([0.78, 0.78, 0.80]) * scene.finger_gray / Scene.finger_gray),
         left_marker=_marker(scene, -1),
         right_marker=_marker(scene, 1),
         marker_materials=_MARKER_MATERIALS if scene.markers else "",
@@ -291,7 +329,7 @@ def _second_rack(scene: Scene, radius_m: float) -> str:
 
 def _tool(scene: Scene, side: int) -> str:
     if scene.tool == "pads":
-        return 'type="box" size=".004 .012 .011"'
+        return f'type="box" size="{_text([_PAD_HALF_THICKNESS_M, *scene.pad_half_m])}"'
     # The tip of a rod of 20 mm is at the position of a pad's face.
     root = _ROD_RADIUS_M - _PAD_HALF_THICKNESS_M + 0.020
     ends = _text([side * (root - scene.rod_length_m), 0, 0, side * root, 0, 0])

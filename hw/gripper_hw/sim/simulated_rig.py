@@ -252,7 +252,7 @@ class SimulatedRig:
         register_bus(self._bus_name, bus)
         self.start_ns = start_ns
         self._failure: Exception | None = None
-        self._stop = threading.Event()
+        self._stop, self._is_prepared = threading.Event(), threading.Event()
         self._thread: threading.Thread | None = None
 
     @staticmethod
@@ -296,10 +296,11 @@ class SimulatedRig:
             )
 
     def start(self) -> None:
-        """Starts the world's thread; in lockstep the clock advances the world instead."""
+        """Starts the world's thread, and waits until it keeps time; in lockstep the clock advances the world."""
         if not self._lockstep and self._thread is None:
             self._thread = threading.Thread(target=self._run_in_real_time, name="simulated-rig", daemon=True)
             self._thread.start()
+            self._is_prepared.wait()
 
     def check(self) -> None:
         """Re-raises an exception of the world's thread, if there was one."""
@@ -344,6 +345,11 @@ class SimulatedRig:
 
     def _run_in_real_time(self) -> None:
         try:
+            if self._config.camera.backend == "simulated":
+                # The first image takes 0.2 s, in which the control loop would not run either.
+                self._world.render(_SUPERSAMPLING * FRAME_SIDE_PX)
+            self._world.advance_to(time.monotonic_ns() - self.start_ns)
+            self._is_prepared.set()
             while not self._stop.is_set():
                 due_ns = time.monotonic_ns() - self.start_ns
                 lag_ns = due_ns - self._world.t_ns
@@ -358,6 +364,7 @@ class SimulatedRig:
         except Exception as error:  # `check` raises it in the session's thread
             self._failure = error
         finally:
+            self._is_prepared.set()
             self._world.close()  # the rendering context belongs to this thread
 
 

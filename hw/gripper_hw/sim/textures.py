@@ -1,5 +1,7 @@
 """Random textures and ArUco markers as PNG files."""
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +25,7 @@ def draw_textures(object_texture: str | None, seed: int, table_seed: int) -> dic
     if object_texture is not None:
         rng = np.random.default_rng(seed)
         _table(rng)  # the table was once drawn first from this seed; without this, textures would change
-        images[object_texture] = _OBJECT_TEXTURES[object_texture](rng)
+        images[object_texture] = _paint(object_texture, rng)
     return {name: cv2.imencode(".png", image)[1].tobytes() for name, image in images.items()}
 
 
@@ -101,4 +103,58 @@ def _ball(rng: np.random.Generator) -> Image:
     return image
 
 
+def _paint(file_name: str, rng: np.random.Generator) -> Image:
+    if file_name in _OBJECT_TEXTURES:
+        return _OBJECT_TEXTURES[file_name](rng)
+    pattern = PATTERNS[file_name.removesuffix(".png")]
+    shade = rng.uniform(60, 220)
+    # Contrast of at least a quarter of the range, to the side where there is room.
+    other = shade + (-1 if shade > 140 else 1) * rng.uniform(50, 110)
+    gray = shade + (other - shade) * pattern(rng) + rng.uniform(2, 10) * _clouds(rng, rng.uniform(1, 8))
+    return _colour(gray, *rng.uniform(0.8, 1.1, 3))
+
+
+def _grid() -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    rows, columns = np.mgrid[:_SIDE_PX, :_SIDE_PX].astype(np.float32) / _SIDE_PX
+    return columns, rows
+
+
+def _bands(rng: np.random.Generator, across: npt.NDArray[np.float32]) -> npt.NDArray[np.floating]:
+    """Returns 0 to 1: bands with soft edges; whole periods, so that the ends of a wall meet."""
+    wave = np.sin(2 * np.pi * (int(rng.integers(5, 11)) * across + rng.uniform()))
+    bands: npt.NDArray[np.floating] = np.clip(0.5 + 4 * (wave - rng.uniform(-0.5, 0.5)), 0, 1)
+    return bands
+
+
+def _spots(rng: np.random.Generator, largest_px: int) -> npt.NDArray[np.floating]:
+    gray = np.zeros((_SIDE_PX, _SIDE_PX), np.float32)
+    for _ in range(int(4000 / largest_px**1.5)):
+        x, y = (int(v) for v in rng.integers(0, _SIDE_PX, 2))
+        radius = max(1, int(largest_px * rng.uniform(0.4, 1)))
+        cv2.circle(gray, (x, y), radius, float(rng.uniform(0.5, 1)), -1, cv2.LINE_AA)
+    return gray
+
+
+def _label(rng: np.random.Generator) -> npt.NDArray[np.floating]:
+    gray = np.zeros((_SIDE_PX, _SIDE_PX), np.float32)
+    low, high = (int(_SIDE_PX * share) for share in (rng.uniform(0.15, 0.3), rng.uniform(0.7, 0.85)))
+    cv2.rectangle(gray, (0, low), (_SIDE_PX, high), 0.8, -1)
+    for _ in range(14):  # lines of print
+        x, y = int(rng.integers(0, _SIDE_PX)), int(rng.integers(low, high))
+        cv2.rectangle(gray, (x, y), (x + int(rng.integers(10, 60)), y + int(rng.integers(3, 14))), 0.1, -1)
+    return gray
+
+
 _OBJECT_TEXTURES = {"sponge.png": _sponge, "cup.png": _cup, "tube.png": _tube, "ball.png": _ball}
+
+PATTERNS: dict[str, Callable[[np.random.Generator], npt.NDArray[np.floating]]] = {
+    "stripes": lambda rng: _bands(rng, _grid()[0]),
+    "rings": lambda rng: _bands(rng, _grid()[1]),
+    "checks": lambda rng: np.abs(_bands(rng, _grid()[0]) - _bands(rng, _grid()[1])),
+    "weave": lambda rng: 0.5 * (_bands(rng, _grid()[0] + _grid()[1]) + _bands(rng, _grid()[0] - _grid()[1])),
+    "spots": lambda rng: _spots(rng, 14),
+    "speckle": lambda rng: _spots(rng, 4),
+    "marble": lambda rng: np.clip(0.5 + 1.5 * _clouds(rng, rng.uniform(8, 16)), 0, 1),
+    "label": _label,
+}
+"""Patterns of the kinds of objects, from 0 to 1; shade and contrast are drawn."""

@@ -9,7 +9,8 @@ from gripper_force.config import BudgetConfig, load_config
 from gripper_force.errors import ConfigError
 from gripper_hw.sim import detail_level as detail
 from gripper_hw.sim.detail_level import resolve_detail, select_level
-from gripper_hw.sim.objects import OBJECTS, Detail
+from gripper_hw.sim.meshes import Detail
+from gripper_hw.sim.objects import OBJECTS
 from gripper_hw.sim.simulated_rig import SimulatedRig
 
 figures = st.floats(0.001, 1000)

@@ -7,7 +7,8 @@ import pytest
 from gripper_force.config import GripperConfig
 from gripper_force.errors import ConfigError
 from gripper_hw.sim.engine import mujoco
-from gripper_hw.sim.objects import BLOCK_WIDTH_M, GAUGES, OBJECTS, PADS_ONLY, Detail, build_object
+from gripper_hw.sim.meshes import Detail
+from gripper_hw.sim.objects import BLOCK_WIDTH_M, GAUGES, OBJECTS, PADS_ONLY, build_object
 from gripper_hw.sim.scene import Scene, scene_mjcf
 
 DETAILS = get_args(Detail)

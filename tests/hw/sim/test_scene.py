@@ -20,6 +20,10 @@ def test_scene_depends_on_seed_only() -> None:
         "detail",
         "tool",
         "rod_length_m",
+        "pad_half_m",
+        "finger_half_m",
+        "pad_gray",
+        "finger_gray",
         "markers",
         "changing_light",
         "moving_background",
@@ -109,6 +113,47 @@ def test_stiffness_fills_its_spread(spread: float) -> None:
     assert max(off) >= 0.8 * spread
 
 
+@pytest.mark.parametrize(
+    ("change", "drawn"),
+    [
+        ({"stiffness_octaves": 1.0}, {"stiffness"}),
+        (
+            {"view_spread": 10.0},
+            {
+                "camera_offset_m",
+                "camera_target_offset_m",
+                "camera_fovy_deg",
+                "lux",
+                "light_direction",
+                "light_ambient",
+            },
+        ),
+        ({"jaw_spread": 1.0}, {"pad_half_m", "finger_half_m", "pad_gray", "finger_gray"}),
+    ],
+)
+def test_wider_spread_changes_nothing_else(change: dict[str, float], drawn: set[str]) -> None:
+    before, after = (asdict(draw_scene("tube", 3, SimConfig(**keys))) for keys in ({}, change))
+    assert {name for name in before if before[name] != after[name]} == drawn
+    fixed = SimConfig(object_seed=1, rig_seed=2, **change)
+    first, again = (asdict(draw_scene("tube", seed, fixed)) for seed in (3, 4))
+    assert {name for name in first if first[name] != again[name]} == {"offset_m", "yaw_deg"}
+
+
+def test_stiffness_octaves_fill_half_to_double() -> None:
+    config = SimConfig(stiffness_octaves=1.0, stiffness_spread=0.0)
+    drawn = [draw_scene("tube", seed, config).stiffness for seed in range(200)]
+    assert 0.5 <= min(drawn) < 0.53
+    assert 1.9 < max(drawn) <= 2.0
+    assert sum(value < 1 for value in drawn) == pytest.approx(100, abs=25)
+
+
+def test_pads_of_other_size_change_the_model() -> None:
+    pads = [
+        scene_mjcf(Scene("tube", "coarse", pad_half_m=(y, 0.011)), GripperConfig())[0] for y in (0.012, 0.01)
+    ]
+    assert pads[0] != pads[1]
+
+
 def test_gauge_has_exact_size_and_stiffness() -> None:
     scene = draw_scene("block", 3, SimConfig(stiffness_spread=0.5))
     assert replace(draw_scene("tube", 3, SimConfig()), object="block", size=1.0, stiffness=1.0) == scene
@@ -118,8 +163,19 @@ def test_every_drawn_number_changes_the_model() -> None:
     gripper = GripperConfig()
     plain = Scene("sponge", "coarse", "rods")
     before = scene_mjcf(plain, gripper)
-    drawn = asdict(draw_scene("sponge", 1, SimConfig(tool="rods", markers=True, moving_background=True)))
-    not_of_the_model = {"object", "detail", "tool", "lux", "shot_noise", "nm_per_a", "changing_light"}
+    drawn = asdict(
+        draw_scene("sponge", 1, SimConfig(tool="rods", markers=True, moving_background=True, jaw_spread=1.0))
+    )
+    not_of_the_model = {
+        "object",
+        "detail",
+        "tool",
+        "lux",
+        "shot_noise",
+        "nm_per_a",
+        "changing_light",
+        "pad_half_m",
+    }
     for name in drawn.keys() - not_of_the_model:
         after = scene_mjcf(replace(plain, **{name: drawn[name]}), gripper)
         if name not in ("texture_seed", "table_seed"):

@@ -198,6 +198,18 @@ def error_of_patched_rig(make_rig: MakeRig, patch: Callable[[SimulatedRig], None
     return caught.value
 
 
+def test_a_rig_that_has_started_in_real_time_is_ready_to_render(make_rig: MakeRig) -> None:
+    """A rendering context that is made later holds up the control loop, until the servo's watchdog trips."""
+    rig = make_rig("clock=realtime", "camera.rate_hz=0.1")
+    rendered: list[int] = []
+    world = rig._world
+    render = world.render
+    world.render = lambda side_px: (rendered.append(side_px), render(side_px))[1]  # type: ignore[method-assign, func-returns-value]
+    rig.start()
+    assert rendered
+    assert world.t_ns > 0
+
+
 def test_too_slow_machine_is_an_error(make_rig: MakeRig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rig_module, "_REALTIME_MAX_LAG_NS", -1)
     error = error_of_patched_rig(make_rig, lambda _: None)

@@ -58,7 +58,8 @@ def test_every_network_trains(
     config = TrainConfig.model_validate({**small_recipe.model_dump(), **recipe, "preprocess": {"size": 32}})
     larger = [replace(clip, frames=clip.frames.repeat(2, axis=1).repeat(2, axis=2)) for clip in clips]
     checkpoint = train(config, larger, tmp_path / "out.safetensors")
-    (member,) = checkpoint.header.members
+    (network,) = checkpoint.force_networks
+    member = network.config
     assert (member.attention, member.backbone) == (attention, backbone)
     assert member.pooling == (pooling if attention in ("ssam", "scam") else "wap")
 
@@ -126,6 +127,7 @@ def test_training_too_short_for_all_recordings_warns(
     assert warnings == [
         "the training was too short: it drew no clip from 5 of its 6 recordings; increase steps"
     ]
+    monkeypatch.setattr(train_module, "LEAST_STEPS", 1)
     train(small_recipe, clips, out, validation_clips=clips, warn=warnings.append)
     assert len(warnings) == 1
     config = one_clip.model_copy(update={"steps": 3})
@@ -203,7 +205,7 @@ def test_command_continues_a_checkpoint(few_logs: Path, tiny_checkpoint: Path, t
     assert result.header.members == start.header.members
     assert result.header.preprocess == start.header.preprocess
     # One step changes each weight by no more than the learning rate; a new network has far smaller weights.
-    before, after = (checkpoint.networks[0].out.weight for checkpoint in (start, result))
+    before, after = (checkpoint.force_networks[0].out.weight for checkpoint in (start, result))
     assert before.abs().max() > 100
     torch.testing.assert_close(after, before, rtol=1e-3, atol=0.01)
     assert result.digest != start.digest
@@ -212,6 +214,36 @@ def test_command_continues_a_checkpoint(few_logs: Path, tiny_checkpoint: Path, t
     assert isinstance(refused, ConfigError)
     assert "preprocess.size=128" in str(refused)
     assert not out.exists()
+
+
+def test_command_takes_several_folders_and_a_teacher(
+    few_logs: Path, tiny_checkpoint: Path, tmp_path: Path
+) -> None:
+    other = tmp_path / "other"
+    other.mkdir()
+    moved = sorted(few_logs.glob("*.mcap"))[0]
+    moved.rename(other / moved.name)
+    out = tmp_path / "out.safetensors"
+    call = ["train", str(other), str(few_logs), "--out", str(out), "--jobs", "1", "--json"]
+    call += ["--teacher", str(tiny_checkpoint)]
+    keys = ["preprocess.size=32", "attentions=[none]", "width=0.25", "steps=1", "device=cpu"]
+    call += [part for key in keys for part in ("--set", key)]
+    done = CliRunner().invoke(cli.app, call)
+    assert done.exit_code == 0, done.output
+    folders = [load_clips(folder, Preprocess(size=32)) for folder in (other, few_logs)]
+    assert [len(folder) for folder in folders] == [1, 2]
+    assert load_checkpoint(out).header.data_digest == digest([*folders[0], *folders[1]])
+    other_size = CliRunner().invoke(cli.app, [*call, "--set", "preprocess.size=16"]).exception
+    assert isinstance(other_size, ConfigError)
+    assert "the teacher sees frames" in str(other_size)
+
+
+def test_frozen_statistics_need_an_initial_checkpoint(
+    clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig
+) -> None:
+    frozen = small_recipe.model_copy(update={"freeze_statistics": True})
+    with pytest.raises(ConfigError, match="add --init"):
+        train(frozen, clips, tmp_path / "out.safetensors")
 
 
 def test_command_leaves_out_logs_that_start_in_contact(

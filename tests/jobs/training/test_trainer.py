@@ -1,15 +1,19 @@
 import time
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
-from gripper_force.jobs.dataset import Clip
+from gripper_force.jobs.dataset import CONTACT_N, Clip
 from gripper_force.jobs.training.batches import Batches
 from gripper_force.jobs.training.parallel import Ranks
 from gripper_force.jobs.training.recipe import TrainConfig
 from gripper_force.jobs.training.train import train
 from gripper_force.jobs.training.trainer import Trainer, one_cycle, squared_error, step_decay
+from gripper_force.vision.batch_inference import normalise, predict
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.header import NetworkConfig
 from gripper_force.vision.network import ForceNetwork
@@ -22,10 +26,9 @@ def gradients(
 ) -> tuple[float, list[torch.Tensor]]:
     """Loss of the training on complete windows, and its gradients."""
     network.zero_grad()
-    loss = (
-        squared_error(network, inputs, forces_n, valid, network.config.context)
-        / valid[:, network.config.context :].sum()
-    )
+    first = network.config.context
+    known = valid[:, first:]
+    loss = squared_error(network(inputs, first), forces_n[:, first:], known) / known.sum()
     loss.backward()
     return loss.item(), [p.grad.clone() for p in network.parameters() if p.grad is not None]
 
@@ -79,6 +82,88 @@ def test_every_precision_and_window_mode_trains(
     assert all(p.dtype == torch.float32 for p in trainer.network.parameters())
 
 
+@pytest.fixture
+def indented(clips: list[Clip]) -> list[Clip]:
+    """The clips with the travel of the jaws, which is a square root of the force, for all but one."""
+    travels_m = [np.float32(0.004) * np.sqrt(clip.forces_n) for clip in clips]
+    return [clips[0], *(replace(c, indentation_m=m) for c, m in zip(clips[1:], travels_m[1:], strict=True))]
+
+
+def test_indentation_and_contact_are_learned_beside_force(
+    indented: list[Clip], small_recipe: TrainConfig, press: Callable[..., Clip]
+) -> None:
+    extra = {"indentation_weight": 0.5, "contact_weight": 0.05, "steps": 150, "clips": 8}
+    config = small_recipe.model_copy(update=extra)
+    trainer = Trainer(config, 0, Batches(indented, config, Ranks("cpu")), Ranks("cpu"))
+    list(trainer.steps())
+    network, unseen = trainer.network, press(99)
+    assert network.config.outputs == ("force", "indentation", "contact")
+    inputs = normalise(
+        torch.from_numpy(unseen.frames)[None], torch.from_numpy(unseen.frames[None, :4]), config.preprocess
+    )
+    with torch.no_grad():
+        features = network.features(inputs)[0]
+        force, indentation, contact = network.outputs(features).numpy().T
+        assert np.array_equal(network(inputs)[0].numpy(), force * np.float32(20))
+    travel_m = 0.004 * np.sqrt(unseen.forces_n)
+    error_m = np.abs(0.02 * indentation - travel_m).mean()
+    assert error_m < 0.4 * np.abs(travel_m - travel_m.mean()).mean()
+    assert np.mean((contact > 0) == (unseen.forces_n > CONTACT_N)) > 0.9
+
+
+def test_new_outputs_leave_the_force_of_the_initial_network(
+    indented: list[Clip], small_recipe: TrainConfig
+) -> None:
+    plain = Trainer(
+        small_recipe, 0, Batches(indented, small_recipe, Ranks("cpu")), Ranks("cpu")
+    ).network.eval()
+    config = small_recipe.model_copy(update={"contact_weight": 1.0})
+    trainer = Trainer(config, 0, Batches(indented, config, Ranks("cpu")), Ranks("cpu"))
+    trainer.start_from(plain)
+    inputs = torch.randn(2, 24, 1, 16, 16)
+    with torch.no_grad():
+        assert torch.equal(trainer.network.eval()(inputs, 19), plain(inputs, 19))
+        assert not trainer.network.outputs(torch.randn(3, plain.config.head))[:, 1].any()
+
+
+@pytest.mark.parametrize("frozen", [False, True])
+def test_frozen_statistics_are_those_of_the_initial_network(
+    frozen: bool, clips: list[Clip], small_recipe: TrainConfig
+) -> None:
+    config = small_recipe.model_copy(update={"freeze_statistics": frozen})
+    trainer = Trainer(config, 0, Batches(clips, config, Ranks("cpu")), Ranks("cpu"))
+
+    def statistics() -> torch.Tensor:
+        state = trainer.network.state_dict()
+        return torch.cat([tensor.flatten().clone() for name, tensor in state.items() if "running" in name])
+
+    before, weight = statistics(), trainer.network.out.weight.clone()
+    list(trainer.steps())
+    assert torch.equal(statistics(), before) == frozen
+    assert not torch.equal(trainer.network.out.weight, weight)
+
+
+def test_teacher_is_imitated(
+    clips: list[Clip], small_recipe: TrainConfig, press: Callable[..., Clip]
+) -> None:
+    """A teacher that says twice the measured force: the student learns its forces and not the labels."""
+    config = small_recipe.model_copy(update={"steps": 120, "clips": 8, "teacher_share": 1.0})
+    batches = Batches(clips, config, Ranks("cpu"))
+    first = Trainer(config, 0, batches, Ranks("cpu"))
+    list(first.steps())
+    with torch.no_grad():
+        first.network.out.weight.mul_(2)
+        first.network.out.bias.mul_(2)
+    teacher = first.network.requires_grad_(False)
+    student = Trainer(config.model_copy(update={"seed": 7}), 0, batches, Ranks("cpu"), [teacher])
+    list(student.steps())
+    unseen = press(99)
+    taught_n = predict([teacher], config.preprocess, unseen.frames)[0]
+    learned_n = predict([student.network], config.preprocess, unseen.frames)[0]
+    assert np.abs(learned_n - taught_n).mean() < 0.25 * np.abs(taught_n - taught_n.mean()).mean()
+    assert np.abs(learned_n - taught_n).mean() < 0.5 * np.abs(learned_n - unseen.forces_n).mean()
+
+
 def test_training_in_parts(clips: list[Clip], small_recipe: TrainConfig) -> None:
     batches = Batches(clips, small_recipe, Ranks("cpu"))
     whole, parts = (Trainer(small_recipe, 0, batches, Ranks("cpu")) for _ in range(2))
@@ -130,7 +215,7 @@ def test_network_is_as_good_in_evaluation_mode_as_in_training(
     config = small_recipe.model_copy(update={"steps": 60, "clips": 8})
     train(config, clips, tmp_path / "out.safetensors")
     (network,) = load_checkpoint(tmp_path / "out.safetensors").networks
-    inputs, forces_n, _ = Batches(clips, config, Ranks("cpu")).batch(1000, 8, 22)
+    inputs, forces_n, *_ = Batches(clips, config, Ranks("cpu")).batch(1000, 8, 22)
     with torch.no_grad():
         evaluated = (network(inputs, 19) - forces_n[:, 19:]).abs().mean()
         trained = (network.train()(inputs, 19) - forces_n[:, 19:]).abs().mean()

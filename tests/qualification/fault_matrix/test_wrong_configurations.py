@@ -187,3 +187,9 @@ def test_the_command_reports_a_row_that_fails(tmp_path: Path, monkeypatch: pytes
     assert done.exit_code == 1
     assert "sim.friction=5.0, clock=lockstep: the result is stuck" in done.stdout
     assert "| friction: 0.3 to 5 times |" in page.read_text()
+
+
+def test_the_shipped_page_shows_every_row() -> None:
+    page = Path(__file__).parents[3] / "docs" / "reliability.md"
+    table = page.read_text(encoding="utf-8").split("<!-- wrong -->")[1].split("<!-- end of wrong -->")[0]
+    assert all(f"| {row.name} |" in table for row in WRONG_CASES)

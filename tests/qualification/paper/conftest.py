@@ -8,7 +8,7 @@ from gripper_force.jobs.dataset import Clip
 from gripper_force.jobs.simulate import OBJECTS
 from gripper_force.qualification.paper.experiment import Test as Estimates
 from gripper_force.qualification.paper.experiment import networks
-from gripper_force.qualification.paper.models import MODELS
+from gripper_force.qualification.paper.models import MODELS, Scale
 from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import Frame, LoadCellSample
 
@@ -59,6 +59,7 @@ def estimates() -> Estimates:
     ]
     measured_n = np.concatenate([clip.forces_n for clip in clips]).astype(np.float64)
     return Estimates(
+        scale=Scale(seeds=SEEDS),
         clips=clips,
         measured_n=measured_n,
         set=np.repeat(np.arange(len(clips)), FRAMES),
@@ -68,5 +69,4 @@ def estimates() -> Estimates:
             for net in networks(MODELS)
             for seed in range(SEEDS)
         },
-        seeds=SEEDS,
     )

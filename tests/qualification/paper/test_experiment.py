@@ -1,14 +1,22 @@
+import math
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from gripper_force.errors import DataError
 from gripper_force.interfaces import no_progress
+from gripper_force.jobs.dataset import load_clips
+from gripper_force.jobs.training import train as module
+from gripper_force.jobs.training.train import train
 from gripper_force.qualification.paper import experiment
 from gripper_force.qualification.paper.experiment import Test as Estimates
 from gripper_force.qualification.paper.experiment import checkpoint_path, networks, run
 from gripper_force.qualification.paper.models import BASELINE, PROPOSED, TWO_PLAIN, Scale
+from gripper_force.qualification.paper.paper_tables import comparison
 
 from .conftest import FRAMES
 
@@ -23,13 +31,21 @@ def ran(touches: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Estima
     def progress(text: str, steps: int = 1) -> None:
         done.append(text)
 
-    return run(TINY, [BASELINE, TWO_PLAIN], touches, out, 1, progress), out, done
+    (test,) = run([TINY], [BASELINE, TWO_PLAIN], touches, out, 1, math.inf, progress)
+    return test, out, done
 
 
-def test_each_network_is_trained_once_with_each_seed(ran: tuple[Estimates, Path, list[str]]) -> None:
+def again(touches: Path, out: Path, *scales: Scale, end_s: float = math.inf) -> list[Estimates]:
+    return run(scales, [BASELINE, TWO_PLAIN], touches, out, 1, end_s, no_progress)
+
+
+def test_each_network_is_trained_once_with_each_seed(
+    ran: tuple[Estimates, Path, list[str]], touches: Path
+) -> None:
     test, out, done = ran
-    assert done == ["plain, seed 0", "plain, seed 1"]
-    assert all(checkpoint_path(out, "plain", seed).exists() for seed in (0, 1))
+    assert [text.split(";")[0] for text in done] == ["plain, seed 0, 2 steps", "plain, seed 1, 2 steps"]
+    assert done[0].endswith("h left")
+    assert all(checkpoint_path(out, touches, TINY, "plain", seed).exists() for seed in (0, 1))
     lead_in = TINY.recipe("plain", 0).preprocess.lead_in
     assert len(test.measured_n) == 8 * (FRAMES - lead_in)
     assert np.isfinite(test.estimates_n["plain", 0]).all()
@@ -40,38 +56,75 @@ def test_existing_networks_are_not_trained_again(
     ran: tuple[Estimates, Path, list[str]], touches: Path
 ) -> None:
     test, out, _ = ran
-    before = checkpoint_path(out, "plain", 0).read_bytes()
-    (out / "plain-0.npy").unlink()
-    again = run(TINY, [BASELINE], touches, out, 1, no_progress)
-    assert checkpoint_path(out, "plain", 0).read_bytes() == before
-    np.testing.assert_array_equal(again.estimates_n["plain", 0], test.estimates_n["plain", 0])
+    path = checkpoint_path(out, touches, TINY, "plain", 0)
+    before = path.stat().st_mtime_ns
+    path.with_suffix(".npy").unlink()
+    (same,) = again(touches, out, TINY)
+    assert path.stat().st_mtime_ns == before
+    assert same.estimates_n.keys() == test.estimates_n.keys()
+    np.testing.assert_array_equal(same.estimates_n["plain", 0], test.estimates_n["plain", 0])
 
 
-def test_networks_of_another_scale_or_data_raise(
-    ran: tuple[Estimates, Path, list[str]], touches: Path
+def test_networks_are_not_used_for_another_recipe_or_other_data(
+    ran: tuple[Estimates, Path, list[str]], touches: Path, tmp_path: Path
 ) -> None:
-    other = TINY.model_copy(update={"steps": 3})
-    with pytest.raises(DataError, match="another scale or other data; give another folder"):
-        run(other, [BASELINE], touches, ran[1], 1, no_progress)
-    with pytest.raises(DataError, match="another scale or other data; give another folder"):
-        run(TINY, [BASELINE], touches / "train", ran[1], 1, no_progress)
+    test, out, _ = ran
+    wider = TINY.model_copy(update={"width": 0.5})
+    longer = TINY.model_copy(update={"steps": 3})
+    untrained = again(touches, out, TINY, longer, end_s=0.0)
+    assert [len(one.estimates_n) for one in untrained] == [2, 0]
+    assert not again(touches, out, wider, end_s=0.0)[0].estimates_n
+    copy = tmp_path / "copy"
+    shutil.copytree(touches, copy)
+    assert again(copy, out, TINY, end_s=0.0)[0].estimates_n.keys() == test.estimates_n.keys()
+    (copy / "train" / "tube-0.mcap").unlink()
+    assert not again(copy, out, TINY, end_s=0.0)[0].estimates_n
+
+
+def test_an_interrupted_run_gives_the_same_table(
+    ran: tuple[Estimates, Path, list[str]], touches: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    test, *_ = ran
+    (nothing,) = again(touches, tmp_path, TINY, end_s=0.0)
+    rows = comparison(nothing, "3").rows
+    assert [row[4:] for row in rows] == [("not measured", *(None,) * 5)] * len(rows)
+
+    recipe, path = TINY.recipe("plain", 0), checkpoint_path(tmp_path, touches, TINY, "plain", 0)
+    reports = 0
+
+    def end_in_step_2(text: str, steps: int = 1) -> None:
+        nonlocal reports
+        reports += 1
+        if reports == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, "STATE_EVERY_S", -1.0)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    with pytest.raises(KeyboardInterrupt):
+        train(recipe, load_clips(touches / "train", recipe.preprocess), path, progress=end_in_step_2)
+    torch.set_num_threads(threads)
+    assert [state.exists() for state in (*module.state_paths(recipe, path), path)] == [True, False]
+    (resumed,) = again(touches, tmp_path, TINY)
+    assert comparison(resumed, "3") == comparison(test, "3")
+    np.testing.assert_array_equal(resumed.estimates_n["plain", 0], test.estimates_n["plain", 0])
 
 
 def test_estimates_of_other_test_sets_raise(ran: tuple[Estimates, Path, list[str]], touches: Path) -> None:
     _, out, _ = ran
-    path = out / "plain-1.npy"
+    path = checkpoint_path(out, touches, TINY, "plain", 1).with_suffix(".npy")
     whole = path.read_bytes()
     np.save(path, np.zeros(3))
     try:
         with pytest.raises(DataError, match="but the test sets have"):
-            run(TINY, [BASELINE], touches, out, 1, no_progress)
+            again(touches, out, TINY)
     finally:
         path.write_bytes(whole)
 
 
 def test_missing_logs_raise(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"no logs in .*train"):
-        run(TINY, [BASELINE], tmp_path, tmp_path / "out", 1, no_progress)
+        again(tmp_path, tmp_path / "out", TINY)
 
 
 def test_missing_logs_of_the_protocol_are_counted(tmp_path: Path) -> None:
@@ -97,6 +150,21 @@ def test_errors_of_a_model(estimates: Estimates) -> None:
     by_set_n = estimates.mae_by_set_n(PROPOSED)
     assert by_set_n.mean() == pytest.approx(estimates.mae_n(PROPOSED).mean())
     assert len(by_set_n) == 8
+
+
+def test_models_are_compared_with_the_seeds_that_both_have(estimates: Estimates) -> None:
+    del estimates.estimates_n["plain", 2]
+    assert estimates.seeds_of(BASELINE) == [0, 1]
+    assert estimates.seeds_of(TWO_PLAIN) == [0]
+    assert estimates.seeds_of(PROPOSED) == [0, 1, 2]
+    assert len(estimates.mae_n(PROPOSED)) == 3
+    assert len(estimates.mae_n(PROPOSED, BASELINE)) == len(estimates.mae_n(BASELINE, PROPOSED)) == 2
+
+
+def test_one_network_is_no_ensemble_of_two(estimates: Estimates) -> None:
+    one = replace(estimates, scale=Scale(seeds=1))
+    assert one.seeds_of(TWO_PLAIN) == []
+    assert one.seeds_of(PROPOSED) == [0]
 
 
 def test_p_value_is_paired_by_test_set(estimates: Estimates) -> None:

@@ -1,0 +1,178 @@
+"""Gain of an object: its stiffness over that of its kind, learned from the motor current of earlier grasps.
+
+An image shows how far an object is compressed, not how stiff it is. So every visual estimate of one object is
+wrong by one factor, which is the ratio of the motor current's force to the visual force, apart from the errors of
+both. The error of friction differs from grasp to grasp and averages out. That of the torque constant does not:
+it is common to all grasps with one servo, and bounds what can be learned.
+
+The posterior of the gain's logarithm is that of a mixture of two normal priors, one for an object like those of
+its kind, one for an object of any stiffness (C. M. Bishop, "Pattern Recognition and Machine Learning", 2006,
+sections 2.3.3 and 2.3.9).
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+KIND_STD: Final = 0.029
+"""Standard deviation of the gain within a kind of object, +-5 % uniform. The network's claimed error includes it."""
+
+_ANY_STD: Final = 0.35
+_ANY_SHARE: Final = 0.1
+"""Standard deviation of the logarithm, and share, of objects of any stiffness: a factor of 2 is two deviations."""
+
+_LEAST_FRAMES: Final = 30
+_LEAST_FORCE_N: Final = 0.3
+"""Least number of frames of a hold, and least mean force in them, that say something about the gain."""
+
+_GATE: Final = 3.29
+"""Deviations beyond which a ratio is implausible (0.1 % of good ones), or is that of another object."""
+
+_REPEAT_STD: Final = 0.03
+"""Standard deviation of the ratio between grasps of one object in different places, beyond the claimed errors."""
+
+
+@dataclass(frozen=True, slots=True)
+class GainEstimate:
+    """Posterior of an object's gain.
+
+    Attributes:
+        gain: Factor on visual estimates.
+        std: Its relative standard deviation.
+        shared_std: Part of it that comes from the torque constant, so that motor current has the same error.
+    """
+
+    gain: float
+    std: float
+    shared_std: float
+
+    def corrected(self, force_n: float, std_n: float) -> tuple[float, float]:
+        """Returns a visual estimate and its claimed error with this gain."""
+        force_n *= self.gain
+        variance_n2 = (self.gain * std_n) ** 2 + force_n**2 * (self.std**2 - KIND_STD**2)
+        # Frames and places differ, whatever is known about the gain.
+        return force_n, math.sqrt(max(variance_n2, (0.5 * self.gain * std_n) ** 2))
+
+
+class ObjectGain:
+    """The gain of one object, from one ratio per grasp.
+
+    Args:
+        torque_std: Relative standard deviation of the torque constant.
+        known: Ratio of earlier grasps, and its relative standard deviation without that of the torque constant;
+            None without any.
+    """
+
+    def __init__(self, torque_std: float, known: tuple[float, float] | None = None) -> None:
+        self._torque_n2 = torque_std**2
+        self.reset()
+        if known is not None:
+            self.add(*known)
+
+    def reset(self) -> None:
+        """Forgets everything: the next grasp is of another object."""
+        self._weight = self._weighted = 0.0
+        self._start_grasp()
+
+    def _start_grasp(self) -> None:
+        self._frames, self._current_n, self._visual_n, self._error_n2 = 0, 0.0, 0.0, 0.0
+
+    def observe(self, current_n: float, visual_n: float, error_n2: float) -> None:
+        """Adds a frame of a hold.
+
+        Args:
+            current_n: Current estimate.
+            visual_n: Visual estimate without a gain.
+            error_n2: Variance of both together that is constant in a grasp, without torque constant and gain.
+        """
+        if math.isfinite(current_n + visual_n + error_n2):
+            self._frames += 1
+            self._current_n += current_n
+            self._visual_n += visual_n
+            self._error_n2 += error_n2
+
+    def finish_grasp(self, *, counts: bool) -> str:
+        """Ends the present grasp. Returns a sentence if it was of another object than the earlier ones.
+
+        Args:
+            counts: False if the grasp does not count, because no object was held to its end.
+        """
+        measured = self._measured() if counts else None
+        self._start_grasp()
+        if measured is None:
+            return ""
+        ratio, variance = measured
+        text = ""
+        if self._weight:
+            before = self._weighted / self._weight
+            if abs(ratio - before) > _GATE * math.sqrt(variance + 1 / self._weight):
+                text = (
+                    f"vision and motor current differ by a factor of {math.exp(ratio):.2f}, in the grasps before by "
+                    f"{math.exp(before):.2f}: another object, whose gain is learned anew"
+                )
+                self.reset()
+        self._add(ratio, variance)
+        return text
+
+    def add(self, ratio: float, std: float) -> None:
+        """Adds the ratio of earlier grasps, with its relative standard deviation as for ``known``."""
+        self._add(math.log(ratio), std**2)
+
+    def _add(self, ratio: float, variance: float) -> None:
+        self._weight += 1 / variance
+        self._weighted += ratio / variance
+
+    def _measured(self) -> tuple[float, float] | None:
+        """Returns logarithm and relative variance of the present grasp's ratio, or None."""
+        least_n = _LEAST_FORCE_N * self._frames
+        if self._frames < _LEAST_FRAMES or min(self._current_n, self._visual_n) < least_n:
+            return None
+        variance = self._error_n2 * self._frames / min(self._current_n, self._visual_n) ** 2
+        return math.log(self._current_n / self._visual_n), variance + _REPEAT_STD**2
+
+    @property
+    def ratio(self) -> tuple[float, float] | None:
+        """Ratio of the finished grasps and its relative standard deviation, as for ``known``; None without any."""
+        if not self._weight:
+            return None
+        return math.exp(self._weighted / self._weight), 1 / math.sqrt(self._weight)
+
+    def estimate(self, *, with_present: bool = False) -> GainEstimate | None:
+        """Returns the posterior after the finished grasps; None before the first.
+
+        Args:
+            with_present: Adds the present grasp.
+        """
+        weight, weighted = self._weight, self._weighted
+        if with_present and (measured := self._measured()) is not None:
+            weight, weighted = weight + 1 / measured[1], weighted + measured[0] / measured[1]
+        if not weight:
+            return None
+        ratio, variance = weighted / weight, self._torque_n2 + 1 / weight
+        parts = []
+        for share, prior in ((1 - _ANY_SHARE, KIND_STD**2), (_ANY_SHARE, _ANY_STD**2)):
+            total = prior + variance
+            density = share * math.exp(-0.5 * min(ratio**2 / total, 1400.0)) / math.sqrt(total)
+            parts.append((density, prior / total * ratio, prior * variance / total, prior / total))
+        densities = [part[0] for part in parts]
+        shares = [density / sum(densities) for density in densities]
+        mean = sum(share * part[1] for share, part in zip(shares, parts, strict=True))
+        spread = sum(
+            share * (part[2] + (part[1] - mean) ** 2) for share, part in zip(shares, parts, strict=True)
+        )
+        shared = self._torque_n2 * sum(share * part[3] for share, part in zip(shares, parts, strict=True))
+        return GainEstimate(math.exp(mean), math.sqrt(spread), math.sqrt(min(shared, spread)))
+
+    @property
+    def problem(self) -> str:
+        """Reason why the ratio is implausible for any object, or an empty text."""
+        if not self._weight:
+            return ""
+        ratio = self._weighted / self._weight
+        limit = _GATE * math.sqrt(_ANY_STD**2 + self._torque_n2 + 1 / self._weight)
+        if abs(ratio) <= limit:
+            return ""
+        return (
+            f"motor current was {math.exp(ratio):.2f} times the visual force in earlier grasps, outside "
+            f"{math.exp(-limit):.2f} to {math.exp(limit):.2f}: the network does not know this object"
+        )

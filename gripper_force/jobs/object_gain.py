@@ -1,0 +1,110 @@
+"""The gain of an object, from the logs of grasps, and its place in an object profile."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from gripper_force.config import config_from_text
+from gripper_force.control.object_gain import GainEstimate, ObjectGain
+from gripper_force.errors import DataError
+from gripper_force.profiles.object_profile import (
+    find_object,
+    read_object,
+    user_folder,
+    weights_path,
+    write_object,
+)
+from gripper_force.runtime.log_reader import LogReader
+from gripper_force.runtime.resolve import make_controller
+from gripper_force.types import Request, ServoState, VisualForce
+
+
+def learned_ratio(path: Path) -> tuple[float, float] | None:
+    """Runs the controller again on a log, and returns the ratio of its grasps; None if no grasp was held with vision.
+
+    Args:
+        path: Log of a run, which may hold several grasps. Its configuration may know a ratio of earlier grasps, which
+            is then part of the result.
+
+    Raises:
+        LogError: The log can't be read.
+        ConfigError: The log holds no run of a controller.
+    """
+    reader = LogReader(path)
+    controller = make_controller(config_from_text(reader.config, str(path)))
+    visual: VisualForce | None = None
+    request: Request | None = None
+    for record in reader.records(VisualForce, Request, ServoState):
+        if isinstance(record, VisualForce):
+            visual = record
+        elif isinstance(record, Request):
+            request = record
+        else:
+            controller.step(record.t_ns, record, visual, request)
+            visual = request = None
+    return controller.end_grasps()
+
+
+@dataclass(frozen=True, slots=True)
+class SavedGain:
+    """Gain of an object that was saved to a profile.
+
+    Attributes:
+        object: Name of the object.
+        object_gain: The gain: the object's stiffness over that of its kind.
+        object_gain_std: Its relative standard deviation.
+        ratio: Motor current over vision, the mean of the grasps.
+        ratio_std: Its relative standard deviation without that of the torque constant.
+        profile: The profile that was written.
+    """
+
+    object: str
+    object_gain: float
+    object_gain_std: float
+    ratio: float
+    ratio_std: float
+    profile: Path
+
+
+def save_gain(name: str, logs: Sequence[Path], out: Path | None = None) -> SavedGain:
+    """Adds the gain that grasps have shown to an object profile.
+
+    Args:
+        name: Object profile, by name or path.
+        logs: Logs of grasps of the object with the profile, in order of time. If a log began with what the one before
+            had learned, pass only the last one of them.
+        out: Profile to write; None: the one with this name in the user's folder of profiles.
+
+    Raises:
+        DataError: No log has a grasp that was held with vision, or the logs contradict each other.
+        ConfigError: The profile or its second file can't be read, or the new one can't be written.
+        LogError: A log can't be read.
+    """
+    source = find_object(name)
+    profile = read_object(source)
+    ratios = [ratio for path in logs if (ratio := learned_ratio(path)) is not None]
+    if not ratios:
+        raise DataError(
+            "no log holds a grasp that was held for half a second with visual estimates; grasp the object with "
+            "control.feedback=fused and control.learn_gain=true"
+        )
+    gain = ObjectGain(_torque_std(logs[-1]))
+    for ratio in ratios:
+        gain.add(*ratio)
+    total, estimate = gain.ratio, gain.estimate()
+    assert total is not None  # there was a ratio
+    assert estimate is not None
+    if gain.problem:
+        raise DataError(f"the gain is not saved: {gain.problem}")
+    target = out or user_folder() / f"{source.stem}.yaml"
+    write_object(target, profile.model_copy(update={"ratio": total}), weights_path(source).read_bytes())
+    return SavedGain(profile.object, estimate.gain, estimate.std, *total, target)
+
+
+def _torque_std(path: Path) -> float:
+    return config_from_text(LogReader(path).config, str(path)).gripper.gain_std
+
+
+def gain_of(ratio: tuple[float, float] | None, torque_std: float) -> GainEstimate | None:
+    """Returns the gain that follows from a ratio; None without one."""
+    return ObjectGain(torque_std, ratio).estimate()

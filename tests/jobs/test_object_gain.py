@@ -1,0 +1,45 @@
+from pathlib import Path
+
+import pytest
+
+from gripper_force.errors import DataError
+from gripper_force.jobs import object_gain
+from gripper_force.jobs.object_gain import gain_of, learned_ratio, save_gain
+from gripper_force.profiles.object_profile import find_object, read_object, weights_path
+from gripper_force.runtime.log_reader import LogReader
+from gripper_force.types import FusedForce
+
+
+def test_a_log_tells_what_its_grasp_has_shown(fused_log: Path) -> None:
+    ratio = learned_ratio(fused_log)
+    last = list(LogReader(fused_log).records(FusedForce))[-1]
+    if last.object_gain == 0:  # too few frames
+        assert ratio is None
+        return
+    found = gain_of(ratio, torque_std=0.06)
+    assert found is not None
+    assert found.gain == pytest.approx(last.object_gain)
+    assert found.std == pytest.approx(last.object_gain_std)
+
+
+def test_a_gain_is_saved_beside_the_correction(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    log = Path(__file__).parents[1] / "data"
+    monkeypatch.setattr(object_gain, "learned_ratio", lambda path: (1.6, 0.05))
+    monkeypatch.setattr(object_gain, "_torque_std", lambda path: 0.06)
+    saved = save_gain("sponge", [log, log], tmp_path / "mine.yaml")
+    assert saved.object_gain == pytest.approx(1.6, rel=0.03)
+    before, after = read_object(find_object("sponge")), read_object(tmp_path / "mine.yaml")
+    assert after.ratio == pytest.approx((1.6, 0.05 / 2**0.5))
+    assert after.model_copy(update={"ratio": None}) == before
+    assert weights_path(tmp_path / "mine.yaml").exists()
+
+
+@pytest.mark.parametrize(("ratio", "words"), [(None, "no log holds a grasp"), ((9.0, 0.05), "is not saved")])
+def test_nothing_is_saved_without_a_plausible_gain(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ratio: tuple[float, float] | None, words: str
+) -> None:
+    monkeypatch.setattr(object_gain, "learned_ratio", lambda path: ratio)
+    monkeypatch.setattr(object_gain, "_torque_std", lambda path: 0.06)
+    with pytest.raises(DataError, match=words):
+        save_gain("sponge", [tmp_path], tmp_path / "mine.yaml")
+    assert not list(tmp_path.iterdir())
