@@ -290,6 +290,7 @@ def checkpoints(
         bool, typer.Option("--write", help="Write the errors into the checkpoints; their digests stay.")
     ] = False,
     jobs: Jobs = CORES,
+    set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
     """Measure the errors of checkpoints on the same logs, so that `vision.checkpoint=auto` can compare them."""
@@ -299,6 +300,7 @@ def checkpoints(
     from gripper_force.jobs.training.stated_errors import state_errors
     from gripper_force.vision.preprocess import Preprocess
 
+    _reject_overrides("checkpoints", set_)
     logs = [path for folder in data for path in find_logs(folder)]
 
     def read(preprocess: Preprocess) -> Sequence[Clip]:

@@ -232,6 +232,7 @@ def gain(
     out: Annotated[
         Path | None, typer.Option(help="Profile to write. Default: NAME.yaml in your folder of profiles.")
     ] = None,
+    set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
     """Save the object's gain, learned from motor current in grasps with the profile, to an object profile."""
@@ -239,7 +240,7 @@ def gain(
     from gripper_force.jobs.object_gain import save_gain
 
     paths = [path for given in logs for path in (find_logs(given) if given.is_dir() else [given])]
-    console.show(save_gain(name, paths, out), as_json)
+    console.show(save_gain(name, paths, out, set_), as_json)
 
 
 def _tell_existing(settings: "Config", touches: int, folder: Path, fresh: bool) -> None:

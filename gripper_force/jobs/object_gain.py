@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from gripper_force.config import config_from_text
+from gripper_force.config import Overrides, config_from_text
 from gripper_force.control.object_gain import GainEstimate, ObjectGain
 from gripper_force.errors import DataError
 from gripper_force.profiles.object_profile import (
@@ -19,19 +19,20 @@ from gripper_force.runtime.resolve import make_controller
 from gripper_force.types import Request, ServoState, VisualForce
 
 
-def learned_ratio(path: Path) -> tuple[float, float] | None:
+def learned_ratio(path: Path, overrides: Overrides | None = None) -> tuple[float, float] | None:
     """Runs the controller again on a log, and returns the ratio of its grasps; None if no grasp was held with vision.
 
     Args:
         path: Log of a run, which may hold several grasps. Its configuration may know a ratio of earlier grasps, which
             is then part of the result.
+        overrides: Changes of the log's configuration, such as ``{"gripper.gain_std": 0.02}``.
 
     Raises:
         LogError: The log can't be read.
         ConfigError: The log holds no run of a controller.
     """
     reader = LogReader(path)
-    controller = make_controller(config_from_text(reader.config, str(path)))
+    controller = make_controller(config_from_text(reader.config, str(path), overrides))
     visual: VisualForce | None = None
     request: Request | None = None
     for record in reader.records(VisualForce, Request, ServoState):
@@ -66,7 +67,9 @@ class SavedGain:
     profile: Path
 
 
-def save_gain(name: str, logs: Sequence[Path], out: Path | None = None) -> SavedGain:
+def save_gain(
+    name: str, logs: Sequence[Path], out: Path | None = None, overrides: Overrides | None = None
+) -> SavedGain:
     """Adds the gain that grasps have shown to an object profile.
 
     Args:
@@ -74,6 +77,7 @@ def save_gain(name: str, logs: Sequence[Path], out: Path | None = None) -> Saved
         logs: Logs of grasps of the object with the profile, in order of time. If a log began with what the one before
             had learned, pass only the last one of them.
         out: Profile to write; None: the one with this name in the user's folder of profiles.
+        overrides: Changes of the logs' configuration; see `learned_ratio`.
 
     Raises:
         DataError: No log has a grasp that was held with vision, or the logs contradict each other.
@@ -82,13 +86,13 @@ def save_gain(name: str, logs: Sequence[Path], out: Path | None = None) -> Saved
     """
     source = find_object(name)
     profile = read_object(source)
-    ratios = [ratio for path in logs if (ratio := learned_ratio(path)) is not None]
+    ratios = [ratio for path in logs if (ratio := learned_ratio(path, overrides)) is not None]
     if not ratios:
         raise DataError(
             "no log holds a grasp that was held for half a second with visual estimates; grasp the object with "
             "control.feedback=fused and control.learn_gain=true"
         )
-    gain = ObjectGain(_torque_std(logs[-1]))
+    gain = ObjectGain(_torque_std(logs[-1], overrides))
     for ratio in ratios:
         gain.add(*ratio)
     total, estimate = gain.ratio, gain.estimate()
@@ -101,8 +105,8 @@ def save_gain(name: str, logs: Sequence[Path], out: Path | None = None) -> Saved
     return SavedGain(profile.object, estimate.gain, estimate.std, *total, target)
 
 
-def _torque_std(path: Path) -> float:
-    return config_from_text(LogReader(path).config, str(path)).gripper.gain_std
+def _torque_std(path: Path, overrides: Overrides | None) -> float:
+    return config_from_text(LogReader(path).config, str(path), overrides).gripper.gain_std
 
 
 def gain_of(ratio: tuple[float, float] | None, torque_std: float) -> GainEstimate | None:

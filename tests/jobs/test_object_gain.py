@@ -24,8 +24,8 @@ def test_a_log_tells_what_its_grasp_has_shown(fused_log: Path) -> None:
 
 def test_a_gain_is_saved_beside_the_correction(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     log = Path(__file__).parents[1] / "data"
-    monkeypatch.setattr(object_gain, "learned_ratio", lambda path: (1.6, 0.05))
-    monkeypatch.setattr(object_gain, "_torque_std", lambda path: 0.06)
+    monkeypatch.setattr(object_gain, "learned_ratio", lambda path, _: (1.6, 0.05))
+    monkeypatch.setattr(object_gain, "_torque_std", lambda path, _: 0.06)
     saved = save_gain("sponge", [log, log], tmp_path / "mine.yaml")
     assert saved.object_gain == pytest.approx(1.6, rel=0.03)
     before, after = read_object(find_object("sponge")), read_object(tmp_path / "mine.yaml")
@@ -38,8 +38,8 @@ def test_a_gain_is_saved_beside_the_correction(tmp_path: Path, monkeypatch: pyte
 def test_nothing_is_saved_without_a_plausible_gain(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ratio: tuple[float, float] | None, words: str
 ) -> None:
-    monkeypatch.setattr(object_gain, "learned_ratio", lambda path: ratio)
-    monkeypatch.setattr(object_gain, "_torque_std", lambda path: 0.06)
+    monkeypatch.setattr(object_gain, "learned_ratio", lambda path, _: ratio)
+    monkeypatch.setattr(object_gain, "_torque_std", lambda path, _: 0.06)
     with pytest.raises(DataError, match=words):
         save_gain("sponge", [tmp_path], tmp_path / "mine.yaml")
     assert not list(tmp_path.iterdir())
