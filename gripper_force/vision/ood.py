@@ -36,11 +36,17 @@ def residual_share(
         axes: Orthonormal basis of the subspace, (F, R).
         floor: Added to the squared distance from the mean: there is always noise.
     """
-    deviation = (features - mean).astype(np.float32)
-    total = np.square(deviation).sum(1, dtype=np.float64)
-    residual = total - np.square(deviation @ axes).sum(1, dtype=np.float64)
-    share: Floats = residual.clip(0) / (total + floor)
+    deviation = features.astype(np.float64) - mean
+    # The difference of the two squares would cancel: a known frame is within a thousandth of the subspace.
+    residual = np.square(deviation - (deviation @ axes) @ axes.T).sum(1)
+    share: Floats = residual / (np.square(deviation).sum(1) + floor)
     return share
+
+
+def orthonormal(axes: npt.NDArray[np.float16]) -> Floats:
+    """Returns an orthonormal basis, (F, R), of the subspace that stored axes span, (F, R)."""
+    basis: Floats = np.linalg.qr(axes.astype(np.float64))[0]
+    return basis
 
 
 class OodScore:
@@ -48,7 +54,7 @@ class OodScore:
 
     def __init__(self, model: OodModel) -> None:
         self._mean = np.frombuffer(model.mean, np.float32)
-        self._axes = np.frombuffer(model.axes, np.float16).reshape(len(self._mean), -1).astype(np.float32)
+        self._axes = orthonormal(np.frombuffer(model.axes, np.float16).reshape(len(self._mean), -1))
         self._floor = model.floor
         self._forces_n, self._typical, self._limit = np.array(
             [(limit.force_n, limit.typical, limit.limit) for limit in model.limits]
