@@ -209,12 +209,15 @@ def network(
     out: Annotated[Path, typer.Option("--out", help="Checkpoint to write; it may be the same file.")],
     checkpoint: Annotated[str, typer.Option(help="Path of a checkpoint, or default or small.")] = "default",
     jobs: Jobs = CORES,
+    set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
     """Fit a network's out-of-distribution score and claimed errors to logs of what it knows."""
     from gripper_force.jobs.dataset import find_logs
     from gripper_force.jobs.training.ood_fit import calibrate_network
 
+    if set_:
+        raise ConfigError(f"calibrate network uses no configuration; leave out --set {set_[0]}")
     logs = find_logs(data)
     with console.bar("calibrating", 2 * len(logs)) as progress:
         model = calibrate_network(logs, out, checkpoint, workers=jobs, progress=progress)

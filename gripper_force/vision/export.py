@@ -220,7 +220,7 @@ def _check(model: Model, path: Path, frames: Sequence[Gray] | None) -> ExportErr
 
 
 def with_added_error(header: Header, errors: ExportErrors) -> Header:
-    """Returns the header with larger claimed errors.
+    """Returns the header with larger claimed errors, and without a score, which the rounding would exceed.
 
     Args:
         header: Header of the checkpoint.
@@ -235,7 +235,7 @@ def with_added_error(header: Header, errors: ExportErrors) -> Header:
         name: math.hypot(value, added_n[name]) if name in added_n else value
         for name, value in header.metrics.items()
     }
-    return header.model_copy(update={"residuals": residuals, "metrics": metrics})
+    return header.model_copy(update={"residuals": residuals, "metrics": metrics, "ood": None})
 
 
 def _replace_header(header: Header, path: Path) -> None:

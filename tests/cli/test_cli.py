@@ -235,13 +235,14 @@ def test_replay_prints_one_json_object(run: Run, fused_log: Path) -> None:
 
 
 def write_recording(folder: Path) -> tuple[Path, Path]:
-    """A bright bar that widens with the force, and the forces."""
+    """A bright bar that widens with the force before a background, and the forces."""
     force_n = np.interp(np.arange(60), [0, 15, 30, 45, 50, 60], [0, 0, 20, 20, 0, 0])
     video, table = folder / "touch.avi", folder / "touch.csv"
     writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"MJPG"), 30.0, (64, 64))
+    background = np.random.default_rng(0).integers(20, 100, (16, 16, 3), np.uint8).repeat(4, 0).repeat(4, 1)
     for force in force_n:
-        image = np.full((64, 64, 3), 60, np.uint8)
-        image[:, : 20 + int(force)] = 200
+        image = background.copy()
+        image[:, : 20 + int(force / 4)] = 200
         writer.write(image)
     writer.release()
     rows = [f"{i},{i / 30:.6f},{force:.5f}" for i, force in enumerate(force_n)]

@@ -39,7 +39,8 @@ def ensemble(*attentions: str, reference: bool = True) -> Checkpoint:
 
 @pytest.fixture
 def frames() -> np.ndarray:
-    return np.random.default_rng(0).integers(0, 256, (30, 50, 60), np.uint8)
+    rng = np.random.default_rng(0)
+    return (rng.integers(20, 236, (50, 60)) + rng.integers(-19, 20, (30, 50, 60))).astype(np.uint8)
 
 
 def run(estimator: ForceEstimator, frames: np.ndarray) -> list[ForceEstimate | None]:
