@@ -154,7 +154,7 @@ class GraspController:
         self._goal_width_m = transmission.open_width_m
         self._motor_force_n = self._free_motor_force_n
         self._servo: ServoState | None = None
-        self._target_n = self._held_width_m = 0.0
+        self._target_n = self._held_width_m = self._settling_width_m = 0.0
         self._move_width_m = transmission.open_width_m
         self._move_time_s = 0.0
         self._move_opens = False
@@ -507,7 +507,12 @@ class GraspController:
         error_n = self._estimate.force_n - self._derated_target_n
         self._error_n += (error_n - self._error_n) * dt_s / (dt_s + _SETTLE_FILTER_S)
         is_near = abs(self._error_n) <= tolerance_n(self._derated_target_n)
-        self._settled_s = self._settled_s + dt_s if is_near and not self._is_unseen else 0.0
+        if self._settled_s == 0.0:
+            self._settling_width_m = width_m
+        # Jaws that come loose from friction close freely against viscous friction, which looks like a steady grip.
+        is_still = self._settling_width_m - width_m <= self._config.slip_width_m
+        is_settled = is_near and is_still and not self._is_unseen
+        self._settled_s = self._settled_s + dt_s if is_settled else 0.0
         if self._outcome == Outcome.NONE and self._settled_s >= self._config.settle_s:
             self._held_width_m = width_m
             self._set_outcome(Outcome.HELD, f"{self._estimate.force_n:.2f} N for {self._settled_s:.2f} s")
