@@ -43,7 +43,7 @@ _MAX_FRAMES: Final = 4000
 
 
 class _Seen(NamedTuple):
-    """What the networks make of the labelled frames of one log."""
+    """Estimates and features of the labelled frames of one log."""
 
     features: npt.NDArray[np.float32]  # (N, F)
     estimate_n: Floats  # (N,)
