@@ -81,7 +81,8 @@ class FrameChecks:
         roughness = float(np.abs(np.diff(pixels)).mean()) / contrast
         if self._first is None:
             self._first = brightness, contrast, roughness
-            self._begin(pixels)
+            if len(pixels) >= _LEAST_PX:
+                self._begin(pixels)
         for name, now, first, most in zip(
             ("brightness", "contrast", "roughness"),
             (brightness, contrast, roughness),
@@ -94,7 +95,7 @@ class FrameChecks:
                     f"the image's {name} changed from {first:.3g} to {now:.3g} since the first frame; check "
                     "the camera and the light"
                 )
-        for change, most, cause in self.changes(pixels):
+        for change, most, cause in self.changes(pixels) if len(pixels) >= _LEAST_PX else ():
             if change > most:
                 raise DataError(f"{cause} since the first frame; check the camera, its lens and the light")
 
@@ -152,6 +153,9 @@ class FrameChecks:
         # A direction that no texture shows stays at zero.
         self._prior = np.diag(np.array([side**2] * 3 + [1] * 4, np.float32) * len(self._directions) / 400)
 
+
+_LEAST_PX: Final = 64
+"""Side of the smallest image in which disturbances are looked for: the limits are half a pixel there."""
 
 _STILL: Final = 0.25
 """Least share of the image that must follow the fitted change. In presses it is 0.5 or more."""
