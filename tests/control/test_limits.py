@@ -138,6 +138,14 @@ def test_force_kept_up_by_friction_does_not_lower_the_current_further():
     assert out.goal_current_a == pytest.approx(0.95 * 0.2)
 
 
+@pytest.mark.parametrize(("current_limit_a", "holds"), [(0.1, True), (3.0, False)])
+def test_the_current_limit_is_told_from_other_limits(current_limit_a, holds):
+    limits = Limits(CONFIG, FINE, current_limit_a)
+    for _ in range(400):
+        limits.apply(ServoCommand(0, 0.0, 5.0), 1.0, 0.95, 6.0, 0.0, 0.005, may_rise=True)
+    assert limits.is_at_current_limit is holds
+
+
 def test_the_largest_target_leaves_room_below_the_limit():
     assert largest_target_n(10.0, 1.0) == pytest.approx(9.0)
     assert largest_target_n(14.0, 1.4) == pytest.approx(9.0)
