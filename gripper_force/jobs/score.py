@@ -158,7 +158,7 @@ def vision_in_hold(
         return None
     start_ns = _start_ns(_GRASP_PHASES, statuses, held_ns[-1])
     sources = {estimate.t_ns: estimate.source for estimate in estimates}
-    reasons = _drop_out_reasons(visuals, events)
+    reasons = drop_out_reasons(visuals, events)
     cycles = used = 0
     lost_s: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
     for status, after in pairwise([*statuses, statuses[-1]]):
@@ -175,8 +175,8 @@ def vision_in_hold(
     return HoldVision(used / cycles, sorted(losses, key=lambda loss: -loss.time_s))
 
 
-def _drop_out_reasons(visuals: Sequence[VisualForce], events: Sequence[Event]) -> list[tuple[int, str]]:
-    """Returns time and reason of each drop-out, in order of time."""
+def drop_out_reasons(visuals: Sequence[VisualForce], events: Sequence[Event]) -> list[tuple[int, str]]:
+    """Returns time and reason of each time at which vision dropped out, in order of time."""
     ready_ns = sorted(visual.ready_ns for visual in visuals)
     reasons, problem_ns, problem = [], 0, ""
     for event in sorted(events, key=lambda event: event.t_ns):

@@ -30,6 +30,12 @@ _KEPT: Final = 512
 _LEAD_S: Final = 0.3
 """Time shown before contact and after release."""
 
+ATTENTION_MAP: Final = "inferno"
+"""Matplotlib's name of the colours of the attention."""
+
+_KNOWN_S: Final = 0.05
+"""A force is known at a time if there is a value within this time of it."""
+
 _OPACITY: Final = 0.5
 _TOUCH_SHARE: Final = 0.05
 """Share of the largest force above which a recording without phases counts as in contact."""
@@ -43,10 +49,19 @@ Attention = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """One frame of a run, (S, S, 3) uint8, with the forces at that time (None: not known)."""
+    """One frame of a run.
+
+    Attributes:
+        t_s: Time of the frame.
+        image: The frame in gray, (S, S, 3) uint8.
+        overlay: The same with the network's attention; None without any.
+        vision_n: Visual estimate at that time; None if it is not known.
+        load_cell_n: Force of the load cell at that time; None if it is not known.
+    """
 
     t_s: float
     image: Colour
+    overlay: Colour | None
     vision_n: float | None
     load_cell_n: float | None
 
@@ -136,7 +151,7 @@ def _grip(run: Run) -> tuple[float, float]:
     if phases:
         return phases[0].start_s, phases[-1].end_s
     cell = run.forces.get("load_cell")
-    if cell is not None and (touched := cell.value_n > _TOUCH_SHARE * cell.value_n.max()).any():
+    if cell is not None and (touched := cell.value > _TOUCH_SHARE * cell.value.max()).any():
         return float(cell.t_s[touched][0]), float(cell.t_s[touched][-1])
     return run.begin_s, run.end_s
 
@@ -154,21 +169,24 @@ def _open_estimator(config: "Config", digest: str) -> "tuple[ForceEstimator | No
         return None, f"Attention is not shown: {error}."
     if checkpoint.digest != digest:
         return None, f"Attention is not shown: {config.vision.checkpoint!r} is not the run's checkpoint."
-    return open_estimator(checkpoint, config.vision), "Overlay: spatial attention, from dark to bright."
+    return open_estimator(
+        checkpoint, config.vision
+    ), "Second row: spatial attention over the same frames, each scaled to its own range."
 
 
 def _picture(frame: _Candidate, t_s: float, run: Run) -> Picture:
     attention = frame.attention if "vision" in run.forces else None
     gray = frame.gray
-    image = np.repeat(gray[:, :, None], 3, axis=2) if attention is None else overlay(gray, attention)
-    return Picture(t_s, image, _at(run, "vision", t_s), _at(run, "load_cell", t_s))
+    image = np.repeat(gray[:, :, None], 3, axis=2)
+    seen = None if attention is None else overlay(gray, attention)
+    return Picture(t_s, image, seen, _at(run, "vision", t_s), _at(run, "load_cell", t_s))
 
 
 def overlay(gray: Gray, attention: Attention) -> Colour:
     """Returns a frame, (S, S), in colour with attention over it, whose opacity follows the attention."""
     spread = cv2.resize(attention, gray.shape[::-1], interpolation=cv2.INTER_CUBIC).clip(0, 1)  # (S, S)
     spread = (spread - spread.min()) / max(float(np.ptp(spread)), 1e-6)
-    heat = colormaps["inferno"](spread)[:, :, :3] * 255  # (S, S, 3)
+    heat = colormaps[ATTENTION_MAP](spread)[:, :, :3] * 255  # (S, S, 3)
     weight = _OPACITY * spread[:, :, None]
     return np.asarray((1 - weight) * gray[:, :, None] + weight * heat, np.uint8)
 
@@ -177,7 +195,9 @@ def _at(run: Run, source: str, t_s: float) -> float | None:
     series = run.forces.get(source)
     if series is None or not series.t_s[0] <= t_s <= series.t_s[-1]:
         return None
-    return float(np.interp(t_s, series.t_s, series.value_n))
+    if np.abs(series.t_s - t_s).min() > _KNOWN_S:
+        return None
+    return float(np.interp(t_s, series.t_s, series.value))
 
 
 def _newtons(force_n: float) -> str:
