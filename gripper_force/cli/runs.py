@@ -123,8 +123,9 @@ def grasp(
             failure = end
     if results and not (as_json and isinstance(failure, GripperError)):
         summary = job.overall(results, settings.control.force_limit_n)
-        printed = {"trials": results, "summary": summary}
-        console.show(printed, as_json, lambda _: trials_table(results, summary))
+        figure = job.write_figure(settings, results, summary)
+        printed = {"trials": results, "summary": summary, "figure": figure}
+        console.show(printed, as_json, lambda _: trials_table(results, summary, figure))
     if failure is not None:
         raise failure
 

@@ -60,7 +60,7 @@ def _gain(r: "Summary") -> str:
     return f"{r['object_gain']:.2f} +- {100 * (r['object_gain_std'] or 0.0):.0f} %{true}"
 
 
-def trials_table(trials: "Sequence[Summary]", summary: "Overall") -> None:
+def trials_table(trials: "Sequence[Summary]", summary: "Overall", figure: str | None = None) -> None:
     """Prints the figures of each trial and over all trials."""
     names = ("object", "target N", "load cell N", "error %", "overshoot N", "settle s", "vision %", "gain")
     table = Table(*names, Column("result", no_wrap=True), box=None)
@@ -94,6 +94,8 @@ def trials_table(trials: "Sequence[Summary]", summary: "Overall") -> None:
     for name, e in summary["estimate_mae_n"].items():
         table.add_row(name, *(number(e[key]) for key in ("visual", "current", "fused", "floor")))
     out.print(table)
+    if figure is not None:
+        pairs({"figure": figure})
 
 
 def errors_table(r: "Evaluation") -> None:
