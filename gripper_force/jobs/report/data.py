@@ -8,10 +8,12 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from gripper_force.config import Config, config_from_text
+from gripper_force.config import Config, config_from_text, dump_config
 from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import CONTACT_N
+from gripper_force.jobs.replay import Replayed
 from gripper_force.jobs.score import (
+    NO_ESTIMATE,
     GraspScore,
     HoldVision,
     controls_with_vision,
@@ -39,6 +41,9 @@ from gripper_force.types import (
 )
 
 _GRIPPING: Final = (Phase.CONTACT, Phase.RAMP, Phase.HOLD)
+
+_CONTROLLER: Final = ("control", "vision")
+"""Units of the controller's events."""
 
 _LEAST_LOSS_S: Final = 0.05
 """Shorter times without vision are not marked."""
@@ -128,6 +133,7 @@ class Run:
         config: Configuration of the run.
         config_text: The same as YAML.
         metadata: Versions, digests and other facts.
+        replayed: True if estimates and decisions are those of an open-loop replay with changes.
         zero_ns: Log time of 0 s: the first grasp request, or the log's start.
         begin_s: Time of the first record.
         end_s: Time of the last record.
@@ -155,6 +161,7 @@ class Run:
     config: Config
     config_text: str
     metadata: dict[str, str]
+    replayed: bool
     zero_ns: int
     begin_s: float
     end_s: float
@@ -196,15 +203,24 @@ class Run:
             parts.append(self.outcome.replace("_", " "))
         if self.simulated:
             parts.append("simulated")
+        if self.replayed:
+            parts.append("replayed with changes, open loop")
         return " · ".join(parts)
 
 
-def read_run(log: LogReader, on_frame: Callable[[Frame], None] = lambda frame: None) -> Run:
+def read_run(
+    log: LogReader,
+    on_frame: Callable[[Frame], None] = lambda frame: None,
+    replayed: Replayed | None = None,
+    config: Config | None = None,
+) -> Run:
     """Reads a log in one pass.
 
     Args:
         log: Log of a run or of a recording.
         on_frame: Called with each frame while the log is read. Frames are not kept.
+        replayed: Estimates and decisions of a replay, which replace those of the log.
+        config: Configuration of that replay.
 
     Raises:
         LogError: The log can't be read.
@@ -229,6 +245,9 @@ def read_run(log: LogReader, on_frame: Callable[[Frame], None] = lambda frame: N
             on_frame(record)
         else:
             records[type(record)].append(record)
+    logged_status = records[GraspStatus]
+    if replayed is not None:
+        _replace(records, replayed)
     vision, fused, status = records[VisualForce], records[FusedForce], records[GraspStatus]
     requests = records[Request]
     grasps = [request for request in requests if request.kind == RequestKind.GRASP]
@@ -244,21 +263,23 @@ def read_run(log: LogReader, on_frame: Callable[[Frame], None] = lambda frame: N
     forces = {source: series for source, series in forces.items() if len(series.t_s)}
     # An empty log still needs a time axis.
     end_s = (log.start_ns + max(log.duration_ns, NS_PER_MS) - zero_ns) / NS_PER_S
-    config = config_from_text(log.config, str(log.path))
+    if config is None:
+        config = config_from_text(log.config, str(log.path))
     errors = _errors(forces)
     uses_vision = controls_with_vision(config)
     simulated_camera = config.camera.backend == "simulated"
     return Run(
         name=log.path.stem,
         config=config,
-        config_text=log.config,
+        config_text=log.config if replayed is None else dump_config(config),
         metadata=log.metadata,
+        replayed=replayed is not None,
         zero_ns=zero_ns,
         begin_s=(log.start_ns - zero_ns) / NS_PER_S,
         end_s=end_s,
         target_n=target_n,
         outcome=next((s.outcome for s in reversed(status) if s.outcome), ""),
-        score=_score(samples, status, target_n),
+        score=_score(samples, logged_status, target_n),
         vision=vision_in_hold(status, fused, vision, records[Event]) if uses_vision else None,
         object_gain=next(
             ((f.object_gain, f.object_gain_std) for f in reversed(fused) if f.object_gain), None
@@ -278,6 +299,18 @@ def read_run(log: LogReader, on_frame: Callable[[Frame], None] = lambda frame: N
         camera_age_ms=np.array([] if simulated_camera else ages_ns) / NS_PER_MS,
         latency_ms=np.array([] if simulated_camera else [v.ready_ns - v.t_ns for v in vision]) / NS_PER_MS,
     )
+
+
+def _replace(records: dict[type, list[Any]], replayed: Replayed) -> None:
+    """Replaces the estimates, decisions and events of a log by those of a replay."""
+    if replayed.visual:
+        records[VisualForce] = replayed.visual
+    if replayed.decisions:
+        records[FusedForce] = [decision.estimate for decision in replayed.decisions]
+        records[GraspStatus] = [decision.status for decision in replayed.decisions]
+        records[ServoCommand] = [decision.command for decision in replayed.decisions]
+        kept = [e for e in records[Event] if e.unit not in _CONTROLLER or e.text.startswith(NO_ESTIMATE)]
+        records[Event] = kept + [event for decision in replayed.decisions for event in decision.events]
 
 
 def histogram(values: Floats) -> tuple[Floats, Floats]:

@@ -45,7 +45,8 @@ def _palette(scheme: str) -> str:
 
 def _headline(run: Run) -> str:
     badge = f'<span class="badge {escape(run.outcome)}">{escape(run.outcome.replace("_", " "))}</span>'
-    origin = '<span class="badge simulated">simulated</span>' if run.simulated else ""
+    origins = {"simulated": run.simulated, "replayed with changes, open loop": run.replayed}
+    origin = "".join(f'<span class="badge origin">{text}</span>' for text, shown in origins.items() if shown)
     heading = f"<h1>{escape(run.object)} {badge if run.outcome else ''}{origin}</h1>"
     return heading + _shown(_cards(run))
 

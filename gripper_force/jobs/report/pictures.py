@@ -93,15 +93,17 @@ class FrameSampler:
 
     Args:
         log: The log. The run's checkpoint is loaded to compute the attention, if the log names one.
+        changed: Configuration of a replay, whose checkpoint is loaded instead; None for the log's own.
 
     Raises:
         ConfigError: The log holds a configuration that this version does not understand.
     """
 
-    def __init__(self, log: LogReader) -> None:
-        config = config_from_text(log.config, str(log.path))
+    def __init__(self, log: LogReader, changed: "Config | None" = None) -> None:
+        config = changed or config_from_text(log.config, str(log.path))
         self._region = config.vision.region
-        self._estimator, self._note = _open_estimator(config, log.metadata.get("checkpoint", ""))
+        used = log.metadata.get("checkpoint", "")
+        self._estimator, self._note = _open_estimator(config, used, any_checkpoint=changed is not None)
         self._kept: list[_Candidate] = []
         self._step = 1
         self._count = 0
@@ -156,8 +158,10 @@ def _grip(run: Run) -> tuple[float, float]:
     return run.begin_s, run.end_s
 
 
-def _open_estimator(config: "Config", digest: str) -> "tuple[ForceEstimator | None, str]":
-    if not digest:
+def _open_estimator(
+    config: "Config", digest: str, *, any_checkpoint: bool
+) -> "tuple[ForceEstimator | None, str]":
+    if not digest or config.vision.checkpoint == "none":
         return None, ""
     # Imported here: a recording without estimates needs no network, and these imports are slow.
     from gripper_force.vision.estimator import open_estimator
@@ -167,7 +171,7 @@ def _open_estimator(config: "Config", digest: str) -> "tuple[ForceEstimator | No
         checkpoint = read_model(config.vision.checkpoint)
     except CheckpointError as error:
         return None, f"Attention is not shown: {error}."
-    if checkpoint.digest != digest:
+    if checkpoint.digest != digest and not any_checkpoint:
         return None, f"Attention is not shown: {config.vision.checkpoint!r} is not the run's checkpoint."
     return open_estimator(
         checkpoint, config.vision
