@@ -45,7 +45,7 @@ _GRIPPING: Final = (Phase.CONTACT, Phase.RAMP, Phase.HOLD)
 _CONTROLLER: Final = ("control", "vision")
 """Units of the controller's events."""
 
-_LEAST_LOSS_S: Final = 0.05
+_LEAST_LOSS_S: Final = 0.1
 """Shorter times without vision are not marked."""
 
 _BETWEEN_TOUCHES_S: Final = 0.2
