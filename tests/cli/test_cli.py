@@ -142,7 +142,7 @@ def test_a_grasp_that_did_not_hold_has_an_exit_code(run: Run, sets: list[str]) -
 
 def test_trials_print_each_and_a_summary(run: Run, sets: list[str]) -> None:
     result = run("grasp", "--json", "--trials", 1, "--jobs", 1, *sets).json()
-    assert set(result) == {"trials", "summary"}
+    assert set(result) == {"trials", "summary", "figure"}
     (trial,) = result["trials"]
     assert set(trial) >= GRASP_KEYS
     assert trial["object"] == "sponge"
