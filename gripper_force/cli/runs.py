@@ -24,6 +24,12 @@ if TYPE_CHECKING:
     from gripper_force.interfaces import Progress, Prompt
     from gripper_force.jobs.checks import RegisterChange
 
+_OPEN_LOOP = (
+    "A replay is open loop: estimates and commands are computed again, but servo, camera and load cell keep what they "
+    "measured. A changed gain or limit shows other commands, not the force that would have followed; to see that, run "
+    "`gripper-force grasp` with it."
+)
+
 
 def grasp(
     config: ConfigPath = None,
@@ -175,18 +181,18 @@ def replay(
     if compare is not None:
         if checkpoint or report:
             raise ConfigError(
-                "--compare names its checkpoints itself, and writes no report; leave out the other"
+                "--compare names its checkpoints and writes no report; leave out --checkpoint and --report"
             )
-        both = []
         with console.bar("replaying", 2 * len(paths)) as progress:
-            for one in compare:
-                other, changes = _choice(one)
-                overrides = [*(set_ or []), *changes]
-                both.append(again(checkpoint=other, overrides=overrides, progress=progress))
-        differences = job.paired_differences(*both)
-        printed = {"logs": len(paths), "first": compare[0], "second": compare[1], "differences": differences}
-        console.show(printed, as_json, lambda _: differences_table(*compare, differences))
-        console.err.print(OPEN_LOOP, soft_wrap=True)
+            sides = [_choice(text) for text in compare]
+            first, second = (
+                again(checkpoint=other, overrides=[*(set_ or []), *changes], progress=progress)
+                for other, changes in sides
+            )
+        found = job.paired_differences(first, second)
+        printed = {"logs": len(paths), "first": compare[0], "second": compare[1], "differences": found}
+        console.show(printed, as_json, lambda _: differences_table(*compare, found))
+        console.err.print(_OPEN_LOOP, soft_wrap=True)
         return
     with console.bar("replaying", len(paths), hidden=len(paths) == 1) as progress:
         results = again(checkpoint=checkpoint, overrides=set_, progress=progress)
@@ -207,14 +213,7 @@ def replay(
         printed = {"logs": results, "summary": summary, **({"reports": pages} if pages else {})}
         console.show(printed, as_json, lambda _: replays_table(results, summary, pages))
     if set_ or checkpoint:
-        console.err.print(OPEN_LOOP, soft_wrap=True)
-
-
-OPEN_LOOP = (
-    "A replay is open loop: estimates and commands are computed again, but servo, camera and load cell keep what they "
-    "measured. A changed gain or limit shows other commands, not the force that would have followed; to see that, run "
-    "`gripper-force grasp` with it."
-)
+        console.err.print(_OPEN_LOOP, soft_wrap=True)
 
 
 def _choice(text: str) -> tuple[str | None, list[str]]:

@@ -435,7 +435,7 @@ def test_two_settings_are_compared(run: Run, fused_log: Path, tmp_path: Path, ti
     assert "95 % interval" in done.out
     assert "A replay is open loop" in done.err
     wrong = run("replay", tmp_path, "--compare", "log", "log", "--report")
-    assert (wrong.code, "--compare names its checkpoints itself" in wrong.err) == (2, True)
+    assert (wrong.code, "--compare names its checkpoints" in wrong.err) == (2, True)
 
 
 def interrupt(arguments: list[str], folder: Path) -> tuple[int, str]:

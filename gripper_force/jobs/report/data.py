@@ -154,7 +154,7 @@ class Run:
         event_rows: Requests, phases and events in order.
         compute_ms: Computing time of each estimate, (N,).
         camera_age_ms: Age of each frame when it was received, (N,); empty with a simulated camera.
-        latency_ms: Time from the middle of the exposure to the estimate, (N,); empty in simulated time.
+        latency_ms: Time from the middle of the exposure to the estimate, (N,); empty with a simulated camera.
     """
 
     name: str

@@ -23,7 +23,7 @@ _LINE: Final = "#8a9099"
 _GRID: Final = "#e3e6ea"
 _BANDS: Final = ("#eef1f5", "#f8f9fb")
 _LOST: Final = "#b3261e"
-_WIDTH: Final = "#7a5195"
+WIDTH_COLOURS: Final = {"light": "#7a5195", "dark": "#b794d6"}
 
 STYLE: Final[dict[Any, Any]] = {
     "font.size": 9.0,
@@ -51,7 +51,7 @@ CSS_COLOURS: Final = {
     _BANDS[0]: "var(--band0)",
     _BANDS[1]: "var(--band1)",
     _LOST: "var(--bad)",
-    _WIDTH: "var(--width)",
+    WIDTH_COLOURS["light"]: "var(--width)",
 }
 """Colours of the figure as variables of the page's style sheet, which change in dark mode."""
 
@@ -324,7 +324,7 @@ def _motor(axes: Axes, run: Run) -> None:
         right = axes.twinx()
         right.grid(visible=False)
         right.spines["right"].set_visible(True)
-        _curve(right, run.motor["width_mm"], color=_WIDTH, lw=1.0, label="width")
+        _curve(right, run.motor["width_mm"], color=WIDTH_COLOURS["light"], lw=1.0, label="width")
         right.set_ylabel("width, mm")
         right.set_ylim(0)
         more_lines, more_labels = right.get_legend_handles_labels()

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from gripper_force.jobs.report.data import SOURCES, Run
-from gripper_force.jobs.report.figure import Svg, thin
+from gripper_force.jobs.report.figure import WIDTH_COLOURS, Svg, thin
 
 _MAX_EVENT_ROWS: Final = 300
 
@@ -39,7 +39,7 @@ def render(run: Run, drawing: Svg, note: str) -> str:
 
 def _palette(scheme: str) -> str:
     colours = {source: getattr(style, scheme) for source, style in SOURCES.items()}
-    colours["width"] = {"light": "#7a5195", "dark": "#b794d6"}[scheme]
+    colours["width"] = WIDTH_COLOURS[scheme]
     return "".join(f"--{name}:{colour};" for name, colour in colours.items())
 
 
