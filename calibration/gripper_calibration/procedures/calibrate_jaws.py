@@ -243,7 +243,7 @@ class _EmptyJaws:
         self.state = state = devices.servo.read()
         if self._safety.check(state, self._goal_a, 1 / _RATE_HZ, over_force=False):
             raise DeviceError(f"stopped: {self._safety.reason}; remove the cause and start again")
-        self._goal_a = min(current_a, self._limits.ceiling_a(math.inf, self._middle_rad))
+        self._goal_a = min(current_a, self._limits.ceiling_a(0.0, self._middle_rad))
         command = ServoCommand(self._due_ns, state.position_rad + side, self._goal_a)
         speed_m_s = speed_share * self._config.control.approach_speed_m_s
         devices.servo.write(self._speed_limit.apply(command, state, speed_m_s))
@@ -263,7 +263,7 @@ class _EmptyJaws:
             if abs(self.state.position_rad - before_rad) < _END_RAD:
                 self._end_a /= _MORE
                 return before_rad
-            ceiling_a = self._limits.ceiling_a(math.inf, self._middle_rad)
+            ceiling_a = self._limits.ceiling_a(0.0, self._middle_rad)
             if self._end_a > ceiling_a:
                 raise DataError(
                     f"the jaws need more than {ceiling_a:.2f} A to move, the current at control.force_limit_n; check "
@@ -305,7 +305,7 @@ class _EmptyJaws:
     def _break_away(self, side: int) -> float:
         begin_rad, current_a = self.state.position_rad, 0.0
         step_a = self._current_a(_RISE_N_S) / _RATE_HZ
-        ceiling_a = self._limits.ceiling_a(math.inf, self._middle_rad)
+        ceiling_a = self._limits.ceiling_a(0.0, self._middle_rad)
         while side * (self.state.position_rad - begin_rad) < _MOVED_RAD:
             current_a += step_a
             if current_a > ceiling_a:
