@@ -31,7 +31,10 @@ _STILL_S: Final = 0.4
 """The jaws stand still if they move by less than this in this time."""
 
 _END_RAD: Final = 0.03
-"""Largest difference between two measurements of an end: pads are elastic."""
+"""Largest difference between two measurements of an end."""
+
+_GIVES_RAD: Final = 0.06
+"""Largest motion at an end under more current: pads and stops are elastic, and a linkage presses harder there."""
 
 _LEAST_TRAVEL_RAD: Final = 0.2
 _MOST_TRAVEL_RAD: Final = 4 * math.pi
@@ -260,7 +263,7 @@ class _EmptyJaws:
         while True:
             before_rad, self._end_a = self.state.position_rad, self._end_a * _MORE
             self._run_to_standstill(side)
-            if abs(self.state.position_rad - before_rad) < _END_RAD:
+            if abs(self.state.position_rad - before_rad) < _GIVES_RAD:
                 self._end_a /= _MORE
                 return before_rad
             ceiling_a = self._limits.ceiling_a(0.0, self._middle_rad)

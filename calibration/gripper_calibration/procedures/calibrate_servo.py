@@ -528,7 +528,8 @@ class _Jaws:
         if self.force_n < _LEAST_SHARE * peak_n:
             raise DataError(
                 f"{current_a:.2f} A give {self.force_n:.1f} N instead of {peak_n:.1f} N; check that the load "
-                "cell lies in the path of the force, its scale, and servo.current_limit_a"
+                "cell lies in the path of the force, its scale, and servo.current_limit_a; if the servo is that weak, "
+                "lower control.force_limit_n"
             )
 
     def back_off(self, contact_rad: float) -> None:

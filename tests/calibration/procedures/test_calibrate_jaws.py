@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,6 +14,7 @@ from gripper_calibration.procedures import calibrate_jaws as procedure
 from gripper_calibration.procedures.calibrate_jaws import JawsResult, calibrate_jaws
 from gripper_force.cli import app
 from gripper_force.config import Config, load_config
+from gripper_force.control.linkage import make_linkage
 from gripper_force.errors import DataError, DeviceError
 from gripper_force.types import ServoState
 from gripper_hw.dynamixel.servo import DynamixelServo
@@ -21,6 +23,7 @@ from gripper_hw.sim import simulated_rig
 from gripper_hw.sim.scene import Scene, draw_scene
 
 # The simulated jaws stop 1 mm before they meet, and 4 mm beyond the nominal open position.
+GRIPPERS = Path(__file__).parents[3] / "examples" / "grippers"
 OPEN_END_RAD = -0.004 / 0.020
 CLOSED_END_RAD = (0.046 - 0.001) / 0.020
 
@@ -51,6 +54,17 @@ def test_ends_direction_and_friction_are_found_with_any_configuration(overrides:
     for breakaway_n, running_n in zip(result.breakaway_n, result.running_n, strict=True):
         assert running_n < breakaway_n < 1.5 * running_n
     assert result.open_width_m == pytest.approx(0.100, abs=0.003)
+
+
+@pytest.mark.parametrize("path", sorted(GRIPPERS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_every_ready_gripper_is_homed(path: Path) -> None:
+    config = load_config(path, ["object=none", "sim.detail=coarse", "seed=5"])
+    result = calibrate_jaws(config, prompt=lambda text: None)
+    assert result.closing_sign == config.gripper.closing_sign
+    spare_m = result.open_width_m - config.gripper.open_width_m  # a rack opens by 4 mm of each jaw more
+    assert -0.0005 < spare_m < 0.009
+    open_rad = make_linkage(config.gripper).closing_rad(result.open_width_m)
+    assert result.open_position_rad == pytest.approx(open_rad, abs=0.07)
 
 
 def test_its_proposal_makes_a_grasp_possible() -> None:
