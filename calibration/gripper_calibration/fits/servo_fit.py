@@ -267,7 +267,7 @@ def _fit_travel(
     if len(passes) < MIN_PASSES:
         raise DataError(
             f"the jaws travelled freely only {len(passes)} times, and {MIN_PASSES} are needed; use a thinner gauge, "
-            "because about one radian of free travel is needed, and remove everything else from their way"
+            "and remove everything else from their way"
         )
     rows, clusters = [], []
     for number, one in enumerate(passes):

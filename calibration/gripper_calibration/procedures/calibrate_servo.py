@@ -10,7 +10,7 @@ from typing import Final, NoReturn
 
 import numpy as np
 
-from gripper_calibration.fits.servo_fit import FreePass, Nominal, ServoFit, ServoPress, fit_servo
+from gripper_calibration.fits.servo_fit import MIN_PASSES, FreePass, Nominal, ServoFit, ServoPress, fit_servo
 from gripper_calibration.plots.servo_plot import draw
 from gripper_force.config import Config, GripperConfig
 from gripper_force.control.limits import Limits, largest_target_n
@@ -35,7 +35,10 @@ PRESSES: Final = ((3.0, 1.0), (6.0, 1.0), (12.0, 1.0), (3.0, 0.6), (6.0, 0.8), (
 """Rate in N/s and share of the largest force of each press. Several rates separate lag from friction."""
 
 SPEEDS_M_S: Final = (0.012, 0.020, 0.028, 0.036, 0.044, 0.052)
-"""Target speeds of one jaw in free travel."""
+"""Target speeds of one jaw in free travel. They are proportionally lower if a pass at the last one is too short."""
+
+_PASS_S: Final = 0.3
+"""Least time of a pass, with its acceleration."""
 
 _RATE_HZ: Final = 200.0
 _PEAK_SHARE: Final = 1.05
@@ -57,7 +60,7 @@ _CLEARANCE_M: Final = 0.005
 _LEAST_TRAVEL_M: Final = 0.001
 """Jaws that closed by less than this did not move."""
 _BRAKE_RAD: Final = 0.3
-"""Distance from the goal at which the servo's own position control takes over."""
+"""Distance from the goal at which the servo's own position control takes over, and at most a fifth of the pass."""
 _SPEED_UP_S: Final = 0.1
 _START_FACTOR: Final = 1.6
 _MIN_SPEED_RAD_S: Final = 0.15
@@ -253,6 +256,8 @@ def measure(
         n_per_a = (config.gripper.nm_per_a or 0.0) / (2 * _reference_m_per_rad(config.gripper))
         friction_n = n_per_a * float(np.median([_friction_a(press) for press in presses]))
         passes = [one for speed in SPEEDS_M_S for one in jaws.travel(friction_n, speed, contact_rad)]
+        if len(passes) < MIN_PASSES:  # some were too short, or the jaws stuck
+            passes += [one for speed in SPEEDS_M_S for one in jaws.travel(friction_n, speed, contact_rad)]
     return presses, passes
 
 
@@ -337,6 +342,7 @@ class _Jaws:
         self._limits = Limits(config.control, self._nominal, config.servo.current_limit_a)
         self._speed_limit = SpeedLimit(self._nominal, position_loop(gripper))
         self._free_friction_n = 0.0  # measured while the jaws close on the gauge
+        self._clearance_m = _CLEARANCE_M  # at most a tenth of the free travel
         self._full_a: float | None = None  # current at the peak of the first press
         self._max_age_s = 0.0  # of the newest force sample
         self._period_ns = round(NS_PER_S / _RATE_HZ)
@@ -441,6 +447,8 @@ class _Jaws:
             self.cycle(goal_rad, self._moving_current_a())
         if self._free_friction_n == 0.0:
             self._free_friction_n = self._friction_n(self._states[first:])
+            free_m = (self.closing_rad - start_rad) * self._jaw_m_per_rad
+            self._clearance_m = min(_CLEARANCE_M, free_m / 10)
         width_m = self._nominal.width_m(self.state.position_rad)
         if abs(width_m - gauge_m) > 0.25 * self._nominal.open_width_m:
             raise DataError(
@@ -537,14 +545,16 @@ class _Jaws:
         self._move_to(self._clear_of(contact_rad))
 
     def _clear_of(self, contact_rad: float) -> float:
-        return contact_rad - 2 * _CLEARANCE_M / self._jaw_m_per_rad
+        return contact_rad - 2 * self._clearance_m / self._jaw_m_per_rad
 
     def travel(self, friction_n: float, speed_m_s: float, contact_rad: float) -> list[FreePass]:
         """Opens and closes under a constant motor force. A pass in which the jaws stick is left out."""
         nominal = self._nominal
-        motor_force_n = friction_n + nominal.damping_n_s_m * speed_m_s
-        clear_rad = _CLEARANCE_M / self._jaw_m_per_rad
+        clear_rad = self._clearance_m / self._jaw_m_per_rad
         ends = (self._sign * nominal.open_position_rad + clear_rad, contact_rad - clear_rad)
+        length_m = (ends[1] - ends[0]) * self._jaw_m_per_rad
+        speed_m_s *= min(length_m / (_PASS_S * SPEEDS_M_S[-1]), 1.0)
+        motor_force_n = friction_n + nominal.damping_n_s_m * speed_m_s
         passes = []
         for side, end_rad in ((-1, ends[0]), (1, ends[1])):
             if (one := self._pass(side, end_rad, motor_force_n, 2 * speed_m_s)) is not None:
@@ -553,6 +563,7 @@ class _Jaws:
 
     def _pass(self, side: int, end_rad: float, motor_force_n: float, limit_m_s: float) -> FreePass | None:
         """One pass, without its acceleration; None if the jaws stuck."""
+        brake_rad = min(_BRAKE_RAD, abs(end_rad - self.closing_rad) / 5)
         for _ in range(round(_MAX_PASS_S * _RATE_HZ)):
             if side * self._sign * self.state.velocity_rad_s > _MIN_SPEED_RAD_S:
                 break
@@ -560,7 +571,7 @@ class _Jaws:
         first = len(self._states) + round(_SPEED_UP_S * _RATE_HZ)
         for _ in range(round(_MAX_PASS_S * _RATE_HZ)):
             self.cycle(end_rad, self._whole_steps_a(motor_force_n), limit_m_s)
-            if side * (end_rad - self.closing_rad) < _BRAKE_RAD:
+            if side * (end_rad - self.closing_rad) < brake_rad:
                 break
         states = self._states[first:]
         self._move_to(end_rad)

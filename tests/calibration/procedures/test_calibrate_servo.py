@@ -24,6 +24,7 @@ from gripper_hw.load_cells.screening import SampleValidator
 from gripper_hw.sim.scene import draw_scene
 from gripper_hw.sim.simulated_rig import SimulatedLoadCell
 
+GRIPPERS = Path(__file__).parents[3] / "examples" / "grippers"
 QUICK = ["object=block", "sim.detail=coarse", "seed=7"]
 
 MADE_UP = LoadCellCalibration(
@@ -74,6 +75,16 @@ def test_torque_and_friction_of_the_scene_are_found(rig: Path) -> None:
     assert found.force_n[0] < 1
     assert 9 < found.force_n[1] < 10
     assert load_config(None, [f"calibration.rig={rig}"]).gripper.nm_per_a == found.nm_per_a.value
+
+
+@pytest.mark.parametrize("name", ["rotary_finger", "four_bar"])
+def test_torque_is_found_through_a_linkage_with_little_free_travel(name: str, tmp_path: Path) -> None:
+    config = load_config(GRIPPERS / f"{name}.yaml", QUICK)
+    calibrate_servo(config, [0.03], tmp_path / "rig.yaml", prompt=lambda text: None)
+    found = read_rig(tmp_path / "rig.yaml").servo
+    assert found is not None
+    scene = draw_scene("block", config.seed, config.sim)
+    assert about(found.nm_per_a, load_model(found.model).nm_per_a * scene.nm_per_a, 0.02)
 
 
 def test_target_above_the_calibrated_force_is_refused(rig: Path, tmp_path: Path) -> None:
