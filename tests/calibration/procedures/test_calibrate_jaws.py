@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -19,8 +18,7 @@ from gripper_force.errors import DataError, DeviceError
 from gripper_force.types import ServoState
 from gripper_hw.dynamixel.servo import DynamixelServo
 from gripper_hw.dynamixel.virtual import VirtualBus, find_bus
-from gripper_hw.sim import simulated_rig
-from gripper_hw.sim.scene import Scene, draw_scene
+from gripper_hw.sim.scene import draw_scene
 
 # The simulated jaws stop 1 mm before they meet, and 4 mm beyond the nominal open position.
 GRIPPERS = Path(__file__).parents[3] / "examples" / "grippers"
@@ -77,15 +75,17 @@ def test_its_proposal_makes_a_grasp_possible() -> None:
         assert gripper.grasp(3.0).outcome == "held"
 
 
-def test_friction_beyond_the_configured_one_is_overcome(monkeypatch: pytest.MonkeyPatch) -> None:
-    def rough(*arguments: Any) -> Scene:
-        scene = draw_scene(*arguments)
-        return replace(scene, servo_friction_nm=4 * scene.servo_friction_nm)
+@pytest.mark.parametrize("times", [3, 5])
+def test_friction_beyond_the_configured_one_is_overcome(times: int) -> None:
+    result = home("seed=3", f"sim.friction={times}")
+    assert result.friction_n == pytest.approx(0.95 * times, rel=0.15)
+    # The simulated stops give by 2 mm under the current that this friction needs.
+    assert result.closed_end_rad == pytest.approx(CLOSED_END_RAD, abs=0.1)
 
-    monkeypatch.setattr(simulated_rig, "draw_scene", rough)
-    result = home("seed=3")
-    assert result.friction_n > 2.0
-    assert result.closed_end_rad == pytest.approx(CLOSED_END_RAD, abs=0.06)
+
+def test_jaws_that_nothing_moves_are_named() -> None:
+    with pytest.raises(DataError, match=r"the jaws move by 0\.00 rad only, .* with all the current"):
+        home("sim.friction=20")
 
 
 @pytest.mark.parametrize(
