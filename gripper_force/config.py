@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from pathlib import Path
-from typing import Any, Final, Literal, Self
+from typing import Any, ClassVar, Final, Literal, Self
 
 from pydantic import Field, PositiveInt, model_validator
 
@@ -320,6 +320,11 @@ class BudgetConfig(Section):
 
 class ControlConfig(Section):
     """Fusion, force loop, phases and limits."""
+
+    unknown_hint: ClassVar[str] = (
+        "The gains of the force loop are no keys: they follow from plant_gain, plant_lag_ms and plant_delay_ms, which "
+        "`gripper-force calibrate object` measures"
+    )
 
     rate_hz: Positive = Field(200.0, description="rate of the control loop")
     feedback: Literal["fused", "current", "vision"] = Field(
