@@ -365,8 +365,11 @@ class ControlConfig(Section):
         description="motor current over vision in earlier grasps of the object, and its relative standard deviation "
         "without that of the torque constant; None: from the object profile, or unknown",
     )
-    min_object_width_m: NonNegative = Field(
-        0.002, description="width below which closed jaws hold nothing; less than the thinnest object"
+    min_object_width_m: Finite = Field(
+        0.002,
+        ge=-0.01,
+        description="width by the servo's angle below which closed jaws hold nothing; gear play and soft pads make it "
+        "1 to 3 mm less than the object's; for paper negative, so that only the camera can tell it from nothing",
     )
     slip_width_m: Positive = Field(0.004, description="closing of the jaws during hold that counts as slip")
     on_slip: Literal["regrip", "hold", "open"] = Field(

@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gripper_force.cli import console
-from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, load_settings
+from gripper_force.cli.options import (
+    CORES,
+    AsJson,
+    ConfigPath,
+    Jobs,
+    Overrides,
+    load_settings,
+    load_settings_before_rig,
+)
 from gripper_force.cli.output.doctor import changes_table, checks_table, setup_line
 from gripper_force.cli.output.runs import (
     differences_table,
@@ -235,7 +243,11 @@ def doctor(
     """Check every device and this machine, and suggest fixes. Exit code 1 if there is a problem."""
     from gripper_force.jobs import doctor as job
 
-    settings = load_settings(config, set_, {})
+    settings, new_rig = load_settings_before_rig(config, set_, {})
+    if new_rig is not None:
+        console.err.print(
+            f"the rig profile {new_rig} does not exist yet, so its values are the defaults", soft_wrap=True
+        )
     if setup:
         result = job.setup(settings, lambda servo, changes: _confirmed(servo, changes, yes))
         console.show(result, as_json, setup_line)

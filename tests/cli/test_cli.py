@@ -596,3 +596,14 @@ def test_options_win_over_overrides() -> None:
     assert (config.seed, config.object) == (4, "tube")
     with pytest.raises(ConfigError, match="configuration key 'target_n'"):
         load_settings(None, None, {"target_n": -1.0})
+
+
+def test_commands_before_the_first_calibration_need_no_rig_profile(run: Run) -> None:
+    new = ("--set", "calibration.rig=rig.yaml", "--set", "object=none", "--set", "sim.detail=coarse")
+    assert "closing_sign: 1" in run("calibrate", "jaws", "--yes", *new).out
+    checked = run("doctor", *new, "--set", "camera.backend=none", "--set", "vision.checkpoint=none")
+    assert "the rig profile rig.yaml does not exist yet" in checked.err
+    assert "load cell" in checked.out
+    refused = run("grasp", *new)
+    assert refused.code == 2
+    assert "there is no rig profile rig.yaml yet; `calibrate load-cell`" in refused.err
