@@ -273,7 +273,7 @@ class _Run:
                 plant.contact_m, plant.deepest_m = _GONE_M, 0.0
                 self._leaves_ns = math.inf
             if self.t_ns >= self._returns_ns:  # at the jaws, if they have closed beyond its place
-                plant.contact_m = max(self._drawn.contact_m, plant.jaw_m)
+                plant.contact_m, plant.deepest_m = max(self._drawn.contact_m, plant.jaw_m), plant.jaw_m
                 self._returns_ns = math.inf
             servo = self.read(self.t_ns, servo_noise)
             seen_n = plant.force_n + self._drawn.motion_n * plant.x_m / _STOP_M
