@@ -65,8 +65,9 @@ motor would add to the force of a springy object."""
 
 _OPENS_SHARE = 0.5
 _PUSH_N_S = 5.0
-"""Jaws whose release is slower than this share of the approach speed get more motor force at this rate, up to the
-force limit: their friction may be larger than configured."""
+_PUSH_SHARE = 3.0
+"""Jaws whose release is slower than this share of the approach speed get more motor force at this rate, up to this
+multiple of that of free travel: their friction may be larger than configured."""
 
 _SEEN_FILTER_S = 0.1
 _UNSEEN_SHARE = 0.15
@@ -550,15 +551,15 @@ class GraspController:
         if self._outcome in (Outcome.NONE, Outcome.HELD):
             self._set_outcome(Outcome.SLIP, reason)
         match self._config.on_slip:
-            case "open":
-                self._start_release(reason)
             case "hold":
                 self._start_travel()
                 self._move_width_m, self._move_opens = width_m, False
                 self._enter(Phase.MOVE, reason)
-            case "regrip":
+            case "regrip" if width_m >= self._config.min_object_width_m:
                 self._approach.start(width_m, self._target_n)
                 self._enter(Phase.APPROACH, reason)
+            case _:
+                self._start_release(reason)
 
     @property
     def _travel_force_n(self) -> float:
@@ -569,7 +570,7 @@ class GraspController:
     def _run_release(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
         is_slow = -closing_m_s < _OPENS_SHARE * self._config.approach_speed_m_s
         if is_slow and self._phase_s > 2 * ACCELERATION_S:
-            self._push_n = min(self._push_n + _PUSH_N_S * dt_s, self._config.force_limit_n)
+            self._push_n = min(self._push_n + _PUSH_N_S * dt_s, _PUSH_SHARE * self._free_motor_force_n)
         self._motor_force_n = self._travel_force_n + self._push_n
         open_width_m = self._transmission.open_width_m
         self._goal_width_m = self._travel.step(open_width_m, dt_s)

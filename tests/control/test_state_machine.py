@@ -373,6 +373,22 @@ def test_jaws_that_lose_their_object_are_not_faster_than_an_approach(make_run, o
     assert fastest_m_s <= 1.4 * run.config.approach_speed_m_s
 
 
+def test_soft_object_that_is_pressed_flat_is_let_go_slowly(make_run):
+    plant = {"stiffness_n_m": 875.0, "contact_m": 0.036, "friction_n": 0.35}
+    run = make_run(plant=plant, feedback="current").grasp(7.8, 6.0)
+    assert run.last.status.outcome == "no_object"
+    opening_m_s = []
+    run = make_run(plant=plant | {"contact_m": 0.026}, feedback="current").grasp(7.8, 4.0)
+    run.plant.contact_m = 1.0
+    run.go(0.1)
+    run.plant.contact_m = 0.036
+    for _ in range(600):
+        run.go(0.005)
+        opening_m_s.append(-run.plant.v_m_s)
+    assert run.last.status.outcome == "slip"
+    assert max(opening_m_s) <= 1.5 * 2 * run.config.approach_speed_m_s
+
+
 @pytest.mark.parametrize("phase", ["open", "approach", "release", "move"])
 def test_grasp_pre_empts(make_run, phase):
     run = make_run().to_phase(phase).grasp(2.0)
