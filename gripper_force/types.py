@@ -1,8 +1,8 @@
 """Frozen records exchanged between the parts of the project, in SI units, with the unit in the name.
 
 Time is the host's monotonic clock in integer nanoseconds (``t_ns``); in lockstep it is the simulated clock.
-Every record but `Frame` is written to a log field by field (see `gripper_force.runtime.log_codecs`), so a field's
-type is ``int``, ``float``, ``bool`` or ``str``.
+Images are logged as ``foxglove.RawImage``, all other records field by field (see `gripper_force.runtime.log_codecs`),
+so the type of their fields is ``int``, ``float``, ``bool`` or ``str``.
 """
 
 from dataclasses import dataclass
@@ -110,6 +110,23 @@ class Frame:
         received_ns: Host time at which the frame became available.
         seq: Frame number of the camera; a gap is a lost frame.
         gray: Image, (H, W) uint8.
+    """
+
+    t_ns: int
+    received_ns: int
+    seq: int
+    gray: Gray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AttentionMap:
+    """Spatial attention of the network over one frame.
+
+    Attributes:
+        t_ns: Capture time of the frame.
+        received_ns: Host time at which the map became available.
+        seq: Number of the frame.
+        gray: Attention over the region of interest, (h, w) uint8: 0 where it is least, 255 where it is most.
     """
 
     t_ns: int
@@ -257,6 +274,7 @@ Record = (
     ServoState
     | ServoCommand
     | Frame
+    | AttentionMap
     | LoadCellSample
     | VisualForce
     | FusedForce

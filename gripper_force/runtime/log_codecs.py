@@ -1,17 +1,20 @@
 """Encoding of the records of a log: protobuf messages, with one topic per record type.
 
 The schemas are made from the dataclasses of `gripper_force.types` when this module is imported, so records and
-schemas always agree and there are no generated files. Images are ``foxglove.RawImage``. Foxglove and Rerun show
-every topic without knowing this project.
+schemas always agree and there are no generated files. Images are ``foxglove.RawImage`` and events ``foxglove.Log``.
+A message's publish time is on the clock of the records; its log time is the same time in UTC (see `UTC_NAME`).
+Foxglove and Rerun show every topic without knowing this project.
 """
 
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from operator import attrgetter
 from typing import Any, Final, get_args, get_type_hints
 
 import numpy as np
+from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf import timestamp_pb2
 from google.protobuf.descriptor import FileDescriptor
@@ -21,10 +24,18 @@ from google.protobuf.message import Message
 from google.protobuf.message_factory import GetMessageClass
 from mcap.records import Message as McapMessage
 
-from gripper_force.types import NS_PER_S, Frame, Record
+from gripper_force.types import NS_PER_S, AttentionMap, Event, Frame, Record
 
 CONFIG_NAME: Final = "config.yaml"
 METADATA_NAME: Final = "gripper_force"
+UTC_NAME: Final = "utc_offset_ns"
+"""Key of the metadata: UTC less the clock of the records, in nanoseconds; missing if that clock is simulated."""
+
+INTERVAL_STD: Final = 1.645
+"""Half-width of the 90 % interval of a normal distribution, in standard deviations."""
+
+_LOW, _HIGH = 101, 102
+"""Numbers of the fields with the ends of the claimed interval, which a viewer can't compute."""
 
 _FIELD_TYPES: Final = {
     int: FieldDescriptorProto.TYPE_INT64,
@@ -36,20 +47,25 @@ _FIELD_TYPES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Codec:
-    """Encoding of one record type."""
+    """Encoding of one record type; ``encode`` takes a record and UTC less its clock."""
 
+    record_type: type[Record]
     topic: str
     schema_name: str
     schema: bytes
-    encode: Callable[[Any], bytes]
-    decode: Callable[[Any], Record]
+    encode: Callable[[Any, int], bytes]
+    decode: Callable[[McapMessage], Record]
 
 
 def _message_class(record_type: type[Record]) -> type[Message]:
     name = record_type.__name__
     file = FileDescriptorProto(name=f"gripper_force/{name}.proto", package="gripper_force", syntax="proto3")
     message = file.message_type.add(name=name)
-    for number, (field, kind) in enumerate(get_type_hints(record_type).items(), start=1):
+    hints = get_type_hints(record_type)
+    fields = [(number, *hint) for number, hint in enumerate(hints.items(), start=1)]
+    if "std_n" in hints:
+        fields += [(_LOW, "low_n", float), (_HIGH, "high_n", float)]
+    for number, field, kind in fields:
         message.field.add(
             name=field, number=number, type=_FIELD_TYPES[kind], label=FieldDescriptorProto.LABEL_OPTIONAL
         )
@@ -70,8 +86,12 @@ def _record_codec(record_type: type[Record]) -> Codec:
     names = tuple(get_type_hints(record_type))
     values = attrgetter(*names)
 
-    def encode(record: Record) -> bytes:
-        data: bytes = message_class(**dict(zip(names, values(record), strict=True))).SerializeToString()
+    def encode(record: Any, utc_offset_ns: int) -> bytes:
+        message = message_class(**dict(zip(names, values(record), strict=True)))
+        if "std_n" in names:
+            half_n = INTERVAL_STD * record.std_n
+            message.low_n, message.high_n = record.force_n - half_n, record.force_n + half_n
+        data: bytes = message.SerializeToString()
         return data
 
     def decode(message: McapMessage) -> Record:
@@ -79,16 +99,34 @@ def _record_codec(record_type: type[Record]) -> Codec:
 
     topic = "/" + re.sub(r"(?<!^)(?=[A-Z])", "_", record_type.__name__).lower()
     descriptor = message_class.DESCRIPTOR
-    return Codec(topic, descriptor.full_name, _schema(descriptor.file), encode, decode)
+    return Codec(record_type, topic, descriptor.full_name, _schema(descriptor.file), encode, decode)
 
 
-def _encode_frame(frame: Frame) -> bytes:
+def _timestamp(t_ns: int) -> timestamp_pb2.Timestamp:
+    seconds, nanos = divmod(t_ns, NS_PER_S)
+    return timestamp_pb2.Timestamp(seconds=seconds, nanos=nanos)
+
+
+def _encode_event(event: Event, utc_offset_ns: int) -> bytes:
+    timestamp = _timestamp(event.t_ns + utc_offset_ns)
+    message = Log(timestamp=timestamp, level=Log.INFO, name=event.unit, message=event.text)
+    data: bytes = message.SerializeToString()
+    return data
+
+
+def _decode_event(message: McapMessage) -> Event:
+    if message.publish_time >= 2**63:
+        raise ValueError(f"an event came at {message.publish_time} ns")
+    log = Log.FromString(message.data)
+    return Event(message.publish_time, log.name, log.message)
+
+
+def _encode_image(frame: Frame | AttentionMap, utc_offset_ns: int) -> bytes:
     if frame.gray.ndim != 2 or frame.gray.dtype != np.uint8:
         raise ValueError(f"a frame is (H, W) uint8, not {frame.gray.shape} {frame.gray.dtype}")
     height, width = frame.gray.shape
-    seconds, nanos = divmod(frame.t_ns, NS_PER_S)
     message = RawImage(
-        timestamp=timestamp_pb2.Timestamp(seconds=seconds, nanos=nanos),
+        timestamp=_timestamp(frame.t_ns + utc_offset_ns),
         frame_id="camera",
         width=width,
         height=height,
@@ -100,7 +138,7 @@ def _encode_frame(frame: Frame) -> bytes:
     return data
 
 
-def _decode_frame(message: McapMessage) -> Frame:
+def _decode_image(record_type: type[Frame | AttentionMap], message: McapMessage) -> Record:
     image = RawImage.FromString(message.data)
     if image.encoding not in {"mono8", "8UC1"}:
         raise ValueError(f"an image is {image.encoding!r}, not mono8")
@@ -108,20 +146,37 @@ def _decode_frame(message: McapMessage) -> Frame:
         raise ValueError(f"an image has {image.width}x{image.height} pixels in rows of {image.step}")
     rows = np.frombuffer(image.data, np.uint8).reshape(image.height, image.step)
     gray = rows[:, : image.width].copy()  # a writable array of its own, as torch wants it  # (H, W)
-    t_ns = image.timestamp.seconds * NS_PER_S + image.timestamp.nanos
-    if not max(abs(t_ns), message.log_time) < 2**63:
-        raise ValueError(f"an image was taken at {t_ns} ns and came at {message.log_time} ns")
-    return Frame(t_ns, message.log_time, message.sequence, gray)
+    utc_offset_ns = message.log_time - message.publish_time
+    t_ns = image.timestamp.seconds * NS_PER_S + image.timestamp.nanos - utc_offset_ns
+    if not max(abs(t_ns), message.publish_time) < 2**63:
+        raise ValueError(f"an image was taken at {t_ns} ns and came at {message.publish_time} ns")
+    return record_type(t_ns, message.publish_time, message.sequence, gray)
 
 
-CODECS: Final[dict[type[Record], Codec]] = {
-    record_type: _record_codec(record_type) for record_type in get_args(Record) if record_type is not Frame
+def _image_codec(record_type: type[Frame | AttentionMap], topic: str) -> Codec:
+    schema = _schema(timestamp_pb2.DESCRIPTOR, RawImage.DESCRIPTOR.file)
+    decode = partial(_decode_image, record_type)
+    return Codec(record_type, topic, RawImage.DESCRIPTOR.full_name, schema, _encode_image, decode)
+
+
+_LOG_SCHEMA: Final = _schema(timestamp_pb2.DESCRIPTOR, Log.DESCRIPTOR.file)
+_OWN: Final = {
+    record_type: _record_codec(record_type)
+    for record_type in get_args(Record)
+    if record_type not in (Frame, AttentionMap)
 }
-CODECS[Frame] = Codec(
-    "/frame",
-    RawImage.DESCRIPTOR.full_name,
-    _schema(timestamp_pb2.DESCRIPTOR, RawImage.DESCRIPTOR.file),
-    _encode_frame,
-    _decode_frame,
-)
-TYPE_OF_TOPIC: Final = {codec.topic: record_type for record_type, codec in CODECS.items()}
+CODECS: Final[dict[type[Record], Codec]] = {
+    **_OWN,
+    Frame: _image_codec(Frame, "/frame"),
+    AttentionMap: _image_codec(AttentionMap, "/attention_map"),
+    Event: Codec(Event, "/log", Log.DESCRIPTOR.full_name, _LOG_SCHEMA, _encode_event, _decode_event),
+}
+CODEC_OF_TOPIC: Final = {codec.topic: codec for codec in (*_OWN.values(), *CODECS.values())}
+"""Codecs of logs of this version and of older ones, whose events have a schema of their own."""
+
+
+def own_fields(schema: bytes) -> list[tuple[str, int, int]]:
+    """Returns name, number and type of the fields that hold a record, without those for viewers."""
+    files = FileDescriptorSet.FromString(schema).file
+    fields = (field for file in files for message in file.message_type for field in message.field)
+    return [(field.name, field.number, field.type) for field in fields if field.number < _LOW]

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, BinaryIO, Final, TypeVar, overload
 
 import zstandard
-from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import DecodeError
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
@@ -20,8 +19,16 @@ from mcap.records import Message as McapMessage
 from mcap.stream_reader import breakup_chunk
 
 from gripper_force.errors import LogError
-from gripper_force.runtime.log_codecs import CODECS, CONFIG_NAME, METADATA_NAME, TYPE_OF_TOPIC, Codec
-from gripper_force.types import NS_PER_S, Frame, Record
+from gripper_force.runtime.log_codecs import (
+    CODEC_OF_TOPIC,
+    CODECS,
+    CONFIG_NAME,
+    METADATA_NAME,
+    UTC_NAME,
+    Codec,
+    own_fields,
+)
+from gripper_force.types import NS_PER_S, Record
 
 _MAGIC: Final = b"\x89MCAP0\r\n"
 _FRAMING: Final = struct.Struct("<BQ")
@@ -64,6 +71,7 @@ class LogReader:
         metadata: Versions, digests and other facts.
         attachments: Files by name, the configuration among them.
         complete: False where the file ends before its footer.
+        utc_offset_ns: UTC less the clock of the records, in nanoseconds; 0 if that clock is simulated.
 
     Raises:
         LogError: The file is missing, no MCAP, not of this project, or (without ``recover``) cut short.
@@ -72,10 +80,12 @@ class LogReader:
     def __init__(self, path: str | Path, *, recover: bool = False) -> None:
         self.path = path = Path(path)
         self.complete = False
+        self.utc_offset_ns = 0
         self.metadata: dict[str, str] = {}
         self.attachments: dict[str, bytes] = {}
         self._recover = recover
         self._chunks: list[_Chunk] = []
+        self._scanned = 0
         try:
             with path.open("rb") as file:
                 self._scan(file)
@@ -90,13 +100,13 @@ class LogReader:
 
     @property
     def start_ns(self) -> int:
-        """Log time of the first record in nanoseconds; 0 for an empty log."""
-        return min((chunk.start_ns for chunk in self._chunks), default=0)
+        """Time of the first record in nanoseconds; 0 for an empty log."""
+        return min((chunk.start_ns - self.utc_offset_ns for chunk in self._chunks), default=0)
 
     @property
     def duration_ns(self) -> int:
-        """Log time from the first record to the last in nanoseconds."""
-        return max((chunk.end_ns for chunk in self._chunks), default=0) - self.start_ns
+        """Time from the first record to the last in nanoseconds."""
+        return max((c.end_ns - self.utc_offset_ns for c in self._chunks), default=0) - self.start_ns
 
     @overload
     def records(self, a: type[A], /) -> Iterator[A]: ...
@@ -127,7 +137,7 @@ class LogReader:
         schemas: dict[int, Schema] = {}
         codecs: dict[int, Codec | None] = {}
         with self.path.open("rb") as file:
-            for chunk in self._chunks:
+            for chunk in self._each_chunk():
                 file.seek(chunk.offset)
                 chunk_data = _checked(Chunk.read(_stream(file.read(chunk.length))))
                 for item in breakup_chunk(chunk_data, validate_crc=True):
@@ -140,29 +150,30 @@ class LogReader:
                     elif isinstance(item, Schema):
                         schemas[item.id] = item
                     elif isinstance(item, Channel):
-                        record_type = self._record_type(item, schemas.get(item.schema_id))
-                        codecs[item.id] = CODECS[record_type] if record_type in wanted else None
+                        codec = self._codec(item, schemas.get(item.schema_id))
+                        codecs[item.id] = codec if codec.record_type in wanted else None
 
-    def _record_type(self, channel: Channel, schema: Schema | None) -> type[Record]:
-        record_type = TYPE_OF_TOPIC.get(channel.topic)
-        if record_type is None or schema is None or schema.encoding != "protobuf":
+    def _each_chunk(self) -> Iterator[_Chunk]:
+        yield from self._chunks
+
+    def _codec(self, channel: Channel, schema: Schema | None) -> Codec:
+        codec = CODEC_OF_TOPIC.get(channel.topic)
+        if codec is None or schema is None or schema.encoding != "protobuf":
             raise LogError(f"{self.path} holds the topic {channel.topic}, which gripper-force doesn't know")
-        codec = CODECS[record_type]
-        # Foxglove and protobuf keep foxglove.RawImage compatible; our own records must agree field by field.
-        if schema.name != codec.schema_name or (
-            record_type is not Frame and not _is_readable(_fields(schema.data), record_type)
-        ):
+        # Foxglove and protobuf keep Foxglove's schemas compatible; our own records must agree field by field.
+        is_own = codec.schema_name.startswith("gripper_force.")
+        if schema.name != codec.schema_name or (is_own and not _is_readable(schema.data, codec)):
             raise LogError(
                 f"{self.path} holds {channel.topic} as another version of gripper-force wrote it; "
                 f"read it with that version{_version(self.metadata)}"
             )
-        return record_type
+        return codec
 
     def _scan(self, file: BinaryIO) -> None:
-        """Reads the framing of the records, and keeps the positions of complete ones."""
-        magic = file.read(len(_MAGIC))
-        if not _MAGIC.startswith(magic):
+        """Reads the framing of the records that were not read yet, and keeps the positions of complete ones."""
+        if not self._scanned and not _MAGIC.startswith(file.read(len(_MAGIC))):
             raise LogError(f"{self.path} is not an MCAP file; pass a log that gripper-force wrote")
+        file.seek(self._scanned or len(_MAGIC))
         size = self.path.stat().st_size
         with contextlib.suppress(*_DAMAGE):
             while file.tell() + _FRAMING.size <= size:
@@ -171,7 +182,7 @@ class LogReader:
                 if start + length > size:
                     return
                 self._note(file, opcode, start, length)
-                file.seek(start + length)
+                self._scanned = file.seek(start + length)
                 if opcode == Opcode.FOOTER:
                     self.complete = file.read() == _MAGIC
                     return
@@ -187,6 +198,7 @@ class LogReader:
             metadata = Metadata.read(_stream(file.read(length)))
             if metadata.name == METADATA_NAME:
                 self.metadata = metadata.metadata
+                self.utc_offset_ns = int(self.metadata.get(UTC_NAME, 0))
 
     def _loss(self) -> str:
         self._recover = True
@@ -215,16 +227,11 @@ def _stream(data: bytes) -> ReadDataStream:
     return ReadDataStream(BytesIO(data))
 
 
-def _fields(schema: bytes) -> list[tuple[str, int, int]]:
-    files = FileDescriptorSet.FromString(schema).file
-    return [(f.name, f.number, f.type) for file in files for m in file.message_type for f in m.field]
-
-
-def _is_readable(fields: list[tuple[str, int, int]], record_type: type[Record]) -> bool:
+def _is_readable(schema: bytes, codec: Codec) -> bool:
     """Returns True if the fields are those of the record, or lack only later ones whose default is zero."""
-    known = _fields(CODECS[record_type].schema)
+    fields, known = own_fields(schema), own_fields(codec.schema)
     missing = known[len(fields) :]
-    defaults = {field.name: field.default for field in dataclasses.fields(record_type)}
+    defaults = {field.name: field.default for field in dataclasses.fields(codec.record_type)}
     return fields == known[: len(fields)] and all(
         defaults[name] in (0.0, "", False) for name, _, _ in missing
     )

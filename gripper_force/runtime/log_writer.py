@@ -13,16 +13,16 @@ from typing import BinaryIO, Final, Self
 from mcap.writer import Writer
 
 from gripper_force.errors import LogError
-from gripper_force.runtime.log_codecs import CODECS, CONFIG_NAME, METADATA_NAME
-from gripper_force.types import NS_PER_MS, Frame, Record, VisualForce
+from gripper_force.runtime.log_codecs import CODECS, CONFIG_NAME, METADATA_NAME, UTC_NAME
+from gripper_force.types import NS_PER_MS, AttentionMap, Frame, Record, VisualForce
 
 CHUNK_NS: Final = 100 * NS_PER_MS
 
 
-def _log_ns(record: Record) -> int:
-    """Time at which the record was first available."""
+def available_ns(record: Record) -> int:
+    """Returns the time at which a record was first available."""
     match record:
-        case Frame():
+        case Frame() | AttentionMap():
             return record.received_ns
         case VisualForce():
             return record.ready_ns
@@ -36,7 +36,7 @@ class LogWriter:
     Args:
         path: A new file; its folder is made if it does not exist.
         config: The run's configuration as YAML.
-        metadata: Versions, digests and other facts.
+        metadata: Versions, digests and other facts; and `UTC_NAME`, unless the clock is simulated.
         wrap_file: Wraps the opened file; None: it is written as it is.
 
     Attributes:
@@ -57,6 +57,7 @@ class LogWriter:
     ) -> None:
         self.waiting = 0
         self._path = path
+        self._utc_offset_ns = int(metadata.get(UTC_NAME, 0))
         self.failed = False
         self._closed = False
         self._channels: dict[type[Record], int] = {}
@@ -95,20 +96,21 @@ class LogWriter:
                 field's value doesn't fit its type (the log goes on without the record).
         """
         record_type = type(record)
-        log_ns = _log_ns(record)
+        t_ns = available_ns(record)
         with self._guard():
-            data = CODECS[record_type].encode(record)
-            if not 0 <= log_ns < 2**64:
-                raise ValueError(f"its time is {log_ns} ns")
-            sequence = record.seq if isinstance(record, Frame) else 0
+            data = CODECS[record_type].encode(record, self._utc_offset_ns)
+            utc_ns = t_ns + self._utc_offset_ns
+            if not (0 <= t_ns < 2**64 and 0 <= utc_ns < 2**64):
+                raise ValueError(f"its time is {t_ns} ns")
+            sequence = record.seq if isinstance(record, Frame | AttentionMap) else 0
             if not 0 <= sequence < 2**32:  # detected later, it would damage the chunk
                 raise ValueError(f"its sequence number is {sequence}")
             channel = self._channels.get(record_type) or self._register(record_type)
-            self._writer.add_message(channel, log_ns, data, publish_time=log_ns, sequence=sequence)
+            self._writer.add_message(channel, utc_ns, data, publish_time=t_ns, sequence=sequence)
             self.waiting += 1
             if self._chunk_start_ns is None:
-                self._chunk_start_ns = log_ns
-            if log_ns - self._chunk_start_ns >= CHUNK_NS:
+                self._chunk_start_ns = t_ns
+            if t_ns - self._chunk_start_ns >= CHUNK_NS:
                 self._writer.flush()
                 self._chunk_start_ns, self.waiting = None, 0
 

@@ -7,10 +7,11 @@ from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 import numpy as np
+import numpy.typing as npt
 
 from gripper_force.errors import GripperError
 from gripper_force.interfaces import Camera, Clock
-from gripper_force.types import NS_PER_MS, ForceEstimate, Frame, Gray, VisualForce
+from gripper_force.types import NS_PER_MS, AttentionMap, ForceEstimate, Frame, Gray, VisualForce
 
 
 class Estimator(Protocol):
@@ -20,13 +21,18 @@ class Estimator(Protocol):
         """Takes the next frame; returns None while the reference is being collected."""
         ...
 
+    def attention_map(self) -> npt.NDArray[np.float32] | None:
+        """Returns the attention over the newest frame, (h, w) in 0..1, or None."""
+        ...
+
 
 class ProcessedFrame(NamedTuple):
-    """A frame, its estimate (None without one), and the problem (empty without one)."""
+    """A frame, its estimate and attention (None without one), and the problem (empty without one)."""
 
     frame: Frame
     visual: VisualForce | None
     problem: str = ""
+    attention: AttentionMap | None = None
 
 
 class FrameProcessor:
@@ -76,7 +82,14 @@ class FrameProcessor:
         self._works = True
         ready_ns = frame.received_ns if now_ns is None else now_ns()
         visual = VisualForce(frame.t_ns, ready_ns, frame.seq, result.force_n, result.std_n, compute_ms)
-        return ProcessedFrame(frame, visual)
+        return ProcessedFrame(frame, visual, attention=_attention(frame, ready_ns, self._estimator))
+
+
+def _attention(frame: Frame, ready_ns: int, estimator: Estimator) -> AttentionMap | None:
+    if (attention := estimator.attention_map()) is None:
+        return None
+    scaled = (attention - attention.min()) / max(float(np.ptp(attention)), 1e-6)
+    return AttentionMap(frame.t_ns, ready_ns, frame.seq, np.rint(255 * scaled).astype(np.uint8))
 
 
 class Perception(Protocol):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from importlib import metadata
@@ -20,6 +21,7 @@ from gripper_force.control.state_machine import Decision, GraspController, is_op
 from gripper_force.errors import DeviceError, GripperError
 from gripper_force.interfaces import Devices, SharedPort
 from gripper_force.runtime.backends import open_devices
+from gripper_force.runtime.log_codecs import UTC_NAME
 from gripper_force.runtime.log_queue import LogQueue
 from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.runtime.monitors import CounterMonitor, LoadCellMonitor
@@ -203,6 +205,8 @@ class Session:
                 visual = processed.visual
                 log(visual)
                 self.has_vision = True
+            if processed.attention is not None:
+                log(processed.attention)
             if processed.problem not in ("", self._problem):
                 log(Event(processed.frame.received_ns, "vision", f"no estimate: {processed.problem}"))
             self._problem = processed.problem
@@ -415,7 +419,8 @@ def _perception(config: Config, devices: Devices, estimator: Estimator | None) -
 
 
 def _metadata(run: ResolvedConfig, devices: Devices) -> dict[str, str]:
-    config = run.config
+    config, clock = run.config, devices.clock
+    utc = {} if devices.lockstep else {UTC_NAME: str(time.time_ns() - clock.now_ns())}
     engine = config.vision.engine if run.model else ""
     packages = (*_PACKAGES, engine) if engine in _ENGINE_PACKAGES else _PACKAGES
     profile = {} if run.correction is None else {"profile": run.correction.profile.weights}
@@ -429,6 +434,7 @@ def _metadata(run: ResolvedConfig, devices: Devices) -> dict[str, str]:
         **{f"version {name}": metadata.version(name) for name in packages},
         **devices.notes,
         **profile,
+        **utc,
     }
 
 

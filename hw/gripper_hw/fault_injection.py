@@ -64,6 +64,10 @@ class FaultyEstimator:
         reference: Gray | None = self._estimator.reference
         return reference
 
+    def attention_map(self) -> Any:
+        """Returns the attention map of the wrapped estimator."""
+        return self._estimator.attention_map()
+
     def update(self, gray: Gray) -> ForceEstimate | None:
         """Passes the next frame to the estimator and returns its estimate with the active fault applied."""
         now_ns = self._clock.now_ns()

@@ -419,7 +419,7 @@ def _phases(zero_ns: int, end_s: float, status: list[GraspStatus]) -> list[Span]
 def _event_rows(
     zero_ns: int, requests: list[Request], status: list[GraspStatus], events: list[Event]
 ) -> list[EventRow]:
-    entries = [(r.t_ns, "request", _request_text(r)) for r in requests]
+    entries = [(r.t_ns, "request", request_text(r)) for r in requests]
     before: GraspStatus | None = None
     for s in status:
         if before is None or s.phase != before.phase:
@@ -435,5 +435,5 @@ def _event_rows(
     return [EventRow((t_ns - zero_ns) / NS_PER_S, unit, text) for t_ns, unit, text in entries]
 
 
-def _request_text(request: Request) -> str:
+def request_text(request: Request) -> str:
     return f"{request.kind} at {request.target_n:g} N" if request.kind == RequestKind.GRASP else request.kind

@@ -16,6 +16,7 @@ from matplotlib.transforms import Bbox
 from gripper_force.control.force_loop import tolerance_n
 from gripper_force.jobs.report.data import SOURCES, Floats, Run, Series, histogram
 from gripper_force.jobs.report.pictures import ATTENTION_MAP, Picture
+from gripper_force.runtime.log_codecs import INTERVAL_STD
 from gripper_force.types import Phase
 
 _SOFT: Final = "#59606a"
@@ -67,9 +68,6 @@ _MAX_POINTS: Final = 2000
 _GAP_S: Final = 0.1
 _GAP_PERIODS: Final = 4.0
 """Points further apart than both, the second in median periods, are not connected."""
-
-_INTERVAL_STD: Final = 1.645
-"""Half-width of the 90 % interval of a normal distribution, in standard deviations."""
 
 _CAUSE_CHARACTERS: Final = 60
 _NAMED_LOSSES: Final = 2
@@ -254,7 +252,7 @@ def _estimate_bands(axes: Axes, run: Run) -> None:
     """Draws the claimed 90 % interval of the fused estimate, and the tolerance about the target."""
     if "fused" in run.forces:
         force, std_n = thin(run.forces["fused"]), thin(run.std_n)
-        half_n = _INTERVAL_STD * np.interp(force.t_s, std_n.t_s, std_n.value)
+        half_n = INTERVAL_STD * np.interp(force.t_s, std_n.t_s, std_n.value)
         axes.fill_between(
             force.t_s,
             force.value - half_n,

@@ -1,0 +1,165 @@
+"""Live view: a run in Rerun or Foxglove, from its log, also while the log is being written.
+
+A viewer runs in a process of its own and reads the log file, so it can't delay the control loop (decision 35).
+"""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+from gripper_force.errors import ConfigError, DataError, LogError
+from gripper_force.runtime.log_reader import LogReader
+from gripper_force.types import Record
+
+VIEWERS: Final = {"rerun": ("rerun", "rerun-sdk"), "foxglove": ("foxglove", "foxglove-sdk")}
+"""Module and package by viewer. The first is the default."""
+
+FOXGLOVE_LAYOUT: Final = Path(__file__).with_name("foxglove_layout.json")
+"""Layout to import in Foxglove, for live data and for log files."""
+
+_POLL_S: Final = 0.02
+_NICENESS: Final = 10
+"""A viewer beside a run leaves the processor to the run."""
+
+_PATIENCE_S: Final = 10.0
+"""Time that a viewer gets at the end of a run to show the rest."""
+
+
+class Viewer(Protocol):
+    """Program that shows records."""
+
+    def show(self, log: LogReader, record: Record) -> None:
+        """Shows the next record of a log."""
+        ...
+
+    def close(self) -> None:
+        """Sends everything, and ends the connection."""
+        ...
+
+
+def require(viewer: str) -> None:
+    """Checks that a viewer is known and installed.
+
+    Raises:
+        ConfigError: It is not.
+    """
+    if viewer not in VIEWERS:
+        raise ConfigError(f"{viewer!r} is not a viewer; use one of {', '.join(VIEWERS)}")
+    module, package = VIEWERS[viewer]
+    if find_spec(module) is None:
+        raise ConfigError(
+            f"{viewer} needs the package {package}, which is not installed; pip install 'gripper-force[view]'"
+        )
+
+
+class GrowingLog(LogReader):
+    """A log that is being written: `records` waits for the next ones until the log is complete.
+
+    Args:
+        path: The file, which need not exist yet.
+        wait: Called while there is nothing new; returns False to end.
+
+    Raises:
+        LogError: The file is not a log, or there was none in the end.
+    """
+
+    def __init__(self, path: Path, wait: Callable[[], bool]) -> None:
+        self._wait = wait
+        while True:
+            if path.exists():
+                try:
+                    super().__init__(path, recover=True)
+                    return
+                except LogError:
+                    if path.stat().st_size > _HEAD_BYTES:
+                        raise
+            if not wait():
+                raise LogError(f"{path} was not written; start the run that writes it")
+
+    def _each_chunk(self) -> Iterator[Any]:
+        shown = 0
+        while True:
+            new = self._chunks[shown:]
+            yield from new
+            shown += len(new)
+            if self.complete or not (new or self._wait()):
+                return
+            with self.path.open("rb") as file:
+                self._scan(file)
+
+
+_HEAD_BYTES: Final = 1 << 20
+"""A log holds its configuration before this position."""
+
+
+def wait_for_writer() -> Callable[[], bool]:
+    """Returns a wait for `GrowingLog` that ends with the process that started this one."""
+    parent = os.getppid()
+
+    def wait() -> bool:
+        time.sleep(_POLL_S)
+        return os.getppid() == parent
+
+    return wait
+
+
+def show(log: LogReader, viewer: Viewer) -> None:
+    """Shows all records of a log, and closes the viewer.
+
+    Raises:
+        LogError: The log is damaged.
+    """
+    try:
+        for record in log.records():
+            viewer.show(log, record)
+    finally:
+        viewer.close()
+
+
+@contextmanager
+def beside_run(path: Path, viewer: str, tell: Callable[[str], None]) -> Iterator[None]:
+    """Opens a viewer in a process of its own, which shows a log from its first record on.
+
+    Args:
+        path: The log that the run will write.
+        viewer: A key of `VIEWERS`.
+        tell: Called with one sentence for a person.
+
+    Raises:
+        ConfigError: The viewer is unknown or not installed.
+        DataError: The viewer did not start.
+    """
+    require(viewer)
+    command = [
+        sys.executable,
+        "-m",
+        "gripper_force",
+        "view",
+        str(path),
+        "--viewer",
+        viewer,
+        "--follow",
+        "--json",
+    ]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, preexec_fn=lambda: os.nice(_NICENESS)
+    ) as process:
+        try:
+            assert process.stdout is not None
+            while not (state := json.loads(process.stdout.readline() or '{"ended": true}')).get("ready"):
+                if "ended" in state or "error" in state:
+                    raise DataError(f"the viewer did not start: {state.get('error', 'it ended at once')}")
+                tell(state["text"])
+            yield
+            process.wait(_PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            tell(f"the viewer is behind and was ended; show the whole run with: gripper-force view {path}")
+        finally:
+            process.terminate()
