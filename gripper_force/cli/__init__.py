@@ -17,7 +17,17 @@ from typing import Annotated, NoReturn
 import typer
 
 from gripper_force import __version__
-from gripper_force.cli import bench, calibrate, configuration, console, data, learning, runs, stability
+from gripper_force.cli import (
+    bench,
+    calibrate,
+    configuration,
+    console,
+    data,
+    learning,
+    runs,
+    stability,
+    viewing,
+)
 from gripper_force.errors import GripperError
 
 app = typer.Typer(
@@ -26,9 +36,10 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+app.command(cls=viewing.ViewCommand)(runs.grasp)
 for _command in (  # in the order of --help
-    runs.grasp,
     runs.replay,
+    viewing.view,
     data.record,
     data.simulate,
     learning.train,

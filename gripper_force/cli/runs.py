@@ -77,11 +77,20 @@ def grasp(
         bool,
         typer.Option("--yes", help="Do not wait for Enter before each trial with a real device."),
     ] = False,
+    view: Annotated[
+        str | None,
+        typer.Option(help="Show the run while it goes on, in rerun (also without a value) or foxglove."),
+    ] = None,
 ) -> None:
     """Grasp with a target force and report the error. Exit code 1 if nothing was held."""
+    from contextlib import nullcontext
+
     from gripper_force.interfaces import no_progress
     from gripper_force.jobs import grasp as job
+    from gripper_force.jobs.view import beside_run
 
+    if view is not None and trials:
+        raise ConfigError("--view shows one grasp; leave out --trials")
     settings = load_settings(
         config,
         set_,
@@ -95,8 +104,11 @@ def grasp(
     )
     if not trials:
         log = job.new_log(settings)
+        viewer = nullcontext() if view is None else beside_run(log, view, console.line)
         try:
-            result = job.grasp(settings, console.line, log)
+            with viewer:
+                job.run_grasp(settings, log, console.line)
+            result = job.summary_and_report(settings, log)
         except KeyboardInterrupt:
             if log.exists():
                 console.err.print(

@@ -146,6 +146,11 @@ def grasp(config: Config, progress: Progress = no_progress, path: Path | None = 
     """
     path = path or new_log(config)
     run_grasp(config, path, progress)
+    return summary_and_report(config, path)
+
+
+def summary_and_report(config: Config, path: Path) -> Summary:
+    """Summarises the log of a grasp, and writes its report if ``log.report`` is set."""
     result = summarise(path)
     if config.log.report:
         from gripper_force.jobs.report import write_report

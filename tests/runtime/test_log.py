@@ -18,11 +18,12 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
 from gripper_force.errors import LogError
-from gripper_force.runtime.log_codecs import CODECS
+from gripper_force.runtime.log_codecs import CODECS, INTERVAL_STD, UTC_NAME
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.log_writer import CHUNK_NS, LogWriter
 from gripper_force.types import (
     NS_PER_MS,
+    AttentionMap,
     Event,
     Frame,
     FusedForce,
@@ -40,29 +41,32 @@ BY_TYPE: dict[Any, st.SearchStrategy[Any]] = {
     str: st.text(),
     bool: st.booleans(),
 }
-SCALAR_TYPES = [kind for kind in get_args(Record) if kind is not Frame]
+IMAGE_TYPES = (Frame, AttentionMap)
+SCALAR_TYPES = [kind for kind in get_args(Record) if kind not in IMAGE_TYPES]
 
 
 @st.composite
-def frames(draw: st.DrawFn) -> Frame:
+def images(draw: st.DrawFn) -> Frame | AttentionMap:
     height, width = draw(st.integers(1, 6)), draw(st.integers(1, 6))
     pixels = draw(st.binary(min_size=height * width, max_size=height * width))
     gray = np.frombuffer(pixels, np.uint8).reshape(height, width)
     t_ns = draw(st.integers(-(2**40), 2**60))
-    return Frame(t_ns, draw(TIMES), draw(st.integers(0, 2**32 - 1)), gray)
+    kind = draw(st.sampled_from(IMAGE_TYPES))
+    return kind(t_ns, draw(TIMES), draw(st.integers(0, 2**32 - 1)), gray)
 
 
 def scalars(kind: type[Any]) -> st.SearchStrategy[Any]:
     return st.builds(kind, *(BY_TYPE[field.type] for field in fields(kind)))
 
 
-RECORDS = st.one_of(frames(), *(scalars(kind) for kind in SCALAR_TYPES))
+RECORDS = st.one_of(images(), *(scalars(kind) for kind in SCALAR_TYPES))
 
 
 def image(record: Record) -> object:
     """A value that is equal only for records that are equal to the bit, NaN included."""
-    if isinstance(record, Frame):
-        return record.t_ns, record.received_ns, record.seq, record.gray.shape, record.gray.tobytes()
+    if isinstance(record, IMAGE_TYPES):
+        times = record.t_ns, record.received_ns
+        return type(record), *times, record.seq, record.gray.shape, record.gray.tobytes()
     return repr(record)
 
 
@@ -84,12 +88,12 @@ def run(path: Path, count: int = 40) -> list[Record]:
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.lists(RECORDS, max_size=12))
+@given(st.lists(RECORDS, max_size=12), st.sampled_from([{}, {UTC_NAME: "1790000000123456789"}]))
 def test_every_record_returns_to_the_bit_and_in_the_order_written(
-    tmp_path_factory: pytest.TempPathFactory, records: list[Record]
+    tmp_path_factory: pytest.TempPathFactory, records: list[Record], metadata: dict[str, str]
 ) -> None:
     path = tmp_path_factory.mktemp("log") / "run.mcap"
-    with LogWriter(path, config="", metadata={}) as log:
+    with LogWriter(path, config="", metadata=metadata) as log:
         for record in records:
             log.write(record)
     assert [image(r) for r in LogReader(path).records()] == [image(r) for r in records]
@@ -129,6 +133,74 @@ def test_an_image_that_is_not_contiguous_is_written_as_seen(tmp_path: Path) -> N
     np.testing.assert_array_equal(frame.gray, gray)
 
 
+def decoded(path: Path) -> list[tuple[str, Message, Any]]:
+    """Topic, message and value of every message, decoded with the schemas in the log alone."""
+    result = []
+    with path.open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages(log_time_order=False):
+            assert schema is not None
+            pool = DescriptorPool()
+            for proto in FileDescriptorSet.FromString(schema.data).file:
+                pool.Add(proto)
+            value: Any = GetMessageClass(pool.FindMessageTypeByName(schema.name)).FromString(message.data)
+            result.append((channel.topic, message, value))
+    return result
+
+
+def test_a_log_carries_utc_beside_the_clock_of_the_records(tmp_path: Path) -> None:
+    path, utc_offset_ns = tmp_path / "run.mcap", 1_790_000_000_123_456_789
+    records: list[Record] = [
+        Event(7_000_000_001, "servo", "a retry"),
+        Frame(7_000_000_002, 7_000_000_005, 7, np.zeros((2, 3), np.uint8)),
+        AttentionMap(7_000_000_002, 7_000_000_009, 7, np.zeros((2, 2), np.uint8)),
+        LoadCellSample(7_000_000_010, 1.5, 2.5),
+    ]
+    with LogWriter(path, config="", metadata={UTC_NAME: str(utc_offset_ns)}) as log:
+        for record in records:
+            log.write(record)
+    messages = decoded(path)
+    assert [topic for topic, _, _ in messages] == ["/log", "/frame", "/attention_map", "/load_cell_sample"]
+    assert {message.log_time - message.publish_time for _, message, _ in messages} == {utc_offset_ns}
+    event, frame, attention, sample = (value for _, _, value in messages)
+    assert (event.name, event.message, event.level) == ("servo", "a retry", event.INFO)
+    assert event.timestamp.ToNanoseconds() == 7_000_000_001 + utc_offset_ns
+    assert (
+        frame.timestamp.ToNanoseconds()
+        == attention.timestamp.ToNanoseconds()
+        == 7_000_000_002 + utc_offset_ns
+    )
+    assert sample.t_ns == messages[-1][1].publish_time == 7_000_000_010
+    reader = LogReader(path)
+    assert (reader.utc_offset_ns, reader.start_ns, reader.duration_ns) == (utc_offset_ns, 7_000_000_001, 9)
+
+
+@given(force_n=st.floats(-100, 100), std_n=st.floats(0, 100))
+def test_an_estimate_is_written_with_its_claimed_interval(
+    tmp_path_factory: pytest.TempPathFactory, force_n: float, std_n: float
+) -> None:
+    path = tmp_path_factory.mktemp("log") / "run.mcap"
+    records = [FusedForce(1, force_n, std_n, 0, 0, 0, ""), VisualForce(1, 2, 3, force_n, std_n, 0)]
+    with LogWriter(path, config="", metadata={}) as log:
+        for record in records:
+            log.write(record)
+    for _, _, value in decoded(path):
+        assert value.high_n - value.low_n == pytest.approx(2 * INTERVAL_STD * std_n, abs=1e-9)
+        assert value.high_n + value.low_n == pytest.approx(2 * force_n, abs=1e-9)
+    assert list(LogReader(path).records()) == records
+
+
+def test_an_offset_that_is_no_number_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.add_metadata("gripper_force", {UTC_NAME: "soon"})
+        writer.add_attachment(0, 0, "config.yaml", "application/yaml", b"")
+        writer.finish()
+    with pytest.raises(LogError, match="cut short or damaged"):
+        LogReader(path)
+
+
 def test_another_program_decodes_every_topic_from_the_log_alone(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     records: list[Record] = [
@@ -140,26 +212,18 @@ def test_another_program_decodes_every_topic_from_the_log_alone(tmp_path: Path) 
     with LogWriter(path, config="", metadata={}) as log:
         for record in records:
             log.write(record)
-    with path.open("rb") as file:
-        decoded = []
-        for schema, channel, message in make_reader(file).iter_messages(log_time_order=False):
-            assert schema is not None
-            pool = DescriptorPool()
-            for proto in FileDescriptorSet.FromString(schema.data).file:
-                pool.Add(proto)
-            value: Any = GetMessageClass(pool.FindMessageTypeByName(schema.name)).FromString(message.data)
-            decoded.append((channel.topic, message, value))
-    assert [topic for topic, _, _ in decoded] == [
+    messages = decoded(path)
+    assert [topic for topic, _, _ in messages] == [
         "/visual_force",
         "/grasp_status",
         "/load_cell_sample",
         "/frame",
     ]
-    vision, status, sample, frame = (value for _, _, value in decoded)
+    vision, status, sample, frame = (value for _, _, value in messages)
     assert (vision.force_n, status.outcome, sample.valid) == (4.5, "held", False)
     assert (frame.timestamp.seconds, frame.timestamp.nanos, frame.encoding) == (2, 5, "mono8")
-    assert [message.log_time for _, message, _ in decoded] == [2, 2, 3, 4]
-    assert decoded[-1][1].sequence == 7
+    assert [message.log_time for _, message, _ in messages] == [2, 2, 3, 4]
+    assert messages[-1][1].sequence == 7
 
 
 @pytest.mark.parametrize("gap_ms", [1, 10, 99, 100, 250])
@@ -329,7 +393,7 @@ def test_a_chunk_that_lies_is_refused(
         writer.add_attachment(0, 0, "config.yaml", "application/yaml", b"")
         schema = writer.register_schema(codec.schema_name, "protobuf", codec.schema)
         channel = writer.register_channel(codec.topic, "protobuf", schema)
-        writer.add_message(channel, 1, codec.encode(Frame(1, 1, 1, np.zeros((2, 3), np.uint8))), 1)
+        writer.add_message(channel, 1, codec.encode(Frame(1, 1, 1, np.zeros((2, 3), np.uint8)), 0), 1)
         writer.finish()
     content, count = re.subn(old, new, path.read_bytes(), count=1, flags=re.DOTALL)
     assert count

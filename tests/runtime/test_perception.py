@@ -25,6 +25,9 @@ class FakeEstimator:
             raise self.error
         return ForceEstimate(float(self.count), 0.5) if self.count > self.references else None
 
+    def attention_map(self) -> np.ndarray | None:
+        return np.array([[0.25, 0.5], [0.5, 0.75]], np.float32) + 0.001 * self.count
+
 
 class Hand:
     """A clock that stands still."""
@@ -80,6 +83,13 @@ def test_in_lockstep_an_estimate_is_there_after_its_time_and_not_before() -> Non
     assert (seen.visual.t_ns, seen.visual.ready_ns) == (20 * NS_PER_MS, 32 * NS_PER_MS)
     assert (seen.visual.seq, seen.visual.force_n, seen.visual.std_n) == (1, 2.0, 0.5)
     assert seen.visual.compute_ms >= 0
+    assert seen.attention is not None
+    assert (seen.attention.t_ns, seen.attention.received_ns, seen.attention.seq) == (
+        seen.visual.t_ns,
+        seen.visual.ready_ns,
+        1,
+    )
+    assert seen.attention.gray.tolist() == [[0, 128], [128, 255]]  # to its own range
 
 
 def test_the_reference_frame_is_seen_and_gives_no_estimate() -> None:

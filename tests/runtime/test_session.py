@@ -313,6 +313,9 @@ class Failing:
             raise DataError("no picture")
         return Guess(self.force_n, 0.1)
 
+    def attention_map(self) -> None:
+        return None
+
 
 def test_the_grip_is_kept_on_motor_current_where_the_estimator_fails(
     open_rig: tuple[ExitStack, OpenRig], monkeypatch: pytest.MonkeyPatch, tmp_path: Path

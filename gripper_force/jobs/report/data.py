@@ -436,4 +436,5 @@ def _event_rows(
 
 
 def request_text(request: Request) -> str:
+    """Returns a request in words."""
     return f"{request.kind} at {request.target_n:g} N" if request.kind == RequestKind.GRASP else request.kind

@@ -72,16 +72,21 @@ class GrowingLog(LogReader):
 
     def __init__(self, path: Path, wait: Callable[[], bool]) -> None:
         self._wait = wait
-        while True:
-            if path.exists():
-                try:
-                    super().__init__(path, recover=True)
-                    return
-                except LogError:
-                    if path.stat().st_size > _HEAD_BYTES:
-                        raise
+        while not self._is_open(path):
             if not wait():
                 raise LogError(f"{path} was not written; start the run that writes it")
+
+    def _is_open(self, path: Path) -> bool:
+        """Opens the file once its configuration has been written."""
+        if not path.exists():
+            return False
+        try:
+            super().__init__(path, recover=True)
+        except LogError:
+            if path.stat().st_size > _HEAD_BYTES:
+                raise
+            return False
+        return True
 
     def _each_chunk(self) -> Iterator[Any]:
         shown = 0

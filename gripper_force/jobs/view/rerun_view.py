@@ -70,7 +70,7 @@ _PHASES: Final = {
 def blueprint() -> rrb.Blueprint:
     """Returns the arrangement: pictures and events above, forces, phases and motor below, on one time axis."""
     plot: Any = {
-        "background": rrb.archetypes.PlotBackground(color=_BACKGROUND),
+        "background": rrb.archetypes.PlotBackground(color=_rgba(_BACKGROUND)),
         "plot_legend": rrb.Corner2D.LeftTop,
     }
     return rrb.Blueprint(
@@ -123,10 +123,12 @@ class RerunViewer:
         self._recording.send_recording_name(name)
         for entity, (label, colour, width) in _LINES.items():
             self._recording.log(
-                entity, rr.SeriesLines(colors=[colour], widths=[width], names=[label]), static=True
+                entity, rr.SeriesLines(colors=[_rgba(colour)], widths=[width], names=[label]), static=True
             )
         phases = [str(phase) for phase in _PHASES]
-        style = rr.StateConfiguration(values=phases, labels=phases, colors=list(_PHASES.values()))
+        style = rr.StateConfiguration(
+            values=phases, labels=phases, colors=[_rgba(c) for c in _PHASES.values()]
+        )
         self._recording.log("state/phase", style, static=True)
 
     def show(self, log: LogReader, record: Record) -> None:
@@ -215,6 +217,11 @@ class RerunViewer:
                 values = rr.Scalars.columns(scalars=[value for _, value in points])
                 self._recording.send_columns(entity, times, values)
                 points.clear()
+
+
+def _rgba(colour: str) -> int:
+    """Converts ``#rrggbb``, as Rerun takes colours."""
+    return int(colour[1:] + "ff", 16)
 
 
 def _require_display() -> None:
