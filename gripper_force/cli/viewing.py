@@ -57,7 +57,7 @@ def view(
     from gripper_force.runtime.log_reader import LogReader
 
     reader = None if follow else LogReader(log, recover=recover)
-    shown = RerunViewer(log.stem, save)
+    shown = RerunViewer(log.stem, save, live=follow)
     if follow:
         _ready(as_json)
     job.show(reader or job.GrowingLog(log, job.wait_for_writer()), shown)

@@ -376,7 +376,7 @@ def test_a_log_of_another_program_is_refused(tmp_path: Path) -> None:
         (CompressionType.NONE, rb"-\x03", b"-\x02", "3x2 pixels in rows of 2"),
         (
             CompressionType.NONE,
-            rb"\x01\0{7}(\x01\0{7}\n\x02\x10\x01)",
+            rb"\x01\0{7}(\n\x02\x10\x01)",
             b"\1\0\0\0\0\0\0\x80\\1",
             "came at 9223372036854775809 ns",
         ),

@@ -4,7 +4,7 @@ import os
 import sys
 from collections import defaultdict
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import rerun as rr
@@ -39,21 +39,22 @@ _BATCH_NS: Final = 100 * NS_PER_MS
 _PICTURE_NS: Final = 30 * NS_PER_MS
 """Frames closer than this are not drawn: a screen shows no more, and a camera's are many megabytes."""
 
-_TARGET: Final = "#a0a6ae"
-_BACKGROUND: Final = "#14171c"
+_SOFT: Final = "#8a9099"
+_INTERVAL: Final = "#8ab4d3"
+_LOAD_CELL: Final = "#cc79a7"
 _LINES: Final = {
-    "force/interval_low": ("claimed 90 % interval, low", "#2c5d80", 1.0),
-    "force/interval_high": ("claimed 90 % interval, high", "#2c5d80", 1.0),
-    "force/target": ("target", _TARGET, 2.0),
-    "force/current": (SOURCES["current"].label, SOURCES["current"].dark, 1.0),
-    "force/vision": (SOURCES["vision"].label, SOURCES["vision"].dark, 1.0),
-    "force/load_cell": (SOURCES["load_cell"].label, SOURCES["load_cell"].dark, 1.5),
-    "force/estimate": ("estimate (" + SOURCES["fused"].label + ")", SOURCES["fused"].dark, 2.5),
-    "motor/width_mm": ("width, mm", WIDTH_COLOURS["dark"], 1.5),
-    "motor/goal_current_ma": ("largest allowed current, mA", _TARGET, 1.0),
-    "motor/current_ma": ("current, mA", SOURCES["current"].dark, 1.5),
+    "force/interval_low": ("claimed 90 % interval, low", _INTERVAL, 1.0),
+    "force/interval_high": ("claimed 90 % interval, high", _INTERVAL, 1.0),
+    "force/target": ("target", _SOFT, 2.0),
+    "force/current": (SOURCES["current"].label, SOURCES["current"].light, 1.0),
+    "force/vision": (SOURCES["vision"].label, SOURCES["vision"].light, 1.0),
+    "force/load_cell": (SOURCES["load_cell"].label, _LOAD_CELL, 1.5),
+    "force/estimate": ("estimate (fusion)", SOURCES["fused"].light, 2.5),
+    "motor/width_mm": ("width, mm", WIDTH_COLOURS["light"], 1.5),
+    "motor/goal_current_ma": ("largest allowed current, mA", _SOFT, 1.0),
+    "motor/current_ma": ("current, mA", SOURCES["current"].light, 1.5),
 }
-"""Label, colour and width of each curve, by entity, in drawing order."""
+"""Label, colour and width of each curve, by entity. The colours show on light and dark backgrounds."""
 
 _PHASES: Final = {
     Phase.OPEN: "#4a5059",
@@ -67,26 +68,29 @@ _PHASES: Final = {
 }
 
 
-def blueprint() -> rrb.Blueprint:
-    """Returns the arrangement: pictures and events above, forces, phases and motor below, on one time axis."""
-    plot: Any = {
-        "background": rrb.archetypes.PlotBackground(color=_rgba(_BACKGROUND)),
-        "plot_legend": rrb.Corner2D.LeftTop,
-    }
+def blueprint(*, live: bool) -> rrb.Blueprint:
+    """Returns the arrangement: pictures and events above, forces, phases and motor below, on one time axis.
+
+    Args:
+        live: True to follow the newest data; False to play from the beginning.
+    """
+    legend = rrb.Corner2D.LeftTop
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(
                 rrb.Spatial2DView(origin="/camera", name="Camera"),
                 rrb.Spatial2DView(origin="/attention", name="Attention of the network"),
-                rrb.TextLogView(origin="/events", name="Events"),
+                rrb.TextLogView(
+                    origin="/events", name="Events", columns=rrb.TextLogColumns(text_log_columns=["Body"])
+                ),
                 column_shares=[2, 2, 5],
             ),
-            rrb.TimeSeriesView(origin="/force", name="Force in N", **plot),
+            rrb.TimeSeriesView(origin="/force", name="Force in N", plot_legend=legend),
             rrb.StateTimelineView(origin="/state", name="Phases"),
-            rrb.TimeSeriesView(origin="/motor", name="Motor", **plot),
+            rrb.TimeSeriesView(origin="/motor", name="Motor", plot_legend=legend),
             row_shares=[5, 8, 3, 4],
         ),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following" if live else "playing"),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
     )
@@ -98,12 +102,13 @@ class RerunViewer:
     Args:
         name: Name of the recording.
         save: File (``.rrd``) to write; None: the viewer is started.
+        live: True if the log is still being written.
 
     Raises:
         DataError: The viewer can't start, or the file can't be written.
     """
 
-    def __init__(self, name: str, save: Path | None = None) -> None:
+    def __init__(self, name: str, save: Path | None = None, *, live: bool = False) -> None:
         self._recording = rr.RecordingStream("gripper-force", recording_id=name)
         self._first_ns: int | None = None
         self._sent_ns = 0
@@ -114,13 +119,14 @@ class RerunViewer:
         try:
             if save is not None:
                 save.parent.mkdir(parents=True, exist_ok=True)
-                self._recording.save(save, default_blueprint=blueprint())
+                self._recording.save(save, default_blueprint=blueprint(live=live))
             else:
                 _require_display()
-                self._recording.spawn(default_blueprint=blueprint(), hide_welcome_screen=True)
+                self._recording.spawn(default_blueprint=blueprint(live=live), hide_welcome_screen=True)
         except (OSError, RuntimeError) as error:
             raise DataError(f"Rerun can't show {name}: {error}") from error
         self._recording.send_recording_name(name)
+        self._recording.set_log_time_enabled(False)
         for entity, (label, colour, width) in _LINES.items():
             self._recording.log(
                 entity, rr.SeriesLines(colors=[_rgba(colour)], widths=[width], names=[label]), static=True
@@ -130,6 +136,7 @@ class RerunViewer:
             values=phases, labels=phases, colors=[_rgba(c) for c in _PHASES.values()]
         )
         self._recording.log("state/phase", style, static=True)
+        self._recording.flush()  # the style before the first data
 
     def show(self, log: LogReader, record: Record) -> None:
         """Draws the next record of a log."""
