@@ -50,7 +50,7 @@ class FoxgloveViewer(ServerListener):
     """
 
     def __init__(self, name: str, port: int, log: LogReader | None = None) -> None:
-        context = foxglove.Context()
+        context = self._context = foxglove.Context()
         self._channels = {
             record_type: foxglove.Channel(
                 codec.topic,

@@ -88,7 +88,7 @@ def blueprint(*, live: bool) -> rrb.Blueprint:
             rrb.TimeSeriesView(origin="/force", name="Force in N", plot_legend=legend),
             rrb.StateTimelineView(origin="/state", name="Phases"),
             rrb.TimeSeriesView(origin="/motor", name="Motor", plot_legend=legend),
-            row_shares=[5, 8, 3, 4],
+            row_shares=[5, 7, 4, 4],
         ),
         rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following" if live else "playing"),
         rrb.BlueprintPanel(state="collapsed"),
@@ -110,6 +110,7 @@ class RerunViewer:
 
     def __init__(self, name: str, save: Path | None = None, *, live: bool = False) -> None:
         self._recording = rr.RecordingStream("gripper-force", recording_id=name)
+        self._saves = save is not None
         self._first_ns: int | None = None
         self._sent_ns = 0
         self._next_picture_ns: dict[type, int] = defaultdict(int)
@@ -163,7 +164,7 @@ class RerunViewer:
                 curve["force/target"].append((t_ns, record.reference_n))
                 curve["motor/width_mm"].append((t_ns, 1e3 * record.width_m))
                 self._change(t_ns, "phase", record.phase)
-                if self._change(t_ns, "outcome", record.outcome or "-") and record.outcome:
+                if self._change(t_ns, "outcome", record.outcome) and record.outcome:
                     self._tell(t_ns, "outcome", record.outcome)
                 if record.reason:
                     self._tell(t_ns, "control", record.reason)
@@ -196,11 +197,14 @@ class RerunViewer:
             self._recording.log("attention", image)
 
     def _change(self, t_ns: int, name: str, state: str) -> bool:
-        if self._states.get(name) == state:
+        if self._states.get(name, "") == state:
             return False
         self._states[name] = state
         self._at(t_ns)
-        self._recording.log(f"state/{name}", rr.StateChange(state=state))
+        # Rerun shows no state as a gap.
+        self._recording.log(
+            f"state/{name}", rr.StateChange(state=state) if state else rr.Clear(recursive=False)
+        )
         return True
 
     def _tell(self, t_ns: int, unit: str, text: str) -> None:
@@ -224,6 +228,8 @@ class RerunViewer:
                 values = rr.Scalars.columns(scalars=[value for _, value in points])
                 self._recording.send_columns(entity, times, values)
                 points.clear()
+        if self._saves:  # in a file, what belongs together is close together
+            self._recording.flush()
 
 
 def _rgba(colour: str) -> int:
