@@ -108,7 +108,8 @@ class FoxgloveViewer(ServerListener):
             LogError: The log is damaged.
         """
         while not self._stopped:
-            self._seek_ns, begin_ns = -1, self._seek_ns
+            with self._changed:
+                self._seek_ns, begin_ns = -1, self._seek_ns
             for record in self._from(log, begin_ns):
                 self.show(log, record)
             with self._changed:
@@ -117,7 +118,7 @@ class FoxgloveViewer(ServerListener):
                     self._server.broadcast_playback_state(self._state(ended=True))
                 while self._seek_ns < 0 and not self._stopped:
                     self._changed.wait(_WAIT_S)
-                    if self._plays:  # at the end: from the beginning
+                    if self._plays and self._seek_ns < 0:  # at the end: from the beginning
                         self._seek_ns = 0
 
     def close(self) -> None:
