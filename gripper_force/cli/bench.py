@@ -21,6 +21,7 @@ from gripper_force.cli.output.bench import (
     startup_table,
     training_table,
 )
+from gripper_force.cli.viewing import ViewCommand
 from gripper_force.errors import ConfigError
 
 app = typer.Typer(no_args_is_help=True, help="Measure speed, memory and error on this machine.")
@@ -160,11 +161,15 @@ def bus(
     _show({"bus": costs}, as_json, lambda: bus_table(costs))
 
 
-@app.command("loop")
+@app.command("loop", cls=ViewCommand)
 def loop(
     seconds: Annotated[
         float, typer.Option(min=1.0, help="Duration with inference, and again without it.")
     ] = 30.0,
+    view: Annotated[
+        str | None,
+        typer.Option(help="Measure also with a viewer: rerun (also without a value) or foxglove."),
+    ] = None,
     config: ConfigPath = None,
     set_: Overrides = None,
     as_json: AsJson = False,
@@ -172,8 +177,8 @@ def loop(
     """Measure the control loop in real time, with and without inference in parallel."""
     from gripper_force.qualification.bench import loop_bench
 
-    with console.err.status(f"running for {2 * seconds:g} s"):
-        costs, log = loop_bench.loop(seconds, set_ or [], config)
+    with console.err.status(f"running for {(2 if view is None else 3) * seconds:g} s"):
+        costs, log = loop_bench.loop(seconds, set_ or [], config, view)
     _show({"loop": costs, "log": log}, as_json, lambda: loop_table(costs, log))
 
 

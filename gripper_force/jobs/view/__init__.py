@@ -129,30 +129,24 @@ def show(log: LogReader, viewer: Viewer) -> None:
 
 
 @contextmanager
-def beside_run(path: Path, viewer: str, tell: Callable[[str], None]) -> Iterator[None]:
+def beside_run(
+    path: Path, viewer: str, tell: Callable[[str], None], save: Path | None = None
+) -> Iterator[None]:
     """Opens a viewer in a process of its own, which shows a log from its first record on.
 
     Args:
         path: The log that the run will write.
         viewer: A key of `VIEWERS`.
         tell: Called with one sentence for a person.
+        save: File for Rerun (``.rrd``) to write instead of opening a window.
 
     Raises:
         ConfigError: The viewer is unknown or not installed.
         DataError: The viewer did not start.
     """
     require(viewer)
-    command = [
-        sys.executable,
-        "-m",
-        "gripper_force",
-        "view",
-        str(path),
-        "--viewer",
-        viewer,
-        "--follow",
-        "--json",
-    ]
+    options = ["--viewer", viewer, "--follow", "--json"] + ([] if save is None else ["--save", str(save)])
+    command = [sys.executable, "-m", "gripper_force", "view", str(path), *options]
     with subprocess.Popen(
         command, stdout=subprocess.PIPE, text=True, preexec_fn=lambda: os.nice(_NICENESS)
     ) as process:

@@ -1,4 +1,4 @@
-"""The control loop in real time: lateness of its cycles with and without inference in parallel.
+"""The control loop in real time: lateness of its cycles with and without inference, and a viewer, in parallel.
 
 It runs the code of a real gripper: the session, the servo driver, the camera thread and the log. A virtual
 servo answers from another process over a pseudo-terminal, and the camera repeats a recording, so no physics
@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,6 +23,7 @@ from gripper_force.config import Config, config_from_text, load_config
 from gripper_force.interfaces import Devices, Servo
 from gripper_force.jobs.grasp import run_grasp
 from gripper_force.jobs.replay import resolve_replay, run_again
+from gripper_force.jobs.view import beside_run, require
 from gripper_force.qualification.bench.startup_bench import LONG_TIMEOUTS
 from gripper_force.runtime.backends import MonotonicClock, load_servo_class
 from gripper_force.runtime.log_reader import LogReader
@@ -52,7 +53,7 @@ class LoopCost:
     """Timing of a loop.
 
     Attributes:
-        beside: Load in parallel: ``vision`` or ``nothing``.
+        beside: Load in parallel: ``vision``, ``nothing``, or vision with a viewer, such as ``vision, rerun``.
         cycles: Cycles run.
         missed: Periods that were skipped, or whose cycle began a whole period late.
         lost_records: Records that the log lacks.
@@ -179,19 +180,24 @@ class _Camera:
 
 
 def loop(
-    seconds: float, overrides: list[str], path: Path | None = None
+    seconds: float, overrides: list[str], path: Path | None = None, viewer: str | None = None
 ) -> tuple[tuple[LoopCost, ...], LogCost]:
     """Runs the loop with and without vision in parallel, in turns.
 
     Args:
-        seconds: Duration of each of the two.
+        seconds: Duration of each of the two, or three.
         overrides: Configuration keys, such as ``vision.threads=2``.
         path: Configuration file, or None.
+        viewer: Viewer to measure as well, with vision; a key of `gripper_force.jobs.view.VIEWERS`. Rerun writes a
+            file then, because a window's cost depends on the graphics.
 
     Raises:
         GripperError: The virtual servo did not answer, or the configuration is wrong.
     """
     loops = {"vision": _Measured(), "nothing": _Measured()}
+    if viewer is not None:
+        require(viewer)
+        loops[f"vision, {viewer}"] = _Measured()
     turns = max(1, round(seconds / _TURN_S))
     with TemporaryDirectory() as name, _virtual_servo() as port:
         folder = Path(name)
@@ -200,11 +206,12 @@ def loop(
         for turn in range(turns):
             for beside, measured in loops.items():
                 no_vision = (
-                    () if beside == "vision" else ("vision.checkpoint=none", "control.feedback=current")
+                    ("vision.checkpoint=none", "control.feedback=current") if beside == "nothing" else ()
                 )
                 settings = [*LONG_TIMEOUTS, *overrides, "clock=realtime", f"servo.port={port}", *no_vision]
                 log_path = folder / f"{beside}{turn}.mcap"
-                _run(load_config(path, settings), frames, seconds / turns, log_path, measured)
+                with _viewer(viewer if beside == f"vision, {viewer}" else None, log_path):
+                    _run(load_config(path, settings), frames, seconds / turns, log_path, measured)
         log = _log_cost(folder / "vision0.mcap", folder / "again.mcap", seconds / turns)
     period_ns = round(NS_PER_S / load_config(path, overrides).control.rate_hz)
     return tuple(_cost(beside, seconds, period_ns, measured) for beside, measured in loops.items()), log
@@ -239,6 +246,13 @@ def _run(config: Config, frames: list[Frame], seconds: float, path: Path, measur
             measured.cycle_ns.append(clock.now_ns() - clock.begun_ns)
     measured.lost += session.lost_records
     measured.compute_ms += [visual.compute_ms for visual in LogReader(path).records(VisualForce)]
+
+
+def _viewer(viewer: str | None, log_path: Path) -> AbstractContextManager[None]:
+    if viewer is None:
+        return nullcontext()
+    save = log_path.with_suffix(".rrd") if viewer == "rerun" else None
+    return beside_run(log_path, viewer, lambda text: print(text, file=sys.stderr), save)  # noqa: T201
 
 
 @contextmanager

@@ -27,7 +27,9 @@ def test_bench_loop_prints_a_table_and_json(monkeypatch: pytest.MonkeyPatch) -> 
     times_ms = 0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0
     cost = LoopCost("nothing", 6000, 3, 0, *times_ms, math.nan, math.nan, 0.0)
 
-    def measure(seconds: float, _overrides: list[str], _path: Path | None) -> tuple[object, LogCost]:
+    def measure(
+        seconds: float, _overrides: list[str], _path: Path | None, _viewer: str | None
+    ) -> tuple[object, LogCost]:
         return (cost,) * int(seconds), LogCost(1.0, 2.0, 3.0, 4.0)
 
     monkeypatch.setattr(loop, "loop", measure)
