@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from gripper_force.runtime.process import own_process as own_process
     from gripper_force.runtime.state import GraspResult as GraspResult
     from gripper_force.runtime.state import GripperState as GripperState
+    from gripper_force.types import AttentionMap as AttentionMap
     from gripper_force.types import EstimateSource as EstimateSource
     from gripper_force.types import Event as Event
     from gripper_force.types import ForceEstimate as ForceEstimate
@@ -95,6 +96,7 @@ _MODULES = {
     "gripper_force.runtime.process": ("own_process",),
     "gripper_force.runtime.state": ("GraspResult", "GripperState"),
     "gripper_force.types": (
+        "AttentionMap",
         "EstimateSource",
         "Event",
         "ForceEstimate",

@@ -17,6 +17,7 @@ HEAVY = {"torch", "mujoco", "depthai", "typer"}
 
 PUBLIC = [
     "__version__",
+    "AttentionMap",
     "BusStats",
     "Camera",
     "CameraConfig",

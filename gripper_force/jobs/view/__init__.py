@@ -148,7 +148,11 @@ def beside_run(
     options = ["--viewer", viewer, "--follow", "--json"] + ([] if save is None else ["--save", str(save)])
     command = [sys.executable, "-m", "gripper_force", "view", str(path), *options]
     with subprocess.Popen(
-        command, stdout=subprocess.PIPE, text=True, preexec_fn=lambda: os.nice(_NICENESS)
+        command,
+        stdout=subprocess.PIPE,  # messages, and an error too
+        stderr=subprocess.DEVNULL,
+        text=True,
+        preexec_fn=lambda: os.nice(_NICENESS),
     ) as process:
         try:
             assert process.stdout is not None
