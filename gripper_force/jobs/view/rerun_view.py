@@ -88,7 +88,7 @@ def blueprint(*, live: bool) -> rrb.Blueprint:
             rrb.TimeSeriesView(origin="/force", name="Force in N", plot_legend=legend),
             rrb.StateTimelineView(origin="/state", name="Phases"),
             rrb.TimeSeriesView(origin="/motor", name="Motor", plot_legend=legend),
-            row_shares=[5, 7, 4, 4],
+            row_shares=[5, 7, 5, 4],
         ),
         rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following" if live else "playing"),
         rrb.BlueprintPanel(state="collapsed"),
