@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from pathlib import Path
-from typing import Any, Final, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import Field, PositiveInt, model_validator
 
@@ -439,9 +439,56 @@ class ControlConfig(Section):
         return gain, lag_ms * 1e-3, delay_ms * 1e-3
 
 
+Metres = Annotated[float, Field(ge=-1, le=1, allow_inf_nan=False)]
+PadLength = Annotated[float, Field(ge=0.004, le=0.05, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+
+
+class SimCameraConfig(Section):
+    """Place, lens and image of the simulated camera. The middle between the jaws' tips is the origin."""
+
+    position_m: tuple[Metres, Metres, Metres] = Field(
+        (0.10, -0.30, 0.125), description="x along the jaws' travel, y towards the wall, z up"
+    )
+    aim_m: tuple[Metres, Metres, Metres] = Field((0, 0, 0), description="point in the middle of the image")
+    fov_deg: float = Field(17.0, ge=2, le=120, description="field of view from edge to edge of the image")
+    roll_deg: float = Field(0.0, ge=-180, le=180, description="turn of the camera about its optical axis")
+    blur_px: float = Field(0.0, ge=0, le=10, description="standard deviation of the lens's blur in pixels")
+    noise: Share | None = Field(
+        None, description="photon noise at full scale as a share of it; None: drawn, 0.012 to 0.024"
+    )
+
+
+class SimJawsConfig(Section):
+    """Size and colour (red, green, blue) of the simulated jaws."""
+
+    pad_m: tuple[PadLength, PadLength] = Field((0.024, 0.022), description="depth and height of a pad")
+    finger_m: PadLength = Field(0.016, description="depth of a finger")
+    pad_rgb: tuple[Share, Share, Share] = Field((0.16, 0.17, 0.19), description="colour of the pads")
+    finger_rgb: tuple[Share, Share, Share] = Field((0.78, 0.78, 0.80), description="colour of the fingers")
+
+
+class SimLightConfig(Section):
+    """Light and background of the simulated world, beside `sim.lux`."""
+
+    direction: tuple[Metres, Metres, Metres] = Field(
+        (-0.40, 0.55, -0.75), description="direction in which the light shines"
+    )
+    ambient: Share = Field(0.30, description="share of the light that comes from everywhere")
+    background: float = Field(1.0, ge=0, le=2, description="factor on the brightness of table and wall")
+
+
 class SimConfig(Section):
     """The simulated world; read only if a device is simulated."""
 
+    object: Path | None = Field(
+        None,
+        description="YAML or MJCF file of the simulated object (docs/simulation.md); object=FOLDER/mug.yaml sets it, "
+        "and object=mug",
+    )
+    camera: SimCameraConfig = SimCameraConfig()
+    jaws: SimJawsConfig = SimJawsConfig()
+    light: SimLightConfig = SimLightConfig()
     detail: Literal["coarse", "medium", "fine", "auto"] = Field(
         "medium",
         description="mesh and time step; auto: the fastest level that keeps budget.sim_error_n and "
@@ -450,10 +497,10 @@ class SimConfig(Section):
     lux: float | None = Field(
         None, description="light level 350, 550 or 750; None: drawn from the seed", gt=0
     )
-    tool: Literal["pads", "rods"] = Field(
+    tool: Literal["pads", "discs", "rods"] = Field(
         "pads",
-        description="jaw tips: flat pads, or rods with round tips, which press the wall of a turned object "
-        "where the edge of a pad would catch on its rim",
+        description="jaw tips: flat pads, flat round discs, or rods with round tips, which press the wall of a turned "
+        "object where the edge of a pad would catch on its rim",
     )
     yaw_deg: float = Field(
         0.0, ge=-90, le=90, description="rotation of the object about the vertical, added to the drawn one"
@@ -546,7 +593,8 @@ class Config(Section):
 
     object: str = Field(
         "sponge",
-        description="name of the grasped object; simulated: sponge, paper_cup, tube, stapler, ball or block",
+        description="name of the grasped object; simulated: sponge, paper_cup, tube, stapler, ball, block, a kind of "
+        "docs/simulation.md, or the path of a file of your own (.yaml, .xml)",
     )
     target_n: Positive = Field(4.0, description="target force")
     seed: int = Field(0, ge=0, description="seed for all random draws")
@@ -570,6 +618,17 @@ class Config(Section):
     faults: tuple[FaultConfig, ...] = Field(
         (), description="faults to inject into simulated devices: unit, kind, at_s, for_s, id"
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _split_object(cls, tree: Any) -> Any:
+        """Makes the path of a simulated object's file its name and ``sim.object``."""
+        if not isinstance(tree, dict) or not str(tree.get("object")).endswith((".yaml", ".yml", ".xml")):
+            return tree
+        sim = tree.get("sim", {})
+        sim = sim.model_dump() if isinstance(sim, SimConfig) else sim
+        path = Path(tree["object"])
+        return tree | {"object": path.stem, "sim": {**sim, "object": path} if isinstance(sim, dict) else sim}
 
     @model_validator(mode="after")
     def _check_fingers(self) -> Self:

@@ -1,0 +1,98 @@
+"""Meshes of a user's objects: STL and OBJ files, read by MuJoCo and checked."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from gripper_force.errors import ConfigError
+from gripper_force.schema import Positive, Section
+from gripper_hw.sim.engine import mujoco
+from gripper_hw.sim.meshes import Indices, Points
+
+MAX_VERTICES = 1000
+"""Each triangle is a candidate of a contact. With 300 vertices a mesh is about as fast as the shipped foams."""
+
+_METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
+_Angle = Annotated[float, Field(ge=-360, le=360)]
+
+
+class MeshFile(Section):
+    """A mesh and its place.
+
+    Attributes:
+        file: Path of a binary STL or an OBJ file.
+        unit: Unit of its coordinates.
+        scale: Factor on its size.
+        turn_deg: Rotations about x, then y, then z, after which x is along the jaws' travel and z points up.
+    """
+
+    file: str
+    unit: Literal["m", "cm", "mm", "inch"]
+    scale: Positive = 1.0
+    turn_deg: tuple[_Angle, _Angle, _Angle] = (0.0, 0.0, 0.0)
+
+
+def read_bytes(path: Path, what: str) -> bytes:
+    """Reads a file of an object. Raises `ConfigError` that names it."""
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise ConfigError(
+            f"can't read the {what} {path}: {error.strerror}; its path is relative to the object's file"
+        ) from error
+
+
+def read_mesh(mesh: MeshFile) -> tuple[Points, Indices]:
+    """Returns the points (N, 3) in metres and the triangles (M, 3) of a closed surface.
+
+    The middle of its width and depth is at x = y = 0, and its lowest point at z = 0.
+
+    Raises:
+        ConfigError: The file can't be read, has too many vertices, or its surface is not closed.
+    """
+    path = Path(mesh.file)
+    name = f"mesh{path.suffix.lower()}"
+    scene = f"""<mujoco><asset><mesh name="mesh" file="{name}" inertia="shell"/></asset>
+      <worldbody><geom type="mesh" mesh="mesh"/></worldbody></mujoco>"""
+    try:
+        model = mujoco.MjModel.from_xml_string(scene, {name: read_bytes(path, "mesh")})
+    except ValueError as error:
+        reason = " ".join(str(error).split())
+        raise ConfigError(
+            f"can't read the mesh {path}: {reason}; save it as binary STL or OBJ with triangles"
+        ) from error
+    # MuJoCo moves a mesh to its principal axes.
+    turn = np.empty(9)
+    mujoco.mju_quat2Mat(turn, model.mesh_quat[0])
+    points = model.mesh_vert.astype(np.float64) @ turn.reshape(3, 3).T + model.mesh_pos[0]
+    extent = float(np.ptp(points, axis=0).max())
+    _, first, number = np.unique(
+        np.round(points / extent, 6), axis=0, return_index=True, return_inverse=True
+    )  # an OBJ file can hold a corner several times, with other texture coordinates
+    triangles = number.reshape(-1)[model.mesh_face]
+    triangles = triangles[[len(set(corners)) == 3 for corners in triangles.tolist()]]
+    if len(first) > MAX_VERTICES:
+        raise ConfigError(
+            f"the mesh {path} has {len(first)} vertices, and at most {MAX_VERTICES} can be simulated; reduce it, "
+            "for example with Decimate in Blender, to about 300"
+        )
+    edges = {
+        (a, b) for corners in triangles.tolist() for a, b in zip(corners, np.roll(corners, -1), strict=True)
+    }
+    if open_edges := sum((b, a) not in edges for a, b in edges) + 3 * len(triangles) - len(edges):
+        raise ConfigError(
+            f"the surface of the mesh {path} is not closed: {open_edges} edges do not join two triangles of equal "
+            "orientation; repair it, for example with Make Manifold in Blender's 3D-Print Toolbox"
+        )
+    points = points[first] * _METRES[mesh.unit] * mesh.scale
+    for axis, angle in enumerate(np.deg2rad(mesh.turn_deg)):
+        i, j = [(1, 2), (2, 0), (0, 1)][axis]
+        u, v = points[:, i].copy(), points[:, j].copy()
+        points[:, i], points[:, j] = (
+            u * np.cos(angle) - v * np.sin(angle),
+            u * np.sin(angle) + v * np.cos(angle),
+        )
+    low, high = points.min(axis=0), points.max(axis=0)
+    return points - [*(low + high)[:2] / 2, low[2]], triangles
