@@ -70,9 +70,10 @@ def digest(path: Path) -> str:
     return content.hexdigest()
 
 
-def attach(scene: str, spec: Any) -> str:
-    """Returns the MJCF of a scene with the body of another specification in its body ``object``."""
-    whole = mujoco.MjSpec.from_string(scene)
+def attach(scene: str, model: ObjectModel, images: dict[str, bytes]) -> str:
+    """Returns the MJCF of a scene, whose images are given, with a user's body in its body ``object``."""
+    whole, spec = mujoco.MjSpec.from_string(scene), model.spec
+    whole.assets = images | model.files
     whole.body("object").add_frame().attach_body(spec.body("object"), _PREFIX, "")
     return str(whole.to_xml())
 

@@ -348,7 +348,7 @@ def scene_mjcf(
     if model.spec is not None:
         from gripper_hw.sim.object_files import attach
 
-        text = attach(text, model.spec)
+        text = attach(text, model, dict.fromkeys(re.findall(r'file="(.+?)"', text), _BLANK_PNG))
     if not textured:
         return text, dict.fromkeys(re.findall(r'file="(.+?)"', text), _BLANK_PNG) | model.files
     from gripper_hw.sim.textures import draw_markers, draw_textures

@@ -16,6 +16,7 @@ from gripper_hw.sim.engine import mujoco, new_renderer
 from gripper_hw.sim.objects import NO_OBJECT
 from gripper_hw.sim.scene import Scene, horn_dynamics, scene_mjcf
 from gripper_hw.sim.surroundings import Surroundings
+from gripper_hw.sim.view_check import check_view
 
 _MAX_PENETRATION_M = 0.004
 """Deepest plausible contact of a pad in the object."""
@@ -100,7 +101,7 @@ class World:
 
     Raises:
         ConfigError: The object does not exist, does not fit between the open jaws, or the tool is not suitable
-            for it.
+            for it; or the camera sees neither pads nor object, or is inside something.
         SimulationError: MuJoCo refuses the scene, or the time step is too long.
     """
 
@@ -153,6 +154,8 @@ class World:
         self.has_object = scene.object != NO_OBJECT
         mujoco.mj_forward(self._model, self._data)
         self._check_fit(gripper.open_width_m)
+        if textured:
+            check_view(self._model, self._data)
         self.call_every(_CHECK_PERIOD_NS, self._check_state)
 
     @property
