@@ -447,23 +447,25 @@ class ControlConfig(Section):
         return gain, lag_ms * 1e-3, delay_ms * 1e-3
 
 
-Metres = Annotated[float, Field(ge=-1, le=1, allow_inf_nan=False)]
-PadLength = Annotated[float, Field(ge=0.004, le=0.05, allow_inf_nan=False)]
-Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+Metre = Annotated[float, Field(ge=-1, le=1)]
+Vector = tuple[Metre, Metre, Metre]
+PadLength = Annotated[float, Field(ge=0.004, le=0.05)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Colour = tuple[Share, Share, Share]
 
 
 class SimCameraConfig(Section):
-    """Place, lens and image of the simulated camera. The middle between the jaws' tips is the origin."""
+    """Place and image of the simulated camera; the point between the jaws' tips is the origin."""
 
-    position_m: tuple[Metres, Metres, Metres] = Field(
-        (0.10, -0.30, 0.125), description="x along the jaws' travel, y towards the wall, z up"
+    position_m: Vector = Field(
+        (0.10, -0.30, 0.125), description="x: travel of the jaws, y: to the wall, z: up"
     )
-    aim_m: tuple[Metres, Metres, Metres] = Field((0, 0, 0), description="point in the middle of the image")
+    aim_m: Vector = Field((0.0, 0.0, 0.0), description="point in the middle of the image")
     fov_deg: float = Field(17.0, ge=2, le=120, description="field of view from edge to edge of the image")
-    roll_deg: float = Field(0.0, ge=-180, le=180, description="turn of the camera about its optical axis")
-    blur_px: float = Field(0.0, ge=0, le=10, description="standard deviation of the lens's blur in pixels")
+    roll_deg: float = Field(0.0, ge=-180, le=180, description="rotation of the camera about its optical axis")
+    blur_px: float = Field(0.0, ge=0, le=10, description="standard deviation of the lens's blur")
     noise: Share | None = Field(
-        None, description="photon noise at full scale as a share of it; None: drawn, 0.012 to 0.024"
+        None, description="photon noise of a white pixel; None: drawn, 0.012 to 0.024"
     )
 
 
@@ -472,16 +474,14 @@ class SimJawsConfig(Section):
 
     pad_m: tuple[PadLength, PadLength] = Field((0.024, 0.022), description="depth and height of a pad")
     finger_m: PadLength = Field(0.016, description="depth of a finger")
-    pad_rgb: tuple[Share, Share, Share] = Field((0.16, 0.17, 0.19), description="colour of the pads")
-    finger_rgb: tuple[Share, Share, Share] = Field((0.78, 0.78, 0.80), description="colour of the fingers")
+    pad_rgb: Colour = Field((0.16, 0.17, 0.19), description="colour of the pads")
+    finger_rgb: Colour = Field((0.78, 0.78, 0.80), description="colour of the fingers")
 
 
 class SimLightConfig(Section):
-    """Light and background of the simulated world, beside `sim.lux`."""
+    """Light and background of the simulated world, beside ``sim.lux``."""
 
-    direction: tuple[Metres, Metres, Metres] = Field(
-        (-0.40, 0.55, -0.75), description="direction in which the light shines"
-    )
+    direction: Vector = Field((-0.40, 0.55, -0.75), description="direction in which the light shines")
     ambient: Share = Field(0.30, description="share of the light that comes from everywhere")
     background: float = Field(1.0, ge=0, le=2, description="factor on the brightness of table and wall")
 
@@ -489,14 +489,12 @@ class SimLightConfig(Section):
 class SimConfig(Section):
     """The simulated world; read only if a device is simulated."""
 
-    object: Path | None = Field(
-        None,
-        description="YAML or MJCF file of the simulated object (docs/simulation.md); object=FOLDER/mug.yaml sets it, "
-        "and object=mug",
-    )
     camera: SimCameraConfig = SimCameraConfig()
     jaws: SimJawsConfig = SimJawsConfig()
     light: SimLightConfig = SimLightConfig()
+    object: Path | None = Field(
+        None, description="file of the simulated object; object=FOLDER/mug.yaml sets it"
+    )
     detail: Literal["coarse", "medium", "fine", "auto"] = Field(
         "medium",
         description="mesh and time step; auto: the fastest level that keeps budget.sim_error_n and "
@@ -602,7 +600,7 @@ class Config(Section):
     object: str = Field(
         "sponge",
         description="name of the grasped object; simulated: sponge, paper_cup, tube, stapler, ball, block, a kind of "
-        "docs/simulation.md, or the path of a file of your own (.yaml, .xml)",
+        "docs/simulation.md, or the path of a file of your own (.yaml or .xml)",
     )
     target_n: Positive = Field(4.0, description="target force")
     seed: int = Field(0, ge=0, description="seed for all random draws")
@@ -630,13 +628,11 @@ class Config(Section):
     @model_validator(mode="before")
     @classmethod
     def _split_object(cls, tree: Any) -> Any:
-        """Makes the path of a simulated object's file its name and ``sim.object``."""
-        if not isinstance(tree, dict) or not str(tree.get("object")).endswith((".yaml", ".yml", ".xml")):
+        """Makes of a simulated object's file, given as ``object``, its name and ``sim.object``."""
+        path, sim = (tree.get("object"), tree.get("sim", {})) if isinstance(tree, dict) else (None, None)
+        if not str(path).endswith((".yaml", ".xml")) or not isinstance(sim, dict | SimConfig):
             return tree
-        sim = tree.get("sim", {})
-        sim = sim.model_dump() if isinstance(sim, SimConfig) else sim
-        path = Path(tree["object"])
-        return tree | {"object": path.stem, "sim": {**sim, "object": path} if isinstance(sim, dict) else sim}
+        return tree | {"object": Path(str(path)).stem, "sim": {**dict(sim), "object": path}}
 
     @model_validator(mode="after")
     def _check_fingers(self) -> Self:
