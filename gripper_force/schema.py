@@ -175,7 +175,8 @@ def _parse(text: str, what_fails: str) -> Any:
 
 
 def _sentence(root: type[Section], error: ValidationError, where: str, what: str) -> str:
-    first = error.errors()[0]
+    # A misspelt key is the cause of the missing one, too.
+    first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
     parts = [str(part) for part in first["loc"]]
     key = ".".join(parts)
     if first["type"] == "extra_forbidden":
@@ -186,7 +187,8 @@ def _sentence(root: type[Section], error: ValidationError, where: str, what: str
     reason = first["msg"].removeprefix("Value error, ")
     if not parts:
         return f"the {what} (from {where}) is inconsistent: {reason}"
-    return f"{what} key {key!r} (from {where}): {reason}, got {first['input']!r}"
+    got = "; add it" if first["type"] == "missing" else f", got {first['input']!r}"
+    return f"{what} key {key!r} (from {where}): {reason}{got}"
 
 
 def _suggestion(root: type[Section], parts: list[str]) -> str:

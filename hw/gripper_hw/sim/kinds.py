@@ -13,7 +13,7 @@ from pydantic import Field, model_validator
 
 from gripper_force.errors import ConfigError
 from gripper_force.schema import Positive, Section, Tree, tree_from, validated
-from gripper_hw.sim.mesh_files import MeshFile, read_bytes, read_mesh
+from gripper_hw.sim.mesh_files import LEAST_M, MOST_M, MeshFile, read_image, read_mesh
 from gripper_hw.sim.meshes import (
     SHELL_CONTACT,
     SOFT_CONTACT,
@@ -42,7 +42,10 @@ _RING_N_M = (300.0, 30_000.0)
 """Stiffness E * wall^3 * length / radius^3 of a shell that the simulation can follow. A thinner wall is folded flat by
 a few newtons and chatters; a thicker one moves less than the pads' own contact."""
 
-Length = Annotated[float, Field(ge=0.004, le=0.2)]
+_SOLID_N_M = 100_000.0
+"""Stiffness E * area / width of a solid that the simulation can follow: 10 N press it by 0.1 mm."""
+
+Length = Annotated[float, Field(ge=LEAST_M, le=MOST_M)]
 Size = tuple[Length, Length, Length]
 Share = Annotated[float, Field(ge=0, le=1)]
 
@@ -79,7 +82,7 @@ class ObjectKind(Section):
         texture, files = f"{self.texture}.png", {}
         if self.texture not in TEXTURES:
             texture = "image.png"
-            files[texture] = read_bytes(Path(self.texture), "texture")
+            files[texture] = read_image(Path(self.texture))
         return ObjectModel(body, contact, texture, self.grip * height_m, timestep_s, files)
 
 
@@ -99,13 +102,13 @@ class Solid(ObjectKind):
 
     family: Literal["solid"]
     size_m: Size | None = None
-    modulus_pa: Annotated[float, Field(ge=2e3, le=1e7)]
+    modulus_pa: Annotated[float, Field(ge=2e3, le=3e6)]
     shape: Literal["box", "roll", "column", "ball"] = "box"
     mesh: MeshFile | None = None
     rounding: Share = 0.15
-    taper: Annotated[float, Field(ge=-0.8, le=0.8)] = 0.0
-    dent: Annotated[float, Field(ge=0, le=0.8)] = 0.0
-    edge: Annotated[float, Field(ge=0, le=0.8)] = 0.0
+    taper: Annotated[float, Field(ge=-0.6, le=0.6)] = 0.0
+    dent: Annotated[float, Field(ge=0, le=0.6)] = 0.0
+    edge: Annotated[float, Field(ge=0, le=0.6)] = 0.0
 
     @model_validator(mode="after")
     def _has_one_shape(self) -> Self:
@@ -128,6 +131,12 @@ class Solid(ObjectKind):
             (points, tetrahedra), lengths = self._shape(), np.array(self.size_m) * size
         else:
             points, tetrahedra, lengths = _mesh_shape(self.mesh, size)
+        most_pa = _SOLID_N_M * lengths[0] / (lengths[1] * lengths[2])
+        if self.modulus_pa > most_pa:
+            raise ConfigError(
+                f"modulus_pa {self.modulus_pa:g} of a simulated object of this size is too stiff to be simulated as "
+                f"elastic; set at most {most_pa:.2g}, or describe a rigid object as MJCF"
+            )
         points = points * lengths / 2 + [0, 0, lengths[2] / 2 + _SKIN_M]
         uv = np.c_[points[:, 0] + 0.5 * points[:, 1], points[:, 2] + 0.5 * points[:, 1]] / 0.1
         nodes = 1 if order == "trilinear" else 2

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
+import cv2
 import numpy as np
 from pydantic import Field
 
@@ -13,6 +14,9 @@ from gripper_hw.sim.meshes import Indices, Points
 
 MAX_VERTICES = 1000
 """Each triangle is a candidate of a contact. With 300 vertices a mesh is about as fast as the shipped foams."""
+
+LEAST_M, MOST_M = 0.004, 0.2
+"""Least and largest length of an object along an axis."""
 
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 _Angle = Annotated[float, Field(ge=-360, le=360)]
@@ -42,6 +46,17 @@ def read_bytes(path: Path, what: str) -> bytes:
         raise ConfigError(
             f"can't read the {what} {path}: {error.strerror}; its path is relative to the object's file"
         ) from error
+
+
+def read_image(path: Path) -> bytes:
+    """Reads a PNG image. Raises `ConfigError` that names it."""
+    data = read_bytes(path, "texture")
+    if (
+        not data.startswith(b"\x89PNG")
+        or cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) is None
+    ):
+        raise ConfigError(f"the texture {path} is not a PNG image; save it as PNG")
+    return data
 
 
 def read_mesh(mesh: MeshFile) -> tuple[Points, Indices]:
@@ -95,4 +110,10 @@ def read_mesh(mesh: MeshFile) -> tuple[Points, Indices]:
             u * np.sin(angle) + v * np.cos(angle),
         )
     low, high = points.min(axis=0), points.max(axis=0)
+    if (high - low).min() < LEAST_M or (high - low).max() > MOST_M:
+        size = " x ".join(f"{1e3 * length:.6g}" for length in high - low)
+        raise ConfigError(
+            f"the mesh {path} measures {size} mm, and from {1e3 * LEAST_M:g} to {1e3 * MOST_M:g} mm can be simulated; "
+            "correct mesh.unit or mesh.scale"
+        )
     return points - [*(low + high)[:2] / 2, low[2]], triangles

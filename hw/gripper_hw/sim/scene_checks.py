@@ -1,4 +1,4 @@
-"""Check of a simulated camera's place before a run: what it sees, and what it is inside of."""
+"""Checks of a simulated scene before a run: what the jaws can touch, and what the camera sees."""
 
 from typing import Any
 
@@ -15,6 +15,29 @@ _HIDDEN_M = 0.03
 """A point is hidden by what is nearer by more than this; half of a pad or of a small part is less."""
 
 _REMEDY = "set sim.camera.position_m, aim_m or fov_deg"
+
+
+def check_reach(model: Any, data: Any, name: str) -> None:
+    """Raises `ConfigError` if the closing jaws would pass the object.
+
+    Args:
+        model: The scene's ``mujoco.MjModel``.
+        data: Its ``mujoco.MjData``, computed forward.
+        name: Name of the object.
+    """
+    low, high = _bounds(model, data, model.geom("pad_right").id)
+    bounds = [
+        _bounds(model, data, geom)
+        for geom in range(model.ngeom)
+        if _is_object(model, geom) and (model.geom_conaffinity[geom] | model.geom_contype[geom]) & 1
+    ]
+    soft = data.flexvert_xpos.reshape(-1, 3)
+    if len(soft):
+        bounds.append((soft.min(0), soft.max(0)))
+    if not any((low < top)[1:].all() and (high > bottom)[1:].all() for bottom, top in bounds):
+        raise ConfigError(
+            f"the jaws would pass the simulated object {name!r} without touching it; move its grip to where it is wide"
+        )
 
 
 def check_view(model: Any, data: Any) -> None:
@@ -45,6 +68,14 @@ def check_view(model: Any, data: Any) -> None:
     limit = np.tan(np.deg2rad(float(model.camera("camera").fovy[0])) / 2)
     if not any(_sees(model, data, eye, axes, limit, point) for point in [*pads, *solid, *soft[::7]]):
         raise ConfigError(f"the simulated camera sees neither a pad nor the object; {_REMEDY}")
+
+
+def _bounds(model: Any, data: Any, geom: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Returns the lowest and highest coordinates of a geom's bounding box."""
+    centre, half = model.geom_aabb[geom].reshape(2, 3)
+    axes = data.geom_xmat[geom].reshape(3, 3)
+    centre, half = data.geom_xpos[geom] + axes @ centre, np.abs(axes) @ half
+    return centre - half, centre + half
 
 
 def _is_object(model: Any, geom: int) -> bool:
