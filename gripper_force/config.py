@@ -500,41 +500,28 @@ class SimConfig(Section):
         description="mesh and time step; auto: the fastest level that keeps budget.sim_error_n and "
         "budget.sim_speed by the table of `gripper-force bench scene`",
     )
-    lux: float | None = Field(
-        None, description="light level 350, 550 or 750; None: drawn from the seed", gt=0
-    )
+    lux: Positive | None = Field(None, description="light level 350, 550 or 750; None: drawn from the seed")
     tool: Literal["pads", "discs", "rods"] = Field(
         "pads",
         description="jaw tips: flat pads, flat round discs, or rods with round tips, which press the wall of a turned "
         "object where the edge of a pad would catch on its rim",
     )
-    yaw_deg: float = Field(
-        0.0, ge=-90, le=90, description="rotation of the object about the vertical, added to the drawn one"
-    )
+    yaw_deg: float = Field(0.0, ge=-90, le=90, description="rotation of the object, added to the drawn one")
     randomise: bool = Field(
         True, description="draw size, pose, camera, texture, light and motor from the seed"
     )
-    object_seed: int | None = Field(
-        None, ge=0, description="seed of the object (size, stiffness, texture); None: seed"
-    )
+    object_seed: int | None = Field(None, ge=0, description="seed of size, stiffness and texture; None: seed")
     rig_seed: int | None = Field(
         None,
         ge=0,
-        description="seed of the gripper and its surroundings (camera, light, noise, table, motor, friction, "
-        "gears, rods); None: seed",
+        description="seed of the gripper and its surroundings (camera, light, table, motor, gears, rods); None: seed",
     )
     size_spread: float = Field(
-        0.04, ge=0, le=0.15, description="half-width of the uniform spread of the object's size"
+        0.04, ge=0, le=0.15, description="half-width of the uniform spread of the size"
     )
-    stiffness_spread: float = Field(
-        0.05, ge=0, le=0.5, description="half-width of the uniform spread of the object's stiffness"
-    )
+    stiffness_spread: float = Field(0.05, ge=0, le=0.5, description="the same of the object's stiffness")
     stiffness_octaves: float = Field(
-        0.0,
-        ge=0,
-        le=1,
-        description="half-width in octaves of a further, log-uniform spread of the object's stiffness; "
-        "1: factors 0.5 to 2",
+        0.0, ge=0, le=1, description="further, log-uniform spread; 1: factors 0.5 to 2"
     )
     view_spread: float = Field(
         1.0,
@@ -555,20 +542,10 @@ class SimConfig(Section):
     moving_background: bool = Field(False, description="things that move behind the object")
     camera_latency_ms: NonNegative = Field(15.0, description="time from mid-exposure to the frame")
     exposure_ms: Positive = Field(4.0, description="exposure at camera.exposure_us 4000")
-    friction: Positive | None = Field(
-        None,
-        description="true friction of motor and rails over that of the default rig; None: drawn, 0.7 to 1.3",
-    )
-    gain: Positive | None = Field(
-        None, description="true torque constant over the servo model's; None: drawn, 0.92 to 1.08"
-    )
-    stiffness: Positive | None = Field(
-        None,
-        description="true stiffness of the object over that of its kind; None: drawn by stiffness_spread",
-    )
-    open_width_m: Positive | None = Field(
-        None, description="true distance between the open jaws; None: gripper.open_width_m"
-    )
+    friction: Positive | None = Field(None, description="true friction over the default rig's; None: drawn")
+    gain: Positive | None = Field(None, description="true torque constant over the model's; None: drawn")
+    stiffness: Positive | None = Field(None, description="true stiffness over that of the kind; None: drawn")
+    open_width_m: Positive | None = Field(None, description="true open width; None: gripper.open_width_m")
 
 
 class CalibrationConfig(Section):

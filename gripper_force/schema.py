@@ -187,8 +187,7 @@ def _sentence(root: type[Section], error: ValidationError, where: str, what: str
     reason = first["msg"].removeprefix("Value error, ")
     if not parts:
         return f"the {what} (from {where}) is inconsistent: {reason}"
-    got = "; add it" if first["type"] == "missing" else f", got {first['input']!r}"
-    return f"{what} key {key!r} (from {where}): {reason}{got}"
+    return f"{what} key {key!r} (from {where}): {reason}, got {first['input']!r}"
 
 
 def _suggestion(root: type[Section], parts: list[str]) -> str:

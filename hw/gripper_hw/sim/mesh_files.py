@@ -15,6 +15,9 @@ from gripper_hw.sim.meshes import Indices, Points
 MAX_VERTICES = 1000
 """Each triangle is a candidate of a contact. With 300 vertices a mesh is about as fast as the shipped foams."""
 
+_LONGEST_M = 0.02
+"""Longest edge of a triangle; a pad is 22 mm high."""
+
 LEAST_M, MOST_M = 0.004, 0.2
 """Least and largest length of an object along an axis."""
 
@@ -116,4 +119,22 @@ def read_mesh(mesh: MeshFile) -> tuple[Points, Indices]:
             f"the mesh {path} measures {size} mm, and from {1e3 * LEAST_M:g} to {1e3 * MOST_M:g} mm can be simulated; "
             "correct mesh.unit or mesh.scale"
         )
-    return points - [*(low + high)[:2] / 2, low[2]], triangles
+    return _refined(points - [*(low + high)[:2] / 2, low[2]], triangles, path)
+
+
+def _refined(points: Points, triangles: Indices, path: Path) -> tuple[Points, Indices]:
+    """Divides each triangle into four until the edges are short: a pad moves the corners of a triangle only."""
+    while True:
+        corners = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], -1), axis=-1)  # (M, 3, 2)
+        edges, number = np.unique(corners.reshape(-1, 2), axis=0, return_inverse=True)
+        longest_m = float(np.linalg.norm(np.diff(points[edges], axis=1), axis=-1).max())
+        if longest_m <= _LONGEST_M:
+            return points, triangles
+        if len(points) + len(edges) > MAX_VERTICES:
+            raise ConfigError(
+                f"the mesh {path} has an edge of {1e3 * longest_m:.0f} mm among short ones, which would make it too "
+                "stiff; divide it evenly, for example with Remesh in Blender"
+            )
+        (a, b, c), (d, e, f) = triangles.T, number.reshape(-1, 3).T + len(points)
+        points = np.vstack([points, points[edges].mean(axis=1)])
+        triangles = np.vstack([np.stack(one, -1) for one in ((a, d, f), (d, b, e), (f, e, c), (d, e, f))])

@@ -1,4 +1,5 @@
 from dataclasses import asdict, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -193,7 +194,7 @@ def test_every_drawn_number_changes_the_model() -> None:
             assert after[1] != before[1]
 
 
-RIG = {
+RIG: dict[str, Any] = {
     "camera.position_m": (0.05, -0.25, 0.1),
     "camera.aim_m": (0.0, 0.01, 0.0),
     "camera.fov_deg": 30.0,
