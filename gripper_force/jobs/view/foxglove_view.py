@@ -33,7 +33,7 @@ _CLOCK_NS: Final = 20 * NS_PER_MS
 _LEAST_SPEED: Final = 0.01
 
 
-class FoxgloveViewer(ServerListener):
+class FoxgloveViewer(ServerListener):  # type: ignore[misc]  # the SDK is not checked
     """Server for the Foxglove app.
 
     Args:
