@@ -51,7 +51,7 @@ def images(draw: st.DrawFn) -> Frame | AttentionMap:
     pixels = draw(st.binary(min_size=height * width, max_size=height * width))
     gray = np.frombuffer(pixels, np.uint8).reshape(height, width)
     t_ns = draw(st.integers(-(2**40), 2**60))
-    kind = draw(st.sampled_from(IMAGE_TYPES))
+    kind = Frame if draw(st.booleans()) else AttentionMap
     return kind(t_ns, draw(TIMES), draw(st.integers(0, 2**32 - 1)), gray)
 
 
@@ -179,7 +179,10 @@ def test_an_estimate_is_written_with_its_claimed_interval(
     tmp_path_factory: pytest.TempPathFactory, force_n: float, std_n: float
 ) -> None:
     path = tmp_path_factory.mktemp("log") / "run.mcap"
-    records = [FusedForce(1, force_n, std_n, 0, 0, 0, ""), VisualForce(1, 2, 3, force_n, std_n, 0)]
+    records: list[Record] = [
+        FusedForce(1, force_n, std_n, 0, 0, 0, ""),
+        VisualForce(1, 2, 3, force_n, std_n, 0),
+    ]
     with LogWriter(path, config="", metadata={}) as log:
         for record in records:
             log.write(record)

@@ -374,7 +374,7 @@ def test_the_foxglove_app_plays_a_log_searches_it_and_plays_it_again(log: Path) 
         request = SimpleNamespace(
             playback_command=command, playback_speed=50.0, seek_time=seek_ns, request_id="1"
         )
-        state = server.on_playback_control_request(request)  # type: ignore[arg-type]
+        state = server.on_playback_control_request(request)
         assert (state.request_id, state.did_seek) == ("1", seek_ns is not None)
         return state.status
 
