@@ -25,8 +25,8 @@ FOXGLOVE_LAYOUT: Final = Path(__file__).with_name("foxglove_layout.json")
 """Layout to import in Foxglove, for live data and for log files."""
 
 _POLL_S: Final = 0.02
-_NICENESS: Final = 10
-"""A viewer beside a run leaves the processor to the run."""
+_NICENESS: Final = 19
+"""A viewer beside a run gets only the time that the run leaves."""
 
 _PATIENCE_S: Final = 10.0
 """Time that a viewer gets at the end of a run to show the rest."""
