@@ -8,7 +8,16 @@ from typing import Annotated
 import typer
 
 from gripper_force.cli import console
-from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, Page, load_settings
+from gripper_force.cli.options import (
+    CORES,
+    AsJson,
+    ConfigPath,
+    Jobs,
+    NoOverrides,
+    Overrides,
+    Page,
+    load_settings,
+)
 from gripper_force.cli.output.bench import (
     bus_table,
     checkpoints_table,
@@ -26,9 +35,6 @@ from gripper_force.errors import ConfigError
 
 app = typer.Typer(no_args_is_help=True, help="Measure speed, memory and error on this machine.")
 
-NoOverrides = Annotated[
-    list[str] | None, typer.Option("--set", help="Not allowed: this command uses no configuration.")
-]
 Folder = Annotated[Path, typer.Option("--out", help="Folder for the results.")]
 
 

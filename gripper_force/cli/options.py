@@ -16,6 +16,9 @@ ConfigPath = Annotated[Path | None, typer.Option("--config", help="YAML file wit
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", help="Set one configuration key: key.path=value. Repeatable.")
 ]
+NoOverrides = Annotated[
+    list[str] | None, typer.Option("--set", help="Not allowed: this command uses no configuration.")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
 Jobs = Annotated[int, typer.Option(min=1, help="Processes to use.")]
 Page = Annotated[Path | None, typer.Option("--write", help="Markdown page to write the table into.")]

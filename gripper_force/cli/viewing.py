@@ -9,7 +9,7 @@ import typer
 from typer.core import TyperCommand
 
 from gripper_force.cli import console
-from gripper_force.cli.options import AsJson
+from gripper_force.cli.options import AsJson, NoOverrides
 from gripper_force.errors import ConfigError
 
 _NAMES = ("rerun", "foxglove")
@@ -42,11 +42,14 @@ def view(
     ] = None,
     port: Annotated[int, typer.Option(min=0, help="Port for Foxglove; 0: a free one.")] = 8765,
     recover: Annotated[bool, typer.Option(help="Show the intact part of a truncated log.")] = False,
+    set_: NoOverrides = None,
     as_json: AsJson = False,
 ) -> None:
     """Show a log in Rerun or Foxglove: frames, attention, forces, phases and events on one timeline."""
     from gripper_force.jobs import view as job
 
+    if set_:
+        raise ConfigError(f"view uses no configuration; leave out --set {set_[0]}")
     job.require(viewer)
     if viewer == "foxglove":
         if save is not None:
