@@ -237,6 +237,11 @@ class Gripper:
         return self.state.width_m
 
     @property
+    def largest_force_n(self) -> float:
+        """Largest force that `grasp` accepts, in newtons; force limit and profiles set it."""
+        return self._run.largest_target_n
+
+    @property
     def frame(self) -> Frame | None:
         """The newest camera frame, (H, W) uint8 in its ``gray``; None without a camera."""
         return self._loop.session.newest_frame
