@@ -17,7 +17,17 @@ from typing import Annotated, NoReturn
 import typer
 
 from gripper_force import __version__
-from gripper_force.cli import bench, calibrate, configuration, console, data, learning, runs, stability
+from gripper_force.cli import (
+    bench,
+    calibrate,
+    configuration,
+    console,
+    data,
+    exports,
+    learning,
+    runs,
+    stability,
+)
 from gripper_force.errors import GripperError
 
 app = typer.Typer(
@@ -34,13 +44,13 @@ for _command in (  # in the order of --help
     learning.train,
     learning.evaluate,
     learning.reproduce,
-    learning.export,
     runs.doctor,
     runs.virtual_servo,
 ):
     app.command()(_command)
 app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(data.import_app, name="import")
+app.add_typer(exports.app, name="export")
 app.add_typer(configuration.app, name="config")
 app.add_typer(bench.app, name="bench")
 app.add_typer(stability.app, name="stability")

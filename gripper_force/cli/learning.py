@@ -1,4 +1,4 @@
-"""Commands for networks: `train`, `evaluate`, `export` and `reproduce`."""
+"""Commands for networks: `train`, `evaluate`, `export network` and `reproduce`."""
 
 import json
 import math
@@ -190,7 +190,7 @@ def evaluate(
         console.err.print(f"figure: {plot}", soft_wrap=True, markup=False)
 
 
-def export(
+def export_network(
     out: Annotated[Path, typer.Option("--out", help="File to write: .onnx, or .xml for OpenVINO.")],
     checkpoint: Annotated[
         str | None,

@@ -7,7 +7,7 @@ import os
 import re
 import time
 from collections.abc import Iterable, Iterator
-from importlib import import_module
+from importlib import import_module, metadata
 from pathlib import Path
 from typing import Final
 
@@ -31,6 +31,14 @@ PROBES: Final = {
 
 _SLEEP_MS: Final = 5
 
+_OPENCV: Final = (
+    "opencv-python-headless",
+    "opencv-python",
+    "opencv-contrib-python-headless",
+    "opencv-contrib-python",
+)
+"""Distributions that contain a module ``cv2``; the one installed last overwrites that of the others."""
+
 
 def doctor(config: Config) -> Iterator[Check]:
     """Checks every device and this machine. Nothing moves, and nothing is written to a device.
@@ -41,6 +49,7 @@ def doctor(config: Config) -> Iterator[Check]:
         yield from _guarded(unit, _probe(module, config))
     yield from _guarded("network", _network(config))
     yield from _guarded("clock", _clock(config))
+    yield from _guarded("opencv", _opencv())
 
 
 def setup(config: Config, confirm: Confirm) -> SetupResult:
@@ -95,6 +104,21 @@ def _network(config: Config) -> Iterator[Check]:
     advice = f"slower than the frames at camera.rate_hz={config.camera.rate_hz:g}: close other programs"
     lockstep = config.clock == "lockstep"
     yield judged("network", "step", found, median_ms <= frame_ms, advice, harmless=lockstep)
+
+
+def _opencv() -> Iterator[Check]:
+    """Checks that one distribution gives ``cv2``, and that it has what this project calls."""
+    import cv2
+
+    installed = [f"{name} {found.version}" for name in _OPENCV for found in metadata.distributions(name=name)]
+    remedy = f"pip uninstall {' '.join(_OPENCV)}, then pip install {_OPENCV[0]}"
+    whole = hasattr(getattr(cv2, "aruco", None), "ArucoDetector")
+    found = f"cv2 {cv2.__version__} of {', '.join(installed) or 'no known distribution'}"
+    if whole:
+        advice = f"each overwrites the module cv2 of the others, and to remove one breaks it: {remedy}"
+        yield judged("opencv", "module", found, len(installed) <= 1, advice, harmless=True)
+    else:
+        yield Check("opencv", "module", f"{found} has no cv2.aruco.ArucoDetector", False, remedy)
 
 
 def _clock(config: Config) -> Iterator[Check]:

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from gripper_hw.cameras import oak
 from lerobot.cameras import Camera
 from lerobot.utils.decorators import check_if_already_connected, check_if_not_connected
 
 import gripper_force as gf
+from gripper_hw.cameras import oak
 from lerobot_camera_oak.config_oak import OakCameraConfig
 
 _POLL_S = 0.001
@@ -70,9 +70,7 @@ class OakCamera(Camera):
             "white_balance_k": config.white_balance_k,
             "timeout_ms": config.timeout_ms,
         }
-        self.settings = gf.load_config(
-            None, {f"camera.{key}": value for key, value in keys.items()}
-        ).camera
+        self.settings = gf.load_config(None, {f"camera.{key}": value for key, value in keys.items()}).camera
         self._lock = threading.Lock()
         self._newest: gf.Frame | None = None
         self._is_unread = False
