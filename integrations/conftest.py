@@ -45,11 +45,10 @@ def _imported(name: str) -> ModuleType:
 
 
 @pytest.fixture(autouse=True)
-def _no_setting_of_the_process(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
+def _offline(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """LeRobot's files go to a folder of the test, and it never asks the network."""
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     monkeypatch.setenv("HF_HOME", str(tmp_path / "hf"))
-    yield
 
 
 QUICK = [

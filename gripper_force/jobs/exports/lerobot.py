@@ -77,9 +77,9 @@ def export_lerobot(
 ) -> ExportResult:
     """Writes logs as a LeRobot dataset. A failed export leaves no dataset.
 
-    Row ``k`` of an episode holds the values of the newest control cycle at ``k / fps`` seconds after the first one (with
-    a camera: the first one with a frame), and the action in force one row later, which is the action that answers it. An
-    episode ends before a stop or a fault.
+    Row ``k`` of an episode holds the values of the newest control cycle at ``k / fps`` seconds after the first one
+    (with a camera: the first one with a frame), and the action in force one row later, which is the action that
+    answers it. An episode ends before a stop or a fault.
 
     Args:
         logs: Logs of runs.
@@ -115,25 +115,37 @@ def export_lerobot(
     frames = 0
     try:
         for path in logs:
-            reader = LogReader(path)
-            config = config_from_text(reader.config, str(path), overrides)
-            rows = 0
-            for row in _rows(reader, config, fps, action, shape):
-                dataset.add_frame({**row, "task": task or f"grasp the {config.object}"})
-                rows += 1
-            if rows == 0:
-                raise DataError(
-                    f"{path} has no control cycles to export, or less than {1 / fps:.2g} s of them before a "
-                    "stop or fault; pass logs of runs"
-                )
-            dataset.save_episode()
-            frames += rows
+            frames += _add_episode(dataset, path, action, task, overrides, shape)
             progress(path.name)
         dataset.finalize()
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
     return ExportResult(folder, len(logs), frames, fps)
+
+
+def _add_episode(
+    dataset: Any,
+    path: Path,
+    action: Action,
+    task: str | None,
+    overrides: Overrides | None,
+    shape: tuple[int, int] | None,
+) -> int:
+    """Adds a log to the dataset, and returns its number of rows."""
+    reader = LogReader(path)
+    config = config_from_text(reader.config, str(path), overrides)
+    rows = 0
+    for row in _rows(reader, config, dataset.fps, action, shape):
+        dataset.add_frame({**row, "task": task or f"grasp the {config.object}"})
+        rows += 1
+    if rows == 0:
+        raise DataError(
+            f"{path} has less than {1 / dataset.fps:.2g} s of control cycles before its end, a stop or a fault; pass "
+            "logs of runs"
+        )
+    dataset.save_episode()
+    return rows
 
 
 def _dataset_class() -> Any:

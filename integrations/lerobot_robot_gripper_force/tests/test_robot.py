@@ -20,10 +20,11 @@ Make = Callable[..., Any]
 FORCE, WIDTH = "gripper.force_n", "gripper.width_m"
 
 
-def torque(served: PtyServer | None = None) -> int:
+def register(name: str, served: PtyServer | None = None) -> int:
+    """Reads a register of the virtual servo."""
     bus: VirtualBus | None = find_bus("rig") if served is None else served.bus
     assert bus is not None
-    return bus.servos[0].get("torque_enable")
+    return bus.servos[0].get(name)
 
 
 def run(robot: Any, frames: int, **action: float) -> dict[str, Any]:
@@ -137,7 +138,7 @@ def test_no_action_resets_a_stop(make_robot: Make, action: float) -> None:
     with pytest.raises(gf.RequestError, match="stopped or is at fault"):
         robot.send_action({FORCE: action})
     assert robot.gripper.state.phase == gf.Phase.FAULT
-    assert torque() == 0
+    assert register("goal_current") == 0
     robot.gripper.release()
     run(robot, 2, force_n=1.0 + action)
     assert robot.gripper.state.phase != gf.Phase.FAULT
@@ -223,7 +224,7 @@ def real_robot(make_robot: Make, server: PtyServer) -> Any:
 def test_a_stop_from_another_thread_wins_over_a_stream_of_actions(real_robot: Any, server: PtyServer) -> None:
     real_robot.connect()
     gripper = real_robot.gripper
-    assert torque(server) == 1
+    assert register("torque_enable", server) == 1
     started, errors = threading.Event(), []
 
     def stream() -> None:
@@ -243,7 +244,9 @@ def test_a_stop_from_another_thread_wins_over_a_stream_of_actions(real_robot: An
     assert len(errors) == 1
     gripper.sleep(0.3)
     assert gripper.state.phase == gf.Phase.FAULT
-    assert torque(server) == 0
+    assert register("goal_current", server) == 0
+    real_robot.disconnect()
+    assert register("torque_enable", server) == 0
 
 
 def test_a_lost_servo_ends_the_observations(real_robot: Any, server: PtyServer) -> None:
