@@ -135,17 +135,17 @@ def _add_episode(
     """Adds a log to the dataset, and returns its number of rows."""
     reader = LogReader(path)
     config = config_from_text(reader.config, str(path), overrides)
-    rows = 0
-    for row in _rows(reader, config, dataset.fps, action, shape):
+    count = 0
+    for row in rows(reader, config, dataset.fps, action, shape):
         dataset.add_frame({**row, "task": task or f"grasp the {config.object}"})
-        rows += 1
-    if rows == 0:
+        count += 1
+    if count == 0:
         raise DataError(
             f"{path} has less than {1 / dataset.fps:.2g} s of control cycles before its end, a stop or a fault; pass "
             "logs of runs"
         )
     dataset.save_episode()
-    return rows
+    return count
 
 
 def _dataset_class() -> Any:
@@ -179,9 +179,21 @@ def _image_shape(path: Path) -> tuple[int, int] | None:
     return None if first is None else (first.gray.shape[0], first.gray.shape[1])
 
 
-def _rows(
+def rows(
     reader: LogReader, config: Config, fps: int, action: Action, shape: tuple[int, int] | None
 ) -> Iterator[dict[str, Any]]:
+    """Yields the rows of a log as LeRobot takes them, without their task; see `export_lerobot`.
+
+    Args:
+        reader: The log.
+        config: Its configuration.
+        fps: Rows per second.
+        action: Kind of the actions.
+        shape: Height and width of the images; None: rows have none.
+
+    Raises:
+        DataError: Images have another size, or a request is none of this kind of action.
+    """
     for cycle, after in pairwise(
         _sampled(_cycles(reader, config, action), fps, with_frame=shape is not None)
     ):
