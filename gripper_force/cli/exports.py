@@ -1,7 +1,7 @@
 """Commands that convert for other software: `export network` and `export lerobot`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 from typer.core import TyperGroup
@@ -11,16 +11,14 @@ from gripper_force.cli.learning import export_network
 from gripper_force.cli.options import AsJson, Overrides
 from gripper_force.errors import ConfigError
 
-if TYPE_CHECKING:  # --help needs neither
-    import click
-
+if TYPE_CHECKING:
     from gripper_force.jobs.exports.lerobot import Action
 
 
 class _NetworkByDefault(TyperGroup):
     """Reads ``export --out FILE``, from before there was a second export, as ``export network --out FILE``."""
 
-    def parse_args(self, ctx: "click.Context", args: list[str]) -> list[str]:
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         if args and args[0] not in (*self.commands, "--help"):
             args = ["network", *args]
         return super().parse_args(ctx, args)

@@ -127,7 +127,8 @@ class OakCamera(Camera):
         """
         self._take()
         self._is_unread = False
-        return self.async_read(_READ_TIMEOUT_MS)
+        image: Image = self.async_read(_READ_TIMEOUT_MS)
+        return image
 
     @check_if_not_connected
     def async_read(self, timeout_ms: float = 200) -> Image:

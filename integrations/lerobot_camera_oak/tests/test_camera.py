@@ -19,7 +19,7 @@ from gripper_hw.cameras import oak
 Make = Callable[..., Any]
 
 
-class CountingSensor(dai.node.ThreadedHostNode):  # type: ignore[misc]
+class CountingSensor(dai.node.ThreadedHostNode):
     """Gives 50 images per second, each a little brighter than the one before, while plugged in."""
 
     def __init__(self, plugged: threading.Event) -> None:

@@ -3,7 +3,6 @@
 import math
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -172,15 +171,6 @@ def test_states_of_the_connection_are_checked(make_robot: Make) -> None:
     assert run(robot, 2, force_n=2.0)[FORCE] < 2.0
 
 
-def test_a_failed_connection_leaves_nothing_open(make_robot: Make) -> None:
-    robot = make_robot(
-        "clock=realtime", "servo.port=/dev/nowhere", "camera.backend=none", "load_cell.backend=none"
-    )
-    with pytest.raises(gf.DeviceError):
-        robot.connect()
-    assert not robot.is_connected
-
-
 def test_wrong_configurations_are_named(make_robot: Make, robots: ModuleType) -> None:
     with pytest.raises(gf.ConfigError, match="nowhere"):
         make_robot("control.nowhere=1")
@@ -264,54 +254,52 @@ def test_a_lost_servo_ends_the_observations(real_robot: Any, server: PtyServer) 
 # Further cameras.
 
 
-def test_further_cameras_are_observed(make_robot: Make, cameras: ModuleType) -> None:
-    from lerobot.cameras import CameraConfig
+class StillCamera:
+    """A camera of LeRobot that gives one black image."""
 
-    if "stills" not in CameraConfig.get_known_choices():
-        _register_still_camera()
-    config_class = CameraConfig.get_choice_class("stills")
-    robot = make_robot("camera.backend=none", cameras={"wrist": config_class(fps=30, width=40, height=30)})
-    assert robot.observation_features["wrist"] == (30, 40, 3)
+    is_connected = False
+
+    def __init__(self, config: Any) -> None:
+        self.width, self.height = config.width, config.height
+
+    def connect(self) -> None:
+        self.is_connected = True
+
+    def async_read(self) -> Any:
+        if not self.is_connected:
+            raise RuntimeError("the camera is not connected")
+        return np.zeros((self.height, self.width, 3), np.uint8)
+
+    def disconnect(self) -> None:
+        self.is_connected = False
+
+
+@pytest.fixture
+def still_cameras(robots: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    """LeRobot makes a `StillCamera` of every configuration of a camera."""
+
+    def make(configs: dict[str, Any]) -> dict[str, StillCamera]:
+        return {name: StillCamera(config) for name, config in configs.items()}
+
+    monkeypatch.setattr(robots.gripper_force, "make_cameras_from_configs", make)
+
+
+def test_further_cameras_are_observed(make_robot: Make, cameras: ModuleType, still_cameras: None) -> None:
+    wrist = cameras.OakCameraConfig(width=30, height=30)
+    robot = make_robot("camera.backend=none", cameras={"wrist": wrist})
+    assert robot.observation_features["wrist"] == (30, 30, 3)
     robot.connect()
-    assert robot.get_observation()["wrist"].shape == (30, 40, 3)
-    wrist = robot.cameras["wrist"]
+    assert robot.get_observation()["wrist"].shape == (30, 30, 3)
     robot.disconnect()
-    assert not wrist.is_connected
+    assert not robot.cameras["wrist"].is_connected
 
 
-def _register_still_camera() -> None:
-    """Registers a camera of LeRobot that gives one black image; its device class is found beside its configuration."""
-    import sys
-
-    from lerobot.cameras import Camera, CameraConfig
-
-    module = type(sys)("stills")
-    package = type(sys)("stills_package")
-
-    class StillCamera(Camera):
-        is_connected = False
-
-        @staticmethod
-        def find_cameras() -> list[dict[str, Any]]:
-            return []
-
-        def connect(self, warmup: bool = True) -> None:
-            self.is_connected = True
-
-        def read(self) -> Any:
-            return np.zeros((self.height, self.width, 3), np.uint8)
-
-        def async_read(self, timeout_ms: float = 200) -> Any:
-            return self.read()
-
-        def disconnect(self) -> None:
-            self.is_connected = False
-
-    class StillCameraConfig(CameraConfig):
-        pass
-
-    StillCameraConfig.__module__ = "stills_package.config"
-    CameraConfig.register_subclass("stills")(dataclass(kw_only=True)(StillCameraConfig))
-    package.StillCamera = StillCamera  # type: ignore[attr-defined]
-    package.config = module  # type: ignore[attr-defined]
-    sys.modules["stills_package"] = package
+def test_cameras_are_closed_if_the_gripper_cannot_be_opened(
+    make_robot: Make, cameras: ModuleType, still_cameras: None
+) -> None:
+    missing = ("clock=realtime", "servo.port=/dev/nowhere", "load_cell.backend=none")
+    robot = make_robot(*missing, "camera.backend=none", cameras={"wrist": cameras.OakCameraConfig()})
+    with pytest.raises(gf.DeviceError):
+        robot.connect()
+    assert not robot.is_connected
+    assert not robot.cameras["wrist"].is_connected
