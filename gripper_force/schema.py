@@ -175,7 +175,8 @@ def _parse(text: str, what_fails: str) -> Any:
 
 
 def _sentence(root: type[Section], error: ValidationError, where: str, what: str) -> str:
-    first = error.errors()[0]
+    # A misspelt key is the cause of the missing one, too.
+    first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
     parts = [str(part) for part in first["loc"]]
     key = ".".join(parts)
     if first["type"] == "extra_forbidden":

@@ -160,7 +160,7 @@ def camera(
 
 @app.command("object")
 def object_(
-    name: Annotated[str, typer.Argument(help="Name of the object; in simulation one of the known objects.")],
+    name: Annotated[str, typer.Argument(help="Name of the object, or the file of a simulated one.")],
     touches: Annotated[int, typer.Option(min=1, help="Number of touches.")] = 8,
     peak_n: Annotated[float | None, typer.Option(help="Largest force of a touch in newtons.")] = None,
     logs: Annotated[
@@ -194,6 +194,7 @@ def object_(
     if fresh and logs is not None:
         raise ConfigError("--fresh records touches and --from records none; leave out one of them")
     settings = load_settings(config, set_, {"object": name, "seed": seed})
+    name = settings.object  # a path has become a name
     folder = folder or job.default_folder(name)
     if logs is None:
         _tell_existing(settings, touches, folder, fresh)

@@ -208,7 +208,8 @@ def export_network(
 ) -> None:
     """Export a network for another engine, and compare it with PyTorch."""
     from gripper_force.jobs.dataset import find_logs, load_clips
-    from gripper_force.vision.export import export as job
+    from gripper_force.vision.export import export as to_float
+    from gripper_force.vision.int8_export import export_int8
     from gripper_force.vision.model_files import read_model
 
     model = read_model(load_settings(None, set_, {"vision.checkpoint": checkpoint}).vision.checkpoint)
@@ -219,7 +220,7 @@ def export_network(
             clips = load_clips(logs, model.header.preprocess, workers=jobs, progress=progress)
         frames = [clip.frames for clip in clips]
     with console.err.status("exporting"):
-        errors = job(model, out, frames)
+        errors = to_float(model, out) if frames is None else export_int8(model, out, frames)
     console.show({"file": str(out), "digest": model.digest, "off_torch_n": errors}, as_json)
 
 

@@ -43,7 +43,9 @@ def grasp(
     config: ConfigPath = None,
     set_: Overrides = None,
     as_json: AsJson = False,
-    object_: Annotated[str | None, typer.Option("--object", help="Object to grasp.")] = None,
+    object_: Annotated[
+        str | None, typer.Option("--object", help="Object to grasp, or the file of a simulated one.")
+    ] = None,
     target_n: Annotated[float | None, typer.Option(help="Target force in newtons.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the simulated scene.")] = None,
     feedback: Annotated[str | None, typer.Option(help="fused, current or vision.")] = None,
@@ -108,7 +110,7 @@ def grasp(
             raise typer.Exit(1)
         return
     device = job.exclusive_device(settings)
-    one_object = device or same_object or object_ is not None
+    one_object = device or same_object or object_ is not None or settings.sim.object is not None
     objects = (settings.object,) if one_object else job.TRIAL_OBJECTS
     jobs = jobs or (1 if device or same_object else CORES)
     prompt: Prompt | None = None

@@ -7,6 +7,7 @@ from types import TracebackType
 from typing import Any, Literal, Self, overload
 
 from gripper_force.config import Config, Overrides, load_config
+from gripper_force.control.limits import largest_target_n
 from gripper_force.errors import ConfigError
 from gripper_force.interfaces import Lock, SharedPort
 from gripper_force.runtime.control_loop import ControlLoop
@@ -65,13 +66,12 @@ def open_gripper(
         raise ConfigError(
             "clock=lockstep runs in the caller's thread; leave background out, or set clock=realtime"
         )
-    if background is None:
-        background = not lockstep
     if (port is None) != (port_lock is None):
         raise ConfigError("a shared port needs port and port_lock; pass both to open_gripper")
     shared = None if port is None or port_lock is None else SharedPort(port, port_lock)
     path = None if log is None else Path(log)
-    loop = ControlLoop(settings, path, background=background, port=shared)
+    in_background = not lockstep if background is None else background
+    loop = ControlLoop(settings, path, background=in_background, port=shared)
     loop.open()
     return Gripper(loop, path)
 
@@ -238,8 +238,9 @@ class Gripper:
 
     @property
     def largest_force_n(self) -> float:
-        """Largest force that `grasp` accepts, in newtons; force limit and profiles set it."""
-        return self._run.largest_target_n
+        """Largest force that `grasp` accepts, in newtons."""
+        limit_n = largest_target_n(self.config.control.force_limit_n, self.config.gripper.gain_bound)
+        return min([limit_n, *self._run.target_limits_n.values()])
 
     @property
     def frame(self) -> Frame | None:
@@ -274,12 +275,6 @@ class Gripper:
         self, force_n: float, *, wait: bool, new_object: bool = False, needs_object: bool = False
     ) -> GraspResult | None:
         self._run.check_target(force_n)
-        return self._loop.request(
-            PendingRequest(
-                RequestKind.GRASP,
-                target_n=float(force_n),
-                new_object=new_object,
-                needs_object=needs_object,
-                is_awaited=wait,
-            )
-        )
+        request = PendingRequest(RequestKind.GRASP, target_n=float(force_n), is_awaited=wait)
+        request.new_object, request.needs_object = new_object, needs_object
+        return self._loop.request(request)

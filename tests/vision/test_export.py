@@ -6,8 +6,9 @@ import pytest
 
 from gripper_force.errors import CheckpointError, ConfigError, DataError
 from gripper_force.vision.engines import open_engine
-from gripper_force.vision.export import export, with_added_error
+from gripper_force.vision.export import export
 from gripper_force.vision.header import Model
+from gripper_force.vision.int8_export import export_int8, with_added_error
 from gripper_force.vision.model_files import read_model
 
 
@@ -51,7 +52,7 @@ def test_export_reports_its_error_and_keeps_the_header(
 
 def test_int8_is_calibrated_on_recordings(model: Model, tmp_path: Path, recordings: list[np.ndarray]) -> None:
     needs("nncf")
-    errors = export(model, tmp_path / "int8.xml", recordings)
+    errors = export_int8(model, tmp_path / "int8.xml", recordings)
     assert 0 < errors["mean_n"] <= errors["rms_n"] <= errors["largest_n"]
     assert b"FakeQuantize" in (tmp_path / "int8.xml").read_bytes()
     opened = open_engine(read_model(tmp_path / "int8.xml"), "openvino", "bfloat16")
@@ -67,10 +68,10 @@ def test_impossible_exports_are_refused(model: Model, tmp_path: Path, recordings
     with pytest.raises(ConfigError, match=r"name a file that ends in \.xml or \.onnx"):
         export(model, tmp_path / "force.trt")
     with pytest.raises(ConfigError, match=r"int8 is exported to OpenVINO only"):
-        export(model, tmp_path / "force.onnx", recordings)
+        export_int8(model, tmp_path / "force.onnx", recordings)
     needs("nncf")
     with pytest.raises(DataError, match="at least 300 frames, and the recordings hold 40"):
-        export(model, tmp_path / "force.xml", [recordings[0][:40]])
+        export_int8(model, tmp_path / "force.xml", [recordings[0][:40]])
     assert not list(tmp_path.iterdir())
     (tmp_path / "file").write_text("", encoding="utf-8")
     with pytest.raises(CheckpointError, match="can't write"):

@@ -56,7 +56,7 @@ class ExportResult:
 
 @dataclass(frozen=True, slots=True)
 class _Cycle:
-    """What a robot knows after a control cycle: the values of `STATE`, the image, and the action in force."""
+    """Values of `STATE` after a control cycle, with the newest image and the action in force."""
 
     t_ns: int
     state: tuple[float, ...]
