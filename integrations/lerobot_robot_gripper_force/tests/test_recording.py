@@ -3,6 +3,8 @@
 import os
 import subprocess
 import sys
+from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -13,6 +15,9 @@ import pytest
 import gripper_force as gf
 
 FPS, FRAMES = 30, 40
+KEEPS_PIXELS = not version("lerobot").startswith("0.4") if find_spec("lerobot") else True
+"""LeRobot 0.4 records no images without ``--dataset.video``, and a video loses detail."""
+
 IMAGE = "observation.images.gripper.frame"
 
 
@@ -45,7 +50,7 @@ def recording(robots: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> R
         f"--dataset.fps={FPS}",
         "--dataset.num_episodes=1",
         "--dataset.episode_time_s=20",
-        "--dataset.video=false",
+        f"--dataset.video={str(not KEEPS_PIXELS).lower()}",
         "--dataset.push_to_hub=false",
         "--play_sounds=false",
     ]
@@ -54,7 +59,7 @@ def recording(robots: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> R
         command, env={**os.environ, **environment}, capture_output=True, text=True, stdin=subprocess.DEVNULL
     )
     assert done.returncode == 0, done.stderr[-4000:]
-    return Recording(LeRobotDataset("me/grasps", root=root), log)
+    return Recording(LeRobotDataset("me/grasps", root=root, video_backend="pyav"), log)
 
 
 def test_the_dataset_has_the_values_of_the_log(recording: Recording) -> None:
@@ -85,10 +90,9 @@ def test_the_dataset_has_the_values_of_the_log(recording: Recording) -> None:
     at = np.arange(len(rows)) * step
     (first,) = (i for i in range(len(logged) - at[-1]) if np.array_equal(logged[i + at], rows))
     assert (rows[:, 0] > 0).any()
-    # PNG keeps every pixel.
     for k in (0, len(rows) // 2, len(rows) - 1):
-        image = np.round(255 * np.asarray(dataset[k][IMAGE]))  # (3, H, W)
-        assert all(np.array_equal(channel, frames[first + at[k]]) for channel in image)
+        error = 255 * np.asarray(dataset[k][IMAGE]) - frames[first + at[k]]  # (3, H, W)
+        assert np.abs(error).mean() < (1e-3 if KEEPS_PIXELS else 4)
 
 
 def test_actions_and_task_are_those_of_the_teleoperator(recording: Recording) -> None:
