@@ -102,6 +102,15 @@ def test_grasp_changes_of_force_and_release(simulated: Open) -> None:
     assert gripper.state.phase == gf.Phase.OPEN
 
 
+@pytest.mark.parametrize("profile", ["null", "stapler"])
+def test_the_largest_force_is_the_largest_that_is_accepted(simulated: Open, profile: str) -> None:
+    gripper = simulated("object=none", f"calibration.object={profile}")
+    largest_n = gripper.largest_force_n
+    gripper.grasp(largest_n, wait=False)
+    with pytest.raises(gf.RequestError, match="profile" if profile == "stapler" else "force_limit_n"):
+        gripper.grasp(math.nextafter(largest_n, math.inf), wait=False)
+
+
 def test_the_same_configuration_gives_the_same_result(simulated: Open) -> None:
     first = simulated()
     result = first.grasp(3.0)
