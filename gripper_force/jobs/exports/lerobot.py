@@ -111,6 +111,7 @@ def export_lerobot(
         root=folder,
         robot_type="gripper_force",
         use_videos=video,
+        video_backend="pyav",  # nothing is decoded, and to look for another one can print a page of warnings
     )
     frames = 0
     try:
