@@ -17,7 +17,7 @@ from typing import Annotated, NoReturn
 import typer
 
 from gripper_force import __version__
-from gripper_force.cli import bench, calibrate, configuration, console, data, learning, runs, stability
+from gripper_force.cli import bench, calibrate, configuration, console, data, learning, runs, setup, stability
 from gripper_force.errors import GripperError
 
 app = typer.Typer(
@@ -27,6 +27,7 @@ app = typer.Typer(
 )
 
 for _command in (  # in the order of --help
+    setup.setup,
     runs.grasp,
     runs.replay,
     data.record,

@@ -143,7 +143,7 @@ def calibrate_camera(
         read_rig(rig)  # a damaged profile is reported before anything moves
     config = _with(config, "calibration", rig=None, object=None)  # their camera settings are replaced
     config = _with(config, "vision", region=region)
-    candidates, images = _try_exposures(config, exposures_us, progress)
+    candidates, images = try_exposures(config, exposures_us, progress)
     selected = select_exposure(candidates)
     config = _with(config, "camera", exposure_us=selected.exposure_us)
     with TemporaryDirectory() as aside:
@@ -258,9 +258,15 @@ def _touch_lags(
     return touches
 
 
-def _try_exposures(
+def try_exposures(
     config: Config, exposures_us: Sequence[int], progress: Progress
 ) -> tuple[list[ExposureCandidate], list[Gray]]:
+    """Returns the gray values and an image at each exposure that is at most half a frame's period.
+
+    Raises:
+        ConfigError: All are longer.
+        DeviceError: The camera failed.
+    """
     longest_us = 0.5e6 / config.camera.rate_hz
     candidates, images = [], []
     for exposure_us in exposures_us:

@@ -242,7 +242,9 @@ class _Inspection:
             case "return_delay_time":
                 return f"{2 * value} us"
             case "baud_rate":
-                return next((f"{rate} baud" for rate, code in BAUD_RATES.items() if code == value), str(value))
+                return next(
+                    (f"{rate} baud" for rate, code in BAUD_RATES.items() if code == value), str(value)
+                )
             case "homing_offset":
                 return f"{value} ticks"
             case "current_limit":

@@ -41,7 +41,10 @@ def ports() -> list[str]:
 
 
 def scan(
-    config: Config, names: Iterable[str], baud_rates: Iterable[int] = BAUD_RATES, progress: Progress = no_progress
+    config: Config,
+    names: Iterable[str],
+    baud_rates: Iterable[int] = BAUD_RATES,
+    progress: Progress = no_progress,
 ) -> list[PortScan]:
     """Returns the servos that answer on each port, or why the port can't be used.
 
