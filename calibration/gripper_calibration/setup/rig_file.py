@@ -102,14 +102,19 @@ class RigFile:
             return {}
         try:
             state = json.loads(self._state.read_text(encoding="utf-8"))
-            if state["format"] != FORMAT:
-                raise ValueError(state["format"])
-            self.steps = dict(state["steps"])
-            return {key: Found(*found) for key, found in state["found"].items()}
+            steps = dict(state["steps"])
+            found = {key: Found(*one) for key, one in state["found"].items()}
+            format_ = state["format"]
         except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
             raise ConfigError(
                 f"can't read the state of the setup, {self._state}: {error}; delete it, and the steps run again"
             ) from error
+        if format_ != FORMAT:
+            raise ConfigError(
+                f"{self._state} has the format {format_!r}, not {FORMAT!r}; delete it, and the steps run again"
+            )
+        self.steps = steps
+        return found
 
     def _state_text(self) -> str:
         state = {"format": FORMAT, "steps": self.steps, "found": self.found}
@@ -118,7 +123,7 @@ class RigFile:
     def _text(self) -> str:
         origins = {key: found.origin for key, found in self.values.items()}
         head = (
-            "# Written by `gripper-force setup`. You may change values; your own comments are lost when it runs again.\n"
+            "# Written by `gripper-force setup`. You may change values; comments are lost when it runs again.\n"
             f"# gripper-force grasp --config {self.path} --target-n 3\n"
         )
         return head + "".join(f"{line}\n" for line in _lines(self.tree(), origins, list(Config.model_fields)))
