@@ -93,7 +93,7 @@ class _Terminal:
         while True:
             answer = self._ask(asked, lambda: typer.prompt(asked, err=True), option)
             if answer in answers:
-                return answer
+                return str(answer)
             self.tell(f"answer one of {', '.join(answers)}")
 
     def number(self, question: str, option: str, default: float | None = None) -> float:
@@ -102,7 +102,9 @@ class _Terminal:
                 raise ConfigError(f"this needs an answer: {question}; pass {option}")
             self.tell(f"{question}: {default:g} (default)")
             return default
-        return self._ask(question, lambda: typer.prompt(question, default, type=float, err=True), option)
+        return float(
+            self._ask(question, lambda: typer.prompt(question, default, type=float, err=True), option)
+        )
 
     def _ask(self, question: str, ask: Callable[[], T], option: str) -> T:
         self._status.stop()

@@ -23,7 +23,7 @@ def blur(gray: Gray) -> float:
     return max(_along(image), _along(image.T.copy()))
 
 
-def _along(image: np.ndarray) -> float:  # type: ignore[type-arg]
+def _along(image: np.ndarray) -> float:
     """Blur along the first axis."""
     again = cv2.blur(image, (1, _TAPS), borderType=cv2.BORDER_REFLECT)
     steps, steps_again = np.abs(np.diff(image, axis=0)), np.abs(np.diff(again, axis=0))
