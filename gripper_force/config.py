@@ -527,7 +527,9 @@ class CalibrationConfig(Section):
         "configuration file and --set replace its values",
     )
     object: str | None = Field(
-        None, description="object profile: a name or a path; own: the one named like `object`"
+        None,
+        description="object profile or bundle: a name or a path; own: the one named like `object`; none: none; None: "
+        "the bundle that `gripper-force teach` made of `object`, if there is one",
     )
     on_mismatch: Literal["refuse", "warn"] = Field(
         "refuse", description="what to do if a profile belongs to another device than the run's"
@@ -587,7 +589,8 @@ class Config(Section):
     @property
     def profile(self) -> str | None:
         """Name or path of the object profile, or None."""
-        return self.object if self.calibration.object == "own" else self.calibration.object
+        name = self.calibration.object
+        return {"own": self.object, "none": None}.get(name, name) if name is not None else None
 
     @property
     def uses_vision(self) -> bool:
@@ -599,6 +602,13 @@ class Config(Section):
         camera = self.camera.model_dump(mode="json", exclude=CAMERA_OTHER_KEYS)
         settings = {f"camera.{key}": value for key, value in camera.items()}
         return {**settings, "vision.region": self.vision.region and list(self.vision.region)}
+
+    def rig_settings(self) -> Tree:
+        """Camera keys, and those of the gripper and of a simulated view, by which one rig differs from another."""
+        gripper = self.gripper.model_dump(mode="json", include={"linkage", "pinion_radius_m", "open_width_m"})
+        sim = self.sim.model_dump(mode="json", include={"tool", "view_spread", "jaw_spread"})
+        rest = {f"gripper.{key}": value for key, value in gripper.items()}
+        return {**self.camera_settings(), **rest, **{f"sim.{key}": value for key, value in sim.items()}}
 
 
 Overrides = Sequence[str | tuple[str, Any]] | Mapping[str, Any]

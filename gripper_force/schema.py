@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from copy import deepcopy
 from difflib import get_close_matches
 from inspect import isclass
+from math import isclose
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args
 
@@ -132,6 +133,15 @@ def read_section(section: type[S], path: Path, format_: str, what: str) -> S:
             "`gripper-force calibrate`"
         )
     return validated(section, tree, str(path), what)
+
+
+def differences(known: Tree, run: Tree) -> list[str]:
+    """Describes the keys in which a run differs, as text. Missing keys, and lengths within 5 %, do not differ."""
+
+    def same(a: object, b: object) -> bool:
+        return isclose(a, b, rel_tol=0.05) if isinstance(a, float) and isinstance(b, float) else a == b
+
+    return [f"{key} {v}, not {run[key]}" for key, v in known.items() if key in run and not same(v, run[key])]
 
 
 def keys(section: type[Section], under: str = "") -> Iterator[tuple[str, FieldInfo]]:

@@ -1,5 +1,6 @@
 """The commands that calibrate a rig and objects."""
 
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -8,7 +9,7 @@ import typer
 
 from gripper_force.cli import console
 from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, load_settings
-from gripper_force.cli.output.calibrate import jaws_table, object_table, rig_table
+from gripper_force.cli.output.calibrate import jaws_table, object_table, rig_table, taught_table
 from gripper_force.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -244,6 +245,93 @@ def gain(
 
     paths = [path for given in logs for path in (find_logs(given) if given.is_dir() else [given])]
     console.show(save_gain(name, paths, out, set_), as_json)
+
+
+def teach(
+    name: Annotated[str, typer.Argument(help="Name of the object; in simulation one of the known objects.")],
+    touches: Annotated[int, typer.Option(min=4, help="Number of touches, with those of earlier calls.")] = 16,
+    peak_n: Annotated[float | None, typer.Option(help="Largest force of a touch in newtons.")] = None,
+    logs: Annotated[
+        list[Path] | None,
+        typer.Option("--from", help="Teach with these logs, or folders of them, without the devices."),
+    ] = None,
+    replay: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Logs of an earlier training; they are mixed in, so that their objects are not forgotten."
+        ),
+    ] = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the touches and of the work so far; nothing in it is repeated."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the bundle. Default: NAME in your folder of profiles.")
+    ] = None,
+    fresh: Annotated[
+        bool,
+        typer.Option(
+            "--fresh", help="Move existing touches to a folder beside, and record all of them again."
+        ),
+    ] = False,
+    pause: Annotated[
+        bool, typer.Option("--pause", help="Wait for Enter before each touch, to place the object again.")
+    ] = False,
+    jobs: Jobs = CORES,
+    config: ConfigPath = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the touches, and of a simulated scene.")] = None,
+    set_: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Teach an object: touch it, train and calibrate the best estimator for it, and make `grasp` use it."""
+    import time
+
+    from gripper_calibration.procedures import calibrate_object
+    from gripper_calibration.procedures import teach as job
+
+    if fresh and logs is not None:
+        raise ConfigError("--fresh records touches and --from records none; leave out one of them")
+    settings = load_settings(config, set_, {"object": name, "seed": seed})
+    folder = folder or calibrate_object.default_folder(name)
+    job.check_bundle(out or job.user_folder() / name)
+    begin_s = time.monotonic()
+    try:
+        if logs is None:
+            _tell_existing(settings, touches, folder, fresh)
+            logs = []
+            with console.err.status("touching") as status:
+                prompt = console.prompt(False, status) if pause else None
+                logs += calibrate_object.record_touches(
+                    settings, touches, peak_n, folder, prompt=prompt, progress=_progress(status)
+                )
+        with console.bar("teaching", job.STEPS) as progress:
+            result = job.teach(
+                settings,
+                name,
+                logs=logs,
+                folder=folder,
+                out=out,
+                replay=replay or (),
+                workers=jobs,
+                progress=progress,
+            )
+    except KeyboardInterrupt:
+        console.err.print("what was done until now is kept; the same command continues", soft_wrap=True)
+        raise
+    shown = console.jsonable(result) | {"minutes": (time.monotonic() - begin_s) / 60}
+    console.show(shown, as_json, lambda _: taught_table(result, shown["minutes"]))
+    if result.more_touches_help:
+        console.err.print(
+            f"more touches would reduce the error further: --touches {2 * len(result.profile.logs)} adds to these",
+            soft_wrap=True,
+        )
+    console.err.print(
+        f"next: gripper-force grasp --object {shlex.quote(name)} --target-n 4, which uses this bundle"
+        if out is None
+        else f"next: gripper-force grasp --object {shlex.quote(name)} --target-n 4 --profile {shlex.quote(str(out.absolute()))}",
+        soft_wrap=True,
+        markup=False,
+    )
 
 
 def _tell_existing(settings: "Config", touches: int, folder: Path, fresh: bool) -> None:

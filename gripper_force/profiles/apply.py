@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING
 
 from gripper_force.config import Config, ControlConfig
 from gripper_force.errors import ConfigError
-from gripper_force.profiles.object_profile import ObjectProfile, find_object, read_object
+from gripper_force.profiles.object_profile import (
+    BUNDLED,
+    ObjectProfile,
+    find_object,
+    read_object,
+    user_folder,
+)
 from gripper_force.profiles.rig_profile import RigProfile, read_rig
 
 if TYPE_CHECKING:  # a run without vision imports none of these
@@ -56,6 +62,26 @@ def read_profiles(config: Config) -> Profiles:
     )
 
 
+def with_bundle(config: Config) -> tuple[Config, str]:
+    """Names profile and network of a bundle in a configuration that leaves the network open.
+
+    Returns:
+        The configuration, and a sentence that names the bundle; empty if none is used.
+    """
+    calibration, name = config.calibration, config.profile
+    if calibration.object is None and (user_folder() / config.object / BUNDLED).is_file():
+        name = config.object
+    if name is None or not config.uses_vision or config.vision.checkpoint != "default":
+        return config, ""
+    profile = read_object(path := find_object(name))
+    if profile.network is None:
+        return config, ""
+    vision = config.vision.model_copy(update={"checkpoint": str(path.with_name(profile.network))})
+    calibration = calibration.model_copy(update={"object": str(path)})
+    config = config.model_copy(update={"calibration": calibration, "vision": vision})
+    return config, f"used the bundle {path.parent}, taught {profile.touches} touches on {profile.date}"
+
+
 def with_object(control: ControlConfig, profiles: Profiles) -> ControlConfig:
     """Fills in the plant and the object's ratio from the object profile, where the configuration leaves them open."""
     if profiles.object is None:
@@ -77,7 +103,7 @@ def read_correction(
     """
     if profiles.object is None or profiles.object_path is None or model is None:
         return None
-    mismatches = profiles.object.mismatches(model.digest, config.camera_settings())
+    mismatches = profiles.object.mismatches(model.digest, config.rig_settings())
     _refuse(config, f"object profile {profiles.object_path}", mismatches)
     from gripper_force.profiles.correction import load_correction
 

@@ -15,9 +15,22 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from gripper_force.errors import ConfigError
-from gripper_force.schema import Finite, NonNegative, Positive, Section, Tree, dump, read_section, write_all
+from gripper_force.schema import (
+    Finite,
+    NonNegative,
+    Positive,
+    Section,
+    Tree,
+    differences,
+    dump,
+    read_section,
+    write_all,
+)
 
 FORMAT: Final = "gripper-force-object/1"
+
+BUNDLED: Final = "profile.yaml"
+"""Profile in the folder of a bundle, which also holds the network that was taught the object."""
 
 SHIPPED: Final = "gripper_calibration"
 """Package whose folder ``objects`` holds the shipped profiles."""
@@ -111,6 +124,10 @@ class ObjectProfile(Section):
         ratio: Motor current over the corrected estimate in earlier grasps, and its relative standard deviation without
             that of the torque constant (see `gripper_force.control.object_gain`); None if it was not learned.
         weights: SHA-256 of the file beside it.
+        network: File beside it with the network, if it is the profile of a bundle (see `BUNDLED`).
+        rig: Settings of the gripper and of a simulated view.
+        logs: SHA-256 of each log of the touches.
+        version: Version of this software that made it.
     """
 
     format: Literal["gripper-force-object/1"] = FORMAT
@@ -130,6 +147,10 @@ class ObjectProfile(Section):
     after_n: NonNegative | None = None
     ratio: tuple[Positive, Positive] | None = None
     weights: str
+    network: str | None = None
+    rig: Tree = Field({})
+    logs: tuple[str, ...] = ()
+    version: str = ""
 
     @model_validator(mode="before")
     @classmethod
@@ -138,20 +159,15 @@ class ObjectProfile(Section):
             return {("ood_limit" if key == "gate" else key): value for key, value in tree.items()}
         return tree
 
-    def mismatches(self, checkpoint: str, camera: Tree) -> list[str]:
+    def mismatches(self, checkpoint: str, rig: Tree) -> list[str]:
         """Returns the differences between the calibration and a run, as text.
 
         Args:
             checkpoint: SHA-256 of the run's network.
-            camera: The run's camera settings, by key of the configuration; missing keys are not compared.
+            rig: The run's `Config.rig_settings`; missing keys are not compared.
         """
-        differ = []
-        if checkpoint != self.checkpoint:
-            differ.append(f"network {self.checkpoint[:12]}, not {checkpoint[:12]}")
-        for key, value in self.camera.items():
-            if key in camera and camera[key] != value:
-                differ.append(f"{key} {value}, not {camera[key]}")
-        return differ
+        known = {"network": self.checkpoint[:12], **self.camera, **self.rig}
+        return differences(known, {"network": checkpoint[:12], **rig})
 
 
 def weights_path(path: Path) -> Path:
@@ -194,13 +210,15 @@ def find_object(name: str) -> Path:
     """Returns the path of an object profile. The user's profiles come before the shipped ones.
 
     Args:
-        name: A name such as ``sponge``, or a path that ends in ``.yaml``.
+        name: A name such as ``sponge``, or the path of a bundle, or one that ends in ``.yaml``.
 
     Raises:
         ConfigError: No profile has that name.
     """
     if name.endswith(".yaml"):
         return Path(name)
+    if (bundle := (Path(name) if "/" in name else user_folder() / name) / BUNDLED).is_file():
+        return bundle
     with as_file(files(SHIPPED) / "objects") as shipped:
         folders = (user_folder(), shipped)
         for folder in folders:

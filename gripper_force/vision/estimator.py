@@ -200,7 +200,7 @@ def open_estimator(
 def _profile_correction(model: Model, name: str) -> Correction:
     path = find_object(name)
     profile = read_object(path)
-    if mismatches := profile.mismatches(model.digest, camera={}):
+    if mismatches := profile.mismatches(model.digest, {}):
         raise ConfigError(
             f"the object profile {path} is of {'; '.join(mismatches)}; calibrate the object with this "
             "network, or use the network of the profile"

@@ -9,7 +9,7 @@ from typing import Annotated, Final, Literal, Self
 from pydantic import Base64UrlBytes, Field, ValidationError, model_validator
 
 from gripper_force.errors import CheckpointError, ConfigError
-from gripper_force.schema import Finite, NonNegative, Positive, Section
+from gripper_force.schema import Finite, NonNegative, Positive, Section, Tree, differences
 from gripper_force.vision.preprocess import Preprocess
 
 Attention = Literal["none", "ssam", "scam", "se", "cbam"]
@@ -184,6 +184,18 @@ class OodModel(Section):
     std_growth: NonNegative
 
 
+class Provenance(Section):
+    """Settings of the recordings that a checkpoint was trained on.
+
+    Attributes:
+        rigs: Number of different settings, simulated views and grippers. A network of several rigs is for others too.
+        settings: Settings of the first one, see `gripper_force.config.Config.rig_settings`.
+    """
+
+    rigs: Annotated[int, Field(ge=1)]
+    settings: Tree
+
+
 class Header(Section):
     """Metadata of a checkpoint.
 
@@ -198,6 +210,7 @@ class Header(Section):
         test_digest: SHA-256 of the forces that the residuals and metrics were measured on, if it is not the
             training's own validation data. Metrics of two checkpoints compare if it is the same.
         identity: SHA-256 of the file before its header was changed; see `digest_of`.
+        provenance: Camera and gripper of the training set; None in checkpoints of earlier versions.
     """
 
     members: tuple[NetworkConfig | ProcessConfig, ...]
@@ -208,6 +221,7 @@ class Header(Section):
     ood: OodModel | None = None
     test_digest: str = ""
     identity: str = ""
+    provenance: Provenance | None = None
 
     @model_validator(mode="after")
     def _fits(self) -> "Header":
@@ -220,6 +234,11 @@ class Header(Section):
             if len(self.ood.mean) != 4 * features or not self.ood.axes or len(self.ood.axes) % (2 * features):
                 raise ValueError(f"ood.mean and ood.axes do not have {features} rows, one for each feature")
         return self
+
+    def mismatches(self, rig: Tree) -> list[str]:
+        """Returns the differences between the one rig of the training set and a run's settings, as text."""
+        known = self.provenance
+        return [] if known is None or known.rigs > 1 else differences(known.settings, rig)
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,12 +14,13 @@ import numpy as np
 from gripper_calibration.fits.object_fit import (
     COVERAGE,
     LearningCurvePoint,
+    ObjectFit,
     fit_correction,
     learning_curve,
 )
 from gripper_calibration.fits.plant_fit import crushing_touch, fit_plant, stiffness_n_m
 from gripper_calibration.plots.object_plot import draw
-from gripper_calibration.touch_logs import join, read_log
+from gripper_calibration.touch_logs import TouchRecording, join, read_log
 from gripper_force.config import Config
 from gripper_force.errors import DataError
 from gripper_force.interfaces import Progress, Prompt, no_progress
@@ -262,15 +263,48 @@ def _fit_and_write(
     progress("fitted the correction")
     curve = list(learning_curve(touches, COVERAGE))
     progress("computed the learning curve")
+    profile, crushed_at_n = make_profile(name, recorded, fit, ResolvedConfig(config, model))
+    write_object(out, profile, pack(fit.arrays))
+    report = out.with_suffix(".png")
+    draw(profile, fit, touches, curve, report)
+    stiffness = stiffness_n_m(recorded.width_m, [press.force_n for press in recorded.presses])
+    return ObjectCalibration(
+        profile=profile,
+        profile_path=out,
+        report_path=report,
+        correction=fit.candidate,
+        candidates_mae_n=fit.errors_n,
+        crushed_at_n=crushed_at_n,
+        stiffness_std_n_m=float(stiffness.std(ddof=1)) if len(stiffness) > 1 else None,
+        touches_needed=_mean_curve(curve),
+        without_contact=tuple(path for path in recordings if path not in with_contact),
+    )
+
+
+def make_profile(
+    name: str, recorded: TouchRecording, fit: ObjectFit, run: ResolvedConfig
+) -> tuple[ObjectProfile, float | None]:
+    """Makes an object profile of a fit.
+
+    Args:
+        name: Name of the object.
+        recorded: The touches that it was fitted to.
+        fit: The fit.
+        run: Configuration, and the network.
+
+    Returns:
+        The profile, and the largest force of the touch after which the object stayed narrower, or None.
+    """
+    assert run.model is not None
+    touches = recorded.touches
     forces_n = [press.force_n for press in recorded.presses]
     stiffness = stiffness_n_m(recorded.width_m, forces_n)
     peaks_n = np.array([force_n.max() for force_n in forces_n])
     crushed = crushing_touch(np.array([width_m[0] for width_m in recorded.width_m]), peaks_n)
-    weights = pack(fit.arrays)
     profile = ObjectProfile(
         object=name,
         date=datetime.now(UTC).date(),
-        checkpoint=checkpoint.digest,
+        checkpoint=run.model.digest,
         camera=recorded.camera,
         touches=len(touches.numbers),
         frames=len(touches.touch),
@@ -279,25 +313,12 @@ def _fit_and_write(
         interval=fit.interval,
         ood_limit=fit.ood_limit,
         stiffness_n_m=float(np.median(stiffness)) if len(stiffness) else None,
-        plant=fit_plant(recorded.presses, recorded.delay_s + _compute_s(ResolvedConfig(config, model))),
+        plant=fit_plant(recorded.presses, recorded.delay_s + _compute_s(run)),
         before_n=fit.before_n,
         after_n=fit.after_n,
-        weights=sha256(weights).hexdigest(),
+        weights=sha256(pack(fit.arrays)).hexdigest(),
     )
-    write_object(out, profile, weights)
-    report = out.with_suffix(".png")
-    draw(profile, fit, touches, curve, report)
-    return ObjectCalibration(
-        profile=profile,
-        profile_path=out,
-        report_path=report,
-        correction=fit.candidate,
-        candidates_mae_n=fit.errors_n,
-        crushed_at_n=None if crushed is None else float(peaks_n[crushed]),
-        stiffness_std_n_m=float(stiffness.std(ddof=1)) if len(stiffness) > 1 else None,
-        touches_needed=_mean_curve(curve),
-        without_contact=tuple(path for path in recordings if path not in with_contact),
-    )
+    return profile, None if crushed is None else float(peaks_n[crushed])
 
 
 def _compute_s(run: ResolvedConfig) -> float:

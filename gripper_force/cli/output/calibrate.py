@@ -9,6 +9,7 @@ from gripper_force.cli.console import number, out, pairs
 if TYPE_CHECKING:
     from gripper_calibration.procedures.calibrate_jaws import JawsResult
     from gripper_calibration.procedures.calibrate_object import ObjectCalibration
+    from gripper_calibration.procedures.teach import Taught
 
 
 def rig_table(r: Mapping[str, object]) -> None:
@@ -64,5 +65,26 @@ def object_table(r: "ObjectCalibration") -> None:
             f"phase margin {plant.phase_margin_deg:.0f} degrees",
             "profile": str(r.profile_path),
             "report": str(r.report_path),
+        }
+    )
+
+
+def taught_table(r: "Taught", minutes: float) -> None:
+    """Prints the candidates' errors, the expected error and the bundle."""
+    for name, mae_n in r.candidates_mae_n.items():
+        out.print(
+            f"[dim]{'taken' if name == r.learned else '     '}[/] {name}: {mae_n:.3f} N", highlight=False
+        )
+    interval = r.profile.interval
+    pairs(
+        {
+            "error before": number(r.before_n, "N"),
+            "expected error": f"{r.mae_n:.3f} N on touches left out, {r.contact_mae_n:.3f} N in contact",
+            "with half of the touches": number(r.half_mae_n, "N"),
+            "interval": f"{100 * interval.coverage:.0f} % within {interval.base_n:.2f} N at 0 N, "
+            f"{math.hypot(interval.base_n, 5 * interval.share):.2f} N at 5 N",
+            "touches": f"{r.profile.touches}, up to {r.profile.force_n:.1f} N",
+            "time": f"{minutes:.1f} min",
+            "bundle": str(r.bundle),
         }
     )

@@ -4,6 +4,7 @@ The diversity of scenes limits this task, not the number of labels. So a step of
 draws short clips from many recordings instead of long ones from a few.
 """
 
+import json
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -28,7 +29,7 @@ from gripper_force.jobs.training.trainer import Trainer
 from gripper_force.vision.batch_inference import predict
 from gripper_force.vision.checkpoint import Checkpoint, Member, load_checkpoint
 from gripper_force.vision.checkpoint_writer import save_checkpoint
-from gripper_force.vision.header import Header, read_checkpoint
+from gripper_force.vision.header import Header, Provenance, read_checkpoint
 from gripper_force.vision.network import ForceNetwork
 
 STATE_EVERY_S: Final = 60.0
@@ -119,7 +120,7 @@ def train(
         if ranks.first:
             forces_n, measured_n = estimates(held_out, networks, config.preprocess, ranks.device)
             mean_n = np.concatenate([clip.forces_n[clip.valid] for clip in training]).mean()
-            _save(out, networks, config, digest([*clips, *replay_clips]), forces_n, measured_n, float(mean_n))
+            _save(out, networks, config, [*clips, *replay_clips], forces_n, measured_n, float(mean_n))
             _add_ood(out, networks, held_out, ranks.device, warn)
             for state in states:
                 state.unlink()
@@ -162,14 +163,14 @@ def _fit(
         np.concatenate([part[clip.valid] for part, clip in zip(parts, measured, strict=True)])
         for parts in (left_out_n, [clip.forces_n for clip in measured])
     )
-    _save(out, [process], config, digest(clips), forces_n, measured_n, mean_n)
+    _save(out, [process], config, clips, forces_n, measured_n, mean_n)
 
 
 def _save(
     out: Path,
     networks: Sequence[Member],
     config: TrainConfig,
-    data_digest: str,
+    clips: Sequence[Clip],
     forces_n: npt.NDArray[np.float32],
     measured_n: npt.NDArray[np.float32],
     mean_n: float,
@@ -178,13 +179,22 @@ def _save(
         members=tuple(network.config for network in networks),
         preprocess=config.preprocess,
         residuals=residuals(forces_n, measured_n),
-        data_digest=data_digest,
+        data_digest=digest(clips),
+        provenance=provenance_of(clips),
         metrics={
             **errors(forces_n, measured_n),
             "constant_mae_n": metrics.mae(np.full_like(measured_n, mean_n), measured_n),
         },
     )
     save_checkpoint(out, networks, header)
+
+
+def provenance_of(clips: Sequence[Clip]) -> Provenance | None:
+    """Returns the settings that clips were recorded with; None if one of them does not know its own."""
+    if not all(clip.rig for clip in clips):
+        return None
+    rigs = {json.dumps([clip.rig, clip.view], sort_keys=True) for clip in clips}
+    return Provenance(rigs=len(rigs), settings=clips[0].rig)
 
 
 def state_paths(config: TrainConfig, out: Path) -> list[Path]:
