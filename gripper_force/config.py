@@ -597,18 +597,16 @@ class Config(Section):
         """True if the run has a camera and a network."""
         return self.camera.backend != "none" and self.vision.checkpoint != "none"
 
-    def camera_settings(self) -> Tree:
-        """Camera keys and values that an object profile is bound to."""
-        camera = self.camera.model_dump(mode="json", exclude=CAMERA_OTHER_KEYS)
-        settings = {f"camera.{key}": value for key, value in camera.items()}
-        return {**settings, "vision.region": self.vision.region and list(self.vision.region)}
-
     def rig_settings(self) -> Tree:
-        """Camera keys, and those of the gripper and of a simulated view, by which one rig differs from another."""
-        gripper = self.gripper.model_dump(mode="json", include={"linkage", "pinion_radius_m", "open_width_m"})
-        sim = self.sim.model_dump(mode="json", include={"tool", "view_spread", "jaw_spread"})
-        rest = {f"gripper.{key}": value for key, value in gripper.items()}
-        return {**self.camera_settings(), **rest, **{f"sim.{key}": value for key, value in sim.items()}}
+        """Keys and values of camera, view and gripper that networks and object profiles are bound to."""
+        parts = {
+            "camera": set(CameraConfig.model_fields) - CAMERA_OTHER_KEYS,
+            "vision": {"region"},
+            "gripper": {"linkage", "pinion_radius_m", "open_width_m"},
+            "sim": {"tool", "view_spread", "jaw_spread"},
+        }
+        tree = self.model_dump(mode="json", include=dict(parts))
+        return {f"{part}.{key}": value for part in parts for key, value in tree[part].items()}
 
 
 Overrides = Sequence[str | tuple[str, Any]] | Mapping[str, Any]

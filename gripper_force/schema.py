@@ -137,11 +137,11 @@ def read_section(section: type[S], path: Path, format_: str, what: str) -> S:
 
 def differences(known: Tree, run: Tree) -> list[str]:
     """Describes the keys in which a run differs, as text. Missing keys, and lengths within 5 %, do not differ."""
-
-    def same(a: object, b: object) -> bool:
-        return isclose(a, b, rel_tol=0.05) if isinstance(a, float) and isinstance(b, float) else a == b
-
-    return [f"{key} {v}, not {run[key]}" for key, v in known.items() if key in run and not same(v, run[key])]
+    pairs = [(key, value, run[key]) for key, value in known.items() if key in run and run[key] != value]
+    lengths = [
+        isinstance(a, float) and isinstance(b, float) and isclose(a, b, rel_tol=0.05) for _, a, b in pairs
+    ]
+    return [f"{key} {a}, not {b}" for (key, a, b), same in zip(pairs, lengths, strict=True) if not same]
 
 
 def keys(section: type[Section], under: str = "") -> Iterator[tuple[str, FieldInfo]]:

@@ -148,6 +148,10 @@ def camera(
             touches=touches,
             progress=_progress(status),
         )
+    for text in result.outdated:
+        console.warn(
+            f"the camera is now another one than that of {text}; teach or calibrate the object again"
+        )
     _show_rig(result, as_json)
 
 
@@ -183,6 +187,7 @@ def object_(
     """Calibrate an object by touching it with the load cell in place. Ctrl-C uses the touches so far."""
     from gripper_calibration.fits.interval_fit import MIN_TOUCHES
     from gripper_calibration.procedures import calibrate_object as job
+    from gripper_force.profiles.object_profile import find_object
 
     if fresh and logs is not None:
         raise ConfigError("--fresh records touches and --from records none; leave out one of them")
@@ -200,6 +205,11 @@ def object_(
             f"a test of the correction on touches outside its fit needs at least {MIN_TOUCHES} touches; "
             f"{job.TOUCHES} are recommended",
             soft_wrap=True,
+        )
+    if out is None and (found := find_object(name)) != result.profile_path:
+        console.warn(
+            f"runs use the bundle {found.parent} instead, which `teach` made; pass --profile {result.profile_path} to "
+            "use this profile, or delete the bundle"
         )
     console.show(result.as_dict(), as_json, lambda _: object_table(result))
 
@@ -288,12 +298,13 @@ def teach(
 
     from gripper_calibration.procedures import calibrate_object
     from gripper_calibration.procedures import teach as job
+    from gripper_force.profiles.object_profile import user_folder
 
     if fresh and logs is not None:
         raise ConfigError("--fresh records touches and --from records none; leave out one of them")
     settings = load_settings(config, set_, {"object": name, "seed": seed})
     folder = folder or calibrate_object.default_folder(name)
-    job.check_bundle(out or job.user_folder() / name)
+    job.check_bundle(out or user_folder() / name)
     begin_s = time.monotonic()
     try:
         if logs is None:
@@ -328,7 +339,8 @@ def teach(
     console.err.print(
         f"next: gripper-force grasp --object {shlex.quote(name)} --target-n 4, which uses this bundle"
         if out is None
-        else f"next: gripper-force grasp --object {shlex.quote(name)} --target-n 4 --profile {shlex.quote(str(out.absolute()))}",
+        else f"next: gripper-force grasp --object {shlex.quote(name)} --target-n 4 "
+        f"--profile {shlex.quote(str(out.absolute()))}",
         soft_wrap=True,
         markup=False,
     )
@@ -392,7 +404,8 @@ def _rig_settings(
 def _show_rig(result: "LoadCellResult | ServoResult | CameraResult", as_json: bool) -> None:
     """Shows the calibrated section of the rig profile and what else was measured, as one level of keys."""
     values = console.jsonable(result)
-    console.show(values.pop("calibration") | values, as_json, rig_table)
+    shown = values.pop("calibration") | values
+    console.show(shown, as_json, lambda _: rig_table({k: v for k, v in shown.items() if k != "outdated"}))
 
 
 def _region(text: str) -> tuple[int, int, int, int]:

@@ -32,7 +32,8 @@ def train(
     recipe: Annotated[
         str,
         typer.Option(
-            help="short_clips (this project's), shin2019 (the paper's), or few (a Gaussian process)."
+            help="short_clips (this project's), shin2019 (the paper's), few (a Gaussian process), or touches (with "
+            "--init, for a few touches of an object)."
         ),
     ] = "short_clips",
     set_: Annotated[
@@ -165,8 +166,11 @@ def evaluate(
     """Compare a checkpoint's estimates with the load cell, over all logs of a folder."""
     from gripper_force.jobs.dataset import find_logs
     from gripper_force.jobs.evaluate import evaluate as job
+    from gripper_force.profiles.apply import with_bundle
 
     settings = load_settings(None, set_, {"vision.checkpoint": checkpoint, "calibration.object": profile})
+    if settings.calibration.object not in (None, "own"):
+        settings, _ = with_bundle(settings)
     logs = find_logs(data)
     with console.bar("evaluating", 2 * len(logs)) as progress:
         result = job(

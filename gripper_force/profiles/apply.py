@@ -63,11 +63,7 @@ def read_profiles(config: Config) -> Profiles:
 
 
 def with_bundle(config: Config) -> tuple[Config, str]:
-    """Names profile and network of a bundle in a configuration that leaves the network open.
-
-    Returns:
-        The configuration, and a sentence that names the bundle; empty if none is used.
-    """
+    """Names a bundle's profile and network in a configuration that leaves the network open, and returns a note too."""
     calibration, name = config.calibration, config.profile
     if calibration.object is None and (user_folder() / config.object / BUNDLED).is_file():
         name = config.object

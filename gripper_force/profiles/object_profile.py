@@ -15,17 +15,7 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from gripper_force.errors import ConfigError
-from gripper_force.schema import (
-    Finite,
-    NonNegative,
-    Positive,
-    Section,
-    Tree,
-    differences,
-    dump,
-    read_section,
-    write_all,
-)
+from gripper_force.schema import Finite, NonNegative, Positive, Section, Tree, differences, read_section
 
 FORMAT: Final = "gripper-force-object/1"
 
@@ -108,7 +98,7 @@ class ObjectProfile(Section):
         object: The object's name.
         date: Date of the calibration.
         checkpoint: SHA-256 of the network's file.
-        camera: The camera's settings, by key of the configuration.
+        camera: Settings of camera, view and gripper, by key of the configuration.
         touches: Number of touches of the calibration.
         frames: Number of their frames.
         force_n: Largest force that the object was pressed with and recovered from. The profile holds up to
@@ -125,7 +115,6 @@ class ObjectProfile(Section):
             that of the torque constant (see `gripper_force.control.object_gain`); None if it was not learned.
         weights: SHA-256 of the file beside it.
         network: File beside it with the network, if it is the profile of a bundle (see `BUNDLED`).
-        rig: Settings of the gripper and of a simulated view.
         logs: SHA-256 of each log of the touches.
         version: Version of this software that made it.
     """
@@ -148,7 +137,6 @@ class ObjectProfile(Section):
     ratio: tuple[Positive, Positive] | None = None
     weights: str
     network: str | None = None
-    rig: Tree = Field({})
     logs: tuple[str, ...] = ()
     version: str = ""
 
@@ -166,7 +154,7 @@ class ObjectProfile(Section):
             checkpoint: SHA-256 of the run's network.
             rig: The run's `Config.rig_settings`; missing keys are not compared.
         """
-        known = {"network": self.checkpoint[:12], **self.camera, **self.rig}
+        known = {"network": self.checkpoint[:12], **self.camera}
         return differences(known, {"network": checkpoint[:12], **rig})
 
 
@@ -178,26 +166,6 @@ def weights_path(path: Path) -> Path:
 def read_object(path: Path) -> ObjectProfile:
     """Reads an object profile. Raises `ConfigError` if the file is missing or invalid."""
     return read_section(ObjectProfile, path, FORMAT, "object profile")
-
-
-def check_place(path: Path) -> None:
-    """Creates the folder of a profile. Raises `ConfigError` if the profile can't be written there."""
-    if path.suffix != ".yaml":
-        raise ConfigError(f"can't write an object profile to {path}; name a file that ends in .yaml")
-    probe = path.with_name(f".{path.name}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise ConfigError(
-            f"can't write {path}: {error.strerror}, {error.filename}; name another file"
-        ) from error
-
-
-def write_object(path: Path, profile: ObjectProfile, weights: bytes) -> None:
-    """Writes an object profile and the safetensors file beside it. Raises `ConfigError` if it can't."""
-    write_all({weights_path(path): weights, path: dump(profile).encode()})
 
 
 def user_folder() -> Path:

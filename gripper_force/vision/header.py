@@ -184,18 +184,6 @@ class OodModel(Section):
     std_growth: NonNegative
 
 
-class Provenance(Section):
-    """Settings of the recordings that a checkpoint was trained on.
-
-    Attributes:
-        rigs: Number of different settings, simulated views and grippers. A network of several rigs is for others too.
-        settings: Settings of the first one, see `gripper_force.config.Config.rig_settings`.
-    """
-
-    rigs: Annotated[int, Field(ge=1)]
-    settings: Tree
-
-
 class Header(Section):
     """Metadata of a checkpoint.
 
@@ -210,7 +198,8 @@ class Header(Section):
         test_digest: SHA-256 of the forces that the residuals and metrics were measured on, if it is not the
             training's own validation data. Metrics of two checkpoints compare if it is the same.
         identity: SHA-256 of the file before its header was changed; see `digest_of`.
-        provenance: Camera and gripper of the training set; None in checkpoints of earlier versions.
+        trained_on: Number of ``rigs`` (cameras, views, grippers) in the training set, and the settings of the first;
+            None if unknown. With several, others will do, too.
     """
 
     members: tuple[NetworkConfig | ProcessConfig, ...]
@@ -221,7 +210,7 @@ class Header(Section):
     ood: OodModel | None = None
     test_digest: str = ""
     identity: str = ""
-    provenance: Provenance | None = None
+    trained_on: Tree | None = None
 
     @model_validator(mode="after")
     def _fits(self) -> "Header":
@@ -237,8 +226,8 @@ class Header(Section):
 
     def mismatches(self, rig: Tree) -> list[str]:
         """Returns the differences between the one rig of the training set and a run's settings, as text."""
-        known = self.provenance
-        return [] if known is None or known.rigs > 1 else differences(known.settings, rig)
+        known = self.trained_on or {}
+        return differences(known, rig) if known.get("rigs") == 1 else []
 
 
 @dataclass(frozen=True, slots=True)

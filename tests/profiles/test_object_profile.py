@@ -6,18 +6,17 @@ import pytest
 
 from gripper_force.config import load_config
 from gripper_force.errors import ConfigError
+from gripper_force.jobs.profile_files import check_place, write_object
 from gripper_force.profiles.apply import read_profiles, with_object
 from gripper_force.profiles.object_profile import (
     Interval,
     LoopPlant,
     ObjectProfile,
     OutputCurve,
-    check_place,
     find_object,
     read_object,
     user_folder,
     weights_path,
-    write_object,
 )
 
 
@@ -26,7 +25,7 @@ def profile(**keys: object) -> ObjectProfile:
         object="mug",
         date=date(2026, 1, 2),
         checkpoint="a" * 64,
-        camera=load_config().camera_settings(),
+        camera=load_config().rig_settings(),
         touches=4,
         frames=400,
         force_n=7.5,
@@ -100,8 +99,8 @@ def test_user_profiles_come_before_shipped_ones(tmp_path: Path, monkeypatch: pyt
 
 
 def test_mismatches_name_network_and_settings() -> None:
-    settings = load_config(None, ["camera.rate_hz=30"]).camera_settings()
-    assert profile().mismatches("a" * 64, load_config().camera_settings()) == []
+    settings = load_config(None, ["camera.rate_hz=30"]).rig_settings()
+    assert profile().mismatches("a" * 64, load_config().rig_settings()) == []
     assert profile().mismatches("c" * 64, settings) == [
         "network aaaaaaaaaaaa, not cccccccccccc",
         "camera.rate_hz 60.0, not 30.0",

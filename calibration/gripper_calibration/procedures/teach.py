@@ -35,23 +35,17 @@ from gripper_calibration.procedures.calibrate_object import (
 )
 from gripper_calibration.touch_logs import TouchRecording, join, read_log
 from gripper_force import __version__
-from gripper_force.config import Config, config_from_text
+from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.interfaces import Progress, Prompt, no_progress
 from gripper_force.jobs.dataset import CONTACT_N, Clip, load_clips
 from gripper_force.jobs.processes import process_pool
+from gripper_force.jobs.profile_files import check_place, write_object
 from gripper_force.jobs.training.recipe import recipe
 from gripper_force.jobs.training.stated_errors import residuals
 from gripper_force.jobs.training.train import train
 from gripper_force.profiles.correction import pack
-from gripper_force.profiles.object_profile import (
-    BUNDLED,
-    ObjectProfile,
-    check_place,
-    user_folder,
-    write_object,
-)
-from gripper_force.runtime.log_reader import LogReader
+from gripper_force.profiles.object_profile import BUNDLED, ObjectProfile, user_folder
 from gripper_force.runtime.resolve import ResolvedConfig, resolve_vision
 from gripper_force.schema import write_all
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
@@ -201,7 +195,7 @@ class _Left(NamedTuple):
 
 
 class _Candidate(NamedTuple):
-    """What an estimator is made of."""
+    """Network and recipe that an estimator is made of."""
 
     name: str
     base: str  # the network to begin with
@@ -262,13 +256,10 @@ class _Work:
         run = ResolvedConfig(config.model_copy(update={"vision": vision}), read_model(checkpoint))
         profile, _ = make_profile(name, recorded, fit, run)
         progress("calibrated")
-        first = LogReader(self._logs[0])
-        rig = config_from_text(first.config, str(first.path)).rig_settings()
         before_n = float(np.mean([np.abs(one.raw_n - one.force_n).mean() for one in left_out[0]]))
         profile = profile.model_copy(
             update={
                 "network": _NETWORK,
-                "rig": {key: value for key, value in rig.items() if key not in profile.camera},
                 "logs": self._digests,
                 "version": __version__,
                 "before_n": before_n,

@@ -26,10 +26,11 @@ from gripper_force.jobs.training.recipe import FITTED_AT_ONCE, continued
 from gripper_force.jobs.training.recipe import TrainConfig as TrainConfig
 from gripper_force.jobs.training.stated_errors import errors, estimates, residuals
 from gripper_force.jobs.training.trainer import Trainer
+from gripper_force.schema import Tree
 from gripper_force.vision.batch_inference import predict
 from gripper_force.vision.checkpoint import Checkpoint, Member, load_checkpoint
 from gripper_force.vision.checkpoint_writer import save_checkpoint
-from gripper_force.vision.header import Header, Provenance, read_checkpoint
+from gripper_force.vision.header import Header, read_checkpoint
 from gripper_force.vision.network import ForceNetwork
 
 STATE_EVERY_S: Final = 60.0
@@ -180,7 +181,7 @@ def _save(
         preprocess=config.preprocess,
         residuals=residuals(forces_n, measured_n),
         data_digest=digest(clips),
-        provenance=provenance_of(clips),
+        trained_on=trained_on(clips),
         metrics={
             **errors(forces_n, measured_n),
             "constant_mae_n": metrics.mae(np.full_like(measured_n, mean_n), measured_n),
@@ -189,12 +190,12 @@ def _save(
     save_checkpoint(out, networks, header)
 
 
-def provenance_of(clips: Sequence[Clip]) -> Provenance | None:
-    """Returns the settings that clips were recorded with; None if one of them does not know its own."""
+def trained_on(clips: Sequence[Clip]) -> Tree | None:
+    """Returns the number of rigs that clips were recorded with, and the first one's settings; None if unknown."""
     if not all(clip.rig for clip in clips):
         return None
     rigs = {json.dumps([clip.rig, clip.view], sort_keys=True) for clip in clips}
-    return Provenance(rigs=len(rigs), settings=clips[0].rig)
+    return {"rigs": len(rigs), **clips[0].rig}
 
 
 def state_paths(config: TrainConfig, out: Path) -> list[Path]:
