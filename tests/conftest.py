@@ -189,6 +189,12 @@ def clips(press: Callable[..., Clip]) -> list[Clip]:
     return [press(seed) for seed in range(6)]
 
 
+@pytest.fixture(scope="session")
+def write_log() -> Callable[[Clip, Path], Path]:
+    """Writes a clip as a log into a folder."""
+    return _write_log
+
+
 @pytest.fixture
 def few_logs(clips: list[Clip], tmp_path: Path) -> Path:
     """Three of the clips as logs in a folder."""

@@ -19,6 +19,7 @@ from gripper_force.profiles.rig_profile import RigProfile, read_rig
 
 if TYPE_CHECKING:  # a run without vision imports none of these
     from gripper_force.profiles.correction import Correction
+    from gripper_force.schema import Tree
     from gripper_force.vision.checkpoint import Checkpoint
     from gripper_force.vision.header import Model
 
@@ -89,9 +90,11 @@ def with_object(control: ControlConfig, profiles: Profiles) -> ControlConfig:
 
 
 def read_correction(
-    config: Config, profiles: Profiles, model: Model | Checkpoint | None
+    config: Config, profiles: Profiles, model: Model | Checkpoint | None, rig: Tree | None = None
 ) -> Correction | None:
     """Reads the object profile's correction of estimates; None without a profile or without vision.
+
+    The run's settings are those of the configuration, or ``rig``.
 
     Raises:
         ConfigError: The profile's second file cannot be read, or the profile belongs to another network or
@@ -99,7 +102,7 @@ def read_correction(
     """
     if profiles.object is None or profiles.object_path is None or model is None:
         return None
-    mismatches = profiles.object.mismatches(model.digest, config.rig_settings())
+    mismatches = profiles.object.mismatches(model.digest, rig or config.rig_settings())
     _refuse(config, f"object profile {profiles.object_path}", mismatches)
     from gripper_force.profiles.correction import load_correction
 

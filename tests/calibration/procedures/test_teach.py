@@ -1,0 +1,274 @@
+"""Teaching from logs of a synthetic press, with tiny networks: what is chosen, kept, written and used."""
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from gripper_calibration.procedures import teach as job
+from gripper_calibration.procedures.teach import MIN_LOGS, STEPS, Taught, select_simplest, teach
+from gripper_force.cli import app
+from gripper_force.config import Config, load_config
+from gripper_force.errors import ConfigError, DataError
+from gripper_force.jobs.dataset import Clip, find_logs, load_clips
+from gripper_force.jobs.evaluate import evaluate
+from gripper_force.jobs.training import recipe as recipes
+from gripper_force.jobs.training.recipe import TrainConfig
+from gripper_force.jobs.training.train import train
+from gripper_force.profiles.apply import with_bundle
+from gripper_force.profiles.object_profile import read_object
+from gripper_force.runtime.resolve import resolve
+from gripper_force.vision.header import read_checkpoint
+from gripper_force.vision.preprocess import Preprocess
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A training of two steps, and a folder of profiles of its own."""
+    monkeypatch.setitem(recipes.RECIPES, "touches", {**recipes.RECIPES["touches"], "steps": 2, "clips": 2})
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+
+
+@pytest.fixture(scope="module")
+def logs(
+    press: Callable[..., Clip],
+    write_log: Callable[[Clip, Path], Path],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> list[Path]:
+    """Six touches of a disc."""
+    folder = tmp_path_factory.mktemp("disc")
+    return [write_log(press(seed), folder) for seed in range(6)]
+
+
+@pytest.fixture(scope="module")
+def network(press: Callable[..., Clip], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small network that knows the disc somewhat."""
+    path = tmp_path_factory.mktemp("network") / "tiny.safetensors"
+    config = TrainConfig(
+        attentions=("ssam",),
+        width=0.5,
+        preprocess=Preprocess(size=16),
+        steps=60,
+        clips=6,
+        device="cpu",
+        seed=1,
+    )
+    train(config, [replace(press(seed), object=f"o{seed}") for seed in range(20, 28)], path)
+    return path
+
+
+@pytest.fixture
+def config(network: Path) -> Config:
+    return load_config(None, [f"vision.checkpoint={network}"])
+
+
+@pytest.fixture
+def taught(config: Config, logs: list[Path], tmp_path: Path) -> Taught:
+    return teach(config, "disc", logs=logs, folder=tmp_path / "work")
+
+
+def test_bundle_holds_network_profile_and_origin(taught: Taught, logs: list[Path], tmp_path: Path) -> None:
+    assert taught.bundle == tmp_path / "data/gripper-force/objects/disc"
+    assert {path.name for path in taught.bundle.iterdir()} == {
+        "profile.yaml",
+        "profile.safetensors",
+        "network.safetensors",
+        "profile.png",
+    }
+    profile = read_object(taught.bundle / "profile.yaml")
+    assert profile == taught.profile
+    assert len(profile.logs) == len(logs)
+    assert profile.version
+    assert profile.camera["camera.exposure_us"] == 4000
+    assert profile.camera["gripper.open_width_m"] == 0.092
+    assert profile.checkpoint == resolve(load_config(None, ["object=disc"])).model.digest  # type: ignore[union-attr]
+
+
+def test_best_candidate_is_taken_and_its_error_is_that_on_new_touches(
+    taught: Taught, press: Callable[..., Clip], write_log: Callable[[Clip, Path], Path], tmp_path: Path
+) -> None:
+    assert list(taught.candidates_mae_n) == [
+        "tiny.safetensors as it is",
+        "tiny.safetensors, trained",
+        "Gaussian process",
+    ]
+    best = min(taught.candidates_mae_n.values())
+    assert taught.mae_n == taught.candidates_mae_n[taught.learned]
+    assert taught.mae_n < 1.5 * best
+    assert taught.mae_n < taught.before_n
+    assert taught.profile.after_n is not None
+    new = [write_log(press(seed), tmp_path / "new") for seed in range(40, 46)]
+    found = evaluate(new, taught.bundle / "network.safetensors", profile=str(taught.bundle))
+    assert 0.4 * taught.mae_n < found.mae_n < 2.5 * taught.mae_n
+    assert taught.half_logs == 3
+
+
+def test_finished_parts_are_not_repeated(
+    config: Config, logs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judged: list[str] = []
+    judge = job._judge
+
+    def stopping(task: job._Task) -> None:
+        if len(judged) == 3:
+            raise KeyboardInterrupt
+        judge(task)
+        judged.append(task.candidate.name)
+
+    monkeypatch.setattr(job, "_judge", stopping)
+    with pytest.raises(KeyboardInterrupt):
+        teach(config, "disc", logs=logs, folder=tmp_path / "work")
+    assert not (tmp_path / "data/gripper-force/objects/disc").exists()
+    monkeypatch.setattr(job, "_judge", lambda task: (judged.append("again"), judge(task))[1])
+    steps: list[int] = []
+    resumed = teach(
+        config,
+        "disc",
+        logs=logs,
+        folder=tmp_path / "work",
+        progress=lambda _text, steps_done=1: steps.append(steps_done),
+    )
+    assert judged.count("again") == 6 - 3  # the network as it is, four trainings, and the process
+    assert sum(steps) == STEPS
+    whole = teach(config, "disc", logs=logs, folder=tmp_path / "other", out=tmp_path / "other-bundle")
+    assert resumed.candidates_mae_n == whole.candidates_mae_n
+    assert resumed.profile.weights == whole.profile.weights
+
+
+def test_more_touches_continue_with_the_old_ones(config: Config, logs: list[Path], tmp_path: Path) -> None:
+    first = teach(config, "disc", logs=logs[:4], folder=tmp_path / "work")
+    second = teach(config, "disc", logs=logs, folder=tmp_path / "work")
+    assert second.profile.logs[:4] == first.profile.logs
+    assert read_object(second.bundle / "profile.yaml").touches == 6
+    assert [path.name for path in second.bundle.parent.iterdir()] == ["disc"]
+
+
+def test_grasps_find_the_bundle_by_the_object_and_a_setting_prevents_it(taught: Taught) -> None:
+    used, note = with_bundle(load_config(None, ["object=disc"]))
+    assert used.vision.checkpoint == str(taught.bundle / "network.safetensors")
+    assert note.startswith(f"used the bundle {taught.bundle}, taught 6 touches on ")
+    assert ("session", note) in resolve(load_config(None, ["object=disc"])).notes
+    for keys in (
+        ["object=sponge"],
+        ["object=disc", "calibration.object=none"],
+        ["object=disc", "vision.checkpoint=small"],
+    ):
+        assert with_bundle(load_config(None, keys)) == (load_config(None, keys), "")
+    by_path = load_config(None, [f"calibration.object={taught.bundle}"])
+    assert with_bundle(by_path)[0].vision.checkpoint == used.vision.checkpoint
+    again = load_config(None, ["object=disc", f"calibration.object={taught.bundle}/profile.yaml"])
+    assert with_bundle(again)[0] == used.model_copy(update={"object": "disc"})
+
+
+@pytest.mark.parametrize(
+    ("key", "sentence"),
+    [
+        ("camera.exposure_us=8000", r"camera.exposure_us 4000, not 8000"),
+        ("vision.region=[0, 0, 64, 64]", r"vision.region None, not \[0, 0, 64, 64\]"),
+        ("gripper.pinion_radius_m=0.01", r"gripper.pinion_radius_m 0.02, not 0.01"),
+        ("sim.tool=rods", r"sim.tool pads, not rods"),
+    ],
+)
+def test_another_rig_is_refused_or_warned_about(taught: Taught, key: str, sentence: str) -> None:
+    with pytest.raises(ConfigError, match=sentence):
+        resolve(load_config(None, ["object=disc", key]))
+    allowed = load_config(None, ["object=disc", "calibration.on_mismatch=warn", key])
+    assert any(
+        f"the object profile was made with {key.split('=')[0]}" in text for _, text in resolve(allowed).notes
+    )
+
+
+def test_taught_network_states_the_error_on_touches_left_out(taught: Taught) -> None:
+    header = read_checkpoint(taught.bundle / "network.safetensors")[2]
+    if taught.learned != "tiny.safetensors as it is":
+        assert header.ood is None
+        assert header.trained_on is not None
+        assert header.trained_on["rigs"] == 1
+        assert header.metrics["mae_n"] > 0
+
+
+def test_logs_without_contact_and_too_few_logs(
+    config: Config,
+    logs: list[Path],
+    press: Callable[..., Clip],
+    write_log: Callable[[Clip, Path], Path],
+    tmp_path: Path,
+) -> None:
+    clip = press(9)
+    free = write_log(replace(clip, name="free", forces_n=0 * clip.forces_n), tmp_path / "free")
+    found = teach(config, "disc", logs=[*logs[:4], free], folder=tmp_path / "work")
+    assert found.without_contact == (free,)
+    with pytest.raises(DataError, match=f"there are 3 logs of touches with contact, but .* needs {MIN_LOGS}"):
+        teach(config, "disc", logs=[*logs[:3], free], folder=tmp_path / "work")
+
+
+def test_folder_that_is_no_bundle_is_not_replaced(config: Config, logs: list[Path], tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    with pytest.raises(ConfigError, match="exists and is not a bundle"):
+        teach(config, "disc", logs=logs, folder=tmp_path / "work", out=tmp_path / "mine")
+
+
+def test_simplest_candidate_within_one_standard_error() -> None:
+    rng = np.random.default_rng(0)
+    base = rng.uniform(0.1, 0.3, (12, 1))
+    noise = rng.normal(0, 0.02, (12, 1))
+    assert select_simplest(np.hstack([base + noise - noise.mean() + 0.001, base])) == 0
+    assert select_simplest(np.hstack([base + 0.1, base])) == 1
+    assert select_simplest(np.hstack([base, base])) == 0
+
+
+def test_command_prints_the_choice_and_the_next_command(
+    network: Path, logs: list[Path], tmp_path: Path
+) -> None:
+    call = ["teach", "disc", "--from", str(logs[0].parent), "--folder", str(tmp_path / "work"), "--jobs", "1"]
+    call += ["--set", f"vision.checkpoint={network}"]
+    result = CliRunner().invoke(app, [*call, "--json"], catch_exceptions=False)
+    assert result.exit_code == 0, result.stderr
+    found = json.loads(result.stdout)
+    assert found["learned"] in found["candidates_mae_n"]
+    assert found["minutes"] > 0
+    assert "next: gripper-force grasp --object disc --target-n 4, which uses this bundle" in result.stderr
+    table = CliRunner().invoke(app, [*call, "--out", str(tmp_path / "b")], catch_exceptions=False)
+    assert "expected error" in table.stdout
+    assert f"--profile {tmp_path / 'b'}" in table.stderr.replace("\n", "")
+    both = CliRunner().invoke(app, [*call, "--fresh"])
+    assert isinstance(both.exception, ConfigError)
+
+
+def test_killed_command_continues(network: Path, logs: list[Path], tmp_path: Path) -> None:
+    """The process is killed while it works; the same command then uses what was finished."""
+    work = tmp_path / "work" / "teach"
+    call = [sys.executable, "-m", "gripper_force", "teach", "disc", "--from", str(logs[0].parent), "--json"]
+    call += ["--folder", str(tmp_path / "work"), "--jobs", "1", "--set", f"vision.checkpoint={network}"]
+    with subprocess.Popen(call, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as running:
+        while running.poll() is None and len(list(work.glob("*.left"))) < 2:
+            pass
+        running.send_signal(signal.SIGKILL)
+    kept = {path: path.stat().st_mtime_ns for path in work.glob("*.left")}
+    assert kept
+    subprocess.run(call, check=True, capture_output=True)
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+    assert (tmp_path / "data/gripper-force/objects/disc/profile.yaml").is_file()
+
+
+def test_provenance_counts_rigs(logs: list[Path]) -> None:
+    from gripper_force.jobs.training.train import trained_on
+
+    clips = load_clips(find_logs(logs), Preprocess(size=16))
+    one = trained_on(clips)
+    assert one is not None
+    assert (one["rigs"], one["camera.exposure_us"]) == (1, 4000)
+    other = replace(clips[0], rig={**clips[0].rig, "camera.exposure_us": 2000})
+    several = trained_on([*clips, other, replace(clips[1], view="another")])
+    assert several is not None
+    assert several["rigs"] == 3
+    assert trained_on([*clips, replace(clips[0], rig={})]) is None
