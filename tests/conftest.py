@@ -212,7 +212,7 @@ def loaded_log(few_logs: Path, press: Callable[..., Clip]) -> Path:
 
 def _write_log(clip: Clip, folder: Path) -> Path:
     path = folder / f"{clip.name}.mcap"
-    config = dump_config(load_config(None, ["object=disc"]))
+    config = dump_config(load_config(None, [f"object={clip.object}"]))
     with LogWriter(path, config=config, metadata={"set": clip.set}) as log:
         for i, (gray, force_n) in enumerate(zip(clip.frames, clip.forces_n.tolist(), strict=True)):
             log.write(Frame(i * 20 * NS_PER_MS, i * 20 * NS_PER_MS, i, gray))

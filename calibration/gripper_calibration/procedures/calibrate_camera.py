@@ -200,7 +200,10 @@ def _outdated(before: Config, after: Config) -> tuple[str, ...]:
     """Names what was made with the camera settings of one configuration, and not with those of the other."""
     made: list[tuple[str, Callable[[Tree], list[str]]]] = []
     for path in sorted([*user_folder().glob("*.yaml"), *user_folder().glob(f"*/{BUNDLED}")]):
-        camera = read_object(path).camera
+        try:
+            camera = read_object(path).camera
+        except ConfigError:  # damaged: a run with it says so
+            continue
         made.append(
             (f"the {'bundle' if path.name == BUNDLED else 'profile'} {path}", partial(differences, camera))
         )

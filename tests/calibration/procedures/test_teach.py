@@ -118,6 +118,10 @@ def test_finished_parts_are_not_repeated(
     judged: list[str] = []
     judge = job._judge
 
+    def counting(task: job._Task) -> None:
+        judged.append("again")
+        judge(task)
+
     def stopping(task: job._Task) -> None:
         if len(judged) == 3:
             raise KeyboardInterrupt
@@ -128,7 +132,7 @@ def test_finished_parts_are_not_repeated(
     with pytest.raises(KeyboardInterrupt):
         teach(config, "disc", logs=logs, folder=tmp_path / "work")
     assert not (tmp_path / "data/gripper-force/objects/disc").exists()
-    monkeypatch.setattr(job, "_judge", lambda task: (judged.append("again"), judge(task))[1])
+    monkeypatch.setattr(job, "_judge", counting)
     steps: list[int] = []
     resumed = teach(
         config,
