@@ -212,7 +212,7 @@ def teach(
     if write is not None:
         write_between(write, "teach recordings" if real else "teach", text)
     shown = {"recordings": real} if real else {"cells": rows}
-    _show(shown, as_json, lambda: console.out.print(text))
+    _show(shown, as_json, lambda: console.out.print(text, soft_wrap=True))
 
 
 @app.command("bus")

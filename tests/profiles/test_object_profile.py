@@ -9,6 +9,7 @@ from gripper_force.errors import ConfigError
 from gripper_force.jobs.profile_files import check_place, write_object
 from gripper_force.profiles.apply import read_profiles, with_object
 from gripper_force.profiles.object_profile import (
+    BUNDLED,
     Interval,
     LoopPlant,
     ObjectProfile,
@@ -96,6 +97,19 @@ def test_user_profiles_come_before_shipped_ones(tmp_path: Path, monkeypatch: pyt
     with pytest.raises(ConfigError, match=r"known: .*mug"):
         find_object("cup_of_another")
     assert find_object("some/where.yaml") == Path("some/where.yaml")
+    bundle = user_folder() / "mug"
+    write_object(bundle / BUNDLED, profile(network="network.safetensors"), b"")
+    assert find_object("mug") == find_object(str(bundle)) == bundle / BUNDLED
+
+
+def test_lengths_of_the_same_gripper_may_differ_a_little() -> None:
+    near = load_config(None, ["gripper.open_width_m=0.0925"]).rig_settings()
+    assert profile().mismatches("a" * 64, near) == []
+    far = load_config(None, ["gripper.open_width_m=0.11", "sim.view_spread=5"]).rig_settings()
+    assert profile().mismatches("a" * 64, far) == [
+        "gripper.open_width_m 0.092, not 0.11",
+        "sim.view_spread 1.0, not 5.0",
+    ]
 
 
 def test_mismatches_name_network_and_settings() -> None:

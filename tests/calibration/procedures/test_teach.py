@@ -4,7 +4,8 @@ import json
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,11 +32,17 @@ from gripper_force.vision.preprocess import Preprocess
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-@pytest.fixture(autouse=True)
-def short(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+SHORT = {"steps": 2, "clips": 2}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A training of two steps, and a folder of profiles of its own."""
-    monkeypatch.setitem(recipes.RECIPES, "touches", {**recipes.RECIPES["touches"], "steps": 2, "clips": 2})
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    folder = tmp_path_factory.mktemp("home")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(recipes.RECIPES, "touches", {**recipes.RECIPES["touches"], **SHORT})
+        patch.setenv("XDG_DATA_HOME", str(folder))
+        yield folder / "gripper-force" / "objects"
 
 
 @pytest.fixture(scope="module")
@@ -66,18 +73,18 @@ def network(press: Callable[..., Clip], tmp_path_factory: pytest.TempPathFactory
     return path
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def config(network: Path) -> Config:
     return load_config(None, [f"vision.checkpoint={network}"])
 
 
-@pytest.fixture
-def taught(config: Config, logs: list[Path], tmp_path: Path) -> Taught:
-    return teach(config, "disc", logs=logs, folder=tmp_path / "work")
+@pytest.fixture(scope="module")
+def taught(config: Config, logs: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Taught:
+    return teach(config, "disc", logs=logs, folder=tmp_path_factory.mktemp("taught"))
 
 
-def test_bundle_holds_network_profile_and_origin(taught: Taught, logs: list[Path], tmp_path: Path) -> None:
-    assert taught.bundle == tmp_path / "data/gripper-force/objects/disc"
+def test_bundle_holds_network_profile_and_origin(taught: Taught, logs: list[Path], home: Path) -> None:
+    assert taught.bundle == home / "disc"
     assert {path.name for path in taught.bundle.iterdir()} == {
         "profile.yaml",
         "profile.safetensors",
@@ -113,7 +120,7 @@ def test_best_candidate_is_taken_and_its_error_is_that_on_new_touches(
 
 
 def test_finished_parts_are_not_repeated(
-    config: Config, logs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    taught: Taught, config: Config, logs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     judged: list[str] = []
     judge = job._judge
@@ -130,8 +137,8 @@ def test_finished_parts_are_not_repeated(
 
     monkeypatch.setattr(job, "_judge", stopping)
     with pytest.raises(KeyboardInterrupt):
-        teach(config, "disc", logs=logs, folder=tmp_path / "work")
-    assert not (tmp_path / "data/gripper-force/objects/disc").exists()
+        teach(config, "disc", logs=logs, folder=tmp_path / "work", out=tmp_path / "bundle")
+    assert not (tmp_path / "bundle").exists()
     monkeypatch.setattr(job, "_judge", counting)
     steps: list[int] = []
     resumed = teach(
@@ -139,20 +146,21 @@ def test_finished_parts_are_not_repeated(
         "disc",
         logs=logs,
         folder=tmp_path / "work",
+        out=tmp_path / "bundle",
         progress=lambda _text, steps_done=1: steps.append(steps_done),
     )
     assert judged.count("again") == 6 - 3  # the network as it is, four trainings, and the process
     assert sum(steps) == STEPS
-    whole = teach(config, "disc", logs=logs, folder=tmp_path / "other", out=tmp_path / "other-bundle")
-    assert resumed.candidates_mae_n == whole.candidates_mae_n
-    assert resumed.profile.weights == whole.profile.weights
+    assert resumed.candidates_mae_n == taught.candidates_mae_n
+    assert resumed.profile.weights == taught.profile.weights
 
 
 def test_more_touches_continue_with_the_old_ones(config: Config, logs: list[Path], tmp_path: Path) -> None:
-    first = teach(config, "disc", logs=logs[:4], folder=tmp_path / "work")
-    second = teach(config, "disc", logs=logs, folder=tmp_path / "work")
+    out = tmp_path / "bundles" / "disc"
+    first = teach(config, "disc", logs=logs[:4], folder=tmp_path / "work", out=out)
+    second = teach(config, "disc", logs=logs[:5], folder=tmp_path / "work", out=out)
     assert second.profile.logs[:4] == first.profile.logs
-    assert read_object(second.bundle / "profile.yaml").touches == 6
+    assert read_object(second.bundle / "profile.yaml").touches == 5
     assert [path.name for path in second.bundle.parent.iterdir()] == ["disc"]
 
 
@@ -178,7 +186,7 @@ def test_grasps_find_the_bundle_by_the_object_and_a_setting_prevents_it(taught: 
     [
         ("camera.exposure_us=8000", r"camera.exposure_us 4000, not 8000"),
         ("vision.region=[0, 0, 64, 64]", r"vision.region None, not \[0, 0, 64, 64\]"),
-        ("gripper.pinion_radius_m=0.01", r"gripper.pinion_radius_m 0.02, not 0.01"),
+        ("gripper.pinion_radius_m=0.03", r"gripper.pinion_radius_m 0.02, not 0.03"),
         ("sim.tool=rods", r"sim.tool pads, not rods"),
     ],
 )
@@ -209,10 +217,10 @@ def test_logs_without_contact_and_too_few_logs(
 ) -> None:
     clip = press(9)
     free = write_log(replace(clip, name="free", forces_n=0 * clip.forces_n), tmp_path / "free")
-    found = teach(config, "disc", logs=[*logs[:4], free], folder=tmp_path / "work")
+    found = teach(config, "disc", logs=[*logs[:4], free], folder=tmp_path / "work", out=tmp_path / "b")
     assert found.without_contact == (free,)
     with pytest.raises(DataError, match=f"there are 3 logs of touches with contact, but .* needs {MIN_LOGS}"):
-        teach(config, "disc", logs=[*logs[:3], free], folder=tmp_path / "work")
+        teach(config, "disc", logs=[*logs[:3], free], folder=tmp_path / "work", out=tmp_path / "b")
 
 
 def test_folder_that_is_no_bundle_is_not_replaced(config: Config, logs: list[Path], tmp_path: Path) -> None:
@@ -231,14 +239,14 @@ def test_simplest_candidate_within_one_standard_error() -> None:
 
 
 def test_command_prints_the_choice_and_the_next_command(
-    network: Path, logs: list[Path], tmp_path: Path
+    taught: Taught, network: Path, logs: list[Path], tmp_path: Path
 ) -> None:
     call = ["teach", "disc", "--from", str(logs[0].parent), "--folder", str(tmp_path / "work"), "--jobs", "1"]
     call += ["--set", f"vision.checkpoint={network}"]
     result = CliRunner().invoke(app, [*call, "--json"], catch_exceptions=False)
     assert result.exit_code == 0, result.stderr
     found = json.loads(result.stdout)
-    assert found["learned"] in found["candidates_mae_n"]
+    assert found["candidates_mae_n"] == taught.candidates_mae_n
     assert found["minutes"] > 0
     assert "next: gripper-force grasp --object disc --target-n 4, which uses this bundle" in result.stderr
     table = CliRunner().invoke(app, [*call, "--out", str(tmp_path / "b")], catch_exceptions=False)
@@ -251,17 +259,21 @@ def test_command_prints_the_choice_and_the_next_command(
 def test_killed_command_continues(network: Path, logs: list[Path], tmp_path: Path) -> None:
     """The process is killed while it works; the same command then uses what was finished."""
     work = tmp_path / "work" / "teach"
-    call = [sys.executable, "-m", "gripper_force", "teach", "disc", "--from", str(logs[0].parent), "--json"]
-    call += ["--folder", str(tmp_path / "work"), "--jobs", "1", "--set", f"vision.checkpoint={network}"]
+    start = f"from gripper_force.jobs.training.recipe import RECIPES; RECIPES['touches'] |= {SHORT}; "
+    start += "from gripper_force.cli import main; main()"
+    call = [sys.executable, "-c", start, "teach", "disc", "--from", str(logs[0].parent), "--jobs", "1"]
+    call += ["--folder", str(tmp_path / "work"), "--out", str(tmp_path / "bundle"), "--json"]
+    call += ["--set", f"vision.checkpoint={network}"]
     with subprocess.Popen(call, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as running:
         while running.poll() is None and len(list(work.glob("*.left"))) < 2:
-            pass
+            time.sleep(0.01)
         running.send_signal(signal.SIGKILL)
     kept = {path: path.stat().st_mtime_ns for path in work.glob("*.left")}
-    assert kept
+    assert 2 <= len(kept) < 6
+    assert not (tmp_path / "bundle").exists()
     subprocess.run(call, check=True, capture_output=True)
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
-    assert (tmp_path / "data/gripper-force/objects/disc/profile.yaml").is_file()
+    assert (tmp_path / "bundle" / "profile.yaml").is_file()
 
 
 def test_provenance_counts_rigs(logs: list[Path]) -> None:
