@@ -211,7 +211,7 @@ def teach(
             text = job.markdown(rows)
     if write is not None:
         write_between(write, "teach recordings" if real else "teach", text)
-    shown = {"recordings": real} if real else {"cells": rows}
+    shown = {"recordings": [row._asdict() for row in real]} if real else {"cells": rows}
     _show(shown, as_json, lambda: console.out.print(text, soft_wrap=True))
 
 

@@ -375,11 +375,13 @@ def _judge_in_process(task: _Task) -> None:
 def _judge(task: _Task) -> None:
     """Makes the candidate for each split, calibrates it, and writes its estimates of the logs left out."""
     arrays: dict[str, Floats] = {}
+    recorded: list[TouchRecording] = []
     task.file.parent.mkdir(parents=True, exist_ok=True)
     for number, (split, test) in enumerate(zip(task.splits, task.tests, strict=True)):
         file = task.file.with_suffix(f".{number}.safetensors")
-        made = _make(task, split, file)
-        recorded = [read_log(path, made) for path in task.logs]
+        if task.candidate.recipe or not recorded:  # a network as it is sees the same in every split
+            made = _make(task, split, file)
+            recorded = [read_log(path, made) for path in task.logs]
         try:
             fit = fit_correction(join({task.logs[i]: recorded[i] for i in split}).touches, COVERAGE)
         except DataError:  # the estimates do not follow the load cell: they stay as they are

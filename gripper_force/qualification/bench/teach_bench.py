@@ -29,7 +29,6 @@ from gripper_force.jobs.imports.video import import_folder
 from gripper_force.jobs.training import few
 from gripper_force.jobs.training.recipe import recipe
 from gripper_force.jobs.training.train import train
-from gripper_force.schema import Tree
 from gripper_force.vision.batch_inference import features
 from gripper_force.vision.kernel_regression import ForceProcess
 from gripper_force.vision.model_files import read_model
@@ -396,8 +395,3 @@ def recordings_markdown(rows: Sequence[RecordingRow]) -> str:
             )
         lines.append(f"| **mean** | {count} | | {' | '.join(f'**{n:.2f}**' for n in mean)} |")
     return "\n".join(lines) + "\n"
-
-
-def as_trees(rows: Sequence[Cell | RecordingRow]) -> list[Tree]:
-    """Returns rows as plain data."""
-    return [row._asdict() if isinstance(row, RecordingRow) else asdict(row) for row in rows]
