@@ -92,9 +92,7 @@ def with_object(control: ControlConfig, profiles: Profiles) -> ControlConfig:
 def read_correction(
     config: Config, profiles: Profiles, model: Model | Checkpoint | None, rig: Tree | None = None
 ) -> Correction | None:
-    """Reads the object profile's correction of estimates; None without a profile or without vision.
-
-    The run's settings are those of the configuration, or ``rig``.
+    """Reads the object profile's correction of estimates; None without a profile or vision. ``rig``: run's settings.
 
     Raises:
         ConfigError: The profile's second file cannot be read, or the profile belongs to another network or

@@ -198,8 +198,7 @@ class Header(Section):
         test_digest: SHA-256 of the forces that the residuals and metrics were measured on, if it is not the
             training's own validation data. Metrics of two checkpoints compare if it is the same.
         identity: SHA-256 of the file before its header was changed; see `digest_of`.
-        trained_on: Number of ``rigs`` (cameras, views, grippers) in the training set, and the settings of the first;
-            None if unknown. With several, others will do, too.
+        trained_on: Number of ``rigs`` in the training set, and the settings of the first; None if unknown.
     """
 
     members: tuple[NetworkConfig | ProcessConfig, ...]
