@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from pathlib import Path
-from typing import Any, Final, Literal, Self
+from typing import Any, ClassVar, Final, Literal, Self
 
 from pydantic import Field, PositiveInt, model_validator
 
@@ -321,6 +321,11 @@ class BudgetConfig(Section):
 class ControlConfig(Section):
     """Fusion, force loop, phases and limits."""
 
+    unknown_hint: ClassVar[str] = (
+        "The gains of the force loop are no keys: they follow from plant_gain, plant_lag_ms and plant_delay_ms, which "
+        "`gripper-force calibrate object` measures"
+    )
+
     rate_hz: Positive = Field(200.0, description="rate of the control loop")
     feedback: Literal["fused", "current", "vision"] = Field(
         "fused", description="feedback of the force loop: vision fused with motor current, or one of them"
@@ -360,8 +365,11 @@ class ControlConfig(Section):
         description="motor current over vision in earlier grasps of the object, and its relative standard deviation "
         "without that of the torque constant; None: from the object profile, or unknown",
     )
-    min_object_width_m: NonNegative = Field(
-        0.002, description="width below which closed jaws hold nothing; less than the thinnest object"
+    min_object_width_m: Finite = Field(
+        0.002,
+        ge=-0.01,
+        description="width by the servo's angle below which closed jaws hold nothing; gear play and soft pads make it "
+        "1 to 3 mm less than the object's; for paper negative, so that only the camera can tell it from nothing",
     )
     slip_width_m: Positive = Field(0.004, description="closing of the jaws during hold that counts as slip")
     on_slip: Literal["regrip", "hold", "open"] = Field(

@@ -6,7 +6,7 @@ from difflib import get_close_matches
 from inspect import isclass
 from math import isclose
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_args
+from typing import Annotated, Any, ClassVar, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -24,9 +24,14 @@ Tree = dict[str, Any]
 
 
 class Section(BaseModel):
-    """Base class of every section: immutable; an unknown key is an error."""
+    """Base class of every section: immutable; an unknown key is an error.
+
+    Attributes:
+        unknown_hint: Sentence for a user who looks for a key that the section does not have.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+    unknown_hint: ClassVar[str] = ""
 
 
 S = TypeVar("S", bound=Section)
@@ -184,9 +189,10 @@ def _sentence(root: type[Section], error: ValidationError, where: str, what: str
     parts = [str(part) for part in first["loc"]]
     key = ".".join(parts)
     if first["type"] == "extra_forbidden":
-        known = list(_section_at(root, parts[:-1]).model_fields)
+        section = _section_at(root, parts[:-1])
         hint = _suggestion(root, parts)
-        return f"unknown {what} key {key!r} (from {where}){hint}; known here: {', '.join(known)}"
+        more = f". {section.unknown_hint}" if section.unknown_hint else ""
+        return f"unknown {what} key {key!r} (from {where}){hint}; known here: {', '.join(section.model_fields)}{more}"
     reason = first["msg"].removeprefix("Value error, ")
     if not parts:
         return f"the {what} (from {where}) is inconsistent: {reason}"
@@ -196,14 +202,13 @@ def _sentence(root: type[Section], error: ValidationError, where: str, what: str
 def _suggestion(root: type[Section], parts: list[str]) -> str:
     """Names the most similar known key path: first in the same section, then in all sections."""
     prefix = "".join(f"{part}." for part in parts[:-1])
-    here = [f"{prefix}{name}" for name in _section_at(root, parts[:-1]).model_fields]
+    here = [
+        f"{prefix}{name}"
+        for name in get_close_matches(parts[-1], list(_section_at(root, parts[:-1]).model_fields), 1)
+    ]
     paths = [path for path, _ in keys(root)]
     same_leaf = [path for path in paths if path.rpartition(".")[2] == parts[-1]]
-    close = (
-        get_close_matches(".".join(parts), here, 1)
-        or same_leaf
-        or get_close_matches(".".join(parts), paths, 1)
-    )
+    close = here or same_leaf or get_close_matches(".".join(parts), paths, 1)
     return f"; did you mean {close[0]!r}?" if close else ""
 
 

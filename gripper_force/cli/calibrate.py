@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gripper_force.cli import console
-from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, load_settings
+from gripper_force.cli.options import (
+    CORES,
+    AsJson,
+    ConfigPath,
+    Jobs,
+    Overrides,
+    load_settings,
+    load_settings_before_rig,
+)
 from gripper_force.cli.output.calibrate import jaws_table, object_table, rig_table, taught_table
 from gripper_force.errors import ConfigError
 
@@ -80,7 +88,7 @@ def jaws(
     """Find the ends, the closing direction and the friction of empty jaws, and propose the configuration."""
     from gripper_calibration.procedures.calibrate_jaws import calibrate_jaws as job
 
-    settings = load_settings(config, set_, {})
+    settings, _ = load_settings_before_rig(config, set_, {})
     with console.err.status("moving") as status:
         result = job(settings, prompt=console.prompt(yes, status), progress=_progress(status))
     console.show(result, as_json, jaws_table)
@@ -391,14 +399,10 @@ def _rig_settings(
     """
     from gripper_force.profiles.rig_profile import read_rig
 
-    settings = load_settings(config, set_, options, new_rig=True)
-    named = settings.calibration.rig
-    if named is not None and not named.exists():
-        if rig is not None and rig.resolve() != named.resolve():
-            read_rig(named)  # raises: this command does not write it
-        calibration = settings.calibration.model_copy(update={"rig": None})
-        settings = settings.model_copy(update={"calibration": calibration})
-    return settings, rig or named or Path("rig.yaml")
+    settings, new = load_settings_before_rig(config, set_, options)
+    if new is not None and rig is not None and rig.resolve() != new.resolve():
+        read_rig(new)  # raises: this command does not write it
+    return settings, rig or new or settings.calibration.rig or Path("rig.yaml")
 
 
 def _show_rig(result: "LoadCellResult | ServoResult | CameraResult", as_json: bool) -> None:

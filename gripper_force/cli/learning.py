@@ -125,6 +125,8 @@ def train(
     for text in warnings:
         console.warn(text)
     found = {"checkpoint": str(checkpoint), "digest": result.digest, **result.header.metrics}
+    if states:  # a Gaussian process has no course of training
+        found["figure"] = str(checkpoint.with_suffix(".png"))
     console.show(
         {**found, "left_out": left_out, "warnings": warnings}, as_json, lambda _: console.pairs(found)
     )
@@ -159,6 +161,9 @@ def evaluate(
         list[str] | None, typer.Option("--object", help="Use only logs of this object. Repeatable.")
     ] = None,
     include_contact_starts: ContactStarts = False,
+    plot: Annotated[
+        Path | None, typer.Option(help="Figure to write: estimates and errors against the load cell.")
+    ] = None,
     jobs: Jobs = CORES,
     set_: Overrides = None,
     as_json: AsJson = False,
@@ -180,10 +185,13 @@ def evaluate(
             config=settings,
             include_contact_starts=include_contact_starts,
             workers=jobs,
+            plot=plot,
             progress=progress,
         )
     _warn_left_out(result.left_out, len(logs))
     console.show(result, as_json, errors_table)
+    if plot is not None:
+        console.err.print(f"figure: {plot}", soft_wrap=True, markup=False)
 
 
 def export(

@@ -21,16 +21,34 @@ Jobs = Annotated[int, typer.Option(min=1, help="Processes to use.")]
 Page = Annotated[Path | None, typer.Option("--write", help="Markdown page to write the table into.")]
 
 
-def load_settings(
-    path: Path | None, overrides: list[str] | None, options: Mapping[str, object], *, new_rig: bool = False
-) -> "Config":
+def load_settings(path: Path | None, overrides: list[str] | None, options: Mapping[str, object]) -> "Config":
     """Loads the configuration of a command; its own options override ``--set``.
-
-    With ``new_rig`` the rig profile need not exist yet, because the command writes it.
 
     Raises:
         ConfigError: A file, key or value is wrong. The sentence names it.
     """
+    return _load(path, overrides, options, new_rig=False)
+
+
+def load_settings_before_rig(
+    path: Path | None, overrides: list[str] | None, options: Mapping[str, object]
+) -> "tuple[Config, Path | None]":
+    """Loads the configuration of a command that needs no rig profile, as `load_settings`.
+
+    Returns:
+        The configuration, without a rig profile that does not exist yet; and the path of that one, or None.
+    """
+    settings = _load(path, overrides, options, new_rig=True)
+    rig = settings.calibration.rig
+    if rig is None or rig.exists():
+        return settings, None
+    calibration = settings.calibration.model_copy(update={"rig": None})
+    return settings.model_copy(update={"calibration": calibration}), rig
+
+
+def _load(
+    path: Path | None, overrides: list[str] | None, options: Mapping[str, object], *, new_rig: bool
+) -> "Config":
     from gripper_force.config import load_config
 
     given = [(key, value) for key, value in options.items() if value is not None]

@@ -9,15 +9,35 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from gripper_force.cli import console
-from gripper_force.cli.options import CORES, AsJson, ConfigPath, Overrides, load_settings
+from gripper_force.cli.options import (
+    CORES,
+    AsJson,
+    ConfigPath,
+    Jobs,
+    Overrides,
+    load_settings,
+    load_settings_before_rig,
+)
 from gripper_force.cli.output.doctor import changes_table, checks_table, setup_line
-from gripper_force.cli.output.runs import grasp_table, replay_table, trials_table
+from gripper_force.cli.output.runs import (
+    differences_table,
+    grasp_table,
+    replay_table,
+    replays_table,
+    trials_table,
+)
 from gripper_force.errors import ConfigError, GripperError
 
 if TYPE_CHECKING:
     from gripper_force.config import Config
     from gripper_force.interfaces import Progress, Prompt
     from gripper_force.jobs.checks import RegisterChange
+
+_OPEN_LOOP = (
+    "A replay is open loop: estimates and commands are computed again, but servo, camera and load cell keep what they "
+    "measured. A changed gain or limit shows other commands, not the force that would have followed; to see that, run "
+    "`gripper-force grasp` with it."
+)
 
 
 def grasp(
@@ -126,8 +146,9 @@ def grasp(
             failure = end
     if results and not (as_json and isinstance(failure, GripperError)):
         summary = job.overall(results, settings.control.force_limit_n)
-        printed = {"trials": results, "summary": summary}
-        console.show(printed, as_json, lambda _: trials_table(results, summary))
+        figure = job.write_figure(settings, results, summary)
+        printed = {"trials": results, "summary": summary, "figure": figure}
+        console.show(printed, as_json, lambda _: trials_table(results, summary, figure))
     if failure is not None:
         raise failure
 
@@ -141,27 +162,84 @@ def _notes(settings: "Config", name: str) -> list[str]:
 
 
 def replay(
-    log: Annotated[Path, typer.Argument(help="Log of a run or of an imported recording.")],
+    logs: Annotated[
+        list[Path], typer.Argument(help="Logs of runs or of imported recordings, or folders with them.")
+    ],
     as_json: AsJson = False,
     checkpoint: Annotated[str | None, typer.Option(help="Estimate with another checkpoint.")] = None,
     set_: Overrides = None,
+    compare: Annotated[
+        tuple[str, str] | None,
+        typer.Option(
+            help="Replay each log twice and compare the errors: each of A and B is a checkpoint, a changed key "
+            "(key=value), or log (unchanged).",
+            metavar="A B",
+        ),
+    ] = None,
     recover: Annotated[bool, typer.Option(help="Read the intact part of a truncated log.")] = False,
-    report: Annotated[bool, typer.Option(help="Write the report again, beside the log.")] = False,
+    report: Annotated[
+        bool,
+        typer.Option(
+            help="Write the report again, beside the log; with --set or --checkpoint that of the replay."
+        ),
+    ] = False,
+    jobs: Jobs = CORES,
 ) -> None:
-    """Run estimator and controller again on a log, and compare the estimates with its load cell."""
-    from gripper_force.jobs.replay import replay as job
+    """Run estimator and controller again on logs, and compare the estimates with their load cells.
 
-    if report and (set_ or checkpoint):
-        raise ConfigError("--report shows the run as it was; leave out --set and --checkpoint, or --report")
-    result = job(log, checkpoint, overrides=set_, recover=recover)
-    if not report:
-        console.show(result, as_json, replay_table)
+    A replay is open loop: it shows what the controller would have commanded with another setting, but not the
+    force that would have followed.
+    """
+    from functools import partial
+
+    from gripper_force.jobs import replay as job
+    from gripper_force.jobs.dataset import find_logs
+
+    paths = [path for given in logs for path in (find_logs(given) if given.is_dir() else [given])]
+    again = partial(job.replay_each, paths, recover=recover, workers=jobs)
+    if compare is not None:
+        if checkpoint or report:
+            raise ConfigError(
+                "--compare names its checkpoints and writes no report; leave out --checkpoint and --report"
+            )
+        with console.bar("replaying", 2 * len(paths)) as progress:
+            sides = [_choice(text) for text in compare]
+            first, second = (
+                again(checkpoint=other, overrides=[*(set_ or []), *changes], progress=progress)
+                for other, changes in sides
+            )
+        found = job.paired_differences(first, second)
+        printed = {"logs": len(paths), "first": compare[0], "second": compare[1], "differences": found}
+        console.show(printed, as_json, lambda _: differences_table(*compare, found))
+        console.err.print(_OPEN_LOOP, soft_wrap=True)
         return
-    from gripper_force.jobs.report import write_report
+    with console.bar("replaying", len(paths), hidden=len(paths) == 1) as progress:
+        results = again(checkpoint=checkpoint, overrides=set_, progress=progress)
+    pages = []
+    if report:
+        from gripper_force.jobs.report import write_report
 
-    page = str(write_report(log, recover=recover).html)
-    shown = {**console.jsonable(result), "report": page}
-    console.show(shown, as_json, lambda _: replay_table(result, page))
+        with console.bar("writing reports", len(paths), hidden=len(paths) == 1) as progress:
+            for path in paths:
+                written = write_report(path, recover=recover, checkpoint=checkpoint, overrides=set_)
+                pages.append(str(written.html))
+                progress(path.name)
+    if len(results) == 1:
+        shown = {**console.jsonable(results[0]), **({"report": pages[0]} if pages else {})}
+        console.show(shown, as_json, lambda _: replay_table(results[0], pages[0] if pages else None))
+    else:
+        summary = job.summary(results)
+        printed = {"logs": results, "summary": summary, **({"reports": pages} if pages else {})}
+        console.show(printed, as_json, lambda _: replays_table(results, summary, pages))
+    if set_ or checkpoint:
+        console.err.print(_OPEN_LOOP, soft_wrap=True)
+
+
+def _choice(text: str) -> tuple[str | None, list[str]]:
+    """Returns the checkpoint and the changed keys that one side of --compare names."""
+    if text == "log":
+        return None, []
+    return (None, [text]) if "=" in text else (text, [])
 
 
 def doctor(
@@ -176,7 +254,11 @@ def doctor(
     """Check every device and this machine, and suggest fixes. Exit code 1 if there is a problem."""
     from gripper_force.jobs import doctor as job
 
-    settings = load_settings(config, set_, {})
+    settings, new_rig = load_settings_before_rig(config, set_, {})
+    if new_rig is not None:
+        console.err.print(
+            f"the rig profile {new_rig} does not exist yet, so its values are the defaults", soft_wrap=True
+        )
     if setup:
         result = job.setup(settings, lambda servo, changes: _confirmed(servo, changes, yes))
         console.show(result, as_json, setup_line)

@@ -67,11 +67,13 @@ Confirm = Callable[[str, list[RegisterChange]], bool]
 
 
 def keep_only(config: Config, unit: Literal["servo", "camera", "load_cell"]) -> Config:
-    """Returns the configuration without the other sensors, so that their failures do not hide this one's."""
+    """Returns the configuration without the other sensors, so that their failures do not hide this one's.
+
+    A simulated rig has no object, because one that does not fit would hide the unit, too.
+    """
     others = {"camera", "load_cell"} - {unit}
-    return config.model_copy(
-        update={name: getattr(config, name).model_copy(update={"backend": "none"}) for name in others}
-    )
+    none = {name: getattr(config, name).model_copy(update={"backend": "none"}) for name in others}
+    return config.model_copy(update={**none, "object": "none"})
 
 
 def gather(devices: Devices, take: Callable[[], Iterable[T]]) -> list[T]:

@@ -89,6 +89,7 @@ def evaluate(
     config: Config | None = None,
     include_contact_starts: bool = False,
     workers: int = 1,
+    plot: Path | None = None,
     progress: Progress = no_progress,
 ) -> Evaluation:
     """Compares a checkpoint's estimates with the load cell, over logs that training has not seen.
@@ -111,6 +112,7 @@ def evaluate(
         include_contact_starts: Also use logs that start in contact. Their reference frames are wrong, and so
             are the estimates.
         workers: Processes that read the logs.
+        plot: Figure to write: estimates and errors against the load cell; None for none.
         progress: Called twice for each log: after reading and after evaluating it.
 
     Returns:
@@ -145,7 +147,16 @@ def evaluate(
         found = gain_of(ratio, config.gripper.gain_std)
         return 1.0 if found is None else found.gain
 
-    result = evaluate_clips(loaded, used, None if calibration.object is None else correction, gain, progress)
+    forces_n = estimate_clips(
+        loaded, used, None if calibration.object is None else correction, gain, progress
+    )
+    lead_in = loaded.header.preprocess.lead_in
+    result = compare(used, forces_n, lead_in)
+    if plot is not None:
+        from gripper_force.jobs.report.plots import draw_estimates
+
+        title = f"{checkpoint}: MAE {result.mae_n:.3f} N on {len(used)} logs"
+        draw_estimates(*_labelled(used, forces_n, lead_in), title, plot)
     return replace(result, left_out=len(chosen) - len(used))
 
 
@@ -156,7 +167,19 @@ def evaluate_clips(
     gain: Callable[[Clip], float] = lambda clip: 1.0,
     progress: Progress = no_progress,
 ) -> Evaluation:
-    """Compares a checkpoint's estimates with the load cell, over clips.
+    """Compares a checkpoint's estimates with the load cell, over clips: `estimate_clips` and `compare`."""
+    forces_n = estimate_clips(checkpoint, clips, correction, gain, progress)
+    return compare(clips, forces_n, checkpoint.header.preprocess.lead_in)
+
+
+def estimate_clips(
+    checkpoint: Checkpoint,
+    clips: Sequence[Clip],
+    correction: Callable[[Clip], Correction | None] | None = None,
+    gain: Callable[[Clip], float] = lambda clip: 1.0,
+    progress: Progress = no_progress,
+) -> list[npt.NDArray[np.floating]]:
+    """Estimates the force in each frame of clips, as a run would.
 
     Args:
         checkpoint: The ensemble, computed on a GPU if there is one; with corrections, on the CPU.
@@ -165,8 +188,11 @@ def evaluate_clips(
         gain: Returns the gain of a clip's object.
         progress: Called after each clip.
 
+    Returns:
+        Forces in N of each clip, (T,).
+
     Raises:
-        DataError: There are no clips, no labels, or frames of another size.
+        DataError: Frames are of another size.
     """
     if correction is None:
         means_n = [members_n.mean(0) for members_n in estimates(checkpoint, clips, progress)]
@@ -175,8 +201,7 @@ def evaluate_clips(
         for clip in clips:
             means_n.append(_corrected_n(checkpoint, clip, correction(clip)))
             progress(f"evaluated {clip.name}")
-    scaled_n = [gain(clip) * mean_n for clip, mean_n in zip(clips, means_n, strict=True)]
-    return compare(clips, scaled_n, checkpoint.header.preprocess.lead_in)
+    return [gain(clip) * mean_n for clip, mean_n in zip(clips, means_n, strict=True)]
 
 
 def estimates(
@@ -264,16 +289,9 @@ def compare(
     Raises:
         DataError: There are no clips or no labels.
     """
-    measured_n, valid = _joined(clips)
-    valid &= np.concatenate([np.arange(len(clip.frames)) >= lead_in for clip in clips])
-    if not valid.any():
-        raise DataError(
-            f"no frame after a recording's first {lead_in} has a load-cell force; use longer recordings"
-        )
-    predicted_n = np.concatenate(predictions)
+    valid = _has_label(clips, lead_in)
+    measured_n, predicted_n, objects = _labelled(clips, predictions, lead_in)
     floors_n = np.concatenate([stiffness_floor_n(clip.forces_n, clip.stiffness) for clip in clips])[valid]
-    objects = np.concatenate([np.full(len(clip.frames), clip.object) for clip in clips])[valid]
-    predicted_n, measured_n = predicted_n[valid], measured_n[valid]
     return Evaluation(
         mae_n=metrics.mae(predicted_n, measured_n),
         rmse_n=metrics.rmse(predicted_n, measured_n),
@@ -305,6 +323,27 @@ def _object_errors(
         floor_n=float(floors_n.mean()),
         frames=len(measured_n),
     )
+
+
+def _has_label(clips: Sequence[Clip], lead_in: int) -> npt.NDArray[np.bool_]:
+    """Returns the mask of the frames with a label after each clip's first ``lead_in``, (N,)."""
+    _, valid = _joined(clips)
+    valid &= np.concatenate([np.arange(len(clip.frames)) >= lead_in for clip in clips])
+    if not valid.any():
+        raise DataError(
+            f"no frame after a recording's first {lead_in} has a load-cell force; use longer recordings"
+        )
+    return valid
+
+
+def _labelled(
+    clips: Sequence[Clip], predictions: Sequence[npt.NDArray[np.floating]], lead_in: int
+) -> tuple[npt.NDArray[np.floating], npt.NDArray[np.floating], npt.NDArray[np.str_]]:
+    """Returns measured and estimated force in N, and the object, of each frame with a label; all (N,)."""
+    valid = _has_label(clips, lead_in)
+    measured_n = np.concatenate([clip.forces_n for clip in clips])[valid]
+    objects = np.concatenate([np.full(len(clip.frames), clip.object) for clip in clips])[valid]
+    return measured_n, np.concatenate(predictions)[valid], objects
 
 
 def _joined(clips: Sequence[Clip]) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:

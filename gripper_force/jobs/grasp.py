@@ -410,6 +410,27 @@ def overall(results: list[Summary], force_limit_n: float) -> Overall:
     }
 
 
+def write_figure(config: Config, results: Sequence[Summary], summary: Overall) -> str | None:
+    """Draws the errors of trials over their targets, beside the logs. Returns the file.
+
+    Returns None without a load cell, or with ``log.report=false``.
+
+    Raises:
+        DataError: The file can't be written.
+    """
+    if not config.log.report or summary["median_error_percent"] is None:
+        return None
+    from gripper_force.jobs.report.plots import draw_grasps
+
+    path = config.log.directory / f"{time.strftime('%Y%m%d-%H%M%S')}-trials.png"
+    title = (
+        f"{summary['held']} of {summary['trials']} grasps held, {config.control.feedback} feedback, median error "
+        f"{summary['median_error_percent']:.1f} %"
+    )
+    draw_grasps(results, title, path)
+    return str(path)
+
+
 def _trial(tree: Tree) -> Summary:
     return grasp(config_from(tree, "trials"))
 

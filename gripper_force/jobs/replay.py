@@ -1,8 +1,10 @@
-"""Replay of a log: the same functions over the same inputs, and every estimate against the load cell."""
+"""Replay of logs: the same functions over the same inputs, and every estimate against the load cell."""
 
 from collections import defaultdict
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +14,11 @@ from gripper_force import __version__
 from gripper_force.config import Config, Overrides, config_from_text
 from gripper_force.control.state_machine import Decision
 from gripper_force.errors import DataError
+from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import CONTACT_N, label_frames
 from gripper_force.jobs.metrics import ForceBin
+from gripper_force.jobs.processes import process_pool
 from gripper_force.profiles.apply import read_correction, read_profiles
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.perception import FrameProcessor
@@ -86,6 +90,54 @@ class ReplayResult:
     log: str
 
 
+@dataclass(frozen=True, slots=True)
+class SourceErrors:
+    """Errors of one source over several logs, weighted by their estimates. Fields as in `Comparison`."""
+
+    mae_n: float
+    rmse_n: float
+    bias_n: float
+    frames: int
+
+
+@dataclass(frozen=True, slots=True)
+class ReplaySummary:
+    """Result of several replays.
+
+    Attributes:
+        logs: Number of logs.
+        identical: Number of logs of which the replay gave the same estimates and decisions.
+        sources: Errors by source, as in `ReplayResult`.
+        per_object: The same by object.
+    """
+
+    logs: int
+    identical: int
+    sources: dict[str, SourceErrors]
+    per_object: dict[str, dict[str, SourceErrors]]
+
+
+@dataclass(frozen=True, slots=True)
+class PairedDifference:
+    """Difference of a source's error between two replays of the same logs.
+
+    Attributes:
+        logs: Number of logs that have the source in both.
+        first_n: Mean over the logs of the first replay's mean absolute error.
+        second_n: The same of the second.
+        difference_n: Mean of second less first.
+        low_n: Lower end of the 95 % interval of that mean (Student's t over logs); None with one log.
+        high_n: Its upper end.
+    """
+
+    logs: int
+    first_n: float
+    second_n: float
+    difference_n: float
+    low_n: float | None
+    high_n: float | None
+
+
 @dataclass(frozen=True)
 class Replayed:
     """Estimates and decisions that a replay computed, and their agreement with the log.
@@ -132,11 +184,7 @@ def replay(
         DataError: The log holds nothing to replay, or no load cell to compare with.
     """
     reader = LogReader(Path(path), recover=recover)
-    config = config_from_text(reader.config, str(path), overrides)
-    if checkpoint is not None:
-        vision = config.vision.model_copy(update={"checkpoint": str(checkpoint)})
-        config = config.model_copy(update={"vision": vision})
-    run = resolve_replay(config)
+    run = resolve_replay(changed_config(reader, checkpoint, overrides))
     replayed = run_again(reader, run)
     flags = [f for f in (replayed.estimates_identical, replayed.decisions_identical) if f is not None]
     sources = _sources(replayed)
@@ -152,13 +200,114 @@ def replay(
         bias_n=best.bias_n,
         per_bin=best.per_bin,
         frames=best.frames,
-        per_object={config.object: overall},
+        per_object={run.config.object: overall},
         identical=all(flags) if flags else None,
         note=_note(reader, run),
         changed=replayed.changed,
         sources=sources,
         log=str(path),
     )
+
+
+def replay_each(
+    logs: Sequence[Path],
+    checkpoint: str | Path | None = None,
+    *,
+    overrides: Overrides | None = None,
+    recover: bool = False,
+    workers: int = 1,
+    progress: Progress = no_progress,
+) -> list[ReplayResult]:
+    """Replays several logs, in several processes.
+
+    Args:
+        logs: The logs.
+        checkpoint: As for `replay`.
+        overrides: As for `replay`.
+        recover: As for `replay`.
+        workers: Processes to use.
+        progress: Called after each log.
+
+    Raises:
+        GripperError: As for `replay`, for the first log that fails.
+    """
+    one = partial(replay, checkpoint=checkpoint, overrides=overrides, recover=recover)
+    results = []
+    with process_pool(workers) if workers > 1 and len(logs) > 1 else nullcontext() as pool:
+        for result in map(one, logs) if pool is None else pool.map(one, logs):
+            results.append(result)
+            progress(f"replayed {Path(result.log).name}")
+    return results
+
+
+def summary(results: Sequence[ReplayResult]) -> ReplaySummary:
+    """Computes the errors over several replays."""
+    objects = sorted({name for result in results for name in result.per_object})
+    return ReplaySummary(
+        logs=len(results),
+        identical=sum(result.identical is True for result in results),
+        sources=_pooled(results),
+        per_object={name: _pooled([r for r in results if name in r.per_object]) for name in objects},
+    )
+
+
+def _pooled(results: Sequence[ReplayResult]) -> dict[str, SourceErrors]:
+    pooled = {}
+    for name in dict.fromkeys(name for result in results for name in result.sources):
+        parts = [result.sources[name] for result in results if name in result.sources]
+        frames = np.array([part.frames for part in parts])
+        weights = frames / frames.sum()
+        pooled[name] = SourceErrors(
+            mae_n=float(weights @ [part.mae_n for part in parts]),
+            rmse_n=float(np.sqrt(weights @ [part.rmse_n**2 for part in parts])),
+            bias_n=float(weights @ [part.bias_n for part in parts]),
+            frames=int(frames.sum()),
+        )
+    return pooled
+
+
+def paired_differences(
+    first: Sequence[ReplayResult], second: Sequence[ReplayResult]
+) -> dict[str, PairedDifference]:
+    """Compares two replays of the same logs, by source. Each log counts once, however long it is."""
+    from scipy import stats  # imported here: it takes longer than a replay's other imports
+
+    found = {}
+    for name in ("visual", "current", "fused"):
+        pairs = [
+            (a.sources[name].mae_n, b.sources[name].mae_n)
+            for a, b in zip(first, second, strict=True)
+            if name in a.sources and name in b.sources
+        ]
+        if not pairs:
+            continue
+        a_n, b_n = np.array(pairs).T
+        difference_n = b_n - a_n
+        half_n = None
+        if len(pairs) > 1:
+            quantile = float(stats.t.ppf(0.975, len(pairs) - 1))
+            half_n = quantile * float(difference_n.std(ddof=1)) / len(pairs) ** 0.5
+        mean_n = float(difference_n.mean())
+        found[name] = PairedDifference(
+            logs=len(pairs),
+            first_n=float(a_n.mean()),
+            second_n=float(b_n.mean()),
+            difference_n=mean_n,
+            low_n=None if half_n is None else mean_n - half_n,
+            high_n=None if half_n is None else mean_n + half_n,
+        )
+    return found
+
+
+def changed_config(
+    reader: LogReader, checkpoint: str | Path | None = None, overrides: Overrides | None = None
+) -> Config:
+    """Returns the configuration of a log with changes."""
+    config = config_from_text(reader.config, str(reader.path), overrides)
+    if checkpoint is None:
+        return config
+    vision = config.vision.model_copy(update={"checkpoint": str(checkpoint)})
+    return config.model_copy(update={"vision": vision})
 
 
 def resolve_replay(config: Config) -> ResolvedConfig:

@@ -56,7 +56,7 @@ class GraspScore:
 LEAST_VISION_SHARE: Final = 0.5
 """A grasp that is configured to use vision fell back if a smaller share of its hold used it."""
 
-_NO_ESTIMATE: Final = "no estimate: "
+NO_ESTIMATE: Final = "no estimate: "
 _NO_NEW_ESTIMATE: Final = "no new estimate"
 _DROP_OUT: Final = re.compile("vision (?:dropped out|is not used): (.*); using motor current alone")
 """Events of `runtime/session.py` and `control/fusion.py`."""
@@ -158,7 +158,7 @@ def vision_in_hold(
         return None
     start_ns = _start_ns(_GRASP_PHASES, statuses, held_ns[-1])
     sources = {estimate.t_ns: estimate.source for estimate in estimates}
-    reasons = _drop_out_reasons(visuals, events)
+    reasons = drop_out_reasons(visuals, events)
     cycles = used = 0
     lost_s: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
     for status, after in pairwise([*statuses, statuses[-1]]):
@@ -175,13 +175,13 @@ def vision_in_hold(
     return HoldVision(used / cycles, sorted(losses, key=lambda loss: -loss.time_s))
 
 
-def _drop_out_reasons(visuals: Sequence[VisualForce], events: Sequence[Event]) -> list[tuple[int, str]]:
-    """Returns time and reason of each drop-out, in order of time."""
+def drop_out_reasons(visuals: Sequence[VisualForce], events: Sequence[Event]) -> list[tuple[int, str]]:
+    """Returns time and reason of each time at which vision dropped out, in order of time."""
     ready_ns = sorted(visual.ready_ns for visual in visuals)
     reasons, problem_ns, problem = [], 0, ""
     for event in sorted(events, key=lambda event: event.t_ns):
-        if event.text.startswith(_NO_ESTIMATE):
-            problem_ns, problem = event.t_ns, event.text.removeprefix(_NO_ESTIMATE)
+        if event.text.startswith(NO_ESTIMATE):
+            problem_ns, problem = event.t_ns, event.text.removeprefix(NO_ESTIMATE)
         elif found := _DROP_OUT.fullmatch(event.text):
             reason = found[1]
             # The controller does not know why a frame gave no estimate; the session does.

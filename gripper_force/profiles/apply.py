@@ -101,6 +101,12 @@ def read_correction(
     if profiles.object is None or profiles.object_path is None or model is None:
         return None
     mismatches = profiles.object.mismatches(model.digest, rig or config.rig_settings())
+    if profiles.object.checkpoint != model.digest:
+        raise ConfigError(
+            f"the object profile {profiles.object_path} was made with {mismatches[0]}, whose estimates it corrects; "
+            f"calibrate the object again with {config.vision.checkpoint!r}, or leave the profile out with "
+            "calibration.object=none"
+        )
     _refuse(config, f"object profile {profiles.object_path}", mismatches)
     from gripper_force.profiles.correction import load_correction
 

@@ -5,6 +5,7 @@ from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import AwareDatetime, Field, model_validator
 
+from gripper_force.errors import ConfigError
 from gripper_force.schema import (
     Finite,
     NonNegative,
@@ -204,6 +205,10 @@ def _std(estimate: CalibratedValue, drift: float) -> float:
 
 def read_rig(path: Path) -> RigProfile:
     """Reads a rig profile. Raises `ConfigError` if the file is missing or invalid."""
+    if not path.exists():
+        raise ConfigError(
+            f"there is no rig profile {path} yet; `calibrate load-cell` or `calibrate servo` writes it"
+        )
     return read_section(RigProfile, path, FORMAT, "rig profile")
 
 

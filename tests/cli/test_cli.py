@@ -1,5 +1,6 @@
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -141,7 +142,7 @@ def test_a_grasp_that_did_not_hold_has_an_exit_code(run: Run, sets: list[str]) -
 
 def test_trials_print_each_and_a_summary(run: Run, sets: list[str]) -> None:
     result = run("grasp", "--json", "--trials", 1, "--jobs", 1, *sets).json()
-    assert set(result) == {"trials", "summary"}
+    assert set(result) == {"trials", "summary", "figure"}
     (trial,) = result["trials"]
     assert set(trial) >= GRASP_KEYS
     assert trial["object"] == "sponge"
@@ -401,9 +402,40 @@ def test_a_file_that_is_no_checkpoint_is_named(
         assert sentence in line
 
 
-def test_a_report_is_of_the_run_as_it_was(run: Run, fused_log: Path) -> None:
-    done = run("replay", fused_log, "--report", "--set", "control.ramp_n_s=4")
-    assert (done.code, "--report shows the run as it was" in done.err) == (2, True)
+def test_a_report_can_be_that_of_a_replay(run: Run, fused_log: Path, tmp_path: Path) -> None:
+    log = Path(shutil.copy(fused_log, tmp_path / "run.mcap"))
+    done = run("replay", log, "--report", "--set", "control.ramp_n_s=4", "--json")
+    page = Path(done.json()["report"])
+    assert page.name == "run-replayed.html"
+    assert "replayed with changes, open loop" in page.read_text(encoding="utf-8")
+    assert "A replay is open loop" in done.err
+    as_it_was = run("replay", log, "--report", "--json")
+    assert Path(as_it_was.json()["report"]).name == "run.html"
+    assert "open loop" not in as_it_was.err
+    assert "open loop" not in (tmp_path / "run.html").read_text(encoding="utf-8")
+
+
+def test_a_folder_is_replayed(run: Run, fused_log: Path, tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        shutil.copy(fused_log, tmp_path / f"{name}.mcap")
+    found = run("replay", tmp_path, "--json", "--jobs", 1).json()
+    assert [Path(log["log"]).stem for log in found["logs"]] == ["a", "b"]
+    assert found["summary"]["identical"] == found["summary"]["logs"] == 2
+    table = run("replay", tmp_path / "a.mcap", tmp_path / "b.mcap", "--jobs", 1)
+    assert "a.mcap" in table.out
+    assert "stapler" in table.out
+
+
+def test_two_settings_are_compared(run: Run, fused_log: Path, tmp_path: Path, tiny_checkpoint: Path) -> None:
+    for name in ("a", "b"):
+        shutil.copy(fused_log, tmp_path / f"{name}.mcap")
+    same = run("replay", tmp_path, "--compare", "log", tiny_checkpoint, "--json", "--jobs", 1).json()
+    assert same["differences"]["visual"]["difference_n"] == 0
+    done = run("replay", tmp_path, "--compare", "log", "control.feedback=current", "--jobs", 1)
+    assert "95 % interval" in done.out
+    assert "A replay is open loop" in done.err
+    wrong = run("replay", tmp_path, "--compare", "log", "log", "--report")
+    assert (wrong.code, "--compare names its checkpoints" in wrong.err) == (2, True)
 
 
 def interrupt(arguments: list[str], folder: Path) -> tuple[int, str]:
@@ -564,3 +596,14 @@ def test_options_win_over_overrides() -> None:
     assert (config.seed, config.object) == (4, "tube")
     with pytest.raises(ConfigError, match="configuration key 'target_n'"):
         load_settings(None, None, {"target_n": -1.0})
+
+
+def test_commands_before_the_first_calibration_need_no_rig_profile(run: Run) -> None:
+    new = ("--set", "calibration.rig=rig.yaml", "--set", "object=none", "--set", "sim.detail=coarse")
+    assert "closing_sign: 1" in run("calibrate", "jaws", "--yes", *new).out
+    checked = run("doctor", *new, "--set", "camera.backend=none", "--set", "vision.checkpoint=none")
+    assert "the rig profile rig.yaml does not exist yet" in checked.err
+    assert "load cell" in checked.out
+    refused = run("grasp", *new)
+    assert refused.code == 2
+    assert "there is no rig profile rig.yaml yet; `calibrate load-cell`" in refused.err

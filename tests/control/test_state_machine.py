@@ -580,6 +580,13 @@ def test_paper_is_gripped_with_the_full_force(make_run):
     assert run.plant.force_n == pytest.approx(9.0, abs=0.5)
 
 
+@pytest.mark.parametrize(("least_m", "outcome"), [(0.0, "no_object"), (-0.002, "held")])
+def test_gear_play_and_soft_pads_make_paper_look_thinner_than_nothing(make_run, least_m, outcome):
+    plant = {"contact_m": 0.04595, "stops_m": (0.0, 0.05), "stiffness_n_m": 2e4, "play_m": 0.0003}
+    run = make_run(plant=plant, min_object_width_m=least_m, feedback="current").grasp(4.0)
+    assert run.last.status.outcome == outcome
+
+
 def test_camera_that_sees_far_too_much_does_not_confirm_jaws_that_friction_holds(make_run):
     run = make_run(plant={"friction_n": 0.9}, vision={"gain": 1.4, "noise_n": 0.05}).grasp(0.8, 9.0)
     assert run.last.status.outcome == "held"

@@ -112,6 +112,7 @@ def test_setup_ends_with_a_sentence(sets: list[str]) -> None:
 
 def test_only_one_sensor_is_kept() -> None:
     kept = keep_only(Config(), "camera")
+    assert kept.object == "none"  # a simulated object that does not fit is no problem of a device
     assert (kept.camera.backend, kept.load_cell.backend) == ("simulated", "none")
     assert keep_only(Config(), "servo").camera.backend == "none"
 

@@ -115,6 +115,24 @@ def test_logs_that_start_in_contact_are_left_out(
     assert json.loads(included.stdout)["frames"] == every.frames
 
 
+def test_estimates_are_drawn(few_logs: Path, tiny_checkpoint: Path, tmp_path: Path) -> None:
+    figure = tmp_path / "figure.png"
+    call = [
+        "evaluate",
+        str(few_logs),
+        "--checkpoint",
+        str(tiny_checkpoint),
+        "--jobs",
+        "1",
+        "--plot",
+        str(figure),
+    ]
+    done = CliRunner().invoke(cli.app, call)
+    assert done.exit_code == 0
+    assert f"figure: {figure}" in done.stderr
+    assert figure.is_file()
+
+
 def test_profile_of_another_checkpoint_raises(few_logs: Path, tiny_checkpoint: Path) -> None:
     with pytest.raises(ConfigError, match="object profile"):
         evaluate(few_logs, tiny_checkpoint, profile="sponge")

@@ -7,10 +7,17 @@ import pytest
 import torch
 
 from gripper_force.config import load_config
-from gripper_force.errors import CheckpointError, DataError, LogError
+from gripper_force.errors import CheckpointError, ConfigError, DataError, LogError
 from gripper_force.jobs.grasp import run_grasp
 from gripper_force.jobs.metrics import bias, mae, rmse
-from gripper_force.jobs.replay import replay
+from gripper_force.jobs.replay import (
+    Comparison,
+    ReplayResult,
+    paired_differences,
+    replay,
+    replay_each,
+    summary,
+)
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import (
@@ -154,3 +161,46 @@ def test_decisions_on_an_estimator_that_was_made_to_fail_are_still_compared(
     result = replay(path)
     assert result.identical is True
     assert "faults were injected" in result.note
+
+
+def test_several_logs_give_the_errors_over_all(fused_log: Path, tmp_path: Path) -> None:
+    half = tampered(fused_log, tmp_path / "half.mcap", lambda r: r if r.t_ns < 1_500_000_000 else None)
+    results = replay_each([fused_log, half], workers=2)
+    assert [result.log for result in results] == [str(fused_log), str(half)]
+    assert results[0] == replay(fused_log)
+    found = summary(results)
+    assert (found.logs, found.identical) == (2, 2)
+    parts = [result.sources["fused"] for result in results]
+    assert found.sources["fused"].frames == sum(part.frames for part in parts)
+    expected_n = sum(part.mae_n * part.frames for part in parts) / sum(part.frames for part in parts)
+    assert found.sources["fused"].mae_n == pytest.approx(expected_n)
+    assert found.per_object["stapler"] == found.sources
+
+
+def result_with(mae_n: float) -> ReplayResult:
+    errors = Comparison(mae_n, mae_n, 0.0, mae_n, 0.0, 100, [])
+    return ReplayResult(mae_n, mae_n, 0.0, [], 100, {}, None, "", {}, {"fused": errors}, "a.mcap")
+
+
+def test_differences_are_those_of_each_log() -> None:
+    first, second = [result_with(n) for n in (0.1, 0.5, 1.0)], [result_with(n) for n in (0.2, 0.6, 1.1)]
+    (name, found), *more = paired_differences(first, second).items()
+    assert (name, more, found.logs) == ("fused", [], 3)
+    assert found.difference_n == pytest.approx(0.1)
+    assert found.low_n == pytest.approx(0.1), "every log differs by the same"
+    assert found.high_n == pytest.approx(0.1)
+    alone = paired_differences(first[:1], second[:1])["fused"]
+    assert (alone.low_n, alone.high_n) == (None, None)
+
+
+def test_the_interval_of_a_difference_is_students() -> None:
+    first, second = [result_with(1.0)] * 2, [result_with(n) for n in (1.0, 1.2)]
+    found = paired_differences(first, second)["fused"]
+    assert found.difference_n == pytest.approx(0.1)
+    assert found.high_n == pytest.approx(0.1 + 12.706 * 0.1, rel=1e-3)
+
+
+def test_the_remedy_for_a_profile_of_another_network_works(fused_log: Path) -> None:
+    with pytest.raises(ConfigError, match=r"leave the profile out with calibration\.object=none"):
+        replay(fused_log, overrides=["calibration.object=sponge"])
+    assert replay(fused_log, overrides=["calibration.object=none"]).identical is True

@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import math
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -17,8 +18,8 @@ from gripper_force.errors import LogError
 from gripper_force.jobs import report as report_module
 from gripper_force.jobs.report import pictures as pictures_module
 from gripper_force.jobs.report import write_report
-from gripper_force.jobs.report.data import SOURCES, Run, histogram, read_run
-from gripper_force.jobs.report.figure import CSS_COLOURS, draw
+from gripper_force.jobs.report.data import SOURCES, Run, Series, histogram, read_run
+from gripper_force.jobs.report.figure import CSS_COLOURS, draw, with_gaps
 from gripper_force.jobs.report.pictures import FrameSampler, Picture, overlay
 from gripper_force.jobs.score import HoldVision, VisionLoss
 from gripper_force.runtime import log_reader as log_reader_module
@@ -27,6 +28,7 @@ from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import (
     NS_PER_MS,
     NS_PER_S,
+    EstimateSource,
     Event,
     Frame,
     FusedForce,
@@ -35,6 +37,8 @@ from gripper_force.types import (
     LoadCellSample,
     Record,
     Request,
+    ServoCommand,
+    ServoState,
     VisualForce,
 )
 from gripper_force.vision.checkpoint import load_checkpoint
@@ -63,11 +67,28 @@ def picture(force: float) -> Gray:
     return np.asarray(60 + 25 * x + 120 * np.exp(-(x**2 + y**2) / (0.05 + 0.05 * force)), np.uint8)
 
 
-def write_grasp(path: Path, *, checkpoint: Path | None = None, digest: str = "") -> Path:
-    """A plausible grasp: control at 100 Hz, camera at 30 Hz, load cell at 100 Hz."""
+REAL = {
+    "servo": {"port": "/dev/ttyUSB0"},
+    "camera": {"backend": "uvc"},
+    "load_cell": {"backend": "serial"},
+    "clock": "realtime",
+}
+"""Configuration of a rig that is not simulated."""
+
+
+def write_grasp(
+    path: Path,
+    *,
+    checkpoint: Path | None = None,
+    digest: str = "",
+    real: bool = True,
+    lost_s: float = math.inf,
+) -> Path:
+    """A plausible grasp: control at 100 Hz, camera at 30 Hz, load cell at 100 Hz; without vision from ``lost_s`` on."""
     rng = np.random.default_rng(0)
     vision = {"checkpoint": str(checkpoint or "nowhere.safetensors"), "threads": 1}
-    config = config_from({"object": "paper_cup", "target_n": TARGET_N, "vision": vision}, "the test")
+    given = {"object": "paper_cup", "target_n": TARGET_N, "vision": vision, **(REAL if real else {})}
+    config = config_from(given, "the test")
     records: list[tuple[int, Record]] = []
     for i in range(600):
         t_s, t_ns = i / 100, START_NS + i * 10 * NS_PER_MS
@@ -76,21 +97,29 @@ def write_grasp(path: Path, *, checkpoint: Path | None = None, digest: str = "")
         outcome = "held" if t_s > 3.4 else ""
         reason = "steady within 0.2 N" if 3.4 < t_s <= 3.41 else ""
         current_n = 0.85 * true_n + 0.3 * (t_s > 0.5) + rng.normal(0, 0.05)
-        fused = FusedForce(t_ns, true_n + rng.normal(0, 0.06), 0.2, current_n, 0.1, 0.9, "fused")
+        source = EstimateSource.FUSED if t_s < lost_s else EstimateSource.CURRENT
+        fused = FusedForce(t_ns, true_n + rng.normal(0, 0.06), 0.2, current_n, 0.1, 0.9, source)
         reference_n = float(np.interp(t_s, [1.4, 2.2, 5.0, 5.01], [0, TARGET_N, TARGET_N, 0]))
         status = GraspStatus(t_ns, phase, outcome, reference_n, 0.04, reason)
         cell = LoadCellSample(t_ns, true_n + rng.normal(0, 0.03), 0.0, valid=i % 50 != 0)
-        records += [(t_ns, record) for record in (fused, status, cell)]
+        servo = ServoState(t_ns, 0.2, 0.0, 0.1 * true_n, 31.0 + 0.5 * t_s, 12.0, 0)
+        command = ServoCommand(t_ns, 0.3, 0.12 * true_n)
+        records += [(t_ns, record) for record in (fused, status, cell, servo, command)]
         if i % 3 == 0:
             ready_ns = t_ns + round(rng.gamma(9, 2.0) * NS_PER_MS)
             received_ns = t_ns + round(rng.gamma(20, 0.5) * NS_PER_MS)
             records.append((received_ns, Frame(t_ns, received_ns, i // 3, picture(true_n))))
-            seen_n = true_n + rng.normal(0, 0.25)
-            records.append((ready_ns, VisualForce(t_ns, ready_ns, i // 3, seen_n, 0.3, rng.gamma(30, 0.15))))
+            seen_n, compute_ms = true_n + rng.normal(0, 0.25), rng.gamma(30, 0.15)
+            if t_s < lost_s:
+                records.append((ready_ns, VisualForce(t_ns, ready_ns, i // 3, seen_n, 0.3, compute_ms)))
     request_ns = START_NS + NS_PER_S // 2
     records.append((request_ns, Request(request_ns, "grasp", TARGET_N)))
     event = Event(START_NS + 3 * NS_PER_S, "camera", "1 frame lost <after> 41 & before 43")
     records.append((event.t_ns, event))
+    if lost_s < math.inf:
+        lost_ns = START_NS + round(lost_s * NS_PER_S)
+        text = "vision dropped out: the lens is covered; using motor current alone"
+        records.append((lost_ns, Event(lost_ns, "vision", text)))
     with LogWriter(path, config=dump_config(config), metadata={"checkpoint": digest, "version": "0"}) as log:
         for _, record in sorted(records, key=lambda entry: entry[0]):
             log.write(record)
@@ -208,7 +237,7 @@ def test_figure_is_drawn_once(grasp: Path, tmp_path: Path, monkeypatch: pytest.M
 def test_page_is_well_formed_and_needs_no_other_file(page: str) -> None:
     parsed = Page(page)
     images = [source for source in parsed.sources if not source.startswith("#")]
-    assert len(images) == 6
+    assert len(images) == 6 + 6 + 1, "frames, frames with attention, and the colour bar"
     assert all(source.startswith("data:image/png;base64,") for source in images)
     assert not re.search(r"https?://|@import|url\((?!#)", page)
 
@@ -235,6 +264,61 @@ def test_the_figure_states_why_vision_was_lost(grasp: Path) -> None:
     text = "vision used in 96 % of the hold\nvision lost for 0.4 s: it is 70 ms old"
     assert draw(run, []).get_supxlabel() == text
     assert draw(dataclasses.replace(run, vision=None), []).get_supxlabel() == ""
+
+
+def test_a_time_without_vision_is_marked_with_its_reason_and_not_drawn(tmp_path: Path) -> None:
+    run, pictures, _ = read(write_grasp(tmp_path / "lost.mcap", lost_s=3.0))
+    assert [loss.reason for loss in run.losses] == ["the lens is covered"]
+    assert run.losses[0].start_s == pytest.approx(2.5, abs=0.03)
+    assert run.losses[0].end_s == pytest.approx(4.5, abs=0.03)
+    texts = [text.get_text() for text in draw(run, []).axes[0].texts]
+    assert "vision lost for 2.0 s: the lens is covered" in texts
+    assert [picture.vision_n is None for picture in pictures][-2:] == [True, True]
+
+
+def test_gaps_are_not_drawn() -> None:
+    t_s = np.array([0.0, 0.01, 0.02, 0.5, 0.51])
+    drawn = with_gaps(Series(t_s, t_s))
+    assert np.isnan(drawn.value).tolist() == [False, False, False, True, False, False]
+    assert 0.02 < drawn.t_s[3] < 0.5
+    assert len(with_gaps(Series(t_s[:3], t_s[:3])).t_s) == 3
+
+
+def test_uncertainty_and_tolerance_are_drawn_as_bands(grasp: Path) -> None:
+    axes = draw(read_run(LogReader(grasp)), []).axes[0]
+    bands = {band.get_label(): band.get_paths()[0].get_extents() for band in axes.collections}
+    assert bands["tolerance"].height == pytest.approx(2 * 0.04 * TARGET_N, rel=0.01)
+    assert bands["90 % interval"].y1 > TARGET_N + 0.3
+
+
+def test_current_width_and_temperature_are_drawn(grasp: Path) -> None:
+    run = read_run(LogReader(grasp))
+    assert set(run.motor) == {"goal_a", "current_a", "width_mm", "temperature_c"}
+    assert np.median(run.motor["width_mm"].value) == pytest.approx(40.0)
+    titles = [axes.get_title(loc="left") for axes in draw(run, []).axes]
+    assert "Motor, 31 to 34 °C" in titles
+
+
+def test_a_simulated_run_says_so_and_shows_no_simulated_latency(tmp_path: Path) -> None:
+    page = write_report(write_grasp(tmp_path / "simulated.mcap", real=False)).html.read_text(encoding="utf-8")
+    text = Page(page).text
+    assert "simulated" in text
+    assert not [entry for entry in text if "Latency" in entry or "on arrival" in entry]
+    assert [entry for entry in text if entry.startswith("Estimator, per frame")]
+
+
+def test_each_touch_of_several_has_a_card(tmp_path: Path) -> None:
+    path = tmp_path / "touches.mcap"
+    with LogWriter(path, config=dump_config(config_from({"object": "egg"}, "")), metadata={}) as log:
+        for i in range(400):
+            t_ns = i * 20 * NS_PER_MS
+            log.write(LoadCellSample(t_ns, 5.0 if 100 <= i < 150 else 3.0 if 250 <= i < 300 else 0.01, 0.0))
+    assert [(touch.start_s, touch.peak_n) for touch in read_run(LogReader(path)).touches] == [
+        (2.0, 5.0),
+        (5.0, 3.0),
+    ]
+    text = Page(write_report(path).html.read_text(encoding="utf-8")).text
+    assert text[text.index("Touch 2, 5.0 to 6.0 s") + 1] == "3.00"
 
 
 def test_texts_of_log_are_escaped(page: str) -> None:
@@ -270,9 +354,9 @@ def test_time_zero_is_the_first_request(grasp: Path) -> None:
 def test_errors_use_valid_samples_only(grasp: Path) -> None:
     run = read_run(LogReader(grasp))
     assert len(run.forces["load_cell"].t_s) == 600 - 12
-    assert abs(run.errors["fused"].value_n.mean()) < 0.02
+    assert abs(run.errors["fused"].value.mean()) < 0.02
     in_hold = (run.errors["current"].t_s > 3) & (run.errors["current"].t_s < 4)
-    assert run.errors["current"].value_n[in_hold].mean() == pytest.approx(-0.15 * TARGET_N + 0.3, abs=0.05)
+    assert run.errors["current"].value[in_hold].mean() == pytest.approx(-0.15 * TARGET_N + 0.3, abs=0.05)
 
 
 def test_event_rows_hold_requests_phases_outcomes_and_events_in_order(grasp: Path) -> None:
@@ -317,7 +401,9 @@ def test_frames_span_the_grip_and_show_attention(grasp: Path) -> None:
     assert pictures[0].t_s == pytest.approx(0.3, abs=0.03)
     assert pictures[-1].t_s == pytest.approx(4.8, abs=0.03)
     assert "spatial attention" in note
-    assert np.ptp(pictures[3].image, axis=2).max() > 20, "the attention is in colour"
+    assert np.ptp(pictures[3].image, axis=2).max() == 0, "the frame as it was"
+    assert pictures[3].overlay is not None
+    assert np.ptp(pictures[3].overlay, axis=2).max() > 20, "the attention is in colour"
     assert pictures[3].load_cell_n == pytest.approx(TARGET_N, abs=0.2)
 
 

@@ -266,8 +266,8 @@ def _fit_travel(
     """Coulomb and viscous friction with their half intervals, (2,) each; `ServoFit.travelled`."""
     if len(passes) < MIN_PASSES:
         raise DataError(
-            f"the jaws travelled freely only {len(passes)} times, and {MIN_PASSES} are needed; remove "
-            "everything from their way except the gauge"
+            f"the jaws travelled freely only {len(passes)} times, and {MIN_PASSES} are needed; use a thinner gauge, "
+            "and remove everything else from their way"
         )
     rows, clusters = [], []
     for number, one in enumerate(passes):

@@ -8,7 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Polygon, Rectangle
 
 from gripper_calibration.fits.camera_fit import CameraLag, ExposureCandidate, Markers, usable_touches
-from gripper_calibration.plots.style import DATA, FIT, GRAY, OTHER, label_axes, saved_figure, value_text
+from gripper_calibration.plots.style import DATA, FIT, GRAY, OTHER, value_text
+from gripper_force.jobs.report.plots import label_axes, saved_figure
 from gripper_force.profiles.rig_profile import CameraCalibration
 from gripper_force.types import Gray
 

@@ -3,7 +3,8 @@
 from pathlib import Path
 
 from gripper_calibration.fits.load_cell_fit import LoadCellFit, allan_deviation
-from gripper_calibration.plots.style import DATA, FIT, GRAY, OTHER, label_axes, saved_figure, value_text
+from gripper_calibration.plots.style import DATA, FIT, GRAY, OTHER, value_text
+from gripper_force.jobs.report.plots import label_axes, saved_figure
 
 
 def draw(fit: LoadCellFit, path: Path) -> None:

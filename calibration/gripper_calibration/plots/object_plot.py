@@ -8,7 +8,8 @@ from matplotlib.axes import Axes
 
 from gripper_calibration.fits.object_fit import LearningCurvePoint, ObjectFit
 from gripper_calibration.fits.touches import Touches
-from gripper_calibration.plots.style import DATA, FIT, GRAY, label_axes, saved_figure
+from gripper_calibration.plots.style import DATA, FIT, GRAY
+from gripper_force.jobs.report.plots import label_axes, saved_figure
 from gripper_force.profiles.correction import curve_n
 from gripper_force.profiles.object_profile import ObjectProfile
 

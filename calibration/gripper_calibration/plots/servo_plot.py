@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from gripper_calibration.fits.servo_fit import Floats, ServoFit, ServoPress
-from gripper_calibration.plots.style import DATA, FIT, GRAY, OTHER, label_axes, saved_figure, value_text
+from gripper_calibration.plots.style import DATA, FIT, GRAY, OTHER, value_text
+from gripper_force.jobs.report.plots import label_axes, saved_figure
 
 
 def draw(fit: ServoFit, presses: Sequence[ServoPress], path: Path) -> None:

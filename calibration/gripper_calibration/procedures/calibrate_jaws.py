@@ -31,7 +31,10 @@ _STILL_S: Final = 0.4
 """The jaws stand still if they move by less than this in this time."""
 
 _END_RAD: Final = 0.03
-"""Largest difference between two measurements of an end: pads are elastic."""
+"""Largest difference between two measurements of an end."""
+
+_GIVES_RAD: Final = 0.06
+"""Largest motion at an end under more current: pads and stops are elastic, and a linkage presses harder there."""
 
 _LEAST_TRAVEL_RAD: Final = 0.2
 _MOST_TRAVEL_RAD: Final = 4 * math.pi
@@ -123,7 +126,7 @@ def calibrate_jaws(config: Config, *, prompt: Prompt, progress: Progress = no_pr
     prompt("Take everything from between the jaws and open them by hand")
     with open_devices(config) as devices, _torque_on(config, devices, progress) as jaws:
         start_rad = jaws.state.position_rad
-        ends = [(jaws.find_end(1), jaws.find_end(-1)) for _ in range(2)]
+        ends = [jaws.find_ends() for _ in range(2)]
         high_rad, low_rad = (float(np.mean([pair[side] for pair in ends])) for side in (0, 1))
         repeat_rad = max(abs(ends[0][side] - ends[1][side]) for side in (0, 1))
         _check_ends(start_rad, low_rad, high_rad, repeat_rad)
@@ -151,8 +154,9 @@ def _check_ends(start_rad: float, low_rad: float, high_rad: float, repeat_rad: f
     travel_rad = high_rad - low_rad
     if travel_rad < _LEAST_TRAVEL_RAD:
         raise DataError(
-            f"the jaws move by {travel_rad:.2f} rad only, between {low_rad:.2f} and {high_rad:.2f} rad; remove what "
-            "blocks them, and check that the horn is screwed tight and servo.current_limit_a is not too small"
+            f"the jaws move by {travel_rad:.2f} rad only, between {low_rad:.2f} and {high_rad:.2f} rad, with all the "
+            "current that servo.current_limit_a and control.force_limit_n allow; remove what blocks them, and check "
+            "that they run smoothly"
         )
     if repeat_rad > _END_RAD:
         raise DataError(
@@ -243,7 +247,7 @@ class _EmptyJaws:
         self.state = state = devices.servo.read()
         if self._safety.check(state, self._goal_a, 1 / _RATE_HZ, over_force=False):
             raise DeviceError(f"stopped: {self._safety.reason}; remove the cause and start again")
-        self._goal_a = min(current_a, self._limits.ceiling_a(math.inf, self._middle_rad))
+        self._goal_a = min(current_a, self._limits.ceiling_a(0.0, self._middle_rad))
         command = ServoCommand(self._due_ns, state.position_rad + side, self._goal_a)
         speed_m_s = speed_share * self._config.control.approach_speed_m_s
         devices.servo.write(self._speed_limit.apply(command, state, speed_m_s))
@@ -253,17 +257,26 @@ class _EmptyJaws:
         for _ in range(round(_REST_S * _RATE_HZ)):
             self.cycle(0, self._end_a)
 
-    def find_end(self, side: int) -> float:
+    def find_ends(self) -> tuple[float, float]:
+        """Returns the angles at the upper and the lower end. Jaws that friction holds get more current."""
+        ceiling_a = self._limits.ceiling_a(0.0, self._middle_rad)
+        while True:
+            high_rad, low_rad = self._find_end(1), self._find_end(-1)
+            if high_rad - low_rad > _LEAST_TRAVEL_RAD or self._end_a >= ceiling_a:
+                return high_rad, low_rad
+            self._end_a = min(_MORE * self._end_a, ceiling_a)
+
+    def _find_end(self, side: int) -> float:
         """Returns the angle at an end, which more current does not move."""
         self._progress(f"moving to the {'upper' if side > 0 else 'lower'} end", 0)
         self._run_to_standstill(side)
         while True:
             before_rad, self._end_a = self.state.position_rad, self._end_a * _MORE
             self._run_to_standstill(side)
-            if abs(self.state.position_rad - before_rad) < _END_RAD:
+            if abs(self.state.position_rad - before_rad) < _GIVES_RAD:
                 self._end_a /= _MORE
                 return before_rad
-            ceiling_a = self._limits.ceiling_a(math.inf, self._middle_rad)
+            ceiling_a = self._limits.ceiling_a(0.0, self._middle_rad)
             if self._end_a > ceiling_a:
                 raise DataError(
                     f"the jaws need more than {ceiling_a:.2f} A to move, the current at control.force_limit_n; check "
@@ -305,7 +318,7 @@ class _EmptyJaws:
     def _break_away(self, side: int) -> float:
         begin_rad, current_a = self.state.position_rad, 0.0
         step_a = self._current_a(_RISE_N_S) / _RATE_HZ
-        ceiling_a = self._limits.ceiling_a(math.inf, self._middle_rad)
+        ceiling_a = self._limits.ceiling_a(0.0, self._middle_rad)
         while side * (self.state.position_rad - begin_rad) < _MOVED_RAD:
             current_a += step_a
             if current_a > ceiling_a:

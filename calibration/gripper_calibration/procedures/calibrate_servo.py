@@ -6,16 +6,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final
+from typing import Final, NoReturn
 
 import numpy as np
 
-from gripper_calibration.fits.servo_fit import FreePass, Nominal, ServoFit, ServoPress, fit_servo
+from gripper_calibration.fits.servo_fit import MIN_PASSES, FreePass, Nominal, ServoFit, ServoPress, fit_servo
 from gripper_calibration.plots.servo_plot import draw
 from gripper_force.config import Config, GripperConfig
 from gripper_force.control.limits import Limits, largest_target_n
 from gripper_force.control.linkage import make_linkage
 from gripper_force.control.safety import Safety
+from gripper_force.control.speed_limit import SpeedLimit
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import ConfigError, DataError, DeviceError
 from gripper_force.interfaces import Devices, LoadCell, Progress, Prompt, no_progress
@@ -27,14 +28,17 @@ from gripper_force.profiles.rig_profile import (
     update_rig,
 )
 from gripper_force.runtime.backends import open_devices
-from gripper_force.runtime.resolve import resolve
+from gripper_force.runtime.resolve import position_loop, resolve
 from gripper_force.types import NS_PER_S, ServoCommand, ServoState
 
 PRESSES: Final = ((3.0, 1.0), (6.0, 1.0), (12.0, 1.0), (3.0, 0.6), (6.0, 0.8), (12.0, 0.8))
 """Rate in N/s and share of the largest force of each press. Several rates separate lag from friction."""
 
 SPEEDS_M_S: Final = (0.012, 0.020, 0.028, 0.036, 0.044, 0.052)
-"""Target speeds of one jaw in free travel."""
+"""Target speeds of one jaw in free travel. They are proportionally lower if a pass at the last one is too short."""
+
+_PASS_S: Final = 0.3
+"""Least time of a pass, with its acceleration."""
 
 _RATE_HZ: Final = 200.0
 _PEAK_SHARE: Final = 1.05
@@ -53,8 +57,10 @@ _LEAST_SHARE: Final = 0.7
 """Least share of the peak force that a press at the current ceiling must reach."""
 _MAX_TARE_N: Final = 1.0
 _CLEARANCE_M: Final = 0.005
+_LEAST_TRAVEL_M: Final = 0.001
+"""Jaws that closed by less than this did not move."""
 _BRAKE_RAD: Final = 0.3
-"""Distance from the goal at which the servo's own position control takes over."""
+"""Distance from the goal at which the servo's own position control takes over, and at most a fifth of the pass."""
 _SPEED_UP_S: Final = 0.1
 _START_FACTOR: Final = 1.6
 _MIN_SPEED_RAD_S: Final = 0.15
@@ -250,6 +256,8 @@ def measure(
         n_per_a = (config.gripper.nm_per_a or 0.0) / (2 * _reference_m_per_rad(config.gripper))
         friction_n = n_per_a * float(np.median([_friction_a(press) for press in presses]))
         passes = [one for speed in SPEEDS_M_S for one in jaws.travel(friction_n, speed, contact_rad)]
+        if len(passes) < MIN_PASSES:  # some were too short, or the jaws stuck
+            passes += [one for speed in SPEEDS_M_S for one in jaws.travel(friction_n, speed, contact_rad)]
     return presses, passes
 
 
@@ -332,6 +340,9 @@ class _Jaws:
         )
         self._safety = Safety(config.control)
         self._limits = Limits(config.control, self._nominal, config.servo.current_limit_a)
+        self._speed_limit = SpeedLimit(self._nominal, position_loop(gripper))
+        self._free_friction_n = 0.0  # measured while the jaws close on the gauge
+        self._clearance_m = _CLEARANCE_M  # at most a tenth of the free travel
         self._full_a: float | None = None  # current at the peak of the first press
         self._max_age_s = 0.0  # of the newest force sample
         self._period_ns = round(NS_PER_S / _RATE_HZ)
@@ -353,7 +364,7 @@ class _Jaws:
     @property
     def _ceiling_a(self) -> float:
         """Largest current: whatever the load cell reads, the motor cannot exceed the force limit."""
-        return self._limits.ceiling_a(math.inf, self.state.position_rad)
+        return self._limits.ceiling_a(self._free_friction_n, self.state.position_rad)
 
     @property
     def _jaw_m_per_rad(self) -> float:
@@ -363,8 +374,8 @@ class _Jaws:
         """Size of the motor current for a motor force at each jaw, at the present angle."""
         return abs(self._nominal.current_a(force_n, self.state.position_rad))
 
-    def cycle(self, goal_rad: float, current_a: float) -> None:
-        """Runs one bus cycle with a goal angle and a current limit."""
+    def cycle(self, goal_rad: float, current_a: float, speed_m_s: float | None = None) -> None:
+        """Runs one bus cycle with a goal angle, a current limit, and a speed limit; None: the approach speed."""
         devices = self._devices
         self._due_ns = max(self._due_ns + self._period_ns, devices.clock.now_ns())
         devices.clock.sleep_until_ns(self._due_ns)
@@ -389,7 +400,9 @@ class _Jaws:
                 "run `gripper-force doctor`"
             )
         self._goal_a = min(max(current_a, 0.0), self._ceiling_a)
-        devices.servo.write(ServoCommand(self._due_ns, self._sign * goal_rad, self._goal_a))
+        command = ServoCommand(self._due_ns, self._sign * goal_rad, self._goal_a)
+        speed_m_s = speed_m_s or self._config.control.approach_speed_m_s
+        devices.servo.write(self._speed_limit.apply(command, state, speed_m_s))
         if state.t_ns - self._reported_ns > NS_PER_S // 5:
             self._reported_ns = state.t_ns
             self._progress(f"{self.step_name}: {self.force_n:.1f} N", 0)
@@ -424,16 +437,18 @@ class _Jaws:
     def close_on_gauge(self, gauge_m: float) -> float:
         """Closes slowly until the load cell measures contact. Returns the angle."""
         speed_rad = _APPROACH_M_S / self._jaw_m_per_rad / _RATE_HZ
-        goal_rad = self.closing_rad
+        start_rad = goal_rad = self.closing_rad
         end_rad = self._sign * self._nominal.closed_position_rad
+        first = len(self._states)
         while self.force_n < _CONTACT_N:
             goal_rad += speed_rad
             if goal_rad > end_rad + _BEYOND_RAD / 4:
-                raise DataError(
-                    "the jaws closed without a force on the load cell; check that it lies between them, in the "
-                    "path of the force, and check load_cell.n_per_raw and its sign"
-                )
+                self._raise_no_contact(self.closing_rad - start_rad)
             self.cycle(goal_rad, self._moving_current_a())
+        if self._free_friction_n == 0.0:
+            self._free_friction_n = self._friction_n(self._states[first:])
+            free_m = (self.closing_rad - start_rad) * self._jaw_m_per_rad
+            self._clearance_m = min(_CLEARANCE_M, free_m / 10)
         width_m = self._nominal.width_m(self.state.position_rad)
         if abs(width_m - gauge_m) > 0.25 * self._nominal.open_width_m:
             raise DataError(
@@ -441,6 +456,28 @@ class _Jaws:
                 "--gauge-mm and the gripper keys of the configuration"
             )
         return self.closing_rad
+
+    def _raise_no_contact(self, moved_rad: float) -> NoReturn:
+        if moved_rad * self._jaw_m_per_rad < _LEAST_TRAVEL_M:
+            raise DataError(
+                f"the jaws do not move with {self._moving_current_a():.2f} A, twice gripper.friction_n; find their "
+                "friction with `calibrate jaws`, and check that they are not at the closed end already "
+                "(gripper.closing_sign, gripper.open_position_rad)"
+            )
+        raise DataError(
+            "the jaws closed without a force on the load cell; check that it lies between them, in the path of the "
+            "force, and check load_cell.n_per_raw and its sign"
+        )
+
+    def _friction_n(self, states: Sequence[ServoState]) -> float:
+        """Friction by the motor current of jaws that close freely; 0 if they never did."""
+        nominal, forces_n = self._nominal, []
+        for state in states:
+            closing_m_s = nominal.closing_m_s(state.velocity_rad_s, state.position_rad)
+            if closing_m_s > _APPROACH_M_S / 2:
+                motor_n = nominal.force_n(state.current_a, state.position_rad)
+                forces_n.append(motor_n - nominal.damping_n_s_m * closing_m_s)
+        return float(np.median(forces_n)) if forces_n else 0.0
 
     def press(
         self, gauge_m: float, contact_rad: float, rate_n_s: float, share: float, full_n: float
@@ -499,7 +536,8 @@ class _Jaws:
         if self.force_n < _LEAST_SHARE * peak_n:
             raise DataError(
                 f"{current_a:.2f} A give {self.force_n:.1f} N instead of {peak_n:.1f} N; check that the load "
-                "cell lies in the path of the force, its scale, and servo.current_limit_a"
+                "cell lies in the path of the force, its scale, and servo.current_limit_a; if the servo is that weak, "
+                "lower control.force_limit_n"
             )
 
     def back_off(self, contact_rad: float) -> None:
@@ -507,30 +545,33 @@ class _Jaws:
         self._move_to(self._clear_of(contact_rad))
 
     def _clear_of(self, contact_rad: float) -> float:
-        return contact_rad - 2 * _CLEARANCE_M / self._jaw_m_per_rad
+        return contact_rad - 2 * self._clearance_m / self._jaw_m_per_rad
 
     def travel(self, friction_n: float, speed_m_s: float, contact_rad: float) -> list[FreePass]:
         """Opens and closes under a constant motor force. A pass in which the jaws stick is left out."""
         nominal = self._nominal
-        motor_force_n = friction_n + nominal.damping_n_s_m * speed_m_s
-        clear_rad = _CLEARANCE_M / self._jaw_m_per_rad
+        clear_rad = self._clearance_m / self._jaw_m_per_rad
         ends = (self._sign * nominal.open_position_rad + clear_rad, contact_rad - clear_rad)
+        length_m = (ends[1] - ends[0]) * self._jaw_m_per_rad
+        speed_m_s *= min(length_m / (_PASS_S * SPEEDS_M_S[-1]), 1.0)
+        motor_force_n = friction_n + nominal.damping_n_s_m * speed_m_s
         passes = []
         for side, end_rad in ((-1, ends[0]), (1, ends[1])):
-            if (one := self._pass(side, end_rad, motor_force_n)) is not None:
+            if (one := self._pass(side, end_rad, motor_force_n, 2 * speed_m_s)) is not None:
                 passes.append(one)
         return passes
 
-    def _pass(self, side: int, end_rad: float, motor_force_n: float) -> FreePass | None:
+    def _pass(self, side: int, end_rad: float, motor_force_n: float, limit_m_s: float) -> FreePass | None:
         """One pass, without its acceleration; None if the jaws stuck."""
+        brake_rad = min(_BRAKE_RAD, abs(end_rad - self.closing_rad) / 5)
         for _ in range(round(_MAX_PASS_S * _RATE_HZ)):
             if side * self._sign * self.state.velocity_rad_s > _MIN_SPEED_RAD_S:
                 break
-            self.cycle(end_rad, _START_FACTOR * self._whole_steps_a(motor_force_n))
+            self.cycle(end_rad, _START_FACTOR * self._whole_steps_a(motor_force_n), limit_m_s)
         first = len(self._states) + round(_SPEED_UP_S * _RATE_HZ)
         for _ in range(round(_MAX_PASS_S * _RATE_HZ)):
-            self.cycle(end_rad, self._whole_steps_a(motor_force_n))
-            if side * (end_rad - self.closing_rad) < _BRAKE_RAD:
+            self.cycle(end_rad, self._whole_steps_a(motor_force_n), limit_m_s)
+            if side * (end_rad - self.closing_rad) < brake_rad:
                 break
         states = self._states[first:]
         self._move_to(end_rad)
@@ -544,7 +585,7 @@ class _Jaws:
 
     def _move_to(self, goal_rad: float) -> None:
         """Moves at a constant low speed, and rests at the goal."""
-        speed_rad = 4 * _APPROACH_M_S / self._jaw_m_per_rad / _RATE_HZ
+        speed_rad = 3 * _APPROACH_M_S / self._jaw_m_per_rad / _RATE_HZ
         next_rad = self.closing_rad
         while abs(goal_rad - next_rad) > speed_rad:
             next_rad += float(np.copysign(speed_rad, goal_rad - next_rad))

@@ -53,12 +53,12 @@ def object_table(r: "ObjectCalibration") -> None:
                 if (at := r.crushed_at_n) is None
                 else {"crushed": f"the object stayed narrower after {at:.1f} N"}
             ),
-            "error before": number(r.mae_before_n, "N"),
-            "error after": "unknown with so few touches" if after_n is None else number(after_n, "N"),
+            "error before": number(r.mae_before_n, " N"),
+            "error after": "unknown with so few touches" if after_n is None else number(after_n, " N"),
             "correction": r.correction,
             "interval": f"{100 * interval.coverage:.0f} % within {interval.base_n:.2f} N at 0 N, "
             f"{math.hypot(interval.base_n, 5 * interval.share):.2f} N at 5 N",
-            "stiffness": number(profile.stiffness_n_m, "N/m", 0),
+            "stiffness": number(profile.stiffness_n_m, " N/m", 0),
             "loop": "unknown: these logs hold no servo"
             if plant is None
             else f"gain {plant.gain:.2f}, lag {plant.lag_ms:.0f} ms, delay {plant.delay_ms:.0f} ms, "

@@ -1,6 +1,7 @@
 """Tables of a grasp, of trials, of a replay, and of errors of estimates."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.table import Column, Table
@@ -11,7 +12,7 @@ if TYPE_CHECKING:  # --help loads neither NumPy nor PyTorch
     from gripper_force.jobs.evaluate import Evaluation
     from gripper_force.jobs.grasp import Overall, Summary
     from gripper_force.jobs.metrics import ForceBin
-    from gripper_force.jobs.replay import ReplayResult
+    from gripper_force.jobs.replay import PairedDifference, ReplayResult, ReplaySummary
 
 
 def grasp_table(r: "Summary") -> None:
@@ -60,7 +61,7 @@ def _gain(r: "Summary") -> str:
     return f"{r['object_gain']:.2f} +- {100 * (r['object_gain_std'] or 0.0):.0f} %{true}"
 
 
-def trials_table(trials: "Sequence[Summary]", summary: "Overall") -> None:
+def trials_table(trials: "Sequence[Summary]", summary: "Overall", figure: str | None = None) -> None:
     """Prints the figures of each trial and over all trials."""
     names = ("object", "target N", "load cell N", "error %", "overshoot N", "settle s", "vision %", "gain")
     table = Table(*names, Column("result", no_wrap=True), box=None)
@@ -94,6 +95,8 @@ def trials_table(trials: "Sequence[Summary]", summary: "Overall") -> None:
     for name, e in summary["estimate_mae_n"].items():
         table.add_row(name, *(number(e[key]) for key in ("visual", "current", "fused", "floor")))
     out.print(table)
+    if figure is not None:
+        pairs({"figure": figure})
 
 
 def errors_table(r: "Evaluation") -> None:
@@ -132,3 +135,44 @@ def replay_table(r: "ReplayResult", report: str | None = None) -> None:
         table.add_row(name, *(number(value) for value in figures), lag, str(s.frames))
     out.print(table)
     _bins_table(r.per_bin)
+
+
+def replays_table(
+    results: "Sequence[ReplayResult]", summary: "ReplaySummary", reports: Sequence[str]
+) -> None:
+    """Prints the result of several replays: one row for each log, and the errors over all of them."""
+    marks = {True: "yes", False: "no", None: "-"}
+    table = Table("log", "object", "identical", "vision N", "current N", "fused N", box=None)
+    for r in results:
+        errors = (
+            r.sources[name].mae_n if name in r.sources else None for name in ("visual", "current", "fused")
+        )
+        table.add_row(
+            Path(r.log).name,
+            ", ".join(r.per_object),
+            marks[r.identical],
+            *(number(value) for value in errors),
+        )
+    out.print(table)
+    if notes := sorted({r.note for r in results if r.note}):
+        out.print("\n".join(notes), soft_wrap=True)
+    pairs({"logs": str(summary.logs), "identical": str(summary.identical)})
+    table = Table("object", "source", "MAE N", "RMSE N", "bias N", "samples", box=None)
+    for name, sources in {"all": summary.sources, **summary.per_object}.items():
+        for source, e in sources.items():
+            table.add_row(name, source, number(e.mae_n), number(e.rmse_n), number(e.bias_n), str(e.frames))
+    out.print(table)
+    if reports:
+        pairs({"reports": reports[0] + (f" and {len(reports) - 1} more" if len(reports) > 1 else "")})
+
+
+def differences_table(first: str, second: str, differences: "dict[str, PairedDifference]") -> None:
+    """Prints how the errors of two replays differ."""
+    table = Table(
+        "source", "logs", f"{first}: MAE N", f"{second}: MAE N", "difference N", "95 % interval", box=None
+    )
+    for name, d in differences.items():
+        interval = "-" if d.low_n is None or d.high_n is None else f"{d.low_n:+.3f} to {d.high_n:+.3f}"
+        row = (number(d.first_n), number(d.second_n), f"{d.difference_n:+.3f}", interval)
+        table.add_row(name, str(d.logs), *row)
+    out.print(table)

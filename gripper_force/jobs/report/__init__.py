@@ -3,7 +3,9 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+from gripper_force.config import Overrides
 from gripper_force.errors import LogError
+from gripper_force.jobs.replay import changed_config, resolve_replay, run_again
 from gripper_force.jobs.report.data import read_run
 from gripper_force.jobs.report.figure import draw, to_svg
 from gripper_force.jobs.report.page import render
@@ -21,25 +23,44 @@ class ReportPaths:
     html: Path
 
 
-def write_report(log: Path, out_dir: Path | None = None, *, recover: bool = False) -> ReportPaths:
+def write_report(
+    log: Path,
+    out_dir: Path | None = None,
+    *,
+    recover: bool = False,
+    checkpoint: str | None = None,
+    overrides: Overrides | None = None,
+) -> ReportPaths:
     """Writes the report of a log: a PNG, and an HTML page that needs no network and no other file.
 
-    The log is read once, and the figure is drawn once for both.
+    Without changes, the log is read once, and the figure is drawn once for both. With them, the report shows the
+    estimates and decisions of an open-loop replay.
 
     Args:
         log: The log.
-        out_dir: Folder for ``<log>.png`` and ``<log>.html``; by default the log's folder.
+        out_dir: Folder for ``<log>.png`` and ``<log>.html``, with ``-replayed`` after the name if there are
+            changes; by default the log's folder.
         recover: Read the intact part of a truncated or damaged log.
+        checkpoint: Another network to estimate with; None: the log's own.
+        overrides: Changes of the log's configuration, as for `gripper_force.jobs.replay.replay`.
 
     Raises:
         LogError: The log can't be read, or the report can't be written.
-        ConfigError: The log holds a configuration that this version does not understand.
+        ConfigError: The log holds a configuration that this version does not understand, or a change is wrong.
+        CheckpointError: The other network's file can't be read.
     """
     folder = out_dir or log.parent
-    paths = ReportPaths(folder / f"{log.stem}.png", folder / f"{log.stem}.html")
     reader = LogReader(log, recover=recover)
-    sampler = FrameSampler(reader)
-    run = read_run(reader, sampler.add)
+    if checkpoint is None and not overrides:
+        stem = log.stem
+        sampler = FrameSampler(reader)
+        run = read_run(reader, sampler.add)
+    else:
+        stem = f"{log.stem}-replayed"
+        again = resolve_replay(changed_config(reader, checkpoint, overrides))
+        sampler = FrameSampler(reader, again.config)
+        run = read_run(reader, sampler.add, run_again(reader, again), again.config)
+    paths = ReportPaths(folder / f"{stem}.png", folder / f"{stem}.html")
     pictures, note = sampler.pictures(run)
     figure = draw(run, pictures)
     try:

@@ -8,13 +8,25 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from gripper_force.config import Config, config_from_text
+from gripper_force.config import Config, config_from_text, dump_config
 from gripper_force.errors import DataError
-from gripper_force.jobs.score import GraspScore, HoldVision, controls_with_vision, score_grasp, vision_in_hold
+from gripper_force.jobs.dataset import CONTACT_N
+from gripper_force.jobs.replay import Replayed
+from gripper_force.jobs.score import (
+    NO_ESTIMATE,
+    GraspScore,
+    HoldVision,
+    controls_with_vision,
+    drop_out_reasons,
+    score_grasp,
+    vision_in_hold,
+)
+from gripper_force.runtime.backends import is_simulated
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import (
     NS_PER_MS,
     NS_PER_S,
+    EstimateSource,
     Event,
     Frame,
     FusedForce,
@@ -23,8 +35,21 @@ from gripper_force.types import (
     Phase,
     Request,
     RequestKind,
+    ServoCommand,
+    ServoState,
     VisualForce,
 )
+
+_GRIPPING: Final = (Phase.CONTACT, Phase.RAMP, Phase.HOLD)
+
+_CONTROLLER: Final = ("control", "vision")
+"""Units of the controller's events."""
+
+_LEAST_LOSS_S: Final = 0.1
+"""Shorter times without vision are not marked."""
+
+_BETWEEN_TOUCHES_S: Final = 0.2
+"""Time without contact that separates two touches."""
 
 Floats = npt.NDArray[np.float64]
 
@@ -49,10 +74,10 @@ SOURCES: Final = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Series:
-    """A force over time: seconds since the request, (N,), and newtons, (N,)."""
+    """A quantity over time: seconds since the request, (N,), and values in the unit of the quantity, (N,)."""
 
     t_s: Floats
-    value_n: Floats
+    value: Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +87,32 @@ class Span:
     start_s: float
     end_s: float
     phase: str
+
+
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """A time of the grip in which the force estimate did not use vision, and its reason."""
+
+    start_s: float
+    end_s: float
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Touch:
+    """A time in contact by the load cell.
+
+    Attributes:
+        start_s: First contact.
+        end_s: Last contact.
+        peak_n: Largest force.
+        mae_n: Mean absolute error by source.
+    """
+
+    start_s: float
+    end_s: float
+    peak_n: float
+    mae_n: dict[str, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +133,7 @@ class Run:
         config: Configuration of the run.
         config_text: The same as YAML.
         metadata: Versions, digests and other facts.
+        replayed: True if estimates and decisions are those of an open-loop replay with changes.
         zero_ns: Log time of 0 s: the first grasp request, or the log's start.
         begin_s: Time of the first record.
         end_s: Time of the last record.
@@ -92,18 +144,24 @@ class Run:
         object_gain: Last gain of the object by motor current, and its relative standard deviation; None without one.
         forces: Force by source; sources that the log lacks are absent.
         errors: Force minus the load cell's force, by source; only where the load cell gives valid samples.
+        std_n: Claimed standard deviation of the fused estimate.
+        motor: ``current_a``, ``goal_a`` (the largest allowed current), ``width_mm`` and ``temperature_c``, as far as
+            the log has them.
         reference: Target force, shaped by the ramp.
+        losses: Times of the grip without vision, if it was to be used.
+        touches: Touches by the load cell.
         phases: Phases in order, without the open ones.
         event_rows: Requests, phases and events in order.
         compute_ms: Computing time of each estimate, (N,).
-        camera_age_ms: Age of each frame when it was received, (N,).
-        latency_ms: Time from the middle of the exposure to the estimate, (N,).
+        camera_age_ms: Age of each frame when it was received, (N,); empty with a simulated camera.
+        latency_ms: Time from the middle of the exposure to the estimate, (N,); empty with a simulated camera.
     """
 
     name: str
     config: Config
     config_text: str
     metadata: dict[str, str]
+    replayed: bool
     zero_ns: int
     begin_s: float
     end_s: float
@@ -114,7 +172,11 @@ class Run:
     object_gain: tuple[float, float] | None
     forces: dict[str, Series]
     errors: dict[str, Series]
+    std_n: Series
+    motor: dict[str, Series]
     reference: Series
+    losses: list[Loss]
+    touches: list[Touch]
     phases: list[Span]
     event_rows: list[EventRow]
     compute_ms: Floats
@@ -127,22 +189,38 @@ class Run:
         return self.config.object.replace("_", " ").capitalize()
 
     @property
+    def simulated(self) -> bool:
+        """True if the run has a simulated world."""
+        return is_simulated(self.config)
+
+    @property
     def title(self) -> str:
-        """Object, target and outcome, in one line."""
+        """Object, target, outcome and origin, in one line."""
         parts = [self.object]
         if self.target_n is not None:
             parts.append(f"target {self.target_n:g} N")
         if self.outcome:
             parts.append(self.outcome.replace("_", " "))
+        if self.simulated:
+            parts.append("simulated")
+        if self.replayed:
+            parts.append("replayed with changes, open loop")
         return " · ".join(parts)
 
 
-def read_run(log: LogReader, on_frame: Callable[[Frame], None] = lambda frame: None) -> Run:
+def read_run(
+    log: LogReader,
+    on_frame: Callable[[Frame], None] = lambda frame: None,
+    replayed: Replayed | None = None,
+    config: Config | None = None,
+) -> Run:
     """Reads a log in one pass.
 
     Args:
         log: Log of a run or of a recording.
         on_frame: Called with each frame while the log is read. Frames are not kept.
+        replayed: Estimates and decisions of a replay, which replace those of the log.
+        config: Configuration of that replay.
 
     Raises:
         LogError: The log can't be read.
@@ -150,12 +228,26 @@ def read_run(log: LogReader, on_frame: Callable[[Frame], None] = lambda frame: N
     """
     records: dict[type, list[Any]] = defaultdict(list)
     ages_ns = []
-    for record in log.records(VisualForce, FusedForce, GraspStatus, Request, LoadCellSample, Event, Frame):
+    kinds = (
+        VisualForce,
+        FusedForce,
+        GraspStatus,
+        Request,
+        ServoState,
+        ServoCommand,
+        LoadCellSample,
+        Event,
+        Frame,
+    )
+    for record in log.records(*kinds):
         if isinstance(record, Frame):
             ages_ns.append(record.received_ns - record.t_ns)
             on_frame(record)
         else:
             records[type(record)].append(record)
+    logged_status = records[GraspStatus]
+    if replayed is not None:
+        _replace(records, replayed)
     vision, fused, status = records[VisualForce], records[FusedForce], records[GraspStatus]
     requests = records[Request]
     grasps = [request for request in requests if request.kind == RequestKind.GRASP]
@@ -171,33 +263,54 @@ def read_run(log: LogReader, on_frame: Callable[[Frame], None] = lambda frame: N
     forces = {source: series for source, series in forces.items() if len(series.t_s)}
     # An empty log still needs a time axis.
     end_s = (log.start_ns + max(log.duration_ns, NS_PER_MS) - zero_ns) / NS_PER_S
-    config = config_from_text(log.config, str(log.path))
+    if config is None:
+        config = config_from_text(log.config, str(log.path))
+    errors = _errors(forces)
+    uses_vision = controls_with_vision(config)
+    simulated_camera = config.camera.backend == "simulated"
     return Run(
         name=log.path.stem,
         config=config,
-        config_text=log.config,
+        config_text=log.config if replayed is None else dump_config(config),
         metadata=log.metadata,
+        replayed=replayed is not None,
         zero_ns=zero_ns,
         begin_s=(log.start_ns - zero_ns) / NS_PER_S,
         end_s=end_s,
         target_n=target_n,
         outcome=next((s.outcome for s in reversed(status) if s.outcome), ""),
-        score=_score(samples, status, target_n),
-        vision=vision_in_hold(status, fused, vision, records[Event])
-        if controls_with_vision(config)
-        else None,
+        score=_score(samples, logged_status, target_n),
+        vision=vision_in_hold(status, fused, vision, records[Event]) if uses_vision else None,
         object_gain=next(
             ((f.object_gain, f.object_gain_std) for f in reversed(fused) if f.object_gain), None
         ),
         forces=forces,
-        errors=_errors(forces),
+        errors=errors,
+        std_n=_series(zero_ns, ((r.t_ns, r.std_n) for r in fused)),
+        motor=_motor(zero_ns, records[ServoState], records[ServoCommand], status),
         reference=_series(zero_ns, ((s.t_ns, s.reference_n) for s in status)),
+        losses=_losses(zero_ns, status, fused, drop_out_reasons(vision, records[Event]))
+        if uses_vision
+        else [],
+        touches=_touches(forces.get("load_cell"), errors),
         phases=_phases(zero_ns, end_s, status),
         event_rows=_event_rows(zero_ns, requests, status, records[Event]),
         compute_ms=np.array([v.compute_ms for v in vision]),
-        camera_age_ms=np.array(ages_ns) / NS_PER_MS,
-        latency_ms=np.array([v.ready_ns - v.t_ns for v in vision]) / NS_PER_MS,
+        camera_age_ms=np.array([] if simulated_camera else ages_ns) / NS_PER_MS,
+        latency_ms=np.array([] if simulated_camera else [v.ready_ns - v.t_ns for v in vision]) / NS_PER_MS,
     )
+
+
+def _replace(records: dict[type, list[Any]], replayed: Replayed) -> None:
+    """Replaces the estimates, decisions and events of a log by those of a replay."""
+    if replayed.visual:
+        records[VisualForce] = replayed.visual
+    if replayed.decisions:
+        records[FusedForce] = [decision.estimate for decision in replayed.decisions]
+        records[GraspStatus] = [decision.status for decision in replayed.decisions]
+        records[ServoCommand] = [decision.command for decision in replayed.decisions]
+        kept = [e for e in records[Event] if e.unit not in _CONTROLLER or e.text.startswith(NO_ESTIMATE)]
+        records[Event] = kept + [event for decision in replayed.decisions for event in decision.events]
 
 
 def histogram(values: Floats) -> tuple[Floats, Floats]:
@@ -215,6 +328,60 @@ def _series(zero_ns: int, pairs: Iterable[tuple[int, float]]) -> Series:
     values = sorted((pair for pair in pairs if np.isfinite(pair[1])), key=lambda pair: pair[0])
     t_s = np.array([t_ns - zero_ns for t_ns, _ in values], np.float64) / NS_PER_S
     return Series(t_s, np.array([value for _, value in values], np.float64))
+
+
+def _motor(
+    zero_ns: int, states: list[ServoState], commands: list[ServoCommand], status: list[GraspStatus]
+) -> dict[str, Series]:
+    motor = {
+        "goal_a": _series(zero_ns, ((c.t_ns, c.goal_current_a) for c in commands)),
+        "current_a": _series(zero_ns, ((s.t_ns, abs(s.current_a)) for s in states)),
+        "width_mm": _series(zero_ns, ((s.t_ns, 1e3 * s.width_m) for s in status)),
+        "temperature_c": _series(zero_ns, ((s.t_ns, s.temperature_c) for s in states)),
+    }
+    return {name: series for name, series in motor.items() if len(series.t_s)}
+
+
+def _losses(
+    zero_ns: int, status: list[GraspStatus], fused: list[FusedForce], reasons: list[tuple[int, str]]
+) -> list[Loss]:
+    """Finds the times of the grip in which the estimate rests on motor current alone."""
+    sources = {estimate.t_ns: estimate.source for estimate in fused}
+    losses: list[Loss] = []
+    begin_ns: int | None = None
+    for s in status:
+        is_lost = (
+            s.phase in _GRIPPING and sources.get(s.t_ns, EstimateSource.CURRENT) == EstimateSource.CURRENT
+        )
+        if is_lost and begin_ns is None:
+            begin_ns = s.t_ns
+        if begin_ns is not None and (not is_lost or s is status[-1]):
+            if (s.t_ns - begin_ns) / NS_PER_S >= _LEAST_LOSS_S:
+                reason = next(
+                    (text for t_ns, text in reversed(reasons) if t_ns <= s.t_ns), "no estimate was used"
+                )
+                losses.append(Loss((begin_ns - zero_ns) / NS_PER_S, (s.t_ns - zero_ns) / NS_PER_S, reason))
+            begin_ns = None
+    return losses
+
+
+def _touches(cell: Series | None, errors: dict[str, Series]) -> list[Touch]:
+    if cell is None:
+        return []
+    times_s = cell.t_s[cell.value > CONTACT_N]
+    if not len(times_s):
+        return []
+    touches = []
+    for part_s in np.split(times_s, np.flatnonzero(np.diff(times_s) > _BETWEEN_TOUCHES_S) + 1):
+        begin_s, end_s = float(part_s[0]), float(part_s[-1])
+        mae_n = {
+            source: float(np.abs(series.value[inside]).mean())
+            for source, series in errors.items()
+            if (inside := (series.t_s >= begin_s) & (series.t_s <= end_s)).any()
+        }
+        inside = (cell.t_s >= begin_s) & (cell.t_s <= end_s)
+        touches.append(Touch(begin_s, end_s, float(cell.value[inside].max()), mae_n))
+    return touches
 
 
 def _score(
@@ -237,7 +404,7 @@ def _errors(forces: dict[str, Series]) -> dict[str, Series]:
         shared = (series.t_s >= cell.t_s[0]) & (series.t_s <= cell.t_s[-1])
         if source != "load_cell" and shared.any():
             t_s = series.t_s[shared]
-            errors[source] = Series(t_s, series.value_n[shared] - np.interp(t_s, cell.t_s, cell.value_n))
+            errors[source] = Series(t_s, series.value[shared] - np.interp(t_s, cell.t_s, cell.value))
     return errors
 
 

@@ -8,16 +8,22 @@ from typing import Any, Final
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.transforms import Bbox
 
+from gripper_force.control.force_loop import tolerance_n
 from gripper_force.jobs.report.data import SOURCES, Floats, Run, Series, histogram
-from gripper_force.jobs.report.pictures import Picture
+from gripper_force.jobs.report.pictures import ATTENTION_MAP, Picture
+from gripper_force.types import Phase
 
 _SOFT: Final = "#59606a"
 _LINE: Final = "#8a9099"
 _GRID: Final = "#e3e6ea"
 _BANDS: Final = ("#eef1f5", "#f8f9fb")
+_LOST: Final = "#b3261e"
+WIDTH_COLOURS: Final = {"light": "#7a5195", "dark": "#b794d6"}
 
 STYLE: Final[dict[Any, Any]] = {
     "font.size": 9.0,
@@ -44,6 +50,8 @@ CSS_COLOURS: Final = {
     _GRID: "var(--line)",
     _BANDS[0]: "var(--band0)",
     _BANDS[1]: "var(--band1)",
+    _LOST: "var(--bad)",
+    WIDTH_COLOURS["light"]: "var(--width)",
 }
 """Colours of the figure as variables of the page's style sheet, which change in dark mode."""
 
@@ -56,12 +64,26 @@ _LINE_IN: Final = 0.18
 _MAX_POINTS: Final = 2000
 """Points drawn per curve; more cannot be seen."""
 
+_GAP_S: Final = 0.1
+_GAP_PERIODS: Final = 4.0
+"""Points further apart than both, the second in median periods, are not connected."""
+
+_INTERVAL_STD: Final = 1.645
+"""Half-width of the 90 % interval of a normal distribution, in standard deviations."""
+
+_CAUSE_CHARACTERS: Final = 60
+_NAMED_LOSSES: Final = 2
+"""Longest text, and number, of the reasons written into the chart. All are below it."""
+
 _SVG_TAG: Final = re.compile(r".*?<svg [^>]*>", re.DOTALL)
 _FONT_FAMILY: Final = re.compile(r"font-family: [^;\"]*;? ?")
 """Left out, so that the page's font is used."""
 
 _SVG_NAMES: Final = "report"
 """Salt of the names inside an SVG: the same log gives the same text."""
+
+_CLIP_NAME: Final = re.compile(r'<clipPath id="(\w+)"')
+"""Names of clip paths, which contain the last bits of the layout and are not the same each time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,11 +110,17 @@ class Svg:
 
 
 def draw(run: Run, pictures: list[Picture]) -> Figure:
-    """Draws force, error, latency and frames, one above the other, without those that the log lacks."""
+    """Draws forces, error, motor, latency and frames, one above the other, without those that the log lacks."""
+    times = {
+        "Estimator, per frame": (run.compute_ms, SOURCES["vision"].light),
+        "Age of a frame on arrival": (run.camera_age_ms, _LINE),
+    }
+    times = {name: entry for name, entry in times.items() if len(entry[0])}
+    with_attention = any(picture.overlay is not None for picture in pictures)
     heights_in = {
-        "curves": 4.9 if run.errors else 3.2,
-        "latency": 1.6 if len(run.latency_ms) and len(run.camera_age_ms) else 0.0,
-        "frames": 1.9 if pictures else 0.0,
+        "curves": 3.2 + (1.7 if run.errors else 0.0) + (1.6 if run.motor else 0.0),
+        "latency": 1.6 if times else 0.0,
+        "frames": (3.0 if with_attention else 1.9) if pictures else 0.0,
     }
     heights_in = {name: height for name, height in heights_in.items() if height}
     with rc_context(STYLE):
@@ -105,12 +133,13 @@ def draw(run: Run, pictures: list[Picture]) -> Figure:
             if name == "curves":
                 _curves(part, run)
             elif name == "latency":
-                left, right = part.subplots(1, 2)
-                _histogram(left, run.compute_ms, "Estimator, per frame", SOURCES["vision"].light)
-                _histogram(right, run.camera_age_ms, "Age of a frame on arrival", _LINE)
+                row = part.subplots(1, 2, squeeze=False)[0]
+                for axes in row[len(times) :]:
+                    axes.set_axis_off()
+                for axes, (title, (values_ms, colour)) in zip(row, times.items(), strict=False):
+                    _histogram(axes, values_ms, title, colour)
             else:
-                for axes, picture in zip(part.subplots(1, len(pictures)), pictures, strict=True):
-                    _frame(axes, picture)
+                _frames(part, pictures, with_attention=with_attention)
         figure.supxlabel("\n".join(lines), x=0.008, ha="left", fontsize=9, color=_SOFT)
     return figure
 
@@ -139,6 +168,8 @@ def to_svg(figure: Figure) -> Svg:
             )
     text = _SVG_TAG.sub(f'<svg viewBox="0 0 {72 * width_in:g} {72 * height_in:g}">', file.getvalue(), count=1)
     text = _FONT_FAMILY.sub("", text)
+    for i, name in enumerate(_CLIP_NAME.findall(text)):
+        text = text.replace(name, f"clip{i}")
     for colour, variable in CSS_COLOURS.items():
         text = text.replace(colour, variable)
     return Svg(text, charts)
@@ -149,7 +180,17 @@ def thin(series: Series) -> Series:
     if len(series.t_s) <= _MAX_POINTS:
         return series
     keep = np.linspace(0, len(series.t_s) - 1, _MAX_POINTS).astype(int)
-    return Series(series.t_s[keep], series.value_n[keep])
+    return Series(series.t_s[keep], series.value[keep])
+
+
+def with_gaps(series: Series) -> Series:
+    """Returns the series with a NaN in each gap, so that no line is drawn across it."""
+    if len(series.t_s) < 3:
+        return series
+    steps_s = np.diff(series.t_s)
+    after = np.flatnonzero(steps_s > max(_GAP_S, _GAP_PERIODS * float(np.median(steps_s)))) + 1
+    between_s = (series.t_s[after - 1] + series.t_s[after]) / 2
+    return Series(np.insert(series.t_s, after, between_s), np.insert(series.value, after, np.nan))
 
 
 def _vision_lines(run: Run) -> list[str]:
@@ -160,14 +201,15 @@ def _vision_lines(run: Run) -> list[str]:
 
 
 def _curves(part: SubFigure, run: Run) -> None:
+    heights = [3.0] + ([1.5] if run.errors else []) + ([1.3] if run.motor else [])
+    rows = list(part.subplots(len(heights), sharex=True, height_ratios=heights, squeeze=False)[:, 0])
+    _force(rows[0], run)
     if run.errors:
-        force, error = part.subplots(2, sharex=True, height_ratios=(2, 1))
-        _error(error, run)
-    else:
-        force = error = part.subplots()
-    _force(force, run)
-    error.set_xlabel("time, s")
-    part.align_ylabels()
+        _error(rows[1], run)
+    if run.motor:
+        _motor(rows[-1], run)
+    rows[-1].set_xlabel("time, s")
+    part.align_ylabels(rows)
 
 
 def _bands(axes: Axes, run: Run, *, named: bool) -> None:
@@ -197,12 +239,100 @@ def _force(axes: Axes, run: Run) -> None:
     if len(run.reference.t_s):
         _curve(axes, run.reference, color=_LINE, lw=1.2, ls="--", label="target")
     low, high = axes.get_ylim()
-    axes.set_ylim(low, high + 0.08 * (high - low))
+    _estimate_bands(axes, run)
+    spare = 0.22 if run.losses else 0.08
+    axes.set_ylim(low, high + spare * (high - low))  # whatever an uncertain estimate's band is
     axes.set_ylabel("grip force, N")
     axes.set_title("Force")
     axes.set_gid("forces")
+    _losses(axes, run)
     if axes.get_lines():
-        axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=5, borderaxespad=0.2)
+        axes.legend(loc="lower right", bbox_to_anchor=(1, 1), ncols=7, borderaxespad=0.2, fontsize=8)
+
+
+def _estimate_bands(axes: Axes, run: Run) -> None:
+    """Draws the claimed 90 % interval of the fused estimate, and the tolerance about the target."""
+    if "fused" in run.forces:
+        force, std_n = thin(run.forces["fused"]), thin(run.std_n)
+        half_n = _INTERVAL_STD * np.interp(force.t_s, std_n.t_s, std_n.value)
+        axes.fill_between(
+            force.t_s,
+            force.value - half_n,
+            force.value + half_n,
+            color=SOURCES["fused"].light,
+            alpha=0.16,
+            lw=0,
+            label="90 % interval",
+        )
+    holds = [span for span in run.phases if span.phase == Phase.HOLD]
+    for i, span in enumerate(holds):
+        inside = (run.reference.t_s >= span.start_s) & (run.reference.t_s < span.end_s)
+        if not inside.any():
+            continue
+        target_n = float(np.median(run.reference.value[inside]))
+        band_n = tolerance_n(target_n)
+        axes.fill_between(
+            [span.start_s, span.end_s],
+            target_n - band_n,
+            target_n + band_n,
+            color=_LINE,
+            alpha=0.3,
+            lw=0,
+            label="tolerance" if i == 0 else None,
+        )
+
+
+def _losses(axes: Axes, run: Run) -> None:
+    """Marks the times without vision at the top of the chart, and writes the reasons of the longest."""
+    named = sorted(run.losses, key=lambda loss: loss.start_s - loss.end_s)[:_NAMED_LOSSES]
+    for loss in run.losses:
+        axes.axvspan(loss.start_s, loss.end_s, ymin=0.9, ymax=0.925, color=_LOST, lw=0)
+    for i, loss in enumerate(named):
+        reason = loss.reason
+        if len(reason) > _CAUSE_CHARACTERS:
+            reason = reason[: _CAUSE_CHARACTERS - 1].rsplit(" ", 1)[0] + " …"
+        on_left = loss.start_s < (run.begin_s + run.end_s) / 2
+        axes.text(
+            loss.start_s if on_left else loss.end_s,
+            0.885 - 0.06 * i,
+            f"vision lost for {loss.end_s - loss.start_s:.1f} s: {reason}",
+            transform=axes.get_xaxis_transform(),
+            ha="left" if on_left else "right",
+            va="top",
+            color=_LOST,
+            fontsize=8,
+        )
+
+
+def _motor(axes: Axes, run: Run) -> None:
+    """Draws the motor current on the left scale, and the width on the right; the title states the temperature."""
+    _bands(axes, run, named=False)
+    if "goal_a" in run.motor:
+        _curve(axes, run.motor["goal_a"], color=_LINE, lw=1.0, ls="--", label="goal current")
+    if "current_a" in run.motor:
+        _curve(axes, run.motor["current_a"], color=SOURCES["current"].light, lw=1.0, label="motor current")
+    axes.set_ylabel("current, A")
+    axes.set_ylim(0)
+    title = "Motor"
+    if "temperature_c" in run.motor:
+        values_c = run.motor["temperature_c"].value
+        low_c, high_c = f"{values_c.min():.0f}", f"{values_c.max():.0f}"
+        title += f", {low_c} °C" if low_c == high_c else f", {low_c} to {high_c} °C"
+    axes.set_title(title)
+    lines, labels = axes.get_legend_handles_labels()
+    if "width_mm" in run.motor:
+        right = axes.twinx()
+        right.grid(visible=False)
+        right.spines["right"].set_visible(True)
+        _curve(right, run.motor["width_mm"], color=WIDTH_COLOURS["light"], lw=1.0, label="width")
+        right.set_ylabel("width, mm")
+        right.set_ylim(0)
+        more_lines, more_labels = right.get_legend_handles_labels()
+        lines, labels = lines + more_lines, labels + more_labels
+    if lines:
+        axes.legend(
+            lines, labels, loc="lower right", bbox_to_anchor=(1, 1), ncols=3, borderaxespad=0.2, fontsize=8
+        )
 
 
 def _error(axes: Axes, run: Run) -> None:
@@ -216,8 +346,8 @@ def _error(axes: Axes, run: Run) -> None:
 
 
 def _curve(axes: Axes, series: Series, **style: Any) -> None:
-    drawn = thin(series)
-    axes.plot(drawn.t_s, drawn.value_n, **style)
+    drawn = with_gaps(thin(series))
+    axes.plot(drawn.t_s, drawn.value, **style)
 
 
 def _histogram(axes: Axes, values_ms: Floats, name: str, colour: str) -> None:
@@ -231,7 +361,18 @@ def _histogram(axes: Axes, values_ms: Floats, name: str, colour: str) -> None:
     axes.set_xlim(edges[0], edges[-1])
 
 
-def _frame(axes: Axes, picture: Picture) -> None:
-    axes.imshow(picture.image)
-    axes.set_axis_off()
-    axes.set_title(picture.caption, fontsize=8, fontweight="normal", loc="center")
+def _frames(part: SubFigure, pictures: list[Picture], *, with_attention: bool) -> None:
+    """Draws the frames, and below them the same with the network's attention and its colour bar."""
+    rows = part.subplots(2 if with_attention else 1, len(pictures), squeeze=False)
+    for axes, picture in zip(rows[0], pictures, strict=True):
+        axes.imshow(picture.image)
+        axes.set_axis_off()
+        axes.set_title(picture.caption, fontsize=8, fontweight="normal", loc="center")
+    if not with_attention:
+        return
+    for axes, picture in zip(rows[1], pictures, strict=True):
+        axes.set_axis_off()
+        axes.imshow(picture.image if picture.overlay is None else picture.overlay)
+    scale = ScalarMappable(Normalize(0, 1), ATTENTION_MAP)
+    bar = part.colorbar(scale, ax=list(rows.ravel()), fraction=0.012, pad=0.01, ticks=[0, 1])
+    bar.set_label("attention, least to most", fontsize=8)

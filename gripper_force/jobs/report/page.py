@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from gripper_force.jobs.report.data import SOURCES, Run
-from gripper_force.jobs.report.figure import Svg, thin
+from gripper_force.jobs.report.figure import WIDTH_COLOURS, Svg, thin
 
 _MAX_EVENT_ROWS: Final = 300
 
@@ -23,7 +23,7 @@ def render(run: Run, drawing: Svg, note: str) -> str:
         note: Note on the frames' overlay; may be empty.
     """
     template = Template(Path(__file__).with_name("page.html").read_text(encoding="utf-8"))
-    sections = [_drawing(run, drawing, note), _events(run)]
+    sections = [_touches(run), _drawing(run, drawing, note), _events(run)]
     return template.substitute(
         title=escape(run.title),
         name=escape(run.name),
@@ -38,18 +38,39 @@ def render(run: Run, drawing: Svg, note: str) -> str:
 
 
 def _palette(scheme: str) -> str:
-    return "".join(f"--{source}:{getattr(style, scheme)};" for source, style in SOURCES.items())
+    colours = {source: getattr(style, scheme) for source, style in SOURCES.items()}
+    colours["width"] = WIDTH_COLOURS[scheme]
+    return "".join(f"--{name}:{colour};" for name, colour in colours.items())
 
 
 def _headline(run: Run) -> str:
     badge = f'<span class="badge {escape(run.outcome)}">{escape(run.outcome.replace("_", " "))}</span>'
-    heading = f"<h1>{escape(run.object)} {badge if run.outcome else ''}</h1>"
+    origins = {"simulated": run.simulated, "replayed with changes, open loop": run.replayed}
+    origin = "".join(f'<span class="badge origin">{text}</span>' for text, shown in origins.items() if shown)
+    heading = f"<h1>{escape(run.object)} {badge if run.outcome else ''}{origin}</h1>"
+    return heading + _shown(_cards(run))
+
+
+def _shown(cards: list[tuple[str, str, str]]) -> str:
     shown = "".join(
         f'<div class="card"><div class="what">{what}</div>'
         f'<div class="value">{value}<small> {unit}</small></div></div>'
-        for what, value, unit in _cards(run)
+        for what, value, unit in cards
     )
-    return f'{heading}<div class="cards">{shown}</div>'
+    return f'<div class="cards">{shown}</div>'
+
+
+def _touches(run: Run) -> str:
+    """One card for each touch, if there are several."""
+    if len(run.touches) < 2:
+        return ""
+    cards = []
+    for i, touch in enumerate(run.touches, 1):
+        errors = ", ".join(f"{SOURCES[source].label} {mae_n:.2f} N" for source, mae_n in touch.mae_n.items())
+        text = f"peak; mean error: {errors}" if errors else "peak"
+        name = f"Touch {i}, {touch.start_s:.1f} to {touch.end_s:.1f} s"
+        cards.append((name, f"{touch.peak_n:.2f}", f"N {text}"))
+    return _shown(cards)
 
 
 def _cards(run: Run) -> list[tuple[str, str, str]]:
@@ -65,7 +86,7 @@ def _cards(run: Run) -> list[tuple[str, str, str]]:
         ]
     for source in ("fused", "vision"):
         if source in run.errors:
-            mean_n = np.abs(run.errors[source].value_n).mean()
+            mean_n = np.abs(run.errors[source].value).mean()
             cards.append((f"Mean error, {SOURCES[source].label}", f"{mean_n:.2f}", "N"))
     if run.object_gain is not None:
         gain, std = run.object_gain
@@ -117,7 +138,7 @@ def _series_json(run: Run) -> str:
                 "label": SOURCES[source].label,
                 "source": source,
                 "t": (1000 * thin(curves[source]).t_s).round().astype(int).tolist(),
-                "v": (1000 * thin(curves[source]).value_n).round().astype(int).tolist(),
+                "v": (1000 * thin(curves[source]).value).round().astype(int).tolist(),
             }
             for source in reversed(SOURCES)
             if source in curves

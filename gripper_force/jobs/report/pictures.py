@@ -30,6 +30,12 @@ _KEPT: Final = 512
 _LEAD_S: Final = 0.3
 """Time shown before contact and after release."""
 
+ATTENTION_MAP: Final = "inferno"
+"""Matplotlib's name of the colours of the attention."""
+
+_KNOWN_S: Final = 0.05
+"""A force is known at a time if there is a value within this time of it."""
+
 _OPACITY: Final = 0.5
 _TOUCH_SHARE: Final = 0.05
 """Share of the largest force above which a recording without phases counts as in contact."""
@@ -43,10 +49,19 @@ Attention = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """One frame of a run, (S, S, 3) uint8, with the forces at that time (None: not known)."""
+    """One frame of a run.
+
+    Attributes:
+        t_s: Time of the frame.
+        image: The frame in gray, (S, S, 3) uint8.
+        overlay: The same with the network's attention; None without any.
+        vision_n: Visual estimate at that time; None if it is not known.
+        load_cell_n: Force of the load cell at that time; None if it is not known.
+    """
 
     t_s: float
     image: Colour
+    overlay: Colour | None
     vision_n: float | None
     load_cell_n: float | None
 
@@ -78,15 +93,17 @@ class FrameSampler:
 
     Args:
         log: The log. The run's checkpoint is loaded to compute the attention, if the log names one.
+        changed: Configuration of a replay, whose checkpoint is loaded instead; None for the log's own.
 
     Raises:
         ConfigError: The log holds a configuration that this version does not understand.
     """
 
-    def __init__(self, log: LogReader) -> None:
-        config = config_from_text(log.config, str(log.path))
+    def __init__(self, log: LogReader, changed: "Config | None" = None) -> None:
+        config = changed or config_from_text(log.config, str(log.path))
         self._region = config.vision.region
-        self._estimator, self._note = _open_estimator(config, log.metadata.get("checkpoint", ""))
+        used = log.metadata.get("checkpoint", "")
+        self._estimator, self._note = _open_estimator(config, used, any_checkpoint=changed is not None)
         self._kept: list[_Candidate] = []
         self._step = 1
         self._count = 0
@@ -136,13 +153,15 @@ def _grip(run: Run) -> tuple[float, float]:
     if phases:
         return phases[0].start_s, phases[-1].end_s
     cell = run.forces.get("load_cell")
-    if cell is not None and (touched := cell.value_n > _TOUCH_SHARE * cell.value_n.max()).any():
+    if cell is not None and (touched := cell.value > _TOUCH_SHARE * cell.value.max()).any():
         return float(cell.t_s[touched][0]), float(cell.t_s[touched][-1])
     return run.begin_s, run.end_s
 
 
-def _open_estimator(config: "Config", digest: str) -> "tuple[ForceEstimator | None, str]":
-    if not digest:
+def _open_estimator(
+    config: "Config", digest: str, *, any_checkpoint: bool
+) -> "tuple[ForceEstimator | None, str]":
+    if not digest or config.vision.checkpoint == "none":
         return None, ""
     # Imported here: a recording without estimates needs no network, and these imports are slow.
     from gripper_force.vision.estimator import open_estimator
@@ -152,23 +171,26 @@ def _open_estimator(config: "Config", digest: str) -> "tuple[ForceEstimator | No
         checkpoint = read_model(config.vision.checkpoint)
     except CheckpointError as error:
         return None, f"Attention is not shown: {error}."
-    if checkpoint.digest != digest:
+    if checkpoint.digest != digest and not any_checkpoint:
         return None, f"Attention is not shown: {config.vision.checkpoint!r} is not the run's checkpoint."
-    return open_estimator(checkpoint, config.vision), "Overlay: spatial attention, from dark to bright."
+    return open_estimator(
+        checkpoint, config.vision
+    ), "Second row: spatial attention over the same frames, each scaled to its own range."
 
 
 def _picture(frame: _Candidate, t_s: float, run: Run) -> Picture:
     attention = frame.attention if "vision" in run.forces else None
     gray = frame.gray
-    image = np.repeat(gray[:, :, None], 3, axis=2) if attention is None else overlay(gray, attention)
-    return Picture(t_s, image, _at(run, "vision", t_s), _at(run, "load_cell", t_s))
+    image = np.repeat(gray[:, :, None], 3, axis=2)
+    seen = None if attention is None else overlay(gray, attention)
+    return Picture(t_s, image, seen, _at(run, "vision", t_s), _at(run, "load_cell", t_s))
 
 
 def overlay(gray: Gray, attention: Attention) -> Colour:
     """Returns a frame, (S, S), in colour with attention over it, whose opacity follows the attention."""
     spread = cv2.resize(attention, gray.shape[::-1], interpolation=cv2.INTER_CUBIC).clip(0, 1)  # (S, S)
     spread = (spread - spread.min()) / max(float(np.ptp(spread)), 1e-6)
-    heat = colormaps["inferno"](spread)[:, :, :3] * 255  # (S, S, 3)
+    heat = colormaps[ATTENTION_MAP](spread)[:, :, :3] * 255  # (S, S, 3)
     weight = _OPACITY * spread[:, :, None]
     return np.asarray((1 - weight) * gray[:, :, None] + weight * heat, np.uint8)
 
@@ -177,7 +199,9 @@ def _at(run: Run, source: str, t_s: float) -> float | None:
     series = run.forces.get(source)
     if series is None or not series.t_s[0] <= t_s <= series.t_s[-1]:
         return None
-    return float(np.interp(t_s, series.t_s, series.value_n))
+    if np.abs(series.t_s - t_s).min() > _KNOWN_S:
+        return None
+    return float(np.interp(t_s, series.t_s, series.value))
 
 
 def _newtons(force_n: float) -> str:

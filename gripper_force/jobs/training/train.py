@@ -17,6 +17,7 @@ from gripper_force.errors import ConfigError
 from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import Clip, check_size, digest, split_by
+from gripper_force.jobs.report.plots import draw_training
 from gripper_force.jobs.training import few
 from gripper_force.jobs.training.batches import Batches, Replay
 from gripper_force.jobs.training.few import PROGRESS_STEPS as PROGRESS_STEPS
@@ -55,7 +56,8 @@ def train(
 ) -> Checkpoint:
     """Trains an ensemble and writes its checkpoint, together with all processes that `torchrun` started.
 
-    Each member's state is saved next to ``out`` every minute, until the checkpoint is written. With ``steps``,
+    Each member's state is saved next to ``out`` every minute, until the checkpoint is written. A figure beside it,
+    ``.png``, shows the training error and the estimates on the validation data. With ``steps``,
     on the CPU with one thread, the result is bit for bit the same for a seed, also after an interruption.
 
     Args:
@@ -112,17 +114,25 @@ def train(
     check_size([*training, *held_out, *replay_clips], config.preprocess)
     states = state_paths(config, out)
     with joined(config.device) as ranks:
-        networks = [
-            t.network
-            for t in _trained(
-                config, training, states, init, teacher, replay_clips, resume, ranks, progress, warn
-            )
-        ]
+        trainers = _trained(
+            config, training, states, init, teacher, replay_clips, resume, ranks, progress, warn
+        )
         if ranks.first:
+            networks = [trainer.network for trainer in trainers]
             forces_n, measured_n = estimates(held_out, networks, config.preprocess, ranks.device)
-            mean_n = np.concatenate([clip.forces_n[clip.valid] for clip in training]).mean()
-            _save(out, networks, config, [*clips, *replay_clips], forces_n, measured_n, float(mean_n))
+            labels_n = np.concatenate([clip.forces_n[clip.valid] for clip in training])
+            data = [*clips, *replay_clips]
+            _save(out, networks, config, data, forces_n, measured_n, float(labels_n.mean()))
             _add_ood(out, networks, held_out, ranks.device, warn)
+            draw_training(
+                {t.network.config.attention: np.array(t.losses).reshape(-1, 2) for t in trainers},
+                measured_n,
+                forces_n,
+                np.concatenate([np.full(int(clip.valid.sum()), clip.object) for clip in held_out]),
+                float(labels_n.std()),
+                f"{out.name}: MAE {metrics.mae(forces_n, measured_n):.3f} N on validation data",
+                out.with_suffix(".png"),
+            )
             for state in states:
                 state.unlink()
         ranks.wait()

@@ -35,6 +35,7 @@ class Trainer:
     Attributes:
         network: The network.
         step: Number of completed steps.
+        losses: Steps and smoothed root mean squared errors in N, in turn: one pair for every tenth step.
     """
 
     def __init__(
@@ -66,6 +67,7 @@ class Trainer:
         self._teacher = [network.to(ranks.device) for network in teacher]
         self._freeze_statistics = False
         self.step = 0
+        self.losses: list[float] = []
         self._elapsed_s = 0.0
         self._smoothed_rmse_n = math.nan
 
@@ -104,6 +106,7 @@ class Trainer:
                 self._smoothed_rmse_n = (
                     rmse_n if self.step == 0 else 0.9 * self._smoothed_rmse_n + 0.1 * rmse_n
                 )
+                self.losses += [float(self.step), self._smoothed_rmse_n]
             self.step += 1
             self._elapsed_s = self._ranks.as_first(time.monotonic() - began)
             yield self._smoothed_rmse_n
@@ -197,6 +200,7 @@ class Trainer:
         for i, moments in self._optimizer.state_dict()["state"].items():
             tensors |= {f"optimizer.{i}.{name}": t.contiguous() for name, t in moments.items()}
         tensors["batches.unseen"] = torch.from_numpy(self._batches.unseen)
+        tensors["losses.values"] = torch.tensor(self.losses, dtype=torch.float64)
         progress = {
             "step": str(self.step),
             "elapsed_s": str(self._elapsed_s),
@@ -245,6 +249,8 @@ class Trainer:
                 weights[name] = tensor
             elif part == "batches":
                 self._batches.unseen &= tensor.cpu().numpy()
+            elif part == "losses":
+                self.losses = tensor.tolist()
             else:
                 number, name = name.split(".")
                 moments.setdefault(int(number), {})[name] = tensor

@@ -13,7 +13,7 @@ HX711_MAX: Final = 0x7FFFFF
 """Limits of the 24-bit converter; it gives one of these two if its input is out of range."""
 
 _HX711: Final = re.compile(
-    rb"\s*(?:\d+,|[A-Za-z][A-Za-z ]*[:= ])?\s*([+-]?\d{1,8})(\.\d*)?\s*(?:[A-Za-z]{1,3})?\s*"
+    rb"\s*(?:\d+,|[A-Za-z][A-Za-z_ ]*[:=\s])?\s*([+-]?\d{1,8})(\.\d*)?\s*(?:[A-Za-z]{1,3})?\s*"
 )
 _CAS: Final = re.compile(rb"(?:(ST|US|OL),(?:GS|NT),(?:..,)?)?(.{8})(?: ?(kg|g | g))?", re.DOTALL)
 _CAS_LENGTHS: Final = frozenset({8, 16, 20})
@@ -40,8 +40,8 @@ def parse_hx711(line: bytes) -> Reading | None:
     """Parses a line of a board with an HX711 converter.
 
     It is ``<raw>`` or ``<micros>,<raw>`` in counts, or a value that the board has scaled, such as ``12.34``,
-    with or without a name before it and a unit behind it: ``Weight: 12.34 g``. The unit is not converted:
-    `load_cell.n_per_raw` is newtons per unit of the value. See
+    with or without a name before it and a unit behind it: ``Weight: 12.34 g``, ``Load_cell output val: 12.34``.
+    The unit is not converted: `load_cell.n_per_raw` is newtons per unit of the value. See
     https://cdn.sparkfun.com/datasheets/Sensors/ForceFlex/hx711_english.pdf for the counts.
 
     Returns:

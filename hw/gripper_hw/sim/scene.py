@@ -22,6 +22,8 @@ LUX_LEVELS = (350.0, 550.0, 750.0)
 _HARD_FRICTION = 'solreffriction=".005 1" solimpfriction=".997 .999 .001"'
 _COUPLING = '<equality><joint joint1="left" joint2="right" solref=".004 1"/></equality>'
 _PAD_HALF_THICKNESS_M = 0.004
+_OPEN_SPARE_M = {"rack": 0.004, "other": 0.001}
+"""Travel of a jaw beyond the open position. Other linkages than a rack are near their dead centre there."""
 _ROD_RADIUS_M = 0.012
 _FINGER_X_M = {"pads": 0.009, "rods": 0.022}
 """Distance of the finger behind the centre of a pad, by tool."""
@@ -278,6 +280,7 @@ def scene_mjcf(
         object_body=model.body,
         contact=model.contact,
         jaw_start=_text([gripper.open_width_m / 2 + _PAD_HALF_THICKNESS_M]),
+        open_spare=_OPEN_SPARE_M["rack" if gripper.linkage.kind == "rack" else "other"],
         jaw_travel=_text([gripper.open_width_m / 2 - 0.001]),
         background=_background(scene),
         left_tool=_tool(scene, -1),

@@ -2,7 +2,7 @@
 
 import json
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
 
 import pytest
 import yaml
@@ -13,14 +13,15 @@ from gripper_calibration.procedures import calibrate_jaws as procedure
 from gripper_calibration.procedures.calibrate_jaws import JawsResult, calibrate_jaws
 from gripper_force.cli import app
 from gripper_force.config import Config, load_config
+from gripper_force.control.linkage import make_linkage
 from gripper_force.errors import DataError, DeviceError
 from gripper_force.types import ServoState
 from gripper_hw.dynamixel.servo import DynamixelServo
 from gripper_hw.dynamixel.virtual import VirtualBus, find_bus
-from gripper_hw.sim import simulated_rig
-from gripper_hw.sim.scene import Scene, draw_scene
+from gripper_hw.sim.scene import draw_scene
 
 # The simulated jaws stop 1 mm before they meet, and 4 mm beyond the nominal open position.
+GRIPPERS = Path(__file__).parents[3] / "examples" / "grippers"
 OPEN_END_RAD = -0.004 / 0.020
 CLOSED_END_RAD = (0.046 - 0.001) / 0.020
 
@@ -53,6 +54,17 @@ def test_ends_direction_and_friction_are_found_with_any_configuration(overrides:
     assert result.open_width_m == pytest.approx(0.100, abs=0.003)
 
 
+@pytest.mark.parametrize("path", sorted(GRIPPERS.glob("*.yaml")), ids=lambda path: path.stem)
+def test_every_ready_gripper_is_homed(path: Path) -> None:
+    config = load_config(path, ["object=none", "sim.detail=coarse", "seed=5"])
+    result = calibrate_jaws(config, prompt=lambda text: None)
+    assert result.closing_sign == config.gripper.closing_sign
+    spare_m = result.open_width_m - config.gripper.open_width_m  # a rack opens by 4 mm of each jaw more
+    assert -0.0005 < spare_m < 0.009
+    open_rad = make_linkage(config.gripper).closing_rad(result.open_width_m)
+    assert result.open_position_rad == pytest.approx(open_rad, abs=0.07)
+
+
 def test_its_proposal_makes_a_grasp_possible() -> None:
     proposed = yaml.safe_load(home("seed=3", *WRONG).yaml)["gripper"]
     overrides = [f"gripper.{key}={value}" for key, value in proposed.items()]
@@ -63,15 +75,17 @@ def test_its_proposal_makes_a_grasp_possible() -> None:
         assert gripper.grasp(3.0).outcome == "held"
 
 
-def test_friction_beyond_the_configured_one_is_overcome(monkeypatch: pytest.MonkeyPatch) -> None:
-    def rough(*arguments: Any) -> Scene:
-        scene = draw_scene(*arguments)
-        return replace(scene, servo_friction_nm=4 * scene.servo_friction_nm)
+@pytest.mark.parametrize("times", [3, 5])
+def test_friction_beyond_the_configured_one_is_overcome(times: int) -> None:
+    result = home("seed=3", f"sim.friction={times}")
+    assert result.friction_n == pytest.approx(0.95 * times, rel=0.15)
+    # The simulated stops give by 2 mm under the current that this friction needs.
+    assert result.closed_end_rad == pytest.approx(CLOSED_END_RAD, abs=0.1)
 
-    monkeypatch.setattr(simulated_rig, "draw_scene", rough)
-    result = home("seed=3")
-    assert result.friction_n > 2.0
-    assert result.closed_end_rad == pytest.approx(CLOSED_END_RAD, abs=0.06)
+
+def test_jaws_that_nothing_moves_are_named() -> None:
+    with pytest.raises(DataError, match=r"the jaws move by 0\.00 rad only, .* with all the current"):
+        home("sim.friction=20")
 
 
 @pytest.mark.parametrize(

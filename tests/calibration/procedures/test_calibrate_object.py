@@ -170,7 +170,7 @@ def test_a_grasp_with_it_is_corrected_and_replays_bit_for_bit(profile: Path, tmp
     log = Path(known["log"])
     assert LogReader(log).metadata["profile"] == read_object(profile).weights
     assert replay(log).identical
-    other = replay(log, overrides=["calibration.object=null"])
+    other = replay(log, overrides=["calibration.object=none"])
     assert not other.identical
     assert "profile was" in other.note
 

@@ -24,6 +24,7 @@ from gripper_hw.load_cells.screening import SampleValidator
 from gripper_hw.sim.scene import draw_scene
 from gripper_hw.sim.simulated_rig import SimulatedLoadCell
 
+GRIPPERS = Path(__file__).parents[3] / "examples" / "grippers"
 QUICK = ["object=block", "sim.detail=coarse", "seed=7"]
 
 MADE_UP = LoadCellCalibration(
@@ -76,6 +77,16 @@ def test_torque_and_friction_of_the_scene_are_found(rig: Path) -> None:
     assert load_config(None, [f"calibration.rig={rig}"]).gripper.nm_per_a == found.nm_per_a.value
 
 
+@pytest.mark.parametrize("name", ["rotary_finger", "four_bar"])
+def test_torque_is_found_through_a_linkage_with_little_free_travel(name: str, tmp_path: Path) -> None:
+    config = load_config(GRIPPERS / f"{name}.yaml", QUICK)
+    calibrate_servo(config, [0.03], tmp_path / "rig.yaml", prompt=lambda text: None)
+    found = read_rig(tmp_path / "rig.yaml").servo
+    assert found is not None
+    scene = draw_scene("block", config.seed, config.sim)
+    assert about(found.nm_per_a, load_model(found.model).nm_per_a * scene.nm_per_a, 0.02)
+
+
 def test_target_above_the_calibrated_force_is_refused(rig: Path, tmp_path: Path) -> None:
     config = config_of(f"calibration.rig={rig}", "control.force_limit_n=20", "target_n=11")
     with pytest.raises(RequestError, match=r"target of 11 N is above the 9\.\d N that the rig profile"):
@@ -109,6 +120,12 @@ def test_profile_of_another_servo_is_refused_or_reported(rig: Path, tmp_path: Pa
             "no valid sample for 1.5 s in closing on the gauge",
         ),
         (["faults=[{unit: servo, kind: wrong, at_s: 3}]"], 0.03, DeviceError, "hardware error"),
+        (
+            ["sim.friction=4"],
+            0.03,
+            DataError,
+            r"the jaws do not move with 0\.\d\d A, twice gripper.friction_n",
+        ),
         (["servo.current_limit_a=0.15"], 0.03, DataError, r"[\d.]+ A give [\d.]+ N instead of [\d.]+ N"),
     ],
 )
@@ -136,15 +153,25 @@ def test_failures_are_named_and_leave_the_torque_off(
 @pytest.fixture
 def true_force_n(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """True forces of the simulated world, one for each reading of the servo."""
-    forces_n: list[float] = []
+    return noted_state(monkeypatch, "force_n")
+
+
+@pytest.fixture
+def true_closing_m_s(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """True closing speeds of a jaw, one for each reading of the servo."""
+    return noted_state(monkeypatch, "closing_m_s")
+
+
+def noted_state(monkeypatch: pytest.MonkeyPatch, name: str) -> list[float]:
+    values: list[float] = []
     drain = SimulatedLoadCell.drain
 
     def noted(cell: SimulatedLoadCell) -> list[LoadCellSample]:
-        forces_n.append(cell._world.force_n)
+        values.append(getattr(cell._world, name))
         return drain(cell)
 
     monkeypatch.setattr(SimulatedLoadCell, "drain", noted)
-    return forces_n
+    return values
 
 
 def test_slow_load_cell_that_is_silent_at_first_is_enough(
@@ -172,9 +199,16 @@ def test_slow_load_cell_that_is_silent_at_first_is_enough(
     assert max(true_force_n) < config.control.force_limit_n
 
 
-@pytest.mark.parametrize("scale", [0.05, 0.3, 0.6])
+@pytest.mark.parametrize(
+    ("scale", "overrides"),
+    [(0.05, []), (0.3, []), (0.6, []), (0.5, ["sim.gain=1.4", "sim.friction=0.3"])],
+)
 def test_load_cell_with_a_wrong_scale_cannot_raise_the_force_above_its_limit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, true_force_n: list[float], scale: float
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    true_force_n: list[float],
+    scale: float,
+    overrides: list[str],
 ) -> None:
     noted = SimulatedLoadCell.drain
 
@@ -182,12 +216,21 @@ def test_load_cell_with_a_wrong_scale_cannot_raise_the_force_above_its_limit(
         return [replace(sample, force_n=scale * sample.force_n) for sample in noted(cell)]
 
     monkeypatch.setattr(SimulatedLoadCell, "drain", drain)
-    config = config_of()
+    config = config_of(*overrides)
     with pytest.raises(
-        DataError, match=r"the jaws closed without a force|A give .* N instead of|0.6\d times the expected"
+        DataError, match=r"the jaws closed without a force|A give .* N instead of|0.[67]\d times the expected"
     ):
         calibrate_servo(config, [0.03], tmp_path / "rig.yaml", prompt=lambda text: None)
     assert max(true_force_n) < 1.05 * config.control.force_limit_n
+
+
+def test_load_cell_that_leaves_the_jaws_during_a_press_does_not_let_them_shut_fast(
+    tmp_path: Path, true_closing_m_s: list[float]
+) -> None:
+    config = config_of("faults=[{unit: plant, kind: 'off', at_s: 8}]")
+    with pytest.raises(DataError, match="the jaws closed without a force"):
+        calibrate_servo(config, [0.03], tmp_path / "rig.yaml", prompt=lambda text: None)
+    assert 0.02 < max(true_closing_m_s) < 1.5 * config.control.approach_speed_m_s
 
 
 def test_table_shows_values_with_intervals(capsys: pytest.CaptureFixture[str]) -> None:

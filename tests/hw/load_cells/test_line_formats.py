@@ -53,6 +53,8 @@ def test_scaled_values_of_boards_are_parsed() -> None:
     for line, raw in [
         (b"12.34\r", 12.34),
         (b"Weight: -0.50 g", -0.5),
+        (b"Load_cell output val: 12.34\r", 12.34),
+        (b"reading:\t-8.1", -8.1),
         (b"HX reading: 12.34", 12.34),
         (b"Load cell = 3.1 N", 3.1),
     ]:

@@ -2,6 +2,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -46,7 +47,7 @@ def test_checkpoint_holds_data_digest_and_metrics(
     assert {"mae_n", "rmse_n", "bias_n", "constant_mae_n"} == header.metrics.keys()
     assert [r.force_n for r in header.residuals] == sorted(r.force_n for r in header.residuals)
     assert all(r.std_n > 0 for r in header.residuals)
-    assert list(out.parent.iterdir()) == [out]
+    assert sorted(out.parent.iterdir()) == [out.with_suffix(".png"), out]
 
 
 @pytest.mark.parametrize("attention", ["none", "ssam", "scam", "se", "cbam"])
@@ -107,6 +108,8 @@ def test_resumed_training_gives_the_same_result(
             raise KeyboardInterrupt
         return update(trainer)
 
+    drawn = Mock()
+    monkeypatch.setattr(train_module, "draw_training", drawn)
     monkeypatch.setattr(Trainer, "_update", failing)
     with pytest.raises(KeyboardInterrupt):
         train(config, clips, broken)
@@ -115,6 +118,10 @@ def test_resumed_training_gives_the_same_result(
     assert next(steps) == 9  # 8 steps and the failed one, none twice
     assert broken.read_bytes() == whole.read_bytes()
     assert not list(tmp_path.glob("*.state"))
+    losses = drawn.call_args.args[0]
+    assert set(losses) == {"ssam", "scam"}
+    assert losses["ssam"][0, 0] == 0, "the error before the interruption is drawn, too"
+    assert whole.with_suffix(".png").is_file()
 
 
 def test_training_too_short_for_all_recordings_warns(
@@ -306,7 +313,7 @@ def test_command_takes_a_recipe(few_logs: Path, tmp_path: Path) -> None:
     call = ["train", str(few_logs), "--recipe", "shin2019", "--out", str(out), "--jobs", "1", *sets, "--json"]
     told = json.loads(CliRunner().invoke(cli.app, call).stdout)
     figures = {"mae_n", "rmse_n", "bias_n", "constant_mae_n"}
-    assert set(told) == {"checkpoint", "digest", "left_out", "warnings", *figures}
+    assert set(told) == {"checkpoint", "digest", "figure", "left_out", "warnings", *figures}
     header = load_checkpoint(out).header
     assert [member.attention for member in header.members] == ["cbam"]
     assert not header.preprocess.reference
