@@ -25,12 +25,15 @@ from rich.progress import track
 
 from gripper_calibration import touch_logs
 from gripper_calibration.fits.object_fit import fit_correction
+from gripper_calibration.fits.touches import Touches
 from gripper_calibration.procedures.calibrate_object import calibrate_object, record_touches
 from gripper_force.config import Config, load_config
 from gripper_force.errors import DataError
+from gripper_force.jobs.dataset import CONTACT_N
 from gripper_force.jobs.grasp import grasp
 from gripper_force.profiles.object_profile import read_object
 from gripper_force.vision.checkpoint import load_checkpoint
+from gripper_force.vision.ood import OodScore
 
 KINDS = ("sponge", "paper_cup", "tube", "stapler", "ball")
 COUNTS = (1, 2, 4, 8, 16)
@@ -64,6 +67,8 @@ def errors(kind: str, number: int, out: Path) -> list[dict[str, Any]]:
         return rows
     paths = list(record_touches(configure(kind, number, out), TOUCHES, None, out / f"{kind}-{number}"))
     checkpoint = load_checkpoint()
+    ood = checkpoint.header.ood
+    assert ood is not None  # the shipped network has one
     touches = touch_logs.join({path: touch_logs.read_log(path, checkpoint) for path in paths}).touches
     test = touches.only(touches.numbers[-TESTED:])
     rng = np.random.default_rng(number)
@@ -74,24 +79,34 @@ def errors(kind: str, number: int, out: Path) -> list[dict[str, Any]]:
             drawn = rng.choice(touches.numbers[:-TESTED], count, replace=False)
             row: dict[str, Any] = {"object": kind, "touches": count, "before_n": before_n}
             try:
-                fitted = fit_correction(touches.only([int(n) for n in drawn]))
+                fitted = fit_correction(touches.only([int(n) for n in drawn]), ood=ood)
             except DataError:  # a light touch may be unusable: the network stays uncorrected
                 rows.append({**row, "after_n": before_n, "refused": 1.0})
                 continue
             after_n = fitted.predict(test)
             error_n = np.abs(after_n - test.force_n)
-            within = error_n <= fitted.interval.half_width_n(after_n)
+            within = (error_n <= fitted.interval.half_width_n(after_n))[test.force_n > CONTACT_N]
             rows.append(
                 {
                     **row,
                     "after_n": float(error_n.mean()),
                     "within": float(within.mean()),
                     "half_width_n": float(fitted.interval.half_width_n(5.0)),
-                    "rejected": float((fitted.arrays.ood_score(test.features) > fitted.ood_limit).mean()),
+                    "rejected": rejected_share(test, OodScore(ood, fitted.arrays.known)),
                 }
             )
     kept.write_text(json.dumps(rows))
     return rows
+
+
+def rejected_share(touches: Touches, score: OodScore) -> float:
+    """Returns the share of frames over the limit; each touch is a stream."""
+    rejected = []
+    for number in touches.numbers:
+        one = touches.only([number])
+        score.reset()
+        rejected.append(score.score(one.features, one.estimate_n) > 1)
+    return float(np.concatenate(rejected).mean())
 
 
 def one_grasp(
@@ -119,17 +134,21 @@ def profile_of(kind: str, number: int, out: Path) -> str:
 
 def errors_table(rows: list[dict[str, Any]]) -> None:
     """Prints errors and intervals by number of touches."""
-    print("| touches | MAE N before | after | ratio | in 90 % interval | half-width | rejected | refused |")
-    print("|---|---|---|---|---|---|---|---|")
+    print(
+        "| touches | MAE N before | after | ratio | in contact in 90 % interval | below 80 % | half-width | rejected | "
+        "refused |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|")
     for count in COUNTS:
         part = [row for row in rows if row["touches"] == count]
         keys = ("before_n", "after_n", "within", "half_width_n", "rejected", "refused")
         known = {key: [row[key] for row in part if key in row] for key in keys}
         mean = {key: float(np.mean(values)) if values else 0.0 for key, values in known.items()}
         refused = len(known["refused"])
+        below = float(np.mean(np.array(known["within"]) < 0.8)) if known["within"] else 0.0
         print(
             f"| {count} | {mean['before_n']:.3f} | {mean['after_n']:.3f} | "
-            f"{mean['before_n'] / mean['after_n']:.1f} | {100 * mean['within']:.0f} % | "
+            f"{mean['before_n'] / mean['after_n']:.1f} | {100 * mean['within']:.0f} % | {100 * below:.0f} % | "
             f"{mean['half_width_n']:.2f} N | {100 * mean['rejected']:.1f} % | {refused} of {len(part)} |"
         )
     print("\n| object | before | " + " | ".join(f"{count} touches" for count in COUNTS) + " |")

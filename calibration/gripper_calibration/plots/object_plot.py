@@ -40,7 +40,6 @@ def draw(
     max_n = max(float(touches.force_n.max()), float(touches.estimate_n.max()))
     line_n = np.linspace(0, max_n, 100)
     half_n = profile.interval.half_width_n(line_n)
-    covered = np.abs(error_n) <= profile.interval.half_width_n(after_n)
     count = "1 touch" if profile.touches == 1 else f"{profile.touches} touches"
     title = f"{profile.object}: {count}, MAE {profile.before_n:.3f} N before, {after_mae_n:.3f} N after ({method})"
     with saved_figure(path, title, 7.0) as figure:
@@ -59,9 +58,16 @@ def draw(
         before_error_n = touches.estimate_n - touches.force_n
         residual_plot.plot(touches.force_n, before_error_n, ".", ms=2, color=GRAY, label="before")
         residual_plot.plot(touches.force_n, error_n, ".", ms=2, color=DATA, label="after")
-        label = f"{100 * profile.interval.coverage:.0f} % interval, contains {100 * covered.mean():.0f} %"
+        label = f"{100 * profile.interval.coverage:.0f} % interval"
+        if fit.coverages:
+            label += f", contains {100 * fit.coverages[0].covered:.0f} % in contact of the touches left out"
         residual_plot.plot(line_n, half_n, color=FIT, label=label)
         residual_plot.plot(line_n, -half_n, color=FIT)
+        for level in fit.coverages[1:]:
+            end_n = max_n if level.to_n is None else min(level.to_n, max_n)
+            middle_n = (level.from_n + max(level.from_n, end_n)) / 2
+            at = (middle_n, float(profile.interval.half_width_n(middle_n)))
+            residual_plot.annotate(f"{100 * level.covered:.0f} %", at, ha="center", va="bottom", fontsize=7)
         label_axes(residual_plot, "errors", "load cell, N", "error, N")
         residual_plot.legend()
         _plot_learning_curve(curve_plot, profile, curve, after_mae_n if validated else None)

@@ -1,12 +1,13 @@
 """Tables of calibrations of a rig and of an object."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from gripper_force.cli.console import number, out, pairs
 
 if TYPE_CHECKING:
+    from gripper_calibration.fits.cross_validation import Coverage
     from gripper_calibration.procedures.calibrate_jaws import JawsResult
     from gripper_calibration.procedures.calibrate_object import ObjectCalibration
 
@@ -39,6 +40,18 @@ def _found(value: object) -> object:
     return f"{value['value']:.6g} ({value['low']:.6g} to {value['high']:.6g})"
 
 
+def _coverage(levels: "Sequence[Coverage]") -> str:
+    if not levels:
+        return "unknown with so few touches"
+    contact, *forces = levels
+    ends = ["N and more" if level.to_n is None else f"to {level.to_n:g} N" for level in forces]
+    parts = [
+        f"{level.from_n:g} {end}: {100 * level.covered:.0f} %"
+        for level, end in zip(forces, ends, strict=True)
+    ]
+    return f"{100 * contact.covered:.0f} % in contact of the touches left out ({', '.join(parts)})"
+
+
 def object_table(r: "ObjectCalibration") -> None:
     """Prints an object's profile."""
     profile, after_n = r.profile, r.mae_after_n
@@ -57,6 +70,7 @@ def object_table(r: "ObjectCalibration") -> None:
             "correction": r.correction,
             "interval": f"{100 * interval.coverage:.0f} % within {interval.base_n:.2f} N at 0 N, "
             f"{math.hypot(interval.base_n, 5 * interval.share):.2f} N at 5 N",
+            "coverage": _coverage(r.coverages),
             "stiffness": number(profile.stiffness_n_m, "N/m", 0),
             "loop": "unknown: these logs hold no servo"
             if plant is None
