@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from gripper_calibration.fits.touches import Touches
+from gripper_calibration.fits.touches import Floats, Touches
 from gripper_force.jobs.training.ood_fit import fit_subspace, smooth_ratios, typical_shares
 from gripper_force.profiles.correction import KnownFrames
 from gripper_force.vision.header import OodModel
@@ -21,6 +21,9 @@ DIMENSIONS: Final = 32
 
 MIN_TOUCHES: Final = 3
 """Fewer touches do not show how touches differ."""
+
+_MAX_FRAMES: Final = 600
+"""Frames for a subspace. Adjacent frames carry nearly the same data, and the cost is cubic."""
 
 _QUANTILE: Final = 0.995
 
@@ -42,15 +45,18 @@ def fit_ood(touches: Touches, model: OodModel) -> KnownFrames:
         return known._replace(limits=tuple(limits))
     shares = []
     for number, left_out in zip(numbers, parts, strict=True):
-        others = touches.without([number])
-        subspace = fit_subspace(others.features, others.force_n, DIMENSIONS)
-        shares.append(residual_share(left_out.features, *subspace))
+        shares.append(residual_share(left_out.features, *_subspace(touches.without([number]))))
     estimates_n = [part.estimate_n for part in parts]
     typical = typical_shares(shares, estimates_n)
     ratios = [smooth_ratios(typical, *touch) for touch in zip(shares, estimates_n, strict=True)]
     limit = _margin(len(parts)) * max(float(np.quantile(ratio, _QUANTILE)) for ratio in ratios)
-    mean, axes, floor = fit_subspace(touches.features, touches.force_n, DIMENSIONS)
+    mean, axes, floor = _subspace(touches)
     return KnownFrames(mean, axes, floor, tuple(t.model_copy(update={"limit": limit}) for t in typical))
+
+
+def _subspace(touches: Touches) -> tuple[Floats, Floats, float]:
+    thin = touches.thinned(_MAX_FRAMES)
+    return fit_subspace(thin.features, thin.force_n, DIMENSIONS)
 
 
 def _margin(touches: int) -> float:
