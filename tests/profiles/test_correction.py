@@ -83,7 +83,7 @@ def test_arrays_round_trip_and_must_match_the_profile(tmp_path: Path) -> None:
     assert expected is not None
     assert known.limits == LIMITS
     shares = [residual_share(features, k.mean, orthonormal(k.axes), k.floor) for k in (known, expected)]
-    np.testing.assert_allclose(*shares, rtol=0.01)  # the axes are stored in half precision
+    np.testing.assert_allclose(shares[0], shares[1], rtol=0.01)  # the axes are stored in half precision
     with pytest.raises(ConfigError, match="for another network: this one has 6"):
         load_correction(path, profile(weights), 6)
     with pytest.raises(ConfigError, match="does not belong to"):

@@ -3,6 +3,7 @@ import pytest
 from scipy.stats import t as student
 
 from gripper_calibration.fits.interval_fit import touch_interval
+from gripper_force.profiles.object_profile import Interval
 
 
 def errors_of(
@@ -26,31 +27,28 @@ def test_half_width_is_students_quantile_of_errors_that_grow_with_force(share: f
 
 def test_each_touch_has_the_same_weight() -> None:
     predicted_n, force_n, touch = errors_of(4, 200, 0.1)
-    often = np.where(touch == 0, 10, 1)
-    once, repeated = (
-        touch_interval(*(np.repeat(values, counts) for values in (predicted_n, force_n, touch)), 0.9)
-        for counts in (np.ones(len(touch), int), often)
-    )
+    often = np.repeat(np.arange(len(touch)), np.where(touch == 0, 10, 1))
+    once = touch_interval(predicted_n, force_n, touch, 0.9)
+    repeated = touch_interval(predicted_n[often], force_n[often], touch[often], 0.9)
     assert repeated.base_n == pytest.approx(once.base_n, rel=1e-3)
     assert repeated.share == pytest.approx(once.share, rel=1e-3)
 
 
 def test_frames_without_contact_do_not_narrow_the_interval() -> None:
     predicted_n, force_n, touch = errors_of(8, 100, 0.1)
-    rest = np.zeros(3000)
     alone = touch_interval(predicted_n, force_n, touch, 0.9)
-    rested = touch_interval(
-        *(np.concatenate(pair) for pair in ((predicted_n, rest), (force_n, rest), (touch, rest.astype(int)))),
-        0.9,
-    )
-    assert rested.half_width_n(5.0) == pytest.approx(alone.half_width_n(5.0), rel=1e-6)
-    noisy = np.where(np.arange(3000) % 2, 0.5, -0.5)  # an offset that only rests show
-    noise = touch_interval(
-        np.concatenate([predicted_n, noisy]),
-        np.concatenate([force_n, rest]),
-        np.concatenate([touch, rest.astype(int)]),
-        0.9,
-    )
+
+    def with_rest(rest_n: np.ndarray) -> Interval:
+        zeros = np.zeros(len(rest_n))
+        return touch_interval(
+            np.concatenate([predicted_n, rest_n]),
+            np.concatenate([force_n, zeros]),
+            np.concatenate([touch, zeros.astype(int)]),
+            0.9,
+        )
+
+    assert with_rest(np.zeros(3000)).half_width_n(5.0) == pytest.approx(alone.half_width_n(5.0), rel=1e-6)
+    noise = with_rest(np.where(np.arange(3000) % 2, 0.5, -0.5))  # a scatter that only rests show
     assert noise.base_n > 2 * alone.base_n
 
 
