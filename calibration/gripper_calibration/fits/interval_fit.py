@@ -8,14 +8,14 @@ the errors of touches are normal, so the interval is not conformal and has no gu
 interval does not exist for so few draws: the quantile needs nine (docs/decisions/0012 and 0030).
 docs/calibration.md has the measured coverage of new touches.
 
-*With one or two touches* the interval follows from the model of the line.
+*With one or two touches* the interval follows from the model of the line, whose prior stands for the missing touches.
 """
 
 from typing import Final
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.special import ndtri, stdtrit
+from scipy.special import stdtrit
 
 from gripper_calibration.fits.output_curve import LinearFit
 from gripper_calibration.fits.touches import Floats
@@ -28,10 +28,10 @@ _MIN_BASE_N: Final = 0.01
 
 def model_interval(line: LinearFit, coverage: float) -> Interval:
     """Returns the interval from a line's model: scatter of frames and touches, and uncertainty of the line."""
-    z = float(ndtri(0.5 + coverage / 2))
+    quantile = float(stdtrit(line.degrees, 0.5 + coverage / 2))
     gain_std, offset_std_n = np.sqrt(np.diag(line.covariance) + np.square(line.touch_std))
-    base_n = z * float(np.hypot(line.frame_std_n, offset_std_n))
-    return Interval(coverage=coverage, base_n=max(base_n, _MIN_BASE_N), share=z * float(gain_std))
+    base_n = quantile * float(np.hypot(line.frame_std_n, offset_std_n))
+    return Interval(coverage=coverage, base_n=max(base_n, _MIN_BASE_N), share=quantile * float(gain_std))
 
 
 def touch_interval(
