@@ -71,6 +71,20 @@ class Interval(Section):
         return width
 
 
+class OodLimit(Section):
+    """Out-of-distribution limit at one estimated force (see `gripper_force.vision.ood`).
+
+    Attributes:
+        force_n: The force.
+        typical: Median share of the residual in known frames.
+        limit: Highest smoothed ratio to ``typical`` at which a frame is used.
+    """
+
+    force_n: Finite
+    typical: Positive
+    limit: Positive
+
+
 class LoopPlant(Section):
     """Plant of the force loop with this object (see `gripper_force.control.tuning`), and its PI controller.
 
@@ -105,8 +119,9 @@ class ObjectProfile(Section):
             it.
         output: Correction of the network's output.
         interval: Interval of the error of the corrected estimate.
-        ood_limit: Highest out-of-distribution score at which an estimate is used, 0 to 1 (see
-            `gripper_force.profiles.correction`). Version 0.1 called it ``gate``.
+        ood_limits: The object's own out-of-distribution limits, in order of rising force; None if the network has no
+            score, or in a profile of an earlier version, whose score is no longer used. The network's limits then
+            count.
         stiffness_n_m: Stiffness, force over travel of both jaws, at half of the largest force.
         plant: The force loop's plant; None if the logs hold no servo.
         before_n: MAE of the network alone on these touches.
@@ -129,7 +144,7 @@ class ObjectProfile(Section):
     force_n: Positive
     output: OutputCurve
     interval: Interval
-    ood_limit: Positive
+    ood_limits: Annotated[tuple[OodLimit, ...], Field(min_length=1)] | None = None
     stiffness_n_m: Positive | None = None
     plant: LoopPlant | None = None
     before_n: NonNegative
@@ -142,9 +157,9 @@ class ObjectProfile(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _read_version_0_1(cls, tree: Any) -> Any:
-        if isinstance(tree, dict) and "gate" in tree and "ood_limit" not in tree:
-            return {("ood_limit" if key == "gate" else key): value for key, value in tree.items()}
+    def _read_earlier_version(cls, tree: Any) -> Any:
+        if isinstance(tree, dict):  # the limits of earlier scores
+            return {key: value for key, value in tree.items() if key not in ("gate", "ood_limit")}
         return tree
 
     def mismatches(self, checkpoint: str, rig: Tree) -> list[str]:

@@ -9,6 +9,7 @@ from typing import Annotated, Final, Literal, Self
 from pydantic import Base64UrlBytes, Field, ValidationError, model_validator
 
 from gripper_force.errors import CheckpointError, ConfigError
+from gripper_force.profiles.object_profile import OodLimit
 from gripper_force.schema import Finite, NonNegative, Positive, Section, Tree, differences
 from gripper_force.vision.preprocess import Preprocess
 
@@ -148,20 +149,6 @@ class Residual(Section):
 
     force_n: Finite
     std_n: NonNegative
-
-
-class OodLimit(Section):
-    """Out-of-distribution limit at one estimated force.
-
-    Attributes:
-        force_n: The force.
-        typical: Median share of the residual in known frames.
-        limit: Highest smoothed ratio to ``typical`` at which a frame is used.
-    """
-
-    force_n: Finite
-    typical: Positive
-    limit: Positive
 
 
 class OodModel(Section):

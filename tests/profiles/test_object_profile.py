@@ -13,6 +13,7 @@ from gripper_force.profiles.object_profile import (
     Interval,
     LoopPlant,
     ObjectProfile,
+    OodLimit,
     OutputCurve,
     find_object,
     read_object,
@@ -32,7 +33,7 @@ def profile(**keys: object) -> ObjectProfile:
         force_n=7.5,
         output=OutputCurve(kind="affine", estimate_n=(0.0, 8.0), force_n=(0.1, 6.5)),
         interval=Interval(coverage=0.9, base_n=0.1, share=0.03),
-        ood_limit=0.02,
+        ood_limits=(OodLimit(force_n=0.0, typical=0.02, limit=3.0),),
         plant=LoopPlant(
             gain=0.9, lag_ms=30, delay_ms=40, proportional=0.4, integral_s=14, phase_margin_deg=61
         ),

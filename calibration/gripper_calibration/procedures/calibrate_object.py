@@ -11,6 +11,7 @@ from typing import Final
 
 import numpy as np
 
+from gripper_calibration.fits.cross_validation import Coverage
 from gripper_calibration.fits.object_fit import (
     COVERAGE,
     LearningCurvePoint,
@@ -48,6 +49,8 @@ class ObjectCalibration:
         report_path: The figure, PNG.
         correction: Name of the selected correction, one of the keys of `candidates_mae_n`.
         candidates_mae_n: Cross-validated MAE of each candidate correction; empty with fewer than three touches.
+        coverages: Share of the frames of each touch within an interval that the other touches gave: in contact, and
+            by force level; empty with fewer than four touches.
         crushed_at_n: Largest force of the touch after which the object stayed narrower; None if it sprang back
             after all touches.
         stiffness_std_n_m: Standard deviation of the stiffness over the touches; None with fewer than two.
@@ -60,6 +63,7 @@ class ObjectCalibration:
     report_path: Path
     correction: str
     candidates_mae_n: dict[str, float]
+    coverages: tuple[Coverage, ...]
     crushed_at_n: float | None
     stiffness_std_n_m: float | None
     touches_needed: tuple[LearningCurvePoint, ...]
@@ -77,7 +81,7 @@ class ObjectCalibration:
 
     @property
     def coverage(self) -> float:
-        """Coverage of the profile's interval: the share of frames of new touches within it."""
+        """Coverage that the profile's interval is made for: the share of frames in contact within it."""
         return self.profile.interval.coverage
 
     def as_dict(self) -> dict[str, object]:
@@ -86,6 +90,7 @@ class ObjectCalibration:
             **self.profile.model_dump(mode="json"),
             "correction": self.correction,
             "candidates_mae_n": self.candidates_mae_n,
+            "coverages": [level._asdict() for level in self.coverages],
             "crushed_at_n": self.crushed_at_n,
             "stiffness_std_n_m": self.stiffness_std_n_m,
             "touches_needed": [point._asdict() for point in self.touches_needed],
@@ -260,7 +265,7 @@ def _fit_and_write(
     with_contact = {path: recording for path, recording in recordings.items() if recording.has_contact}
     recorded = join(with_contact or recordings)  # without any contact, the fit reports the largest force
     touches = recorded.touches
-    fit = fit_correction(touches, COVERAGE)
+    fit = fit_correction(touches, COVERAGE, checkpoint.header.ood)
     progress("fitted the correction")
     curve = list(learning_curve(touches, COVERAGE))
     progress("computed the learning curve")
@@ -275,6 +280,7 @@ def _fit_and_write(
         report_path=report,
         correction=fit.candidate,
         candidates_mae_n=fit.errors_n,
+        coverages=fit.coverages,
         crushed_at_n=crushed_at_n,
         stiffness_std_n_m=float(stiffness.std(ddof=1)) if len(stiffness) > 1 else None,
         touches_needed=_mean_curve(curve),
@@ -312,7 +318,7 @@ def make_profile(
         force_n=float(touches.force_n.max() if crushed is None else peaks_n[:crushed].max()),
         output=fit.output,
         interval=fit.interval,
-        ood_limit=fit.ood_limit,
+        ood_limits=None if fit.arrays.known is None else fit.arrays.known.limits,
         stiffness_n_m=float(np.median(stiffness)) if len(stiffness) else None,
         plant=fit_plant(recorded.presses, recorded.delay_s + _compute_s(run)),
         before_n=fit.before_n,

@@ -2,31 +2,41 @@
 
 The candidates are, from the simplest: the configured network as it is, networks trained further on the touches, and a
 Gaussian process fitted to them. Each is calibrated as `calibrate_object` does it. The logs of the touches are divided
-into folds; a fold is estimated by what was trained and calibrated on the others. Among the candidates that are not
-worse than the best by more than one standard error, the simplest is taken (L. Breiman et al., Classification and
-Regression Trees, 1984, section 3.4.3), trained on all touches, and calibrated. Its interval and its expected error are
-those of the folds.
+into folds; a fold is estimated by what was trained and calibrated on the others. The simplest candidate that is about
+as good as the best is taken, as in `cross_validation`, trained on all touches, and calibrated.
+
+The expected error and the interval are nested, as in `cross_validation`: each fold is estimated by the candidate that
+the other folds alone select, by trainings without that fold.
 """
 
 import json
-import math
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass, replace
 from hashlib import sha256
+from itertools import combinations
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from safetensors.numpy import load, save
 
-from gripper_calibration.fits.interval_fit import conformal_interval
-from gripper_calibration.fits.object_fit import COVERAGE, LearningCurvePoint, ObjectFit, fit_correction
-from gripper_calibration.fits.ood_fit import fit_ood_limit
+from gripper_calibration.fits.cross_validation import (
+    Coverage,
+    Measured,
+    coverages,
+    estimate_left_out,
+    select_simplest,
+    touch_errors_n,
+)
+from gripper_calibration.fits.interval_fit import touch_interval
+from gripper_calibration.fits.object_fit import COVERAGE, fit_correction
+from gripper_calibration.fits.ood_fit import object_limits, object_subspace
 from gripper_calibration.fits.touches import Floats
-from gripper_calibration.plots.object_plot import draw
+from gripper_calibration.plots.taught_plot import draw
 from gripper_calibration.procedures.calibrate_object import (
     default_folder,
     find_logs,
@@ -41,17 +51,20 @@ from gripper_force.interfaces import Progress, Prompt, no_progress
 from gripper_force.jobs.dataset import CONTACT_N, Clip, load_clips
 from gripper_force.jobs.processes import process_pool
 from gripper_force.jobs.profile_files import check_place, write_object
+from gripper_force.jobs.training.ood_fit import model_of_scores
 from gripper_force.jobs.training.recipe import recipe
-from gripper_force.jobs.training.stated_errors import residuals
+from gripper_force.jobs.training.stated_errors import errors, residuals
 from gripper_force.jobs.training.train import train
-from gripper_force.profiles.correction import pack
+from gripper_force.profiles.correction import KnownFrames, ProfileArrays, pack
 from gripper_force.profiles.object_profile import BUNDLED, ObjectProfile, user_folder
 from gripper_force.runtime.resolve import ResolvedConfig, resolve_vision
 from gripper_force.schema import write_all
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
 from gripper_force.vision.checkpoint_writer import replace_header
-from gripper_force.vision.header import SHIPPED, Model, ProcessConfig
+from gripper_force.vision.estimator import claimed_std_n
+from gripper_force.vision.header import SHIPPED, Header, Model, ProcessConfig
 from gripper_force.vision.model_files import read_model
+from gripper_force.vision.ood import residual_share
 from gripper_force.vision.preprocess import Preprocess
 
 TOUCHES: Final = 16
@@ -61,15 +74,16 @@ MIN_LOGS: Final = 4
 """Fewer logs of touches can't be divided into halves that are calibrated."""
 
 FOLDS: Final = 3
-"""Parts of the logs, each left out once. More would take longer than a user waits."""
+"""Parts of the logs, each left out once, and each two of them. More would take longer than a user waits."""
 
-STEPS: Final = 4 * (FOLDS + 1) + 3
-"""Steps of progress that `teach` reports after the touches."""
+STEPS: Final = 4 * 2 * FOLDS + 3
+"""Steps of progress that `teach` reports after the touches: four candidates, without one fold and without two."""
 
 _HELPS: Final = 0.85
-"""More touches help if the error after the touches of the folds is less than this share of that after half of all."""
+"""More touches help if the error after two of three folds is less than this share of that after one."""
 
 _NETWORK: Final = "network.safetensors"
+_FIGURE: Final = "teach.png"
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,13 +94,14 @@ class Taught:
         bundle: Folder with network, profile and figure. A grasp of the object uses it.
         profile: The profile in it.
         learned: Name of the selected candidate, one of the keys of `candidates_mae_n`.
-        candidates_mae_n: MAE of each candidate on touches left out.
+        candidates_mae_n: MAE of each candidate on touches left out, after it has learned from the other two thirds.
         before_n: MAE of the configured network without calibration.
-        mae_n: Expected MAE: that of the selected candidate on touches left out.
+        mae_n: Expected MAE, on touches that took no part in the selection of the candidate either.
         contact_mae_n: The same, of the frames in contact.
-        half_mae_n: MAE of the selected candidate on the touches left out after it has learned from `half_logs` logs.
-        half_logs: Half of the logs.
+        fewer_mae_n: MAE of the selected candidate after it has learned from one third of the touches.
         more_touches_help: True if the error still falls clearly with the number of touches.
+        coverages: Share of the frames of each touch within an interval that the other folds gave: in contact, and by
+            force level.
         without_contact: Logs that were not used because they show no contact.
     """
 
@@ -97,10 +112,15 @@ class Taught:
     before_n: float
     mae_n: float
     contact_mae_n: float
-    half_mae_n: float
-    half_logs: int
+    fewer_mae_n: float
     more_touches_help: bool
+    coverages: tuple[Coverage, ...]
     without_contact: tuple[Path, ...]
+
+    @property
+    def figure(self) -> Path:
+        """The figure, PNG."""
+        return self.bundle / _FIGURE
 
 
 def teach(
@@ -182,16 +202,21 @@ def check_bundle(out: Path) -> None:
 
 
 class _Left(NamedTuple):
-    """Estimates of a log by what was made without it."""
+    """Results on a log by what was made without it."""
 
     raw_n: Floats  # (N,), not corrected
     estimate_n: Floats  # (N,)
     force_n: Floats  # (N,), of the load cell
-    ood_score: Floats  # (N,)
+    share: Floats  # (N,), of the residual of the features, see `residual_share`
+    touch: npt.NDArray[np.int64]  # (N,), number of the touch
 
-    @property
-    def mae_n(self) -> float:
-        return float(np.abs(self.estimate_n - self.force_n).mean())
+    def last(self, frames: int) -> "_Left":
+        """Returns the results on the last frames."""
+        return _Left(*(values[-frames:] for values in self))  # type: ignore[arg-type]  # of two types
+
+
+_Results = Sequence[Mapping[frozenset[int], Mapping[int, _Left]]]
+"""Results of each candidate, by the folds left out and the log."""
 
 
 class _Candidate(NamedTuple):
@@ -207,7 +232,7 @@ class _Task(NamedTuple):
 
     candidate: _Candidate
     logs: tuple[Path, ...]
-    splits: tuple[tuple[int, ...], ...]  # of each split the logs to learn from; the others are the test
+    splits: tuple[tuple[int, ...], ...]  # of each split the logs to learn from; all others are the test
     replay: tuple[Path, ...]
     file: Path  # of the result; the state of a training lies beside it
 
@@ -238,60 +263,59 @@ class _Work:
         without_contact: tuple[Path, ...],
         progress: Progress,
     ) -> Taught:
-        count = len(self._logs)
-        folds = [tuple(i for i in range(count) if i % FOLDS != fold) for fold in range(FOLDS)]
-        half = tuple(range(0, count, 2))
-        candidates = _candidates(config, model)
-        results = self._judged(candidates, [*folds, half], progress)
-        progress("", STEPS - 3 - len(candidates) * (FOLDS + 1))
-        left_out = [[parts[log % FOLDS][log] for log in range(count)] for parts in results]
-        error_n = np.array([[left.mae_n for left in one] for one in left_out]).T  # (logs, candidates)
-        best = select_simplest(error_n)
-        chosen, left = candidates[best], left_out[best]
-        checkpoint = self._learned(chosen, left)
+        candidates = _candidates(config, model, len(self._logs))
+        results = self._judged(candidates, progress)
+        progress("", STEPS - 3 - 2 * FOLDS * len(candidates))
+        found = _compare(results, len(self._logs))
+        chosen = candidates[found.best]
+        checkpoint = self._learned(chosen)
         progress(f"trained on all touches: {chosen.name}")
-        recorded = join({path: read_log(path, load_checkpoint(checkpoint)) for path in self._logs})
-        fit = _with_left_out(fit_correction(recorded.touches, COVERAGE), recorded, left)
+        learned = load_checkpoint(checkpoint)
+        recorded = join({path: read_log(path, learned) for path in self._logs})
+        subspace = object_subspace(recorded.touches)
+        limits = object_limits([one.share for one in found.left], [one.raw_n for one in found.left])
+        fit = fit_correction(recorded.touches, COVERAGE)
+        error_n, contact = (
+            np.abs(found.estimate_n - found.measured.force_n),
+            found.measured.force_n > CONTACT_N,
+        )
+        mae_n, contact_mae_n = float(error_n.mean()), float(error_n[contact].mean())
+        fit = replace(
+            fit,
+            arrays=replace(fit.arrays, known=KnownFrames(*subspace, limits)),
+            interval=touch_interval(found.estimate_n, *found.measured, COVERAGE),
+            before_n=float(np.abs(found.before_n - found.measured.force_n).mean()),
+            after_n=mae_n,
+        )
         vision = config.vision.model_copy(update={"checkpoint": str(checkpoint)})
         run = ResolvedConfig(config.model_copy(update={"vision": vision}), read_model(checkpoint))
         profile, _ = make_profile(name, recorded, fit, run)
-        progress("calibrated")
-        before_n = float(np.mean([np.abs(one.raw_n - one.force_n).mean() for one in left_out[0]]))
         profile = profile.model_copy(
-            update={
-                "network": _NETWORK,
-                "logs": self._digests,
-                "version": __version__,
-                "before_n": before_n,
-            }
+            update={"network": _NETWORK, "logs": self._digests, "version": __version__}
         )
-        half_n = float(np.mean([one.mae_n for one in results[best][FOLDS].values()]))
-        curve = [LearningCurvePoint(len(half), half_n, math.nan)]
-        _write_bundle(out, checkpoint, profile, fit, recorded, curve)
-        progress("wrote the bundle")
-        mae_n = float(error_n.mean(0)[best])
-        error, force_n = (
-            np.concatenate(parts)
-            for parts in zip(*((one.estimate_n - one.force_n, one.force_n) for one in left), strict=True)
-        )
-        return Taught(
+        progress("calibrated")
+        taught = Taught(
             bundle=out,
             profile=profile,
             learned=chosen.name,
-            candidates_mae_n={c.name: float(e) for c, e in zip(candidates, error_n.mean(0), strict=True)},
-            before_n=before_n,
+            candidates_mae_n={c.name: float(e) for c, e in zip(candidates, found.error_n, strict=True)},
+            before_n=fit.before_n,
             mae_n=mae_n,
-            contact_mae_n=float(np.abs(error[force_n > CONTACT_N]).mean()),
-            half_mae_n=half_n,
-            half_logs=len(half),
-            more_touches_help=mae_n < _HELPS * half_n,
+            contact_mae_n=contact_mae_n,
+            fewer_mae_n=float(found.fewer_n[found.best]),
+            more_touches_help=bool(found.error_n[found.best] < _HELPS * found.fewer_n[found.best]),
+            coverages=coverages(found.measured, found.within),
             without_contact=without_contact,
         )
+        header = _stated(learned.header, chosen, subspace, found.left)
+        _write_bundle(taught, checkpoint, header, fit.arrays, found)
+        progress("wrote the bundle")
+        return taught
 
-    def _judged(
-        self, candidates: Sequence[_Candidate], splits: Sequence[tuple[int, ...]], progress: Progress
-    ) -> list[list[dict[int, _Left]]]:
-        """Returns for each candidate and split the estimates of the logs left out, by the log's index."""
+    def _judged(self, candidates: Sequence[_Candidate], progress: Progress) -> _Results:
+        """Returns the results of the candidates on the logs left out."""
+        outs = [frozenset(out) for n in (1, 2) for out in combinations(range(FOLDS), n)]
+        splits = [tuple(i for i in range(len(self._logs)) if i % FOLDS not in out) for out in outs]
         tasks = []
         for candidate in candidates:
             # A network is trained for each split alone; all else is quick.
@@ -311,60 +335,98 @@ class _Work:
                 for future in as_completed(futures):
                     future.result()
                     progress(futures[future].candidate.name, len(futures[future].splits))
-        return [
+        parts = [
             [part for task in tasks if task.candidate == candidate for part in _read(task)]
             for candidate in candidates
         ]
+        return [dict(zip(outs, one, strict=True)) for one in parts]
 
     def _task(self, candidate: _Candidate, splits: tuple[tuple[int, ...], ...]) -> _Task:
         digest = read_model(candidate.base).digest
         settings = recipe(candidate.recipe).model_dump_json() if candidate.recipe else ""
-        parts = [candidate, digest, settings, splits, self._digests, [str(path) for path in self._replay]]
+        replay = [str(path) for path in self._replay]
+        parts = [candidate, digest, settings, splits, self._digests, replay, _Left._fields]
         key = sha256(json.dumps(parts).encode()).hexdigest()
         return _Task(candidate, self._logs, splits, self._replay, self._folder / f"{key[:16]}.left")
 
-    def _learned(self, candidate: _Candidate, left: Sequence[_Left]) -> Path:
-        """Returns the checkpoint of a candidate that has learned from all logs. Its error is that on logs left out."""
+    def _learned(self, candidate: _Candidate) -> Path:
+        """Returns the checkpoint of a candidate that has learned from all logs."""
+        if not candidate.recipe:
+            return read_model(candidate.base).path
         task = self._task(candidate, (tuple(range(len(self._logs))),))
         checkpoint = task.file.with_suffix(".safetensors")
         if not checkpoint.exists():
-            checkpoint.parent.mkdir(parents=True, exist_ok=True)
             part = checkpoint.with_name(f"all-{checkpoint.name}")
-            made = _make(task, task.splits[0], part)
-            raw_n, force_n = (
-                np.concatenate([getattr(one, key) for one in left]) for key in ("raw_n", "force_n")
-            )
-            stated = {
-                "residuals": residuals(raw_n, force_n),
-                "metrics": {"mae_n": float(np.abs(raw_n - force_n).mean())},
-                "ood": None,  # fitted to the recordings of the training; the profile has a limit
-            }
-            if candidate.recipe:
-                replace_header(part, made.header.model_copy(update=stated), checkpoint)
-                part.unlink()
-            else:
-                replace_header(candidate.base, made.header, checkpoint)
+            _make(task, task.splits[0], part)
+            part.rename(checkpoint)
         return checkpoint
 
 
-def select_simplest(error_n: Floats) -> int:
-    """Returns the first candidate that is not worse than the best by more than one standard error.
+class _Compared(NamedTuple):
+    """Comparison of the candidates. The frames of all logs are in the order of the folds."""
 
-    Args:
-        error_n: MAE of each candidate on each log left out, (logs, candidates), from the simplest.
-    """
-    excess_n = error_n - error_n[:, [int(error_n.mean(0).argmin())]]
-    return int(np.argmax(excess_n.mean(0) <= excess_n.std(0, ddof=1) / np.sqrt(len(error_n))))
+    best: int  # the candidate to take
+    error_n: Floats  # (candidates,), MAE without one fold
+    fewer_n: Floats  # (candidates,), MAE without two folds
+    left: list[_Left]  # results of the best candidate without one fold
+    measured: Measured
+    before_n: Floats  # (N,), by the configured network, not corrected
+    estimate_n: Floats  # (N,), nested
+    within: npt.NDArray[np.bool_]  # (N,), nested
 
 
-def _candidates(config: Config, model: Model) -> list[_Candidate]:
+def _compare(results: _Results, count: int) -> _Compared:
+    folds = [[log for log in range(count) if log % FOLDS == fold] for fold in range(FOLDS)]
+    # Networks with other reference frames have other first estimates; the last frames are the same.
+    frames = [
+        min(len(part[log].force_n) for one in results for part in one.values() if log in part)
+        for log in range(count)
+    ]
+
+    def left(candidate: int, fold: int, other: int) -> list[_Left]:
+        part = results[candidate][frozenset((fold, other))]
+        return [part[log].last(frames[log]) for log in folds[fold]]
+
+    def joined(key: str, candidate: int, fold: int, other: int) -> Floats:
+        return np.concatenate([getattr(one, key) for one in left(candidate, fold, other)])
+
+    each = range(FOLDS)
+    parts = [Measured(joined("force_n", 0, i, i), joined("touch", 0, i, i).astype(np.int64)) for i in each]
+    estimates_n = {
+        (i, j): np.stack([joined("estimate_n", one, i, j) for one in range(len(results))])
+        for i in each
+        for j in each
+    }
+    error_n, fewer_n = (
+        np.concatenate(
+            [touch_errors_n(estimates_n[i, j], parts[i]) for i in each for j in each if (i == j) == same]
+        )
+        for same in (True, False)
+    )
+    nested_n, within = estimate_left_out(estimates_n, parts, COVERAGE)
+    best = select_simplest(error_n)
+    return _Compared(
+        best,
+        error_n.mean(0),
+        fewer_n.mean(0),
+        [one for i in each for one in left(best, i, i)],
+        Measured(*(np.concatenate(values) for values in zip(*parts, strict=True))),
+        np.concatenate([joined("raw_n", 0, i, i) for i in each]),
+        np.concatenate(nested_n),
+        np.concatenate(within),
+    )
+
+
+def _candidates(config: Config, model: Model, logs: int) -> list[_Candidate]:
     base = config.vision.checkpoint
     named = base if base in SHIPPED else Path(base).name
     found = [_Candidate(f"{named} as it is", base, "")]
     if not any(isinstance(member, ProcessConfig) for member in model.header.members):
         smaller = ["small"] if base == "default" else []
         found += [_Candidate(f"{Path(one).name}, trained", one, "touches") for one in (*smaller, base)]
-    return [*found, _Candidate("Gaussian process", base, "few")]
+    if logs >= 2 * FOLDS:  # a process chooses its settings on logs left out, and so needs two in a fold
+        found.append(_Candidate("Gaussian process", base, "few"))
+    return found
 
 
 def _judge_in_process(task: _Task) -> None:
@@ -374,7 +436,7 @@ def _judge_in_process(task: _Task) -> None:
 
 def _judge(task: _Task) -> None:
     """Makes the candidate for each split, calibrates it, and writes its estimates of the logs left out."""
-    arrays: dict[str, Floats] = {}
+    arrays: dict[str, npt.NDArray[Any]] = {}
     recorded: list[TouchRecording] = []
     task.file.parent.mkdir(parents=True, exist_ok=True)
     for number, (split, test) in enumerate(zip(task.splits, task.tests, strict=True)):
@@ -382,17 +444,21 @@ def _judge(task: _Task) -> None:
         if task.candidate.recipe or not recorded:  # a network as it is sees the same in every split
             made = _make(task, split, file)
             recorded = [read_log(path, made) for path in task.logs]
+        known = join({task.logs[i]: recorded[i] for i in split}).touches
+        subspace = object_subspace(known)
         try:
-            fit = fit_correction(join({task.logs[i]: recorded[i] for i in split}).touches, COVERAGE)
+            fit = fit_correction(known, COVERAGE)
         except DataError:  # the estimates do not follow the load cell: they stay as they are
             fit = None
+        begins = np.cumsum([0, *(len(one.touches.numbers) for one in recorded)])
         for i in test:
             touches = recorded[i].touches
             left = _Left(
                 touches.estimate_n,
                 touches.estimate_n if fit is None else fit.predict(touches),
                 touches.force_n,
-                np.zeros(len(touches.force_n)) if fit is None else fit.arrays.ood_score(touches.features),
+                residual_share(touches.features, *subspace),
+                touches.touch + begins[i],
             )
             arrays |= {f"{number} {i} {key}": value for key, value in left._asdict().items()}
         file.unlink(missing_ok=True)
@@ -418,13 +484,11 @@ def _make(task: _Task, split: Sequence[int], file: Path) -> Checkpoint:
     if task.candidate.recipe == "few":
         settings = recipe("few", [f"preprocess.size={preprocess.size}"])
         return train(settings, [*clips, *replayed], file)
-    left_out = [i for i in range(len(task.logs)) if i not in split]
-    unseen = _clips(task.logs, preprocess.size, left_out or split)
     return train(
         recipe("touches"),
         clips,
         file,
-        validation_clips=unseen,
+        validation_clips=clips[:1],  # the errors of the folds replace what the checkpoint states
         init=base,
         replay_clips=replayed,
         resume=True,
@@ -446,36 +510,47 @@ def _digest_of(path: Path) -> str:
     return sha256(path.read_bytes()).hexdigest()
 
 
-def _with_left_out(fit: ObjectFit, recorded: TouchRecording, left: Sequence[_Left]) -> ObjectFit:
-    """Replaces what a fit states about its own touches, which the network has seen, by what left-out logs show."""
-    estimate_n = np.concatenate([one.estimate_n for one in left])
-    touches = recorded.touches
-    return replace(
-        fit,
-        cross_validated_n=estimate_n,
-        after_n=float(np.abs(estimate_n - touches.force_n).mean()),
-        interval=conformal_interval(estimate_n, touches.force_n, touches.touch, COVERAGE),
-        ood_limit=fit_ood_limit([one.ood_score for one in left if one.ood_score.any()]),
-    )
+def _stated(
+    header: Header, candidate: _Candidate, subspace: tuple[Floats, Floats, float], left: Sequence[_Left]
+) -> Header:
+    """Returns a header with the errors, and the out-of-distribution score, that logs left out show."""
+    raw_n, force_n = (np.concatenate([getattr(one, key) for one in left]) for key in ("raw_n", "force_n"))
+    if candidate.recipe:
+        stated = {"residuals": residuals(raw_n, force_n), "metrics": errors(raw_n, force_n), "ood": None}
+        header = header.model_copy(update=stated)
+    if header.ood is None:
+        z = (raw_n - force_n) / claimed_std_n(header, raw_n[None])
+        scored = [one.share for one in left], [one.raw_n for one in left]
+        ood = model_of_scores(subspace, *scored, z, force_n > CONTACT_N)
+        header = header.model_copy(update={"ood": ood})
+    return header
 
 
 def _write_bundle(
-    out: Path,
-    checkpoint: Path,
-    profile: ObjectProfile,
-    fit: ObjectFit,
-    recorded: TouchRecording,
-    curve: Sequence[LearningCurvePoint],
+    taught: Taught, checkpoint: Path, header: Header, arrays: ProfileArrays, found: _Compared
 ) -> None:
     """Writes the folder of a bundle. An earlier one is replaced once the new one is complete."""
+    out = taught.bundle
     part, old = out.with_name(f".{out.name}.part"), out.with_name(f".{out.name}.old")
     try:
         for folder in (part, old):
             shutil.rmtree(folder, ignore_errors=True)
         part.mkdir(parents=True)
-        shutil.copyfile(checkpoint, part / _NETWORK)
-        write_object(part / BUNDLED, profile, pack(fit.arrays))
-        draw(profile, fit, recorded.touches, curve, part / "profile.png")
+        replace_header(checkpoint, header, part / _NETWORK)
+        write_object(part / BUNDLED, taught.profile, pack(arrays))
+        draw(
+            taught.profile,
+            found.measured.force_n,
+            found.before_n,
+            found.estimate_n,
+            taught.coverages,
+            {
+                name: ends
+                for name, *ends in zip(taught.candidates_mae_n, found.fewer_n, found.error_n, strict=True)
+            },
+            taught.learned,
+            part / _FIGURE,
+        )
         if out.exists():
             out.rename(old)
         part.rename(out)
