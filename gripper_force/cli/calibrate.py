@@ -312,7 +312,7 @@ def teach(
         raise ConfigError("--fresh records touches and --from records none; leave out one of them")
     settings = load_settings(config, set_, {"object": name, "seed": seed})
     folder = folder or calibrate_object.default_folder(name)
-    job.check_bundle(out or user_folder() / name)
+    job.check(settings, out or user_folder() / name)
     begin_s = time.monotonic()
     try:
         if logs is None:
@@ -323,7 +323,8 @@ def teach(
                 logs += calibrate_object.record_touches(
                     settings, touches, peak_n, folder, prompt=prompt, progress=_progress(status)
                 )
-        with console.bar("teaching", job.STEPS) as progress:
+        bar = console.bar if console.err.is_terminal else console.lines
+        with bar("teaching", job.STEPS) as progress:
             result = job.teach(
                 settings,
                 name,
@@ -344,14 +345,17 @@ def teach(
             f"more touches would reduce the error further: --touches {2 * len(result.profile.logs)} adds to these",
             soft_wrap=True,
         )
-    console.err.print(
-        f"next: gripper-force grasp --object {shlex.quote(name)} --target-n 4, which uses this bundle"
-        if out is None
-        else f"next: gripper-force grasp --object {shlex.quote(name)} --target-n 4 "
-        f"--profile {shlex.quote(str(out.absolute()))}",
-        soft_wrap=True,
-        markup=False,
-    )
+    target_n = min(4.0, round(result.profile.force_n / 2, 1))
+    words = ["gripper-force", "grasp", "--object", name, "--target-n", f"{target_n:g}"]
+    words += [] if out is None else ["--profile", str(out.absolute())]
+    words += [] if config is None else ["--config", str(config)]
+    words += [] if seed is None else ["--seed", str(seed)]
+    # With another network than the default one a grasp would not use the bundle's.
+    others = [one for one in set_ or [] if not one.startswith("vision.checkpoint=")]
+    if config is not None and settings.vision.checkpoint != "default":
+        others.append("vision.checkpoint=default")
+    words += [word for one in others for word in ("--set", one)]
+    console.err.print(f"next: {shlex.join(words)}", soft_wrap=True, markup=False)
 
 
 def _tell_existing(settings: "Config", touches: int, folder: Path, fresh: bool) -> None:

@@ -177,7 +177,7 @@ def teach(
     """
     out = user_folder() / name if out is None else Path(out)
     place = default_folder(name) if folder is None else Path(folder)
-    check_bundle(out)
+    config, model = check(config, out)
     if logs is None:
         named = config.model_copy(update={"object": name})
         paths = []
@@ -186,19 +186,35 @@ def teach(
             progress(f"touch {len(paths)} of {touches}")
     else:
         paths = find_logs([Path(path) for path in logs])
+    used = [path for path in paths if _has_contact(path, model)]
+    without_contact = tuple(path for path in paths if path not in used)
+    # The same touch in two folds would be both learned and left out.
+    logs_by_digest = {_digest_of(path): path for path in used}
+    work = _Work(logs_by_digest, find_logs([Path(path) for path in replay]), place / "teach", workers)
+    return work.run(config, model, name, out, without_contact, progress)
+
+
+def check(config: Config, out: Path) -> tuple[Config, Model]:
+    """Checks what `teach` needs before the first touch.
+
+    Args:
+        config: The configuration.
+        out: Folder of the bundle.
+
+    Returns:
+        The configuration with the choice of the network made, and the network to begin with.
+
+    Raises:
+        ConfigError: There is no network, or the bundle can't be written.
+        CheckpointError: The network can't be read.
+    """
+    check_place(out.with_name(f"{out.name}.yaml"))
+    if out.exists() and not (out / BUNDLED).is_file():
+        raise ConfigError(f"{out} exists and is not a bundle; name another folder")
     config, model, _ = resolve_vision(config)
     if model is None:
         raise ConfigError("teach needs a network to begin with; set vision.checkpoint, such as to default")
-    used = [path for path in paths if _has_contact(path, model)]
-    work = _Work(used, find_logs([Path(path) for path in replay]), place / "teach", workers)
-    return work.run(config, model, name, out, tuple(path for path in paths if path not in used), progress)
-
-
-def check_bundle(out: Path) -> None:
-    """Raises `ConfigError` if a bundle can't be written, or the folder is something else."""
-    check_place(out.with_suffix(".yaml"))
-    if out.exists() and not (out / BUNDLED).is_file():
-        raise ConfigError(f"{out} exists and is not a bundle; name another folder")
+    return config, model
 
 
 class _Left(NamedTuple):
@@ -244,15 +260,14 @@ class _Task(NamedTuple):
 class _Work:
     """The work after the touches. Each part of it leaves a file, and is not repeated."""
 
-    def __init__(self, logs: Sequence[Path], replay: Sequence[Path], folder: Path, workers: int) -> None:
+    def __init__(self, logs: Mapping[str, Path], replay: Sequence[Path], folder: Path, workers: int) -> None:
         if len(logs) < MIN_LOGS:
             raise DataError(
-                f"there are {len(logs)} logs of touches with contact, but teach leaves some out to compare, and needs "
-                f"{MIN_LOGS}; touch the object more often, or use `gripper-force calibrate object`"
+                f"there are {len(logs)} different logs of touches with contact, but teach leaves some out to compare, "
+                f"and needs {MIN_LOGS}; touch the object more often, or use `gripper-force calibrate object`"
             )
-        self._logs, self._replay = tuple(logs), tuple(replay)
+        self._logs, self._digests, self._replay = tuple(logs.values()), tuple(logs), tuple(replay)
         self._folder, self._workers = folder, workers
-        self._digests = tuple(_digest_of(path) for path in logs)
 
     def run(
         self,
@@ -359,6 +374,7 @@ class _Work:
             part = checkpoint.with_name(f"all-{checkpoint.name}")
             _make(task, task.splits[0], part)
             part.rename(checkpoint)
+            _delete(part)
         return checkpoint
 
 
@@ -461,7 +477,7 @@ def _judge(task: _Task) -> None:
                 touches.touch + begins[i],
             )
             arrays |= {f"{number} {i} {key}": value for key, value in left._asdict().items()}
-        file.unlink(missing_ok=True)
+        _delete(file)
     write_all({task.file: save(arrays)})
 
 
@@ -493,6 +509,12 @@ def _make(task: _Task, split: Sequence[int], file: Path) -> Checkpoint:
         replay_clips=replayed,
         resume=True,
     )
+
+
+def _delete(checkpoint: Path) -> None:
+    """Deletes a checkpoint and the figure of its training."""
+    for path in (checkpoint, checkpoint.with_suffix(".png")):
+        path.unlink(missing_ok=True)
 
 
 def _clips(logs: Sequence[Path], size: int, chosen: Sequence[int]) -> list[Clip]:

@@ -217,8 +217,10 @@ def test_logs_without_contact_and_too_few_logs(
     free = write_log(replace(clip, name="free", forces_n=0 * clip.forces_n), tmp_path / "free")
     found = teach(config, "disc", logs=[*logs[:4], free], folder=tmp_path / "work", out=tmp_path / "b")
     assert found.without_contact == (free,)
-    with pytest.raises(DataError, match=f"there are 3 logs of touches with contact, but .* needs {MIN_LOGS}"):
-        teach(config, "disc", logs=[*logs[:3], free], folder=tmp_path / "work", out=tmp_path / "b")
+    with pytest.raises(
+        DataError, match=f"there are 3 different logs of touches with contact, but .* needs {MIN_LOGS}"
+    ):
+        teach(config, "disc", logs=[*logs[:3], logs[0], free], folder=tmp_path / "work", out=tmp_path / "b")
 
 
 def test_folder_that_is_no_bundle_is_not_replaced(config: Config, logs: list[Path], tmp_path: Path) -> None:
@@ -231,13 +233,16 @@ def test_command_prints_the_choice_and_the_next_command(
     taught: Taught, network: Path, logs: list[Path], tmp_path: Path
 ) -> None:
     call = ["teach", "disc", "--from", str(logs[0].parent), "--folder", str(tmp_path / "work"), "--jobs", "1"]
-    call += ["--set", f"vision.checkpoint={network}"]
+    call += ["--set", f"vision.checkpoint={network}", "--seed", "3"]
     result = CliRunner().invoke(app, [*call, "--json"], catch_exceptions=False)
     assert result.exit_code == 0, result.stderr
     found = json.loads(result.stdout)
     assert found["candidates_mae_n"] == taught.candidates_mae_n
     assert found["minutes"] > 0
-    assert "next: gripper-force grasp --object disc --target-n 4, which uses this bundle" in result.stderr
+    assert (
+        "next: gripper-force grasp --object disc --target-n 4 --seed 3\n"
+        in result.stderr
+    )
     table = CliRunner().invoke(app, [*call, "--out", str(tmp_path / "b")], catch_exceptions=False)
     assert "expected error" in table.stdout
     assert f"--profile {tmp_path / 'b'}" in table.stderr.replace("\n", "")
