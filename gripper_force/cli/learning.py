@@ -212,6 +212,7 @@ def export(
 ) -> None:
     """Export a network for another engine, and compare it with PyTorch."""
     from gripper_force.jobs.dataset import find_logs, load_clips
+    from gripper_force.jobs.int8_export import export_int8
     from gripper_force.vision.export import export as job
     from gripper_force.vision.model_files import read_model
 
@@ -223,7 +224,7 @@ def export(
             clips = load_clips(logs, model.header.preprocess, workers=jobs, progress=progress)
         frames = [clip.frames for clip in clips]
     with console.err.status("exporting"):
-        errors = job(model, out, frames)
+        errors = job(model, out) if frames is None else export_int8(model, out, frames)
     console.show({"file": str(out), "digest": model.digest, "off_torch_n": errors}, as_json)
 
 

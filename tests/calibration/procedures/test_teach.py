@@ -239,10 +239,7 @@ def test_command_prints_the_choice_and_the_next_command(
     found = json.loads(result.stdout)
     assert found["candidates_mae_n"] == taught.candidates_mae_n
     assert found["minutes"] > 0
-    assert (
-        "next: gripper-force grasp --object disc --target-n 4 --seed 3\n"
-        in result.stderr
-    )
+    assert "next: gripper-force grasp --object disc --target-n 4 --seed 3\n" in result.stderr
     table = CliRunner().invoke(app, [*call, "--out", str(tmp_path / "b")], catch_exceptions=False)
     assert "expected error" in table.stdout
     assert f"--profile {tmp_path / 'b'}" in table.stderr.replace("\n", "")
