@@ -614,7 +614,8 @@ class Config(Section):
             "sim": {"tool", "view_spread", "jaw_spread"},
         }
         tree = self.model_dump(mode="json", include=dict(parts))
-        return {f"{part}.{key}": value for part in parts for key, value in tree[part].items()}
+        tree["gripper.linkage"] = tree["gripper"].pop("linkage")
+        return {f"{part}.{key}": value for part in tree for key, value in tree[part].items()}
 
 
 Overrides = Sequence[str | tuple[str, Any]] | Mapping[str, Any]

@@ -76,7 +76,7 @@ def with_bundle(config: Config) -> tuple[Config, str]:
     vision = config.vision.model_copy(update={"checkpoint": str(path.with_name(profile.network))})
     calibration = calibration.model_copy(update={"object": str(path)})
     config = config.model_copy(update={"calibration": calibration, "vision": vision})
-    return config, f"used the bundle {path.parent}, taught {profile.touches} touches on {profile.date}"
+    return config, f"used the bundle {path.parent}, made of {profile.touches} touches on {profile.date}"
 
 
 def with_object(control: ControlConfig, profiles: Profiles) -> ControlConfig:
@@ -134,6 +134,6 @@ def rig_mismatches(config: Config, profiles: Profiles) -> list[str]:
 def _refuse(config: Config, profile: str, mismatches: list[str]) -> None:
     if mismatches and config.calibration.on_mismatch == "refuse":
         raise ConfigError(
-            f"the {profile} was made with {'; '.join(mismatches)}; calibrate again, or set "
+            f"the {profile} was made with {'; '.join(mismatches)}; teach or calibrate again, or set "
             "calibration.on_mismatch=warn"
         )

@@ -77,7 +77,7 @@ def plot_errors(
     axes.plot(force_n, after_n - force_n, ".", ms=2, color=DATA, label="after")
     label = f"{100 * interval.coverage:.0f} % interval"
     if coverages:
-        label += f", contains {100 * coverages[0].covered:.0f} % in contact of the touches left out"
+        label += f", contains {100 * coverages[0].covered:.0f} % in contact"
     axes.plot(line_n, half_n, color=FIT, label=label)
     axes.plot(line_n, -half_n, color=FIT)
     for level in coverages[1:]:
@@ -86,7 +86,7 @@ def plot_errors(
         at = (middle_n, float(interval.half_width_n(middle_n)))
         axes.annotate(f"{100 * level.covered:.0f} %", at, ha="center", va="bottom", fontsize=7)
     label_axes(axes, "errors", "load cell, N", "error, N")
-    axes.legend()
+    axes.legend(fontsize=8, markerscale=3)
 
 
 def _plot_learning_curve(

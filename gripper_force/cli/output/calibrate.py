@@ -4,6 +4,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from rich.table import Table
+
 from gripper_force.cli.console import number, out, pairs
 
 if TYPE_CHECKING:
@@ -90,15 +92,15 @@ def object_table(r: "ObjectCalibration") -> None:
 
 def taught_table(r: "Taught", minutes: float) -> None:
     """Prints the candidates' errors, the expected error and the bundle."""
+    table = Table("candidate", "error on touches left out", "", box=None, pad_edge=False)
     for name, mae_n in r.candidates_mae_n.items():
-        out.print(
-            f"[dim]{'taken' if name == r.learned else '     '}[/] {name}: {mae_n:.3f} N", highlight=False
-        )
+        table.add_row(name, number(mae_n, " N"), "taken" if name == r.learned else "")
+    out.print(table)
     profile = r.profile
     pairs(
         {
             "error before": number(r.before_n, " N"),
-            "expected error": f"{r.mae_n:.3f} N on touches left out, {r.contact_mae_n:.3f} N in contact",
+            "expected error": f"{r.mae_n:.3f} N, in contact {r.contact_mae_n:.3f} N",
             "with half as many touches": number(r.fewer_mae_n, " N"),
             "interval": _interval(profile.interval),
             "coverage": _coverage(r.coverages),

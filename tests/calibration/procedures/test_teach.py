@@ -7,8 +7,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -24,7 +26,9 @@ from gripper_force.jobs.training.recipe import TrainConfig
 from gripper_force.jobs.training.train import train
 from gripper_force.profiles.apply import with_bundle
 from gripper_force.profiles.object_profile import read_object
-from gripper_force.runtime.resolve import resolve
+from gripper_force.runtime.resolve import make_estimator, resolve
+from gripper_force.types import Gray
+from gripper_force.vision.estimator import ForceEstimator
 from gripper_force.vision.header import read_checkpoint
 from gripper_force.vision.preprocess import Preprocess
 
@@ -78,8 +82,14 @@ def config(network: Path) -> Config:
 
 
 @pytest.fixture(scope="module")
-def taught(config: Config, logs: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Taught:
-    return teach(config, "disc", logs=logs, folder=tmp_path_factory.mktemp("taught"))
+def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of `taught`."""
+    return tmp_path_factory.mktemp("taught")
+
+
+@pytest.fixture(scope="module")
+def taught(config: Config, logs: list[Path], work: Path) -> Taught:
+    return teach(config, "disc", logs=logs, folder=work)
 
 
 def test_bundle_holds_network_profile_and_origin(taught: Taught, logs: list[Path], home: Path) -> None:
@@ -110,6 +120,7 @@ def test_best_candidate_is_taken_and_its_error_is_that_on_new_touches(
     best = min(taught.candidates_mae_n.values())
     assert taught.candidates_mae_n[taught.learned] < 1.5 * best
     assert taught.mae_n < taught.before_n
+    assert taught.coverages[0].touches == 6
     assert taught.profile.after_n == taught.mae_n
     new = [write_log(press(seed), tmp_path / "new") for seed in range(40, 46)]
     found = evaluate(new, taught.bundle / "network.safetensors", profile=str(taught.bundle))
@@ -165,7 +176,7 @@ def test_more_touches_continue_with_the_old_ones(config: Config, logs: list[Path
 def test_grasps_find_the_bundle_by_the_object_and_a_setting_prevents_it(taught: Taught) -> None:
     used, note = with_bundle(load_config(None, ["object=disc"]))
     assert used.vision.checkpoint == str(taught.bundle / "network.safetensors")
-    assert note.startswith(f"used the bundle {taught.bundle}, taught 6 touches on ")
+    assert note.startswith(f"used the bundle {taught.bundle}, made of 6 touches on ")
     assert ("session", note) in resolve(load_config(None, ["object=disc"])).notes
     for keys in (
         ["object=sponge"],
@@ -197,13 +208,66 @@ def test_another_rig_is_refused_or_warned_about(taught: Taught, key: str, senten
     )
 
 
-def test_taught_network_states_the_error_on_touches_left_out(taught: Taught) -> None:
-    header = read_checkpoint(taught.bundle / "network.safetensors")[2]
-    if taught.learned != "tiny.safetensors as it is":
-        assert header.ood is None
-        assert header.trained_on is not None
-        assert header.trained_on["rigs"] == 1
-        assert header.metrics["mae_n"] > 0
+@pytest.mark.parametrize("taken", [1, 2])
+def test_any_learned_estimator_states_errors_and_a_score_from_touches_left_out(
+    taken: int,
+    taught: Taught,
+    config: Config,
+    logs: list[Path],
+    work: Path,
+    press: Callable[..., Clip],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A trained network, and a process: neither is what `taught` takes."""
+    monkeypatch.setattr(job, "select_simplest", lambda _: taken)
+    found = teach(config, "disc", logs=logs, folder=work, out=tmp_path / "disc")
+    assert found.learned == list(taught.candidates_mae_n)[taken]
+    header = read_checkpoint(found.bundle / "network.safetensors")[2]
+    assert header.trained_on is not None
+    assert header.trained_on["rigs"] == 1
+    assert header.metrics["mae_n"] > 0
+    assert header.ood is not None
+    assert found.profile.ood_limits is not None
+    frames = press(41).frames
+    for profile in ("none", str(found.bundle)):  # the network's score, and the profile's
+        run = load_config(
+            None,
+            [f"vision.checkpoint={found.bundle}/network.safetensors", f"calibration.object={profile}"],
+        )
+        estimator = make_estimator(resolve(run))
+        assert estimator is not None
+        assert sum(_is_rejected(estimator, frame) for frame in frames) < 0.2 * len(frames)
+
+
+def _is_rejected(estimator: ForceEstimator, frame: Gray) -> bool:
+    try:
+        estimator.update(frame)
+    except DataError:
+        return True
+    return False
+
+
+def test_a_fold_takes_no_part_in_the_choice_that_estimates_it() -> None:
+    """The second candidate is the best of all, but only because of the first fold: the others choose the first one."""
+    force_n = np.linspace(0, 4, 30)
+    errors_n = {0: {0: 1.0, 1: 0.1, 2: 0.1}, 1: {0: 0.0, 1: 0.2, 2: 0.2}}  # by candidate and fold
+
+    def left(candidate: int, log: int) -> job._Left:
+        error_n = errors_n[candidate][log % job.FOLDS]
+        touch = np.full(30, log)
+        return job._Left(force_n, force_n + error_n, force_n, np.full(30, 1e-4), touch)
+
+    outs = [frozenset(out) for n in (1, 2) for out in combinations(range(job.FOLDS), n)]
+    results = [
+        {out: {log: left(candidate, log) for log in range(6) if log % job.FOLDS in out} for out in outs}
+        for candidate in range(2)
+    ]
+    found = job._compare(results, 6)
+    assert found.best == 1
+    error_n = found.estimate_n - found.measured.force_n
+    np.testing.assert_allclose([error_n[found.measured.touch == log].mean() for log in (0, 3)], 1.0)
+    assert not found.within[np.isin(found.measured.touch, (0, 3))].any()
 
 
 def test_logs_without_contact_and_too_few_logs(
@@ -223,6 +287,13 @@ def test_logs_without_contact_and_too_few_logs(
         teach(config, "disc", logs=[*logs[:3], logs[0], free], folder=tmp_path / "work", out=tmp_path / "b")
 
 
+def test_a_missing_network_is_found_before_the_first_touch(config: Config, tmp_path: Path) -> None:
+    vision = config.vision.model_copy(update={"checkpoint": "none"})
+    with pytest.raises(ConfigError, match="teach needs a network to begin with"):
+        teach(config.model_copy(update={"vision": vision}), "disc", folder=tmp_path / "touches")
+    assert not (tmp_path / "touches").exists()
+
+
 def test_folder_that_is_no_bundle_is_not_replaced(config: Config, logs: list[Path], tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     with pytest.raises(ConfigError, match="exists and is not a bundle"):
@@ -240,9 +311,16 @@ def test_command_prints_the_choice_and_the_next_command(
     assert found["candidates_mae_n"] == taught.candidates_mae_n
     assert found["minutes"] > 0
     assert "next: gripper-force grasp --object disc --target-n 4 --seed 3\n" in result.stderr
-    table = CliRunner().invoke(app, [*call, "--out", str(tmp_path / "b")], catch_exceptions=False)
+    assert found["coverages"]
+    rig = tmp_path / "my.yaml"
+    rig.write_text(f"vision: {{checkpoint: {network}}}\n", encoding="utf-8")
+    table = CliRunner().invoke(
+        app, [*call[:7], "--config", str(rig), "--out", str(tmp_path / "b")], catch_exceptions=False
+    )
     assert "expected error" in table.stdout
-    assert f"--profile {tmp_path / 'b'}" in table.stderr.replace("\n", "")
+    assert "coverage" in table.stdout
+    text = f"--profile {tmp_path / 'b'} --config {rig} --set vision.checkpoint=default"
+    assert text in table.stderr.replace("\n", "")
     both = CliRunner().invoke(app, [*call, "--fresh"])
     assert isinstance(both.exception, ConfigError)
 
