@@ -68,12 +68,17 @@ def with_bundle(config: Config) -> tuple[Config, str]:
     calibration, name = config.calibration, config.profile
     if calibration.object is None and (user_folder() / config.object / BUNDLED).is_file():
         name = config.object
-    if name is None or not config.uses_vision or config.vision.checkpoint != "default":
+    if name is None or not config.uses_vision:
         return config, ""
     profile = read_object(path := find_object(name))
-    if profile.network is None:
+    if profile.network is None or config.vision.checkpoint == (
+        network := str(path.with_name(profile.network))
+    ):
         return config, ""
-    vision = config.vision.model_copy(update={"checkpoint": str(path.with_name(profile.network))})
+    if config.vision.checkpoint != "default":
+        named = f"vision.checkpoint is {config.vision.checkpoint!r}; set it to default to use the bundle"
+        return config, f"did not use the network of the bundle {path.parent}, because {named}"
+    vision = config.vision.model_copy(update={"checkpoint": network})
     calibration = calibration.model_copy(update={"object": str(path)})
     config = config.model_copy(update={"calibration": calibration, "vision": vision})
     return config, f"used the bundle {path.parent}, made of {profile.touches} touches on {profile.date}"

@@ -280,8 +280,8 @@ class _Work:
     ) -> Taught:
         candidates = _candidates(config, model, len(self._logs))
         results = self._judged(candidates, progress)
-        progress("", STEPS - 3 - 2 * FOLDS * len(candidates))
         found = _compare(results, len(self._logs))
+        progress("compared the candidates", STEPS - 3 - 2 * FOLDS * len(candidates))
         chosen = candidates[found.best]
         checkpoint = self._learned(chosen)
         progress(f"trained on all touches: {chosen.name}")
@@ -374,7 +374,6 @@ class _Work:
             part = checkpoint.with_name(f"all-{checkpoint.name}")
             _make(task, task.splits[0], part)
             part.rename(checkpoint)
-            _delete(part)
         return checkpoint
 
 
@@ -477,7 +476,7 @@ def _judge(task: _Task) -> None:
                 touches.touch + begins[i],
             )
             arrays |= {f"{number} {i} {key}": value for key, value in left._asdict().items()}
-        _delete(file)
+        file.unlink(missing_ok=True)
     write_all({task.file: save(arrays)})
 
 
@@ -508,13 +507,8 @@ def _make(task: _Task, split: Sequence[int], file: Path) -> Checkpoint:
         init=base,
         replay_clips=replayed,
         resume=True,
+        figure=False,
     )
-
-
-def _delete(checkpoint: Path) -> None:
-    """Deletes a checkpoint and the figure of its training."""
-    for path in (checkpoint, checkpoint.with_suffix(".png")):
-        path.unlink(missing_ok=True)
 
 
 def _clips(logs: Sequence[Path], size: int, chosen: Sequence[int]) -> list[Clip]:

@@ -51,6 +51,7 @@ def train(
     teacher: Checkpoint | None = None,
     replay_clips: Sequence[Clip] = (),
     resume: bool = False,
+    figure: bool = True,
     progress: Progress = no_progress,
     warn: Callable[[str], None] = lambda _: None,
 ) -> Checkpoint:
@@ -73,6 +74,7 @@ def train(
         replay_clips: Recordings of an earlier training, from which ``replay_share`` of each step's clips are
             drawn, so that their objects are not forgotten.
         resume: Continue an interrupted training from its saved states.
+        figure: Draw the figure. A Gaussian process has none.
         progress: Called with the training error; `PROGRESS_STEPS` for each network in total.
         warn: Called with a sentence if the training was too short to draw a clip from each recording, or to
             converge, or if there are too few validation clips for an out-of-distribution score.
@@ -124,15 +126,16 @@ def train(
             data = [*clips, *replay_clips]
             _save(out, networks, config, data, forces_n, measured_n, float(labels_n.mean()))
             _add_ood(out, networks, held_out, ranks.device, warn)
-            draw_training(
-                {t.network.config.attention: np.array(t.losses).reshape(-1, 2) for t in trainers},
-                measured_n,
-                forces_n,
-                np.concatenate([np.full(int(clip.valid.sum()), clip.object) for clip in held_out]),
-                float(labels_n.std()),
-                f"{out.name}: MAE {metrics.mae(forces_n, measured_n):.3f} N on validation data",
-                out.with_suffix(".png"),
-            )
+            if figure:
+                draw_training(
+                    {t.network.config.attention: np.array(t.losses).reshape(-1, 2) for t in trainers},
+                    measured_n,
+                    forces_n,
+                    np.concatenate([np.full(int(clip.valid.sum()), clip.object) for clip in held_out]),
+                    float(labels_n.std()),
+                    f"{out.name}: MAE {metrics.mae(forces_n, measured_n):.3f} N on validation data",
+                    out.with_suffix(".png"),
+                )
             for state in states:
                 state.unlink()
         ranks.wait()

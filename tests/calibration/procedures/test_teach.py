@@ -178,12 +178,12 @@ def test_grasps_find_the_bundle_by_the_object_and_a_setting_prevents_it(taught: 
     assert used.vision.checkpoint == str(taught.bundle / "network.safetensors")
     assert note.startswith(f"used the bundle {taught.bundle}, made of 6 touches on ")
     assert ("session", note) in resolve(load_config(None, ["object=disc"])).notes
-    for keys in (
-        ["object=sponge"],
-        ["object=disc", "calibration.object=none"],
-        ["object=disc", "vision.checkpoint=small"],
-    ):
+    for keys in (["object=sponge"], ["object=disc", "calibration.object=none"]):
         assert with_bundle(load_config(None, keys)) == (load_config(None, keys), "")
+    small = load_config(None, ["object=disc", "vision.checkpoint=small"])
+    assert with_bundle(small)[0] == small
+    assert "because vision.checkpoint is 'small'; set it to default" in with_bundle(small)[1]
+    assert with_bundle(used) == (used, "")
     by_path = load_config(None, [f"calibration.object={taught.bundle}"])
     assert with_bundle(by_path)[0].vision.checkpoint == used.vision.checkpoint
     again = load_config(None, ["object=disc", f"calibration.object={taught.bundle}/profile.yaml"])
@@ -315,7 +315,7 @@ def test_command_prints_the_choice_and_the_next_command(
     rig = tmp_path / "my.yaml"
     rig.write_text(f"vision: {{checkpoint: {network}}}\n", encoding="utf-8")
     table = CliRunner().invoke(
-        app, [*call[:7], "--config", str(rig), "--out", str(tmp_path / "b")], catch_exceptions=False
+        app, [*call[:8], "--config", str(rig), "--out", str(tmp_path / "b")], catch_exceptions=False
     )
     assert "expected error" in table.stdout
     assert "coverage" in table.stdout
