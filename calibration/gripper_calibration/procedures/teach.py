@@ -287,8 +287,8 @@ class _Work:
         progress(f"trained on all touches: {chosen.name}")
         learned = load_checkpoint(checkpoint)
         recorded = join({path: read_log(path, learned) for path in self._logs})
-        subspace = object_subspace(recorded.touches)
         limits = object_limits([one.share for one in found.left], [one.raw_n for one in found.left])
+        known = KnownFrames(*object_subspace(recorded.touches), limits)
         fit = fit_correction(recorded.touches, COVERAGE)
         error_n, contact = (
             np.abs(found.estimate_n - found.measured.force_n),
@@ -297,7 +297,7 @@ class _Work:
         mae_n, contact_mae_n = float(error_n.mean()), float(error_n[contact].mean())
         fit = replace(
             fit,
-            arrays=replace(fit.arrays, known=KnownFrames(*subspace, limits)),
+            arrays=replace(fit.arrays, known=known),
             interval=touch_interval(found.estimate_n, *found.measured, COVERAGE),
             before_n=float(np.abs(found.before_n - found.measured.force_n).mean()),
             after_n=mae_n,
@@ -322,7 +322,7 @@ class _Work:
             coverages=coverages(found.measured, found.within),
             without_contact=without_contact,
         )
-        header = _stated(learned.header, chosen, subspace, found.left)
+        header = _stated(learned.header, chosen, known, found.left)
         _write_bundle(taught, checkpoint, header, fit.arrays, found)
         progress("wrote the bundle")
         return taught
@@ -526,9 +526,7 @@ def _digest_of(path: Path) -> str:
     return sha256(path.read_bytes()).hexdigest()
 
 
-def _stated(
-    header: Header, candidate: _Candidate, subspace: tuple[Floats, Floats, float], left: Sequence[_Left]
-) -> Header:
+def _stated(header: Header, candidate: _Candidate, known: KnownFrames, left: Sequence[_Left]) -> Header:
     """Returns a header with the errors, and the out-of-distribution score, that logs left out show."""
     raw_n, force_n = (np.concatenate([getattr(one, key) for one in left]) for key in ("raw_n", "force_n"))
     if candidate.recipe:
@@ -537,7 +535,7 @@ def _stated(
     if header.ood is None:
         z = (raw_n - force_n) / claimed_std_n(header, raw_n[None])
         scored = [one.share for one in left], [one.raw_n for one in left]
-        ood = model_of_scores(subspace, *scored, z, force_n > CONTACT_N)
+        ood = model_of_scores(known, *scored, z, force_n > CONTACT_N)
         header = header.model_copy(update={"ood": ood})
     return header
 

@@ -12,6 +12,7 @@ from scipy.optimize import minimize
 from gripper_force.errors import DataError
 from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.dataset import CONTACT_N, Clip, check_size, load_clips, without_contact_starts
+from gripper_force.profiles.correction import KnownFrames
 from gripper_force.profiles.object_profile import OodLimit
 from gripper_force.vision.batch_inference import features
 from gripper_force.vision.checkpoint import load_checkpoint
@@ -89,33 +90,33 @@ def fit_ood(
         subspace = _subspace([log for log, own in zip(seen, fold, strict=True) if own != part])
         for i in np.flatnonzero(fold == part):
             shares[i] = residual_share(seen[i].features, *subspace)
+    estimates_n = [log.estimate_n for log in seen]
     return model_of_scores(
-        _subspace(seen),
+        KnownFrames(*_subspace(seen), _limits(shares, estimates_n)),
         shares,
-        [log.estimate_n for log in seen],
+        estimates_n,
         np.concatenate([(log.estimate_n - log.force_n) / log.std_n for log in seen]),
         np.concatenate([log.force_n > CONTACT_N for log in seen]),
     )
 
 
 def model_of_scores(
-    subspace: tuple[Floats, Floats, float],
+    known: KnownFrames,
     shares: Sequence[Floats],
     estimates_n: Sequence[Floats],
     z: Floats,
     contact: npt.NDArray[np.bool_],
 ) -> OodModel:
-    """Returns the model of a subspace, with limits and claimed deviation from logs that were left out.
+    """Returns the model of known frames, with the claimed deviation from logs that were left out.
 
     Args:
-        subspace: Mean, axes and floor of all known frames, as from `fit_subspace`.
+        known: The known frames.
         shares: Shares of the residual of the frames of each log, (N,) each, by a subspace without the log.
         estimates_n: Their estimates, (N,) each.
         z: Errors of all frames over the deviation claimed without the score, (N,).
         contact: True for the frames in contact, (N,).
     """
-    mean, axes, floor = subspace
-    limits = _limits(shares, estimates_n)
+    mean, axes, floor, limits = known
     ratio = np.concatenate([smooth_ratios(limits, *log) for log in zip(shares, estimates_n, strict=True)])
     score = ratio / np.interp(
         np.concatenate(estimates_n), [o.force_n for o in limits], [o.limit for o in limits]
@@ -265,6 +266,6 @@ def _std_factors(score: Floats, z: Floats) -> tuple[float, float]:
     return float(base), float(growth)
 
 
-def _encoded(values: Floats, dtype: type[np.floating]) -> bytes:
+def _encoded(values: npt.NDArray[np.floating], dtype: type[np.floating]) -> bytes:
     """Returns an array as the header's text: base64 of its bytes."""
     return urlsafe_b64encode(values.astype(dtype).tobytes())

@@ -229,7 +229,6 @@ def test_any_learned_estimator_states_errors_and_a_score_from_touches_left_out(
     assert header.metrics["mae_n"] > 0
     assert header.ood is not None
     assert found.profile.ood_limits is not None
-    frames = press(41).frames
     for profile in ("none", str(found.bundle)):  # the network's score, and the profile's
         run = load_config(
             None,
@@ -237,7 +236,11 @@ def test_any_learned_estimator_states_errors_and_a_score_from_touches_left_out(
         )
         estimator = make_estimator(resolve(run))
         assert estimator is not None
-        assert sum(_is_rejected(estimator, frame) for frame in frames) < 0.2 * len(frames)
+        rejected = []
+        for seed in (41, 42, 43):
+            estimator.reset()
+            rejected += [_is_rejected(estimator, frame) for frame in press(seed).frames]
+        assert np.mean(rejected) < 0.2
 
 
 def _is_rejected(estimator: ForceEstimator, frame: Gray) -> bool:
