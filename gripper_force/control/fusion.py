@@ -55,6 +55,10 @@ _PLAY_SHARE = 0.15
 """Error of a steady current estimate after the motor force has fallen within the play, as a share of friction and of
 the reversal: 0.11 N at 60 % in simulated grasps."""
 
+_SLIDES_SHARE = 0.2
+"""Share of the approach speed above which jaws slide during a steady hold: their object has left. If it returns at
+once, the motor force has stayed within the play all the time."""
+
 _GATE = 3.29
 """Innovation gate in standard deviations: 0.1 % of good estimates are rejected (chi-square, 10.8)."""
 
@@ -100,6 +104,7 @@ class Fusion:
         _, self._lag_s, _ = config.plant
         self._std_limit_n = config.vision_std_n
         self._reentry = max(round(_REENTRY_S * config.frame_hz), _MIN_REENTRY)
+        self._slides_m_s = _SLIDES_SHARE * config.approach_speed_m_s
         self._transmission = transmission
         self._gain = ObjectGain(transmission.gain_std, config.object_ratio)
         self._learns_gain = config.learn_gain
@@ -196,8 +201,8 @@ class Fusion:
         if self._was_lowering and not lowering:
             self.reset_variance()
         self._was_lowering = lowering
-        self._predict(servo, free)
         self._holds = holding and not self._has_lowered
+        self._predict(servo, free)
         self._note_change(gripping or opening, gripping)
         self._variance_n2 = max(self._variance_n2, self._opening_variance_n2)
         if visual is not None and visual.t_ns > self._newest_visual_ns and self._feedback != "current":
@@ -227,9 +232,8 @@ class Fusion:
 
     def _predict(self, servo: ServoState, free: bool) -> None:
         before_n = self._current_n
-        damping_n = self._transmission.damping_n_s_m * self._transmission.closing_m_s(
-            servo.velocity_rad_s, servo.position_rad
-        )
+        closing_m_s = self._transmission.closing_m_s(servo.velocity_rad_s, servo.position_rad)
+        damping_n = self._transmission.damping_n_s_m * closing_m_s
         motor_force_n = self._transmission.force_n(servo.current_a, servo.position_rad) - damping_n
         dt_s = 0.0
         if self._history:
@@ -243,9 +247,10 @@ class Fusion:
             self._learn_friction()
         # Coulomb friction acts as play: the contact force stays until the motor force differs by friction.
         friction_n = self._friction_n
-        self._current_n = min(
-            max(before_n, self._motor_force_n - friction_n), self._motor_force_n + friction_n
-        )
+        low_n, high_n = self._motor_force_n - friction_n, self._motor_force_n + friction_n
+        self._current_n = min(max(before_n, low_n), high_n)
+        if self._holds and closing_m_s > self._slides_m_s:  # friction acts in full against the motion
+            self._current_n = low_n
         if free:
             self._current_n = self._difference_n = 0.0
         # The further the motor force has reversed within that play, the less certain the contact force is.

@@ -63,6 +63,12 @@ _LET_GO_LEAD_S = 0.03
 """Time in which the lead of the goal position reaches its full length after a release. With a full lead at once, the
 motor would add to the force of a springy object."""
 
+_OPENS_SHARE = 0.5
+_PUSH_N_S = 5.0
+_PUSH_SHARE = 3.0
+"""Jaws whose release is slower than this share of the approach speed get more motor force at this rate, up to this
+multiple of that of free travel: their friction may be larger than configured."""
+
 _SEEN_FILTER_S = 0.1
 _UNSEEN_SHARE = 0.15
 """A grip counts as held only while the filtered visual estimate has risen by at least this share of the target since
@@ -161,7 +167,7 @@ class GraspController:
         self._grasp_ns = 0
         self._phase_s = self._settled_s = self._error_n = 0.0
         self._was_over_force = False
-        self._let_go_n = 0.0
+        self._let_go_n = self._push_n = 0.0
         self._seen_n: float | None = None
         self._seen_ns, self._seen_before_n = 0, 0.0
         self._has_seen = self._has_unsure = self._was_held = False
@@ -377,7 +383,9 @@ class GraspController:
         if self._phase in _GRIPPING:
             self._let_go_n, self._was_held = self._motor_force_n, self._outcome == Outcome.HELD
         speed_m_s = _TRAVEL_SPEED_SHARE * self._config.approach_speed_m_s
-        self._travel.start(self._present_width_m, speed_m_s)
+        self._goal_width_m = self._present_width_m  # in the cycle that loses an object, the jaws still close
+        self._travel.start(self._goal_width_m, speed_m_s)
+        self._push_n = 0.0
         self._limits.reset()
 
     def _enter_fault(self) -> None:
@@ -419,6 +427,15 @@ class GraspController:
         return self._target_n * self._derating
 
     @property
+    def _tolerance_n(self) -> float:
+        """Largest force error at which the target counts as held: at least one step of an uncorrected current."""
+        band_n = tolerance_n(self._derated_target_n)
+        if self._estimate.source != EstimateSource.CURRENT:
+            return band_n
+        step_n = self._transmission.force_n(self._transmission.current_step_a, self._present_rad)
+        return max(band_n, abs(step_n))
+
+    @property
     def _present_width_m(self) -> float:
         return self._goal_width_m if self._width_m is None else self._width_m
 
@@ -443,11 +460,11 @@ class GraspController:
             case Phase.HOLD:
                 self._run_hold(dt_s, width_m, closing_m_s)
             case Phase.RELEASE:
-                self._run_release(dt_s, width_m)
+                self._run_release(dt_s, width_m, closing_m_s)
             case Phase.MOVE:
                 self._run_move(dt_s, width_m)
             case Phase.FAULT if self._opens_at_fault:
-                self._run_release(dt_s, width_m)
+                self._run_release(dt_s, width_m, closing_m_s)
         if self._phase in _GRIPPING:
             self._goal_width_m = width_m - 2 * GOAL_OFFSET_M
         if self._phase in (Phase.APPROACH, *_GRIPPING) and self._outcome == Outcome.NONE:
@@ -506,7 +523,7 @@ class GraspController:
         )
         error_n = self._estimate.force_n - self._derated_target_n
         self._error_n += (error_n - self._error_n) * dt_s / (dt_s + _SETTLE_FILTER_S)
-        is_near = abs(self._error_n) <= tolerance_n(self._derated_target_n)
+        is_near = abs(self._error_n) <= self._tolerance_n
         if self._settled_s == 0.0:
             self._settling_width_m = width_m
         # Jaws that come loose from friction close freely against viscous friction, which looks like a steady grip.
@@ -534,15 +551,15 @@ class GraspController:
         if self._outcome in (Outcome.NONE, Outcome.HELD):
             self._set_outcome(Outcome.SLIP, reason)
         match self._config.on_slip:
-            case "open":
-                self._start_release(reason)
             case "hold":
                 self._start_travel()
                 self._move_width_m, self._move_opens = width_m, False
                 self._enter(Phase.MOVE, reason)
-            case "regrip":
+            case "regrip" if width_m >= self._config.min_object_width_m:
                 self._approach.start(width_m, self._target_n)
                 self._enter(Phase.APPROACH, reason)
+            case _:
+                self._start_release(reason)
 
     @property
     def _travel_force_n(self) -> float:
@@ -550,8 +567,11 @@ class GraspController:
         remaining_n = self._let_go_n * (1 - self._phase_s / _LET_GO_S)
         return max(self._free_motor_force_n, remaining_n)
 
-    def _run_release(self, dt_s: float, width_m: float) -> None:
-        self._motor_force_n = self._travel_force_n
+    def _run_release(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
+        is_slow = -closing_m_s < _OPENS_SHARE * self._config.approach_speed_m_s
+        if is_slow and self._phase_s > 2 * ACCELERATION_S:
+            self._push_n = min(self._push_n + _PUSH_N_S * dt_s, _PUSH_SHARE * self._free_motor_force_n)
+        self._motor_force_n = self._travel_force_n + self._push_n
         open_width_m = self._transmission.open_width_m
         self._goal_width_m = self._travel.step(open_width_m, dt_s)
         lead_m = 2 * _LEAD_M

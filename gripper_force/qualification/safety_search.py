@@ -60,6 +60,7 @@ class Draw:
         play_m: Gear play in each direction.
         contact_m: Travel of a jaw at which it meets the object; 1 m without an object.
         leaves_s: Time at which the object leaves the jaws; infinite for never.
+        away_s: Time for which it is away; infinite for ever.
         start_m: Error of the configured open position, as travel of a jaw.
         sign: -1 if the configured closing direction is wrong.
         width: Configured open width over the true one.
@@ -81,6 +82,7 @@ class Draw:
     play_m: float
     contact_m: float
     leaves_s: float
+    away_s: float
     start_m: float
     sign: int
     width: float
@@ -184,6 +186,7 @@ def draw(config: ControlConfig, gain_bound: float, seed: int, index: int) -> Dra
         vision_noise_n=between(0.03, 0.3),
         seed=int(rng.integers(2**31)),
         motion_n=rarely(0.3, between(0.0, 6.0), 0.0),
+        away_s=rarely(0.5, log_between(0.02, 1.5), math.inf),
     )
 
 
@@ -241,6 +244,8 @@ class _Run:
     ) -> None:
         self._plant, self._controller, self._drawn = plant, controller, drawn
         self._offset_rad = offset_rad
+        self._leaves_ns = drawn.leaves_s * NS_PER_S
+        self._returns_ns = (drawn.leaves_s + drawn.away_s) * NS_PER_S
         self._rng = np.random.default_rng(drawn.seed)
         self._vision = SimulatedVision(
             0.035 + 0.5 / drawn.camera_hz, drawn.vision_noise_n, drawn.camera_hz, drawn.vision_gain
@@ -264,8 +269,12 @@ class _Run:
             (round(time_s * NS_PER_S / CYCLE_NS), 2)
         ).tolist():
             plant = self._plant
-            if self.t_ns >= self._drawn.leaves_s * NS_PER_S and plant.contact_m < _GONE_M:
+            if self.t_ns >= self._leaves_ns and plant.contact_m < _GONE_M:
                 plant.contact_m, plant.deepest_m = _GONE_M, 0.0
+                self._leaves_ns = math.inf
+            if self.t_ns >= self._returns_ns:  # at the jaws, if they have closed beyond its place
+                plant.contact_m, plant.deepest_m = max(self._drawn.contact_m, plant.jaw_m), plant.jaw_m
+                self._returns_ns = math.inf
             servo = self.read(self.t_ns, servo_noise)
             seen_n = plant.force_n + self._drawn.motion_n * plant.x_m / _STOP_M
             visual = self._vision.sample(self.t_ns, seen_n, vision_noise)

@@ -29,8 +29,6 @@ _STILL_M_S: Final = 0.003
 _TRAVEL_SHARE: Final = 2.0
 """Speed of a release as a share of the approach speed."""
 
-_GRASPING: Final = (Phase.APPROACH, Phase.CONTACT, Phase.RAMP, Phase.HOLD)
-
 
 class SafetyStatements:
     """Observes one grasp for the three statements: its largest force and speed, and a hold on nothing.
@@ -82,7 +80,7 @@ class SafetyStatements:
         self.held_nothing |= self._nothing_s > (self._still_reaction_s if is_still else REACTION_S)
         self.force_share = max(self.force_share, peak_n / self._limit_n)
         if force_n == 0.0:
-            # The jaws also open before they approach again; a wrong sign exchanges the directions.
+            # Only opening jaws may be faster, and only a release opens them; a wrong sign exchanges the directions.
             opens = self._sign * closing_m_s < 0
-            limit_m_s = self._speed_m_s * (_TRAVEL_SHARE if opens or phase not in _GRASPING else 1.0)
+            limit_m_s = self._speed_m_s * (_TRAVEL_SHARE if opens else 1.0)
             self.speed_share = max(self.speed_share, abs(closing_m_s) / limit_m_s)

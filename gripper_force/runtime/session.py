@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from gripper_force.config import Config, dump_config
 from gripper_force.control.state_machine import Decision, GraspController, is_open
-from gripper_force.errors import DeviceError, DeviceTimeoutError, GripperError
+from gripper_force.errors import DeviceError, GripperError
 from gripper_force.interfaces import Devices, SharedPort
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log_queue import LogQueue
@@ -25,6 +25,7 @@ from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.runtime.monitors import CounterMonitor, LoadCellMonitor
 from gripper_force.runtime.perception import Estimator, LockstepPerception, Perception, ThreadedPerception
 from gripper_force.runtime.process import deferred_signals, real_time_settings
+from gripper_force.runtime.reading import read_patiently
 from gripper_force.runtime.resolve import ResolvedConfig, make_controller, make_estimator, resolve
 from gripper_force.types import (
     NS_PER_MS,
@@ -223,26 +224,20 @@ class Session:
         return decision
 
     def _read_servo(self) -> ServoState:
-        """Reads the servo, again if it does not answer, for as long as its watchdog waits.
-
-        Meanwhile the last command stands, which was within the limits.
-        """
-        clock, patience_ns = self._devices.clock, self.run.config.servo.bus_watchdog_ms * NS_PER_MS
-        while True:
-            try:
-                state = self._devices.servo.read()
-            except DeviceTimeoutError:
-                next_ns = clock.now_ns() + self._period_ns
-                if self.servo_state is None or next_ns - self.servo_state.t_ns > patience_ns:
-                    raise
-                clock.sleep_until_ns(next_ns)
-                self.raise_if_interrupted()
-            else:
-                if self.servo_state is not None:
-                    gap_ns = state.t_ns - self.servo_state.t_ns
-                    if gap_ns > _GAP_CYCLES * self._period_ns:
-                        self._log(Event(state.t_ns, "servo", f"no answer for {gap_ns / NS_PER_MS:.0f} ms"))
-                return state
+        devices = self._devices
+        state = read_patiently(
+            devices.servo,
+            devices.clock,
+            self.servo_state,
+            period_ns=self._period_ns,
+            patience_ns=self.run.config.servo.bus_watchdog_ms * NS_PER_MS,
+            before_retry=self.raise_if_interrupted,
+        )
+        if self.servo_state is not None:
+            gap_ns = state.t_ns - self.servo_state.t_ns
+            if gap_ns > _GAP_CYCLES * self._period_ns:
+                self._log(Event(state.t_ns, "servo", f"no answer for {gap_ns / NS_PER_MS:.0f} ms"))
+        return state
 
     def release(self) -> GraspStatus:
         """Opens the jaws and returns the last status. An object that catches on them can keep them closed."""

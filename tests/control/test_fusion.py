@@ -36,13 +36,15 @@ class Bench:
         lowering=False,
         gripping=False,
         holding=False,
+        closing_m_s=0.0,
     ):
         """`motor_force_n` and `seen_n` are functions of the time in seconds; `seen_n` is the visual force."""
         for _ in range(round(time_s * 200)):
             t_s = self.t_ns / 1e9
-            servo = ServoState(
-                self.t_ns, 0.0, 0.0, self.transmission.current_a(motor_force_n(t_s), 0.0), 30.0, 12.0, 0
-            )
+            damping_n = self.transmission.damping_n_s_m * closing_m_s
+            current_a = self.transmission.current_a(motor_force_n(t_s) + damping_n, 0.0)
+            rad_s = closing_m_s / self.transmission.closing_m_s(1.0, 0.0)
+            servo = ServoState(self.t_ns, 0.0, rad_s, current_a, 30.0, 12.0, 0)
             visual = None
             if seen_n is not None and self.t_ns // (5 * MS) % 3 == 0:
                 capture_ns = self.t_ns - latency_ms * MS
@@ -80,6 +82,16 @@ def test_friction_acts_as_play(bench, transmission):
     b.run(1.0, lambda _: 3.0 + transmission.friction_n)
     assert b.run(1.0, lambda _: 3.0 - 0.9 * transmission.friction_n).force_n == pytest.approx(3.0, abs=1e-6)
     assert b.run(1.0, lambda _: 2.0 - transmission.friction_n).force_n == pytest.approx(2.0, abs=1e-6)
+
+
+def test_sliding_jaws_leave_the_play(bench, transmission):
+    motor_force_n = 3.0
+    b = bench(feedback="current")
+    b.run(1.0, lambda _: motor_force_n + transmission.friction_n)
+    held = b.run(0.5, lambda _: motor_force_n, holding=True)
+    assert held.current_n == pytest.approx(motor_force_n, abs=1e-6)
+    slid = b.run(0.05, lambda _: motor_force_n, holding=True, closing_m_s=0.02)
+    assert slid.current_n == pytest.approx(motor_force_n - transmission.friction_n, abs=0.001)
 
 
 def test_vision_finds_the_bias(bench):

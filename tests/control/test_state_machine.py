@@ -350,6 +350,45 @@ def test_release_pre_empts(make_run, phase):
     assert run.plant.x_m < 0.003
 
 
+@pytest.mark.parametrize("friction", [1.4, 1.8, 3.0, 5.0])
+def test_release_opens_jaws_whose_friction_has_grown(make_run, friction):
+    run = make_run().grasp(4.0, 3.0)
+    run.plant.friction_n *= friction
+    run.go(4.0, "release")
+    assert run.last.status.phase == "open"
+    assert run.plant.x_m < 0.003
+
+
+@pytest.mark.parametrize("on_slip", ["hold", "open", "regrip"])
+@pytest.mark.parametrize(("target_n", "gain"), [(8.1, 0.9), (7.5, 1.25)])
+def test_jaws_that_lose_their_object_are_not_faster_than_an_approach(make_run, on_slip, target_n, gain):
+    run = make_run(plant={"stiffness_n_m": 5000.0, "gain": gain}, on_slip=on_slip)
+    run.grasp(target_n, 2.5)
+    run.plant.contact_m = 1.0
+    fastest_m_s = 0.0
+    for _ in range(100):
+        run.go(0.005)
+        fastest_m_s = max(fastest_m_s, run.plant.v_m_s)
+    assert "slip" in [status.outcome for status in run.statuses]
+    assert fastest_m_s <= 1.4 * run.config.approach_speed_m_s
+
+
+def test_soft_object_that_is_pressed_flat_is_let_go_slowly(make_run):
+    plant = {"stiffness_n_m": 875.0, "contact_m": 0.036, "friction_n": 0.35}
+    run = make_run(plant=plant, feedback="current").grasp(7.8, 6.0)
+    assert run.last.status.outcome == "no_object"
+    opening_m_s = []
+    run = make_run(plant=plant | {"contact_m": 0.026}, feedback="current").grasp(7.8, 4.0)
+    run.plant.contact_m = 1.0
+    run.go(0.1)
+    run.plant.contact_m = 0.036
+    for _ in range(600):
+        run.go(0.005)
+        opening_m_s.append(-run.plant.v_m_s)
+    assert run.last.status.outcome == "slip"
+    assert max(opening_m_s) <= 1.5 * 2 * run.config.approach_speed_m_s
+
+
 @pytest.mark.parametrize("phase", ["open", "approach", "release", "move"])
 def test_grasp_pre_empts(make_run, phase):
     run = make_run().to_phase(phase).grasp(2.0)

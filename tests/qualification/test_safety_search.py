@@ -44,6 +44,7 @@ def test_draws_cover_what_can_be_wrong(config: Config) -> None:
     assert any(one.width > 1.1 for one in drawn)
     assert any(one.start_m > 0.01 for one in drawn)
     assert any(one.leaves_s < 3 for one in drawn)
+    assert any(one.leaves_s < 3 and one.away_s < 0.1 for one in drawn)
 
 
 # Each defect is planted into the controller, and the search must find it.

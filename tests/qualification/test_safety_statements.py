@@ -42,11 +42,12 @@ def test_force_counts_against_the_limit() -> None:
         (Phase.HOLD, 0.03, 1, 1.5),
         (Phase.APPROACH, -0.03, 1, 0.75),
         (Phase.RELEASE, -0.03, 1, 0.75),
-        (Phase.MOVE, 0.03, 1, 0.75),
+        (Phase.MOVE, 0.03, 1, 1.5),
+        (Phase.MOVE, -0.03, 1, 0.75),
         (Phase.APPROACH, -0.03, -1, 1.5),
     ],
 )
-def test_speed_counts_against_that_of_the_phase(
+def test_speed_counts_against_that_of_the_direction(
     phase: Phase, closing_m_s: float, sign: int, share: float
 ) -> None:
     assert shown(phase, closing_m_s=closing_m_s, sign=sign).speed_share == pytest.approx(share)

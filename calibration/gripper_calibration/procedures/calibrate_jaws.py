@@ -16,12 +16,13 @@ from gripper_force.control.transmission import Transmission
 from gripper_force.errors import DataError, DeviceError
 from gripper_force.interfaces import Devices, Progress, Prompt, no_progress
 from gripper_force.runtime.backends import open_devices
+from gripper_force.runtime.reading import read_patiently
 from gripper_force.runtime.resolve import position_loop, resolve
-from gripper_force.types import NS_PER_S, ServoCommand, ServoState
+from gripper_force.types import NS_PER_MS, NS_PER_S, ServoCommand, ServoState
 
 _RATE_HZ: Final = 200.0
-_PRESS_N: Final = 0.5
-"""Force at the ends beyond friction."""
+_START_N: Final = 1.0
+"""Motor force at first. Jaws that friction holds get more; the configured friction may be wrong."""
 
 _MORE: Final = 1.5
 """An end is confirmed with this much more current: friction would let the jaws move on."""
@@ -131,6 +132,7 @@ def calibrate_jaws(config: Config, *, prompt: Prompt, progress: Progress = no_pr
         repeat_rad = max(abs(ends[0][side] - ends[1][side]) for side in (0, 1))
         _check_ends(start_rad, low_rad, high_rad, repeat_rad)
         sign = 1 if start_rad - low_rad < high_rad - start_rad else -1
+        jaws.raise_current()
         friction = [jaws.friction(side, low_rad, high_rad) for side in (sign, -sign)]
         jaws.rest()
     open_rad, closed_rad = (low_rad, high_rad) if sign > 0 else (high_rad, low_rad)
@@ -228,8 +230,7 @@ class _EmptyJaws:
         self._goal_a = 0.0
         # Half open, where a linkage is far from its dead centres.
         self._middle_rad = self._transmission.position_rad(self._transmission.open_width_m / 2)
-        friction_n = (1 + 3 * self._transmission.friction_std) * self._transmission.friction_n
-        self._end_a = self._current_a(friction_n + _PRESS_N)
+        self._end_a = self._current_a(_START_N)
         self.state = state
 
     def _current_a(self, force_n: float) -> float:
@@ -244,10 +245,16 @@ class _EmptyJaws:
         self._due_ns = max(self._due_ns + self._period_ns, devices.clock.now_ns())
         devices.clock.sleep_until_ns(self._due_ns)
         devices.check()
-        self.state = state = devices.servo.read()
+        self.state = state = read_patiently(
+            devices.servo,
+            devices.clock,
+            self.state,
+            period_ns=self._period_ns,
+            patience_ns=self._config.servo.bus_watchdog_ms * NS_PER_MS,
+        )
         if self._safety.check(state, self._goal_a, 1 / _RATE_HZ, over_force=False):
             raise DeviceError(f"stopped: {self._safety.reason}; remove the cause and start again")
-        self._goal_a = min(current_a, self._limits.ceiling_a(0.0, self._middle_rad))
+        self._goal_a = min(current_a, self._ceiling_a)
         command = ServoCommand(self._due_ns, state.position_rad + side, self._goal_a)
         speed_m_s = speed_share * self._config.control.approach_speed_m_s
         devices.servo.write(self._speed_limit.apply(command, state, speed_m_s))
@@ -259,12 +266,19 @@ class _EmptyJaws:
 
     def find_ends(self) -> tuple[float, float]:
         """Returns the angles at the upper and the lower end. Jaws that friction holds get more current."""
-        ceiling_a = self._limits.ceiling_a(0.0, self._middle_rad)
         while True:
             high_rad, low_rad = self._find_end(1), self._find_end(-1)
-            if high_rad - low_rad > _LEAST_TRAVEL_RAD or self._end_a >= ceiling_a:
+            if high_rad - low_rad > _LEAST_TRAVEL_RAD or self._end_a >= self._ceiling_a:
                 return high_rad, low_rad
-            self._end_a = min(_MORE * self._end_a, ceiling_a)
+            self.raise_current()
+
+    def raise_current(self) -> None:
+        """Raises the current of the coming motions."""
+        self._end_a = min(_MORE * self._end_a, self._ceiling_a)
+
+    @property
+    def _ceiling_a(self) -> float:
+        return self._limits.ceiling_a(0.0, self._middle_rad)
 
     def _find_end(self, side: int) -> float:
         """Returns the angle at an end, which more current does not move."""
@@ -276,11 +290,10 @@ class _EmptyJaws:
             if abs(self.state.position_rad - before_rad) < _GIVES_RAD:
                 self._end_a /= _MORE
                 return before_rad
-            ceiling_a = self._limits.ceiling_a(0.0, self._middle_rad)
-            if self._end_a > ceiling_a:
+            if self._end_a > self._ceiling_a:
                 raise DataError(
-                    f"the jaws need more than {ceiling_a:.2f} A to move, the current at control.force_limit_n; check "
-                    "that nothing lies between them, servo.model and gripper.friction_n"
+                    f"the jaws need more than {self._ceiling_a:.2f} A to move, the current at control.force_limit_n; "
+                    "check that nothing lies between them, servo.model and gripper.friction_n"
                 )
 
     def _run_to_standstill(self, side: int) -> None:
@@ -318,13 +331,12 @@ class _EmptyJaws:
     def _break_away(self, side: int) -> float:
         begin_rad, current_a = self.state.position_rad, 0.0
         step_a = self._current_a(_RISE_N_S) / _RATE_HZ
-        ceiling_a = self._limits.ceiling_a(0.0, self._middle_rad)
         while side * (self.state.position_rad - begin_rad) < _MOVED_RAD:
             current_a += step_a
-            if current_a > ceiling_a:
+            if current_a > self._ceiling_a:
                 raise DataError(
-                    f"the jaws do not move at {begin_rad:.2f} rad with {ceiling_a:.2f} A, although they moved there "
-                    "before; check that they run smoothly"
+                    f"the jaws do not move at {begin_rad:.2f} rad with {self._ceiling_a:.2f} A, although they moved "
+                    "there before; check that they run smoothly"
                 )
             self.cycle(side, current_a)
         return current_a

@@ -28,8 +28,9 @@ from gripper_force.profiles.rig_profile import (
     update_rig,
 )
 from gripper_force.runtime.backends import open_devices
+from gripper_force.runtime.reading import read_patiently
 from gripper_force.runtime.resolve import position_loop, resolve
-from gripper_force.types import NS_PER_S, ServoCommand, ServoState
+from gripper_force.types import NS_PER_MS, NS_PER_S, ServoCommand, ServoState
 
 PRESSES: Final = ((3.0, 1.0), (6.0, 1.0), (12.0, 1.0), (3.0, 0.6), (6.0, 0.8), (12.0, 0.8))
 """Rate in N/s and share of the largest force of each press. Several rates separate lag from friction."""
@@ -380,7 +381,13 @@ class _Jaws:
         self._due_ns = max(self._due_ns + self._period_ns, devices.clock.now_ns())
         devices.clock.sleep_until_ns(self._due_ns)
         devices.check()
-        self.state = state = devices.servo.read()
+        self.state = state = read_patiently(
+            devices.servo,
+            devices.clock,
+            self.state,
+            period_ns=self._period_ns,
+            patience_ns=self._config.servo.bus_watchdog_ms * NS_PER_MS,
+        )
         for sample in self._cell.drain():
             if sample.valid:
                 self._sample_ns = max(self._sample_ns, sample.t_ns)

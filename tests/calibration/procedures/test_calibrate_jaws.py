@@ -1,6 +1,8 @@
 """Homing on the simulated rig, whose ends, closing direction and friction are known."""
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +17,8 @@ from gripper_force.cli import app
 from gripper_force.config import Config, load_config
 from gripper_force.control.linkage import make_linkage
 from gripper_force.errors import DataError, DeviceError
+from gripper_force.interfaces import Devices
+from gripper_force.runtime.backends import open_devices
 from gripper_force.types import ServoState
 from gripper_hw.dynamixel.servo import DynamixelServo
 from gripper_hw.dynamixel.virtual import VirtualBus, find_bus
@@ -81,6 +85,33 @@ def test_friction_beyond_the_configured_one_is_overcome(times: int) -> None:
     assert result.friction_n == pytest.approx(0.95 * times, rel=0.15)
     # The simulated stops give by 2 mm under the current that this friction needs.
     assert result.closed_end_rad == pytest.approx(CLOSED_END_RAD, abs=0.1)
+
+
+@pytest.mark.parametrize("friction_n", [0.1, 5.0])
+def test_the_configured_friction_does_not_change_the_ends(friction_n: float) -> None:
+    result = home("seed=3", f"gripper.friction_n={friction_n}")
+    assert result.open_width_m == pytest.approx(0.100, abs=0.003)
+
+
+def test_an_object_between_the_jaws_is_pressed_gently(monkeypatch: pytest.MonkeyPatch) -> None:
+    forces_n: list[float] = []
+
+    @contextmanager
+    def observed(config: Config) -> Iterator[Devices]:
+        with open_devices(config) as devices:
+            assert devices.observe_world is not None
+            devices.observe_world(lambda state: forces_n.append(state.force_n))
+            yield devices
+
+    monkeypatch.setattr(procedure, "open_devices", observed)
+    with pytest.raises(DataError, match="nothing lies between"):
+        home("object=sponge")
+    assert 0.3 < max(forces_n) < 2.0
+
+
+def test_a_silence_of_the_bus_that_the_watchdog_tolerates_is_no_error() -> None:
+    result = home("seed=3", "faults=[{unit: bus, kind: slow, at_s: 3, for_s: 0.02}]")
+    assert result.open_width_m == pytest.approx(0.100, abs=0.003)
 
 
 def test_jaws_that_nothing_moves_are_named() -> None:
