@@ -159,24 +159,6 @@ def keys(section: type[Section], under: str = "") -> Iterator[tuple[str, FieldIn
             yield f"{under}{name}", field
 
 
-def write_all(files: dict[Path, bytes]) -> None:
-    """Writes several files; none appears under its name before all are complete.
-
-    Raises:
-        ConfigError: One can't be written.
-    """
-    parts = {path: path.with_name(f".{path.name}.part") for path in files}
-    try:
-        for path, data in files.items():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            parts[path].write_bytes(data)
-        for path, part in parts.items():
-            part.replace(path)
-    except OSError as error:
-        names = " and ".join(map(str, files))
-        raise ConfigError(f"can't write {names}: {error.strerror}, {error.filename}") from error
-
-
 def _parse(text: str, what_fails: str) -> Any:
     try:
         return yaml.safe_load(text)

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 from safetensors import SafetensorError
-from safetensors.numpy import load, save
+from safetensors.numpy import load
 
 from gripper_force.errors import ConfigError
 from gripper_force.profiles.object_profile import ObjectProfile, OodLimit, weights_path
@@ -115,17 +115,6 @@ def curve_n(estimate_n: Floats, force_n: Floats, at_n: npt.ArrayLike) -> Floats:
     slope = np.diff(force_n) / np.diff(estimate_n)
     value: Floats = force_n[segment] + slope[segment] * (at - estimate_n[segment])
     return value
-
-
-def pack(arrays: ProfileArrays) -> bytes:
-    """Returns the content of the safetensors file beside a profile, with the axes in half precision."""
-    tensors = {name: getattr(arrays, name).astype(np.float32) for name in _NAMES}
-    if arrays.known is not None:
-        mean, axes, floor, _ = arrays.known
-        tensors |= {"mean": mean.astype(np.float32), "axes": np.ascontiguousarray(axes, np.float16)}
-        tensors["floor"] = np.array([floor], np.float32)
-    data: bytes = save(tensors)
-    return data
 
 
 def load_correction(

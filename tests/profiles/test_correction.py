@@ -9,13 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gripper_force.errors import ConfigError
+from gripper_force.jobs.profile_files import pack
 from gripper_force.profiles.correction import (
     Correction,
     KnownFrames,
     ProfileArrays,
     curve_n,
     load_correction,
-    pack,
 )
 from gripper_force.profiles.object_profile import (
     Interval,

@@ -11,8 +11,8 @@ import torch
 
 from gripper_force.config import VisionConfig
 from gripper_force.errors import ConfigError, DataError, NonFiniteError
-from gripper_force.jobs.profile_files import write_object
-from gripper_force.profiles.correction import Correction, KnownFrames, ProfileArrays, pack
+from gripper_force.jobs.profile_files import pack, write_object
+from gripper_force.profiles.correction import Correction, KnownFrames, ProfileArrays
 from gripper_force.profiles.object_profile import Interval, ObjectProfile, OodLimit, OutputCurve
 from gripper_force.types import ForceEstimate
 from gripper_force.vision.batch_inference import features, predict

@@ -50,15 +50,14 @@ from gripper_force.errors import ConfigError, DataError
 from gripper_force.interfaces import Progress, Prompt, no_progress
 from gripper_force.jobs.dataset import CONTACT_N, Clip, load_clips
 from gripper_force.jobs.processes import process_pool
-from gripper_force.jobs.profile_files import check_place, write_object
+from gripper_force.jobs.profile_files import check_place, pack, write_all, write_object
 from gripper_force.jobs.training.ood_fit import model_of_scores
 from gripper_force.jobs.training.recipe import recipe
 from gripper_force.jobs.training.stated_errors import errors, residuals
 from gripper_force.jobs.training.train import train
-from gripper_force.profiles.correction import KnownFrames, ProfileArrays, pack
+from gripper_force.profiles.correction import KnownFrames, ProfileArrays
 from gripper_force.profiles.object_profile import BUNDLED, ObjectProfile, user_folder
 from gripper_force.runtime.resolve import ResolvedConfig, resolve_vision
-from gripper_force.schema import write_all
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
 from gripper_force.vision.checkpoint_writer import replace_header
 from gripper_force.vision.estimator import claimed_std_n

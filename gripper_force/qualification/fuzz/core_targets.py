@@ -30,9 +30,10 @@ from gripper_force.errors import GripperError
 from gripper_force.jobs.dataset import load_clip
 from gripper_force.jobs.grasp import summarise
 from gripper_force.jobs.imports.video import estimate_tare, read_forces
+from gripper_force.jobs.profile_files import pack
 from gripper_force.jobs.replay import replay
 from gripper_force.jobs.report.data import read_run
-from gripper_force.profiles.correction import Correction, KnownFrames, ProfileArrays, load_correction, pack
+from gripper_force.profiles.correction import Correction, KnownFrames, ProfileArrays, load_correction
 from gripper_force.profiles.object_profile import (
     Interval,
     ObjectProfile,
