@@ -67,6 +67,7 @@ PUBLIC = [
     "open_gripper",
     "own_process",
     "replay",
+    "teach",
 ]
 
 
