@@ -643,10 +643,11 @@ class Config(Section):
             "camera": set(CameraConfig.model_fields) - CAMERA_OTHER_KEYS,
             "vision": {"region"},
             "gripper": {"linkage", "pinion_radius_m", "open_width_m"},
-            "sim": {"tool", "view_spread", "jaw_spread"},
+            "sim": {"tool", "view_spread", "jaw_spread", "camera", "jaws", "light"},
         }
         tree = self.model_dump(mode="json", include=dict(parts))
-        tree["gripper.linkage"] = tree["gripper"].pop("linkage")
+        for part, key in (("gripper", "linkage"), ("sim", "camera"), ("sim", "jaws"), ("sim", "light")):
+            tree[f"{part}.{key}"] = tree[part].pop(key)
         return {f"{part}.{key}": value for part in tree for key, value in tree[part].items()}
 
 

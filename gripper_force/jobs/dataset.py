@@ -32,8 +32,15 @@ _VIEW_KEYS: Final = (
     "camera_offset_m",
     "camera_target_offset_m",
     "camera_fovy_deg",
+    "camera_from_grip_m",
+    "camera_aim_m",
+    "camera_roll_deg",
+    "camera_blur_px",
     "pad_half_m",
     "finger_half_m",
+    "pad_rgb",
+    "finger_rgb",
+    "background",
 )
 """Keys of a simulated scene that tell one rig from another."""
 
