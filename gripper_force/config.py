@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from pathlib import Path
-from typing import Any, ClassVar, Final, Literal, Self
+from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
 from pydantic import Field, PositiveInt, model_validator
 
@@ -447,49 +447,81 @@ class ControlConfig(Section):
         return gain, lag_ms * 1e-3, delay_ms * 1e-3
 
 
+Metre = Annotated[float, Field(ge=-1, le=1)]
+Vector = tuple[Metre, Metre, Metre]
+PadLength = Annotated[float, Field(ge=0.004, le=0.05)]
+Share = Annotated[float, Field(ge=0, le=1)]
+Colour = tuple[Share, Share, Share]
+
+
+class SimCameraConfig(Section):
+    """Place and image of the simulated camera; the point between the jaws' tips is the origin."""
+
+    position_m: Vector = Field(
+        (0.10, -0.30, 0.125), description="x: travel of the jaws, y: to the wall, z: up"
+    )
+    aim_m: Vector = Field((0.0, 0.0, 0.0), description="point in the middle of the image")
+    fov_deg: float = Field(17.0, ge=2, le=120, description="field of view from edge to edge of the image")
+    roll_deg: float = Field(0.0, ge=-180, le=180, description="rotation of the camera about its optical axis")
+    blur_px: float = Field(0.0, ge=0, le=10, description="standard deviation of the lens's blur")
+    noise: Share | None = Field(
+        None, description="photon noise of a white pixel; None: drawn, 0.012 to 0.024"
+    )
+
+
+class SimJawsConfig(Section):
+    """Size and colour (red, green, blue) of the simulated jaws."""
+
+    pad_m: tuple[PadLength, PadLength] = Field((0.024, 0.022), description="depth and height of a pad")
+    finger_m: PadLength = Field(0.016, description="depth of a finger")
+    pad_rgb: Colour = Field((0.16, 0.17, 0.19), description="colour of the pads")
+    finger_rgb: Colour = Field((0.78, 0.78, 0.80), description="colour of the fingers")
+
+
+class SimLightConfig(Section):
+    """Light and background of the simulated world, beside ``sim.lux``."""
+
+    direction: Vector = Field((-0.40, 0.55, -0.75), description="direction in which the light shines")
+    ambient: Share = Field(0.30, description="share of the light that comes from everywhere")
+    background: float = Field(1.0, ge=0, le=2, description="factor on the brightness of table and wall")
+
+
 class SimConfig(Section):
     """The simulated world; read only if a device is simulated."""
 
+    camera: SimCameraConfig = SimCameraConfig()
+    jaws: SimJawsConfig = SimJawsConfig()
+    light: SimLightConfig = SimLightConfig()
+    object: Path | None = Field(
+        None, description="file of the simulated object; object=FOLDER/mug.yaml sets it"
+    )
     detail: Literal["coarse", "medium", "fine", "auto"] = Field(
         "medium",
         description="mesh and time step; auto: the fastest level that keeps budget.sim_error_n and "
         "budget.sim_speed by the table of `gripper-force bench scene`",
     )
-    lux: float | None = Field(
-        None, description="light level 350, 550 or 750; None: drawn from the seed", gt=0
-    )
-    tool: Literal["pads", "rods"] = Field(
+    lux: Positive | None = Field(None, description="light level 350, 550 or 750; None: drawn from the seed")
+    tool: Literal["pads", "discs", "rods"] = Field(
         "pads",
-        description="jaw tips: flat pads, or rods with round tips, which press the wall of a turned object "
-        "where the edge of a pad would catch on its rim",
+        description="jaw tips: flat pads, flat round discs, or rods with round tips, which press the wall of a turned "
+        "object where the edge of a pad would catch on its rim",
     )
-    yaw_deg: float = Field(
-        0.0, ge=-90, le=90, description="rotation of the object about the vertical, added to the drawn one"
-    )
+    yaw_deg: float = Field(0.0, ge=-90, le=90, description="rotation of the object, added to the drawn one")
     randomise: bool = Field(
         True, description="draw size, pose, camera, texture, light and motor from the seed"
     )
-    object_seed: int | None = Field(
-        None, ge=0, description="seed of the object (size, stiffness, texture); None: seed"
-    )
+    object_seed: int | None = Field(None, ge=0, description="seed of size, stiffness and texture; None: seed")
     rig_seed: int | None = Field(
         None,
         ge=0,
-        description="seed of the gripper and its surroundings (camera, light, noise, table, motor, friction, "
-        "gears, rods); None: seed",
+        description="seed of the gripper and its surroundings (camera, light, table, motor, gears, rods); None: seed",
     )
     size_spread: float = Field(
-        0.04, ge=0, le=0.15, description="half-width of the uniform spread of the object's size"
+        0.04, ge=0, le=0.15, description="half-width of the uniform spread of the size"
     )
-    stiffness_spread: float = Field(
-        0.05, ge=0, le=0.5, description="half-width of the uniform spread of the object's stiffness"
-    )
+    stiffness_spread: float = Field(0.05, ge=0, le=0.5, description="the same of the object's stiffness")
     stiffness_octaves: float = Field(
-        0.0,
-        ge=0,
-        le=1,
-        description="half-width in octaves of a further, log-uniform spread of the object's stiffness; "
-        "1: factors 0.5 to 2",
+        0.0, ge=0, le=1, description="further, log-uniform spread; 1: factors 0.5 to 2"
     )
     view_spread: float = Field(
         1.0,
@@ -510,20 +542,10 @@ class SimConfig(Section):
     moving_background: bool = Field(False, description="things that move behind the object")
     camera_latency_ms: NonNegative = Field(15.0, description="time from mid-exposure to the frame")
     exposure_ms: Positive = Field(4.0, description="exposure at camera.exposure_us 4000")
-    friction: Positive | None = Field(
-        None,
-        description="true friction of motor and rails over that of the default rig; None: drawn, 0.7 to 1.3",
-    )
-    gain: Positive | None = Field(
-        None, description="true torque constant over the servo model's; None: drawn, 0.92 to 1.08"
-    )
-    stiffness: Positive | None = Field(
-        None,
-        description="true stiffness of the object over that of its kind; None: drawn by stiffness_spread",
-    )
-    open_width_m: Positive | None = Field(
-        None, description="true distance between the open jaws; None: gripper.open_width_m"
-    )
+    friction: Positive | None = Field(None, description="true friction over the default rig's; None: drawn")
+    gain: Positive | None = Field(None, description="true torque constant over the model's; None: drawn")
+    stiffness: Positive | None = Field(None, description="true stiffness over that of the kind; None: drawn")
+    open_width_m: Positive | None = Field(None, description="true open width; None: gripper.open_width_m")
 
 
 class CalibrationConfig(Section):
@@ -535,7 +557,9 @@ class CalibrationConfig(Section):
         "configuration file and --set replace its values",
     )
     object: str | None = Field(
-        None, description="object profile: a name or a path; own: the one named like `object`"
+        None,
+        description="object profile or bundle: a name or a path; own: the one named like `object`; none: none; None: "
+        "the bundle that `gripper-force teach` made of `object`, if there is one",
     )
     on_mismatch: Literal["refuse", "warn"] = Field(
         "refuse", description="what to do if a profile belongs to another device than the run's"
@@ -554,7 +578,8 @@ class Config(Section):
 
     object: str = Field(
         "sponge",
-        description="name of the grasped object; simulated: sponge, paper_cup, tube, stapler, ball or block",
+        description="name of the grasped object; simulated: sponge, paper_cup, tube, stapler, ball, block, a kind of "
+        "docs/simulation.md, or the path of a file of your own (.yaml or .xml)",
     )
     target_n: Positive = Field(4.0, description="target force")
     seed: int = Field(0, ge=0, description="seed for all random draws")
@@ -579,6 +604,15 @@ class Config(Section):
         (), description="faults to inject into simulated devices: unit, kind, at_s, for_s, id"
     )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _split_object(cls, tree: Any) -> Any:
+        """Makes of a simulated object's file, given as ``object``, its name and ``sim.object``."""
+        path, sim = (tree.get("object"), tree.get("sim", {})) if isinstance(tree, dict) else (None, None)
+        if not str(path).endswith((".yaml", ".xml")) or not isinstance(sim, dict | SimConfig):
+            return tree
+        return tree | {"object": Path(str(path)).stem, "sim": {**dict(sim), "object": path}}
+
     @model_validator(mode="after")
     def _check_fingers(self) -> Self:
         if self.gripper.linkage.kind == "finger" and len(self.servo.ids) > 1:
@@ -595,18 +629,26 @@ class Config(Section):
     @property
     def profile(self) -> str | None:
         """Name or path of the object profile, or None."""
-        return self.object if self.calibration.object == "own" else self.calibration.object
+        name = self.calibration.object
+        return {"own": self.object, "none": None}.get(name, name) if name is not None else None
 
     @property
     def uses_vision(self) -> bool:
         """True if the run has a camera and a network."""
         return self.camera.backend != "none" and self.vision.checkpoint != "none"
 
-    def camera_settings(self) -> Tree:
-        """Camera keys and values that an object profile is bound to."""
-        camera = self.camera.model_dump(mode="json", exclude=CAMERA_OTHER_KEYS)
-        settings = {f"camera.{key}": value for key, value in camera.items()}
-        return {**settings, "vision.region": self.vision.region and list(self.vision.region)}
+    def rig_settings(self) -> Tree:
+        """Keys and values of camera, view and gripper that networks and object profiles are bound to."""
+        parts = {
+            "camera": set(CameraConfig.model_fields) - CAMERA_OTHER_KEYS,
+            "vision": {"region"},
+            "gripper": {"linkage", "pinion_radius_m", "open_width_m"},
+            "sim": {"tool", "view_spread", "jaw_spread", "camera", "jaws", "light"},
+        }
+        tree = self.model_dump(mode="json", include=dict(parts))
+        for part, key in (("gripper", "linkage"), ("sim", "camera"), ("sim", "jaws"), ("sim", "light")):
+            tree[f"{part}.{key}"] = tree[part].pop(key)
+        return {f"{part}.{key}": value for part in tree for key, value in tree[part].items()}
 
 
 Overrides = Sequence[str | tuple[str, Any]] | Mapping[str, Any]

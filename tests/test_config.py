@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from gripper_force.config import (
     HARD_FORCE_LIMIT_N,
     Config,
+    SimConfig,
     config_from,
     config_from_text,
     dump_config,
@@ -256,3 +257,15 @@ def test_a_lens_position_that_an_oak_does_not_have_is_refused() -> None:
     assert (
         load_config(None, {"camera.backend": "uvc", "camera.lens_position": 999}).camera.lens_position == 999
     )
+
+
+def test_the_path_of_an_object_becomes_its_name_and_its_file() -> None:
+    for config in (
+        load_config(None, ["object=things/mug.yaml", "sim.lux=350"]),
+        Config(object="things/mug.yaml", sim=SimConfig(lux=350)),
+    ):
+        assert (config.object, config.sim.object, config.sim.lux) == ("mug", Path("things/mug.yaml"), 350)
+    again = config_from_text(dump_config(config), "a log")
+    assert (again.object, again.sim.object) == ("mug", Path("things/mug.yaml"))
+    assert load_config(None, {"object": "clip.xml"}).sim.object == Path("clip.xml")
+    assert load_config(None, {"object": "mug"}).sim.object is None

@@ -32,6 +32,7 @@ for _command in (  # in the order of --help
     runs.replay,
     data.record,
     data.simulate,
+    calibrate.teach,
     learning.train,
     learning.evaluate,
     learning.reproduce,

@@ -33,8 +33,8 @@ def simulate(
         list[str] | None,
         typer.Option(
             "--object",
-            help="Simulate this object, or a group: training-kinds, held-out-kinds. Repeatable.  "
-            "[default: all four, in turn]",
+            help="Simulate this object (a name, or the path of its file), or a group: training-kinds, "
+            "held-out-kinds. Repeatable.  [default: all four, in turn]",
         ),
     ] = None,
     protocol: Annotated[

@@ -66,7 +66,7 @@ def setup(
 def _next(load_cell: str, vision: bool, path: Path) -> str:
     """The command that follows: teaching needs camera and load cell."""
     if vision and load_cell != "none":
-        return f"gripper-force calibrate object NAME --config {path}"
+        return f"gripper-force teach NAME --config {path}"
     return f"gripper-force grasp --config {path} --target-n 3"
 
 

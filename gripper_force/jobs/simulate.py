@@ -62,7 +62,7 @@ class SimulationPlan:
 
     Attributes:
         kind: Kind of the run.
-        object: The simulated object.
+        object: The simulated object, by name or by the path of its file.
         seed: Seed of all random draws.
     """
 
@@ -73,7 +73,8 @@ class SimulationPlan:
     @property
     def name(self) -> str:
         """File name of the log."""
-        return f"{self.kind}-{self.object}-{self.seed:06d}.mcap"
+        name = config_from({"object": self.object}, "simulate").object
+        return f"{self.kind}-{name}-{self.seed:06d}.mcap"
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -122,7 +123,7 @@ def make_log(task: SimulationPlan, out: Path, config: Tree) -> Path:
         config: Configuration as plain data.
     """
     rng = np.random.default_rng([task.seed, 10])
-    drawn = _randomised(config_from(config, "simulate"), task, rng)
+    drawn = _randomised(config_from({**config, "object": task.object}, "simulate"), task, rng)
     path, unfinished = out / task.name, out / f".{task.name}.part"
     unfinished.unlink(missing_ok=True)
     if task.kind == "grasp":
@@ -144,7 +145,6 @@ def _randomised(config: Config, task: SimulationPlan, rng: np.random.Generator) 
     )
     return config.model_copy(
         update={
-            "object": task.object,
             "seed": task.seed,
             "target_n": _draw_target_n(rng),
             "control": control,

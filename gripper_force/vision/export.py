@@ -1,10 +1,8 @@
 """Export of a checkpoint to ONNX or OpenVINO. Each file is checked against PyTorch before it is kept."""
 
 import logging
-import math
 import shutil
 import warnings
-import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from io import StringIO
@@ -15,13 +13,13 @@ from typing import Any, Final, TypedDict
 import numpy as np
 import torch
 
-from gripper_force.errors import CheckpointError, ConfigError, DataError
+from gripper_force.errors import CheckpointError, ConfigError
 from gripper_force.types import Gray
 from gripper_force.vision.checkpoint import load_checkpoint
-from gripper_force.vision.engines import Engine, Floats, Step, open_engine
+from gripper_force.vision.engines import Engine, Floats, open_engine
 from gripper_force.vision.engines.pytorch import TorchEngine, restored_threads
 from gripper_force.vision.ensemble_step import FRAME, EnsembleStep, state_names
-from gripper_force.vision.header import EXPORTED, KEY, Header, Model, Residual, exported_metadata
+from gripper_force.vision.header import EXPORTED, KEY, Model, exported_metadata
 from gripper_force.vision.preprocess import Normaliser
 
 TOLERANCE: Final = 1e-4
@@ -32,9 +30,6 @@ _CHECKED: Final = 30
 
 _CLIPS: Final = 4
 """Recordings that a quantised network is checked on."""
-
-_SAMPLES: Final = 300
-"""Frames that int8 ranges are calibrated on; NNCF's default."""
 
 
 class ExportErrors(TypedDict):
@@ -51,40 +46,44 @@ class ExportErrors(TypedDict):
     rms_n: float
 
 
-def export(model: Model, path: Path, frames: Sequence[Gray] | None = None) -> ExportErrors:
+def export(model: Model, path: Path) -> ExportErrors:
     """Writes an ensemble's streaming step as an ONNX or OpenVINO file.
-
-    With ``frames`` the convolutions are quantised to int8. Other layers, a tenth of the arithmetic or less,
-    stay in floating point: with the whole network in int8, errors exceeded 1 N.
 
     Args:
         model: The checkpoint.
         path: File to write; its suffix selects the format. An OpenVINO file's weights go beside it, into
             ``.bin``.
-        frames: Recordings, (T, S, S) uint8 each, to calibrate the ranges of int8 on; None for float32.
 
     Returns:
-        The difference from PyTorch, on the recordings or on noise. The header of an int8 file claims errors
-        that include it.
+        The difference from PyTorch, on noise.
 
     Raises:
         ConfigError: The suffix is unknown, or a package is not installed.
         CheckpointError: The checkpoint can't be read, or the exported network computes something else.
-        DataError: The recordings hold too few frames.
+    """
+    with written(path) as made:
+        if path.suffix == ".xml":
+            save_openvino(openvino_network(model), model, made)
+        else:
+            _save_onnx(model, made)
+        return compare(model, made)
+
+
+@contextmanager
+def written(path: Path) -> Iterator[Path]:
+    """Yields a file in a folder of its own, and moves it, with what lies beside it, to ``path`` at the end.
+
+    Raises:
+        ConfigError: The suffix is unknown, or a package is not installed.
+        CheckpointError: The file can't be written.
     """
     if path.suffix not in EXPORTED:
         raise ConfigError(f"can't export to {path}; name a file that ends in {' or '.join(EXPORTED)}")
-    if frames is not None and path.suffix != ".xml":
-        raise ConfigError(f"int8 is exported to OpenVINO only, not to {path}; name a file that ends in .xml")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=path.parent) as folder, _quiet(), restored_threads():
             torch.set_num_threads(1)  # the rounding of sums depends on the number of threads
-            made = Path(folder) / path.name
-            (_openvino if path.suffix == ".xml" else _onnx)(model, made, frames)
-            errors = _check(model, made, frames)
-            if frames is not None:
-                _replace_header(with_added_error(model.header, errors), made)
+            yield Path(folder) / path.name
             # The weights first: a process that finds the .xml must find its .bin too.
             for part in sorted(Path(folder).iterdir(), key=lambda part: part.suffix == path.suffix):
                 shutil.move(part, path.parent / part.name)
@@ -95,10 +94,9 @@ def export(model: Model, path: Path, frames: Sequence[Gray] | None = None) -> Ex
         ) from error
     except OSError as error:
         raise CheckpointError(f"can't write {path}: {error.strerror}; name another file") from error
-    return errors
 
 
-def _onnx(model: Model, path: Path, _frames: Sequence[Gray] | None) -> None:
+def _save_onnx(model: Model, path: Path) -> None:
     step, inputs = _traced(model)
     program = torch.onnx.export(
         step,
@@ -114,7 +112,8 @@ def _onnx(model: Model, path: Path, _frames: Sequence[Gray] | None) -> None:
     program.save(str(path))
 
 
-def _openvino(model: Model, path: Path, frames: Sequence[Gray] | None) -> None:
+def openvino_network(model: Model) -> Any:
+    """Returns an ensemble's streaming step as a network of OpenVINO."""
     import openvino
 
     step, inputs = _traced(model)
@@ -127,58 +126,16 @@ def _openvino(model: Model, path: Path, frames: Sequence[Gray] | None) -> None:
     network.validate_nodes_and_infer_types()
     for port, name in zip(network.outputs, step.outputs, strict=True):
         port.get_tensor().set_names({name})
-    if frames is not None:
-        network = _quantised(network, model, frames)
+    return network
+
+
+def save_openvino(network: Any, model: Model, path: Path) -> None:
+    """Writes a network of OpenVINO with a model's header and digest."""
+    import openvino
+
     for name, text in exported_metadata(model).items():
         network.set_rt_info(text, [KEY, name])
     openvino.save_model(network, path, compress_to_fp16=False)
-
-
-def _quantised(network: Any, model: Model, frames: Sequence[Gray]) -> Any:
-    """Quantises the convolutions to int8: weights with a scale per channel, inputs calibrated on frames."""
-    import nncf
-
-    total = sum(len(clip) for clip in frames)
-    if total < _SAMPLES:
-        raise DataError(
-            f"int8 needs at least {_SAMPLES} frames, and the recordings hold {total}; record more"
-        )
-    engine = _InputRecorder(model, total // _SAMPLES)
-    for clip in frames:
-        engine.reset()
-        for frame in inputs_of(model, clip):
-            engine.step(frame)
-    kept = {"Convolution", "GroupConvolution"}
-    nodes = network.get_ops()
-    others = sorted({node.get_type_name() for node in nodes} - kept)
-    # The first convolution stays too: one input channel, so little to gain, and small input values.
-    first = [
-        n.get_friendly_name()
-        for n in nodes
-        if n.get_type_name() == "Convolution" and n.input(1).get_shape()[1] == 1
-    ]
-    return nncf.quantize(
-        network,
-        nncf.Dataset(engine.recorded),
-        subset_size=len(engine.recorded),
-        fast_bias_correction=False,
-        ignored_scope=nncf.IgnoredScope(types=others, names=first, validate=False),
-    )
-
-
-class _InputRecorder(TorchEngine):
-    """Records the inputs of every n-th step."""
-
-    def __init__(self, model: Model, every: int) -> None:
-        super().__init__(model)
-        self.recorded: list[list[Floats]] = []
-        self._every, self._count = every, 0
-
-    def _infer(self, frame: Floats) -> Step:
-        self._count += self._begun
-        if self._begun and self._count % self._every == 0:
-            self.recorded.append([frame[None, None], *(np.array(tensor) for tensor in self._states)])
-        return super()._infer(frame)
 
 
 def _traced(model: Model) -> tuple[EnsembleStep, tuple[torch.Tensor, ...]]:
@@ -194,7 +151,12 @@ def inputs_of(model: Model, clip: Gray) -> Iterator[Floats]:
         yield from normaliser.push(frame)
 
 
-def _check(model: Model, path: Path, frames: Sequence[Gray] | None) -> ExportErrors:
+def compare(model: Model, path: Path, frames: Sequence[Gray] | None = None) -> ExportErrors:
+    """Compares an exported file with PyTorch, on recordings, (T, S, S) uint8 each, or on noise.
+
+    Raises:
+        CheckpointError: The file computes something else; on recordings, only if its estimates are not finite.
+    """
     exact = frames is None
     if frames is None:
         size = model.header.preprocess.size
@@ -217,34 +179,6 @@ def _check(model: Model, path: Path, frames: Sequence[Gray] | None) -> ExportErr
         "mean_n": float(error_n.mean()),
         "rms_n": float(np.sqrt(np.square(error_n).mean())),
     }
-
-
-def with_added_error(header: Header, errors: ExportErrors) -> Header:
-    """Returns the header with larger claimed errors, and without a score, which the rounding would exceed.
-
-    Args:
-        header: Header of the checkpoint.
-        errors: Additional errors, taken as independent of the ones claimed so far.
-    """
-    added_n = {"mae_n": errors["mean_n"], "rmse_n": errors["rms_n"]}
-    residuals = tuple(
-        Residual(force_n=residual.force_n, std_n=math.hypot(residual.std_n, errors["rms_n"]))
-        for residual in header.residuals
-    )
-    metrics = {
-        name: math.hypot(value, added_n[name]) if name in added_n else value
-        for name, value in header.metrics.items()
-    }
-    return header.model_copy(update={"residuals": residuals, "metrics": metrics, "ood": None})
-
-
-def _replace_header(header: Header, path: Path) -> None:
-    """Replaces the header in an OpenVINO file."""
-    tree = ET.parse(path)  # noqa: S314 - written just before
-    entry = tree.find(f"rt_info/{KEY}/header")
-    assert entry is not None
-    entry.set("value", header.model_dump_json(exclude_none=True))
-    tree.write(path, encoding="utf-8", xml_declaration=True)
 
 
 def _estimates(engine: Engine, model: Model, clip: Gray) -> Floats:

@@ -23,11 +23,12 @@ from gripper_force.errors import ConfigError
 from gripper_force.interfaces import Progress
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import Clip
+from gripper_force.jobs.int8_export import export_int8
 from gripper_force.qualification.bench.roofline import Roofline, measure
 from gripper_force.types import NS_PER_MS
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.engines import Engine, Floats, Precision, open_engine
-from gripper_force.vision.export import export, inputs_of
+from gripper_force.vision.export import inputs_of
 from gripper_force.vision.header import Model, NetworkConfig
 from gripper_force.vision.model_files import cache_folder, read_model
 from gripper_force.vision.selection import installed
@@ -142,7 +143,7 @@ def bench(
         model = read_model(source)
         clips = held_out(model)
         int8_path = cache_folder() / f"{model.digest[:32]}-int8.xml"
-        export(model, int8_path, [clip.frames for clip in scaling(model)])
+        export_int8(model, int8_path, [clip.frames for clip in scaling(model)])
         progress(f"{source}: int8")
         variants = [(model, *variant) for variant in _variants()]
         variants += [(read_model(int8_path), "openvino", "int8", "bfloat16")]

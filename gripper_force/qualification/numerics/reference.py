@@ -19,6 +19,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from gripper_force.jobs.int8_export import export_int8
 from gripper_force.types import Gray
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.engines import Engine, Floats, Precision, open_engine
@@ -123,7 +124,8 @@ class ReferenceEnsemble:
         if variant.engine != "torch":
             path = self._folder / f"{model.path.stem}{variant.file}"
             if not path.exists():
-                reported = export(model, path, clips if variant.precision == "int8" else None)
+                int8 = variant.precision == "int8"
+                reported = export_int8(model, path, clips) if int8 else export(model, path)
                 self.reported_n = reported["largest_n"]
             model = read_model(path)
         precision: Precision = "bfloat16" if variant.precision == "bfloat16" else "float32"

@@ -1,7 +1,7 @@
 """Meshes of simulated objects, and what an object is to a scene."""
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +25,8 @@ class ObjectModel:
         texture: File name of the texture image, or None for a plain material.
         grip_height_m: Height of the jaws above the table.
         timestep_s: Physics step for this mesh.
+        files: Further files of the object's own, by the name that its MJCF has.
+        spec: A body from an MJCF file as a ``mujoco.MjSpec``, to be attached to ``body``; or None.
     """
 
     body: str
@@ -32,6 +34,8 @@ class ObjectModel:
     texture: str | None
     grip_height_m: float
     timestep_s: float
+    files: dict[str, bytes] = field(default_factory=dict)
+    spec: Any = None
 
 
 def solid_cube(cells: int) -> tuple[Points, Indices]:

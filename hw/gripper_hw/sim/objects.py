@@ -5,11 +5,12 @@ against the finest level.
 """
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
 from gripper_force.errors import ConfigError
-from gripper_hw.sim.kinds import build_kind, load_kinds
+from gripper_hw.sim.kinds import load_kinds
 from gripper_hw.sim.meshes import (
     SHELL_CONTACT,
     SOFT_CONTACT,
@@ -34,26 +35,49 @@ PADS_ONLY = frozenset({"ball"})
 """Objects that only pads may press: the tip of a rod would invert elements of their mesh."""
 
 
-def build_object(name: str, detail: Detail, size: float, stiffness: float) -> ObjectModel:
+def build_object(
+    name: str, detail: Detail, size: float, stiffness: float, file: Path | None = None
+) -> ObjectModel:
     """Builds an object.
 
     Args:
-        name: A key of `OBJECTS`, a kind of ``kinds.yaml``, or `NO_OBJECT`.
+        name: A key of `OBJECTS`, a kind of ``kinds.yaml``, or `NO_OBJECT`; with a file only a name.
         detail: Level of detail.
         size: Factor on all lengths. Material moduli are scaled inversely, so that the force at a given travel
             of the jaws does not change.
         stiffness: Factor on the force at a given travel of the jaws.
+        file: File of a user's object.
 
     Raises:
-        ConfigError: The object does not exist.
+        ConfigError: The object does not exist, or its file is wrong.
     """
+    if file is not None:
+        from gripper_hw.sim.object_files import read_object
+
+        return read_object(file).build(detail, size, stiffness)
     if name == NO_OBJECT:
         return ObjectModel("", SOFT_CONTACT, None, 0.025, 0.0025)
     if name in OBJECTS:
         return OBJECTS[name](detail, size, stiffness)
     if name in (kinds := load_kinds()):
-        return build_kind(kinds[name], detail, size, stiffness)
-    raise ConfigError(f"no simulated object {name!r}; there are {', '.join([*OBJECTS, *kinds, NO_OBJECT])}")
+        return kinds[name].build(detail, size, stiffness)
+    raise ConfigError(
+        f"no simulated object {name!r}; there are {', '.join([*OBJECTS, *kinds, NO_OBJECT])}, or the path of a file "
+        "of your own that ends in .yaml or .xml"
+    )
+
+
+def object_file(name: str, file: Path | None) -> Path | None:
+    """Returns the file of a scene's object. Raises `ConfigError` if its name is another object's."""
+    if file is None:
+        return None
+    if file.stem != name:
+        raise ConfigError(
+            f"the object is {name!r}, but sim.object is {file}; leave sim.object out, or set object={file}"
+        )
+    if name in {*OBJECTS, *load_kinds(), NO_OBJECT}:
+        raise ConfigError(f"the simulated object {file} has the name of a shipped one; rename the file")
+    return file
 
 
 def _sponge(detail: Detail, size: float, stiffness: float) -> ObjectModel:

@@ -4,6 +4,7 @@ import base64
 import re
 from dataclasses import dataclass, replace
 from importlib import resources
+from pathlib import Path
 from string import Template
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy.typing as npt
 from gripper_force.config import Config, GripperConfig, SimConfig
 from gripper_force.errors import ConfigError
 from gripper_hw.sim.meshes import ObjectModel
-from gripper_hw.sim.objects import GAUGES, PADS_ONLY, build_object
+from gripper_hw.sim.objects import GAUGES, PADS_ONLY, build_object, object_file
 
 LUX_LEVELS = (350.0, 550.0, 750.0)
 """The paper's three light levels."""
@@ -25,7 +26,7 @@ _PAD_HALF_THICKNESS_M = 0.004
 _OPEN_SPARE_M = {"rack": 0.004, "other": 0.001}
 """Travel of a jaw beyond the open position. Other linkages than a rack are near their dead centre there."""
 _ROD_RADIUS_M = 0.012
-_FINGER_X_M = {"pads": 0.009, "rods": 0.022}
+_FINGER_X_M = {"pads": 0.009, "discs": 0.009, "rods": 0.022}
 """Distance of the finger behind the centre of a pad, by tool."""
 
 _SECOND_FINGER_SEEDS = 50_000_000
@@ -46,9 +47,6 @@ _BLANK_PNG = base64.b64decode(
     "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVQIHWNoAAAAggCB8KrjIgAAAABJRU5ErkJggg=="
 )
 
-# Position of the camera relative to the point between the jaws.
-_CAMERA_FROM_GRIP_M = np.array([0.10, -0.30, 0.125])
-
 
 @dataclass(frozen=True)
 class Scene:
@@ -57,14 +55,19 @@ class Scene:
     Attributes:
         object: Name of the object.
         detail: Level of detail of its mesh.
-        tool: Ends of the jaws, ``pads`` or ``rods``.
+        tool: Ends of the jaws, ``pads``, ``discs`` or ``rods``.
+        object_file: File of a user's object; empty for a shipped one.
         size: Factor on the object's lengths.
         stiffness: Factor on the object's force at a given travel.
         offset_m: Position of the object relative to the gripper's centre, x and y.
         yaw_deg: Rotation of the object about the vertical.
+        camera_from_grip_m: Position of the camera, relative to the point between the jaws.
+        camera_aim_m: Point the camera is aimed at, likewise.
         camera_offset_m: Offset of the camera's position.
         camera_target_offset_m: Offset of the point the camera is aimed at.
         camera_fovy_deg: Vertical field of view.
+        camera_roll_deg: Rotation of the camera about its optical axis.
+        camera_blur_px: Standard deviation of the lens's blur, in pixels of a frame.
         lux: Illumination.
         light_direction: Direction of the key light.
         light_ambient: Ambient share of the light.
@@ -77,10 +80,13 @@ class Scene:
         jaw_friction_n: Coulomb friction of one rail; applied at the horn.
         backlash_m: Half of the gear play at the rack.
         rod_length_m: Length of a rod beyond its finger (tool ``rods`` only).
-        pad_half_m: Half of the depth and height of a pad (tool ``pads`` only).
+        pad_half_m: Half of the depth and height of a pad; a disc has the smaller one as its radius.
         finger_half_m: Half of the depth of a finger.
-        pad_gray: Brightness of the pads, 0 to 1.
-        finger_gray: Brightness of the fingers, 0 to 1.
+        pad_gray: Brightness of the pads, 0 to 1, if they had the default colour.
+        finger_gray: Brightness of the fingers, likewise.
+        pad_rgb: Colour of the pads.
+        finger_rgb: Colour of the fingers.
+        background: Factor on the brightness of table and wall.
         markers: True if each finger carries an ArUco marker.
         changing_light: True if the light varies over time.
         moving_background: True if objects move in the background.
@@ -89,13 +95,18 @@ class Scene:
     object: str
     detail: str
     tool: str = "pads"
+    object_file: str = ""
     size: float = 1.0
     stiffness: float = 1.0
     offset_m: tuple[float, float] = (0.0, 0.0)
     yaw_deg: float = 0.0
+    camera_from_grip_m: tuple[float, float, float] = (0.10, -0.30, 0.125)
+    camera_aim_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     camera_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     camera_target_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     camera_fovy_deg: float = 17.0
+    camera_roll_deg: float = 0.0
+    camera_blur_px: float = 0.0
     lux: float = 550.0
     light_direction: tuple[float, float, float] = (-0.40, 0.55, -0.75)
     light_ambient: float = 0.30
@@ -112,6 +123,9 @@ class Scene:
     finger_half_m: float = 0.008
     pad_gray: float = 0.17
     finger_gray: float = 0.78
+    pad_rgb: tuple[float, float, float] = (0.16, 0.17, 0.19)
+    finger_rgb: tuple[float, float, float] = (0.78, 0.78, 0.80)
+    background: float = 1.0
     markers: bool = False
     changing_light: bool = False
     moving_background: bool = False
@@ -130,7 +144,8 @@ def draw_scene(object_name: str, seed: int, config: SimConfig) -> Scene:
     def draw(other_seed: int | None) -> Scene:
         return _draw(object_name, seed if other_seed is None else other_seed, config)
 
-    placement, grasped, rig = draw(None), draw(config.object_seed), draw(config.rig_seed)
+    file = object_file(object_name, config.object)
+    placement, grasped, rig = draw(None), draw(config.object_seed), _of_rig(draw(config.rig_seed), config)
     if config.gain is not None:
         rig = replace(rig, nm_per_a=config.gain)
     if config.friction is not None:
@@ -153,7 +168,8 @@ def draw_scene(object_name: str, seed: int, config: SimConfig) -> Scene:
         markers=config.markers,
         changing_light=config.changing_light,
         moving_background=config.moving_background,
-        size=1.0 if exact else grasped.size,
+        object_file="" if file is None else str(file),
+        size=1.0 if exact or (file is not None and file.suffix == ".xml") else grasped.size,
         stiffness=1.0 if exact else grasped.stiffness * 2.0**octaves,
         texture_seed=grasped.texture_seed,
         offset_m=placement.offset_m,
@@ -204,6 +220,29 @@ def _draw(object_name: str, seed: int, config: SimConfig) -> Scene:
     )
 
 
+def _of_rig(drawn: Scene, config: SimConfig) -> Scene:
+    """Returns a scene with camera, jaws and light of a configuration; what was drawn is a deviation from them."""
+    camera, jaws, light = config.camera, config.jaws, config.light
+    shift = np.array(light.direction) - Scene.light_direction
+    ambient = drawn.light_ambient + (light.ambient - Scene.light_ambient)
+    return replace(
+        drawn,
+        camera_from_grip_m=camera.position_m,
+        camera_aim_m=camera.aim_m,
+        camera_fovy_deg=drawn.camera_fovy_deg * (camera.fov_deg / Scene.camera_fovy_deg),
+        camera_roll_deg=camera.roll_deg,
+        camera_blur_px=camera.blur_px,
+        shot_noise=drawn.shot_noise if camera.noise is None else camera.noise,
+        light_direction=tuple((np.array(drawn.light_direction) + shift).tolist()),
+        light_ambient=min(max(ambient, 0.0), 1.0),
+        pad_half_m=(jaws.pad_m[0] / 2, jaws.pad_m[1] / 2),
+        finger_half_m=jaws.finger_m / 2,
+        pad_rgb=jaws.pad_rgb,
+        finger_rgb=jaws.finger_rgb,
+        background=light.background,
+    )
+
+
 def _draw_jaws(rig: Scene, seed: int, spread: float) -> Scene:
     depth, height, finger, pad_gray, finger_gray = spread * np.random.default_rng([seed, 20]).uniform(
         -1, 1, 5
@@ -211,10 +250,10 @@ def _draw_jaws(rig: Scene, seed: int, spread: float) -> Scene:
     return replace(
         rig,
         pad_half_m=(
-            Scene.pad_half_m[0] * float(1 + 0.3 * depth),
-            Scene.pad_half_m[1] * float(1 + 0.3 * height),
+            rig.pad_half_m[0] * float(1 + 0.3 * depth),
+            rig.pad_half_m[1] * float(1 + 0.3 * height),
         ),
-        finger_half_m=Scene.finger_half_m * float(1 + 0.4 * finger),
+        finger_half_m=rig.finger_half_m * float(1 + 0.4 * finger),
         pad_gray=Scene.pad_gray + float(pad_gray * 0.15 if pad_gray < 0 else pad_gray * 0.65),
         finger_gray=Scene.finger_gray + float(finger_gray * (0.6 if finger_gray < 0 else 0.2)),
     )
@@ -257,9 +296,11 @@ def scene_mjcf(
         raise ConfigError(
             f"sim.tool=rods would dent the simulated {scene.object} beyond its model; set sim.tool=pads"
         )
-    model = build_object(scene.object, scene.detail, scene.size, scene.stiffness)  # type: ignore[arg-type]
+    file = Path(scene.object_file) if scene.object_file else None
+    model = build_object(scene.object, scene.detail, scene.size, scene.stiffness, file)  # type: ignore[arg-type]
     grip = np.array([0.0, 0.0, model.grip_height_m])
-    position = grip + _CAMERA_FROM_GRIP_M + scene.camera_offset_m
+    position = grip + scene.camera_from_grip_m + scene.camera_offset_m
+    target = grip + scene.camera_aim_m + scene.camera_target_offset_m
     template = Template(
         resources.files(__package__).joinpath("assets/gripper.xml").read_text(encoding="utf-8")
     )
@@ -273,7 +314,7 @@ def scene_mjcf(
         light_diffuse=_text([1.0 - scene.light_ambient] * 3),
         light_ambient=_text([scene.light_ambient] * 3),
         camera_position=_text(position),
-        camera_axes=_text(_camera_axes(position, grip + scene.camera_target_offset_m)),
+        camera_axes=_text(_camera_axes(position, target, scene.camera_roll_deg)),
         camera_fovy=scene.camera_fovy_deg,
         object_position=_text([*scene.offset_m, 0.0]),
         object_yaw=scene.yaw_deg,
@@ -286,8 +327,10 @@ def scene_mjcf(
         left_tool=_tool(scene, -1),
         right_tool=_tool(scene, 1),
         finger_half=_text([scene.finger_half_m]),
-        pad_rgb=_text(np.array([0.16, 0.17, 0.19]) * scene.pad_gray / Scene.pad_gray),
-        finger_rgb=_text(np.array([0.78, 0.78, 0.80]) * scene.finger_gray / Scene.finger_gray),
+        pad_rgb=_text(np.array(scene.pad_rgb) * scene.pad_gray / Scene.pad_gray),
+        finger_rgb=_text(np.array(scene.finger_rgb) * scene.finger_gray / Scene.finger_gray),
+        table_rgb="" if scene.background == 1.0 else f' rgba="{_text([*3 * [scene.background], 1])}"',
+        wall_rgb=_text(np.array([0.33, 0.35, 0.38]) * scene.background),
         left_marker=_marker(scene, -1),
         right_marker=_marker(scene, 1),
         marker_materials=_MARKER_MATERIALS if scene.markers else "",
@@ -305,12 +348,17 @@ def scene_mjcf(
         second_rack="" if second is None else _second_rack(second, radius_m),
         second_motor="" if second is None else '<motor name="second_servo" joint="second_servo"/>',
     )
+    if model.spec is not None:
+        from gripper_hw.sim.object_files import attach
+
+        text = attach(text, model, dict.fromkeys(re.findall(r'file="(.+?)"', text), _BLANK_PNG))
     if not textured:
-        return text, dict.fromkeys(re.findall(r'file="(.+?)"', text), _BLANK_PNG)
+        return text, dict.fromkeys(re.findall(r'file="(.+?)"', text), _BLANK_PNG) | model.files
     from gripper_hw.sim.textures import draw_markers, draw_textures
 
-    images = draw_textures(model.texture, scene.texture_seed, scene.table_seed)
-    return text, images | (draw_markers() if scene.markers else {})
+    pattern = None if model.texture in model.files else model.texture
+    images = draw_textures(pattern, scene.texture_seed, scene.table_seed)
+    return text, images | (draw_markers() if scene.markers else {}) | model.files
 
 
 def _second_horn(scene: Scene, radius_m: float, height_m: float) -> str:
@@ -333,6 +381,10 @@ def _second_rack(scene: Scene, radius_m: float) -> str:
 def _tool(scene: Scene, side: int) -> str:
     if scene.tool == "pads":
         return f'type="box" size="{_text([_PAD_HALF_THICKNESS_M, *scene.pad_half_m])}"'
+    if scene.tool == "discs":
+        return (
+            f'type="cylinder" size="{_text([min(scene.pad_half_m), _PAD_HALF_THICKNESS_M])}" euler="0 90 0"'
+        )
     # The tip of a rod of 20 mm is at the position of a pad's face.
     root = _ROD_RADIUS_M - _PAD_HALF_THICKNESS_M + 0.020
     ends = _text([side * (root - scene.rod_length_m), 0, 0, side * root, 0, 0])
@@ -373,13 +425,22 @@ def _material(model: ObjectModel) -> str:
 
 
 def _camera_axes(
-    position: npt.NDArray[np.float64], target: npt.NDArray[np.float64]
+    position: npt.NDArray[np.float64], target: npt.NDArray[np.float64], roll_deg: float
 ) -> npt.NDArray[np.float64]:
+    """Returns the camera's axes to the right and up, (6,). A camera that looks straight down has +y on top."""
     backward = position - target
-    backward = backward / np.linalg.norm(backward)
+    if (distance_m := np.linalg.norm(backward)) < 1e-3:
+        raise ConfigError("the simulated camera is aimed at itself; set sim.camera.aim_m to another point")
+    backward = backward / distance_m
     right = np.cross([0.0, 0.0, 1.0], backward)
+    if np.linalg.norm(right) < 1e-6:
+        right = np.array([1.0, 0.0, 0.0])
     right = right / np.linalg.norm(right)
-    return np.concatenate([right, np.cross(backward, right)])
+    up = np.cross(backward, right)
+    if roll_deg:
+        c, s = np.cos(np.deg2rad(roll_deg)), np.sin(np.deg2rad(roll_deg))
+        right, up = c * right + s * up, c * up - s * right
+    return np.concatenate([right, up])
 
 
 def _text(values: npt.ArrayLike) -> str:

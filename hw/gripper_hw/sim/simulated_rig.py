@@ -22,6 +22,7 @@ from gripper_hw.dynamixel.control_table import load_model
 from gripper_hw.dynamixel.virtual import VirtualBus, VirtualServo, register_bus, unregister_bus
 from gripper_hw.fault_injection import Faults, FaultyEstimator, FaultyFile
 from gripper_hw.sim.detail_level import resolve_detail
+from gripper_hw.sim.object_files import digest
 from gripper_hw.sim.scene import Scene, draw_scene, draw_second_finger, true_gripper
 from gripper_hw.sim.surroundings import Surroundings
 from gripper_hw.sim.world import World
@@ -116,7 +117,8 @@ class SimulatedCamera:
             return
         image = self._world.render(_SUPERSAMPLING * FRAME_SIDE_PX)
         lux = self._scene.lux * self._surroundings.light_factor(t_ns / NS_PER_S)
-        gray = expose(image, lux * self._exposure, self._scene.shot_noise, self._rng)
+        scene = self._scene
+        gray = expose(image, lux * self._exposure, scene.shot_noise, self._rng, scene.camera_blur_px)
         t_ns += self._start_ns
         self._pending.append(Frame(t_ns, t_ns + self._latency_ns, self._seq, gray))
         self._seq += 1
@@ -238,6 +240,7 @@ class SimulatedRig:
             textured=config.camera.backend == "simulated",
             second=None if self._second is None else (motors[1], self._second),
         )
+        self._object_digest = "" if config.sim.object is None else digest(config.sim.object)
         self._exposure_ms = config.sim.exposure_ms * _relative_exposure(config)
         clock: Clock = LockstepClock(self._world) if self._lockstep else MonotonicClock()
         self.clock: Clock = clock
@@ -308,9 +311,16 @@ class SimulatedRig:
             raise self._failure
 
     def notes(self) -> dict[str, str]:
-        """Facts for the log: the scene's parameters and the exposure."""
+        """Facts for the log: the scene's parameters, the exposure, and the digest of a user's object file."""
         second = {} if self._second is None else {"second finger": json.dumps(asdict(self._second))}
-        return {"scene": json.dumps(asdict(self.scene)), "exposure_ms": str(self._exposure_ms), **second}
+        file = self._config.sim.object
+        own = {} if file is None else {"object file": str(file), "object file sha256": self._object_digest}
+        return {
+            "scene": json.dumps(asdict(self.scene)),
+            "exposure_ms": str(self._exposure_ms),
+            **second,
+            **own,
+        }
 
     def render_under_light(self, lux: float) -> tuple[Camera, dict[str, str]]:
         """Returns a camera of this world with the images of a rig of this ``sim.lux``, and its notes."""
@@ -373,17 +383,24 @@ def _relative_exposure(config: Config) -> float:
     return (config.camera.exposure_us or _NOMINAL_EXPOSURE_US) / _NOMINAL_EXPOSURE_US
 
 
-def expose(image: npt.NDArray[np.uint8], lux: float, shot_noise: float, rng: np.random.Generator) -> Gray:
+def expose(
+    image: npt.NDArray[np.uint8],
+    lux: float,
+    shot_noise: float,
+    rng: np.random.Generator,
+    blur_px: float = 0.0,
+) -> Gray:
     """Converts a rendered image to a frame of a gray camera with locked exposure.
 
-    The image is averaged over each pixel and linearised; light, vignette, photon and read noise are applied;
-    the result is encoded with gamma 2.2.
+    The image is averaged over each pixel and linearised; light, blur, vignette, photon and read noise are
+    applied; the result is encoded with gamma 2.2.
 
     Args:
         image: Rendered image, (2 H, 2 W, 3) uint8.
         lux: Illumination, scaled by the relative exposure.
         shot_noise: Standard deviation of the photon noise at full scale, as a share of it.
         rng: Source of the noise.
+        blur_px: Standard deviation of the lens's blur, in pixels of the frame.
 
     Returns:
         Frame, (H, W) uint8.
@@ -395,7 +412,10 @@ def expose(image: npt.NDArray[np.uint8], lux: float, shot_noise: float, rng: np.
     gray = pixels @ _LUMA / 255.0  # (H, W)
     y, x = np.ogrid[:height, :width]
     radius2 = ((x - width / 2) ** 2 + (y - height / 2) ** 2) / (width * width / 4)
-    linear = gray**_GAMMA * np.float32(lux / _WHITE_LUX) * (1 - _VIGNETTE * radius2).astype(np.float32)
+    linear = gray**_GAMMA
+    if blur_px:
+        linear = cv2.GaussianBlur(linear, (0, 0), blur_px, borderType=cv2.BORDER_REPLICATE)
+    linear = linear * np.float32(lux / _WHITE_LUX) * (1 - _VIGNETTE * radius2).astype(np.float32)
     spread = np.sqrt(shot_noise**2 * linear + _READ_NOISE**2)
     linear += rng.standard_normal(gray.shape, dtype=np.float32) * spread
     encoded: Gray = (255 * np.clip(linear, 0, 1) ** (1 / _GAMMA)).astype(np.uint8)

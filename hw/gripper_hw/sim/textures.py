@@ -156,5 +156,6 @@ PATTERNS: dict[str, Callable[[np.random.Generator], npt.NDArray[np.floating]]] =
     "speckle": lambda rng: _spots(rng, 4),
     "marble": lambda rng: np.clip(0.5 + 1.5 * _clouds(rng, rng.uniform(8, 16)), 0, 1),
     "label": _label,
+    "plain": lambda _: np.zeros((_SIDE_PX, _SIDE_PX), np.float32),
 }
 """Patterns of the kinds of objects, from 0 to 1; shade and contrast are drawn."""

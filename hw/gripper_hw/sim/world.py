@@ -15,6 +15,7 @@ from gripper_force.types import NS_PER_S
 from gripper_hw.sim.engine import mujoco, new_renderer
 from gripper_hw.sim.objects import NO_OBJECT
 from gripper_hw.sim.scene import Scene, horn_dynamics, scene_mjcf
+from gripper_hw.sim.scene_checks import check_reach, check_view
 from gripper_hw.sim.surroundings import Surroundings
 
 _MAX_PENETRATION_M = 0.004
@@ -25,6 +26,9 @@ _MAX_RACK_SLIP_M = 0.005
 
 _MAX_FORCE_N = 200.0
 """Largest plausible grip force."""
+
+_LEAST_NODE_KG = 0.004
+"""Least mass of a node of an elastic solid that a pad presses; below 0.001 kg contacts can explode."""
 
 _CHECK_PERIOD_NS = 5_000_000
 _MAX_STEP_S = 0.004
@@ -99,8 +103,8 @@ class World:
         has_object: False if there is no object, or it has left the jaws.
 
     Raises:
-        ConfigError: The object does not exist, does not fit between the open jaws, or the tool is not suitable
-            for it.
+        ConfigError: The object does not exist, does not fit between the open jaws, can't be touched by them, or the
+            tool is not suitable for it; or the camera sees neither pads nor object, or is inside something.
         SimulationError: MuJoCo refuses the scene, or the time step is too long.
     """
 
@@ -131,6 +135,8 @@ class World:
                 f"take one above 0 and at most {1e3 * _MAX_STEP_S:g} ms"
             )
         self._data: Any = mujoco.MjData(self._model)
+        if scene.object_file:
+            self._make_nodes_heavier()
         self._scene, self._surroundings = scene, Surroundings(scene)
         self._rng = np.random.default_rng([seed, 1])
         self.step_ns = round(self._model.opt.timestep * NS_PER_S)
@@ -151,8 +157,15 @@ class World:
         self.t_ns = 0
         self.force_n = 0.0
         self.has_object = scene.object != NO_OBJECT
+        self._racks = [
+            i for i in range(self._model.ntendon) if self._model.tendon(i).name in ("rack", "second_rack")
+        ]
         mujoco.mj_forward(self._model, self._data)
         self._check_fit(gripper.open_width_m)
+        if self.has_object:
+            check_reach(self._model, self._data, scene.object)
+        if textured:
+            check_view(self._model, self._data)
         self.call_every(_CHECK_PERIOD_NS, self._check_state)
 
     @property
@@ -203,6 +216,17 @@ class World:
                 if periodic.due_ns <= self.t_ns:
                     periodic.due_ns += periodic.period_ns
                     periodic.call(self.t_ns)
+
+    def _make_nodes_heavier(self) -> None:
+        """Gives each node of a user's solid the least mass with which its contacts are stable.
+
+        MuJoCo divides the mass by the vertices near a node, and a rounded solid leaves little at the corners of its
+        cage. The shipped objects are stable without, and keep their masses.
+        """
+        nodes = np.unique(self._model.flex_nodebodyid)
+        nodes = nodes[self._model.body_dofnum[nodes] > 0]
+        self._model.body_mass[nodes] = np.maximum(self._model.body_mass[nodes], _LEAST_NODE_KG)
+        mujoco.mj_setConst(self._model, self._data)
 
     def _addresses(self, joint: str) -> tuple[int, int]:
         return int(self._model.joint(joint).qposadr[0]), int(self._model.joint(joint).dofadr[0])
@@ -270,7 +294,7 @@ class World:
             )
         if data.ncon and (depth := -float(data.contact.dist.min())) > _MAX_PENETRATION_M:
             raise SimulationError(self._failure_text(f"a pad is {depth * 1e3:.1f} mm deep in the object"))
-        if (slip := float(np.abs(data.ten_length).max())) > _MAX_RACK_SLIP_M:
+        if (slip := float(np.abs(data.ten_length[self._racks]).max())) > _MAX_RACK_SLIP_M:
             raise SimulationError(
                 self._failure_text(f"the rack has slipped {slip * 1e3:.1f} mm on its pinion")
             )
@@ -281,7 +305,8 @@ class World:
         s = self._scene
         return (
             f"the simulation of {s.object!r} ({s.detail}) broke at {self.t_ns / NS_PER_S:.3f} s: {cause}; "
-            "take a finer sim.detail or another seed"
+            + (f"simplify {s.object_file} or take" if s.object_file else "take")
+            + " a finer sim.detail or another seed"
         )
 
     def __del__(self) -> None:

@@ -1,10 +1,12 @@
 from dataclasses import asdict, replace
+from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from gripper_force.config import GripperConfig, SimConfig
+from gripper_force.config import GripperConfig, SimConfig, load_config
 from gripper_force.errors import ConfigError
 from gripper_hw.sim.engine import mujoco
 from gripper_hw.sim.scene import LUX_LEVELS, Scene, draw_scene, scene_mjcf
@@ -19,11 +21,19 @@ def test_scene_depends_on_seed_only() -> None:
         "object",
         "detail",
         "tool",
+        "object_file",
+        "camera_from_grip_m",
+        "camera_aim_m",
+        "camera_roll_deg",
+        "camera_blur_px",
         "rod_length_m",
         "pad_half_m",
         "finger_half_m",
         "pad_gray",
         "finger_gray",
+        "pad_rgb",
+        "finger_rgb",
+        "background",
         "markers",
         "changing_light",
         "moving_background",
@@ -166,22 +176,88 @@ def test_every_drawn_number_changes_the_model() -> None:
     drawn = asdict(
         draw_scene("sponge", 1, SimConfig(tool="rods", markers=True, moving_background=True, jaw_spread=1.0))
     )
-    not_of_the_model = {
-        "object",
-        "detail",
-        "tool",
-        "lux",
-        "shot_noise",
-        "nm_per_a",
-        "changing_light",
-        "pad_half_m",
+    not_drawn = {"object", "object_file", "detail", "tool", "changing_light"}
+    not_drawn |= {
+        "camera_from_grip_m",
+        "camera_aim_m",
+        "camera_roll_deg",
+        "pad_rgb",
+        "finger_rgb",
+        "background",
     }
-    for name in drawn.keys() - not_of_the_model:
+    not_of_the_model = {"lux", "shot_noise", "camera_blur_px", "nm_per_a", "pad_half_m"}
+    for name in drawn.keys() - not_drawn - not_of_the_model:
         after = scene_mjcf(replace(plain, **{name: drawn[name]}), gripper)
         if name not in ("texture_seed", "table_seed"):
             assert after[0] != before[0], name
         else:
             assert after[1] != before[1]
+
+
+RIG: dict[str, Any] = {
+    "camera.position_m": (0.05, -0.25, 0.1),
+    "camera.aim_m": (0.0, 0.01, 0.0),
+    "camera.fov_deg": 30.0,
+    "camera.roll_deg": 20.0,
+    "camera.blur_px": 0.8,
+    "camera.noise": 0.05,
+    "jaws.pad_m": (0.03, 0.02),
+    "jaws.finger_m": 0.01,
+    "jaws.pad_rgb": (0.9, 0.1, 0.1),
+    "jaws.finger_rgb": (0.1, 0.9, 0.1),
+    "light.direction": (0.4, 0.5, -0.7),
+    "light.ambient": 0.6,
+    "light.background": 0.5,
+}
+IN_IMAGE = {"camera.blur_px": "camera_blur_px", "camera.noise": "shot_noise"}
+"""Keys that change the frame after rendering, and their attribute of the scene."""
+
+
+def test_the_table_of_rig_keys_is_complete() -> None:
+    sections = {name: SimConfig.model_fields[name].annotation for name in ("camera", "jaws", "light")}
+    known = {f"{name}.{key}" for name, section in sections.items() for key in section.model_fields}  # type: ignore[union-attr]
+    assert RIG.keys() == known
+
+
+@pytest.mark.parametrize("key", RIG)
+def test_each_key_of_a_rig_changes_the_scene(key: str) -> None:
+    config = load_config(None, {f"sim.{key}": RIG[key]}).sim
+    before, after = draw_scene("tube", 3, SimConfig()), draw_scene("tube", 3, config)
+    if key in IN_IMAGE:
+        assert getattr(after, IN_IMAGE[key]) == RIG[key] != getattr(before, IN_IMAGE[key])
+    else:
+        assert scene_mjcf(after, GripperConfig()) != scene_mjcf(before, GripperConfig())
+
+
+def test_draws_deviate_from_the_configured_rig_as_from_the_default_one() -> None:
+    config = load_config(None, {f"sim.{key}": value for key, value in RIG.items()}).sim
+    for seed in range(20):
+        before, after = draw_scene("tube", seed, SimConfig()), draw_scene("tube", seed, config)
+        assert after.camera_offset_m == before.camera_offset_m
+        assert after.camera_fovy_deg / 30 == pytest.approx(before.camera_fovy_deg / 17)
+        moved = np.subtract(after.light_direction, before.light_direction)
+        assert moved == pytest.approx(np.subtract(RIG["light.direction"], Scene.light_direction))
+        assert after.light_ambient == pytest.approx(before.light_ambient + 0.3)
+
+
+def test_roll_turns_the_camera_about_its_axis() -> None:
+    def camera(roll_deg: float) -> np.ndarray:
+        text, assets = scene_mjcf(Scene("block", "coarse", camera_roll_deg=roll_deg), GripperConfig())
+        model = mujoco.MjModel.from_xml_string(text, assets)
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        return np.array(data.camera("camera").xmat.reshape(3, 3))
+
+    level, turned = camera(0), camera(90)
+    assert turned[:, 2] == pytest.approx(level[:, 2], abs=1e-5)
+    assert turned[:, 0] == pytest.approx(level[:, 1], abs=1e-5)
+
+
+def test_a_camera_may_look_straight_down_but_not_at_itself() -> None:
+    down = Scene("block", "coarse", camera_from_grip_m=(0.0, 0.0, 0.3))
+    assert 'xyaxes="1 0 0 0 1 0"' in scene_mjcf(down, GripperConfig())[0]
+    with pytest.raises(ConfigError, match=r"aimed at itself; set sim\.camera\.aim_m"):
+        scene_mjcf(replace(down, camera_aim_m=(0.0, 0.0, 0.3)), GripperConfig())
 
 
 def test_template_is_complete_and_textures_exist() -> None:

@@ -1,0 +1,125 @@
+"""Files of simulated objects: a record of a kind as YAML, or a body as MJCF (docs/simulation.md)."""
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gripper_force.errors import ConfigError
+from gripper_force.schema import read_tree
+from gripper_hw.sim.engine import mujoco
+from gripper_hw.sim.kinds import ObjectKind, kind_from
+from gripper_hw.sim.mesh_files import read_bytes
+from gripper_hw.sim.meshes import SOFT_CONTACT, Detail, ObjectModel
+
+_PREFIX = "own_"
+"""Of the names of a user's body, so that they differ from those of the gripper."""
+
+
+@dataclass(frozen=True)
+class MjcfBody:
+    """A body from an MJCF file."""
+
+    path: Path
+
+    def build(self, detail: Detail, size: float, stiffness: float) -> ObjectModel:
+        """Builds the object; the stiffness of its joints is multiplied by ``stiffness``, its size is exact."""
+        spec = _read_spec(self.path)
+        for joint in spec.joints:
+            joint.stiffness = joint.stiffness * stiffness
+        model = _compile(spec, self.path)
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        holder = """<inertial mass=".01" pos="0 0 0" diaginertia="1e-5 1e-5 1e-5"/>
+          <joint name="self_centre" type="slide" axis="1 0 0" stiffness="20" damping="8"/>"""
+        timestep_s = {"coarse": 0.0025, "medium": 0.00125, "fine": 0.0005}[detail]
+        height_m = float(data.site("grip").xpos[2])
+        return ObjectModel(holder, SOFT_CONTACT, None, height_m, timestep_s, _mjcf_files(spec), spec)
+
+
+def read_object(path: Path) -> ObjectKind | MjcfBody:
+    """Reads an object's file. Raises `ConfigError` that names the file, and the key or what is missing."""
+    if path.suffix == ".xml":
+        _read_spec(path)
+        return MjcfBody(path)
+    tree = read_tree(path, "simulated object")
+    if "format" in tree:
+        raise ConfigError(
+            f"{path} is a {tree['format']} file, not a simulated object; pass an object profile with --profile {path}"
+        )
+    for section, key in ((tree, "texture"), (tree.get("mesh"), "file")):
+        if isinstance(section, dict) and Path(str(section.get(key))).suffix:
+            section[key] = str(path.parent / str(section[key]))
+    return kind_from(tree, str(path))
+
+
+def digest(path: Path) -> str:
+    """Returns the SHA-256 of an object's file and of the files that it names."""
+    kind = read_object(path)
+    used = sorted(_mjcf_files(_read_spec(path)).items()) if isinstance(kind, MjcfBody) else []
+    if isinstance(kind, ObjectKind):
+        named = [Path(kind.texture)] if kind.texture.endswith(".png") else []
+        mesh = getattr(kind, "mesh", None)
+        used = [
+            (str(name), read_bytes(name, "file"))
+            for name in named + ([] if mesh is None else [Path(mesh.file)])
+        ]
+    content = hashlib.sha256(path.read_bytes())
+    for _, data in used:
+        content.update(data)
+    return content.hexdigest()
+
+
+def attach(scene: str, model: ObjectModel, images: dict[str, bytes]) -> str:
+    """Returns the MJCF of a scene, whose images are given, with a user's body in its body ``object``."""
+    whole, spec = mujoco.MjSpec.from_string(scene), model.spec
+    whole.assets = images | model.files
+    whole.body("object").add_frame().attach_body(spec.body("object"), _PREFIX, "")
+    return str(whole.to_xml())
+
+
+def _read_spec(path: Path) -> Any:
+    read_bytes(path, "simulated object")
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise ConfigError(f"MuJoCo can't read {path}: {' '.join(str(error).split())}; correct it") from error
+    bodies = [body.name for body in spec.worldbody.bodies]
+    kinds = mujoco.mjtJoint
+    wrong = {
+        f"exactly one body in its worldbody, named object (it has {', '.join(bodies) or 'none'})": bodies
+        != ["object"],
+        "a site named grip in that body, at the height of the jaws": "grip"
+        not in [s.name for s in spec.sites],
+        "only hinge and slide joints: the object must not fly away": any(
+            joint.type not in (kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE) for joint in spec.joints
+        ),
+        "no flex; describe an elastic object as YAML": bool(len(spec.flexes)),
+        "a geom with conaffinity, which the pads can touch": not any(
+            geom.conaffinity & 1 or geom.contype & 1 for geom in spec.geoms
+        ),
+    }
+    if missing := [text for text, is_wrong in wrong.items() if is_wrong]:
+        raise ConfigError(f"the simulated object {path} needs {'; and '.join(missing)}")
+    _compile(spec, path)
+    return spec
+
+
+def _compile(spec: Any, path: Path) -> Any:
+    try:
+        return spec.compile()
+    except ValueError as error:
+        raise ConfigError(f"MuJoCo refuses {path}: {' '.join(str(error).split())}; correct it") from error
+
+
+def _mjcf_files(spec: Any) -> dict[str, bytes]:
+    """Contents of a specification's meshes and textures, by the names that it has for them."""
+    folder = Path(spec.modelfiledir)
+    files = [(spec.meshdir, mesh) for mesh in spec.meshes] + [
+        (spec.texturedir, item) for item in spec.textures
+    ]
+    return {
+        item.file: read_bytes(folder / (subfolder or "") / item.file, "file")
+        for subfolder, item in files
+        if item.file
+    }
