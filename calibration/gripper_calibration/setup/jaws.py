@@ -31,7 +31,12 @@ def jaws(task: Task) -> Outcome:
         config = with_keys(config, "gripper", **{key: answer_m})
         origin = "default, not measured" if answer_m == 1e-3 * default_mm else "as you answered"
         values[f"gripper.{key}"] = Found(round(answer_m, 6), origin)
-    homed = config.model_copy(update={"object": _AIR}) if is_simulated(config) else config
+    homed = config
+    if is_simulated(config):
+        homed = config.model_copy(update={"object": _AIR})
+        if config.sim.open_width_m is None:  # what is found must not change the simulated gripper
+            true_m = config.gripper.open_width_m
+            values["sim.open_width_m"] = Found(true_m, "true width of the simulated jaws")
     found = calibrate_jaws(homed, prompt=task.person.do, progress=task.progress)
     today = date.today().isoformat()
     origin = f"homed {today}, ends repeated within {found.repeat_rad:.3f} rad"
@@ -46,7 +51,8 @@ def jaws(task: Task) -> Outcome:
             f"{found.running_n[0]:.2f} N closing, {found.running_n[1]:.2f} N opening, homed {today}",
         ),
     }
-    gripper = {key.partition(".")[2]: one.value for key, one in values.items()}
+    found_keys = (key.partition(".") for key in values)
+    gripper = {key: values[f"gripper.{key}"].value for part, _, key in found_keys if part == "gripper"}
     resolve(
         with_keys(config, "gripper", **gripper), vision=False
     )  # the travel must lie within the servo's turn

@@ -10,7 +10,8 @@ import yaml
 from gripper_calibration.setup.step import Found
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError
-from gripper_force.schema import Tree, assign, assign_value, read_tree, write_all
+from gripper_force.jobs.profile_files import write_all
+from gripper_force.schema import Tree, assign, assign_value, read_tree
 
 FORMAT: Final = "gripper-force-setup/1"
 _COMMENT_COLUMN: Final = 44

@@ -57,6 +57,9 @@ def test_a_setup_without_a_load_cell_ends_with_a_rig_file_and_continues_there(tm
     config = load_config(path)
     assert config.servo.baud_rate == 1_000_000
     assert config.gripper.open_width_m == pytest.approx(0.0995, abs=0.002)
+    # The simulated jaws are 92 mm apart at 0 rad, and a rack moves both.
+    open_rad = (0.092 - config.gripper.open_width_m) / 2 / config.gripper.pinion_radius_m
+    assert config.gripper.open_position_rad == pytest.approx(open_rad, abs=0.03)
     assert "homed" in path.read_text(encoding="utf-8")
     # A changed key repeats only the steps that rest on it.
     again = Setup(path, ["camera.rate_hz=30"]).run(Script())
