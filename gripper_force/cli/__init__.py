@@ -26,6 +26,7 @@ from gripper_force.cli import (
     exports,
     learning,
     runs,
+    setup,
     stability,
 )
 from gripper_force.errors import GripperError
@@ -37,10 +38,12 @@ app = typer.Typer(
 )
 
 for _command in (  # in the order of --help
+    setup.setup,
     runs.grasp,
     runs.replay,
     data.record,
     data.simulate,
+    calibrate.teach,
     learning.train,
     learning.evaluate,
     learning.reproduce,

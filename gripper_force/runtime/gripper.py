@@ -66,12 +66,13 @@ def open_gripper(
         raise ConfigError(
             "clock=lockstep runs in the caller's thread; leave background out, or set clock=realtime"
         )
+    if background is None:
+        background = not lockstep
     if (port is None) != (port_lock is None):
         raise ConfigError("a shared port needs port and port_lock; pass both to open_gripper")
     shared = None if port is None or port_lock is None else SharedPort(port, port_lock)
     path = None if log is None else Path(log)
-    in_background = not lockstep if background is None else background
-    loop = ControlLoop(settings, path, background=in_background, port=shared)
+    loop = ControlLoop(settings, path, background=background, port=shared)
     loop.open()
     return Gripper(loop, path)
 
@@ -275,6 +276,12 @@ class Gripper:
         self, force_n: float, *, wait: bool, new_object: bool = False, needs_object: bool = False
     ) -> GraspResult | None:
         self._run.check_target(force_n)
-        request = PendingRequest(RequestKind.GRASP, target_n=float(force_n), is_awaited=wait)
-        request.new_object, request.needs_object = new_object, needs_object
-        return self._loop.request(request)
+        return self._loop.request(
+            PendingRequest(
+                RequestKind.GRASP,
+                target_n=float(force_n),
+                new_object=new_object,
+                needs_object=needs_object,
+                is_awaited=wait,
+            )
+        )

@@ -65,7 +65,7 @@ def test_a_defect_of_one_probe_hides_no_other(monkeypatch: pytest.MonkeyPatch) -
 def test_a_second_opencv_is_found_and_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (before,) = doctor._opencv()
     assert before.ok
-    for name in ("opencv_python", "opencv_contrib_python"):  # as pip records them
+    for name in ("opencv_python", "opencv_python_headless"):  # as pip records them
         folder = tmp_path / f"{name}-4.1.2.dist-info"
         folder.mkdir()
         (folder / "METADATA").write_text(
@@ -74,8 +74,8 @@ def test_a_second_opencv_is_found_and_named(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.syspath_prepend(tmp_path)
     (check,) = doctor._opencv()
     assert "opencv-python 4.1.2" in check.found
-    assert "opencv-contrib-python 4.1.2" in check.found
-    assert check.advice.endswith("then pip install opencv-python-headless")
+    assert "opencv-python-headless 4.1.2" in check.found
+    assert check.advice.endswith("then pip install opencv-contrib-python-headless")
 
 
 def test_an_opencv_without_what_is_called_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
