@@ -202,5 +202,5 @@ def _section_at(root: type[Section], parts: list[str]) -> type[Section]:
         if part in section.model_fields:
             annotation = section.model_fields[part].annotation
             kinds = (annotation, *get_args(annotation))
-            section = next(kind for kind in kinds if isclass(kind) and issubclass(kind, Section))
+            section = next((kind for kind in kinds if isclass(kind) and issubclass(kind, Section)), section)
     return section

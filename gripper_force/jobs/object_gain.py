@@ -7,7 +7,6 @@ from pathlib import Path
 from gripper_force.config import Overrides, config_from_text
 from gripper_force.control.object_gain import GainEstimate, ObjectGain
 from gripper_force.errors import DataError
-from gripper_force.jobs.profile_files import write_object
 from gripper_force.profiles.object_profile import BUNDLED, find_object, read_object, user_folder, weights_path
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import make_controller
@@ -79,6 +78,8 @@ def save_gain(
         ConfigError: The profile or its second file can't be read, or the new one can't be written.
         LogError: A log can't be read.
     """
+    from gripper_force.jobs.profile_files import write_object
+
     source = find_object(name)
     profile = read_object(source)
     ratios = [ratio for path in logs if (ratio := learned_ratio(path, overrides)) is not None]

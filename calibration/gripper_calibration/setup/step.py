@@ -42,7 +42,7 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """What a step works with.
+    """Configuration, files and person that a step works with.
 
     Attributes:
         config: The configuration so far.

@@ -116,7 +116,7 @@ def test_different_camera_is_refused_or_reported(tmp_path: Path) -> None:
     named = [*QUICK, f"calibration.rig={rig}"]
     assert mismatches(load_config(None, named)) == []
     another = load_config(None, [*named, "camera.exposure_us=500", "camera.side_px=64"])
-    why = "with camera.side_px 128, not 64; camera.exposure_us 4000, not 500; calibrate again"
+    why = "with camera.side_px 128, not 64; camera.exposure_us 4000, not 500; teach or calibrate"
     with pytest.raises(ConfigError, match=why):
         mismatches(another)
     with pytest.raises(
