@@ -65,7 +65,7 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What a step found.
+    """Result of a step.
 
     Attributes:
         summary: One sentence.
