@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 EGL_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri
 
-.PHONY: grasp test docs setup setup-dev format clean
+.PHONY: grasp test test-lerobot docs setup setup-dev format clean
 
 grasp: setup
 	$(BIN)/gripper-force grasp $(ARGS)
@@ -15,11 +15,22 @@ test: setup-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/mypy tests examples
+	$(BIN)/mypy integrations/conftest.py integrations/*/tests
 	$(BIN)/lint-imports
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto $(ARGS)
 	$(BIN)/coverage run -m pytest -q tests/control/test_safety.py tests/control/test_limits.py
 	$(BIN)/coverage report
+
+# LeRobot 0.6.1 needs Python 3.12: make test-lerobot LEROBOT=0.6.1 PYTHON=python3.12
+LEROBOT ?= 0.4.4
+LEROBOT_VENV := .venv-lerobot-$(LEROBOT)
+test-lerobot:
+	test -x $(LEROBOT_VENV)/bin/pip || $(PYTHON) -m venv $(LEROBOT_VENV)
+	$(LEROBOT_VENV)/bin/pip install --quiet --disable-pip-version-check --editable '.[dev,lerobot]' \
+		--editable integrations/lerobot_robot_gripper_force --editable integrations/lerobot_camera_oak \
+		lerobot==$(LEROBOT)
+	$(LEROBOT_VENV)/bin/pytest -m lerobot $(ARGS)
 
 docs: setup-dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
@@ -43,4 +54,4 @@ $(VENV)/installed-dev: $(VENV)/installed
 	touch $@
 
 clean:
-	rm -rf $(VENV)
+	rm -rf $(VENV) .venv-lerobot-*

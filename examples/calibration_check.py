@@ -25,16 +25,18 @@ from rich.progress import track
 
 from gripper_calibration import touch_logs
 from gripper_calibration.fits.object_fit import fit_correction
+from gripper_calibration.fits.touches import Touches
 from gripper_calibration.procedures.calibrate_object import calibrate_object, record_touches
 from gripper_force.config import Config, load_config
 from gripper_force.errors import DataError
+from gripper_force.jobs.dataset import CONTACT_N
 from gripper_force.jobs.grasp import grasp
 from gripper_force.profiles.object_profile import read_object
 from gripper_force.vision.checkpoint import load_checkpoint
+from gripper_force.vision.ood import OodScore
 
 KINDS = ("sponge", "paper_cup", "tube", "stapler", "ball")
 COUNTS = (1, 2, 4, 8, 16)
-TOUCHES, TESTED = 24, 8
 DRAWS = 4
 PROFILE = 8
 TARGETS_N = (1.0, 8.0)
@@ -56,42 +58,54 @@ def configure(kind: str, number: int, out: Path, *more: str) -> Config:
     )
 
 
-def errors(kind: str, number: int, out: Path) -> list[dict[str, Any]]:
+def errors(kind: str, number: int, out: Path, touched: int, tested: int) -> list[dict[str, Any]]:
     """Touches an object and calibrates on increasing numbers of touches. Returns a row for each draw."""
-    kept = out / f"{kind}-{number}.json"
+    kept = out / f"{kind}-{number}-{touched}-{tested}.json"
     if kept.exists():
         rows: list[dict[str, Any]] = json.loads(kept.read_text())
         return rows
-    paths = list(record_touches(configure(kind, number, out), TOUCHES, None, out / f"{kind}-{number}"))
+    paths = list(record_touches(configure(kind, number, out), touched, None, out / f"{kind}-{number}"))
     checkpoint = load_checkpoint()
+    ood = checkpoint.header.ood
+    assert ood is not None  # the shipped network has one
     touches = touch_logs.join({path: touch_logs.read_log(path, checkpoint) for path in paths}).touches
-    test = touches.only(touches.numbers[-TESTED:])
+    test = touches.only(touches.numbers[-tested:])
     rng = np.random.default_rng(number)
     before_n = float(np.abs(test.estimate_n - test.force_n).mean())
     rows = []
-    for count in COUNTS:
+    for count in (count for count in COUNTS if count <= touched - tested):
         for _ in range(DRAWS):
-            drawn = rng.choice(touches.numbers[:-TESTED], count, replace=False)
+            drawn = rng.choice(touches.numbers[:-tested], count, replace=False)
             row: dict[str, Any] = {"object": kind, "touches": count, "before_n": before_n}
             try:
-                fitted = fit_correction(touches.only([int(n) for n in drawn]))
+                fitted = fit_correction(touches.only([int(n) for n in drawn]), ood=ood)
             except DataError:  # a light touch may be unusable: the network stays uncorrected
                 rows.append({**row, "after_n": before_n, "refused": 1.0})
                 continue
             after_n = fitted.predict(test)
             error_n = np.abs(after_n - test.force_n)
-            within = error_n <= fitted.interval.half_width_n(after_n)
+            within = (error_n <= fitted.interval.half_width_n(after_n))[test.force_n > CONTACT_N]
             rows.append(
                 {
                     **row,
                     "after_n": float(error_n.mean()),
                     "within": float(within.mean()),
                     "half_width_n": float(fitted.interval.half_width_n(5.0)),
-                    "rejected": float((fitted.arrays.ood_score(test.features) > fitted.ood_limit).mean()),
+                    "rejected": rejected_share(test, OodScore(ood, fitted.arrays.known)),
                 }
             )
     kept.write_text(json.dumps(rows))
     return rows
+
+
+def rejected_share(touches: Touches, score: OodScore) -> float:
+    """Returns the share of frames over the limit; each touch is a stream."""
+    rejected = []
+    for number in touches.numbers:
+        one = touches.only([number])
+        score.reset()
+        rejected.append(score.score(one.features, one.estimate_n) > 1)
+    return float(np.concatenate(rejected).mean())
 
 
 def one_grasp(
@@ -119,24 +133,29 @@ def profile_of(kind: str, number: int, out: Path) -> str:
 
 def errors_table(rows: list[dict[str, Any]]) -> None:
     """Prints errors and intervals by number of touches."""
-    print("| touches | MAE N before | after | ratio | in 90 % interval | half-width | rejected | refused |")
-    print("|---|---|---|---|---|---|---|---|")
-    for count in COUNTS:
+    print(
+        "| touches | MAE N before | after | ratio | in contact in 90 % interval | below 80 % | half-width | rejected | "
+        "refused |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|")
+    counts = sorted({row["touches"] for row in rows})
+    for count in counts:
         part = [row for row in rows if row["touches"] == count]
         keys = ("before_n", "after_n", "within", "half_width_n", "rejected", "refused")
         known = {key: [row[key] for row in part if key in row] for key in keys}
         mean = {key: float(np.mean(values)) if values else 0.0 for key, values in known.items()}
         refused = len(known["refused"])
+        below = float(np.mean(np.array(known["within"]) < 0.8)) if known["within"] else 0.0
         print(
             f"| {count} | {mean['before_n']:.3f} | {mean['after_n']:.3f} | "
-            f"{mean['before_n'] / mean['after_n']:.1f} | {100 * mean['within']:.0f} % | "
+            f"{mean['before_n'] / mean['after_n']:.1f} | {100 * mean['within']:.0f} % | {100 * below:.0f} % | "
             f"{mean['half_width_n']:.2f} N | {100 * mean['rejected']:.1f} % | {refused} of {len(part)} |"
         )
-    print("\n| object | before | " + " | ".join(f"{count} touches" for count in COUNTS) + " |")
-    print("|---|---|" + "---|" * len(COUNTS))
+    print("\n| object | before | " + " | ".join(f"{count} touches" for count in counts) + " |")
+    print("|---|---|" + "---|" * len(counts))
     for kind in KINDS:
         own = [row for row in rows if row["object"] == kind]
-        cells = [np.mean([r["after_n"] for r in own if r["touches"] == count]) for count in COUNTS]
+        cells = [np.mean([r["after_n"] for r in own if r["touches"] == count]) for count in counts]
         print(
             f"| {kind} | {np.mean([r['before_n'] for r in own]):.3f} | "
             + " | ".join(f"{cell:.3f}" for cell in cells)
@@ -169,6 +188,8 @@ def main() -> None:
     """Prints the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--each", type=int, default=3, help="objects of each kind")
+    parser.add_argument("--touches", type=int, default=24, help="touches of each object")
+    parser.add_argument("--tested", type=int, default=8, help="the last touches, which are for testing only")
     parser.add_argument("--grasps", type=int, default=0, help="number of grasps with and without a profile")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--out", type=Path, default=Path("data/calibration"))
@@ -178,7 +199,9 @@ def main() -> None:
     console = Console(stderr=True)
     with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("spawn")) as pool:
         if not options.grasps:
-            done = [pool.submit(errors, *which, options.out) for which in objects]
+            done = [
+                pool.submit(errors, *which, options.out, options.touches, options.tested) for which in objects
+            ]
             errors_table([r for f in track(done, "objects", console=console) for r in f.result()])
             return
         made = [pool.submit(profile_of, *which, options.out) for which in objects]

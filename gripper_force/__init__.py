@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from gripper_calibration.procedures.calibrate_object import calibrate_object as calibrate_object
+    from gripper_calibration.procedures.teach import teach as teach
     from gripper_force.config import CameraConfig as CameraConfig
     from gripper_force.config import Config as Config
     from gripper_force.config import LoadCellConfig as LoadCellConfig
@@ -72,6 +73,7 @@ __version__ = "0.2.0.dev0"
 
 _MODULES = {
     "gripper_calibration.procedures.calibrate_object": ("calibrate_object",),
+    "gripper_calibration.procedures.teach": ("teach",),
     "gripper_force.config": ("CameraConfig", "Config", "LoadCellConfig", "ServoConfig", "load_config"),
     "gripper_force.errors": (
         "CheckpointError",

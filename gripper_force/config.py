@@ -557,7 +557,9 @@ class CalibrationConfig(Section):
         "configuration file and --set replace its values",
     )
     object: str | None = Field(
-        None, description="object profile: a name or a path; own: the one named like `object`"
+        None,
+        description="object profile or bundle: a name or a path; own: the one named like `object`; none: none; None: "
+        "the bundle that `gripper-force teach` made of `object`, if there is one",
     )
     on_mismatch: Literal["refuse", "warn"] = Field(
         "refuse", description="what to do if a profile belongs to another device than the run's"
@@ -627,18 +629,26 @@ class Config(Section):
     @property
     def profile(self) -> str | None:
         """Name or path of the object profile, or None."""
-        return self.object if self.calibration.object == "own" else self.calibration.object
+        name = self.calibration.object
+        return {"own": self.object, "none": None}.get(name, name) if name is not None else None
 
     @property
     def uses_vision(self) -> bool:
         """True if the run has a camera and a network."""
         return self.camera.backend != "none" and self.vision.checkpoint != "none"
 
-    def camera_settings(self) -> Tree:
-        """Camera keys and values that an object profile is bound to."""
-        camera = self.camera.model_dump(mode="json", exclude=CAMERA_OTHER_KEYS)
-        settings = {f"camera.{key}": value for key, value in camera.items()}
-        return {**settings, "vision.region": self.vision.region and list(self.vision.region)}
+    def rig_settings(self) -> Tree:
+        """Keys and values of camera, view and gripper that networks and object profiles are bound to."""
+        parts = {
+            "camera": set(CameraConfig.model_fields) - CAMERA_OTHER_KEYS,
+            "vision": {"region"},
+            "gripper": {"linkage", "pinion_radius_m", "open_width_m"},
+            "sim": {"tool", "view_spread", "jaw_spread", "camera", "jaws", "light"},
+        }
+        tree = self.model_dump(mode="json", include=dict(parts))
+        for part, key in (("gripper", "linkage"), ("sim", "camera"), ("sim", "jaws"), ("sim", "light")):
+            tree[f"{part}.{key}"] = tree[part].pop(key)
+        return {f"{part}.{key}": value for part in tree for key, value in tree[part].items()}
 
 
 Overrides = Sequence[str | tuple[str, Any]] | Mapping[str, Any]

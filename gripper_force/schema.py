@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from copy import deepcopy
 from difflib import get_close_matches
 from inspect import isclass
+from math import isclose
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar, get_args
 
@@ -139,6 +140,15 @@ def read_section(section: type[S], path: Path, format_: str, what: str) -> S:
     return validated(section, tree, str(path), what)
 
 
+def differences(known: Tree, run: Tree) -> list[str]:
+    """Describes the keys in which a run differs, as text. Missing keys, and lengths within 5 %, do not differ."""
+    pairs = [(key, value, run[key]) for key, value in known.items() if key in run and run[key] != value]
+    lengths = [
+        isinstance(a, float) and isinstance(b, float) and isclose(a, b, rel_tol=0.05) for _, a, b in pairs
+    ]
+    return [f"{key} {a}, not {b}" for (key, a, b), same in zip(pairs, lengths, strict=True) if not same]
+
+
 def keys(section: type[Section], under: str = "") -> Iterator[tuple[str, FieldInfo]]:
     """Yields the path and the field of every key of a section and its subsections."""
     for name, field in section.model_fields.items():
@@ -147,24 +157,6 @@ def keys(section: type[Section], under: str = "") -> Iterator[tuple[str, FieldIn
             yield from keys(kind, f"{under}{name}.")
         else:
             yield f"{under}{name}", field
-
-
-def write_all(files: dict[Path, bytes]) -> None:
-    """Writes several files; none appears under its name before all are complete.
-
-    Raises:
-        ConfigError: One can't be written.
-    """
-    parts = {path: path.with_name(f".{path.name}.part") for path in files}
-    try:
-        for path, data in files.items():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            parts[path].write_bytes(data)
-        for path, part in parts.items():
-            part.replace(path)
-    except OSError as error:
-        names = " and ".join(map(str, files))
-        raise ConfigError(f"can't write {names}: {error.strerror}, {error.filename}") from error
 
 
 def _parse(text: str, what_fails: str) -> Any:
@@ -210,5 +202,5 @@ def _section_at(root: type[Section], parts: list[str]) -> type[Section]:
         if part in section.model_fields:
             annotation = section.model_fields[part].annotation
             kinds = (annotation, *get_args(annotation))
-            section = next(kind for kind in kinds if isclass(kind) and issubclass(kind, Section))
+            section = next((kind for kind in kinds if isclass(kind) and issubclass(kind, Section)), section)
     return section

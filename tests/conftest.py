@@ -189,6 +189,12 @@ def clips(press: Callable[..., Clip]) -> list[Clip]:
     return [press(seed) for seed in range(6)]
 
 
+@pytest.fixture(scope="session")
+def write_log() -> Callable[[Clip, Path], Path]:
+    """Writes a clip as a log into a folder."""
+    return _write_log
+
+
 @pytest.fixture
 def few_logs(clips: list[Clip], tmp_path: Path) -> Path:
     """Three of the clips as logs in a folder."""
@@ -206,7 +212,7 @@ def loaded_log(few_logs: Path, press: Callable[..., Clip]) -> Path:
 
 def _write_log(clip: Clip, folder: Path) -> Path:
     path = folder / f"{clip.name}.mcap"
-    config = dump_config(load_config(None, ["object=disc"]))
+    config = dump_config(load_config(None, [f"object={clip.object}"]))
     with LogWriter(path, config=config, metadata={"set": clip.set}) as log:
         for i, (gray, force_n) in enumerate(zip(clip.frames, clip.forces_n.tolist(), strict=True)):
             log.write(Frame(i * 20 * NS_PER_MS, i * 20 * NS_PER_MS, i, gray))

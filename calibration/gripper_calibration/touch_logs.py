@@ -115,7 +115,7 @@ def read_log(path: Path, checkpoint: Checkpoint) -> TouchRecording:
     estimate_lag_s = lag_s(t_s, estimate_n[labelled], t_s, force_n[labelled])
     return TouchRecording(
         touches=Touches(read_out[labelled], estimate_n[labelled], force_n[labelled], numbers),
-        camera=config.camera_settings(),
+        camera=config.rig_settings(),
         source=_label_source(config),
         presses=presses,
         width_m=width_m,

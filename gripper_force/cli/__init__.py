@@ -23,8 +23,10 @@ from gripper_force.cli import (
     configuration,
     console,
     data,
+    exports,
     learning,
     runs,
+    setup,
     stability,
     viewing,
 )
@@ -36,22 +38,24 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+app.command()(setup.setup)
 app.command(cls=viewing.ViewCommand)(runs.grasp)
 for _command in (  # in the order of --help
     runs.replay,
     viewing.view,
     data.record,
     data.simulate,
+    calibrate.teach,
     learning.train,
     learning.evaluate,
     learning.reproduce,
-    learning.export,
     runs.doctor,
     runs.virtual_servo,
 ):
     app.command()(_command)
 app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(data.import_app, name="import")
+app.add_typer(exports.app, name="export")
 app.add_typer(configuration.app, name="config")
 app.add_typer(bench.app, name="bench")
 app.add_typer(stability.app, name="stability")

@@ -149,6 +149,79 @@ def gain(
     _show({"objects": rows}, as_json, lambda: gain_table(rows))
 
 
+@app.command("teach")
+def teach(
+    rigs: Annotated[
+        list[Path] | None,
+        typer.Option("--rig", help="Configuration file of a rig. Repeatable. Default: six drawn rigs."),
+    ] = None,
+    objects: Annotated[
+        list[str] | None, typer.Option("--object", help="Object. Repeatable. Default: the held-out kinds.")
+    ] = None,
+    touches: Annotated[
+        list[int] | None,
+        typer.Option(min=4, help="Number of touches. Repeatable. Default: 4, 8, 16 and 32."),
+    ] = None,
+    methods: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--method", help="shipped, calibrated, taught or from scratch. Repeatable. Default: all."
+        ),
+    ] = None,
+    drawn: Annotated[int, typer.Option(min=1, help="Number of drawn rigs, without --rig.")] = 6,
+    grasps: Annotated[int, typer.Option(min=0, help="Grasps of each cell with each feedback.")] = 6,
+    recordings: Annotated[
+        Path | None,
+        typer.Option(help="Folder of real recordings instead: each object is left out, then taught."),
+    ] = None,
+    write: Page = None,
+    folder: Folder = Path("runs/teach"),
+    jobs: Jobs = CORES,
+    set_: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure what teaching gains on foreign rigs and unknown objects. Continues if interrupted."""
+    from gripper_force.qualification.bench import teach_bench as job
+    from gripper_force.qualification.markdown_blocks import write_between
+    from gripper_hw.sim.kinds import held_out_kinds
+
+    if strange := sorted(set(methods or ()) - set(job.METHODS)):
+        raise ConfigError(f"no method {strange[0]!r}; use one of {', '.join(job.METHODS)}")
+    rows: list[job.Cell] = []
+    real: list[job.RecordingRow] = []
+    with console.err.status("teaching") as status:
+
+        def tell(text: str, steps: int = 1) -> None:
+            status.update(text)
+
+        if recordings is not None:
+            for found in job.bench_recordings(recordings, folder, tell):
+                real.append(found)
+                console.line(f"{found.object}, {found.trials} trials: {found.taught_n:.2f} N")
+            text = job.recordings_markdown(real)
+        else:
+            settings = load_settings(None, set_, {})
+            chosen = job.read_rigs(rigs, set_) if rigs else job.foreign_rigs(settings, drawn)
+            for cell in job.bench(
+                chosen,
+                objects or held_out_kinds(),
+                touches or job.COUNTS,
+                methods or job.METHODS,
+                grasps=grasps,
+                folder=folder,
+                workers=jobs,
+                progress=tell,
+            ):
+                rows.append(cell)
+                error = cell.problem or f"{cell.mae_n:.3f} N"
+                console.line(f"{cell.rig}, {cell.object}, {cell.method}, {cell.touches} touches: {error}")
+            text = job.markdown(rows)
+    if write is not None:
+        write_between(write, "teach recordings" if real else "teach", text)
+    shown = {"recordings": [row._asdict() for row in real]} if real else {"cells": rows}
+    _show(shown, as_json, lambda: console.out.print(text, soft_wrap=True))
+
+
 @app.command("bus")
 def bus(
     cycles: Annotated[int, typer.Option(min=1, help="Cycles of each client at each setting.")] = 1000,

@@ -1,5 +1,6 @@
 """The commands that calibrate a rig and objects."""
 
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -16,7 +17,7 @@ from gripper_force.cli.options import (
     load_settings,
     load_settings_before_rig,
 )
-from gripper_force.cli.output.calibrate import jaws_table, object_table, rig_table
+from gripper_force.cli.output.calibrate import jaws_table, object_table, rig_table, taught_table
 from gripper_force.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -155,6 +156,10 @@ def camera(
             touches=touches,
             progress=_progress(status),
         )
+    for text in result.outdated:
+        console.warn(
+            f"the camera is now another one than that of {text}; teach or calibrate the object again"
+        )
     _show_rig(result, as_json)
 
 
@@ -190,6 +195,7 @@ def object_(
     """Calibrate an object by touching it with the load cell in place. Ctrl-C uses the touches so far."""
     from gripper_calibration.fits.interval_fit import MIN_TOUCHES
     from gripper_calibration.procedures import calibrate_object as job
+    from gripper_force.profiles.object_profile import find_object
 
     if fresh and logs is not None:
         raise ConfigError("--fresh records touches and --from records none; leave out one of them")
@@ -208,6 +214,11 @@ def object_(
             f"a test of the correction on touches outside its fit needs at least {MIN_TOUCHES} touches; "
             f"{job.TOUCHES} are recommended",
             soft_wrap=True,
+        )
+    if out is None and (found := find_object(name)) != result.profile_path:
+        console.warn(
+            f"runs use the bundle {found.parent} instead, which `teach` made; pass --profile {result.profile_path} to "
+            "use this profile, or delete the bundle"
         )
     console.show(result.as_dict(), as_json, lambda _: object_table(result))
 
@@ -253,6 +264,99 @@ def gain(
 
     paths = [path for given in logs for path in (find_logs(given) if given.is_dir() else [given])]
     console.show(save_gain(name, paths, out, set_), as_json)
+
+
+def teach(
+    name: Annotated[str, typer.Argument(help="Name of the object; in simulation one of the known objects.")],
+    touches: Annotated[int, typer.Option(min=4, help="Number of touches, with those of earlier calls.")] = 16,
+    peak_n: Annotated[float | None, typer.Option(help="Largest force of a touch in newtons.")] = None,
+    logs: Annotated[
+        list[Path] | None,
+        typer.Option("--from", help="Teach with these logs, or folders of them, without the devices."),
+    ] = None,
+    replay: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Logs of an earlier training; they are mixed in, so that their objects are not forgotten."
+        ),
+    ] = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the touches and of the work so far; nothing in it is repeated."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the bundle. Default: NAME in your folder of profiles.")
+    ] = None,
+    fresh: Annotated[
+        bool,
+        typer.Option(
+            "--fresh", help="Move existing touches to a folder beside, and record all of them again."
+        ),
+    ] = False,
+    pause: Annotated[
+        bool, typer.Option("--pause", help="Wait for Enter before each touch, to place the object again.")
+    ] = False,
+    jobs: Jobs = CORES,
+    config: ConfigPath = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the touches, and of a simulated scene.")] = None,
+    set_: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Teach an object: touch it, train and calibrate the best estimator for it, and make `grasp` use it."""
+    import time
+
+    from gripper_calibration.procedures import calibrate_object
+    from gripper_calibration.procedures import teach as job
+    from gripper_force.profiles.object_profile import user_folder
+
+    if fresh and logs is not None:
+        raise ConfigError("--fresh records touches and --from records none; leave out one of them")
+    settings = load_settings(config, set_, {"object": name, "seed": seed})
+    folder = folder or calibrate_object.default_folder(name)
+    job.check(settings, out or user_folder() / name)
+    begin_s = time.monotonic()
+    try:
+        if logs is None:
+            _tell_existing(settings, touches, folder, fresh)
+            logs = []
+            with console.err.status("touching") as status:
+                prompt = console.prompt(False, status) if pause else None
+                logs += calibrate_object.record_touches(
+                    settings, touches, peak_n, folder, prompt=prompt, progress=_progress(status)
+                )
+        bar = console.bar if console.err.is_terminal else console.lines
+        with bar("teaching", job.STEPS) as progress:
+            result = job.teach(
+                settings,
+                name,
+                logs=logs,
+                folder=folder,
+                out=out,
+                replay=replay or (),
+                workers=jobs,
+                progress=progress,
+            )
+    except KeyboardInterrupt:
+        console.err.print("what was done until now is kept; the same command continues", soft_wrap=True)
+        raise
+    shown = console.jsonable(result) | {"minutes": (time.monotonic() - begin_s) / 60}
+    console.show(shown, as_json, lambda _: taught_table(result, shown["minutes"]))
+    if result.more_touches_help:
+        console.err.print(
+            f"more touches would reduce the error further: --touches {2 * len(result.profile.logs)} adds to these",
+            soft_wrap=True,
+        )
+    target_n = min(4.0, round(result.profile.force_n / 2, 1))
+    words = ["gripper-force", "grasp", "--object", name, "--target-n", f"{target_n:g}"]
+    words += [] if out is None else ["--profile", str(out.absolute())]
+    words += [] if config is None else ["--config", str(config)]
+    words += [] if seed is None else ["--seed", str(seed)]
+    # With another network than the default one a grasp would not use the bundle's.
+    others = [one for one in set_ or [] if not one.startswith("vision.checkpoint=")]
+    if config is not None and settings.vision.checkpoint != "default":
+        others.append("vision.checkpoint=default")
+    words += [word for one in others for word in ("--set", one)]
+    console.err.print(f"next: {shlex.join(words)}", soft_wrap=True, markup=False)
 
 
 def _tell_existing(settings: "Config", touches: int, folder: Path, fresh: bool) -> None:
@@ -309,7 +413,8 @@ def _rig_settings(
 def _show_rig(result: "LoadCellResult | ServoResult | CameraResult", as_json: bool) -> None:
     """Shows the calibrated section of the rig profile and what else was measured, as one level of keys."""
     values = console.jsonable(result)
-    console.show(values.pop("calibration") | values, as_json, rig_table)
+    shown = values.pop("calibration") | values
+    console.show(shown, as_json, lambda _: rig_table({k: v for k, v in shown.items() if k != "outdated"}))
 
 
 def _region(text: str) -> tuple[int, int, int, int]:

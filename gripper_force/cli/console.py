@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as ProgressBar
-from rich.table import Table
+from rich.table import Column, Table
 
 from gripper_force.errors import ConfigError, GripperError
 
@@ -127,7 +127,7 @@ def number(value: object, unit: str = "", digits: int = 3) -> str:
 
 def pairs(values: Mapping[str, object]) -> None:
     """Prints names and values."""
-    table = Table(box=None, show_header=False, pad_edge=False)
+    table = Table("", Column("", overflow="fold"), box=None, show_header=False, pad_edge=False)
     for name, value in values.items():
         table.add_row(f"[dim]{name}[/]", number(value))
     out.print(table)

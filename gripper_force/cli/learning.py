@@ -1,4 +1,4 @@
-"""Commands for networks: `train`, `evaluate`, `export` and `reproduce`."""
+"""Commands for networks: `train`, `evaluate`, `export network` and `reproduce`."""
 
 import json
 import math
@@ -32,7 +32,8 @@ def train(
     recipe: Annotated[
         str,
         typer.Option(
-            help="short_clips (this project's), shin2019 (the paper's), or few (a Gaussian process)."
+            help="short_clips (this project's), shin2019 (the paper's), few (a Gaussian process), or touches (with "
+            "--init, for a few touches of an object)."
         ),
     ] = "short_clips",
     set_: Annotated[
@@ -170,8 +171,11 @@ def evaluate(
     """Compare a checkpoint's estimates with the load cell, over all logs of a folder."""
     from gripper_force.jobs.dataset import find_logs
     from gripper_force.jobs.evaluate import evaluate as job
+    from gripper_force.profiles.apply import with_bundle
 
     settings = load_settings(None, set_, {"vision.checkpoint": checkpoint, "calibration.object": profile})
+    if settings.calibration.object not in (None, "own"):
+        settings, _ = with_bundle(settings)
     logs = find_logs(data)
     with console.bar("evaluating", 2 * len(logs)) as progress:
         result = job(
@@ -190,7 +194,7 @@ def evaluate(
         console.err.print(f"figure: {plot}", soft_wrap=True, markup=False)
 
 
-def export(
+def export_network(
     out: Annotated[Path, typer.Option("--out", help="File to write: .onnx, or .xml for OpenVINO.")],
     checkpoint: Annotated[
         str | None,
@@ -208,8 +212,8 @@ def export(
 ) -> None:
     """Export a network for another engine, and compare it with PyTorch."""
     from gripper_force.jobs.dataset import find_logs, load_clips
-    from gripper_force.vision.export import export as to_float
-    from gripper_force.vision.int8_export import export_int8
+    from gripper_force.jobs.int8_export import export_int8
+    from gripper_force.vision.export import export as job
     from gripper_force.vision.model_files import read_model
 
     model = read_model(load_settings(None, set_, {"vision.checkpoint": checkpoint}).vision.checkpoint)
@@ -220,7 +224,7 @@ def export(
             clips = load_clips(logs, model.header.preprocess, workers=jobs, progress=progress)
         frames = [clip.frames for clip in clips]
     with console.err.status("exporting"):
-        errors = to_float(model, out) if frames is None else export_int8(model, out, frames)
+        errors = job(model, out) if frames is None else export_int8(model, out, frames)
     console.show({"file": str(out), "digest": model.digest, "off_torch_n": errors}, as_json)
 
 

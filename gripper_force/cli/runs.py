@@ -29,6 +29,7 @@ from gripper_force.cli.output.runs import (
 from gripper_force.errors import ConfigError, GripperError
 
 if TYPE_CHECKING:
+    from gripper_force.config import Config
     from gripper_force.interfaces import Progress, Prompt
     from gripper_force.jobs.checks import RegisterChange
 
@@ -104,6 +105,12 @@ def grasp(
             "calibration.object": profile,
         },
     )
+    device = job.exclusive_device(settings)
+    named = object_ is not None or settings.sim.object is not None
+    one_object = not trials or bool(device) or same_object or named
+    objects = (settings.object,) if one_object else job.TRIAL_OBJECTS
+    for text in dict.fromkeys(text for name in objects for text in _notes(settings, name)):
+        console.line(text)
     if not trials:
         log = job.new_log(settings)
         viewer = nullcontext() if view is None else beside_run(log, view, console.line)
@@ -121,9 +128,6 @@ def grasp(
         if result["result"] != "held":
             raise typer.Exit(1)
         return
-    device = job.exclusive_device(settings)
-    one_object = device or same_object or object_ is not None or settings.sim.object is not None
-    objects = (settings.object,) if one_object else job.TRIAL_OBJECTS
     jobs = jobs or (1 if device or same_object else CORES)
     prompt: Prompt | None = None
     lines: Progress = no_progress
@@ -162,6 +166,14 @@ def grasp(
         console.show(printed, as_json, lambda _: trials_table(results, summary, figure))
     if failure is not None:
         raise failure
+
+
+def _notes(settings: "Config", name: str) -> list[str]:
+    """Returns the bundle that grasps of an object use, and what differs from the rig it or the network is for."""
+    from gripper_force.runtime.resolve import resolve
+
+    run = resolve(settings.model_copy(update={"object": name}))
+    return [text for unit, text in run.notes if unit == "session"]
 
 
 def replay(

@@ -66,6 +66,36 @@ Confirm = Callable[[str, list[RegisterChange]], bool]
 """Receives a servo's name and the changes; returns True to apply them."""
 
 
+@dataclass(frozen=True, slots=True)
+class FoundServo:
+    """A servo that answered a ping.
+
+    Attributes:
+        port: Its port.
+        baud_rate: Baud rate at which it answered.
+        id: Its id.
+        model: Value of ``servo.model``, or for an unsupported servo its name or number.
+        firmware: Firmware version.
+        max_current_a: Largest current limit; None if it is not supported.
+    """
+
+    port: str
+    baud_rate: int
+    id: int
+    model: str
+    firmware: int
+    max_current_a: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class PortScan:
+    """Servos on one serial port; or why it could not be searched, which is empty otherwise."""
+
+    port: str
+    servos: list[FoundServo]
+    problem: str
+
+
 def keep_only(config: Config, unit: Literal["servo", "camera", "load_cell"]) -> Config:
     """Returns the configuration without the other sensors, so that their failures do not hide this one's.
 

@@ -19,6 +19,7 @@ from gripper_force.errors import DataError
 from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.processes import process_pool
 from gripper_force.runtime.log_reader import LogReader
+from gripper_force.schema import Tree
 from gripper_force.types import NS_PER_MS, Frame, Gray, LoadCellSample, Record, ServoState
 
 if TYPE_CHECKING:  # labels need no OpenCV
@@ -26,6 +27,22 @@ if TYPE_CHECKING:  # labels need no OpenCV
 
 CONTACT_N: Final = 0.25
 """Measured force above which a frame counts as in contact."""
+
+_VIEW_KEYS: Final = (
+    "camera_offset_m",
+    "camera_target_offset_m",
+    "camera_fovy_deg",
+    "camera_from_grip_m",
+    "camera_aim_m",
+    "camera_roll_deg",
+    "camera_blur_px",
+    "pad_half_m",
+    "finger_half_m",
+    "pad_rgb",
+    "finger_rgb",
+    "background",
+)
+"""Keys of a simulated scene that tell one rig from another."""
 
 NEAR_NS: Final = 50 * NS_PER_MS
 """Largest time from a frame to a valid load-cell sample; other frames have no label."""
@@ -44,6 +61,8 @@ class Clip:
         set: Name of the set. A split keeps a set on one side, such as all light levels of one simulation.
         stiffness: Stiffness of a simulated object over the nominal one of its kind; NaN if unknown.
         indentation_m: Travel of the jaws since first contact at each frame, (T,) float32; NaN if unknown.
+        rig: Settings of camera and gripper, see `gripper_force.config.Config.rig_settings`; empty if unknown.
+        view: Camera and jaws of a simulated scene, as text; empty for a real one.
     """
 
     frames: Gray
@@ -54,6 +73,8 @@ class Clip:
     set: str
     stiffness: float = float("nan")
     indentation_m: npt.NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+    rig: Tree = field(default_factory=dict)
+    view: str = ""
 
     def __post_init__(self) -> None:
         """Makes the indentation unknown where none is given."""
@@ -315,7 +336,18 @@ def read_clip(
     travel_m = indentations(
         frame_t_ns, forces_n, states, Transmission.from_config(config.gripper, servo_nm_per_a=1.0).width_m
     )
-    return Clip(np.stack(small), forces_n, valid, name, config.object, set_, stiffness, travel_m)
+    return Clip(
+        np.stack(small),
+        forces_n,
+        valid,
+        name,
+        config.object,
+        set_,
+        stiffness,
+        travel_m,
+        config.rig_settings(),
+        _view_of(reader.metadata),
+    )
 
 
 def stiffness_of(metadata: Mapping[str, str]) -> float:
@@ -328,6 +360,12 @@ def stiffness_of(metadata: Mapping[str, str]) -> float:
         DataError: The metadata hold a scene without a stiffness above 0.
     """
     return _positive(metadata, "scene", lambda scene: float(json.loads(scene)["stiffness"]), float("nan"))
+
+
+def _view_of(metadata: Mapping[str, str]) -> str:
+    """Returns the camera and the jaws of a simulated scene; empty for a real one."""
+    scene: Tree = json.loads(metadata["scene"]) if "scene" in metadata else {}
+    return json.dumps({key: scene[key] for key in _VIEW_KEYS if key in scene}) if scene else ""
 
 
 def _positive(metadata: Mapping[str, str], key: str, read: Callable[[str], float], default: float) -> float:

@@ -7,7 +7,7 @@ import os
 import re
 import time
 from collections.abc import Iterable, Iterator
-from importlib import import_module
+from importlib import import_module, metadata
 from pathlib import Path
 from typing import Final
 
@@ -15,10 +15,12 @@ import numpy as np
 
 from gripper_force.config import Config
 from gripper_force.errors import GripperError
-from gripper_force.jobs.checks import Check, Confirm, SetupResult, judged, time_ms
+from gripper_force.interfaces import Progress, no_progress
+from gripper_force.jobs.checks import Check, Confirm, PortScan, SetupResult, judged, time_ms
 from gripper_force.runtime.backends import MonotonicClock
 from gripper_force.runtime.process import real_time_priority
 from gripper_force.runtime.resolve import ResolvedConfig, make_estimator, resolve_vision
+from gripper_force.schema import Tree
 from gripper_force.types import NS_PER_MS
 
 PROBES: Final = {
@@ -29,7 +31,16 @@ PROBES: Final = {
 }
 """Modules with a function ``probe(config)`` that yields checks, in the order of the table."""
 
+_SCAN: Final = "gripper_hw.dynamixel.servo_scan"
 _SLEEP_MS: Final = 5
+
+_OPENCV: Final = (
+    "opencv-contrib-python-headless",
+    "opencv-contrib-python",
+    "opencv-python-headless",
+    "opencv-python",
+)
+"""Distributions that contain a module ``cv2``; the one installed last overwrites that of the others."""
 
 
 def doctor(config: Config) -> Iterator[Check]:
@@ -37,20 +48,56 @@ def doctor(config: Config) -> Iterator[Check]:
 
     A failure becomes a row of the table; nothing is raised.
     """
-    for unit, module in PROBES.items():
-        yield from _guarded(unit, _probe(module, config))
+    for unit in PROBES:
+        yield from check(config, unit)
     yield from _guarded("network", _network(config))
     yield from _guarded("clock", _clock(config))
+    yield from _guarded("opencv", _opencv())
 
 
-def setup(config: Config, confirm: Confirm) -> SetupResult:
+def check(config: Config, unit: str) -> Iterator[Check]:
+    """Checks one unit of `PROBES`, as `doctor` does."""
+    yield from _guarded(unit, _probe(PROBES[unit], config))
+
+
+def setup(config: Config, confirm: Confirm, *, commission: bool = False) -> SetupResult:
     """Sets the registers of the configured servo to the values that a run needs, if ``confirm`` agrees.
+
+    Args:
+        config: The configuration.
+        confirm: Called with the changes.
+        commission: Only registers that survive power-off, among them Homing Offset and, if no other servo shares the
+            bus, a baud rate of at least a million. ``confirm`` is then called once for each change.
 
     Raises:
         GripperError: The servo is missing, is another model, has torque on, or does not keep a value.
     """
-    result: SetupResult = import_module(PROBES["servo"]).setup(config, confirm)
+    result: SetupResult = import_module(PROBES["servo"]).setup(config, confirm, commission=commission)
     return result
+
+
+def serial_ports() -> list[str]:
+    """Returns the paths of the serial ports that are plugged in, those that stay after a restart if there are such."""
+    found: list[str] = import_module(_SCAN).ports()
+    return found
+
+
+def scan_servos(config: Config, ports: Iterable[str], progress: Progress = no_progress) -> list[PortScan]:
+    """Looks for servos on each port at every baud rate of the X series. Nothing is written."""
+    found: list[PortScan] = import_module(_SCAN).scan(config, ports, progress=progress)
+    return found
+
+
+def find_cameras() -> list[Tree]:
+    """Returns the keys of the section ``camera`` for each camera that is plugged in."""
+    found: list[Tree] = import_module(PROBES["camera"]).find()
+    return found
+
+
+def find_load_cell(config: Config, ports: Iterable[str], progress: Progress = no_progress) -> Tree | None:
+    """Returns the keys of ``load_cell`` for the first port that sends a load cell's lines, or None."""
+    found: Tree | None = import_module(PROBES["load cell"]).find(config, ports, progress)
+    return found
 
 
 def _probe(module: str, config: Config) -> Iterator[Check]:
@@ -95,6 +142,21 @@ def _network(config: Config) -> Iterator[Check]:
     advice = f"slower than the frames at camera.rate_hz={config.camera.rate_hz:g}: close other programs"
     lockstep = config.clock == "lockstep"
     yield judged("network", "step", found, median_ms <= frame_ms, advice, harmless=lockstep)
+
+
+def _opencv() -> Iterator[Check]:
+    """Checks that one distribution gives ``cv2``, and that it has what this project calls."""
+    import cv2
+
+    installed = [f"{name} {found.version}" for name in _OPENCV for found in metadata.distributions(name=name)]
+    remedy = f"pip uninstall {' '.join(_OPENCV)}, then pip install {_OPENCV[0]}"
+    whole = hasattr(getattr(cv2, "aruco", None), "ArucoDetector")
+    found = f"cv2 {cv2.__version__} of {', '.join(installed) or 'no known distribution'}"
+    if whole:
+        advice = f"each overwrites the module cv2 of the others, and to remove one breaks it: {remedy}"
+        yield judged("opencv", "module", found, len(installed) <= 1, advice, harmless=True)
+    else:
+        yield Check("opencv", "module", f"{found} has no cv2.aruco.ArucoDetector", False, remedy)
 
 
 def _clock(config: Config) -> Iterator[Check]:

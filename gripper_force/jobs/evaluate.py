@@ -107,8 +107,8 @@ def evaluate(
         profile: Object profile that corrects the estimates, by name or path; ``own`` for the profile with
             the name of each log's object; None for the configuration's, by default none.
         objects: Only logs of these objects are used; empty for all.
-        config: Its ``vision.region`` replaces the region in each log's own configuration, and its camera and
-            ``calibration.on_mismatch`` apply to profiles. Default: the defaults.
+        config: Its ``vision.region`` replaces the region in each log's own configuration, and its
+            ``calibration.on_mismatch`` applies to profiles of another rig than a log's. Default: the defaults.
         include_contact_starts: Also use logs that start in contact. Their reference frames are wrong, and so
             are the estimates.
         workers: Processes that read the logs.
@@ -139,7 +139,7 @@ def evaluate(
 
     def correction(clip: Clip) -> Correction | None:
         own = config.model_copy(update={"object": clip.object, "calibration": calibration})
-        return read_correction(own, read_profiles(own), loaded)
+        return read_correction(own, read_profiles(own), loaded, clip.rig)
 
     def gain(clip: Clip) -> float:
         own = config.model_copy(update={"object": clip.object, "calibration": calibration})

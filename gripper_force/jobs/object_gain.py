@@ -7,13 +7,7 @@ from pathlib import Path
 from gripper_force.config import Overrides, config_from_text
 from gripper_force.control.object_gain import GainEstimate, ObjectGain
 from gripper_force.errors import DataError
-from gripper_force.profiles.object_profile import (
-    find_object,
-    read_object,
-    user_folder,
-    weights_path,
-    write_object,
-)
+from gripper_force.profiles.object_profile import BUNDLED, find_object, read_object, user_folder, weights_path
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import make_controller
 from gripper_force.types import Request, ServoState, VisualForce
@@ -76,7 +70,7 @@ def save_gain(
         name: Object profile, by name or path.
         logs: Logs of grasps of the object with the profile, in order of time. If a log began with what the one before
             had learned, pass only the last one of them.
-        out: Profile to write; None: the one with this name in the user's folder of profiles.
+        out: Profile to write; None: that of the bundle, or the one with this name in the user's folder of profiles.
         overrides: Changes of the logs' configuration; see `learned_ratio`.
 
     Raises:
@@ -84,6 +78,8 @@ def save_gain(
         ConfigError: The profile or its second file can't be read, or the new one can't be written.
         LogError: A log can't be read.
     """
+    from gripper_force.jobs.profile_files import write_object
+
     source = find_object(name)
     profile = read_object(source)
     ratios = [ratio for path in logs if (ratio := learned_ratio(path, overrides)) is not None]
@@ -100,7 +96,7 @@ def save_gain(
     assert estimate is not None
     if gain.problem:
         raise DataError(f"the gain is not saved: {gain.problem}")
-    target = out or user_folder() / f"{source.stem}.yaml"
+    target = out or (source if source.name == BUNDLED else user_folder() / f"{source.stem}.yaml")
     write_object(target, profile.model_copy(update={"ratio": total}), weights_path(source).read_bytes())
     return SavedGain(profile.object, estimate.gain, estimate.std, *total, target)
 

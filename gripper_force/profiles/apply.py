@@ -8,11 +8,18 @@ from typing import TYPE_CHECKING
 
 from gripper_force.config import Config, ControlConfig
 from gripper_force.errors import ConfigError
-from gripper_force.profiles.object_profile import ObjectProfile, find_object, read_object
+from gripper_force.profiles.object_profile import (
+    BUNDLED,
+    ObjectProfile,
+    find_object,
+    read_object,
+    user_folder,
+)
 from gripper_force.profiles.rig_profile import RigProfile, read_rig
 
 if TYPE_CHECKING:  # a run without vision imports none of these
     from gripper_force.profiles.correction import Correction
+    from gripper_force.schema import Tree
     from gripper_force.vision.checkpoint import Checkpoint
     from gripper_force.vision.header import Model
 
@@ -56,6 +63,27 @@ def read_profiles(config: Config) -> Profiles:
     )
 
 
+def with_bundle(config: Config) -> tuple[Config, str]:
+    """Names a bundle's profile and network in a configuration that leaves the network open, and returns a note too."""
+    calibration, name = config.calibration, config.profile
+    if calibration.object is None and (user_folder() / config.object / BUNDLED).is_file():
+        name = config.object
+    if name is None or not config.uses_vision:
+        return config, ""
+    profile = read_object(path := find_object(name))
+    if profile.network is None or config.vision.checkpoint == (
+        network := str(path.with_name(profile.network))
+    ):
+        return config, ""
+    if config.vision.checkpoint != "default":
+        named = f"vision.checkpoint is {config.vision.checkpoint!r}; set it to default to use the bundle"
+        return config, f"did not use the network of the bundle {path.parent}, because {named}"
+    vision = config.vision.model_copy(update={"checkpoint": network})
+    calibration = calibration.model_copy(update={"object": str(path)})
+    config = config.model_copy(update={"calibration": calibration, "vision": vision})
+    return config, f"used the bundle {path.parent}, made of {profile.touches} touches on {profile.date}"
+
+
 def with_object(control: ControlConfig, profiles: Profiles) -> ControlConfig:
     """Fills in the plant and the object's ratio from the object profile, where the configuration leaves them open."""
     if profiles.object is None:
@@ -67,9 +95,9 @@ def with_object(control: ControlConfig, profiles: Profiles) -> ControlConfig:
 
 
 def read_correction(
-    config: Config, profiles: Profiles, model: Model | Checkpoint | None
+    config: Config, profiles: Profiles, model: Model | Checkpoint | None, rig: Tree | None = None
 ) -> Correction | None:
-    """Reads the object profile's correction of estimates; None without a profile or without vision.
+    """Reads the object profile's correction of estimates; None without a profile or vision. ``rig``: run's settings.
 
     Raises:
         ConfigError: The profile's second file cannot be read, or the profile belongs to another network or
@@ -77,12 +105,12 @@ def read_correction(
     """
     if profiles.object is None or profiles.object_path is None or model is None:
         return None
-    mismatches = profiles.object.mismatches(model.digest, config.camera_settings())
+    mismatches = profiles.object.mismatches(model.digest, rig or config.rig_settings())
     if profiles.object.checkpoint != model.digest:
         raise ConfigError(
             f"the object profile {profiles.object_path} was made with {mismatches[0]}, whose estimates it corrects; "
             f"calibrate the object again with {config.vision.checkpoint!r}, or leave the profile out with "
-            "calibration.object=null"
+            "calibration.object=none"
         )
     _refuse(config, f"object profile {profiles.object_path}", mismatches)
     from gripper_force.profiles.correction import load_correction
@@ -111,6 +139,6 @@ def rig_mismatches(config: Config, profiles: Profiles) -> list[str]:
 def _refuse(config: Config, profile: str, mismatches: list[str]) -> None:
     if mismatches and config.calibration.on_mismatch == "refuse":
         raise ConfigError(
-            f"the {profile} was made with {'; '.join(mismatches)}; calibrate again, or set "
+            f"the {profile} was made with {'; '.join(mismatches)}; teach or calibrate again, or set "
             "calibration.on_mismatch=warn"
         )

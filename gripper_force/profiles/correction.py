@@ -1,14 +1,11 @@
-"""Correction of the network's estimate by an object profile: force, interval, out-of-distribution score.
+"""Correction of the network's estimate by an object profile: force, interval, known frames.
 
 *Corrected force*: ``curve(mean of the members) + head . features + offset``. The curve never falls. The head,
 a correction of the last layer that is linear in its features, is zero if there were too few touches to fit
 it.
 
-*Out-of-distribution score*: the calibration's features lie near a linear subspace of few dimensions. The
-score is the squared distance of a frame's features from that subspace, divided by the mean squared distance
-of the calibration's features from their mean. This is the Q statistic of J. E. Jackson and G. S. Mudholkar,
-"Control procedures for residuals associated with principal component analysis", Technometrics 21 (1979)
-341-349, doi:10.1080/00401706.1979.10489779.
+*Known frames*: what the touches of the calibration have shown, for the out-of-distribution score
+(`gripper_force.vision.ood`).
 """
 
 import hashlib
@@ -16,20 +13,38 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import NormalDist
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from safetensors import SafetensorError
-from safetensors.numpy import load, save
+from safetensors.numpy import load
 
 from gripper_force.errors import ConfigError
-from gripper_force.profiles.object_profile import ObjectProfile, weights_path
+from gripper_force.profiles.object_profile import ObjectProfile, OodLimit, weights_path
 
 Floats = npt.NDArray[np.float64]
 Features = npt.NDArray[np.float32]
 """Concatenated inputs of the members' last layers, (N, F); see `vision.batch_inference.features`."""
 
-_NAMES = ("head", "offset", "mean", "axes", "spread")
+_NAMES = ("head", "offset")
+_KNOWN_NAMES = ("mean", "axes", "floor")
+
+
+class KnownFrames(NamedTuple):
+    """Features of known frames, for the out-of-distribution score.
+
+    Attributes:
+        mean: Mean of the features without contact, (F,).
+        axes: Basis of the subspace near which the features lie, (F, R).
+        floor: Squared distance from the mean that is added to a frame's.
+        limits: Limits, in order of rising force.
+    """
+
+    mean: npt.NDArray[np.floating]
+    axes: npt.NDArray[np.floating]
+    floor: float
+    limits: tuple[OodLimit, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,27 +54,16 @@ class ProfileArrays:
     Attributes:
         head: Correction of the last layers in newtons per unit of a feature, (F,); zeros for none.
         offset: Constant part of the correction in newtons, (1,).
-        mean: Mean of the calibration's features, (F,).
-        axes: Orthonormal basis of the subspace in which the features vary most, (F, R).
-        spread: Mean squared distance of the features from their mean, (1,).
+        known: Known frames; None without limits in the profile.
     """
 
     head: Features
     offset: Features
-    mean: Features
-    axes: Features
-    spread: Features
+    known: KnownFrames | None = None
 
     def head_n(self, features: Features) -> Floats:
         """Returns the correction by head and offset in newtons, (N,), for features (N, F)."""
         return features.astype(np.float64) @ self.head.astype(np.float64) + float(self.offset[0])
-
-    def ood_score(self, features: Features) -> Floats:
-        """Returns the Q statistic over the calibration's spread, (N,), for features (N, F)."""
-        deviation = (features - self.mean).astype(np.float64)
-        residual = deviation - (deviation @ self.axes) @ self.axes.T
-        score: Floats = np.square(residual).sum(1) / float(self.spread[0])
-        return score
 
 
 class Correction:
@@ -68,11 +72,12 @@ class Correction:
     Attributes:
         profile: The profile.
         differs: Differences between the calibration's network and camera and the run's, as text.
+        known: Frames of the calibration, for the out-of-distribution score; None if the network's limits count.
     """
 
     def __init__(self, profile: ObjectProfile, arrays: ProfileArrays, differs: Sequence[str] = ()) -> None:
         self.profile, self.differs = profile, tuple(differs)
-        self._arrays = arrays
+        self._arrays, self.known = arrays, arrays.known
         self._estimate_n = np.array(profile.output.estimate_n)
         self._force_n = np.array(profile.output.force_n)
         self._z = NormalDist().inv_cdf(0.5 + profile.interval.coverage / 2)
@@ -96,10 +101,6 @@ class Correction:
         """Returns the standard deviation of a normal error with that interval, (N,)."""
         return self.half_width_n(force_n) / self._z
 
-    def ood_score(self, features: Features) -> Floats:
-        """Returns the out-of-distribution score over the profile's limit, (N,); above 1 it is rejected."""
-        return self._arrays.ood_score(features) / self.profile.ood_limit
-
 
 def curve_n(estimate_n: Floats, force_n: Floats, at_n: npt.ArrayLike) -> Floats:
     """Evaluates a piecewise linear curve, extrapolated linearly beyond its ends.
@@ -114,14 +115,6 @@ def curve_n(estimate_n: Floats, force_n: Floats, at_n: npt.ArrayLike) -> Floats:
     slope = np.diff(force_n) / np.diff(estimate_n)
     value: Floats = force_n[segment] + slope[segment] * (at - estimate_n[segment])
     return value
-
-
-def pack(arrays: ProfileArrays) -> bytes:
-    """Returns the content of the safetensors file beside a profile, with the axes in half precision."""
-    data: bytes = save(
-        {n: getattr(arrays, n).astype(np.float16 if n == "axes" else np.float32) for n in _NAMES}
-    )
-    return data
 
 
 def load_correction(
@@ -147,23 +140,26 @@ def load_correction(
         ) from error
     if hashlib.sha256(data).hexdigest() != profile.weights:
         raise ConfigError(f"{arrays_path} does not belong to {path}; copy both files, or calibrate again")
+    names = _NAMES if profile.ood_limits is None else (*_NAMES, *_KNOWN_NAMES)
     try:
         tensors = load(data)
-        arrays = ProfileArrays(**{name: tensors[name].astype(np.float32) for name in _NAMES})
+        arrays = {name: tensors[name].astype(np.float32) for name in names}
     except (SafetensorError, KeyError, ValueError, TypeError) as error:
         raise ConfigError(
             f"{arrays_path} does not hold the arrays of an object profile: {error}; calibrate again"
         ) from error
-    shapes = {name: getattr(arrays, name).shape for name in _NAMES}
-    flat = {"head": (features,), "mean": (features,), "offset": (1,), "spread": (1,)}
-    wrong = [name for name, shape in flat.items() if shapes[name] != shape]
-    if wrong or len(shapes["axes"]) != 2 or shapes["axes"][0] != features:
+    shapes = {name: array.shape for name, array in arrays.items()}
+    expected = {"head": (features,), "offset": (1,), "mean": (features,), "floor": (1,)}
+    wrong = [name for name, shape in expected.items() if shapes.get(name, shape) != shape]
+    axes = shapes.get("axes", (features, 1))
+    if wrong or len(axes) != 2 or axes[0] != features or axes[1] == 0:
         raise ConfigError(
             f"{arrays_path} is for another network: this one has {features} features, and the shapes are "
             f"{shapes}; calibrate again"
         )
-    if not all(np.isfinite(getattr(arrays, name)).all() for name in _NAMES) or arrays.spread[0] <= 0:
-        raise ConfigError(
-            f"{arrays_path} holds values that are not finite, or a spread of 0; calibrate again"
-        )
-    return Correction(profile, arrays, differs)
+    if not all(np.isfinite(array).all() for array in arrays.values()) or arrays.get("floor", [1.0])[0] <= 0:
+        raise ConfigError(f"{arrays_path} holds values that are not finite, or a floor of 0; calibrate again")
+    known = None
+    if profile.ood_limits is not None:
+        known = KnownFrames(arrays["mean"], arrays["axes"], float(arrays["floor"][0]), profile.ood_limits)
+    return Correction(profile, ProfileArrays(arrays["head"], arrays["offset"], known), differs)

@@ -15,9 +15,12 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 
 from gripper_force.errors import ConfigError
-from gripper_force.schema import Finite, NonNegative, Positive, Section, Tree, dump, read_section, write_all
+from gripper_force.schema import Finite, NonNegative, Positive, Section, Tree, differences, read_section
 
 FORMAT: Final = "gripper-force-object/1"
+
+BUNDLED: Final = "profile.yaml"
+"""Profile in the folder of a bundle, which also holds the network that was taught the object."""
 
 SHIPPED: Final = "gripper_calibration"
 """Package whose folder ``objects`` holds the shipped profiles."""
@@ -68,6 +71,20 @@ class Interval(Section):
         return width
 
 
+class OodLimit(Section):
+    """Out-of-distribution limit at one estimated force (see `gripper_force.vision.ood`).
+
+    Attributes:
+        force_n: The force.
+        typical: Median share of the residual in known frames.
+        limit: Highest smoothed ratio to ``typical`` at which a frame is used.
+    """
+
+    force_n: Finite
+    typical: Positive
+    limit: Positive
+
+
 class LoopPlant(Section):
     """Plant of the force loop with this object (see `gripper_force.control.tuning`), and its PI controller.
 
@@ -95,15 +112,16 @@ class ObjectProfile(Section):
         object: The object's name.
         date: Date of the calibration.
         checkpoint: SHA-256 of the network's file.
-        camera: The camera's settings, by key of the configuration.
+        camera: Settings of camera, view and gripper, by key of the configuration.
         touches: Number of touches of the calibration.
         frames: Number of their frames.
         force_n: Largest force that the object was pressed with and recovered from. The profile holds up to
             it.
         output: Correction of the network's output.
         interval: Interval of the error of the corrected estimate.
-        ood_limit: Highest out-of-distribution score at which an estimate is used, 0 to 1 (see
-            `gripper_force.profiles.correction`). Version 0.1 called it ``gate``.
+        ood_limits: The object's own out-of-distribution limits, in order of rising force; None if the network has no
+            score, or in a profile of an earlier version, whose score is no longer used. The network's limits then
+            count.
         stiffness_n_m: Stiffness, force over travel of both jaws, at half of the largest force.
         plant: The force loop's plant; None if the logs hold no servo.
         before_n: MAE of the network alone on these touches.
@@ -111,6 +129,9 @@ class ObjectProfile(Section):
         ratio: Motor current over the corrected estimate in earlier grasps, and its relative standard deviation without
             that of the torque constant (see `gripper_force.control.object_gain`); None if it was not learned.
         weights: SHA-256 of the file beside it.
+        network: File beside it with the network, if it is the profile of a bundle (see `BUNDLED`).
+        logs: SHA-256 of each log of the touches.
+        version: Version of this software that made it.
     """
 
     format: Literal["gripper-force-object/1"] = FORMAT
@@ -123,35 +144,33 @@ class ObjectProfile(Section):
     force_n: Positive
     output: OutputCurve
     interval: Interval
-    ood_limit: Positive
+    ood_limits: Annotated[tuple[OodLimit, ...], Field(min_length=1)] | None = None
     stiffness_n_m: Positive | None = None
     plant: LoopPlant | None = None
     before_n: NonNegative
     after_n: NonNegative | None = None
     ratio: tuple[Positive, Positive] | None = None
     weights: str
+    network: str | None = None
+    logs: tuple[str, ...] = ()
+    version: str = ""
 
     @model_validator(mode="before")
     @classmethod
-    def _read_version_0_1(cls, tree: Any) -> Any:
-        if isinstance(tree, dict) and "gate" in tree and "ood_limit" not in tree:
-            return {("ood_limit" if key == "gate" else key): value for key, value in tree.items()}
+    def _read_earlier_version(cls, tree: Any) -> Any:
+        if isinstance(tree, dict):  # the limits of earlier scores
+            return {key: value for key, value in tree.items() if key not in ("gate", "ood_limit")}
         return tree
 
-    def mismatches(self, checkpoint: str, camera: Tree) -> list[str]:
+    def mismatches(self, checkpoint: str, rig: Tree) -> list[str]:
         """Returns the differences between the calibration and a run, as text.
 
         Args:
             checkpoint: SHA-256 of the run's network.
-            camera: The run's camera settings, by key of the configuration; missing keys are not compared.
+            rig: The run's `Config.rig_settings`; missing keys are not compared.
         """
-        differ = []
-        if checkpoint != self.checkpoint:
-            differ.append(f"network {self.checkpoint[:12]}, not {checkpoint[:12]}")
-        for key, value in self.camera.items():
-            if key in camera and camera[key] != value:
-                differ.append(f"{key} {value}, not {camera[key]}")
-        return differ
+        known = {"network": self.checkpoint[:12], **self.camera}
+        return differences(known, {"network": checkpoint[:12], **rig})
 
 
 def weights_path(path: Path) -> Path:
@@ -164,26 +183,6 @@ def read_object(path: Path) -> ObjectProfile:
     return read_section(ObjectProfile, path, FORMAT, "object profile")
 
 
-def check_place(path: Path) -> None:
-    """Creates the folder of a profile. Raises `ConfigError` if the profile can't be written there."""
-    if path.suffix != ".yaml":
-        raise ConfigError(f"can't write an object profile to {path}; name a file that ends in .yaml")
-    probe = path.with_name(f".{path.name}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise ConfigError(
-            f"can't write {path}: {error.strerror}, {error.filename}; name another file"
-        ) from error
-
-
-def write_object(path: Path, profile: ObjectProfile, weights: bytes) -> None:
-    """Writes an object profile and the safetensors file beside it. Raises `ConfigError` if it can't."""
-    write_all({weights_path(path): weights, path: dump(profile).encode()})
-
-
 def user_folder() -> Path:
     """Returns the folder of the user's profiles (https://specifications.freedesktop.org/basedir-spec/latest/)."""
     base = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local/share"
@@ -194,13 +193,15 @@ def find_object(name: str) -> Path:
     """Returns the path of an object profile. The user's profiles come before the shipped ones.
 
     Args:
-        name: A name such as ``sponge``, or a path that ends in ``.yaml``.
+        name: A name such as ``sponge``, or the path of a bundle, or one that ends in ``.yaml``.
 
     Raises:
         ConfigError: No profile has that name.
     """
     if name.endswith(".yaml"):
         return Path(name)
+    if (bundle := (Path(name) if "/" in name else user_folder() / name) / BUNDLED).is_file():
+        return bundle
     with as_file(files(SHIPPED) / "objects") as shipped:
         folders = (user_folder(), shipped)
         for folder in folders:

@@ -6,16 +6,7 @@ from typing import Annotated, Any, Final, Literal, Self
 from pydantic import AwareDatetime, Field, model_validator
 
 from gripper_force.errors import ConfigError
-from gripper_force.schema import (
-    Finite,
-    NonNegative,
-    Positive,
-    Section,
-    Tree,
-    dump,
-    read_section,
-    write_all,
-)
+from gripper_force.schema import Finite, NonNegative, Positive, Section, Tree, read_section
 
 FORMAT: Final = "gripper-force-rig/1"
 
@@ -210,16 +201,3 @@ def read_rig(path: Path) -> RigProfile:
             f"there is no rig profile {path} yet; `calibrate load-cell` or `calibrate servo` writes it"
         )
     return read_section(RigProfile, path, FORMAT, "rig profile")
-
-
-def update_rig(path: Path, section: LoadCellCalibration | ServoCalibration | CameraCalibration) -> RigProfile:
-    """Replaces one section of a rig profile, or creates the profile, and writes it.
-
-    Raises:
-        ConfigError: The file exists and is not a rig profile, or it can't be written.
-    """
-    profile = read_rig(path) if path.exists() else RigProfile()
-    names = {LoadCellCalibration: "load_cell", ServoCalibration: "servo", CameraCalibration: "camera"}
-    profile = profile.model_copy(update={names[type(section)]: section})
-    write_all({path: dump(profile).encode()})
-    return profile

@@ -7,6 +7,7 @@ from types import TracebackType
 from typing import Any, Literal, Self, overload
 
 from gripper_force.config import Config, Overrides, load_config
+from gripper_force.control.limits import largest_target_n
 from gripper_force.errors import ConfigError
 from gripper_force.interfaces import Lock, SharedPort
 from gripper_force.runtime.control_loop import ControlLoop
@@ -235,6 +236,12 @@ class Gripper:
     def width_m(self) -> float:
         """Distance between the jaws, in metres."""
         return self.state.width_m
+
+    @property
+    def largest_force_n(self) -> float:
+        """Largest force that `grasp` accepts, in newtons."""
+        limit_n = largest_target_n(self.config.control.force_limit_n, self.config.gripper.gain_bound)
+        return min([limit_n, *self._run.target_limits_n.values()])
 
     @property
     def frame(self) -> Frame | None:

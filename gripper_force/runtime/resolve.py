@@ -14,7 +14,13 @@ from gripper_force.control.state_machine import MAX_CYCLE_S, GraspController
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import ConfigError, RequestError
 from gripper_force.interfaces import ServoSpec
-from gripper_force.profiles.apply import read_correction, read_profiles, rig_mismatches, with_object
+from gripper_force.profiles.apply import (
+    read_correction,
+    read_profiles,
+    rig_mismatches,
+    with_bundle,
+    with_object,
+)
 from gripper_force.runtime.backends import load_servo_class, resolve_simulation, with_camera_rate
 from gripper_force.runtime.process import allowed
 
@@ -94,6 +100,7 @@ def resolve(config: Config, *, vision: bool = True) -> ResolvedConfig:
         config = config.model_copy(update={"vision": config.vision.model_copy(update={"checkpoint": "none"})})
     _check_rate(config)
     config = with_camera_rate(config)
+    config, bundle = with_bundle(config)
     config, model, choice = resolve_vision(config)
     config, detail = resolve_simulation(config)
     spec = load_servo_class(config).spec(config.servo)
@@ -109,9 +116,11 @@ def resolve(config: Config, *, vision: bool = True) -> ResolvedConfig:
     mismatches = {
         "object profile": () if correction is None else correction.differs,
         "rig profile": rig_mismatches(config, profiles),
+        "network": () if model is None or correction else model.header.mismatches(config.rig_settings()),
     }
     notes = [
         ("vision", choice),
+        ("session", bundle),
         ("simulation", detail),
         *(
             ("session", f"the {profile} was made with {'; '.join(found)}")

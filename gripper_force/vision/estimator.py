@@ -31,7 +31,8 @@ class ForceEstimator:
     one. Its standard deviation is that of the profile's interval. Without a profile, it combines the error
     measured in validation at that force with half of the members' spread, as independent errors, and
     grows with the frame's out-of-distribution score. It grows with the distance to the forces seen in
-    validation or calibration. The score is the object profile's, or without one the checkpoint's.
+    validation or calibration. The limits of that score are the object profile's, if it has some, and otherwise the
+    checkpoint's.
     """
 
     def __init__(
@@ -52,7 +53,8 @@ class ForceEstimator:
         self._engine = engine
         self._preprocess = engine.header.preprocess
         self._correction = correction
-        self._ood = None if engine.header.ood is None else OodScore(engine.header.ood)
+        own = None if correction is None else correction.known
+        self._ood = None if engine.header.ood is None else OodScore(engine.header.ood, own)
         self.reset()
 
     @classmethod
@@ -143,18 +145,30 @@ class ForceEstimator:
                 f"the network returned {forces} N; check the checkpoint and the camera's image"
             )
         force_n = sum(forces) / len(forces)
-        if self._correction is not None:
-            return _corrected(self._correction, force_n, step.features)
-        std_n = float(claimed_std_n(self._engine.header, step.forces_n[:, None])[0])
+        features, score = step.features[None], 0.0  # (1, F)
         if self._ood is not None:
-            score = float(self._ood.score(step.features[None], np.array([force_n]))[0])
+            score = float(self._ood.score(features, np.array([force_n]))[0])
             if score > 1:
-                raise DataError(
-                    f"the frame's out-of-distribution score is {score:.1f} times the network's limit: it shows what "
-                    "the network does not know; calibrate the object, or train a network with it"
-                )
-            std_n *= float(self._ood.std_factor(score))
-        return ForceEstimate(force_n, std_n)
+                raise DataError(f"the frame's out-of-distribution score is {score:.1f} times {self._limit()}")
+        if self._correction is not None:
+            corrected_n = self._correction.force_n([force_n], features)
+            return ForceEstimate(float(corrected_n[0]), float(self._correction.std_n(corrected_n)[0]))
+        std_n = float(claimed_std_n(self._engine.header, step.forces_n[:, None])[0])
+        return ForceEstimate(
+            force_n, std_n if self._ood is None else std_n * float(self._ood.std_factor(score))
+        )
+
+    def _limit(self) -> str:
+        """Names the limit that a frame exceeds, and what to do."""
+        if self._correction is None:
+            return (
+                "the network's limit: it shows what the network does not know; calibrate the object, or train a "
+                "network with it"
+            )
+        name = repr(self._correction.profile.object)
+        if self._correction.known is None:
+            return f"the network's limit, and the object profile {name} has no limits of its own; calibrate again"
+        return f"the limit of the object profile {name}; check that the object is the profile's, or calibrate again"
 
     def attention_map(self) -> Floats | None:
         """Returns SSAM's attention map of the newest frame, (h, w) in 0..1; None without SSAM or a frame."""
@@ -200,21 +214,9 @@ def open_estimator(
 def _profile_correction(model: Model, name: str) -> Correction:
     path = find_object(name)
     profile = read_object(path)
-    if mismatches := profile.mismatches(model.digest, camera={}):
+    if mismatches := profile.mismatches(model.digest, {}):
         raise ConfigError(
             f"the object profile {path} is of {'; '.join(mismatches)}; calibrate the object with this "
             "network, or use the network of the profile"
         )
     return load_correction(path, profile, sum(member.head for member in model.header.members))
-
-
-def _corrected(correction: Correction, force_n: float, step_features: Floats) -> ForceEstimate:
-    features = step_features[None]  # (1, F)
-    ood_score = float(correction.ood_score(features)[0])
-    if ood_score > 1:
-        raise DataError(
-            f"the frame's out-of-distribution score is {ood_score:.1f} times the limit of the object profile "
-            f"{correction.profile.object!r}; check that the object is the profile's, or calibrate again"
-        )
-    corrected_n = correction.force_n([force_n], features)
-    return ForceEstimate(float(corrected_n[0]), float(correction.std_n(corrected_n)[0]))

@@ -9,7 +9,8 @@ from typing import Annotated, Final, Literal, Self
 from pydantic import Base64UrlBytes, Field, ValidationError, model_validator
 
 from gripper_force.errors import CheckpointError, ConfigError
-from gripper_force.schema import Finite, NonNegative, Positive, Section
+from gripper_force.profiles.object_profile import OodLimit
+from gripper_force.schema import Finite, NonNegative, Positive, Section, Tree, differences
 from gripper_force.vision.preprocess import Preprocess
 
 Attention = Literal["none", "ssam", "scam", "se", "cbam"]
@@ -150,20 +151,6 @@ class Residual(Section):
     std_n: NonNegative
 
 
-class OodLimit(Section):
-    """Out-of-distribution limit at one estimated force.
-
-    Attributes:
-        force_n: The force.
-        typical: Median share of the residual in known frames.
-        limit: Highest smoothed ratio to ``typical`` at which a frame is used.
-    """
-
-    force_n: Finite
-    typical: Positive
-    limit: Positive
-
-
 class OodModel(Section):
     """Model of the features of known frames, for the out-of-distribution score (see `gripper_force.vision.ood`).
 
@@ -198,6 +185,7 @@ class Header(Section):
         test_digest: SHA-256 of the forces that the residuals and metrics were measured on, if it is not the
             training's own validation data. Metrics of two checkpoints compare if it is the same.
         identity: SHA-256 of the file before its header was changed; see `digest_of`.
+        trained_on: Number of ``rigs`` in the training set, and the settings of the first; None if unknown.
     """
 
     members: tuple[NetworkConfig | ProcessConfig, ...]
@@ -208,6 +196,7 @@ class Header(Section):
     ood: OodModel | None = None
     test_digest: str = ""
     identity: str = ""
+    trained_on: Tree | None = None
 
     @model_validator(mode="after")
     def _fits(self) -> "Header":
@@ -220,6 +209,11 @@ class Header(Section):
             if len(self.ood.mean) != 4 * features or not self.ood.axes or len(self.ood.axes) % (2 * features):
                 raise ValueError(f"ood.mean and ood.axes do not have {features} rows, one for each feature")
         return self
+
+    def mismatches(self, rig: Tree) -> list[str]:
+        """Returns the differences between the one rig of the training set and a run's settings, as text."""
+        known = self.trained_on or {}
+        return differences(known, rig) if known.get("rigs") == 1 else []
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from gripper_force.profiles.correction import KnownFrames
 from gripper_force.vision.header import OodModel
 
 Floats = npt.NDArray[np.float64]
@@ -43,21 +44,33 @@ def residual_share(
     return share
 
 
-def orthonormal(axes: npt.NDArray[np.float16]) -> Floats:
+def orthonormal(axes: npt.NDArray[np.floating]) -> Floats:
     """Returns an orthonormal basis, (F, R), of the subspace that stored axes span, (F, R)."""
     basis: Floats = np.linalg.qr(axes.astype(np.float64))[0]
     return basis
 
 
-class OodScore:
-    """Scores the frames of a stream with the model of a checkpoint."""
+def known_frames(model: OodModel) -> KnownFrames:
+    """Returns the known frames of a checkpoint."""
+    mean = np.frombuffer(model.mean, np.float32)
+    axes = np.frombuffer(model.axes, np.float16).reshape(len(mean), -1)
+    return KnownFrames(mean, axes, model.floor, model.limits)
 
-    def __init__(self, model: OodModel) -> None:
-        self._mean = np.frombuffer(model.mean, np.float32)
-        self._axes = orthonormal(np.frombuffer(model.axes, np.float16).reshape(len(self._mean), -1))
-        self._floor = model.floor
+
+class OodScore:
+    """Scores the frames of a stream."""
+
+    def __init__(self, model: OodModel, known: KnownFrames | None = None) -> None:
+        """Starts a stream.
+
+        Args:
+            model: Model of the checkpoint.
+            known: Known frames of an object profile, in place of those of the checkpoint.
+        """
+        self._mean, axes, self._floor, limits = known or known_frames(model)
+        self._axes = orthonormal(axes)
         self._forces_n, self._typical, self._limit = np.array(
-            [(limit.force_n, limit.typical, limit.limit) for limit in model.limits]
+            [(limit.force_n, limit.typical, limit.limit) for limit in limits]
         ).T
         self._std = model.std_base, model.std_growth
         self.reset()

@@ -95,6 +95,13 @@ def test_the_command_line_answers_without_what_is_heavy() -> None:
     assert not heavy & set(done.stdout.split())
 
 
+@pytest.mark.parametrize("first", [("network",), ("network", "small"), (), ("small",)], ids=" ".join)
+def test_export_without_a_subcommand_exports_a_network(run: Run, first: tuple[str, ...]) -> None:
+    done = run("export", *first, "--out", "force.trt")
+    assert done.code == 2
+    assert "can't export to force.trt" in done.err
+
+
 @pytest.mark.parametrize(
     ("assignment", "message"),
     [

@@ -21,7 +21,7 @@ MODELS = ["XM430-W350", "XL330-M288", "XC330-T288", "XH540-W270", "XD430-T210"]
 
 
 @pytest.mark.parametrize(
-    ("model", "target_n"), [*((model, 2.0) for model in MODELS), (None, 5.0)], ids=[*MODELS, "own servo"]
+    ("model", "target_n"), [*((model, 2.0) for model in MODELS), (None, 3.5)], ids=[*MODELS, "own servo"]
 )
 @pytest.mark.parametrize("path", [*GRIPPERS, None], ids=lambda path: path.stem if path else "table")
 def test_the_force_is_held_by_motor_current(

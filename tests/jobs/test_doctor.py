@@ -31,7 +31,7 @@ def test_without_any_hardware_the_rig_is_fit(sets: list[str]) -> None:
     report: dict[str, Any] = json.loads(done.stdout)
     assert report["ok"] is True
     assert {check["unit"] for check in report["checks"]} == {
-        *("servo", "servo 1", "camera", "load cell", "simulation", "network", "clock"),
+        *("servo", "servo 1", "camera", "load cell", "simulation", "network", "clock", "opencv"),
     }
     assert set(report["checks"][0]) == {"unit", "name", "found", "ok", "advice"}
     assert not [check for check in report["checks"] if check["ok"] is False]
@@ -59,7 +59,30 @@ def test_a_defect_of_one_probe_hides_no_other(monkeypatch: pytest.MonkeyPatch) -
     checks = list(doctor.doctor(load_config(None, ["vision.checkpoint=none"])))
     assert checks[0].ok is False
     assert "ModuleNotFoundError" in checks[0].found
-    assert checks[-1].unit == "clock"
+    assert {"clock", "opencv"} <= {check.unit for check in checks}
+
+
+def test_a_second_opencv_is_found_and_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (before,) = doctor._opencv()
+    assert before.ok
+    for name in ("opencv_python", "opencv_python_headless"):  # as pip records them
+        folder = tmp_path / f"{name}-4.1.2.dist-info"
+        folder.mkdir()
+        (folder / "METADATA").write_text(
+            f"Metadata-Version: 2.1\nName: {name.replace('_', '-')}\nVersion: 4.1.2\n"
+        )
+    monkeypatch.syspath_prepend(tmp_path)
+    (check,) = doctor._opencv()
+    assert "opencv-python 4.1.2" in check.found
+    assert "opencv-python-headless 4.1.2" in check.found
+    assert check.advice.endswith("then pip install opencv-contrib-python-headless")
+
+
+def test_an_opencv_without_what_is_called_is_a_problem(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr("cv2.aruco.ArucoDetector")
+    (check,) = doctor._opencv()
+    assert check.ok is False
+    assert "has no cv2.aruco.ArucoDetector" in check.found
 
 
 def test_the_table_is_for_people(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -201,6 +201,6 @@ def test_the_interval_of_a_difference_is_students() -> None:
 
 
 def test_the_remedy_for_a_profile_of_another_network_works(fused_log: Path) -> None:
-    with pytest.raises(ConfigError, match=r"leave the profile out with calibration\.object=null"):
+    with pytest.raises(ConfigError, match=r"leave the profile out with calibration\.object=none"):
         replay(fused_log, overrides=["calibration.object=sponge"])
-    assert replay(fused_log, overrides=["calibration.object=null"]).identical is True
+    assert replay(fused_log, overrides=["calibration.object=none"]).identical is True

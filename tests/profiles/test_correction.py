@@ -1,3 +1,4 @@
+from dataclasses import replace
 from datetime import date
 from hashlib import sha256
 from pathlib import Path
@@ -8,14 +9,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gripper_force.errors import ConfigError
+from gripper_force.jobs.profile_files import pack
 from gripper_force.profiles.correction import (
     Correction,
+    KnownFrames,
     ProfileArrays,
     curve_n,
     load_correction,
-    pack,
 )
-from gripper_force.profiles.object_profile import Interval, ObjectProfile, OutputCurve, weights_path
+from gripper_force.profiles.object_profile import (
+    Interval,
+    ObjectProfile,
+    OodLimit,
+    OutputCurve,
+    weights_path,
+)
+from gripper_force.vision.ood import orthonormal, residual_share
+
+LIMITS = (OodLimit(force_n=0.0, typical=0.01, limit=2.0), OodLimit(force_n=4.0, typical=0.02, limit=3.0))
 
 
 def profile(weights: str = "") -> ObjectProfile:
@@ -29,16 +40,16 @@ def profile(weights: str = "") -> ObjectProfile:
         force_n=6.0,
         output=OutputCurve(kind="monotone", estimate_n=(0.0, 2.0, 4.0), force_n=(0.5, 1.5, 4.5)),
         interval=Interval(coverage=0.9, base_n=0.3, share=0.1),
-        ood_limit=0.5,
+        ood_limits=LIMITS,
         before_n=0.5,
         weights=weights,
     )
 
 
-def arrays(features: int = 5, spread: float = 2.0) -> ProfileArrays:
-    axes = np.eye(features, 2, dtype=np.float32)
+def arrays(features: int = 5, floor: float = 2.0) -> ProfileArrays:
+    axes = np.linalg.qr(np.random.default_rng(3).normal(size=(features, 2)))[0]
     zeros = np.zeros(features, np.float32)
-    return ProfileArrays(zeros, np.zeros(1, np.float32), zeros, axes, np.array([spread], np.float32))
+    return ProfileArrays(zeros, np.zeros(1, np.float32), KnownFrames(zeros + 1, axes, floor, LIMITS))
 
 
 def written(path: Path, arrays: ProfileArrays) -> str:
@@ -62,19 +73,17 @@ def test_interval_grows_with_force_and_faster_beyond_calibrated_forces() -> None
     assert correction.std_n([4.0])[0] * 1.6449 == pytest.approx(half_n[2], rel=1e-4)
 
 
-def test_ood_score_measures_distance_from_the_subspace() -> None:
-    correction = Correction(profile(), arrays())
-    on, off = np.array([[9, 9, 0, 0, 0], [9, 9, 0, 1, 1]], np.float32)
-    assert correction.ood_score(np.stack([on, off])) == pytest.approx([0, 1 / 0.5])
-
-
 def test_arrays_round_trip_and_must_match_the_profile(tmp_path: Path) -> None:
     path = tmp_path / "mug.yaml"
     weights = written(path, arrays())
     correction = load_correction(path, profile(weights), 5)
     features = np.random.default_rng(0).normal(size=(7, 5)).astype(np.float32)
-    expected = Correction(profile(), arrays())
-    np.testing.assert_array_equal(correction.ood_score(features), expected.ood_score(features))
+    known, expected = correction.known, arrays().known
+    assert known is not None
+    assert expected is not None
+    assert known.limits == LIMITS
+    shares = [residual_share(features, k.mean, orthonormal(k.axes), k.floor) for k in (known, expected)]
+    np.testing.assert_allclose(shares[0], shares[1], rtol=0.01)  # the axes are stored in half precision
     with pytest.raises(ConfigError, match="for another network: this one has 6"):
         load_correction(path, profile(weights), 6)
     with pytest.raises(ConfigError, match="does not belong to"):
@@ -84,9 +93,18 @@ def test_arrays_round_trip_and_must_match_the_profile(tmp_path: Path) -> None:
         load_correction(path, profile(weights), 5)
 
 
-@pytest.mark.parametrize("spread", [0.0, np.nan])
-def test_invalid_spread_is_refused(tmp_path: Path, spread: float) -> None:
+def test_arrays_of_known_frames_are_needed_only_with_limits(tmp_path: Path) -> None:
     path = tmp_path / "mug.yaml"
-    weights = written(path, arrays(spread=spread))
+    weights = written(path, replace(arrays(), known=None))
+    with pytest.raises(ConfigError, match="mean"):
+        load_correction(path, profile(weights), 5)
+    without = profile(weights).model_copy(update={"ood_limits": None})
+    assert load_correction(path, without, 5).known is None
+
+
+@pytest.mark.parametrize("floor", [0.0, np.nan])
+def test_invalid_floor_is_refused(tmp_path: Path, floor: float) -> None:
+    path = tmp_path / "mug.yaml"
+    weights = written(path, arrays(floor=floor))
     with pytest.raises(ConfigError, match="not finite"):
         load_correction(path, profile(weights), 5)

@@ -6,18 +6,19 @@ import pytest
 
 from gripper_force.config import load_config
 from gripper_force.errors import ConfigError
+from gripper_force.jobs.profile_files import check_place, write_object
 from gripper_force.profiles.apply import read_profiles, with_object
 from gripper_force.profiles.object_profile import (
+    BUNDLED,
     Interval,
     LoopPlant,
     ObjectProfile,
+    OodLimit,
     OutputCurve,
-    check_place,
     find_object,
     read_object,
     user_folder,
     weights_path,
-    write_object,
 )
 
 
@@ -26,13 +27,13 @@ def profile(**keys: object) -> ObjectProfile:
         object="mug",
         date=date(2026, 1, 2),
         checkpoint="a" * 64,
-        camera=load_config().camera_settings(),
+        camera=load_config().rig_settings(),
         touches=4,
         frames=400,
         force_n=7.5,
         output=OutputCurve(kind="affine", estimate_n=(0.0, 8.0), force_n=(0.1, 6.5)),
         interval=Interval(coverage=0.9, base_n=0.1, share=0.03),
-        ood_limit=0.02,
+        ood_limits=(OodLimit(force_n=0.0, typical=0.02, limit=3.0),),
         plant=LoopPlant(
             gain=0.9, lag_ms=30, delay_ms=40, proportional=0.4, integral_s=14, phase_margin_deg=61
         ),
@@ -97,11 +98,24 @@ def test_user_profiles_come_before_shipped_ones(tmp_path: Path, monkeypatch: pyt
     with pytest.raises(ConfigError, match=r"known: .*mug"):
         find_object("cup_of_another")
     assert find_object("some/where.yaml") == Path("some/where.yaml")
+    bundle = user_folder() / "mug"
+    write_object(bundle / BUNDLED, profile(network="network.safetensors"), b"")
+    assert find_object("mug") == find_object(str(bundle)) == bundle / BUNDLED
+
+
+def test_lengths_of_the_same_gripper_may_differ_a_little() -> None:
+    near = load_config(None, ["gripper.open_width_m=0.0925"]).rig_settings()
+    assert profile().mismatches("a" * 64, near) == []
+    far = load_config(None, ["gripper.open_width_m=0.11", "sim.view_spread=5"]).rig_settings()
+    assert profile().mismatches("a" * 64, far) == [
+        "gripper.open_width_m 0.092, not 0.11",
+        "sim.view_spread 1.0, not 5.0",
+    ]
 
 
 def test_mismatches_name_network_and_settings() -> None:
-    settings = load_config(None, ["camera.rate_hz=30"]).camera_settings()
-    assert profile().mismatches("a" * 64, load_config().camera_settings()) == []
+    settings = load_config(None, ["camera.rate_hz=30"]).rig_settings()
+    assert profile().mismatches("a" * 64, load_config().rig_settings()) == []
     assert profile().mismatches("c" * 64, settings) == [
         "network aaaaaaaaaaaa, not cccccccccccc",
         "camera.rate_hz 60.0, not 30.0",

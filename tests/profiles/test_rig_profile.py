@@ -5,13 +5,13 @@ import pytest
 
 from gripper_force.config import load_config
 from gripper_force.errors import ConfigError
+from gripper_force.jobs.profile_files import update_rig
 from gripper_force.profiles.rig_profile import (
     CalibratedValue,
     LoadCellCalibration,
     RigProfile,
     ServoCalibration,
     read_rig,
-    update_rig,
 )
 
 NOW = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)

@@ -102,6 +102,15 @@ def test_grasp_changes_of_force_and_release(simulated: Open) -> None:
     assert gripper.state.phase == gf.Phase.OPEN
 
 
+@pytest.mark.parametrize("profile", ["null", "stapler"])
+def test_the_largest_force_is_the_largest_that_is_accepted(simulated: Open, profile: str) -> None:
+    gripper = simulated("object=none", f"calibration.object={profile}")
+    largest_n = gripper.largest_force_n
+    gripper.grasp(largest_n, wait=False)
+    with pytest.raises(gf.RequestError, match="profile" if profile == "stapler" else "force_limit_n"):
+        gripper.grasp(math.nextafter(largest_n, math.inf), wait=False)
+
+
 def test_the_same_configuration_gives_the_same_result(simulated: Open) -> None:
     first = simulated()
     result = first.grasp(3.0)
@@ -852,3 +861,20 @@ def test_signals_work_as_before_once_another_thread_has_closed_the_gripper(
     )
     assert done.returncode == -number, done.stderr
     assert done.stdout == ("True\n" if number == signal.SIGINT else "")
+
+
+def test_a_new_object_begins_without_the_gain_of_the_one_before(simulated: Open) -> None:
+    eyes = ("camera.backend=simulated", "vision.checkpoint=small", "control.feedback=fused")
+    gripper = simulated(*eyes, "control.settle_s=0.8", "object=sponge", "sim.stiffness=1.5")
+    first = gripper.grasp(3.0)
+    assert first.object_gain > 1.05
+    with pytest.raises(gf.RequestError, match="an object is held"):
+        gripper.grasp(3.0, new_object=True)
+    gripper.release()
+    second = gripper.grasp(3.0)
+    assert (
+        second.object_gain > first.object_gain + 0.1
+    )  # two grasps are less likely an error of the torque constant
+    gripper.release()
+    other = gripper.grasp(3.0, new_object=True)
+    assert other.object_gain == pytest.approx(first.object_gain, rel=0.05)

@@ -10,6 +10,8 @@ from gripper_force.errors import ConfigError, RequestError
 from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.runtime.resolve import ResolvedConfig, make_controller, make_estimator, resolve
 from gripper_force.types import NS_PER_S, Frame
+from gripper_force.vision.checkpoint_writer import replace_header
+from gripper_force.vision.header import read_checkpoint
 from gripper_hw.dynamixel.servo import DynamixelServo
 
 NO_SENSORS = ["camera.backend=none", "load_cell.backend=none"]
@@ -157,3 +159,33 @@ def test_a_wrong_servo_backend_is_named(key: str, message: str | None) -> None:
 def test_a_missing_checkpoint_is_found_before_devices_open(tmp_path: Path) -> None:
     with pytest.raises(Exception, match=r"no\.safetensors"):
         resolve(load_config(None, [f"vision.checkpoint={tmp_path}/no.safetensors"]))
+
+
+def test_a_network_of_one_rig_says_so_on_another(tiny_checkpoint: Path, tmp_path: Path) -> None:
+    header = read_checkpoint(tiny_checkpoint)[2]
+    one, several = tmp_path / "one.safetensors", tmp_path / "several.safetensors"
+    settings = load_config().rig_settings()
+    for path, rigs in ((one, 1), (several, 2)):
+        replace_header(
+            tiny_checkpoint, header.model_copy(update={"trained_on": {"rigs": rigs, **settings}}), path
+        )
+    other = ["camera.exposure_us=8000", "vision.region=[0, 0, 90, 90]"]
+    notes = resolve(load_config(None, [f"vision.checkpoint={one}", *other])).notes
+    assert (
+        "session",
+        "the network was made with camera.exposure_us 4000, not 8000; vision.region None, not [0, 0, 90, 90]",
+    ) in notes
+    for checkpoint, keys in ((one, []), (several, other), (tiny_checkpoint, other)):
+        notes = resolve(load_config(None, [f"vision.checkpoint={checkpoint}", *keys])).notes
+        assert not any("was made with" in text for _, text in notes)
+
+
+@pytest.mark.parametrize("name", ["default", "small"])
+def test_shipped_networks_are_for_any_rig(name: str) -> None:
+    keys = [
+        "camera.exposure_us=8000",
+        "gripper.open_width_m=0.05",
+        "sim.tool=rods",
+        f"vision.checkpoint={name}",
+    ]
+    assert not any("was made with" in text for _, text in resolve(load_config(None, keys)).notes)

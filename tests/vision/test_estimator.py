@@ -1,4 +1,6 @@
 import math
+from base64 import urlsafe_b64encode
+from dataclasses import replace
 from datetime import date
 from hashlib import sha256
 from pathlib import Path
@@ -9,14 +11,15 @@ import torch
 
 from gripper_force.config import VisionConfig
 from gripper_force.errors import ConfigError, DataError, NonFiniteError
-from gripper_force.profiles.correction import Correction, ProfileArrays, pack
-from gripper_force.profiles.object_profile import Interval, ObjectProfile, OutputCurve, write_object
+from gripper_force.jobs.profile_files import pack, write_object
+from gripper_force.profiles.correction import Correction, KnownFrames, ProfileArrays
+from gripper_force.profiles.object_profile import Interval, ObjectProfile, OodLimit, OutputCurve
 from gripper_force.types import ForceEstimate
 from gripper_force.vision.batch_inference import features, predict
 from gripper_force.vision.checkpoint import Checkpoint
 from gripper_force.vision.engines.pytorch import TorchEngine
 from gripper_force.vision.estimator import ForceEstimator, open_estimator
-from gripper_force.vision.header import Header, NetworkConfig, Residual
+from gripper_force.vision.header import Header, NetworkConfig, OodModel, Residual
 from gripper_force.vision.model_files import read_model
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess, downscale
@@ -131,7 +134,11 @@ def test_invalid_frame_or_region_is_refused(frames: np.ndarray) -> None:
         ForceEstimator(TorchEngine(ensemble("ssam"))).update(frames)
 
 
-def profile_of(ood_limit: float, checkpoint: str = "", weights: str = "") -> ObjectProfile:
+def limits_of(limit: float) -> tuple[OodLimit, ...]:
+    return (OodLimit(force_n=0.0, typical=1.0, limit=limit),)
+
+
+def profile_of(limit: float | None, checkpoint: str = "", weights: str = "") -> ObjectProfile:
     """An object profile that halves the force and adds 0.2 N."""
     return ObjectProfile(
         object="mug",
@@ -143,25 +150,38 @@ def profile_of(ood_limit: float, checkpoint: str = "", weights: str = "") -> Obj
         force_n=5.0,
         output=OutputCurve(kind="affine", estimate_n=(0.0, 2.0), force_n=(0.2, 1.2)),
         interval=Interval(coverage=0.9, base_n=0.3, share=0.1),
-        ood_limit=ood_limit,
+        ood_limits=None if limit is None else limits_of(limit),
         before_n=0.5,
         weights=weights,
     )
 
 
-def arrays_of(mean: np.ndarray) -> ProfileArrays:
+def arrays_of(mean: np.ndarray, limit: float | None = 1e6) -> ProfileArrays:
     """A head that adds 0.1 N and one feature, and a subspace of one dimension."""
     rng = np.random.default_rng(0)
     unit = rng.normal(size=(len(mean), 1))
     head = np.zeros(len(mean), np.float32)
     head[3] = 2.0
-    return ProfileArrays(
-        head, np.array([0.1], np.float32), mean, unit / np.linalg.norm(unit), np.array([1.0], np.float32)
+    known = KnownFrames(mean, unit / np.linalg.norm(unit), 1e-6, limits_of(limit)) if limit else None
+    return ProfileArrays(head, np.array([0.1], np.float32), known)
+
+
+def correction(limit: float | None, mean: np.ndarray) -> Correction:
+    return Correction(profile_of(limit), arrays_of(mean, limit))
+
+
+def with_score(checkpoint: Checkpoint, limit: float) -> Checkpoint:
+    """The checkpoint with a score of one dimension, which says little and rejects frames above the limit."""
+    features = sum(member.head for member in checkpoint.header.members)
+    model = OodModel(
+        mean=urlsafe_b64encode(np.zeros(features, np.float32).tobytes()),
+        axes=urlsafe_b64encode(np.eye(features, 1, dtype=np.float16).tobytes()),
+        floor=1e-6,
+        limits=limits_of(limit),
+        std_base=1.0,
+        std_growth=0.0,
     )
-
-
-def correction(ood_limit: float, mean: np.ndarray) -> Correction:
-    return Correction(profile_of(ood_limit), arrays_of(mean))
+    return replace(checkpoint, header=checkpoint.header.model_copy(update={"ood": model}))
 
 
 def test_profile_corrects_a_stream_like_a_batch(frames: np.ndarray) -> None:
@@ -178,11 +198,36 @@ def test_profile_corrects_a_stream_like_a_batch(frames: np.ndarray) -> None:
         assert estimate.std_n == pytest.approx(half_n / 1.6449, abs=1e-3)
 
 
-def test_out_of_distribution_frame_gives_no_estimate(frames: np.ndarray) -> None:
-    checkpoint = ensemble("ssam")
-    estimator = ForceEstimator(TorchEngine(checkpoint), REGION, correction(1e-6, np.zeros(7, np.float32)))
-    with pytest.raises(DataError, match=r"profile 'mug'; check that the object is the profile's"):
+@pytest.mark.parametrize(
+    ("network", "own", "words"),
+    [
+        (1e6, 1e-6, r"limit of the object profile 'mug'; check that the object is the profile's"),
+        (
+            1e-6,
+            None,
+            r"network's limit, and the object profile 'mug' has no limits of its own; calibrate again",
+        ),
+        (1e-6, 1e6, None),
+        (1e6, None, None),
+    ],
+)
+def test_limits_of_a_profile_replace_those_of_the_network(
+    frames: np.ndarray, network: float, own: float | None, words: str | None
+) -> None:
+    checkpoint = with_score(ensemble("ssam"), network)
+    estimator = ForceEstimator(TorchEngine(checkpoint), REGION, correction(own, np.zeros(7, np.float32)))
+    if words is None:
+        assert run(estimator, frames)[-1] is not None
+        return
+    with pytest.raises(DataError, match=words):
         run(estimator, frames)
+
+
+def test_a_network_without_a_score_rejects_no_frame(frames: np.ndarray) -> None:
+    estimator = ForceEstimator(
+        TorchEngine(ensemble("ssam")), REGION, correction(1e-6, np.zeros(7, np.float32))
+    )
+    assert run(estimator, frames)[-1] is not None
 
 
 def test_loads_a_network_by_name_or_path(tiny_checkpoint: Path, frames: np.ndarray) -> None:

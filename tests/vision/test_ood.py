@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from gripper_force.errors import DataError
+from gripper_force.profiles.object_profile import OodLimit
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import Frame
 from gripper_force.vision.engines.openvino import OpenVinoEngine
 from gripper_force.vision.estimator import ForceEstimator
-from gripper_force.vision.header import OodLimit, OodModel
+from gripper_force.vision.header import OodModel
 from gripper_force.vision.model_files import read_model
 from gripper_force.vision.ood import FRAMES, OodScore, orthonormal, residual_share
 

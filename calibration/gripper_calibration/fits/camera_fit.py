@@ -100,7 +100,12 @@ def select_exposure(candidates: Sequence[ExposureCandidate]) -> ExposureCandidat
             f"the image is dark or clipped at every exposure ({measured}); change the light, the gain or the "
             "aperture, or pass other exposures with --exposure-us"
         )
-    return min(usable, key=lambda candidate: abs(np.log(candidate.mean / _BEST_MEAN)))
+    return nearest_exposure(usable)
+
+
+def nearest_exposure(candidates: Sequence[ExposureCandidate]) -> ExposureCandidate:
+    """Returns the candidate with the best mean gray value, a usable one if there is one."""
+    return min(candidates, key=lambda one: (not one.usable, abs(np.log(max(one.mean, 1.0) / _BEST_MEAN))))
 
 
 def find_markers(gray: Gray) -> Markers:

@@ -1,31 +1,77 @@
-"""Fit of the out-of-distribution limit from left-out touches."""
+"""Fit of the out-of-distribution score of one object: that of a checkpoint, with the known frames of its touches.
 
-from collections.abc import Iterable
+*With three or more touches* the subspace is that of the touches alone, so the score tells the object from others, also
+if the network does not know it. Each touch is scored against the others, which shows how touches differ.
+
+*With one or two touches* the subspace is that of the checkpoint, and its limits are widened by what the touches show.
+"""
+
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
 
-from gripper_calibration.fits.touches import Floats
+from gripper_calibration.fits.touches import Floats, Touches
+from gripper_force.jobs.training.ood_fit import fit_subspace, smooth_ratios, typical_shares
+from gripper_force.profiles.correction import KnownFrames
+from gripper_force.profiles.object_profile import OodLimit
+from gripper_force.vision.header import OodModel
+from gripper_force.vision.ood import OodScore, known_frames, residual_share
 
-SUBSPACE_DIMENSIONS: Final = 32
+DIMENSIONS: Final = 32
 """Dimensions of the subspace near which the features of one object lie."""
 
-DEFAULT_LIMIT: Final = 1.0
-"""Limit with one or two touches, which do not show how touches differ: a deviation off the subspace as large as
-the calibration frames' mean square distance from their mean."""
+MIN_TOUCHES: Final = 3
+"""Fewer touches do not show how touches differ."""
+
+_MAX_FRAMES: Final = 600
+"""Frames for a subspace. Adjacent frames carry nearly the same data, and the cost is cubic."""
 
 _QUANTILE: Final = 0.995
-_MIN_TOUCHES: Final = 3
 
 
-def fit_ood_limit(left_out: Iterable[Floats]) -> float:
-    """Returns the out-of-distribution limit.
+def fit_ood(touches: Touches, model: OodModel) -> KnownFrames:
+    """Returns the known frames of an object.
 
     Args:
-        left_out: For each touch, the out-of-distribution scores of its frames against all other touches,
-            (N,) each.
+        touches: One or more touches.
+        model: Model of the network.
     """
-    worst = [float(np.quantile(ood_score, _QUANTILE)) for ood_score in left_out]
-    if len(worst) < _MIN_TOUCHES:
-        return DEFAULT_LIMIT
-    return 1.5 * (1 + 2 / len(worst)) * max(worst)
+    numbers = touches.numbers
+    parts = [touches.only([number]) for number in numbers]
+    if len(numbers) < MIN_TOUCHES:
+        worst = [np.quantile(OodScore(model).score(p.features, p.estimate_n), _QUANTILE) for p in parts]
+        known = known_frames(model)
+        widened = max(1.0, _margin(len(parts)) * float(max(worst)))
+        return known._replace(
+            limits=tuple(one.model_copy(update={"limit": widened * one.limit}) for one in known.limits)
+        )
+    shares = []
+    for number, left_out in zip(numbers, parts, strict=True):
+        shares.append(residual_share(left_out.features, *object_subspace(touches.without([number]))))
+    limits = object_limits(shares, [part.estimate_n for part in parts])
+    return KnownFrames(*object_subspace(touches), limits)
+
+
+def object_limits(shares: Sequence[Floats], estimates_n: Sequence[Floats]) -> tuple[OodLimit, ...]:
+    """Returns the limits that follow from touches, each scored against others.
+
+    Args:
+        shares: Shares of the residual of the frames of each touch, (N,) each.
+        estimates_n: Their estimates, (N,) each.
+    """
+    typical = typical_shares(shares, estimates_n)
+    ratios = [smooth_ratios(typical, *touch) for touch in zip(shares, estimates_n, strict=True)]
+    limit = _margin(len(ratios)) * max(float(np.quantile(ratio, _QUANTILE)) for ratio in ratios)
+    return tuple(t.model_copy(update={"limit": limit}) for t in typical)
+
+
+def object_subspace(touches: Touches) -> tuple[Floats, Floats, float]:
+    """Returns mean, axes and floor of the features of touches, as `KnownFrames` has them."""
+    thin = touches.thinned(_MAX_FRAMES)
+    return fit_subspace(thin.features, thin.force_n, DIMENSIONS)
+
+
+def _margin(touches: int) -> float:
+    """Factor from the highest score of some touches to a limit: the fewer touches, the higher new ones may be."""
+    return 1.5 * (1 + 2 / touches)

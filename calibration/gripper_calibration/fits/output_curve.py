@@ -60,6 +60,7 @@ class LinearFit:
         offset_n: Newtons to add.
         covariance: Covariance of gain and offset, (2, 2).
         touch_std: Standard deviations of the touches' gains and offsets about the line's, (2,).
+        degrees: Degrees of freedom of `touch_std`: one less than the touches, and the prior's weight.
         frame_std_n: Standard deviation of a frame about the line of its touch.
     """
 
@@ -67,6 +68,7 @@ class LinearFit:
     offset_n: float
     covariance: Floats
     touch_std: Floats
+    degrees: float
     frame_std_n: float
 
     def predict(self, estimate_n: Floats) -> Floats:
@@ -116,6 +118,7 @@ def fit_line(touches: Touches) -> LinearFit:
         offset_n=float(line[1]),
         covariance=np.asarray(np.linalg.inv(precision), np.float64),
         touch_std=np.sqrt(touch_var),
+        degrees=len(parts) - 1 + _TOUCH_PRIOR_WEIGHT,
         frame_std_n=frame_std_n,
     )
 

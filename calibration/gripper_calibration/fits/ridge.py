@@ -20,7 +20,6 @@ class Ridge:
 
     Attributes:
         mean: Mean of the features, (F,).
-        spread: Mean square distance from the mean.
     """
 
     def __init__(self, features: Features) -> None:
@@ -31,18 +30,12 @@ class Ridge:
         values, self._vectors = np.linalg.eigh(gram)  # ascending
         # Eigenvalues at the rounding level belong to directions without variance; never divide by them.
         self._values = np.where(values > values[-1] * len(values) * np.finfo(np.float64).eps, values, 0.0)
-        self.spread = max(float(np.trace(gram)) / len(gram), 1e-12)
+        self._spread = max(float(np.trace(gram)) / len(gram), 1e-12)
 
     def solve(self, residual_n: Floats, penalty: float) -> tuple[Floats, float]:
         """Returns weights (F,) and offset in N that fit the residuals (N,) with one of `PENALTIES`."""
         mean_n = float(residual_n.mean())
         along = self._vectors.T @ (residual_n - mean_n)
-        damped = along / (self._values + penalty * self.spread * len(self._values))
+        damped = along / (self._values + penalty * self._spread * len(self._values))
         weights: Floats = self._deviation.T @ (self._vectors @ damped)
         return weights, mean_n - float(self.mean @ weights)
-
-    def axes(self, max_axes: int) -> Floats:
-        """Returns the principal directions of the features, orthonormal, (F, R) with R <= ``max_axes``."""
-        keep = np.flatnonzero(self._values > 0)[::-1][:max_axes]
-        directions: Floats = self._deviation.T @ (self._vectors[:, keep] / np.sqrt(self._values[keep]))
-        return directions

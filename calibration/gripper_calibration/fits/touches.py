@@ -44,9 +44,9 @@ class Touches:
         """Returns these touches."""
         return self._select(np.isin(self.touch, numbers))
 
-    def without(self, number: int) -> "Touches":
-        """Returns all touches except this one."""
-        return self._select(self.touch != number)
+    def without(self, numbers: list[int]) -> "Touches":
+        """Returns all touches except these."""
+        return self._select(~np.isin(self.touch, numbers))
 
     def thinned(self, max_frames: int) -> "Touches":
         """Returns at most ``max_frames`` evenly spaced frames. Adjacent frames carry nearly the same data."""

@@ -6,12 +6,13 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 
+from gripper_calibration.fits.cross_validation import Coverage
 from gripper_calibration.fits.object_fit import LearningCurvePoint, ObjectFit
-from gripper_calibration.fits.touches import Touches
+from gripper_calibration.fits.touches import Floats, Touches
 from gripper_calibration.plots.style import DATA, FIT, GRAY
 from gripper_force.jobs.report.plots import label_axes, saved_figure
 from gripper_force.profiles.correction import curve_n
-from gripper_force.profiles.object_profile import ObjectProfile
+from gripper_force.profiles.object_profile import Interval, ObjectProfile
 
 
 def draw(
@@ -36,12 +37,9 @@ def draw(
     validated = np.isfinite(fit.cross_validated_n).all()
     after_n = fit.cross_validated_n if validated else fit.predict(touches)
     method = "cross-validated" if validated else "fitted on the same touches"
-    error_n = after_n - touches.force_n
-    after_mae_n = float(np.abs(error_n).mean())
+    after_mae_n = float(np.abs(after_n - touches.force_n).mean())
     max_n = max(float(touches.force_n.max()), float(touches.estimate_n.max()))
     line_n = np.linspace(0, max_n, 100)
-    half_n = profile.interval.half_width_n(line_n)
-    covered = np.abs(error_n) <= profile.interval.half_width_n(after_n)
     count = "1 touch" if profile.touches == 1 else f"{profile.touches} touches"
     title = f"{profile.object}: {count}, MAE {profile.before_n:.3f} N before, {after_mae_n:.3f} N after ({method})"
     with saved_figure(path, title, 7.0) as figure:
@@ -57,15 +55,38 @@ def draw(
         after_plot.plot(after_n, touches.force_n, ".", ms=2, color=DATA)
         after_plot.plot(line_n, line_n, color=GRAY, lw=0.8)
         label_axes(after_plot, "after", "corrected estimate, N", "load cell, N")
-        before_error_n = touches.estimate_n - touches.force_n
-        residual_plot.plot(touches.force_n, before_error_n, ".", ms=2, color=GRAY, label="before")
-        residual_plot.plot(touches.force_n, error_n, ".", ms=2, color=DATA, label="after")
-        label = f"{100 * profile.interval.coverage:.0f} % interval, contains {100 * covered.mean():.0f} %"
-        residual_plot.plot(line_n, half_n, color=FIT, label=label)
-        residual_plot.plot(line_n, -half_n, color=FIT)
-        label_axes(residual_plot, "errors", "load cell, N", "error, N")
-        residual_plot.legend()
+        plot_errors(
+            residual_plot, touches.force_n, touches.estimate_n, after_n, profile.interval, fit.coverages
+        )
         _plot_learning_curve(curve_plot, profile, curve, after_mae_n if validated else None)
+
+
+def plot_errors(
+    axes: Axes,
+    force_n: Floats,
+    before_n: Floats,
+    after_n: Floats,
+    interval: Interval,
+    coverages: Sequence[Coverage],
+) -> None:
+    """Plots errors against the force, (N,) each, with an interval and the coverage of each force level."""
+    max_n = float(max(force_n.max(), before_n.max()))
+    line_n = np.linspace(0, max_n, 100)
+    half_n = interval.half_width_n(line_n)
+    axes.plot(force_n, before_n - force_n, ".", ms=2, color=GRAY, label="before")
+    axes.plot(force_n, after_n - force_n, ".", ms=2, color=DATA, label="after")
+    label = f"{100 * interval.coverage:.0f} % interval"
+    if coverages:
+        label += f", contains {100 * coverages[0].covered:.0f} % in contact"
+    axes.plot(line_n, half_n, color=FIT, label=label)
+    axes.plot(line_n, -half_n, color=FIT)
+    for level in coverages[1:]:
+        end_n = max_n if level.to_n is None else min(level.to_n, max_n)
+        middle_n = (level.from_n + max(level.from_n, end_n)) / 2
+        at = (middle_n, float(interval.half_width_n(middle_n)))
+        axes.annotate(f"{100 * level.covered:.0f} %", at, ha="center", va="bottom", fontsize=7)
+    label_axes(axes, "errors", "load cell, N", "error, N")
+    axes.legend(fontsize=8, markerscale=3)
 
 
 def _plot_learning_curve(

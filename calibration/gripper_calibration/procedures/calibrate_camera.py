@@ -1,9 +1,10 @@
 """Calibration of a camera: exposure, region of interest and lag, from touches of a compliant object."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
@@ -25,13 +26,16 @@ from gripper_calibration.plots.camera_plot import draw
 from gripper_force.config import CAMERA_OTHER_KEYS, Config
 from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
 from gripper_force.interfaces import Progress, no_progress
+from gripper_force.jobs.profile_files import update_rig
 from gripper_force.jobs.recording.lag import camera_lags_s, load_cell_lag_s
 from gripper_force.jobs.recording.record import RecordingPlan, record
 from gripper_force.jobs.recording.summary import releases_ns
-from gripper_force.profiles.rig_profile import CalibratedValue, CameraCalibration, read_rig, update_rig
+from gripper_force.profiles.object_profile import BUNDLED, read_object, user_folder
+from gripper_force.profiles.rig_profile import CalibratedValue, CameraCalibration, read_rig
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import ResolvedConfig, make_estimator, resolve, resolve_vision
+from gripper_force.schema import Tree, differences
 from gripper_force.types import (
     NS_PER_MS,
     NS_PER_S,
@@ -97,6 +101,8 @@ class CameraResult:
         touches_that_tell: Number of touches that determine the lag.
         rig: The rig profile.
         report: The figure, PNG.
+        outdated: Profiles and bundles of the user, and the network, that were made with the settings before and not
+            with these, each with its difference.
     """
 
     calibration: CameraCalibration
@@ -107,6 +113,7 @@ class CameraResult:
     touches_that_tell: int
     rig: Path
     report: Path
+    outdated: tuple[str, ...]
 
 
 def calibrate_camera(
@@ -141,9 +148,10 @@ def calibrate_camera(
         )
     if rig.exists():
         read_rig(rig)  # a damaged profile is reported before anything moves
+    before = config
     config = _with(config, "calibration", rig=None, object=None)  # their camera settings are replaced
     config = _with(config, "vision", region=region)
-    candidates, images = _try_exposures(config, exposures_us, progress)
+    candidates, images = try_exposures(config, exposures_us, progress)
     selected = select_exposure(candidates)
     config = _with(config, "camera", exposure_us=selected.exposure_us)
     with TemporaryDirectory() as aside:
@@ -185,6 +193,27 @@ def calibrate_camera(
         touches_that_tell=len(correlations_ms),
         rig=rig,
         report=report,
+        outdated=_outdated(before, _with(config, "vision", region=found_region)),
+    )
+
+
+def _outdated(before: Config, after: Config) -> tuple[str, ...]:
+    """Names what was made with the camera settings of one configuration, and not with those of the other."""
+    made: list[tuple[str, Callable[[Tree], list[str]]]] = []
+    for path in sorted([*user_folder().glob("*.yaml"), *user_folder().glob(f"*/{BUNDLED}")]):
+        try:
+            camera = read_object(path).camera
+        except ConfigError:  # damaged: a run with it says so
+            continue
+        made.append(
+            (f"the {'bundle' if path.name == BUNDLED else 'profile'} {path}", partial(differences, camera))
+        )
+    if (model := resolve_vision(before)[1]) is not None:
+        made.append((f"the network {model.path}", model.header.mismatches))
+    return tuple(
+        f"{name} ({', '.join(found)})"
+        for name, differ in made
+        if (found := differ(after.rig_settings())) and not differ(before.rig_settings())
     )
 
 
@@ -258,9 +287,15 @@ def _touch_lags(
     return touches
 
 
-def _try_exposures(
+def try_exposures(
     config: Config, exposures_us: Sequence[int], progress: Progress
 ) -> tuple[list[ExposureCandidate], list[Gray]]:
+    """Returns the gray values and an image at each exposure that is at most half a frame's period.
+
+    Raises:
+        ConfigError: All are longer.
+        DeviceError: The camera failed.
+    """
     longest_us = 0.5e6 / config.camera.rate_hz
     candidates, images = [], []
     for exposure_us in exposures_us:

@@ -230,7 +230,10 @@ class _EmptyJaws:
         self._goal_a = 0.0
         # Half open, where a linkage is far from its dead centres.
         self._middle_rad = self._transmission.position_rad(self._transmission.open_width_m / 2)
-        self._end_a = self._current_a(_START_N)
+        start_n = _START_N
+        if len(config.servo.ids) > 1:  # with less, one finger would move and the other stick
+            start_n += (1 + 3 * self._transmission.friction_std) * self._transmission.friction_n
+        self._end_a = self._current_a(start_n)
         self.state = state
 
     def _current_a(self, force_n: float) -> float:

@@ -11,21 +11,23 @@ from typing import Final
 
 import numpy as np
 
+from gripper_calibration.fits.cross_validation import Coverage
 from gripper_calibration.fits.object_fit import (
     COVERAGE,
     LearningCurvePoint,
+    ObjectFit,
     fit_correction,
     learning_curve,
 )
 from gripper_calibration.fits.plant_fit import crushing_touch, fit_plant, stiffness_n_m
 from gripper_calibration.plots.object_plot import draw
-from gripper_calibration.touch_logs import join, read_log
+from gripper_calibration.touch_logs import TouchRecording, join, read_log
 from gripper_force.config import Config
 from gripper_force.errors import DataError
 from gripper_force.interfaces import Progress, Prompt, no_progress
+from gripper_force.jobs.profile_files import check_place, pack, write_object
 from gripper_force.jobs.recording.record import RecordingPlan, record
-from gripper_force.profiles.correction import pack
-from gripper_force.profiles.object_profile import ObjectProfile, check_place, user_folder, write_object
+from gripper_force.profiles.object_profile import ObjectProfile, user_folder
 from gripper_force.runtime.resolve import ResolvedConfig, make_estimator, resolve_vision
 from gripper_force.types import NS_PER_MS
 from gripper_force.vision.checkpoint import load_checkpoint
@@ -46,6 +48,8 @@ class ObjectCalibration:
         report_path: The figure, PNG.
         correction: Name of the selected correction, one of the keys of `candidates_mae_n`.
         candidates_mae_n: Cross-validated MAE of each candidate correction; empty with fewer than three touches.
+        coverages: Share of the frames of each touch within an interval that the other touches gave: in contact, and
+            by force level; empty with fewer than four touches.
         crushed_at_n: Largest force of the touch after which the object stayed narrower; None if it sprang back
             after all touches.
         stiffness_std_n_m: Standard deviation of the stiffness over the touches; None with fewer than two.
@@ -58,6 +62,7 @@ class ObjectCalibration:
     report_path: Path
     correction: str
     candidates_mae_n: dict[str, float]
+    coverages: tuple[Coverage, ...]
     crushed_at_n: float | None
     stiffness_std_n_m: float | None
     touches_needed: tuple[LearningCurvePoint, ...]
@@ -75,7 +80,7 @@ class ObjectCalibration:
 
     @property
     def coverage(self) -> float:
-        """Coverage of the profile's interval: the share of frames of new touches within it."""
+        """Coverage that the profile's interval is made for: the share of frames in contact within it."""
         return self.profile.interval.coverage
 
     def as_dict(self) -> dict[str, object]:
@@ -84,6 +89,7 @@ class ObjectCalibration:
             **self.profile.model_dump(mode="json"),
             "correction": self.correction,
             "candidates_mae_n": self.candidates_mae_n,
+            "coverages": [level._asdict() for level in self.coverages],
             "crushed_at_n": self.crushed_at_n,
             "stiffness_std_n_m": self.stiffness_std_n_m,
             "touches_needed": [point._asdict() for point in self.touches_needed],
@@ -258,46 +264,67 @@ def _fit_and_write(
     with_contact = {path: recording for path, recording in recordings.items() if recording.has_contact}
     recorded = join(with_contact or recordings)  # without any contact, the fit reports the largest force
     touches = recorded.touches
-    fit = fit_correction(touches, COVERAGE)
+    fit = fit_correction(touches, COVERAGE, checkpoint.header.ood)
     progress("fitted the correction")
     curve = list(learning_curve(touches, COVERAGE))
     progress("computed the learning curve")
-    forces_n = [press.force_n for press in recorded.presses]
-    stiffness = stiffness_n_m(recorded.width_m, forces_n)
-    peaks_n = np.array([force_n.max() for force_n in forces_n])
-    crushed = crushing_touch(np.array([width_m[0] for width_m in recorded.width_m]), peaks_n)
-    weights = pack(fit.arrays)
-    profile = ObjectProfile(
-        object=name,
-        date=datetime.now(UTC).date(),
-        checkpoint=checkpoint.digest,
-        camera=recorded.camera,
-        touches=len(touches.numbers),
-        frames=len(touches.touch),
-        force_n=float(touches.force_n.max() if crushed is None else peaks_n[:crushed].max()),
-        output=fit.output,
-        interval=fit.interval,
-        ood_limit=fit.ood_limit,
-        stiffness_n_m=float(np.median(stiffness)) if len(stiffness) else None,
-        plant=fit_plant(recorded.presses, recorded.delay_s + _compute_s(ResolvedConfig(config, model))),
-        before_n=fit.before_n,
-        after_n=fit.after_n,
-        weights=sha256(weights).hexdigest(),
-    )
-    write_object(out, profile, weights)
+    profile, crushed_at_n = make_profile(name, recorded, fit, ResolvedConfig(config, model))
+    write_object(out, profile, pack(fit.arrays))
     report = out.with_suffix(".png")
     draw(profile, fit, touches, curve, report)
+    stiffness = stiffness_n_m(recorded.width_m, [press.force_n for press in recorded.presses])
     return ObjectCalibration(
         profile=profile,
         profile_path=out,
         report_path=report,
         correction=fit.candidate,
         candidates_mae_n=fit.errors_n,
-        crushed_at_n=None if crushed is None else float(peaks_n[crushed]),
+        coverages=fit.coverages,
+        crushed_at_n=crushed_at_n,
         stiffness_std_n_m=float(stiffness.std(ddof=1)) if len(stiffness) > 1 else None,
         touches_needed=_mean_curve(curve),
         without_contact=tuple(path for path in recordings if path not in with_contact),
     )
+
+
+def make_profile(
+    name: str, recorded: TouchRecording, fit: ObjectFit, run: ResolvedConfig
+) -> tuple[ObjectProfile, float | None]:
+    """Makes an object profile of a fit.
+
+    Args:
+        name: Name of the object.
+        recorded: The touches that it was fitted to.
+        fit: The fit.
+        run: Configuration, and the network.
+
+    Returns:
+        The profile, and the largest force of the touch after which the object stayed narrower, or None.
+    """
+    assert run.model is not None
+    touches = recorded.touches
+    forces_n = [press.force_n for press in recorded.presses]
+    stiffness = stiffness_n_m(recorded.width_m, forces_n)
+    peaks_n = np.array([force_n.max() for force_n in forces_n])
+    crushed = crushing_touch(np.array([width_m[0] for width_m in recorded.width_m]), peaks_n)
+    profile = ObjectProfile(
+        object=name,
+        date=datetime.now(UTC).date(),
+        checkpoint=run.model.digest,
+        camera=recorded.camera,
+        touches=len(touches.numbers),
+        frames=len(touches.touch),
+        force_n=float(touches.force_n.max() if crushed is None else peaks_n[:crushed].max()),
+        output=fit.output,
+        interval=fit.interval,
+        ood_limits=None if fit.arrays.known is None else fit.arrays.known.limits,
+        stiffness_n_m=float(np.median(stiffness)) if len(stiffness) else None,
+        plant=fit_plant(recorded.presses, recorded.delay_s + _compute_s(run)),
+        before_n=fit.before_n,
+        after_n=fit.after_n,
+        weights=sha256(pack(fit.arrays)).hexdigest(),
+    )
+    return profile, None if crushed is None else float(peaks_n[crushed])
 
 
 def _compute_s(run: ResolvedConfig) -> float:

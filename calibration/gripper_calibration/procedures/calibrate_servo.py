@@ -20,12 +20,12 @@ from gripper_force.control.speed_limit import SpeedLimit
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import ConfigError, DataError, DeviceError
 from gripper_force.interfaces import Devices, LoadCell, Progress, Prompt, no_progress
+from gripper_force.jobs.profile_files import update_rig
 from gripper_force.profiles.rig_profile import (
     CalibratedValue,
     RigProfile,
     ServoCalibration,
     read_rig,
-    update_rig,
 )
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.reading import read_patiently

@@ -1,14 +1,19 @@
 """Tables of calibrations of a rig and of an object."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
+
+from rich.table import Table
 
 from gripper_force.cli.console import number, out, pairs
 
 if TYPE_CHECKING:
+    from gripper_calibration.fits.cross_validation import Coverage
     from gripper_calibration.procedures.calibrate_jaws import JawsResult
     from gripper_calibration.procedures.calibrate_object import ObjectCalibration
+    from gripper_calibration.procedures.teach import Taught
+    from gripper_force.profiles.object_profile import Interval
 
 
 def rig_table(r: Mapping[str, object]) -> None:
@@ -39,10 +44,27 @@ def _found(value: object) -> object:
     return f"{value['value']:.6g} ({value['low']:.6g} to {value['high']:.6g})"
 
 
+def _interval(interval: "Interval") -> str:
+    at_5_n = math.hypot(interval.base_n, 5 * interval.share)
+    return f"{100 * interval.coverage:.0f} % within {interval.base_n:.2f} N at 0 N, {at_5_n:.2f} N at 5 N"
+
+
+def _coverage(levels: "Sequence[Coverage]") -> str:
+    if not levels:
+        return "unknown with so few touches"
+    contact, *forces = levels
+    ends = ["N and more" if level.to_n is None else f"to {level.to_n:g} N" for level in forces]
+    parts = [
+        f"{level.from_n:g} {end}: {100 * level.covered:.0f} %"
+        for level, end in zip(forces, ends, strict=True)
+    ]
+    return f"{100 * contact.covered:.0f} % in contact of the touches left out ({', '.join(parts)})"
+
+
 def object_table(r: "ObjectCalibration") -> None:
     """Prints an object's profile."""
     profile, after_n = r.profile, r.mae_after_n
-    interval, plant = profile.interval, profile.plant
+    plant = profile.plant
     pairs(
         {
             "object": profile.object,
@@ -55,8 +77,8 @@ def object_table(r: "ObjectCalibration") -> None:
             "error before": number(r.mae_before_n, " N"),
             "error after": "unknown with so few touches" if after_n is None else number(after_n, " N"),
             "correction": r.correction,
-            "interval": f"{100 * interval.coverage:.0f} % within {interval.base_n:.2f} N at 0 N, "
-            f"{math.hypot(interval.base_n, 5 * interval.share):.2f} N at 5 N",
+            "interval": _interval(profile.interval),
+            "coverage": _coverage(r.coverages),
             "stiffness": number(profile.stiffness_n_m, " N/m", 0),
             "loop": "unknown: these logs hold no servo"
             if plant is None
@@ -64,5 +86,27 @@ def object_table(r: "ObjectCalibration") -> None:
             f"phase margin {plant.phase_margin_deg:.0f} degrees",
             "profile": str(r.profile_path),
             "report": str(r.report_path),
+        }
+    )
+
+
+def taught_table(r: "Taught", minutes: float) -> None:
+    """Prints the candidates' errors, the expected error and the bundle."""
+    table = Table("candidate", "error on touches left out", "", box=None, pad_edge=False)
+    for name, mae_n in r.candidates_mae_n.items():
+        table.add_row(name, number(mae_n, " N"), "taken" if name == r.learned else "")
+    out.print(table)
+    profile = r.profile
+    pairs(
+        {
+            "error before": number(r.before_n, " N"),
+            "expected error": f"{r.mae_n:.3f} N, in contact {r.contact_mae_n:.3f} N",
+            "with half as many touches": number(r.fewer_mae_n, " N"),
+            "interval": _interval(profile.interval),
+            "coverage": _coverage(r.coverages),
+            "touches": f"{profile.touches}, up to {profile.force_n:.1f} N",
+            "time": f"{minutes:.1f} min",
+            "bundle": str(r.bundle),
+            "figure": str(r.figure),
         }
     )

@@ -12,11 +12,13 @@ from scipy.optimize import minimize
 from gripper_force.errors import DataError
 from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.dataset import CONTACT_N, Clip, check_size, load_clips, without_contact_starts
+from gripper_force.profiles.correction import KnownFrames
+from gripper_force.profiles.object_profile import OodLimit
 from gripper_force.vision.batch_inference import features
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.checkpoint_writer import replace_header
 from gripper_force.vision.estimator import claimed_std_n
-from gripper_force.vision.header import Header, OodLimit, OodModel, read_checkpoint
+from gripper_force.vision.header import Header, OodModel, read_checkpoint
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.ood import Smooth, orthonormal, residual_share
 
@@ -88,25 +90,47 @@ def fit_ood(
         subspace = _subspace([log for log, own in zip(seen, fold, strict=True) if own != part])
         for i in np.flatnonzero(fold == part):
             shares[i] = residual_share(seen[i].features, *subspace)
-    estimate_n, std_n, force_n = (
-        np.concatenate(values)
-        for values in zip(*((log.estimate_n, log.std_n, log.force_n) for log in seen), strict=True)
+    estimates_n = [log.estimate_n for log in seen]
+    return model_of_scores(
+        KnownFrames(*_subspace(seen), _limits(shares, estimates_n)),
+        shares,
+        estimates_n,
+        np.concatenate([(log.estimate_n - log.force_n) / log.std_n for log in seen]),
+        np.concatenate([log.force_n > CONTACT_N for log in seen]),
     )
-    mean, axes, floor = _subspace(seen)
-    model = OodModel(
+
+
+def model_of_scores(
+    known: KnownFrames,
+    shares: Sequence[Floats],
+    estimates_n: Sequence[Floats],
+    z: Floats,
+    contact: npt.NDArray[np.bool_],
+) -> OodModel:
+    """Returns the model of known frames, with the claimed deviation from logs that were left out.
+
+    Args:
+        known: The known frames.
+        shares: Shares of the residual of the frames of each log, (N,) each, by a subspace without the log.
+        estimates_n: Their estimates, (N,) each.
+        z: Errors of all frames over the deviation claimed without the score, (N,).
+        contact: True for the frames in contact, (N,).
+    """
+    mean, axes, floor, limits = known
+    ratio = np.concatenate([smooth_ratios(limits, *log) for log in zip(shares, estimates_n, strict=True)])
+    score = ratio / np.interp(
+        np.concatenate(estimates_n), [o.force_n for o in limits], [o.limit for o in limits]
+    )
+    used = (score <= 1) & contact
+    base, growth = _std_factors(score[used], z[used])
+    return OodModel(
         mean=_encoded(mean, np.float32),
         axes=_encoded(axes, np.float16),
         floor=floor,
-        limits=_limits(shares, [log.estimate_n for log in seen]),
-        std_base=1.0,
-        std_growth=0.0,
+        limits=limits,
+        std_base=base,
+        std_growth=growth,
     )
-    score = np.concatenate(
-        [_ratios(model.limits, *log) for log in zip(shares, [log.estimate_n for log in seen], strict=True)]
-    ) / np.interp(estimate_n, [o.force_n for o in model.limits], [o.limit for o in model.limits])
-    used = (score <= 1) & (force_n > CONTACT_N)
-    base, growth = _std_factors(score[used], (estimate_n - force_n)[used] / std_n[used])
-    return model.model_copy(update={"std_base": base, "std_growth": growth})
 
 
 def add_ood(source: str | Path, model: OodModel, out: Path) -> None:
@@ -158,45 +182,77 @@ def calibrate_network(
     return model
 
 
-def _subspace(logs: Sequence[_Seen]) -> tuple[Floats, Floats, float]:
-    """Returns the mean without contact (F,), the axes (F, R), and the floor."""
-    read_out = np.concatenate([log.features for log in logs]).astype(np.float64)
-    free = np.concatenate([log.force_n for log in logs]) < CONTACT_N
+def fit_subspace(
+    features: npt.NDArray[np.float32], force_n: Floats, dimensions: int = DIMENSIONS
+) -> tuple[Floats, Floats, float]:
+    """Fits the subspace near which features lie.
+
+    Args:
+        features: Features, (N, F).
+        force_n: Load-cell forces, (N,).
+        dimensions: Dimensions of the subspace, R; fewer if the features vary in fewer.
+
+    Returns:
+        The mean without contact (F,), the orthonormal axes (F, R), and the floor.
+    """
+    read_out = features.astype(np.float64)
+    free = force_n < CONTACT_N
     if not free.any():
-        free[:] = True
+        free = np.ones_like(free)
     mean = read_out[free].mean(0)
     total = np.square(read_out - mean).sum(1)
     floor = max(_FLOOR * float(np.median(total[~free] if (~free).any() else total)), 1e-6)
     deviation = read_out[:: -(-len(read_out) // _MAX_FRAMES)] - mean
-    values, vectors = np.linalg.eigh(deviation.T @ deviation)  # rising
-    keep = np.flatnonzero(values > values[-1] * 1e-9)[-DIMENSIONS:]
-    return mean, orthonormal(vectors[:, keep].astype(np.float16)), floor
+    if len(deviation) < deviation.shape[1]:  # the smaller of the two products has the same directions
+        values, frames = np.linalg.eigh(deviation @ deviation.T)  # rising
+        vectors = deviation.T @ frames
+    else:
+        values, vectors = np.linalg.eigh(deviation.T @ deviation)
+    keep = np.flatnonzero(values > values[-1] * 1e-9)[-dimensions:]
+    axes = vectors[:, keep] / np.linalg.norm(vectors[:, keep], axis=0)
+    return mean, orthonormal(axes.astype(np.float16)), floor
+
+
+def typical_shares(shares: Sequence[Floats], estimates_n: Sequence[Floats]) -> tuple[OodLimit, ...]:
+    """Returns the typical share of each bin of estimated force that has frames, with a limit of 1.
+
+    Args:
+        shares: Shares of the residual of the frames of each log, (N,) each.
+        estimates_n: Their estimates, (N,) each.
+    """
+    share, estimate_n = np.concatenate(shares), np.concatenate(estimates_n)
+    bins = np.digitize(estimate_n, EDGES_N)
+    return tuple(
+        OodLimit(
+            force_n=float(np.median(estimate_n[bins == number])),
+            typical=max(float(np.median(share[bins == number])), 1e-9),
+            limit=1.0,
+        )
+        for number in np.unique(bins)
+    )
 
 
 def _limits(shares: Sequence[Floats], estimates_n: Sequence[Floats]) -> tuple[OodLimit, ...]:
     """Returns the limit of each bin of estimated force that has frames, for the frames of each log."""
-    share, estimate_n = np.concatenate(shares), np.concatenate(estimates_n)
-    bins = np.digitize(estimate_n, EDGES_N)
-    kinds = [(i, bins == i) for i in np.unique(bins)]
-    typical = [
-        OodLimit(
-            force_n=float(np.median(estimate_n[own])),
-            typical=max(float(np.median(share[own])), 1e-9),
-            limit=1.0,
-        )
-        for _, own in kinds
-    ]
-    ratio = np.concatenate([_ratios(typical, *log) for log in zip(shares, estimates_n, strict=True)])
+    typical = typical_shares(shares, estimates_n)
+    bins = np.digitize(np.concatenate(estimates_n), EDGES_N)
+    ratio = np.concatenate([smooth_ratios(typical, *log) for log in zip(shares, estimates_n, strict=True)])
     return tuple(
-        limit.model_copy(update={"limit": float(np.quantile(ratio[own], 1 - REJECTED))})
-        for limit, (_, own) in zip(typical, kinds, strict=True)
+        limit.model_copy(update={"limit": float(np.quantile(ratio[bins == number], 1 - REJECTED))})
+        for limit, number in zip(typical, np.unique(bins), strict=True)
     )
 
 
-def _ratios(limits: Sequence[OodLimit], share: Floats, estimate_n: Floats) -> Floats:
+def smooth_ratios(limits: Sequence[OodLimit], share: Floats, estimate_n: Floats) -> Floats:
     """Returns the smoothed ratio to the typical share, (N,), for the frames of one log."""
     typical = np.interp(estimate_n, [limit.force_n for limit in limits], [limit.typical for limit in limits])
     return Smooth().step(share / typical)
+
+
+def _subspace(logs: Sequence[_Seen]) -> tuple[Floats, Floats, float]:
+    return fit_subspace(
+        np.concatenate([log.features for log in logs]), np.concatenate([log.force_n for log in logs])
+    )
 
 
 def _std_factors(score: Floats, z: Floats) -> tuple[float, float]:
@@ -210,6 +266,6 @@ def _std_factors(score: Floats, z: Floats) -> tuple[float, float]:
     return float(base), float(growth)
 
 
-def _encoded(values: Floats, dtype: type[np.floating]) -> bytes:
+def _encoded(values: npt.NDArray[np.floating], dtype: type[np.floating]) -> bytes:
     """Returns an array as the header's text: base64 of its bytes."""
     return urlsafe_b64encode(values.astype(dtype).tobytes())

@@ -48,9 +48,21 @@ RECIPES: Final[dict[str, Tree]] = {
         "noise": 0.0,
         "precision": "float32",
     },
+    "touches": {
+        "steps": 100,
+        "clips": 8,
+        "warmup": 0.1,
+        "short_share": 0.0,
+        "shift_px": 1,
+        "light": 0.1,
+        "noise": 0.01,
+        "freeze_statistics": True,
+    },
     "few": {"method": "process", "preprocess": {"size": 64, "magnitude": True}},
 }
 """Keys that each recipe sets; all others have `TrainConfig`'s defaults, which are ``short_clips``.
+
+``touches`` continues a shipped network (``--init``) with a few touches of one object, as `teach` does.
 
 ``few`` fits a Gaussian process instead of training a network, for a few recordings, see `training.few`.
 

@@ -4,6 +4,7 @@ The diversity of scenes limits this task, not the number of labels. So a step of
 draws short clips from many recordings instead of long ones from a few.
 """
 
+import json
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -26,6 +27,7 @@ from gripper_force.jobs.training.recipe import FITTED_AT_ONCE, continued
 from gripper_force.jobs.training.recipe import TrainConfig as TrainConfig
 from gripper_force.jobs.training.stated_errors import errors, estimates, residuals
 from gripper_force.jobs.training.trainer import Trainer
+from gripper_force.schema import Tree
 from gripper_force.vision.batch_inference import predict
 from gripper_force.vision.checkpoint import Checkpoint, Member, load_checkpoint
 from gripper_force.vision.checkpoint_writer import save_checkpoint
@@ -49,6 +51,7 @@ def train(
     teacher: Checkpoint | None = None,
     replay_clips: Sequence[Clip] = (),
     resume: bool = False,
+    figure: bool = True,
     progress: Progress = no_progress,
     warn: Callable[[str], None] = lambda _: None,
 ) -> Checkpoint:
@@ -71,6 +74,7 @@ def train(
         replay_clips: Recordings of an earlier training, from which ``replay_share`` of each step's clips are
             drawn, so that their objects are not forgotten.
         resume: Continue an interrupted training from its saved states.
+        figure: Draw the figure. A Gaussian process has none.
         progress: Called with the training error; `PROGRESS_STEPS` for each network in total.
         warn: Called with a sentence if the training was too short to draw a clip from each recording, or to
             converge, or if there are too few validation clips for an out-of-distribution score.
@@ -119,18 +123,19 @@ def train(
             networks = [trainer.network for trainer in trainers]
             forces_n, measured_n = estimates(held_out, networks, config.preprocess, ranks.device)
             labels_n = np.concatenate([clip.forces_n[clip.valid] for clip in training])
-            data = digest([*clips, *replay_clips])
+            data = [*clips, *replay_clips]
             _save(out, networks, config, data, forces_n, measured_n, float(labels_n.mean()))
             _add_ood(out, networks, held_out, ranks.device, warn)
-            draw_training(
-                {t.network.config.attention: np.array(t.losses).reshape(-1, 2) for t in trainers},
-                measured_n,
-                forces_n,
-                np.concatenate([np.full(int(clip.valid.sum()), clip.object) for clip in held_out]),
-                float(labels_n.std()),
-                f"{out.name}: MAE {metrics.mae(forces_n, measured_n):.3f} N on validation data",
-                out.with_suffix(".png"),
-            )
+            if figure:
+                draw_training(
+                    {t.network.config.attention: np.array(t.losses).reshape(-1, 2) for t in trainers},
+                    measured_n,
+                    forces_n,
+                    np.concatenate([np.full(int(clip.valid.sum()), clip.object) for clip in held_out]),
+                    float(labels_n.std()),
+                    f"{out.name}: MAE {metrics.mae(forces_n, measured_n):.3f} N on validation data",
+                    out.with_suffix(".png"),
+                )
             for state in states:
                 state.unlink()
         ranks.wait()
@@ -172,14 +177,14 @@ def _fit(
         np.concatenate([part[clip.valid] for part, clip in zip(parts, measured, strict=True)])
         for parts in (left_out_n, [clip.forces_n for clip in measured])
     )
-    _save(out, [process], config, digest(clips), forces_n, measured_n, mean_n)
+    _save(out, [process], config, clips, forces_n, measured_n, mean_n)
 
 
 def _save(
     out: Path,
     networks: Sequence[Member],
     config: TrainConfig,
-    data_digest: str,
+    clips: Sequence[Clip],
     forces_n: npt.NDArray[np.float32],
     measured_n: npt.NDArray[np.float32],
     mean_n: float,
@@ -188,13 +193,22 @@ def _save(
         members=tuple(network.config for network in networks),
         preprocess=config.preprocess,
         residuals=residuals(forces_n, measured_n),
-        data_digest=data_digest,
+        data_digest=digest(clips),
+        trained_on=trained_on(clips),
         metrics={
             **errors(forces_n, measured_n),
             "constant_mae_n": metrics.mae(np.full_like(measured_n, mean_n), measured_n),
         },
     )
     save_checkpoint(out, networks, header)
+
+
+def trained_on(clips: Sequence[Clip]) -> Tree | None:
+    """Returns the number of rigs that clips were recorded with, and the first one's settings; None if unknown."""
+    if not all(clip.rig for clip in clips):
+        return None
+    rigs = {json.dumps([clip.rig, clip.view], sort_keys=True) for clip in clips}
+    return {"rigs": len(rigs), **clips[0].rig}
 
 
 def state_paths(config: TrainConfig, out: Path) -> list[Path]:

@@ -23,13 +23,13 @@ from gripper_force.errors import ConfigError
 from gripper_force.interfaces import Progress
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import Clip
+from gripper_force.jobs.int8_export import export_int8
 from gripper_force.qualification.bench.roofline import Roofline, measure
 from gripper_force.types import NS_PER_MS
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.engines import Engine, Floats, Precision, open_engine
 from gripper_force.vision.export import inputs_of
 from gripper_force.vision.header import Model, NetworkConfig
-from gripper_force.vision.int8_export import export_int8
 from gripper_force.vision.model_files import cache_folder, read_model
 from gripper_force.vision.selection import installed
 from gripper_force.vision.step_benchmark import Candidate, cache_key, update_cache

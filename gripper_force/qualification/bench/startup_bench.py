@@ -84,7 +84,7 @@ STARTUP_CASES: Final = (
     StartupCase("--help", command=("--help",)),
     StartupCase(
         "doctor, real servo alone",  # it lists all devices, through every device package
-        _SERVO | {"depthai", "gripper_hw.cameras", "gripper_hw.load_cells", "gripper_hw.sim"},
+        _SERVO | {"cv2", "depthai", "gripper_hw.cameras", "gripper_hw.load_cells", "gripper_hw.sim"},
         command=("doctor", *(f"--set={key}" for key in (*_REAL, *_NO_LOAD_CELL, *_NO_CAMERA))),
     ),
     StartupCase("real servo", _SERVO, frozenset({"log_queue"}), (*_REAL, *_NO_LOAD_CELL, *_NO_CAMERA)),

@@ -30,12 +30,14 @@ from gripper_force.errors import GripperError
 from gripper_force.jobs.dataset import load_clip
 from gripper_force.jobs.grasp import summarise
 from gripper_force.jobs.imports.video import estimate_tare, read_forces
+from gripper_force.jobs.profile_files import pack
 from gripper_force.jobs.replay import replay
 from gripper_force.jobs.report.data import read_run
-from gripper_force.profiles.correction import Correction, ProfileArrays, load_correction, pack
+from gripper_force.profiles.correction import Correction, KnownFrames, ProfileArrays, load_correction
 from gripper_force.profiles.object_profile import (
     Interval,
     ObjectProfile,
+    OodLimit,
     OutputCurve,
     read_object,
     weights_path,
@@ -65,6 +67,7 @@ from gripper_force.vision.engines.pytorch import TorchEngine
 from gripper_force.vision.estimator import ForceEstimator
 from gripper_force.vision.header import FORMAT, Header, NetworkConfig, Residual
 from gripper_force.vision.network import ForceNetwork
+from gripper_force.vision.ood import orthonormal, residual_share
 from gripper_force.vision.preprocess import Preprocess
 
 _SIDE: Final = 16
@@ -84,6 +87,9 @@ _CONFIG: Final = Config(gripper=GripperConfig(nm_per_a=1.8, current_step_a=0.003
 # Configurations and profiles.
 
 
+_LIMITS: Final = tuple(OodLimit(force_n=force_n, typical=1e-3, limit=4.0) for force_n in (0.0, 5.0))
+
+
 def _object(weights: str = "") -> ObjectProfile:
     return ObjectProfile(
         object="mug",
@@ -95,7 +101,7 @@ def _object(weights: str = "") -> ObjectProfile:
         force_n=8.0,
         output=OutputCurve(kind="monotone", estimate_n=(0.0, 4.0, 9.0), force_n=(0.1, 3.5, 8.0)),
         interval=Interval(coverage=0.9, base_n=0.1, share=0.03),
-        ood_limit=0.02,
+        ood_limits=_LIMITS,
         before_n=0.4,
         weights=weights,
     )
@@ -105,9 +111,7 @@ _FEATURES: Final = np.linspace(-1, 1, 8, dtype=np.float32)[None]
 _ARRAYS: Final = ProfileArrays(
     head=np.ones(8, np.float32),
     offset=np.ones(1, np.float32),
-    mean=np.ones(8, np.float32),
-    axes=np.eye(8, 2, dtype=np.float32),
-    spread=np.ones(1, np.float32),
+    known=KnownFrames(np.ones(8, np.float32), np.eye(8, 2, dtype=np.float32), 1.0, _LIMITS),
 )
 
 
@@ -134,7 +138,9 @@ def _correct(correction: Correction) -> None:
     force_n = correction.force_n([-1.0, 0.0, 5.0, 30.0], np.repeat(_FEATURES, 4, 0))
     assert not np.isnan(force_n).any()
     assert (correction.half_width_n(force_n) > 0).all()
-    assert correction.ood_score(_FEATURES) >= 0
+    assert correction.known is not None
+    mean, axes, floor, _ = correction.known
+    assert residual_share(_FEATURES, mean, orthonormal(axes), floor) >= 0
 
 
 def _configs() -> list[bytes]:

@@ -19,12 +19,12 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from gripper_force.jobs.int8_export import export_int8
 from gripper_force.types import Gray
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.engines import Engine, Floats, Precision, open_engine
 from gripper_force.vision.export import export
 from gripper_force.vision.header import Model
-from gripper_force.vision.int8_export import export_int8
 from gripper_force.vision.model_files import read_model
 from gripper_force.vision.network import ForceNetwork
 

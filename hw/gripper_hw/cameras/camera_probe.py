@@ -8,6 +8,7 @@ import numpy as np
 from gripper_force.config import Config
 from gripper_force.jobs.checks import Check, clock_name, gather, judged, keep_only, rate_hz
 from gripper_force.runtime.backends import open_devices
+from gripper_force.schema import Tree
 from gripper_force.types import NS_PER_MS, Frame
 
 _SYSFS = Path("/sys")
@@ -52,6 +53,18 @@ def probe(config: Config, sysfs: Path = _SYSFS) -> Iterator[Check]:
         if config.camera.backend == "oak":  # a device is listed as USB 2 until it is opened
             yield from _usb_checks(sysfs / "bus/usb/devices")
     yield from _frame_checks(config, frames)
+
+
+def find(sysfs: Path = _SYSFS) -> list[Tree]:
+    """Returns the section ``camera`` of each camera that is plugged in: OAK cameras, then USB cameras."""
+    import depthai as dai
+
+    oaks: list[Tree] = [
+        {"backend": "oak", "device": info.deviceId} for info in dai.Device.getAllAvailableDevices()
+    ]
+    nodes = sorted((sysfs / "class/video4linux").glob("video*"))
+    captures = [node for node in nodes if (node / "index").read_text().strip() == "0"]  # others: metadata
+    return oaks + [{"backend": "uvc", "device": f"/dev/{node.name}"} for node in captures]
 
 
 def _settings_check(config: Config, settings: Mapping[str, float | str]) -> Check:

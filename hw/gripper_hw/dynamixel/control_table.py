@@ -176,6 +176,13 @@ def model_names() -> tuple[str, ...]:
     return tuple(sorted(name.removesuffix(".yaml") for name in files if name != _SHARED))
 
 
+def model_name(number: int) -> str | None:
+    """Returns the vendor's name of the model with a Model Number, with or without current control."""
+    names = {load_model(name).number: name for name in model_names()}
+    names |= {without: name for name, without in _shared()["without_current_control"].items()}
+    return names.get(number)
+
+
 def load_model(name: str) -> ServoModel:
     """Loads a model.
 
@@ -223,10 +230,9 @@ def check_model_number(model: ServoModel, number: int, label: str) -> None:
     """
     if number == model.number:
         return
-    for name, known in _shared()["without_current_control"].items():
-        if number == known:
-            raise ConfigError(f"{label} is an {name}: {_no_current_control(name)}")
-    name = next((known for known in model_names() if load_model(known).number == number), "an unknown model")
+    name = model_name(number) or "an unknown model"
+    if name in _shared()["without_current_control"]:
+        raise ConfigError(f"{label} is an {name}: {_no_current_control(name)}")
     raise ConfigError(
         f"{label} is {name} (model number {number}), not the configured {model.name} ({model.number}); "
         "set servo.model to the model that is connected"

@@ -14,13 +14,13 @@ from gripper_force.runtime.backends import open_devices
 from gripper_hw.dynamixel.control_table import (
     REGISTERS,
     check_model_number,
-    load_model,
-    model_names,
+    model_name,
     rad_from_ticks,
 )
 from gripper_hw.dynamixel.fingers import FingerPair
 from gripper_hw.dynamixel.port import VIRTUAL_PREFIX
 from gripper_hw.dynamixel.servo import CYCLE_BYTES, MIN_FIRMWARE, DynamixelBus, hardware_error_text
+from gripper_hw.dynamixel.servo_scan import BAUD_RATES, FAST_BAUD_RATE
 from gripper_hw.dynamixel.transport import Transport
 
 _SYSFS: Final = Path("/sys/bus/usb-serial/devices")
@@ -28,7 +28,6 @@ _CYCLES: Final = 200
 _MIN_REPLY_MARGIN_MS: Final = 100.0
 """Longer than servo.reply_margin_ms, so that a bus too slow for a run is measured instead of failing."""
 
-_BAUD_RATES: Final = (57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
 _MODES: Final = {
     0: "current",
     1: "velocity",
@@ -67,7 +66,8 @@ def probe(config: Config, sysfs: Path = _SYSFS) -> Iterator[Check]:
         found = inspection.transport.scan()
         for id_, (number, firmware) in sorted(found.items()):
             if id_ not in servo.ids:
-                yield Check(f"servo {id_}", "model", f"{_model_name(number)}, firmware {firmware}", None)
+                name = model_name(number) or f"model number {number}"
+                yield Check(f"servo {id_}", "model", f"{name}, firmware {firmware}", None)
         ready = True
         for id_ in servo.ids:
             if id_ in found:
@@ -86,8 +86,13 @@ def probe(config: Config, sysfs: Path = _SYSFS) -> Iterator[Check]:
         yield Check(f"servo {id_}", "model", found_text, False, advice)
 
 
-def setup(config: Config, confirm: Confirm) -> SetupResult:
+def setup(config: Config, confirm: Confirm, *, commission: bool = False) -> SetupResult:
     """Writes the registers that a run would write, if ``confirm`` returns True. A run then writes no EEPROM.
+
+    Args:
+        config: The configuration.
+        confirm: Called with the changes.
+        commission: See `gripper_force.jobs.doctor.setup`.
 
     Raises:
         GripperError: See `gripper_force.jobs.doctor.setup`.
@@ -98,7 +103,7 @@ def setup(config: Config, confirm: Confirm) -> SetupResult:
             f"--set servo.id={config.servo.second.id} as well"
         )
     with _opened(config) as inspection:
-        return inspection.set_up(config.servo.id, confirm)
+        return inspection.set_up(config.servo.id, confirm, commission)
 
 
 class _Inspection:
@@ -175,7 +180,7 @@ class _Inspection:
         advice = f"longer than a cycle at control.rate_hz={rate_hz:g}: close other programs, or lower it"
         yield judged(unit, "bus cycle", found, p99_ms <= 1e3 / rate_hz, advice, harmless=lockstep)
 
-    def set_up(self, id_: int, confirm: Confirm) -> SetupResult:
+    def set_up(self, id_: int, confirm: Confirm, commission: bool) -> SetupResult:
         """Implements `setup`."""
         number = self.transport.ping(id_)
         check_model_number(self.model, number, f"the servo with id {id_} on {self._config.port}")
@@ -183,18 +188,51 @@ class _Inspection:
             raise DeviceError(
                 f"servo {id_} has torque on, so nothing was changed; remove the object, then power-cycle it"
             )
-        values = self._values(id_)
-        differing = {name: new for name, new in self._expected.items() if values[name] != new}
-        text = self._text
-        changes = [
-            RegisterChange(name, text(name, values[name]), text(name, new)) for name, new in differing.items()
+        wanted = self._commissioned(id_) if commission else self._expected
+        values = {name: self.transport.get(id_, name) for name in wanted}
+        differing = [name for name, new in wanted.items() if values[name] != new]
+        changes = {
+            name: RegisterChange(name, self._text(name, values[name]), self._text(name, wanted[name]))
+            for name in differing
+        }
+        steps = [[name] for name in differing] if commission else [differing]
+        accepted = [
+            name
+            for names in steps
+            if names and confirm(f"servo {id_}", [changes[name] for name in names])
+            for name in names
         ]
-        applied = bool(changes) and confirm(f"servo {id_}", changes)
-        if applied:
+        if accepted:
             self.transport.enable_replies(id_)
-            for name, new in differing.items():
-                self.transport.set(id_, name, new)
-        return SetupResult(id_, changes, applied)
+        for name in accepted:
+            if name == "baud_rate":
+                self._change_baud_rate(id_, wanted[name])
+            else:
+                self.transport.set(id_, name, wanted[name])
+        return SetupResult(id_, list(changes.values()), bool(accepted) and len(accepted) == len(differing))
+
+    def _commissioned(self, id_: int) -> dict[str, int]:
+        """Returns the EEPROM registers that a servo needs, the baud rate last."""
+        wanted = {name: new for name, new in self._expected.items() if REGISTERS[name].eeprom}
+        wanted["homing_offset"] = self._config.homing_offset
+        rate = next(
+            (rate for rate, code in BAUD_RATES.items() if code == self.transport.get(id_, "baud_rate")), 0
+        )
+        # A servo with another baud rate than the others on its bus would be lost to their program.
+        if rate < FAST_BAUD_RATE and set(self.transport.scan()) == {id_}:
+            wanted["baud_rate"] = BAUD_RATES[FAST_BAUD_RATE]
+        return wanted
+
+    def _change_baud_rate(self, id_: int, code: int) -> None:
+        with suppress(DeviceTimeoutError):  # the reply may come at either rate
+            register = REGISTERS["baud_rate"]
+            self.transport.write(id_, register.address, register.encode(code))
+        self.transport.close()
+        self._config = self._config.model_copy(update={"baud_rate": FAST_BAUD_RATE})
+        self.transport = Transport(self._config)
+        _open(self.transport, self._config)
+        if self.transport.get(id_, "baud_rate") != code:
+            raise DeviceError(f"servo {id_} did not keep its new baud rate; power-cycle it and start again")
 
     def _values(self, id_: int) -> dict[str, int]:
         return {name: self.transport.get(id_, name) for name in self._expected}
@@ -203,6 +241,12 @@ class _Inspection:
         match name:
             case "return_delay_time":
                 return f"{2 * value} us"
+            case "baud_rate":
+                return next(
+                    (f"{rate} baud" for rate, code in BAUD_RATES.items() if code == value), str(value)
+                )
+            case "homing_offset":
+                return f"{value} ticks"
             case "current_limit":
                 return f"{value * self.model.current_unit_a:.3f} A"
             case "operating_mode":
@@ -218,7 +262,7 @@ def _opened(config: Config) -> Iterator[_Inspection]:
         if config.servo.port.startswith(VIRTUAL_PREFIX):
             stack.enter_context(open_devices(keep_only(config, "servo")))
         inspection = _Inspection(config.servo)
-        stack.callback(inspection.transport.close)
+        stack.callback(lambda: inspection.transport.close())
         _open(inspection.transport, config.servo)
         yield inspection
 
@@ -230,7 +274,7 @@ def _open(transport: Transport, servo: ServoConfig) -> None:
 def _other_baud_rate(servo: ServoConfig, id_: int) -> int | None:
     if servo.port.startswith(VIRTUAL_PREFIX):
         return None
-    for rate in _BAUD_RATES:
+    for rate in BAUD_RATES:
         if rate == servo.baud_rate:
             continue
         other = servo.model_copy(update={"baud_rate": rate, "retries": 0})
@@ -239,8 +283,3 @@ def _other_baud_rate(servo: ServoConfig, id_: int) -> int | None:
             transport.ping(id_)
             return rate
     return None
-
-
-def _model_name(number: int) -> str:
-    known = {load_model(name).number: name for name in model_names()}
-    return known.get(number, f"model number {number}")

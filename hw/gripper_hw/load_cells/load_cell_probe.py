@@ -1,15 +1,31 @@
-"""Diagnostics of the load cell for `doctor`: rate, noise and rejected samples."""
+"""Diagnostics of the load cell for `doctor`: rate, noise and rejected samples. Also the search for one."""
 
-from collections.abc import Iterator
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import closing, suppress
+from typing import Final
 
 import numpy as np
 
 from gripper_force.config import Config
+from gripper_force.errors import GripperError
+from gripper_force.interfaces import Progress
 from gripper_force.jobs.checks import Check, clock_name, gather, judged, keep_only, rate_hz
-from gripper_force.runtime.backends import open_devices
+from gripper_force.runtime.backends import MonotonicClock, open_devices, open_load_cell
+from gripper_force.schema import Tree
+from gripper_force.types import NS_PER_S
 
 _MIN_VALID_SHARE = 0.9
 """Lowest share of valid samples that passes."""
+
+_LINES: Final = (("hx711", 115_200), ("cas", 9_600), ("hx711", 57_600), ("hx711", 9_600))
+"""Formats and baud rates that the search tries, in this order."""
+
+_SEARCH_S: Final = 4.0
+"""Time for the first readings: an Arduino restarts for 1.6 s, and an HX711 may give 10 samples per second."""
+
+_ENOUGH: Final = 8
+"""Readings that make a load cell."""
 
 
 def probe(config: Config) -> Iterator[Check]:
@@ -46,3 +62,36 @@ def probe(config: Config) -> Iterator[Check]:
         advice = "set load_cell.n_per_raw (newtons per unit of its reading) and load_cell.tare_raw"
     rejected = f"{len(samples) - len(forces_n)} of {len(samples)} samples"
     yield judged("load cell", "rejected", rejected + (f" ({causes})" if causes else ""), enough_valid, advice)
+
+
+def find(config: Config, ports: Iterable[str], progress: Progress) -> Tree | None:
+    """Returns the section ``load_cell`` for the first port on which one of the known kinds of lines arrives, or None.
+
+    Args:
+        config: The configuration; of its load cell only the calibration is used.
+        ports: Ports to listen at. Nothing is sent.
+        progress: Called with each port.
+    """
+    for port in ports:
+        for form, baud_rate in _LINES:
+            progress(f"{port}: a load cell ({form}, {baud_rate} baud)?", 0)
+            keys: Tree = {"backend": "serial", "port": port, "format": form, "baud_rate": baud_rate}
+            with suppress(GripperError):  # in use by another program, or no serial port
+                if _sends_readings(config, keys):
+                    return keys
+    return None
+
+
+def _sends_readings(config: Config, keys: Tree) -> bool:
+    clock = MonotonicClock()
+    section = config.load_cell.model_copy(update=keys)
+    with closing(open_load_cell(config.model_copy(update={"load_cell": section}), clock)) as cell:
+        cell.start()
+        end_ns, readings = clock.now_ns() + round(_SEARCH_S * NS_PER_S), 0
+        while clock.now_ns() < end_ns:
+            time.sleep(0.05)
+            readings += len(cell.drain())
+            if readings >= _ENOUGH:
+                # Lines of another device, or at another baud rate, are unreadable for the most part.
+                return bool(cell.counts().get("unreadable", 0) < readings / 4)
+    return False

@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-import cv2
 import numpy as np
 from pydantic import Field
 
@@ -53,6 +52,8 @@ def read_bytes(path: Path, what: str) -> bytes:
 
 def read_image(path: Path) -> bytes:
     """Reads a PNG image. Raises `ConfigError` that names it."""
+    import cv2
+
     data = read_bytes(path, "texture")
     if (
         not data.startswith(b"\x89PNG")

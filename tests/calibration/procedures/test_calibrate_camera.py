@@ -6,19 +6,24 @@ from pathlib import Path
 
 import cv2
 import pytest
+import yaml
 from typer.testing import CliRunner
 
 from gripper_calibration.fits.camera_fit import estimate_lag
+from gripper_calibration.procedures import calibrate_camera as calibrate_camera_module
 from gripper_calibration.procedures.calibrate_camera import calibrate_camera, compute_ms, observe
 from gripper_force.cli import app
 from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
 from gripper_force.jobs.recording.record import RecordingPlan, record
 from gripper_force.profiles.apply import read_profiles, rig_mismatches
+from gripper_force.profiles.object_profile import find_object
 from gripper_force.profiles.rig_profile import read_rig
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import NS_PER_MS, Frame
+from gripper_force.vision.checkpoint_writer import replace_header
+from gripper_force.vision.header import read_checkpoint
 
 QUICK = ["object=stapler", "sim.detail=coarse", "vision.checkpoint=none", "seed=2", "camera.rate_hz=30"]
 WHOLE = (0, 0, 128, 128)
@@ -111,7 +116,7 @@ def test_different_camera_is_refused_or_reported(tmp_path: Path) -> None:
     named = [*QUICK, f"calibration.rig={rig}"]
     assert mismatches(load_config(None, named)) == []
     another = load_config(None, [*named, "camera.exposure_us=500", "camera.side_px=64"])
-    why = "with camera.side_px 128, not 64; camera.exposure_us 4000, not 500; calibrate again"
+    why = "with camera.side_px 128, not 64; camera.exposure_us 4000, not 500; teach or calibrate"
     with pytest.raises(ConfigError, match=why):
         mismatches(another)
     with pytest.raises(
@@ -188,3 +193,30 @@ def test_given_region_is_checked(tmp_path: Path, region: str, why: str) -> None:
     assert done.exit_code != 0
     assert isinstance(done.exception, ConfigError)
     assert why in str(done.exception)
+
+
+def test_a_new_exposure_names_what_it_outdates(
+    tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
+    folder = tmp_path / "gripper-force" / "objects"
+    folder.mkdir(parents=True)
+    sponge = yaml.safe_load(find_object("sponge").read_text())
+    for path, exposure_us in (("mug.yaml", 4000), ("taught/profile.yaml", 4000), ("old.yaml", 1000)):
+        (folder / path).parent.mkdir(exist_ok=True)
+        tree = {**sponge, "camera": {**sponge["camera"], "camera.exposure_us": exposure_us}}
+        (folder / path).write_text(yaml.safe_dump(tree))
+    (folder / "damaged.yaml").write_text("no profile")
+    network = tmp_path / "network.safetensors"
+    settings = {"rigs": 1, **load_config().rig_settings()}
+    header = read_checkpoint(tiny_checkpoint)[2].model_copy(update={"trained_on": settings})
+    replace_header(tiny_checkpoint, header, network)
+    before = load_config(None, [f"vision.checkpoint={network}"])
+    after = load_config(None, [f"vision.checkpoint={network}", "camera.exposure_us=2000"])
+    why = "(camera.exposure_us 4000, not 2000)"
+    assert calibrate_camera_module._outdated(before, after) == (
+        f"the profile {folder / 'mug.yaml'} {why}",
+        f"the bundle {folder / 'taught/profile.yaml'} {why}",
+        f"the network {network} {why}",
+    )
+    assert calibrate_camera_module._outdated(before, before) == ()

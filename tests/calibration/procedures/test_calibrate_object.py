@@ -27,6 +27,7 @@ from gripper_force.runtime.resolve import resolve
 from gripper_force.types import NS_PER_S, Event, Frame, GraspStatus, LoadCellSample, Phase, ServoState
 from gripper_force.vision.batch_inference import features
 from gripper_force.vision.checkpoint import load_checkpoint
+from gripper_force.vision.estimator import ForceEstimator
 
 QUICK = [
     "object=stapler",
@@ -170,7 +171,7 @@ def test_a_grasp_with_it_is_corrected_and_replays_bit_for_bit(profile: Path, tmp
     log = Path(known["log"])
     assert LogReader(log).metadata["profile"] == read_object(profile).weights
     assert replay(log).identical
-    other = replay(log, overrides=["calibration.object=null"])
+    other = replay(log, overrides=["calibration.object=none"])
     assert not other.identical
     assert "profile was" in other.note
 
@@ -206,6 +207,62 @@ def test_profile_with_missing_or_wrong_weights_is_refused(profile: Path, tmp_pat
     weights_path(copy).write_bytes(b"something else")
     with pytest.raises(ConfigError, match="does not belong to"):
         grasp(run(tmp_path, f"calibration.object={copy}"))
+
+
+def rejected_share(log: Path, profile: Path | None) -> float:
+    """Share of a log's frames whose out-of-distribution score is over the limit."""
+    estimator, rejected, count = ForceEstimator.load("default", profile=profile, threads=1), 0, 0
+    for frame in LogReader(log).records(Frame):
+        count += 1
+        try:
+            estimator.update(frame.gray)
+        except DataError as error:
+            rejected += "out-of-distribution score" in str(error)
+    return rejected / count
+
+
+@pytest.fixture(scope="module")
+def unknown(folder: Path) -> list[Path]:
+    """Touches of an object of a kind that the network does not know."""
+    config = load_config(None, ["object=hourglass", *QUICK[1:2], *QUICK[3:]])
+    return list(record_touches(config, 4, 6.0, folder / "unknown"))
+
+
+def test_a_calibrated_unknown_object_is_accepted_and_another_object_is_not(
+    touched: list[Path], unknown: list[Path], tmp_path: Path
+) -> None:
+    path = tmp_path / "hourglass.yaml"
+    calibrate_object(load_config(), "hourglass", logs=unknown[:3], out=path)
+    assert rejected_share(unknown[3], None) > 0.3
+    assert rejected_share(unknown[3], path) < 0.05
+    assert rejected_share(touched[0], None) < 0.1
+    assert rejected_share(touched[0], path) > 0.4
+
+
+def test_one_touch_widens_the_limits_of_the_network(unknown: list[Path], tmp_path: Path) -> None:
+    path = tmp_path / "hourglass.yaml"
+    calibrate_object(load_config(), "hourglass", logs=unknown[:1], out=path)
+    assert rejected_share(unknown[3], path) < 0.05
+
+
+def test_coverage_in_contact_and_by_force_is_printed_and_stored(unknown: list[Path], tmp_path: Path) -> None:
+    given = [
+        "calibrate",
+        "object",
+        "hourglass",
+        "--from",
+        str(unknown[0].parent),
+        "--out",
+        str(tmp_path / "it.yaml"),
+    ]
+    table = CliRunner().invoke(app, given, catch_exceptions=False)
+    assert "in contact of the touches left out (0.25 to 1 N: " in " ".join(table.stdout.split())
+    found = json.loads(CliRunner().invoke(app, [*given, "--json"], catch_exceptions=False).stdout)
+    contact, *levels = found["coverages"]
+    assert (contact["from_n"], contact["to_n"], contact["touches"]) == (0.25, None, 4)
+    assert [level["from_n"] for level in levels[:2]] == [0.25, 1.0]
+    assert all(0 <= level["covered"] <= 1 for level in found["coverages"])
+    assert Path(found["report"]).stat().st_size > 10_000
 
 
 def test_logs_of_two_cameras_are_refused(touched: list[Path], tmp_path: Path) -> None:

@@ -15,7 +15,8 @@ from gripper_force.cli.output.calibrate import rig_table
 from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError, DataError, DeviceError, RequestError
 from gripper_force.jobs.grasp import run_grasp
-from gripper_force.profiles.rig_profile import CalibratedValue, LoadCellCalibration, read_rig, update_rig
+from gripper_force.jobs.profile_files import update_rig
+from gripper_force.profiles.rig_profile import CalibratedValue, LoadCellCalibration, read_rig
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import Event, LoadCellSample
 from gripper_hw.dynamixel.control_table import load_model

@@ -1,9 +1,8 @@
-"""Export of a checkpoint to OpenVINO in int8, calibrated and checked on recordings."""
+"""Export of a checkpoint to OpenVINO with int8 convolutions, calibrated on recordings."""
 
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,45 +12,49 @@ from gripper_force.errors import ConfigError, DataError
 from gripper_force.types import Gray
 from gripper_force.vision.engines import Floats, Step
 from gripper_force.vision.engines.pytorch import TorchEngine
-from gripper_force.vision.export import ExportErrors, difference, exporting, inputs_of, write_openvino
+from gripper_force.vision.export import (
+    ExportErrors,
+    compare,
+    inputs_of,
+    openvino_network,
+    save_openvino,
+    written,
+)
 from gripper_force.vision.header import KEY, Header, Model, Residual
-
-_CLIPS: Final = 4
-"""Recordings that a quantised network is checked on."""
 
 _SAMPLES: Final = 300
 """Frames that int8 ranges are calibrated on; NNCF's default."""
 
 
 def export_int8(model: Model, path: Path, frames: Sequence[Gray]) -> ExportErrors:
-    """Writes an ensemble's streaming step as an OpenVINO file with convolutions in int8.
+    """Writes an ensemble's streaming step as an OpenVINO file, with its convolutions in int8.
 
     Other layers, a tenth of the arithmetic or less, stay in floating point: with the whole network in int8, errors
     exceeded 1 N.
 
     Args:
         model: The checkpoint.
-        path: File to write, which ends in ``.xml``. The weights go beside it, into ``.bin``.
-        frames: Recordings, (T, S, S) uint8 each, to calibrate the ranges of int8 on.
+        path: File to write, ``.xml``; see `gripper_force.vision.export.export`.
+        frames: Recordings, (T, S, S) uint8 each, to calibrate the ranges on.
 
     Returns:
-        The difference from PyTorch on the recordings. The header of the file claims errors that include it.
+        The difference from PyTorch, on the recordings. The header of the file claims errors that include it.
 
     Raises:
-        ConfigError: The suffix is wrong, or a package is not installed.
-        CheckpointError: The checkpoint can't be read, or the exported network computes no finite numbers.
+        ConfigError: The suffix is another one, or a package is not installed.
+        CheckpointError: The checkpoint can't be read, the file can't be written, or its estimates are not finite.
         DataError: The recordings hold too few frames.
     """
     if path.suffix != ".xml":
         raise ConfigError(f"int8 is exported to OpenVINO only, not to {path}; name a file that ends in .xml")
-    with exporting(path) as made:
-        write_openvino(model, made, partial(_quantised, model, frames))
-        errors = difference(model, made, frames[:_CLIPS])
+    with written(path) as made:
+        save_openvino(_quantised(openvino_network(model), model, frames), model, made)
+        errors = compare(model, made, frames)
         _replace_header(with_added_error(model.header, errors), made)
     return errors
 
 
-def _quantised(model: Model, frames: Sequence[Gray], network: Any) -> Any:
+def _quantised(network: Any, model: Model, frames: Sequence[Gray]) -> Any:
     """Quantises the convolutions to int8: weights with a scale per channel, inputs calibrated on frames."""
     import nncf
 

@@ -1,0 +1,1 @@
+"""Guided setup of a rig, step by step, into one configuration file: see `gripper_calibration.setup.run`."""

@@ -1,0 +1,64 @@
+"""Step ``jaws``: finds the ends of the travel, the closing direction and friction."""
+
+from datetime import date
+
+from gripper_calibration.procedures.calibrate_jaws import calibrate_jaws
+from gripper_calibration.setup.step import Found, Outcome, Task, with_keys
+from gripper_force.runtime.backends import is_simulated
+from gripper_force.runtime.resolve import resolve
+
+_AIR = "none"
+"""The simulated object that is no object."""
+
+
+def jaws(task: Task) -> Outcome:
+    """Asks for the geometry that is not given, and moves the empty jaws to both ends.
+
+    Raises:
+        ConfigError: The travel leaves the servo's turn, so its angle is lost at power-off.
+        GripperError: See `calibrate_jaws`.
+    """
+    config, values = task.config, {}
+    for key, question in (
+        ("pinion_radius_m", "Pitch radius of the pinion in mm"),
+        ("open_width_m", "Distance between the open jaws in mm"),
+    ):
+        rack_only = key == "pinion_radius_m" and config.gripper.linkage.kind != "rack"
+        if f"gripper.{key}" in task.given or rack_only:
+            continue
+        default_mm = 1e3 * getattr(config.gripper, key)
+        answer_m = 1e-3 * task.person.number(question, f"--set gripper.{key}=METRES", default_mm)
+        config = with_keys(config, "gripper", **{key: answer_m})
+        origin = "default, not measured" if answer_m == 1e-3 * default_mm else "as you answered"
+        values[f"gripper.{key}"] = Found(round(answer_m, 6), origin)
+    homed = config
+    if is_simulated(config):
+        homed = config.model_copy(update={"object": _AIR})
+        if config.sim.open_width_m is None:  # what is found must not change the simulated gripper
+            true_m = config.gripper.open_width_m
+            values["sim.open_width_m"] = Found(true_m, "true width of the simulated jaws")
+    found = calibrate_jaws(homed, prompt=task.person.do, progress=task.progress)
+    today = date.today().isoformat()
+    origin = f"homed {today}, ends repeated within {found.repeat_rad:.3f} rad"
+    values |= {
+        "gripper.closing_sign": Found(found.closing_sign, f"homed {today}"),
+        "gripper.open_position_rad": Found(round(found.open_position_rad, 4), origin),
+        "gripper.open_width_m": Found(
+            round(found.open_width_m, 4), f"travel between the ends, homed {today}"
+        ),
+        "gripper.friction_n": Found(
+            round(found.friction_n, 2),
+            f"{found.running_n[0]:.2f} N closing, {found.running_n[1]:.2f} N opening, homed {today}",
+        ),
+    }
+    found_keys = (key.partition(".") for key in values)
+    gripper = {key: values[f"gripper.{key}"].value for part, _, key in found_keys if part == "gripper"}
+    resolve(
+        with_keys(config, "gripper", **gripper), vision=False
+    )  # the travel must lie within the servo's turn
+    return Outcome(
+        f"the jaws open to {1e3 * found.open_width_m:.1f} mm, close with "
+        f"{'rising' if found.closing_sign > 0 else 'falling'} angle, friction {found.friction_n:.2f} N",
+        values,
+        details={"jaws": found},
+    )

@@ -1,0 +1,65 @@
+"""Step ``load-cell``: tare and scale, with a known mass."""
+
+from typing import Final
+
+from gripper_calibration.procedures.calibrate_load_cell import STANDARD_GRAVITY_M_S2, calibrate_load_cell
+from gripper_calibration.setup.step import Found, Outcome, Task, with_keys
+from gripper_force.errors import ConfigError
+from gripper_force.jobs import doctor
+from gripper_force.profiles.rig_profile import CalibratedValue
+
+PROFILE: Final = "measured.yaml"
+"""Rig profile in the setup's folder, in which the procedures keep their results."""
+
+_GOOD_RATE_HZ: Final = 40.0
+"""With fewer samples per second presses become slow, and the camera's lag can't be measured."""
+
+WITHOUT: Final = (
+    "Without a load cell everything works but what needs newtons measured at the jaws: `calibrate servo`, "
+    "`calibrate object` and training. Motor current measures the force instead; the next step states its error."
+)
+
+
+def load_cell(task: Task) -> Outcome:
+    """Calibrates the load cell, or says what is possible without one.
+
+    Raises:
+        ConfigError: A script did not give the mass.
+        GripperError: See `calibrate_load_cell`.
+    """
+    backend = task.config.load_cell.backend
+    if backend == "none":
+        return Outcome("no load cell", remarks=[WITHOUT])
+    if backend in ("simulated", "playback"):
+        return Outcome(f"the {backend} load cell gives newtons and needs no calibration")
+    mass_kg = task.mass_kg
+    if mass_kg is None:
+        mass_kg = 1e-3 * task.person.number("Known mass in grams", "--mass-kg KG")
+    if mass_kg <= 0:
+        raise ConfigError(f"a mass of {mass_kg:g} kg can't calibrate the load cell; use one of 0.2 to 1 kg")
+    found = calibrate_load_cell(
+        task.config,
+        mass_kg * STANDARD_GRAVITY_M_S2,
+        task.folder / PROFILE,
+        prompt=task.person.do,
+        progress=task.progress,
+    )
+    cell = found.calibration
+    by = f"weighed with {1e3 * mass_kg:g} g, {cell.date.date().isoformat()}"
+    config = with_keys(task.config, "load_cell", tare_raw=cell.tare_raw.value, n_per_raw=cell.n_per_raw.value)
+    remarks = [f"load cell, {one.name}: {one.found}" for one in doctor.check(config, "load cell")]
+    return Outcome(
+        f"calibrated with {1e3 * mass_kg:g} g; noise {cell.noise_n:.3f} N",
+        {
+            "load_cell.tare_raw": Found(cell.tare_raw.value, by),
+            "load_cell.n_per_raw": Found(cell.n_per_raw.value, f"{interval(cell.n_per_raw)}, {by}"),
+        },
+        remarks,
+        {"figure": found.report},
+        {"load_cell": cell},
+    )
+
+
+def interval(value: CalibratedValue) -> str:
+    """The 95 % interval of a value, for a comment."""
+    return "given" if value.low is None else f"95 %: {value.low:.4g} to {value.high:.4g}"

@@ -1,0 +1,207 @@
+"""Runs the steps of a setup: those that are not finished, or that rest on values which have changed."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final, Literal
+
+from gripper_calibration.setup.camera import camera
+from gripper_calibration.setup.jaws import jaws
+from gripper_calibration.setup.load_cell import load_cell
+from gripper_calibration.setup.rig_file import RigFile, flat
+from gripper_calibration.setup.scan import scan
+from gripper_calibration.setup.servo import servo
+from gripper_calibration.setup.step import Outcome, Person, Task
+from gripper_calibration.setup.torque import torque
+from gripper_force.config import Config, load_config
+from gripper_force.errors import ConfigError
+from gripper_force.interfaces import Progress, no_progress
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A step of the setup.
+
+    Attributes:
+        title: What it does, for a person.
+        run: Its function.
+        rests_on: Sections and keys of the configuration; if one changes, the step runs again.
+        but: Keys among them that the step sets itself.
+    """
+
+    title: str
+    run: Callable[[Task], Outcome]
+    rests_on: tuple[str, ...] = ()
+    but: tuple[str, ...] = ()
+
+
+_GEOMETRY: Final = ("gripper.linkage", "gripper.pinion_radius_m")
+
+STEPS: Final = {
+    "scan": Step("servo, camera and load cell are looked for", scan),
+    "servo": Step(
+        "the servo is checked and set up",
+        servo,
+        ("servo.backend", "servo.port", "servo.id", "servo.second", "servo.model", "servo.current_limit_a"),
+    ),
+    "jaws": Step(
+        "the empty jaws move to both ends",
+        jaws,
+        ("servo.id", "servo.second", "servo.model", *_GEOMETRY),
+        ("gripper.pinion_radius_m",),
+    ),
+    "camera": Step(
+        "a picture is taken and judged", camera, ("camera",), ("camera.exposure_us", "camera.timeout_ms")
+    ),
+    "load-cell": Step(
+        "the load cell weighs a known mass",
+        load_cell,
+        ("load_cell",),
+        ("load_cell.tare_raw", "load_cell.n_per_raw", "load_cell.rate_hz"),
+    ),
+    "torque": Step(
+        "motor current is compared with newtons",
+        torque,
+        ("servo.id", "servo.second", "servo.model", "load_cell", *_GEOMETRY, "gripper.closing_sign"),
+    ),
+}
+"""The steps by name, in their order."""
+
+
+@dataclass(frozen=True, slots=True)
+class StepReport:
+    """What became of a step.
+
+    Attributes:
+        name: Its name.
+        result: done: it ran now; kept: it was finished before.
+        summary: One sentence.
+        remarks: What a person should know.
+        values: Keys that it set.
+        files: Pictures, by what they show.
+        details: Anything else for scripts.
+    """
+
+    name: str
+    result: Literal["done", "kept"]
+    summary: str
+    remarks: Sequence[str]
+    values: dict[str, Any]
+    files: dict[str, str]
+    details: dict[str, Any]
+
+
+class Setup:
+    """A setup of one rig.
+
+    Attributes:
+        rig: The rig file and the state.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        overrides: list[str] | None = None,
+        *,
+        only: str | None = None,
+        fresh: bool = False,
+        mass_kg: float | None = None,
+        gauge_mm: float | None = None,
+    ) -> None:
+        """Reads the rig file, which need not exist.
+
+        Args:
+            path: The rig file.
+            overrides: Assignments ``key.path=value``; they go into the file.
+            only: Name of the only step to run, even if it is finished; None: all that are not.
+            fresh: Forgets what earlier steps found.
+            mass_kg: Known mass for the load cell; None: asked for.
+            gauge_mm: Width of the load cell between the jaws; None: asked for.
+
+        Raises:
+            ConfigError: A file, key or value is wrong.
+        """
+        load_config(path if path.exists() else None, overrides)  # its messages name the file
+        self.rig = RigFile.load(path, overrides, fresh=fresh)
+        self._only, self._mass_kg, self._gauge_mm = only, mass_kg, gauge_mm
+
+    @property
+    def config(self) -> Config:
+        """The configuration so far."""
+        return load_config(None, self.rig.tree())
+
+    def run(self, person: Person, progress: Progress = no_progress) -> Iterator[StepReport]:
+        """Runs the steps and writes the rig file after each.
+
+        Args:
+            person: Answers questions.
+            progress: Called with what the devices do.
+
+        Raises:
+            GripperError: A step failed. What earlier steps found is in the rig file.
+        """
+        for number, (name, step) in enumerate(STEPS.items(), 1):
+            if self._only not in (None, name):
+                continue
+            if self._only is None and name in self.rig.steps:
+                changed = self._changed(name, step)
+                if not changed:
+                    yield self._kept(name)
+                    continue
+                person.tell(f"{name} runs again, because these changed: {', '.join(changed)}")
+            person.tell(f"[{number} of {len(STEPS)}] {name}: {step.title}")
+            task = Task(
+                config=self.config,
+                given={key: one.value for key, one in self.rig.given.items()},
+                folder=self.rig.folder,
+                person=person,
+                progress=progress,
+                mass_kg=self._mass_kg,
+                gauge_mm=self._gauge_mm,
+            )
+            outcome = step.run(task)
+            yield self._finish(name, step, outcome)
+
+    def _finish(self, name: str, step: Step, outcome: Outcome) -> StepReport:
+        files = {what: str(path) for what, path in outcome.files.items()}
+        self.rig.take(outcome.values)
+        self.rig.finish(
+            name,
+            {
+                "date": datetime.now(UTC).replace(microsecond=0).isoformat(),
+                "summary": outcome.summary,
+                "remarks": list(outcome.remarks),
+                "files": files,
+                "rests_on": self._inputs(step),
+            },
+        )
+        values = {key: found.value for key, found in outcome.values.items()}
+        return StepReport(
+            name, "done", outcome.summary, outcome.remarks, values, files, dict(outcome.details)
+        )
+
+    def _kept(self, name: str) -> StepReport:
+        state = self.rig.steps[name]
+        summary = f"{state['summary']} ({state['date'][:10]})"
+        return StepReport(name, "kept", summary, state["remarks"], {}, state["files"], {})
+
+    def _inputs(self, step: Step) -> dict[str, Any]:
+        """The values that a step rests on, as in JSON."""
+        leaves = flat(self.config.model_dump(mode="json"))
+        return {
+            key: value
+            for key, value in leaves.items()
+            if key not in step.but and any(key == one or key.startswith(f"{one}.") for one in step.rests_on)
+        }
+
+    def _changed(self, name: str, step: Step) -> list[str]:
+        """Keys whose values differ from those that a finished step rested on."""
+        before, now = self.rig.steps[name].get("rests_on", {}), self._inputs(step)
+        return [key for key in now if now[key] != before.get(key)]
+
+
+def check_step(name: str | None) -> None:
+    """Raises `ConfigError` if there is no step of this name."""
+    if name is not None and name not in STEPS:
+        raise ConfigError(f"there is no step {name!r}; use one of {', '.join(STEPS)}")

@@ -1,0 +1,87 @@
+"""Vocabulary of the steps of a setup: what a step gets, asks and finds."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+from gripper_force.config import Config
+from gripper_force.interfaces import Progress
+
+
+class Person(Protocol):
+    """The person who sets up the rig, or a script that answers with yes and with defaults."""
+
+    def tell(self, text: str) -> None:
+        """Shows a remark."""
+        ...
+
+    def do(self, text: str) -> None:
+        """Asks for an action and returns once it is done."""
+        ...
+
+    def agrees(self, question: str) -> bool:
+        """Asks a question whose answer is yes or no. A script answers yes."""
+        ...
+
+    def choose(self, question: str, answers: Sequence[str], option: str) -> str:
+        """Returns one of the answers. A script can't choose: `ConfigError` names its ``option``."""
+        ...
+
+    def number(self, question: str, option: str, default: float | None = None) -> float:
+        """Returns a number. A script takes the default; without one `ConfigError` names its ``option``."""
+        ...
+
+
+class Found(NamedTuple):
+    """A value for the rig file and its origin, for the comment behind it."""
+
+    value: Any
+    origin: str
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """Configuration, files and person that a step works with.
+
+    Attributes:
+        config: The configuration so far.
+        given: Paths of the keys that the rig file or ``--set`` states.
+        folder: Folder for pictures and measurements.
+        person: Answers questions.
+        progress: Called with what the devices do.
+        mass_kg: Known mass for the load cell, if it was given.
+        gauge_mm: Width of the load cell between the jaws, if it was given.
+    """
+
+    config: Config
+    given: Mapping[str, Any]
+    folder: Path
+    person: Person
+    progress: Progress
+    mass_kg: float | None = None
+    gauge_mm: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Result of a step.
+
+    Attributes:
+        summary: One sentence.
+        values: Keys for the rig file.
+        remarks: What a person should know.
+        files: Pictures, by what they show.
+        details: Anything else for scripts.
+    """
+
+    summary: str
+    values: Mapping[str, Found] = field(default_factory=dict)
+    remarks: Sequence[str] = ()
+    files: Mapping[str, Path] = field(default_factory=dict)
+    details: Mapping[str, Any] = field(default_factory=dict)
+
+
+def with_keys(config: Config, section: str, **values: object) -> Config:
+    """Returns a configuration with other values in one section."""
+    return config.model_copy(update={section: getattr(config, section).model_copy(update=values)})

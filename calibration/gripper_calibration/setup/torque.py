@@ -1,0 +1,89 @@
+"""Step ``torque``: what a motor current is in newtons at the jaws, by the load cell, a weight, or the data sheet."""
+
+import math
+from typing import Any, Final
+
+from gripper_calibration.procedures.calibrate_servo import calibrate_servo
+from gripper_calibration.setup.load_cell import PROFILE, interval
+from gripper_calibration.setup.step import Found, Outcome, Task, with_keys
+from gripper_force.config import Config
+from gripper_force.profiles.rig_profile import RigProfile
+from gripper_force.runtime.backends import is_simulated
+from gripper_force.runtime.resolve import resolve
+
+_SIM_GAUGE_MM: Final = 30.0
+_SIM_GAUGE: Final = "block"
+"""The simulated object that stands for a load cell's rigid body."""
+
+_NORMAL: Final = 1.96
+_FORCES_N: Final = (2.0, 4.0, 8.0)
+
+
+def torque(task: Task) -> Outcome:
+    """Presses the load cell; without one, takes the data sheet's torque constant and states its interval.
+
+    Raises:
+        ConfigError: A script did not give the width of the load cell.
+        GripperError: See `calibrate_servo`.
+    """
+    config = task.config
+    if config.load_cell.backend in ("none", "playback") or len(config.servo.ids) > 1:
+        return _data_sheet(task)
+    simulated = is_simulated(config)
+    gauge_mm = task.gauge_mm
+    if gauge_mm is None:
+        default = _SIM_GAUGE_MM if simulated else None
+        gauge_mm = task.person.number(
+            "Width of the load cell between the jaws in mm", "--gauge-mm MM", default
+        )
+    pressed = config.model_copy(update={"object": _SIM_GAUGE}) if simulated else config
+    found = calibrate_servo(
+        pressed, [1e-3 * gauge_mm], task.folder / PROFILE, prompt=task.person.do, progress=task.progress
+    )
+    servo = found.calibration
+    by = f"pressed the load cell, {servo.date.date().isoformat()}"
+    settings = RigProfile(servo=servo).settings()["gripper"]
+    origins = {
+        "nm_per_a": interval(servo.nm_per_a),
+        "friction_n": interval(servo.friction_n),
+        "damping_n_s_m": interval(servo.damping_n_s_m),
+        "open_position_rad": interval(servo.open_position_rad),
+        "gain_std": "relative error of nm_per_a",
+        "friction_std": "relative error of friction_n",
+    }
+    values = {
+        f"gripper.{key}": Found(round(settings[key], 5), f"{origin}, {by}") for key, origin in origins.items()
+    }
+    after = with_keys(config, "gripper", **{key: settings[key] for key in origins})
+    return Outcome(
+        f"{servo.nm_per_a.value:.3f} Nm/A ({interval(servo.nm_per_a)})",
+        values,
+        [_reference(after)],
+        {"figure": found.report},
+        {"servo": servo, "intervals_n": _intervals_n(after)},
+    )
+
+
+def _data_sheet(task: Task) -> Outcome:
+    config = resolve(task.config, vision=False).config
+    return Outcome(
+        f"torque constant of the data sheet, {config.gripper.nm_per_a:.3f} Nm/A, not measured",
+        remarks=[_reference(config)],
+        details={"intervals_n": _intervals_n(config)},
+    )
+
+
+def _intervals_n(config: Config) -> dict[str, Any]:
+    """95 % intervals of the force at a jaw, while motor current reads some forces after closing."""
+    gripper = config.gripper
+    bounds = {}
+    for force_n in _FORCES_N:
+        gain_n = gripper.gain_std * (force_n + gripper.friction_n)
+        half_n = _NORMAL * math.hypot(gain_n, gripper.friction_std * gripper.friction_n)
+        bounds[f"{force_n:g}"] = [round(max(force_n - half_n, 0.0), 2), round(force_n + half_n, 2)]
+    return bounds
+
+
+def _reference(config: Config) -> str:
+    bounds = ", ".join(f"{of} N: {low:g} to {high:g}" for of, (low, high) in _intervals_n(config).items())
+    return f"force by motor current alone, 95 % interval: {bounds}"

@@ -1,0 +1,119 @@
+"""The command `setup`, and the person or script that answers it."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TypeVar
+
+import typer
+
+from gripper_force.cli import console
+from gripper_force.cli.options import AsJson, Overrides
+from gripper_force.cli.output.setup import setup_report, step_lines
+from gripper_force.errors import ConfigError, GripperError
+
+if TYPE_CHECKING:
+    from rich.status import Status
+
+T = TypeVar("T")
+
+
+def setup(
+    config: Annotated[
+        Path, typer.Option("--config", help="Rig file to write; an existing one is continued.")
+    ] = Path("rig.yaml"),
+    step: Annotated[
+        str | None,
+        typer.Option(help="Run only this step: scan, servo, jaws, camera, load-cell or torque."),
+    ] = None,
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Start over: forget what earlier steps found.")
+    ] = False,
+    mass_kg: Annotated[float | None, typer.Option(help="Known mass for the load cell.")] = None,
+    gauge_mm: Annotated[
+        float | None, typer.Option(help="Width of the load cell between the jaws, for the torque constant.")
+    ] = None,
+    yes: Annotated[
+        bool,
+        typer.Option("--yes", help="Do not ask: answer yes, take defaults, and write to the servo's EEPROM."),
+    ] = False,
+    set_: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Set up a rig step by step, and write one file for `grasp --config`. Continues after the last finished step."""
+    from gripper_calibration.setup.run import Setup, check_step
+
+    check_step(step)
+    running = Setup(config, set_, only=step, fresh=fresh, mass_kg=mass_kg, gauge_mm=gauge_mm)
+    reports = []
+    with console.err.status("setting up") as status:
+        person = _Terminal(yes, status)
+        try:
+            for report in running.run(person, lambda text, steps=1: status.update(text)):
+                step_lines(report)
+                reports.append(report)
+        except (GripperError, KeyboardInterrupt):
+            status.stop()
+            if running.rig.path.exists():
+                console.err.print(
+                    f"what was found so far is in {config}; the same command continues there", soft_wrap=True
+                )
+            raise
+    next_command = _next(running.config.load_cell.backend, running.config.uses_vision, config)
+    result = {"rig": config, "steps": reports, "next": next_command}
+    console.show(result, as_json, lambda _: setup_report(config, next_command))
+
+
+def _next(load_cell: str, vision: bool, path: Path) -> str:
+    """The command that follows: teaching needs camera and load cell."""
+    if vision and load_cell != "none":
+        return f"gripper-force teach NAME --config {path}"
+    return f"gripper-force grasp --config {path} --target-n 3"
+
+
+class _Terminal:
+    """Asks at the terminal, or with ``yes`` answers for the person. Implements `gripper_calibration`'s `Person`."""
+
+    def __init__(self, yes: bool, status: "Status") -> None:
+        self._yes, self._status = yes, status
+        self.do = console.prompt(yes, status)
+
+    def tell(self, text: str) -> None:
+        console.err.print(text, soft_wrap=True, markup=False)
+
+    def agrees(self, question: str) -> bool:
+        if self._yes:
+            self.tell(f"{question} yes")
+            return True
+        return self._ask(question, lambda: typer.confirm(question, default=None, err=True), "--yes")
+
+    def choose(self, question: str, answers: Sequence[str], option: str) -> str:
+        asked = f"{question} ({', '.join(answers)})"
+        if self._yes:
+            raise ConfigError(f"this needs an answer: {asked}; pass {option}")
+        while True:
+            answer = self._ask(asked, lambda: typer.prompt(asked, err=True), option)
+            if answer in answers:
+                return str(answer)
+            self.tell(f"answer one of {', '.join(answers)}")
+
+    def number(self, question: str, option: str, default: float | None = None) -> float:
+        if self._yes:
+            if default is None:
+                raise ConfigError(f"this needs an answer: {question}; pass {option}")
+            self.tell(f"{question}: {default:g} (default)")
+            return default
+        return float(
+            self._ask(question, lambda: typer.prompt(question, default, type=float, err=True), option)
+        )
+
+    def _ask(self, question: str, ask: Callable[[], T], option: str) -> T:
+        self._status.stop()
+        try:
+            answer = ask()
+        except typer.Abort as abort:
+            if not isinstance(abort.__context__, EOFError):
+                raise
+            console.err.print()
+            raise ConfigError(f"this was not answered: {question}; pass {option} in scripts") from abort
+        self._status.start()
+        return answer

@@ -1,0 +1,1 @@
+"""Conversion of logs to formats of other software."""

@@ -1,0 +1,80 @@
+"""Writing of profiles."""
+
+from pathlib import Path
+
+import numpy as np
+from safetensors.numpy import save
+
+from gripper_force.errors import ConfigError
+from gripper_force.profiles.correction import ProfileArrays
+from gripper_force.profiles.object_profile import ObjectProfile, weights_path
+from gripper_force.profiles.rig_profile import (
+    CameraCalibration,
+    LoadCellCalibration,
+    RigProfile,
+    ServoCalibration,
+    read_rig,
+)
+from gripper_force.schema import dump
+
+
+def check_place(path: Path) -> None:
+    """Creates the folder of a profile. Raises `ConfigError` if the profile can't be written there."""
+    if path.suffix != ".yaml":
+        raise ConfigError(f"can't write an object profile to {path}; name a file that ends in .yaml")
+    probe = path.with_name(f".{path.name}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise ConfigError(
+            f"can't write {path}: {error.strerror}, {error.filename}; name another file"
+        ) from error
+
+
+def write_object(path: Path, profile: ObjectProfile, weights: bytes) -> None:
+    """Writes an object profile and the safetensors file beside it. Raises `ConfigError` if it can't."""
+    write_all({weights_path(path): weights, path: dump(profile).encode()})
+
+
+def pack(arrays: ProfileArrays) -> bytes:
+    """Returns the content of the safetensors file beside a profile, with the axes in half precision."""
+    tensors = {name: getattr(arrays, name).astype(np.float32) for name in ("head", "offset")}
+    if arrays.known is not None:
+        mean, axes, floor, _ = arrays.known
+        tensors |= {"mean": mean.astype(np.float32), "axes": np.ascontiguousarray(axes, np.float16)}
+        tensors["floor"] = np.array([floor], np.float32)
+    data: bytes = save(tensors)
+    return data
+
+
+def update_rig(path: Path, section: LoadCellCalibration | ServoCalibration | CameraCalibration) -> RigProfile:
+    """Replaces one section of a rig profile, or creates the profile, and writes it.
+
+    Raises:
+        ConfigError: The file exists and is not a rig profile, or it can't be written.
+    """
+    profile = read_rig(path) if path.exists() else RigProfile()
+    names = {LoadCellCalibration: "load_cell", ServoCalibration: "servo", CameraCalibration: "camera"}
+    profile = profile.model_copy(update={names[type(section)]: section})
+    write_all({path: dump(profile).encode()})
+    return profile
+
+
+def write_all(files: dict[Path, bytes]) -> None:
+    """Writes several files; none appears under its name before all are complete.
+
+    Raises:
+        ConfigError: One can't be written.
+    """
+    parts = {path: path.with_name(f".{path.name}.part") for path in files}
+    try:
+        for path, data in files.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            parts[path].write_bytes(data)
+        for path, part in parts.items():
+            part.replace(path)
+    except OSError as error:
+        names = " and ".join(map(str, files))
+        raise ConfigError(f"can't write {names}: {error.strerror}, {error.filename}") from error

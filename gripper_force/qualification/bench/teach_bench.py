@@ -1,0 +1,397 @@
+"""Errors of the shipped network, calibrated, taught, and of one trained from scratch, on foreign rigs and objects.
+
+A *cell* is one rig, one object, one number of touches and one method. Its figures are the error of vision on fresh
+touches up to `PEAK_N`, the median error of grasps, and the minutes that the method took after the touches. A finished
+cell is one line of a file, and is not repeated.
+"""
+
+import json
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from gripper_calibration.fits.object_fit import fit_correction
+from gripper_calibration.fits.touches import Touches
+from gripper_calibration.procedures.calibrate_object import calibrate_object, record_touches
+from gripper_calibration.procedures.teach import teach
+from gripper_force.config import Config, load_config
+from gripper_force.errors import DataError
+from gripper_force.interfaces import Progress, no_progress
+from gripper_force.jobs.dataset import Clip, load_clips, without_contact_starts
+from gripper_force.jobs.evaluate import evaluate
+from gripper_force.jobs.grasp import overall, trials
+from gripper_force.jobs.imports.video import import_folder
+from gripper_force.jobs.training import few
+from gripper_force.jobs.training.recipe import recipe
+from gripper_force.jobs.training.train import train
+from gripper_force.vision.batch_inference import features
+from gripper_force.vision.kernel_regression import ForceProcess
+from gripper_force.vision.model_files import read_model
+
+FIRST_SEED: Final = 98_000_000
+"""Seed of the first rig. No training uses the seeds from here on."""
+
+PEAK_N: Final = 8.0
+TESTS: Final = 6
+"""Largest force and number of the touches that vision is tested on."""
+
+COUNTS: Final = (4, 8, 16, 32)
+METHODS: Final = ("shipped", "calibrated", "taught", "from scratch")
+
+_SCRATCH: Final = (
+    "attentions=[ssam]",
+    "width=0.5",
+    "hidden=64",
+    "head=256",
+    "preprocess.size=64",
+    "steps=400",
+)
+"""Recipe of a network that is trained from scratch: of the size of the small network, which learns faster."""
+
+_OTHER_SEEDS: Final = 500
+"""Distance of the seeds of the test from those of the touches."""
+
+Floats = npt.NDArray[np.floating]
+
+
+class Rig(NamedTuple):
+    """A rig to test on.
+
+    Attributes:
+        name: Its name.
+        config: Its configuration.
+    """
+
+    name: str
+    config: Config
+
+
+@dataclass(frozen=True, slots=True)
+class Cell:
+    """Figures of one cell; None for what could not be measured.
+
+    Attributes:
+        rig: Name of the rig.
+        object: Name of the object.
+        touches: Number of touches that the method used; 0 for the shipped network.
+        method: One of `METHODS`.
+        network: Digest of the network to begin with.
+        mae_n: MAE of vision on fresh touches.
+        fused_percent: Median error of grasps with vision and motor current, as a share of the target.
+        vision_percent: The same by vision alone.
+        fell_back: Grasps by vision that fell back to motor current.
+        minutes: Time of the method after the touches.
+        learned: What `teach` took.
+        problem: Reason why the method gave nothing; empty if it did.
+    """
+
+    rig: str
+    object: str
+    touches: int
+    method: str
+    network: str
+    mae_n: float | None = None
+    fused_percent: float | None = None
+    vision_percent: float | None = None
+    fell_back: int = 0
+    minutes: float = 0.0
+    learned: str = ""
+    problem: str = ""
+
+
+def foreign_rigs(config: Config, count: int) -> list[Rig]:
+    """Returns rigs that no network has seen: other mountings and lenses, other jaws, other light."""
+    rigs = []
+    for i in range(count):
+        sim = config.sim.model_copy(
+            update={
+                "rig_seed": FIRST_SEED + i,
+                "object_seed": FIRST_SEED + i,
+                "view_spread": (3.0, 6.0, 10.0)[i % 3],
+                "jaw_spread": (0.3, 0.6, 1.0)[i // 2 % 3],
+                "lux": (None, 350.0, 750.0)[(i + i // 3) % 3],
+            }
+        )
+        own = config.model_copy(update={"sim": sim, "seed": FIRST_SEED + 1000 * i})
+        rigs.append(Rig(f"view {sim.view_spread:g}, jaws {sim.jaw_spread:g}, {sim.lux or 'any'} lux", own))
+    return rigs
+
+
+def read_rigs(paths: Sequence[Path], overrides: list[str] | None) -> list[Rig]:
+    """Returns the rigs of configuration files. Raises `ConfigError` if one can't be read."""
+    return [Rig(path.stem, load_config(path, overrides)) for path in paths]
+
+
+def bench(
+    rigs: Sequence[Rig],
+    objects: Sequence[str],
+    counts: Sequence[int],
+    methods: Sequence[str],
+    *,
+    grasps: int,
+    folder: Path,
+    workers: int = 1,
+    progress: Progress = no_progress,
+) -> Iterator[Cell]:
+    """Measures the cells that are not yet in ``folder/cells.jsonl``, and yields all.
+
+    Args:
+        rigs: The rigs.
+        objects: Names of the objects.
+        counts: Numbers of touches.
+        methods: Some of `METHODS`.
+        grasps: Grasps of each cell and feedback; 0 for none.
+        folder: Folder of logs, bundles and results.
+        workers: Processes of `teach`.
+        progress: Called before each part of a cell.
+
+    Raises:
+        GripperError: A touch failed, or a file can't be read or written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    file = folder / "cells.jsonl"
+    cells = [Cell(**json.loads(line)) for line in file.read_text().splitlines()] if file.exists() else []
+    known = {(c.rig, c.object, c.touches, c.method, c.network): c for c in cells}
+    for rig in rigs:
+        digest = read_model(rig.config.vision.checkpoint).digest
+        for name in objects:
+            for method in methods:
+                for count in (0,) if method == "shipped" else counts:
+                    key = (rig.name, name, count, method, digest)
+                    if key not in known:
+                        progress(f"{name}, {rig.name}: {method}, {count} touches")
+                        known[key] = _measured(Cell(*key), rig.config, grasps, folder, workers, progress)
+                        with file.open("a") as out:
+                            out.write(json.dumps(asdict(known[key])) + "\n")
+                    yield known[key]
+
+
+def _measured(
+    cell: Cell, config: Config, grasps: int, folder: Path, workers: int, progress: Progress
+) -> Cell:
+    place = folder / f"{cell.rig} {cell.object}".replace(",", "").replace(" ", "-")
+    log = config.log.model_copy(update={"directory": place / "grasps", "report": False})
+    config = config.model_copy(update={"object": cell.object, "log": log})
+    config = _with(config, "calibration", object="none")
+    touched = list(
+        record_touches(config, cell.touches, PEAK_N, place / "touches", progress=progress)
+        if cell.touches
+        else ()
+    )
+    other = config.model_copy(update={"seed": config.seed + _OTHER_SEEDS})
+    other = _with(other, "sim", object_seed=_seed(config, "object_seed"), rig_seed=_seed(config, "rig_seed"))
+    test = list(record_touches(other, TESTS, PEAK_N, place / "test", progress=progress))
+    begin_s = time.monotonic()
+    learned = ""
+    out = place / f"{cell.method}-{cell.touches}-{cell.network[:8]}".replace(" ", "-")
+    try:
+        if cell.method == "calibrated":
+            profile = calibrate_object(config, cell.object, logs=touched, out=out.with_suffix(".yaml"))
+            config = _with(config, "calibration", object=str(profile.profile_path))
+        elif cell.method == "taught":
+            taught = teach(
+                config,
+                cell.object,
+                logs=touched,
+                folder=out,
+                out=place / f"bundle-{cell.touches}",
+                workers=workers,
+            )
+            learned = taught.learned
+            config = _with(config, "calibration", object=str((taught.bundle / "profile.yaml").absolute()))
+            config = _with(config, "vision", checkpoint=str(taught.bundle / "network.safetensors"))
+        elif cell.method == "from scratch":
+            config = _scratch(config, cell.object, touched, out)
+    except DataError as error:  # too little to learn from: the method has no figure here
+        return replace(cell, minutes=(time.monotonic() - begin_s) / 60, problem=str(error))
+    minutes = (time.monotonic() - begin_s) / 60
+    progress(f"{cell.object}: testing {cell.method}")
+    found = evaluate(test, config.vision.checkpoint, config=config)
+    below = [b for b in found.per_bin if b.from_n < PEAK_N]
+    mae_n = float(np.average([b.mae_n for b in below], weights=[b.frames for b in below]))
+    result = replace(cell, mae_n=mae_n, minutes=minutes, learned=learned)
+    for feedback in ("fused", "vision") if grasps else ():
+        own = _with(other, "control", feedback=feedback)
+        own = own.model_copy(update={"vision": config.vision, "calibration": config.calibration})
+        own = own.model_copy(update={"seed": other.seed + _OTHER_SEEDS})
+        done = list(trials(own, grasps, 1, objects=(cell.object,), progress=progress))
+        figures = overall(done, own.control.force_limit_n)
+        if feedback == "fused":
+            result = replace(result, fused_percent=figures["median_error_percent"])
+        else:
+            result = replace(
+                result, vision_percent=figures["median_error_percent"], fell_back=figures["fell_back"]
+            )
+    return result
+
+
+def _scratch(config: Config, name: str, touched: Sequence[Path], out: Path) -> Config:
+    settings = recipe("short_clips", list(_SCRATCH))
+    clips = [replace(clip, set=clip.name) for clip in load_clips(list(touched), settings.preprocess)]
+    network = out.with_suffix(".network.safetensors")
+    train(settings, clips, network, validation_clips=clips)
+    config = _with(config, "vision", checkpoint=str(network))
+    profile = calibrate_object(config, name, logs=touched, out=out.with_suffix(".yaml"))
+    return _with(config, "calibration", object=str(profile.profile_path))
+
+
+def _seed(config: Config, key: str) -> int:
+    seed: int | None = getattr(config.sim, key)
+    return config.seed if seed is None else seed
+
+
+def _with(config: Config, section: str, **values: object) -> Config:
+    return config.model_copy(update={section: getattr(config, section).model_copy(update=values)})
+
+
+def markdown(cells: Sequence[Cell]) -> str:
+    """Returns the table for a page: medians over rigs and objects, and the worst of them."""
+    lines = [
+        "| method | touches | cells | MAE N, median | worst | grasps, fused % | by vision % | minutes |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    groups = dict.fromkeys((cell.method, cell.touches) for cell in cells)
+    for method, touches in sorted(groups, key=lambda group: (METHODS.index(group[0]), group[1])):
+        own = [cell for cell in cells if (cell.method, cell.touches) == (method, touches)]
+        errors_n = [cell.mae_n for cell in own if cell.mae_n is not None]
+        figures = [
+            f"{len(errors_n)} of {len(own)}",
+            _median(errors_n, "{:.3f}"),
+            f"{max(errors_n):.3f}" if errors_n else "-",
+            _median([c.fused_percent for c in own if c.fused_percent is not None], "{:.1f}"),
+            _median([c.vision_percent for c in own if c.vision_percent is not None], "{:.1f}"),
+            _median([c.minutes for c in own], "{:.1f}"),
+        ]
+        lines.append(f"| {method} | {touches or '-'} | {' | '.join(figures)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _median(values: Sequence[float], text: str) -> str:
+    return text.format(float(np.median(values))) if values else "-"
+
+
+class RecordingRow(NamedTuple):
+    """Errors on real recordings of one object, which was left out of the training.
+
+    Attributes:
+        object: Name of the object.
+        trials: Number of its first recordings that were learned from.
+        tested: Number of its other recordings, which are the test.
+        untaught_n: MAE of the process that was fitted to the other objects.
+        calibrated_n: The same, calibrated on the trials.
+        taught_n: MAE of a process fitted to the other objects and the trials.
+    """
+
+    object: str
+    trials: int
+    tested: int
+    untaught_n: float
+    calibrated_n: float
+    taught_n: float
+
+
+def bench_recordings(
+    recordings: Path, folder: Path, progress: Progress = no_progress
+) -> Iterator[RecordingRow]:
+    """Leaves out each object of a folder of real recordings, and teaches its first one and its first two.
+
+    Recordings that start in contact are left out, as in `train`. The settings of the process are chosen among the other
+    objects alone.
+
+    Args:
+        recordings: Folder as for `import video`.
+        folder: Folder of logs and results; finished rows are not repeated.
+        progress: Called before each object.
+
+    Yields:
+        Two rows for each object that has more than two recordings, one if it has two.
+
+    Raises:
+        DataError: The recordings can't be used.
+    """
+    logs = folder / "recordings"
+    if not any(logs.glob("*.mcap")):
+        import_folder(recordings, logs)
+    preprocess = recipe("few").preprocess
+    clips = without_contact_starts(load_clips(logs, preprocess), preprocess)
+    file = folder / "recordings.jsonl"
+    rows = (
+        [RecordingRow(**json.loads(line)) for line in file.read_text().splitlines()] if file.exists() else []
+    )
+    for name in sorted({clip.object for clip in clips}):
+        own = [clip for clip in clips if clip.object == name]
+        counts = [count for count in (1, 2) if count < len(own)]
+        found = [row for row in rows if row.object == name]
+        if len(found) < len(counts):
+            progress(f"{name}: fitting the others")
+            others = [clip for clip in clips if clip.object != name]
+            fit = few.fit(others, preprocess)
+            found = [_recording_row(name, own, count, others, fit) for count in counts]
+            with file.open("a") as out:
+                out.writelines(json.dumps(row._asdict()) + "\n" for row in found)
+        yield from found
+
+
+def _recording_row(
+    name: str, own: Sequence[Clip], count: int, others: Sequence[Clip], fit: few.Fit
+) -> RecordingRow:
+    learned, test = own[:count], own[count:]
+    preprocess = recipe("few").preprocess
+    taught = few.fitted([*others, *learned], preprocess, fit.setting)
+    before = [_touches(fit.process, clip, i) for i, clip in enumerate(learned)]
+    try:
+        corrected = fit_correction(
+            Touches(*(np.concatenate([getattr(t, key) for t in before]) for key in Touches.__annotations__))
+        ).predict
+    except DataError:  # the estimates do not follow the load cell: they stay as they are
+        corrected = lambda touches: touches.estimate_n  # noqa: E731
+    raw = [_touches(fit.process, clip, 0) for clip in test]
+
+    def mae_n(estimates: Sequence[Floats], touches: Sequence[Touches]) -> float:
+        error = np.concatenate([a - b.force_n for a, b in zip(estimates, touches, strict=True)])
+        return float(np.abs(error).mean())
+
+    after = [_touches(taught, clip, 0) for clip in test]
+    return RecordingRow(
+        name,
+        count,
+        len(test),
+        mae_n([t.estimate_n for t in raw], raw),
+        mae_n([corrected(t) for t in raw], raw),
+        mae_n([t.estimate_n for t in after], after),
+    )
+
+
+def _touches(process: ForceProcess, clip: Clip, number: int) -> Touches:
+    preprocess = recipe("few").preprocess
+    forces_n, read_out = features([process], preprocess, clip.frames)
+    used = clip.valid & (np.arange(len(clip.frames)) >= preprocess.lead_in)
+    return Touches(
+        read_out[used],
+        forces_n[0][used].astype(np.float64),
+        clip.forces_n[used].astype(np.float64),
+        np.full(int(used.sum()), number),
+    )
+
+
+def recordings_markdown(rows: Sequence[RecordingRow]) -> str:
+    """Returns the table of real recordings for a page, with the mean over the objects."""
+    lines = [
+        "| object left out | trials learned | recordings tested | before N | calibrated N | taught N |",
+        "|---|---|---|---|---|---|",
+    ]
+    for count in sorted({row.trials for row in rows}):
+        own = [row for row in rows if row.trials == count]
+        mean = np.mean([[row.untaught_n, row.calibrated_n, row.taught_n] for row in own], axis=0)
+        for row in own:
+            figures = (row.untaught_n, row.calibrated_n, row.taught_n)
+            lines.append(
+                f"| {row.object} | {count} | {row.tested} | {' | '.join(f'{n:.2f}' for n in figures)} |"
+            )
+        lines.append(f"| **mean** | {count} | | {' | '.join(f'**{n:.2f}**' for n in mean)} |")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,362 @@
+"""Teaching from logs of a synthetic press, with tiny networks: what is chosen, kept, written and used."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from gripper_calibration.procedures import teach as job
+from gripper_calibration.procedures.teach import MIN_LOGS, STEPS, Taught, teach
+from gripper_force.cli import app
+from gripper_force.config import Config, load_config
+from gripper_force.errors import ConfigError, DataError
+from gripper_force.jobs.dataset import Clip, find_logs, load_clips
+from gripper_force.jobs.evaluate import evaluate
+from gripper_force.jobs.training import recipe as recipes
+from gripper_force.jobs.training.recipe import TrainConfig
+from gripper_force.jobs.training.train import train
+from gripper_force.profiles.apply import with_bundle
+from gripper_force.profiles.object_profile import read_object
+from gripper_force.runtime.resolve import make_estimator, resolve
+from gripper_force.types import Gray
+from gripper_force.vision.estimator import ForceEstimator
+from gripper_force.vision.header import read_checkpoint
+from gripper_force.vision.preprocess import Preprocess
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+SHORT = {"steps": 2, "clips": 2}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A training of two steps, and a folder of profiles of its own."""
+    folder = tmp_path_factory.mktemp("home")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(recipes.RECIPES, "touches", {**recipes.RECIPES["touches"], **SHORT})
+        patch.setenv("XDG_DATA_HOME", str(folder))
+        yield folder / "gripper-force" / "objects"
+
+
+@pytest.fixture(scope="module")
+def logs(
+    press: Callable[..., Clip],
+    write_log: Callable[[Clip, Path], Path],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> list[Path]:
+    """Six touches of a disc."""
+    folder = tmp_path_factory.mktemp("disc")
+    return [write_log(press(seed), folder) for seed in range(6)]
+
+
+@pytest.fixture(scope="module")
+def network(press: Callable[..., Clip], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small network that knows the disc somewhat."""
+    path = tmp_path_factory.mktemp("network") / "tiny.safetensors"
+    config = TrainConfig(
+        attentions=("ssam",),
+        width=0.5,
+        preprocess=Preprocess(size=16),
+        steps=60,
+        clips=6,
+        device="cpu",
+        seed=1,
+    )
+    train(config, [replace(press(seed), object=f"o{seed}") for seed in range(20, 28)], path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def config(network: Path) -> Config:
+    return load_config(None, [f"vision.checkpoint={network}"])
+
+
+@pytest.fixture(scope="module")
+def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of `taught`."""
+    return tmp_path_factory.mktemp("taught")
+
+
+@pytest.fixture(scope="module")
+def taught(config: Config, logs: list[Path], work: Path) -> Taught:
+    return teach(config, "disc", logs=logs, folder=work)
+
+
+def test_bundle_holds_network_profile_and_origin(taught: Taught, logs: list[Path], home: Path) -> None:
+    assert taught.bundle == home / "disc"
+    assert {path.name for path in taught.bundle.iterdir()} == {
+        "profile.yaml",
+        "profile.safetensors",
+        "network.safetensors",
+        "teach.png",
+    }
+    profile = read_object(taught.bundle / "profile.yaml")
+    assert profile == taught.profile
+    assert len(profile.logs) == len(logs)
+    assert profile.version
+    assert profile.camera["camera.exposure_us"] == 4000
+    assert profile.camera["gripper.open_width_m"] == 0.092
+    assert profile.checkpoint == resolve(load_config(None, ["object=disc"])).model.digest  # type: ignore[union-attr]
+
+
+def test_best_candidate_is_taken_and_its_error_is_that_on_new_touches(
+    taught: Taught, press: Callable[..., Clip], write_log: Callable[[Clip, Path], Path], tmp_path: Path
+) -> None:
+    assert list(taught.candidates_mae_n) == [
+        "tiny.safetensors as it is",
+        "tiny.safetensors, trained",
+        "Gaussian process",
+    ]
+    best = min(taught.candidates_mae_n.values())
+    assert taught.candidates_mae_n[taught.learned] < 1.5 * best
+    assert taught.mae_n < taught.before_n
+    assert taught.coverages[0].touches == 6
+    assert taught.profile.after_n == taught.mae_n
+    new = [write_log(press(seed), tmp_path / "new") for seed in range(40, 46)]
+    found = evaluate(new, taught.bundle / "network.safetensors", profile=str(taught.bundle))
+    assert 0.4 * taught.mae_n < found.mae_n < 2.5 * taught.mae_n
+    assert taught.fewer_mae_n > 0
+
+
+def test_finished_parts_are_not_repeated(
+    taught: Taught, config: Config, logs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judged: list[str] = []
+    judge = job._judge
+
+    def counting(task: job._Task) -> None:
+        judged.append("again")
+        judge(task)
+
+    def stopping(task: job._Task) -> None:
+        if len(judged) == 3:
+            raise KeyboardInterrupt
+        judge(task)
+        judged.append(task.candidate.name)
+
+    monkeypatch.setattr(job, "_judge", stopping)
+    with pytest.raises(KeyboardInterrupt):
+        teach(config, "disc", logs=logs, folder=tmp_path / "work", out=tmp_path / "bundle")
+    assert not (tmp_path / "bundle").exists()
+    monkeypatch.setattr(job, "_judge", counting)
+    steps: list[int] = []
+    resumed = teach(
+        config,
+        "disc",
+        logs=logs,
+        folder=tmp_path / "work",
+        out=tmp_path / "bundle",
+        progress=lambda _text, steps_done=1: steps.append(steps_done),
+    )
+    assert judged.count("again") == 8 - 3  # the network as it is, six trainings, and the process
+    assert sum(steps) == STEPS
+    assert resumed.candidates_mae_n == taught.candidates_mae_n
+    assert resumed.profile.weights == taught.profile.weights
+
+
+def test_more_touches_continue_with_the_old_ones(config: Config, logs: list[Path], tmp_path: Path) -> None:
+    out = tmp_path / "bundles" / "disc"
+    first = teach(config, "disc", logs=logs[:4], folder=tmp_path / "work", out=out)
+    second = teach(config, "disc", logs=logs[:5], folder=tmp_path / "work", out=out)
+    assert second.profile.logs[:4] == first.profile.logs
+    assert read_object(second.bundle / "profile.yaml").touches == 5
+    assert [path.name for path in second.bundle.parent.iterdir()] == ["disc"]
+
+
+def test_grasps_find_the_bundle_by_the_object_and_a_setting_prevents_it(taught: Taught) -> None:
+    used, note = with_bundle(load_config(None, ["object=disc"]))
+    assert used.vision.checkpoint == str(taught.bundle / "network.safetensors")
+    assert note.startswith(f"used the bundle {taught.bundle}, made of 6 touches on ")
+    assert ("session", note) in resolve(load_config(None, ["object=disc"])).notes
+    for keys in (["object=sponge"], ["object=disc", "calibration.object=none"]):
+        assert with_bundle(load_config(None, keys)) == (load_config(None, keys), "")
+    small = load_config(None, ["object=disc", "vision.checkpoint=small"])
+    assert with_bundle(small)[0] == small
+    assert "because vision.checkpoint is 'small'; set it to default" in with_bundle(small)[1]
+    assert with_bundle(used) == (used, "")
+    by_path = load_config(None, [f"calibration.object={taught.bundle}"])
+    assert with_bundle(by_path)[0].vision.checkpoint == used.vision.checkpoint
+    again = load_config(None, ["object=disc", f"calibration.object={taught.bundle}/profile.yaml"])
+    assert with_bundle(again)[0] == used.model_copy(update={"object": "disc"})
+
+
+@pytest.mark.parametrize(
+    ("key", "sentence"),
+    [
+        ("camera.exposure_us=8000", r"camera.exposure_us 4000, not 8000"),
+        ("vision.region=[0, 0, 64, 64]", r"vision.region None, not \[0, 0, 64, 64\]"),
+        ("gripper.pinion_radius_m=0.03", r"gripper.pinion_radius_m 0.02, not 0.03"),
+        ("sim.tool=rods", r"sim.tool pads, not rods"),
+    ],
+)
+def test_another_rig_is_refused_or_warned_about(taught: Taught, key: str, sentence: str) -> None:
+    with pytest.raises(ConfigError, match=sentence):
+        resolve(load_config(None, ["object=disc", key]))
+    allowed = load_config(None, ["object=disc", "calibration.on_mismatch=warn", key])
+    assert any(
+        f"the object profile was made with {key.split('=')[0]}" in text for _, text in resolve(allowed).notes
+    )
+
+
+@pytest.mark.parametrize("taken", [1, 2])
+def test_any_learned_estimator_states_errors_and_a_score_from_touches_left_out(
+    taken: int,
+    taught: Taught,
+    config: Config,
+    logs: list[Path],
+    work: Path,
+    press: Callable[..., Clip],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A trained network, and a process: neither is what `taught` takes."""
+    monkeypatch.setattr(job, "select_simplest", lambda _: taken)
+    found = teach(config, "disc", logs=logs, folder=work, out=tmp_path / "disc")
+    assert found.learned == list(taught.candidates_mae_n)[taken]
+    header = read_checkpoint(found.bundle / "network.safetensors")[2]
+    assert header.trained_on is not None
+    assert header.trained_on["rigs"] == 1
+    assert header.metrics["mae_n"] > 0
+    assert header.ood is not None
+    assert found.profile.ood_limits is not None
+    for profile in ("none", str(found.bundle)):  # the network's score, and the profile's
+        run = load_config(
+            None,
+            [f"vision.checkpoint={found.bundle}/network.safetensors", f"calibration.object={profile}"],
+        )
+        estimator = make_estimator(resolve(run))
+        assert estimator is not None
+        rejected = []
+        for seed in (41, 42, 43):
+            estimator.reset()
+            rejected += [_is_rejected(estimator, frame) for frame in press(seed).frames]
+        assert np.mean(rejected) < 0.2
+
+
+def _is_rejected(estimator: ForceEstimator, frame: Gray) -> bool:
+    try:
+        estimator.update(frame)
+    except DataError:
+        return True
+    return False
+
+
+def test_a_fold_takes_no_part_in_the_choice_that_estimates_it() -> None:
+    """The second candidate is the best of all, but only because of the first fold: the others choose the first one."""
+    force_n = np.linspace(0, 4, 30)
+    errors_n = {0: {0: 1.0, 1: 0.1, 2: 0.1}, 1: {0: 0.0, 1: 0.2, 2: 0.2}}  # by candidate and fold
+
+    def left(candidate: int, log: int) -> job._Left:
+        error_n = errors_n[candidate][log % job.FOLDS]
+        touch = np.full(30, log)
+        return job._Left(force_n, force_n + error_n, force_n, np.full(30, 1e-4), touch)
+
+    outs = [frozenset(out) for n in (1, 2) for out in combinations(range(job.FOLDS), n)]
+    results = [
+        {out: {log: left(candidate, log) for log in range(6) if log % job.FOLDS in out} for out in outs}
+        for candidate in range(2)
+    ]
+    found = job._compare(results, 6)
+    assert found.best == 1
+    error_n = found.estimate_n - found.measured.force_n
+    np.testing.assert_allclose([error_n[found.measured.touch == log].mean() for log in (0, 3)], 1.0)
+    assert not found.within[np.isin(found.measured.touch, (0, 3))].any()
+
+
+def test_logs_without_contact_and_too_few_logs(
+    config: Config,
+    logs: list[Path],
+    press: Callable[..., Clip],
+    write_log: Callable[[Clip, Path], Path],
+    tmp_path: Path,
+) -> None:
+    clip = press(9)
+    free = write_log(replace(clip, name="free", forces_n=0 * clip.forces_n), tmp_path / "free")
+    found = teach(config, "disc", logs=[*logs[:4], free], folder=tmp_path / "work", out=tmp_path / "b")
+    assert found.without_contact == (free,)
+    with pytest.raises(
+        DataError, match=f"there are 3 different logs of touches with contact, but .* needs {MIN_LOGS}"
+    ):
+        teach(config, "disc", logs=[*logs[:3], logs[0], free], folder=tmp_path / "work", out=tmp_path / "b")
+
+
+def test_a_missing_network_is_found_before_the_first_touch(config: Config, tmp_path: Path) -> None:
+    vision = config.vision.model_copy(update={"checkpoint": "none"})
+    with pytest.raises(ConfigError, match="teach needs a network to begin with"):
+        teach(config.model_copy(update={"vision": vision}), "disc", folder=tmp_path / "touches")
+    assert not (tmp_path / "touches").exists()
+
+
+def test_folder_that_is_no_bundle_is_not_replaced(config: Config, logs: list[Path], tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    with pytest.raises(ConfigError, match="exists and is not a bundle"):
+        teach(config, "disc", logs=logs, folder=tmp_path / "work", out=tmp_path / "mine")
+
+
+def test_command_prints_the_choice_and_the_next_command(
+    taught: Taught, network: Path, logs: list[Path], tmp_path: Path
+) -> None:
+    call = ["teach", "disc", "--from", str(logs[0].parent), "--folder", str(tmp_path / "work"), "--jobs", "1"]
+    call += ["--set", f"vision.checkpoint={network}", "--seed", "3"]
+    result = CliRunner().invoke(app, [*call, "--json"], catch_exceptions=False)
+    assert result.exit_code == 0, result.stderr
+    found = json.loads(result.stdout)
+    assert found["candidates_mae_n"] == taught.candidates_mae_n
+    assert found["minutes"] > 0
+    assert "next: gripper-force grasp --object disc --target-n 4 --seed 3\n" in result.stderr
+    assert found["coverages"]
+    rig = tmp_path / "my.yaml"
+    rig.write_text(f"vision: {{checkpoint: {network}}}\n", encoding="utf-8")
+    table = CliRunner().invoke(
+        app, [*call[:8], "--config", str(rig), "--out", str(tmp_path / "b")], catch_exceptions=False
+    )
+    assert "expected error" in table.stdout
+    assert "coverage" in table.stdout
+    text = f"--profile {tmp_path / 'b'} --config {rig} --set vision.checkpoint=default"
+    assert text in table.stderr.replace("\n", "")
+    both = CliRunner().invoke(app, [*call, "--fresh"])
+    assert isinstance(both.exception, ConfigError)
+
+
+def test_killed_command_continues(network: Path, logs: list[Path], tmp_path: Path) -> None:
+    """The process is killed while it works; the same command then uses what was finished."""
+    work = tmp_path / "work" / "teach"
+    start = f"from gripper_force.jobs.training.recipe import RECIPES; RECIPES['touches'] |= {SHORT}; "
+    start += "from gripper_force.cli import main; main()"
+    call = [sys.executable, "-c", start, "teach", "disc", "--from", str(logs[0].parent), "--jobs", "1"]
+    call += ["--folder", str(tmp_path / "work"), "--out", str(tmp_path / "bundle"), "--json"]
+    call += ["--set", f"vision.checkpoint={network}"]
+    with subprocess.Popen(call, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as running:
+        while running.poll() is None and len(list(work.glob("*.left"))) < 2:
+            time.sleep(0.01)
+        running.send_signal(signal.SIGKILL)
+    kept = {path: path.stat().st_mtime_ns for path in work.glob("*.left")}
+    assert 2 <= len(kept) < 8
+    assert not (tmp_path / "bundle").exists()
+    subprocess.run(call, check=True, capture_output=True)
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+    assert (tmp_path / "bundle" / "profile.yaml").is_file()
+
+
+def test_provenance_counts_rigs(logs: list[Path]) -> None:
+    from gripper_force.jobs.training.train import trained_on
+
+    clips = load_clips(find_logs(logs), Preprocess(size=16))
+    one = trained_on(clips)
+    assert one is not None
+    assert (one["rigs"], one["camera.exposure_us"]) == (1, 4000)
+    other = replace(clips[0], rig={**clips[0].rig, "camera.exposure_us": 2000})
+    several = trained_on([*clips, other, replace(clips[1], view="another")])
+    assert several is not None
+    assert several["rigs"] == 3
+    assert trained_on([*clips, replace(clips[0], rig={})]) is None

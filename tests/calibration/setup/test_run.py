@@ -1,0 +1,105 @@
+"""The steps of `setup` on a simulated rig."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from gripper_calibration.setup.rig_file import RigFile, flat
+from gripper_calibration.setup.run import STEPS, Setup, check_step
+from gripper_calibration.setup.step import Found
+from gripper_force.config import load_config
+from gripper_force.errors import ConfigError
+
+EXAMPLES = Path(__file__).parents[3] / "examples/setups"
+PAGE = (Path(__file__).parents[3] / "docs/your-own-rig.md").read_text(encoding="utf-8")
+SIMULATED = ["servo.port=virtual:setup", "load_cell.backend=none", "sim.detail=coarse"]
+
+
+class Script:
+    """Answers with yes and with defaults, and keeps what it was told."""
+
+    def __init__(self) -> None:
+        self.told: list[str] = []
+
+    def tell(self, text: str) -> None:
+        self.told.append(text)
+
+    def do(self, text: str) -> None:
+        self.told.append(text)
+
+    def agrees(self, question: str) -> bool:
+        self.told.append(question)
+        return True
+
+    def choose(self, question: str, answers: Sequence[str], option: str) -> str:
+        raise ConfigError(f"{question}; pass {option}")
+
+    def number(self, question: str, option: str, default: float | None = None) -> float:
+        if default is None:
+            raise ConfigError(f"{question}; pass {option}")
+        return default
+
+
+def test_a_setup_without_a_load_cell_ends_with_a_rig_file_and_continues_there(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    first = Script()
+    running = Setup(path, SIMULATED).run(first)
+    names = [next(running).name for _ in range(3)]  # interrupted after the jaws
+    assert names == ["scan", "servo", "jaws"]
+    reports = list(Setup(path).run(Script()))
+    assert [report.result for report in reports] == 3 * ["kept"] + 3 * ["done"]
+    by_name = {report.name: report for report in reports}
+    assert "Motor current measures the force instead" in by_name["load-cell"].remarks[0]
+    intervals_n = by_name["torque"].details["intervals_n"]
+    assert intervals_n["4"][0] < 4 < intervals_n["4"][1]
+    assert Path(by_name["camera"].files["picture"]).stat().st_size > 1000
+    config = load_config(path)
+    assert config.servo.baud_rate == 1_000_000
+    assert config.gripper.open_width_m == pytest.approx(0.0995, abs=0.002)
+    # The simulated jaws are 92 mm apart at 0 rad, and a rack moves both.
+    open_rad = (0.092 - config.gripper.open_width_m) / 2 / config.gripper.pinion_radius_m
+    assert config.gripper.open_position_rad == pytest.approx(open_rad, abs=0.03)
+    assert "homed" in path.read_text(encoding="utf-8")
+    # A changed key repeats only the steps that rest on it.
+    again = Setup(path, ["camera.rate_hz=30"]).run(Script())
+    assert [report.name for report in again if report.result == "done"] == ["camera"]
+
+
+def test_values_that_a_person_writes_are_kept_and_named(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    path.write_text("servo: {id: 3}\n", encoding="utf-8")
+    rig = RigFile.load(path, ["camera.rate_hz=30"], fresh=False)
+    rig.take({"servo.id": Found(3, "found"), "servo.baud_rate": Found(57600, "found")})
+    rig.finish("scan", {"summary": "done"})
+    text = path.read_text(encoding="utf-8")
+    assert "id: 3" in text
+    assert "# given in this file" in text
+    assert (rig.folder / "original.yaml").read_text(encoding="utf-8") == "servo: {id: 3}\n"
+    again = RigFile.load(path, None, fresh=False)
+    assert again.steps == {"scan": {"summary": "done"}}
+    assert flat(again.tree()) == {"servo.id": 3, "servo.baud_rate": 57600, "camera.rate_hz": 30}
+    assert not RigFile.load(path, None, fresh=True).found
+
+
+def test_a_damaged_state_and_an_unknown_step_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    rig = RigFile(path)
+    rig.finish("scan", {})
+    (rig.folder / "state.json").write_text("{", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"state\.json.*delete it"):
+        RigFile.load(path, None, fresh=False)
+    with pytest.raises(ConfigError, match="no step 'jaw'; use one of scan, servo, jaws"):
+        check_step("jaw")
+
+
+@pytest.mark.parametrize("name", ["xm430_oak_hx711", "xl330_webcam_hx711", "viperx_oak"])
+def test_an_example_to_start_from_is_valid(name: str) -> None:
+    config = load_config(EXAMPLES / f"{name}.yaml")
+    assert config.clock == "realtime"
+    assert f"{name}.yaml" in PAGE
+
+
+def test_the_page_has_every_step() -> None:
+    section = PAGE.split("## Setup")[1].split("\n## ")[0]
+    assert [name for name in STEPS if f"| `{name}` |" not in section] == []

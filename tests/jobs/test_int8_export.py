@@ -1,0 +1,51 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gripper_force.errors import ConfigError, DataError
+from gripper_force.jobs.int8_export import export_int8, with_added_error
+from gripper_force.vision.engines import open_engine
+from gripper_force.vision.header import Model
+from gripper_force.vision.model_files import read_model
+
+
+@pytest.fixture
+def model(tiny_checkpoint: Path) -> Model:
+    return read_model(tiny_checkpoint)
+
+
+@pytest.fixture
+def recordings() -> list[np.ndarray]:
+    """A square that moves over noise."""
+    rng = np.random.default_rng(0)
+    clips = []
+    for _ in range(3):
+        clip = rng.integers(90, 110, (130, 32, 32), np.uint8)
+        for i, frame in enumerate(clip[10:]):
+            frame[8:16, i % 20 : i % 20 + 8] += 60
+        clips.append(clip)
+    return clips
+
+
+def test_int8_is_calibrated_on_recordings(model: Model, tmp_path: Path, recordings: list[np.ndarray]) -> None:
+    pytest.importorskip("nncf", reason="pip install 'gripper-force[engines]'")
+    errors = export_int8(model, tmp_path / "int8.xml", recordings)
+    assert 0 < errors["mean_n"] <= errors["rms_n"] <= errors["largest_n"]
+    assert b"FakeQuantize" in (tmp_path / "int8.xml").read_bytes()
+    opened = open_engine(read_model(tmp_path / "int8.xml"), "openvino", "bfloat16")
+    assert np.isfinite(opened.step(np.zeros((32, 32), np.float32)).forces_n).all()
+    # The claimed error includes that of the quantisation.
+    assert opened.header == with_added_error(model.header, errors)
+    for before, after in zip(model.header.residuals, opened.header.residuals, strict=True):
+        assert after.std_n**2 == pytest.approx(before.std_n**2 + errors["rms_n"] ** 2)
+        assert after.std_n > before.std_n
+
+
+def test_impossible_exports_are_refused(model: Model, tmp_path: Path, recordings: list[np.ndarray]) -> None:
+    with pytest.raises(ConfigError, match=r"int8 is exported to OpenVINO only"):
+        export_int8(model, tmp_path / "force.onnx", recordings)
+    pytest.importorskip("nncf", reason="pip install 'gripper-force[engines]'")
+    with pytest.raises(DataError, match="at least 300 frames, and the recordings hold 40"):
+        export_int8(model, tmp_path / "force.xml", [recordings[0][:40]])
+    assert not list(tmp_path.iterdir())

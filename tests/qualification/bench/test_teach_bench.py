@@ -1,0 +1,86 @@
+"""The bench of teaching: cells that are kept, what is measured, and its tables."""
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from gripper_force.cli import app
+from gripper_force.config import load_config
+from gripper_force.errors import ConfigError
+from gripper_force.jobs.dataset import Clip
+from gripper_force.qualification.bench import teach_bench as job
+from gripper_force.qualification.bench.teach_bench import Cell, bench, foreign_rigs, markdown
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def test_drawn_rigs_differ_and_belong_to_no_training() -> None:
+    rigs = foreign_rigs(load_config(), 6)
+    seeds = {rig.config.sim.rig_seed for rig in rigs}
+    assert len(seeds) == len({rig.name for rig in rigs}) == 6
+    assert min(seed for seed in seeds if seed is not None) >= job.FIRST_SEED
+    assert len({(rig.config.sim.view_spread, rig.config.sim.jaw_spread) for rig in rigs}) == 6
+
+
+def test_a_finished_cell_is_not_measured_again(
+    quick: list[str], tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(job, "TESTS", 1)
+    keys = [*quick, "camera.backend=simulated", f"vision.checkpoint={tiny_checkpoint}"]
+    rigs = foreign_rigs(load_config(None, keys), 1)
+
+    def cells() -> list[Cell]:
+        return list(bench(rigs, ["stapler"], [4], ["shipped"], grasps=0, folder=tmp_path))
+
+    first = cells()
+    assert first[0].mae_n is not None
+    assert first[0].mae_n > 0
+    assert (first[0].touches, first[0].fused_percent, first[0].problem) == (0, None, "")
+    log = next(tmp_path.rglob("*.mcap"))
+    log.unlink()
+    assert cells() == first
+    assert not log.exists()
+    (kept,) = (tmp_path / "cells.jsonl").read_text().splitlines()
+    assert Cell(**json.loads(kept)) == first[0]
+
+
+def test_table_has_medians_and_the_worst_of_what_was_measured() -> None:
+    base = Cell("a", "lemon", 4, "taught", "d", mae_n=0.1, fused_percent=2.0, vision_percent=4.0, minutes=3.0)
+    cells = [
+        replace(base, touches=0, method="shipped", mae_n=0.8),
+        base,
+        replace(base, object="peg", mae_n=0.2, vision_percent=None),
+        replace(base, rig="b", mae_n=None, fused_percent=None, vision_percent=None, problem="too weak"),
+    ]
+    assert markdown(cells).splitlines()[2:] == [
+        "| shipped | - | 1 of 1 | 0.800 | 0.800 | 2.0 | 4.0 | 3.0 |",
+        "| taught | 4 | 2 of 3 | 0.150 | 0.200 | 2.0 | 4.0 | 3.0 |",
+    ]
+
+
+def test_real_recordings_are_left_out_by_object_and_taught_in_order(
+    press: Callable[..., Clip], write_log: Callable[[Clip, Path], Path], tmp_path: Path
+) -> None:
+    for number in range(9):
+        write_log(replace(press(number), object=f"o{number // 3}"), tmp_path / "recordings")
+    call = ["bench", "teach", "--recordings", str(tmp_path), "--out", str(tmp_path), "--json"]
+    result = CliRunner().invoke(app, call, catch_exceptions=False)
+    rows = json.loads(result.stdout)["recordings"]
+    assert [(row["object"], row["trials"], row["tested"]) for row in rows] == [
+        (name, trials, 3 - trials) for name in ("o0", "o1", "o2") for trials in (1, 2)
+    ]
+    assert all(0 < row["taught_n"] < 3 for row in rows)
+    kept = (tmp_path / "recordings.jsonl").read_text()
+    again = CliRunner().invoke(app, call, catch_exceptions=False)
+    assert json.loads(again.stdout)["recordings"] == rows
+    assert (tmp_path / "recordings.jsonl").read_text() == kept
+
+
+def test_unknown_method_is_named() -> None:
+    result = CliRunner().invoke(app, ["bench", "teach", "--method", "magic"])
+    assert isinstance(result.exception, ConfigError)
+    assert "no method 'magic'" in str(result.exception)

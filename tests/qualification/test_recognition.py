@@ -1,0 +1,60 @@
+"""`bench recognition` on one simulated press."""
+
+import json
+from collections.abc import Iterator
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from gripper_force import cli
+from gripper_force.errors import DataError
+from gripper_force.qualification import recognition
+
+ROWS = (
+    recognition.Row("known kinds", "still"),
+    recognition.Row("disturbances", "blob", change=recognition.blob),
+)
+
+
+@contextmanager
+def threads(count: int) -> Iterator[Executor]:
+    with ThreadPoolExecutor(count) as pool:  # another process would not see the rows of this test
+        yield pool
+
+
+@pytest.fixture
+def command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    monkeypatch.setattr(recognition, "ROWS", ROWS)
+    monkeypatch.setattr(recognition, "process_pool", threads)
+    call = ["bench", "recognition", "--presses", "1", "--jobs", "1", "--out", str(tmp_path)]
+    return [*call, "--set", "vision.checkpoint=small", "--set", "sim.detail=coarse"]
+
+
+def test_a_covered_view_is_rejected_and_an_existing_press_is_used_again(
+    command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = CliRunner().invoke(cli.app, [*command, "--json"], catch_exceptions=False)
+    still, blob = json.loads(first.stdout)["rows"]
+    assert (still["name"], blob["name"]) == ("still", "blob")
+    assert still["frames"] > blob["frames"] > 10
+    assert still["rejected"] < 0.1 < 0.9 < blob["rejected"]
+    assert still["mae_n"] > 0
+    assert len(list(tmp_path.rglob("*.mcap"))) == 1
+
+    monkeypatch.delattr(recognition, "make_log")  # nothing is simulated again
+    page = tmp_path / "page.md"
+    page.write_text("before\n<!-- recognition -->\nold\n<!-- end of recognition -->\nafter\n")
+    again = CliRunner().invoke(cli.app, [*command, "--write", str(page)], catch_exceptions=False)
+    assert "blob" in again.stdout
+    written = page.read_text()
+    assert "| disturbances | blob |" in written
+    assert "old" not in written
+
+    (kept,) = tmp_path.rglob("disturbances-*.json")
+    kept.write_text("{")
+    error = CliRunner().invoke(cli.app, command).exception
+    assert isinstance(error, DataError)
+    assert "delete it" in str(error)
