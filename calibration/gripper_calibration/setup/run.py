@@ -71,7 +71,7 @@ STEPS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class StepReport:
-    """What became of a step.
+    """Report of a step.
 
     Attributes:
         name: Its name.
