@@ -353,7 +353,7 @@ def teach(
     words += [] if seed is None else ["--seed", str(seed)]
     # With another network than the default one a grasp would not use the bundle's.
     others = [one for one in set_ or [] if not one.startswith("vision.checkpoint=")]
-    if config is not None and settings.vision.checkpoint != "default":
+    if config is not None and load_settings(config, others, {}).vision.checkpoint != "default":
         others.append("vision.checkpoint=default")
     words += [word for one in others for word in ("--set", one)]
     console.err.print(f"next: {shlex.join(words)}", soft_wrap=True, markup=False)
