@@ -267,7 +267,12 @@ def gain(
 
 
 def teach(
-    name: Annotated[str, typer.Argument(help="Name of the object; in simulation one of the known objects.")],
+    name: Annotated[
+        str,
+        typer.Argument(
+            help="Name of the object; in simulation one of the known objects, or a file of your own."
+        ),
+    ],
     touches: Annotated[int, typer.Option(min=4, help="Number of touches, with those of earlier calls.")] = 16,
     peak_n: Annotated[float | None, typer.Option(help="Largest force of a touch in newtons.")] = None,
     logs: Annotated[
@@ -312,6 +317,7 @@ def teach(
     if fresh and logs is not None:
         raise ConfigError("--fresh records touches and --from records none; leave out one of them")
     settings = load_settings(config, set_, {"object": name, "seed": seed})
+    given, name = name, settings.object  # a path has become a name
     folder = folder or calibrate_object.default_folder(name)
     job.check(settings, out or user_folder() / name)
     begin_s = time.monotonic()
@@ -347,7 +353,7 @@ def teach(
             soft_wrap=True,
         )
     target_n = min(4.0, round(result.profile.force_n / 2, 1))
-    words = ["gripper-force", "grasp", "--object", name, "--target-n", f"{target_n:g}"]
+    words = ["gripper-force", "grasp", "--object", given, "--target-n", f"{target_n:g}"]
     words += [] if out is None else ["--profile", str(out.absolute())]
     words += [] if config is None else ["--config", str(config)]
     words += [] if seed is None else ["--seed", str(seed)]

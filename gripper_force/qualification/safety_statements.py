@@ -80,7 +80,7 @@ class SafetyStatements:
         self.held_nothing |= self._nothing_s > (self._still_reaction_s if is_still else REACTION_S)
         self.force_share = max(self.force_share, peak_n / self._limit_n)
         if force_n == 0.0:
-            # Only opening jaws may be faster, and only a release opens them; a wrong sign exchanges the directions.
+            # Only opening jaws may be faster; a wrong sign exchanges the directions.
             opens = self._sign * closing_m_s < 0
             limit_m_s = self._speed_m_s * (_TRAVEL_SHARE if opens else 1.0)
             self.speed_share = max(self.speed_share, abs(closing_m_s) / limit_m_s)

@@ -35,6 +35,7 @@ from gripper_force.vision.preprocess import Preprocess
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
+OBJECTS = Path(__file__).parents[3] / "examples" / "objects"
 SHORT = {"steps": 2, "clips": 2}
 
 
@@ -324,6 +325,11 @@ def test_command_prints_the_choice_and_the_next_command(
     assert "coverage" in table.stdout
     text = f"--profile {tmp_path / 'b'} --config {rig} --set vision.checkpoint=default"
     assert text in table.stderr.replace("\n", "")
+    own = tmp_path / "disc.yaml"
+    own.write_text((OBJECTS / "avocado.yaml").read_text(encoding="utf-8"), encoding="utf-8")
+    named = CliRunner().invoke(app, ["teach", str(own), *call[2:]], catch_exceptions=False)
+    assert named.exit_code == 0
+    assert f"--object {own} --target-n 4" in named.stderr.replace("\n", "")
     both = CliRunner().invoke(app, [*call, "--fresh"])
     assert isinstance(both.exception, ConfigError)
 
