@@ -26,7 +26,7 @@ class FakeEstimator:
         return ForceEstimate(float(self.count), 0.5) if self.count > self.references else None
 
     def attention_map(self) -> np.ndarray | None:
-        return np.array([[0.25, 0.5], [0.5, 0.75]], np.float32) + 0.001 * self.count
+        return np.array([[0.2, 0.4], [0.5, 0.7]], np.float32) + 0.001 * self.count
 
 
 class Hand:
@@ -89,7 +89,7 @@ def test_in_lockstep_an_estimate_is_there_after_its_time_and_not_before() -> Non
         seen.visual.ready_ns,
         1,
     )
-    assert seen.attention.gray.tolist() == [[0, 128], [128, 255]]  # to its own range
+    assert seen.attention.gray.tolist() == [[0, 102], [153, 255]]  # to its own range
 
 
 def test_the_reference_frame_is_seen_and_gives_no_estimate() -> None:
