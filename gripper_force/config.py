@@ -222,8 +222,10 @@ class CameraConfig(Section):
         description="colour temperature of the white balance of a colour camera, which is not automatic; oak: "
         "None: 5000; uvc: None: unchanged",
     )
-    timeout_ms: Positive = Field(
-        250.0, description="oak, uvc: age of the newest frame after which the camera counts as lost"
+    timeout_ms: Positive | None = Field(
+        None,
+        description="oak, uvc: age of the newest frame after which the camera counts as lost; None: 250, or four frame "
+        "periods if they are longer",
     )
 
     @model_validator(mode="after")
