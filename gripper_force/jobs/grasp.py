@@ -335,7 +335,7 @@ def summarise(path: Path) -> Summary:
         records[type(record)].append(record)
     statuses, cells = records[GraspStatus], sorted(records[LoadCellSample], key=lambda c: c.t_ns)
     cycles_ns = [state.t_ns for state in records[ServoState]]
-    visuals = records[VisualForce]
+    visuals = [visual for visual in records[VisualForce] if visual.is_familiar]
     compute_ms = [visual.compute_ms for visual in visuals]
     vision_s = (visuals[-1].t_ns - visuals[0].t_ns) / NS_PER_S if len(visuals) > 1 else 0.0
     config = config_from_text(reader.config, str(path))

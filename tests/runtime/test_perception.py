@@ -5,7 +5,7 @@ from collections import deque
 import numpy as np
 import pytest
 
-from gripper_force.errors import DataError
+from gripper_force.errors import DataError, UnfamiliarFrameError
 from gripper_force.runtime.perception import LockstepPerception, ProcessedFrame, ThreadedPerception
 from gripper_force.types import NS_PER_MS, ForceEstimate, Frame, Gray
 
@@ -143,6 +143,20 @@ def test_a_later_error_costs_one_estimate_and_is_told() -> None:
         seen += perception.poll()
     assert [s.visual is None for s in seen] == [True, False, False, True, False, False]
     assert [s.problem for s in seen] == ["", "", "", "RuntimeError: no kernel", "", ""]
+
+
+def test_the_force_in_an_unfamiliar_frame_claims_nothing() -> None:
+    camera = Shutter()
+    error = UnfamiliarFrameError("unlike all", 3.0)
+    perception = LockstepPerception(camera, FakeEstimator(error, at=3), Hand(), 0.0)
+    seen = []
+    for seq in range(3):
+        camera.give(seq)
+        seen += perception.poll()
+    visual = seen[-1].visual
+    assert (visual.force_n, visual.std_n, visual.is_familiar) == (3.0, np.inf, False)
+    assert seen[1].visual.is_familiar
+    assert [s.problem for s in seen] == ["", "", "unlike all"]
 
 
 def test_a_camera_that_hangs_gives_no_estimates() -> None:
