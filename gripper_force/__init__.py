@@ -128,11 +128,11 @@ def __getattr__(name: str) -> object:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:
         value: object = getattr(_import_module(_MODULE_OF[name]), name)
-    except ModuleNotFoundError as error:
+    except ModuleNotFoundError:
         from gripper_force.plugins import importing
 
         with importing(f"gripper_force.{name}"):
-            raise error
+            raise
     globals()[name] = value
     return value
 
