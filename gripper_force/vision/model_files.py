@@ -5,6 +5,7 @@ An ONNX file holds the header in its metadata, an OpenVINO file in its ``rt_info
 
 import os
 import xml.etree.ElementTree as ET
+from importlib import import_module
 from pathlib import Path
 from typing import Final
 
@@ -73,8 +74,8 @@ def exported_file(model: Model, suffix: str) -> Path:
             f"exporting {model.path.name} for {EXPORTED[suffix]}",
             ", or run `gripper-force export` on another machine and set vision.checkpoint to its file",
         ):
-            from gripper_force.vision.export import export
-        export(model, path)
+            exporter = import_module("gripper_force.vision.export")  # no part of a robot's installation
+        exporter.export(model, path)
     return path
 
 
