@@ -5,6 +5,7 @@ from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
 from operator import attrgetter
 from typing import Any, Final
 
@@ -40,9 +41,14 @@ def importing(purpose: str, alternative: str = "") -> Iterator[None]:
         ) from error
 
 
-def load_class(
-    group: str, builtin: Mapping[str, str], name: str, key: str, alternative: str = ""
-) -> Any:
+def require(module: str, purpose: str, alternative: str = "") -> None:
+    """Raises `ConfigError` if a module is not installed, without importing it; see `importing`."""
+    with importing(purpose, alternative):
+        if find_spec(module) is None:
+            raise ModuleNotFoundError(name=module)
+
+
+def load_class(group: str, builtin: Mapping[str, str], name: str, key: str, alternative: str = "") -> Any:
     """Imports the class that a configuration key names.
 
     Args:

@@ -24,7 +24,7 @@ class ViewCommand(TyperCommand):
 
 
 def _with_viewer(args: Sequence[str]) -> Sequence[str]:
-    following = [*args[1:], ""]
+    following = [*args, ""][1:]
     return [
         "--view=rerun" if arg == "--view" and (not then or then.startswith("-")) else arg
         for arg, then in zip(args, following, strict=True)

@@ -4,7 +4,6 @@ import math
 import time
 from collections import defaultdict
 from collections.abc import Generator, Mapping, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final, TypedDict
 
@@ -25,7 +24,7 @@ from gripper_force.jobs.score import (
     score_grasp,
     vision_in_hold,
 )
-from gripper_force.plugins import importing
+from gripper_force.plugins import require
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import resolve
 from gripper_force.runtime.session import Session, open_run
@@ -153,9 +152,8 @@ def grasp(config: Config, progress: Progress = no_progress, path: Path | None = 
 
 def require_report(config: Config) -> None:
     """Raises `ConfigError` if ``log.report`` is set and a package for it is missing, so that no run is in vain."""
-    with importing("log.report=true", ", or set log.report=false"):
-        if config.log.report and find_spec("matplotlib") is None:
-            raise ModuleNotFoundError(name="matplotlib")
+    if config.log.report:
+        require("matplotlib", "log.report=true", ", or set log.report=false")
 
 
 def summary_and_report(config: Config, path: Path) -> Summary:
