@@ -137,8 +137,6 @@ def test_a_grasp_on_motor_current_needs_the_core_only(tmp_path: Path) -> None:
     result = json.loads(done.stdout)
     assert result["result"] == "held"
     assert Path(tmp_path, result["log"]).is_file()
-    again = without_extras("replay", result["log"], "--json", cwd=tmp_path)
-    assert again.returncode == 0, again.stderr
 
 
 @pytest.fixture(scope="module")
@@ -202,7 +200,10 @@ LINKAGE = "gripper.linkage={kind: table, table: [[0, 0.092], [1, 0.05], [2, 0]]}
             "oak",
         ),
         (
-            ["grasp", *settings(*REAL, "camera.backend=none", "load_cell.backend=phidget")],
+            [
+                "grasp",
+                *settings(*REAL, "camera.backend=none", "load_cell.backend=phidget", "load_cell.rate_hz=80"),
+            ],
             "load_cell.backend=phidget needs the package Phidget22",
             "phidget",
         ),
@@ -213,8 +214,8 @@ LINKAGE = "gripper.linkage={kind: table, table: [[0, 0.092], [1, 0.05], [2, 0]]}
         (["calibrate", "load-cell", "--mass-kg=1", "--yes"], "this command needs scipy", "calibrate"),
         (["export", "small", "--out=small.onnx"], "this command needs torch", "train"),
         (
-            ["replay", "frames.mcap", "--report", "--set=camera.backend=none"],
-            "this command needs matplotlib",
+            ["replay", "frames.mcap", "--report"],
+            "--report needs matplotlib",
             "report",
         ),
         (["simulate", "--presses=1"], "needs mujoco", "sim"),
