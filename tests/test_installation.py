@@ -446,7 +446,7 @@ def test_metadata_of_the_wheel(wheel: Path) -> None:
     about = metadata.PathDistribution(folder)
     assert about.version == gf.__version__
     assert set(about.metadata.get_all("Provides-Extra") or ()) == set(PROJECT["optional-dependencies"])
-    text = str(about.metadata.get_payload())
+    text = (folder / "METADATA").read_text().partition("\n\n")[2]
     assert "# gripper-force" in text
     targets = re.findall(r"\]\(([^)]+)\)", text)
     assert targets
@@ -486,3 +486,29 @@ def test_one_address_of_the_repository() -> None:
     text = (ROOT / "pyproject.toml").read_text()
     owners = set(re.findall(r"(?:github\.com|githubusercontent\.com)/([\w-]+/[\w-]+)", text))
     assert owners == {repository}
+
+
+def test_workflows_are_valid() -> None:
+    """By the schema of GitHub Actions."""
+    workflows = map(str, (ROOT / ".github/workflows").glob("*.yml"))
+    check = [
+        sys.executable,
+        "-m",
+        "check_jsonschema",
+        "--builtin-schema",
+        "vendor.github-workflows",
+        *workflows,
+    ]
+    done = subprocess.run(check, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_image_installs_what_make_grasp_installs() -> None:
+    """And from the same index of PyTorch."""
+    makefile, dockerfile = (ROOT / "Makefile").read_text(), (ROOT / "Dockerfile").read_text()
+    packages = re.search(r"EGL_PACKAGES := (.+)", makefile)
+    index = re.search(r"CPU_INDEX := (.+)", makefile)
+    extras = re.search(r"--editable '\.(\[.+\])'\n\ttouch", makefile)
+    assert packages and index and extras
+    for text in (packages[1], index[1], f"/src{extras[1]}"):
+        assert text in dockerfile
