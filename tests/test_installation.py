@@ -509,6 +509,8 @@ def test_the_image_installs_what_make_grasp_installs() -> None:
     packages = re.search(r"EGL_PACKAGES := (.+)", makefile)
     index = re.search(r"CPU_INDEX := (.+)", makefile)
     extras = re.search(r"--editable '\.(\[.+\])'\n\ttouch", makefile)
-    assert packages and index and extras
+    assert packages is not None
+    assert index is not None
+    assert extras is not None
     for text in (packages[1], index[1], f"/src{extras[1]}"):
         assert text in dockerfile
