@@ -19,6 +19,7 @@ from gripper_force.cli.options import (
 )
 from gripper_force.cli.output.calibrate import jaws_table, object_table, rig_table, taught_table
 from gripper_force.errors import ConfigError
+from gripper_force.plugins import require
 
 if TYPE_CHECKING:
     from rich.status import Status
@@ -193,6 +194,7 @@ def object_(
     as_json: AsJson = False,
 ) -> None:
     """Calibrate an object by touching it with the load cell in place. Ctrl-C uses the touches so far."""
+    require("torch", "calibrate object")
     from gripper_calibration.fits.interval_fit import MIN_TOUCHES
     from gripper_calibration.procedures import calibrate_object as job
     from gripper_force.profiles.object_profile import find_object
@@ -233,6 +235,7 @@ def network(
     as_json: AsJson = False,
 ) -> None:
     """Fit a network's out-of-distribution score and claimed errors to logs of what it knows."""
+    require("torch", "calibrate network")
     from gripper_force.jobs.dataset import find_logs
     from gripper_force.jobs.training.ood_fit import calibrate_network
 
@@ -310,6 +313,7 @@ def teach(
     """Teach an object: touch it, train and calibrate the best estimator for it, and make `grasp` use it."""
     import time
 
+    require("torch", "teach")
     from gripper_calibration.procedures import calibrate_object
     from gripper_calibration.procedures import teach as job
     from gripper_force.profiles.object_profile import user_folder

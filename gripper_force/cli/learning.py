@@ -14,6 +14,7 @@ from gripper_force.cli.options import CORES, AsJson, Jobs, Overrides, load_setti
 from gripper_force.cli.output.paper import paper_tables
 from gripper_force.cli.output.runs import errors_table
 from gripper_force.errors import ConfigError
+from gripper_force.plugins import require
 
 ContactStarts = Annotated[
     bool,
@@ -66,6 +67,7 @@ def train(
     as_json: AsJson = False,
 ) -> None:
     """Train the force network on logs; under `torchrun`, in several processes."""
+    require("torch", "train")
     from gripper_force.jobs.dataset import find_logs, load_clips, without_contact_starts
     from gripper_force.jobs.training.recipe import continued
     from gripper_force.jobs.training.recipe import recipe as named
@@ -272,6 +274,7 @@ def reproduce(
     """Reproduce the paper's tables and figures, with its numbers. Continues an interrupted run."""
     import time
 
+    require("torch", "reproduce")
     from gripper_force.qualification.markdown_blocks import write_between
     from gripper_force.qualification.paper import paper_page as page
     from gripper_force.qualification.paper.models import SCALES, Scale

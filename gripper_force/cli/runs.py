@@ -27,6 +27,7 @@ from gripper_force.cli.output.runs import (
     trials_table,
 )
 from gripper_force.errors import ConfigError, GripperError
+from gripper_force.plugins import require
 
 if TYPE_CHECKING:
     from gripper_force.config import Config
@@ -207,6 +208,8 @@ def replay(
     """
     from functools import partial
 
+    if report:
+        require("matplotlib", "--report")
     from gripper_force.jobs import replay as job
     from gripper_force.jobs.dataset import find_logs
 

@@ -435,7 +435,7 @@ def _metadata(run: ResolvedConfig, devices: Devices) -> dict[str, str]:
         "checkpoint": run.model.digest if run.model else "",
         "choices": "\n".join(run.choices),
         "python": sys.version.split()[0],
-        **{f"version {name}": metadata.version(name) for name in packages},
+        **{f"version {name}": d.version for name in packages for d in metadata.distributions(name=name)},
         **devices.notes,
         **profile,
         **utc,
