@@ -2,8 +2,8 @@
 
     python examples/docs_figures.py docs/figures
 
-``loop``, ``calibration``, ``safety`` and ``wiring`` are diagrams. ``fusion`` and ``terminal`` show simulated grasps, which
-the script runs first (about 30 s).
+``loop``, ``calibration``, ``safety`` and ``wiring`` are diagrams. ``fusion`` and ``terminal`` show simulated grasps,
+which the script runs first (about 30 s).
 """
 
 import argparse
@@ -202,7 +202,7 @@ def fusion() -> Figure:
         )
         seen = np.array([(r.ready_ns, r.force_n) for r in reader.records(VisualForce)])
         cell = np.array([(r.t_ns, r.force_n) for r in reader.records(LoadCellSample) if r.valid])
-    begin_ns = fused[np.argmax(fused[:, 1] > 0.5), 0]
+    begin_ns = cell[np.argmax(cell[:, 1] > 0.1), 0]
     t, seen_t, cell_t = (1e-9 * (table[:, 0] - begin_ns) for table in (fused, seen, cell))
     figure = Figure(figsize=(9.6, 5.2), layout="constrained")
     forces, bias = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
@@ -218,6 +218,7 @@ def fusion() -> Figure:
     forces.legend(frameon=False, loc="lower right")
     bias.axhline(0, color="#8a9099", lw=0.8)
     bias.plot(t, fused[:, 4], color=FUSED, lw=1.4)
+    bias.set_ylim(-0.2, 0.6)
     bias.set_ylabel("correction\nof the current, N")
     bias.set_xlabel("time since contact, s")
     for axes in (forces, bias):
