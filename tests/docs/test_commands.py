@@ -1,4 +1,4 @@
-"""Every command of the pages is parsed by the real command line, with its keys; those of the tutorials run.
+"""Every command of the pages is parsed by the real command line, with its keys.
 
 A block whose first line is ``# needs hardware`` has commands for a real rig. They are parsed, too.
 """
