@@ -39,7 +39,7 @@ test-lerobot:
 
 docs: setup-dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
-	@echo open build/site/library.html
+	@echo open build/site/index.html
 
 # sdist and wheel in dist/, with the networks that a robot without PyTorch runs
 wheel: setup-dev

@@ -1,6 +1,5 @@
 """The commands that calibrate a rig and objects."""
 
-import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,6 +13,7 @@ from gripper_force.cli.options import (
     ConfigPath,
     Jobs,
     Overrides,
+    again,
     load_settings,
     load_settings_before_rig,
 )
@@ -329,13 +329,14 @@ def teach(
         if logs is None:
             _tell_existing(settings, touches, folder, fresh)
             logs = []
-            with console.err.status("touching") as status:
-                prompt = console.prompt(False, status) if pause else None
-                logs += calibrate_object.record_touches(
-                    settings, touches, peak_n, folder, prompt=prompt, progress=_progress(status)
-                )
-        bar = console.bar if console.err.is_terminal else console.lines
-        with bar("teaching", job.STEPS) as progress:
+            with console.bar("touching", touches) as touching:
+                prompt = console.prompt(False, touching) if pause else None
+                for path in calibrate_object.record_touches(
+                    settings, touches, peak_n, folder, prompt=prompt, progress=touching
+                ):
+                    logs.append(path)
+                    touching(path.name)
+        with console.bar_or_lines("teaching", job.STEPS) as progress:
             result = job.teach(
                 settings,
                 name,
@@ -357,16 +358,14 @@ def teach(
             soft_wrap=True,
         )
     target_n = min(4.0, round(result.profile.force_n / 2, 1))
-    words = ["gripper-force", "grasp", "--object", given, "--target-n", f"{target_n:g}"]
+    words = ["grasp", "--object", given, "--target-n", f"{target_n:g}"]
     words += [] if out is None else ["--profile", str(out.absolute())]
-    words += [] if config is None else ["--config", str(config)]
     words += [] if seed is None else ["--seed", str(seed)]
     # With another network than the default one a grasp would not use the bundle's.
     others = [one for one in set_ or [] if not one.startswith("vision.checkpoint=")]
     if config is not None and load_settings(config, others, {}).vision.checkpoint != "default":
         others.append("vision.checkpoint=default")
-    words += [word for one in others for word in ("--set", one)]
-    console.err.print(f"next: {shlex.join(words)}", soft_wrap=True, markup=False)
+    console.next_step(*words, *again(config, others))
 
 
 def _tell_existing(settings: "Config", touches: int, folder: Path, fresh: bool) -> None:
@@ -390,13 +389,14 @@ def _touches(settings: "Config", touches: int, peak_n: float | None, folder: Pat
     from gripper_calibration.procedures import calibrate_object as job
 
     paths: list[Path] = []
-    with console.err.status("touching") as status:
-        prompt = console.prompt(False, status) if pause else None
+    with console.bar("touching", touches) as progress:
+        prompt = console.prompt(False, progress) if pause else None
         try:
             for path in job.record_touches(
-                settings, touches, peak_n, folder, prompt=prompt, progress=_progress(status)
+                settings, touches, peak_n, folder, prompt=prompt, progress=progress
             ):
                 paths.append(path)
+                progress(path.name)
         except KeyboardInterrupt:
             if not paths:
                 raise

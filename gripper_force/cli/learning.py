@@ -3,7 +3,6 @@
 import json
 import math
 import os
-import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -132,12 +131,7 @@ def train(
     console.show(
         {**found, "left_out": left_out, "warnings": warnings}, as_json, lambda _: console.pairs(found)
     )
-    console.err.print(
-        f"next: gripper-force evaluate FOLDER --checkpoint {shlex.quote(str(checkpoint))}, with logs that were "
-        "not used for training",
-        soft_wrap=True,
-        markup=False,
-    )
+    console.next_step("evaluate", "FOLDER", "--checkpoint", checkpoint)
 
 
 def _warn_left_out(left_out: int, logs: int) -> None:
@@ -194,6 +188,8 @@ def evaluate(
     console.show(result, as_json, errors_table)
     if plot is not None:
         console.err.print(f"figure: {plot}", soft_wrap=True, markup=False)
+    if checkpoint is not None:
+        console.next_step("grasp", "--set", f"vision.checkpoint={checkpoint}")
 
 
 def export_network(
@@ -216,6 +212,7 @@ def export_network(
     from gripper_force.jobs.dataset import find_logs, load_clips
     from gripper_force.jobs.int8_export import export_int8
     from gripper_force.vision.export import export as job
+    from gripper_force.vision.header import EXPORTED
     from gripper_force.vision.model_files import read_model
 
     model = read_model(load_settings(None, set_, {"vision.checkpoint": checkpoint}).vision.checkpoint)
@@ -228,6 +225,8 @@ def export_network(
     with console.err.status("exporting"):
         errors = job(model, out) if frames is None else export_int8(model, out, frames)
     console.show({"file": str(out), "digest": model.digest, "off_torch_n": errors}, as_json)
+    engine = EXPORTED[out.suffix]
+    console.next_step("grasp", "--set", f"vision.checkpoint={out}", "--set", f"vision.engine={engine}")
 
 
 def reproduce(
@@ -289,8 +288,7 @@ def reproduce(
     options += set_ or []
     lengths = [f"steps={text}" for text in steps.split(",")] if steps else []
     scales = [section_from(Scale, [*options, length]) for length in lengths] or [section_from(Scale, options)]
-    bar = console.bar if console.err.is_terminal else console.lines
-    result = page.reproduce(names, scales, data, folder, jobs, bar, end_s)
+    result = page.reproduce(names, scales, data, folder, jobs, console.bar_or_lines, end_s)
     pictures = write.with_suffix("") if write else folder
     pictures.mkdir(parents=True, exist_ok=True)
     figures = {}

@@ -15,6 +15,7 @@ from gripper_force.cli.options import (
     ConfigPath,
     Jobs,
     Overrides,
+    again,
     load_settings,
     load_settings_before_rig,
 )
@@ -126,6 +127,10 @@ def grasp(
                 )
             raise
         console.show(result, as_json, grasp_table)
+        if result["report"] is None:
+            console.next_step("replay", log, "--report")
+        else:
+            console.err.print(f"next: open {result['report']}", soft_wrap=True, markup=False)
         if result["result"] != "held":
             raise typer.Exit(1)
         return
@@ -167,6 +172,8 @@ def grasp(
         console.show(printed, as_json, lambda _: trials_table(results, summary, figure))
     if failure is not None:
         raise failure
+    worst = max(results, key=lambda one: abs(one["steady_error_n"] or 0.0))
+    console.next_step("replay", worst["log"], "--report")
 
 
 def _notes(settings: "Config", name: str) -> list[str]:
@@ -251,6 +258,14 @@ def replay(
         console.show(printed, as_json, lambda _: replays_table(results, summary, pages))
     if set_ or checkpoint:
         console.err.print(_OPEN_LOOP, soft_wrap=True)
+    if pages:
+        console.err.print(f"next: open {pages[0]}", soft_wrap=True, markup=False)
+    elif len(results) == 1:
+        console.next_step("replay", *logs, *_changes(checkpoint, set_), "--report")
+
+
+def _changes(checkpoint: str | None, overrides: list[str] | None) -> list[str]:
+    return [*(() if checkpoint is None else ("--checkpoint", checkpoint)), *again(None, overrides)]
 
 
 def _choice(text: str) -> tuple[str | None, list[str]]:
@@ -287,6 +302,7 @@ def doctor(
     console.show({"checks": checks, "ok": ok}, as_json, lambda _: checks_table(checks))
     if not ok:
         raise typer.Exit(1)
+    console.next_step("grasp", *again(config, set_))
 
 
 def virtual_servo(
