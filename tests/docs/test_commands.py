@@ -65,7 +65,7 @@ def block_lines(page: Path) -> Iterator[Line]:
         for text in body.replace("\\\n", " ").splitlines():
             start = re.search(r"(^|/bin/|--no-python )gripper-force ", text.strip())
             if start is not None and not text.strip().startswith("#"):
-                yield Line(page, text.strip()[start.end() :].split(" < ")[0], hardware)
+                yield Line(page, re.split(r" [<|] ", text.strip()[start.end() :])[0], hardware)
 
 
 def inline_commands(page: Path) -> Iterator[Line]:
