@@ -154,7 +154,9 @@ def test_the_force_in_an_unfamiliar_frame_claims_nothing() -> None:
         camera.give(seq)
         seen += perception.poll()
     visual = seen[-1].visual
+    assert visual is not None
     assert (visual.force_n, visual.std_n, visual.is_familiar) == (3.0, np.inf, False)
+    assert seen[1].visual is not None
     assert seen[1].visual.is_familiar
     assert [s.problem for s in seen] == ["", "", "unlike all"]
 
