@@ -43,6 +43,14 @@ RigPath = Annotated[
         "rig.yaml.",
     ),
 ]
+Fresh = Annotated[
+    bool,
+    typer.Option("--fresh", help="Move existing touches to a folder beside, and record all of them again."),
+]
+Pause = Annotated[
+    bool, typer.Option("--pause", help="Wait for Enter before each touch, to place the object again.")
+]
+TouchSeed = Annotated[int | None, typer.Option(help="Seed of the touches, and of a simulated scene.")]
 
 
 @app.command("load-cell")
@@ -139,7 +147,7 @@ def camera(
     ] = None,
     touches: Annotated[int, typer.Option(min=3, help="Number of touches.")] = 10,
     object_: Annotated[str | None, typer.Option("--object", help="Object between the jaws.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of the touches, and of a simulated scene.")] = None,
+    seed: TouchSeed = None,
     config: ConfigPath = None,
     set_: Overrides = None,
     as_json: AsJson = False,
@@ -179,17 +187,10 @@ def object_(
     out: Annotated[
         Path | None, typer.Option(help="Profile to write. Default: NAME.yaml in your folder of profiles.")
     ] = None,
-    fresh: Annotated[
-        bool,
-        typer.Option(
-            "--fresh", help="Move existing touches to a folder beside, and record all of them again."
-        ),
-    ] = False,
-    pause: Annotated[
-        bool, typer.Option("--pause", help="Wait for Enter before each touch, to place the object again.")
-    ] = False,
+    fresh: Fresh = False,
+    pause: Pause = False,
     config: ConfigPath = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of the touches, and of a simulated scene.")] = None,
+    seed: TouchSeed = None,
     set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
@@ -295,18 +296,11 @@ def teach(
     out: Annotated[
         Path | None, typer.Option(help="Folder of the bundle. Default: NAME in your folder of profiles.")
     ] = None,
-    fresh: Annotated[
-        bool,
-        typer.Option(
-            "--fresh", help="Move existing touches to a folder beside, and record all of them again."
-        ),
-    ] = False,
-    pause: Annotated[
-        bool, typer.Option("--pause", help="Wait for Enter before each touch, to place the object again.")
-    ] = False,
+    fresh: Fresh = False,
+    pause: Pause = False,
     jobs: Jobs = CORES,
     config: ConfigPath = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of the touches, and of a simulated scene.")] = None,
+    seed: TouchSeed = None,
     set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
