@@ -18,11 +18,15 @@ _RETURN_S = 0.05
 """Lowering: the fall takes the sum of the first two, the first at full rate. After it the motor force returns to the
 closing side of friction in the third, which stops the jaws: later, their inertia carries them too far."""
 
+_AGAIN_S = 0.05
+"""A lowering that ends above the tolerance is followed at once by a second one of twice this time. The first leaves a
+stiff object with too much force: the motor force returns before its lag lets it reach its lowest value."""
+
 _REPEAT_SHARE = 0.75
 _REPEAT_S = 0.5
 _REPEAT_WITHIN_S = 1.0
-"""A lowering that ends above the target by this share of the tolerance, for this time, is repeated once, if that shows
-soon. The integral would have to overcome twice the friction first, which takes seconds."""
+"""If the camera soon shows that the force stays above the target by this share of the tolerance, for this time, it is
+lowered once more. The integral would have to overcome twice the friction first, which takes seconds."""
 
 _WAIT_SHARE = 0.2
 _WAIT_N = 0.2
@@ -89,7 +93,7 @@ class ForceLoop:
         self._profile = TrapezoidalProfile(_RAMP_S)
         self._trim_n = 0.0
         self._rising, self._side, self.is_lowering = True, 1.0, False
-        self._repeat_s, self._high_s = 0.0, 0.0
+        self._lowers_again, self._repeat_s, self._high_s = False, 0.0, 0.0
 
     @property
     def reference_n(self) -> float:
@@ -98,19 +102,26 @@ class ForceLoop:
 
     def start(self, force_n: float, target_n: float) -> None:
         """Starts a ramp at the present force."""
-        self._trim_n, self._repeat_s = 0.0, 0.0
+        self._trim_n, self._repeat_s, self._lowers_again = 0.0, 0.0, False
         self._start(force_n, target_n)
 
     def retarget(self, target_n: float) -> None:
         """Starts a ramp at the present reference and keeps the trim."""
-        self._repeat_s = _REPEAT_WITHIN_S if target_n < self.reference_n else 0.0
+        self._lowers_again = target_n < self.reference_n
+        self._repeat_s = _REPEAT_WITHIN_S if self._lowers_again else 0.0
         self._start(self.reference_n, target_n)
 
-    def _start(self, force_n: float, target_n: float) -> None:
+    def _start(
+        self,
+        force_n: float,
+        target_n: float,
+        fall_s: float = _LOWERING_S,
+        fall_ramp_s: float = _LOWERING_RAMP_S,
+    ) -> None:
         self._rising, self.is_lowering = True, target_n < force_n
         self._side = -1.0 if self.is_lowering else 1.0
-        self._profile = TrapezoidalProfile(_LOWERING_RAMP_S if self.is_lowering else _RAMP_S)
-        rate_n_s = (force_n - target_n) / _LOWERING_S if self.is_lowering else self._ramp_n_s
+        self._profile = TrapezoidalProfile(fall_ramp_s if self.is_lowering else _RAMP_S)
+        rate_n_s = (force_n - target_n) / fall_s if self.is_lowering else self._ramp_n_s
         self._profile.start(force_n, rate_n_s)
 
     def step(self, dt_s: float, target_n: float, estimate: FusedForce, *, shortfall_n: float = 0.0) -> float:
@@ -128,6 +139,10 @@ class ForceLoop:
         if self.is_lowering and not ramping:
             self._side = min(self._side + 2 * dt_s / _RETURN_S, 1.0)
             self.is_lowering = self._side < 1.0
+            is_high = estimate.force_n > target_n + tolerance_n(target_n)
+            if not self.is_lowering and self._lowers_again and is_high:
+                self._lowers_again = False
+                self._start(estimate.force_n, target_n, _AGAIN_S, _AGAIN_S)
         waits = shortfall_n > _WAIT_SHARE * self.reference_n + _WAIT_N
         reference_n = self._profile.step(target_n, 0.0 if waits else dt_s)
         error_n = 0.0

@@ -108,6 +108,22 @@ def test_lowering_falls_below_friction_and_returns(loop, transmission):
     assert not any(lowered[lowered.index(False) :])
 
 
+@pytest.mark.parametrize(("left_n", "falls"), [(0.05, 1), (0.3, 2), (-0.3, 1)])
+def test_lowering_that_leaves_too_much_force_is_repeated_once(loop, left_n, falls):
+    ramp(loop, 4.0)
+    loop.retarget(2.0)
+    lowered = []
+    for _ in range(200):
+        left = left_n if not loop.is_lowering else max(left_n, 0.0)
+        loop.step(0.005, 2.0, estimate(loop.reference_n + left, source="current"))
+        lowered.append(loop.is_lowering)
+    starts = [now and not before for before, now in zip([False, *lowered], lowered, strict=False)]
+    shows_again = [now < before for before, now in zip([False, *lowered], lowered, strict=False)]
+    assert lowered[0]
+    assert sum(starts) == sum(shows_again) == 1
+    assert sum(lowered) * 0.005 == pytest.approx(0.35 if falls == 1 else 0.5, abs=0.03)
+
+
 def test_ramp_and_integral_wait_while_the_motor_force_falls_short(loop):
     loop.start(0.5, 4.0)
     for _ in range(20):
