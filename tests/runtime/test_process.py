@@ -2,6 +2,7 @@ import os
 import signal
 import threading
 from contextlib import ExitStack
+from pathlib import Path
 from types import FrameType
 
 import pytest
@@ -28,14 +29,43 @@ def test_is_this_threads_alone_and_for_as_long_as_asked() -> None:
     assert policy() == before
 
 
-def test_where_it_is_not_allowed_it_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def refused(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise PermissionError
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
+
+
+@pytest.mark.usefixtures("refused")
+def test_where_it_is_not_allowed_it_says_what_to_do() -> None:
     with real_time_priority() as refusal:
         assert "limits.conf" in refusal
     assert policy() == os.SCHED_OTHER
+
+
+def slice_ns() -> int:
+    """Reads the time slice of this thread; 0 where the kernel does not show it."""
+    path = Path(f"/proc/self/task/{threading.get_native_id()}/sched")
+    lines = path.read_text().splitlines() if path.exists() else []
+    return next((int(line.split()[-1]) for line in lines if line.startswith("se.slice")), 0)
+
+
+@pytest.mark.usefixtures("refused")
+def test_where_it_is_not_allowed_this_thread_alone_gets_a_short_time_slice() -> None:
+    if not (before_ns := slice_ns()):
+        pytest.skip(
+            "the kernel does not show the time slice (Linux before 6.12, or without CONFIG_SCHED_DEBUG)"
+        )
+    nice = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+    others_ns: list[int] = []
+    with real_time_priority():
+        assert slice_ns() == 100_000
+        assert os.getpriority(os.PRIO_PROCESS, threading.get_native_id()) == nice
+        thread = threading.Thread(target=lambda: others_ns.append(slice_ns()))
+        thread.start()
+        thread.join()
+    assert [slice_ns(), *others_ns] == [before_ns, before_ns]
 
 
 def in_another_thread(stack: ExitStack) -> None:
