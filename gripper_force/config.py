@@ -548,6 +548,9 @@ class SimConfig(Section):
     gain: Positive | None = Field(None, description="true torque constant over the model's; None: drawn")
     stiffness: Positive | None = Field(None, description="true stiffness over that of the kind; None: drawn")
     open_width_m: Positive | None = Field(None, description="true open width; None: gripper.open_width_m")
+    hanging_mass_kg: NonNegative = Field(
+        0.0, description="mass that pulls one jaw open; 0: none, and in `calibrate weight` the stated one"
+    )
 
 
 class CalibrationConfig(Section):

@@ -17,7 +17,7 @@ from gripper_force.cli.options import (
     load_settings,
     load_settings_before_rig,
 )
-from gripper_force.cli.output.calibrate import jaws_table, object_table, rig_table, taught_table
+from gripper_force.cli.output.calibrate import jaws_table, object_table, rig_table, taught_table, weight_table
 from gripper_force.errors import ConfigError
 from gripper_force.plugins import require
 
@@ -132,6 +132,33 @@ def servo(
             progress=_progress(status),
         )
     _show_rig(result, as_json)
+
+
+@app.command("weight")
+def weight(
+    mass_kg: Annotated[float, typer.Option(help="Known mass to hang from one jaw.")],
+    yes: Annotated[
+        bool, typer.Option("--yes", help="Do not wait for Enter: only with a simulated gripper.")
+    ] = False,
+    config: ConfigPath = None,
+    set_: Overrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure a servo's torque constant without a load cell: the jaws balance a known mass."""
+    from gripper_calibration.procedures import calibrate_weight as job
+
+    settings, _ = load_settings_before_rig(config, set_, {})
+    if yes and not job.is_servo_simulated(settings):
+        raise ConfigError(
+            "calibrate weight needs a person who turns the gripper and hangs up the mass; leave out --yes"
+        )
+    with console.err.status("moving") as status:
+        result = job.calibrate_weight(
+            settings, mass_kg, prompt=console.prompt(yes, status), progress=_progress(status)
+        )
+    console.show(
+        console.jsonable(result) | {"settings": result.settings}, as_json, lambda _: weight_table(result)
+    )
 
 
 @app.command("camera")

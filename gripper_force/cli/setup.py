@@ -28,7 +28,9 @@ def setup(
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Start over: forget what earlier steps found.")
     ] = False,
-    mass_kg: Annotated[float | None, typer.Option(help="Known mass for the load cell.")] = None,
+    mass_kg: Annotated[
+        float | None, typer.Option(help="Known mass for the load cell, or to hang from one jaw without one.")
+    ] = None,
     gauge_mm: Annotated[
         float | None, typer.Option(help="Width of the load cell between the jaws, for the torque constant.")
     ] = None,

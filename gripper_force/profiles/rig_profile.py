@@ -14,7 +14,7 @@ _GAIN_DRIFT: Final = 0.02
 """Relative drift of the torque constant: neodymium magnets lose 0.11 % per kelvin, and a motor under load
 warms by 20 K and more."""
 
-_FRICTION_DRIFT: Final = 0.1
+FRICTION_DRIFT: Final = 0.1
 """Relative variation of friction with grease, wear and position on the rack: an assumption."""
 
 _NORMAL: Final = 1.96
@@ -154,10 +154,7 @@ class RigProfile(Section):
             tree["load_cell"] = {"tare_raw": cell.tare_raw.value, "n_per_raw": cell.n_per_raw.value}
         if (servo := self.servo) is not None:
             tree["gripper"] = {
-                "nm_per_a": servo.nm_per_a.value,
-                "friction_n": max(servo.friction_n.value, 0.0),
-                "friction_std": _std(servo.friction_n, _FRICTION_DRIFT),
-                "gain_std": _std(servo.nm_per_a, _GAIN_DRIFT),
+                **torque_settings(servo.nm_per_a, servo.friction_n),
                 "damping_n_s_m": max(servo.damping_n_s_m.value, 0.0),
                 "pinion_radius_m": servo.pinion_radius_m.value,
                 "open_position_rad": servo.open_position_rad.value,
@@ -186,6 +183,16 @@ class RigProfile(Section):
         if self.camera is not None and camera["backend"] != "none":
             differ += self.camera.mismatches(camera)
         return differ
+
+
+def torque_settings(nm_per_a: CalibratedValue, friction_n: CalibratedValue) -> Tree:
+    """Returns the keys of the section `gripper` that follow from a torque constant and the friction at each jaw."""
+    return {
+        "nm_per_a": nm_per_a.value,
+        "friction_n": max(friction_n.value, 0.0),
+        "friction_std": _std(friction_n, FRICTION_DRIFT),
+        "gain_std": _std(nm_per_a, _GAIN_DRIFT),
+    }
 
 
 def _std(estimate: CalibratedValue, drift: float) -> float:

@@ -16,7 +16,8 @@ _GOOD_RATE_HZ: Final = 40.0
 
 WITHOUT: Final = (
     "Without a load cell everything works but what needs newtons measured at the jaws: `calibrate servo`, "
-    "`calibrate object` and training. Motor current measures the force instead; the next step states its error."
+    "`calibrate object` and training. Motor current measures the force instead; the next step can compare it with a "
+    "known mass, and states its error."
 )
 
 

@@ -116,7 +116,7 @@ class Setup:
             overrides: Assignments ``key.path=value``; they go into the file.
             only: Name of the only step to run, even if it is finished; None: all that are not.
             fresh: Forgets what earlier steps found.
-            mass_kg: Known mass for the load cell; None: asked for.
+            mass_kg: Known mass for the load cell, or without one for a jaw; None: asked for.
             gauge_mm: Width of the load cell between the jaws; None: asked for.
 
         Raises:

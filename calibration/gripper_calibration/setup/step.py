@@ -50,7 +50,7 @@ class Task:
         folder: Folder for pictures and measurements.
         person: Answers questions.
         progress: Called with what the devices do.
-        mass_kg: Known mass for the load cell, if it was given.
+        mass_kg: Known mass for the load cell, or without one for a jaw, if it was given.
         gauge_mm: Width of the load cell between the jaws, if it was given.
     """
 

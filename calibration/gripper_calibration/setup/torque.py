@@ -1,13 +1,16 @@
-"""Step ``torque``: what a motor current is in newtons at the jaws, by the load cell, a weight, or the data sheet."""
+"""Step ``torque``: motor current in newtons at the jaws, by the load cell, a weight, or the data sheet."""
 
 import math
+from datetime import date
 from typing import Any, Final
 
 from gripper_calibration.procedures.calibrate_servo import calibrate_servo
+from gripper_calibration.procedures.calibrate_weight import calibrate_weight, masses_kg
 from gripper_calibration.setup.load_cell import PROFILE, interval
 from gripper_calibration.setup.step import Found, Outcome, Task, with_keys
 from gripper_force.config import Config
-from gripper_force.profiles.rig_profile import RigProfile
+from gripper_force.errors import ConfigError
+from gripper_force.profiles.rig_profile import FRICTION_DRIFT, RigProfile
 from gripper_force.runtime.backends import is_simulated
 from gripper_force.runtime.resolve import resolve
 
@@ -20,15 +23,15 @@ _FORCES_N: Final = (2.0, 4.0, 8.0)
 
 
 def torque(task: Task) -> Outcome:
-    """Presses the load cell; without one, takes the data sheet's torque constant and states its interval.
+    """Presses the load cell; without one, balances a known mass, or takes the data sheet's torque constant.
 
     Raises:
         ConfigError: A script did not give the width of the load cell.
-        GripperError: See `calibrate_servo`.
+        GripperError: See `calibrate_servo` and `calibrate_weight`.
     """
     config = task.config
     if config.load_cell.backend in ("none", "playback") or len(config.servo.ids) > 1:
-        return _data_sheet(task)
+        return _weight(task)
     simulated = is_simulated(config)
     gauge_mm = task.gauge_mm
     if gauge_mm is None:
@@ -61,6 +64,40 @@ def torque(task: Task) -> Outcome:
         [_reference(after)],
         {"figure": found.report},
         {"servo": servo, "intervals_n": _intervals_n(after)},
+    )
+
+
+def _weight(task: Task) -> Outcome:
+    """Balances a mass, if the gripper can and there is one."""
+    try:
+        least_kg, most_kg = masses_kg(task.config)
+    except ConfigError:
+        return _data_sheet(task)
+    mass_kg = task.mass_kg
+    if mass_kg is None:
+        mass_kg = 1e-3 * task.person.number(
+            f"Known mass to hang from one jaw in grams, {1e3 * least_kg:.0f} to {1e3 * most_kg:.0f}; 0 for none",
+            "--mass-kg KG",
+            0.0,
+        )
+    if mass_kg == 0:
+        return _data_sheet(task)
+    found = calibrate_weight(task.config, mass_kg, prompt=task.person.do, progress=task.progress)
+    by = f"balanced {1e3 * mass_kg:g} g, {date.today().isoformat()}"
+    settings = {**found.settings, "friction_std": FRICTION_DRIFT}  # the jaws step has measured the friction
+    origins = {
+        "nm_per_a": f"{interval(found.nm_per_a)}, {by}",
+        "gain_std": f"relative error of nm_per_a, {by}",
+        "friction_n": f"that of the homing, scaled like nm_per_a, {by}",
+        "friction_std": "relative error of friction_n",
+    }
+    values = {f"gripper.{key}": Found(round(value, 5), origins[key]) for key, value in settings.items()}
+    after = with_keys(task.config, "gripper", **settings)
+    return Outcome(
+        f"{found.nm_per_a.value:.3f} Nm/A ({interval(found.nm_per_a)})",
+        values,
+        [_reference(after)],
+        details={"weight": found, "intervals_n": _intervals_n(after)},
     )
 
 

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from gripper_calibration.fits.cross_validation import Coverage
     from gripper_calibration.procedures.calibrate_jaws import JawsResult
     from gripper_calibration.procedures.calibrate_object import ObjectCalibration
+    from gripper_calibration.procedures.calibrate_weight import WeightResult
     from gripper_calibration.procedures.teach import Taught
     from gripper_force.profiles.object_profile import Interval
 
@@ -32,6 +33,18 @@ def jaws_table(r: "JawsResult") -> None:
         }
     )
     out.print(f"\nput this into your configuration:\n{r.yaml}", end="")
+
+
+def weight_table(r: "WeightResult") -> None:
+    """Prints what a weight measured, and the proposed configuration."""
+    pairs(
+        {
+            "torque constant, Nm/A": _found(r.nm_per_a.model_dump()),
+            "breakaway friction": f"{r.breakaway_n:.2f} N",
+        }
+    )
+    keys = "".join(f"  {key}: {value:.4g}\n" for key, value in r.settings.items())
+    out.print(f"\nput this into your configuration:\ngripper:\n{keys}", end="")
 
 
 def _found(value: object) -> object:

@@ -239,6 +239,7 @@ class SimulatedRig:
             config.seed,
             textured=config.camera.backend == "simulated",
             second=None if self._second is None else (motors[1], self._second),
+            hanging_mass_kg=config.sim.hanging_mass_kg,
         )
         self._object_digest = "" if config.sim.object is None else digest(config.sim.object)
         self._exposure_ms = config.sim.exposure_ms * _relative_exposure(config)

@@ -37,6 +37,7 @@ _MAX_STEP_S = 0.004
 _CURRENT_NOISE_A = 0.003
 _JAW_HALF_HEIGHT_M = 0.011
 _AWAY_M = (1.0, 0.0, 0.0)
+_STANDARD_GRAVITY_M_S2 = 9.80665
 """Position of an object that has left the jaws, outside the image."""
 
 # In software rendering, each of these costs more than all the rest of a 128x128 image.
@@ -95,6 +96,7 @@ class World:
         textured: False for blank textures, if the world is never rendered.
         step_s: Time step in place of the scene's, to study its effect.
         second: Motor of the left finger and its scene (see `draw_second_finger`); None: one servo drives both.
+        hanging_mass_kg: Mass whose weight pulls the right jaw open.
 
     Attributes:
         t_ns: Simulated time.
@@ -119,6 +121,7 @@ class World:
         textured: bool = True,
         step_s: float | None = None,
         second: tuple[Motor, Scene] | None = None,
+        hanging_mass_kg: float = 0.0,
     ) -> None:
         text, assets = scene_mjcf(scene, gripper, textured=textured, second=second and second[1])
         try:
@@ -160,6 +163,7 @@ class World:
         self._racks = [
             i for i in range(self._model.ntendon) if self._model.tendon(i).name in ("rack", "second_rack")
         ]
+        self._hang_up(hanging_mass_kg)
         mujoco.mj_forward(self._model, self._data)
         self._check_fit(gripper.open_width_m)
         if self.has_object:
@@ -227,6 +231,14 @@ class World:
         nodes = nodes[self._model.body_dofnum[nodes] > 0]
         self._model.body_mass[nodes] = np.maximum(self._model.body_mass[nodes], _LEAST_NODE_KG)
         mujoco.mj_setConst(self._model, self._data)
+
+    def _hang_up(self, mass_kg: float) -> None:
+        """Adds a mass and its weight to the right jaw, which moves up while it closes."""
+        if mass_kg == 0:
+            return
+        self._model.body_mass[self._model.body("right").id] += mass_kg
+        mujoco.mj_setConst(self._model, self._data)
+        self._data.qfrc_applied[self._addresses("right")[1]] = -mass_kg * _STANDARD_GRAVITY_M_S2
 
     def _addresses(self, joint: str) -> tuple[int, int]:
         return int(self._model.joint(joint).qposadr[0]), int(self._model.joint(joint).dofadr[0])

@@ -10,6 +10,8 @@ from gripper_calibration.setup.run import STEPS, Setup, check_step
 from gripper_calibration.setup.step import Found
 from gripper_force.config import load_config
 from gripper_force.errors import ConfigError
+from gripper_hw.dynamixel.control_table import load_model
+from gripper_hw.sim.scene import draw_scene
 
 EXAMPLES = Path(__file__).parents[3] / "examples/setups"
 PAGE = (Path(__file__).parents[3] / "docs/your-own-rig.md").read_text(encoding="utf-8")
@@ -64,6 +66,19 @@ def test_a_setup_without_a_load_cell_ends_with_a_rig_file_and_continues_there(tm
     # A changed key repeats only the steps that rest on it.
     again = Setup(path, ["camera.rate_hz=30"]).run(Script())
     assert [report.name for report in again if report.result == "done"] == ["camera"]
+
+
+def test_a_known_mass_takes_the_place_of_a_load_cell(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    reports = list(Setup(path, SIMULATED, mass_kg=0.5).run(script := Script()))
+    assert any("Hang 0.5 kg" in text for text in script.told)
+    config = load_config(path)
+    true = load_model(config.servo.model).nm_per_a * draw_scene("none", config.seed, config.sim).nm_per_a
+    assert config.gripper.nm_per_a == pytest.approx(true, rel=0.02)
+    by_name = {report.name: report for report in reports}
+    low_n, high_n = by_name["torque"].details["intervals_n"]["4"]
+    assert 3.7 < low_n < 4 < high_n < 4.3
+    assert "balanced 500 g" in path.read_text(encoding="utf-8")
 
 
 def test_values_that_a_person_writes_are_kept_and_named(tmp_path: Path) -> None:
