@@ -89,7 +89,7 @@ class ForceLoop:
         self._vision_alone = config.feedback == "vision"
         self._gains = self.margins["vision" if self._vision_alone else "hold"].gains
         self._transmission = transmission
-        self._ramp_n_s = config.ramp_n_s
+        self._ramp_n_s, self._largest_m_s = config.ramp_n_s, config.approach_speed_m_s
         self._profile = TrapezoidalProfile(_RAMP_S)
         self._trim_n = 0.0
         self._rising, self._side, self.is_lowering = True, 1.0, False
@@ -124,7 +124,15 @@ class ForceLoop:
         rate_n_s = (force_n - target_n) / fall_s if self.is_lowering else self._ramp_n_s
         self._profile.start(force_n, rate_n_s)
 
-    def step(self, dt_s: float, target_n: float, estimate: FusedForce, *, shortfall_n: float = 0.0) -> float:
+    def step(
+        self,
+        dt_s: float,
+        target_n: float,
+        estimate: FusedForce,
+        *,
+        shortfall_n: float = 0.0,
+        closing_m_s: float = 0.0,
+    ) -> float:
         """Runs one cycle and returns the motor force at each jaw.
 
         Args:
@@ -133,6 +141,8 @@ class ForceLoop:
             estimate: The force estimate.
             shortfall_n: Commanded less measured motor force. Ramp and integral wait while it is large: the
                 jaws close on a soft object as fast as they may.
+            closing_m_s: Speed of a jaw. A lowering waits while a soft object pushes the jaws open faster than they
+                may close: their inertia would carry them away from it.
         """
         self._repeat_lowering(dt_s, target_n, estimate)
         ramping = self.reference_n != target_n
@@ -144,6 +154,7 @@ class ForceLoop:
                 self._lowers_again = False
                 self._start(estimate.force_n, target_n, _AGAIN_S, _AGAIN_S)
         waits = shortfall_n > _WAIT_SHARE * self.reference_n + _WAIT_N
+        waits |= self.is_lowering and -closing_m_s > self._largest_m_s
         reference_n = self._profile.step(target_n, 0.0 if waits else dt_s)
         error_n = 0.0
         # A constant motor force holds a constant contact force. The current alone carries no new information

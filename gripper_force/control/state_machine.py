@@ -510,6 +510,7 @@ class GraspController:
             self._derated_target_n,
             self._estimate,
             shortfall_n=shortfall_n,
+            closing_m_s=closing_m_s,
         )
         if width_m < self._config.min_object_width_m and self._outcome == Outcome.NONE:
             self._set_outcome(Outcome.NO_OBJECT, "closed while the force was to rise")

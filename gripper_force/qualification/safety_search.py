@@ -1,6 +1,7 @@
 """Random search for wrong configurations and plants with which a grasp is not safe.
 
-Every case draws a plant and a configuration that is wrong about it, grasps, and releases. The statements of
+Every case draws a plant and a configuration that is wrong about it, grasps, half of the time changes the force, and
+releases. The statements of
 `safety_statements` must hold. With motor current alone an end stop cannot be told from a rigid object. So such cases
 are counted, but are no violations; `calibrate jaws` prevents them.
 """
@@ -50,6 +51,10 @@ class Draw:
 
     Attributes:
         target_n: Requested force.
+        then_n: Force requested after it; not a number for none.
+        then_s: Time of this request.
+        force_limit_n: As ``control.force_limit_n``.
+        approach_m_s: As ``control.approach_speed_m_s``.
         feedback: As ``control.feedback``.
         on_slip: As ``control.on_slip``.
         friction: True friction over the configured one.
@@ -72,6 +77,10 @@ class Draw:
     """
 
     target_n: float
+    then_n: float
+    then_s: float
+    force_limit_n: float
+    approach_m_s: float
     feedback: str
     on_slip: str
     friction: float
@@ -120,7 +129,7 @@ class CaseResult:
 
 
 class WorstCase(TypedDict):
-    """A case with what was drawn for it. An infinite time is null."""
+    """A case with what was drawn for it. What is not finite is null."""
 
     index: int
     outcome: str
@@ -166,8 +175,14 @@ def draw(config: ControlConfig, gain_bound: float, seed: int, index: int) -> Dra
     def rarely(share: float, value: float, otherwise: float) -> float:
         return value if rng.uniform() < share else otherwise
 
+    force_limit_n = rarely(0.5, between(2.0, 20.0), config.force_limit_n)
+    most_n = largest_target_n(force_limit_n, gain_bound)
     return Draw(
-        target_n=between(0.5, largest_target_n(config.force_limit_n, gain_bound)),
+        force_limit_n=force_limit_n,
+        approach_m_s=rarely(0.5, log_between(0.01, 0.04), config.approach_speed_m_s),
+        target_n=between(0.5, most_n),
+        then_n=rarely(0.5, between(0.5, most_n), math.nan),
+        then_s=between(1.0, 4.0),
         feedback=str(rng.choice(["fused", "current", "vision"])),
         on_slip=str(rng.choice(["regrip", "hold", "open"])),
         friction=log_between(0.3, 5.0),
@@ -201,6 +216,8 @@ def run_case(config: Config, seed: int, index: int) -> CaseResult:
             "feedback": drawn.feedback,
             "on_slip": drawn.on_slip,
             "vision_rate_hz": drawn.camera_hz,
+            "force_limit_n": drawn.force_limit_n,
+            "approach_speed_m_s": drawn.approach_m_s,
         }
     )
     plant = Gripper(
@@ -218,7 +235,10 @@ def run_case(config: Config, seed: int, index: int) -> CaseResult:
     run = _Run(plant, controller, drawn, drawn.start_m / radius_m, control)
     if controller.start_problem(run.read(0, 0.0)):
         return CaseResult(index, "refused", 0.0, 0.0, held_nothing=False, held_stop=False)
-    run.go(_GRASP_S, Request(0, RequestKind.GRASP, drawn.target_n))
+    run.go(drawn.then_s, Request(0, RequestKind.GRASP, drawn.target_n))
+    changes = math.isfinite(drawn.then_n) and run.outcome in (Outcome.NONE, Outcome.HELD)
+    change = Request(run.t_ns, RequestKind.GRASP, drawn.then_n) if changes else None
+    run.go(_GRASP_S - drawn.then_s, change)
     run.go(_RELEASE_S, Request(run.t_ns, RequestKind.RELEASE))
     shown = run.statements
     return CaseResult(
@@ -252,7 +272,7 @@ class _Run:
         )
         self.t_ns = 0
         self.outcome: str = Outcome.NONE
-        self.statements = SafetyStatements(control, drawn.target_n, drawn.sign)
+        self.statements = SafetyStatements(control, np.fmin(drawn.target_n, drawn.then_n), drawn.sign)
 
     def read(self, t_ns: int, noise: float) -> ServoState:
         state = self._plant.read(t_ns, NOISE_A * noise)
@@ -379,7 +399,9 @@ def _report(config: Config, results: list[CaseResult]) -> SearchReport:
             if name == "held nothing" and not result.held_nothing:
                 return
             drawn = asdict(draw(config.control, config.gripper.gain_bound, config.seed, result.index))
-            finite = {k: None if v == math.inf else v for k, v in drawn.items()}
+            finite = {
+                k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in drawn.items()
+            }
             yield {**asdict(result), "drawn": finite}  # type: ignore[typeddict-item]
 
     return {

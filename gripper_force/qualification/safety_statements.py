@@ -47,6 +47,7 @@ class SafetyStatements:
     def __init__(self, control: ControlConfig, target_n: float, sign: int = 1) -> None:
         self._limit_n, self._speed_m_s = control.force_limit_n, control.approach_speed_m_s
         self._nothing_n, self._sign = NOTHING_SHARE * target_n, sign
+        self._goes_limp = control.on_fault == "limp"
         self._still_reaction_s = STILL_REACTION_S + STILL_REACTION_FRAMES / control.frame_hz
         self._nothing_s = 0.0
         self.force_share = self.speed_share = 0.0
@@ -82,5 +83,7 @@ class SafetyStatements:
         if force_n == 0.0:
             # Only opening jaws may be faster; a wrong sign exchanges the directions.
             opens = self._sign * closing_m_s < 0
+            if opens and phase == Phase.FAULT and self._goes_limp:
+                return  # a soft object pushes jaws without torque open
             limit_m_s = self._speed_m_s * (_TRAVEL_SHARE if opens else 1.0)
             self.speed_share = max(self.speed_share, abs(closing_m_s) / limit_m_s)

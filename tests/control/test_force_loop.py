@@ -124,6 +124,17 @@ def test_lowering_that_leaves_too_much_force_is_repeated_once(loop, left_n, fall
     assert sum(lowered) * 0.005 == pytest.approx(0.35 if falls == 1 else 0.5, abs=0.03)
 
 
+def test_a_lowering_waits_while_the_jaws_open_fast(loop):
+    ramp(loop, 4.0)
+    loop.retarget(2.0)
+    for _ in range(10):
+        loop.step(0.005, 2.0, estimate(loop.reference_n), closing_m_s=-0.02)
+    before_n = loop.reference_n
+    for _ in range(10):
+        loop.step(0.005, 2.0, estimate(loop.reference_n), closing_m_s=-0.05)
+    assert 2.0 < loop.reference_n == before_n < 4.0
+
+
 def test_ramp_and_integral_wait_while_the_motor_force_falls_short(loop):
     loop.start(0.5, 4.0)
     for _ in range(20):

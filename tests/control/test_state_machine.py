@@ -349,6 +349,17 @@ def test_vision_stays_in_use_at_any_frame_rate(make_run, rate_hz):
     assert run.plant.force_n == pytest.approx(4.0, abs=0.2)
 
 
+@pytest.mark.parametrize("feedback", ["fused", "current"])
+@pytest.mark.parametrize("stiffness_n_m", [250.0, 350.0])
+def test_a_lowering_does_not_lose_a_very_soft_object(make_run, feedback, stiffness_n_m):
+    run = make_run(plant={"stiffness_n_m": stiffness_n_m}, feedback=feedback).grasp(6.0, 6.0)
+    held = len(run.cell)
+    run.grasp(0.5, 2.0)
+    assert "slip" not in [status.outcome for status in run.statuses]
+    assert min(sample.force_n for sample in run.cell[held:]) > 0.0
+    assert run.plant.force_n < run.plant.friction_n + 0.1  # friction alone holds as much
+
+
 def test_vision_removes_the_rest_of_a_lowering(make_run):
     run = make_run(plant={"stiffness_n_m": 600.0}).grasp(5.0, 5.0).grasp(2.0, 2.0)
     assert run.plant.force_n == pytest.approx(2.0, abs=0.1)
