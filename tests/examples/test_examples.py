@@ -129,3 +129,11 @@ def test_own_camera_satisfies_the_contract(tmp_path: Path) -> None:
     (tmp_path / "test_own.py").write_text(program)
     done = run_beside_examples("-m", "pytest", "-q", "-p", "no:cacheprovider", tmp_path / "test_own.py")
     assert done.returncode == 0, done.stdout
+
+
+def test_lower_force_prints_a_row_per_object_and_feedback() -> None:
+    arguments = ["--feedback", "current", "--object", "tube", "--friction", "1", "--seeds", "1"]
+    shown = run_beside_examples(EXAMPLES / "lower_force.py", *arguments).stdout.splitlines()
+    assert len(shown) == 3
+    assert shown[2].startswith("| current | tube | 1 of 1 |")
+    assert shown[2].endswith("| 0 |")
