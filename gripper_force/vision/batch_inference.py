@@ -1,6 +1,6 @@
 """Inference on whole recordings in batches, on any device. Equals streaming frame by frame."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -9,10 +9,14 @@ from torch import Tensor
 
 from gripper_force.types import Gray
 from gripper_force.vision.checkpoint import Member
+from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import DIFFERENCE_GAIN, FLAT_STD, Preprocess
 
 CHUNK = 256
-"""Frames that pass the backbone together; limits memory."""
+"""Frames of which the windows are read together; limits memory."""
+
+BACKBONE_CHUNK = {"cpu": 32, "cuda": 256}
+"""Frames that pass the backbone together. On a CPU, the maps of a few frames stay in its cache."""
 
 
 def normalise(frames: Tensor, leading: Tensor, preprocess: Preprocess) -> Tensor:
@@ -70,12 +74,44 @@ def features(
     """
     clip = torch.from_numpy(frames)[None].to(device)  # (1, T, S, S)
     leading = clip[:, : preprocess.reference_frames]
-    context = max(network.config.context for network in networks)
+    return _run(networks, len(frames), lambda begin, end: normalise(clip[:, begin:end], leading, preprocess))
+
+
+@torch.inference_mode()
+def prepared_features(
+    networks: Sequence[Member], inputs: npt.NDArray[np.float32]
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """Does the same as `features` for the prepared frames of a stream, (T, S, S), on the CPU."""
+    clip = torch.from_numpy(inputs)[None, :, None]  # (1, T, 1, S, S)
+    return _run(networks, len(inputs), lambda begin, end: clip[:, begin:end])
+
+
+def _run(
+    networks: Sequence[Member], length: int, inputs: Callable[[int, int], Tensor]
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """Runs the networks on the prepared frames that ``inputs(begin, end)`` returns, (1, end - begin, 1, S, S)."""
     forces, all_features = [], []
-    for begin in range(0, clip.shape[1], CHUNK):
+    for network in networks:
+        found = torch.cat(list(_features(network, length, inputs)))  # (T, head)
+        forces.append(network.force_n(found))
+        all_features.append(found)
+    return torch.stack(forces).cpu().numpy(), torch.cat(all_features, dim=1).cpu().numpy()
+
+
+def _features(network: Member, length: int, inputs: Callable[[int, int], Tensor]) -> Iterator[Tensor]:
+    context = network.config.context
+    if not isinstance(network, ForceNetwork):
+        for begin in range(0, length, CHUNK):
+            first = max(0, begin - context)
+            yield network.features(inputs(first, begin + CHUNK), begin - first)[0]
+        return
+    kept = network.config.maps_kept
+    parts = []
+    step = BACKBONE_CHUNK[network.out.weight.device.type]
+    for begin in range(0, length, step):
+        first = max(0, begin - kept)
+        parts.append(network.pooled(inputs(first, begin + step))[:, begin - first :])
+    pooled = torch.cat(parts, dim=1)  # (1, T, C)
+    for begin in range(0, length, CHUNK):
         first = max(0, begin - context)
-        inputs = normalise(clip[:, first : begin + CHUNK], leading, preprocess)
-        part = [network.features(inputs, begin - first)[0] for network in networks]  # (chunk, head) each
-        forces.append(torch.stack([n.force_n(f) for n, f in zip(networks, part, strict=True)]))
-        all_features.append(torch.cat(part, dim=1))
-    return torch.cat(forces, dim=1).cpu().numpy(), torch.cat(all_features).cpu().numpy()
+        yield network.read_windows(pooled[:, first : begin + CHUNK], begin - first)[0]

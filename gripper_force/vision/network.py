@@ -140,6 +140,10 @@ class ForceNetwork(nn.Module):
 
     def features(self, clips: Tensor, start: int = 0) -> Tensor:
         """Returns the inputs of the last layer, (B, T - start, head); arguments are those of `forward`."""
+        return self.read_windows(self.pooled(clips), start)
+
+    def pooled(self, clips: Tensor) -> Tensor:
+        """Returns each frame's map after attention, averaged, (B, T, C); clips are those of `forward`."""
         batch, length = clips.shape[:2]
         flat = self.backbone(clips.flatten(0, 1))  # (B*T, C, H, W)
         maps = flat.view(batch, length, *flat.shape[1:])
@@ -147,7 +151,11 @@ class ForceNetwork(nn.Module):
         if n := self.config.maps_kept:
             padded = torch.cat([maps[:, :1].expand(-1, n, -1, -1, -1), maps], dim=1)  # (B, n + T, C, H, W)
             stack = torch.cat([padded[:, k : k + length] for k in range(n + 1)], dim=2).flatten(0, 1)
-        pooled = self._pool(stack, flat)[0].view(batch, length, -1)
+        return self._pool(stack, flat)[0].view(batch, length, -1)
+
+    def read_windows(self, pooled: Tensor, start: int = 0) -> Tensor:
+        """Returns the inputs of the last layer, (B, T - start, head), for the output of `pooled`, (B, T, C)."""
+        batch, length = pooled.shape[:2]
         window = self.config.window
         padded = torch.cat([pooled[:, :1].expand(-1, window - 1, -1), pooled], dim=1)
         windows = padded.unfold(1, window, 1)[:, start:].transpose(2, 3)  # (B, T - start, window, C)
