@@ -1,6 +1,8 @@
 """Inference on whole recordings in batches, on any device. Equals streaming frame by frame."""
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -8,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gripper_force.types import Gray
-from gripper_force.vision.checkpoint import Member
+from gripper_force.vision.checkpoint import Checkpoint, Member, load_checkpoint
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import DIFFERENCE_GAIN, FLAT_STD, Preprocess
 
@@ -17,6 +19,12 @@ CHUNK = 256
 
 BACKBONE_CHUNK = {"cpu": 32, "cuda": 256}
 """Frames that pass the backbone together. On a CPU, the maps of a few frames stay in its cache."""
+
+
+@lru_cache(maxsize=2)
+def kept_checkpoint(source: str | Path, digest: str) -> Checkpoint:
+    """Loads a checkpoint once for all logs that a process computes; ``digest`` tells a changed file."""
+    return load_checkpoint(source)
 
 
 def normalise(frames: Tensor, leading: Tensor, preprocess: Preprocess) -> Tensor:
