@@ -206,8 +206,8 @@ def replay(
 ) -> None:
     """Run estimator and controller again on logs, and compare the estimates with their load cells.
 
-    Exit code 2 if a log could not be read; the others are replayed. A replay is open loop: it shows what the controller would have commanded with another setting, but not the
-    force that would have followed.
+    A replay is open loop: it shows what the controller would have commanded with another setting, but not the
+    force that would have followed. Exit code 2 if a log could not be read; the others are replayed.
     """
     from functools import partial
 
@@ -267,11 +267,11 @@ def replay(
         console.show(shown, as_json, lambda _: replay_table(results[0], pages[0] if pages else None))
     else:
         summary = job.summary(results)
-        failed = {log: str(error) for log, error in replays.failed.items()}
+        problems = {log: str(error) for log, error in replays.failed.items()}
         printed = {
             "logs": results,
             "summary": summary,
-            **({"failed": failed} if failed else {}),
+            **({"failed": problems} if problems else {}),
             **({"reports": pages} if pages else {}),
         }
         console.show(printed, as_json, lambda _: replays_table(results, summary, pages))

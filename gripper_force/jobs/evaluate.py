@@ -180,14 +180,12 @@ def evaluate(
         without_contact_starts([one.clip for one in chosen.values()], model.header.preprocess)  # raises
     clips = [one.clip for one in used.values()]
     forces_n = [one.forces_n for one in used.values() if one.forces_n is not None]
+    each = list(zip(used, clips, forces_n, strict=True))
     lead_in = model.header.preprocess.lead_in
     result = replace(
         compare(clips, forces_n, lead_in),
         left_out=len(chosen) - len(clips),
-        per_log={
-            str(path): _log_errors(*one, lead_in)
-            for path, one in zip(used, zip(clips, forces_n), strict=True)
-        },
+        per_log={str(path): _log_errors(clip, force_n, lead_in) for path, clip, force_n in each},
         failed={str(paths[index]): str(failed[index]) for index in sorted(failed)},
     )
     if plot is not None:
@@ -196,7 +194,7 @@ def evaluate(
         title = f"{checkpoint}: MAE {result.mae_n:.3f} N on {len(clips)} logs"
         draw_estimates(*_labelled(clips, forces_n, lead_in), title, plot)
     if out is not None:
-        columns = [_columns(path, *one) for path, one in zip(used, zip(clips, forces_n), strict=True)]
+        columns = [_columns(*one) for one in each]
         write_summary(out, f"Evaluation of {checkpoint}", evaluation_tables(result), columns)
     return result
 
@@ -384,7 +382,7 @@ def _object_errors(
 def _log_errors(clip: Clip, forces_n: npt.NDArray[np.floating], lead_in: int) -> ObjectErrors:
     valid = clip.valid & (np.arange(len(forces_n)) >= lead_in)
     if not valid.any():
-        return ObjectErrors(*[math.nan] * 4, 0)
+        return ObjectErrors(math.nan, math.nan, math.nan, math.nan, 0)
     measured_n = clip.forces_n[valid]
     return _object_errors(forces_n[valid], measured_n, stiffness_floor_n(measured_n, clip.stiffness))
 

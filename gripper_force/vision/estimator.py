@@ -138,8 +138,7 @@ class ForceEstimator:
 
     def prepare(self, gray: Gray) -> list[Floats]:
         """Checks the next frame, and returns the network's inputs that are ready: the first half of `update`."""
-        small = downscale(gray, self._region, self._preprocess.size)
-        self._frame_checks.check(small)
+        self._frame_checks.check(small := downscale(gray, self._region, self._preprocess.size))
         return self._normaliser.push(small)
 
     def finish(self, step: Step) -> ForceEstimate:

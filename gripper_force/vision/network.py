@@ -120,11 +120,6 @@ class ForceNetwork(nn.Module):
         moved: Self = self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         return moved
 
-    def to_channels_first(self) -> Self:
-        """Puts the channels first in memory, PyTorch's default, for comparison."""
-        moved: Self = self.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
-        return moved
-
     def forward(self, clips: Tensor, start: int = 0) -> Tensor:
         """Estimates the force for the frames of clips, with one pass of the backbone for all windows.
 

@@ -165,7 +165,8 @@ def test_decisions_on_an_estimator_that_was_made_to_fail_are_still_compared(
 
 def test_several_logs_give_the_errors_over_all(fused_log: Path, tmp_path: Path) -> None:
     half = tampered(fused_log, tmp_path / "half.mcap", lambda r: r if r.t_ns < 1_500_000_000 else None)
-    results = replay_each([fused_log, half], workers=2)
+    results, columns, failed = replay_each([fused_log, half], workers=2)
+    assert not failed
     assert [result.log for result in results] == [str(fused_log), str(half)]
     assert results[0] == replay(fused_log)
     found = summary(results)
