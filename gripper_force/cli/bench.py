@@ -294,9 +294,11 @@ def replay(
             with console.bar("simulating", presses) as progress:
                 for made in simulate(plan("press", presses, 900_000), logs, load_config(None, None), jobs):
                     progress(made.name)
-        paths = find_logs(logs)
-        rows = replay_bench.bench(paths, checkpoints or ["default", "small"], jobs, rounds, console.line)
-    about = f"{len(paths)} logs, median of {rounds} rounds, {CORES} cores, load {load:.1f} before the first command."
+        count = len(find_logs(logs))
+        rows = replay_bench.bench(logs, checkpoints or ["default", "small"], jobs, rounds, console.line)
+    about = (
+        f"{count} logs, median of {rounds} rounds, {CORES} cores, load {load:.1f} before the first command."
+    )
     text = replay_bench.markdown(rows, about)
     if write is not None:
         write_between(write, "rates", text)

@@ -12,6 +12,7 @@ from statistics import median
 from typing import Any, Final
 
 from gripper_force.errors import GripperError
+from gripper_force.jobs.dataset import find_logs
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import NS_PER_S
 
@@ -36,7 +37,7 @@ class ReplayRate:
 
 
 def bench(
-    logs: Sequence[Path],
+    folder: Path,
     checkpoints: Sequence[str],
     processes: int,
     rounds: int,
@@ -45,7 +46,7 @@ def bench(
     """Measures rates, each way once in each round, and checks that all ways give the same results.
 
     Args:
-        logs: The logs.
+        folder: Folder with the logs.
         checkpoints: Networks, by name or path.
         processes: Processes of the second way, and workers of the third one.
         rounds: Rounds; within one, the ways follow one another.
@@ -54,7 +55,7 @@ def bench(
     Raises:
         GripperError: A command failed, or two ways gave different results.
     """
-    seconds = sum(LogReader(path).duration_ns for path in logs) / NS_PER_S
+    seconds = sum(LogReader(path).duration_ns for path in find_logs(folder)) / NS_PER_S
     rows: dict[tuple[str, str, str], list[float]] = {}
     expected: dict[tuple[str, str], Any] = {}
     with _ray_cluster(processes) as address:
@@ -67,7 +68,7 @@ def bench(
                     for where, options in ways.items():
                         call = [
                             command,
-                            *_sources(command, logs),
+                            str(folder),
                             "--checkpoint",
                             checkpoint,
                             *options,
@@ -92,10 +93,6 @@ def markdown(rows: Sequence[ReplayRate], about: str) -> str:
             f"| `{row.command}` | {row.checkpoint} | {row.where} | {median(row.rates):.1f}{spread} |"
         )
     return "\n".join([*lines, "", about, ""])
-
-
-def _sources(command: str, logs: Sequence[Path]) -> list[str]:
-    return [str(logs[0].parent)] if command == "evaluate" else [str(path) for path in logs]
 
 
 def _run(arguments: Sequence[str]) -> Any:
