@@ -4,8 +4,12 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 EGL_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri
+PIP := $(BIN)/pip install --quiet --disable-pip-version-check
+# PyPI's PyTorch for Linux brings 2 GB of CUDA libraries. Where this index can't be reached, pip's own has to do.
+CPU_INDEX := https://download.pytorch.org/whl/cpu
+TORCH := $(shell grep -om1 'torch>=[^"]*' pyproject.toml)
 
-.PHONY: grasp test test-lerobot docs setup setup-dev format clean
+.PHONY: grasp test test-lerobot docs wheel setup setup-dev format clean
 
 grasp: setup
 	$(BIN)/gripper-force grasp $(ARGS)
@@ -27,14 +31,19 @@ LEROBOT ?= 0.4.4
 LEROBOT_VENV := .venv-lerobot-$(LEROBOT)
 test-lerobot:
 	test -x $(LEROBOT_VENV)/bin/pip || $(PYTHON) -m venv $(LEROBOT_VENV)
-	$(LEROBOT_VENV)/bin/pip install --quiet --disable-pip-version-check --editable '.[dev,lerobot]' \
+	$(LEROBOT_VENV)/bin/pip install --quiet --disable-pip-version-check \
+		--editable '.[dev,lerobot,oak,report,sim,train]' \
 		--editable integrations/lerobot_robot_gripper_force --editable integrations/lerobot_camera_oak \
 		lerobot==$(LEROBOT)
 	$(LEROBOT_VENV)/bin/pytest -m lerobot $(ARGS)
 
 docs: setup-dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
-	@echo open build/site/library.html
+	@echo open build/site/index.html
+
+# sdist and wheel in dist/, with the networks that a robot without PyTorch runs
+wheel: setup-dev
+	$(BIN)/python scripts/build-wheel
 
 format: setup-dev
 	$(BIN)/ruff check --fix .
@@ -46,11 +55,12 @@ setup-dev: $(VENV)/installed-dev
 $(VENV)/installed: pyproject.toml scripts/system-packages
 	PYTHON=$(PYTHON) scripts/system-packages $(EGL_PACKAGES)
 	test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check --editable .
+	test "$$(uname)" != Linux || $(PIP) --retries 0 --timeout 10 --index-url $(CPU_INDEX) --no-deps '$(TORCH)' 2>/dev/null || true
+	$(PIP) --editable '.[report,sim,train]'
 	touch $@
 
 $(VENV)/installed-dev: $(VENV)/installed
-	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev,engines]'
+	$(PIP) --editable '.[dev,engines,oak,report,sim,train]'
 	touch $@
 
 clean:

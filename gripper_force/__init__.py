@@ -126,7 +126,13 @@ def __getattr__(name: str) -> object:
     """Imports a public name when it is first used (PEP 562)."""
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value: object = getattr(_import_module(_MODULE_OF[name]), name)
+    try:
+        value: object = getattr(_import_module(_MODULE_OF[name]), name)
+    except ModuleNotFoundError:
+        from gripper_force.plugins import importing
+
+        with importing(f"gripper_force.{name}"):
+            raise
     globals()[name] = value
     return value
 

@@ -59,7 +59,7 @@ class ServoConfig(Section):
     options: Tree = Field({}, description="keys of a third-party servo backend")
     model: str = Field(
         "XM430-W350",
-        description="model, e.g. XM430-W350 or XC330-T288-T, or the path of a YAML file (docs/servos.md)",
+        description="model, e.g. XM430-W350 or XC330-T288-T, or the path of a YAML file (page Servos)",
     )
     port: str = Field(
         "virtual:rig", description="device path, or virtual:NAME for a simulated bus in this process"
@@ -128,7 +128,7 @@ class LinkageConfig(Section):
 class GripperConfig(Section):
     """Transmission from the servo to the jaws."""
 
-    linkage: LinkageConfig = Field(LinkageConfig(), description="geometry; see docs/grippers.md")
+    linkage: LinkageConfig = Field(LinkageConfig(), description="geometry (page Grippers)")
     pinion_radius_m: Positive = Field(0.020, description="rack: travel of one jaw per radian of the servo")
     closing_sign: Literal[-1, 1] = Field(1, description="-1 if a falling servo position closes the jaws")
     open_position_rad: Finite = Field(0.0, description="servo angle with open jaws")
@@ -222,8 +222,10 @@ class CameraConfig(Section):
         description="colour temperature of the white balance of a colour camera, which is not automatic; oak: "
         "None: 5000; uvc: None: unchanged",
     )
-    timeout_ms: Positive = Field(
-        250.0, description="oak, uvc: age of the newest frame after which the camera counts as lost"
+    timeout_ms: Positive | None = Field(
+        None,
+        description="oak, uvc: age of the newest frame after which the camera counts as lost; None: 250, or four frame "
+        "periods if they are longer",
     )
 
     @model_validator(mode="after")
@@ -578,8 +580,8 @@ class Config(Section):
 
     object: str = Field(
         "sponge",
-        description="name of the grasped object; simulated: sponge, paper_cup, tube, stapler, ball, block, a kind of "
-        "docs/simulation.md, or the path of a file of your own (.yaml or .xml)",
+        description="name of the grasped object; simulated: sponge, paper_cup, tube, stapler, ball, block, a kind "
+        "(page Simulation), or the path of a file of your own (.yaml or .xml)",
     )
     target_n: Positive = Field(4.0, description="target force")
     seed: int = Field(0, ge=0, description="seed for all random draws")

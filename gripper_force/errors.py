@@ -58,6 +58,18 @@ class DataError(GripperError):
     """A recording or data set is incomplete or unusable."""
 
 
+class UnfamiliarFrameError(DataError):
+    """A frame shows what a network does not know.
+
+    Attributes:
+        force_n: The network's output for this frame: not the contact force, but it rises when a grip gets firmer.
+    """
+
+    def __init__(self, message: str, force_n: float) -> None:
+        super().__init__(message)
+        self.force_n = force_n
+
+
 class CheckpointError(GripperError):
     """A checkpoint is missing, damaged, or belongs to another network."""
 

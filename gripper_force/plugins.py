@@ -1,9 +1,11 @@
 """Lookup of classes by name: built-in ones, registered entry points, and ``package.module:Class``."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
 from operator import attrgetter
 from typing import Any, Final
 
@@ -12,10 +14,43 @@ from gripper_force.errors import ConfigError
 _METHODS: Final = {"servos": "spec", "cameras": "newest", "load_cells": "drain", "engines": "step"}
 """A method of each interface, which tells its classes from others before one is called."""
 
+EXTRAS: Final = {
+    "torch": "train",
+    "mujoco": "sim",
+    "depthai": "oak",
+    "scipy": "calibrate",
+    "matplotlib": "report",
+    **dict.fromkeys(("openvino", "nncf", "onnx", "onnxscript"), "engines"),
+    **dict.fromkeys(("rerun", "foxglove"), "view"),
+    "lerobot": "lerobot",
+    "pyarrow": "parquet",
+    "Phidget22": "phidget",
+    "ray": "ray",
+}
+"""Extra of gripper-force that installs each optional module."""
 
-def load_class(
-    group: str, builtin: Mapping[str, str], name: str, key: str, *, extra: str | None = None
-) -> Any:
+
+@contextmanager
+def importing(purpose: str, alternative: str = "") -> Iterator[None]:
+    """Raises `ConfigError` if a package that the block imports is not installed: what needs it, and its extra."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        extra = EXTRAS.get((error.name or "").partition(".")[0])
+        remedy = f"pip install 'gripper-force[{extra}]'" if extra else "install it"
+        raise ConfigError(
+            f"{purpose} needs {error.name}, which is not installed; {remedy}{alternative}"
+        ) from error
+
+
+def require(module: str, purpose: str, alternative: str = "") -> None:
+    """Raises `ConfigError` if a module is not installed, without importing it; see `importing`."""
+    with importing(purpose, alternative):
+        if find_spec(module) is None:
+            raise ModuleNotFoundError(name=module)
+
+
+def load_class(group: str, builtin: Mapping[str, str], name: str, key: str, alternative: str = "") -> Any:
     """Imports the class that a configuration key names.
 
     Args:
@@ -24,7 +59,7 @@ def load_class(
         builtin: Built-in names, and the ``module:Class`` of each. They come before registered ones.
         name: A built-in name, a registered name, or ``package.module:Class``.
         key: The configuration key that holds ``name``, for error messages.
-        extra: Extra of gripper-force that installs the packages of the built-in classes.
+        alternative: Another remedy if a package is not installed; see `importing`.
 
     Raises:
         ConfigError: The name is unknown, its module or a package that it needs is not installed, or what it
@@ -33,10 +68,8 @@ def load_class(
     target = _target(group, builtin, name, key)
     module_name, _, attribute = target.partition(":")
     try:
-        module = import_module(module_name)
-    except ModuleNotFoundError as error:
-        install = f"pip install 'gripper-force[{extra}]'" if extra and name in builtin else "install it"
-        raise ConfigError(f"{key}={name} needs {error.name}, which is not installed; {install}") from error
+        with importing(f"{key}={name}", alternative):
+            module = import_module(module_name)
     except (ImportError, ValueError, TypeError) as error:  # the last two: an empty or relative name
         raise ConfigError(
             f"{key}={name}: can't import {module_name!r}: {error}; name it as package.module:Class"
@@ -52,7 +85,7 @@ def load_class(
     if isinstance(found, type) and group in _METHODS and not hasattr(found, _METHODS[group]):
         raise ConfigError(
             f"{key}={name}: {target} has no method {_METHODS[group]!r}; name a class with the methods of the "
-            "interface (docs/api.md)"
+            "interface in gripper_force.interfaces"
         )
     return found
 

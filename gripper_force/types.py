@@ -174,7 +174,7 @@ class VisualForce:
         ready_ns: Host time at which the estimate became available.
         seq: Number of the frame.
         force_n: Estimated contact force.
-        std_n: Standard deviation claimed by the estimator.
+        std_n: Standard deviation claimed by the estimator; infinite if the frame shows what it does not know.
         compute_ms: Computing time of the estimator.
     """
 
@@ -184,6 +184,11 @@ class VisualForce:
     force_n: float
     std_n: float
     compute_ms: float
+
+    @property
+    def is_familiar(self) -> bool:
+        """False if the frame shows what the estimator does not know: the force is not that of the contact."""
+        return self.std_n != float("inf")
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,13 +5,13 @@ import pytest
 
 from gripper_force import plugins
 from gripper_force.errors import ConfigError
-from gripper_force.plugins import load_class
+from gripper_force.plugins import EXTRAS, load_class
 
 BUILTIN = {"fraction": "fractions:Fraction", "decimal": "decimal:Decimal"}
 
 
-def load(name: str, extra: str | None = None) -> object:
-    return load_class("shapes", BUILTIN, name, "shape.kind", extra=extra)
+def load(name: str, alternative: str = "") -> object:
+    return load_class("shapes", BUILTIN, name, "shape.kind", alternative)
 
 
 @pytest.fixture(autouse=True)
@@ -71,9 +71,11 @@ def test_errors_name_key_and_problem(name: str, message: str) -> None:
         load(name)
 
 
-def test_builtin_class_without_its_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("name", ["gone", "no_such_package:Shape"])
+def test_a_missing_package_names_its_extra(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setitem(BUILTIN, "gone", "no_such_package:Shape")
-    with pytest.raises(ConfigError, match=r"pip install 'gripper-force\[shapes\]'"):
-        load("gone", extra="shapes")
-    with pytest.raises(ConfigError, match="install it"):
-        load("no_such_package:Shape", extra="shapes")
+    with pytest.raises(ConfigError, match=r"needs no_such_package, which is not installed; install it$"):
+        load(name)
+    monkeypatch.setitem(EXTRAS, "no_such_package", "shapes")
+    with pytest.raises(ConfigError, match=r"; pip install 'gripper-force\[shapes\]', or draw it$"):
+        load(name, ", or draw it")

@@ -31,6 +31,7 @@ from gripper_force.cli import (
     viewing,
 )
 from gripper_force.errors import GripperError
+from gripper_force.plugins import importing
 
 app = typer.Typer(
     help="Gripper force control from camera images: run, calibrate, replay.",
@@ -72,7 +73,8 @@ def main() -> NoReturn:
         if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup sets it
             signal.signal(number, process.raise_interrupt)
     try:
-        app(prog_name="gripper-force")
+        with importing("this command"):
+            app(prog_name="gripper-force")
     except GripperError as error:
         console.err.print(f"[bold red]error:[/] {console.plain(error)}", soft_wrap=True)
         if "--json" in sys.argv:

@@ -1,6 +1,5 @@
 """The commands that calibrate a rig and objects."""
 
-import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -14,11 +13,13 @@ from gripper_force.cli.options import (
     ConfigPath,
     Jobs,
     Overrides,
+    again,
     load_settings,
     load_settings_before_rig,
 )
 from gripper_force.cli.output.calibrate import jaws_table, object_table, rig_table, taught_table
 from gripper_force.errors import ConfigError
+from gripper_force.plugins import require
 
 if TYPE_CHECKING:
     from rich.status import Status
@@ -42,6 +43,14 @@ RigPath = Annotated[
         "rig.yaml.",
     ),
 ]
+Fresh = Annotated[
+    bool,
+    typer.Option("--fresh", help="Move existing touches to a folder beside, and record all of them again."),
+]
+Pause = Annotated[
+    bool, typer.Option("--pause", help="Wait for Enter before each touch, to place the object again.")
+]
+TouchSeed = Annotated[int | None, typer.Option(help="Seed of the touches, and of a simulated scene.")]
 
 
 @app.command("load-cell")
@@ -138,7 +147,7 @@ def camera(
     ] = None,
     touches: Annotated[int, typer.Option(min=3, help="Number of touches.")] = 10,
     object_: Annotated[str | None, typer.Option("--object", help="Object between the jaws.")] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of the touches, and of a simulated scene.")] = None,
+    seed: TouchSeed = None,
     config: ConfigPath = None,
     set_: Overrides = None,
     as_json: AsJson = False,
@@ -178,21 +187,15 @@ def object_(
     out: Annotated[
         Path | None, typer.Option(help="Profile to write. Default: NAME.yaml in your folder of profiles.")
     ] = None,
-    fresh: Annotated[
-        bool,
-        typer.Option(
-            "--fresh", help="Move existing touches to a folder beside, and record all of them again."
-        ),
-    ] = False,
-    pause: Annotated[
-        bool, typer.Option("--pause", help="Wait for Enter before each touch, to place the object again.")
-    ] = False,
+    fresh: Fresh = False,
+    pause: Pause = False,
     config: ConfigPath = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of the touches, and of a simulated scene.")] = None,
+    seed: TouchSeed = None,
     set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
     """Calibrate an object by touching it with the load cell in place. Ctrl-C uses the touches so far."""
+    require("torch", "calibrate object")
     from gripper_calibration.fits.interval_fit import MIN_TOUCHES
     from gripper_calibration.procedures import calibrate_object as job
     from gripper_force.profiles.object_profile import find_object
@@ -233,6 +236,7 @@ def network(
     as_json: AsJson = False,
 ) -> None:
     """Fit a network's out-of-distribution score and claimed errors to logs of what it knows."""
+    require("torch", "calibrate network")
     from gripper_force.jobs.dataset import find_logs
     from gripper_force.jobs.training.ood_fit import calibrate_network
 
@@ -292,24 +296,18 @@ def teach(
     out: Annotated[
         Path | None, typer.Option(help="Folder of the bundle. Default: NAME in your folder of profiles.")
     ] = None,
-    fresh: Annotated[
-        bool,
-        typer.Option(
-            "--fresh", help="Move existing touches to a folder beside, and record all of them again."
-        ),
-    ] = False,
-    pause: Annotated[
-        bool, typer.Option("--pause", help="Wait for Enter before each touch, to place the object again.")
-    ] = False,
+    fresh: Fresh = False,
+    pause: Pause = False,
     jobs: Jobs = CORES,
     config: ConfigPath = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of the touches, and of a simulated scene.")] = None,
+    seed: TouchSeed = None,
     set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
     """Teach an object: touch it, train and calibrate the best estimator for it, and make `grasp` use it."""
     import time
 
+    require("torch", "teach")
     from gripper_calibration.procedures import calibrate_object
     from gripper_calibration.procedures import teach as job
     from gripper_force.profiles.object_profile import user_folder
@@ -325,13 +323,14 @@ def teach(
         if logs is None:
             _tell_existing(settings, touches, folder, fresh)
             logs = []
-            with console.err.status("touching") as status:
-                prompt = console.prompt(False, status) if pause else None
-                logs += calibrate_object.record_touches(
-                    settings, touches, peak_n, folder, prompt=prompt, progress=_progress(status)
-                )
-        bar = console.bar if console.err.is_terminal else console.lines
-        with bar("teaching", job.STEPS) as progress:
+            with console.bar("touching", touches) as touching:
+                prompt = console.prompt(False, touching) if pause else None
+                for path in calibrate_object.record_touches(
+                    settings, touches, peak_n, folder, prompt=prompt, progress=touching
+                ):
+                    logs.append(path)
+                    touching(path.name)
+        with console.bar_or_lines("teaching", job.STEPS) as progress:
             result = job.teach(
                 settings,
                 name,
@@ -353,16 +352,14 @@ def teach(
             soft_wrap=True,
         )
     target_n = min(4.0, round(result.profile.force_n / 2, 1))
-    words = ["gripper-force", "grasp", "--object", given, "--target-n", f"{target_n:g}"]
+    words = ["grasp", "--object", given, "--target-n", f"{target_n:g}"]
     words += [] if out is None else ["--profile", str(out.absolute())]
-    words += [] if config is None else ["--config", str(config)]
     words += [] if seed is None else ["--seed", str(seed)]
     # With another network than the default one a grasp would not use the bundle's.
     others = [one for one in set_ or [] if not one.startswith("vision.checkpoint=")]
     if config is not None and load_settings(config, others, {}).vision.checkpoint != "default":
         others.append("vision.checkpoint=default")
-    words += [word for one in others for word in ("--set", one)]
-    console.err.print(f"next: {shlex.join(words)}", soft_wrap=True, markup=False)
+    console.next_step(*words, *again(config, others))
 
 
 def _tell_existing(settings: "Config", touches: int, folder: Path, fresh: bool) -> None:
@@ -386,13 +383,14 @@ def _touches(settings: "Config", touches: int, peak_n: float | None, folder: Pat
     from gripper_calibration.procedures import calibrate_object as job
 
     paths: list[Path] = []
-    with console.err.status("touching") as status:
-        prompt = console.prompt(False, status) if pause else None
+    with console.bar("touching", touches) as progress:
+        prompt = console.prompt(False, progress) if pause else None
         try:
             for path in job.record_touches(
-                settings, touches, peak_n, folder, prompt=prompt, progress=_progress(status)
+                settings, touches, peak_n, folder, prompt=prompt, progress=progress
             ):
                 paths.append(path)
+                progress(path.name)
         except KeyboardInterrupt:
             if not paths:
                 raise

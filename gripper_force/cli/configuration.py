@@ -1,11 +1,14 @@
-"""Commands for configuration files: show, check, schema."""
+"""Commands for configuration files: show, check, schema, file."""
 
 import sys
+from pathlib import Path
+from typing import Annotated
 
 import typer
 
 from gripper_force.cli import console
-from gripper_force.cli.options import AsJson, ConfigPath, Overrides, load_settings
+from gripper_force.cli.options import AsJson, ConfigPath, NoOverrides, Overrides, load_settings
+from gripper_force.errors import ConfigError
 
 app = typer.Typer(help="Show, check or describe the configuration.", no_args_is_help=True)
 
@@ -44,3 +47,34 @@ def schema(set_: Overrides = None, as_json: AsJson = False) -> None:
     load_settings(None, set_, {})
     tree = Config.model_json_schema()
     console.show(tree, as_json, lambda _: sys.stdout.write(json.dumps(tree, indent=2) + "\n"))
+
+
+@app.command()
+def file(
+    name: Annotated[str | None, typer.Argument(help="Name of a file.  [default: list all]")] = None,
+    set_: NoOverrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Print a file that comes with the package: an example, the udev rules, or the layout for Foxglove."""
+    if set_:
+        raise ConfigError(f"config file uses no configuration; leave out --set {set_[0]}")
+    files = shipped_files()
+    if name is None:
+        console.show({key: str(path) for key, path in files.items()}, as_json)
+    elif name not in files:
+        raise ConfigError(f"no file {name!r} comes with gripper-force; use one of: {', '.join(files)}")
+    elif as_json:
+        console.show({"path": str(files[name])}, as_json)
+    else:
+        sys.stdout.buffer.write(files[name].read_bytes())
+
+
+def shipped_files() -> dict[str, Path]:
+    """Returns the files by name. A wheel has them in the package, a clone beside it."""
+    from gripper_force.jobs.view import FOXGLOVE_LAYOUT
+    from gripper_hw import UDEV_RULES
+
+    package = Path(__file__).parents[1]
+    examples = next(folder for base in (package, package.parent) if (folder := base / "examples").is_dir())
+    found = [path for path in sorted(examples.rglob("*")) if path.suffix in (".yaml", ".xml", ".stl")]
+    return {path.name: path for path in (*found, UDEV_RULES, FOXGLOVE_LAYOUT)}

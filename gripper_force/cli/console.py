@@ -2,22 +2,25 @@
 
 import json
 import math
+import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as ProgressBar
 from rich.table import Column, Table
 
 from gripper_force.errors import ConfigError, GripperError
 
 if TYPE_CHECKING:  # --help loads no NumPy
+    from contextlib import AbstractContextManager
+
     from rich.status import Status
 
     from gripper_force.interfaces import Progress, Prompt
@@ -25,16 +28,37 @@ if TYPE_CHECKING:  # --help loads no NumPy
 err = Console(stderr=True, highlight=False)
 out = Console(highlight=False)
 
+_SPEED_S: Final = 3600.0
+"""Time over which the speed of a job is averaged: a step of a training or of a matrix may take minutes."""
+
 T = TypeVar("T")
 
 
+class Bar:
+    """A running progress bar: a `Progress` callback that can be taken off the screen while a person is asked."""
+
+    def __init__(self, shown: ProgressBar, task: TaskID) -> None:
+        self._shown, self._task = shown, task
+        self.stop, self.start = shown.stop, shown.start
+
+    def __call__(self, text: str, steps: int = 1) -> None:
+        """Reports progress, see `Progress`."""
+        self._shown.update(self._task, advance=steps, note=text)
+
+
 @contextmanager
-def bar(label: str, total: int, *, hidden: bool = False) -> "Iterator[Progress]":
-    """Shows a progress bar on stderr, unless it is hidden, and gives its `Progress` callback."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with ProgressBar(*columns, TextColumn("{task.fields[note]}"), console=err, disable=hidden) as shown:
-        task = shown.add_task(label, total=total, note="")
-        yield lambda text, steps=1: shown.update(task, advance=steps, note=text)
+def bar(label: str, total: int, *, hidden: bool = False) -> "Iterator[Bar]":
+    """Shows a progress bar with the remaining time on stderr, unless it is hidden, and gives its callback."""
+    left = TimeRemainingColumn(elapsed_when_finished=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), left)
+    note = TextColumn("{task.fields[note]}")
+    with ProgressBar(*columns, note, console=err, disable=hidden, speed_estimate_period=_SPEED_S) as shown:
+        yield Bar(shown, shown.add_task(label, total=total, note=""))
+
+
+def bar_or_lines(label: str, total: int) -> "AbstractContextManager[Progress]":
+    """Returns `bar` on a terminal, and otherwise `lines`: for jobs so long that a log file should follow them."""
+    return bar(label, total) if err.is_terminal else lines(label, total)
 
 
 @contextmanager
@@ -60,7 +84,12 @@ def warn(text: str) -> None:
     err.print(f"[yellow]warning:[/] {escape(text)}", soft_wrap=True)
 
 
-def prompt(yes: bool, status: "Status | None" = None) -> "Prompt":
+def next_step(*words: object) -> None:
+    """Prints the step that usually follows, as the last line: a command of gripper-force by its words."""
+    err.print(f"next: {shlex.join(map(str, ('gripper-force', *words)))}", soft_wrap=True, markup=False)
+
+
+def prompt(yes: bool, status: "Status | Bar | None" = None) -> "Prompt":
     """Returns a prompt that waits for Enter, or with ``yes`` only prints. Meanwhile ``status`` is hidden."""
 
     def ask(text: str) -> None:

@@ -2,7 +2,7 @@
 
 from contextlib import closing
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
 
@@ -12,6 +12,9 @@ from gripper_force.cli.output.data import database_table, imports_table, sets_ta
 from gripper_force.errors import ConfigError, DataError
 
 import_app = typer.Typer(no_args_is_help=True, help="Convert other recordings to logs.")
+
+_MANY_SETS: Final = 100
+"""Number of recordings above which a network learns more than a Gaussian process (docs/training.md)."""
 
 
 def simulate(
@@ -109,6 +112,10 @@ def simulate(
                 made += 1
                 progress(path.name)
     console.show({"logs": len(names), "made": made, "folder": str(folder)}, as_json)
+    if protocol is None:
+        console.next_step("train", folder, "--out", "force.safetensors")
+    else:
+        console.next_step("reproduce", "3", "--data", folder)
 
 
 def record(
@@ -155,6 +162,8 @@ def record(
         for path in job.record(settings, plan, folder, progress):
             progress(path.name)
     console.show(summarise(paths), as_json, sets_table)
+    few = () if sets > _MANY_SETS else ("--recipe", "few")
+    console.next_step("train", folder / "train", *few, "--out", "force.safetensors")
 
 
 @import_app.command("video")
@@ -183,6 +192,7 @@ def import_video(
         log = folder / f"{video.stem}.mcap"
         summaries = [job.import_video(video, forces, log, object_name=object_, region=region, align=align)]
     console.show({"logs": summaries}, as_json, lambda _: imports_table(summaries))
+    console.next_step("evaluate", folder)
 
 
 @import_app.command("database")
@@ -216,3 +226,4 @@ def import_database(
             progress(path.name)
     result = {"environments": rows, "ignored": ignored}
     console.show(result, as_json, lambda _: database_table(rows, ignored))
+    console.next_step("evaluate", folder)

@@ -3,7 +3,6 @@
 import json
 import math
 import os
-import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -14,6 +13,7 @@ from gripper_force.cli.options import CORES, AsJson, Jobs, Overrides, Ray, Summa
 from gripper_force.cli.output.paper import paper_tables
 from gripper_force.cli.output.runs import errors_table
 from gripper_force.errors import ConfigError
+from gripper_force.plugins import require
 
 ContactStarts = Annotated[
     bool,
@@ -66,6 +66,7 @@ def train(
     as_json: AsJson = False,
 ) -> None:
     """Train the force network on logs; under `torchrun`, in several processes."""
+    require("torch", "train")
     from gripper_force.jobs.dataset import find_logs, load_clips, without_contact_starts
     from gripper_force.jobs.training.recipe import continued
     from gripper_force.jobs.training.recipe import recipe as named
@@ -130,12 +131,7 @@ def train(
     console.show(
         {**found, "left_out": left_out, "warnings": warnings}, as_json, lambda _: console.pairs(found)
     )
-    console.err.print(
-        f"next: gripper-force evaluate FOLDER --checkpoint {shlex.quote(str(checkpoint))}, with logs that were "
-        "not used for training",
-        soft_wrap=True,
-        markup=False,
-    )
+    console.next_step("evaluate", "FOLDER", "--checkpoint", checkpoint)
 
 
 def _warn_left_out(left_out: int, logs: int) -> None:
@@ -201,6 +197,8 @@ def evaluate(
         console.err.print(f"figure: {plot}", soft_wrap=True, markup=False)
     if out is not None:
         console.err.print(f"summary: {out / 'summary.html'}", soft_wrap=True, markup=False)
+    if checkpoint is not None:
+        console.next_step("grasp", "--set", f"vision.checkpoint={checkpoint}")
     console.end_with_failures(result.failed, len(logs))
 
 
@@ -224,6 +222,7 @@ def export_network(
     from gripper_force.jobs.dataset import find_logs, load_clips
     from gripper_force.jobs.int8_export import export_int8
     from gripper_force.vision.export import export as job
+    from gripper_force.vision.header import EXPORTED
     from gripper_force.vision.model_files import read_model
 
     model = read_model(load_settings(None, set_, {"vision.checkpoint": checkpoint}).vision.checkpoint)
@@ -236,6 +235,8 @@ def export_network(
     with console.err.status("exporting"):
         errors = job(model, out) if frames is None else export_int8(model, out, frames)
     console.show({"file": str(out), "digest": model.digest, "off_torch_n": errors}, as_json)
+    engine = EXPORTED[out.suffix]
+    console.next_step("grasp", "--set", f"vision.checkpoint={out}", "--set", f"vision.engine={engine}")
 
 
 def reproduce(
@@ -282,6 +283,7 @@ def reproduce(
     """Reproduce the paper's tables and figures, with its numbers. Continues an interrupted run."""
     import time
 
+    require("torch", "reproduce")
     from gripper_force.qualification.markdown_blocks import write_between
     from gripper_force.qualification.paper import paper_page as page
     from gripper_force.qualification.paper.models import SCALES, Scale
@@ -296,8 +298,7 @@ def reproduce(
     options += set_ or []
     lengths = [f"steps={text}" for text in steps.split(",")] if steps else []
     scales = [section_from(Scale, [*options, length]) for length in lengths] or [section_from(Scale, options)]
-    bar = console.bar if console.err.is_terminal else console.lines
-    result = page.reproduce(names, scales, data, folder, jobs, bar, end_s)
+    result = page.reproduce(names, scales, data, folder, jobs, console.bar_or_lines, end_s)
     pictures = write.with_suffix("") if write else folder
     pictures.mkdir(parents=True, exist_ok=True)
     figures = {}

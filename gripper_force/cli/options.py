@@ -35,6 +35,14 @@ SummaryFolder = Annotated[
 Page = Annotated[Path | None, typer.Option("--write", help="Markdown page to write the table into.")]
 
 
+def again(config: Path | None, overrides: list[str] | None) -> list[str]:
+    """Returns the options with which the next command has the same configuration."""
+    return [
+        *(() if config is None else ("--config", str(config))),
+        *(w for o in overrides or () for w in ("--set", o)),
+    ]
+
+
 def load_settings(path: Path | None, overrides: list[str] | None, options: Mapping[str, object]) -> "Config":
     """Loads the configuration of a command; its own options override ``--set``.
 

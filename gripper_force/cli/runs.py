@@ -17,6 +17,7 @@ from gripper_force.cli.options import (
     Overrides,
     Ray,
     SummaryFolder,
+    again,
     load_settings,
     load_settings_before_rig,
 )
@@ -29,6 +30,7 @@ from gripper_force.cli.output.runs import (
     trials_table,
 )
 from gripper_force.errors import ConfigError, GripperError
+from gripper_force.plugins import require
 
 if TYPE_CHECKING:
     from gripper_force.config import Config
@@ -127,6 +129,10 @@ def grasp(
                 )
             raise
         console.show(result, as_json, grasp_table)
+        if result["report"] is None:
+            console.next_step("replay", log, "--report")
+        else:
+            console.err.print(f"next: open {result['report']}", soft_wrap=True, markup=False)
         if result["result"] != "held":
             raise typer.Exit(1)
         return
@@ -168,6 +174,8 @@ def grasp(
         console.show(printed, as_json, lambda _: trials_table(results, summary, figure))
     if failure is not None:
         raise failure
+    worst = max(results, key=lambda one: abs(one["steady_error_n"] or 0.0))
+    console.next_step("replay", worst["log"], "--report")
 
 
 def _notes(settings: "Config", name: str) -> list[str]:
@@ -211,6 +219,9 @@ def replay(
     """
     from functools import partial
 
+    if report:
+        require("matplotlib", "--report")
+
     import numpy as np
 
     from gripper_force.jobs import replay as job
@@ -218,7 +229,7 @@ def replay(
     from gripper_force.jobs.summary_files import check_writable, replay_tables, write_summary
 
     paths = [path for given in logs for path in (find_logs(given) if given.is_dir() else [given])]
-    again = partial(job.replay_each, paths, recover=recover, workers=jobs, ray=ray)
+    replay_all = partial(job.replay_each, paths, recover=recover, workers=jobs, ray=ray)
     if out is not None:
         check_writable(out)
     if compare is not None:
@@ -229,7 +240,7 @@ def replay(
         with console.bar("replaying", 2 * len(paths)) as progress:
             sides = [_choice(text) for text in compare]
             first, second = (
-                again(checkpoint=other, overrides=[*(set_ or []), *changes], progress=progress)
+                replay_all(checkpoint=other, overrides=[*(set_ or []), *changes], progress=progress)
                 for other, changes in sides
             )
         failed = {**first.failed, **second.failed}
@@ -250,7 +261,7 @@ def replay(
         console.end_with_failures(failed, len(paths))
         return
     with console.bar("replaying", len(paths), hidden=len(paths) == 1) as progress:
-        replays = again(checkpoint=checkpoint, overrides=set_, progress=progress)
+        replays = replay_all(checkpoint=checkpoint, overrides=set_, progress=progress)
     results = replays.results
     pages = []
     if report:
@@ -280,7 +291,15 @@ def replay(
         console.err.print(f"summary: {out / 'summary.html'}", soft_wrap=True, markup=False)
     if set_ or checkpoint:
         console.err.print(_OPEN_LOOP, soft_wrap=True)
+    if pages:
+        console.err.print(f"next: open {pages[0]}", soft_wrap=True, markup=False)
+    elif len(results) == 1:
+        console.next_step("replay", *logs, *_changes(checkpoint, set_), "--report")
     console.end_with_failures(replays.failed, len(paths))
+
+
+def _changes(checkpoint: str | None, overrides: list[str] | None) -> list[str]:
+    return [*(() if checkpoint is None else ("--checkpoint", checkpoint)), *again(None, overrides)]
 
 
 def _choice(text: str) -> tuple[str | None, list[str]]:
@@ -317,6 +336,7 @@ def doctor(
     console.show({"checks": checks, "ok": ok}, as_json, lambda _: checks_table(checks))
     if not ok:
         raise typer.Exit(1)
+    console.next_step("grasp", *again(config, set_))
 
 
 def virtual_servo(

@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,10 +25,9 @@ class ViewCommand(TyperCommand):
 
 
 def _with_viewer(args: Sequence[str]) -> Sequence[str]:
-    following = [*args[1:], ""]
     return [
         "--view=rerun" if arg == "--view" and (not then or then.startswith("-")) else arg
-        for arg, then in zip(args, following, strict=True)
+        for arg, then in pairwise([*args, ""])
     ]
 
 

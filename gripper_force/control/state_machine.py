@@ -259,7 +259,7 @@ class GraspController:
         self._estimate, fusion_events = self._fusion.step(
             t_ns,
             servo,
-            visual,
+            visual if visual is not None and visual.is_familiar else None,
             free=is_free,
             gripping=self._phase in _GRIPPING,
             holding=self._phase == Phase.HOLD,
@@ -270,13 +270,17 @@ class GraspController:
         return [*fusion_events, *self._derate(t_ns, servo.temperature_c)]
 
     def _note_vision(self, t_ns: int, visual: VisualForce | None) -> None:
-        """Filters what vision estimates, also where fusion rejects it because the motor current differs."""
+        """Filters what vision estimates, also of unfamiliar frames and where the motor current differs.
+
+        Fusion does not use these, but a grip makes them rise, too.
+        """
         if t_ns - self._seen_ns > (self._config.timeout_ms + self._config.max_age_ms) * NS_PER_MS:
             self._seen_n = None
         if visual is None or visual.t_ns <= self._seen_ns or self._config.feedback == "current":
             return
         # A comparison with NaN is false.
-        if not (abs(visual.force_n) <= 1e9 and 0 <= visual.std_n <= self._config.vision_std_n):
+        is_sure = not visual.is_familiar or 0 <= visual.std_n <= self._config.vision_std_n
+        if not (abs(visual.force_n) <= 1e9 and is_sure):
             self._has_unsure |= self._phase in _GRIPPING
             return
         self._has_seen |= self._phase in _GRIPPING

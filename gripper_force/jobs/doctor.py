@@ -8,7 +8,6 @@ import re
 import time
 from collections.abc import Iterable, Iterator
 from importlib import import_module, metadata
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -121,7 +120,7 @@ def _network(config: Config) -> Iterator[Check]:
     if not config.uses_vision:
         yield Check("network", "step", "not needed: no camera or no checkpoint", None)
         return
-    from gripper_force.vision.step_benchmark import engine_version
+    from gripper_force.vision.step_benchmark import cpu_info, engine_version
 
     config, model, _ = resolve_vision(config)
     estimator = make_estimator(ResolvedConfig(config, model))
@@ -130,8 +129,7 @@ def _network(config: Config) -> Iterator[Check]:
     package = f"{vision.engine} {engine_version(vision.engine)}".strip()
     threads = f"{vision.precision}, {vision.threads} of {os.cpu_count()} threads"
     yield Check("network", vision.engine, f"{package}, {threads}", True)
-    cpu = Path("/proc/cpuinfo").read_text(encoding="utf-8")
-    bfloat16 = re.search(r"\b(\w*bf16)\b", cpu)
+    bfloat16 = re.search(r"\b(\w*bf16)\b", "\n".join(cpu_info()))
     yield Check("network", "bfloat16", bfloat16[0] if bfloat16 else "not in this CPU", None)
     gray = np.random.default_rng(0).integers(0, 256, (128, 128), np.uint8)
     while estimator.update(gray) is None:

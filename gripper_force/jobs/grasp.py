@@ -24,6 +24,7 @@ from gripper_force.jobs.score import (
     score_grasp,
     vision_in_hold,
 )
+from gripper_force.plugins import require
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import resolve
 from gripper_force.runtime.session import Session, open_run
@@ -149,6 +150,12 @@ def grasp(config: Config, progress: Progress = no_progress, path: Path | None = 
     return summary_and_report(config, path)
 
 
+def require_report(config: Config) -> None:
+    """Raises `ConfigError` if ``log.report`` is set and a package for it is missing, so that no run is in vain."""
+    if config.log.report:
+        require("matplotlib", "log.report=true", ", or set log.report=false")
+
+
 def summary_and_report(config: Config, path: Path) -> Summary:
     """Summarises the log of a grasp, and writes its report if ``log.report`` is set."""
     result = summarise(path)
@@ -172,6 +179,7 @@ def run_grasp(config: Config, path: Path, progress: Progress = no_progress) -> N
         GripperError: Something failed. The servo was stopped as configured, and the log holds the run until
             then.
     """
+    require_report(config)
     run = resolve(config)
     run.check_target(config.target_n)
     with open_run(run, path) as session:
@@ -265,6 +273,7 @@ def trials(
         DeviceError: A grasp with a real device ended with a fault: nothing moves until a person has looked.
         GripperError: A grasp failed.
     """
+    require_report(config)
     device = exclusive_device(config)
     if device and jobs > 1:
         raise ConfigError(f"only one process can open {device}, not {jobs}; leave out --jobs, or set it to 1")
@@ -335,7 +344,7 @@ def summarise(path: Path) -> Summary:
         records[type(record)].append(record)
     statuses, cells = records[GraspStatus], sorted(records[LoadCellSample], key=lambda c: c.t_ns)
     cycles_ns = [state.t_ns for state in records[ServoState]]
-    visuals = records[VisualForce]
+    visuals = [visual for visual in records[VisualForce] if visual.is_familiar]
     compute_ms = [visual.compute_ms for visual in visuals]
     vision_s = (visuals[-1].t_ns - visuals[0].t_ns) / NS_PER_S if len(visuals) > 1 else 0.0
     config = config_from_text(reader.config, str(path))

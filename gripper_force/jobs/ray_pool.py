@@ -12,6 +12,7 @@ from typing import Any
 
 from gripper_force.errors import ConfigError, GripperError
 from gripper_force.jobs.processes import answer, use_settings
+from gripper_force.plugins import importing
 from gripper_force.runtime.process import ProcessOptions, allowed
 
 _TRIES = 2
@@ -35,12 +36,8 @@ def ray_pool(address: str) -> Iterator[Executor]:
     Raises:
         ConfigError: Ray is not installed, or no cluster answers there.
     """
-    try:
+    with importing("--ray", ", or use --jobs"):
         import ray
-    except ImportError as error:
-        raise ConfigError(
-            "--ray needs Ray; install it with: pip install 'gripper-force[ray]', or use --jobs"
-        ) from error
     handler = signal.getsignal(signal.SIGTERM)
     try:
         ray.init(address, log_to_driver=False, logging_level="error")

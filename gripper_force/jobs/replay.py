@@ -585,7 +585,8 @@ def _note(reader: LogReader, run: ResolvedConfig) -> str:
 def _sources(replayed: Replayed) -> dict[str, Comparison]:
     series: dict[str, tuple[list[int], list[float]]] = {}
     if replayed.visual:
-        series["visual"] = [v.t_ns for v in replayed.visual], [v.force_n for v in replayed.visual]
+        visual = [v for v in replayed.visual if v.is_familiar]
+        series["visual"] = [v.t_ns for v in visual], [v.force_n for v in visual]
     if replayed.decisions:
         estimates = [d.estimate for d in replayed.decisions]
         times = [e.t_ns for e in estimates]

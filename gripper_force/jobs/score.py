@@ -150,7 +150,7 @@ def vision_in_hold(
     Args:
         statuses: States of the controller in order of time.
         estimates: Fused estimates, one per cycle.
-        visuals: Visual estimates.
+        visuals: Visual estimates of familiar frames.
         events: Events of the run.
     """
     held_ns = [s.t_ns for s in statuses if s.phase == Phase.HOLD]

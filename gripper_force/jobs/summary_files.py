@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from gripper_force.errors import ConfigError
+from gripper_force.plugins import require
 
 if TYPE_CHECKING:
     from gripper_force.jobs.evaluate import Evaluation
@@ -48,13 +49,7 @@ def check_writable(folder: Path) -> None:
     Raises:
         ConfigError: The folder can't be made, or the package for the estimates' file is missing.
     """
-    try:
-        import pyarrow.parquet  # noqa: F401
-    except ImportError as error:
-        raise ConfigError(
-            "--out writes the estimates as Parquet, which needs pyarrow; install it with: "
-            "pip install 'gripper-force[parquet]', or leave out --out"
-        ) from error
+    require("pyarrow", "--out", ", or leave out --out")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

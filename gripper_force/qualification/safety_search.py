@@ -20,7 +20,7 @@ from gripper_force.config import Config, ControlConfig
 from gripper_force.control.limits import largest_target_n
 from gripper_force.control.linkage import RackAndPinion
 from gripper_force.control.state_machine import GraspController
-from gripper_force.errors import DataError
+from gripper_force.errors import ConfigError, DataError
 from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.processes import process_pool
 from gripper_force.qualification.loop_margin.analytic_plant import (
@@ -316,8 +316,13 @@ def search(
         progress: Called after each case.
 
     Raises:
+        ConfigError: The gripper is no rack and pinion.
         DataError: The file can't be read or written, or is of another configuration or seed.
     """
+    if (kind := config.gripper.linkage.kind) != "rack":
+        raise ConfigError(
+            f"the plants of the search have a rack and pinion, not gripper.linkage.kind={kind}; leave that key out"
+        )
     results = _read(keep, config) if resume else {}
     missing = [index for index in range(cases) if index not in results]
     progress("", min(len(results), cases))

@@ -14,6 +14,7 @@ import numpy as np
 from gripper_force.config import Config
 from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.grasp import TRIAL_OBJECTS, TRIAL_TARGETS_N, grasp
+from gripper_force.qualification.proc_files import process_text
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import NS_PER_S
 
@@ -150,9 +151,9 @@ def measure_growth(samples: list[Sample]) -> Growth:
 
 def _sample(simulated_s: float) -> Sample:
     gc.collect()
+    process_text("statm")  # without Linux there is no malloc_trim either
     ctypes.CDLL(None).malloc_trim(0)  # memory that was freed but kept for reuse is not a leak
-    status = Path("/proc/self/status").read_text(encoding="ascii")
-    facts = dict(line.split(":", 1) for line in status.splitlines())
+    facts = dict(line.split(":", 1) for line in process_text("status").splitlines())
     handles = sum(1 for _ in Path("/proc/self/fd").iterdir())
     return Sample(simulated_s, _kilobytes_to_mb(facts["RssAnon"]), handles, int(facts["Threads"]))
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from importlib import import_module
 from typing import Any, Final
 
 from gripper_force.config import CameraConfig, Config, LoadCellConfig
@@ -178,8 +177,7 @@ def open_load_cell(config: Config, clock: Clock) -> Any:
 
 
 def _rig_class() -> Any:
-    module, _, name = RIG.partition(":")
-    return getattr(import_module(module), name)
+    return load_class("rigs", {"virtual:rig": RIG}, "virtual:rig", "servo.port")
 
 
 def _open_sensor(

@@ -1,5 +1,6 @@
 """Perception: camera frames to visual estimates, in lockstep or in a thread of its own."""
 
+import math
 import threading
 import time
 from collections import deque
@@ -9,7 +10,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from gripper_force.errors import GripperError
+from gripper_force.errors import GripperError, UnfamiliarFrameError
 from gripper_force.interfaces import Camera, Clock
 from gripper_force.types import NS_PER_MS, AttentionMap, ForceEstimate, Frame, Gray, VisualForce
 
@@ -68,21 +69,23 @@ class FrameProcessor:
         self._last = frame.gray
         if self._works and repeats and not self._may_repeat:
             return ProcessedFrame(frame, None, "the camera repeats its last image; check whether it hangs")
-        begin_ns = time.perf_counter_ns()
+        begin_ns, problem = time.perf_counter_ns(), ""
         try:
             result = self._estimator.update(frame.gray)
         except Exception as error:
             if not self._works:
                 raise
-            own = isinstance(error, GripperError)
-            return ProcessedFrame(frame, None, str(error) if own else f"{type(error).__name__}: {error}")
+            problem = str(error) if isinstance(error, GripperError) else f"{type(error).__name__}: {error}"
+            if not isinstance(error, UnfamiliarFrameError):
+                return ProcessedFrame(frame, None, problem)
+            result = ForceEstimate(error.force_n, math.inf)
         compute_ms = (time.perf_counter_ns() - begin_ns) / NS_PER_MS
         if result is None:
             return ProcessedFrame(frame, None)
         self._works = True
         ready_ns = frame.received_ns if now_ns is None else now_ns()
         visual = VisualForce(frame.t_ns, ready_ns, frame.seq, result.force_n, result.std_n, compute_ms)
-        return ProcessedFrame(frame, visual, attention=_attention(frame, ready_ns, self._estimator))
+        return ProcessedFrame(frame, visual, problem, _attention(frame, ready_ns, self._estimator))
 
 
 def _attention(frame: Frame, ready_ns: int, estimator: Estimator) -> AttentionMap | None:

@@ -94,6 +94,9 @@ def real_time_priority() -> Iterator[str]:
     Yields:
         Reason for a refusal, and the remedy; empty if granted.
     """
+    if not hasattr(os, "sched_setscheduler"):
+        yield "the control loop has no real-time priority, so cycles may start late; use Linux for a real gripper"
+        return
     before, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))

@@ -14,6 +14,7 @@ from gripper_force.control.state_machine import MAX_CYCLE_S, GraspController
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import ConfigError, RequestError
 from gripper_force.interfaces import ServoSpec
+from gripper_force.plugins import importing
 from gripper_force.profiles.apply import (
     read_correction,
     read_profiles,
@@ -203,10 +204,11 @@ def _complete_gripper(gripper: GripperConfig, spec: ServoSpec) -> GripperConfig:
 
 def _check_travel(gripper: GripperConfig, spec: ServoSpec) -> None:
     """Raises if the travel leaves the turn in which the servo reports its position after power-on."""
+    with importing(f"gripper.linkage.kind={gripper.linkage.kind}"):
+        transmission = Transmission.from_config(gripper, spec.nm_per_a)
     if spec.position_range_rad is None:
         return
     low_rad, high_rad = spec.position_range_rad
-    transmission = Transmission.from_config(gripper, spec.nm_per_a)
     open_rad, closed_rad = transmission.open_position_rad, transmission.closed_position_rad
     if min(open_rad, closed_rad) < low_rad or max(open_rad, closed_rad) > high_rad:
         raise ConfigError(

@@ -7,6 +7,7 @@ time; `gripper_force.jobs.replay` feeds the same controller from a log, in the o
 from __future__ import annotations
 
 import json
+import re
 import sys
 import threading
 import time
@@ -57,6 +58,8 @@ _GAP_CYCLES: Final = 2.5
 
 _OPENING_NS: Final = 5 * NS_PER_S
 """Longest time in which the jaws open."""
+
+_NUMBER: Final = re.compile(r"[\d.]+")
 
 _PACKAGES: Final = ("gripper-force", "dynamixel-sdk", "mujoco", "numpy", "torch")
 _ENGINE_PACKAGES: Final = ("openvino", "onnxruntime")
@@ -207,9 +210,10 @@ class Session:
                 self.has_vision = True
             if processed.attention is not None:
                 log(processed.attention)
-            if processed.problem not in ("", self._problem):
+            kind_of_problem = _NUMBER.sub("", processed.problem)  # one event, although its numbers change
+            if kind_of_problem not in ("", self._problem):
                 log(Event(processed.frame.received_ns, "vision", f"no estimate: {processed.problem}"))
-            self._problem = processed.problem
+            self._problem = kind_of_problem
         state = self.servo_state = self._read_servo()
         request = self._request(state.t_ns, kind, target_n, width_m, new_object)
         decision = self._controller.step(state.t_ns, state, visual, request)
@@ -431,7 +435,7 @@ def _metadata(run: ResolvedConfig, devices: Devices) -> dict[str, str]:
         "checkpoint": run.model.digest if run.model else "",
         "choices": "\n".join(run.choices),
         "python": sys.version.split()[0],
-        **{f"version {name}": metadata.version(name) for name in packages},
+        **{f"version {name}": d.version for name in packages for d in metadata.distributions(name=name)},
         **devices.notes,
         **profile,
         **utc,

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gripper_force.config import VisionConfig
-from gripper_force.errors import ConfigError, DataError, NonFiniteError
+from gripper_force.errors import ConfigError, NonFiniteError, UnfamiliarFrameError
 from gripper_force.profiles.correction import Correction, load_correction
 from gripper_force.profiles.object_profile import find_object, read_object
 from gripper_force.types import ForceEstimate, Gray
@@ -126,8 +126,9 @@ class ForceEstimator:
             The estimate for this frame, or None while the reference is being collected.
 
         Raises:
-            DataError: The frame is not a gray image of bytes, is implausible (see `FrameChecks`), or its
-                out-of-distribution score exceeds the limit of the object profile or of the checkpoint.
+            DataError: The frame is not a gray image of bytes, or is implausible (see `FrameChecks`).
+            UnfamiliarFrameError: The frame's out-of-distribution score exceeds the limit of the object profile or
+                of the checkpoint.
             ConfigError: The region of interest reaches beyond the frame.
             NonFiniteError: A network returned NaN or infinity.
         """
@@ -154,7 +155,9 @@ class ForceEstimator:
         if self._ood is not None:
             score = float(self._ood.score(features, np.array([force_n]))[0])
             if score > 1:
-                raise DataError(f"the frame's out-of-distribution score is {score:.1f} times {self._limit()}")
+                raise UnfamiliarFrameError(
+                    f"the frame's out-of-distribution score is {score:.1f} times {self._limit()}", force_n
+                )
         if self._correction is not None:
             corrected_n = self._correction.force_n([force_n], features)
             return ForceEstimate(float(corrected_n[0]), float(self._correction.std_n(corrected_n)[0]))

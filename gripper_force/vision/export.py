@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from gripper_force.errors import CheckpointError, ConfigError
+from gripper_force.plugins import importing
 from gripper_force.types import Gray
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.engines import Engine, Floats, open_engine
@@ -81,17 +82,17 @@ def written(path: Path) -> Iterator[Path]:
         raise ConfigError(f"can't export to {path}; name a file that ends in {' or '.join(EXPORTED)}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(dir=path.parent) as folder, _quiet(), restored_threads():
+        with (
+            importing(f"exporting to {path.suffix}"),
+            TemporaryDirectory(dir=path.parent) as folder,
+            _quiet(),
+            restored_threads(),
+        ):
             torch.set_num_threads(1)  # the rounding of sums depends on the number of threads
             yield Path(folder) / path.name
             # The weights first: a process that finds the .xml must find its .bin too.
             for part in sorted(Path(folder).iterdir(), key=lambda part: part.suffix == path.suffix):
                 shutil.move(part, path.parent / part.name)
-    except ModuleNotFoundError as error:
-        raise ConfigError(
-            f"exporting to {path.suffix} needs {error.name}, which is not installed; "
-            "pip install 'gripper-force[engines]'"
-        ) from error
     except OSError as error:
         raise CheckpointError(f"can't write {path}: {error.strerror}; name another file") from error
 

@@ -5,9 +5,12 @@ An ONNX file holds the header in its metadata, an OpenVINO file in its ``rt_info
 
 import os
 import xml.etree.ElementTree as ET
+from importlib import import_module
 from pathlib import Path
+from typing import Final
 
-from gripper_force.errors import CheckpointError, ConfigError
+from gripper_force.errors import CheckpointError
+from gripper_force.plugins import importing
 from gripper_force.vision.header import (
     EXPORTED,
     KEY,
@@ -19,6 +22,9 @@ from gripper_force.vision.header import (
     read_checkpoint,
 )
 
+SHIPPED_EXPORTS: Final = Path(__file__).with_name("exported")
+"""Folder of the shipped checkpoints as ONNX files. It is in wheels, which `scripts/build-wheel` makes."""
+
 
 def read_model(source: str | Path) -> Model:
     """Reads the header of a checkpoint, or of a file exported from one.
@@ -28,7 +34,6 @@ def read_model(source: str | Path) -> Model:
 
     Raises:
         CheckpointError: The file is missing, damaged, or not of this project.
-        ConfigError: The package that reads the file's format is not installed.
     """
     if str(source) in SHIPPED or Path(source).suffix not in EXPORTED:
         path, data, header = read_checkpoint(source)
@@ -47,7 +52,8 @@ def read_model(source: str | Path) -> Model:
 def exported_file(model: Model, suffix: str) -> Path:
     """Returns the file of a model that an engine runs.
 
-    This is the model's own file, or, for a checkpoint, an export in the cache folder, made at the first use.
+    This is the model's own file; or, for a checkpoint, an export that a wheel brings for a shipped one, or one in
+    the cache folder, made at the first use.
 
     Args:
         model: The model.
@@ -59,12 +65,23 @@ def exported_file(model: Model, suffix: str) -> Path:
     if model.path.suffix == suffix:
         return model.path
     check_not_exported(model)
-    path = cache_folder() / f"{model.digest[:32]}{suffix}"
+    name = exported_name(model, suffix)
+    if (shipped := SHIPPED_EXPORTS / name).exists():
+        return shipped
+    path = cache_folder() / name
     if not path.exists():
-        from gripper_force.vision.export import export
-
-        export(model, path)
+        with importing(
+            f"exporting {model.path.name} for {EXPORTED[suffix]}",
+            ", or run `gripper-force export` on another machine and set vision.checkpoint to its file",
+        ):
+            exporter = import_module("gripper_force.vision.export")  # no part of a robot's installation
+        exporter.export(model, path)
     return path
+
+
+def exported_name(model: Model, suffix: str) -> str:
+    """Returns the file name under which the export of a checkpoint is kept."""
+    return f"{model.digest[:32]}{suffix}"
 
 
 def cache_folder() -> Path:
@@ -85,12 +102,8 @@ def _openvino_metadata(path: Path) -> dict[str, str]:
 
 
 def _onnx_metadata(path: Path) -> dict[str, str]:
-    try:
-        import onnxruntime
-    except ModuleNotFoundError as error:
-        raise ConfigError(
-            f"{path} needs ONNX Runtime, which is not installed; pip install 'gripper-force[engines]'"
-        ) from error
+    import onnxruntime
+
     try:
         session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
     except Exception as error:  # ONNX Runtime's classes have no common base but Exception

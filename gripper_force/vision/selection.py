@@ -9,6 +9,7 @@ from typing import NamedTuple, get_args
 
 from gripper_force.config import BudgetConfig, VisionConfig
 from gripper_force.errors import ConfigError
+from gripper_force.plugins import importing
 from gripper_force.vision.engines import ENGINES, Precision, open_engine
 from gripper_force.vision.header import EXPORTED, SHIPPED, Model
 from gripper_force.vision.model_files import read_model
@@ -163,7 +164,8 @@ def _settings(vision: VisionConfig, set_threads: bool) -> Iterator[_Setting]:
 
 def _own_threads() -> int:
     """Returns PyTorch's present thread count."""
-    import torch
+    with importing("vision.engine=torch"):
+        import torch
 
     return torch.get_num_threads()
 

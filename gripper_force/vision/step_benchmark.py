@@ -131,13 +131,14 @@ def _cache_file() -> Path:
 @cache
 def _machine() -> str:
     cpu = next(
-        (line.split(":", 1)[1].strip() for line in _cpu_info() if line.startswith("model name")),
+        (line.split(":", 1)[1].strip() for line in cpu_info() if line.startswith("model name")),
         platform.processor(),
     )
     return f"{platform.node()} {cpu} {os.cpu_count()}"
 
 
-def _cpu_info() -> list[str]:
+def cpu_info() -> list[str]:
+    """Returns the lines of /proc/cpuinfo; none on a system without it."""
     try:
         return Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

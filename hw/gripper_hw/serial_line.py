@@ -2,7 +2,7 @@
 
 import fcntl
 import os
-import struct
+import sys
 import termios
 from collections.abc import Iterator
 from contextlib import suppress
@@ -56,8 +56,9 @@ def open_line(name: str, baud_rate: int, *, unit: str, timeout_s: float | None) 
 def _claim(fd: int, name: str) -> None:
     """Sets the exclusive mode. Raises `OSError` (EBUSY) if another program uses the port."""
     # Root may open a port in exclusive mode, and anyone one that is open without it.
-    (exclusive,) = struct.unpack("i", fcntl.ioctl(fd, _TIOCGEXCL, bytes(4)))
-    if exclusive or any(_users(name)):
+    # macOS has no way to ask, and no /proc: there the lock alone keeps two runs apart.
+    linux = sys.platform == "linux"
+    if (linux and any(fcntl.ioctl(fd, _TIOCGEXCL, bytes(4)))) or any(_users(name)):
         raise OSError(EBUSY, os.strerror(EBUSY))
     fcntl.ioctl(fd, termios.TIOCEXCL)
 

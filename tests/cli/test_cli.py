@@ -518,7 +518,7 @@ def test_an_interrupt_that_became_another_error_is_an_interrupt(
 
     handler = signal.getsignal(signal.SIGINT)
     monkeypatch.setattr(process, "_received", [])
-    monkeypatch.setattr("gripper_force.jobs.grasp.grasp", converted)
+    monkeypatch.setattr("gripper_force.jobs.grasp.run_grasp", converted)
     try:
         done = run("grasp")
     finally:

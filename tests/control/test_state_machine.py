@@ -175,6 +175,22 @@ def test_force_that_a_camera_sees_before_the_contact_confirms_no_grip(make_run):
     assert any("the camera sees" in reason and "before the contact" in reason for reason in run.reasons)
 
 
+@pytest.mark.parametrize(("contact_m", "outcome"), [(1.0, "timeout"), (0.015, "held")])
+def test_unfamiliar_frames_tell_a_grip_from_empty_jaws_on_an_end_stop(make_run, contact_m, outcome):
+    run = make_run(plant={"contact_m": contact_m, "stops_m": (0.0, 0.020)}, timeout_s=3.0)
+    sample = run.vision.sample
+
+    def unfamiliar(t_ns, force_n, noise):
+        """Sees force in the motion of the jaws, and a third of that on the object."""
+        visual = sample(t_ns, 100.0 * run.plant.x_m + force_n / 3, noise)
+        return None if visual is None else replace(visual, std_n=float("inf"))
+
+    run.vision.sample = unfamiliar
+    run.grasp(3.0, 4.0)
+    assert run.last.status.outcome == outcome
+    assert {decision.estimate.source for decision in run.decisions} == {"current"}
+
+
 def test_camera_that_is_uncertain_throughout_a_grip_prevents_held(make_run):
     run = make_run(vision={"noise_n": 2.0}, timeout_s=3.0).grasp(2.0, 4.0)
     assert run.last.status.outcome == "timeout"

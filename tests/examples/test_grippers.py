@@ -12,12 +12,16 @@ from gripper_force.config import ServoConfig, load_config
 from gripper_force.profiles.rig_profile import read_rig
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import NS_PER_S, GraspStatus, LoadCellSample, Phase
-from gripper_hw.dynamixel.control_table import load_model
+from gripper_hw.dynamixel.control_table import load_model, model_names
 from gripper_hw.sim.scene import draw_scene
 
 GRIPPERS = sorted((Path(__file__).parents[2] / "examples/grippers").glob("*.yaml"))
 TABLE = "[[0.0, 0.092], [0.5, 0.075], [1.0, 0.052], [1.5, 0.030], [2.0, 0.012]]"
-MODELS = ["XM430-W350", "XL330-M288", "XC330-T288", "XH540-W270", "XD430-T210"]
+MODELS = ["XM430-W350", "XL330-M288", "XC330-T288", "XH540-W270", "XD430-T210", "XW540-T260"]
+
+
+def test_every_family_of_servos_is_tried() -> None:
+    assert {name[:2] for name in MODELS} == {name[:2] for name in model_names()}
 
 
 @pytest.mark.parametrize(

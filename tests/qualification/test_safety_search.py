@@ -13,7 +13,7 @@ from gripper_force.config import Config, load_config
 from gripper_force.control.limits import Limits
 from gripper_force.control.speed_limit import SpeedLimit
 from gripper_force.control.state_machine import GraspController
-from gripper_force.errors import DataError
+from gripper_force.errors import ConfigError, DataError
 from gripper_force.qualification import safety_search
 from gripper_force.qualification.safety_search import SearchReport, draw, run_case, search
 from gripper_force.types import ServoCommand
@@ -97,6 +97,12 @@ def test_search_continues_where_it_was_interrupted(
     other = config.model_copy(update={"seed": 1})
     with pytest.raises(DataError, match="another configuration or seed"):
         search(other, 6, 1, keep, resume=True)
+
+
+def test_another_linkage_than_that_of_the_plants_is_refused(tmp_path: Path) -> None:
+    config = load_config(None, ["gripper.linkage={kind: finger, finger_m: 0.06, open_finger_rad: 0.9}"])
+    with pytest.raises(ConfigError, match=r"rack and pinion, not gripper\.linkage\.kind=finger"):
+        search(config, 1, 1, tmp_path / "search.jsonl")
 
 
 def test_command_reports_violations_with_exit_code_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

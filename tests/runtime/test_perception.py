@@ -5,7 +5,7 @@ from collections import deque
 import numpy as np
 import pytest
 
-from gripper_force.errors import DataError
+from gripper_force.errors import DataError, UnfamiliarFrameError
 from gripper_force.runtime.perception import LockstepPerception, ProcessedFrame, ThreadedPerception
 from gripper_force.types import NS_PER_MS, ForceEstimate, Frame, Gray
 
@@ -26,7 +26,7 @@ class FakeEstimator:
         return ForceEstimate(float(self.count), 0.5) if self.count > self.references else None
 
     def attention_map(self) -> np.ndarray | None:
-        return np.array([[0.25, 0.5], [0.5, 0.75]], np.float32) + 0.001 * self.count
+        return np.array([[0.2, 0.4], [0.5, 0.7]], np.float32) + 0.001 * self.count
 
 
 class Hand:
@@ -89,7 +89,7 @@ def test_in_lockstep_an_estimate_is_there_after_its_time_and_not_before() -> Non
         seen.visual.ready_ns,
         1,
     )
-    assert seen.attention.gray.tolist() == [[0, 128], [128, 255]]  # to its own range
+    assert seen.attention.gray.tolist() == [[0, 102], [153, 255]]  # to its own range
 
 
 def test_the_reference_frame_is_seen_and_gives_no_estimate() -> None:
@@ -143,6 +143,22 @@ def test_a_later_error_costs_one_estimate_and_is_told() -> None:
         seen += perception.poll()
     assert [s.visual is None for s in seen] == [True, False, False, True, False, False]
     assert [s.problem for s in seen] == ["", "", "", "RuntimeError: no kernel", "", ""]
+
+
+def test_the_force_in_an_unfamiliar_frame_claims_nothing() -> None:
+    camera = Shutter()
+    error = UnfamiliarFrameError("unlike all", 3.0)
+    perception = LockstepPerception(camera, FakeEstimator(error, at=3), Hand(), 0.0)
+    seen = []
+    for seq in range(3):
+        camera.give(seq)
+        seen += perception.poll()
+    visual = seen[-1].visual
+    assert visual is not None
+    assert (visual.force_n, visual.std_n, visual.is_familiar) == (3.0, np.inf, False)
+    assert seen[1].visual is not None
+    assert seen[1].visual.is_familiar
+    assert [s.problem for s in seen] == ["", "", "unlike all"]
 
 
 def test_a_camera_that_hangs_gives_no_estimates() -> None:

@@ -1,13 +1,14 @@
 """Homing: both ends of the jaws' travel, the closing direction and friction, without a load cell."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
+from gripper_calibration.procedures.powered_servo import torque_on
 from gripper_force.config import Config
 from gripper_force.control.limits import Limits
 from gripper_force.control.safety import Safety
@@ -206,18 +207,23 @@ def _proposal(config: Config, open_rad: float, closed_rad: float, sign: int) -> 
 @contextmanager
 def _torque_on(config: Config, devices: Devices, progress: Progress) -> Iterator["_EmptyJaws"]:
     """Yields jaws under torque, and turns torque off at every end."""
-    state = devices.servo.start()  # if this raises, it has turned torque off itself
-    try:
-        yield _EmptyJaws(config, devices, state, progress)
-    finally:
-        devices.servo.stop(hold=False)
+    with torque_on(devices.servo) as (state, raise_if_interrupted):
+        yield _EmptyJaws(config, devices, state, raise_if_interrupted, progress)
 
 
 class _EmptyJaws:
     """Moves jaws whose ends are unknown. Directions are those of the servo's angle."""
 
-    def __init__(self, config: Config, devices: Devices, state: ServoState, progress: Progress) -> None:
+    def __init__(
+        self,
+        config: Config,
+        devices: Devices,
+        state: ServoState,
+        raise_if_interrupted: Callable[[], None],
+        progress: Progress,
+    ) -> None:
         self._config, self._devices, self._progress = config, devices, progress
+        self._raise_if_interrupted = raise_if_interrupted
         gripper = config.gripper
         self._transmission = Transmission.from_config(
             gripper, gripper.nm_per_a or 0.0, gripper.current_step_a or 0.0
@@ -247,6 +253,7 @@ class _EmptyJaws:
         devices = self._devices
         self._due_ns = max(self._due_ns + self._period_ns, devices.clock.now_ns())
         devices.clock.sleep_until_ns(self._due_ns)
+        self._raise_if_interrupted()
         devices.check()
         self.state = state = read_patiently(
             devices.servo,

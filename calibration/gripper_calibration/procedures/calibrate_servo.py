@@ -1,7 +1,7 @@
 """Calibration of a servo: torque, friction and jaw geometry, with the load cell's body as a gauge."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -12,6 +12,7 @@ import numpy as np
 
 from gripper_calibration.fits.servo_fit import MIN_PASSES, FreePass, Nominal, ServoFit, ServoPress, fit_servo
 from gripper_calibration.plots.servo_plot import draw
+from gripper_calibration.procedures.powered_servo import torque_on
 from gripper_force.config import Config, GripperConfig
 from gripper_force.control.limits import Limits, largest_target_n
 from gripper_force.control.linkage import make_linkage
@@ -29,7 +30,7 @@ from gripper_force.profiles.rig_profile import (
 )
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.reading import read_patiently
-from gripper_force.runtime.resolve import position_loop, resolve
+from gripper_force.runtime.resolve import make_controller, position_loop, resolve
 from gripper_force.types import NS_PER_MS, NS_PER_S, ServoCommand, ServoState
 
 PRESSES: Final = ((3.0, 1.0), (6.0, 1.0), (12.0, 1.0), (3.0, 0.6), (6.0, 0.8), (12.0, 0.8))
@@ -123,7 +124,7 @@ def calibrate_servo(
     Raises:
         ConfigError: There is no load cell, a gauge does not fit, there are two servos, or the profile can't be read
             or written.
-        DeviceError: A device failed. The servo has no torque.
+        DeviceError: A device failed, or the jaws start outside their travel. The servo has no torque.
         DataError: The jaws met nothing, or the readings are not sufficient for a calibration.
     """
     if len(config.servo.ids) > 1:
@@ -237,7 +238,7 @@ def measure(
         progress: Called with the step and the force.
 
     Raises:
-        DeviceError: A device failed. The servo has no torque.
+        DeviceError: A device failed, or the jaws start outside their travel. The servo has no torque.
         DataError: The load cell reads a force without contact, or the jaws met nothing.
     """
     with open_devices(config) as devices, _torque_on(config, devices, progress) as jaws:
@@ -279,11 +280,10 @@ def _torque_on(config: Config, devices: Devices, progress: Progress) -> Iterator
     assert devices.load_cell is not None
     devices.load_cell.start()
     _wait_for_sample(devices)
-    state = devices.servo.start()  # if this raises, it has turned torque off itself
-    try:
-        yield _Jaws(config, devices, state, progress)
-    finally:
-        devices.servo.stop(hold=False)
+    with torque_on(devices.servo) as (state, raise_if_interrupted):
+        if problem := make_controller(config).start_problem(state):
+            raise DeviceError(problem)
+        yield _Jaws(config, devices, state, raise_if_interrupted, progress)
 
 
 def _wait_for_sample(devices: Devices) -> None:
@@ -330,10 +330,17 @@ def _reduce(transmission: Transmission, states: Sequence[ServoState]) -> FreePas
 class _Jaws:
     """Moves the jaws cycle by cycle, and records servo and load cell. Positive angles close the jaws."""
 
-    def __init__(self, config: Config, devices: Devices, state: ServoState, progress: Progress) -> None:
+    def __init__(
+        self,
+        config: Config,
+        devices: Devices,
+        state: ServoState,
+        raise_if_interrupted: Callable[[], None],
+        progress: Progress,
+    ) -> None:
         assert devices.load_cell is not None
         self._config, self._devices, self._cell = config, devices, devices.load_cell
-        self._progress = progress
+        self._raise_if_interrupted, self._progress = raise_if_interrupted, progress
         self._sign = config.gripper.closing_sign
         gripper = config.gripper
         self._nominal = Transmission.from_config(
@@ -380,6 +387,7 @@ class _Jaws:
         devices = self._devices
         self._due_ns = max(self._due_ns + self._period_ns, devices.clock.now_ns())
         devices.clock.sleep_until_ns(self._due_ns)
+        self._raise_if_interrupted()
         devices.check()
         self.state = state = read_patiently(
             devices.servo,

@@ -39,6 +39,8 @@ def _found(value: object) -> object:
         return ", ".join(f"{item:.5g}" for item in value)
     if not isinstance(value, dict):
         return value
+    if "low" not in value:  # settings
+        return ", ".join(f"{name} {setting}" for name, setting in value.items())
     if value["low"] is None:
         return f"{value['value']:.6g} (given)"
     return f"{value['value']:.6g} ({value['low']:.6g} to {value['high']:.6g})"

@@ -57,7 +57,9 @@ _FREE_N: Final = 0.1
 
 _RELEASE_TIMEOUT_S: Final = 5.0
 _SILENT_NS: Final = 2 * NS_PER_S
-"""A camera or load cell without data for this long has failed. The slowest samples take 1.3 s."""
+_FIRST_SAMPLE_NS: Final = 5 * NS_PER_S
+"""A camera or load cell without data for this long has failed. The slowest samples take 1.3 s. The first one may take
+longer: a board that resets when its port is opened is silent for about 2 s."""
 
 _SAME: Final = ("object", "seed", "target_n", "camera", "sim")
 """Keys that all sets of a recording share, apart from the set's number in the seed. Others may change."""
@@ -275,15 +277,13 @@ class _MonitoredSession:
                 f"the camera has given no frame for {_SILENT_NS / NS_PER_S:g} s in set {self.number}; check "
                 "its cable, and run doctor"
             )
-        sample_ns = (
-            self._begin_ns
-            if self.last_load_cell_sample is None
-            else max(self.last_load_cell_sample.t_ns, self._begin_ns)
-        )
-        if status.t_ns - sample_ns > _SILENT_NS:
+        last = self.last_load_cell_sample
+        sample_ns = self._begin_ns if last is None else max(last.t_ns, self._begin_ns)
+        silent_ns = _FIRST_SAMPLE_NS if last is None else _SILENT_NS
+        if status.t_ns - sample_ns > silent_ns:
             counts = ", ".join(f"{n} {name}" for name, n in self._cell.counts().items() if n)
             raise DeviceError(
-                f"the load cell has given no valid sample for {_SILENT_NS / NS_PER_S:g} s in set "
+                f"the load cell has given no valid sample for {silent_ns / NS_PER_S:g} s in set "
                 f"{self.number} (rejected: {counts or 'none'}); check its wiring and its section of the "
                 "configuration, and run doctor"
             )

@@ -248,7 +248,8 @@ def read_run(
     logged_status = records[GraspStatus]
     if replayed is not None:
         _replace(records, replayed)
-    vision, fused, status = records[VisualForce], records[FusedForce], records[GraspStatus]
+    vision = [visual for visual in records[VisualForce] if visual.is_familiar]
+    fused, status = records[FusedForce], records[GraspStatus]
     requests = records[Request]
     grasps = [request for request in requests if request.kind == RequestKind.GRASP]
     zero_ns = grasps[0].t_ns if grasps else log.start_ns

@@ -156,7 +156,7 @@ class RerunViewer:
                 curve["force/interval_high"].append((t_ns, record.force_n + half_n))
                 curve["force/current"].append((t_ns, record.current_n))
                 self._change(t_ns, "source", record.source)
-            case VisualForce(t_ns=t_ns):
+            case VisualForce(t_ns=t_ns) if record.is_familiar:
                 curve["force/vision"].append((t_ns, record.force_n))
             case LoadCellSample(t_ns=t_ns, valid=True):
                 curve["force/load_cell"].append((t_ns, record.force_n))

@@ -25,6 +25,7 @@ from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import Clip
 from gripper_force.jobs.int8_export import export_int8
 from gripper_force.qualification.bench.roofline import Roofline, measure
+from gripper_force.qualification.proc_files import process_text
 from gripper_force.types import NS_PER_MS
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.engines import Engine, Floats, Precision, open_engine
@@ -272,6 +273,7 @@ def _time_steps(variant: _Timed, frames: Sequence[Floats], steps: int, *, keep: 
 
 
 def _memory_mb(model: Model, engine: str, precision: str, threads: int) -> float:
+    process_text("status")  # which the process reads
     done = subprocess.run(
         [sys.executable, "-c", _MEMORY, str(model.path), engine, precision, str(threads)],
         capture_output=True,

@@ -18,6 +18,7 @@ import numpy as np
 
 from gripper_force.config import Config, dump_config
 from gripper_force.errors import GripperError
+from gripper_force.qualification.proc_files import process_text
 from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import NS_PER_S, Frame
 from gripper_hw.dynamixel.pty_server import serve_virtual_servo
@@ -171,6 +172,7 @@ def startup(scenes: Sequence[StartupCase], times: int = 3) -> Iterator[Start]:
     Raises:
         GripperError: A scene did not start.
     """
+    process_text("statm")  # which each process reads
     with simulated_devices() as places:
         for scene in scenes:
             start(scene, places)

@@ -152,11 +152,12 @@ def _judge_vision(row: FaultCase, run: Grasp, config: Config, at_ns: int) -> tup
     good = [
         v.ready_ns
         for v in run.records(VisualForce)
-        if v.ready_ns <= alone[0] and (some_valid or v.ready_ns - compute_ns < at_ns)
+        if v.is_familiar and v.ready_ns <= alone[0] and (some_valid or v.ready_ns - compute_ns < at_ns)
     ]
     due_ns = max(at_ns, good[-1] + round(NS_PER_S / config.camera.rate_hz)) if good else at_ns
     if row.unit == "estimator" and row.kind == "garbage":
-        due_ns = min(v.ready_ns for v in run.records(VisualForce) if not math.isfinite(v.force_n))
+        bad_ns = [v.ready_ns for v in run.records(VisualForce) if not math.isfinite(v.force_n)]
+        due_ns = min(bad_ns, default=at_ns)  # none if the frames were unfamiliar
     return max(_ms(alone[0] - due_ns), 0.0), "" if run.result in _FINISHED else run.result
 
 

@@ -24,6 +24,7 @@ from gripper_force.errors import ConfigError, GripperError
 from gripper_force.interfaces import Progress, no_progress
 from gripper_force.qualification.fuzz import bus_targets, core_targets, load_cell_targets
 from gripper_force.qualification.fuzz.target import Target
+from gripper_force.qualification.proc_files import memory_bytes
 from gripper_force.types import NS_PER_S
 
 HANG_S: Final = 30.0
@@ -140,6 +141,7 @@ def fuzz(
         GripperError: A process died before its first input.
     """
     begin_s = time.monotonic()
+    memory_bytes()  # which each process reads
     targets = all_targets()
     plan = _plan(targets, count, only)
     findings: dict[tuple[str, str], Finding] = {}
@@ -367,7 +369,7 @@ def _work(
     warnings.simplefilter("ignore")
     targets = make_targets()
     examples = [target.examples() if share else () for target, share in zip(targets, shares, strict=True)]
-    limit = _address_space() + MEMORY_BYTES
+    limit = memory_bytes()[0] + MEMORY_BYTES
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     reported = set()
     for t, target in list(enumerate(targets))[first_target:]:
@@ -409,8 +411,3 @@ def _save_input(out: Path, target: Target, seed: int, index: int) -> Path:
     path = out / f"{target.name}-{seed}-{index}.bin"
     path.write_bytes(input_of(target, target.examples(), seed, index))
     return path
-
-
-def _address_space() -> int:
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    return pages * resource.getpagesize()

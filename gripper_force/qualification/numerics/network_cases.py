@@ -1,7 +1,6 @@
 """Hard cases for the network: each engine and precision, and the estimator, compared with float64."""
 
 import math
-import resource
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
@@ -39,6 +38,7 @@ from gripper_force.qualification.numerics.reference import (
     Float64Result,
     ReferenceEnsemble,
 )
+from gripper_force.qualification.proc_files import memory_bytes
 from gripper_force.runtime.perception import FrameProcessor
 from gripper_force.types import NS_PER_MS, Frame, Gray, VisualForce
 from gripper_force.vision.checkpoint import load_checkpoint
@@ -481,5 +481,4 @@ def _stream(
 
 
 def _resident_mb() -> float:
-    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-    return pages * resource.getpagesize() / 2**20
+    return memory_bytes()[1] / 2**20

@@ -110,7 +110,8 @@ def open_engine(
         raise ConfigError(f"vision.threads {threads} is not positive; use at least 1, or None")
     if precision != "float32" and engine in ENGINES and engine != "openvino":
         raise ConfigError(f"vision.engine={engine} computes in float32 only; {precision} needs openvino")
-    engine_class = load_class("engines", ENGINES, engine, "vision.engine", extra="engines")
+    other = "" if engine == "onnxruntime" else ", or set vision.engine=onnxruntime"
+    engine_class = load_class("engines", ENGINES, engine, "vision.engine", other)
     opened: Engine = engine_class(model, precision, threads)
     opened.step(np.zeros((model.header.preprocess.size,) * 2, np.float32))
     opened.reset()

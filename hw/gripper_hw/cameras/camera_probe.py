@@ -1,7 +1,8 @@
 """Diagnostics of cameras for `doctor`: lists them, and measures rate and latency of the configured one."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -57,11 +58,7 @@ def probe(config: Config, sysfs: Path = _SYSFS) -> Iterator[Check]:
 
 def find(sysfs: Path = _SYSFS) -> list[Tree]:
     """Returns the section ``camera`` of each camera that is plugged in: OAK cameras, then USB cameras."""
-    import depthai as dai
-
-    oaks: list[Tree] = [
-        {"backend": "oak", "device": info.deviceId} for info in dai.Device.getAllAvailableDevices()
-    ]
+    oaks: list[Tree] = [{"backend": "oak", "device": info.deviceId} for info in _oak_infos() or ()]
     nodes = sorted((sysfs / "class/video4linux").glob("video*"))
     captures = [node for node in nodes if (node / "index").read_text().strip() == "0"]  # others: metadata
     return oaks + [{"backend": "uvc", "device": f"/dev/{node.name}"} for node in captures]
@@ -112,12 +109,22 @@ def _frame_checks(config: Config, frames: list[Frame]) -> Iterator[Check]:
 
 
 def _oak_devices() -> Iterator[str]:
-    import depthai as dai
-
-    devices = dai.Device.getAllAvailableDevices()
-    yield from (f"OAK {info.deviceId} at {info.name}" for info in devices)
-    if not devices:
+    if (infos := _oak_infos()) is None:
+        yield "no OAK can be listed: pip install 'gripper-force[oak]'"
+        return
+    yield from (f"OAK {info.deviceId} at {info.name}" for info in infos)
+    if not infos:
         yield "no free OAK"
+
+
+def _oak_infos() -> Sequence[Any] | None:
+    """Returns the free OAK devices; None if DepthAI is not installed."""
+    try:
+        import depthai as dai
+    except ModuleNotFoundError:
+        return None
+    infos: Sequence[Any] = dai.Device.getAllAvailableDevices()
+    return infos
 
 
 def _video_devices(folder: Path) -> Iterator[str]:

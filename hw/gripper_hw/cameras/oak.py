@@ -10,12 +10,14 @@ from contextlib import ExitStack, contextmanager
 from datetime import timedelta
 from typing import Any
 
+import depthai as dai
 import numpy as np
 
 from gripper_force.config import CameraConfig
 from gripper_force.errors import DeviceError, DeviceLostError, DeviceNotFoundError
 from gripper_force.interfaces import Clock
 from gripper_force.types import Gray
+from gripper_hw import UDEV_RULES
 from gripper_hw.cameras.reader import BackgroundCamera, RawFrame, ReadFrame, Settings, crop_square
 
 _MAX_DEFAULT_PX = 1280 * 800
@@ -45,8 +47,6 @@ def device_pipeline(config: CameraConfig, stack: ExitStack) -> SensorOutput:
     Raises:
         DeviceError: There is no such device or sensor, or the sensor cannot do what is configured.
     """
-    import depthai as dai
-
     device = dai.Device(_find(config.device, dai.Device.getAllAvailableDevices()))
     stack.callback(device.close)
     device.setMaxReconnectionAttempts(0)  # the library would reconnect to any device, with 10 s per attempt
@@ -105,8 +105,6 @@ def set_controls(control: Any, sensor: Any, config: CameraConfig) -> None:
     Raises:
         DeviceError: The sensor does not have what is configured, or needs what is not.
     """
-    import depthai as dai
-
     name, position, colour_k = f"the sensor {_name(sensor)}", config.lens_position, config.white_balance_k
     if sensor.hasAutofocus:
         if position is None:
@@ -128,8 +126,6 @@ def set_controls(control: Any, sensor: Any, config: CameraConfig) -> None:
 
 
 def _is_mono(sensor: Any) -> bool:
-    import depthai as dai
-
     return dai.CameraSensorType.MONO in sensor.supportedTypes
 
 
@@ -142,8 +138,6 @@ def build_queue(config: CameraConfig, pipeline: Any, output: Any, size_px: tuple
 
     If the pipeline has no device, this runs on the host.
     """
-    import depthai as dai
-
     left, top, side = crop_square(config, *size_px)
     manip = pipeline.create(dai.node.ImageManip)
     manip.setRunOnHost(pipeline.getDefaultDevice() is None)
@@ -173,8 +167,6 @@ class OakCamera(BackgroundCamera):
 
     @contextmanager
     def _open(self) -> Iterator[ReadFrame]:
-        import depthai as dai
-
         pipeline_errors: list[Exception] = []
 
         def run() -> None:
@@ -232,5 +224,5 @@ def _find(wanted: str | int | None, available: Sequence[Any]) -> Any:
     shown = "null" if wanted is None else wanted
     raise DeviceNotFoundError(
         f"{len(matches)} free OAK cameras match camera.device={shown} (free: {known}); check cable, power, "
-        "the rules of hw/udev, and that no other program uses it; of several, name one by its id"
+        f"that the rules {UDEV_RULES} are installed, and that no other program uses it; of several, name one by its id"
     )

@@ -130,6 +130,7 @@ class BackgroundCamera(ABC):
 
     def _capture(self) -> None:
         """Opens the camera and stores its frames until it is lost or closed. Raises if opening fails."""
+        timeout_ms = self._config.timeout_ms or max(250.0, 4e3 / self._config.rate_hz)
         with self._open() as read:
             raw = self._next_frame(read, _FIRST_FRAME_TIMEOUT_NS)
             # A reopened camera counts from 0 again; frame numbers must keep rising.
@@ -137,7 +138,7 @@ class BackgroundCamera(ABC):
             try:
                 while raw is not None:
                     self._store(raw, seq_offset)
-                    raw = self._next_frame(read, round(self._config.timeout_ms * NS_PER_MS))
+                    raw = self._next_frame(read, round(timeout_ms * NS_PER_MS))
             except DeviceError:
                 self._losses += 1
 

@@ -5,6 +5,7 @@ OpenCV's names: https://github.com/opencv/opencv/blob/4.x/modules/videoio/src/ca
 """
 
 import math
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import count
@@ -64,13 +65,18 @@ class UvcCamera(BackgroundCamera):
         open_capture: Opens a path as ``cv2.VideoCapture``; tests open a video file.
 
     Raises:
-        ConfigError: ``camera.device`` is not set, or ``camera.gain`` without an exposure.
+        ConfigError: ``camera.device`` is not set, or the system is not Linux.
     """
 
     def __init__(
         self, config: CameraConfig, clock: Clock, open_capture: Callable[[str], Any] = _open_v4l2
     ) -> None:
         super().__init__(config, clock)
+        if sys.platform != "linux" and open_capture is _open_v4l2:
+            raise ConfigError(
+                "camera.backend=uvc needs Video4Linux, which only Linux has; use an OAK camera, or one of a class of "
+                "your own"
+            )
         if config.device is None:
             raise ConfigError(
                 "camera.backend=uvc needs camera.device; set it to an index, a /dev path or a name"

@@ -81,8 +81,8 @@ class SerialPort(PortHandler):  # type: ignore[misc]
         """Opens the port; raises the errors of `open_port`."""
         self.closePort()
         self.ser = open_line(self.port_name, cflag_baud, unit="servo", timeout_s=0)
-        # Only some adapters, and no pseudo-terminal, have a latency timer.
-        with contextlib.suppress(ValueError, OSError):
+        # Only some adapters, and no pseudo-terminal, have a latency timer; macOS has no call for it.
+        with contextlib.suppress(ValueError, OSError, NotImplementedError):
             self.ser.set_low_latency_mode(True)
         self.is_open = True
         self.tx_time_per_byte = 10_000.0 / cflag_baud

@@ -11,6 +11,7 @@ from gripper_force.config import Config, ServoConfig
 from gripper_force.errors import ConfigError, DeviceError, DeviceTimeoutError, GripperError
 from gripper_force.jobs.checks import Check, Confirm, RegisterChange, SetupResult, judged, keep_only, time_ms
 from gripper_force.runtime.backends import open_devices
+from gripper_hw import UDEV_RULES
 from gripper_hw.dynamixel.control_table import (
     REGISTERS,
     check_model_number,
@@ -61,7 +62,7 @@ def probe(config: Config, sysfs: Path = _SYSFS) -> Iterator[Check]:
         if timer.is_file():
             latency_ms = int(timer.read_text())
             fast = latency_ms < servo.reply_margin_ms
-            advice = "install the rules of hw/udev, which set it to 1 ms"
+            advice = f"copy {UDEV_RULES} to /etc/udev/rules.d: it sets the timer to 1 ms"
             yield judged("servo", "latency timer", f"{latency_ms} ms", fast, advice)
         found = inspection.transport.scan()
         for id_, (number, firmware) in sorted(found.items()):

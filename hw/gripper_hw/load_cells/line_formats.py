@@ -13,7 +13,8 @@ HX711_MAX: Final = 0x7FFFFF
 """Limits of the 24-bit converter; it gives one of these two if its input is out of range."""
 
 _HX711: Final = re.compile(
-    rb"\s*(?:\d+,|[A-Za-z][A-Za-z_ ]*[:=\s])?\s*([+-]?\d{1,8})(\.\d*)?\s*(?:[A-Za-z]{1,3})?\s*"
+    rb"\s*(?:\d+,|[A-Za-z][^:=|]*[:=]|[A-Za-z][A-Za-z_ ]*\s)?"
+    rb"\s*([+-]?\d{1,8})(\.\d*)?\s*([A-Za-z]{1,3})?\s*(?:\|.*)?"
 )
 _CAS: Final = re.compile(rb"(?:(ST|US|OL),(?:GS|NT),(?:..,)?)?(.{8})(?: ?(kg|g | g))?", re.DOTALL)
 _CAS_LENGTHS: Final = frozenset({8, 16, 20})
@@ -40,8 +41,9 @@ def parse_hx711(line: bytes) -> Reading | None:
     """Parses a line of a board with an HX711 converter.
 
     It is ``<raw>`` or ``<micros>,<raw>`` in counts, or a value that the board has scaled, such as ``12.34``,
-    with or without a name before it and a unit behind it: ``Weight: 12.34 g``, ``Load_cell output val: 12.34``.
-    The unit is not converted: `load_cell.n_per_raw` is newtons per unit of the value. See
+    with or without a name before it and a unit behind it: ``HX711 reading: 8421``, ``Weight: 12 g``. What
+    follows a bar is not used: ``one reading: -0.4 | average: -0.2``. The unit is not converted:
+    `load_cell.n_per_raw` is newtons per unit of the value. See
     https://cdn.sparkfun.com/datasheets/Sensors/ForceFlex/hx711_english.pdf for the counts.
 
     Returns:
@@ -50,8 +52,8 @@ def parse_hx711(line: bytes) -> Reading | None:
     found = _HX711.fullmatch(line)
     if found is None:
         return None
-    if found[2] is not None:
-        return Reading(float(found[1] + found[2]), rounded=True)
+    if found[2] is not None or found[3] is not None:
+        return Reading(float(found[1] + (found[2] or b"")), rounded=True)
     if not HX711_MIN <= (raw := int(found[1])) <= HX711_MAX:
         return None
     return Reading(float(raw), saturated=raw in (HX711_MIN, HX711_MAX))

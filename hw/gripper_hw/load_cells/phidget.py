@@ -10,6 +10,7 @@ from typing import Any, Final
 from gripper_force.config import LoadCellConfig
 from gripper_force.errors import ConfigError, DeviceError, DeviceNotFoundError
 from gripper_force.interfaces import Clock
+from gripper_hw import UDEV_RULES
 from gripper_hw.load_cells.screening import LiveLoadCell
 
 MIN_RATE_HZ: Final = 1
@@ -76,7 +77,7 @@ class PhidgetLoadCell(LiveLoadCell):
             if error.code == _TIMED_OUT:
                 raise DeviceNotFoundError(
                     f"no Phidget bridge answers for load_cell.channel={self._config.channel}; check its "
-                    "cable, and that the rules of hw/udev are installed"
+                    f"cable, and that the rules {UDEV_RULES} are installed"
                 ) from error
             raise DeviceError(
                 f"could not configure the Phidget bridge ({error.description}); unplug and reconnect it"

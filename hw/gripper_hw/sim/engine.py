@@ -2,6 +2,7 @@
 
 import importlib
 import os
+import sys
 from typing import Any, Final
 
 from gripper_force.errors import SimulationError
@@ -11,7 +12,8 @@ NO_EGL = (
     "on Debian or Ubuntu: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri"
 )
 
-_GL: Final = os.environ.get("MUJOCO_GL", "egl")
+_LINUX: Final = sys.platform == "linux"
+_GL: Final = os.environ.get("MUJOCO_GL", "egl" if _LINUX else "cgl")  # CGL is Apple's
 os.environ["MUJOCO_GL"] = "disable"  # a scene without a camera needs no EGL
 import mujoco  # noqa: E402
 
@@ -28,7 +30,7 @@ mujoco.mj_setCacheCapacity(mujoco.mj_getCache(), 0)
 
 
 def new_renderer(model: Any, side_px: int) -> Any:
-    """Returns a MuJoCo renderer of square images of a model. Raises `SimulationError` without EGL."""
+    """Returns a MuJoCo renderer of square images of a model. Raises `SimulationError` if it can't render."""
     from mujoco.rendering.classic import gl_context
 
     try:
@@ -37,7 +39,8 @@ def new_renderer(model: Any, side_px: int) -> Any:
         return mujoco.Renderer(model, side_px, side_px)
     # MuJoCo raises any of these if libEGL, or a driver for it, is missing.
     except (AttributeError, ImportError, RuntimeError, mujoco.FatalError) as error:
-        raise SimulationError(NO_EGL) from error
+        other = f"MuJoCo cannot render on this machine ({error}); set camera.backend=none"
+        raise SimulationError(NO_EGL if _LINUX else other) from error
 
 
 __all__ = ["NO_EGL", "mujoco", "new_renderer"]

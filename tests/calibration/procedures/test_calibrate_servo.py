@@ -115,6 +115,12 @@ def test_profile_of_another_servo_is_refused_or_reported(rig: Path, tmp_path: Pa
         (["faults=[{unit: load_cell, kind: wrong}]"], 0.03, DataError, "no valid sample for 5 s"),
         (["gripper.closing_sign=-1"], 0.03, DataError, "the jaws closed without a force on the load cell"),
         (
+            ["gripper.open_position_rad=0.5"],
+            0.03,
+            DeviceError,
+            r"outside their travel.*nothing has moved.*gripper\.open_position_rad",
+        ),
+        (
             ["faults=[{unit: load_cell, kind: stuck, at_s: 1}]"],
             0.03,
             DeviceError,

@@ -1,5 +1,6 @@
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import chain, repeat
@@ -70,6 +71,40 @@ def test_error_after_start_is_a_loss_and_camera_is_reopened(
         pass
     assert frame.seq > 0
     assert camera.counts()["losses"] >= 1
+    camera.close()
+
+
+@pytest.mark.parametrize(("rate_hz", "losses"), [(5.0, 0), (60.0, 1)])
+def test_a_slow_camera_may_lose_two_frames(
+    monkeypatch: pytest.MonkeyPatch, rate_hz: float, losses: int
+) -> None:
+    monkeypatch.setattr(reader, "_REOPEN_PERIOD_S", 0.0)
+
+    class Now(MonotonicClock):
+        t_ns = 0
+
+        def now_ns(self) -> int:
+            return self.t_ns
+
+    def frames() -> Iterator[RawFrame | None]:
+        yield RawFrame(1, 0, GRAY)
+        yield from [None] * 30  # 0.6 s
+        yield RawFrame(2, 1, GRAY)
+        ended.wait()
+        yield from repeat(None)
+
+    def read() -> RawFrame | None:
+        clock.t_ns += 20_000_000
+        return next(coming)
+
+    clock, ended, coming = Now(), threading.Event(), frames()
+    camera = Camera(CameraConfig(backend="oak", rate_hz=rate_hz), clock)
+    camera.read = read
+    camera.start()
+    while (frame := camera.newest()) is None or frame.t_ns == 1:
+        pass
+    assert camera.counts() == {"losses": losses}
+    ended.set()
     camera.close()
 
 

@@ -8,6 +8,7 @@ import pytest
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DeviceError, DeviceNotFoundError
 from gripper_force.jobs.checks import RegisterChange, SetupResult
+from gripper_hw import UDEV_RULES
 from gripper_hw.dynamixel.control_table import REGISTERS, load_model
 from gripper_hw.dynamixel.firmware import OVERLOAD_ERROR
 from gripper_hw.dynamixel.packets import Instruction
@@ -181,7 +182,7 @@ def test_adapter_latency_is_checked(endpoint, tmp_path, latency_ms, ok):
     checks = probe(config_of(endpoint, reply_margin_ms=10.0), tmp_path)
     check = next(check for check in checks if check.name == "latency timer")
     assert (check.found, check.ok) == (f"{latency_ms} ms", ok)
-    assert ("hw/udev" in check.advice) is not ok
+    assert (str(UDEV_RULES) in check.advice) is not ok
 
 
 def test_wrong_model_and_missing_port_raise(endpoint):

@@ -55,15 +55,23 @@ def test_scaled_values_of_boards_are_parsed() -> None:
         (b"Weight: -0.50 g", -0.5),
         (b"Load_cell output val: 12.34\r", 12.34),
         (b"reading:\t-8.1", -8.1),
-        (b"HX reading: 12.34", 12.34),
-        (b"Load cell = 3.1 N", 3.1),
+        (b"HX711 reading: 12.34", 12.34),
+        (b"Load cell 1 (N) = 3.1 N", 3.1),
+        (b"one reading:\t-0.4\t| average:\t-0.2\r", -0.4),
+        (b"Weight: 12 g\r", 12.0),
     ]:
         assert parse_hx711(line) == Reading(raw, rounded=True)
-    assert parse_hx711(b"Reading: 4711") == Reading(4711.0)
+    # The basic example of https://github.com/bogde/HX711 has digits in its name.
+    for line in (b"HX711 reading: 4711\r", b"Reading: 4711", b"raw 4711"):
+        assert parse_hx711(line) == Reading(4711.0)
 
 
 @pytest.mark.parametrize(
-    "line", [b"", b"8388608", b"-8388609", b"1,2,3", b"12 34", b"ready", b"1_0", b"1.2.3"]
+    "line",
+    [
+        *(b"", b"8388608", b"-8388609", b"1,2,3", b"12 34", b"ready", b"1_0", b"1.2.3"),
+        *(b"HX711 not found.", b"HX711 Demo", b"a: b: 12", b"| 12", b"x=1 y=2"),
+    ],
 )
 def test_invalid_hx711_line_gives_no_reading(line: bytes) -> None:
     assert parse_hx711(line) is None

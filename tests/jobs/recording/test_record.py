@@ -16,9 +16,18 @@ from gripper_force.jobs.recording import record as module
 from gripper_force.jobs.recording.record import RecordingPlan, record
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log_reader import LogReader
-from gripper_force.types import Frame, GraspStatus, LoadCellSample, Phase, Request, RequestKind
+from gripper_force.types import (
+    NS_PER_S,
+    Frame,
+    GraspStatus,
+    LoadCellSample,
+    Phase,
+    Request,
+    RequestKind,
+)
 from gripper_force.vision.preprocess import Preprocess
 from gripper_hw.dynamixel import virtual
+from gripper_hw.sim.simulated_rig import SimulatedLoadCell
 
 
 @pytest.fixture
@@ -138,6 +147,25 @@ def test_device_failure_ends_recording(
     with pytest.raises(DeviceError, match=sentence):
         made(config.model_copy(update={"faults": broken}), RecordingPlan(1), tmp_path)
     assert not list(tmp_path.rglob("*.mcap"))
+
+
+def test_board_that_is_silent_at_first_is_waited_for(
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As one that resets when its port is opened."""
+    drain = SimulatedLoadCell.drain
+    boots_ns = 3 * NS_PER_S
+
+    def late(cell: SimulatedLoadCell) -> list[LoadCellSample]:
+        return [sample for sample in drain(cell) if sample.t_ns > cell._start_ns + boots_ns]
+
+    monkeypatch.setattr(SimulatedLoadCell, "drain", late)
+    (path,) = made(config, RecordingPlan(1, 1, 3.0), tmp_path)
+    boots_ns = 10 * NS_PER_S
+    with pytest.raises(DeviceError, match=r"no valid sample for 5 s in set 1 \(rejected: none\)"):
+        made(config, RecordingPlan(1, 1, 3.0), tmp_path / "again")
+    first = next(iter(LogReader(path).records(Request)))
+    assert next(iter(LogReader(path).records(LoadCellSample))).t_ns < first.t_ns
 
 
 def test_jaws_open_after_fault_if_configured(config: Config, tmp_path: Path) -> None:

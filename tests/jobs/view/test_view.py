@@ -96,6 +96,7 @@ def fails(error: type[Exception], match: str, *arguments: str | Path) -> None:
         (["--view", "foxglove"], ["--view", "foxglove"]),
         (["--view=foxglove", "--seed", "3"], ["--view=foxglove", "--seed", "3"]),
         (["--seed", "3"], ["--seed", "3"]),
+        ([], []),
     ],
 )
 def test_view_without_a_value_means_rerun(given: list[str], meant: list[str]) -> None:
