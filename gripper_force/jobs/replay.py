@@ -15,7 +15,7 @@ import numpy.typing as npt
 from gripper_force import __version__
 from gripper_force.config import Config, Overrides, config_from_text
 from gripper_force.control.state_machine import Decision
-from gripper_force.errors import DataError, GripperError
+from gripper_force.errors import DataError, GripperError, UnfamiliarFrameError
 from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import CONTACT_N, label_frames
@@ -24,6 +24,7 @@ from gripper_force.jobs.processes import Workers
 from gripper_force.profiles.apply import read_correction, read_profiles
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.perception import FrameProcessor
+from gripper_force.runtime.process import allowed
 from gripper_force.runtime.resolve import ResolvedConfig, make_controller, make_estimator, resolve_vision
 from gripper_force.types import (
     NS_PER_S,
@@ -479,10 +480,13 @@ def _in_batches(
     """Does the same as `_frame_by_frame`, with the networks computed at the end of the log; frames are empty."""
     from gripper_force.vision.batch_inference import kept_checkpoint, prepared_features
     from gripper_force.vision.engines import Step
+    from gripper_force.vision.engines.pytorch import TorchEngine
+    from gripper_force.vision.estimator import ForceEstimator
 
-    estimator = make_estimator(run)
-    assert estimator is not None
     assert run.model is not None
+    vision, checkpoint = run.config.vision, kept_checkpoint(run.model.path, run.model.digest)
+    engine = TorchEngine(checkpoint, threads=vision.threads if allowed().torch_threads else None)
+    estimator = ForceEstimator(engine, vision.region, run.correction)
     preparation = _Preparation(estimator)
     processor = FrameProcessor(preparation)
     kept: list[tuple[Record, VisualForce | None, int]] = []
@@ -493,20 +497,22 @@ def _in_batches(
             record = replace(record, gray=_NO_IMAGE)
         kept.append((record, visual, len(preparation.inputs) - 1))
     if preparation.inputs:
-        networks = kept_checkpoint(run.model.path, run.model.digest).networks
-        forces_n, features = prepared_features(networks, np.stack(preparation.inputs))  # (M, T), (T, F)
+        inputs = np.stack(preparation.inputs)  # (T, S, S)
+        forces_n, features = prepared_features(checkpoint.networks, inputs)  # (M, T), (T, F)
     works = False
     for record, visual, last in kept:
         if visual is not None:
             try:
                 estimate = estimator.finish(Step(forces_n[:, last], features[last], None))
-            except GripperError:  # as `FrameProcessor` treats it
+                visual = replace(visual, force_n=estimate.force_n, std_n=estimate.std_n)
+            except GripperError as error:  # as `FrameProcessor` treats it
                 if not works:
                     raise
-                visual = None
-            else:
-                works = True
-                visual = replace(visual, force_n=estimate.force_n, std_n=estimate.std_n)
+                if isinstance(error, UnfamiliarFrameError):
+                    visual = replace(visual, force_n=error.force_n, std_n=math.inf)
+                else:
+                    visual = None
+            works = True
         yield record, visual
 
 

@@ -1,6 +1,6 @@
 """Inference on whole recordings in batches, on any device. Equals streaming frame by frame."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -14,11 +14,12 @@ from gripper_force.vision.checkpoint import Checkpoint, Member, load_checkpoint
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import DIFFERENCE_GAIN, FLAT_STD, Preprocess
 
-CHUNK = 256
-"""Frames of which the windows are read together; limits memory."""
+BATCH = {"cpu": 16, "cuda": 256}
+"""Frames that pass the backbone together. On a CPU, the maps of a few frames stay in its cache, and the process keeps their
+memory: where larger maps go back to the system each time, a batch takes a third longer."""
 
-BACKBONE_CHUNK = {"cpu": 32, "cuda": 256}
-"""Frames that pass the backbone together. On a CPU, the maps of a few frames stay in its cache."""
+CHUNK = 256
+"""Frames whose windows are read together; limits memory."""
 
 
 @lru_cache(maxsize=2)
@@ -82,7 +83,8 @@ def features(
     """
     clip = torch.from_numpy(frames)[None].to(device)  # (1, T, S, S)
     leading = clip[:, : preprocess.reference_frames]
-    return _run(networks, len(frames), lambda begin, end: normalise(clip[:, begin:end], leading, preprocess))
+    batches = (normalise(part, leading, preprocess) for part in _batches(clip))
+    return _run(networks, batches)
 
 
 @torch.inference_mode()
@@ -91,35 +93,35 @@ def prepared_features(
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
     """Does the same as `features` for the prepared frames of a stream, (T, S, S), on the CPU."""
     clip = torch.from_numpy(inputs)[None, :, None]  # (1, T, 1, S, S)
-    return _run(networks, len(inputs), lambda begin, end: clip[:, begin:end])
+    return _run(networks, _batches(clip))
+
+
+def _batches(clip: Tensor) -> Iterator[Tensor]:
+    size = BATCH[clip.device.type]
+    return (clip[:, begin : begin + size] for begin in range(0, clip.shape[1], size))
 
 
 def _run(
-    networks: Sequence[Member], length: int, inputs: Callable[[int, int], Tensor]
+    networks: Sequence[Member], batches: Iterable[Tensor]
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """Runs the networks on the prepared frames that ``inputs(begin, end)`` returns, (1, end - begin, 1, S, S)."""
-    forces, all_features = [], []
-    for network in networks:
-        found = torch.cat(list(_features(network, length, inputs)))  # (T, head)
-        forces.append(network.force_n(found))
-        all_features.append(found)
-    return torch.stack(forces).cpu().numpy(), torch.cat(all_features, dim=1).cpu().numpy()
+    """Runs the networks on consecutive batches of a recording's prepared frames, (1, N, 1, S, S) each."""
+    parts: list[list[Tensor]] = [[] for _ in networks]
+    maps: list[Tensor | None] = [None for _ in networks]
+    for batch in batches:
+        for i, network in enumerate(networks):
+            if isinstance(network, ForceNetwork):
+                part, maps[i] = network.pooled(batch, maps[i])
+            else:
+                part = network.features(batch)
+            parts[i].append(part[0])
+    features = [_read(network, torch.cat(part)) for network, part in zip(networks, parts, strict=True)]
+    forces = [network.force_n(part) for network, part in zip(networks, features, strict=True)]
+    return torch.stack(forces).cpu().numpy(), torch.cat(features, dim=1).cpu().numpy()
 
 
-def _features(network: Member, length: int, inputs: Callable[[int, int], Tensor]) -> Iterator[Tensor]:
-    context = network.config.context
+def _read(network: Member, pooled: Tensor) -> Tensor:
+    """Returns the inputs of a network's last layer, (T, head), for its output of the batches, (T, C)."""
     if not isinstance(network, ForceNetwork):
-        for begin in range(0, length, CHUNK):
-            first = max(0, begin - context)
-            yield network.features(inputs(first, begin + CHUNK), begin - first)[0]
-        return
-    kept = network.config.maps_kept
-    parts = []
-    step = BACKBONE_CHUNK[network.out.weight.device.type]
-    for begin in range(0, length, step):
-        first = max(0, begin - kept)
-        parts.append(network.pooled(inputs(first, begin + step))[:, begin - first :])
-    pooled = torch.cat(parts, dim=1)  # (1, T, C)
-    for begin in range(0, length, CHUNK):
-        first = max(0, begin - context)
-        yield network.read_windows(pooled[:, first : begin + CHUNK], begin - first)[0]
+        return pooled
+    begins = range(0, len(pooled), CHUNK)
+    return torch.cat([network.read_pooled(pooled, begin, begin + CHUNK) for begin in begins])
