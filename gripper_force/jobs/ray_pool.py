@@ -7,6 +7,7 @@ from concurrent.futures import Executor, Future
 from contextlib import contextmanager, suppress
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
+from socket import create_connection
 from threading import Lock
 from typing import Any
 
@@ -18,6 +19,9 @@ from gripper_force.runtime.process import ProcessOptions, allowed
 _TRIES = 2
 """Further tries of a job whose machine was lost."""
 
+_KNOCK_S = 5.0
+"""Longest wait for the cluster's head to accept a connection."""
+
 
 @contextmanager
 def ray_pool(address: str) -> Iterator[Executor]:
@@ -27,8 +31,7 @@ def ray_pool(address: str) -> Iterator[Executor]:
     counts from this process's folder. A job on a machine that is lost runs again on another one.
 
     Args:
-        address: ``HOST:PORT`` of the head, ``ray://HOST:PORT`` of its client server, or ``auto`` for the cluster
-            that this machine belongs to.
+        address: ``HOST:PORT`` of the head, or ``auto`` for the cluster that this machine belongs to.
 
     Yields:
         An executor. Ray decides how many jobs run at a time: one for each CPU of the cluster.
@@ -40,8 +43,9 @@ def ray_pool(address: str) -> Iterator[Executor]:
         import ray
     handler = signal.getsignal(signal.SIGTERM)
     try:
+        _knock(address)
         ray.init(address, log_to_driver=False, logging_level="error")
-    except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
+    except (OSError, ValueError, RuntimeError) as error:
         reason = str(error).splitlines()[0]
         raise ConfigError(
             f"no Ray cluster answers at {address} ({reason}); start one with `ray start --head`, or leave out --ray"
@@ -55,6 +59,16 @@ def ray_pool(address: str) -> Iterator[Executor]:
     finally:
         pool.end()
         ray.shutdown()
+
+
+def _knock(address: str) -> None:
+    """Raises `OSError` if nothing listens at an address: Ray would try for minutes."""
+    if address == "auto":
+        return
+    host, _, port = address.rpartition(":")
+    if not host or "/" in host or not port.isdecimal():
+        raise ConfigError(f"--ray {address} is no address; give HOST:PORT of the cluster's head, or auto")
+    create_connection((host.strip("[]"), int(port)), _KNOCK_S).close()
 
 
 class _RayPool(Executor):
@@ -96,7 +110,7 @@ class _RayPool(Executor):
         try:
             succeeded, result = ForkingPickler.loads(done.result())
         except Exception as error:
-            reason = str(error).splitlines()[0]
+            reason = (str(error) or type(error).__name__).splitlines()[0]
             future.set_exception(
                 GripperError(f"Ray lost a job: {reason}; see `ray status`, and run it again")
             )

@@ -86,9 +86,9 @@ def test_logs_are_evaluated_like_their_clips(
     expected = evaluate_clips(checkpoint, load_clips(few_logs, checkpoint.header.preprocess))
     assert expected.frames == 3 * 57
     assert capsys.readouterr() == ("", "")
-    for logs in (str(few_logs), sorted(few_logs.iterdir())):
+    for logs, workers in ((str(few_logs), 1), (sorted(few_logs.iterdir()), 2)):
         progress = Mock()
-        result = evaluate(logs, tiny_checkpoint, objects=["disc"], progress=progress)
+        result = evaluate(logs, tiny_checkpoint, objects=["disc"], workers=workers, progress=progress)
         assert (result.mae_n, result.per_bin) == (expected.mae_n, expected.per_bin)
         steps = [call.args[1] if len(call.args) > 1 else 1 for call in progress.call_args_list]
         assert sum(steps) == len(list(few_logs.iterdir()))

@@ -28,6 +28,7 @@ from gripper_force.jobs.replay import (
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import (
+    Frame,
     FusedForce,
     GraspStatus,
     LoadCellSample,
@@ -238,6 +239,27 @@ def test_another_network_in_batches_gives_the_estimates_of_a_run(fused_log: Path
     # Without contact the score divides by little, so rounding shows more.
     assert [v.std_n for v in batch.visual] == pytest.approx([v.std_n for v in single.visual], abs=1e-3)
     assert len(batch.decisions) == len(single.decisions)
+
+
+def test_frames_that_a_network_does_not_know_are_the_same_in_batches(fused_log: Path, tmp_path: Path) -> None:
+    small = load_checkpoint("small")
+    assert small.header.ood is not None
+    limits = [one.model_copy(update={"limit": 0.45 * one.limit}) for one in small.header.ood.limits]
+    ood = small.header.ood.model_copy(update={"limits": tuple(limits)})
+    strict = tmp_path / "strict.safetensors"
+    save_checkpoint(strict, small.networks, small.header.model_copy(update={"ood": ood}))
+    dark = tampered(  # rejected before the network sees it
+        fused_log,
+        tmp_path / "dark.mcap",
+        lambda r: dataclasses.replace(r, gray=r.gray // 4) if isinstance(r, Frame) and r.seq == 40 else r,
+    )
+    reader = LogReader(dark)
+    run = resolve_replay(changed_config(reader, str(strict)))
+    single, batch = run_again(reader, run).visual, run_again(reader, run, in_batches=True).visual
+    assert {v.is_familiar for v in single} == {True, False}
+    assert 40 not in {v.seq for v in single}
+    assert [(v.seq, v.is_familiar) for v in batch] == [(v.seq, v.is_familiar) for v in single]
+    assert [v.force_n for v in batch] == pytest.approx([v.force_n for v in single], abs=1e-4)
 
 
 def test_the_columns_hold_each_estimate(fused_log: Path) -> None:

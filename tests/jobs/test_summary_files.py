@@ -1,6 +1,5 @@
 import csv
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -8,14 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from gripper_force import cli
-from gripper_force.errors import ConfigError
 from gripper_force.jobs import summary_files
-
-
-def test_out_without_pyarrow_names_the_extra(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
-    with pytest.raises(ConfigError, match=r"gripper-force\[parquet\]"):
-        summary_files.check_writable(tmp_path / "out")
 
 
 def test_the_files_agree(tmp_path: Path) -> None:
