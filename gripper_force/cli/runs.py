@@ -227,6 +227,7 @@ def replay(
     from gripper_force.jobs import replay as job
     from gripper_force.jobs.dataset import find_logs
     from gripper_force.jobs.summary_files import check_writable, replay_tables, write_summary
+    from gripper_force.vision.model_files import read_model
 
     paths = [path for given in logs for path in (find_logs(given) if given.is_dir() else [given])]
     replay_all = partial(job.replay_each, paths, recover=recover, workers=jobs, ray=ray)
@@ -237,8 +238,11 @@ def replay(
             raise ConfigError(
                 "--compare names its checkpoints and writes no report; leave out --checkpoint and --report"
             )
+        sides = [_choice(text) for text in compare]
+        for other, _ in sides:
+            if other is not None:
+                read_model(other)  # a missing one ends the command before the first side is computed
         with console.bar("replaying", 2 * len(paths)) as progress:
-            sides = [_choice(text) for text in compare]
             first, second = (
                 replay_all(checkpoint=other, overrides=[*(set_ or []), *changes], progress=progress)
                 for other, changes in sides

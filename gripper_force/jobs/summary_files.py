@@ -35,10 +35,10 @@ td.number {{ text-align: right; }}
 """
 
 _NOTES: Final = {
-    "sources": "Errors against the load cell over all estimates. The mean over logs counts each log once; low_n and "
-    "high_n are the ends of its 95 % interval (Student's t).",
-    "differences": "Mean over logs of second less first, of each log's mean absolute error, with the ends of its 95 % "
-    "interval (Student's t).",
+    "sources": "Errors against the load cell over all estimates, without frames that a network does not know. The mean "
+    "over logs counts each log once; low and high are the ends of its 95 % interval (Student's t).",
+    "differences": "Second less first, of each log's mean absolute error: the mean over logs, and the ends of its 95 % "
+    "interval, low and high (Student's t). If zero lies between them, the logs show no difference.",
     "failed": "These logs are not part of the figures.",
 }
 
@@ -65,7 +65,7 @@ def replay_tables(
     from gripper_force.jobs.metrics import mean_interval
     from gripper_force.jobs.replay import summary
 
-    tables: dict[str, Rows] = {name: [] for name in ("sources", "objects", "differences", "logs", "failed")}
+    tables: dict[str, Rows] = {name: [] for name in ("differences", "sources", "objects", "logs", "failed")}
     for side, replays in sides.items():
         head = {"setting": side} if len(sides) > 1 else {}
         over_all = summary(replays.results)
@@ -157,7 +157,7 @@ def _write_parquet(path: Path, columns: "Sequence[Columns]") -> None:
 
 
 def _section(name: str, rows: Rows) -> str:
-    head = "".join(f"<th>{escape(key)}</th>" for key in rows[0])
+    head = "".join(f"<th>{escape(_heading(key))}</th>" for key in rows[0])
     body = "".join(f"<tr>{''.join(_cell(value) for value in row.values())}</tr>" for row in rows)
     note = f"<p>{escape(_NOTES[name])}</p>" if name in _NOTES else ""
     return (
@@ -166,12 +166,19 @@ def _section(name: str, rows: Rows) -> str:
     )
 
 
+def _heading(key: str) -> str:
+    """Returns the name of a column, with its unit in brackets."""
+    name, _, unit = key.replace("rmse", "RMSE").replace("mae", "MAE").rpartition("_")
+    units = {"n": "N", "s": "s"}
+    return f"{name.replace('_', ' ')} [{units[unit]}]" if unit in units else key
+
+
 def _cell(value: object) -> str:
     value = _known(value)
     if isinstance(value, bool):
         value = "yes" if value else "no"
     if isinstance(value, float):
-        return f'<td class="number">{value:.4f}</td>'
+        return f'<td class="number">{value:.3f}</td>'
     if isinstance(value, int):
         return f'<td class="number">{value}</td>'
     return f"<td>{'-' if value is None else escape(str(value))}</td>"

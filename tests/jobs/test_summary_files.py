@@ -19,7 +19,9 @@ def test_the_files_agree(tmp_path: Path) -> None:
     assert [row["mae_n"] for row in csv.DictReader((tmp_path / "summary.csv").read_text().splitlines())] == [
         "0.25"
     ]
-    assert "&lt;a&gt;.mcap" in (tmp_path / "summary.html").read_text()
+    page = (tmp_path / "summary.html").read_text()
+    assert "&lt;a&gt;.mcap" in page
+    assert "<th>MAE [N]</th><th>lag [s]</th>" in page
     from pyarrow import parquet
 
     assert parquet.read_table(tmp_path / "frames.parquet").column("visual_n").to_pylist()[:2] == [1.0, 2.0]
