@@ -9,9 +9,10 @@ from typer.testing import CliRunner
 from gripper_force import cli
 from gripper_force.jobs import summary_files
 
+pytest.importorskip("pyarrow", reason="pyarrow is not installed: pip install 'gripper-force[parquet]'")
+
 
 def test_the_files_agree(tmp_path: Path) -> None:
-    pytest.importorskip("pyarrow")
     tables = {"sources": [], "logs": [{"log": "<a>.mcap", "mae_n": 0.25, "lag_s": float("nan")}]}
     columns = {"log": np.array(["<a>.mcap"] * 3), "visual_n": np.array([1.0, 2.0, np.nan])}
     summary_files.write_summary(tmp_path, "Title", tables, [columns])
@@ -29,7 +30,6 @@ def test_the_files_agree(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("command", ["evaluate", "replay", "compare"])
 def test_commands_write_them(command: str, few_logs: Path, fused_log: Path, tmp_path: Path) -> None:
-    pytest.importorskip("pyarrow")
     call = {
         "evaluate": ["evaluate", str(few_logs), "--checkpoint", "small"],
         "replay": ["replay", str(fused_log), str(fused_log)],
