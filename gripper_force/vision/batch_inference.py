@@ -14,7 +14,7 @@ from gripper_force.vision.checkpoint import Checkpoint, Member, load_checkpoint
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import DIFFERENCE_GAIN, FLAT_STD, Preprocess
 
-BATCH = {"cpu": 16, "cuda": 256}
+BATCH = {"cpu": 32, "cuda": 256}
 """Frames that pass the backbone together. On a CPU, the maps of a few frames stay in its cache, and the process
 keeps their memory: where larger maps go back to the system each time, a batch takes a third longer."""
 
