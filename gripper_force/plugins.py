@@ -23,7 +23,9 @@ EXTRAS: Final = {
     **dict.fromkeys(("openvino", "nncf", "onnx", "onnxscript"), "engines"),
     **dict.fromkeys(("rerun", "foxglove"), "view"),
     "lerobot": "lerobot",
+    "pyarrow": "parquet",
     "Phidget22": "phidget",
+    "ray": "ray",
 }
 """Extra of gripper-force that installs each optional module."""
 

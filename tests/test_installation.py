@@ -218,6 +218,8 @@ LINKAGE = "gripper.linkage={kind: table, table: [[0, 0.092], [1, 0.05], [2, 0]]}
             "--report needs matplotlib",
             "report",
         ),
+        (["replay", "frames.mcap", "--out=summary"], "--out needs pyarrow", "parquet"),
+        (["replay", "frames.mcap", "--ray=auto"], "--ray needs ray", "ray"),
         (["simulate", "--presses=1"], "needs mujoco", "sim"),
         (["view", "frames.mcap"], "rerun needs the package rerun-sdk", "view"),
     ],

@@ -261,6 +261,50 @@ def loop(
     _show({"loop": costs, "log": log}, as_json, lambda: loop_table(costs, log))
 
 
+@app.command("replay")
+def replay(
+    logs: Annotated[Path | None, typer.Option(help="Folder with logs. Default: simulated presses.")] = None,
+    presses: Annotated[int, typer.Option(min=1, help="Simulated presses, without --logs.")] = 24,
+    checkpoints: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--checkpoint", help="Checkpoint, by path or name. Repeatable. Default: default and small."
+        ),
+    ] = None,
+    rounds: Annotated[int, typer.Option(min=1, help="Rounds, in each of which all ways take turns.")] = 2,
+    jobs: Jobs = CORES,
+    write: Page = None,
+    set_: NoOverrides = None,
+    as_json: AsJson = False,
+) -> None:
+    """Measure how fast many logs are replayed and evaluated: in one process, in several, and on a Ray cluster."""
+    from tempfile import TemporaryDirectory
+
+    from gripper_force.config import load_config
+    from gripper_force.jobs.dataset import find_logs
+    from gripper_force.jobs.simulate import plan, simulate
+    from gripper_force.qualification.bench import replay_bench
+    from gripper_force.qualification.markdown_blocks import write_between
+
+    _reject_overrides("replay", set_)
+    load = os.getloadavg()[0]
+    with TemporaryDirectory() as name:
+        if logs is None:
+            logs = Path(name) / "logs"
+            with console.bar("simulating", presses) as progress:
+                for made in simulate(plan("press", presses, 900_000), logs, load_config(None, None), jobs):
+                    progress(made.name)
+        count = len(find_logs(logs))
+        rows = replay_bench.bench(logs, checkpoints or ["default", "small"], jobs, rounds, console.line)
+    about = (
+        f"{count} logs, median of {rounds} rounds, {CORES} cores, load {load:.1f} before the first command."
+    )
+    text = replay_bench.markdown(rows, about)
+    if write is not None:
+        write_between(write, "rates", text)
+    _show({"replay": rows}, as_json, lambda: console.out.print(text, soft_wrap=True))
+
+
 @app.command("recognition")
 def recognition(
     presses: Annotated[int, typer.Option(min=1, help="Simulated presses of each row.")] = 8,

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
+import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
@@ -145,6 +146,16 @@ def jsonable(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return str(value) if isinstance(value, Path) else value
+
+
+def end_with_failures(failed: Mapping[str, object], count: int) -> None:
+    """Prints the problem of each of ``count`` logs that failed, and ends with exit code 2 if there are any."""
+    if not failed:
+        return
+    for problem in failed.values():
+        err.print(f"[bold red]error:[/] {escape(str(problem))}", soft_wrap=True)
+    err.print(f"{len(failed)} of {count} logs are not part of the figures")
+    raise typer.Exit(2)
 
 
 def number(value: object, unit: str = "", digits: int = 3) -> str:

@@ -7,7 +7,7 @@ from typing import Annotated, Final
 import typer
 
 from gripper_force.cli import console
-from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, load_settings
+from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, Ray, load_settings
 from gripper_force.cli.output.data import database_table, imports_table, sets_table
 from gripper_force.errors import ConfigError, DataError
 
@@ -58,6 +58,7 @@ def simulate(
         ),
     ] = None,
     jobs: Jobs = CORES,
+    ray: Ray = None,
     config: ConfigPath = None,
     set_: Overrides = None,
     as_json: AsJson = False,
@@ -106,7 +107,7 @@ def simulate(
     made = 0
     with console.bar("simulating", len(names)) as progress:
         progress("", sum((folder / name).exists() for name in names))
-        with closing(job.simulate(plans, folder, settings, jobs)) as paths:
+        with closing(job.simulate(plans, folder, settings, jobs, ray)) as paths:
             for path in paths:
                 made += 1
                 progress(path.name)

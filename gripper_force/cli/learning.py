@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from gripper_force.cli import console
-from gripper_force.cli.options import CORES, AsJson, Jobs, Overrides, load_settings
+from gripper_force.cli.options import CORES, AsJson, Jobs, Overrides, Ray, SummaryFolder, load_settings
 from gripper_force.cli.output.paper import paper_tables
 from gripper_force.cli.output.runs import errors_table
 from gripper_force.errors import ConfigError
@@ -160,11 +160,16 @@ def evaluate(
     plot: Annotated[
         Path | None, typer.Option(help="Figure to write: estimates and errors against the load cell.")
     ] = None,
+    out: SummaryFolder = None,
     jobs: Jobs = CORES,
+    ray: Ray = None,
     set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compare a checkpoint's estimates with the load cell, over all logs of a folder."""
+    """Compare a checkpoint's estimates with the load cell, over all logs of a folder.
+
+    Exit code 2 if a log could not be read; the others are evaluated.
+    """
     from gripper_force.jobs.dataset import find_logs
     from gripper_force.jobs.evaluate import evaluate as job
     from gripper_force.profiles.apply import with_bundle
@@ -173,7 +178,7 @@ def evaluate(
     if settings.calibration.object not in (None, "own"):
         settings, _ = with_bundle(settings)
     logs = find_logs(data)
-    with console.bar("evaluating", 2 * len(logs)) as progress:
+    with console.bar("evaluating", len(logs)) as progress:
         result = job(
             logs,
             settings.vision.checkpoint,
@@ -181,15 +186,20 @@ def evaluate(
             config=settings,
             include_contact_starts=include_contact_starts,
             workers=jobs,
+            ray=ray,
             plot=plot,
+            out=out,
             progress=progress,
         )
     _warn_left_out(result.left_out, len(logs))
     console.show(result, as_json, errors_table)
     if plot is not None:
         console.err.print(f"figure: {plot}", soft_wrap=True, markup=False)
+    if out is not None:
+        console.err.print(f"summary: {out / 'summary.html'}", soft_wrap=True, markup=False)
     if checkpoint is not None:
         console.next_step("grasp", "--set", f"vision.checkpoint={checkpoint}")
+    console.end_with_failures(result.failed, len(logs))
 
 
 def export_network(

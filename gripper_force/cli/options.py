@@ -21,6 +21,17 @@ NoOverrides = Annotated[
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
 Jobs = Annotated[int, typer.Option(min=1, help="Processes to use.")]
+Ray = Annotated[
+    str | None,
+    typer.Option(help="Use a Ray cluster instead of --jobs: its address, or auto.", metavar="ADDRESS"),
+]
+SummaryFolder = Annotated[
+    Path | None,
+    typer.Option(
+        "--out",
+        help="Folder for a summary (summary.html, .csv and .json) and the estimates of each frame (frames.parquet).",
+    ),
+]
 Page = Annotated[Path | None, typer.Option("--write", help="Markdown page to write the table into.")]
 
 

@@ -15,6 +15,8 @@ from gripper_force.cli.options import (
     ConfigPath,
     Jobs,
     Overrides,
+    Ray,
+    SummaryFolder,
     again,
     load_settings,
     load_settings_before_rig,
@@ -206,62 +208,98 @@ def replay(
             help="Write the report again, beside the log; with --set or --checkpoint that of the replay."
         ),
     ] = False,
+    out: SummaryFolder = None,
     jobs: Jobs = CORES,
+    ray: Ray = None,
 ) -> None:
     """Run estimator and controller again on logs, and compare the estimates with their load cells.
 
     A replay is open loop: it shows what the controller would have commanded with another setting, but not the
-    force that would have followed.
+    force that would have followed. Exit code 2 if a log could not be read; the others are replayed.
     """
     from functools import partial
 
     if report:
         require("matplotlib", "--report")
+
+    import numpy as np
+
     from gripper_force.jobs import replay as job
     from gripper_force.jobs.dataset import find_logs
+    from gripper_force.jobs.summary_files import check_writable, replay_tables, write_summary
+    from gripper_force.vision.model_files import read_model
 
     paths = [path for given in logs for path in (find_logs(given) if given.is_dir() else [given])]
-    again = partial(job.replay_each, paths, recover=recover, workers=jobs)
+    replay_all = partial(job.replay_each, paths, recover=recover, workers=jobs, ray=ray)
+    if out is not None:
+        check_writable(out)
     if compare is not None:
         if checkpoint or report:
             raise ConfigError(
                 "--compare names its checkpoints and writes no report; leave out --checkpoint and --report"
             )
+        sides = [_choice(text) for text in compare]
+        for other, _ in sides:
+            if other is not None:
+                read_model(other)  # a missing one ends the command before the first side is computed
         with console.bar("replaying", 2 * len(paths)) as progress:
-            sides = [_choice(text) for text in compare]
             first, second = (
-                again(checkpoint=other, overrides=[*(set_ or []), *changes], progress=progress)
+                replay_all(checkpoint=other, overrides=[*(set_ or []), *changes], progress=progress)
                 for other, changes in sides
             )
-        found = job.paired_differences(first, second)
-        printed = {"logs": len(paths), "first": compare[0], "second": compare[1], "differences": found}
+        failed = {**first.failed, **second.failed}
+        pair = tuple([r for r in side.results if r.log not in failed] for side in (first, second))
+        found = job.paired_differences(*pair)
+        printed = {"logs": len(pair[0]), "first": compare[0], "second": compare[1], "differences": found}
         console.show(printed, as_json, lambda _: differences_table(*compare, found))
+        if out is not None:
+            tables = replay_tables(dict(zip(compare, (first, second), strict=True)), found)
+            columns = [
+                {"setting": np.full(len(one["log"]), name), **one}
+                for name, side in zip(compare, (first, second), strict=True)
+                for one in side.columns
+            ]
+            write_summary(out, f"Replay with {compare[0]} and with {compare[1]}", tables, columns)
+            console.err.print(f"summary: {out / 'summary.html'}", soft_wrap=True, markup=False)
         console.err.print(_OPEN_LOOP, soft_wrap=True)
+        console.end_with_failures(failed, len(paths))
         return
     with console.bar("replaying", len(paths), hidden=len(paths) == 1) as progress:
-        results = again(checkpoint=checkpoint, overrides=set_, progress=progress)
+        replays = replay_all(checkpoint=checkpoint, overrides=set_, progress=progress)
+    results = replays.results
     pages = []
     if report:
         from gripper_force.jobs.report import write_report
 
-        with console.bar("writing reports", len(paths), hidden=len(paths) == 1) as progress:
-            for path in paths:
+        whole = [path for path in paths if str(path) not in replays.failed]
+        with console.bar("writing reports", len(whole), hidden=len(paths) == 1) as progress:
+            for path in whole:
                 written = write_report(path, recover=recover, checkpoint=checkpoint, overrides=set_)
                 pages.append(str(written.html))
                 progress(path.name)
-    if len(results) == 1:
+    if len(paths) == 1:
         shown = {**console.jsonable(results[0]), **({"report": pages[0]} if pages else {})}
         console.show(shown, as_json, lambda _: replay_table(results[0], pages[0] if pages else None))
     else:
         summary = job.summary(results)
-        printed = {"logs": results, "summary": summary, **({"reports": pages} if pages else {})}
+        problems = {log: str(error) for log, error in replays.failed.items()}
+        printed = {
+            "logs": results,
+            "summary": summary,
+            **({"failed": problems} if problems else {}),
+            **({"reports": pages} if pages else {}),
+        }
         console.show(printed, as_json, lambda _: replays_table(results, summary, pages))
+    if out is not None:
+        write_summary(out, f"Replay of {len(results)} logs", replay_tables({"": replays}), replays.columns)
+        console.err.print(f"summary: {out / 'summary.html'}", soft_wrap=True, markup=False)
     if set_ or checkpoint:
         console.err.print(_OPEN_LOOP, soft_wrap=True)
     if pages:
         console.err.print(f"next: open {pages[0]}", soft_wrap=True, markup=False)
     elif len(results) == 1:
         console.next_step("replay", *logs, *_changes(checkpoint, set_), "--report")
+    console.end_with_failures(replays.failed, len(paths))
 
 
 def _changes(checkpoint: str | None, overrides: list[str] | None) -> list[str]:

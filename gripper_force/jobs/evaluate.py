@@ -1,32 +1,42 @@
 """Evaluation of a checkpoint on recordings that training has not seen."""
 
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Collection, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
 
-from gripper_force.config import Config
-from gripper_force.errors import DataError
+from gripper_force.config import Config, config_from
+from gripper_force.errors import DataError, GripperError
 from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import (
     CONTACT_N,
     Clip,
     check_size,
-    load_clips,
+    find_logs,
+    load_clip,
+    starts_in_contact,
     stiffness_floor_n,
     without_contact_starts,
 )
 from gripper_force.jobs.object_gain import gain_of
+from gripper_force.jobs.processes import Workers
+from gripper_force.jobs.summary_files import check_writable, evaluation_tables, write_summary
 from gripper_force.profiles.apply import read_correction, read_profiles, with_object
 from gripper_force.profiles.correction import Correction
-from gripper_force.vision.batch_inference import features, predict
-from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
+from gripper_force.schema import Tree
+from gripper_force.vision.batch_inference import features, kept_checkpoint, predict
+from gripper_force.vision.checkpoint import Checkpoint
+from gripper_force.vision.engines.pytorch import restored_threads
+from gripper_force.vision.model_files import read_model
 
 RIDGE_SIZE_PX: Final = 32
 RIDGE_COMPONENTS: Final = 20
@@ -68,6 +78,8 @@ class Evaluation:
         per_object: Errors by object.
         per_bin: Errors by measured force, in bins of 1 N.
         left_out: Logs that were left out because they start in contact.
+        per_log: Errors by path of the log; empty for clips.
+        failed: Problem of each log that could not be evaluated, by path.
     """
 
     mae_n: float
@@ -78,6 +90,8 @@ class Evaluation:
     per_object: dict[str, ObjectErrors]
     per_bin: list[metrics.ForceBin]
     left_out: int = 0
+    per_log: dict[str, ObjectErrors] = field(default_factory=dict)
+    failed: dict[str, str] = field(default_factory=dict)
 
 
 def evaluate(
@@ -89,7 +103,9 @@ def evaluate(
     config: Config | None = None,
     include_contact_starts: bool = False,
     workers: int = 1,
+    ray: str | None = None,
     plot: Path | None = None,
+    out: Path | None = None,
     progress: Progress = no_progress,
 ) -> Evaluation:
     """Compares a checkpoint's estimates with the load cell, over logs that training has not seen.
@@ -111,97 +127,135 @@ def evaluate(
             ``calibration.on_mismatch`` applies to profiles of another rig than a log's. Default: the defaults.
         include_contact_starts: Also use logs that start in contact. Their reference frames are wrong, and so
             are the estimates.
-        workers: Processes that read the logs.
+        workers: Processes to use. Results do not depend on them.
+        ray: Address of a Ray cluster to use instead, see `gripper_force.jobs.ray_pool`; None for none.
         plot: Figure to write: estimates and errors against the load cell; None for none.
-        progress: Called twice for each log: after reading and after evaluating it.
+        out: Folder for a summary and the estimates, see `gripper_force.jobs.summary_files`; None for none.
+        progress: Called after each log.
 
     Returns:
         The errors over all frames with a load-cell force, by object, and by measured force.
 
+    A log that can't be read, or has no frames or no labels, does not stop the others; see `Evaluation.failed`.
+
     Raises:
-        DataError: There are no logs, none of these objects, a log has no frames or no labels, or all start in
-            contact.
-        LogError: A log can't be read.
+        DataError: There are no logs, none of these objects, or all start in contact.
+        LogError: No log can be read. The error is that of the first.
         CheckpointError: The checkpoint can't be read.
         ConfigError: The profile can't be read, or belongs to another checkpoint or camera.
     """
+    if out is not None:
+        check_writable(out)
     config = Config() if config is None else config
-    loaded = load_checkpoint(checkpoint)
-    clips = load_clips(logs, loaded.header.preprocess, config.vision.region, workers, progress)
-    chosen = [clip for clip in clips if not objects or clip.object in objects]
-    if not chosen:
-        raise DataError(f"no log in {logs} is of {', '.join(objects)}; choose among the logs' own objects")
-    used = chosen if include_contact_starts else without_contact_starts(chosen, loaded.header.preprocess)
-    progress("", len(clips) - len(used))
+    model = read_model(checkpoint)
     calibration = config.calibration
     if profile is not None:
         calibration = calibration.model_copy(update={"object": profile})
-
-    def correction(clip: Clip) -> Correction | None:
-        own = config.model_copy(update={"object": clip.object, "calibration": calibration})
-        return read_correction(own, read_profiles(own), loaded, clip.rig)
-
-    def gain(clip: Clip) -> float:
-        own = config.model_copy(update={"object": clip.object, "calibration": calibration})
-        ratio = with_object(own.control, read_profiles(own)).object_ratio
-        found = gain_of(ratio, config.gripper.gain_std)
-        return 1.0 if found is None else found.gain
-
-    forces_n = estimate_clips(
-        loaded, used, None if calibration.object is None else correction, gain, progress
+    settings = config.model_copy(update={"calibration": calibration})
+    paths = find_logs(logs)
+    one = partial(
+        _evaluate_log,
+        checkpoint=(model.path, model.digest),
+        config=settings.model_dump(mode="json"),
+        objects=tuple(objects),
+        include_contact_starts=include_contact_starts,
     )
-    lead_in = loaded.header.preprocess.lead_in
-    result = compare(used, forces_n, lead_in)
+    found: dict[int, _Evaluated] = {}
+    failed: dict[int, GripperError] = {}
+    with closing(Workers(workers, ray).run_each(one, paths)) as answers:
+        for index, answer in answers:
+            if isinstance(answer, GripperError):
+                failed[index] = answer
+                progress(f"failed: {paths[index].name}")
+            else:
+                found[index] = answer
+                progress(f"evaluated {paths[index].name}")
+    if failed and not found:
+        raise failed[min(failed)]
+    chosen = {paths[index]: found[index] for index in sorted(found) if found[index].is_chosen}
+    if not chosen:
+        raise DataError(f"no log in {logs} is of {', '.join(objects)}; choose among the logs' own objects")
+    used = {path: one for path, one in chosen.items() if one.forces_n is not None}
+    if not used:
+        without_contact_starts([one.clip for one in chosen.values()], model.header.preprocess)  # raises
+    clips = [one.clip for one in used.values()]
+    forces_n = [one.forces_n for one in used.values() if one.forces_n is not None]
+    each = list(zip(used, clips, forces_n, strict=True))
+    lead_in = model.header.preprocess.lead_in
+    result = replace(
+        compare(clips, forces_n, lead_in),
+        left_out=len(chosen) - len(clips),
+        per_log={str(path): _log_errors(clip, force_n, lead_in) for path, clip, force_n in each},
+        failed={str(paths[index]): str(failed[index]) for index in sorted(failed)},
+    )
     if plot is not None:
         from gripper_force.jobs.report.plots import draw_estimates
 
-        title = f"{checkpoint}: MAE {result.mae_n:.3f} N on {len(used)} logs"
-        draw_estimates(*_labelled(used, forces_n, lead_in), title, plot)
-    return replace(result, left_out=len(chosen) - len(used))
+        title = f"{checkpoint}: MAE {result.mae_n:.3f} N on {len(clips)} logs"
+        draw_estimates(*_labelled(clips, forces_n, lead_in), title, plot)
+    if out is not None:
+        columns = [_columns(*one) for one in each]
+        write_summary(out, f"Evaluation of {checkpoint}", evaluation_tables(result), columns)
+    return result
+
+
+def _columns(path: Path, clip: Clip, forces_n: npt.NDArray[np.floating]) -> dict[str, npt.NDArray[Any]]:
+    """Returns the estimate of each frame of a log, and its load-cell force, NaN without a label; all (T,)."""
+    return {
+        "log": np.full(len(forces_n), str(path)),
+        "object": np.full(len(forces_n), clip.object),
+        "frame": np.arange(len(forces_n)),
+        "measured_n": np.where(clip.valid, clip.forces_n, np.float32("nan")),
+        "visual_n": forces_n,
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class _Evaluated:
+    """A recording without its images, and the estimates; None if it starts in contact or is of another object."""
+
+    clip: Clip
+    is_chosen: bool
+    forces_n: npt.NDArray[np.floating] | None
+
+
+def _evaluate_log(
+    path: Path,
+    *,
+    checkpoint: tuple[Path, str],
+    config: Tree,
+    objects: tuple[str, ...],
+    include_contact_starts: bool,
+) -> _Evaluated:
+    """Reads and estimates one log, with one thread: the last digits depend on their number."""
+    settings = config_from(config, "evaluate")
+    loaded = kept_checkpoint(*checkpoint)
+    preprocess = loaded.header.preprocess
+    clip = load_clip(path, preprocess, settings.vision.region)
+    kept = replace(clip, frames=clip.frames[:, :0, :0])
+    if objects and clip.object not in objects:
+        return _Evaluated(kept, False, None)
+    in_contact = preprocess.reference and starts_in_contact(clip.forces_n, preprocess.reference_frames)
+    if in_contact and not include_contact_starts:
+        return _Evaluated(kept, True, None)
+    own = settings.model_copy(update={"object": clip.object})
+    profiles = read_profiles(own)
+    gain = gain_of(with_object(own.control, profiles).object_ratio, settings.gripper.gain_std)
+    with restored_threads():
+        torch.set_num_threads(1)
+        if settings.calibration.object is None:
+            force_n = estimates(loaded, [clip])[0].mean(0)
+        else:
+            force_n = _corrected_n(loaded, clip, read_correction(own, profiles, loaded, clip.rig))
+    return _Evaluated(kept, True, (1.0 if gain is None else gain.gain) * force_n)
 
 
 def evaluate_clips(
-    checkpoint: Checkpoint,
-    clips: Sequence[Clip],
-    correction: Callable[[Clip], Correction | None] | None = None,
-    gain: Callable[[Clip], float] = lambda clip: 1.0,
-    progress: Progress = no_progress,
+    checkpoint: Checkpoint, clips: Sequence[Clip], progress: Progress = no_progress
 ) -> Evaluation:
-    """Compares a checkpoint's estimates with the load cell, over clips: `estimate_clips` and `compare`."""
-    forces_n = estimate_clips(checkpoint, clips, correction, gain, progress)
+    """Compares a checkpoint's estimates with the load cell, over clips: `estimates` and `compare`."""
+    forces_n = [members_n.mean(0) for members_n in estimates(checkpoint, clips, progress)]
     return compare(clips, forces_n, checkpoint.header.preprocess.lead_in)
-
-
-def estimate_clips(
-    checkpoint: Checkpoint,
-    clips: Sequence[Clip],
-    correction: Callable[[Clip], Correction | None] | None = None,
-    gain: Callable[[Clip], float] = lambda clip: 1.0,
-    progress: Progress = no_progress,
-) -> list[npt.NDArray[np.floating]]:
-    """Estimates the force in each frame of clips, as a run would.
-
-    Args:
-        checkpoint: The ensemble, computed on a GPU if there is one; with corrections, on the CPU.
-        clips: Recordings, downscaled to the checkpoint's size.
-        correction: Returns the correction for a clip's object.
-        gain: Returns the gain of a clip's object.
-        progress: Called after each clip.
-
-    Returns:
-        Forces in N of each clip, (T,).
-
-    Raises:
-        DataError: Frames are of another size.
-    """
-    if correction is None:
-        means_n = [members_n.mean(0) for members_n in estimates(checkpoint, clips, progress)]
-    else:
-        means_n = []
-        for clip in clips:
-            means_n.append(_corrected_n(checkpoint, clip, correction(clip)))
-            progress(f"evaluated {clip.name}")
-    return [gain(clip) * mean_n for clip, mean_n in zip(clips, means_n, strict=True)]
 
 
 def estimates(
@@ -323,6 +377,14 @@ def _object_errors(
         floor_n=float(floors_n.mean()),
         frames=len(measured_n),
     )
+
+
+def _log_errors(clip: Clip, forces_n: npt.NDArray[np.floating], lead_in: int) -> ObjectErrors:
+    valid = clip.valid & (np.arange(len(forces_n)) >= lead_in)
+    if not valid.any():
+        return ObjectErrors(math.nan, math.nan, math.nan, math.nan, 0)
+    measured_n = clip.forces_n[valid]
+    return _object_errors(forces_n[valid], measured_n, stiffness_floor_n(measured_n, clip.stiffness))
 
 
 def _has_label(clips: Sequence[Clip], lead_in: int) -> npt.NDArray[np.bool_]:

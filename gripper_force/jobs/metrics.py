@@ -33,6 +33,18 @@ class ForceBin:
     bias_n: float
 
 
+def mean_interval(values: Signal) -> tuple[float, float | None, float | None]:
+    """Returns the mean, and the ends of its 95 % interval (Student's t), which are None for one value."""
+    from scipy import stats  # imported here: it takes longer than a replay's other imports
+
+    each = np.asarray(values, np.float64)
+    mean = float(each.mean())
+    if len(each) < 2:
+        return mean, None, None
+    half = float(stats.t.ppf(0.975, len(each) - 1)) * float(each.std(ddof=1)) / len(each) ** 0.5
+    return mean, mean - half, mean + half
+
+
 def mae(predicted: Signal, measured: Signal) -> float:
     """Mean absolute error."""
     return float(np.abs(_error(predicted, measured)).mean())

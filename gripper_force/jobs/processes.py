@@ -1,20 +1,20 @@
-"""Process pools for independent jobs, which end at once and quietly on an interrupt."""
+"""Pools for independent jobs: processes of this machine, which end at once on an interrupt, or a Ray cluster."""
 
 import atexit
 import os
 import signal
 import threading
 import traceback
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import Executor, Future, as_completed
 from contextlib import contextmanager, suppress
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from multiprocessing import get_context, parent_process, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from multiprocessing.reduction import ForkingPickler
 from queue import Empty, SimpleQueue
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from gripper_force.errors import GripperError
 from gripper_force.runtime.process import ProcessOptions, allowed, own_process
@@ -25,7 +25,62 @@ _TERMINAL_SIGNALS: Final = (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
 _THREAD_S: Final = 1.0
 """Longest wait for a thread whose process was killed: an interrupt can leave a future locked."""
 
+T = TypeVar("T")
+R = TypeVar("R")
+
 _Job = tuple[Future[Any], Callable[..., Any], tuple[Any, ...], dict[str, Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Workers:
+    """Processes that independent jobs run in.
+
+    Attributes:
+        count: Processes of this machine; 1: this process.
+        ray: Address of a Ray cluster, whose processes are used instead; None for none.
+    """
+
+    count: int = 1
+    ray: str | None = None
+
+    @contextmanager
+    def pool(self) -> Iterator[Executor]:
+        """Opens the pool. If the block ends with an exception, its jobs are ended."""
+        if self.ray is None:
+            with process_pool(self.count) as pool:
+                yield pool
+            return
+        from gripper_force.jobs.ray_pool import ray_pool
+
+        with ray_pool(self.ray) as pool:
+            yield pool
+
+    def run_each(
+        self, function: Callable[[T], R], items: Sequence[T]
+    ) -> Generator[tuple[int, R | GripperError], None, None]:
+        """Runs a function on each item, and yields the item's index and its result or error, as they come.
+
+        Close the generator to end the jobs that remain.
+
+        Args:
+            function: A function that another process can import, or a `functools.partial` of one.
+            items: Its arguments.
+        """
+        if self.ray is None and (self.count == 1 or len(items) < 2):  # starting a process takes seconds
+            for index, item in enumerate(items):
+                try:
+                    yield index, function(item)
+                except GripperError as error:
+                    yield index, error
+            return
+        with self.pool() as pool:
+            index_of = {pool.submit(function, item): index for index, item in enumerate(items)}
+            for future in as_completed(index_of):
+                try:
+                    result: R | GripperError = future.result()
+                except GripperError as error:
+                    result = error
+                yield index_of.pop(future), result
 
 
 @contextmanager
@@ -164,7 +219,7 @@ class _ProcessPool(Executor):
 
 def _serve(connection: Connection, options: ProcessOptions) -> None:
     """Runs jobs in a process of the pool, until the parent closes the connection."""
-    own_process(**{**asdict(options), "signals": False})
+    use_settings(options)
     for number in _TERMINAL_SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _TERMINAL_SIGNALS)
@@ -174,10 +229,15 @@ def _serve(connection: Connection, options: ProcessOptions) -> None:
             data = connection.recv_bytes()
         except (EOFError, ConnectionError):
             return
-        connection.send_bytes(_answer(data))
+        connection.send_bytes(answer(data))
 
 
-def _answer(data: bytes) -> Any:
+def use_settings(options: ProcessOptions) -> None:
+    """Allows this worker the same settings as the process that sends it jobs, but for the signals."""
+    own_process(**{**asdict(options), "signals": False})
+
+
+def answer(data: bytes) -> Any:
     """Runs a pickled job. Returns the pickled pair of success and result, or of failure and exception."""
     try:
         function, args, kwargs = ForkingPickler.loads(data)

@@ -1,39 +1,53 @@
 """Replay of logs: the same functions over the same inputs, and every estimate against the load cell."""
 
+import math
 from collections import defaultdict
-from collections.abc import Sequence
-from contextlib import nullcontext
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from gripper_force import __version__
 from gripper_force.config import Config, Overrides, config_from_text
 from gripper_force.control.state_machine import Decision
-from gripper_force.errors import DataError
+from gripper_force.errors import DataError, GripperError, UnfamiliarFrameError
 from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import CONTACT_N, label_frames
 from gripper_force.jobs.metrics import ForceBin
-from gripper_force.jobs.processes import process_pool
+from gripper_force.jobs.processes import Workers
 from gripper_force.profiles.apply import read_correction, read_profiles
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.perception import FrameProcessor
+from gripper_force.runtime.process import allowed
 from gripper_force.runtime.resolve import ResolvedConfig, make_controller, make_estimator, resolve_vision
 from gripper_force.types import (
     NS_PER_S,
+    ForceEstimate,
     Frame,
     FusedForce,
     GraspStatus,
+    Gray,
     LoadCellSample,
+    Record,
     Request,
     ServoCommand,
     ServoState,
     VisualForce,
 )
+
+if TYPE_CHECKING:  # a log without vision needs no estimator
+    from gripper_force.vision.engines import Floats
+    from gripper_force.vision.estimator import ForceEstimator
+
+
+Columns = dict[str, npt.NDArray[Any]]
+"""Table of estimates: name and values of each column, (N,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,9 +197,24 @@ def replay(
         CheckpointError: The network's file cannot be read.
         DataError: The log holds nothing to replay, or no load cell to compare with.
     """
+    return replay_frames(path, checkpoint, overrides=overrides, recover=recover)[0]
+
+
+def replay_frames(
+    path: str | Path,
+    checkpoint: str | Path | None = None,
+    *,
+    overrides: Overrides | None = None,
+    recover: bool = False,
+) -> "tuple[ReplayResult, Columns]":
+    """Does the same as `replay`, and returns its estimates at each visual estimate, or without any each cycle, too.
+
+    The columns are ``log``, ``object``, ``seq`` (0 for a cycle), ``t_ns``, ``measured_n`` (load cell),
+    ``visual_n``, ``visual_std_n``, ``fused_n`` and ``current_n``; NaN where there is none.
+    """
     reader = LogReader(Path(path), recover=recover)
     run = resolve_replay(changed_config(reader, checkpoint, overrides))
-    replayed = run_again(reader, run)
+    replayed = run_again(reader, run, in_batches=_may_batch(reader, run))
     flags = [f for f in (replayed.estimates_identical, replayed.decisions_identical) if f is not None]
     sources = _sources(replayed)
     best = next((sources[name] for name in ("fused", "visual") if name in sources), None)
@@ -194,7 +223,7 @@ def replay(
             f"{path} holds no estimate to compare with a load cell; replay a log of a run with a load cell"
         )
     overall = {"mae_n": best.mae_n, "rmse_n": best.rmse_n, "bias_n": best.bias_n, "frames": best.frames}
-    return ReplayResult(
+    result = ReplayResult(
         mae_n=best.mae_n,
         rmse_n=best.rmse_n,
         bias_n=best.bias_n,
@@ -207,6 +236,57 @@ def replay(
         sources=sources,
         log=str(path),
     )
+    return result, _columns(result.log, run.config.object, replayed)
+
+
+def _may_batch(reader: LogReader, run: ResolvedConfig) -> bool:
+    """Returns True if no estimate can equal a logged one bit for bit: then batches, which round otherwise, do."""
+    model, vision = run.model, run.config.vision
+    if model is None or vision.engine != "torch":
+        return False
+    return reader.metadata.get("checkpoint", "") != model.digest
+
+
+def _columns(log: str, object_name: str, replayed: Replayed) -> Columns:
+    visual, decisions = replayed.visual, replayed.decisions
+    times = [v.t_ns for v in visual] if visual else [d.estimate.t_ns for d in decisions]
+    t_ns = np.array(times, np.int64)
+    cells = sorted(replayed.load_cell, key=lambda sample: sample.t_ns)
+    measured_n, valid = label_frames(t_ns, cells, 0)
+    missing = np.full(len(t_ns), np.nan)
+    fused_n, current_n = missing, missing
+    if decisions:
+        decided_ns = np.array([d.estimate.t_ns for d in decisions], np.int64)
+        newest = np.searchsorted(decided_ns, t_ns, "right") - 1
+        fused_n, current_n = (
+            np.where(newest < 0, np.nan, np.array(values)[newest])
+            for values in zip(*((d.estimate.force_n, d.estimate.current_n) for d in decisions), strict=True)
+        )
+    return {
+        "log": np.full(len(t_ns), log),
+        "object": np.full(len(t_ns), object_name),
+        "seq": np.array([v.seq for v in visual], np.int64) if visual else np.zeros(len(t_ns), np.int64),
+        "t_ns": t_ns,
+        "measured_n": np.where(valid, measured_n, np.nan),
+        "visual_n": np.array([v.force_n for v in visual]) if visual else missing,
+        "visual_std_n": np.array([v.std_n for v in visual]) if visual else missing,
+        "fused_n": fused_n,
+        "current_n": current_n,
+    }
+
+
+class Replays(NamedTuple):
+    """Replays of several logs, in the order of the logs.
+
+    Attributes:
+        results: Results of the logs that could be replayed.
+        columns: Their estimates, see `replay_frames`.
+        failed: Problem of each other log, by path.
+    """
+
+    results: list[ReplayResult]
+    columns: list[Columns]
+    failed: dict[str, GripperError]
 
 
 def replay_each(
@@ -216,28 +296,42 @@ def replay_each(
     overrides: Overrides | None = None,
     recover: bool = False,
     workers: int = 1,
+    ray: str | None = None,
     progress: Progress = no_progress,
-) -> list[ReplayResult]:
-    """Replays several logs, in several processes.
+) -> Replays:
+    """Replays several logs. A log that can't be replayed does not stop the others.
 
     Args:
         logs: The logs.
         checkpoint: As for `replay`.
         overrides: As for `replay`.
         recover: As for `replay`.
-        workers: Processes to use.
+        workers: Processes to use. Results do not depend on them.
+        ray: Address of a Ray cluster to use instead, see `gripper_force.jobs.ray_pool`; None for none.
         progress: Called after each log.
 
     Raises:
-        GripperError: As for `replay`, for the first log that fails.
+        GripperError: No log could be replayed; the first one's error, as for `replay`.
     """
-    one = partial(replay, checkpoint=checkpoint, overrides=overrides, recover=recover)
-    results = []
-    with process_pool(workers) if workers > 1 and len(logs) > 1 else nullcontext() as pool:
-        for result in map(one, logs) if pool is None else pool.map(one, logs):
-            results.append(result)
-            progress(f"replayed {Path(result.log).name}")
-    return results
+    one = partial(replay_frames, checkpoint=checkpoint, overrides=overrides, recover=recover)
+    found: dict[int, tuple[ReplayResult, Columns]] = {}
+    failed: dict[int, GripperError] = {}
+    with closing(Workers(workers, ray).run_each(one, logs)) as answers:
+        for index, answer in answers:
+            if isinstance(answer, GripperError):
+                failed[index] = answer
+                progress(f"failed: {logs[index].name}")
+            else:
+                found[index] = answer
+                progress(f"replayed {logs[index].name}")
+    if failed and not found:
+        raise failed[min(failed)]
+    ordered = [found[index] for index in sorted(found)]
+    return Replays(
+        [result for result, _ in ordered],
+        [columns for _, columns in ordered],
+        {str(logs[index]): failed[index] for index in sorted(failed)},
+    )
 
 
 def summary(results: Sequence[ReplayResult]) -> ReplaySummary:
@@ -270,8 +364,6 @@ def paired_differences(
     first: Sequence[ReplayResult], second: Sequence[ReplayResult]
 ) -> dict[str, PairedDifference]:
     """Compares two replays of the same logs, by source. Each log counts once, however long it is."""
-    from scipy import stats  # imported here: it takes longer than a replay's other imports
-
     found = {}
     for name in ("visual", "current", "fused"):
         pairs = [
@@ -282,19 +374,14 @@ def paired_differences(
         if not pairs:
             continue
         a_n, b_n = np.array(pairs).T
-        difference_n = b_n - a_n
-        half_n = None
-        if len(pairs) > 1:
-            quantile = float(stats.t.ppf(0.975, len(pairs) - 1))
-            half_n = quantile * float(difference_n.std(ddof=1)) / len(pairs) ** 0.5
-        mean_n = float(difference_n.mean())
+        mean_n, low_n, high_n = metrics.mean_interval(b_n - a_n)
         found[name] = PairedDifference(
             logs=len(pairs),
             first_n=float(a_n.mean()),
             second_n=float(b_n.mean()),
             difference_n=mean_n,
-            low_n=None if half_n is None else mean_n - half_n,
-            high_n=None if half_n is None else mean_n + half_n,
+            low_n=low_n,
+            high_n=high_n,
         )
     return found
 
@@ -326,14 +413,19 @@ def resolve_replay(config: Config) -> ResolvedConfig:
     )
 
 
-def run_again(reader: LogReader, run: ResolvedConfig) -> Replayed:
+def run_again(reader: LogReader, run: ResolvedConfig, *, in_batches: bool = False) -> Replayed:
     """Feeds estimator and controller from a log, in the order in which the run had its inputs.
 
     If faults were injected into the run's estimator, the controller gets the logged estimates.
+
+    Args:
+        reader: The log.
+        run: Its configuration.
+        in_batches: Computes the networks on many frames at a time, with PyTorch. Its rounding differs in the last
+            digits from that of a run, which has one frame at a time.
     """
     config = run.config
     has_faulty_estimates = _has_faulty_estimates(config)
-    processor = FrameProcessor(make_estimator(run))
     had_controller = config.gripper.nm_per_a is not None  # an imported recording had none
     controller = make_controller(config) if had_controller else None
     visual: list[VisualForce] = []
@@ -343,13 +435,15 @@ def run_again(reader: LogReader, run: ResolvedConfig) -> Replayed:
     newest: VisualForce | None = None
     request: Request | None = None
     pending: dict[int, VisualForce] = {}
-    for record in reader.records():
-        logged[type(record)].append(record)
+    estimated = _in_batches if in_batches and run.model is not None else _frame_by_frame
+    for record, estimate in estimated(reader.records(), run):
         if isinstance(record, Frame):
-            if (estimate := processor.process(record).visual) is not None:
+            if estimate is not None:
                 visual.append(estimate)
                 pending[record.seq] = estimate
-        elif isinstance(record, VisualForce):
+            continue
+        logged[type(record)].append(record)
+        if isinstance(record, VisualForce):
             again = None if has_faulty_estimates else pending.pop(record.seq, None)
             # The time at which an estimate was ready is the run's, not this computer's.
             newest = record if again is None else replace(again, ready_ns=record.ready_ns)
@@ -369,6 +463,78 @@ def run_again(reader: LogReader, run: ResolvedConfig) -> Replayed:
         decisions,
         cells,
     )
+
+
+def _frame_by_frame(
+    records: Iterable[Record], run: ResolvedConfig
+) -> Iterator[tuple[Record, VisualForce | None]]:
+    """Yields each record, with the estimate of a frame."""
+    processor = FrameProcessor(make_estimator(run))
+    for record in records:
+        yield record, processor.process(record).visual if isinstance(record, Frame) else None
+
+
+def _in_batches(
+    records: Iterable[Record], run: ResolvedConfig
+) -> Iterator[tuple[Record, VisualForce | None]]:
+    """Does the same as `_frame_by_frame`, with the networks computed at the end of the log; frames are empty."""
+    from gripper_force.vision.batch_inference import kept_checkpoint, prepared_features
+    from gripper_force.vision.engines import Step
+    from gripper_force.vision.engines.pytorch import TorchEngine
+    from gripper_force.vision.estimator import ForceEstimator
+
+    assert run.model is not None
+    vision, checkpoint = run.config.vision, kept_checkpoint(run.model.path, run.model.digest)
+    engine = TorchEngine(checkpoint, threads=vision.threads if allowed().torch_threads else None)
+    estimator = ForceEstimator(engine, vision.region, run.correction)
+    preparation = _Preparation(estimator)
+    processor = FrameProcessor(preparation)
+    kept: list[tuple[Record, VisualForce | None, int]] = []
+    for record in records:
+        visual = None
+        if isinstance(record, Frame):
+            visual = processor.process(record).visual
+            record = replace(record, gray=_NO_IMAGE)
+        kept.append((record, visual, len(preparation.inputs) - 1))
+    if preparation.inputs:
+        inputs = np.stack(preparation.inputs)  # (T, S, S)
+        forces_n, features = prepared_features(checkpoint.networks, inputs)  # (M, T), (T, F)
+    works = False
+    for record, visual, last in kept:
+        if visual is not None:
+            try:
+                estimate = estimator.finish(Step(forces_n[:, last], features[last], None))
+                visual = replace(visual, force_n=estimate.force_n, std_n=estimate.std_n)
+            except GripperError as error:  # as `FrameProcessor` treats it
+                if not works:
+                    raise
+                if isinstance(error, UnfamiliarFrameError):
+                    visual = replace(visual, force_n=error.force_n, std_n=math.inf)
+                else:
+                    visual = None
+            works = True
+        yield record, visual
+
+
+class _Preparation:
+    """Takes the place of an estimator in `FrameProcessor`, and only prepares the frames for the networks."""
+
+    def __init__(self, estimator: "ForceEstimator") -> None:
+        self._estimator = estimator
+        self.inputs: list[Floats] = []
+
+    def update(self, gray: Gray) -> ForceEstimate | None:
+        """Prepares the next frame; returns None while the reference is being collected."""
+        ready = self._estimator.prepare(gray)
+        self.inputs += ready
+        return _UNKNOWN if ready else None
+
+    def attention_map(self) -> None:
+        """Returns None: nothing was computed yet."""
+
+
+_UNKNOWN: Final = ForceEstimate(math.nan, math.nan)
+_NO_IMAGE: Final = np.zeros((0, 0), np.uint8)
 
 
 def _same_estimates(logged: list[VisualForce], again: list[VisualForce]) -> bool:

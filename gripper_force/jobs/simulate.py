@@ -19,7 +19,7 @@ import numpy as np
 
 from gripper_force.config import Config, config_from
 from gripper_force.jobs.grasp import run_grasp
-from gripper_force.jobs.processes import process_pool
+from gripper_force.jobs.processes import Workers
 from gripper_force.jobs.recording.touches import ramp, wait
 from gripper_force.runtime.session import open_run
 from gripper_force.schema import Tree
@@ -91,7 +91,9 @@ def plan(kind: Kind, count: int, first_seed: int, objects: tuple[str, ...] = OBJ
     return [SimulationPlan(kind, objects[i % len(objects)], first_seed + i) for i in range(count)]
 
 
-def simulate(plans: Sequence[Plan], out: Path, config: Config, jobs: int) -> Generator[Path, None, None]:
+def simulate(
+    plans: Sequence[Plan], out: Path, config: Config, jobs: int, ray: str | None = None
+) -> Generator[Path, None, None]:
     """Makes the logs that do not exist yet, in several processes, and yields each once it is complete.
 
     Args:
@@ -99,6 +101,7 @@ def simulate(plans: Sequence[Plan], out: Path, config: Config, jobs: int) -> Gen
         out: Output folder.
         config: Configuration; the plans set object, seed, target and some of ``control``.
         jobs: Number of processes.
+        ray: Address of a Ray cluster to use instead, see `gripper_force.jobs.ray_pool`; None for none.
 
     Raises:
         GripperError: A simulation failed; logs made so far are kept.
@@ -106,7 +109,7 @@ def simulate(plans: Sequence[Plan], out: Path, config: Config, jobs: int) -> Gen
     out.mkdir(parents=True, exist_ok=True)
     missing = [p for p in plans if not all((out / name).exists() for name in p.names)]
     tree = config.model_dump(mode="json")
-    with process_pool(jobs) as pool:
+    with Workers(jobs, ray).pool() as pool:
         futures = [pool.submit(p.make, out, tree) for p in missing]
         for future in as_completed(futures):
             yield from future.result()

@@ -2,7 +2,6 @@
 
 from itertools import pairwise
 
-import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
@@ -38,11 +37,13 @@ class Vgg(Backbone):
         """Maps frames (N, 1, S, S) to feature maps (N, C, S/16, S/16)."""
         x = frames
         for i, (first, second) in enumerate(zip(self.first, self.second, strict=True)):
-            x = second(F.relu(first(x)))
+            x = second(F.relu(first(x), inplace=True))
             if i < len(self.norm):
                 # Pooling before the ReLU gives the same numbers with a quarter of its operations.
-                x = self.norm[i](F.relu(F.max_pool2d(x, 2)))  # (N, C_i, S / 2^(i+1), S / 2^(i+1))
-        return torch.relu(x)
+                x = self.norm[i](
+                    F.relu(F.max_pool2d(x, 2), inplace=True)
+                )  # (N, C_i, S / 2^(i+1), S / 2^(i+1))
+        return F.relu(x, inplace=True)
 
 
 class ResNet18(Backbone):

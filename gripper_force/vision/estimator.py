@@ -12,7 +12,7 @@ from gripper_force.errors import ConfigError, NonFiniteError, UnfamiliarFrameErr
 from gripper_force.profiles.correction import Correction, load_correction
 from gripper_force.profiles.object_profile import find_object, read_object
 from gripper_force.types import ForceEstimate, Gray
-from gripper_force.vision.engines import Engine, Floats, Precision, open_engine
+from gripper_force.vision.engines import Engine, Floats, Precision, Step, open_engine
 from gripper_force.vision.frame_checks import FrameChecks
 from gripper_force.vision.header import RESIDUAL_HALF_N, Header, Model
 from gripper_force.vision.model_files import read_model
@@ -133,12 +133,17 @@ class ForceEstimator:
             NonFiniteError: A network returned NaN or infinity.
         """
         step = None
-        small = downscale(gray, self._region, self._preprocess.size)
-        self._frame_checks.check(small)
-        for frame in self._normaliser.push(small):
+        for frame in self.prepare(gray):
             step = self._engine.step(frame)
-        if step is None:
-            return None
+        return None if step is None else self.finish(step)
+
+    def prepare(self, gray: Gray) -> list[Floats]:
+        """Checks the next frame, and returns the network's inputs that are ready: the first half of `update`."""
+        self._frame_checks.check(small := downscale(gray, self._region, self._preprocess.size))
+        return self._normaliser.push(small)
+
+    def finish(self, step: Step) -> ForceEstimate:
+        """Returns the estimate for the networks' next output: the second half of `update`."""
         forces: list[float] = step.forces_n.tolist()
         self._attention = step.attention
         if not all(math.isfinite(force) for force in forces):

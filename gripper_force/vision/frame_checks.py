@@ -40,9 +40,8 @@ _GRID: Final = 8
 _SAMPLES: Final = 32
 """Pixels along a side that the motion is fitted to."""
 
-_STEPS: Final = 6
-_SCALES: Final = (12.0, 3.0)
-"""Steps of the robust fit, and its scale in gray levels at the first and the last step."""
+_SCALES: Final = np.geomspace(12, 3, 6, dtype=np.float32)
+"""Scale of the robust fit in gray levels, at each of its steps."""
 
 Floats = npt.NDArray[np.float32]
 
@@ -108,11 +107,11 @@ class FrameChecks:
         smooth = cv2.GaussianBlur(pixels, (0, 0), _SMOOTHING)
         difference = _sampled(smooth - self._smooth)  # (N,)
         change = np.zeros(self._directions.shape[1], np.float32)
-        for scale in np.geomspace(*_SCALES, _STEPS, dtype=np.float32):
+        for scale in _SCALES:
             weight = (1 + np.square((difference - self._directions @ change) / scale)) ** -2
-            weighted = self._directions.T * weight
+            weighted = np.multiply(self._directions, weight[:, None], out=self._weighted).T
             change = np.linalg.solve(weighted @ self._directions + self._prior, weighted @ difference)
-        still = np.abs(difference - self._directions @ change) < 2 * _SCALES[1]
+        still = np.abs(difference - self._directions @ change) < 2 * _SCALES[-1]
         if still.mean() < _STILL:  # nothing to compare with
             change[:], still[:] = 0, False
         shift, zoom = float(np.hypot(*change[:2])), float(abs(change[2]))
@@ -150,6 +149,9 @@ class FrameChecks:
             y,
         )
         self._directions = np.stack([_sampled(part) for part in parts], axis=1)  # (N, 7)
+        self._weighted = np.empty_like(
+            self._directions
+        )  # a new array for each step would take longer than the step
         # A direction that no texture shows stays at zero.
         self._prior = np.diag(np.array([side**2] * 3 + [1] * 4, np.float32) * len(self._directions) / 400)
 

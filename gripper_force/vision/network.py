@@ -58,18 +58,41 @@ class LastStepBlstm(nn.Module):
         input_weight, hidden_weight, input_bias, hidden_bias = self.forward_lstm.all_weights[0]
         from_input = F.linear(newest, input_weight, input_bias + hidden_bias)  # (B, 4*hidden)
         gates = from_input[:, None] + F.linear(hidden, hidden_weight)  # (B, L, 4*hidden)
-        gate_in, forget, candidate, gate_out = gates.chunk(4, dim=2)
-        next_cell = torch.sigmoid(forget) * cell + torch.sigmoid(gate_in) * torch.tanh(candidate)
-        next_hidden = torch.sigmoid(gate_out) * torch.tanh(next_cell)  # (B, L, hidden)
+        next_hidden, next_cell = _lstm_cell(gates, cell)  # (B, L, hidden) each
         output = torch.cat([next_hidden[:, -1], self._backward(newest)], dim=1)
         # Row 0 has processed nothing and stays zero; every other row moves on by one.
         hidden = torch.cat([hidden[:, :1], next_hidden[:, :-1]], 1)
         return output, hidden, torch.cat([cell[:, :1], next_cell[:, :-1]], 1)
 
+    def over_windows(self, vectors: Tensor, window: int) -> Tensor:
+        """Returns the output of `forward` for each window of a sequence, (T - window + 1, 2*hidden).
+
+        The products with the input weights are computed once for each vector, not for each window that contains it.
+
+        Args:
+            vectors: The sequence, (T, F).
+            window: Length of the windows.
+        """
+        input_weight, hidden_weight, input_bias, hidden_bias = self.forward_lstm.all_weights[0]
+        from_input = F.linear(vectors, input_weight, input_bias + hidden_bias)  # (T, 4*hidden)
+        count = len(vectors) - window + 1
+        hidden = cell = vectors.new_zeros(count, self.forward_lstm.hidden_size)
+        for k in range(window):
+            gates = torch.addmm(from_input[k : k + count], hidden, hidden_weight.t())  # (count, 4*hidden)
+            hidden, cell = _lstm_cell(gates, cell)
+        return torch.cat([hidden, self._backward(vectors[window - 1 :])], dim=1)
+
     def _backward(self, newest: Tensor) -> Tensor:
         gate_in, candidate, gate_out = self.backward_linear(newest).chunk(3, dim=1)
         cell = torch.sigmoid(gate_in) * torch.tanh(candidate)
         return torch.sigmoid(gate_out) * torch.tanh(cell)
+
+
+def _lstm_cell(gates: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns the next hidden and cell states, (..., hidden), for the sums before the gates, (..., 4*hidden)."""
+    gate_in, forget, candidate, gate_out = gates.chunk(4, dim=-1)
+    next_cell = torch.sigmoid(forget) * cell + torch.sigmoid(gate_in) * torch.tanh(candidate)
+    return torch.sigmoid(gate_out) * torch.tanh(next_cell), next_cell
 
 
 class StreamState(NamedTuple):
@@ -120,11 +143,6 @@ class ForceNetwork(nn.Module):
         moved: Self = self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         return moved
 
-    def to_channels_first(self) -> Self:
-        """Puts the channels first in memory, PyTorch's default, for comparison."""
-        moved: Self = self.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
-        return moved
-
     def forward(self, clips: Tensor, start: int = 0) -> Tensor:
         """Estimates the force for the frames of clips, with one pass of the backbone for all windows.
 
@@ -140,18 +158,40 @@ class ForceNetwork(nn.Module):
 
     def features(self, clips: Tensor, start: int = 0) -> Tensor:
         """Returns the inputs of the last layer, (B, T - start, head); arguments are those of `forward`."""
+        pooled, _ = self.pooled(clips)
+        batch, length = pooled.shape[:2]
+        window = self.config.window
+        padded = torch.cat([pooled[:, :1].expand(-1, window - 1, -1), pooled], dim=1)
+        windows = padded.unfold(1, window, 1)[:, start:].transpose(2, 3)  # (B, T - start, window, C)
+        return self._head(windows.flatten(0, 1)).view(batch, length - start, -1)
+
+    def pooled(self, clips: Tensor, earlier: Tensor | None = None) -> tuple[Tensor, Tensor | None]:
+        """Computes each frame's map after attention, averaged.
+
+        Args:
+            clips: As for `forward`.
+            earlier: Maps of the frames before the clips, which the last call returned; None at their beginning.
+
+        Returns:
+            The averages, (B, T, C), and the maps of the last frames, (B, n, C, H, W), None without earlier frames.
+        """
         batch, length = clips.shape[:2]
         flat = self.backbone(clips.flatten(0, 1))  # (B*T, C, H, W)
         maps = flat.view(batch, length, *flat.shape[1:])
         stack = flat
         if n := self.config.maps_kept:
-            padded = torch.cat([maps[:, :1].expand(-1, n, -1, -1, -1), maps], dim=1)  # (B, n + T, C, H, W)
+            if earlier is None:
+                earlier = maps[:, :1].expand(-1, n, -1, -1, -1)
+            padded = torch.cat([earlier, maps], dim=1)  # (B, n + T, C, H, W)
+            earlier = padded[:, length:]
             stack = torch.cat([padded[:, k : k + length] for k in range(n + 1)], dim=2).flatten(0, 1)
-        pooled = self._pool(stack, flat)[0].view(batch, length, -1)
+        return self._pool(stack, flat)[0].view(batch, length, -1), earlier
+
+    def read_pooled(self, pooled: Tensor, begin: int, end: int) -> Tensor:
+        """Returns the inputs of the last layer, (end - begin, head), for a recording's averages, (T, C)."""
         window = self.config.window
-        padded = torch.cat([pooled[:, :1].expand(-1, window - 1, -1), pooled], dim=1)
-        windows = padded.unfold(1, window, 1)[:, start:].transpose(2, 3)  # (B, T - start, window, C)
-        return self._head(windows.flatten(0, 1)).view(batch, length - start, -1)
+        padded = torch.cat([pooled[:1].expand(window - 1, -1), pooled])[begin : end + window - 1]
+        return torch.tanh(self.dense(self.blstm.over_windows(padded, window)))
 
     def force_n(self, features: Tensor) -> Tensor:
         """Applies the last layer: features (N, head) to forces in N, (N,)."""

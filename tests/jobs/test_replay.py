@@ -1,11 +1,14 @@
 import dataclasses
+import json
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from typer.testing import CliRunner
 
+from gripper_force import cli
 from gripper_force.config import load_config
 from gripper_force.errors import CheckpointError, ConfigError, DataError, LogError
 from gripper_force.jobs.grasp import run_grasp
@@ -13,14 +16,19 @@ from gripper_force.jobs.metrics import bias, mae, rmse
 from gripper_force.jobs.replay import (
     Comparison,
     ReplayResult,
+    changed_config,
     paired_differences,
     replay,
     replay_each,
+    replay_frames,
+    resolve_replay,
+    run_again,
     summary,
 )
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import (
+    Frame,
     FusedForce,
     GraspStatus,
     LoadCellSample,
@@ -165,7 +173,8 @@ def test_decisions_on_an_estimator_that_was_made_to_fail_are_still_compared(
 
 def test_several_logs_give_the_errors_over_all(fused_log: Path, tmp_path: Path) -> None:
     half = tampered(fused_log, tmp_path / "half.mcap", lambda r: r if r.t_ns < 1_500_000_000 else None)
-    results = replay_each([fused_log, half], workers=2)
+    results, _, failed = replay_each([fused_log, half], workers=2)
+    assert not failed
     assert [result.log for result in results] == [str(fused_log), str(half)]
     assert results[0] == replay(fused_log)
     found = summary(results)
@@ -204,3 +213,57 @@ def test_the_remedy_for_a_profile_of_another_network_works(fused_log: Path) -> N
     with pytest.raises(ConfigError, match=r"leave the profile out with calibration\.object=none"):
         replay(fused_log, overrides=["calibration.object=sponge"])
     assert replay(fused_log, overrides=["calibration.object=none"]).identical is True
+
+
+def test_a_broken_log_is_named_and_the_others_are_replayed(fused_log: Path, tmp_path: Path) -> None:
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes(fused_log.read_bytes()[:5000])
+    call = ["replay", str(broken), str(fused_log), "--jobs", "1", "--json"]
+    done = CliRunner().invoke(cli.app, call)
+    assert done.exit_code == 2
+    assert f"error: {broken}" in done.stderr
+    printed = json.loads(done.stdout)
+    assert [log["log"] for log in printed["logs"]] == [str(fused_log)]
+    assert list(printed["failed"]) == [str(broken)]
+    with pytest.raises(LogError, match=r"broken\.mcap"):
+        replay_each([broken, broken])
+
+
+def test_another_network_in_batches_gives_the_estimates_of_a_run(fused_log: Path) -> None:
+    reader = LogReader(fused_log)
+    run = resolve_replay(changed_config(reader, "small"))
+    single, batch = run_again(reader, run), run_again(reader, run, in_batches=True)
+    assert len(single.visual) > 50
+    assert [v.seq for v in batch.visual] == [v.seq for v in single.visual]
+    assert [v.force_n for v in batch.visual] == pytest.approx([v.force_n for v in single.visual], abs=1e-4)
+    # Without contact the score divides by little, so rounding shows more.
+    assert [v.std_n for v in batch.visual] == pytest.approx([v.std_n for v in single.visual], abs=1e-3)
+    assert len(batch.decisions) == len(single.decisions)
+
+
+def test_frames_that_a_network_does_not_know_are_the_same_in_batches(fused_log: Path, tmp_path: Path) -> None:
+    small = load_checkpoint("small")
+    assert small.header.ood is not None
+    limits = [one.model_copy(update={"limit": 0.45 * one.limit}) for one in small.header.ood.limits]
+    ood = small.header.ood.model_copy(update={"limits": tuple(limits)})
+    strict = tmp_path / "strict.safetensors"
+    save_checkpoint(strict, small.networks, small.header.model_copy(update={"ood": ood}))
+    dark = tampered(  # rejected before the network sees it
+        fused_log,
+        tmp_path / "dark.mcap",
+        lambda r: dataclasses.replace(r, gray=r.gray // 4) if isinstance(r, Frame) and r.seq == 40 else r,
+    )
+    reader = LogReader(dark)
+    run = resolve_replay(changed_config(reader, str(strict)))
+    single, batch = run_again(reader, run).visual, run_again(reader, run, in_batches=True).visual
+    assert {v.is_familiar for v in single} == {True, False}
+    assert 40 not in {v.seq for v in single}
+    assert [(v.seq, v.is_familiar) for v in batch] == [(v.seq, v.is_familiar) for v in single]
+    assert [v.force_n for v in batch] == pytest.approx([v.force_n for v in single], abs=1e-4)
+
+
+def test_the_columns_hold_each_estimate(fused_log: Path) -> None:
+    result, columns = replay_frames(fused_log)
+    assert len({len(values) for values in columns.values()}) == 1
+    error_n = columns["visual_n"] - columns["measured_n"]
+    assert np.nanmean(np.abs(error_n)) == pytest.approx(result.sources["visual"].mae_n, rel=1e-6)

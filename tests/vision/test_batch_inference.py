@@ -8,8 +8,10 @@ from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess
 
 
-@pytest.mark.parametrize("chunk", [1, 7, 40])
-def test_result_does_not_depend_on_chunk_size(chunk: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("batch", "chunk"), [(1, 40), (7, 9), (40, 1), (16, 256)])
+def test_result_does_not_depend_on_the_size_of_batches(
+    batch: int, chunk: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     torch.manual_seed(0)
     tiny = NetworkConfig(size=16, width=0.25, hidden=6, head=7)
     networks = [
@@ -21,6 +23,7 @@ def test_result_does_not_depend_on_chunk_size(chunk: int, monkeypatch: pytest.Mo
     with torch.inference_mode():
         inputs = batch_inference.normalise(clip, clip[:, :4], Preprocess(size=16))
         whole = torch.cat([network(inputs) for network in networks])
+    monkeypatch.setitem(batch_inference.BATCH, "cpu", batch)
     monkeypatch.setattr(batch_inference, "CHUNK", chunk)
     forces = batch_inference.predict(networks, Preprocess(size=16), frames)
     np.testing.assert_allclose(forces, whole, rtol=1e-5, atol=1e-5)

@@ -245,7 +245,10 @@ def _in_turns(
     networks = load_checkpoint(model.path).force_networks
     context = max(member.context for member in model.header.members)
     clip = torch.from_numpy(np.stack(frames[: context + 1]))[None, :, None]  # (1, T, 1, S, S)
-    plain = [deepcopy(network).to_channels_first() for network in networks]
+    plain = [
+        deepcopy(network).to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
+        for network in networks
+    ]
     windows = {
         WINDOW: _Timed(lambda _: [network(clip, clip.shape[1] - 1) for network in networks], []),
         PLAIN_WINDOW: _Timed(lambda _: [network(clip, clip.shape[1] - 1) for network in plain], []),

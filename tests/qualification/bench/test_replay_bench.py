@@ -1,0 +1,50 @@
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from shutil import copy
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from gripper_force import cli
+from gripper_force.errors import GripperError
+from gripper_force.qualification.bench import replay_bench
+
+
+@pytest.fixture
+def logs(fused_log: Path, tmp_path: Path) -> Path:
+    """A folder with two logs."""
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    for name in ("a", "b"):
+        copy(fused_log, folder / f"{name}.mcap")
+    return folder
+
+
+def test_the_commands_run_in_every_way(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(replay_bench, "COMMANDS", ("replay",))
+    page = tmp_path / "page.md"
+    page.write_text("<!-- rates -->\n<!-- end of rates -->\n")
+    call = ["bench", "replay", "--logs", str(logs), "--checkpoint", "small", "--rounds", "1", "--jobs", "2"]
+    done = CliRunner().invoke(cli.app, [*call, "--write", str(page), "--json"])
+    assert done.exit_code == 0, done.output
+    rows = json.loads(done.stdout)["replay"]
+    assert [row["where"] for row in rows][:2] == ["1 process", "2 processes"]
+    assert all(row["rates"][0] > 0 for row in rows)
+    assert "| `replay` | small | 2 processes |" in page.read_text()
+    assert "2 logs, median of 1 rounds" in page.read_text()
+
+
+def test_ways_that_disagree_are_an_error(logs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def run(arguments: Sequence[str]) -> Any:
+        return {"mae_n": 0.1 if "1" in arguments else 0.2}
+
+    monkeypatch.setattr(replay_bench, "_run", run)
+    with pytest.raises(GripperError, match="replay with small in 2 processes gave another result"):
+        replay_bench.bench(logs, ["small"], 2, 1, lambda _: None)
+
+
+def test_a_command_that_fails_is_an_error(logs: Path) -> None:
+    with pytest.raises(GripperError, match=r"(?s)gripper-force replay failed: .*no checkpoint at missing"):
+        replay_bench.bench(logs, ["missing.safetensors"], 2, 1, lambda _: None)
