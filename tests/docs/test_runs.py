@@ -1,0 +1,158 @@
+"""The commands of each page run in order, as a reader runs them: in one new folder, with user folders of its own.
+
+`make test` runs the pages in `QUICK`, `make test-docs` all of them. A block whose first line begins with ``# needs``
+(hardware, root, a display) is not run. Commands that are long are shortened by the tables below, which keep the command.
+"""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from importlib.util import find_spec
+from pathlib import Path
+
+import matplotlib
+import pytest
+
+ROOT = Path(__file__).parents[2]
+BLOCK = re.compile(r"^ *```([^\n]*)\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
+PAGES = [
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md")),
+    *sorted(path for path in (ROOT / "docs").rglob("*.md") if path.parent.name != "decisions"),
+]
+QUICK = {"docs/replay.md", "docs/commands.md"}
+
+ADDED = {
+    "grasp": "--set sim.detail=coarse --set log.report=false --set control.hold_s=0.3",
+    "calibrate object": "--touches 4 --set sim.detail=coarse",
+    "teach": "--touches 4 --set sim.detail=coarse --set vision.checkpoint=small",
+    "simulate": "--presses 0 --grasps 0 --set sim.detail=coarse",
+    "train data/train": "--set steps=2",
+    "stability numerics": "--part filter",
+    "stability faults": "--table faults --seeds 1 --live 0",
+    "bench estimator": "--threads 1",
+}
+"""Options that shorten a command. They stand before its own, which win."""
+
+LOWERED = {
+    r"--trials \d+": "--trials 2",
+    r"--(presses|taps|grasps) [1-9]\d*": r"--\1 4",
+    r"--sets \d+": "--sets 2",
+    r"--touches \d+": "--touches 4",
+    r"\b(minutes=|--minutes )\d+": r"\g<1>0.02",
+    r"\bsteps=\d+": "steps=2",
+}
+"""Numbers that are lowered, so that hours of simulation and training become seconds."""
+
+PREPARED = {
+    "gripper-force replay runs/LOG.mcap": "gripper-force grasp --object stapler && mv runs/*.mcap runs/LOG.mcap",
+    "gripper-force view runs/LOG.mcap --save run.rrd": "gripper-force grasp --object stapler && mv runs/*.mcap runs/LOG.mcap",
+    "gripper-force export network force.safetensors --out force.onnx": f"cp {ROOT}/gripper_force/vision/small.safetensors force.safetensors",
+    "gripper-force train data/mine --recipe few --out mine.safetensors": "cp -r data/train data/mine",
+    "gripper-force export lerobot data/real --out data/lerobot --task 'grasp the sponge'": "gripper-force grasp --object sponge --set log.directory=data/real",
+    "gripper-force calibrate network data/score --out gripper_force/vision/default.safetensors": "cp -r data/busy data/score",
+}
+"""What a page takes for granted before a command: a log, a network, or the reader's own recordings."""
+
+NOT_RUN = {
+    "pip install": "downloads; the workflow `test` installs the wheel",
+    "python3 -m venv": "downloads",
+    "GRIPPER_FORCE_CLIENT_PYTHON=": "needs the environment of the line before",
+    "lerobot-record": "`make test-lerobot` runs it",
+    "gripper-force reproduce": "takes hours; tests/qualification/paper runs it with tiny networks",
+    "gripper-force simulate --protocol": "80 logs; tests/jobs runs it",
+    "gripper-force bench checkpoints data/stated": "writes into the shipped checkpoints",
+}
+"""Beginnings of commands that are not run, with the reason."""
+
+PACKAGES = {"gripper-force view": "rerun", "gripper-force export lerobot": "lerobot"}
+"""Optional packages, without which a command is not run."""
+
+EXIT_CODES = {"gripper-force grasp --object none": 1}
+"""Documented exit codes other than 0."""
+
+
+def name_of(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def shown_lines(page: Path) -> list[str]:
+    """Returns the commands of a page's blocks, without comments and the blocks that need something."""
+    lines = []
+    for language, body in BLOCK.findall(page.read_text()):
+        if language.strip() in ("", "sh") and not body.lstrip().startswith("# needs"):
+            for line in re.sub(r" *\\\n *", " ", body).splitlines():
+                lines.append(re.sub(r"\s+# .*|^# .*", "", line).strip())
+    return [line for line in lines if line]
+
+
+def shortened(line: str) -> str:
+    """Returns a command with the options that shorten it."""
+    for name, options in ADDED.items():
+        line = re.sub(rf"(gripper-force {name}) ", rf"\1 {options} ", f"{line} ").strip()
+    for pattern, lowered in LOWERED.items():
+        line = re.sub(pattern, lowered, line)
+    return re.sub(r"^make ", "make --dry-run ", line)
+
+
+def reason_not_to_run(line: str) -> str | None:
+    for begin, reason in NOT_RUN.items():
+        if line.startswith(begin):
+            return reason
+    for begin, package in PACKAGES.items():
+        if line.startswith(begin) and find_spec(package) is None:
+            return f"needs {package}"
+    return None
+
+
+@pytest.fixture
+def clone(tmp_path: Path) -> Path:
+    """A folder with what commands use of a clone: they may write into the pages, but not change the project."""
+    folder = tmp_path / "clone"
+    shutil.copytree(ROOT / "docs", folder / "docs")
+    for name in ("Makefile", "pyproject.toml", "examples", "scripts"):
+        (folder / name).symlink_to(ROOT / name)
+    (folder / ".venv").symlink_to(sys.prefix)
+    return folder
+
+
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, id=name_of(page), marks=() if name_of(page) in QUICK else pytest.mark.docs)
+        for page in PAGES
+        if shown_lines(page)
+    ],
+)
+def test_the_commands_of_a_page_run(page: Path, clone: Path) -> None:
+    text = page.read_text()
+    for name, shown in re.findall(r"`([\w-]+\.yaml)`:\n\n```yaml\n(.*?)```", text, re.DOTALL):
+        (clone / name).write_text(shown)
+    env = {
+        **os.environ,
+        "PATH": f"{sys.prefix}/bin{os.pathsep}{os.environ['PATH']}",
+        "MPLCONFIGDIR": matplotlib.get_configdir(),  # its list of fonts takes seconds
+        **{f"XDG_{kind}_HOME": str(clone.parent / kind.lower()) for kind in ("DATA", "CACHE", "CONFIG")},
+    }
+    for line in shown_lines(page):
+        if (reason := reason_not_to_run(line)) is not None:
+            sys.stdout.write(f"not run, {reason}: {line}\n")
+            continue
+        command = shortened(line)
+        if line in PREPARED:
+            command = f"{shortened(PREPARED[line])} && {command}"
+        begin_s = time.monotonic()
+        done = subprocess.run(
+            ["bash", "-c", command],
+            cwd=clone,
+            env=env,
+            capture_output=True,
+            text=True,
+            check=False,
+            stdin=subprocess.DEVNULL,
+        )
+        sys.stdout.write(f"{time.monotonic() - begin_s:.0f} s: {command}\n")
+        assert done.returncode == EXIT_CODES.get(line, 0), f"{line}\n{done.stdout}\n{done.stderr}"
