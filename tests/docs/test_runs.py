@@ -6,6 +6,7 @@
 
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -15,6 +16,9 @@ from pathlib import Path
 
 import matplotlib
 import pytest
+from typer.testing import CliRunner
+
+from gripper_force import cli
 
 ROOT = Path(__file__).parents[2]
 BLOCK = re.compile(r"^ *```([^\n]*)\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
@@ -38,10 +42,10 @@ ADDED = {
 
 LOWERED = {
     r"--trials \d+": "--trials 2",
-    r"--(presses|taps|grasps) [1-9]\d*": r"--\1 4",
+    r"--(presses|taps|grasps) [1-9]\d*": r"--\1 5",
     r"--sets \d+": "--sets 2",
     r"--touches \d+": "--touches 4",
-    r"\b(minutes=|--minutes )\d+": r"\g<1>0.02",
+    r"(\bminutes=|--minutes )\d+": r"\g<1>0.02",
     r"\bsteps=\d+": "steps=2",
 }
 """Numbers that are lowered, so that hours of simulation and training become seconds."""
@@ -156,3 +160,6 @@ def test_the_commands_of_a_page_run(page: Path, clone: Path) -> None:
         )
         sys.stdout.write(f"{time.monotonic() - begin_s:.0f} s: {command}\n")
         assert done.returncode == EXIT_CODES.get(line, 0), f"{line}\n{done.stdout}\n{done.stderr}"
+        for follows in re.findall(r"^next: gripper-force (.*)", done.stderr, re.MULTILINE):
+            help_ = CliRunner().invoke(cli.app, [*shlex.split(follows), "--help"])
+            assert help_.exit_code == 0, f"{follows}\n{help_.output}"
