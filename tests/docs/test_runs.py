@@ -22,11 +22,14 @@ from gripper_force import cli
 
 ROOT = Path(__file__).parents[2]
 BLOCK = re.compile(r"^ *```([^\n]*)\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
+README = ROOT / "README.md"
 PAGES = [
-    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md")),
+    README,
+    ROOT / "CONTRIBUTING.md",
     *sorted(path for path in (ROOT / "docs").rglob("*.md") if path.parent.name != "decisions"),
 ]
-QUICK = {"docs/replay.md", "docs/commands.md"}
+QUICK = {"docs/commands.md", "docs/index.md"}
+"""Pages of few seconds."""
 
 ADDED = {
     "grasp": "--set sim.detail=coarse --set log.report=false --set control.hold_s=0.3",
@@ -83,9 +86,11 @@ def name_of(page: Path) -> str:
 
 
 def shown_lines(page: Path) -> list[str]:
-    """Returns the commands of a page's blocks, without comments and the blocks that need something."""
+    """Returns the commands of a page's blocks, without comments, blocks that need something, and those of the README."""
     lines = []
     for language, body in BLOCK.findall(page.read_text()):
+        if page != README and body in README.read_text():
+            continue
         if language.strip() in ("", "sh") and not body.lstrip().startswith("# needs"):
             for line in re.sub(r" *\\\n *", " ", body).splitlines():
                 lines.append(re.sub(r"\s+# .*|^# .*", "", line).strip())
@@ -116,7 +121,7 @@ def clone(tmp_path: Path) -> Path:
     """A folder with what commands use of a clone: they may write into the pages, but not change the project."""
     folder = tmp_path / "clone"
     shutil.copytree(ROOT / "docs", folder / "docs")
-    for name in ("Makefile", "pyproject.toml", "examples", "scripts"):
+    for name in ("Makefile", "pyproject.toml", "examples", "scripts", "tests"):
         (folder / name).symlink_to(ROOT / name)
     (folder / ".venv").symlink_to(sys.prefix)
     return folder
