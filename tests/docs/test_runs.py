@@ -1,7 +1,8 @@
 """The commands of each page run in order, as a reader runs them: in one new folder, with user folders of its own.
 
 `make test` runs the pages in `QUICK`, `make test-docs` all of them. A block whose first line begins with ``# needs``
-(hardware, root, a display) is not run. Commands that are long are shortened by the tables below, which keep the command.
+(hardware, root, a display) is not run, but see `SIMULATED`. The tables below shorten long commands; they keep the command
+and its own options.
 """
 
 import os
@@ -31,7 +32,11 @@ PAGES = [
 QUICK = {"docs/commands.md", "docs/index.md"}
 """Pages of few seconds."""
 
+SIMULATED = {"README.md", "docs/your-own-rig.md"}
+"""Pages whose commands for a real rig run, too: on a simulated one, with a simulated object."""
+
 ADDED = {
+    "setup": "--yes --set servo.port=virtual:rig",
     "grasp": "--set sim.detail=coarse --set log.report=false --set control.hold_s=0.3",
     "calibrate object": "--touches 4 --set sim.detail=coarse",
     "teach": "--touches 4 --set sim.detail=coarse --set vision.checkpoint=small",
@@ -43,7 +48,8 @@ ADDED = {
 }
 """Options that shorten a command. They stand before its own, which win."""
 
-LOWERED = {
+REPLACED = {
+    r"\bmug\b": "lemon",
     r"--trials \d+": "--trials 2",
     r"--(presses|taps|grasps) [1-9]\d*": r"--\1 5",
     r"--sets \d+": "--sets 2",
@@ -51,7 +57,7 @@ LOWERED = {
     r"(\bminutes=|--minutes )\d+": r"\g<1>0.02",
     r"\bsteps=\d+": "steps=2",
 }
-"""Numbers that are lowered, so that hours of simulation and training become seconds."""
+"""An object that the simulation has, and numbers that turn hours of simulation and training into seconds."""
 
 PREPARED = {
     "gripper-force replay runs/LOG.mcap": "gripper-force grasp --object stapler && mv runs/*.mcap runs/LOG.mcap",
@@ -91,7 +97,9 @@ def shown_lines(page: Path) -> list[str]:
     for language, body in BLOCK.findall(page.read_text()):
         if page != README and body in README.read_text():
             continue
-        if language.strip() in ("", "sh") and not body.lstrip().startswith("# needs"):
+        mark = re.match(r"\s*# needs (\w+)", body)
+        runs = mark is None or (mark[1] == "hardware" and name_of(page) in SIMULATED)
+        if language.strip() in ("", "sh") and runs:
             for line in re.sub(r" *\\\n *", " ", body).splitlines():
                 lines.append(re.sub(r"\s+# .*|^# .*", "", line).strip())
     return [line for line in lines if line]
@@ -101,8 +109,8 @@ def shortened(line: str) -> str:
     """Returns a command with the options that shorten it."""
     for name, options in ADDED.items():
         line = re.sub(rf"(gripper-force {name}) ", rf"\1 {options} ", f"{line} ").strip()
-    for pattern, lowered in LOWERED.items():
-        line = re.sub(pattern, lowered, line)
+    for pattern, text in REPLACED.items():
+        line = re.sub(pattern, text, line)
     return re.sub(r"^make ", "make --dry-run ", line)
 
 
