@@ -53,7 +53,7 @@ REPLACED = {
     r"--trials \d+": "--trials 2",
     r"--(presses|taps|grasps) [1-9]\d*": r"--\1 5",
     r"--sets \d+": "--sets 2",
-    r"--touches \d+": "--touches 4",
+    r"--touches ([5-9]|\d\d)": "--touches 4",
     r"(\bminutes=|--minutes )\d+": r"\g<1>0.02",
     r"\bsteps=\d+": "steps=2",
 }
