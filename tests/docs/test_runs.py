@@ -30,7 +30,7 @@ PAGES = [
     *sorted(path for path in (ROOT / "docs").rglob("*.md") if path.parent.name != "decisions"),
 ]
 QUICK = {"docs/commands.md", "docs/index.md"}
-"""Pages of few seconds."""
+"""Pages that take some seconds."""
 
 SIMULATED = {"README.md", "docs/your-own-rig.md"}
 """Pages whose commands for a real rig run, too: on a simulated one, with a simulated object."""
@@ -90,7 +90,11 @@ NOT_RUN = {
 PACKAGES = {"gripper-force view": "rerun", "gripper-force export lerobot": "lerobot"}
 """Optional packages, without which a command is not run."""
 
-EXIT_CODES = {"gripper-force grasp --object none": 1}
+EXIT_CODES = {
+    "gripper-force grasp --object none": 1,
+    "gripper-force grasp --object peach.yaml --target-n 3": 1,
+    "gripper-force grasp --set sim.friction=4 --set target_n=3": 1,
+}
 """Documented exit codes other than 0."""
 
 
