@@ -9,7 +9,7 @@ PIP := $(BIN)/pip install --quiet --disable-pip-version-check
 CPU_INDEX := https://download.pytorch.org/whl/cpu
 TORCH := $(shell grep -om1 'torch>=[^"]*' pyproject.toml)
 
-.PHONY: grasp test test-lerobot docs wheel setup setup-dev format clean
+.PHONY: grasp test test-docs test-lerobot docs wheel setup setup-dev format clean
 
 grasp: setup
 	$(BIN)/gripper-force grasp $(ARGS)
@@ -25,6 +25,10 @@ test: setup-dev
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto $(ARGS)
 	$(BIN)/coverage run -m pytest -q tests/control/test_safety.py tests/control/test_limits.py
 	$(BIN)/coverage report
+
+# Runs the commands of all pages; `make test` runs only those of short pages.
+test-docs: setup-dev
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto -m '' tests/docs $(ARGS)
 
 # LeRobot 0.6.1 needs Python 3.12: make test-lerobot LEROBOT=0.6.1 PYTHON=python3.12
 LEROBOT ?= 0.4.4

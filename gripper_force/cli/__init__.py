@@ -77,12 +77,16 @@ def main() -> NoReturn:
             app(prog_name="gripper-force")
     except GripperError as error:
         console.err.print(f"[bold red]error:[/] {console.plain(error)}", soft_wrap=True)
-        if "--json" in sys.argv:
-            sys.stdout.write(json.dumps({"error": str(error)}) + "\n")
+        _print_json_error(str(error))
         sys.exit(2)
     except BaseException as end:
         if isinstance(end, SystemExit):
             interrupted = end.code == _INTERRUPTED  # typer's code after an interrupt
+            usage = getattr(
+                end.__context__, "format_message", None
+            )  # of a wrong option; typer has printed it
+            if usage is not None:
+                _print_json_error(usage())
         else:  # native code, such as pydantic's, can turn an interrupt into an exception of its own
             interrupted = isinstance(end, KeyboardInterrupt) or process.is_interrupted()
         if interrupted:
@@ -91,6 +95,11 @@ def main() -> NoReturn:
             sys.exit(process.interrupt_exit_code())
         raise
     sys.exit(0)
+
+
+def _print_json_error(message: str) -> None:
+    if "--json" in sys.argv:
+        sys.stdout.write(json.dumps({"error": message}) + "\n")
 
 
 def _print_version(value: bool) -> None:

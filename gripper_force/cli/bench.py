@@ -81,20 +81,23 @@ def estimator(
     if data is not None and (config is not None or set_):
         raise ConfigError("--config and --set apply to simulated logs only; leave them out with --data")
     settings = load_settings(config, set_, {})
-    with TemporaryDirectory() as name, console.err.status("measuring") as status:
+    sources, counts = checkpoints or list(SHIPPED), threads or sorted({1, CORES})
+    with TemporaryDirectory() as name:
         if data is None or scale_on is None:
             data, scale_on = Path(name) / "data", Path(name) / "scale"
-            for logs, plans in ((data, plan("press", 12, 900_000)), (scale_on, plan("press", 8, 100_000))):
-                for made in simulate(plans, logs, settings, jobs):
-                    status.update(f"simulating {made.name}")
-        status.update("measuring")
-        rows = estimator_bench.bench(
-            checkpoints or list(SHIPPED),
-            lambda model: load_clips(data, model.header.preprocess, workers=jobs),
-            lambda model: load_clips(scale_on, model.header.preprocess, workers=jobs),
-            threads or sorted({1, CORES}),
-            console.line,
-        )
+            made = ((data, plan("press", 12, 900_000)), (scale_on, plan("press", 8, 100_000)))
+            with console.bar("simulating", sum(len(plans) for _, plans in made)) as progress:
+                for logs, plans in made:
+                    for path in simulate(plans, logs, settings, jobs):
+                        progress(path.name)
+        with console.bar_or_lines("measuring", estimator_bench.count_steps(sources, counts)) as measured:
+            rows = estimator_bench.bench(
+                sources,
+                lambda model: load_clips(data, model.header.preprocess, workers=jobs),
+                lambda model: load_clips(scale_on, model.header.preprocess, workers=jobs),
+                counts,
+                measured,
+            )
     plot = folder / "estimator.png" if write is None else write.with_suffix(".png")
     file = folder / "estimator.json"
     estimator_bench.write_json(file, rows)
@@ -133,7 +136,7 @@ def gain(
     kinds = objects or list(TRIAL_OBJECTS)
     folder.mkdir(parents=True, exist_ok=True)
     rows = []
-    with console.err.status("grasping") as status:
+    with console.bar("grasping", rounds * len(kinds) * (grasps + presses)) as progress:
         running = gain_bench.bench(
             settings,
             kinds,
@@ -141,7 +144,7 @@ def gain(
             grasps=grasps,
             presses=presses,
             folder=folder,
-            progress=lambda text, steps=1: status.update(text),
+            progress=progress,
         )
         for row in running:
             rows.append(row)
@@ -189,33 +192,31 @@ def teach(
         raise ConfigError(f"no method {strange[0]!r}; use one of {', '.join(job.METHODS)}")
     rows: list[job.Cell] = []
     real: list[job.RecordingRow] = []
-    with console.err.status("teaching") as status:
-
-        def tell(text: str, steps: int = 1) -> None:
-            status.update(text)
-
-        if recordings is not None:
-            for found in job.bench_recordings(recordings, folder, tell):
+    if recordings is not None:
+        with console.err.status("teaching") as status:
+            for found in job.bench_recordings(recordings, folder, lambda text, steps=1: status.update(text)):
                 real.append(found)
                 console.line(f"{found.object}, {found.trials} trials: {found.taught_n:.2f} N")
-            text = job.recordings_markdown(real)
-        else:
-            settings = load_settings(None, set_, {})
-            chosen = job.read_rigs(rigs, set_) if rigs else job.foreign_rigs(settings, drawn)
-            for cell in job.bench(
-                chosen,
-                objects or held_out_kinds(),
-                touches or job.COUNTS,
-                methods or job.METHODS,
+        text = job.recordings_markdown(real)
+    else:
+        settings = load_settings(None, set_, {})
+        chosen = job.read_rigs(rigs, set_) if rigs else job.foreign_rigs(settings, drawn)
+        counts, used = touches or job.COUNTS, methods or job.METHODS
+        cells = job.list_cells(chosen, objects or held_out_kinds(), counts, used)
+        with console.bar("teaching", len(cells)) as progress:
+            running = job.bench(
+                cells,
                 grasps=grasps,
                 folder=folder,
                 workers=jobs,
-                progress=tell,
-            ):
+                progress=lambda text, steps=1: progress(text, 0),
+            )
+            for cell in running:
                 rows.append(cell)
                 error = cell.problem or f"{cell.mae_n:.3f} N"
                 console.line(f"{cell.rig}, {cell.object}, {cell.method}, {cell.touches} touches: {error}")
-            text = job.markdown(rows)
+                progress("")
+        text = job.markdown(rows)
     if write is not None:
         write_between(write, "teach recordings" if real else "teach", text)
     shown = {"recordings": [row._asdict() for row in real]} if real else {"cells": rows}
@@ -358,10 +359,10 @@ def scene(
     if write is not None and objects:
         raise ConfigError("--write needs all objects; leave out --object")
     rows: list[scene_bench.SceneCost] = []
-    with console.err.status("squeezing") as status:
+    with console.bar("squeezing", scene_bench.count_rows(objects or [])) as progress:
         for row in scene_bench.scene_costs(objects or [], keep_table=write is not None):
             rows.append(row)
-            status.update(f"squeezed {row.object}, {row.detail}")
+            progress(f"{row.object}, {row.detail}")
     if write is not None:
         write_between(write, "detail", scene_bench.markdown(rows))
     _show({"scene": rows}, as_json, lambda: scene_table(rows))
@@ -400,9 +401,11 @@ def training(
     from gripper_force.qualification.bench import training_bench
 
     points: list[training_bench.Point] = []
-    for point in training_bench.learn(partial(load_clips, data, workers=jobs), minutes, set_ or [], folder):
-        points.append(point)
-        console.err.print(f"{point.way}, {point.minutes:.2f} min: {point.mae_n:.3f} N")
+    load = partial(load_clips, data, workers=jobs)
+    with console.bar("training", training_bench.TURNS) as progress:
+        for point in training_bench.learn(load, minutes, set_ or [], folder, progress):
+            points.append(point)
+            console.err.print(f"{point.way}, {point.minutes:.2f} min: {point.mae_n:.3f} N")
     reached = training_bench.reached(points)
     result = {"points": points, "as_good_as_paper_min": reached, "folder": folder}
     _show(result, as_json, lambda: training_table(points, reached, folder))

@@ -83,6 +83,7 @@ def load_cell(
             progress=_progress(status),
         )
     _show_rig(result, as_json)
+    _next_step(["calibrate", "servo", "--gauge-mm", "MM"], config, set_, path)
 
 
 @app.command("jaws")
@@ -101,6 +102,13 @@ def jaws(
     with console.err.status("moving") as status:
         result = job(settings, prompt=console.prompt(yes, status), progress=_progress(status))
     console.show(result, as_json, jaws_table)
+    if settings.load_cell.backend == "none":
+        words = ["grasp"]
+    elif settings.load_cell.backend == "simulated":  # needs no calibration
+        words = ["calibrate", "servo", "--gauge-mm", "30", "--set", "object=block"]
+    else:
+        words = ["calibrate", "load-cell", "--mass-kg", "KG"]
+    _next_step(words, config, set_)
 
 
 @app.command("servo")
@@ -132,6 +140,10 @@ def servo(
             progress=_progress(status),
         )
     _show_rig(result, as_json)
+    words = (
+        ["calibrate", "camera", "--object", "NAME"] if settings.uses_vision else ["grasp", "--object", "NAME"]
+    )
+    _next_step(words, config, set_, path)
 
 
 @app.command("weight")
@@ -197,6 +209,7 @@ def camera(
             f"the camera is now another one than that of {text}; teach or calibrate the object again"
         )
     _show_rig(result, as_json)
+    _next_step(["calibrate", "object", "NAME"], config, set_, path)
 
 
 @app.command("object")
@@ -230,7 +243,7 @@ def object_(
     if fresh and logs is not None:
         raise ConfigError("--fresh records touches and --from records none; leave out one of them")
     settings = load_settings(config, set_, {"object": name, "seed": seed})
-    name = settings.object  # a path has become a name
+    given, name = name, settings.object  # a path has become a name
     folder = folder or job.default_folder(name)
     if logs is None:
         _tell_existing(settings, touches, folder, fresh)
@@ -251,6 +264,16 @@ def object_(
             "use this profile, or delete the bundle"
         )
     console.show(result.as_dict(), as_json, lambda _: object_table(result))
+    profile = name if out is None and find_object(name) == result.profile_path else result.profile_path
+    words = [
+        "grasp",
+        "--object",
+        given,
+        "--profile",
+        str(profile),
+        *([] if seed is None else ["--seed", str(seed)]),
+    ]
+    _next_step(words, config, set_)
 
 
 @app.command("network")
@@ -274,6 +297,7 @@ def network(
         model = calibrate_network(logs, out, checkpoint, workers=jobs, progress=progress)
     fitted = model.model_dump(mode="json", exclude={"mean", "axes"})
     console.show({"checkpoint": str(out), **fitted}, as_json)
+    console.next_step("evaluate", data, "--checkpoint", out)
 
 
 @app.command("gain")
@@ -294,7 +318,9 @@ def gain(
     from gripper_force.jobs.object_gain import save_gain
 
     paths = [path for given in logs for path in (find_logs(given) if given.is_dir() else [given])]
-    console.show(save_gain(name, paths, out, set_), as_json)
+    saved = save_gain(name, paths, out, set_)
+    console.show(saved, as_json)
+    console.next_step("grasp", "--object", saved.object, "--profile", out or name)
 
 
 def teach(
@@ -439,6 +465,17 @@ def _rig_settings(
     if new is not None and rig is not None and rig.resolve() != new.resolve():
         read_rig(new)  # raises: this command does not write it
     return settings, rig or new or settings.calibration.rig or Path("rig.yaml")
+
+
+def _next_step(
+    words: list[str], config: Path | None, set_: list[str] | None, rig: Path | None = None
+) -> None:
+    """Prints the step that follows, with the same configuration except the object, and the written rig profile."""
+    dropped = ("object=", *([] if rig is None else ["calibration.rig="]))
+    keys = [key for key in set_ or [] if not key.startswith(dropped)]
+    if rig is not None and load_settings_before_rig(config, None, {})[0].calibration.rig != rig:
+        keys.append(f"calibration.rig={rig}")
+    console.next_step(*words, *again(config, keys))
 
 
 def _show_rig(result: "LoadCellResult | ServoResult | CameraResult", as_json: bool) -> None:

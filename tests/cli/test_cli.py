@@ -70,7 +70,18 @@ def commands(group: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]
         yield from commands(command, (*path, name))
 
 
-@pytest.mark.parametrize("path", list(commands(typer.main.get_command(cli.app))), ids=" ".join)
+def find(path: tuple[str, ...]) -> Any:
+    command: Any = typer.main.get_command(cli.app)
+    for name in path:
+        command = command.commands[name]
+    return command
+
+
+GROUPS = {path: find(path) for path in commands(typer.main.get_command(cli.app))}
+LEAVES = {path: command for path, command in GROUPS.items() if not hasattr(command, "commands")}
+
+
+@pytest.mark.parametrize("path", GROUPS, ids=" ".join)
 def test_every_command_explains_itself(path: tuple[str, ...]) -> None:
     result = CliRunner().invoke(cli.app, [*path, "--help"])
     assert result.exit_code == 0
@@ -78,14 +89,9 @@ def test_every_command_explains_itself(path: tuple[str, ...]) -> None:
 
 
 def test_every_command_can_be_set_and_read_by_a_script() -> None:
-    groups = list(commands(typer.main.get_command(cli.app)))
-    for path in groups:
-        command: Any = typer.main.get_command(cli.app)
-        for name in path:
-            command = command.commands[name]
-        if not hasattr(command, "commands"):
-            options = {option for parameter in command.params for option in parameter.opts}
-            assert options >= {"--set", "--json"}, path
+    for path, command in LEAVES.items():
+        options = {option for parameter in command.params for option in parameter.opts}
+        assert options >= {"--set", "--json"}, path
 
 
 def test_the_command_line_answers_without_what_is_heavy() -> None:
@@ -372,6 +378,40 @@ def test_bad_input_to_grasp_is_one_sentence(
     (line,) = done.err.splitlines()
     assert line.startswith("error: ")
     assert sentence in line
+
+
+def required_words(command: Any) -> list[str]:
+    """A word for each parameter that a command needs: a number, and a file that does not exist."""
+    needed = [parameter for parameter in command.params if parameter.required]
+    return [word for p in needed for word in (*(p.opts if p.param_type_name == "option" else ()), "1")]
+
+
+@pytest.mark.parametrize("wrong", [["--set", "no.such=1"], ["--no-such-option"]], ids=["key", "option"])
+@pytest.mark.parametrize("path", LEAVES, ids=" ".join)
+def test_with_json_every_error_is_one_object(run: Run, path: tuple[str, ...], wrong: list[str]) -> None:
+    done = run(*path, "--json", *required_words(LEAVES[path]), *wrong)
+    assert (done.code, "Traceback" in done.err) == (2, False), done.err
+    (line,) = done.out.splitlines()
+    assert list(json.loads(line)) == ["error"]
+
+
+SUCCESSES = [
+    "config show",
+    "config check",
+    "config schema",
+    "config file",
+    "bench bus --cycles 2",
+    "calibrate jaws --yes --set object=none --set sim.detail=coarse",
+    "simulate --presses 0 --grasps 0 --taps 1 --object stapler --set sim.detail=coarse --jobs 1",
+    "stability fuzz --cases 3 --jobs 1",
+    "export network {checkpoint} --out force.onnx",
+]
+"""Commands of each group; those of `import`, and others, have tests of their own."""
+
+
+@pytest.mark.parametrize("command", SUCCESSES)
+def test_with_json_a_result_is_one_object(run: Run, command: str, tiny_checkpoint: Path) -> None:
+    assert run(*command.format(checkpoint=tiny_checkpoint).split(), "--json").json()
 
 
 def test_with_json_the_error_is_json_too(run: Run) -> None:

@@ -129,7 +129,7 @@ def bench(
         held_out: Loads recordings that were not in the training data, at the model's size.
         scaling: Loads other recordings, to calibrate int8 on.
         threads: Numbers of CPU threads.
-        progress: Called after each measurement.
+        progress: Called after each of `count_steps` measurements.
 
     Raises:
         ConfigError: A package is not installed, or an engine fails in a separate process.
@@ -151,6 +151,11 @@ def bench(
         for each in _measure(source, model, variants, clips, threads, roofs, progress):
             rows.append(each)
     return _with_front(rows)
+
+
+def count_steps(sources: Sequence[str], threads: Sequence[int]) -> int:
+    """Number of measurements of `bench`, for its progress."""
+    return 1 + len(sources) * (1 + len(_variants()) + 1 + len(threads))  # rooflines, int8, errors, times
 
 
 def _variants() -> list[tuple[str, str, Precision]]:

@@ -79,7 +79,7 @@ def bench(
         grasps: Number of grasps of each object.
         presses: Number of presses of each object.
         folder: Folder of the logs.
-        progress: Called before each step.
+        progress: Called after each grasp and each press.
 
     Raises:
         GripperError: A grasp failed, or a scene can't be simulated.
@@ -92,7 +92,6 @@ def bench(
         results = []
         ratio = None
         for place in range(grasps):
-            progress(f"{name}, seed {seed}: grasp {place + 1}")
             again = one.model_copy(
                 update={
                     "seed": seed + place,
@@ -102,11 +101,12 @@ def bench(
             target_n = round(float(rng.uniform(*TARGETS_N)), 2)
             results += list(trials(again, 1, 1, objects=(name,), target_n=target_n, same_object=True))
             ratio = learned_ratio(Path(results[-1]["log"]))
+            progress(f"{name}, seed {seed}: grasp {place + 1}")
         logs = []
         for place in range(presses):
-            progress(f"{name}, seed {seed}: press {place + 1}")
             logs.append(folder / f"press-{name}-{seed + _PRESS_SEEDS + place}.mcap")
             _press(one.model_copy(update={"seed": seed + _PRESS_SEEDS + place}), logs[-1], rng)
+            progress(f"{name}, seed {seed}: press {place + 1}")
         yield _row(one, results, ratio, logs)
 
 

@@ -77,6 +77,11 @@ class _Squeeze(NamedTuple):
     speed: float
 
 
+def count_rows(names: list[str]) -> int:
+    """Number of rows of `scene_costs`."""
+    return len(names or OBJECTS) * len(get_args(Detail))
+
+
 def scene_costs(names: list[str], keep_table: bool) -> Iterator[SceneCost]:
     """Squeezes objects up to 10 N at each level of detail, along one path.
 

@@ -127,11 +127,29 @@ def read_rigs(paths: Sequence[Path], overrides: list[str] | None) -> list[Rig]:
     return [Rig(path.stem, load_config(path, overrides)) for path in paths]
 
 
+def list_cells(
+    rigs: Sequence[Rig], objects: Sequence[str], counts: Sequence[int], methods: Sequence[str]
+) -> list[tuple[Rig, Cell]]:
+    """Returns the cells to measure, each with its rig.
+
+    Args:
+        rigs: The rigs.
+        objects: Names of the objects.
+        counts: Numbers of touches.
+        methods: Some of `METHODS`.
+    """
+    cells = []
+    for rig in rigs:
+        digest = read_model(rig.config.vision.checkpoint).digest
+        for name in objects:
+            for method in methods:
+                for count in (0,) if method == "shipped" else counts:
+                    cells.append((rig, Cell(rig.name, name, count, method, digest)))
+    return cells
+
+
 def bench(
-    rigs: Sequence[Rig],
-    objects: Sequence[str],
-    counts: Sequence[int],
-    methods: Sequence[str],
+    cells: Sequence[tuple[Rig, Cell]],
     *,
     grasps: int,
     folder: Path,
@@ -141,10 +159,7 @@ def bench(
     """Measures the cells that are not yet in ``folder/cells.jsonl``, and yields all.
 
     Args:
-        rigs: The rigs.
-        objects: Names of the objects.
-        counts: Numbers of touches.
-        methods: Some of `METHODS`.
+        cells: Cells of `list_cells`.
         grasps: Grasps of each cell and feedback; 0 for none.
         folder: Folder of logs, bundles and results.
         workers: Processes of `teach`.
@@ -155,20 +170,16 @@ def bench(
     """
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / "cells.jsonl"
-    cells = [Cell(**json.loads(line)) for line in file.read_text().splitlines()] if file.exists() else []
-    known = {(c.rig, c.object, c.touches, c.method, c.network): c for c in cells}
-    for rig in rigs:
-        digest = read_model(rig.config.vision.checkpoint).digest
-        for name in objects:
-            for method in methods:
-                for count in (0,) if method == "shipped" else counts:
-                    key = (rig.name, name, count, method, digest)
-                    if key not in known:
-                        progress(f"{name}, {rig.name}: {method}, {count} touches")
-                        known[key] = _measured(Cell(*key), rig.config, grasps, folder, workers, progress)
-                        with file.open("a") as out:
-                            out.write(json.dumps(asdict(known[key])) + "\n")
-                    yield known[key]
+    done = [Cell(**json.loads(line)) for line in file.read_text().splitlines()] if file.exists() else []
+    known = {(c.rig, c.object, c.touches, c.method, c.network): c for c in done}
+    for rig, cell in cells:
+        key = (cell.rig, cell.object, cell.touches, cell.method, cell.network)
+        if key not in known:
+            progress(f"{cell.object}, {cell.rig}: {cell.method}, {cell.touches} touches")
+            known[key] = _measured(cell, rig.config, grasps, folder, workers, progress)
+            with file.open("a") as out:
+                out.write(json.dumps(asdict(known[key])) + "\n")
+        yield known[key]
 
 
 def _measured(

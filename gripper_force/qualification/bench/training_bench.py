@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
 from gripper_force.errors import ConfigError
+from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import Clip, split_by
 from gripper_force.jobs.report.figure import STYLE
@@ -65,7 +66,9 @@ class Point:
     rmse_n: float
 
 
-def learn(load: Load, minutes: float, overrides: Sequence[str], out: Path) -> Iterator[Point]:
+def learn(
+    load: Load, minutes: float, overrides: Sequence[str], out: Path, progress: Progress = no_progress
+) -> Iterator[Point]:
     """Trains one network with each recipe, in turns; writes ``learning.json`` and ``learning.png``.
 
     Each recipe gets the same minutes, and its schedule ends with them; the first gets a tenth. A point before
@@ -76,6 +79,7 @@ def learn(load: Load, minutes: float, overrides: Sequence[str], out: Path) -> It
         minutes: Training time of each recipe.
         overrides: Keys of all recipes, as ``key=value``.
         out: Folder for the results. Points are written one by one, the figure at the end or at an interrupt.
+        progress: Called after each of `TURNS` turns.
 
     Yields:
         The points, as they are measured.
@@ -106,7 +110,7 @@ def learn(load: Load, minutes: float, overrides: Sequence[str], out: Path) -> It
             training, held_out[recipe] = split_by(clips[size], "set", config.validation, config.seed)
             trainers[recipe] = Trainer(config, 0, Batches(training, config, ranks), ranks)
         try:
-            for recipe in _in_turns(trainers, minutes, budgets):
+            for recipe in _in_turns(trainers, minutes, budgets, progress):
                 trainer, preprocess = trainers[recipe], configs[recipe].preprocess
                 forces = estimates(held_out[recipe], [trainer.network], preprocess, ranks.device)
                 spent = trainer.done * budgets[recipe]
@@ -118,7 +122,9 @@ def learn(load: Load, minutes: float, overrides: Sequence[str], out: Path) -> It
                 draw(points).savefig(out / "learning.png")
 
 
-def _in_turns(trainers: dict[str, Trainer], minutes: float, budgets: dict[str, float]) -> Iterator[str]:
+def _in_turns(
+    trainers: dict[str, Trainer], minutes: float, budgets: dict[str, float], progress: Progress
+) -> Iterator[str]:
     """Trains the recipes alternately; yields the name of a recipe when it is due for evaluation."""
     marks = set(np.geomspace(2, TURNS, POINTS).round().astype(int).tolist())
     for turn in range(1, TURNS + 1):
@@ -128,6 +134,7 @@ def _in_turns(trainers: dict[str, Trainer], minutes: float, budgets: dict[str, f
                 pass
             if trainer.step > before and (turn in marks or trainer.done >= 1):
                 yield recipe
+        progress(f"turn {turn}")
 
 
 def reached(points: Sequence[Point]) -> dict[str, float | None]:

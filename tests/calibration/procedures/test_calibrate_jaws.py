@@ -170,6 +170,9 @@ def test_command_prints_the_configuration() -> None:
     done = CliRunner().invoke(app, call)
     assert done.exit_code == 0
     assert "closing_sign: 1" in done.stdout
+    assert (
+        "next: gripper-force calibrate servo --gauge-mm 30 --set object=block --set sim.detail" in done.stderr
+    )
     found = json.loads(CliRunner().invoke(app, [*call, "--json"]).stdout)
     assert found["closing_sign"] == 1
     assert found["open_width_m"] > 0.09

@@ -103,6 +103,8 @@ def test_command_calibrates_from_one_touch(touched: list[Path], tmp_path: Path) 
     assert (found["touches"], found["after_n"], found["touches_needed"]) == (1, None, [])
     assert Path(found["report"]).stat().st_size > 10_000
     assert "needs at least 3 touches; 8 are recommended" in result.stderr
+    profile = tmp_path / "it.yaml"
+    assert f"next: gripper-force grasp --object stapler --profile {profile} --set" in result.stderr
 
 
 def test_log_is_read_once_with_the_results_of_separate_reads(

@@ -13,7 +13,7 @@ from gripper_force.config import load_config
 from gripper_force.errors import ConfigError
 from gripper_force.jobs.dataset import Clip
 from gripper_force.qualification.bench import teach_bench as job
-from gripper_force.qualification.bench.teach_bench import Cell, bench, foreign_rigs, markdown
+from gripper_force.qualification.bench.teach_bench import Cell, bench, foreign_rigs, list_cells, markdown
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -34,7 +34,7 @@ def test_a_finished_cell_is_not_measured_again(
     rigs = foreign_rigs(load_config(None, keys), 1)
 
     def cells() -> list[Cell]:
-        return list(bench(rigs, ["stapler"], [4], ["shipped"], grasps=0, folder=tmp_path))
+        return list(bench(list_cells(rigs, ["stapler"], [4], ["shipped"]), grasps=0, folder=tmp_path))
 
     first = cells()
     assert first[0].mae_n is not None

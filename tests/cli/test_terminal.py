@@ -1,0 +1,88 @@
+"""Terminal behaviour: escape codes only on a terminal that wants them, progress that a log file can hold, exit codes."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+COMMAND = [sys.executable, "-c", "from gripper_force.cli import main; main()"]
+TAP = "simulate --presses 0 --grasps 0 --taps 1 --object stapler --set sim.detail=coarse --jobs 1"
+ESCAPE = re.compile(r"\x1b")
+COLOUR = re.compile(r"\x1b\[[0-9;]*\b([349]|10)[0-8](;[0-9;]*)?m")
+CALLS = {
+    "a bar": (TAP, 0),
+    "a table": ("config file", 0),
+    "an error": ("grasp --set no.such=1", 2),
+    "help": ("--help", 0),
+}
+
+
+def on_terminal(arguments: str, folder: Path, **variables: str) -> tuple[int, str]:
+    """Runs the command in a terminal. Returns its exit code, and what the terminal got."""
+    env = {key: value for key, value in os.environ.items() if key not in ("NO_COLOR", "FORCE_COLOR", "TERM")}
+    master, slave = os.openpty()
+    command = [*COMMAND, *arguments.split()]
+    with subprocess.Popen(
+        command, cwd=folder, env=env | variables, stdin=slave, stdout=slave, stderr=slave
+    ) as child:
+        os.close(slave)
+        parts = []
+        while part := _read(master):
+            parts.append(part)
+    os.close(master)
+    return child.returncode, b"".join(parts).decode()
+
+
+def _read(master: int) -> bytes:
+    try:
+        return os.read(master, 65536)
+    except OSError:  # EIO: the other end was closed
+        return b""
+
+
+@pytest.mark.parametrize(("arguments", "code"), CALLS.values(), ids=CALLS)
+def test_a_dumb_terminal_gets_no_escape_codes(arguments: str, code: int, tmp_path: Path) -> None:
+    done, shown = on_terminal(arguments, tmp_path, TERM="dumb")
+    assert (done, ESCAPE.search(shown)) == (code, None)
+    assert shown
+
+
+@pytest.mark.parametrize("name", ["a bar", "an error", "help"])
+def test_there_is_colour_unless_no_color_is_set(name: str, tmp_path: Path) -> None:
+    (arguments, code), term = CALLS[name], "xterm-256color"
+    done, shown = on_terminal(arguments, tmp_path, TERM=term)
+    assert (done, COLOUR.search(shown) is not None) == (code, True)
+    done, shown = on_terminal(arguments, tmp_path, TERM=term, NO_COLOR="1")
+    assert (done, COLOUR.search(shown)) == (code, None)
+
+
+def test_without_a_terminal_a_bar_is_printed_once(tmp_path: Path) -> None:
+    done = subprocess.run([*COMMAND, *TAP.split()], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert "\r" not in done.stdout + done.stderr
+    assert not ESCAPE.search(done.stdout + done.stderr)
+    assert done.stderr.count("simulating ") == 1
+    assert " 1/1 " in done.stderr
+    assert done.stderr.splitlines()[-1] == "next: gripper-force train data/sim --out force.safetensors"
+    assert "logs" in done.stdout
+
+
+def test_ctrl_c_ends_with_130_and_no_result(tmp_path: Path) -> None:
+    command = [*COMMAND, "virtual-servo", "--json"]
+    with subprocess.Popen(
+        command,
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as child:
+        assert child.stdout is not None
+        assert "/dev/" in child.stdout.readline()
+        child.send_signal(signal.SIGINT)
+        out, err = child.communicate(timeout=60)
+    assert (child.returncode, out) == (130, "")
+    assert err.splitlines()[-1] == "interrupted; the run was stopped as configured"
