@@ -171,6 +171,8 @@ def weight(
     console.show(
         console.jsonable(result) | {"settings": result.settings}, as_json, lambda _: weight_table(result)
     )
+    found = [f"gripper.{key}={value:.4g}" for key, value in result.settings.items()]
+    _next_step(["grasp"], config, [*(set_ or []), *found])
 
 
 @app.command("camera")
