@@ -22,6 +22,9 @@ _AGAIN_S = 0.05
 """A lowering that ends above the tolerance is followed at once by a second one of twice this time. The first leaves a
 stiff object with too much force: the motor force returns before its lag lets it reach its lowest value."""
 
+_LOWERING_WAIT_S = 1.0
+"""A lowering waits no longer than this in all, whatever the measured speed is."""
+
 _REPEAT_SHARE = 0.75
 _REPEAT_S = 0.5
 _REPEAT_WITHIN_S = 1.0
@@ -94,6 +97,7 @@ class ForceLoop:
         self._trim_n = 0.0
         self._rising, self._side, self.is_lowering = True, 1.0, False
         self._lowers_again, self._repeat_s, self._high_s = False, 0.0, 0.0
+        self._highest_n, self._waited_s = 0.0, 0.0
 
     @property
     def reference_n(self) -> float:
@@ -109,6 +113,7 @@ class ForceLoop:
         """Starts a ramp at the present reference and keeps the trim."""
         self._lowers_again = target_n < self.reference_n
         self._repeat_s = _REPEAT_WITHIN_S if self._lowers_again else 0.0
+        self._highest_n, self._waited_s = self.reference_n, 0.0
         self._start(self.reference_n, target_n)
 
     def _start(
@@ -149,12 +154,13 @@ class ForceLoop:
         if self.is_lowering and not ramping:
             self._side = min(self._side + 2 * dt_s / _RETURN_S, 1.0)
             self.is_lowering = self._side < 1.0
-            is_high = estimate.force_n > target_n + tolerance_n(target_n)
-            if not self.is_lowering and self._lowers_again and is_high:
-                self._lowers_again = False
-                self._start(estimate.force_n, target_n, _AGAIN_S, _AGAIN_S)
-        waits = shortfall_n > _WAIT_SHARE * self.reference_n + _WAIT_N
-        waits |= self.is_lowering and -closing_m_s > self._largest_m_s
+            if not self.is_lowering:
+                self._lower_at_once(target_n, estimate)
+        if self.is_lowering:
+            waits = -closing_m_s > self._largest_m_s and self._waited_s < _LOWERING_WAIT_S
+            self._waited_s += dt_s * waits
+        else:
+            waits = shortfall_n > _WAIT_SHARE * self.reference_n + _WAIT_N
         reference_n = self._profile.step(target_n, 0.0 if waits else dt_s)
         error_n = 0.0
         # A constant motor force holds a constant contact force. The current alone carries no new information
@@ -172,6 +178,13 @@ class ForceLoop:
         motor_force_n = feedforward_n + self._trim_n + self._gains.proportional * error_n
         return min(max(motor_force_n, low_n), high_n)
 
+    def _lower_at_once(self, target_n: float, estimate: FusedForce) -> None:
+        """Lowers the force again if it is still too high by motor current; one visual estimate may be an outlier."""
+        again, self._lowers_again = self._lowers_again, False
+        is_high = estimate.force_n > target_n + tolerance_n(target_n)
+        if again and is_high and estimate.source != EstimateSource.VISION:
+            self._start(min(estimate.force_n, self._highest_n), target_n, _AGAIN_S, _AGAIN_S)
+
     def _repeat_lowering(self, dt_s: float, target_n: float, estimate: FusedForce) -> None:
         """Lowers the force again if the camera shows that it has stayed too high."""
         rests = not self.is_lowering and self.reference_n == target_n
@@ -182,7 +195,7 @@ class ForceLoop:
             self._repeat_s -= dt_s
             if self._high_s > _REPEAT_S:
                 self._repeat_s = 0.0
-                self._start(estimate.force_n, target_n)
+                self._start(min(estimate.force_n, self._highest_n), target_n)
 
     def _beyond_deadband(self, error_n: float, band_n: float) -> float:
         forward_n = error_n if self._rising else -error_n

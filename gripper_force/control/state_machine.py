@@ -524,7 +524,7 @@ class GraspController:
     def _run_hold(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
         shortfall_n = self._motor_force_n - self._measured_motor_force_n
         self._motor_force_n = self._loop.step(
-            dt_s, self._derated_target_n, self._estimate, shortfall_n=shortfall_n
+            dt_s, self._derated_target_n, self._estimate, shortfall_n=shortfall_n, closing_m_s=closing_m_s
         )
         error_n = self._estimate.force_n - self._derated_target_n
         self._error_n += (error_n - self._error_n) * dt_s / (dt_s + _SETTLE_FILTER_S)

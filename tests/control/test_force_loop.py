@@ -124,6 +124,32 @@ def test_lowering_that_leaves_too_much_force_is_repeated_once(loop, left_n, fall
     assert sum(lowered) * 0.005 == pytest.approx(0.35 if falls == 1 else 0.5, abs=0.03)
 
 
+@pytest.mark.parametrize("outlier_n", [8.0, 15.0])
+def test_one_visual_outlier_at_the_end_of_a_lowering_changes_nothing(transmission, outlier_n):
+    loop = ForceLoop(ControlConfig(feedback="vision"), transmission)
+    loop.start(0.5, 4.0)
+    ramp(loop, 4.0)
+    loop.retarget(2.0)
+    was_lowering = True
+    for _ in range(100):
+        ends = was_lowering and not loop.is_lowering
+        was_lowering = loop.is_lowering
+        seen_n = outlier_n if loop.is_lowering or ends else 2.0
+        loop.step(0.005, 2.0, estimate(seen_n, source="vision"))
+    assert not loop.is_lowering
+    assert loop.reference_n == 2.0
+
+
+@pytest.mark.parametrize("closing_m_s", [-0.05, -1.0])
+def test_a_lowering_ends_whatever_the_measured_speed(loop, closing_m_s):
+    ramp(loop, 4.0)
+    loop.retarget(2.0)
+    for _ in range(300):
+        loop.step(0.005, 2.0, estimate(loop.reference_n), closing_m_s=closing_m_s)
+    assert loop.reference_n == 2.0
+    assert not loop.is_lowering
+
+
 def test_a_lowering_waits_while_the_jaws_open_fast(loop):
     ramp(loop, 4.0)
     loop.retarget(2.0)
