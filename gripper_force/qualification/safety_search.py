@@ -238,6 +238,8 @@ def run_case(config: Config, seed: int, index: int) -> CaseResult:
     run.go(drawn.then_s, Request(0, RequestKind.GRASP, drawn.target_n))
     changes = math.isfinite(drawn.then_n) and run.outcome in (Outcome.NONE, Outcome.HELD)
     change = Request(run.t_ns, RequestKind.GRASP, drawn.then_n) if changes else None
+    if changes:
+        run.statements.change_target(drawn.then_n)
     run.go(_GRASP_S - drawn.then_s, change)
     run.go(_RELEASE_S, Request(run.t_ns, RequestKind.RELEASE))
     shown = run.statements
@@ -272,7 +274,7 @@ class _Run:
         )
         self.t_ns = 0
         self.outcome: str = Outcome.NONE
-        self.statements = SafetyStatements(control, np.fmin(drawn.target_n, drawn.then_n), drawn.sign)
+        self.statements = SafetyStatements(control, drawn.target_n, drawn.sign)
 
     def read(self, t_ns: int, noise: float) -> ServoState:
         state = self._plant.read(t_ns, NOISE_A * noise)
@@ -313,6 +315,7 @@ class _Run:
                 object_n=plant.force_n,
                 peak_n=plant.peak_n,
                 closing_m_s=plant.v_m_s,
+                has_torque=command.goal_current_a > 0,
             )
 
 

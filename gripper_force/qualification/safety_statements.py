@@ -1,9 +1,9 @@
 """Three statements that hold for every grasp, whatever the configuration wrongly says.
 
 The contact force stays within the force limit and 5 %. Jaws without contact are never faster than 1.5 times the
-configured speed. A grasp is never ``held`` on nothing for longer than 0.1 s; jaws that friction or an end stop keeps
-still do not show that their object is gone, and the camera takes up to 0.5 s and two frame periods. All three are
-about the true plant.
+configured speed, except those that an object pushes open while the motor has no torque. A grasp is never ``held`` on
+nothing for longer than 0.1 s; jaws that friction or an end stop keeps still do not show that their object is gone, and
+the camera takes up to 0.5 s and two frame periods. All three are about the true plant.
 """
 
 from typing import Final
@@ -46,12 +46,16 @@ class SafetyStatements:
 
     def __init__(self, control: ControlConfig, target_n: float, sign: int = 1) -> None:
         self._limit_n, self._speed_m_s = control.force_limit_n, control.approach_speed_m_s
-        self._nothing_n, self._sign = NOTHING_SHARE * target_n, sign
-        self._goes_limp = control.on_fault == "limp"
+        self._sign = sign
+        self.change_target(target_n)
         self._still_reaction_s = STILL_REACTION_S + STILL_REACTION_FRAMES / control.frame_hz
         self._nothing_s = 0.0
         self.force_share = self.speed_share = 0.0
         self.held_nothing = False
+
+    def change_target(self, target_n: float) -> None:
+        """Takes the force of a new request."""
+        self._nothing_n = NOTHING_SHARE * target_n
 
     def observe(
         self,
@@ -63,6 +67,7 @@ class SafetyStatements:
         object_n: float,
         peak_n: float,
         closing_m_s: float,
+        has_torque: bool = True,
     ) -> None:
         """Takes one step of the plant.
 
@@ -74,6 +79,7 @@ class SafetyStatements:
             object_n: Contact force on an object.
             peak_n: Largest contact force in the step.
             closing_m_s: Speed of a jaw, positive while it closes.
+            has_torque: False if the motor force is zero: then an object may push the jaws open at any speed.
         """
         claims = outcome == Outcome.HELD and phase in (Phase.RAMP, Phase.HOLD)
         self._nothing_s = self._nothing_s + dt_s if claims and object_n < self._nothing_n else 0.0
@@ -83,7 +89,7 @@ class SafetyStatements:
         if force_n == 0.0:
             # Only opening jaws may be faster; a wrong sign exchanges the directions.
             opens = self._sign * closing_m_s < 0
-            if opens and phase == Phase.FAULT and self._goes_limp:
-                return  # a soft object pushes jaws without torque open
+            if closing_m_s < 0 and not has_torque:
+                return
             limit_m_s = self._speed_m_s * (_TRAVEL_SHARE if opens else 1.0)
             self.speed_share = max(self.speed_share, abs(closing_m_s) / limit_m_s)

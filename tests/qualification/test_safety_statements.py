@@ -16,6 +16,7 @@ def shown(
     force_n: float = 0.0,
     object_n: float = 0.0,
     closing_m_s: float = 0.0,
+    has_torque: bool = True,
 ) -> SafetyStatements:
     statements = SafetyStatements(CONTROL, 4.0, sign)
     for _ in range(steps):
@@ -27,6 +28,7 @@ def shown(
             object_n=object_n,
             peak_n=force_n,
             closing_m_s=closing_m_s,
+            has_torque=has_torque,
         )
     return statements
 
@@ -55,6 +57,23 @@ def test_speed_counts_against_that_of_the_direction(
 
 def test_speed_in_contact_does_not_count() -> None:
     assert shown(force_n=0.1, closing_m_s=1.0).speed_share == 0.0
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_jaws_without_torque_may_be_pushed_open_but_not_shut(sign: int) -> None:
+    assert shown(Phase.FAULT, closing_m_s=-1.0, sign=sign, has_torque=False).speed_share == 0.0
+    assert shown(Phase.FAULT, closing_m_s=1.0, sign=sign, has_torque=False).speed_share > 1.5
+    assert shown(Phase.FAULT, closing_m_s=-1.0, sign=sign).speed_share > 1.5
+
+
+def test_nothing_is_a_share_of_the_last_target() -> None:
+    statements = SafetyStatements(CONTROL, 8.0)
+    statements.change_target(2.0)
+    for _ in range(20):
+        statements.observe(
+            0.01, Phase.HOLD, Outcome.HELD, force_n=0.2, object_n=0.2, peak_n=0.2, closing_m_s=0.01
+        )
+    assert not statements.held_nothing
 
 
 @pytest.mark.parametrize(
