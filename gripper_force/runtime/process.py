@@ -112,12 +112,18 @@ def real_time_priority() -> Iterator[str]:
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
     except PermissionError:
-        _set_time_slice(_SLICE_NS)
-        yield (
+        refusal = (
             "the control loop has no real-time priority, so cycles may start 3 ms late; allow it with "
             f"'@dialout - rtprio {PRIORITY}' in /etc/security/limits.conf, and log in again"
         )
-        _set_time_slice(0)
+        if before & ~os.SCHED_RESET_ON_FORK != os.SCHED_OTHER:  # what the user chose stays
+            yield refusal
+            return
+        _set_time_slice(_SLICE_NS)
+        try:
+            yield refusal
+        finally:
+            _set_time_slice(0)
         return
     try:
         yield ""
@@ -133,7 +139,7 @@ def _set_time_slice(slice_ns: int) -> None:
     See sched_setattr(2), https://man7.org/linux/man-pages/man2/sched_setattr.2.html.
     """
     call = _SCHED_SETATTR.get(platform.machine())
-    if call is None:
+    if call is None or sys.maxsize < 2**32:  # 32-bit programs on such a kernel have other numbers
         return
     nice = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
     # Size, policy, flags (1: threads that it starts have the default), nice, priority, slice, deadline, period.

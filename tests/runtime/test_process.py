@@ -68,6 +68,34 @@ def test_where_it_is_not_allowed_this_thread_alone_gets_a_short_time_slice() -> 
     assert [slice_ns(), *others_ns] == [before_ns, before_ns]
 
 
+@pytest.mark.usefixtures("refused")
+def test_after_an_error_the_time_slice_is_the_default() -> None:
+    before_ns = slice_ns()
+    with pytest.raises(RuntimeError), real_time_priority():
+        raise RuntimeError
+    assert slice_ns() == before_ns
+
+
+def test_a_policy_that_the_user_chose_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError
+
+    found: list[int] = []
+
+    def run() -> None:
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "sched_setscheduler", refuse)
+            with real_time_priority():
+                found.append(policy())
+        found.append(policy())
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+    assert found == [os.SCHED_BATCH, os.SCHED_BATCH]
+
+
 def in_another_thread(stack: ExitStack) -> None:
     thread = threading.Thread(target=stack.close)
     thread.start()
