@@ -171,6 +171,16 @@ def weight(
     console.show(
         console.jsonable(result) | {"settings": result.settings}, as_json, lambda _: weight_table(result)
     )
+    if abs(result.ratio - 1) > 0.1:
+        console.warn(
+            f"the torque constant is {100 * (result.ratio - 1):+.0f} % off the configured one, more than motors of one "
+            "model differ; check the mass"
+        )
+    if result.friction_n is None:
+        console.warn(
+            f"gripper.friction_n contradicts the breakaway friction of {result.breakaway_n:.2f} N; measure it with "
+            "`calibrate jaws`"
+        )
     found = [f"gripper.{key}={value:.4g}" for key, value in result.settings.items()]
     _next_step(["grasp"], config, [*(set_ or []), *found])
 

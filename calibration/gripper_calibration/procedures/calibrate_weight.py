@@ -44,6 +44,9 @@ _BEHIND_M: Final = 0.006
 _LEAD_M: Final = 0.02
 """Lead of the goal width while the current alone drives the jaws."""
 
+_AGREES: Final = (0.5, 1.2)
+"""Range of the configured friction as shares of the breakaway friction, which is larger."""
+
 _MASS_ERROR: Final = 0.01
 """Relative error of a known mass, and of gravity."""
 
@@ -61,14 +64,16 @@ class WeightResult:
 
     Attributes:
         nm_per_a: Torque constant at the horn.
-        friction_n: The configured friction at each jaw, with this torque constant in place of the configured one.
+        ratio: The same over the configured one.
+        friction_n: The configured friction at each jaw, with this torque constant; None if it contradicts the next.
         breakaway_n: Friction at which the jaws begin to move.
         weight_n: Weight of the mass.
         places: Number of places at which it was balanced.
     """
 
     nm_per_a: CalibratedValue
-    friction_n: float
+    ratio: float
+    friction_n: float | None
     breakaway_n: float
     weight_n: float
     places: int
@@ -76,15 +81,16 @@ class WeightResult:
     @property
     def settings(self) -> dict[str, float]:
         """The keys of the section `gripper` that follow."""
-        keys = torque_settings(self.nm_per_a, CalibratedValue(value=self.friction_n))
-        return {key: keys[key] for key in ("nm_per_a", "gain_std", "friction_n")}
+        keys = torque_settings(self.nm_per_a, CalibratedValue(value=self.friction_n or 0.0))
+        used = ("nm_per_a", "gain_std", *(() if self.friction_n is None else ("friction_n",)))
+        return {key: keys[key] for key in used}
 
 
 def masses_kg(config: Config) -> tuple[float, float]:
-    """Returns the least and the greatest mass that the gripper can lift and measure.
+    """Returns the least and the greatest mass that the gripper can lift and measure, in whole grams.
 
     Raises:
-        ConfigError: A weight does not measure this gripper.
+        ConfigError: A weight does not measure this gripper, or its force limit is too small for one.
     """
     kind = config.gripper.linkage.kind
     if kind not in LINKAGES or len(config.servo.ids) > 1:
@@ -94,7 +100,15 @@ def masses_kg(config: Config) -> tuple[float, float]:
         )
     gripper = config.gripper
     most_n = 2 * (config.control.force_limit_n / gripper.gain_bound / _FORCE_FACTOR - gripper.friction_n)
-    return 2 * _LEAST_N / STANDARD_GRAVITY_M_S2, most_n / STANDARD_GRAVITY_M_S2
+    least_kg = math.ceil(1e3 * 2 * _LEAST_N / STANDARD_GRAVITY_M_S2) / 1e3
+    most_kg = math.floor(1e3 * most_n / STANDARD_GRAVITY_M_S2) / 1e3
+    if most_kg < least_kg:
+        raise ConfigError(
+            f"with control.force_limit_n {config.control.force_limit_n:g} and gripper.friction_n "
+            f"{gripper.friction_n:g} the jaws can't lift a mass of {least_kg:g} kg, the least that measures anything; "
+            "raise the limit, or use a load cell"
+        )
+    return least_kg, most_kg
 
 
 def is_servo_simulated(config: Config) -> bool:
@@ -134,7 +148,7 @@ def calibrate_weight(
     if not least_kg <= mass_kg <= most_kg:
         raise ConfigError(
             f"a mass of {mass_kg:g} kg does not suit this gripper and control.force_limit_n; use one of "
-            f"{least_kg:.1f} to {most_kg:.1f} kg"
+            f"{least_kg:g} to {most_kg:g} kg"
         )
     config, simulated, hung_kg = (
         _alone(config),
@@ -148,7 +162,7 @@ def calibrate_weight(
         "Turn the gripper so that one jaw moves straight up while the jaws close, open them, and take everything from "
         "between them"
     )
-    empty = _balance(config, 0.0, "empty", progress)
+    empty = _balance(config, 0.0, 0.0, "empty", progress)
     prompt(
         f"Hang {mass_kg:g} kg on a thread from the jaw that moves up while the jaws close, and keep your hands away: "
         "it drops to the open position whenever torque is off"
@@ -156,7 +170,11 @@ def calibrate_weight(
     if simulated:
         config = _simulated(config, hung_kg)
     weight_n = mass_kg * STANDARD_GRAVITY_M_S2
-    return _fit(config, empty, _balance(config, weight_n, "loaded", progress), weight_n)
+    loaded = _balance(config, weight_n, weight_n / 2, "loaded", progress)
+    if abs(error_n := float(_steps_n(empty, loaded).mean()) - weight_n / 2) > _breakaway_n(empty) / 2:
+        # The jaws began beyond the band in which friction holds them: once more from the balance that was found.
+        loaded = _balance(config, weight_n, weight_n / 2 + error_n, "loaded, again", progress)
+    return _fit(config, empty, loaded, weight_n)
 
 
 def _simulated(config: Config, hung_kg: float) -> Config:
@@ -168,7 +186,7 @@ def _fit(config: Config, empty: "_Balance", loaded: "_Balance", weight_n: float)
     gripper = config.gripper
     expected = gripper.nm_per_a
     assert expected is not None
-    steps_n = (loaded.up_n + loaded.down_n - empty.up_n - empty.down_n) / 2
+    steps_n = _steps_n(empty, loaded)
     step_n = float(steps_n.mean())
     ratio = weight_n / 2 / step_n if step_n > 0 else math.inf
     if not 1 / _PLAUSIBLE_RATIO < ratio < _PLAUSIBLE_RATIO:
@@ -178,15 +196,27 @@ def _fit(config: Config, empty: "_Balance", loaded: "_Balance", weight_n: float)
             "closing, and check servo.model and gripper.pinion_radius_m"
         )
     half = expected * ratio * math.hypot(_half(steps_n) / step_n, _MASS_ERROR)
+    friction_n, breakaway_n = ratio * gripper.friction_n, ratio * _breakaway_n(empty)
+    agrees = _AGREES[0] * breakaway_n <= friction_n <= _AGREES[1] * breakaway_n
     return WeightResult(
         nm_per_a=CalibratedValue(
             value=expected * ratio, low=expected * ratio - half, high=expected * ratio + half
         ),
-        friction_n=ratio * gripper.friction_n,
-        breakaway_n=ratio * float((empty.up_n - empty.down_n).mean()) / 2,
+        ratio=ratio,
+        friction_n=friction_n if agrees else None,
+        breakaway_n=breakaway_n,
         weight_n=weight_n,
         places=len(PLACES),
     )
+
+
+def _steps_n(empty: "_Balance", loaded: "_Balance") -> npt.NDArray[np.float64]:
+    """Motor forces that balance the weight, (P,)."""
+    return (loaded.up_n + loaded.down_n - empty.up_n - empty.down_n) / 2
+
+
+def _breakaway_n(empty: "_Balance") -> float:
+    return float((empty.up_n - empty.down_n).mean()) / 2
 
 
 def _half(values: npt.NDArray[np.float64]) -> float:
@@ -202,11 +232,11 @@ class _Balance:
     down_n: npt.NDArray[np.float64]
 
 
-def _balance(config: Config, weight_n: float, load: str, progress: Progress) -> _Balance:
+def _balance(config: Config, weight_n: float, expected_n: float, load: str, progress: Progress) -> _Balance:
     with open_devices(config) as devices, torque_on(devices.servo) as (state, raise_if_interrupted):
         if problem := make_controller(config).start_problem(state):
             raise DeviceError(problem)
-        jaws = _Jaws(config, devices, state, raise_if_interrupted, weight_n)
+        jaws = _Jaws(config, devices, state, raise_if_interrupted, weight_n, expected_n)
         up_n: list[float] = []
         down_n: list[float] = []
         for number, share in enumerate(PLACES, start=1):
@@ -228,6 +258,7 @@ class _Jaws:
         state: ServoState,
         raise_if_interrupted: Callable[[], None],
         weight_n: float,
+        expected_n: float,
     ) -> None:
         gripper = config.gripper
         self._config, self._devices, self._state = config, devices, state
@@ -241,7 +272,8 @@ class _Jaws:
         middle_rad = transmission.position_rad(transmission.open_width_m / 2)
         ceiling_n = abs(transmission.force_n(limits.ceiling_a(0.0, middle_rad), middle_rad))
         self._most_n = min(_FORCE_FACTOR * (weight_n / 2 + gripper.friction_n) + _SPARE_N, ceiling_n)
-        self._balance_n = weight_n / 2
+        self._expected_n, self._is_loaded = expected_n, weight_n > 0
+        self._speed_m_s = min(_SPEED_M_S, config.control.approach_speed_m_s)
         self._goal_a = 0.0
         self._period_ns = round(NS_PER_S / _RATE_HZ)
         self._due_ns = devices.clock.now_ns()
@@ -253,7 +285,7 @@ class _Jaws:
     def move(self, share: float) -> None:
         """Moves to a share of the travel at a low speed, and rests there."""
         goal_m, next_m = (1 - share) * self._transmission.open_width_m, self._width_m
-        step_m = 2 * _SPEED_M_S / _RATE_HZ
+        step_m = 2 * self._speed_m_s / _RATE_HZ
         rest = round(_REST_S * _RATE_HZ)
         while rest > 0:
             rest -= next_m == goal_m
@@ -264,7 +296,7 @@ class _Jaws:
 
     def break_away(self, side: int) -> float:
         """Raises (1) or lowers (-1) the closing motor force from the expected one until the jaws follow. Returns it."""
-        begin_m, force_n = self._width_m, self._balance_n
+        begin_m, force_n = self._width_m, self._expected_n
         moved_m = 2 * _MOVED_RAD * self._transmission.jaw_m_per_rad(self._state.position_rad)
         while side * (begin_m - self._width_m) < moved_m:
             force_n += side * _RAMP_N_S / _RATE_HZ
@@ -274,10 +306,14 @@ class _Jaws:
         return force_n
 
     def _raise_stuck(self, problem: str) -> NoReturn:
+        remedy = "check gripper.closing_sign and gripper.friction_n with `calibrate jaws`, and that nothing blocks them"
+        if self._is_loaded:
+            remedy = (
+                "take a smaller mass, and check that it hangs on the jaw that moves up while closing, and that nothing "
+                "blocks it"
+            )
         raise DataError(
-            f"the jaws {problem} at {1e3 * self._width_m:.0f} mm with a motor force of {self._most_n:.1f} N; take a "
-            "smaller mass, and check that it hangs on the jaw that moves up while closing, that nothing blocks it, and "
-            "that gripper.friction_n is that of `calibrate jaws`"
+            f"the jaws {problem} at {1e3 * self._width_m:.0f} mm with a motor force of {self._most_n:.1f} N; {remedy}"
         )
 
     def _cycle(self, goal_width_m: float, force_n: float) -> None:

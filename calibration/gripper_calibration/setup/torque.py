@@ -84,7 +84,9 @@ def _weight(task: Task) -> Outcome:
         return _data_sheet(task)
     found = calibrate_weight(task.config, mass_kg, prompt=task.person.do, progress=task.progress)
     by = f"balanced {1e3 * mass_kg:g} g, {date.today().isoformat()}"
-    settings = {**found.settings, "friction_std": FRICTION_DRIFT}  # the jaws step has measured the friction
+    settings = found.settings
+    if "friction_n" in settings:
+        settings["friction_std"] = FRICTION_DRIFT  # the jaws step has measured it
     origins = {
         "nm_per_a": f"{interval(found.nm_per_a)}, {by}",
         "gain_std": f"relative error of nm_per_a, {by}",

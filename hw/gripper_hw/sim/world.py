@@ -36,8 +36,8 @@ _MAX_STEP_S = 0.004
 
 _CURRENT_NOISE_A = 0.003
 _JAW_HALF_HEIGHT_M = 0.011
-_AWAY_M = (1.0, 0.0, 0.0)
 _STANDARD_GRAVITY_M_S2 = 9.80665
+_AWAY_M = (1.0, 0.0, 0.0)
 """Position of an object that has left the jaws, outside the image."""
 
 # In software rendering, each of these costs more than all the rest of a 128x128 image.

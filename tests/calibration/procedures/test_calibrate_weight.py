@@ -55,8 +55,27 @@ def test_other_grippers_are_refused(name: str) -> None:
 
 @pytest.mark.parametrize("mass_kg", [0.0, -1.0, 0.1, 5.0, float("nan")])
 def test_an_unsuitable_mass_is_refused(mass_kg: float) -> None:
-    with pytest.raises(ConfigError, match=r"use one of 0\.2 to 0\.8 kg"):
+    with pytest.raises(ConfigError, match=r"use one of 0\.204 to 0\.8\d* kg"):
         measure(load_config(None), mass_kg)
+
+
+def test_a_force_limit_that_lifts_no_mass_is_named() -> None:
+    with pytest.raises(ConfigError, match="raise the limit, or use a load cell"):
+        measure(load_config(None, ["control.force_limit_n=3"]))
+
+
+def test_friction_that_contradicts_the_breakaway_is_not_proposed() -> None:
+    assert measure(load_config(None, ["sim.friction=0.2"])).settings.keys() == {"nm_per_a", "gain_std"}
+
+
+def test_the_torque_constant_of_a_weak_motor_with_little_friction_is_found() -> None:
+    config = load_config(None, ["sim.friction=0.2", "sim.gain=0.75", "gripper.friction_n=0.3"])
+    assert measure(config, 0.7).ratio == pytest.approx(0.75, rel=0.02)
+
+
+def test_a_wrong_closing_direction_is_named() -> None:
+    with pytest.raises((DataError, DeviceError), match=r"closing_sign|stopped"):
+        measure(load_config(None, ["gripper.closing_sign=-1"]))
 
 
 def test_another_mass_than_the_stated_one_is_refused() -> None:
