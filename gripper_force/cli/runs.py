@@ -238,6 +238,8 @@ def replay(
             raise ConfigError(
                 "--compare names its checkpoints and writes no report; leave out --checkpoint and --report"
             )
+        if compare[0] == compare[1]:
+            raise ConfigError(f"--compare {compare[0]} {compare[1]} compares a setting with itself; name two")
         sides = [_choice(text) for text in compare]
         for other, _ in sides:
             if other is not None:
@@ -248,9 +250,13 @@ def replay(
                 for other, changes in sides
             )
         failed = {**first.failed, **second.failed}
-        pair = tuple([r for r in side.results if r.log not in failed] for side in (first, second))
-        found = job.paired_differences(*pair)
-        printed = {"logs": len(pair[0]), "first": compare[0], "second": compare[1], "differences": found}
+        kept, others = (
+            [(r, one) for r, one in zip(side.results, side.columns, strict=True) if r.log not in failed]
+            for side in (first, second)
+        )
+        frames = [one for _, one in kept], [one for _, one in others]
+        found = job.paired_differences([r for r, _ in kept], [r for r, _ in others], frames)
+        printed = {"logs": len(kept), "first": compare[0], "second": compare[1], "differences": found}
         console.show(printed, as_json, lambda _: differences_table(*compare, found))
         if out is not None:
             tables = replay_tables(dict(zip(compare, (first, second), strict=True)), found)

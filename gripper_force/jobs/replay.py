@@ -361,9 +361,18 @@ def _pooled(results: Sequence[ReplayResult]) -> dict[str, SourceErrors]:
 
 
 def paired_differences(
-    first: Sequence[ReplayResult], second: Sequence[ReplayResult]
+    first: Sequence[ReplayResult],
+    second: Sequence[ReplayResult],
+    columns: "tuple[Sequence[Columns], Sequence[Columns]] | None" = None,
 ) -> dict[str, PairedDifference]:
-    """Compares two replays of the same logs, by source. Each log counts once, however long it is."""
+    """Compares two replays of the same logs, by source. Each log counts once, however long it is.
+
+    Args:
+        first: Results of one side.
+        second: Those of the other side, of the same logs.
+        columns: Their estimates (see `replay_frames`). With them, visual estimates are compared on the frames that
+            the networks of both sides know: otherwise a network that rejects the hard frames would look better.
+    """
     found = {}
     for name in ("visual", "current", "fused"):
         pairs = [
@@ -371,6 +380,8 @@ def paired_differences(
             for a, b in zip(first, second, strict=True)
             if name in a.sources and name in b.sources
         ]
+        if name == "visual" and columns is not None:
+            pairs = [errors for a, b in zip(*columns, strict=True) if (errors := _common_errors_n(a, b))]
         if not pairs:
             continue
         a_n, b_n = np.array(pairs).T
@@ -384,6 +395,21 @@ def paired_differences(
             high_n=high_n,
         )
     return found
+
+
+def _common_errors_n(first: Columns, second: Columns) -> tuple[float, float] | None:
+    """Returns the mean absolute errors over the frames that both networks know, or None without any."""
+    _, at, and_at = np.intersect1d(first["seq"], second["seq"], return_indices=True)
+    errors_n = (
+        first["visual_n"][at] - first["measured_n"][at],
+        second["visual_n"][and_at] - second["measured_n"][and_at],
+    )
+    known = np.isfinite(
+        first["visual_std_n"][at] + second["visual_std_n"][and_at] + errors_n[0] + errors_n[1]
+    )
+    if not known.any():
+        return None
+    return float(np.abs(errors_n[0][known]).mean()), float(np.abs(errors_n[1][known]).mean())
 
 
 def changed_config(
@@ -478,9 +504,11 @@ def _in_batches(
     records: Iterable[Record], run: ResolvedConfig
 ) -> Iterator[tuple[Record, VisualForce | None]]:
     """Does the same as `_frame_by_frame`, with the networks computed at the end of the log; frames are empty."""
+    import torch
+
     from gripper_force.vision.batch_inference import kept_checkpoint, prepared_features
     from gripper_force.vision.engines import Step
-    from gripper_force.vision.engines.pytorch import TorchEngine
+    from gripper_force.vision.engines.pytorch import TorchEngine, restored_threads
     from gripper_force.vision.estimator import ForceEstimator
 
     assert run.model is not None
@@ -498,7 +526,9 @@ def _in_batches(
         kept.append((record, visual, len(preparation.inputs) - 1))
     if preparation.inputs:
         inputs = np.stack(preparation.inputs)  # (T, S, S)
-        forces_n, features = prepared_features(checkpoint.networks, inputs)  # (M, T), (T, F)
+        with restored_threads():
+            torch.set_num_threads(1)  # the last digits depend on their number
+            forces_n, features = prepared_features(checkpoint.networks, inputs)  # (M, T), (T, F)
     works = False
     for record, visual, last in kept:
         if visual is not None:

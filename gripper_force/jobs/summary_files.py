@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from html import escape
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -38,8 +39,9 @@ _NOTES: Final = {
     "sources": "Errors against the load cell over all estimates, without frames that a network does not know. The mean "
     "over logs counts each log once; low and high are the ends of its 95 % interval (Student's t).",
     "differences": "Second less first, of each log's mean absolute error: the mean over logs, and the ends of its 95 % "
-    "interval, low and high (Student's t). If zero lies between them, the logs show no difference.",
-    "failed": "These logs are not part of the figures.",
+    "interval, low and high (Student's t). If zero lies between them, the logs do not show which is better. Visual "
+    "estimates are compared on the frames that both networks know.",
+    "failed": "These logs failed. A log that failed with one of two settings is not part of the differences.",
 }
 
 
@@ -52,9 +54,11 @@ def check_writable(folder: Path) -> None:
     require("pyarrow", "--out", ", or leave out --out")
     try:
         folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=folder):
+            pass
     except OSError as error:
         raise ConfigError(
-            f"can't make the folder {folder} of --out: {error.strerror}; choose another"
+            f"can't write in the folder {folder} of --out: {error.strerror}; choose another"
         ) from error
 
 
@@ -97,7 +101,8 @@ def evaluation_tables(result: "Evaluation") -> dict[str, Rows]:
     from gripper_force.jobs.metrics import mean_interval
 
     over_all = {key: getattr(result, key) for key in ("mae_n", "rmse_n", "bias_n", "floor_n", "frames")}
-    each_n = [errors.mae_n for errors in result.per_log.values()]
+    # A log with labels in its lead-in only has no error.
+    each_n = [errors.mae_n for errors in result.per_log.values() if math.isfinite(errors.mae_n)]
     mean_n, low_n, high_n = mean_interval(each_n)
     of_logs = {"logs": len(each_n), "mean_mae_n": mean_n, "low_n": low_n, "high_n": high_n}
     return {

@@ -14,6 +14,7 @@ from gripper_force.errors import CheckpointError, ConfigError, DataError, LogErr
 from gripper_force.jobs.grasp import run_grasp
 from gripper_force.jobs.metrics import bias, mae, rmse
 from gripper_force.jobs.replay import (
+    Columns,
     Comparison,
     ReplayResult,
     changed_config,
@@ -200,6 +201,26 @@ def test_differences_are_those_of_each_log() -> None:
     assert found.high_n == pytest.approx(0.1)
     alone = paired_differences(first[:1], second[:1])["fused"]
     assert (alone.low_n, alone.high_n) == (None, None)
+
+
+def columns_with(visual_n: list[float], std_n: list[float]) -> Columns:
+    """Frames with 1 N each."""
+    return {
+        "seq": np.arange(len(visual_n)),
+        "measured_n": np.ones(len(visual_n)),
+        "visual_n": np.array(visual_n),
+        "visual_std_n": np.array(std_n),
+    }
+
+
+def test_a_network_that_rejects_the_hard_frames_does_not_look_better() -> None:
+    both = [result_with(1.0)], [result_with(1.0)]
+    all_known, strict = columns_with([1.1, 3.0], [0.1, 0.1]), columns_with([1.1, 3.0], [0.1, np.inf])
+    found = paired_differences(*both, ([all_known], [strict]))["visual"]
+    assert found.difference_n == 0.0
+    assert found.first_n == pytest.approx(0.1)
+    none_known = columns_with([1.1, 3.0], [np.inf, np.inf])
+    assert "visual" not in paired_differences(*both, ([all_known], [none_known]))
 
 
 def test_the_interval_of_a_difference_is_students() -> None:
