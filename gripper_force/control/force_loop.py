@@ -13,9 +13,8 @@ _RAMP_S = 0.4
 """Acceleration time of the ramp: longer than a quarter oscillation period of the softest object."""
 
 _LOWERING_S = 0.15
-_LOWERING_RAMP_S = 0.15
 _RETURN_S = 0.05
-"""Lowering: the fall takes the sum of the first two, the first at full rate. After it the motor force returns to the
+"""Lowering: the fall takes twice the first, half of it at full rate. After it the motor force returns to the
 closing side of friction in the third, which stops the jaws: later, their inertia carries them too far."""
 
 _AGAIN_S = 0.05
@@ -96,8 +95,8 @@ class ForceLoop:
         self._profile = TrapezoidalProfile(_RAMP_S)
         self._trim_n = 0.0
         self._rising, self._side, self.is_lowering = True, 1.0, False
-        self._lowers_again, self._repeat_s, self._high_s = False, 0.0, 0.0
-        self._highest_n, self._waited_s = 0.0, 0.0
+        self._lowers_again = False
+        self._repeat_s = self._high_s = self._highest_n = self._waited_s = 0.0
 
     @property
     def reference_n(self) -> float:
@@ -116,16 +115,10 @@ class ForceLoop:
         self._highest_n, self._waited_s = self.reference_n, 0.0
         self._start(self.reference_n, target_n)
 
-    def _start(
-        self,
-        force_n: float,
-        target_n: float,
-        fall_s: float = _LOWERING_S,
-        fall_ramp_s: float = _LOWERING_RAMP_S,
-    ) -> None:
+    def _start(self, force_n: float, target_n: float, fall_s: float = _LOWERING_S) -> None:
         self._rising, self.is_lowering = True, target_n < force_n
         self._side = -1.0 if self.is_lowering else 1.0
-        self._profile = TrapezoidalProfile(fall_ramp_s if self.is_lowering else _RAMP_S)
+        self._profile = TrapezoidalProfile(fall_s if self.is_lowering else _RAMP_S)
         rate_n_s = (force_n - target_n) / fall_s if self.is_lowering else self._ramp_n_s
         self._profile.start(force_n, rate_n_s)
 
@@ -146,8 +139,7 @@ class ForceLoop:
             estimate: The force estimate.
             shortfall_n: Commanded less measured motor force. Ramp and integral wait while it is large: the
                 jaws close on a soft object as fast as they may.
-            closing_m_s: Speed of a jaw. A lowering waits while a soft object pushes the jaws open faster than they
-                may close: their inertia would carry them away from it.
+            closing_m_s: Speed of a jaw. A lowering waits while a soft object pushes the jaws open too fast.
         """
         self._repeat_lowering(dt_s, target_n, estimate)
         ramping = self.reference_n != target_n
@@ -180,10 +172,9 @@ class ForceLoop:
 
     def _lower_at_once(self, target_n: float, estimate: FusedForce) -> None:
         """Lowers the force again if it is still too high by motor current; one visual estimate may be an outlier."""
-        again, self._lowers_again = self._lowers_again, False
-        is_high = estimate.force_n > target_n + tolerance_n(target_n)
-        if again and is_high and estimate.source != EstimateSource.VISION:
-            self._start(min(estimate.force_n, self._highest_n), target_n, _AGAIN_S, _AGAIN_S)
+        again, self._lowers_again = self._lowers_again and estimate.source != EstimateSource.VISION, False
+        if again and estimate.force_n > target_n + tolerance_n(target_n):
+            self._start(min(estimate.force_n, self._highest_n), target_n, _AGAIN_S)
 
     def _repeat_lowering(self, dt_s: float, target_n: float, estimate: FusedForce) -> None:
         """Lowers the force again if the camera shows that it has stayed too high."""

@@ -506,11 +506,7 @@ class GraspController:
     def _run_ramp(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
         shortfall_n = self._motor_force_n - self._measured_motor_force_n
         self._motor_force_n = self._loop.step(
-            dt_s,
-            self._derated_target_n,
-            self._estimate,
-            shortfall_n=shortfall_n,
-            closing_m_s=closing_m_s,
+            dt_s, self._derated_target_n, self._estimate, shortfall_n=shortfall_n, closing_m_s=closing_m_s
         )
         if width_m < self._config.min_object_width_m and self._outcome == Outcome.NONE:
             self._set_outcome(Outcome.NO_OBJECT, "closed while the force was to rise")

@@ -28,10 +28,8 @@ SWITCH_INTERVAL_S: Final = 2e-4
 
 
 _SLICE_NS: Final = 100_000
-"""Time slice of a control thread without real-time priority: the shortest that the kernel accepts."""
-
 _SCHED_SETATTR: Final = {"x86_64": 314, "aarch64": 274, "riscv64": 274}
-"""Number of the system call by machine: the C library of most distributions has no function for it."""
+"""The shortest time slice that the kernel accepts, and the system call that sets it, by machine."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,18 +110,17 @@ def real_time_priority() -> Iterator[str]:
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
     except PermissionError:
-        refusal = (
-            "the control loop has no real-time priority, so cycles may start 3 ms late; allow it with "
-            f"'@dialout - rtprio {PRIORITY}' in /etc/security/limits.conf, and log in again"
-        )
-        if before & ~os.SCHED_RESET_ON_FORK != os.SCHED_OTHER:  # what the user chose stays
-            yield refusal
-            return
-        _set_time_slice(_SLICE_NS)
+        is_ordinary = (
+            before & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER
+        )  # another policy is the user's choice
+        _set_time_slice(_SLICE_NS if is_ordinary else None)
         try:
-            yield refusal
+            yield (
+                "the control loop has no real-time priority, so cycles may start 3 ms late; allow it with "
+                f"'@dialout - rtprio {PRIORITY}' in /etc/security/limits.conf, and log in again"
+            )
         finally:
-            _set_time_slice(0)
+            _set_time_slice(0 if is_ordinary else None)
         return
     try:
         yield ""
@@ -132,18 +129,20 @@ def real_time_priority() -> Iterator[str]:
         os.sched_setscheduler(0, before | os.SCHED_RESET_ON_FORK, parameter)
 
 
-def _set_time_slice(slice_ns: int) -> None:
-    """Sets the time slice of this thread (0: the default). Linux before 6.12 ignores it.
+def _set_time_slice(slice_ns: int | None) -> None:
+    """Sets the time slice of this thread (0: the default, None: as it is). Linux before 6.12 ignores it.
 
-    A thread that wakes interrupts one with a longer slice, if it has had less than its share of the core.
-    See sched_setattr(2), https://man7.org/linux/man-pages/man2/sched_setattr.2.html.
+    A waking thread interrupts one with a longer slice. See https://man7.org/linux/man-pages/man2/sched_setattr.2.html.
     """
     call = _SCHED_SETATTR.get(platform.machine())
-    if call is None or sys.maxsize < 2**32:  # 32-bit programs on such a kernel have other numbers
+    if (
+        slice_ns is None or call is None or sys.maxsize < 2**32
+    ):  # 32-bit programs on such a kernel have other numbers
         return
     nice = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
-    # Size, policy, flags (1: threads that it starts have the default), nice, priority, slice, deadline, period.
-    attributes = struct.pack("=IIQiIQQQ", 48, os.SCHED_OTHER, 1, nice, 0, slice_ns, 0, 0)
+    attributes = struct.pack(
+        "=IIQiIQQQ", 48, os.SCHED_OTHER, 1, nice, 0, slice_ns, 0, 0
+    )  # 1: children have none
     ctypes.CDLL(None).syscall(call, 0, attributes, 0)
 
 
