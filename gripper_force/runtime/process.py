@@ -96,8 +96,8 @@ def real_time_settings() -> Iterator[str]:
 def real_time_priority() -> Iterator[str]:
     """Gives this thread real-time priority, so that it runs as soon as it wakes. Threads it starts have none.
 
-    Without it, a thread that wakes on a core that computes an estimate may wait for 3 ms (Linux 6.18). A thread that
-    is refused it gets the shortest time slice, which needs no privilege, and with which it waits less.
+    Without it, a thread that wakes on a core that computes an estimate may wait for 3 ms (Linux 6.18), or less with
+    the shortest time slice, which needs no privilege.
     See sched(7), https://man7.org/linux/man-pages/man7/sched.7.html.
 
     Yields:
@@ -140,9 +140,7 @@ def _set_time_slice(slice_ns: int | None) -> None:
     ):  # 32-bit programs on such a kernel have other numbers
         return
     nice = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
-    attributes = struct.pack(
-        "=IIQiIQQQ", 48, os.SCHED_OTHER, 1, nice, 0, slice_ns, 0, 0
-    )  # 1: children have none
+    attributes = struct.pack("=IIQiIQQQ", 48, os.SCHED_OTHER, 1, nice, 0, slice_ns, 0, 0)
     ctypes.CDLL(None).syscall(call, 0, attributes, 0)
 
 
