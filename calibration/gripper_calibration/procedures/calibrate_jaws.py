@@ -1,27 +1,22 @@
 """Homing: both ends of the jaws' travel, the closing direction and friction, without a load cell."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
-from gripper_calibration.procedures.powered_servo import torque_on
+from gripper_calibration.procedures.powered_servo import RATE_HZ, BusCycles, servo_alone, torque_on
 from gripper_force.config import Config
-from gripper_force.control.limits import Limits
-from gripper_force.control.safety import Safety
-from gripper_force.control.speed_limit import SpeedLimit
 from gripper_force.control.transmission import Transmission
-from gripper_force.errors import DataError, DeviceError
+from gripper_force.errors import DataError
 from gripper_force.interfaces import Devices, Progress, Prompt, no_progress
 from gripper_force.runtime.backends import open_devices
-from gripper_force.runtime.reading import read_patiently
-from gripper_force.runtime.resolve import position_loop, resolve
-from gripper_force.types import NS_PER_MS, NS_PER_S, ServoCommand, ServoState
+from gripper_force.runtime.resolve import resolve
+from gripper_force.types import ServoState
 
-_RATE_HZ: Final = 200.0
 _START_N: Final = 1.0
 """Motor force at first. Jaws that friction holds get more; the configured friction may be wrong."""
 
@@ -117,14 +112,11 @@ def calibrate_jaws(config: Config, *, prompt: Prompt, progress: Progress = no_pr
         DeviceError: A device failed. The servo has no torque.
         DataError: The jaws do not move, have no ends, or the results contradict each other.
     """
-    none = {
-        name: getattr(config, name).model_copy(update={"backend": "none"}) for name in ("camera", "load_cell")
-    }
     # The configured angle may be wrong, so the travel is assumed around zero, where every servo can be.
     linkage = Transmission.from_config(config.gripper, 1.0).linkage
     middle_rad = -config.gripper.closing_sign * linkage.closing_rad(0.0) / 2
     gripper = config.gripper.model_copy(update={"open_position_rad": middle_rad})
-    config = resolve(config.model_copy(update={**none, "gripper": gripper}), vision=False).config
+    config = resolve(servo_alone(config).model_copy(update={"gripper": gripper}), vision=False).config
     prompt("Take everything from between the jaws and open them by hand")
     with open_devices(config) as devices, _torque_on(config, devices, progress) as jaws:
         start_rad = jaws.state.position_rad
@@ -208,39 +200,25 @@ def _proposal(config: Config, open_rad: float, closed_rad: float, sign: int) -> 
 def _torque_on(config: Config, devices: Devices, progress: Progress) -> Iterator["_EmptyJaws"]:
     """Yields jaws under torque, and turns torque off at every end."""
     with torque_on(devices.servo) as (state, raise_if_interrupted):
-        yield _EmptyJaws(config, devices, state, raise_if_interrupted, progress)
+        yield _EmptyJaws(config, BusCycles(config, devices, state, raise_if_interrupted), progress)
 
 
 class _EmptyJaws:
     """Moves jaws whose ends are unknown. Directions are those of the servo's angle."""
 
-    def __init__(
-        self,
-        config: Config,
-        devices: Devices,
-        state: ServoState,
-        raise_if_interrupted: Callable[[], None],
-        progress: Progress,
-    ) -> None:
-        self._config, self._devices, self._progress = config, devices, progress
-        self._raise_if_interrupted = raise_if_interrupted
-        gripper = config.gripper
-        self._transmission = Transmission.from_config(
-            gripper, gripper.nm_per_a or 0.0, gripper.current_step_a or 0.0
-        )
-        self._limits = Limits(config.control, self._transmission, config.servo.current_limit_a)
-        self._speed_limit = SpeedLimit(self._transmission, position_loop(gripper))
-        self._safety = Safety(config.control)
-        self._period_ns = round(NS_PER_S / _RATE_HZ)
-        self._due_ns = devices.clock.now_ns()
-        self._goal_a = 0.0
+    def __init__(self, config: Config, cycles: BusCycles, progress: Progress) -> None:
+        self._config, self._cycles, self._progress = config, cycles, progress
+        self._transmission, self._limits = cycles.transmission, cycles.limits
         # Half open, where a linkage is far from its dead centres.
         self._middle_rad = self._transmission.position_rad(self._transmission.open_width_m / 2)
         start_n = _START_N
         if len(config.servo.ids) > 1:  # with less, one finger would move and the other stick
             start_n += (1 + 3 * self._transmission.friction_std) * self._transmission.friction_n
         self._end_a = self._current_a(start_n)
-        self.state = state
+
+    @property
+    def state(self) -> ServoState:
+        return self._cycles.state
 
     def _current_a(self, force_n: float) -> float:
         return abs(self._transmission.current_a(force_n, self._middle_rad))
@@ -250,28 +228,13 @@ class _EmptyJaws:
 
     def cycle(self, side: int, current_a: float, speed_share: float = 0.5) -> None:
         """Runs one bus cycle towards a side, or with 0 at rest, at most at a share of the approach speed."""
-        devices = self._devices
-        self._due_ns = max(self._due_ns + self._period_ns, devices.clock.now_ns())
-        devices.clock.sleep_until_ns(self._due_ns)
-        self._raise_if_interrupted()
-        devices.check()
-        self.state = state = read_patiently(
-            devices.servo,
-            devices.clock,
-            self.state,
-            period_ns=self._period_ns,
-            patience_ns=self._config.servo.bus_watchdog_ms * NS_PER_MS,
-        )
-        if self._safety.check(state, self._goal_a, 1 / _RATE_HZ, over_force=False):
-            raise DeviceError(f"stopped: {self._safety.reason}; remove the cause and start again")
-        self._goal_a = min(current_a, self._ceiling_a)
-        command = ServoCommand(self._due_ns, state.position_rad + side, self._goal_a)
+        state = self._cycles.read()
         speed_m_s = speed_share * self._config.control.approach_speed_m_s
-        devices.servo.write(self._speed_limit.apply(command, state, speed_m_s))
+        self._cycles.write(state.position_rad + side, min(current_a, self._ceiling_a), speed_m_s)
 
     def rest(self) -> None:
         """Stands still for a moment."""
-        for _ in range(round(_REST_S * _RATE_HZ)):
+        for _ in range(round(_REST_S * RATE_HZ)):
             self.cycle(0, self._end_a)
 
     def find_ends(self) -> tuple[float, float]:
@@ -309,7 +272,7 @@ class _EmptyJaws:
     def _run_to_standstill(self, side: int) -> None:
         begin_rad = still_rad = self.state.position_rad
         cycles = 0
-        while cycles < _STILL_S * _RATE_HZ:
+        while cycles < _STILL_S * RATE_HZ:
             self.cycle(side, self._end_a)
             cycles += 1
             if abs(self.state.position_rad - still_rad) > _STILL_RAD:
@@ -340,7 +303,7 @@ class _EmptyJaws:
 
     def _break_away(self, side: int) -> float:
         begin_rad, current_a = self.state.position_rad, 0.0
-        step_a = self._current_a(_RISE_N_S) / _RATE_HZ
+        step_a = self._current_a(_RISE_N_S) / RATE_HZ
         while side * (self.state.position_rad - begin_rad) < _MOVED_RAD:
             current_a += step_a
             if current_a > self._ceiling_a:
@@ -359,9 +322,9 @@ class _EmptyJaws:
         wanted_m_s = _RUN_SPEED_SHARE * self._config.control.approach_speed_m_s
         begin_rad, force_n = self.state.position_rad, self._force_n(current_a)
         forces_n = []
-        for _ in range(round(_RUN_S * _RATE_HZ)):
+        for _ in range(round(_RUN_S * RATE_HZ)):
             moving_m_s = abs(self._transmission.closing_m_s(self.state.velocity_rad_s, self._middle_rad))
-            force_n += _SPEED_INTEGRAL_N_M * (wanted_m_s - moving_m_s) / _RATE_HZ
+            force_n += _SPEED_INTEGRAL_N_M * (wanted_m_s - moving_m_s) / RATE_HZ
             drive_n = max(force_n + _SPEED_GAIN_N_S_M * (wanted_m_s - moving_m_s), 0.0)
             self.cycle(side, min(self._current_a(drive_n), self._end_a), 2 * _RUN_SPEED_SHARE)
             forces_n.append(

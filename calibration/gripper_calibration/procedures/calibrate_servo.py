@@ -1,7 +1,7 @@
 """Calibration of a servo: torque, friction and jaw geometry, with the load cell's body as a gauge."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -12,12 +12,10 @@ import numpy as np
 
 from gripper_calibration.fits.servo_fit import MIN_PASSES, FreePass, Nominal, ServoFit, ServoPress, fit_servo
 from gripper_calibration.plots.servo_plot import draw
-from gripper_calibration.procedures.powered_servo import torque_on
+from gripper_calibration.procedures.powered_servo import RATE_HZ, BusCycles, torque_on
 from gripper_force.config import Config, GripperConfig
-from gripper_force.control.limits import Limits, largest_target_n
+from gripper_force.control.limits import largest_target_n
 from gripper_force.control.linkage import make_linkage
-from gripper_force.control.safety import Safety
-from gripper_force.control.speed_limit import SpeedLimit
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import ConfigError, DataError, DeviceError
 from gripper_force.interfaces import Devices, LoadCell, Progress, Prompt, no_progress
@@ -29,9 +27,8 @@ from gripper_force.profiles.rig_profile import (
     read_rig,
 )
 from gripper_force.runtime.backends import open_devices
-from gripper_force.runtime.reading import read_patiently
-from gripper_force.runtime.resolve import make_controller, position_loop, resolve
-from gripper_force.types import NS_PER_MS, NS_PER_S, ServoCommand, ServoState
+from gripper_force.runtime.resolve import make_controller, resolve
+from gripper_force.types import NS_PER_S, ServoState
 
 PRESSES: Final = ((3.0, 1.0), (6.0, 1.0), (12.0, 1.0), (3.0, 0.6), (6.0, 0.8), (12.0, 0.8))
 """Rate in N/s and share of the largest force of each press. Several rates separate lag from friction."""
@@ -42,7 +39,6 @@ SPEEDS_M_S: Final = (0.012, 0.020, 0.028, 0.036, 0.044, 0.052)
 _PASS_S: Final = 0.3
 """Least time of a pass, with its acceleration."""
 
-_RATE_HZ: Final = 200.0
 _PEAK_SHARE: Final = 1.05
 """Peak force as a share of the largest target, so that every target lies within the calibrated range."""
 _APPROACH_M_S: Final = 0.008
@@ -283,7 +279,7 @@ def _torque_on(config: Config, devices: Devices, progress: Progress) -> Iterator
     with torque_on(devices.servo) as (state, raise_if_interrupted):
         if problem := make_controller(config).start_problem(state):
             raise DeviceError(problem)
-        yield _Jaws(config, devices, state, raise_if_interrupted, progress)
+        yield _Jaws(config, devices, BusCycles(config, devices, state, raise_if_interrupted), progress)
 
 
 def _wait_for_sample(devices: Devices) -> None:
@@ -298,7 +294,7 @@ def _wait_for_sample(devices: Devices) -> None:
                 f"(rejected: {_rejected(cell)}); check its wiring, calibrate it first with "
                 "`calibrate load-cell`, and run `gripper-force doctor`"
             )
-        clock.sleep_until_ns(clock.now_ns() + round(NS_PER_S / _RATE_HZ))
+        clock.sleep_until_ns(clock.now_ns() + round(NS_PER_S / RATE_HZ))
 
 
 def _rejected(cell: LoadCell) -> str:
@@ -330,40 +326,26 @@ def _reduce(transmission: Transmission, states: Sequence[ServoState]) -> FreePas
 class _Jaws:
     """Moves the jaws cycle by cycle, and records servo and load cell. Positive angles close the jaws."""
 
-    def __init__(
-        self,
-        config: Config,
-        devices: Devices,
-        state: ServoState,
-        raise_if_interrupted: Callable[[], None],
-        progress: Progress,
-    ) -> None:
+    def __init__(self, config: Config, devices: Devices, cycles: BusCycles, progress: Progress) -> None:
         assert devices.load_cell is not None
-        self._config, self._devices, self._cell = config, devices, devices.load_cell
-        self._raise_if_interrupted, self._progress = raise_if_interrupted, progress
+        self._config, self._cell, self._cycles, self._progress = config, devices.load_cell, cycles, progress
         self._sign = config.gripper.closing_sign
-        gripper = config.gripper
-        self._nominal = Transmission.from_config(
-            gripper, gripper.nm_per_a or 0.0, gripper.current_step_a or 0.0
-        )
-        self._safety = Safety(config.control)
-        self._limits = Limits(config.control, self._nominal, config.servo.current_limit_a)
-        self._speed_limit = SpeedLimit(self._nominal, position_loop(gripper))
+        self._nominal, self._limits = cycles.transmission, cycles.limits
         self._free_friction_n = 0.0  # measured while the jaws close on the gauge
         self._clearance_m = _CLEARANCE_M  # at most a tenth of the free travel
         self._full_a: float | None = None  # current at the peak of the first press
         self._max_age_s = 0.0  # of the newest force sample
-        self._period_ns = round(NS_PER_S / _RATE_HZ)
-        self._due_ns = devices.clock.now_ns()
-        self._sample_ns = self._due_ns
-        self._goal_a = 0.0
+        self._sample_ns = devices.clock.now_ns()
         self._reported_ns = 0
         self._tare_n = 0.0
         self._states: list[ServoState] = []
         self._forces: list[tuple[int, float]] = []
         self.force_n = 0.0
-        self.state = state
         self.step_name = "opening"
+
+    @property
+    def state(self) -> ServoState:
+        return self._cycles.state
 
     @property
     def closing_rad(self) -> float:
@@ -384,40 +366,26 @@ class _Jaws:
 
     def cycle(self, goal_rad: float, current_a: float, speed_m_s: float | None = None) -> None:
         """Runs one bus cycle with a goal angle, a current limit, and a speed limit; None: the approach speed."""
-        devices = self._devices
-        self._due_ns = max(self._due_ns + self._period_ns, devices.clock.now_ns())
-        devices.clock.sleep_until_ns(self._due_ns)
-        self._raise_if_interrupted()
-        devices.check()
-        self.state = state = read_patiently(
-            devices.servo,
-            devices.clock,
-            self.state,
-            period_ns=self._period_ns,
-            patience_ns=self._config.servo.bus_watchdog_ms * NS_PER_MS,
-        )
+        state = self._cycles.read()
         for sample in self._cell.drain():
             if sample.valid:
                 self._sample_ns = max(self._sample_ns, sample.t_ns)
                 self.force_n = sample.force_n - self._tare_n
                 self._forces.append((sample.t_ns, self.force_n))
         self._states.append(state)
-        limit_n = self._config.control.force_limit_n
-        over = self.force_n > limit_n
-        if self._safety.check(state, self._goal_a, 1 / _RATE_HZ, over_force=over):
-            raise DeviceError(
-                f"stopped in {self.step_name}: {self._safety.reason}; remove the cause and start again"
-            )
         if state.t_ns - self._sample_ns > _SILENT_NS:
             raise DeviceError(
                 f"the load cell has given no valid sample for {_SILENT_NS / NS_PER_S:g} s in "
                 f"{self.step_name} (rejected: {_rejected(self._cell)}); check its wiring, calibrate it first, and "
                 "run `gripper-force doctor`"
             )
-        self._goal_a = min(max(current_a, 0.0), self._ceiling_a)
-        command = ServoCommand(self._due_ns, self._sign * goal_rad, self._goal_a)
-        speed_m_s = speed_m_s or self._config.control.approach_speed_m_s
-        devices.servo.write(self._speed_limit.apply(command, state, speed_m_s))
+        self._cycles.write(
+            self._sign * goal_rad,
+            min(max(current_a, 0.0), self._ceiling_a),
+            speed_m_s or self._config.control.approach_speed_m_s,
+            over_force=self.force_n > self._config.control.force_limit_n,
+            step=self.step_name,
+        )
         if state.t_ns - self._reported_ns > NS_PER_S // 5:
             self._reported_ns = state.t_ns
             self._progress(f"{self.step_name}: {self.force_n:.1f} N", 0)
@@ -430,10 +398,10 @@ class _Jaws:
         """Takes the load cell's reading at rest as zero force."""
         goal_rad = self.closing_rad
         mark = len(self._forces)
-        for i in range(round(_MAX_TARE_S * _RATE_HZ)):
+        for i in range(round(_MAX_TARE_S * RATE_HZ)):
             self.cycle(goal_rad, self._moving_current_a())
             self._max_age_s = max(self._max_age_s, (self.state.t_ns - self._sample_ns) / NS_PER_S)
-            if i > _REST_S * _RATE_HZ and len(self._forces) >= mark + _TARE_SAMPLES:
+            if i > _REST_S * RATE_HZ and len(self._forces) >= mark + _TARE_SAMPLES:
                 break
         rest_n = np.array([force for _, force in self._forces[mark:]])
         if len(rest_n) < _TARE_SAMPLES:
@@ -451,7 +419,7 @@ class _Jaws:
 
     def close_on_gauge(self, gauge_m: float) -> float:
         """Closes slowly until the load cell measures contact. Returns the angle."""
-        speed_rad = _APPROACH_M_S / self._jaw_m_per_rad / _RATE_HZ
+        speed_rad = _APPROACH_M_S / self._jaw_m_per_rad / RATE_HZ
         start_rad = goal_rad = self.closing_rad
         end_rad = self._sign * self._nominal.closed_position_rad
         first = len(self._states)
@@ -506,10 +474,10 @@ class _Jaws:
         if self._full_a is None and self._max_age_s > 0:
             rate_n_s = min(rate_n_s, _OVERSHOOT_SHARE * peak_n / self._max_age_s)
         last_a = math.inf if self._full_a is None else share * self._full_a
-        step_a = self._current_a(rate_n_s) / _RATE_HZ
+        step_a = self._current_a(rate_n_s) / RATE_HZ
         max_a = 1.5 * self._current_a(peak_n + self._nominal.friction_n)
         current_a = abs(self.state.current_a)
-        for _ in range(round(_REST_S * _RATE_HZ)):  # lets the force of the impact fade
+        for _ in range(round(_REST_S * RATE_HZ)):  # lets the force of the impact fade
             self.cycle(self.closing_rad + _BEYOND_RAD, current_a)
         first, mark = len(self._states), len(self._forces)
         while self.force_n < peak_n and current_a < last_a:
@@ -544,7 +512,7 @@ class _Jaws:
 
     def _wait_for_force(self, peak_n: float, current_a: float) -> None:
         """Raises `DataError` if the current gives much less than the peak force, by samples as new as the current."""
-        for _ in range(round(self._max_age_s * _RATE_HZ)):
+        for _ in range(round(self._max_age_s * RATE_HZ)):
             if self.force_n >= peak_n:
                 return
             self.cycle(self.closing_rad + _BEYOND_RAD, current_a)
@@ -579,18 +547,18 @@ class _Jaws:
     def _pass(self, side: int, end_rad: float, motor_force_n: float, limit_m_s: float) -> FreePass | None:
         """One pass, without its acceleration; None if the jaws stuck."""
         brake_rad = min(_BRAKE_RAD, abs(end_rad - self.closing_rad) / 5)
-        for _ in range(round(_MAX_PASS_S * _RATE_HZ)):
+        for _ in range(round(_MAX_PASS_S * RATE_HZ)):
             if side * self._sign * self.state.velocity_rad_s > _MIN_SPEED_RAD_S:
                 break
             self.cycle(end_rad, _START_FACTOR * self._whole_steps_a(motor_force_n), limit_m_s)
-        first = len(self._states) + round(_SPEED_UP_S * _RATE_HZ)
-        for _ in range(round(_MAX_PASS_S * _RATE_HZ)):
+        first = len(self._states) + round(_SPEED_UP_S * RATE_HZ)
+        for _ in range(round(_MAX_PASS_S * RATE_HZ)):
             self.cycle(end_rad, self._whole_steps_a(motor_force_n), limit_m_s)
             if side * (end_rad - self.closing_rad) < brake_rad:
                 break
         states = self._states[first:]
         self._move_to(end_rad)
-        if len(states) < _RATE_HZ / 10 or abs(states[-1].velocity_rad_s) < _MIN_SPEED_RAD_S:
+        if len(states) < RATE_HZ / 10 or abs(states[-1].velocity_rad_s) < _MIN_SPEED_RAD_S:
             return None
         return _reduce(self._nominal, states)
 
@@ -600,12 +568,12 @@ class _Jaws:
 
     def _move_to(self, goal_rad: float) -> None:
         """Moves at a constant low speed, and rests at the goal."""
-        speed_rad = 3 * _APPROACH_M_S / self._jaw_m_per_rad / _RATE_HZ
+        speed_rad = 3 * _APPROACH_M_S / self._jaw_m_per_rad / RATE_HZ
         next_rad = self.closing_rad
         while abs(goal_rad - next_rad) > speed_rad:
             next_rad += float(np.copysign(speed_rad, goal_rad - next_rad))
             self.cycle(next_rad, self._moving_current_a())
-        for _ in range(round(_REST_S * _RATE_HZ)):
+        for _ in range(round(_REST_S * RATE_HZ)):
             self.cycle(goal_rad, self._moving_current_a())
 
     def _moving_current_a(self) -> float:

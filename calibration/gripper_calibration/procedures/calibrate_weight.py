@@ -1,7 +1,6 @@
 """Torque constant without a load cell: the motor balances a known mass that hangs on one jaw."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, NoReturn
 
@@ -10,24 +9,17 @@ import numpy.typing as npt
 from scipy.stats import t as student
 
 from gripper_calibration.procedures.calibrate_load_cell import STANDARD_GRAVITY_M_S2
-from gripper_calibration.procedures.powered_servo import torque_on
+from gripper_calibration.procedures.powered_servo import RATE_HZ, BusCycles, servo_alone, torque_on
 from gripper_force.config import Config
-from gripper_force.control.limits import Limits
-from gripper_force.control.safety import Safety
-from gripper_force.control.speed_limit import SpeedLimit
-from gripper_force.control.transmission import Transmission
 from gripper_force.errors import ConfigError, DataError, DeviceError
-from gripper_force.interfaces import Devices, Progress, Prompt, no_progress
+from gripper_force.interfaces import Progress, Prompt, no_progress
 from gripper_force.profiles.rig_profile import CalibratedValue, torque_settings
 from gripper_force.runtime.backends import is_simulated, open_devices
-from gripper_force.runtime.reading import read_patiently
-from gripper_force.runtime.resolve import make_controller, position_loop, resolve
-from gripper_force.types import NS_PER_MS, NS_PER_S, ServoCommand, ServoState
+from gripper_force.runtime.resolve import make_controller, resolve
 
 LINKAGES: Final = ("rack", "crank_slider", "table")
 """Linkages whose jaws move along a line, so that a weight on one jaw does the same work everywhere."""
 
-_RATE_HZ: Final = 200.0
 _SPEED_M_S: Final = 0.010
 PLACES: Final = (0.3, 0.4, 0.5, 0.6)
 """Places at which the weight is balanced, as shares of the travel."""
@@ -113,15 +105,7 @@ def masses_kg(config: Config) -> tuple[float, float]:
 
 def is_servo_simulated(config: Config) -> bool:
     """Returns True if nobody has to hang up the mass."""
-    return is_simulated(_alone(config))
-
-
-def _alone(config: Config) -> Config:
-    """The servo without camera and load cell."""
-    none = {
-        name: getattr(config, name).model_copy(update={"backend": "none"}) for name in ("camera", "load_cell")
-    }
-    return config.model_copy(update=none)
+    return is_simulated(servo_alone(config))
 
 
 def calibrate_weight(
@@ -150,11 +134,9 @@ def calibrate_weight(
             f"a mass of {mass_kg:g} kg does not suit this gripper and control.force_limit_n; use one of "
             f"{least_kg:g} to {most_kg:g} kg"
         )
-    config, simulated, hung_kg = (
-        _alone(config),
-        is_servo_simulated(config),
-        config.sim.hanging_mass_kg or mass_kg,
-    )
+    hung_kg = config.sim.hanging_mass_kg or mass_kg
+    config = servo_alone(config)
+    simulated = is_simulated(config)
     if simulated:
         config = _simulated(config, 0.0)
     config = resolve(config, vision=False).config
@@ -236,7 +218,7 @@ def _balance(config: Config, weight_n: float, expected_n: float, load: str, prog
     with open_devices(config) as devices, torque_on(devices.servo) as (state, raise_if_interrupted):
         if problem := make_controller(config).start_problem(state):
             raise DeviceError(problem)
-        jaws = _Jaws(config, devices, state, raise_if_interrupted, weight_n, expected_n)
+        jaws = _Jaws(config, BusCycles(config, devices, state, raise_if_interrupted), weight_n, expected_n)
         up_n: list[float] = []
         down_n: list[float] = []
         for number, share in enumerate(PLACES, start=1):
@@ -251,42 +233,24 @@ def _balance(config: Config, weight_n: float, expected_n: float, load: str, prog
 class _Jaws:
     """Moves the jaws with a limited motor force."""
 
-    def __init__(
-        self,
-        config: Config,
-        devices: Devices,
-        state: ServoState,
-        raise_if_interrupted: Callable[[], None],
-        weight_n: float,
-        expected_n: float,
-    ) -> None:
-        gripper = config.gripper
-        self._config, self._devices, self._state = config, devices, state
-        self._raise_if_interrupted = raise_if_interrupted
-        self._transmission = transmission = Transmission.from_config(
-            gripper, gripper.nm_per_a or 0.0, gripper.current_step_a or 0.0
-        )
-        self._safety = Safety(config.control)
-        self._speed_limit = SpeedLimit(transmission, position_loop(gripper))
-        limits = Limits(config.control, transmission, config.servo.current_limit_a)
+    def __init__(self, config: Config, cycles: BusCycles, weight_n: float, expected_n: float) -> None:
+        self._config, self._cycles = config, cycles
+        transmission, friction_n = cycles.transmission, config.gripper.friction_n
         middle_rad = transmission.position_rad(transmission.open_width_m / 2)
-        ceiling_n = abs(transmission.force_n(limits.ceiling_a(0.0, middle_rad), middle_rad))
-        self._most_n = min(_FORCE_FACTOR * (weight_n / 2 + gripper.friction_n) + _SPARE_N, ceiling_n)
+        ceiling_n = abs(transmission.force_n(cycles.limits.ceiling_a(0.0, middle_rad), middle_rad))
+        self._most_n = min(_FORCE_FACTOR * (weight_n / 2 + friction_n) + _SPARE_N, ceiling_n)
         self._expected_n, self._is_loaded = expected_n, weight_n > 0
         self._speed_m_s = min(_SPEED_M_S, config.control.approach_speed_m_s)
-        self._goal_a = 0.0
-        self._period_ns = round(NS_PER_S / _RATE_HZ)
-        self._due_ns = devices.clock.now_ns()
 
     @property
     def _width_m(self) -> float:
-        return self._transmission.width_m(self._state.position_rad)
+        return self._cycles.transmission.width_m(self._cycles.state.position_rad)
 
     def move(self, share: float) -> None:
         """Moves to a share of the travel at a low speed, and rests there."""
-        goal_m, next_m = (1 - share) * self._transmission.open_width_m, self._width_m
-        step_m = 2 * self._speed_m_s / _RATE_HZ
-        rest = round(_REST_S * _RATE_HZ)
+        goal_m, next_m = (1 - share) * self._cycles.transmission.open_width_m, self._width_m
+        step_m = 2 * self._speed_m_s / RATE_HZ
+        rest = round(_REST_S * RATE_HZ)
         while rest > 0:
             rest -= next_m == goal_m
             next_m += min(max(goal_m - next_m, -step_m), step_m)
@@ -297,9 +261,9 @@ class _Jaws:
     def break_away(self, side: int) -> float:
         """Raises (1) or lowers (-1) the closing motor force from the expected one until the jaws follow. Returns it."""
         begin_m, force_n = self._width_m, self._expected_n
-        moved_m = 2 * _MOVED_RAD * self._transmission.jaw_m_per_rad(self._state.position_rad)
+        moved_m = 2 * _MOVED_RAD * self._cycles.transmission.jaw_m_per_rad(self._cycles.state.position_rad)
         while side * (begin_m - self._width_m) < moved_m:
-            force_n += side * _RAMP_N_S / _RATE_HZ
+            force_n += side * _RAMP_N_S / RATE_HZ
             if abs(force_n) > self._most_n:
                 self._raise_stuck("do not move")
             self._cycle(self._width_m - math.copysign(_LEAD_M, force_n), abs(force_n))
@@ -317,21 +281,9 @@ class _Jaws:
         )
 
     def _cycle(self, goal_width_m: float, force_n: float) -> None:
-        devices, transmission = self._devices, self._transmission
-        self._due_ns = max(self._due_ns + self._period_ns, devices.clock.now_ns())
-        devices.clock.sleep_until_ns(self._due_ns)
-        self._raise_if_interrupted()
-        devices.check()
-        self._state = state = read_patiently(
-            devices.servo,
-            devices.clock,
-            self._state,
-            period_ns=self._period_ns,
-            patience_ns=self._config.servo.bus_watchdog_ms * NS_PER_MS,
+        cycles, transmission = self._cycles, self._cycles.transmission
+        state = cycles.read()
+        current_a = abs(transmission.current_a(force_n, state.position_rad))
+        cycles.write(
+            transmission.position_rad(goal_width_m), current_a, self._config.control.approach_speed_m_s
         )
-        if self._safety.check(state, self._goal_a, 1 / _RATE_HZ, over_force=False):
-            raise DeviceError(f"stopped: {self._safety.reason}; remove the cause and start again")
-        self._goal_a = abs(transmission.current_a(force_n, state.position_rad))
-        command = ServoCommand(self._due_ns, transmission.position_rad(goal_width_m), self._goal_a)
-        speed_m_s = self._config.control.approach_speed_m_s
-        devices.servo.write(self._speed_limit.apply(command, state, speed_m_s))
