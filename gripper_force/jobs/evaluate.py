@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Collection, Sequence
-from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy.typing as npt
 import torch
 
 from gripper_force.config import Config, config_from
-from gripper_force.errors import DataError, GripperError
+from gripper_force.errors import DataError
 from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import (
@@ -160,19 +159,8 @@ def evaluate(
         objects=tuple(objects),
         include_contact_starts=include_contact_starts,
     )
-    found: dict[int, _Evaluated] = {}
-    failed: dict[int, GripperError] = {}
-    with closing(Workers(workers, ray).run_each(one, paths)) as answers:
-        for index, answer in answers:
-            if isinstance(answer, GripperError):
-                failed[index] = answer
-                progress(f"failed: {paths[index].name}")
-            else:
-                found[index] = answer
-                progress(f"evaluated {paths[index].name}")
-    if failed and not found:
-        raise failed[min(failed)]
-    chosen = {paths[index]: found[index] for index in sorted(found) if found[index].is_chosen}
+    found, failed = Workers(workers, ray).read_logs(one, paths, "evaluated", progress)
+    chosen = {paths[number]: log for number, log in found.items() if log.is_chosen}
     if not chosen:
         raise DataError(f"no log in {logs} is of {', '.join(objects)}; choose among the logs' own objects")
     used = {path: one for path, one in chosen.items() if one.forces_n is not None}
@@ -186,7 +174,7 @@ def evaluate(
         compare(clips, forces_n, lead_in),
         left_out=len(chosen) - len(clips),
         per_log={str(path): _log_errors(clip, force_n, lead_in) for path, clip, force_n in each},
-        failed={str(paths[index]): str(failed[index]) for index in sorted(failed)},
+        failed={str(paths[number]): str(error) for number, error in failed.items()},
     )
     if plot is not None:
         from gripper_force.jobs.report.plots import draw_estimates

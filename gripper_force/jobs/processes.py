@@ -7,16 +7,18 @@ import threading
 import traceback
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Executor, Future, as_completed
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context, parent_process, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from multiprocessing.reduction import ForkingPickler
+from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, Final, TypeVar
 
 from gripper_force.errors import GripperError
+from gripper_force.interfaces import Progress
 from gripper_force.runtime.process import ProcessOptions, allowed, own_process
 
 _TERMINAL_SIGNALS: Final = (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
@@ -55,32 +57,55 @@ class Workers:
         with ray_pool(self.ray) as pool:
             yield pool
 
-    def run_each(
-        self, function: Callable[[T], R], items: Sequence[T]
-    ) -> Generator[tuple[int, R | GripperError], None, None]:
-        """Runs a function on each item, and yields the item's index and its result or error, as they come.
-
-        Close the generator to end the jobs that remain.
+    def read_logs(
+        self, function: Callable[[Path], R], logs: Sequence[Path], verb: str, progress: Progress
+    ) -> tuple[dict[int, R], dict[int, GripperError]]:
+        """Runs a function on each log. One that fails does not stop the others.
 
         Args:
             function: A function that another process can import, or a `functools.partial` of one.
-            items: Its arguments.
+            logs: Its arguments.
+            verb: What is done, in the past tense, for ``progress``.
+            progress: Called after each log.
+
+        Returns:
+            The results and the errors by the number of the log, in the order of the logs.
+
+        Raises:
+            GripperError: All logs failed; the error of the first.
         """
-        if self.ray is None and (self.count == 1 or len(items) < 2):  # starting a process takes seconds
-            for index, item in enumerate(items):
+        found: dict[int, R] = {}
+        failed: dict[int, GripperError] = {}
+        with closing(self._run_each(function, logs)) as answers:
+            for number, answer in answers:
+                if isinstance(answer, GripperError):
+                    failed[number] = answer
+                else:
+                    found[number] = answer
+                progress(f"{'failed:' if number in failed else verb} {logs[number].name}")
+        if failed and not found:
+            raise failed[min(failed)]
+        return dict(sorted(found.items())), dict(sorted(failed.items()))
+
+    def _run_each(
+        self, function: Callable[[Path], R], logs: Sequence[Path]
+    ) -> Generator[tuple[int, R | GripperError], None, None]:
+        """Yields the number of each log and its result or error, as they come. Closing it ends the remaining jobs."""
+        if self.ray is None and (self.count == 1 or len(logs) < 2):  # starting a process takes seconds
+            for number, log in enumerate(logs):
                 try:
-                    yield index, function(item)
+                    yield number, function(log)
                 except GripperError as error:
-                    yield index, error
+                    yield number, error
             return
         with self.pool() as pool:
-            index_of = {pool.submit(function, item): index for index, item in enumerate(items)}
-            for future in as_completed(index_of):
+            number_of = {pool.submit(function, log): number for number, log in enumerate(logs)}
+            for future in as_completed(number_of):
                 try:
                     result: R | GripperError = future.result()
                 except GripperError as error:
                     result = error
-                yield index_of.pop(future), result
+                yield number_of.pop(future), result
 
 
 @contextmanager

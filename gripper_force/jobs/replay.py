@@ -3,7 +3,6 @@
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -207,10 +206,10 @@ def replay_frames(
     overrides: Overrides | None = None,
     recover: bool = False,
 ) -> "tuple[ReplayResult, Columns]":
-    """Does the same as `replay`, and returns its estimates at each visual estimate, or without any each cycle, too.
+    """Replays one log, and returns its errors and its estimates: one row for each visual estimate, or for each cycle.
 
-    The columns are ``log``, ``object``, ``seq`` (0 for a cycle), ``t_ns``, ``measured_n`` (load cell),
-    ``visual_n``, ``visual_std_n``, ``fused_n`` and ``current_n``; NaN where there is none.
+    Arguments and errors are those of `replay`. The columns are ``log``, ``object``, ``seq`` (0 for a cycle), ``t_ns``,
+    ``measured_n`` (load cell), ``visual_n``, ``visual_std_n``, ``fused_n`` and ``current_n``; NaN where there is none.
     """
     reader = LogReader(Path(path), recover=recover)
     run = resolve_replay(changed_config(reader, checkpoint, overrides))
@@ -314,23 +313,11 @@ def replay_each(
         GripperError: No log could be replayed; the first one's error, as for `replay`.
     """
     one = partial(replay_frames, checkpoint=checkpoint, overrides=overrides, recover=recover)
-    found: dict[int, tuple[ReplayResult, Columns]] = {}
-    failed: dict[int, GripperError] = {}
-    with closing(Workers(workers, ray).run_each(one, logs)) as answers:
-        for index, answer in answers:
-            if isinstance(answer, GripperError):
-                failed[index] = answer
-                progress(f"failed: {logs[index].name}")
-            else:
-                found[index] = answer
-                progress(f"replayed {logs[index].name}")
-    if failed and not found:
-        raise failed[min(failed)]
-    ordered = [found[index] for index in sorted(found)]
+    found, failed = Workers(workers, ray).read_logs(one, logs, "replayed", progress)
     return Replays(
-        [result for result, _ in ordered],
-        [columns for _, columns in ordered],
-        {str(logs[index]): failed[index] for index in sorted(failed)},
+        [result for result, _ in found.values()],
+        [columns for _, columns in found.values()],
+        {str(logs[number]): error for number, error in failed.items()},
     )
 
 
@@ -503,7 +490,7 @@ def _frame_by_frame(
 def _in_batches(
     records: Iterable[Record], run: ResolvedConfig
 ) -> Iterator[tuple[Record, VisualForce | None]]:
-    """Does the same as `_frame_by_frame`, with the networks computed at the end of the log; frames are empty."""
+    """Yields the records with their estimates, computed in batches at the end of the log. Frames are empty."""
     import torch
 
     from gripper_force.vision.batch_inference import kept_checkpoint, prepared_features

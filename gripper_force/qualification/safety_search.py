@@ -1,9 +1,8 @@
 """Random search for wrong configurations and plants with which a grasp is not safe.
 
 Every case draws a plant and a configuration that is wrong about it, grasps, half of the time changes the force, and
-releases. The statements of
-`safety_statements` must hold. With motor current alone an end stop cannot be told from a rigid object. So such cases
-are counted, but are no violations; `calibrate jaws` prevents them.
+releases. The statements of `safety_statements` must hold. With motor current alone an end stop cannot be told from a
+rigid object. So such cases are counted, but are no violations; `calibrate jaws` prevents them.
 """
 
 import json

@@ -91,7 +91,7 @@ def features(
 def prepared_features(
     networks: Sequence[Member], inputs: npt.NDArray[np.float32]
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """Does the same as `features` for the prepared frames of a stream, (T, S, S), on the CPU."""
+    """Computes `features` on the CPU, for frames of a stream that are prepared already, (T, S, S)."""
     clip = torch.from_numpy(inputs)[None, :, None]  # (1, T, 1, S, S)
     return _run(networks, _batches(clip))
 

@@ -70,7 +70,7 @@ PREPARED = {
     'python -c \'import gripper_force as gf\n\nwith gf.open_gripper("my.yaml"': "echo 'object: sponge' > my.yaml",
     'python -c \'import gripper_force as gf\n\nlog = gf.LogReader("run.mcap"': f"{STAPLER} && mv runs/*.mcap run.mcap",
 }
-"""What a page takes for granted before a command: a log, a network, or the reader's own files."""
+"""Files that a page needs before a command: a log, a network, or the reader's own."""
 
 NOT_RUN = {
     "pip install": "downloads; the workflow `test` installs the wheel",
