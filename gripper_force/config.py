@@ -340,7 +340,11 @@ class ControlConfig(Section):
         description="above this force the current is reduced, and after 0.25 s the grasp ends as a fault; "
         "the largest target is 0.9 / gripper.gain_bound of it",
     )
-    approach_speed_m_s: Positive = Field(0.025, description="closing speed of one jaw before contact")
+    approach_speed_m_s: Positive = Field(
+        0.025,
+        description="closing speed of one jaw before contact; a release is twice as fast. So that no impact exceeds "
+        "force_limit_n, both are at most 4.5 mm/s per newton of it with a pinion of 20 mm",
+    )
     approach_force_n: Positive = Field(0.5, description="largest grip force before contact")
     ramp_n_s: Positive = Field(8.0, description="rate at which the reference force rises after contact")
     settle_s: Positive = Field(1.0, description="time within tolerance after which a grasp counts as held")

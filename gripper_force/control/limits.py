@@ -13,6 +13,10 @@ _RISE_FACTOR = 4.0
 _OVER_FORCE_CEILING = 0.95
 """Until the grasp ends, the current stays below this share of a current that caused an over-force."""
 
+_OVER_FORCE_MEASURED = 0.9
+"""Until then, the goal current does not rise while the measured one is above this share of that at the over-force: the
+motor may draw more than its goal."""
+
 _CEILING_SHARE = 1.04
 """Share of the force limit that sets the current ceiling, for the largest torque constant. The force exceeds its
 limit by 5 % at most, whatever vision estimates."""
@@ -43,7 +47,7 @@ class Limits:
         self._rise_n_s = _RISE_FACTOR * config.ramp_n_s
         self._step_a = transmission.current_step_a
         self._low_rad, self._high_rad = transmission.goal_range_rad
-        self._over_force_ceiling_a = math.inf
+        self._over_force_ceiling_a = self._over_force_motor_n = math.inf
         self._unrounded_a = 0.0
         self._rounding_a = 0.0
         self._last_a = 0.0
@@ -81,12 +85,13 @@ class Limits:
         """
         self._refuse_non_finite(command, force_n, friction_n, motor_force_n, present_rad)
         ceiling_a = min(self.ceiling_a(friction_n, present_rad), self._over_force_ceiling_a)
-        if not may_rise:
+        if not may_rise or motor_force_n > _OVER_FORCE_MEASURED * self._over_force_motor_n:
             ceiling_a = min(ceiling_a, self._last_a)
         over = force_n > self._force_limit_n
         if over and not opening:
             if not self._over:
                 self._over_force_ceiling_a = _OVER_FORCE_CEILING * self._last_a
+                self._over_force_motor_n = motor_force_n
             # Friction may keep the force up. A motor force too small to reach the limit need not fall.
             lowers = motor_force_n > self._force_limit_n - friction_n
             ceiling_a = min(ceiling_a, (_OVER_FORCE_FACTOR if lowers else 1.0) * self._last_a)
@@ -101,7 +106,7 @@ class Limits:
 
     def reset(self) -> None:
         """Removes the ceiling that an over-force set. Called at the start and the end of a grasp."""
-        self._over_force_ceiling_a = math.inf
+        self._over_force_ceiling_a = self._over_force_motor_n = math.inf
 
     @property
     def is_at_current_limit(self) -> bool:

@@ -139,6 +139,10 @@ class GraspController:
         current_limit_a: float,
         position_loop: PositionLoop | None = None,
     ) -> None:
+        impact_m_s = transmission.impact_m_s(config.force_limit_n)
+        self._travel_m_s = min(_TRAVEL_SPEED_SHARE * config.approach_speed_m_s, impact_m_s)
+        if impact_m_s < config.approach_speed_m_s:
+            config = config.model_copy(update={"approach_speed_m_s": impact_m_s})
         self._config = config
         self._transmission = transmission
         self._fusion = Fusion(config, transmission)
@@ -378,17 +382,15 @@ class GraspController:
         self._outcome = Outcome.NONE
         distance_m = width_m - self._present_width_m
         self._move_width_m, self._move_opens = width_m, distance_m > 0
-        rate_m_s = _TRAVEL_SPEED_SHARE * self._config.approach_speed_m_s
-        self._move_time_s = abs(distance_m) / rate_m_s + ACCELERATION_S + _MOVE_SPARE_S
+        self._move_time_s = abs(distance_m) / self._travel_m_s + ACCELERATION_S + _MOVE_SPARE_S
         self._enter(Phase.MOVE, f"move to {1e3 * width_m:.1f} mm requested")
 
     def _start_travel(self) -> None:
         self._let_go_n = 0.0
         if self._phase in _GRIPPING:
             self._let_go_n, self._was_held = self._motor_force_n, self._outcome == Outcome.HELD
-        speed_m_s = _TRAVEL_SPEED_SHARE * self._config.approach_speed_m_s
         self._goal_width_m = self._present_width_m  # in the cycle that loses an object, the jaws still close
-        self._travel.start(self._goal_width_m, speed_m_s)
+        self._travel.start(self._goal_width_m, self._travel_m_s)
         self._push_n = 0.0
         self._limits.reset()
 
@@ -421,7 +423,7 @@ class GraspController:
         """Largest speed of one jaw in the present phase."""
         full_m_s = self._config.approach_speed_m_s
         if self._is_opening or self._phase in (Phase.MOVE, Phase.OPEN):
-            return _TRAVEL_SPEED_SHARE * full_m_s
+            return self._travel_m_s
         if self._phase == Phase.APPROACH:
             return self._approach.speed_m_s
         return full_m_s if self._phase in (Phase.CONTACT, Phase.RAMP) else _HOLD_SPEED_SHARE * full_m_s

@@ -16,11 +16,11 @@ from typing import Final, Literal, get_args
 
 import numpy as np
 
-from gripper_force.config import Config, config_from, config_from_text, dump_config
+from gripper_force.config import HARD_FORCE_LIMIT_N, Config, config_from, config_from_text, dump_config
 from gripper_force.errors import ConfigError, SimulationError
 from gripper_force.interfaces import Camera
 from gripper_force.jobs.recording.touches import touch, wait
-from gripper_force.jobs.simulate import OBJECTS, PEAK_N
+from gripper_force.jobs.simulate import OBJECTS
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.log_writer import LogWriter
@@ -275,7 +275,7 @@ def _set_config(config: Config, task: SetPlan, seed: int, lux: int, rng: np.rand
     control = config.control.model_copy(
         update={
             "feedback": "current",
-            "force_limit_n": 1.2 * PEAK_N * config.gripper.gain_bound,
+            "force_limit_n": HARD_FORCE_LIMIT_N,  # so high that it does not bound the speed
             # Four touches in the paper's 500 frames leave 0.8 s for each.
             "approach_speed_m_s": 0.2,
             "approach_force_n": 1.5,

@@ -140,7 +140,7 @@ def _randomised(config: Config, task: SimulationPlan, rng: np.random.Generator) 
     control = config.control.model_copy(
         update={
             "feedback": "current",
-            "force_limit_n": 1.2 * PEAK_N * config.gripper.gain_bound,
+            "force_limit_n": 1.3 * PEAK_N * config.gripper.gain_bound,
             "approach_speed_m_s": float(rng.uniform(0.02, 0.05)),
             "ramp_n_s": float(np.exp(rng.uniform(np.log(3.0), np.log(25.0)))),
             "hold_s": float(rng.uniform(0.3, 1.0)),

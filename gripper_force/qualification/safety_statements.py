@@ -1,9 +1,9 @@
 """Three statements that hold for every grasp, whatever the configuration wrongly says.
 
 The contact force stays within the force limit and 5 %. Jaws without contact are never faster than 1.5 times the
-configured speed, except those that an object pushes open while the motor has no torque. A grasp is never ``held`` on
-nothing for longer than 0.1 s; jaws that friction or an end stop keeps still do not show that their object is gone, and
-the camera takes up to 0.5 s and two frame periods. All three are about the true plant.
+configured speed, except those that an object pushes open while the motor has no torque. Jaws that move are never
+``held`` on nothing for longer than 0.1 s; jaws that friction or an end stop keeps still do not show that their object
+is gone, and the camera takes up to 0.5 s and two frame periods. All three are about the true plant.
 """
 
 from typing import Final
@@ -17,11 +17,11 @@ NOTHING_SHARE: Final = 0.05
 """Contact force as a share of the target below which the jaws hold nothing."""
 
 REACTION_S: Final = 0.1
-"""Time in which a grasp may still count as held after the object has left."""
+"""Time for which jaws in motion may still count as held after the object has left."""
 
 STILL_REACTION_S: Final = 0.5
 STILL_REACTION_FRAMES: Final = 2
-"""The same for jaws that stand still: this time and this many frame periods."""
+"""The same with the time in which they stand still: this time and this many frame periods."""
 
 _STILL_M_S: Final = 0.003
 """Speed below which a jaw stands still: friction creeps."""
@@ -49,7 +49,7 @@ class SafetyStatements:
         self._sign = sign
         self.change_target(target_n)
         self._still_reaction_s = STILL_REACTION_S + STILL_REACTION_FRAMES / control.frame_hz
-        self._nothing_s = 0.0
+        self._nothing_s = self._moving_s = 0.0
         self.force_share = self.speed_share = 0.0
         self.held_nothing = False
 
@@ -82,9 +82,12 @@ class SafetyStatements:
             has_torque: False if the motor force is zero: then an object may push the jaws open at any speed.
         """
         claims = outcome == Outcome.HELD and phase in (Phase.RAMP, Phase.HOLD)
-        self._nothing_s = self._nothing_s + dt_s if claims and object_n < self._nothing_n else 0.0
-        is_still = abs(closing_m_s) < _STILL_M_S
-        self.held_nothing |= self._nothing_s > (self._still_reaction_s if is_still else REACTION_S)
+        if claims and object_n < self._nothing_n:
+            self._nothing_s += dt_s
+            self._moving_s += dt_s if abs(closing_m_s) >= _STILL_M_S else 0.0
+        else:
+            self._nothing_s = self._moving_s = 0.0
+        self.held_nothing |= self._nothing_s > self._still_reaction_s or self._moving_s > REACTION_S
         self.force_share = max(self.force_share, peak_n / self._limit_n)
         if force_n == 0.0:
             # Only opening jaws may be faster; a wrong sign exchanges the directions.
