@@ -1,7 +1,6 @@
 """Shared base of YAML-backed models: base class, number types, loading, and error messages."""
 
 from collections.abc import Iterator
-from copy import deepcopy
 from difflib import get_close_matches
 from inspect import isclass
 from math import isclose
@@ -88,23 +87,6 @@ def merged(under: Tree, over: Tree) -> Tree:
         below = both.get(key)
         both[key] = merged(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
     return both
-
-
-def section_from(section: type[S], overrides: list[str] | None, tree: Tree | None = None) -> S:
-    """Builds a section that is not part of a configuration, such as a training recipe.
-
-    Args:
-        section: What to build.
-        overrides: Assignments ``key=value``, applied last.
-        tree: Keys that differ from the defaults.
-
-    Raises:
-        ConfigError: A key or value is wrong.
-    """
-    tree = deepcopy(tree or {})
-    for assignment in overrides or []:
-        assign(tree, assignment)
-    return validated(section, tree, "--set")
 
 
 def validated(section: type[S], tree: Tree, where: str, what: str = "configuration") -> S:

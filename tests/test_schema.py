@@ -12,7 +12,6 @@ from gripper_force.schema import (
     dump,
     merged,
     read_tree,
-    section_from,
     tree_from,
     validated,
 )
@@ -63,12 +62,6 @@ def test_a_wrong_value_is_named_with_what_it_is_of() -> None:
         validated(Whole, {"part": {"size": "big"}}, "there", "profile")
     with pytest.raises(ConfigError, match="can't read the profile there"):
         tree_from("a: [1", "there", "profile")
-
-
-def test_a_section_stands_alone() -> None:
-    assert section_from(Part, ["size=3"], {"size": 2}) == Part(size=3)
-    with pytest.raises(ConfigError, match=r"unknown configuration key 'sise'.*size"):
-        section_from(Part, ["sise=3"])
 
 
 def test_an_assignment_makes_the_sections_it_needs() -> None:

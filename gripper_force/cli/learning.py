@@ -284,10 +284,10 @@ def reproduce(
     import time
 
     require("torch", "reproduce")
+    from gripper_force.jobs.training.recipe import section_from
     from gripper_force.qualification.markdown_blocks import write_between
     from gripper_force.qualification.paper import paper_page as page
     from gripper_force.qualification.paper.models import SCALES, Scale
-    from gripper_force.schema import section_from
 
     end_s = math.inf if minutes is None else time.monotonic() + 60 * minutes
     names = page.expand_name(what)

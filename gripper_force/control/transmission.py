@@ -14,8 +14,6 @@ _IMPACT_RAD_S_PER_N = 0.225
 """Speed of the horn per newton with which an object of 30 N/mm stops an XM430's rotor: at a pinion of 20 mm, 1.4 kg
 per jaw."""
 
-_STEPS = 32
-
 
 @dataclass(frozen=True, slots=True)
 class Transmission:
@@ -102,9 +100,8 @@ class Transmission:
 
     def impact_m_s(self, force_n: float) -> float:
         """Returns the largest speed of a jaw that a hard object stops within a force, anywhere in the travel."""
-        widths_m = (self.open_width_m * step / _STEPS for step in range(_STEPS + 1))
-        smallest_m_per_rad = min(self.jaw_m_per_rad(self.position_rad(width_m)) for width_m in widths_m)
-        return _IMPACT_RAD_S_PER_N * force_n * smallest_m_per_rad
+        positions_rad = (self.position_rad(self.open_width_m * i / 32) for i in range(33))
+        return _IMPACT_RAD_S_PER_N * force_n * min(map(self.jaw_m_per_rad, positions_rad))
 
     def n_per_a(self, position_rad: float) -> float:
         """Returns the motor force at each jaw per ampere at a servo angle."""

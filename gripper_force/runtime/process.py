@@ -26,7 +26,6 @@ SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 SWITCH_INTERVAL_S: Final = 2e-4
 """Python's default lets a computing thread delay the control thread by 5 ms."""
 
-
 _SLICE_NS: Final = 100_000
 _SCHED_SETATTR: Final = {"x86_64": 314, "aarch64": 274, "riscv64": 274}
 """The shortest time slice that the kernel accepts, and the system call that sets it, by machine."""
@@ -110,17 +109,17 @@ def real_time_priority() -> Iterator[str]:
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
     except PermissionError:
-        is_ordinary = (
-            before & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER
-        )  # another policy is the user's choice
-        _set_time_slice(_SLICE_NS if is_ordinary else None)
+        is_ordinary = before & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER  # another one is the user's choice
+        if is_ordinary:
+            _set_time_slice(_SLICE_NS)
         try:
             yield (
                 "the control loop has no real-time priority, so cycles may start 3 ms late; allow it with "
                 f"'@dialout - rtprio {PRIORITY}' in /etc/security/limits.conf, and log in again"
             )
         finally:
-            _set_time_slice(0 if is_ordinary else None)
+            if is_ordinary:
+                _set_time_slice(0)
         return
     try:
         yield ""
@@ -129,15 +128,13 @@ def real_time_priority() -> Iterator[str]:
         os.sched_setscheduler(0, before | os.SCHED_RESET_ON_FORK, parameter)
 
 
-def _set_time_slice(slice_ns: int | None) -> None:
-    """Sets the time slice of this thread (0: the default, None: as it is). Linux before 6.12 ignores it.
+def _set_time_slice(slice_ns: int) -> None:
+    """Sets the time slice of this thread; 0 is the default. Linux before 6.12 ignores it.
 
     A waking thread interrupts one with a longer slice. See https://man7.org/linux/man-pages/man2/sched_setattr.2.html.
     """
     call = _SCHED_SETATTR.get(platform.machine())
-    if (
-        slice_ns is None or call is None or sys.maxsize < 2**32
-    ):  # 32-bit programs on such a kernel have other numbers
+    if call is None or sys.maxsize < 2**32:  # 32-bit programs on such a kernel have other numbers
         return
     nice = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
     attributes = struct.pack("=IIQiIQQQ", 48, os.SCHED_OTHER, 1, nice, 0, slice_ns, 0, 0)

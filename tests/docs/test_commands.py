@@ -16,9 +16,8 @@ import typer
 from gripper_force import cli
 from gripper_force.config import Config, load_config
 from gripper_force.jobs.grasp import exclusive_device
-from gripper_force.jobs.training.recipe import TrainConfig, recipe
+from gripper_force.jobs.training.recipe import TrainConfig, recipe, section_from
 from gripper_force.qualification.paper.models import Scale
-from gripper_force.schema import section_from
 
 ROOT = Path(__file__).parents[2]
 PAGES = [

@@ -1,7 +1,8 @@
 """Training recipes: all keys, and recipes by name."""
 
 import json
-from typing import Annotated, Final, Literal, Self
+from copy import deepcopy
+from typing import Annotated, Final, Literal, Self, TypeVar
 
 from pydantic import Field, ValidationError, model_validator
 
@@ -11,8 +12,8 @@ from gripper_force.schema import (
     Positive,
     Section,
     Tree,
+    assign,
     assign_value,
-    section_from,
     validated,
 )
 from gripper_force.vision.header import (
@@ -26,6 +27,8 @@ from gripper_force.vision.header import (
     Quantity,
 )
 from gripper_force.vision.preprocess import Preprocess
+
+S = TypeVar("S", bound=Section)
 
 Share = Annotated[float, Field(ge=0, le=1)]
 
@@ -211,6 +214,23 @@ class TrainConfig(Section):
             head=self.head,
             outputs=self.outputs,
         )
+
+
+def section_from(section: type[S], overrides: list[str] | None, tree: Tree | None = None) -> S:
+    """Builds a section that is not part of a configuration, such as a recipe.
+
+    Args:
+        section: What to build.
+        overrides: Assignments ``key=value``, applied last.
+        tree: Keys that differ from the defaults.
+
+    Raises:
+        ConfigError: A key or value is wrong.
+    """
+    tree = deepcopy(tree or {})
+    for assignment in overrides or []:
+        assign(tree, assignment)
+    return validated(section, tree, "--set")
 
 
 def recipe(name: str, overrides: list[str] | None = None) -> TrainConfig:

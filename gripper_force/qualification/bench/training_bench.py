@@ -18,10 +18,10 @@ from gripper_force.jobs.dataset import Clip, split_by
 from gripper_force.jobs.report.figure import STYLE
 from gripper_force.jobs.training.batches import Batches
 from gripper_force.jobs.training.parallel import joined
-from gripper_force.jobs.training.recipe import RECIPES, TrainConfig
+from gripper_force.jobs.training.recipe import RECIPES, TrainConfig, section_from
 from gripper_force.jobs.training.stated_errors import estimates
 from gripper_force.jobs.training.trainer import Trainer
-from gripper_force.schema import Tree, section_from
+from gripper_force.schema import Tree
 from gripper_force.vision.preprocess import Preprocess
 
 Load = Callable[[Preprocess], list[Clip]]

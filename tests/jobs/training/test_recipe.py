@@ -1,7 +1,7 @@
 import pytest
 
 from gripper_force.errors import ConfigError
-from gripper_force.jobs.training.recipe import RECIPES, TrainConfig, continued, recipe
+from gripper_force.jobs.training.recipe import RECIPES, TrainConfig, continued, recipe, section_from
 from gripper_force.vision.header import Header, NetworkConfig, Residual, read_checkpoint
 from gripper_force.vision.preprocess import Preprocess
 
@@ -106,3 +106,9 @@ def test_checkpoint_that_no_recipe_makes_raises() -> None:
     made = header(NetworkConfig(size=32, window=9), preprocess=Preprocess(size=32))
     with pytest.raises(ConfigError, match=r"network 0 .* has window=9, but a recipe makes window=20"):
         continued(TrainConfig(), made)
+
+
+def test_a_section_stands_alone() -> None:
+    assert section_from(TrainConfig, ["steps=3"], {"steps": 2}) == TrainConfig(steps=3)
+    with pytest.raises(ConfigError, match=r"unknown configuration key 'stepps'.*steps"):
+        section_from(TrainConfig, ["stepps=3"])
