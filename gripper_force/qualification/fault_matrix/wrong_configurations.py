@@ -37,7 +37,6 @@ REFUSED: Final = "refused"
 _LIMIT_SPARE: Final = 1.001
 """Force limit over the lowest one that allows the target; a limit far above the target would never act."""
 
-_TIMEOUT_S: Final = 5.0
 _AFTER_OUTCOME_NS: Final = NS_PER_S
 """Time for which a grasp goes on after its outcome has last changed."""
 
@@ -284,7 +283,6 @@ def draw(config: Config, row: WrongCase, index: int) -> tuple[Tree, dict[str, An
         "target_n": target_n,
         "seed": config.seed + index,
         "control.force_limit_n": round(_LIMIT_SPARE * lowest_limit_n, 4),
-        "control.timeout_s": _TIMEOUT_S,
         **(_NO_CAMERA if is_blind else {}),
         **row.keys(config, share, index),
     }
