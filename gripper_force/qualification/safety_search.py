@@ -18,8 +18,8 @@ import numpy as np
 
 from gripper_force.config import Config, ControlConfig
 from gripper_force.control.limits import largest_target_n
-from gripper_force.control.linkage import RackAndPinion
 from gripper_force.control.state_machine import GraspController
+from gripper_force.control.transmission import Transmission
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.processes import process_pool
@@ -41,7 +41,11 @@ _GRASP_S: Final = 5.0
 _RELEASE_S: Final = 1.5
 _CHUNK: Final = 20
 _GONE_M: Final = 1.0
-_STOP_M: Final = 0.0455
+_PINION_M: Final = 0.020
+"""Travel of a jaw per radian to which the drawn masses belong."""
+
+_STOP_MARGIN_M: Final = 0.0005
+"""Distance of each jaw from the middle at the end stop."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,8 +165,15 @@ class SearchReport(TypedDict):
     worst: dict[str, list[WorstCase]]
 
 
-def draw(config: ControlConfig, gain_bound: float, seed: int, index: int) -> Draw:
-    """Draws a case. The same arguments give the same case."""
+def draw(config: ControlConfig, truth: Transmission, seed: int, index: int) -> Draw:
+    """Draws a case. The same arguments give the same case.
+
+    Args:
+        config: Force limit and speed of half of the cases.
+        truth: The gripper.
+        seed: Seed of all draws.
+        index: Number of the case.
+    """
     rng = np.random.default_rng([seed, 50, index])
 
     def between(low: float, high: float) -> float:
@@ -175,7 +186,8 @@ def draw(config: ControlConfig, gain_bound: float, seed: int, index: int) -> Dra
         return value if rng.uniform() < share else otherwise
 
     force_limit_n = rarely(0.5, between(2.0, 20.0), config.force_limit_n)
-    most_n = largest_target_n(force_limit_n, gain_bound)
+    most_n = largest_target_n(force_limit_n, truth.gain_bound)
+    open_m_per_rad = truth.jaw_m_per_rad(truth.open_position_rad)
     return Draw(
         force_limit_n=force_limit_n,
         approach_m_s=rarely(0.5, log_between(0.01, 0.04), config.approach_speed_m_s),
@@ -187,10 +199,10 @@ def draw(config: ControlConfig, gain_bound: float, seed: int, index: int) -> Dra
         friction=log_between(0.3, 5.0),
         gain=between(0.7, 1.4),
         stiffness_n_m=log_between(200.0, 30_000.0),
-        mass_kg=between(0.8, 1.5),
-        damping_n_s_m=between(8.0, 16.0),
+        mass_kg=between(0.8, 1.5) * (_PINION_M / open_m_per_rad) ** 2,
+        damping_n_s_m=between(0.55, 1.1) * truth.damping_n_s_m,
         play_m=between(0.0002, 0.0004),
-        contact_m=rarely(0.2, _GONE_M, between(0.002, 0.043)),
+        contact_m=rarely(0.2, _GONE_M, between(0.002, truth.open_width_m / 2 - 0.003)),
         leaves_s=rarely(0.25, between(0.5, _GRASP_S), math.inf),
         start_m=rarely(0.3, between(-0.02, 0.02), 0.0),
         sign=int(rarely(0.1, -1, 1)),
@@ -206,10 +218,14 @@ def draw(config: ControlConfig, gain_bound: float, seed: int, index: int) -> Dra
 
 def run_case(config: Config, seed: int, index: int) -> CaseResult:
     """Grasps and releases with one drawn plant, in closed loop with the unmodified controller."""
-    drawn = draw(config.control, config.gripper.gain_bound, seed, index)
+    refused = CaseResult(index, "refused", 0.0, 0.0, held_nothing=False, held_stop=False)
     truth = transmission_of(config.gripper)
-    radius_m = truth.jaw_m_per_rad(truth.open_position_rad)
-    believed = replace(truth, linkage=RackAndPinion(radius_m, drawn.width * truth.open_width_m))
+    drawn = draw(config.control, truth, seed, index)
+    width_m = drawn.width * truth.open_width_m
+    try:
+        believed = transmission_of(config.gripper.model_copy(update={"open_width_m": width_m}))
+    except ConfigError:  # the linkage cannot close so far
+        return refused
     control = config.control.model_copy(
         update={
             "feedback": drawn.feedback,
@@ -228,12 +244,13 @@ def run_case(config: Config, seed: int, index: int) -> CaseResult:
         play_m=drawn.play_m,
         mass_kg=drawn.mass_kg,
         contact_m=drawn.contact_m,
-        stops_m=(0.0, _STOP_M),
+        stops_m=(0.0, truth.open_width_m / 2 - _STOP_MARGIN_M),
     )
     controller = GraspController(control, believed, config.servo.current_limit_a, POSITION_LOOP)
-    run = _Run(plant, controller, drawn, drawn.start_m / radius_m, control)
+    offset_rad = drawn.start_m / truth.jaw_m_per_rad(truth.open_position_rad)
+    run = _Run(plant, controller, drawn, offset_rad, control)
     if controller.start_problem(run.read(0, 0.0)):
-        return CaseResult(index, "refused", 0.0, 0.0, held_nothing=False, held_stop=False)
+        return refused
     run.go(drawn.then_s, Request(0, RequestKind.GRASP, drawn.target_n))
     changes = math.isfinite(drawn.then_n) and run.outcome in (Outcome.NONE, Outcome.HELD)
     change = Request(run.t_ns, RequestKind.GRASP, drawn.then_n) if changes else None
@@ -297,7 +314,7 @@ class _Run:
                 plant.contact_m, plant.deepest_m = max(self._drawn.contact_m, plant.jaw_m), plant.jaw_m
                 self._returns_ns = math.inf
             servo = self.read(self.t_ns, servo_noise)
-            seen_n = plant.force_n + self._drawn.motion_n * plant.x_m / _STOP_M
+            seen_n = plant.force_n + self._drawn.motion_n * plant.x_m / plant.stops_m[1]
             visual = self._vision.sample(self.t_ns, seen_n, vision_noise)
             decision = self._controller.step(self.t_ns, servo, visual, request)
             request = None
@@ -338,13 +355,8 @@ def search(
         progress: Called after each case.
 
     Raises:
-        ConfigError: The gripper is no rack and pinion.
         DataError: The file can't be read or written, or is of another configuration or seed.
     """
-    if (kind := config.gripper.linkage.kind) != "rack":
-        raise ConfigError(
-            f"the plants of the search have a rack and pinion, not gripper.linkage.kind={kind}; leave that key out"
-        )
     results = _read(keep, config) if resume else {}
     missing = [index for index in range(cases) if index not in results]
     progress("", min(len(results), cases))
@@ -400,7 +412,7 @@ def _report(config: Config, results: list[CaseResult]) -> SearchReport:
         for result in sorted(results, key=key, reverse=True)[:WORST]:
             if name == "held nothing" and not result.held_nothing:
                 return
-            drawn = asdict(draw(config.control, config.gripper.gain_bound, config.seed, result.index))
+            drawn = asdict(draw(config.control, transmission_of(config.gripper), config.seed, result.index))
             finite = {
                 k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in drawn.items()
             }

@@ -13,7 +13,7 @@ def test_jaws_that_come_loose_while_the_force_settles_hold_nothing() -> None:
     # Friction feigns a contact, and the network takes the motion of the jaws for force.
     config = load_config(None, [])
     drawn = replace(
-        safety_search.draw(config.control, config.gripper.gain_bound, 777, 152),
+        safety_search.draw(config.control, transmission_of(config.gripper), 777, 152),
         feedback="fused",
     )
     truth = transmission_of(config.gripper)

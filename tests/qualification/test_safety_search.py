@@ -13,10 +13,14 @@ from gripper_force.config import Config, load_config
 from gripper_force.control.limits import Limits
 from gripper_force.control.speed_limit import SpeedLimit
 from gripper_force.control.state_machine import GraspController
-from gripper_force.errors import ConfigError, DataError
+from gripper_force.errors import DataError
 from gripper_force.qualification import safety_search
+from gripper_force.qualification.loop_margin.analytic_plant import transmission_of
 from gripper_force.qualification.safety_search import SearchReport, draw, run_case, search
 from gripper_force.types import ServoCommand
+
+GRIPPERS = Path(__file__).parents[2] / "examples" / "grippers"
+RACK = transmission_of(load_config(None).gripper)
 
 
 @pytest.fixture
@@ -36,7 +40,7 @@ def test_the_first_cases_hold_all_three_statements(config: Config) -> None:
 
 
 def test_draws_cover_what_can_be_wrong(config: Config) -> None:
-    drawn = [draw(config.control, config.gripper.gain_bound, 0, index) for index in range(300)]
+    drawn = [draw(config.control, RACK, 0, index) for index in range(300)]
     assert min(one.friction for one in drawn) < 0.4
     assert max(one.friction for one in drawn) > 4.0
     assert {one.sign for one in drawn} == {-1, 1}
@@ -71,7 +75,7 @@ def test_a_grip_on_nothing_is_found(config: Config, monkeypatch: pytest.MonkeyPa
     wrong = [
         i
         for i in range(1000)
-        if (one := draw(config.control, 1.4, 0, i)).width > 1.05 and one.contact_m == 1 and one.sign == 1
+        if (one := draw(config.control, RACK, 0, i)).width > 1.05 and one.contact_m == 1 and one.sign == 1
     ]
     found = [run_case(config, 0, i) for i in wrong]
     assert any(result.held_nothing for result in found)
@@ -99,10 +103,21 @@ def test_search_continues_where_it_was_interrupted(
         search(other, 6, 1, keep, resume=True)
 
 
-def test_another_linkage_than_that_of_the_plants_is_refused(tmp_path: Path) -> None:
-    config = load_config(None, ["gripper.linkage={kind: finger, finger_m: 0.06, open_finger_rad: 0.9}"])
-    with pytest.raises(ConfigError, match=r"rack and pinion, not gripper\.linkage\.kind=finger"):
-        search(config, 1, 1, tmp_path / "search.jsonl")
+@pytest.mark.parametrize(
+    "name", ["viperx_aloha", "four_bar", "rotary_finger", "two_servos", "openmanipulator_x"]
+)
+def test_the_statements_hold_with_every_linkage(name: str) -> None:
+    config = load_config(GRIPPERS / f"{name}.yaml")
+    found = results(config, 0, 15)
+    assert all(result.ok for result in found)
+    assert any(result.force_share > 0.1 for result in found)
+
+
+def test_a_linkage_that_cannot_close_so_far_is_refused() -> None:
+    config = load_config(GRIPPERS / "viperx_aloha.yaml")
+    truth = transmission_of(config.gripper)
+    wide = next(i for i in range(1000) if draw(config.control, truth, 0, i).width > 1.18)
+    assert run_case(config, 0, wide).outcome == "refused"
 
 
 def test_command_reports_violations_with_exit_code_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

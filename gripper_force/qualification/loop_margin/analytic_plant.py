@@ -2,7 +2,7 @@
 
 One jaw, driven by half of the motor: current loop, inertia, Coulomb and viscous friction and gear play, as in
 the simulated rig (docs/simulation.md), and an object that is a spring. The servo is an X-series
-one in mode 5 (current-based position control).
+one in mode 5 (current-based position control). A linkage's travel per radian is that at the begin of each cycle.
 """
 
 import math
@@ -53,7 +53,7 @@ class Gripper:
         damping_n_s_m: True viscous friction.
         play_m: Gear play in each direction.
         step_a: True resolution of the goal current.
-        mass_kg: Mass of a jaw with its half of the rotor.
+        mass_kg: Mass of an open jaw with its half of the rotor, which a linkage multiplies as it closes.
         contact_m: Travel at which the jaw meets the object.
         stops_m: Travel of the motor at its two end stops, at which it comes to rest.
         x_m: Travel of the motor, as travel of a jaw.
@@ -98,15 +98,16 @@ class Gripper:
         """Integrates the motion for ``time_s`` while the servo follows ``command``."""
         stiffness_n_m, stiffening_n_m2 = self.stiffness_n_m, self.stiffening_n_m2
         contact_m, play_m, (low_m, high_m) = self.contact_m, self.play_m, self.stops_m
-        damping_n_s_m, mass_kg, friction_n = self.damping_n_s_m, self.mass_kg, self.friction_n
-        open_rad = self.transmission.open_position_rad
-        n_per_a, radius_m = self.gain * self.transmission.n_per_a(open_rad), self._radius_m
+        damping_n_s_m, friction_n = self.damping_n_s_m, self.friction_n
+        transmission, position_rad = self.transmission, self._position_rad
+        n_per_a, radius_m = self.gain * transmission.n_per_a(position_rad), self._radius_m
+        mass_kg = self.mass_kg * (transmission.jaw_m_per_rad(transmission.open_position_rad) / radius_m) ** 2
         x_m, v_m_s, jaw_m, current_a = self.x_m, self.v_m_s, self.jaw_m, self.current_a
         deepest_m = self.deepest_m
         limit_a = command.goal_current_a
         if self.step_a:
             limit_a = round(limit_a / self.step_a) * self.step_a
-        goal_m = self.transmission.closing_m_s(command.goal_position_rad, open_rad)
+        goal_m = self.x_m + transmission.closing_m_s(command.goal_position_rad - position_rad, position_rad)
         pwm_per_m = _PWM_PER_TICK / (_TICK_RAD * radius_m)
         steps = math.ceil(time_s / self._step_s)
         dt_s = time_s / steps
@@ -132,12 +133,13 @@ class Gripper:
 
     def read(self, t_ns: int, noise_a: float) -> ServoState:
         """Returns the servo's reading in the servo's own steps; ``noise_a`` is added to the current."""
-        radius_m = self._radius_m
-        measured_a = self.current_a + noise_a
+        sign = self.transmission.closing_sign
+        velocity_rad_s = sign * self.v_m_s / self._radius_m
+        measured_a = sign * self.current_a + noise_a
         return ServoState(
             t_ns=t_ns,
-            position_rad=round(self.x_m / radius_m / _TICK_RAD) * _TICK_RAD,
-            velocity_rad_s=round(self.v_m_s / radius_m / _VELOCITY_STEP_RAD_S) * _VELOCITY_STEP_RAD_S,
+            position_rad=round(self._position_rad / _TICK_RAD) * _TICK_RAD,
+            velocity_rad_s=round(velocity_rad_s / _VELOCITY_STEP_RAD_S) * _VELOCITY_STEP_RAD_S,
             current_a=round(measured_a / CURRENT_STEP_A) * CURRENT_STEP_A,
             temperature_c=35.0,
             voltage_v=12.0,
@@ -145,8 +147,13 @@ class Gripper:
         )
 
     @property
+    def _position_rad(self) -> float:
+        return self.transmission.position_rad(self.transmission.open_width_m - 2 * self.x_m)
+
+    @property
     def _radius_m(self) -> float:
-        return self.transmission.jaw_m_per_rad(self.transmission.open_position_rad)
+        """Travel of a jaw per radian."""
+        return self.transmission.jaw_m_per_rad(self._position_rad)
 
     @property
     def _step_s(self) -> float:

@@ -1,10 +1,11 @@
 import math
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gripper_force.config import GripperConfig
+from gripper_force.config import GripperConfig, load_config
 from gripper_force.qualification.loop_margin.analytic_plant import (
     CURRENT_STEP_A,
     Gripper,
@@ -119,3 +120,17 @@ def test_visual_gain_and_a_new_delay_apply_to_the_next_frame() -> None:
     late = vision.sample(50 * NS_PER_MS, 2.0, 0.0)
     assert late is not None
     assert late.t_ns == 20 * NS_PER_MS
+
+
+def test_a_linkage_sets_travel_and_force_by_the_servo_angle() -> None:
+    config = load_config(Path(__file__).parents[3] / "examples" / "grippers" / "viperx_aloha.yaml")
+    rig = transmission_of(config.gripper)
+    for travel_m in (0.005, 0.030):
+        plant = Gripper(
+            rig, x_m=travel_m, jaw_m=travel_m, friction_n=0.0, contact_m=travel_m, stiffness_n_m=1e5
+        )
+        position_rad = plant.read(0, 0.0).position_rad
+        assert rig.width_m(position_rad) == pytest.approx(rig.open_width_m - 2 * travel_m, abs=2e-5)
+        for _ in range(200):
+            plant.advance(ServoCommand(0, position_rad + 0.5, 0.2), 0.005)
+        assert plant.force_n == pytest.approx(0.2 * rig.n_per_a(position_rad), rel=0.03)
