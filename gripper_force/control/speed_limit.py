@@ -1,5 +1,6 @@
 """Limit on the speed of the jaws that holds whatever friction and torque constant are."""
 
+import math
 from dataclasses import dataclass, replace
 
 from gripper_force.control.transmission import Transmission
@@ -40,14 +41,21 @@ class SpeedLimit:
     def __init__(self, transmission: Transmission, loop: PositionLoop | None) -> None:
         self._transmission, self._loop = transmission, loop
 
-    def apply(self, command: ServoCommand, servo: ServoState, speed_m_s: float) -> ServoCommand:
-        """Returns the command with a goal position whose lead keeps the speed of one jaw to ``speed_m_s``."""
+    def apply(
+        self, command: ServoCommand, servo: ServoState, speed_m_s: float, opening_a: float = math.inf
+    ) -> ServoCommand:
+        """Returns the command with a goal position whose lead keeps the speed of one jaw to ``speed_m_s``.
+
+        To open, the lead allows no more current than ``opening_a`` at rest.
+        """
         distance_rad = command.goal_position_rad - servo.position_rad
         moving_m_s = self._transmission.closing_m_s(servo.velocity_rad_s, servo.position_rad)
         ahead = distance_rad * servo.velocity_rad_s > 0
         if ahead and abs(moving_m_s) > _OVERSPEED * speed_m_s:
             return replace(command, goal_position_rad=servo.position_rad)
-        lead_rad = self._lead_rad(command.goal_current_a, servo.position_rad, speed_m_s)
+        opens = distance_rad * self._transmission.closing_sign < 0
+        rest_a = min(command.goal_current_a, opening_a) if opens else command.goal_current_a
+        lead_rad = self._lead_rad(rest_a, servo.position_rad, speed_m_s)
         bounded_rad = min(max(distance_rad, -lead_rad), lead_rad)
         return replace(command, goal_position_rad=servo.position_rad + bounded_rad)
 

@@ -639,7 +639,8 @@ class GraspController:
             opening=self._is_opening,
         )
         if self._servo is not None:
-            command = self._speed_limit.apply(command, self._servo, self._speed_m_s)
+            free_a = self._transmission.current_a(self._free_motor_force_n + self._push_n, self._present_rad)
+            command = self._speed_limit.apply(command, self._servo, self._speed_m_s, abs(free_a))
         return command, is_over
 
     def _status(self, t_ns: int) -> GraspStatus:

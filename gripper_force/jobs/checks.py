@@ -3,12 +3,15 @@
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Final, Literal, TypeVar
+from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
 
 from gripper_force.config import Config
-from gripper_force.interfaces import Devices
+from gripper_force.errors import ConfigError
+from gripper_force.interfaces import Clock, Devices
+from gripper_force.plugins import load_class
+from gripper_force.runtime.backends import LOAD_CELLS
 from gripper_force.types import NS_PER_MS, NS_PER_S
 
 _FIRST_NS: Final = 5 * NS_PER_S
@@ -144,3 +147,15 @@ def time_ms(call: Callable[[], object], count: int) -> tuple[float, float]:
 def judged(unit: str, name: str, found: str, good: bool, advice: str, *, harmless: bool = False) -> Check:
     """Makes a check, with advice if it is not good. A harmless one does not count as a problem."""
     return Check(unit, name, found, True) if good else Check(unit, name, found, harmless, advice)
+
+
+def open_load_cell(config: Config, clock: Clock) -> Any:
+    """Opens the configured load cell alone, without a simulated world.
+
+    Raises:
+        ConfigError: The backend is unknown, simulated, or ``none``.
+    """
+    name = config.load_cell.backend
+    if name in ("none", "simulated"):
+        raise ConfigError(f"this needs a real load cell, but load_cell.backend is {name!r}; name yours")
+    return load_class("load_cells", LOAD_CELLS, name, "load_cell.backend")(config.load_cell, clock)

@@ -164,18 +164,6 @@ def open_devices(config: Config, port: SharedPort | None = None) -> Iterator[Dev
         )
 
 
-def open_load_cell(config: Config, clock: Clock) -> Any:
-    """Opens the configured load cell alone, without a simulated world.
-
-    Raises:
-        ConfigError: The backend is unknown, simulated, or ``none``.
-    """
-    name = config.load_cell.backend
-    if name in ("none", "simulated"):
-        raise ConfigError(f"this needs a real load cell, but load_cell.backend is {name!r}; name yours")
-    return load_class("load_cells", LOAD_CELLS, name, "load_cell.backend")(config.load_cell, clock)
-
-
 def _rig_class() -> Any:
     return load_class("rigs", {"virtual:rig": RIG}, "virtual:rig", "servo.port")
 

@@ -149,3 +149,20 @@ def test_the_current_limit_is_told_from_other_limits(current_limit_a, holds):
 def test_the_largest_target_leaves_room_below_the_limit():
     assert largest_target_n(10.0, 1.0) == pytest.approx(9.0)
     assert largest_target_n(14.0, 1.4) == pytest.approx(9.0)
+
+
+def test_a_motor_that_draws_more_than_its_goal_does_not_return_to_an_over_force():
+    limits, limit_n = Limits(CONFIG, FINE, 3.0), CONFIG.force_limit_n
+
+    def goal_a(motor_force_n, force_n=1.0):
+        wanted = ServoCommand(0, 0.0, 0.05)
+        return limits.apply(wanted, force_n, 0.0, motor_force_n, 0.0, 0.05, may_rise=True)[0].goal_current_a
+
+    for _ in range(5):
+        before_a = goal_a(4.0)
+    assert goal_a(limit_n + 1.0, limit_n + 0.5) < before_a  # the motor gives more than the goal of 0.05 A
+    low_a = goal_a(0.95 * (limit_n + 1.0))
+    assert goal_a(0.95 * (limit_n + 1.0)) == low_a
+    assert goal_a(0.5 * limit_n) > low_a
+    limits.reset()
+    assert goal_a(0.95 * (limit_n + 1.0)) > low_a

@@ -68,3 +68,13 @@ def test_goal_lies_between_present_and_wanted_position(
     assert low_rad - 1e-12 <= command.goal_position_rad <= high_rad + 1e-12
     assert (command.t_ns, command.goal_current_a) == (7, current_a)
     assert math.isfinite(command.goal_position_rad)
+
+
+def test_to_open_the_lead_goes_by_the_current_of_free_travel(transmission):
+    limit = SpeedLimit(transmission, POSITION_LOOP)
+
+    def lead_rad(goal_rad, *free_a):
+        return abs(limit.apply(ServoCommand(0, goal_rad, 0.5), reading(), 0.001, *free_a).goal_position_rad)
+
+    assert lead_rad(-9.0, 0.05) == pytest.approx(0.1 * lead_rad(-9.0), rel=0.2)
+    assert lead_rad(9.0, 0.05) == lead_rad(9.0) == lead_rad(-9.0)

@@ -106,6 +106,15 @@ def test_jaws_already_in_contact_grip(make_run):
     assert run.plant.force_n == pytest.approx(2.0, abs=0.1)
 
 
+@pytest.mark.parametrize("limit_n", [1.0, 3.0, 14.0])
+def test_no_impact_on_a_hard_object_exceeds_the_force_limit(make_run, limit_n):
+    plant = {"stiffness_n_m": 30_000.0, "mass_kg": 1.4, "friction_n": 0.3}
+    run = make_run(plant=plant, force_limit_n=limit_n, approach_speed_m_s=0.05, timeout_s=20.0)
+    run.grasp(0.64 * limit_n, 8.0)
+    assert run.last.status.outcome == "held"
+    assert run.plant.peak_n < 1.05 * limit_n
+
+
 def test_no_object(make_run):
     run = make_run(plant={"contact_m": 1.0}, timeout_s=20.0).grasp(8.0, 4.0)
     assert phases(run)[:2] == ["approach", "release"]

@@ -14,9 +14,10 @@ from gripper_calibration.plots.load_cell_plot import draw
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
 from gripper_force.interfaces import Clock, LoadCell, Progress, Prompt, no_progress
+from gripper_force.jobs.checks import open_load_cell
 from gripper_force.jobs.profile_files import update_rig
 from gripper_force.profiles.rig_profile import LoadCellCalibration, read_rig
-from gripper_force.runtime.backends import MonotonicClock, open_load_cell
+from gripper_force.runtime.backends import MonotonicClock
 from gripper_force.types import NS_PER_MS, NS_PER_S, LoadCellSample
 
 STANDARD_GRAVITY_M_S2: Final = 9.80665
