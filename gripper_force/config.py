@@ -343,7 +343,7 @@ class ControlConfig(Section):
     approach_speed_m_s: Positive = Field(
         0.025,
         description="closing speed of one jaw before contact; a release is twice as fast. So that no impact exceeds "
-        "force_limit_n, both are at most 4.5 mm/s per newton of it with a pinion of 20 mm",
+        "force_limit_n, both are at most 3.6 mm/s per newton of it with a pinion of 20 mm",
     )
     approach_force_n: Positive = Field(0.5, description="largest grip force before contact")
     ramp_n_s: Positive = Field(8.0, description="rate at which the reference force rises after contact")

@@ -66,7 +66,7 @@ class ApproachState(Enum):
 
 
 class Approach:
-    """Speed loop of the closing jaws, with the decision on contact.
+    """Speed loop of the closing jaws, at most at ``most_m_s``, with the decision on contact.
 
     A standstill is a contact only after the jaws have travelled: jaws whose friction is larger than configured
     do not move at all, and stand still without an object. Jaws that stand still from the start open a little
@@ -78,8 +78,8 @@ class Approach:
         is_backing_off: True while the jaws open to close again.
     """
 
-    def __init__(self, config: ControlConfig, transmission: Transmission) -> None:
-        self._config, self._transmission = config, transmission
+    def __init__(self, config: ControlConfig, transmission: Transmission, most_m_s: float) -> None:
+        self._config, self._transmission, self._most_m_s = config, transmission, most_m_s
         self.speed_m_s = self.motor_force_n = 0.0
         self.is_backing_off = False
         self._target_n = 0.0
@@ -93,7 +93,7 @@ class Approach:
     def set_target(self, target_n: float) -> None:
         """Changes the target force during the approach."""
         self._target_n = target_n
-        self.speed_m_s = min(self._config.approach_speed_m_s, _IMPACT_M_S_PER_N * target_n)
+        self.speed_m_s = min(self._most_m_s, _IMPACT_M_S_PER_N * target_n)
 
     def _begin(self, width_m: float) -> None:
         self._start_m = width_m

@@ -81,6 +81,9 @@ _OPEN_M = 0.003
 _START_SPARE_M = 0.004
 """Distance outside the travel at which a run may start: the error of the configured open position."""
 
+_OPENING_SPARE_S = 4.0
+"""Time for an opening beyond that of its distance: larger friction makes the jaws late."""
+
 _AT_WIDTH_M = 0.0005
 """Distance from the requested width at which a move has arrived: six times what Coulomb friction and the
 servo's proportional gain leave (80 um)."""
@@ -129,7 +132,12 @@ class GraspController:
     opens the jaws without a request after ``no_object`` and ``stuck``. When the object has left the jaws, it
     does what ``on_slip`` says. After another ``slip``, and after ``timeout``, it continues.
 
-    *Speed.* Every command passes `SpeedLimit`, so the jaws are never much faster than the phase allows.
+    *Speed.* Every command passes `SpeedLimit`, so the jaws are never much faster than the phase allows. Jaws on their
+    way to an object are so slow that their impact stays within the force limit. A ramp or hold has the object already.
+
+    Attributes:
+        timeout_s: Time after which a grasp has timed out: as configured, and what slower jaws need.
+        opening_s: Longest time in which the jaws open.
     """
 
     def __init__(
@@ -139,10 +147,12 @@ class GraspController:
         current_limit_a: float,
         position_loop: PositionLoop | None = None,
     ) -> None:
+        full_m_s = config.approach_speed_m_s
         impact_m_s = transmission.impact_m_s(config.force_limit_n)
-        self._travel_m_s = min(_TRAVEL_SPEED_SHARE * config.approach_speed_m_s, impact_m_s)
-        if impact_m_s < config.approach_speed_m_s:
-            config = config.model_copy(update={"approach_speed_m_s": impact_m_s})
+        approach_m_s = min(full_m_s, impact_m_s)
+        self._travel_m_s = min(_TRAVEL_SPEED_SHARE * full_m_s, impact_m_s)
+        self.timeout_s = config.timeout_s + transmission.open_width_m / 2 * (1 / approach_m_s - 1 / full_m_s)
+        self.opening_s = _OPENING_SPARE_S + transmission.open_width_m / 2 / self._travel_m_s
         self._config = config
         self._transmission = transmission
         self._fusion = Fusion(config, transmission)
@@ -150,7 +160,7 @@ class GraspController:
         self._limits = Limits(config, transmission, current_limit_a)
         self._speed_limit = SpeedLimit(transmission, position_loop)
         self._safety = Safety(config)
-        self._approach = Approach(config, transmission)
+        self._approach = Approach(config, transmission, approach_m_s)
         self._slip = SlipMonitor(config)
         self._travel = TrapezoidalProfile(ACCELERATION_S)
         self._largest_target_n = largest_target_n(config.force_limit_n, transmission.gain_bound)
@@ -571,7 +581,7 @@ class GraspController:
         return max(self._free_motor_force_n, remaining_n)
 
     def _run_release(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
-        is_slow = -closing_m_s < _OPENS_SHARE * self._config.approach_speed_m_s
+        is_slow = -closing_m_s < _OPENS_SHARE / _TRAVEL_SPEED_SHARE * self._travel_m_s
         if is_slow and self._phase_s > 2 * ACCELERATION_S:
             self._push_n = min(self._push_n + _PUSH_N_S * dt_s, _PUSH_SHARE * self._free_motor_force_n)
         self._motor_force_n = self._travel_force_n + self._push_n
@@ -602,8 +612,8 @@ class GraspController:
             self._set_outcome(Outcome.BLOCKED, f"stopped at {width_m * 1e3:.1f} mm by an obstacle")
 
     def _check_timeout(self, t_ns: int) -> None:
-        if t_ns - self._grasp_ns > self._config.timeout_s * NS_PER_S:
-            reason = f"not held within {self._config.timeout_s:g} s"
+        if t_ns - self._grasp_ns > self.timeout_s * NS_PER_S:
+            reason = f"not held within {self.timeout_s:.3g} s"
             if self._is_unseen:
                 reason += (
                     f": the camera {self._sight}. The jaws may press on an end stop: check "
@@ -626,7 +636,8 @@ class GraspController:
         )
         may_rise = self._phase != Phase.FAULT or self._opens_at_fault
         force_n, friction_n = self._estimate.force_n, self._estimate.friction_n
-        if self._phase in _GRIPPING:  # friction that is smaller than believed would be force
+        # Friction that is smaller than believed would be force, also of an opening with a wrong closing direction.
+        if self._phase in _GRIPPING or self._is_opening:
             friction_n = min(friction_n, self._fusion.measured_friction_n)
         command, is_over = self._limits.apply(
             wanted,

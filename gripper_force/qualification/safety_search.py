@@ -185,7 +185,7 @@ def draw(config: ControlConfig, truth: Transmission, seed: int, index: int) -> D
     def rarely(share: float, value: float, otherwise: float) -> float:
         return value if rng.uniform() < share else otherwise
 
-    force_limit_n = rarely(0.5, between(2.0, 20.0), config.force_limit_n)
+    force_limit_n = rarely(0.5, log_between(0.8, 20.0), config.force_limit_n)
     most_n = largest_target_n(force_limit_n, truth.gain_bound)
     open_m_per_rad = truth.jaw_m_per_rad(truth.open_position_rad)
     return Draw(
@@ -251,13 +251,13 @@ def run_case(config: Config, seed: int, index: int) -> CaseResult:
     run = _Run(plant, controller, drawn, offset_rad, control)
     if controller.start_problem(run.read(0, 0.0)):
         return refused
-    run.go(drawn.then_s, Request(0, RequestKind.GRASP, drawn.target_n))
+    run.go(run.slower_s + drawn.then_s, Request(0, RequestKind.GRASP, drawn.target_n))
     changes = math.isfinite(drawn.then_n) and run.outcome in (Outcome.NONE, Outcome.HELD)
     change = Request(run.t_ns, RequestKind.GRASP, drawn.then_n) if changes else None
     if changes:
         run.statements.change_target(drawn.then_n)
     run.go(_GRASP_S - drawn.then_s, change)
-    run.go(_RELEASE_S, Request(run.t_ns, RequestKind.RELEASE))
+    run.go(run.slower_s + _RELEASE_S, Request(run.t_ns, RequestKind.RELEASE))
     shown = run.statements
     return CaseResult(
         index,
@@ -282,8 +282,10 @@ class _Run:
     ) -> None:
         self._plant, self._controller, self._drawn = plant, controller, drawn
         self._offset_rad = offset_rad
-        self._leaves_ns = drawn.leaves_s * NS_PER_S
-        self._returns_ns = (drawn.leaves_s + drawn.away_s) * NS_PER_S
+        # Jaws with a small force limit are slow, so that all else happens later.
+        self.slower_s = controller.timeout_s - control.timeout_s
+        self._leaves_ns = (self.slower_s + drawn.leaves_s) * NS_PER_S
+        self._returns_ns = self._leaves_ns + drawn.away_s * NS_PER_S
         self._rng = np.random.default_rng(drawn.seed)
         self._vision = SimulatedVision(
             0.035 + 0.5 / drawn.camera_hz, drawn.vision_noise_n, drawn.camera_hz, drawn.vision_gain

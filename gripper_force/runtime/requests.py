@@ -14,9 +14,6 @@ from gripper_force.types import NS_PER_S, Outcome, Phase, RequestKind
 
 CLOSED: Final = "the gripper is closed; open it again with open_gripper"
 
-_RELEASE_NS: Final = 6 * NS_PER_S
-"""Longest wait for open jaws: the controller's own limit of 5 s, and some slack."""
-
 
 @dataclass(eq=False, slots=True)
 class PendingRequest:
@@ -42,10 +39,10 @@ class PendingRequest:
     start_ns: int = 0
     result: Future[GraspResult] = field(default_factory=Future)
 
-    def is_done(self, state: GripperState) -> bool:
-        """Returns True if the cycle with this state has ended the request."""
+    def is_done(self, state: GripperState, opening_s: float) -> bool:
+        """Returns True if the cycle with this state has ended the request. Opening takes at most ``opening_s``."""
         if self.kind == RequestKind.RELEASE:
-            return state.phase != Phase.RELEASE or state.t_ns - self.start_ns > _RELEASE_NS
+            return state.phase != Phase.RELEASE or state.t_ns - self.start_ns > opening_s * NS_PER_S
         return state.outcome != Outcome.NONE
 
     def is_like(self, other: PendingRequest) -> bool:
@@ -107,7 +104,12 @@ class RequestQueue:
             return self._queued[0] if self._queued else None
 
     def finish_cycle(
-        self, request: PendingRequest | None, refusal: str, state: GripperState, result: GraspResult
+        self,
+        request: PendingRequest | None,
+        refusal: str,
+        state: GripperState,
+        result: GraspResult,
+        opening_s: float,
     ) -> None:
         """Ends the requests that a cycle has refused, replaced or brought to a result.
 
@@ -116,13 +118,14 @@ class RequestQueue:
             refusal: Reason why it was refused, or an empty text.
             state: State after the cycle.
             result: Result for the requests that end with this state.
+            opening_s: Longest time in which the jaws open.
         """
         with self._lock:
             self._phase = state.phase
             if request is not None and not self._is_closed:
                 self._start(request, refusal, state.t_ns)
             for started in self._started:
-                if started.is_done(state):
+                if started.is_done(state, opening_s):
                     started.result.set_result(result)
             self._started = [started for started in self._started if not started.result.done()]
 

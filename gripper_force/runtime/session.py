@@ -56,9 +56,6 @@ _REFERENCE_NS: Final = NS_PER_S // 10
 _GAP_CYCLES: Final = 2.5
 """A gap between two readings that is longer than this many cycles is logged."""
 
-_OPENING_NS: Final = 5 * NS_PER_S
-"""Longest time in which the jaws open."""
-
 _NUMBER: Final = re.compile(r"[\d.]+")
 
 _PACKAGES: Final = ("gripper-force", "dynamixel-sdk", "mujoco", "numpy", "torch")
@@ -107,6 +104,16 @@ class Session:
         self.newest_frame: Frame | None = None
         self.servo_state: ServoState | None = None
         self.last_load_cell_sample: LoadCellSample | None = None
+
+    @property
+    def timeout_s(self) -> float:
+        """Time after which a grasp has timed out."""
+        return self._controller.timeout_s
+
+    @property
+    def opening_s(self) -> float:
+        """Longest time in which the jaws open."""
+        return self._controller.opening_s
 
     @property
     def lost_records(self) -> int:
@@ -252,8 +259,8 @@ class Session:
         return self.wait_until_open(self.cycle(RequestKind.RELEASE).status)
 
     def wait_until_open(self, status: GraspStatus) -> GraspStatus:
-        """Runs cycles until opening jaws are open, or for at most 5 s. Returns the last status."""
-        end_ns = status.t_ns + _OPENING_NS
+        """Runs cycles until opening jaws are open, or for `opening_s`. Returns the last status."""
+        end_ns = status.t_ns + round(self.opening_s * NS_PER_S)
         while status.t_ns < end_ns and not is_open(self.run.config.gripper.open_width_m, status.width_m):
             status = self.cycle().status
         return status

@@ -52,7 +52,7 @@ class Cycle:
         request = self.queue.next()
         self.state = replace(self.state, t_ns=self.state.t_ns + 5_000_000, phase=phase, outcome=outcome)
         result = GraspResult(outcome, 3.0, 0.1, 0.05, 0.0, "")
-        self.queue.finish_cycle(request, refusal, self.state, result)
+        self.queue.finish_cycle(request, refusal, self.state, result, opening_s=5.0)
         return request
 
 
@@ -155,7 +155,11 @@ def test_a_stop_during_a_cycle_overrides_in_the_next_one(cycle: Cycle) -> None:
     queued = cycle.submit(RequestKind.GRASP)
     cycle.stop()
     cycle.queue.finish_cycle(
-        in_flight, "", replace(STATE, phase=Phase.RELEASE, outcome=Outcome.HELD), GraspResult(*RESULT)
+        in_flight,
+        "",
+        replace(STATE, phase=Phase.RELEASE, outcome=Outcome.HELD),
+        GraspResult(*RESULT),
+        opening_s=5.0,
     )
     assert not queued.result.done()  # the state is older than the stop
     cycle.run(Phase.FAULT, Outcome.FAULT)

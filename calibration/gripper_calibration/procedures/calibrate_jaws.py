@@ -229,7 +229,7 @@ class _EmptyJaws:
     def cycle(self, side: int, current_a: float, speed_share: float = 0.5) -> None:
         """Runs one bus cycle towards a side, or with 0 at rest, at most at a share of the approach speed."""
         state = self._cycles.read()
-        speed_m_s = speed_share * self._config.control.approach_speed_m_s
+        speed_m_s = speed_share * self._cycles.approach_m_s
         self._cycles.write(state.position_rad + side, min(current_a, self._ceiling_a), speed_m_s)
 
     def rest(self) -> None:
@@ -319,7 +319,7 @@ class _EmptyJaws:
 
         The goal leads far, so that the current alone drives the jaws: a goal that moves with them causes a ripple.
         """
-        wanted_m_s = _RUN_SPEED_SHARE * self._config.control.approach_speed_m_s
+        wanted_m_s = _RUN_SPEED_SHARE * self._cycles.approach_m_s
         begin_rad, force_n = self.state.position_rad, self._force_n(current_a)
         forces_n = []
         for _ in range(round(_RUN_S * RATE_HZ)):

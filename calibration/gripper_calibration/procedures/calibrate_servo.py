@@ -382,7 +382,7 @@ class _Jaws:
         self._cycles.write(
             self._sign * goal_rad,
             min(max(current_a, 0.0), self._ceiling_a),
-            speed_m_s or self._config.control.approach_speed_m_s,
+            speed_m_s or self._cycles.approach_m_s,
             over_force=self.force_n > self._config.control.force_limit_n,
             step=self.step_name,
         )

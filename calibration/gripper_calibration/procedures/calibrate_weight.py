@@ -240,7 +240,7 @@ class _Jaws:
         ceiling_n = abs(transmission.force_n(cycles.limits.ceiling_a(0.0, middle_rad), middle_rad))
         self._most_n = min(_FORCE_FACTOR * (weight_n / 2 + friction_n) + _SPARE_N, ceiling_n)
         self._expected_n, self._is_loaded = expected_n, weight_n > 0
-        self._speed_m_s = min(_SPEED_M_S, config.control.approach_speed_m_s)
+        self._speed_m_s = min(_SPEED_M_S, cycles.approach_m_s)
 
     @property
     def _width_m(self) -> float:
@@ -285,5 +285,5 @@ class _Jaws:
         state = cycles.read()
         current_a = abs(transmission.current_a(force_n, state.position_rad))
         cycles.write(
-            transmission.position_rad(goal_width_m), current_a, self._config.control.approach_speed_m_s
+            transmission.position_rad(goal_width_m), current_a, cycles.approach_m_s
         )

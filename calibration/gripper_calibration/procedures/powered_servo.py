@@ -58,6 +58,7 @@ class BusCycles:
     Attributes:
         transmission: By the configuration.
         limits: By the configuration.
+        approach_m_s: Speed of a jaw on its way to an object, as in a grasp.
         state: The last reading.
     """
 
@@ -68,12 +69,14 @@ class BusCycles:
         self.transmission = Transmission.from_config(
             gripper, gripper.nm_per_a or 0.0, gripper.current_step_a or 0.0
         )
+        self.approach_m_s = min(
+            config.control.approach_speed_m_s, self.transmission.impact_m_s(config.control.force_limit_n)
+        )
         self.limits = Limits(config.control, self.transmission, config.servo.current_limit_a)
         self.state = state
         self._config, self._devices = config, devices
         self._raise_if_interrupted = raise_if_interrupted
         self._speed_limit = SpeedLimit(self.transmission, position_loop(gripper))
-        self._impact_m_s = self.transmission.impact_m_s(config.control.force_limit_n)
         self._safety = Safety(config.control)
         self._period_ns = round(NS_PER_S / RATE_HZ)
         self._due_ns = devices.clock.now_ns()
@@ -108,7 +111,7 @@ class BusCycles:
         Args:
             goal_rad: Goal angle of the servo.
             current_a: Goal current.
-            speed_m_s: Largest speed of a jaw; that of an impact within the force limit bounds it, too.
+            speed_m_s: Largest speed of a jaw.
             over_force: True if a load cell reads more than the force limit.
             step: Step of the procedure, for an error.
 
@@ -120,5 +123,4 @@ class BusCycles:
             raise DeviceError(f"stopped{where}: {self._safety.reason}; remove the cause and start again")
         self._goal_a = current_a
         command = ServoCommand(self._due_ns, goal_rad, current_a)
-        speed_m_s = min(speed_m_s, self._impact_m_s)
         self._devices.servo.write(self._speed_limit.apply(command, self.state, speed_m_s))

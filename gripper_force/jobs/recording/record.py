@@ -55,7 +55,6 @@ _REST_SAMPLES: Final = 8
 _FREE_N: Final = 0.1
 """Largest load-cell force of a free object above the force at rest."""
 
-_RELEASE_TIMEOUT_S: Final = 5.0
 _SILENT_NS: Final = 2 * NS_PER_S
 _FIRST_SAMPLE_NS: Final = 5 * NS_PER_S
 """A camera or load cell without data for this long has failed. The slowest samples take 1.3 s. The first one may take
@@ -225,6 +224,7 @@ class _MonitoredSession:
         self._session, self._cell, self._progress = session, devices.load_cell, progress
         self._plan = plan
         self.config, self.number = config, number
+        self.timeout_s, self.opening_s = session.timeout_s, session.opening_s
         self.touch = 0
         self.peak_n = 0.0
         self._begin_ns = self._progress_ns = self._frame_ns = devices.clock.now_ns()
@@ -303,8 +303,8 @@ def _touch_all(session: _MonitoredSession, touches: int) -> None:
             peak_n,
             float(rng.uniform(*_HOLD_S)),
             free_n=free_n,
-            timeout_s=session.config.control.timeout_s,
-            release_timeout_s=_RELEASE_TIMEOUT_S,
+            timeout_s=session.timeout_s,
+            release_timeout_s=session.opening_s,
         )
         which = f"touch {session.touch} of set {session.number}"
         if problem:

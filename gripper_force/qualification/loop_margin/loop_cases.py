@@ -125,7 +125,8 @@ class _Bounds:
 
 def crushing_n_m(control: ControlConfig, truth: Gripper) -> float:
     """Returns the stiffness from which the impact of first contact alone exceeds the force limit."""
-    speed_m_s = min(control.approach_speed_m_s, 0.010 * _TARGET_N)
+    impact_m_s = truth.transmission.impact_m_s(control.force_limit_n)
+    speed_m_s = min(control.approach_speed_m_s, impact_m_s, 0.010 * _TARGET_N)
     return ((1 + _OVER_SHARE) * control.force_limit_n / speed_m_s) ** 2 / truth.mass_kg
 
 
