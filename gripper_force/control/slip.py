@@ -18,7 +18,7 @@ at their last rest. Against an object they would need more force."""
 
 _COLLAPSE_SHARE = 0.5
 _COLLAPSE_S = 0.1
-"""A force below this share of the target, for this time, is a slip."""
+"""A force below this share of the target, for this time, is a slip. A cycle in which the jaws close counts twice."""
 
 
 class SlipMonitor:
@@ -84,7 +84,9 @@ class SlipMonitor:
     def _moves(self, closing_m_s: float) -> bool:
         return closing_m_s > _FREE_SPEED_SHARE * self._config.approach_speed_m_s
 
-    def has_slipped(self, dt_s: float, force_n: float, target_n: float, closed_m: float) -> str:
+    def has_slipped(
+        self, dt_s: float, force_n: float, target_n: float, closed_m: float, closing_m_s: float
+    ) -> str:
         """Returns why the object slips, or an empty text.
 
         Args:
@@ -92,8 +94,10 @@ class SlipMonitor:
             force_n: Estimated contact force.
             target_n: Target force.
             closed_m: Closing of the jaws since the object was held.
+            closing_m_s: Closing speed of one jaw.
         """
-        self._collapsed_s = self._collapsed_s + dt_s if force_n < _COLLAPSE_SHARE * target_n else 0.0
+        counted_s = 2 * dt_s if self._moves(closing_m_s) else dt_s
+        self._collapsed_s = self._collapsed_s + counted_s if force_n < _COLLAPSE_SHARE * target_n else 0.0
         if self._collapsed_s >= _COLLAPSE_S:
             return f"the force fell to {force_n:.2f} N"
         if closed_m > self._config.slip_width_m:

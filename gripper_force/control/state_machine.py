@@ -133,7 +133,7 @@ class GraspController:
     does what ``on_slip`` says. After another ``slip``, and after ``timeout``, it continues.
 
     *Speed.* Every command passes `SpeedLimit`, so the jaws are never much faster than the phase allows. Jaws on their
-    way to an object are so slow that their impact stays within the force limit. A ramp or hold has the object already.
+    way to an object, or in a hold that the object may leave, are so slow that an impact stays within the force limit.
 
     Attributes:
         timeout_s: Time after which a grasp has timed out: as configured, and what slower jaws need.
@@ -151,6 +151,7 @@ class GraspController:
         impact_m_s = transmission.impact_m_s(config.force_limit_n)
         approach_m_s = min(full_m_s, impact_m_s)
         self._travel_m_s = min(_TRAVEL_SPEED_SHARE * full_m_s, impact_m_s)
+        self._hold_m_s = min(_HOLD_SPEED_SHARE * full_m_s, impact_m_s)
         self.timeout_s = config.timeout_s + transmission.open_width_m / 2 * (1 / approach_m_s - 1 / full_m_s)
         self.opening_s = _OPENING_SPARE_S + transmission.open_width_m / 2 / self._travel_m_s
         self._config = config
@@ -436,7 +437,7 @@ class GraspController:
             return self._travel_m_s
         if self._phase == Phase.APPROACH:
             return self._approach.speed_m_s
-        return full_m_s if self._phase in (Phase.CONTACT, Phase.RAMP) else _HOLD_SPEED_SHARE * full_m_s
+        return full_m_s if self._phase in (Phase.CONTACT, Phase.RAMP) else self._hold_m_s
 
     @property
     def _derated_target_n(self) -> float:
@@ -553,7 +554,9 @@ class GraspController:
             self._handle_loss(width_m, lost)
             return
         closed_m = self._held_width_m - width_m if self._outcome == Outcome.HELD else 0.0
-        slip = self._slip.has_slipped(dt_s, self._estimate.force_n, self._derated_target_n, closed_m)
+        slip = self._slip.has_slipped(
+            dt_s, self._estimate.force_n, self._derated_target_n, closed_m, closing_m_s
+        )
         if not slip and self._outcome == Outcome.HELD and self._is_unseen:
             slip = f"the camera {self._sight}; friction or an end stop may hold the jaws"
         if slip and self._outcome in (Outcome.NONE, Outcome.HELD):

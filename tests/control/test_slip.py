@@ -84,13 +84,13 @@ def test_creep_of_a_soft_object_is_no_loss():
 
 def test_collapsed_force_is_a_slip_after_its_time():
     monitor = SlipMonitor(CONFIG)
-    found = [monitor.has_slipped(0.005, 1.9, 4.0, 0.0) for _ in range(25)]
+    found = [monitor.has_slipped(0.005, 1.9, 4.0, 0.0, closing_m_s=0.0) for _ in range(25)]
     assert not any(found[:19])
     assert "fell to 1.90 N" in found[20]
     monitor.start()
-    assert not monitor.has_slipped(0.005, 1.9, 4.0, 0.0)
+    assert not monitor.has_slipped(0.005, 1.9, 4.0, 0.0, closing_m_s=0.0)
 
 
 def test_closing_while_held_is_a_slip():
-    assert "closed by 5.0 mm" in SlipMonitor(CONFIG).has_slipped(0.005, 4.0, 4.0, 0.005)
-    assert not SlipMonitor(CONFIG).has_slipped(0.005, 4.0, 4.0, 0.003)
+    assert "closed by 5.0 mm" in SlipMonitor(CONFIG).has_slipped(0.005, 4.0, 4.0, 0.005, 0.0)
+    assert not SlipMonitor(CONFIG).has_slipped(0.005, 4.0, 4.0, 0.003, 0.0)
