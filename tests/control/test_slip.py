@@ -91,6 +91,13 @@ def test_collapsed_force_is_a_slip_after_its_time():
     assert not monitor.has_slipped(0.005, 1.9, 4.0, 0.0, closing_m_s=0.0)
 
 
+def test_collapsed_force_of_closing_jaws_is_a_slip_after_half_the_time():
+    monitor = SlipMonitor(CONFIG)
+    found = [monitor.has_slipped(0.005, 1.9, 4.0, 0.0, closing_m_s=0.01) for _ in range(15)]
+    assert not any(found[:9])
+    assert "fell to 1.90 N" in found[10]
+
+
 def test_closing_while_held_is_a_slip():
     assert "closed by 5.0 mm" in SlipMonitor(CONFIG).has_slipped(0.005, 4.0, 4.0, 0.005, 0.0)
     assert not SlipMonitor(CONFIG).has_slipped(0.005, 4.0, 4.0, 0.003, 0.0)

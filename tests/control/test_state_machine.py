@@ -109,10 +109,20 @@ def test_jaws_already_in_contact_grip(make_run):
 @pytest.mark.parametrize("limit_n", [1.0, 3.0, 14.0])
 def test_no_impact_on_a_hard_object_exceeds_the_force_limit(make_run, limit_n):
     plant = {"stiffness_n_m": 30_000.0, "mass_kg": 1.4, "friction_n": 0.3}
-    run = make_run(plant=plant, force_limit_n=limit_n, approach_speed_m_s=0.05, timeout_s=20.0)
+    run = make_run(plant=plant, force_limit_n=limit_n, approach_speed_m_s=0.05)
     run.grasp(0.64 * limit_n, 8.0)
     assert run.last.status.outcome == "held"
     assert run.plant.peak_n < 1.05 * limit_n
+
+
+def test_slower_jaws_have_more_time(make_run, transmission):
+    usual, slow = make_run().controller, make_run(force_limit_n=1.0).controller
+    assert (usual.timeout_s, usual.opening_s) == (8.0, pytest.approx(4.92))
+    travel_s = transmission.open_width_m / 2 / transmission.impact_m_s(1.0)
+    assert slow.timeout_s == pytest.approx(8.0 + travel_s - transmission.open_width_m / 2 / 0.025)
+    assert slow.opening_s == pytest.approx(4.0 + travel_s)
+    run = make_run(force_limit_n=1.0, timeout_s=3.0).grasp(0.6, 7.0)  # 4.4 s to the object
+    assert run.last.status.outcome == "held"
 
 
 def test_no_object(make_run):

@@ -40,6 +40,12 @@ def test_the_first_cases_hold_all_three_statements(config: Config) -> None:
     assert found == results(config, 0, 40)
 
 
+@pytest.mark.parametrize("index", [395, 732])  # force limits below 2 N
+def test_what_a_search_found_is_mended(config: Config, index: int) -> None:
+    """An object leaves, and returns after 20 ms or never."""
+    assert run_case(config, 0, index).ok
+
+
 def test_draws_cover_what_can_be_wrong(config: Config) -> None:
     drawn = [draw(config.control, RACK, 0, index) for index in range(300)]
     assert min(one.friction for one in drawn) < 0.4
@@ -47,6 +53,7 @@ def test_draws_cover_what_can_be_wrong(config: Config) -> None:
     assert {one.sign for one in drawn} == {-1, 1}
     assert {one.feedback for one in drawn} == {"fused", "current", "vision"}
     assert any(one.width > 1.1 for one in drawn)
+    assert min(one.force_limit_n for one in drawn) < 1.0
     assert any(one.start_m > 0.01 for one in drawn)
     assert any(one.leaves_s < 3 for one in drawn)
     assert any(one.leaves_s < 3 and one.away_s < 0.1 for one in drawn)

@@ -284,6 +284,4 @@ class _Jaws:
         cycles, transmission = self._cycles, self._cycles.transmission
         state = cycles.read()
         current_a = abs(transmission.current_a(force_n, state.position_rad))
-        cycles.write(
-            transmission.position_rad(goal_width_m), current_a, cycles.approach_m_s
-        )
+        cycles.write(transmission.position_rad(goal_width_m), current_a, cycles.approach_m_s)
