@@ -152,8 +152,8 @@ class Gripper:
     def move(self, width_m: float, *, wait: bool = True) -> float:
         """Moves the jaws to a width, and lets go of an object if one is gripped.
 
-        The jaws move with ``control.approach_speed_m_s`` and press on an obstacle with at most
-        ``control.approach_force_n``.
+        The jaws move with the speed of a release (see ``control.approach_speed_m_s``) and press on an obstacle with
+        at most ``control.approach_force_n``.
 
         Args:
             width_m: Distance between the jaws, in metres: 0 to ``gripper.open_width_m``.
