@@ -38,7 +38,8 @@ _STEADY_S = 0.1
 
 _STEADY_FORCE_N = 0.3
 _STEADY_FILTER_S = 0.03
-"""The motor force counts as steady if its mean over this time is that close to the commanded one."""
+"""The motor force counts as steady if its mean over this time is at most that much above the commanded one. The speed
+limit may keep it below."""
 
 _DEBOUNCE_S = 0.05
 """Time for which the signs of contact must persist."""
@@ -116,7 +117,7 @@ class Approach:
         if self.is_backing_off or self._time_s < ACCELERATION_S + _STEADY_S:
             return False
         steady_speed = abs(closing_m_s - self.speed_m_s) < _STEADY_SHARE * self.speed_m_s
-        return steady_speed and abs(self._mean_force_n - self.motor_force_n) < _STEADY_FORCE_N
+        return steady_speed and self._mean_force_n - self.motor_force_n < _STEADY_FORCE_N
 
     def step(
         self, dt_s: float, width_m: float, closing_m_s: float, measured_n: float, estimate: FusedForce

@@ -90,6 +90,7 @@ def test_free_motion_needs_steady_speed_and_force(approach):
     run(approach, 60, START_M - 0.001, 0.025, estimate())
     assert approach.moves_freely(0.025, approach.motor_force_n)
     assert not approach.moves_freely(0.031, approach.motor_force_n)
-    for _ in range(20):
-        approach.step(0.005, START_M - 0.001, 0.025, approach.motor_force_n - 1.0, estimate())
-    assert not approach.moves_freely(0.025, approach.motor_force_n)
+    for difference_n, is_free in ((-1.0, True), (1.0, False)):  # the speed limit keeps the motor force low
+        for _ in range(30):
+            approach.step(0.005, START_M - 0.001, 0.025, approach.motor_force_n + difference_n, estimate())
+        assert approach.moves_freely(0.025, approach.motor_force_n) == is_free

@@ -130,6 +130,13 @@ def test_long_fingers_open_at_the_speed_of_a_release() -> None:
     assert run_case(config, 0, 240).speed_share < 1.5
 
 
+def test_friction_is_measured_by_jaws_that_the_speed_limit_holds_back() -> None:
+    # Otherwise an approach credits the configured friction, and presses with 1.5 times a limit of 0.8 N.
+    config = load_config(GRIPPERS / "four_bar.yaml")
+    assert draw(config.control, transmission_of(config.gripper), 0, 369).force_limit_n < 1.0
+    assert run_case(config, 0, 369).force_share < 1.05
+
+
 def test_a_linkage_that_cannot_close_so_far_is_refused() -> None:
     config = load_config(GRIPPERS / "viperx_aloha.yaml")
     truth = transmission_of(config.gripper)
