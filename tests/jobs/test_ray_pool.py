@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 from gripper_force import cli
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, GripperError, LogError
+from gripper_force.interfaces import no_progress
 from gripper_force.jobs.evaluate import evaluate
 from gripper_force.jobs.processes import Workers
 from gripper_force.jobs.replay import replay_each
@@ -50,6 +51,19 @@ def test_a_cluster_gives_the_results_of_one_process(
 def test_a_job_that_the_cluster_loses_is_one_error(address: str) -> None:
     with pytest.raises(GripperError, match="Ray lost a job"), Workers(1, address).pool() as pool:
         pool.submit(os._exit, 1).result()
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_log_that_fails_unforeseen_is_named_and_the_others_are_read(address: str) -> None:
+    logs = [Path("a.mcap"), Path("b.mcap")]
+    found, failed = Workers(1, address).read_logs(fail_at_b, logs, "read", no_progress)
+    assert found == {0: "a"}
+    assert str(failed[1]).startswith("b.mcap failed with KeyError at test_ray_pool.py:")
+    assert "in fail_at_b" in failed[1].__notes__[0]
+
+
+def fail_at_b(log: Path) -> str:
+    return {"a": "a"}[log.stem]
 
 
 @pytest.mark.filterwarnings("default")

@@ -2,6 +2,7 @@ import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ from typer.testing import CliRunner
 from gripper_force import cli
 from gripper_force.config import load_config
 from gripper_force.errors import CheckpointError, ConfigError, DataError, LogError
+from gripper_force.jobs import replay as job
+from gripper_force.jobs import report
 from gripper_force.jobs.grasp import run_grasp
 from gripper_force.jobs.metrics import bias, mae, rmse
 from gripper_force.jobs.replay import (
@@ -26,6 +29,7 @@ from gripper_force.jobs.replay import (
     run_again,
     summary,
 )
+from gripper_force.jobs.report import ReportPaths
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import (
@@ -248,6 +252,32 @@ def test_a_broken_log_is_named_and_the_others_are_replayed(fused_log: Path, tmp_
     assert list(printed["failed"]) == [str(broken)]
     with pytest.raises(LogError, match=r"broken\.mcap"):
         replay_each([broken, broken])
+
+
+@pytest.mark.parametrize("stage", ["replay", "report"])
+def test_an_unforeseen_exception_at_one_log_does_not_stop_the_others(
+    fused_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: str
+) -> None:
+    bad = tmp_path / "bad.mcap"
+    bad.write_bytes(fused_log.read_bytes())
+
+    def replay_unless_bad(log: Path, **options: Any) -> object:
+        return {}[log] if log == bad and stage == "replay" else replay_frames(log, **options)
+
+    def report_unless_bad(log: Path, **_: object) -> ReportPaths:
+        return {fused_log: ReportPaths(log, log)}[log]
+
+    monkeypatch.setattr(job, "replay_frames", replay_unless_bad)
+    monkeypatch.setattr(report, "write_report", report_unless_bad)
+    done = CliRunner().invoke(
+        cli.app, ["replay", str(bad), str(fused_log), "--jobs", "1", "--json", "--report"]
+    )
+    assert done.exit_code == 2
+    assert f"error: {bad} failed with KeyError at test_replay.py:" in done.stderr
+    printed = json.loads(done.stdout)
+    assert printed["reports"] == [str(fused_log)]
+    assert len(printed["logs"]) == (1 if stage == "replay" else 2)
+    assert list(printed.get("failed", [])) == ([str(bad)] if stage == "replay" else [])
 
 
 def test_another_network_in_batches_gives_the_estimates_of_a_run(fused_log: Path) -> None:
