@@ -235,10 +235,19 @@ def label_frames(
         Forces in N, (T,) float32, 0 without a label, and the mask of frames with a label, (T,) bool.
     """
     valid_samples = [sample for sample in samples if sample.valid and np.isfinite(sample.force_n)]
-    if not valid_samples:
-        return np.zeros(len(frame_t_ns), np.float32), np.zeros(len(frame_t_ns), np.bool_)
     t_ns = np.array([sample.t_ns for sample in valid_samples], np.int64)
-    force_n = np.array([sample.force_n for sample in valid_samples])
+    return label_at(frame_t_ns, t_ns, np.array([sample.force_n for sample in valid_samples]), exposure_ns)
+
+
+def label_at(
+    frame_t_ns: npt.NDArray[np.int64],
+    t_ns: npt.NDArray[np.int64],
+    force_n: npt.NDArray[np.float64],
+    exposure_ns: int,
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
+    """Returns what `label_frames` does, for valid samples by rising time: ``t_ns`` and ``force_n``, (N,)."""
+    if not len(t_ns):
+        return np.zeros(len(frame_t_ns), np.float32), np.zeros(len(frame_t_ns), np.bool_)
     labels = np.interp(frame_t_ns, t_ns, force_n)
     cumulative = np.concatenate([[0.0], np.cumsum(force_n)])
     first = np.searchsorted(t_ns, frame_t_ns - exposure_ns // 2, "left")

@@ -137,7 +137,7 @@ def is_running(pid: int) -> bool:
     return state != "Z"
 
 
-class Unsendable(Exception):
+class UnsendableError(Exception):
     """An exception that another process can't read: its arguments are not those of its constructor."""
 
     def __init__(self, first: int, second: int) -> None:
@@ -151,7 +151,7 @@ def read_or_fail(log: Path) -> str:
         case "unforeseen":
             raise KeyError("gone")
         case "unsendable":
-            raise Unsendable(1, 2)
+            raise UnsendableError(1, 2)
     return log.stem
 
 
@@ -164,7 +164,7 @@ def test_a_log_that_fails_unforeseen_is_named_and_the_others_are_read(count: int
         number: str(error).partition(" at test_processes.py:")[0] for number, error in failed.items()
     } == {
         0: "unforeseen.mcap failed with KeyError",
-        2: "unsendable.mcap failed with Unsendable",
+        2: "unsendable.mcap failed with UnsendableError",
         4: "the frame is dark",
     }
     assert all(isinstance(error, DataError) and "\n" not in str(error) for error in failed.values())

@@ -1,5 +1,7 @@
 import dataclasses
+import gc
 import json
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -33,6 +35,8 @@ from gripper_force.jobs.report import ReportPaths
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import (
+    NS_PER_MS,
+    NS_PER_S,
     Frame,
     FusedForce,
     GraspStatus,
@@ -318,3 +322,44 @@ def test_the_columns_hold_each_estimate(fused_log: Path) -> None:
     assert len({len(values) for values in columns.values()}) == 1
     error_n = columns["visual_n"] - columns["measured_n"]
     assert np.nanmean(np.abs(error_n)) == pytest.approx(result.sources["visual"].mae_n, rel=1e-6)
+
+
+def long_log(log: Path, path: Path, times: int) -> Path:
+    """A log whose records are those of another one, again and again."""
+    reader = LogReader(log)
+    records = list(reader.records())
+    frames = 1 + max(record.seq for record in records if isinstance(record, Frame))
+    with LogWriter(path, config=reader.config, metadata=reader.metadata) as writer:
+        for turn in range(times):
+            for record in records:
+                changes = {
+                    name: getattr(record, name)
+                    for name in ("t_ns", "ready_ns", "received_ns")
+                    if hasattr(record, name)
+                }
+                later = {
+                    name: t_ns + turn * (reader.duration_ns + NS_PER_MS) for name, t_ns in changes.items()
+                }
+                number = {"seq": record.seq + turn * frames} if hasattr(record, "seq") else {}
+                writer.write(dataclasses.replace(record, **later, **number))
+    return path
+
+
+@pytest.mark.parametrize("checkpoint", [None, "small"])
+def test_memory_does_not_grow_with_the_records_of_a_log(
+    fused_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, checkpoint: str | None
+) -> None:
+    monkeypatch.setattr(
+        job.metrics, "lag_s", lambda *_: 0.0
+    )  # its transform takes 0.1 MB for each second of log
+    replay(fused_log, checkpoint)  # imports, and loads the network
+    peaks = []
+    for times in (3, 7):
+        log = long_log(fused_log, tmp_path / f"{times}.mcap", times)
+        gc.collect()
+        tracemalloc.start()
+        replay_frames(log, checkpoint)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    longer_s = 4 * LogReader(fused_log).duration_ns / NS_PER_S
+    assert (peaks[1] - peaks[0]) / longer_s < 50_000, "bytes for each second of log"
