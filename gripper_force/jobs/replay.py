@@ -18,7 +18,7 @@ from gripper_force.control.state_machine import Decision
 from gripper_force.errors import DataError, GripperError, UnfamiliarFrameError
 from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs import metrics
-from gripper_force.jobs.dataset import CONTACT_N, label_at
+from gripper_force.jobs.dataset import CONTACT_N, CellSeries, label_at
 from gripper_force.jobs.metrics import ForceBin
 from gripper_force.jobs.processes import Workers
 from gripper_force.profiles.apply import read_correction, read_profiles
@@ -217,7 +217,7 @@ def replay_frames(
     series = _Series()
     agreement = _feed(reader, run, series, in_batches=_may_batch(reader, run))
     flags = [flag for flag in (agreement.estimates, agreement.decisions) if flag is not None]
-    cells = series.cells()
+    cells = series.cells.sorted()
     sources = _sources(series, cells)
     best = next((sources[name] for name in ("fused", "visual") if name in sources), None)
     if best is None:
@@ -277,7 +277,7 @@ class _Series:
             array("d"),
         )
         self.fused_ns, self.fused_n, self.current_n = array("q"), array("d"), array("d")
-        self._cell_ns, self._cell_n = array("q"), array("d")
+        self.cells = CellSeries()
 
     def add_visual(self, visual: VisualForce) -> None:
         self.seq.append(visual.seq)
@@ -291,14 +291,7 @@ class _Series:
         self.current_n.append(decision.estimate.current_n)
 
     def add_cell(self, sample: LoadCellSample) -> None:
-        if sample.valid and math.isfinite(sample.force_n):
-            self._cell_ns.append(sample.t_ns)
-            self._cell_n.append(sample.force_n)
-
-    def cells(self) -> _Cells:
-        t_ns = np.array(self._cell_ns)
-        order = np.argsort(t_ns, kind="stable")
-        return t_ns[order], np.array(self._cell_n)[order]
+        self.cells.add(sample)
 
 
 def _columns(log: str, object_name: str, series: _Series, cells: _Cells) -> Columns:
@@ -766,10 +759,10 @@ def compare(
     Returns:
         The errors, or None if the load cell has no valid sample near any estimate.
     """
-    series = _Series()
+    series = CellSeries()
     for sample in cells:
-        series.add_cell(sample)
-    return _compare(np.array(t_ns, np.int64), np.array(force_n), series.cells())
+        series.add(sample)
+    return _compare(np.array(t_ns, np.int64), np.array(force_n), series.sorted())
 
 
 def _compare(

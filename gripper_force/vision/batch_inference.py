@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
+from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
@@ -81,14 +82,40 @@ def features(
     Returns:
         Each member's forces in N, (M, T), and the members' concatenated features, (T, F).
     """
-    clip = torch.from_numpy(frames)[None].to(device)  # (1, T, S, S)
-    leading = clip[:, : preprocess.reference_frames]
-    size = BATCH[clip.device.type]
-    parts = (clip[:, begin : begin + size] for begin in range(0, clip.shape[1], size))
-    forces_n, read_out = zip(
-        *_run(networks, (normalise(part, leading, preprocess) for part in parts)), strict=True
-    )
+    forces_n, read_out = zip(*stream_features(networks, preprocess, frames, device), strict=True)
     return np.concatenate(forces_n, axis=1), np.concatenate(read_out)
+
+
+@torch.inference_mode()
+def stream_features(
+    networks: Sequence[Member], preprocess: Preprocess, frames: Iterable[Gray], device: str = "cpu"
+) -> Iterator[tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]]:
+    """Yields `features` of the next `CHUNK` frames or the last ones, and keeps no others.
+
+    Arguments are those of `predict`; ``frames`` may be an iterator.
+    """
+    yield from _run(networks, _normalised(_batches(frames, torch.device(device)), preprocess))
+
+
+def _batches(frames: Iterable[Gray], device: torch.device) -> Iterator[Tensor]:
+    """Yields the next frames of a recording, (1, N, S, S), with `BATCH` of them but in the last."""
+    remaining = iter(frames)
+    while part := list(islice(remaining, BATCH[device.type])):
+        yield torch.from_numpy(np.stack(part))[None].to(device)
+
+
+def _normalised(parts: Iterator[Tensor], preprocess: Preprocess) -> Iterator[Tensor]:
+    """Yields batches of a recording's frames, (1, N, S, S), prepared for the networks."""
+    first: list[Tensor] = []
+    while (
+        sum(part.shape[1] for part in first) < preprocess.reference_frames
+        and (part := next(parts, None)) is not None
+    ):
+        first.append(part)
+    if first:
+        leading = torch.cat(first, dim=1)[:, : preprocess.reference_frames]
+        for part in chain(first, parts):
+            yield normalise(part, leading, preprocess)
 
 
 @torch.inference_mode()
