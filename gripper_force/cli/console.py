@@ -148,6 +148,14 @@ def jsonable(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
+def tell_missing_parquet(folder: Path | None) -> None:
+    """Says before the work begins that a summary in this folder will lack the estimates' file, if it will."""
+    from gripper_force.jobs.summary_files import missing_parquet
+
+    if folder is not None and (text := missing_parquet()):
+        err.print(escape(text), soft_wrap=True)
+
+
 def end_with_failures(
     failed: Mapping[str, object], count: int, unreported: Mapping[str, object] | None = None
 ) -> None:

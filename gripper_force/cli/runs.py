@@ -221,6 +221,8 @@ def replay(
 
     if report:
         require("matplotlib", "--report")
+    if compare is not None:
+        require("scipy", "--compare")
 
     import numpy as np
 
@@ -233,6 +235,7 @@ def replay(
     replay_all = partial(job.replay_each, paths, recover=recover, workers=jobs, ray=ray)
     if out is not None:
         check_writable(out)
+    console.tell_missing_parquet(out)
     if compare is not None:
         if checkpoint or report:
             raise ConfigError(
