@@ -2,6 +2,7 @@ import os
 import socket
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -80,6 +81,21 @@ def test_an_interrupt_ends_the_jobs(address: str, tmp_path: Path) -> None:
         interrupted()
     with Workers(1, address).pool() as pool:  # they are free again
         assert list(pool.map(abs, [-1, -2])) == [1, 2]
+
+
+@pytest.mark.filterwarnings("default")
+@pytest.mark.parametrize("fails", [False, True])
+def test_the_connection_of_the_program_stays(address: str, fails: bool) -> None:
+    ray.init(address, log_to_driver=False, logging_level="error")
+    try:
+        kept = ray.put(7)
+        with suppress(ZeroDivisionError), Workers(1, "auto").pool() as pool:
+            assert pool.submit(abs, -3).result() == 3
+            assert 1 / (not fails)
+        assert ray.is_initialized()
+        assert ray.get(kept) == 7
+    finally:
+        ray.shutdown()
 
 
 def mark_and_wait(path: Path) -> None:

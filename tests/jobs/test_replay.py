@@ -16,6 +16,7 @@ from gripper_force.config import load_config
 from gripper_force.errors import CheckpointError, ConfigError, DataError, LogError
 from gripper_force.jobs import metrics, report
 from gripper_force.jobs import replay as job
+from gripper_force.jobs.evaluate import evaluate
 from gripper_force.jobs.grasp import run_grasp
 from gripper_force.jobs.metrics import bias, mae, rmse
 from gripper_force.jobs.replay import (
@@ -347,18 +348,25 @@ def long_log(log: Path, path: Path, times: int) -> Path:
     return path
 
 
-@pytest.mark.parametrize("checkpoint", [None, "small"])
+@pytest.mark.parametrize("command", ["replay", "replay in batches", "evaluate"])
 def test_memory_does_not_grow_with_the_records_of_a_log(
-    fused_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, checkpoint: str | None
+    fused_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
 ) -> None:
     monkeypatch.setattr(metrics, "lag_s", lambda *_: 0.0)  # its transform takes 0.1 MB for each second of log
-    replay(fused_log, checkpoint)  # imports, and loads the network
+
+    def run(log: Path) -> None:
+        if command == "evaluate":
+            evaluate([log], "small")
+        else:
+            replay_frames(log, "small" if command == "replay in batches" else None)
+
+    run(fused_log)  # imports, and loads the network
     peaks = []
     for times in (3, 7):
         log = long_log(fused_log, tmp_path / f"{times}.mcap", times)
         gc.collect()
         tracemalloc.start()
-        replay_frames(log, checkpoint)
+        run(log)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     longer_s = 4 * LogReader(fused_log).duration_ns / NS_PER_S
