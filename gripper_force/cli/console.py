@@ -148,13 +148,32 @@ def jsonable(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def end_with_failures(failed: Mapping[str, object], count: int) -> None:
-    """Prints the problem of each of ``count`` logs that failed, and ends with exit code 2 if there are any."""
-    if not failed:
+def tell_missing_parquet(folder: Path | None) -> None:
+    """Says before the work begins that a summary in this folder will lack the estimates' file, if it will."""
+    from gripper_force.jobs.summary_files import missing_parquet
+
+    if folder is not None and (text := missing_parquet()):
+        err.print(escape(text), soft_wrap=True)
+
+
+def end_with_failures(
+    failed: Mapping[str, object], count: int, unreported: Mapping[str, object] | None = None
+) -> None:
+    """Prints the problems of logs, and ends with exit code 2 if there are any.
+
+    Args:
+        failed: Problem of each of ``count`` logs that failed, by path.
+        count: Number of all logs.
+        unreported: Problem of each report that could not be written, by path of the log.
+    """
+    problems = [*failed.items(), *(unreported or {}).items()]
+    if not problems:
         return
-    for problem in failed.values():
-        err.print(f"[bold red]error:[/] {escape(str(problem))}", soft_wrap=True)
-    err.print(f"{len(failed)} of {count} logs are not part of the figures")
+    for log, problem in problems:
+        text = str(problem) if log in str(problem) else f"{log}: {problem}"
+        err.print(f"[bold red]error:[/] {escape(text)}", soft_wrap=True)
+    if failed:
+        err.print(f"{len(failed)} of {count} logs are not part of the figures")
     raise typer.Exit(2)
 
 

@@ -178,6 +178,7 @@ def evaluate(
     if settings.calibration.object not in (None, "own"):
         settings, _ = with_bundle(settings)
     logs = find_logs(data)
+    console.tell_missing_parquet(out)
     with console.bar("evaluating", len(logs)) as progress:
         result = job(
             logs,

@@ -29,7 +29,8 @@ SummaryFolder = Annotated[
     Path | None,
     typer.Option(
         "--out",
-        help="Folder for a summary (summary.html, .csv and .json) and the estimates of each frame (frames.parquet).",
+        help="Folder for a summary (summary.html, .csv and .json) and, with the extra parquet, the estimates of each "
+        "frame (frames.parquet).",
     ),
 ]
 Page = Annotated[Path | None, typer.Option("--write", help="Markdown page to write the table into.")]

@@ -221,6 +221,8 @@ def replay(
 
     if report:
         require("matplotlib", "--report")
+    if compare is not None:
+        require("scipy", "--compare")
 
     import numpy as np
 
@@ -233,6 +235,7 @@ def replay(
     replay_all = partial(job.replay_each, paths, recover=recover, workers=jobs, ray=ray)
     if out is not None:
         check_writable(out)
+    console.tell_missing_parquet(out)
     if compare is not None:
         if checkpoint or report:
             raise ConfigError(
@@ -257,6 +260,8 @@ def replay(
         frames = [one for _, one in kept], [one for _, one in others]
         found = job.paired_differences([r for r, _ in kept], [r for r, _ in others], frames)
         printed = {"logs": len(kept), "first": compare[0], "second": compare[1], "differences": found}
+        if failed:
+            printed["failed"] = {log: str(error) for log, error in failed.items()}
         console.show(printed, as_json, lambda _: differences_table(*compare, found))
         if out is not None:
             tables = replay_tables(dict(zip(compare, (first, second), strict=True)), found)
@@ -273,26 +278,31 @@ def replay(
     with console.bar("replaying", len(paths), hidden=len(paths) == 1) as progress:
         replays = replay_all(checkpoint=checkpoint, overrides=set_, progress=progress)
     results = replays.results
-    pages = []
+    pages: list[str] = []
+    unreported: dict[str, GripperError] = {}
     if report:
+        from gripper_force.jobs.processes import Workers
         from gripper_force.jobs.report import write_report
 
         whole = [path for path in paths if str(path) not in replays.failed]
+        write = partial(write_report, recover=recover, checkpoint=checkpoint, overrides=set_)
         with console.bar("writing reports", len(whole), hidden=len(paths) == 1) as progress:
-            for path in whole:
-                written = write_report(path, recover=recover, checkpoint=checkpoint, overrides=set_)
-                pages.append(str(written.html))
-                progress(path.name)
+            try:
+                written, problems = Workers().read_logs(write, whole, "report of", progress)
+            except GripperError as error:  # all failed: the figures are shown all the same
+                written, problems = {}, {0: error}
+        pages = [str(one.html) for one in written.values()]
+        unreported = {str(whole[number]): error for number, error in problems.items()}
     if len(paths) == 1:
         shown = {**console.jsonable(results[0]), **({"report": pages[0]} if pages else {})}
         console.show(shown, as_json, lambda _: replay_table(results[0], pages[0] if pages else None))
     else:
         summary = job.summary(results)
-        problems = {log: str(error) for log, error in replays.failed.items()}
+        unread = {log: str(error) for log, error in replays.failed.items()}
         printed = {
             "logs": results,
             "summary": summary,
-            **({"failed": problems} if problems else {}),
+            **({"failed": unread} if unread else {}),
             **({"reports": pages} if pages else {}),
         }
         console.show(printed, as_json, lambda _: replays_table(results, summary, pages))
@@ -305,7 +315,7 @@ def replay(
         console.err.print(f"next: open {pages[0]}", soft_wrap=True, markup=False)
     elif len(results) == 1:
         console.next_step("replay", *logs, *_changes(checkpoint, set_), "--report")
-    console.end_with_failures(replays.failed, len(paths))
+    console.end_with_failures(replays.failed, len(paths), unreported)
 
 
 def _changes(checkpoint: str | None, overrides: list[str] | None) -> list[str]:

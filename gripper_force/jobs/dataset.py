@@ -3,7 +3,8 @@
 import hashlib
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from array import array
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import partial
@@ -234,11 +235,21 @@ def label_frames(
     Returns:
         Forces in N, (T,) float32, 0 without a label, and the mask of frames with a label, (T,) bool.
     """
-    valid_samples = [sample for sample in samples if sample.valid and np.isfinite(sample.force_n)]
-    if not valid_samples:
+    series = CellSeries()
+    for sample in samples:
+        series.add(sample)
+    return label_at(frame_t_ns, *series.sorted(), exposure_ns)
+
+
+def label_at(
+    frame_t_ns: npt.NDArray[np.int64],
+    t_ns: npt.NDArray[np.int64],
+    force_n: npt.NDArray[np.float64],
+    exposure_ns: int,
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
+    """Returns what `label_frames` does, for valid samples by rising time: ``t_ns`` and ``force_n``, (N,)."""
+    if not len(t_ns):
         return np.zeros(len(frame_t_ns), np.float32), np.zeros(len(frame_t_ns), np.bool_)
-    t_ns = np.array([sample.t_ns for sample in valid_samples], np.int64)
-    force_n = np.array([sample.force_n for sample in valid_samples])
     labels = np.interp(frame_t_ns, t_ns, force_n)
     cumulative = np.concatenate([[0.0], np.cumsum(force_n)])
     first = np.searchsorted(t_ns, frame_t_ns - exposure_ns // 2, "left")
@@ -254,7 +265,8 @@ def label_frames(
 def indentations(
     frame_t_ns: npt.NDArray[np.int64],
     forces_n: npt.NDArray[np.float32],
-    states: Sequence[ServoState],
+    servo_t_ns: npt.NDArray[np.int64],
+    position_rad: Sequence[float],
     width_m: Callable[[float], float],
 ) -> npt.NDArray[np.float32]:
     """Returns the travel of the jaws at each frame since the first frame in contact; 0 while they are wider.
@@ -262,19 +274,18 @@ def indentations(
     Args:
         frame_t_ns: Middle of each exposure, (T,).
         forces_n: Load-cell force at each frame, (T,); 0 without a label.
-        states: Servo states by rising time.
+        servo_t_ns: Times of the servo states, rising, (N,).
+        position_rad: Positions of the servo in them, (N,).
         width_m: Maps the servo's angle to the distance between the jaws.
 
     Returns:
         Travel in m, (T,) float32; NaN without servo states around a frame, or if there is no contact.
     """
     contacts = np.flatnonzero(forces_n > CONTACT_N)
-    if not states or not len(contacts):
+    if not len(servo_t_ns) or not len(contacts):
         return np.full(len(frame_t_ns), np.nan, np.float32)
-    t_ns = [state.t_ns for state in states]
-    widths_m = np.interp(
-        frame_t_ns, t_ns, [width_m(state.position_rad) for state in states], left=np.nan, right=np.nan
-    )
+    each_m = [width_m(position) for position in position_rad]
+    widths_m = np.interp(frame_t_ns, servo_t_ns, each_m, left=np.nan, right=np.nan)
     travel_m: npt.NDArray[np.float64] = np.maximum(0.0, widths_m[contacts[0]] - widths_m)
     return travel_m.astype(np.float32)
 
@@ -306,48 +317,97 @@ def read_clip(
         DataError: There are no frames or no labels.
         LogError: The log can't be read.
     """
-    from gripper_force.vision.preprocess import downscale
+    streamed = StreamedClip(reader, config, records, preprocess, region)
+    small = list(streamed.frames())
+    return streamed.clip(np.stack(small) if small else streamed.no_images)
 
-    path = reader.path
-    region = region or config.vision.region
-    small: list[Gray] = []
-    t_ns: list[int] = []
-    samples: list[LoadCellSample] = []
-    states: list[ServoState] = []
-    for record in records:
-        if isinstance(record, Frame):
-            small.append(downscale(record.gray, region, preprocess.size))
-            t_ns.append(record.t_ns)
-        elif isinstance(record, LoadCellSample):
-            samples.append(record)
-        elif isinstance(record, ServoState):
-            states.append(record)
-    if not small:
-        raise DataError(f"{path} holds no camera frames; remove it from the logs")
-    samples.sort(key=lambda sample: sample.t_ns)
-    exposure_ns = round(_positive(reader.metadata, "exposure_ms", float, 0.0) * NS_PER_MS)
-    frame_t_ns = np.array(t_ns, np.int64)
-    forces_n, valid = label_frames(frame_t_ns, samples, exposure_ns)
-    if not valid.any():
-        raise DataError(f"{path} holds no valid load-cell sample near any frame; remove it from the logs")
-    name = path.stem
-    set_ = reader.metadata.get("set", name)
-    stiffness = stiffness_of(reader.metadata)
-    travel_m = indentations(
-        frame_t_ns, forces_n, states, Transmission.from_config(config.gripper, servo_nm_per_a=1.0).width_m
-    )
-    return Clip(
-        np.stack(small),
-        forces_n,
-        valid,
-        name,
-        config.object,
-        set_,
-        stiffness,
-        travel_m,
-        config.rig_settings(),
-        _view_of(reader.metadata),
-    )
+
+class StreamedClip:
+    """A clip that is read frame by frame, so that no frame need be kept. Arguments are those of `read_clip`."""
+
+    def __init__(
+        self,
+        reader: LogReader,
+        config: Config,
+        records: Iterable[Record],
+        preprocess: "Preprocess",
+        region: "Region | None" = None,
+    ) -> None:
+        self._reader, self._config, self._records = reader, config, records
+        self._region, self._size = region or config.vision.region, preprocess.size
+        self._t_ns = array("q")
+        self._samples = CellSeries()
+        self._servo_ns, self._position_rad = array("q"), array("d")
+
+    def frames(self) -> Iterator[Gray]:
+        """Yields the frames, cropped and downscaled, (S, S) uint8, once.
+
+        Raises:
+            LogError: The log can't be read.
+        """
+        from gripper_force.vision.preprocess import downscale
+
+        for record in self._records:
+            if isinstance(record, Frame):
+                self._t_ns.append(record.t_ns)
+                yield downscale(record.gray, self._region, self._size)
+            elif isinstance(record, LoadCellSample):
+                self._samples.add(record)
+            elif isinstance(record, ServoState):
+                self._servo_ns.append(record.t_ns)
+                self._position_rad.append(record.position_rad)
+
+    @property
+    def no_images(self) -> Gray:
+        """Frames without pixels, (T, 0, 0), for a clip whose images are not needed any more."""
+        return np.empty((len(self._t_ns), 0, 0), np.uint8)
+
+    def clip(self, frames: Gray) -> Clip:
+        """Returns the clip, after the last of its frames.
+
+        Raises:
+            DataError: There are no frames or no labels.
+        """
+        path, metadata, config = self._reader.path, self._reader.metadata, self._config
+        if not self._t_ns:
+            raise DataError(f"{path} holds no camera frames; remove it from the logs")
+        exposure_ns = round(_positive(metadata, "exposure_ms", float, 0.0) * NS_PER_MS)
+        frame_t_ns = np.array(self._t_ns)
+        forces_n, valid = label_at(frame_t_ns, *self._samples.sorted(), exposure_ns)
+        if not valid.any():
+            raise DataError(f"{path} holds no valid load-cell sample near any frame; remove it from the logs")
+        width_m = Transmission.from_config(config.gripper, servo_nm_per_a=1.0).width_m
+        return Clip(
+            frames,
+            forces_n,
+            valid,
+            path.stem,
+            config.object,
+            metadata.get("set", path.stem),
+            stiffness_of(metadata),
+            indentations(frame_t_ns, forces_n, np.array(self._servo_ns), self._position_rad, width_m),
+            config.rig_settings(),
+            _view_of(metadata),
+        )
+
+
+class CellSeries:
+    """Times and forces of the load cell's valid samples: 16 bytes each."""
+
+    def __init__(self) -> None:
+        self._t_ns, self._force_n = array("q"), array("d")
+
+    def add(self, sample: LoadCellSample) -> None:
+        """Takes the next sample; one that is not valid is left out."""
+        if sample.valid and math.isfinite(sample.force_n):
+            self._t_ns.append(sample.t_ns)
+            self._force_n.append(sample.force_n)
+
+    def sorted(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+        """Returns times and forces by rising time, (N,)."""
+        t_ns = np.array(self._t_ns)
+        order = np.argsort(t_ns, kind="stable")
+        return t_ns[order], np.array(self._force_n)[order]
 
 
 def stiffness_of(metadata: Mapping[str, str]) -> float:

@@ -12,16 +12,16 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from gripper_force.config import Config, config_from
+from gripper_force.config import Config, config_from, config_from_text
 from gripper_force.errors import DataError
 from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import (
     CONTACT_N,
     Clip,
+    StreamedClip,
     check_size,
     find_logs,
-    load_clip,
     starts_in_contact,
     stiffness_floor_n,
     without_contact_starts,
@@ -30,9 +30,10 @@ from gripper_force.jobs.object_gain import gain_of
 from gripper_force.jobs.processes import Workers
 from gripper_force.jobs.summary_files import check_writable, evaluation_tables, write_summary
 from gripper_force.profiles.apply import read_correction, read_profiles, with_object
-from gripper_force.profiles.correction import Correction
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.schema import Tree
-from gripper_force.vision.batch_inference import features, kept_checkpoint, predict
+from gripper_force.types import Frame, LoadCellSample, ServoState
+from gripper_force.vision.batch_inference import kept_checkpoint, predict, stream_features
 from gripper_force.vision.checkpoint import Checkpoint
 from gripper_force.vision.engines.pytorch import restored_threads
 from gripper_force.vision.model_files import read_model
@@ -160,7 +161,7 @@ def evaluate(
         include_contact_starts=include_contact_starts,
     )
     found, failed = Workers(workers, ray).read_logs(one, paths, "evaluated", progress)
-    chosen = {paths[number]: log for number, log in found.items() if log.is_chosen}
+    chosen = {paths[number]: log for number, log in found.items() if log is not None}
     if not chosen:
         raise DataError(f"no log in {logs} is of {', '.join(objects)}; choose among the logs' own objects")
     used = {path: one for path, one in chosen.items() if one.forces_n is not None}
@@ -200,10 +201,9 @@ def _columns(path: Path, clip: Clip, forces_n: npt.NDArray[np.floating]) -> dict
 
 @dataclass(frozen=True, eq=False)
 class _Evaluated:
-    """A recording without its images, and the estimates; None if it starts in contact or is of another object."""
+    """A recording without its images, and the estimates; None if it starts in contact."""
 
     clip: Clip
-    is_chosen: bool
     forces_n: npt.NDArray[np.floating] | None
 
 
@@ -214,28 +214,39 @@ def _evaluate_log(
     config: Tree,
     objects: tuple[str, ...],
     include_contact_starts: bool,
-) -> _Evaluated:
-    """Reads and estimates one log, with one thread: the last digits depend on their number."""
+) -> _Evaluated | None:
+    """Reads and estimates one log, with one thread: the last digits depend on their number. None: another object."""
     settings = config_from(config, "evaluate")
     loaded = kept_checkpoint(*checkpoint)
     preprocess = loaded.header.preprocess
-    clip = load_clip(path, preprocess, settings.vision.region)
-    kept = replace(clip, frames=np.empty((len(clip.frames), 0, 0), np.uint8))  # a view would keep the images
-    if objects and clip.object not in objects:
-        return _Evaluated(kept, False, None)
-    in_contact = preprocess.reference and starts_in_contact(clip.forces_n, preprocess.reference_frames)
-    if in_contact and not include_contact_starts:
-        return _Evaluated(kept, True, None)
-    own = settings.model_copy(update={"object": clip.object})
+    reader = LogReader(path)
+    logged = config_from_text(reader.config, str(path))
+    records = reader.records(Frame, LoadCellSample, ServoState)
+    streamed = StreamedClip(reader, logged, records, preprocess, settings.vision.region)
+    if objects and logged.object not in objects:
+        return None
+    own = settings.model_copy(update={"object": logged.object})
     profiles = read_profiles(own)
     gain = gain_of(with_object(own.control, profiles).object_ratio, settings.gripper.gain_std)
+    correction, device = None, "cuda" if torch.cuda.is_available() else "cpu"
+    if settings.calibration.object is not None:
+        correction, device = read_correction(own, profiles, loaded, logged.rig_settings()), "cpu"
+    networks = [network.to(device) for network in loaded.networks]
+    parts: list[npt.NDArray[np.floating]] = []
     with restored_threads():
         torch.set_num_threads(1)
-        if settings.calibration.object is None:
-            force_n = estimates(loaded, [clip])[0].mean(0)
-        else:
-            force_n = _corrected_n(loaded, clip, read_correction(own, profiles, loaded, clip.rig))
-    return _Evaluated(kept, True, (1.0 if gain is None else gain.gain) * force_n)
+        for forces_n, read_out in stream_features(networks, preprocess, streamed.frames(), device):
+            mean_n = forces_n.mean(0)
+            parts.append(
+                mean_n if correction is None else correction.force_n(mean_n, read_out).astype(np.float32)
+            )
+    for network in networks:
+        network.cpu()
+    clip = streamed.clip(streamed.no_images)
+    in_contact = preprocess.reference and starts_in_contact(clip.forces_n, preprocess.reference_frames)
+    if in_contact and not include_contact_starts:
+        return _Evaluated(clip, None)
+    return _Evaluated(clip, (1.0 if gain is None else gain.gain) * np.concatenate(parts))
 
 
 def evaluate_clips(
@@ -273,16 +284,6 @@ def estimates(
     for network in networks:
         network.cpu()
     return forces_n
-
-
-def _corrected_n(
-    checkpoint: Checkpoint, clip: Clip, correction: Correction | None
-) -> npt.NDArray[np.float32]:
-    preprocess = checkpoint.header.preprocess
-    check_size([clip], preprocess)
-    forces_n, read_out = features(checkpoint.networks, preprocess, clip.frames)
-    mean_n = forces_n.mean(0)
-    return mean_n if correction is None else correction.force_n(mean_n, read_out).astype(np.float32)
 
 
 def ridge_baseline(train_clips: Sequence[Clip], test_clips: Sequence[Clip]) -> Evaluation:

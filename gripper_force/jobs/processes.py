@@ -9,6 +9,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Executor, Future, as_completed
 from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from multiprocessing import get_context, parent_process, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
@@ -17,7 +18,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, Final, TypeVar
 
-from gripper_force.errors import GripperError
+from gripper_force.errors import DataError, GripperError
 from gripper_force.interfaces import Progress
 from gripper_force.runtime.process import ProcessOptions, allowed, own_process
 
@@ -60,7 +61,7 @@ class Workers:
     def read_logs(
         self, function: Callable[[Path], R], logs: Sequence[Path], verb: str, progress: Progress
     ) -> tuple[dict[int, R], dict[int, GripperError]]:
-        """Runs a function on each log. One that fails does not stop the others.
+        """Runs a function on each log. One that fails, in a way foreseen or not, does not stop the others.
 
         Args:
             function: A function that another process can import, or a `functools.partial` of one.
@@ -72,11 +73,12 @@ class Workers:
             The results and the errors by the number of the log, in the order of the logs.
 
         Raises:
-            GripperError: All logs failed; the error of the first.
+            GripperError: All logs failed; the error of the first. That of an unforeseen exception has it as its cause,
+                or in another process as its note.
         """
         found: dict[int, R] = {}
         failed: dict[int, GripperError] = {}
-        with closing(self._run_each(function, logs)) as answers:
+        with closing(self._run_each(partial(_run_named, function), logs)) as answers:
             for number, answer in answers:
                 if isinstance(answer, GripperError):
                     failed[number] = answer
@@ -101,11 +103,37 @@ class Workers:
         with self.pool() as pool:
             number_of = {pool.submit(function, log): number for number, log in enumerate(logs)}
             for future in as_completed(number_of):
+                number = number_of.pop(future)
                 try:
                     result: R | GripperError = future.result()
-                except GripperError as error:
-                    result = error
-                yield number_of.pop(future), result
+                except Exception as error:  # also of the way to the process and back
+                    result = _named(logs[number], error)
+                yield number, result
+
+
+def _run_named(function: Callable[[Path], R], log: Path) -> R:
+    """Runs a function on a log, where an unforeseen exception still has its traceback."""
+    try:
+        return function(log)
+    except Exception as error:
+        named = _named(log, error)
+        if named is error:
+            raise
+        raise named from error
+
+
+def _named(log: Path, error: Exception) -> GripperError:
+    """Returns an error itself if it was foreseen, or one that names the log, the exception and its place."""
+    if isinstance(error, GripperError):
+        return error
+    calls = traceback.extract_tb(error.__traceback__)
+    own = [call for call in calls[1:] if "gripper_" in call.filename] or calls  # the first is `_run_named`
+    place = f" at {Path(own[-1].filename).name}:{own[-1].lineno}" if own else ""
+    reason = (str(error) or "no reason").splitlines()[0][:200]
+    return DataError(
+        f"{log} failed with {type(error).__name__}{place}: {reason}; leave this log out, and report it as a fault of "
+        "gripper-force"
+    )
 
 
 @contextmanager

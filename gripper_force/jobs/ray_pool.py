@@ -30,6 +30,9 @@ def ray_pool(address: str) -> Iterator[Executor]:
     The cluster's machines need this version of gripper-force, and the same files at the same paths: a relative path
     counts from this process's folder. A job on a machine that is lost runs again on another one.
 
+    A program that is connected to Ray already keeps its connection: the jobs run there, whatever the address, and only
+    they end with the pool.
+
     Args:
         address: ``HOST:PORT`` of the head, or ``auto`` for the cluster that this machine belongs to.
 
@@ -41,6 +44,20 @@ def ray_pool(address: str) -> Iterator[Executor]:
     """
     with importing("--ray", ", or use --jobs"):
         import ray
+    is_ours = not ray.is_initialized()
+    if is_ours:
+        _connect(ray, address)
+    pool = _RayPool(ray)
+    try:
+        yield pool
+        pool.shutdown()
+    finally:
+        pool.end()
+        if is_ours:
+            ray.shutdown()
+
+
+def _connect(ray: Any, address: str) -> None:
     handler = signal.getsignal(signal.SIGTERM)
     try:
         _knock(address)
@@ -52,13 +69,6 @@ def ray_pool(address: str) -> Iterator[Executor]:
         ) from error
     with suppress(ValueError):  # not in the main thread, where Ray sets none
         signal.signal(signal.SIGTERM, handler)  # ours stops the run as configured, Ray's leaves at once
-    pool = _RayPool(ray)
-    try:
-        yield pool
-        pool.shutdown()
-    finally:
-        pool.end()
-        ray.shutdown()
 
 
 def _knock(address: str) -> None:

@@ -1,12 +1,13 @@
 """Replay of logs: the same functions over the same inputs, and every estimate against the load cell."""
 
 import math
-from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from array import array
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +18,7 @@ from gripper_force.control.state_machine import Decision
 from gripper_force.errors import DataError, GripperError, UnfamiliarFrameError
 from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs import metrics
-from gripper_force.jobs.dataset import CONTACT_N, label_frames
+from gripper_force.jobs.dataset import CONTACT_N, CellSeries, label_at
 from gripper_force.jobs.metrics import ForceBin
 from gripper_force.jobs.processes import Workers
 from gripper_force.profiles.apply import read_correction, read_profiles
@@ -213,9 +214,11 @@ def replay_frames(
     """
     reader = LogReader(Path(path), recover=recover)
     run = resolve_replay(changed_config(reader, checkpoint, overrides))
-    replayed = run_again(reader, run, in_batches=_may_batch(reader, run))
-    flags = [f for f in (replayed.estimates_identical, replayed.decisions_identical) if f is not None]
-    sources = _sources(replayed)
+    series = _Series()
+    agreement = _feed(reader, run, series, in_batches=_may_batch(reader, run))
+    flags = [flag for flag in (agreement.estimates, agreement.decisions) if flag is not None]
+    cells = series.cells.sorted()
+    sources = _sources(series, cells)
     best = next((sources[name] for name in ("fused", "visual") if name in sources), None)
     if best is None:
         raise DataError(
@@ -231,11 +234,11 @@ def replay_frames(
         per_object={run.config.object: overall},
         identical=all(flags) if flags else None,
         note=_note(reader, run),
-        changed=replayed.changed,
+        changed=agreement.changed,
         sources=sources,
         log=str(path),
     )
-    return result, _columns(result.log, run.config.object, replayed)
+    return result, _columns(result.log, run.config.object, series, cells)
 
 
 def _may_batch(reader: LogReader, run: ResolvedConfig) -> bool:
@@ -246,29 +249,71 @@ def _may_batch(reader: LogReader, run: ResolvedConfig) -> bool:
     return reader.metadata.get("checkpoint", "") != model.digest
 
 
-def _columns(log: str, object_name: str, replayed: Replayed) -> Columns:
-    visual, decisions = replayed.visual, replayed.decisions
-    times = [v.t_ns for v in visual] if visual else [d.estimate.t_ns for d in decisions]
-    t_ns = np.array(times, np.int64)
-    cells = sorted(replayed.load_cell, key=lambda sample: sample.t_ns)
-    measured_n, valid = label_frames(t_ns, cells, 0)
+class _Sink(Protocol):
+    """Receiver of all that a replay computes, and of the load cell's samples."""
+
+    def add_visual(self, visual: VisualForce) -> None:
+        """Takes the next visual estimate."""
+
+    def add_decision(self, decision: Decision) -> None:
+        """Takes the next decision."""
+
+    def add_cell(self, sample: LoadCellSample) -> None:
+        """Takes the next sample of the load cell."""
+
+
+_Cells = tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]
+"""Times and forces of the load cell's valid samples by rising time, (N,)."""
+
+
+class _Series:
+    """The numbers that figures and columns need: 8 bytes each, so that a long log takes little memory."""
+
+    def __init__(self) -> None:
+        self.seq, self.visual_ns, self.visual_n, self.visual_std_n = (
+            array("q"),
+            array("q"),
+            array("d"),
+            array("d"),
+        )
+        self.fused_ns, self.fused_n, self.current_n = array("q"), array("d"), array("d")
+        self.cells = CellSeries()
+
+    def add_visual(self, visual: VisualForce) -> None:
+        self.seq.append(visual.seq)
+        self.visual_ns.append(visual.t_ns)
+        self.visual_n.append(visual.force_n)
+        self.visual_std_n.append(visual.std_n)
+
+    def add_decision(self, decision: Decision) -> None:
+        self.fused_ns.append(decision.estimate.t_ns)
+        self.fused_n.append(decision.estimate.force_n)
+        self.current_n.append(decision.estimate.current_n)
+
+    def add_cell(self, sample: LoadCellSample) -> None:
+        self.cells.add(sample)
+
+
+def _columns(log: str, object_name: str, series: _Series, cells: _Cells) -> Columns:
+    has_visual = len(series.seq) > 0
+    t_ns = np.array(series.visual_ns if has_visual else series.fused_ns)
+    measured_n, valid = label_at(t_ns, *cells, 0)
     missing = np.full(len(t_ns), np.nan)
     fused_n, current_n = missing, missing
-    if decisions:
-        decided_ns = np.array([d.estimate.t_ns for d in decisions], np.int64)
-        newest = np.searchsorted(decided_ns, t_ns, "right") - 1
+    if series.fused_ns:
+        newest = np.searchsorted(np.array(series.fused_ns), t_ns, "right") - 1
         fused_n, current_n = (
             np.where(newest < 0, np.nan, np.array(values)[newest])
-            for values in zip(*((d.estimate.force_n, d.estimate.current_n) for d in decisions), strict=True)
+            for values in (series.fused_n, series.current_n)
         )
     return {
-        "log": np.full(len(t_ns), log),
-        "object": np.full(len(t_ns), object_name),
-        "seq": np.array([v.seq for v in visual], np.int64) if visual else np.zeros(len(t_ns), np.int64),
+        "log": np.full(len(t_ns), log, object),  # one text; an array of texts would hold a copy in each row
+        "object": np.full(len(t_ns), object_name, object),
+        "seq": np.array(series.seq) if has_visual else np.zeros(len(t_ns), np.int64),
         "t_ns": t_ns,
         "measured_n": np.where(valid, measured_n, np.nan),
-        "visual_n": np.array([v.force_n for v in visual]) if visual else missing,
-        "visual_std_n": np.array([v.std_n for v in visual]) if visual else missing,
+        "visual_n": np.array(series.visual_n) if has_visual else missing,
+        "visual_std_n": np.array(series.visual_std_n) if has_visual else missing,
         "fused_n": fused_n,
         "current_n": current_n,
     }
@@ -437,25 +482,64 @@ def run_again(reader: LogReader, run: ResolvedConfig, *, in_batches: bool = Fals
         in_batches: Computes the networks on many frames at a time, with PyTorch. Its rounding differs in the last
             digits from that of a run, which has one frame at a time.
     """
+    kept = _Kept([], [], [])
+    agreement = _feed(reader, run, kept, in_batches=in_batches)
+    return Replayed(
+        agreement.estimates, agreement.decisions, agreement.changed, kept.visual, kept.decisions, kept.cells
+    )
+
+
+class _Kept(NamedTuple):
+    """All that a replay computed, as records."""
+
+    visual: list[VisualForce]
+    decisions: list[Decision]
+    cells: list[LoadCellSample]
+
+    def add_visual(self, visual: VisualForce) -> None:
+        self.visual.append(visual)
+
+    def add_decision(self, decision: Decision) -> None:
+        self.decisions.append(decision)
+
+    def add_cell(self, sample: LoadCellSample) -> None:
+        self.cells.append(sample)
+
+
+class _Agreement(NamedTuple):
+    """Agreement of a replay with its log; the fields are those of `Replayed`."""
+
+    estimates: bool | None
+    decisions: bool | None
+    changed: dict[str, float]
+
+
+def _feed(reader: LogReader, run: ResolvedConfig, sink: _Sink, *, in_batches: bool) -> _Agreement:
+    """Runs estimator and controller on a log, as `run_again`. Keeps no record for longer than it is needed."""
     config = run.config
     has_faulty_estimates = _has_faulty_estimates(config)
     had_controller = config.gripper.nm_per_a is not None  # an imported recording had none
     controller = make_controller(config) if had_controller else None
-    visual: list[VisualForce] = []
-    decisions: list[Decision] = []
-    cells: list[LoadCellSample] = []
-    logged: dict[type, list[Any]] = defaultdict(list)
     newest: VisualForce | None = None
     request: Request | None = None
     pending: dict[int, VisualForce] = {}
+    estimates = _Pairs(lambda v: (v.seq, v.force_n, v.std_n))
+    commands = _Pairs(lambda c: c, lambda a, b: abs(a.goal_current_a - b.goal_current_a))
+    fused = _Pairs(lambda f: f, lambda a, b: abs(a.force_n - b.force_n))
+    status = _Pairs(lambda s: s)
+    pairs_of = {VisualForce: estimates, ServoCommand: commands, FusedForce: fused, GraspStatus: status}
     estimated = _in_batches if in_batches and run.model is not None else _frame_by_frame
     for record, estimate in estimated(reader.records(), run):
         if isinstance(record, Frame):
             if estimate is not None:
-                visual.append(estimate)
+                sink.add_visual(estimate)
+                estimates.add_again(estimate)
                 pending[record.seq] = estimate
+                if len(pending) > _BACKLOG:
+                    del pending[next(iter(pending))]
             continue
-        logged[type(record)].append(record)
+        if (pairs := pairs_of.get(type(record))) is not None:
+            pairs.add_logged(record)
         if isinstance(record, VisualForce):
             again = None if has_faulty_estimates else pending.pop(record.seq, None)
             # The time at which an estimate was ready is the run's, not this computer's.
@@ -463,19 +547,70 @@ def run_again(reader: LogReader, run: ResolvedConfig, *, in_batches: bool = Fals
         elif isinstance(record, Request):
             request = record
         elif isinstance(record, ServoState) and controller is not None:
-            decisions.append(controller.step(record.t_ns, record, newest, request))
+            decision = controller.step(record.t_ns, record, newest, request)
+            sink.add_decision(decision)
+            commands.add_again(decision.command)
+            fused.add_again(decision.estimate)
+            status.add_again(decision.status)
             newest = request = None
         elif isinstance(record, LoadCellSample):
-            cells.append(record)
-    compares_estimates = bool(logged[VisualForce]) and not has_faulty_estimates
-    return Replayed(
-        _same_estimates(logged[VisualForce], visual) if compares_estimates else None,
-        _same_decisions(logged, decisions) if logged[ServoCommand] else None,
-        _changed(logged, decisions) if logged[ServoCommand] else {},
-        visual,
-        decisions,
-        cells,
+            sink.add_cell(record)
+    # The run may have ended before it used the estimates of its last frames, and the last cycle of a truncated log
+    # may be incomplete.
+    same_decisions = all(pairs.agree(spare=1) for pairs in (commands, fused, status))
+    return _Agreement(
+        estimates.agree() if estimates.logged and not has_faulty_estimates else None,
+        same_decisions if commands.logged else None,
+        {"goal_current_a": commands.largest, "fused_n": fused.largest} if commands.logged else {},
     )
+
+
+_BACKLOG: Final = 1024
+"""Records that wait for their counterpart: a log has it a few records later, or not at all."""
+
+
+class _Pairs:
+    """Compares a log's records of a type with those of the replay, in their order, while both are made.
+
+    Args:
+        key: Returns what is compared of a record.
+        difference: Difference of two records of which the largest counts.
+    """
+
+    def __init__(
+        self, key: Callable[[Any], object], difference: Callable[[Any, Any], float] = lambda a, b: 0.0
+    ) -> None:
+        self._key, self._difference = key, difference
+        self._logged: deque[Any] = deque()
+        self._again: deque[Any] = deque()
+        self._same, self._ended = True, False
+        self.logged = False
+        self.largest = 0.0
+
+    def add_logged(self, record: Record) -> None:
+        """Takes the log's next record."""
+        self.logged = True
+        self._logged.append(record)
+        self._compare()
+
+    def add_again(self, record: Record) -> None:
+        """Takes the replay's next record."""
+        self._again.append(record)
+        self._compare()
+
+    def agree(self, spare: int | None = None) -> bool:
+        """Returns True if all logged records equal the replay's, which may have ``spare`` more; None: any number."""
+        return self._same and not self._logged and (spare is None or len(self._again) <= spare)
+
+    def _compare(self) -> None:
+        while self._logged and self._again and not self._ended:
+            a, b = self._logged.popleft(), self._again.popleft()
+            self._same = self._same and self._key(a) == self._key(b)
+            self.largest = max(self.largest, self._difference(a, b))
+        if self._ended or max(len(self._logged), len(self._again)) > _BACKLOG:  # a counterpart is missing
+            self._same, self._ended = False, True
+            self._logged.clear()
+            self._again.clear()
 
 
 def _frame_by_frame(
@@ -490,10 +625,10 @@ def _frame_by_frame(
 def _in_batches(
     records: Iterable[Record], run: ResolvedConfig
 ) -> Iterator[tuple[Record, VisualForce | None]]:
-    """Yields the records with their estimates, computed in batches at the end of the log. Frames are empty."""
+    """Yields the records with their estimates, computed many frames at a time. Frames are empty."""
     import torch
 
-    from gripper_force.vision.batch_inference import kept_checkpoint, prepared_features
+    from gripper_force.vision.batch_inference import BATCH, kept_checkpoint, prepared_features
     from gripper_force.vision.engines import Step
     from gripper_force.vision.engines.pytorch import TorchEngine, restored_threads
     from gripper_force.vision.estimator import ForceEstimator
@@ -504,33 +639,50 @@ def _in_batches(
     estimator = ForceEstimator(engine, vision.region, run.correction)
     preparation = _Preparation(estimator)
     processor = FrameProcessor(preparation)
-    kept: list[tuple[Record, VisualForce | None, int]] = []
-    for record in records:
-        visual = None
-        if isinstance(record, Frame):
-            visual = processor.process(record).visual
-            record = replace(record, gray=_NO_IMAGE)
-        kept.append((record, visual, len(preparation.inputs) - 1))
-    if preparation.inputs:
-        inputs = np.stack(preparation.inputs)  # (T, S, S)
+    waiting: deque[tuple[Record, VisualForce | None, int]] = deque()  # the last: inputs up to the record
+
+    def batches() -> "Iterator[Floats]":
+        """Reads records until there are frames enough."""
+        inputs, count = preparation.inputs, 0
+        for record in records:
+            visual, before = None, len(inputs)
+            if isinstance(record, Frame):
+                visual = processor.process(record).visual
+                record = replace(record, gray=_NO_IMAGE)
+            count += len(inputs) - before
+            waiting.append((record, visual, count))
+            while len(inputs) >= BATCH["cpu"]:
+                yield np.stack(inputs[: BATCH["cpu"]])  # (N, S, S)
+                del inputs[: BATCH["cpu"]]
+        if inputs:
+            yield np.stack(inputs)
+
+    chunks = prepared_features(checkpoint.networks, batches())
+    works, done = False, 0
+    while True:
         with restored_threads():
             torch.set_num_threads(1)  # the last digits depend on their number
-            forces_n, features = prepared_features(checkpoint.networks, inputs)  # (M, T), (T, F)
-    works = False
-    for record, visual, last in kept:
-        if visual is not None:
-            try:
-                estimate = estimator.finish(Step(forces_n[:, last], features[last], None))
-                visual = replace(visual, force_n=estimate.force_n, std_n=estimate.std_n)
-            except GripperError as error:  # as `FrameProcessor` treats it
-                if not works:
-                    raise
-                if isinstance(error, UnfamiliarFrameError):
-                    visual = replace(visual, force_n=error.force_n, std_n=math.inf)
-                else:
-                    visual = None
-            works = True
-        yield record, visual
+            forces_n, features = next(chunks, (_NOTHING, _NOTHING))  # (M, K), (K, F)
+        known = done + len(features)
+        while waiting and waiting[0][2] <= known:
+            record, visual, count = waiting.popleft()
+            if visual is not None:
+                try:
+                    last = count - 1 - done
+                    estimate = estimator.finish(Step(forces_n[:, last], features[last], None))
+                    visual = replace(visual, force_n=estimate.force_n, std_n=estimate.std_n)
+                except GripperError as error:  # as `FrameProcessor` treats it
+                    if not works:
+                        raise
+                    if isinstance(error, UnfamiliarFrameError):
+                        visual = replace(visual, force_n=error.force_n, std_n=math.inf)
+                    else:
+                        visual = None
+                works = True
+            yield record, visual
+        if not len(features):
+            return
+        done = known
 
 
 class _Preparation:
@@ -552,33 +704,7 @@ class _Preparation:
 
 _UNKNOWN: Final = ForceEstimate(math.nan, math.nan)
 _NO_IMAGE: Final = np.zeros((0, 0), np.uint8)
-
-
-def _same_estimates(logged: list[VisualForce], again: list[VisualForce]) -> bool:
-    def key(v: VisualForce) -> tuple[int, float, float]:
-        return v.seq, v.force_n, v.std_n
-
-    # The run may have ended before it used the estimates of its last frames.
-    return [key(v) for v in logged] == [key(v) for v in again[: len(logged)]]
-
-
-def _same_decisions(logged: dict[type, list[Any]], again: list[Decision]) -> bool:
-    # The last cycle of a truncated log may be incomplete.
-    pairs = (
-        (logged[ServoCommand], [d.command for d in again]),
-        (logged[FusedForce], [d.estimate for d in again]),
-        (logged[GraspStatus], [d.status for d in again]),
-    )
-    return all(a == b[: len(a)] and len(b) - len(a) <= 1 for a, b in pairs)
-
-
-def _changed(logged: dict[type, list[Any]], again: list[Decision]) -> dict[str, float]:
-    commands = zip(logged[ServoCommand], again, strict=False)
-    fused = zip(logged[FusedForce], again, strict=False)
-    return {
-        "goal_current_a": max(abs(a.goal_current_a - b.command.goal_current_a) for a, b in commands),
-        "fused_n": max((abs(a.force_n - b.estimate.force_n) for a, b in fused), default=0.0),
-    }
+_NOTHING: Final = np.zeros((0, 0), np.float32)
 
 
 def _has_faulty_estimates(config: Config) -> bool:
@@ -605,21 +731,18 @@ def _note(reader: LogReader, run: ResolvedConfig) -> str:
     return ""
 
 
-def _sources(replayed: Replayed) -> dict[str, Comparison]:
-    series: dict[str, tuple[list[int], list[float]]] = {}
-    if replayed.visual:
-        visual = [v for v in replayed.visual if v.is_familiar]
-        series["visual"] = [v.t_ns for v in visual], [v.force_n for v in visual]
-    if replayed.decisions:
-        estimates = [d.estimate for d in replayed.decisions]
-        times = [e.t_ns for e in estimates]
-        series["current"] = times, [e.current_n for e in estimates]
-        series["fused"] = times, [e.force_n for e in estimates]
-    cells = sorted(replayed.load_cell, key=lambda sample: sample.t_ns)
+def _sources(series: _Series, cells: _Cells) -> dict[str, Comparison]:
+    columns: dict[str, tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]] = {}
+    if series.seq:
+        known = np.array(series.visual_std_n) != np.inf
+        columns["visual"] = np.array(series.visual_ns)[known], np.array(series.visual_n)[known]
+    if series.fused_ns:
+        columns["current"] = np.array(series.fused_ns), np.array(series.current_n)
+        columns["fused"] = np.array(series.fused_ns), np.array(series.fused_n)
     return {
         name: figures
-        for name, (t_ns, force_n) in series.items()
-        if (figures := compare(t_ns, force_n, cells)) is not None
+        for name, (t_ns, force_n) in columns.items()
+        if (figures := _compare(t_ns, force_n, cells)) is not None
     }
 
 
@@ -636,8 +759,16 @@ def compare(
     Returns:
         The errors, or None if the load cell has no valid sample near any estimate.
     """
-    times_ns, estimates_n = np.array(t_ns, np.int64), np.array(force_n)
-    measured_n, valid = label_frames(times_ns, cells, 0)
+    series = CellSeries()
+    for sample in cells:
+        series.add(sample)
+    return _compare(np.array(t_ns, np.int64), np.array(force_n), series.sorted())
+
+
+def _compare(
+    times_ns: npt.NDArray[np.int64], estimates_n: npt.NDArray[np.float64], cells: _Cells
+) -> Comparison | None:
+    measured_n, valid = label_at(times_ns, *cells, 0)
     if not valid.any():
         return None
     t_s, predicted_n, measured_n = times_ns[valid] / NS_PER_S, estimates_n[valid], measured_n[valid]

@@ -13,13 +13,15 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from gripper_force.errors import ConfigError
-from gripper_force.plugins import require
+from gripper_force.plugins import importing, require
 
 if TYPE_CHECKING:
     from gripper_force.jobs.evaluate import Evaluation
     from gripper_force.jobs.replay import Columns, PairedDifference, Replays
 
 Rows = list[dict[str, Any]]
+
+_FRAMES: Final = "frames.parquet"
 
 _PAGE: Final = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width">
@@ -49,9 +51,9 @@ def check_writable(folder: Path) -> None:
     """Makes the folder before the work begins.
 
     Raises:
-        ConfigError: The folder can't be made, or the package for the estimates' file is missing.
+        ConfigError: The folder can't be made, no file can be written there, or the package for intervals is missing.
     """
-    require("pyarrow", "--out", ", or leave out --out")
+    require("scipy", "--out", ", or leave out --out")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with TemporaryFile(dir=folder):
@@ -60,6 +62,17 @@ def check_writable(folder: Path) -> None:
         raise ConfigError(
             f"can't write in the folder {folder} of --out: {error.strerror}; choose another"
         ) from error
+
+
+def missing_parquet() -> str:
+    """Returns a sentence if a package for the estimates' file is missing, so that there will be no such file."""
+    try:
+        with importing(f"{_FRAMES} of --out", "; the other files are written without it"):
+            import pyarrow
+            import pyarrow.parquet  # noqa: F401
+    except (ConfigError, ImportError) as error:
+        return str(error)
+    return ""
 
 
 def replay_tables(
@@ -119,6 +132,8 @@ def write_summary(
 ) -> list[Path]:
     """Writes ``summary.html``, ``summary.json``, ``summary.csv`` (the table of the logs) and ``frames.parquet``.
 
+    The last one is left out if `missing_parquet`.
+
     Args:
         folder: An existing folder; see `check_writable`.
         title: Heading of the page.
@@ -131,8 +146,8 @@ def write_summary(
     Raises:
         ConfigError: A file can't be written.
     """
-    files = [folder / name for name in ("summary.html", "summary.csv", "summary.json", "frames.parquet")]
-    page, table, tree, frames = files
+    page, table, tree = (folder / name for name in ("summary.html", "summary.csv", "summary.json"))
+    files, frames = [page, table, tree], folder / _FRAMES
     try:
         sections = [_section(name, rows) for name, rows in tables.items() if rows]
         page.write_text(_PAGE.format(title=escape(title), sections="\n".join(sections)), encoding="utf-8")
@@ -144,7 +159,11 @@ def write_summary(
             name: [{k: _known(v) for k, v in row.items()} for row in rows] for name, rows in tables.items()
         }
         tree.write_text(json.dumps({"title": title, **clean}, indent=1, allow_nan=False), encoding="utf-8")
-        _write_parquet(frames, list(columns))
+        if missing_parquet():
+            frames.unlink(missing_ok=True)  # one of an earlier summary would not belong to this one
+        else:
+            _write_parquet(frames, list(columns))
+            files.append(frames)
     except OSError as error:
         raise ConfigError(
             f"can't write the summary in {folder}: {error.strerror}; choose another --out"

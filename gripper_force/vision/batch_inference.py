@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from functools import lru_cache
+from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
@@ -81,47 +82,105 @@ def features(
     Returns:
         Each member's forces in N, (M, T), and the members' concatenated features, (T, F).
     """
-    clip = torch.from_numpy(frames)[None].to(device)  # (1, T, S, S)
-    leading = clip[:, : preprocess.reference_frames]
-    batches = (normalise(part, leading, preprocess) for part in _batches(clip))
-    return _run(networks, batches)
+    forces_n, read_out = zip(*stream_features(networks, preprocess, frames, device), strict=True)
+    return np.concatenate(forces_n, axis=1), np.concatenate(read_out)
+
+
+@torch.inference_mode()
+def stream_features(
+    networks: Sequence[Member], preprocess: Preprocess, frames: Iterable[Gray], device: str = "cpu"
+) -> Iterator[tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]]:
+    """Yields `features` of the next `CHUNK` frames or the last ones, and keeps no others.
+
+    Arguments are those of `predict`; ``frames`` may be an iterator.
+    """
+    yield from _run(networks, _normalised(_batches(frames, torch.device(device)), preprocess))
+
+
+def _batches(frames: Iterable[Gray], device: torch.device) -> Iterator[Tensor]:
+    """Yields the next frames of a recording, (1, N, S, S), with `BATCH` of them but in the last."""
+    remaining = iter(frames)
+    while part := list(islice(remaining, BATCH[device.type])):
+        yield torch.from_numpy(np.stack(part))[None].to(device)
+
+
+def _normalised(parts: Iterator[Tensor], preprocess: Preprocess) -> Iterator[Tensor]:
+    """Yields batches of a recording's frames, (1, N, S, S), prepared for the networks."""
+    first: list[Tensor] = []
+    while (
+        sum(part.shape[1] for part in first) < preprocess.reference_frames
+        and (part := next(parts, None)) is not None
+    ):
+        first.append(part)
+    if first:
+        leading = torch.cat(first, dim=1)[:, : preprocess.reference_frames]
+        for part in chain(first, parts):
+            yield normalise(part, leading, preprocess)
 
 
 @torch.inference_mode()
 def prepared_features(
-    networks: Sequence[Member], inputs: npt.NDArray[np.float32]
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """Computes `features` on the CPU, for frames of a stream that are prepared already, (T, S, S)."""
-    clip = torch.from_numpy(inputs)[None, :, None]  # (1, T, 1, S, S)
-    return _run(networks, _batches(clip))
+    networks: Sequence[Member], batches: Iterable[npt.NDArray[np.float32]]
+) -> Iterator[tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]]:
+    """Yields `features` of consecutive frames, on the CPU.
 
-
-def _batches(clip: Tensor) -> Iterator[Tensor]:
-    size = BATCH[clip.device.type]
-    return (clip[:, begin : begin + size] for begin in range(0, clip.shape[1], size))
+    Args:
+        networks: As for `features`.
+        batches: Frames of a stream that are prepared already, (N, S, S): `BATCH` each, but for the last.
+    """
+    yield from _run(networks, (torch.from_numpy(batch)[None, :, None] for batch in batches))
 
 
 def _run(
     networks: Sequence[Member], batches: Iterable[Tensor]
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """Runs the networks on consecutive batches of a recording's prepared frames, (1, N, 1, S, S) each."""
-    parts: list[list[Tensor]] = [[] for _ in networks]
-    maps: list[Tensor | None] = [None for _ in networks]
+) -> Iterator[tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]]:
+    """Runs the networks on consecutive batches of a recording's prepared frames, (1, N, 1, S, S) each.
+
+    Yields:
+        Each member's forces, (M, K), and the members' features, (K, F), of the next `CHUNK` frames or the last ones.
+    """
+    readers = [_Reader(network) for network in networks]
     for batch in batches:
-        for i, network in enumerate(networks):
-            if isinstance(network, ForceNetwork):
-                part, maps[i] = network.pooled(batch, maps[i])
-            else:
-                part = network.features(batch)
-            parts[i].append(part[0])
-    features = [_read(network, torch.cat(part)) for network, part in zip(networks, parts, strict=True)]
-    forces = [network.force_n(part) for network, part in zip(networks, features, strict=True)]
+        for reader in readers:
+            reader.push(batch)
+        if readers[0].waiting >= CHUNK:
+            yield _read(readers)
+    if readers[0].waiting:
+        yield _read(readers)
+
+
+def _read(readers: "Sequence[_Reader]") -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    forces, features = zip(*(reader.read() for reader in readers), strict=True)
     return torch.stack(forces).cpu().numpy(), torch.cat(features, dim=1).cpu().numpy()
 
 
-def _read(network: Member, pooled: Tensor) -> Tensor:
-    """Returns the inputs of a network's last layer, (T, head), for its output of the batches, (T, C)."""
-    if not isinstance(network, ForceNetwork):
-        return pooled
-    begins = range(0, len(pooled), CHUNK)
-    return torch.cat([network.read_pooled(pooled, begin, begin + CHUNK) for begin in begins])
+class _Reader:
+    """Runs a network on the batches of a stream, and keeps only what the next ones need."""
+
+    def __init__(self, network: Member) -> None:
+        self._network = network
+        self._parts: list[Tensor] = []
+        self._maps: Tensor | None = None
+        self._before: Tensor | None = None
+        self.waiting = 0
+
+    def push(self, batch: Tensor) -> None:
+        """Runs the network up to its averages, or a network without windows as a whole."""
+        if isinstance(self._network, ForceNetwork):
+            part, self._maps = self._network.pooled(batch, self._maps)
+        else:
+            part = self._network.features(batch)
+        self._parts.append(part[0])
+        self.waiting += batch.shape[1]
+
+    def read(self) -> tuple[Tensor, Tensor]:
+        """Returns forces, (K,), and the inputs of the last layer, (K, head), of the frames since the last call."""
+        features = torch.cat(self._parts)
+        self._parts, self.waiting = [], 0
+        if isinstance(self._network, ForceNetwork):
+            earlier = self._network.config.window - 1
+            before = features[:1].expand(earlier, -1) if self._before is None else self._before
+            pooled = torch.cat([before, features])
+            self._before = pooled[len(pooled) - earlier :]
+            features = self._network.read_pooled(pooled)
+        return self._network.force_n(features), features

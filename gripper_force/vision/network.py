@@ -187,11 +187,9 @@ class ForceNetwork(nn.Module):
             stack = torch.cat([padded[:, k : k + length] for k in range(n + 1)], dim=2).flatten(0, 1)
         return self._pool(stack, flat)[0].view(batch, length, -1), earlier
 
-    def read_pooled(self, pooled: Tensor, begin: int, end: int) -> Tensor:
-        """Returns the inputs of the last layer, (end - begin, head), for a recording's averages, (T, C)."""
-        window = self.config.window
-        padded = torch.cat([pooled[:1].expand(window - 1, -1), pooled])[begin : end + window - 1]
-        return torch.tanh(self.dense(self.blstm.over_windows(padded, window)))
+    def read_pooled(self, pooled: Tensor) -> Tensor:
+        """Maps consecutive averages (T, C) to the inputs of the last layer of each window, (T - window + 1, head)."""
+        return torch.tanh(self.dense(self.blstm.over_windows(pooled, self.config.window)))
 
     def force_n(self, features: Tensor) -> Tensor:
         """Applies the last layer: features (N, head) to forces in N, (N,)."""

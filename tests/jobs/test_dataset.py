@@ -20,7 +20,7 @@ from gripper_force.jobs.dataset import (
     without_contact_starts,
 )
 from gripper_force.runtime.log_writer import LogWriter
-from gripper_force.types import NS_PER_MS, Frame, LoadCellSample, ServoState
+from gripper_force.types import NS_PER_MS, Frame, LoadCellSample
 from gripper_force.vision.preprocess import Preprocess, downscale
 
 SMALL = Preprocess(size=16)
@@ -182,12 +182,9 @@ def test_clips_that_start_in_contact_are_left_out() -> None:
 def test_indentation_is_travel_since_first_contact() -> None:
     t_ns = np.arange(6) * 10 * NS_PER_MS
     forces_n = np.array([0, 0, 0.5, 2, 1, 0], np.float32)
-    states = [
-        ServoState(int(t), angle, 0.0, 0.0, 30.0, 12.0, 0)
-        for t, angle in zip(t_ns[:5], [0.0, 1.0, 2.0, 4.0, 2.5], strict=True)
-    ]
-    travel_m = indentations(t_ns, forces_n, states, lambda angle: 0.1 - 0.01 * angle)
+    angles = [0.0, 1.0, 2.0, 4.0, 2.5]
+    travel_m = indentations(t_ns, forces_n, t_ns[:5], angles, lambda angle: 0.1 - 0.01 * angle)
     assert travel_m[:5] == pytest.approx([0, 0, 0, 0.02, 0.005], abs=1e-7)
     assert np.isnan(travel_m[5])  # no servo state after it
-    assert np.isnan(indentations(t_ns, 0 * forces_n, states, lambda angle: angle)).all()
-    assert np.isnan(indentations(t_ns, forces_n, [], lambda angle: angle)).all()
+    assert np.isnan(indentations(t_ns, 0 * forces_n, t_ns[:5], angles, lambda angle: angle)).all()
+    assert np.isnan(indentations(t_ns, forces_n, t_ns[:0], [], lambda angle: angle)).all()

@@ -13,7 +13,8 @@ from pathlib import Path
 import pytest
 
 from gripper_force.errors import DataError, GripperError
-from gripper_force.jobs.processes import process_pool
+from gripper_force.interfaces import no_progress
+from gripper_force.jobs.processes import Workers, process_pool
 
 
 def interrupted_itself(number: signal.Signals) -> int:
@@ -102,7 +103,8 @@ def test_an_interruption_while_results_are_sent_ends_at_once() -> None:
 FORGETFUL = """
 import os, sys, time
 from gripper_force.errors import DataError, GripperError
-from gripper_force.jobs.processes import process_pool
+from gripper_force.interfaces import no_progress
+from gripper_force.jobs.processes import Workers, process_pool
 
 def jobs():
     with process_pool(1) as pool:
@@ -133,3 +135,41 @@ def is_running(pid: int) -> bool:
     except (FileNotFoundError, ProcessLookupError):
         return False
     return state != "Z"
+
+
+class UnsendableError(Exception):
+    """An exception that another process can't read: its arguments are not those of its constructor."""
+
+    def __init__(self, first: int, second: int) -> None:
+        super().__init__(f"{first} and {second}\nmore")
+
+
+def read_or_fail(log: Path) -> str:
+    match log.stem:
+        case "foreseen":
+            raise DataError("the frame is dark")
+        case "unforeseen":
+            raise KeyError("gone")
+        case "unsendable":
+            raise UnsendableError(1, 2)
+    return log.stem
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_log_that_fails_unforeseen_is_named_and_the_others_are_read(count: int) -> None:
+    logs = [Path(f"{name}.mcap") for name in ("unforeseen", "a", "unsendable", "b", "foreseen")]
+    found, failed = Workers(count).read_logs(read_or_fail, logs, "read", no_progress)
+    assert found == {1: "a", 3: "b"}
+    assert {
+        number: str(error).partition(" at test_processes.py:")[0] for number, error in failed.items()
+    } == {
+        0: "unforeseen.mcap failed with KeyError",
+        2: "unsendable.mcap failed with UnsendableError",
+        4: "the frame is dark",
+    }
+    assert all(isinstance(error, DataError) and "\n" not in str(error) for error in failed.values())
+    assert ": 1 and 2; leave this log out" in str(failed[2])
+    if count == 1:
+        assert isinstance(failed[0].__cause__, KeyError)
+    else:
+        assert "in read_or_fail" in failed[0].__notes__[0]

@@ -2,6 +2,7 @@ import os
 import socket
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from typer.testing import CliRunner
 from gripper_force import cli
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, GripperError, LogError
+from gripper_force.interfaces import no_progress
 from gripper_force.jobs.evaluate import evaluate
 from gripper_force.jobs.processes import Workers
 from gripper_force.jobs.replay import replay_each
@@ -53,6 +55,19 @@ def test_a_job_that_the_cluster_loses_is_one_error(address: str) -> None:
 
 
 @pytest.mark.filterwarnings("default")
+def test_a_log_that_fails_unforeseen_is_named_and_the_others_are_read(address: str) -> None:
+    logs = [Path("a.mcap"), Path("b.mcap")]
+    found, failed = Workers(1, address).read_logs(fail_at_b, logs, "read", no_progress)
+    assert found == {0: "a"}
+    assert str(failed[1]).startswith("b.mcap failed with KeyError at test_ray_pool.py:")
+    assert "in fail_at_b" in failed[1].__notes__[0]
+
+
+def fail_at_b(log: Path) -> str:
+    return {"a": "a"}[log.stem]
+
+
+@pytest.mark.filterwarnings("default")
 def test_an_interrupt_ends_the_jobs(address: str, tmp_path: Path) -> None:
     def interrupted() -> None:
         with Workers(1, address).pool() as pool:
@@ -66,6 +81,21 @@ def test_an_interrupt_ends_the_jobs(address: str, tmp_path: Path) -> None:
         interrupted()
     with Workers(1, address).pool() as pool:  # they are free again
         assert list(pool.map(abs, [-1, -2])) == [1, 2]
+
+
+@pytest.mark.filterwarnings("default")
+@pytest.mark.parametrize("fails", [False, True])
+def test_the_connection_of_the_program_stays(address: str, fails: bool) -> None:
+    ray.init(address, log_to_driver=False, logging_level="error")
+    try:
+        kept = ray.put(7)
+        with suppress(ZeroDivisionError), Workers(1, "auto").pool() as pool:
+            assert pool.submit(abs, -3).result() == 3
+            assert 1 / (not fails)
+        assert ray.is_initialized()
+        assert ray.get(kept) == 7
+    finally:
+        ray.shutdown()
 
 
 def mark_and_wait(path: Path) -> None:

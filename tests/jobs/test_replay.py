@@ -1,7 +1,10 @@
 import dataclasses
+import gc
 import json
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -11,6 +14,9 @@ from typer.testing import CliRunner
 from gripper_force import cli
 from gripper_force.config import load_config
 from gripper_force.errors import CheckpointError, ConfigError, DataError, LogError
+from gripper_force.jobs import metrics, report
+from gripper_force.jobs import replay as job
+from gripper_force.jobs.evaluate import evaluate
 from gripper_force.jobs.grasp import run_grasp
 from gripper_force.jobs.metrics import bias, mae, rmse
 from gripper_force.jobs.replay import (
@@ -26,9 +32,12 @@ from gripper_force.jobs.replay import (
     run_again,
     summary,
 )
+from gripper_force.jobs.report import ReportPaths
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import (
+    NS_PER_MS,
+    NS_PER_S,
     Frame,
     FusedForce,
     GraspStatus,
@@ -250,6 +259,34 @@ def test_a_broken_log_is_named_and_the_others_are_replayed(fused_log: Path, tmp_
         replay_each([broken, broken])
 
 
+@pytest.mark.parametrize("stage", ["replay", "report"])
+def test_an_unforeseen_exception_at_one_log_does_not_stop_the_others(
+    fused_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: str
+) -> None:
+    bad = tmp_path / "bad.mcap"
+    bad.write_bytes(fused_log.read_bytes())
+
+    def replay_unless_bad(log: Path, **options: Any) -> object:
+        if log == bad and stage == "replay":
+            raise KeyError("gone")
+        return replay_frames(log, **options)
+
+    def report_unless_bad(log: Path, **_: object) -> ReportPaths:
+        return {fused_log: ReportPaths(log, log)}[log]
+
+    monkeypatch.setattr(job, "replay_frames", replay_unless_bad)
+    monkeypatch.setattr(report, "write_report", report_unless_bad)
+    done = CliRunner().invoke(
+        cli.app, ["replay", str(bad), str(fused_log), "--jobs", "1", "--json", "--report"]
+    )
+    assert done.exit_code == 2
+    assert f"error: {bad} failed with KeyError at test_replay.py:" in done.stderr
+    printed = json.loads(done.stdout)
+    assert printed["reports"] == [str(fused_log)]
+    assert len(printed["logs"]) == (1 if stage == "replay" else 2)
+    assert list(printed.get("failed", [])) == ([str(bad)] if stage == "replay" else [])
+
+
 def test_another_network_in_batches_gives_the_estimates_of_a_run(fused_log: Path) -> None:
     reader = LogReader(fused_log)
     run = resolve_replay(changed_config(reader, "small"))
@@ -288,3 +325,49 @@ def test_the_columns_hold_each_estimate(fused_log: Path) -> None:
     assert len({len(values) for values in columns.values()}) == 1
     error_n = columns["visual_n"] - columns["measured_n"]
     assert np.nanmean(np.abs(error_n)) == pytest.approx(result.sources["visual"].mae_n, rel=1e-6)
+
+
+def long_log(log: Path, path: Path, times: int) -> Path:
+    """A log whose records are those of another one, again and again."""
+    reader = LogReader(log)
+    records = list(reader.records())
+    frames = 1 + max(record.seq for record in records if isinstance(record, Frame))
+    with LogWriter(path, config=reader.config, metadata=reader.metadata) as writer:
+        for turn in range(times):
+            for record in records:
+                changes = {
+                    name: getattr(record, name)
+                    for name in ("t_ns", "ready_ns", "received_ns")
+                    if hasattr(record, name)
+                }
+                later = {
+                    name: t_ns + turn * (reader.duration_ns + NS_PER_MS) for name, t_ns in changes.items()
+                }
+                number = {"seq": record.seq + turn * frames} if hasattr(record, "seq") else {}
+                writer.write(dataclasses.replace(cast(Any, record), **later, **number))
+    return path
+
+
+@pytest.mark.parametrize("command", ["replay", "replay in batches", "evaluate"])
+def test_memory_does_not_grow_with_the_records_of_a_log(
+    fused_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str
+) -> None:
+    monkeypatch.setattr(metrics, "lag_s", lambda *_: 0.0)  # its transform takes 0.1 MB for each second of log
+
+    def run(log: Path) -> None:
+        if command == "evaluate":
+            evaluate([log], "small")
+        else:
+            replay_frames(log, "small" if command == "replay in batches" else None)
+
+    run(fused_log)  # imports, and loads the network
+    peaks = []
+    for times in (3, 7):
+        log = long_log(fused_log, tmp_path / f"{times}.mcap", times)
+        gc.collect()
+        tracemalloc.start()
+        run(log)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    longer_s = 4 * LogReader(fused_log).duration_ns / NS_PER_S
+    assert (peaks[1] - peaks[0]) / longer_s < 50_000, "bytes for each second of log"

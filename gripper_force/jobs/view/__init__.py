@@ -130,7 +130,11 @@ def show(log: LogReader, viewer: Viewer) -> None:
 
 @contextmanager
 def beside_run(
-    path: Path, viewer: str, tell: Callable[[str], None], save: Path | None = None
+    path: Path,
+    viewer: str,
+    tell: Callable[[str], None],
+    save: Path | None = None,
+    connect: Callable[[str], None] | None = None,
 ) -> Iterator[None]:
     """Opens a viewer in a process of its own, which shows a log from its first record on.
 
@@ -139,6 +143,8 @@ def beside_run(
         viewer: A key of `VIEWERS`.
         tell: Called with one sentence for a person.
         save: File for Rerun (``.rrd``) to write instead of opening a window.
+        connect: Called with the address of Foxglove's server, instead of ``tell``, to connect a client: the server
+            waits for one.
 
     Raises:
         ConfigError: The viewer is unknown or not installed.
@@ -159,7 +165,10 @@ def beside_run(
             while not (state := json.loads(process.stdout.readline() or '{"ended": true}')).get("ready"):
                 if "ended" in state or "error" in state:
                     raise DataError(f"the viewer did not start: {state.get('error', 'it ended at once')}")
-                tell(state["text"])
+                if connect is not None and "url" in state:
+                    connect(state["url"])
+                else:
+                    tell(state["text"])
             yield
             process.wait(_PATIENCE_S)
         except subprocess.TimeoutExpired:

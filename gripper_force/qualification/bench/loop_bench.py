@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,10 +20,12 @@ from typing import Any, Final, cast
 import numpy as np
 
 from gripper_force.config import Config, config_from_text, load_config
+from gripper_force.errors import GripperError
 from gripper_force.interfaces import Devices, Servo
 from gripper_force.jobs.grasp import run_grasp
 from gripper_force.jobs.replay import resolve_replay, run_again
 from gripper_force.jobs.view import beside_run, require
+from gripper_force.qualification.bench import foxglove_client
 from gripper_force.qualification.bench.startup_bench import LONG_TIMEOUTS
 from gripper_force.runtime.backends import MonotonicClock, load_servo_class
 from gripper_force.runtime.log_reader import LogReader
@@ -189,7 +191,7 @@ def loop(
         overrides: Configuration keys, such as ``vision.threads=2``.
         path: Configuration file, or None.
         viewer: Viewer to measure as well, with vision; a key of `gripper_force.jobs.view.VIEWERS`. Rerun writes a
-            file then, because a window's cost depends on the graphics.
+            file then, because a window's cost depends on the graphics. Foxglove has a client that shows nothing.
 
     Raises:
         GripperError: The virtual servo did not answer, or the configuration is wrong.
@@ -248,11 +250,36 @@ def _run(config: Config, frames: list[Frame], seconds: float, path: Path, measur
     measured.compute_ms += [visual.compute_ms for visual in LogReader(path).records(VisualForce)]
 
 
-def _viewer(viewer: str | None, log_path: Path) -> AbstractContextManager[None]:
+@contextmanager
+def _viewer(viewer: str | None, log_path: Path) -> Iterator[None]:
+    """Opens a viewer beside a run, and for Foxglove a client: nobody need open the app."""
     if viewer is None:
-        return nullcontext()
+        yield
+        return
     save = log_path.with_suffix(".rrd") if viewer == "rerun" else None
-    return beside_run(log_path, viewer, lambda text: print(text, file=sys.stderr), save)  # noqa: T201
+    clients: list[subprocess.Popen[str]] = []
+    try:
+        with beside_run(log_path, viewer, _tell, save, lambda url: clients.append(_foxglove_client(url))):
+            yield
+    finally:
+        for client in clients:
+            with client:
+                client.terminate()
+
+
+def _tell(text: str) -> None:
+    print(text, file=sys.stderr)  # noqa: T201
+
+
+def _foxglove_client(url: str) -> "subprocess.Popen[str]":
+    """Starts a client in a process of its own, and waits until it has subscribed."""
+    command = [sys.executable, "-m", foxglove_client.__name__, url]
+    client = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert client.stdout is not None
+    if not client.stdout.readline():
+        problem = client.communicate()[1].strip().rpartition("\n")[2]
+        raise GripperError(f"the client could not use the Foxglove server at {url}: {problem}; run it again")
+    return client
 
 
 @contextmanager

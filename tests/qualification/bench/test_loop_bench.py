@@ -1,11 +1,14 @@
 import json
 import math
+import socket
+import threading
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from gripper_force import cli
+from gripper_force.errors import GripperError
 from gripper_force.qualification.bench import loop_bench as loop
 from gripper_force.qualification.bench.loop_bench import LogCost, LoopCost
 
@@ -21,6 +24,29 @@ def test_the_loop_runs_in_real_time_with_vision_and_without(tiny_checkpoint: Pat
         assert 0 <= cost.late_p50_ms <= cost.late_p99_ms <= cost.late_max_ms
         assert 0 < cost.bus_p50_ms <= cost.cycle_p99_ms
     assert min(log.run_mb_s, log.write_mb_s, log.record_us, log.replay_times) > 0
+
+
+def test_foxglove_is_measured_without_the_app(tiny_checkpoint: Path) -> None:
+    pytest.importorskip(
+        "foxglove", reason="Foxglove's SDK is not installed: pip install 'gripper-force[view]'"
+    )
+    costs, _ = loop.loop(1.0, [f"vision.checkpoint={tiny_checkpoint}"], viewer="foxglove")
+    assert [cost.beside for cost in costs] == ["vision", "nothing", "vision, foxglove"]
+    assert costs[2].estimates_hz > 0
+
+
+def test_a_server_that_is_no_foxglove_server_ends_the_measurement() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def refuse() -> None:
+            with server.accept()[0] as connection:
+                connection.sendall(b"HTTP/1.1 404 Not Found\r\n\r\n")
+
+        answers = threading.Thread(target=refuse)
+        answers.start()
+        with pytest.raises(GripperError, match=r"could not use the Foxglove server at ws://.*404 Not Found"):
+            loop._foxglove_client(f"ws://127.0.0.1:{server.getsockname()[1]}")
+        answers.join()
 
 
 def test_bench_loop_prints_a_table_and_json(monkeypatch: pytest.MonkeyPatch) -> None:

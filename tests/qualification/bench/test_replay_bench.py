@@ -1,5 +1,6 @@
 import json
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from shutil import copy
 from typing import Any
@@ -10,6 +11,7 @@ from typer.testing import CliRunner
 from gripper_force import cli
 from gripper_force.errors import GripperError
 from gripper_force.qualification.bench import replay_bench
+from gripper_force.qualification.bench.replay_bench import ReplayRate
 
 
 @pytest.fixture
@@ -22,6 +24,7 @@ def logs(fused_log: Path, tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.mark.filterwarnings("default")  # of Ray
 def test_the_commands_run_in_every_way(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(replay_bench, "COMMANDS", ("replay",))
     page = tmp_path / "page.md"
@@ -30,10 +33,24 @@ def test_the_commands_run_in_every_way(logs: Path, tmp_path: Path, monkeypatch: 
     done = CliRunner().invoke(cli.app, [*call, "--write", str(page), "--json"])
     assert done.exit_code == 0, done.output
     rows = json.loads(done.stdout)["replay"]
-    assert [row["where"] for row in rows][:2] == ["1 process", "2 processes"]
+    with_ray = ["Ray, 2 workers"] if find_spec("ray") else []
+    assert [row["where"] for row in rows] == ["1 process", "2 processes", *with_ray]
     assert all(row["rates"][0] > 0 for row in rows)
     assert "| `replay` | small | 2 processes |" in page.read_text()
     assert "2 logs, median of 1 rounds" in page.read_text()
+
+
+def test_the_table_has_the_median_and_the_range_of_the_rounds() -> None:
+    rows = [
+        ReplayRate("replay", "small", "1 process", [2.0, 3.06, 2.5]),
+        ReplayRate("evaluate", "small", "1 process", [4.0]),
+    ]
+    assert replay_bench.markdown(rows, "About it.").splitlines()[2:] == [
+        "| `replay` | small | 1 process | 2.5 (2.0 to 3.1) |",
+        "| `evaluate` | small | 1 process | 4.0 |",
+        "",
+        "About it.",
+    ]
 
 
 def test_ways_that_disagree_are_an_error(logs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
