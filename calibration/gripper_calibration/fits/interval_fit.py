@@ -24,6 +24,8 @@ from gripper_force.profiles.object_profile import Interval
 
 MIN_TOUCHES: Final = 3
 _MIN_BASE_N: Final = 0.01
+_MIN_VARIANCE_N2: Final = 1e-12
+"""Touches without any error would need none, and the search would end in a division by zero."""
 
 
 def model_interval(line: LinearFit, coverage: float) -> Interval:
@@ -54,7 +56,7 @@ def touch_interval(
 
     def cost(log_std: Floats) -> float:
         base2, share2 = np.exp(2 * log_std)
-        variance = base2 + share2 * size2
+        variance = np.maximum(base2 + share2 * size2, _MIN_VARIANCE_N2)
         return float(weight @ (np.log(variance) + error2 / variance))
 
     rms_n = max(float(np.sqrt(weight @ error2)), _MIN_BASE_N)

@@ -1,5 +1,6 @@
 """Import of MuJoCo. EGL is only loaded for the first rendering; if it is missing, a clear error is raised."""
 
+import ctypes
 import importlib
 import os
 import sys
@@ -9,7 +10,7 @@ from gripper_force.errors import SimulationError
 
 NO_EGL = (
     "MuJoCo cannot render on this machine because EGL is missing; "
-    "on Debian or Ubuntu: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri"
+    "on Debian or Ubuntu: apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0"
 )
 
 _LINUX: Final = sys.platform == "linux"
@@ -37,8 +38,8 @@ def new_renderer(model: Any, side_px: int) -> Any:
         if not hasattr(gl_context, "GLContext"):
             importlib.reload(gl_context)
         return mujoco.Renderer(model, side_px, side_px)
-    # MuJoCo raises any of these if libEGL, or a driver for it, is missing.
-    except (AttributeError, ImportError, RuntimeError, mujoco.FatalError) as error:
+    # MuJoCo raises any of these if libEGL, libOpenGL, or a driver, is missing.
+    except (AttributeError, ctypes.ArgumentError, ImportError, RuntimeError, mujoco.FatalError) as error:
         other = f"MuJoCo cannot render on this machine ({error}); set camera.backend=none"
         raise SimulationError(NO_EGL if _LINUX else other) from error
 

@@ -3,7 +3,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from gripper_calibration.fits.object_fit import fit_correction, learning_curve
@@ -116,6 +116,8 @@ def test_nonfinite_values_are_refused(touched: Callable[..., Touches]) -> None:
     repeat=st.booleans(),
     seed=st.integers(0, 100),
 )
+@example(count=3, gain=1.0, offset_n=0.0, scatter=0.5, noise_n=0.0, repeat=False, seed=0)
+@example(count=3, gain=1.0, offset_n=0.0, scatter=0.0, noise_n=0.0, repeat=False, seed=0)
 def test_any_fit_is_refused_or_finite_and_monotone(
     touched: Callable[..., Touches],
     count: int,
@@ -138,4 +140,5 @@ def test_any_fit_is_refused_or_finite_and_monotone(
     assert (np.diff(fitted.output.force_n) >= 0).all()
     assert 0 < fitted.interval.base_n < 100
     if fitted.after_n is not None:
-        assert fitted.after_n <= fitted.errors_n["the network as it is"] + 3 * noise_n + 0.1
+        as_it_is_n = fitted.errors_n["the network as it is"]
+        assert fitted.after_n <= as_it_is_n + 3 * noise_n + scatter + 0.1  # touches that differ mislead it

@@ -160,21 +160,23 @@ NO_LIBRARY = """
     load, find = ctypes.CDLL.__init__, ctypes.util.find_library
 
     def refuse(self, name, *args, **kwargs):
-        if name and "EGL" in str(name):
+        if name and any(library in str(name) for library in MISSING):
             raise OSError(f"{name}: cannot open shared object file")
         load(self, name, *args, **kwargs)
 
     ctypes.CDLL.__init__ = refuse
-    ctypes.util.find_library = lambda name: None if "EGL" in name else find(name)
+    ctypes.util.find_library = lambda name: None if name in MISSING else find(name)
 """
 
 
-@pytest.mark.parametrize("lacks", ["library", "driver"])
-def test_missing_egl_names_the_packages(lacks: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("missing", [("EGL",), ("OpenGL", "GL", "GLESv2", "GLESv1_CM"), ()])
+def test_missing_egl_names_the_packages(missing: tuple[str, ...], tmp_path: Path) -> None:
+    """A library is missing, or without one the driver."""
     env = dict(os.environ)
-    if lacks == "library":
-        (tmp_path / "sitecustomize.py").write_text(textwrap.dedent(NO_LIBRARY))
-        env["PYTHONPATH"] = str(tmp_path)
+    if missing:
+        code = f"MISSING = {missing}\n" + textwrap.dedent(NO_LIBRARY)
+        (tmp_path / "sitecustomize.py").write_text(code)
+        env["PYTHONPATH"] = os.pathsep.join([str(tmp_path), *filter(None, [env.get("PYTHONPATH")])])
     else:
         env["__EGL_VENDOR_LIBRARY_FILENAMES"] = "/nonexistent"
     code = "from gripper_force.cli import main; main()"
@@ -192,7 +194,7 @@ def test_missing_egl_names_the_packages(lacks: str, tmp_path: Path) -> None:
     )
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == f"error: {NO_EGL}\n"
-    assert "apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri" in NO_EGL
+    assert "apt-get install libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0" in NO_EGL
 
 
 @pytest.mark.parametrize("name", ["sponge", "paper_cup", "tube", "stapler", "ball", "block"])
