@@ -40,11 +40,11 @@ if TYPE_CHECKING:
     from gripper_force.interfaces import Camera as Camera
     from gripper_force.interfaces import Clock as Clock
     from gripper_force.interfaces import LoadCell as LoadCell
-    from gripper_force.interfaces import Progress as Progress
     from gripper_force.interfaces import Servo as Servo
     from gripper_force.interfaces import ServoSpec as ServoSpec
     from gripper_force.jobs.evaluate import evaluate as evaluate
     from gripper_force.jobs.replay import replay as replay
+    from gripper_force.progress import Progress as Progress
     from gripper_force.runtime.gripper import Gripper as Gripper
     from gripper_force.runtime.gripper import open_gripper as open_gripper
     from gripper_force.runtime.log_reader import LogReader as LogReader

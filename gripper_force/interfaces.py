@@ -1,4 +1,4 @@
-"""Protocols of devices, which `gripper_force.runtime.backends` opens by name, and of callbacks."""
+"""Protocols of devices, which `gripper_force.runtime.backends` opens by name."""
 
 from __future__ import annotations
 
@@ -20,31 +20,6 @@ class BusStats:
     retries: int = 0
     timeouts: int = 0
     corrupt: int = 0
-
-
-class Progress(Protocol):
-    """Callback that long work calls to report what it does."""
-
-    def __call__(self, text: str, steps: int = 1) -> None:
-        """Reports progress.
-
-        Args:
-            text: What is being done, for a person.
-            steps: Steps of the announced total that were finished since the last call; 0 for none.
-        """
-        ...
-
-
-class Prompt(Protocol):
-    """Callback that asks a person to do something."""
-
-    def __call__(self, text: str) -> None:
-        """Shows an instruction and returns once the person has confirmed it."""
-        ...
-
-
-def no_progress(text: str, steps: int = 1) -> None:
-    """Ignores progress reports."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from gripper_calibration.procedures.calibrate_load_cell import LoadCellResult
     from gripper_calibration.procedures.calibrate_servo import ServoResult
     from gripper_force.config import Config
-    from gripper_force.interfaces import Progress
+    from gripper_force.progress import Progress
 
 app = typer.Typer(
     no_args_is_help=True,

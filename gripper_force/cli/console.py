@@ -23,7 +23,7 @@ if TYPE_CHECKING:  # --help loads no NumPy
 
     from rich.status import Status
 
-    from gripper_force.interfaces import Progress, Prompt
+    from gripper_force.progress import Progress, Prompt
 
 err = Console(stderr=True, highlight=False)
 out = Console(highlight=False)

@@ -34,8 +34,8 @@ from gripper_force.plugins import require
 
 if TYPE_CHECKING:
     from gripper_force.config import Config
-    from gripper_force.interfaces import Progress, Prompt
     from gripper_force.jobs.checks import RegisterChange
+    from gripper_force.progress import Progress, Prompt
 
 _OPEN_LOOP = (
     "A replay is open loop: estimates and commands are computed again, but servo, camera and load cell keep what they "
@@ -92,9 +92,9 @@ def grasp(
     """Grasp with a target force and report the error. Exit code 1 if nothing was held."""
     from contextlib import nullcontext
 
-    from gripper_force.interfaces import no_progress
     from gripper_force.jobs import grasp as job
     from gripper_force.jobs.view import beside_run
+    from gripper_force.progress import no_progress
 
     if view is not None and trials:
         raise ConfigError("--view shows one grasp; leave out --trials")

@@ -17,8 +17,8 @@ import numpy.typing as npt
 from gripper_force.config import Config, config_from_text
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import DataError
-from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.processes import process_pool
+from gripper_force.progress import Progress, no_progress
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.schema import Tree
 from gripper_force.types import NS_PER_MS, Frame, Gray, LoadCellSample, Record, ServoState

@@ -14,8 +14,8 @@ import numpy as np
 
 from gripper_force.config import Config
 from gripper_force.errors import GripperError
-from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.checks import Check, Confirm, PortScan, SetupResult, judged, time_ms
+from gripper_force.progress import Progress, no_progress
 from gripper_force.runtime.backends import MonotonicClock
 from gripper_force.runtime.process import real_time_priority
 from gripper_force.runtime.resolve import ResolvedConfig, make_estimator, resolve_vision

@@ -14,7 +14,6 @@ import torch
 
 from gripper_force.config import Config, config_from, config_from_text
 from gripper_force.errors import DataError
-from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import (
     CONTACT_N,
@@ -30,6 +29,7 @@ from gripper_force.jobs.object_gain import gain_of
 from gripper_force.jobs.processes import Workers
 from gripper_force.jobs.summary_files import check_writable, evaluation_tables, write_summary
 from gripper_force.profiles.apply import read_correction, read_profiles, with_object
+from gripper_force.progress import Progress, no_progress
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.schema import Tree
 from gripper_force.types import Frame, LoadCellSample, ServoState

@@ -12,7 +12,6 @@ import numpy as np
 from gripper_force.config import Config, config_from, config_from_text
 from gripper_force.control.limits import largest_target_n
 from gripper_force.errors import ConfigError, DataError, DeviceError
-from gripper_force.interfaces import Progress, Prompt, no_progress
 from gripper_force.jobs.dataset import stiffness_floor_n, stiffness_of
 from gripper_force.jobs.object_gain import learned_ratio
 from gripper_force.jobs.processes import process_pool
@@ -25,6 +24,7 @@ from gripper_force.jobs.score import (
     vision_in_hold,
 )
 from gripper_force.plugins import require
+from gripper_force.progress import Progress, Prompt, no_progress
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import resolve
 from gripper_force.runtime.session import Session, open_run

@@ -19,7 +19,7 @@ from queue import Empty, SimpleQueue
 from typing import Any, Final, TypeVar
 
 from gripper_force.errors import DataError, GripperError
-from gripper_force.interfaces import Progress
+from gripper_force.progress import Progress
 from gripper_force.runtime.process import ProcessOptions, allowed, own_process
 
 _TERMINAL_SIGNALS: Final = (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)

@@ -16,12 +16,12 @@ from gripper_force import __version__
 from gripper_force.config import Config, Overrides, config_from_text
 from gripper_force.control.state_machine import Decision
 from gripper_force.errors import DataError, GripperError, UnfamiliarFrameError
-from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import CONTACT_N, CellSeries, label_at
 from gripper_force.jobs.metrics import ForceBin
 from gripper_force.jobs.processes import Workers
 from gripper_force.profiles.apply import read_correction, read_profiles
+from gripper_force.progress import Progress, no_progress
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.perception import FrameProcessor
 from gripper_force.runtime.process import allowed

@@ -18,10 +18,10 @@ import numpy.typing as npt
 
 from gripper_force.config import Config, config_from
 from gripper_force.errors import DataError
-from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.dataset import CONTACT_N, label_frames
 from gripper_force.jobs.processes import process_pool
 from gripper_force.jobs.simulate import OBJECTS, make_log, plan
+from gripper_force.progress import Progress, no_progress
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.schema import Tree
 from gripper_force.types import NS_PER_MS, Frame, Gray, LoadCellSample

@@ -21,8 +21,8 @@ from gripper_force.control.limits import largest_target_n
 from gripper_force.control.state_machine import GraspController
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import ConfigError, DataError
-from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.processes import process_pool
+from gripper_force.progress import Progress, no_progress
 from gripper_force.qualification.loop_margin.analytic_plant import (
     CYCLE_NS,
     NOISE_A,

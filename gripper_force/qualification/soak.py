@@ -12,8 +12,8 @@ from typing import Final, TypedDict
 import numpy as np
 
 from gripper_force.config import Config
-from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.grasp import TRIAL_OBJECTS, TRIAL_TARGETS_N, grasp
+from gripper_force.progress import Progress, no_progress
 from gripper_force.qualification.proc_files import process_text
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import NS_PER_S

@@ -8,9 +8,9 @@ import pytest
 from gripper_force.config import Config, config_from_text, load_config
 from gripper_force.control.limits import largest_target_n
 from gripper_force.errors import ConfigError, DeviceError, RequestError
-from gripper_force.interfaces import Progress
 from gripper_force.jobs import grasp as grasp_module
 from gripper_force.jobs.grasp import Summary, exclusive_device, overall, summarise, trials
+from gripper_force.progress import Progress
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import NS_PER_S, GraspStatus, LoadCellSample, VisualForce

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from gripper_force.errors import DataError, GripperError
-from gripper_force.interfaces import no_progress
 from gripper_force.jobs.processes import Workers, process_pool
+from gripper_force.progress import no_progress
 
 
 def interrupted_itself(number: signal.Signals) -> int:
@@ -103,7 +103,7 @@ def test_an_interruption_while_results_are_sent_ends_at_once() -> None:
 FORGETFUL = """
 import os, sys, time
 from gripper_force.errors import DataError, GripperError
-from gripper_force.interfaces import no_progress
+from gripper_force.progress import no_progress
 from gripper_force.jobs.processes import Workers, process_pool
 
 def jobs():

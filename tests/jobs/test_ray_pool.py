@@ -11,11 +11,11 @@ from typer.testing import CliRunner
 from gripper_force import cli
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, GripperError, LogError
-from gripper_force.interfaces import no_progress
 from gripper_force.jobs.evaluate import evaluate
 from gripper_force.jobs.processes import Workers
 from gripper_force.jobs.replay import replay_each
 from gripper_force.jobs.simulate import plan, simulate
+from gripper_force.progress import no_progress
 
 ray = pytest.importorskip("ray", reason="Ray is not installed: pip install 'gripper-force[ray]'")
 

@@ -25,13 +25,13 @@ from gripper_calibration.fits.camera_fit import (
 from gripper_calibration.plots.camera_plot import draw
 from gripper_force.config import CAMERA_OTHER_KEYS, Config
 from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
-from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.profile_files import update_rig
 from gripper_force.jobs.recording.lag import camera_lags_s, load_cell_lag_s
 from gripper_force.jobs.recording.record import RecordingPlan, record
 from gripper_force.jobs.recording.summary import releases_ns
 from gripper_force.profiles.object_profile import BUNDLED, read_object, user_folder
 from gripper_force.profiles.rig_profile import CalibratedValue, CameraCalibration, read_rig
+from gripper_force.progress import Progress, no_progress
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import ResolvedConfig, make_estimator, resolve, resolve_vision

@@ -12,7 +12,8 @@ from gripper_calibration.procedures.powered_servo import RATE_HZ, BusCycles, ser
 from gripper_force.config import Config
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import DataError
-from gripper_force.interfaces import Devices, Progress, Prompt, no_progress
+from gripper_force.interfaces import Devices
+from gripper_force.progress import Progress, Prompt, no_progress
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.resolve import resolve
 from gripper_force.types import ServoState

@@ -13,10 +13,11 @@ from gripper_calibration.fits.load_cell_fit import LoadCellFit, Rest, fit_load_c
 from gripper_calibration.plots.load_cell_plot import draw
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
-from gripper_force.interfaces import Clock, LoadCell, Progress, Prompt, no_progress
+from gripper_force.interfaces import Clock, LoadCell
 from gripper_force.jobs.checks import open_load_cell
 from gripper_force.jobs.profile_files import update_rig
 from gripper_force.profiles.rig_profile import LoadCellCalibration, read_rig
+from gripper_force.progress import Progress, Prompt, no_progress
 from gripper_force.runtime.backends import MonotonicClock
 from gripper_force.types import NS_PER_MS, NS_PER_S, LoadCellSample
 

@@ -24,10 +24,10 @@ from gripper_calibration.plots.object_plot import draw
 from gripper_calibration.touch_logs import TouchRecording, join, read_log
 from gripper_force.config import Config
 from gripper_force.errors import DataError
-from gripper_force.interfaces import Progress, Prompt, no_progress
 from gripper_force.jobs.profile_files import check_place, pack, write_object
 from gripper_force.jobs.recording.record import RecordingPlan, record
 from gripper_force.profiles.object_profile import ObjectProfile, user_folder
+from gripper_force.progress import Progress, Prompt, no_progress
 from gripper_force.runtime.resolve import ResolvedConfig, make_estimator, resolve_vision
 from gripper_force.types import NS_PER_MS
 from gripper_force.vision.checkpoint import load_checkpoint

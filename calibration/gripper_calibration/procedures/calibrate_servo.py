@@ -18,7 +18,7 @@ from gripper_force.control.limits import largest_target_n
 from gripper_force.control.linkage import make_linkage
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import ConfigError, DataError, DeviceError
-from gripper_force.interfaces import Devices, LoadCell, Progress, Prompt, no_progress
+from gripper_force.interfaces import Devices, LoadCell
 from gripper_force.jobs.profile_files import update_rig
 from gripper_force.profiles.rig_profile import (
     CalibratedValue,
@@ -26,6 +26,7 @@ from gripper_force.profiles.rig_profile import (
     ServoCalibration,
     read_rig,
 )
+from gripper_force.progress import Progress, Prompt, no_progress
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.resolve import make_controller, resolve
 from gripper_force.types import NS_PER_S, ServoState

@@ -12,8 +12,8 @@ from gripper_calibration.procedures.calibrate_load_cell import STANDARD_GRAVITY_
 from gripper_calibration.procedures.powered_servo import RATE_HZ, BusCycles, servo_alone, torque_on
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DataError, DeviceError
-from gripper_force.interfaces import Progress, Prompt, no_progress
 from gripper_force.profiles.rig_profile import CalibratedValue, torque_settings
+from gripper_force.progress import Progress, Prompt, no_progress
 from gripper_force.runtime.backends import is_simulated, open_devices
 from gripper_force.runtime.resolve import make_controller, resolve
 

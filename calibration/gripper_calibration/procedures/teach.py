@@ -47,7 +47,6 @@ from gripper_calibration.touch_logs import TouchRecording, join, read_log
 from gripper_force import __version__
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DataError
-from gripper_force.interfaces import Progress, Prompt, no_progress
 from gripper_force.jobs.dataset import CONTACT_N, Clip, load_clips
 from gripper_force.jobs.processes import process_pool
 from gripper_force.jobs.profile_files import check_place, pack, write_all, write_object
@@ -57,6 +56,7 @@ from gripper_force.jobs.training.stated_errors import errors, residuals
 from gripper_force.jobs.training.train import train
 from gripper_force.profiles.correction import KnownFrames, ProfileArrays
 from gripper_force.profiles.object_profile import BUNDLED, ObjectProfile, user_folder
+from gripper_force.progress import Progress, Prompt, no_progress
 from gripper_force.runtime.resolve import ResolvedConfig, resolve_vision
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
 from gripper_force.vision.checkpoint_writer import replace_header

@@ -16,7 +16,7 @@ from gripper_calibration.setup.step import Outcome, Person, Task
 from gripper_calibration.setup.torque import torque
 from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError
-from gripper_force.interfaces import Progress, no_progress
+from gripper_force.progress import Progress, no_progress
 
 
 @dataclass(frozen=True, slots=True)

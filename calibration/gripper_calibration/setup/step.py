@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 from gripper_force.config import Config
-from gripper_force.interfaces import Progress
+from gripper_force.progress import Progress
 
 
 class Person(Protocol):

@@ -14,7 +14,7 @@ import numpy as np
 
 from gripper_force.config import Config, Overrides, config_from_text
 from gripper_force.errors import ConfigError, DataError
-from gripper_force.interfaces import Progress, no_progress
+from gripper_force.progress import Progress, no_progress
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import (
     NS_PER_S,

@@ -19,9 +19,9 @@ import numpy.typing as npt
 
 from gripper_force.config import Config, dump_config
 from gripper_force.errors import DataError, LogError
-from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.dataset import label_frames, starts_in_contact
 from gripper_force.jobs.recording.lag import force_lag_s
+from gripper_force.progress import Progress, no_progress
 from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.spikes import find_spikes
 from gripper_force.types import NS_PER_S, Frame, Gray, LoadCellSample

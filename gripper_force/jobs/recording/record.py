@@ -21,9 +21,10 @@ from gripper_force.config import Config, config_from_text
 from gripper_force.control.limits import largest_target_n
 from gripper_force.control.state_machine import Decision
 from gripper_force.errors import ConfigError, DataError, DeviceError
-from gripper_force.interfaces import Devices, Progress, Prompt, no_progress
+from gripper_force.interfaces import Devices
 from gripper_force.jobs.dataset import CONTACT_N
 from gripper_force.jobs.recording.touches import touch
+from gripper_force.progress import Progress, Prompt, no_progress
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import ResolvedConfig, resolve

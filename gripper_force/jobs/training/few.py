@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from gripper_force.errors import DataError
-from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.dataset import CONTACT_N, Clip
+from gripper_force.progress import Progress, no_progress
 from gripper_force.vision.batch_inference import normalise
 from gripper_force.vision.header import ProcessConfig
 from gripper_force.vision.kernel_regression import ForceProcess, matern, pooled

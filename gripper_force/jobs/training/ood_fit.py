@@ -10,10 +10,10 @@ import numpy.typing as npt
 from scipy.optimize import minimize
 
 from gripper_force.errors import DataError
-from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.dataset import CONTACT_N, Clip, check_size, load_clips, without_contact_starts
 from gripper_force.profiles.correction import KnownFrames
 from gripper_force.profiles.object_profile import OodLimit
+from gripper_force.progress import Progress, no_progress
 from gripper_force.vision.batch_inference import features
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.checkpoint_writer import replace_header

@@ -14,7 +14,6 @@ import numpy as np
 import numpy.typing as npt
 
 from gripper_force.errors import ConfigError
-from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import Clip, check_size, digest, split_by
 from gripper_force.jobs.report.plots import draw_training
@@ -27,6 +26,7 @@ from gripper_force.jobs.training.recipe import FITTED_AT_ONCE, continued
 from gripper_force.jobs.training.recipe import TrainConfig as TrainConfig
 from gripper_force.jobs.training.stated_errors import errors, estimates, residuals
 from gripper_force.jobs.training.trainer import Trainer
+from gripper_force.progress import Progress, no_progress
 from gripper_force.schema import Tree
 from gripper_force.vision.batch_inference import predict
 from gripper_force.vision.checkpoint import Checkpoint, Member, load_checkpoint

@@ -20,10 +20,10 @@ import numpy as np
 import torch
 
 from gripper_force.errors import ConfigError
-from gripper_force.interfaces import Progress
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import Clip
 from gripper_force.jobs.int8_export import export_int8
+from gripper_force.progress import Progress
 from gripper_force.qualification.bench.roofline import Roofline, measure
 from gripper_force.qualification.proc_files import process_text
 from gripper_force.types import NS_PER_MS

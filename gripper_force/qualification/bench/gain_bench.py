@@ -8,12 +8,12 @@ from typing import Final
 import numpy as np
 
 from gripper_force.config import Config
-from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.dataset import load_clips
 from gripper_force.jobs.evaluate import estimates
 from gripper_force.jobs.grasp import Summary, trials, with_same_object
 from gripper_force.jobs.object_gain import gain_of, learned_ratio
 from gripper_force.jobs.recording.touches import ramp, wait
+from gripper_force.progress import Progress, no_progress
 from gripper_force.runtime.session import open_run
 from gripper_force.types import Outcome
 from gripper_force.vision.checkpoint import load_checkpoint

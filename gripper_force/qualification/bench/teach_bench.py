@@ -21,7 +21,6 @@ from gripper_calibration.procedures.calibrate_object import calibrate_object, re
 from gripper_calibration.procedures.teach import teach
 from gripper_force.config import Config, load_config
 from gripper_force.errors import DataError
-from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs.dataset import Clip, load_clips, without_contact_starts
 from gripper_force.jobs.evaluate import evaluate
 from gripper_force.jobs.grasp import overall, trials
@@ -29,6 +28,7 @@ from gripper_force.jobs.imports.video import import_folder
 from gripper_force.jobs.training import few
 from gripper_force.jobs.training.recipe import recipe
 from gripper_force.jobs.training.train import train
+from gripper_force.progress import Progress, no_progress
 from gripper_force.vision.batch_inference import features
 from gripper_force.vision.kernel_regression import ForceProcess
 from gripper_force.vision.model_files import read_model

@@ -12,7 +12,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
 from gripper_force.errors import ConfigError
-from gripper_force.interfaces import Progress, no_progress
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import Clip, split_by
 from gripper_force.jobs.report.figure import STYLE
@@ -21,6 +20,7 @@ from gripper_force.jobs.training.parallel import joined
 from gripper_force.jobs.training.recipe import RECIPES, TrainConfig, section_from
 from gripper_force.jobs.training.stated_errors import estimates
 from gripper_force.jobs.training.trainer import Trainer
+from gripper_force.progress import Progress, no_progress
 from gripper_force.schema import Tree
 from gripper_force.vision.preprocess import Preprocess
 

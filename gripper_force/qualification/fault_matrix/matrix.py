@@ -17,9 +17,10 @@ import numpy as np
 
 from gripper_force.config import Config, config_from
 from gripper_force.errors import GripperError, LogError
-from gripper_force.interfaces import Devices, Progress, no_progress
+from gripper_force.interfaces import Devices
 from gripper_force.jobs.grasp import TRIAL_OBJECTS, TRIAL_TARGETS_N, grasp_and_release
 from gripper_force.jobs.processes import process_pool
+from gripper_force.progress import Progress, no_progress
 from gripper_force.qualification.fault_matrix.cases import ROWS, FaultCase
 from gripper_force.qualification.fault_matrix.judge import FaultFreeGrasp, Grasp, judge
 from gripper_force.qualification.fault_matrix.kill_process import kill_trial

@@ -17,9 +17,10 @@ from gripper_force.config import Config, config_from
 from gripper_force.control.limits import largest_target_n
 from gripper_force.control.state_machine import is_open
 from gripper_force.errors import ConfigError, DeviceError, GripperError, SimulationError
-from gripper_force.interfaces import Progress, WorldState, no_progress
+from gripper_force.interfaces import WorldState
 from gripper_force.jobs.grasp import TRIAL_OBJECTS, TRIAL_TARGETS_N
 from gripper_force.jobs.processes import process_pool
+from gripper_force.progress import Progress, no_progress
 from gripper_force.qualification.fault_matrix.outcome_file import OutcomeFile
 from gripper_force.qualification.safety_statements import FORCE_SHARE, SPEED_SHARE, SafetyStatements
 from gripper_force.runtime.backends import open_devices
@@ -40,8 +41,6 @@ _LIMIT_SPARE: Final = 1.001
 _AFTER_OUTCOME_NS: Final = NS_PER_S
 """Time for which a grasp goes on after its outcome has last changed."""
 
-_LONGEST_NS: Final = 10 * NS_PER_S
-_RELEASE_NS: Final = 1500 * NS_PER_MS
 _AFTER_NS: Final = 300 * NS_PER_MS
 """Time after the run in which force and speed are still observed."""
 
@@ -362,7 +361,8 @@ def _grasp_and_release(
     add(session.wait_for_reference().status)
     status = cycle(RequestKind.GRASP, target_n)
     begin_ns = changed_ns = status.t_ns
-    while status.t_ns - begin_ns < _LONGEST_NS and (
+    longest_ns = round(session.timeout_s * NS_PER_S) + 2 * _AFTER_OUTCOME_NS
+    while status.t_ns - begin_ns < longest_ns and (
         status.outcome == Outcome.NONE or status.t_ns - changed_ns < _AFTER_OUTCOME_NS
     ):
         before, status = status.outcome, cycle()
@@ -371,8 +371,8 @@ def _grasp_and_release(
     result = str(status.outcome)
     if status.phase != Phase.FAULT:  # after a fault nothing moves until a person has looked
         status = cycle(RequestKind.RELEASE)
-        begin_ns, open_width_m = status.t_ns, session.run.config.gripper.open_width_m
-        while status.t_ns - begin_ns < _RELEASE_NS and not is_open(open_width_m, status.width_m):
+        end_ns = status.t_ns + round(session.opening_s * NS_PER_S)
+        while status.t_ns < end_ns and not is_open(session.run.config.gripper.open_width_m, status.width_m):
             status = cycle()
     return result
 

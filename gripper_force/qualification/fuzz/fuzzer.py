@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, Final, TypedDict
 
 from gripper_force.errors import ConfigError, GripperError
-from gripper_force.interfaces import Progress, no_progress
+from gripper_force.progress import Progress, no_progress
 from gripper_force.qualification.fuzz import bus_targets, core_targets, load_cell_targets
 from gripper_force.qualification.fuzz.target import Target
 from gripper_force.qualification.proc_files import memory_bytes

@@ -8,7 +8,7 @@ from typing import Final, TypedDict
 
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError
-from gripper_force.interfaces import Progress, no_progress
+from gripper_force.progress import Progress, no_progress
 from gripper_force.qualification.numerics.numerical_case import NumericalCase
 
 Part = Callable[[Config, Path | None], Iterator[NumericalCase]]

@@ -19,13 +19,13 @@ from scipy import stats
 
 from gripper_force.config import load_config
 from gripper_force.errors import DataError
-from gripper_force.interfaces import Progress
 from gripper_force.jobs.dataset import CONTACT_N, Clip, load_clips
 from gripper_force.jobs.evaluate import estimates
 from gripper_force.jobs.paper_protocol import RATE_HZ, SetPlan, plan_protocol
 from gripper_force.jobs.processes import process_pool
 from gripper_force.jobs.simulate import simulate
 from gripper_force.jobs.training.train import train
+from gripper_force.progress import Progress
 from gripper_force.qualification.paper.models import MODELS, Scale
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.preprocess import Preprocess

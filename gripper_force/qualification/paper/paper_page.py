@@ -11,7 +11,7 @@ from typing import Final
 from matplotlib.figure import Figure
 
 from gripper_force.errors import ConfigError
-from gripper_force.interfaces import Progress
+from gripper_force.progress import Progress
 from gripper_force.qualification.paper import experiment, paper_figures, paper_tables
 from gripper_force.qualification.paper.experiment import Test, checkpoint_path
 from gripper_force.qualification.paper.models import BASELINE, PROPOSED, SINGLE_FRAME, Scale

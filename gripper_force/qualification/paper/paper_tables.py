@@ -7,8 +7,8 @@ from typing import Final
 import numpy as np
 import torch
 
-from gripper_force.interfaces import Progress
 from gripper_force.jobs.training.recipe import TrainConfig
+from gripper_force.progress import Progress
 from gripper_force.qualification.paper.experiment import Test
 from gripper_force.qualification.paper.models import BASELINE, NETS, PROPOSED, SINGLE_FRAME, TWO_PLAIN
 from gripper_force.types import NS_PER_MS

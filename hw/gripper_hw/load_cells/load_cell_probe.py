@@ -9,8 +9,8 @@ import numpy as np
 
 from gripper_force.config import Config
 from gripper_force.errors import GripperError
-from gripper_force.interfaces import Progress
 from gripper_force.jobs.checks import Check, clock_name, gather, judged, keep_only, open_load_cell, rate_hz
+from gripper_force.progress import Progress
 from gripper_force.runtime.backends import MonotonicClock, open_devices
 from gripper_force.schema import Tree
 from gripper_force.types import NS_PER_S

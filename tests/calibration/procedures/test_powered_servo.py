@@ -9,7 +9,7 @@ import pytest
 from gripper_calibration.procedures.calibrate_jaws import calibrate_jaws
 from gripper_calibration.procedures.calibrate_servo import calibrate_servo
 from gripper_force.config import load_config
-from gripper_force.interfaces import Progress
+from gripper_force.progress import Progress
 from gripper_force.runtime.process import SIGNALS, raise_interrupt
 from gripper_hw.dynamixel.servo import DynamixelServo
 from gripper_hw.dynamixel.virtual import VirtualBus, find_bus

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from gripper_force.errors import DataError
-from gripper_force.interfaces import no_progress
 from gripper_force.jobs.dataset import load_clips
 from gripper_force.jobs.training import train as module
 from gripper_force.jobs.training.train import train
+from gripper_force.progress import no_progress
 from gripper_force.qualification.paper import experiment
 from gripper_force.qualification.paper.experiment import Test as Estimates
 from gripper_force.qualification.paper.experiment import checkpoint_path, networks, run
