@@ -5,6 +5,8 @@ import pty
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,6 +14,7 @@ import pytest
 from gripper_force.config import CameraConfig, Config
 from gripper_force.errors import ConfigError, DeviceError
 from gripper_force.jobs import doctor
+from gripper_force.qualification.bench.command_bench import commands
 from gripper_force.qualification.proc_files import process_text
 from gripper_force.runtime import process
 from gripper_force.runtime.backends import MonotonicClock
@@ -51,7 +54,7 @@ def test_real_time_priority_is_refused() -> None:
 @pytest.mark.usefixtures("macos")
 def test_a_port_has_one_user(device_path: str) -> None:
     line = open_line(device_path, 57_600, unit="servo", timeout_s=0)
-    with pytest.raises(DeviceError, match="is in use by"):
+    with pytest.raises(DeviceError, match=r"is in use by .* one that it can't see; close that first"):
         open_line(device_path, 57_600, unit="servo", timeout_s=0)
     line.close()
     open_line(device_path, 57_600, unit="servo", timeout_s=0).close()
@@ -77,7 +80,18 @@ def test_a_measurement_of_proc_is_refused() -> None:
         ConfigError, match="reads /proc/self/no_such_file, which only Linux has; run it on Linux"
     ):
         process_text("no_such_file")
-    assert int(process_text("statm").split()[1]) > 0
+    if Path("/proc").is_dir():
+        assert int(process_text("statm").split()[1]) > 0
+
+
+@pytest.mark.usefixtures("macos")
+def test_the_memory_of_a_command_is_counted_in_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As macOS counts it; Linux counts kilobytes."""
+    taken = SimpleNamespace(ru_utime=0.1, ru_stime=0.0, ru_maxrss=100 * 2**20)
+    wait = os.wait4
+    monkeypatch.setattr(os, "wait4", lambda *which: (*wait(*which)[:2], taken))
+    (cost,) = commands(["--version"])
+    assert cost.memory_mb == 100.0
 
 
 @pytest.mark.usefixtures("macos")
@@ -110,6 +124,7 @@ except Exception as error:
 """
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="a Mac has that renderer")
 def test_the_simulation_asks_for_apples_renderer() -> None:
     """Linux has none, so the rendering is refused, in other words than those for a missing EGL."""
     environment = {key: value for key, value in os.environ.items() if key != "MUJOCO_GL"}

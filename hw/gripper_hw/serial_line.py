@@ -91,6 +91,6 @@ def _open_error(name: str, unit: str, error: Exception) -> DeviceError:
     if isinstance(error, OSError) and error.errno == EACCES:
         return DeviceError(f"no permission to open {port}; join the group dialout and log in again")
     if isinstance(error, OSError) and error.errno in (EAGAIN, EBUSY):
-        user = " and ".join(_users(name)) or "this program"
+        user = " and ".join(_users(name)) or "this program, or one that it can't see"
         return DeviceError(f"{port} is in use by {user}; close that first")
     return DeviceError(f"can't open {port} ({error}); set {unit}.port to a serial port")

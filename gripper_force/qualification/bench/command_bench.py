@@ -80,7 +80,14 @@ def commands(lines: Sequence[str] = COMMANDS) -> Iterator[CommandCost]:
                 if process.returncode not in _ALLOWED:
                     stderr.seek(0)
                     raise GripperError(f"gripper-force {line} failed: {stderr.read().strip()[-500:]}")
-            yield CommandCost(line, wall_s, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1024)
+            yield CommandCost(
+                line, wall_s, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / _maxrss_per_mb()
+            )
+
+
+def _maxrss_per_mb() -> int:
+    """Returns the unit of ``ru_maxrss``: macOS counts bytes, Linux kilobytes."""
+    return 2**20 if sys.platform == "darwin" else 2**10
 
 
 def _expanded(folder: Path, word: str) -> list[str]:
