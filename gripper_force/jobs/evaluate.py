@@ -233,15 +233,17 @@ def _evaluate_log(
         correction, device = read_correction(own, profiles, loaded, logged.rig_settings()), "cpu"
     networks = [network.to(device) for network in loaded.networks]
     parts: list[npt.NDArray[np.floating]] = []
-    with restored_threads():
-        torch.set_num_threads(1)
-        for forces_n, read_out in stream_features(networks, preprocess, streamed.frames(), device):
-            mean_n = forces_n.mean(0)
-            parts.append(
-                mean_n if correction is None else correction.force_n(mean_n, read_out).astype(np.float32)
-            )
-    for network in networks:
-        network.cpu()
+    try:
+        with restored_threads():
+            torch.set_num_threads(1)
+            for forces_n, read_out in stream_features(networks, preprocess, streamed.frames(), device):
+                mean_n = forces_n.mean(0)
+                if correction is not None:
+                    mean_n = correction.force_n(mean_n, read_out).astype(np.float32)
+                parts.append(mean_n)
+    finally:
+        for network in networks:
+            network.cpu()  # they are kept for the next log, and for a replay
     clip = streamed.clip(streamed.no_images)
     in_contact = preprocess.reference and starts_in_contact(clip.forces_n, preprocess.reference_frames)
     if in_contact and not include_contact_starts:
