@@ -133,7 +133,7 @@ class GraspController:
     does what ``on_slip`` says. After another ``slip``, and after ``timeout``, it continues.
 
     *Speed.* Every command passes `SpeedLimit`, so the jaws are never much faster than the phase allows. Jaws on their
-    way to an object, or in a hold that the object may leave, are so slow that an impact stays within the force limit.
+    way to an object are so slow that their impact stays within the force limit. A ramp or hold has the object already.
 
     Attributes:
         timeout_s: Time after which a grasp has timed out: as configured, and what slower jaws need.
@@ -151,9 +151,8 @@ class GraspController:
         impact_m_s = transmission.impact_m_s(config.force_limit_n)
         approach_m_s = min(full_m_s, impact_m_s)
         self._travel_m_s = min(_TRAVEL_SPEED_SHARE * full_m_s, impact_m_s)
-        self._hold_m_s = min(_HOLD_SPEED_SHARE * full_m_s, impact_m_s)
         self.timeout_s = config.timeout_s + transmission.open_width_m / 2 * (1 / approach_m_s - 1 / full_m_s)
-        self.opening_s = _OPENING_SPARE_S + transmission.open_width_m / 2 / self._travel_m_s
+        self.opening_s = _OPENING_SPARE_S + transmission.open_width_m / self._travel_m_s
         self._config = config
         self._transmission = transmission
         self._fusion = Fusion(config, transmission)
@@ -437,7 +436,7 @@ class GraspController:
             return self._travel_m_s
         if self._phase == Phase.APPROACH:
             return self._approach.speed_m_s
-        return full_m_s if self._phase in (Phase.CONTACT, Phase.RAMP) else self._hold_m_s
+        return full_m_s if self._phase in (Phase.CONTACT, Phase.RAMP) else _HOLD_SPEED_SHARE * full_m_s
 
     @property
     def _derated_target_n(self) -> float:
@@ -640,8 +639,9 @@ class GraspController:
         may_rise = self._phase != Phase.FAULT or self._opens_at_fault
         force_n, friction_n = self._estimate.force_n, self._estimate.friction_n
         # Friction that is smaller than believed would be force, also of an opening with a wrong closing direction.
-        if self._phase in _GRIPPING or self._is_opening:
-            friction_n = min(friction_n, self._fusion.measured_friction_n)
+        measured_n = self._fusion.measured_friction_n
+        if self._phase in _GRIPPING or (self._is_opening and measured_n > 0):
+            friction_n = min(friction_n, measured_n)
         command, is_over = self._limits.apply(
             wanted,
             force_n,

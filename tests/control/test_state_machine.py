@@ -117,12 +117,28 @@ def test_no_impact_on_a_hard_object_exceeds_the_force_limit(make_run, limit_n):
 
 def test_slower_jaws_have_more_time(make_run, transmission):
     usual, slow = make_run().controller, make_run(force_limit_n=1.0).controller
-    assert (usual.timeout_s, usual.opening_s) == (8.0, pytest.approx(4.92))
+    assert (usual.timeout_s, usual.opening_s) == (8.0, pytest.approx(5.84))
     travel_s = transmission.open_width_m / 2 / transmission.impact_m_s(1.0)
     assert slow.timeout_s == pytest.approx(8.0 + travel_s - transmission.open_width_m / 2 / 0.025)
-    assert slow.opening_s == pytest.approx(4.0 + travel_s)
+    assert slow.opening_s == pytest.approx(4.0 + 2 * travel_s)
     run = make_run(force_limit_n=1.0, timeout_s=3.0).grasp(0.6, 7.0)  # 4.4 s to the object
     assert run.last.status.outcome == "held"
+
+
+@pytest.mark.parametrize("limit_n", [0.8, 1.0, 1.5, 14.0])
+def test_closed_jaws_open_in_their_time(make_run, limit_n):
+    # The first request: no grasp has measured the friction.
+    run = make_run(plant={"x_m": 0.044, "jaw_m": 0.044, "contact_m": 1.0}, force_limit_n=limit_n)
+    run.go(run.controller.opening_s, "release")
+    assert run.last.status.phase == "open"
+
+
+@pytest.mark.parametrize("limit_n", [0.8, 1.2, 2.0])
+def test_loss_under_a_small_force_limit_opens_soon(make_run, limit_n):
+    run = make_run(force_limit_n=limit_n, on_slip="open").grasp(0.9 * limit_n / 1.4, 9.0)
+    assert run.last.status.phase == "hold"
+    run.plant.contact_m = 1.0
+    assert run.go(0.2).last.status.phase == "release"
 
 
 def test_no_object(make_run):
