@@ -63,11 +63,11 @@ _LET_GO_LEAD_S = 0.03
 """Time in which the lead of the goal position reaches its full length after a release. With a full lead at once, the
 motor would add to the force of a springy object."""
 
-_OPENS_SHARE = 0.5
+_OPENS_SHARE = 0.25
 _PUSH_N_S = 5.0
 _PUSH_SHARE = 3.0
-"""Jaws whose release is slower than this share of the approach speed get more motor force at this rate, up to this
-multiple of that of free travel: their friction may be larger than configured."""
+"""Jaws whose release is slower than this share of its speed get more motor force at this rate, up to this multiple of
+that of free travel: their friction may be larger than configured."""
 
 _SEEN_FILTER_S = 0.1
 _UNSEEN_SHARE = 0.15
@@ -583,7 +583,7 @@ class GraspController:
         return max(self._free_motor_force_n, remaining_n)
 
     def _run_release(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
-        is_slow = -closing_m_s < _OPENS_SHARE / _TRAVEL_SPEED_SHARE * self._travel_m_s
+        is_slow = -closing_m_s < _OPENS_SHARE * self._travel_m_s
         if is_slow and self._phase_s > 2 * ACCELERATION_S:
             self._push_n = min(self._push_n + _PUSH_N_S * dt_s, _PUSH_SHARE * self._free_motor_force_n)
         self._motor_force_n = self._travel_force_n + self._push_n
