@@ -75,6 +75,26 @@ def observer_lag_s(frame_hz: float) -> float:
     return math.sqrt(_FRAME_NOISE_N**2 / (frame_hz * _OPENING_DRIFT_N2_S))
 
 
+class FreeTravel:
+    """Mean motor force of jaws that move without contact: their friction."""
+
+    def __init__(self) -> None:
+        self._cycles, self._sum_n = 0, 0.0
+
+    def add(self, motor_force_n: float) -> None:
+        """Adds the motor force of one cycle in the direction of the motion."""
+        if self._cycles < _FREE_CYCLES[1]:
+            self._cycles += 1
+            self._sum_n += motor_force_n
+
+    @property
+    def friction_n(self) -> float | None:
+        """Least friction that the motion proves; None before enough cycles."""
+        if self._cycles < _FREE_CYCLES[0]:
+            return None
+        return max(self._sum_n / self._cycles - 2 * _FREE_NOISE_N / math.sqrt(self._cycles), 0.0)
+
+
 class Fusion:
     """Kalman filter on the difference between the visual and the current estimate, of which a share is used.
 
@@ -95,6 +115,9 @@ class Fusion:
 
     Without vision for `ControlConfig.timeout_ms` the source is the current alone, with the last bias
     and a growing variance.
+
+    Attributes:
+        free_travel: The approach of this grasp.
     """
 
     def __init__(self, config: ControlConfig, transmission: Transmission) -> None:
@@ -140,17 +163,9 @@ class Fusion:
         self._friction_n = self._transmission.friction_n
         self._friction_n2 = (self._transmission.friction_std * self._friction_n) ** 2
         self._opening_variance_n2 = 0.0
-        self._free_cycles, self._free_sum_n = 0, 0.0
+        self.free_travel = FreeTravel()
         self._was_lowering = self._has_lowered = False
         self.reset_variance()
-
-    @property
-    def measured_friction_n(self) -> float:
-        """Friction that the free travel of this grasp proves; 0 without enough of it."""
-        if self._free_cycles < _FREE_CYCLES[0]:
-            return 0.0
-        mean_n = self._free_sum_n / self._free_cycles
-        return max(mean_n - 2 * _FREE_NOISE_N / math.sqrt(self._free_cycles), 0.0)
 
     def end_grasp(self, *, was_held: bool) -> tuple[float, float] | None:
         """Ends the present grasp, and returns the ratio that the object's gain rests on (see `ObjectGain.ratio`)."""
@@ -271,9 +286,7 @@ class Fusion:
         self._history.append((servo.t_ns, self._current_n))
 
     def _learn_friction(self) -> None:
-        if self._free_cycles < _FREE_CYCLES[1]:
-            self._free_cycles += 1
-            self._free_sum_n += self._motor_force_n
+        self.free_travel.add(self._motor_force_n)
         gain = self._friction_n2 / (self._friction_n2 + _FREE_NOISE_N**2)
         self._friction_n = max(self._friction_n + gain * (self._motor_force_n - self._friction_n), 0.0)
         self._friction_n2 = _combined_variance_n2(self._friction_n2, _FREE_NOISE_N**2)

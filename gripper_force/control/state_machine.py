@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from gripper_force.config import ControlConfig
 from gripper_force.control.approach import ACCELERATION_S, Approach, ApproachState
 from gripper_force.control.force_loop import ForceLoop, Margin, tolerance_n
-from gripper_force.control.fusion import Fusion
+from gripper_force.control.fusion import FreeTravel, Fusion
 from gripper_force.control.limits import Limits, largest_target_n
 from gripper_force.control.safety import Safety, is_sound
 from gripper_force.control.slip import SlipMonitor
@@ -62,6 +62,9 @@ _PROVEN_SHARE = 0.5
 _LET_GO_LEAD_S = 0.03
 """Time in which the lead of the goal position reaches its full length after a release. With a full lead at once, the
 motor would add to the force of a springy object."""
+
+_FREELY_SHARE = 0.8
+"""Share of its speed above which an opening meets no resistance: its motor force is then friction."""
 
 _OPENS_SHARE = 0.25
 _PUSH_N_S = 5.0
@@ -182,6 +185,7 @@ class GraspController:
         self._phase_s = self._settled_s = self._error_n = 0.0
         self._was_over_force = False
         self._let_go_n = self._push_n = 0.0
+        self._opening_travel = FreeTravel()
         self._seen_n: float | None = None
         self._seen_ns, self._seen_before_n = 0, 0.0
         self._has_seen = self._has_unsure = self._was_held = False
@@ -402,6 +406,7 @@ class GraspController:
         self._goal_width_m = self._present_width_m  # in the cycle that loses an object, the jaws still close
         self._travel.start(self._goal_width_m, self._travel_m_s)
         self._push_n = 0.0
+        self._opening_travel = FreeTravel()
         self._limits.reset()
 
     def _enter_fault(self) -> None:
@@ -485,6 +490,10 @@ class GraspController:
             self._goal_width_m = width_m - 2 * GOAL_OFFSET_M
         if self._phase in (Phase.APPROACH, *_GRIPPING) and self._outcome == Outcome.NONE:
             self._check_timeout(t_ns)
+        # At first the object may push the jaws open.
+        is_free = self._phase_s >= _LET_GO_S or not self._let_go_n
+        if self._is_opening and is_free and -closing_m_s > _FREELY_SHARE * self._travel_m_s:
+            self._opening_travel.add(-self._measured_motor_force_n)
 
     def _run_approach(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
         # The goal position leads far enough that the goal current alone drives the jaws. A goal that moved in
@@ -639,9 +648,10 @@ class GraspController:
         may_rise = self._phase != Phase.FAULT or self._opens_at_fault
         force_n, friction_n = self._estimate.force_n, self._estimate.friction_n
         # Friction that is smaller than believed would be force, also of an opening with a wrong closing direction.
-        measured_n = self._fusion.measured_friction_n
-        if self._phase in _GRIPPING or (self._is_opening and measured_n > 0):
-            friction_n = min(friction_n, measured_n)
+        travels = (self._fusion.free_travel, *((self._opening_travel,) if self._is_opening else ()))
+        proven_n = [travel.friction_n for travel in travels if travel.friction_n is not None]
+        if self._phase in _GRIPPING or (self._is_opening and proven_n):
+            friction_n = min(friction_n, *proven_n) if proven_n else 0.0
         command, is_over = self._limits.apply(
             wanted,
             force_n,

@@ -136,6 +136,14 @@ def test_friction_is_measured_by_jaws_that_the_speed_limit_holds_back() -> None:
     assert run_case(config, 0, 369).force_share < 1.05
 
 
+def test_an_opening_in_the_wrong_direction_credits_the_friction_that_it_measures(config: Config) -> None:
+    # The approach did not move far enough to measure it. With the configured one the release presses with 1.2 times
+    # the limit.
+    drawn = draw(config.control, RACK, 0, 4188)
+    assert (drawn.sign, drawn.friction < 0.4, drawn.force_limit_n < 2.0) == (-1, True, True)
+    assert 0.1 < run_case(config, 0, 4188).force_share < 1.0
+
+
 def test_a_linkage_that_cannot_close_so_far_is_refused() -> None:
     config = load_config(GRIPPERS / "viperx_aloha.yaml")
     truth = transmission_of(config.gripper)
