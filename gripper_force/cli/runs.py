@@ -228,6 +228,7 @@ def replay(
 
     from gripper_force.jobs import replay as job
     from gripper_force.jobs.dataset import find_logs
+    from gripper_force.jobs.replay.comparison import paired_differences, summary
     from gripper_force.jobs.summary_files import check_writable, replay_tables, write_summary
     from gripper_force.vision.model_files import read_model
 
@@ -258,7 +259,7 @@ def replay(
             for side in (first, second)
         )
         frames = [one for _, one in kept], [one for _, one in others]
-        found = job.paired_differences([r for r, _ in kept], [r for r, _ in others], frames)
+        found = paired_differences([r for r, _ in kept], [r for r, _ in others], frames)
         printed = {"logs": len(kept), "first": compare[0], "second": compare[1], "differences": found}
         if failed:
             printed["failed"] = {log: str(error) for log, error in failed.items()}
@@ -297,15 +298,15 @@ def replay(
         shown = {**console.jsonable(results[0]), **({"report": pages[0]} if pages else {})}
         console.show(shown, as_json, lambda _: replay_table(results[0], pages[0] if pages else None))
     else:
-        summary = job.summary(results)
+        overall = summary(results)
         unread = {log: str(error) for log, error in replays.failed.items()}
         printed = {
             "logs": results,
-            "summary": summary,
+            "summary": overall,
             **({"failed": unread} if unread else {}),
             **({"reports": pages} if pages else {}),
         }
-        console.show(printed, as_json, lambda _: replays_table(results, summary, pages))
+        console.show(printed, as_json, lambda _: replays_table(results, overall, pages))
     if out is not None:
         write_summary(out, f"Replay of {len(results)} logs", replay_tables({"": replays}), replays.columns)
         console.err.print(f"summary: {out / 'summary.html'}", soft_wrap=True, markup=False)

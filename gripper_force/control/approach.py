@@ -3,11 +3,9 @@
 from enum import Enum, auto
 
 from gripper_force.config import ControlConfig
+from gripper_force.control.trajectory import ACCELERATION_S
 from gripper_force.control.transmission import Transmission
 from gripper_force.types import EstimateSource, FusedForce
-
-ACCELERATION_S = 0.1
-"""Time in which the jaws reach full speed."""
 
 _IMPACT_M_S_PER_N = 0.010
 """Approach speed of one jaw per newton of target: on the stiffest object, impact stays below the target."""

@@ -10,6 +10,7 @@ from collections import deque
 from dataclasses import replace
 
 from gripper_force.config import ControlConfig
+from gripper_force.control.free_travel import FREE_NOISE_N, FreeTravel
 from gripper_force.control.object_gain import KIND_STD, ObjectGain
 from gripper_force.control.transmission import Transmission
 from gripper_force.types import (
@@ -28,15 +29,8 @@ _DRIFT_N2_S = 0.03**2
 _OPENING_DRIFT_N2_S = 0.15**2
 """Additional growth for jaws that are about to open."""
 
-_FREE_NOISE_N = 0.5
-"""Standard deviation of motor force about friction in one cycle of free travel. Inertia correlates the
-cycles."""
-
 _FREE_FLOOR_N = 0.08
 """Standard deviation of friction under load after free travel: viscous friction, variation with position."""
-
-_FREE_CYCLES = (10, 40)
-"""Least and greatest number of cycles of free travel that prove friction. Later ones may press a soft object."""
 
 _VISION_FLOOR_N = 0.05
 """Lower limit of the standard deviation of a visual estimate, whatever it claims."""
@@ -73,26 +67,6 @@ def observer_lag_s(frame_hz: float) -> float:
     It is the square root of noise over drift of the steady-state filter.
     """
     return math.sqrt(_FRAME_NOISE_N**2 / (frame_hz * _OPENING_DRIFT_N2_S))
-
-
-class FreeTravel:
-    """Mean motor force of jaws that move without contact: their friction."""
-
-    def __init__(self) -> None:
-        self._cycles, self._sum_n = 0, 0.0
-
-    def add(self, motor_force_n: float) -> None:
-        """Adds the motor force of one cycle in the direction of the motion."""
-        if self._cycles < _FREE_CYCLES[1]:
-            self._cycles += 1
-            self._sum_n += motor_force_n
-
-    @property
-    def friction_n(self) -> float | None:
-        """Least friction that the motion proves; None before enough cycles."""
-        if self._cycles < _FREE_CYCLES[0]:
-            return None
-        return max(self._sum_n / self._cycles - 2 * _FREE_NOISE_N / math.sqrt(self._cycles), 0.0)
 
 
 class Fusion:
@@ -287,9 +261,9 @@ class Fusion:
 
     def _learn_friction(self) -> None:
         self.free_travel.add(self._motor_force_n)
-        gain = self._friction_n2 / (self._friction_n2 + _FREE_NOISE_N**2)
+        gain = self._friction_n2 / (self._friction_n2 + FREE_NOISE_N**2)
         self._friction_n = max(self._friction_n + gain * (self._motor_force_n - self._friction_n), 0.0)
-        self._friction_n2 = _combined_variance_n2(self._friction_n2, _FREE_NOISE_N**2)
+        self._friction_n2 = _combined_variance_n2(self._friction_n2, FREE_NOISE_N**2)
 
     def _update(self, t_ns: int, visual: VisualForce) -> str:
         """Updates the filter with one estimate. Returns the reason of a rejection, or an empty text."""

@@ -4,17 +4,18 @@ import dataclasses
 from dataclasses import dataclass
 
 from gripper_force.config import ControlConfig
-from gripper_force.control.approach import ACCELERATION_S, Approach, ApproachState
+from gripper_force.control.approach import Approach, ApproachState
 from gripper_force.control.force_loop import ForceLoop, Margin, tolerance_n
-from gripper_force.control.fusion import FreeTravel, Fusion
+from gripper_force.control.fusion import Fusion
 from gripper_force.control.limits import Limits, largest_target_n
 from gripper_force.control.safety import Safety, is_sound
 from gripper_force.control.slip import SlipMonitor
 from gripper_force.control.speed_limit import PositionLoop, SpeedLimit
-from gripper_force.control.trajectory import TrapezoidalProfile
+from gripper_force.control.trajectory import ACCELERATION_S
 from gripper_force.control.transmission import GOAL_OFFSET_M, Transmission
+from gripper_force.control.travel import Travel
+from gripper_force.control.visual_check import VisualCheck
 from gripper_force.types import (
-    NS_PER_MS,
     NS_PER_S,
     EstimateSource,
     Event,
@@ -38,45 +39,11 @@ _HOLD_SPEED_SHARE = 0.5
 _TRAVEL_SPEED_SHARE = 2.0
 """Speed of a release or move, as a share of the approach speed."""
 
-_LEAD_M = 0.004
-"""Largest lead of the profile over one jaw in free travel, so that jaws that were held back do not jump."""
-
 _DWELL_S = 0.12
 """Time in contact before the ramp: the impact decays and vision catches up."""
 
 _SETTLE_FILTER_S = 0.25
 """Time constant of the filter on the force error that decides on `held`: vision alone is noisy."""
-
-_LET_GO_S = 0.6
-"""Time in which the largest motor force of a grip falls to that of free travel after a release. With less motor
-force at once, the servo could not brake the jaws, and a springy object pushed them open at four times the wanted
-speed."""
-
-_BEYOND_SHARE = 1.0
-_BEYOND_N = 1.5
-"""Excess of the visual estimate over the target, the larger of the two, that no object explains."""
-
-_PROVEN_SHARE = 0.5
-"""The motor current proves a grip if it exceeds friction by this share of the target."""
-
-_LET_GO_LEAD_S = 0.03
-"""Time in which the lead of the goal position reaches its full length after a release. With a full lead at once, the
-motor would add to the force of a springy object."""
-
-_FREELY_SHARE = 0.8
-"""Share of its speed above which an opening meets no resistance: its motor force is then friction."""
-
-_OPENS_SHARE = 0.25
-_PUSH_N_S = 5.0
-_PUSH_SHARE = 3.0
-"""Jaws whose release is slower than this share of its speed get more motor force at this rate, up to this multiple of
-that of free travel: their friction may be larger than configured."""
-
-_SEEN_FILTER_S = 0.1
-_UNSEEN_SHARE = 0.15
-"""A grip counts as held only while the filtered visual estimate has risen by at least this share of the target since
-the jaws stopped. Otherwise they may press on an end stop or be held by friction, which the motor current cannot tell
-from an object."""
 
 _OPEN_M = 0.003
 """Distance from the open width at which the jaws count as open."""
@@ -153,9 +120,12 @@ class GraspController:
         full_m_s = config.approach_speed_m_s
         impact_m_s = transmission.impact_m_s(config.force_limit_n)
         approach_m_s = min(full_m_s, impact_m_s)
-        self._travel_m_s = min(_TRAVEL_SPEED_SHARE * full_m_s, impact_m_s)
+        free_motor_force_n = config.approach_force_n + transmission.friction_n
+        self._travel = Travel(
+            min(_TRAVEL_SPEED_SHARE * full_m_s, impact_m_s), free_motor_force_n, transmission.open_width_m
+        )
         self.timeout_s = config.timeout_s + transmission.open_width_m / 2 * (1 / approach_m_s - 1 / full_m_s)
-        self.opening_s = _OPENING_SPARE_S + transmission.open_width_m / self._travel_m_s
+        self.opening_s = _OPENING_SPARE_S + transmission.open_width_m / self._travel.speed_m_s
         self._config = config
         self._transmission = transmission
         self._fusion = Fusion(config, transmission)
@@ -165,9 +135,8 @@ class GraspController:
         self._safety = Safety(config)
         self._approach = Approach(config, transmission, approach_m_s)
         self._slip = SlipMonitor(config)
-        self._travel = TrapezoidalProfile(ACCELERATION_S)
+        self._visual_check = VisualCheck(config)
         self._largest_target_n = largest_target_n(config.force_limit_n, transmission.gain_bound)
-        self._free_motor_force_n = config.approach_force_n + transmission.friction_n
         self._phase, self._outcome, self._reason = Phase.OPEN, Outcome.NONE, ""
         self._estimate = FusedForce(
             0, 0.0, transmission.bias_std_n(0.0), 0.0, 0.0, transmission.friction_n, EstimateSource.CURRENT
@@ -175,7 +144,7 @@ class GraspController:
         self._t_ns: int | None = None
         self._width_m: float | None = None
         self._goal_width_m = transmission.open_width_m
-        self._motor_force_n = self._free_motor_force_n
+        self._motor_force_n = free_motor_force_n
         self._servo: ServoState | None = None
         self._target_n = self._held_width_m = self._settling_width_m = 0.0
         self._move_width_m = transmission.open_width_m
@@ -184,11 +153,7 @@ class GraspController:
         self._grasp_ns = 0
         self._phase_s = self._settled_s = self._error_n = 0.0
         self._was_over_force = False
-        self._let_go_n = self._push_n = 0.0
-        self._opening_travel = FreeTravel()
-        self._seen_n: float | None = None
-        self._seen_ns, self._seen_before_n = 0, 0.0
-        self._has_seen = self._has_unsure = self._was_held = False
+        self._was_held = False
         self._goal_current_a = self._measured_motor_force_n = 0.0
         self._derating = 1.0
 
@@ -284,50 +249,8 @@ class GraspController:
             opening=self._is_opening,
             lowering=self._phase in (Phase.RAMP, Phase.HOLD) and self._loop.is_lowering,
         )
-        self._note_vision(t_ns, visual)
+        self._visual_check.add(t_ns, visual, gripping=self._phase in _GRIPPING)
         return [*fusion_events, *self._derate(t_ns, servo.temperature_c)]
-
-    def _note_vision(self, t_ns: int, visual: VisualForce | None) -> None:
-        """Filters what vision estimates, also of unfamiliar frames and where the motor current differs.
-
-        Fusion does not use these, but a grip makes them rise, too.
-        """
-        if t_ns - self._seen_ns > (self._config.timeout_ms + self._config.max_age_ms) * NS_PER_MS:
-            self._seen_n = None
-        if visual is None or visual.t_ns <= self._seen_ns or self._config.feedback == "current":
-            return
-        # A comparison with NaN is false.
-        is_sure = not visual.is_familiar or 0 <= visual.std_n <= self._config.vision_std_n
-        if not (abs(visual.force_n) <= 1e9 and is_sure):
-            self._has_unsure |= self._phase in _GRIPPING
-            return
-        self._has_seen |= self._phase in _GRIPPING
-        dt_s = (visual.t_ns - self._seen_ns) / NS_PER_S
-        before_n = visual.force_n if self._seen_n is None else self._seen_n
-        self._seen_n = before_n + (visual.force_n - before_n) * dt_s / (dt_s + _SEEN_FILTER_S)
-        self._seen_ns = visual.t_ns
-
-    @property
-    def _is_unseen(self) -> bool:
-        """True if the camera does not confirm a grip.
-
-        It sees next to no rise of the force, has been too uncertain throughout this grip, or sees far more than the
-        target while friction may hold the jaws: a network can give any force for an empty scene.
-        """
-        target_n = self._derated_target_n
-        if self._seen_n is None:
-            return self._has_unsure and not self._has_seen
-        by_friction = self._motor_force_n - self._estimate.friction_n < _PROVEN_SHARE * target_n
-        beyond_n = max(_BEYOND_SHARE * target_n, _BEYOND_N)
-        rise_n = self._seen_n - self._seen_before_n
-        return rise_n < _UNSEEN_SHARE * target_n or (by_friction and self._seen_n - target_n > beyond_n)
-
-    @property
-    def _sight(self) -> str:
-        """The visual estimate in words."""
-        if self._seen_n is None:
-            return "is uncertain"
-        return f"sees {self._seen_n:.1f} N, and saw {self._seen_before_n:.1f} N before the contact"
 
     def _derate(self, t_ns: int, temperature_c: float) -> list[Event]:
         """Lowers the target force of a hot servo, before the servo shuts down."""
@@ -396,17 +319,15 @@ class GraspController:
         self._outcome = Outcome.NONE
         distance_m = width_m - self._present_width_m
         self._move_width_m, self._move_opens = width_m, distance_m > 0
-        self._move_time_s = abs(distance_m) / self._travel_m_s + ACCELERATION_S + _MOVE_SPARE_S
+        self._move_time_s = abs(distance_m) / self._travel.speed_m_s + ACCELERATION_S + _MOVE_SPARE_S
         self._enter(Phase.MOVE, f"move to {1e3 * width_m:.1f} mm requested")
 
     def _start_travel(self) -> None:
-        self._let_go_n = 0.0
+        grip_n = 0.0
         if self._phase in _GRIPPING:
-            self._let_go_n, self._was_held = self._motor_force_n, self._outcome == Outcome.HELD
+            grip_n, self._was_held = self._motor_force_n, self._outcome == Outcome.HELD
         self._goal_width_m = self._present_width_m  # in the cycle that loses an object, the jaws still close
-        self._travel.start(self._goal_width_m, self._travel_m_s)
-        self._push_n = 0.0
-        self._opening_travel = FreeTravel()
+        self._travel.start(self._goal_width_m, grip_n)
         self._limits.reset()
 
     def _enter_fault(self) -> None:
@@ -438,7 +359,7 @@ class GraspController:
         """Largest speed of one jaw in the present phase."""
         full_m_s = self._config.approach_speed_m_s
         if self._is_opening or self._phase in (Phase.MOVE, Phase.OPEN):
-            return self._travel_m_s
+            return self._travel.speed_m_s
         if self._phase == Phase.APPROACH:
             return self._approach.speed_m_s
         return full_m_s if self._phase in (Phase.CONTACT, Phase.RAMP) else _HOLD_SPEED_SHARE * full_m_s
@@ -446,6 +367,12 @@ class GraspController:
     @property
     def _derated_target_n(self) -> float:
         return self._target_n * self._derating
+
+    @property
+    def _objection(self) -> str:
+        """Observation of the camera that speaks against a grip; empty without one."""
+        current_n = self._motor_force_n - self._estimate.friction_n
+        return self._visual_check.objection(self._derated_target_n, current_n)
 
     @property
     def _tolerance_n(self) -> float:
@@ -490,10 +417,8 @@ class GraspController:
             self._goal_width_m = width_m - 2 * GOAL_OFFSET_M
         if self._phase in (Phase.APPROACH, *_GRIPPING) and self._outcome == Outcome.NONE:
             self._check_timeout(t_ns)
-        # At first the object may push the jaws open.
-        is_free = self._phase_s >= _LET_GO_S or not self._let_go_n
-        if self._is_opening and is_free and -closing_m_s > _FREELY_SHARE * self._travel_m_s:
-            self._opening_travel.add(-self._measured_motor_force_n)
+        if self._is_opening:
+            self._travel.note_friction(self._phase_s, closing_m_s, self._measured_motor_force_n)
 
     def _run_approach(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
         # The goal position leads far enough that the goal current alone drives the jaws. A goal that moved in
@@ -507,8 +432,7 @@ class GraspController:
             case ApproachState.BACKING_OFF:
                 self._goal_width_m = min(self._approach.back_off_width_m, self._transmission.open_width_m)
             case ApproachState.CONTACT:
-                self._has_seen = self._has_unsure = False
-                self._seen_before_n = max(self._seen_n or 0.0, 0.0)
+                self._visual_check.start()
                 self._fusion.reset_variance()
                 self._enter(Phase.CONTACT, f"contact at {width_m * 1e3:.1f} mm")
             case ApproachState.CLOSED:
@@ -550,7 +474,7 @@ class GraspController:
             self._settling_width_m = width_m
         # Jaws that come loose from friction close freely against viscous friction, which looks like a steady grip.
         is_still = self._settling_width_m - width_m <= self._config.slip_width_m
-        is_settled = is_near and is_still and not self._is_unseen
+        is_settled = is_near and is_still and not self._objection
         self._settled_s = self._settled_s + dt_s if is_settled else 0.0
         if self._outcome == Outcome.NONE and self._settled_s >= self._config.settle_s:
             self._held_width_m = width_m
@@ -565,8 +489,8 @@ class GraspController:
         slip = self._slip.has_slipped(
             dt_s, self._estimate.force_n, self._derated_target_n, closed_m, closing_m_s
         )
-        if not slip and self._outcome == Outcome.HELD and self._is_unseen:
-            slip = f"the camera {self._sight}; friction or an end stop may hold the jaws"
+        if not slip and self._outcome == Outcome.HELD and (objection := self._objection):
+            slip = f"{objection}; friction or an end stop may hold the jaws"
         if slip and self._outcome in (Outcome.NONE, Outcome.HELD):
             self._set_outcome(Outcome.SLIP, slip)
 
@@ -585,35 +509,18 @@ class GraspController:
             case _:
                 self._start_release(reason)
 
-    @property
-    def _travel_force_n(self) -> float:
-        """Motor force of a release or move: that of free travel, and at first what remains of a grip."""
-        remaining_n = self._let_go_n * (1 - self._phase_s / _LET_GO_S)
-        return max(self._free_motor_force_n, remaining_n)
-
     def _run_release(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
-        is_slow = -closing_m_s < _OPENS_SHARE * self._travel_m_s
-        if is_slow and self._phase_s > 2 * ACCELERATION_S:
-            self._push_n = min(self._push_n + _PUSH_N_S * dt_s, _PUSH_SHARE * self._free_motor_force_n)
-        self._motor_force_n = self._travel_force_n + self._push_n
+        self._travel.open(dt_s, self._phase_s, width_m, closing_m_s)
+        self._motor_force_n, self._goal_width_m = self._travel.motor_force_n, self._travel.goal_width_m
         open_width_m = self._transmission.open_width_m
-        self._goal_width_m = self._travel.step(open_width_m, dt_s)
-        lead_m = 2 * _LEAD_M
-        if self._let_go_n and self._phase_s < _LET_GO_S:
-            # The object drives the jaws: their start is sharp, which shows the lag of the sensors.
-            self._goal_width_m = open_width_m
-            lead_m *= min(self._phase_s / _LET_GO_LEAD_S, 1.0)
-        self._goal_width_m = self._travel.value = min(self._goal_width_m, width_m + lead_m)
         if is_open(open_width_m, width_m):
             self._goal_width_m = open_width_m
             if self._phase == Phase.RELEASE:
                 self._enter(Phase.OPEN, "open")
 
     def _run_move(self, dt_s: float, width_m: float) -> None:
-        self._motor_force_n = self._travel_force_n
-        goal_width_m = self._travel.step(self._move_width_m, dt_s)
-        self._goal_width_m = min(max(goal_width_m, width_m - 2 * _LEAD_M), width_m + 2 * _LEAD_M)
-        self._travel.value = self._goal_width_m
+        self._travel.move(dt_s, self._phase_s, width_m, self._move_width_m)
+        self._motor_force_n, self._goal_width_m = self._travel.motor_force_n, self._travel.goal_width_m
         if self._outcome != Outcome.NONE:
             return
         is_there = abs(width_m - self._move_width_m) <= _AT_WIDTH_M
@@ -625,9 +532,9 @@ class GraspController:
     def _check_timeout(self, t_ns: int) -> None:
         if t_ns - self._grasp_ns > self.timeout_s * NS_PER_S:
             reason = f"not held within {self.timeout_s:.3g} s"
-            if self._is_unseen:
+            if objection := self._objection:
                 reason += (
-                    f": the camera {self._sight}. The jaws may press on an end stop: check "
+                    f": {objection}. The jaws may press on an end stop: check "
                     "gripper.open_width_m with `calibrate jaws`. If there is an object, calibrate it, or set "
                     "control.feedback=current"
                 )
@@ -648,7 +555,7 @@ class GraspController:
         may_rise = self._phase != Phase.FAULT or self._opens_at_fault
         force_n, friction_n = self._estimate.force_n, self._estimate.friction_n
         # Friction that is smaller than believed would be force, also of an opening with a wrong closing direction.
-        travels = (self._fusion.free_travel, *((self._opening_travel,) if self._is_opening else ()))
+        travels = (self._fusion.free_travel, *((self._travel.free_travel,) if self._is_opening else ()))
         proven_n = [travel.friction_n for travel in travels if travel.friction_n is not None]
         if self._phase in _GRIPPING or (self._is_opening and proven_n):
             friction_n = min(friction_n, *proven_n) if proven_n else 0.0
@@ -663,7 +570,7 @@ class GraspController:
             opening=self._is_opening,
         )
         if self._servo is not None:
-            free_a = self._transmission.current_a(self._free_motor_force_n + self._push_n, self._present_rad)
+            free_a = self._transmission.current_a(self._travel.free_motor_force_n, self._present_rad)
             command = self._speed_limit.apply(command, self._servo, self._speed_m_s, abs(free_a))
         return command, is_over
 

@@ -1,6 +1,10 @@
 """Trapezoidal speed profile of the force reference and of the jaws' goal position."""
 
 import math
+from typing import Final
+
+ACCELERATION_S: Final = 0.1
+"""Time in which the jaws reach full speed."""
 
 
 class TrapezoidalProfile:

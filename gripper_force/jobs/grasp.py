@@ -15,7 +15,7 @@ from gripper_force.errors import ConfigError, DataError, DeviceError
 from gripper_force.jobs.dataset import stiffness_floor_n, stiffness_of
 from gripper_force.jobs.object_gain import learned_ratio
 from gripper_force.jobs.processes import process_pool
-from gripper_force.jobs.replay import compare
+from gripper_force.jobs.replay.comparison import compare
 from gripper_force.jobs.score import (
     LEAST_VISION_SHARE,
     VisionLoss,

@@ -17,7 +17,8 @@ from gripper_force.plugins import importing, require
 
 if TYPE_CHECKING:
     from gripper_force.jobs.evaluate import Evaluation
-    from gripper_force.jobs.replay import Columns, PairedDifference, Replays
+    from gripper_force.jobs.replay import Replays
+    from gripper_force.jobs.replay.comparison import Columns, PairedDifference
 
 Rows = list[dict[str, Any]]
 
@@ -80,7 +81,7 @@ def replay_tables(
 ) -> dict[str, Rows]:
     """Returns the tables of one replay of logs, or of the two sides of a comparison, by the name of each side."""
     from gripper_force.jobs.metrics import mean_interval
-    from gripper_force.jobs.replay import summary
+    from gripper_force.jobs.replay.comparison import summary
 
     tables: dict[str, Rows] = {name: [] for name in ("differences", "sources", "objects", "logs", "failed")}
     for side, replays in sides.items():

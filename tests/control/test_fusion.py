@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gripper_force.config import ControlConfig
-from gripper_force.control.fusion import FreeTravel, Fusion
+from gripper_force.control.fusion import Fusion
 from gripper_force.types import ServoState, VisualForce
 
 MS = 1_000_000
@@ -365,16 +365,3 @@ def test_a_bias_from_vision_is_in_doubt_once_vision_contradicts_the_current(benc
     assert agreed.bias_n < -0.25
     assert contradicted.source == "current"
     assert contradicted.std_n > agreed.std_n + 0.1
-
-
-@pytest.mark.parametrize(("motor_force_n", "friction_n"), [(0.9, 0.742), (0.1, 0.0), (-0.5, 0.0)])
-def test_enough_free_travel_proves_a_least_friction(motor_force_n, friction_n):
-    travel = FreeTravel()
-    for _ in range(9):
-        travel.add(motor_force_n)
-    assert travel.friction_n is None
-    for _ in range(31):
-        travel.add(motor_force_n)
-    assert travel.friction_n == pytest.approx(friction_n, abs=0.001)
-    travel.add(50.0)  # jaws that have met an object
-    assert travel.friction_n == pytest.approx(friction_n, abs=0.001)

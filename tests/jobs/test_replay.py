@@ -19,19 +19,15 @@ from gripper_force.jobs import replay as job
 from gripper_force.jobs.evaluate import evaluate
 from gripper_force.jobs.grasp import run_grasp
 from gripper_force.jobs.metrics import bias, mae, rmse
-from gripper_force.jobs.replay import (
+from gripper_force.jobs.replay import replay, replay_each, replay_frames
+from gripper_force.jobs.replay.comparison import (
     Columns,
     Comparison,
     ReplayResult,
-    changed_config,
     paired_differences,
-    replay,
-    replay_each,
-    replay_frames,
-    resolve_replay,
-    run_again,
     summary,
 )
+from gripper_force.jobs.replay.feed import changed_config, resolve_replay, run_again
 from gripper_force.jobs.report import ReportPaths
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.log_writer import LogWriter

@@ -13,7 +13,7 @@ from gripper_force.cli import app
 from gripper_force.config import Config, load_config
 from gripper_force.control.limits import Limits
 from gripper_force.control.speed_limit import SpeedLimit
-from gripper_force.control.state_machine import GraspController
+from gripper_force.control.visual_check import VisualCheck
 from gripper_force.errors import DataError
 from gripper_force.qualification import safety_search
 from gripper_force.qualification.loop_margin.analytic_plant import transmission_of
@@ -78,7 +78,7 @@ def test_a_missing_speed_limit_is_found(config: Config, monkeypatch: pytest.Monk
 
 
 def test_a_grip_on_nothing_is_found(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(GraspController, "_is_unseen", property(lambda _self: False))
+    monkeypatch.setattr(VisualCheck, "objection", lambda *_: "")
     wrong = [
         i
         for i in range(1000)

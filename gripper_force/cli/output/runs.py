@@ -12,7 +12,7 @@ if TYPE_CHECKING:  # --help loads neither NumPy nor PyTorch
     from gripper_force.jobs.evaluate import Evaluation
     from gripper_force.jobs.grasp import Overall, Summary
     from gripper_force.jobs.metrics import ForceBin
-    from gripper_force.jobs.replay import PairedDifference, ReplayResult, ReplaySummary
+    from gripper_force.jobs.replay.comparison import PairedDifference, ReplayResult, ReplaySummary
 
 
 def grasp_table(r: "Summary") -> None:

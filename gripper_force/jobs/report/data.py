@@ -11,7 +11,7 @@ import numpy.typing as npt
 from gripper_force.config import Config, config_from_text, dump_config
 from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import CONTACT_N
-from gripper_force.jobs.replay import Replayed
+from gripper_force.jobs.replay.feed import Replayed
 from gripper_force.jobs.score import (
     NO_ESTIMATE,
     GraspScore,

@@ -23,7 +23,7 @@ from gripper_force.config import Config, config_from_text, load_config
 from gripper_force.errors import GripperError
 from gripper_force.interfaces import Devices, Servo
 from gripper_force.jobs.grasp import run_grasp
-from gripper_force.jobs.replay import resolve_replay, run_again
+from gripper_force.jobs.replay.feed import resolve_replay, run_again
 from gripper_force.jobs.view import beside_run, require
 from gripper_force.qualification.bench import foxglove_client
 from gripper_force.qualification.bench.startup_bench import LONG_TIMEOUTS

@@ -1,0 +1,31 @@
+"""Friction that a motion without contact shows."""
+
+import math
+from typing import Final
+
+FREE_NOISE_N: Final = 0.5
+"""Standard deviation of motor force about friction in one cycle of free travel. Inertia correlates the
+cycles."""
+
+_FREE_CYCLES = (10, 40)
+"""Least and greatest number of cycles of free travel that prove friction. Later ones may press a soft object."""
+
+
+class FreeTravel:
+    """Mean motor force of jaws that move without contact: their friction."""
+
+    def __init__(self) -> None:
+        self._cycles, self._sum_n = 0, 0.0
+
+    def add(self, motor_force_n: float) -> None:
+        """Adds the motor force of one cycle in the direction of the motion."""
+        if self._cycles < _FREE_CYCLES[1]:
+            self._cycles += 1
+            self._sum_n += motor_force_n
+
+    @property
+    def friction_n(self) -> float | None:
+        """Least friction that the motion proves; None before enough cycles."""
+        if self._cycles < _FREE_CYCLES[0]:
+            return None
+        return max(self._sum_n / self._cycles - 2 * FREE_NOISE_N / math.sqrt(self._cycles), 0.0)

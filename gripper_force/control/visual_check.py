@@ -1,0 +1,77 @@
+"""Check of a grip against the camera."""
+
+from gripper_force.config import ControlConfig
+from gripper_force.types import NS_PER_MS, NS_PER_S, VisualForce
+
+_FILTER_S = 0.1
+_RISE_SHARE = 0.15
+"""The filtered visual estimate must have risen by at least this share of the target since the jaws stopped."""
+
+_BEYOND_SHARE = 1.0
+_BEYOND_N = 1.5
+"""Excess of the visual estimate over the target, the larger of the two, that no object explains."""
+
+_PROVEN_SHARE = 0.5
+"""The motor current proves a grip if it exceeds friction by this share of the target."""
+
+
+class VisualCheck:
+    """Tells whether the camera confirms a grip.
+
+    Jaws may press on an end stop or be held by friction, which the motor current cannot tell from an object. The check
+    also uses estimates that fusion does not: those of unfamiliar frames, and those that differ from the motor current.
+    A grip makes them rise, too.
+    """
+
+    def __init__(self, config: ControlConfig) -> None:
+        self._config = config
+        self._force_n: float | None = None
+        self._t_ns, self._before_n = 0, 0.0
+        self._has_seen = self._has_unsure = False
+
+    def start(self) -> None:
+        """Starts at the beginning of a grip."""
+        self._has_seen = self._has_unsure = False
+        self._before_n = max(self._force_n or 0.0, 0.0)
+
+    def add(self, t_ns: int, visual: VisualForce | None, *, gripping: bool) -> None:
+        """Filters a new estimate.
+
+        Args:
+            t_ns: Present time.
+            visual: Newest visual estimate, or None. A repeated one is used once.
+            gripping: True between contact and release.
+        """
+        if t_ns - self._t_ns > (self._config.timeout_ms + self._config.max_age_ms) * NS_PER_MS:
+            self._force_n = None
+        if visual is None or visual.t_ns <= self._t_ns or self._config.feedback == "current":
+            return
+        # A comparison with NaN is false.
+        is_sure = not visual.is_familiar or 0 <= visual.std_n <= self._config.vision_std_n
+        if not (abs(visual.force_n) <= 1e9 and is_sure):
+            self._has_unsure |= gripping
+            return
+        self._has_seen |= gripping
+        dt_s = (visual.t_ns - self._t_ns) / NS_PER_S
+        before_n = visual.force_n if self._force_n is None else self._force_n
+        self._force_n = before_n + (visual.force_n - before_n) * dt_s / (dt_s + _FILTER_S)
+        self._t_ns = visual.t_ns
+
+    def objection(self, target_n: float, current_n: float) -> str:
+        """Returns the observation that speaks against a grip, or an empty text.
+
+        It sees next to no rise of the force, has been too uncertain throughout this grip, or sees far more than the
+        target while friction may hold the jaws: a network can give any force for an empty scene.
+
+        Args:
+            target_n: Target force.
+            current_n: Motor force beyond friction.
+        """
+        if self._force_n is None:
+            return "the camera is uncertain" if self._has_unsure and not self._has_seen else ""
+        by_friction = current_n < _PROVEN_SHARE * target_n
+        beyond_n = max(_BEYOND_SHARE * target_n, _BEYOND_N)
+        has_risen = self._force_n - self._before_n >= _RISE_SHARE * target_n
+        if has_risen and not (by_friction and self._force_n - target_n > beyond_n):
+            return ""
+        return f"the camera sees {self._force_n:.1f} N, and saw {self._before_n:.1f} N before the contact"

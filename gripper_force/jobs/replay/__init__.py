@@ -1,0 +1,165 @@
+"""Replay of logs: the same functions over the same inputs, and every estimate against the load cell."""
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+from gripper_force import __version__
+from gripper_force.config import Overrides
+from gripper_force.errors import DataError, GripperError
+from gripper_force.jobs.processes import Workers
+from gripper_force.jobs.replay.comparison import (
+    Columns,
+    EstimateSeries,
+    ReplayResult,
+    columns_of,
+    errors_by_source,
+)
+from gripper_force.jobs.replay.feed import changed_config, feed, has_faulty_estimates, resolve_replay
+from gripper_force.progress import Progress, no_progress
+from gripper_force.runtime.log_reader import LogReader
+from gripper_force.runtime.resolve import ResolvedConfig
+
+
+def replay(
+    path: str | Path,
+    checkpoint: str | Path | None = None,
+    *,
+    overrides: Overrides | None = None,
+    recover: bool = False,
+) -> ReplayResult:
+    """Runs estimator and controller again on a log, and compares the estimates with its load cell.
+
+    The replay is open loop: a changed setting changes the decisions, but not what the log's servo, camera and
+    load cell measured.
+
+    Args:
+        path: Log of a run or of an imported recording.
+        checkpoint: Another network to estimate with; None: the log's own.
+        overrides: Changes of the log's configuration: ``{"control.ramp_n_s": 4}`` or
+            ``["control.ramp_n_s=4"]``.
+        recover: Read the intact part of a truncated log.
+
+    Raises:
+        LogError: The log cannot be read.
+        CheckpointError: The network's file cannot be read.
+        DataError: The log holds nothing to replay, or no load cell to compare with.
+    """
+    return replay_frames(path, checkpoint, overrides=overrides, recover=recover)[0]
+
+
+def replay_frames(
+    path: str | Path,
+    checkpoint: str | Path | None = None,
+    *,
+    overrides: Overrides | None = None,
+    recover: bool = False,
+) -> "tuple[ReplayResult, Columns]":
+    """Replays one log, and returns its errors and its estimates: one row for each visual estimate, or for each cycle.
+
+    Arguments and errors are those of `replay`. The columns are ``log``, ``object``, ``seq`` (0 for a cycle), ``t_ns``,
+    ``measured_n`` (load cell), ``visual_n``, ``visual_std_n``, ``fused_n`` and ``current_n``; NaN where there is none.
+    """
+    reader = LogReader(Path(path), recover=recover)
+    run = resolve_replay(changed_config(reader, checkpoint, overrides))
+    series = EstimateSeries()
+    agreement = feed(reader, run, series, in_batches=_may_batch(reader, run))
+    flags = [flag for flag in (agreement.estimates, agreement.decisions) if flag is not None]
+    cells = series.cells.sorted()
+    sources = errors_by_source(series, cells)
+    best = next((sources[name] for name in ("fused", "visual") if name in sources), None)
+    if best is None:
+        raise DataError(
+            f"{path} holds no estimate to compare with a load cell; replay a log of a run with a load cell"
+        )
+    overall = {"mae_n": best.mae_n, "rmse_n": best.rmse_n, "bias_n": best.bias_n, "frames": best.frames}
+    result = ReplayResult(
+        mae_n=best.mae_n,
+        rmse_n=best.rmse_n,
+        bias_n=best.bias_n,
+        per_bin=best.per_bin,
+        frames=best.frames,
+        per_object={run.config.object: overall},
+        identical=all(flags) if flags else None,
+        note=_note(reader, run),
+        changed=agreement.changed,
+        sources=sources,
+        log=str(path),
+    )
+    return result, columns_of(result.log, run.config.object, series, cells)
+
+
+def _may_batch(reader: LogReader, run: ResolvedConfig) -> bool:
+    """Returns True if no estimate can equal a logged one bit for bit: then batches, which round otherwise, do."""
+    model, vision = run.model, run.config.vision
+    if model is None or vision.engine != "torch":
+        return False
+    return reader.metadata.get("checkpoint", "") != model.digest
+
+
+class Replays(NamedTuple):
+    """Replays of several logs, in the order of the logs.
+
+    Attributes:
+        results: Results of the logs that could be replayed.
+        columns: Their estimates, see `replay_frames`.
+        failed: Problem of each other log, by path.
+    """
+
+    results: list[ReplayResult]
+    columns: list[Columns]
+    failed: dict[str, GripperError]
+
+
+def replay_each(
+    logs: Sequence[Path],
+    checkpoint: str | Path | None = None,
+    *,
+    overrides: Overrides | None = None,
+    recover: bool = False,
+    workers: int = 1,
+    ray: str | None = None,
+    progress: Progress = no_progress,
+) -> Replays:
+    """Replays several logs. A log that can't be replayed does not stop the others.
+
+    Args:
+        logs: The logs.
+        checkpoint: As for `replay`.
+        overrides: As for `replay`.
+        recover: As for `replay`.
+        workers: Processes to use. Results do not depend on them.
+        ray: Address of a Ray cluster to use instead, see `gripper_force.jobs.ray_pool`; None for none.
+        progress: Called after each log.
+
+    Raises:
+        GripperError: No log could be replayed; the first one's error, as for `replay`.
+    """
+    one = partial(replay_frames, checkpoint=checkpoint, overrides=overrides, recover=recover)
+    found, failed = Workers(workers, ray).read_logs(one, logs, "replayed", progress)
+    return Replays(
+        [result for result, _ in found.values()],
+        [columns for _, columns in found.values()],
+        {str(logs[number]): error for number, error in failed.items()},
+    )
+
+
+def _note(reader: LogReader, run: ResolvedConfig) -> str:
+    """Returns the reason why estimates or decisions may differ from the logged ones, or an empty text."""
+    wrote = reader.metadata.get("version gripper-force", "")
+    if wrote != __version__:
+        return f"version {wrote or 'unknown'} wrote the log, this is {__version__}: its controller may decide otherwise"
+    used = reader.metadata.get("checkpoint", "")
+    if run.model is None or used == "":
+        return ""
+    if has_faulty_estimates(run.config):
+        return "faults were injected into the run's estimator, so only decisions are compared"
+    if used != run.model.digest:
+        return f"the run's checkpoint was {used[:12]}, this one is {run.model.digest[:12]}: estimates differ"
+    profile = run.correction.profile.weights if run.correction else ""
+    used = reader.metadata.get("profile", "")
+    if used != profile:
+        names = [text[:12] or "none" for text in (used, profile)]
+        return f"the run's object profile was {names[0]}, this one is {names[1]}: estimates differ"
+    return ""

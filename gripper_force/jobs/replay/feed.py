@@ -1,0 +1,342 @@
+"""Estimator and controller run again on the inputs that a log holds."""
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
+
+import numpy as np
+
+from gripper_force.config import Config, Overrides, config_from_text
+from gripper_force.control.state_machine import Decision
+from gripper_force.errors import GripperError, UnfamiliarFrameError
+from gripper_force.profiles.apply import read_correction, read_profiles
+from gripper_force.runtime.log_reader import LogReader
+from gripper_force.runtime.perception import FrameProcessor
+from gripper_force.runtime.process import allowed
+from gripper_force.runtime.resolve import ResolvedConfig, make_controller, make_estimator, resolve_vision
+from gripper_force.types import (
+    ForceEstimate,
+    Frame,
+    FusedForce,
+    GraspStatus,
+    Gray,
+    LoadCellSample,
+    Record,
+    Request,
+    ServoCommand,
+    ServoState,
+    VisualForce,
+)
+
+if TYPE_CHECKING:  # a log without vision needs no estimator
+    from gripper_force.vision.engines import Floats
+    from gripper_force.vision.estimator import ForceEstimator
+
+
+@dataclass(frozen=True)
+class Replayed:
+    """Estimates and decisions that a replay computed, and their agreement with the log.
+
+    Attributes:
+        estimates_identical: True if every visual estimate equals the logged one; None without any.
+        decisions_identical: True if every command, status and fused force does; None without any.
+        changed: Largest differences from the log: ``goal_current_a``, ``fused_n``; empty without any.
+        visual: Visual estimates, as computed now.
+        decisions: Decisions, as computed now.
+        load_cell: Load cell samples of the log.
+    """
+
+    estimates_identical: bool | None
+    decisions_identical: bool | None
+    changed: dict[str, float]
+    visual: list[VisualForce]
+    decisions: list[Decision]
+    load_cell: list[LoadCellSample]
+
+
+def changed_config(
+    reader: LogReader, checkpoint: str | Path | None = None, overrides: Overrides | None = None
+) -> Config:
+    """Returns the configuration of a log with changes."""
+    config = config_from_text(reader.config, str(reader.path), overrides)
+    if checkpoint is None:
+        return config
+    vision = config.vision.model_copy(update={"checkpoint": str(checkpoint)})
+    return config.model_copy(update={"vision": vision})
+
+
+def resolve_replay(config: Config) -> ResolvedConfig:
+    """Resolves the configuration of a log: network and object profile; the rest of it is complete.
+
+    Raises:
+        ConfigError: The profile does not belong to the network, or nothing fits the budget.
+        CheckpointError: The network's file cannot be read.
+    """
+    config, model, choice = resolve_vision(config)
+    return ResolvedConfig(
+        config,
+        model,
+        read_correction(config, read_profiles(config), model),
+        choices=(choice,) if choice else (),
+    )
+
+
+def run_again(reader: LogReader, run: ResolvedConfig, *, in_batches: bool = False) -> Replayed:
+    """Feeds estimator and controller from a log, in the order in which the run had its inputs.
+
+    If faults were injected into the run's estimator, the controller gets the logged estimates.
+
+    Args:
+        reader: The log.
+        run: Its configuration.
+        in_batches: Computes the networks on many frames at a time, with PyTorch. Its rounding differs in the last
+            digits from that of a run, which has one frame at a time.
+    """
+    kept = _Kept([], [], [])
+    agreement = feed(reader, run, kept, in_batches=in_batches)
+    return Replayed(
+        agreement.estimates, agreement.decisions, agreement.changed, kept.visual, kept.decisions, kept.cells
+    )
+
+
+class Sink(Protocol):
+    """Receiver of all that a replay computes, and of the load cell's samples."""
+
+    def add_visual(self, visual: VisualForce) -> None:
+        """Takes the next visual estimate."""
+
+    def add_decision(self, decision: Decision) -> None:
+        """Takes the next decision."""
+
+    def add_cell(self, sample: LoadCellSample) -> None:
+        """Takes the next sample of the load cell."""
+
+
+class _Kept(NamedTuple):
+    """All that a replay computed, as records."""
+
+    visual: list[VisualForce]
+    decisions: list[Decision]
+    cells: list[LoadCellSample]
+
+    def add_visual(self, visual: VisualForce) -> None:
+        self.visual.append(visual)
+
+    def add_decision(self, decision: Decision) -> None:
+        self.decisions.append(decision)
+
+    def add_cell(self, sample: LoadCellSample) -> None:
+        self.cells.append(sample)
+
+
+class Agreement(NamedTuple):
+    """Agreement of a replay with its log; the fields are those of `Replayed`."""
+
+    estimates: bool | None
+    decisions: bool | None
+    changed: dict[str, float]
+
+
+def feed(reader: LogReader, run: ResolvedConfig, sink: Sink, *, in_batches: bool) -> Agreement:
+    """Runs estimator and controller on a log, as `run_again`. Keeps no record for longer than it is needed."""
+    config = run.config
+    is_faulty = has_faulty_estimates(config)
+    had_controller = config.gripper.nm_per_a is not None  # an imported recording had none
+    controller = make_controller(config) if had_controller else None
+    newest: VisualForce | None = None
+    request: Request | None = None
+    pending: dict[int, VisualForce] = {}
+    estimates = _Pairs(lambda v: (v.seq, v.force_n, v.std_n))
+    commands = _Pairs(lambda c: c, lambda a, b: abs(a.goal_current_a - b.goal_current_a))
+    fused = _Pairs(lambda f: f, lambda a, b: abs(a.force_n - b.force_n))
+    status = _Pairs(lambda s: s)
+    pairs_of = {VisualForce: estimates, ServoCommand: commands, FusedForce: fused, GraspStatus: status}
+    estimated = _in_batches if in_batches and run.model is not None else _frame_by_frame
+    for record, estimate in estimated(reader.records(), run):
+        if isinstance(record, Frame):
+            if estimate is not None:
+                sink.add_visual(estimate)
+                estimates.add_again(estimate)
+                pending[record.seq] = estimate
+                if len(pending) > _BACKLOG:
+                    del pending[next(iter(pending))]
+            continue
+        if (pairs := pairs_of.get(type(record))) is not None:
+            pairs.add_logged(record)
+        if isinstance(record, VisualForce):
+            again = None if is_faulty else pending.pop(record.seq, None)
+            # The time at which an estimate was ready is the run's, not this computer's.
+            newest = record if again is None else replace(again, ready_ns=record.ready_ns)
+        elif isinstance(record, Request):
+            request = record
+        elif isinstance(record, ServoState) and controller is not None:
+            decision = controller.step(record.t_ns, record, newest, request)
+            sink.add_decision(decision)
+            commands.add_again(decision.command)
+            fused.add_again(decision.estimate)
+            status.add_again(decision.status)
+            newest = request = None
+        elif isinstance(record, LoadCellSample):
+            sink.add_cell(record)
+    # The run may have ended before it used the estimates of its last frames, and the last cycle of a truncated log
+    # may be incomplete.
+    same_decisions = all(pairs.agree(spare=1) for pairs in (commands, fused, status))
+    return Agreement(
+        estimates.agree() if estimates.logged and not is_faulty else None,
+        same_decisions if commands.logged else None,
+        {"goal_current_a": commands.largest, "fused_n": fused.largest} if commands.logged else {},
+    )
+
+
+_BACKLOG: Final = 1024
+"""Records that wait for their counterpart: a log has it a few records later, or not at all."""
+
+
+class _Pairs:
+    """Compares a log's records of a type with those of the replay, in their order, while both are made.
+
+    Args:
+        key: Returns what is compared of a record.
+        difference: Difference of two records of which the largest counts.
+    """
+
+    def __init__(
+        self, key: Callable[[Any], object], difference: Callable[[Any, Any], float] = lambda a, b: 0.0
+    ) -> None:
+        self._key, self._difference = key, difference
+        self._logged: deque[Any] = deque()
+        self._again: deque[Any] = deque()
+        self._same, self._ended = True, False
+        self.logged = False
+        self.largest = 0.0
+
+    def add_logged(self, record: Record) -> None:
+        """Takes the log's next record."""
+        self.logged = True
+        self._logged.append(record)
+        self._compare()
+
+    def add_again(self, record: Record) -> None:
+        """Takes the replay's next record."""
+        self._again.append(record)
+        self._compare()
+
+    def agree(self, spare: int | None = None) -> bool:
+        """Returns True if all logged records equal the replay's, which may have ``spare`` more; None: any number."""
+        return self._same and not self._logged and (spare is None or len(self._again) <= spare)
+
+    def _compare(self) -> None:
+        while self._logged and self._again and not self._ended:
+            a, b = self._logged.popleft(), self._again.popleft()
+            self._same = self._same and self._key(a) == self._key(b)
+            self.largest = max(self.largest, self._difference(a, b))
+        if self._ended or max(len(self._logged), len(self._again)) > _BACKLOG:  # a counterpart is missing
+            self._same, self._ended = False, True
+            self._logged.clear()
+            self._again.clear()
+
+
+def _frame_by_frame(
+    records: Iterable[Record], run: ResolvedConfig
+) -> Iterator[tuple[Record, VisualForce | None]]:
+    """Yields each record, with the estimate of a frame."""
+    processor = FrameProcessor(make_estimator(run))
+    for record in records:
+        yield record, processor.process(record).visual if isinstance(record, Frame) else None
+
+
+def _in_batches(
+    records: Iterable[Record], run: ResolvedConfig
+) -> Iterator[tuple[Record, VisualForce | None]]:
+    """Yields the records with their estimates, computed many frames at a time. Frames are empty."""
+    import torch
+
+    from gripper_force.vision.batch_inference import BATCH, kept_checkpoint, prepared_features
+    from gripper_force.vision.engines import Step
+    from gripper_force.vision.engines.pytorch import TorchEngine, restored_threads
+    from gripper_force.vision.estimator import ForceEstimator
+
+    assert run.model is not None
+    vision, checkpoint = run.config.vision, kept_checkpoint(run.model.path, run.model.digest)
+    engine = TorchEngine(checkpoint, threads=vision.threads if allowed().torch_threads else None)
+    estimator = ForceEstimator(engine, vision.region, run.correction)
+    preparation = _Preparation(estimator)
+    processor = FrameProcessor(preparation)
+    waiting: deque[tuple[Record, VisualForce | None, int]] = deque()  # the last: inputs up to the record
+
+    def batches() -> "Iterator[Floats]":
+        """Reads records until there are frames enough."""
+        inputs, count = preparation.inputs, 0
+        for record in records:
+            visual, before = None, len(inputs)
+            if isinstance(record, Frame):
+                visual = processor.process(record).visual
+                record = replace(record, gray=_NO_IMAGE)
+            count += len(inputs) - before
+            waiting.append((record, visual, count))
+            while len(inputs) >= BATCH["cpu"]:
+                yield np.stack(inputs[: BATCH["cpu"]])  # (N, S, S)
+                del inputs[: BATCH["cpu"]]
+        if inputs:
+            yield np.stack(inputs)
+
+    chunks = prepared_features(checkpoint.networks, batches())
+    works, done = False, 0
+    while True:
+        with restored_threads():
+            torch.set_num_threads(1)  # the last digits depend on their number
+            forces_n, features = next(chunks, (_NOTHING, _NOTHING))  # (M, K), (K, F)
+        known = done + len(features)
+        while waiting and waiting[0][2] <= known:
+            record, visual, count = waiting.popleft()
+            if visual is not None:
+                try:
+                    last = count - 1 - done
+                    estimate = estimator.finish(Step(forces_n[:, last], features[last], None))
+                    visual = replace(visual, force_n=estimate.force_n, std_n=estimate.std_n)
+                except GripperError as error:  # as `FrameProcessor` treats it
+                    if not works:
+                        raise
+                    if isinstance(error, UnfamiliarFrameError):
+                        visual = replace(visual, force_n=error.force_n, std_n=math.inf)
+                    else:
+                        visual = None
+                works = True
+            yield record, visual
+        if not len(features):
+            return
+        done = known
+
+
+class _Preparation:
+    """Takes the place of an estimator in `FrameProcessor`, and only prepares the frames for the networks."""
+
+    def __init__(self, estimator: "ForceEstimator") -> None:
+        self._estimator = estimator
+        self.inputs: list[Floats] = []
+
+    def update(self, gray: Gray) -> ForceEstimate | None:
+        """Prepares the next frame; returns None while the reference is being collected."""
+        ready = self._estimator.prepare(gray)
+        self.inputs += ready
+        return _UNKNOWN if ready else None
+
+    def attention_map(self) -> None:
+        """Returns None: nothing was computed yet."""
+
+
+_UNKNOWN: Final = ForceEstimate(math.nan, math.nan)
+
+
+_NO_IMAGE: Final = np.zeros((0, 0), np.uint8)
+
+
+_NOTHING: Final = np.zeros((0, 0), np.float32)
+
+
+def has_faulty_estimates(config: Config) -> bool:
+    """Returns True if faults were injected into the run's estimator."""
+    return any(fault.unit == "estimator" for fault in config.faults)

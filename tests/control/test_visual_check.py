@@ -1,0 +1,69 @@
+import math
+
+import pytest
+
+from gripper_force.config import ControlConfig
+from gripper_force.control.visual_check import VisualCheck
+from gripper_force.types import NS_PER_MS, VisualForce
+
+CONFIG = ControlConfig()
+FRAME_NS = 16 * NS_PER_MS
+
+
+def visual(t_ns, force_n=4.0, std_n=0.1):
+    return VisualForce(t_ns, t_ns, 0, force_n, std_n, 1.0)
+
+
+def seen(force_n, before_n=0.0, std_n=0.1, config=CONFIG):
+    """Returns a check that has seen half a second of each force, the second in a grip, and the present time."""
+    check = VisualCheck(config)
+    for cycle in range(1, 61):
+        gripping = cycle > 30
+        if cycle == 31:
+            check.start()
+        estimate = visual(cycle * FRAME_NS, force_n if gripping else before_n, std_n)
+        check.add(cycle * FRAME_NS, estimate, gripping=gripping)
+    return check, 60 * FRAME_NS
+
+
+@pytest.mark.parametrize("std_n", [0.1, math.inf], ids=["familiar", "unfamiliar"])
+def test_a_force_that_rises_confirms_a_grip(std_n):
+    check, _ = seen(4.0, std_n=std_n)
+    assert not check.objection(4.0, 0.0)
+
+
+@pytest.mark.parametrize("std_n", [0.1, math.inf], ids=["familiar", "unfamiliar"])
+@pytest.mark.parametrize("before_n", [0.0, 3.0])
+def test_a_force_that_does_not_rise_is_an_objection(before_n, std_n):
+    check, _ = seen(before_n + 0.1, before_n=before_n, std_n=std_n)
+    assert f"saw {before_n:.1f} N before the contact" in check.objection(4.0, 4.0)
+
+
+def test_far_more_than_the_target_is_an_objection_unless_the_motor_current_proves_a_grip():
+    check, _ = seen(9.0)
+    assert "sees 8.9 N" in check.objection(4.0, 1.9)
+    assert not check.objection(4.0, 2.0)
+
+
+def test_uncertain_estimates_alone_are_an_objection():
+    check, _ = seen(4.0, std_n=2 * CONFIG.vision_std_n)
+    assert check.objection(4.0, 4.0) == "the camera is uncertain"
+
+
+@pytest.mark.parametrize("strange", [{"force_n": math.nan}, {"force_n": math.inf}, {"std_n": math.nan}])
+def test_estimates_that_are_not_finite_do_not_count(strange):
+    check, t_ns = seen(4.0)
+    check.add(t_ns + 1, visual(t_ns + 1, **strange), gripping=True)
+    assert not check.objection(4.0, 4.0)
+
+
+def test_a_camera_that_has_stopped_objects_to_nothing():
+    check, t_ns = seen(0.0)
+    assert check.objection(4.0, 4.0)
+    check.add(t_ns + 1000 * NS_PER_MS, None, gripping=True)
+    assert not check.objection(4.0, 4.0)
+
+
+def test_by_motor_current_alone_the_camera_has_no_say():
+    check, _ = seen(0.0, config=CONFIG.model_copy(update={"feedback": "current"}))
+    assert not check.objection(4.0, 4.0)
