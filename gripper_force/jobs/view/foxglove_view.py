@@ -86,10 +86,12 @@ class FoxgloveViewer(ServerListener):  # type: ignore[misc]  # the SDK is not ch
         self.app_url = self._server.app_url() or ""
 
     def wait_for_app(self, poll: Callable[[], bool] = lambda: True) -> None:
-        """Waits until the app has subscribed to a topic, or ``poll`` returns False."""
+        """Waits until the app has subscribed to its topics, or ``poll`` returns False."""
         with self._changed:
             while not self._subscribed and poll():
                 self._changed.wait(_WAIT_S)
+            while self._subscribed and self._changed.wait(_WAIT_S):
+                pass  # it subscribes to one topic after the other
 
     def show(self, log: LogReader, record: Record) -> None:
         """Sends the next record of a log."""
