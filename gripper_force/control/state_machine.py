@@ -45,6 +45,11 @@ _DWELL_S = 0.12
 _SETTLE_FILTER_S = 0.25
 """Time constant of the filter on the force error that decides on `held`: vision alone is noisy."""
 
+_STALLED_SHARE = 0.1
+_STALLED_S = 0.3
+"""Closing jaws that are slower than this share of their speed for this time may press on an object: only friction that
+a free travel has shown is then credited. Until then they may be coming loose."""
+
 _OPEN_M = 0.003
 """Distance from the open width at which the jaws count as open."""
 
@@ -151,7 +156,7 @@ class GraspController:
         self._move_time_s = 0.0
         self._move_opens = False
         self._grasp_ns = 0
-        self._phase_s = self._settled_s = self._error_n = 0.0
+        self._phase_s = self._stalled_s = self._settled_s = self._error_n = 0.0
         self._was_over_force = False
         self._was_held = False
         self._goal_current_a = self._measured_motor_force_n = 0.0
@@ -291,7 +296,7 @@ class GraspController:
 
     def _enter(self, phase: Phase, reason: str) -> None:
         self._phase, self._reason = phase, reason
-        self._phase_s = self._settled_s = 0.0
+        self._phase_s = self._stalled_s = self._settled_s = 0.0
 
     def _set_outcome(self, outcome: Outcome, reason: str) -> None:
         self._outcome, self._reason = outcome, reason
@@ -323,9 +328,9 @@ class GraspController:
         self._enter(Phase.MOVE, f"move to {1e3 * width_m:.1f} mm requested")
 
     def _start_travel(self) -> None:
-        grip_n = 0.0
         if self._phase in _GRIPPING:
-            grip_n, self._was_held = self._motor_force_n, self._outcome == Outcome.HELD
+            self._was_held = self._outcome == Outcome.HELD
+        grip_n = self._motor_force_n if self._phase in (*_GRIPPING, Phase.FAULT) else 0.0
         self._goal_width_m = self._present_width_m  # in the cycle that loses an object, the jaws still close
         self._travel.start(self._goal_width_m, grip_n)
         self._limits.reset()
@@ -353,6 +358,14 @@ class GraspController:
             or (self._phase == Phase.APPROACH and self._approach.is_backing_off)
             or self._opens_at_fault
         )
+
+    @property
+    def _is_travelling(self) -> bool:
+        return self._is_opening or self._phase == Phase.MOVE
+
+    @property
+    def _is_closing(self) -> bool:
+        return self._phase in (Phase.APPROACH, Phase.MOVE) and not self._is_opening
 
     @property
     def _speed_m_s(self) -> float:
@@ -396,6 +409,8 @@ class GraspController:
 
     def _run_phase(self, t_ns: int, dt_s: float, width_m: float, closing_m_s: float) -> None:
         self._phase_s += dt_s
+        is_stalled = closing_m_s < _STALLED_SHARE * self._speed_m_s
+        self._stalled_s = self._stalled_s + dt_s if is_stalled else 0.0
         match self._phase:
             case Phase.APPROACH:
                 self._run_approach(dt_s, width_m, closing_m_s)
@@ -417,8 +432,10 @@ class GraspController:
             self._goal_width_m = width_m - 2 * GOAL_OFFSET_M
         if self._phase in (Phase.APPROACH, *_GRIPPING) and self._outcome == Outcome.NONE:
             self._check_timeout(t_ns)
-        if self._is_opening:
-            self._travel.note_friction(self._phase_s, closing_m_s, self._measured_motor_force_n)
+        if self._is_travelling:
+            self._travel.note_friction(
+                self._phase_s, closing_m_s, self._measured_motor_force_n, opens=self._is_opening
+            )
 
     def _run_approach(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
         # The goal position leads far enough that the goal current alone drives the jaws. A goal that moved in
@@ -555,9 +572,10 @@ class GraspController:
         may_rise = self._phase != Phase.FAULT or self._opens_at_fault
         force_n, friction_n = self._estimate.force_n, self._estimate.friction_n
         # Friction that is smaller than believed would be force, also of an opening with a wrong closing direction.
-        travels = (self._fusion.free_travel, *((self._travel.free_travel,) if self._is_opening else ()))
+        travels = (self._fusion.free_travel, *((self._travel.free_travel,) if self._is_travelling else ()))
         proven_n = [travel.friction_n for travel in travels if travel.friction_n is not None]
-        if self._phase in _GRIPPING or (self._is_opening and proven_n):
+        may_press = self._phase in _GRIPPING or (self._is_closing and self._stalled_s > _STALLED_S)
+        if may_press or (self._is_travelling and proven_n):
             friction_n = min(friction_n, *proven_n) if proven_n else 0.0
         command, is_over = self._limits.apply(
             wanted,

@@ -16,7 +16,9 @@ _LET_GO_LEAD_S = 0.03
 motor would add to the force of a springy object."""
 
 _FREELY_SHARE = 0.8
-"""Share of its speed above which an opening meets no resistance: its motor force is then friction."""
+_MOVES_FREELY_SHARE = 0.4
+"""Shares of the largest speed above which an opening, or a move that closes, meets no resistance: the motor force is
+then friction. A move has half of that speed."""
 
 _OPENS_SHARE = 0.25
 _PUSH_N_S = 5.0
@@ -32,7 +34,7 @@ class Travel:
         speed_m_s: Largest speed of one jaw.
         goal_width_m: Goal of the distance between the jaws.
         motor_force_n: Largest motor force at each jaw.
-        free_travel: Motor force of this travel's opening.
+        free_travel: Motor force of this travel, where nothing resisted.
     """
 
     def __init__(self, speed_m_s: float, free_motor_force_n: float, open_width_m: float) -> None:
@@ -88,10 +90,18 @@ class Travel:
         self.goal_width_m = min(max(goal_width_m, width_m - 2 * _LEAD_M), width_m + 2 * _LEAD_M)
         self._profile.value = self.goal_width_m
 
-    def note_friction(self, t_s: float, closing_m_s: float, motor_force_n: float) -> None:
-        """Takes the measured motor force of one cycle of an opening as friction, if nothing resists or helps."""
-        if not self._is_letting_go(t_s) and -closing_m_s > _FREELY_SHARE * self.speed_m_s:
-            self.free_travel.add(-motor_force_n)
+    def note_friction(self, t_s: float, closing_m_s: float, motor_force_n: float, *, opens: bool) -> None:
+        """Takes the motor force of one cycle as friction, if nothing resists or helps.
+
+        Args:
+            t_s: Time since the start.
+            closing_m_s: Closing speed of one jaw.
+            motor_force_n: Measured motor force at each jaw.
+            opens: True if the jaws are to open.
+        """
+        side, share = (-1, _FREELY_SHARE) if opens else (1, _MOVES_FREELY_SHARE)
+        if not self._is_letting_go(t_s) and side * closing_m_s > share * self.speed_m_s:
+            self.free_travel.add(side * motor_force_n)
 
     def _is_letting_go(self, t_s: float) -> bool:
         """Returns True while the object may push the jaws open."""

@@ -49,6 +49,18 @@ def test_move_to_the_present_width_ends_at_once(make_run):
     assert any(reason.startswith("moved to 52.0 mm") for reason in run.reasons)
 
 
+@pytest.mark.parametrize("limit_n", [0.9, 1.2, 2.0])
+@pytest.mark.parametrize("contact_m", [0.004, 0.02])
+def test_a_move_onto_an_object_keeps_the_force_limit_whatever_friction_is_configured(
+    make_run, limit_n, contact_m
+):
+    friction_n = make_run().transmission.friction_n
+    plant = {"friction_n": 0.3 * friction_n, "gain": 1.35, "contact_m": contact_m, "stiffness_n_m": 26_000.0}
+    run = make_run(plant=plant, force_limit_n=limit_n).move(0.03, 35.0)
+    assert run.last.status.outcome == "blocked"
+    assert 0.0 < run.plant.peak_n <= 1.05 * limit_n
+
+
 @settings(deadline=None, max_examples=25)
 @given(
     start_m=st.floats(0.0, 0.044),

@@ -141,6 +141,25 @@ def test_loss_under_a_small_force_limit_opens_soon(make_run, limit_n):
     assert run.go(0.2).last.status.phase == "release"
 
 
+@pytest.mark.parametrize("limit_n", [0.8, 1.2, 2.0])
+@pytest.mark.parametrize("x_m", [0.0, 0.02])
+def test_a_grasp_that_begins_in_contact_keeps_a_small_force_limit(make_run, limit_n, x_m):
+    # Friction is far smaller than configured, and no free travel has shown it.
+    plant = {"contact_m": x_m, "x_m": x_m, "jaw_m": x_m, "stiffness_n_m": 20_000.0}
+    plant |= {"friction_n": 0.3 * make_run().transmission.friction_n, "gain": 1.4}
+    run = make_run(plant=plant, force_limit_n=limit_n, feedback="current").grasp(0.6 * limit_n)
+    assert 0.0 < run.plant.peak_n <= 1.05 * limit_n
+
+
+def test_a_release_after_a_stop_lets_a_springy_object_go_slowly(make_run):
+    run = make_run(plant={"stiffness_n_m": 970.0, "mass_kg": 0.83}, on_fault="hold").grasp(6.9)
+    run.go(0.5, "stop").go(2.0, "release")
+    assert run.last.status.phase == "open"
+    opening_m_s = [-state.velocity_rad_s for _, state, _, _ in run.inputs]
+    fastest_m_s = max(abs(v) for v in opening_m_s) * abs(run.transmission.jaw_m_per_rad(0.0))
+    assert fastest_m_s < 1.5 * 2 * run.config.approach_speed_m_s
+
+
 def test_no_object(make_run):
     run = make_run(plant={"contact_m": 1.0}, timeout_s=20.0).grasp(8.0, 4.0)
     assert phases(run)[:2] == ["approach", "release"]

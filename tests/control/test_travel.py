@@ -1,3 +1,5 @@
+import math
+
 import pytest
 
 from gripper_force.control.travel import Travel
@@ -67,18 +69,21 @@ def test_a_move_ends_at_its_width():
 
 
 @pytest.mark.parametrize(
-    ("grip_n", "t_s", "opening_share", "is_friction"),
+    ("grip_n", "t_s", "closing_share", "is_friction"),
     [
-        (0.0, 0.0, 0.9, True),
-        (0.0, 0.0, 0.7, False),  # something resists
-        (6.0, 0.3, 0.9, False),  # the object may help
-        (6.0, 0.6, 0.9, True),
+        (0.0, 0.0, -0.9, True),
+        (0.0, 0.0, -0.7, False),  # something resists
+        (6.0, 0.3, -0.9, False),  # the object may help
+        (6.0, 0.6, -0.9, True),
+        (0.0, 0.0, 0.5, True),
+        (0.0, 0.0, 0.3, False),
     ],
 )
-def test_free_opening_shows_the_friction(grip_n, t_s, opening_share, is_friction):
+def test_free_travel_shows_the_friction(grip_n, t_s, closing_share, is_friction):
     travel = make_travel(grip_n)
     for _ in range(100):
-        travel.note_friction(t_s, -opening_share * SPEED_M_S, -1.3)
+        motor_force_n = math.copysign(1.3, closing_share)
+        travel.note_friction(t_s, closing_share * SPEED_M_S, motor_force_n, opens=closing_share < 0)
     if is_friction:
         assert 1.0 < travel.free_travel.friction_n <= 1.3
     else:
