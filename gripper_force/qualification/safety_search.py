@@ -1,8 +1,9 @@
 """Random search for wrong configurations and plants with which a grasp is not safe.
 
-Every case draws a plant and a configuration that is wrong about it, grasps, half of the time changes the force, and
-releases. The statements of `safety_statements` must hold. With motor current alone an end stop cannot be told from a
-rigid object. So such cases are counted, but are no violations; `calibrate jaws` prevents them.
+Every case draws a plant and a configuration that is wrong about it. Three of four cases grasp, half of the time change
+the force, and release. The fourth draws a sequence of requests, at any time and from any phase. The statements of
+`safety_statements` must hold. With motor current alone an end stop cannot be told from a rigid object. So such cases
+are counted, but are no violations; `calibrate jaws` prevents them.
 """
 
 import json
@@ -12,7 +13,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Final, TypedDict
+from typing import Final, NamedTuple, TypedDict
 
 import numpy as np
 
@@ -48,6 +49,20 @@ _STOP_MARGIN_M: Final = 0.0005
 """Distance of each jaw from the middle at the end stop."""
 
 
+class Step(NamedTuple):
+    """A request, and the time until the next one.
+
+    Attributes:
+        time_s: The time.
+        kind: Kind of the request.
+        value: Target in N, or width in m.
+    """
+
+    time_s: float
+    kind: str
+    value: float
+
+
 @dataclass(frozen=True, slots=True)
 class Draw:
     """One case: the plant, and the wrong configuration of it.
@@ -77,6 +92,8 @@ class Draw:
         vision_noise_n: Its noise.
         motion_n: Force that the network sees in the motion of the jaws alone, once they are closed.
         seed: Seed of the noise.
+        on_fault: As ``control.on_fault``.
+        requests: Requests instead of a grasp and a change of its force; none in most cases.
     """
 
     target_n: float
@@ -103,6 +120,8 @@ class Draw:
     vision_noise_n: float
     motion_n: float
     seed: int
+    on_fault: str
+    requests: tuple[Step, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +159,7 @@ class WorstCase(TypedDict):
     speed_share: float
     held_nothing: bool
     held_stop: bool
-    drawn: dict[str, float | str | None]
+    drawn: dict[str, object]
 
 
 class SearchReport(TypedDict):
@@ -185,6 +204,12 @@ def draw(config: ControlConfig, truth: Transmission, seed: int, index: int) -> D
     def rarely(share: float, value: float, otherwise: float) -> float:
         return value if rng.uniform() < share else otherwise
 
+    def draw_step() -> Step:
+        kinds = [RequestKind.GRASP, RequestKind.RELEASE, RequestKind.MOVE, RequestKind.STOP]
+        kind = RequestKind(rng.choice(kinds, p=[0.6, 0.2, 0.12, 0.08]))
+        value = between(0.3, most_n) if kind == RequestKind.GRASP else between(0.0, truth.open_width_m)
+        return Step(log_between(0.02, 4.0), kind, value)
+
     force_limit_n = rarely(0.5, log_between(0.8, 20.0), config.force_limit_n)
     most_n = largest_target_n(force_limit_n, truth.gain_bound)
     open_m_per_rad = truth.jaw_m_per_rad(truth.open_position_rad)
@@ -213,6 +238,8 @@ def draw(config: ControlConfig, truth: Transmission, seed: int, index: int) -> D
         seed=int(rng.integers(2**31)),
         motion_n=rarely(0.3, between(0.0, 6.0), 0.0),
         away_s=rarely(0.5, log_between(0.02, 1.5), math.inf),
+        on_fault=str(rng.choice(["limp", "hold", "open"])),
+        requests=tuple(draw_step() for _ in range(int(rng.integers(3, 9)))) if index % 4 == 2 else (),
     )
 
 
@@ -233,6 +260,7 @@ def run_case(config: Config, seed: int, index: int) -> CaseResult:
             "vision_rate_hz": drawn.camera_hz,
             "force_limit_n": drawn.force_limit_n,
             "approach_speed_m_s": drawn.approach_m_s,
+            "on_fault": drawn.on_fault,
         }
     )
     plant = Gripper(
@@ -251,12 +279,15 @@ def run_case(config: Config, seed: int, index: int) -> CaseResult:
     run = _Run(plant, controller, drawn, offset_rad, control)
     if controller.start_problem(run.read(0, 0.0)):
         return refused
-    run.go(run.slower_s + drawn.then_s, Request(0, RequestKind.GRASP, drawn.target_n))
-    changes = math.isfinite(drawn.then_n) and run.outcome in (Outcome.NONE, Outcome.HELD)
-    change = Request(run.t_ns, RequestKind.GRASP, drawn.then_n) if changes else None
-    if changes:
-        run.statements.change_target(drawn.then_n)
-    run.go(_GRASP_S - drawn.then_s, change)
+    if drawn.requests:
+        for step in drawn.requests:
+            run.request(step)
+    else:
+        run.request(Step(run.slower_s + drawn.then_s, RequestKind.GRASP, drawn.target_n))
+        if math.isfinite(drawn.then_n) and run.outcome in (Outcome.NONE, Outcome.HELD):
+            run.request(Step(_GRASP_S - drawn.then_s, RequestKind.GRASP, drawn.then_n))
+        else:
+            run.go(_GRASP_S - drawn.then_s, None)
     run.go(run.slower_s + _RELEASE_S, Request(run.t_ns, RequestKind.RELEASE))
     shown = run.statements
     return CaseResult(
@@ -303,6 +334,11 @@ class _Run:
             velocity_rad_s=sign * state.velocity_rad_s,
             current_a=sign * state.current_a,
         )
+
+    def request(self, step: Step) -> None:
+        if step.kind == RequestKind.GRASP:
+            self.statements.change_target(step.value)
+        self.go(step.time_s, Request(self.t_ns, step.kind, target_n=step.value, width_m=step.value))
 
     def go(self, time_s: float, request: Request | None) -> None:
         for servo_noise, vision_noise in self._rng.standard_normal(

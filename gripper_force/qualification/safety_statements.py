@@ -27,7 +27,7 @@ _STILL_M_S: Final = 0.003
 """Speed below which a jaw stands still: friction creeps."""
 
 _TRAVEL_SHARE: Final = 2.0
-"""Speed of a release as a share of the approach speed."""
+"""Speed of a release or a move as a share of the approach speed."""
 
 
 class SafetyStatements:
@@ -90,9 +90,10 @@ class SafetyStatements:
         self.held_nothing |= self._nothing_s > self._still_reaction_s or self._moving_s > REACTION_S
         self.force_share = max(self.force_share, peak_n / self._limit_n)
         if force_n == 0.0:
-            # Only opening jaws may be faster; a wrong sign exchanges the directions.
-            opens = self._sign * closing_m_s < 0
+            # Opening jaws and moves may be faster. With a wrong sign a release closes the jaws, and a grasp opens them.
+            is_move = phase == Phase.MOVE and outcome != Outcome.SLIP
+            travels = closing_m_s < 0 or self._sign < 0 or is_move
             if closing_m_s < 0 and not has_torque:
                 return
-            limit_m_s = self._speed_m_s * (_TRAVEL_SHARE if opens else 1.0)
+            limit_m_s = self._speed_m_s * (_TRAVEL_SHARE if travels else 1.0)
             self.speed_share = max(self.speed_share, abs(closing_m_s) / limit_m_s)

@@ -13,6 +13,7 @@ from gripper_force.cli import app
 from gripper_force.config import Config, load_config
 from gripper_force.control.limits import Limits
 from gripper_force.control.speed_limit import SpeedLimit
+from gripper_force.control.travel import Travel
 from gripper_force.control.visual_check import VisualCheck
 from gripper_force.errors import DataError
 from gripper_force.qualification import safety_search
@@ -56,6 +57,17 @@ def test_draws_cover_what_can_be_wrong(config: Config) -> None:
     assert any(one.start_m > 0.01 for one in drawn)
     assert any(one.leaves_s < 3 for one in drawn)
     assert any(one.leaves_s < 3 and one.away_s < 0.1 for one in drawn)
+    assert {one.on_fault for one in drawn} == {"limp", "hold", "open"}
+    assert {step.kind for one in drawn for step in one.requests} == {"grasp", "release", "move", "stop"}
+    assert any(not one.requests for one in drawn)
+
+
+def test_a_sequence_of_requests_can_be_searched(config: Config) -> None:
+    cases = [i for i in range(60) if draw(config.control, RACK, 0, i).requests]
+    assert len(cases) == 15
+    found = [run_case(config, 0, i) for i in cases]
+    assert all(result.ok for result in found)
+    assert any(result.force_share > 0.3 for result in found)
 
 
 # Each defect is planted into the controller, and the search must find it.
@@ -70,6 +82,15 @@ def test_a_current_beyond_its_limit_is_found(config: Config, monkeypatch: pytest
 
     monkeypatch.setattr(Limits, "apply", doubled)
     assert any(result.force_share > 1.05 for result in results(config, 0, 60))
+
+
+def test_a_grip_that_a_release_after_a_stop_forgets_is_found(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start = Travel.start
+    monkeypatch.setattr(Travel, "start", lambda travel, width_m, _: start(travel, width_m, 0.0))
+    cases = [i for i in range(400) if draw(config.control, RACK, 0, i).requests]
+    assert any(run_case(config, 0, i).speed_share > 1.5 for i in cases)
 
 
 def test_a_missing_speed_limit_is_found(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
