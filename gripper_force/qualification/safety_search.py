@@ -41,6 +41,13 @@ WORST: Final = 5
 _GRASP_S: Final = 5.0
 _RELEASE_S: Final = 1.5
 _CHUNK: Final = 20
+_SEQUENCE: Final = 4
+"""One case of so many is a sequence of requests."""
+
+_REACH_SHARE: Final = 0.2
+"""The object of such a case is nearer by this factor, so that requests meet jaws that hold it. Its closing direction is
+right: with a wrong one no grasp reaches an object, and a springy one that a release has pressed pushes the jaws open."""
+
 _GONE_M: Final = 1.0
 _PINION_M: Final = 0.020
 """Travel of a jaw per radian to which the drawn masses belong."""
@@ -208,8 +215,10 @@ def draw(config: ControlConfig, truth: Transmission, seed: int, index: int) -> D
         kinds = [RequestKind.GRASP, RequestKind.RELEASE, RequestKind.MOVE, RequestKind.STOP]
         kind = RequestKind(rng.choice(kinds, p=[0.6, 0.2, 0.12, 0.08]))
         value = between(0.3, most_n) if kind == RequestKind.GRASP else between(0.0, truth.open_width_m)
-        return Step(log_between(0.02, 4.0), kind, value)
+        return Step(log_between(0.05, 8.0), kind, value)
 
+    is_sequence = index % _SEQUENCE == _SEQUENCE - 2
+    reach = _REACH_SHARE if is_sequence else 1.0
     force_limit_n = rarely(0.5, log_between(0.8, 20.0), config.force_limit_n)
     most_n = largest_target_n(force_limit_n, truth.gain_bound)
     open_m_per_rad = truth.jaw_m_per_rad(truth.open_position_rad)
@@ -227,10 +236,10 @@ def draw(config: ControlConfig, truth: Transmission, seed: int, index: int) -> D
         mass_kg=between(0.8, 1.5) * (_PINION_M / open_m_per_rad) ** 2,
         damping_n_s_m=between(0.55, 1.1) * truth.damping_n_s_m,
         play_m=between(0.0002, 0.0004),
-        contact_m=rarely(0.2, _GONE_M, between(0.002, truth.open_width_m / 2 - 0.003)),
+        contact_m=rarely(0.2, _GONE_M, reach * between(0.002, truth.open_width_m / 2 - 0.003)),
         leaves_s=rarely(0.25, between(0.5, _GRASP_S), math.inf),
         start_m=rarely(0.3, between(-0.02, 0.02), 0.0),
-        sign=int(rarely(0.1, -1, 1)),
+        sign=int(rarely(0.0 if is_sequence else 0.1, -1, 1)),
         width=rarely(0.3, between(0.8, 1.2), 1.0),
         camera_hz=between(5.0, 60.0),
         vision_gain=log_between(0.4, 2.5),
@@ -239,7 +248,7 @@ def draw(config: ControlConfig, truth: Transmission, seed: int, index: int) -> D
         motion_n=rarely(0.3, between(0.0, 6.0), 0.0),
         away_s=rarely(0.5, log_between(0.02, 1.5), math.inf),
         on_fault=str(rng.choice(["limp", "hold", "open"])),
-        requests=tuple(draw_step() for _ in range(int(rng.integers(3, 9)))) if index % 4 == 2 else (),
+        requests=tuple(draw_step() for _ in range(int(rng.integers(3, 9)) if is_sequence else 0)),
     )
 
 
