@@ -46,7 +46,7 @@ _SEQUENCE: Final = 4
 
 _REACH_SHARE: Final = 0.2
 """The object of such a case is nearer by this factor, so that requests meet jaws that hold it. Its closing direction is
-right: with a wrong one no grasp reaches an object, and a springy one that a release has pressed pushes the jaws open."""
+right: with a wrong one no grasp reaches an object, and a springy one that a release presses pushes the jaws open."""
 
 _GONE_M: Final = 1.0
 _PINION_M: Final = 0.020
