@@ -13,7 +13,7 @@ from gripper_force.control.slip import SlipMonitor
 from gripper_force.control.speed_limit import PositionLoop, SpeedLimit
 from gripper_force.control.trajectory import ACCELERATION_S
 from gripper_force.control.transmission import GOAL_OFFSET_M, Transmission
-from gripper_force.control.travel import Travel
+from gripper_force.control.travel import LET_GO_S, Travel
 from gripper_force.control.visual_check import VisualCheck
 from gripper_force.types import (
     NS_PER_S,
@@ -155,6 +155,7 @@ class GraspController:
         self._move_width_m = transmission.open_width_m
         self._move_time_s = 0.0
         self._move_opens = False
+        self._let_go_n = 0.0
         self._grasp_ns = 0
         self._phase_s = self._stalled_s = self._settled_s = self._error_n = 0.0
         self._was_over_force = False
@@ -309,6 +310,13 @@ class GraspController:
             self._loop.retarget(self._derated_target_n)
             self._enter(Phase.RAMP, f"new target {target_n:g} N")
             return
+        if (
+            self._phase == Phase.APPROACH and not new_object
+        ):  # it keeps what it knows of friction and standstill
+            self._approach.set_target(target_n)
+            self._reason = f"new target {target_n:g} N"
+            return
+        self._let_go_n = self._travel.grip_left_n(self._phase_s) if self._is_travelling else 0.0
         self._fusion.restart(was_held=self._was_held, new_object=new_object)
         self._was_held = False
         self._limits.reset()
@@ -444,7 +452,9 @@ class GraspController:
         progress = self._approach.step(
             dt_s, width_m, closing_m_s, self._measured_motor_force_n, self._estimate
         )
-        self._motor_force_n = self._approach.motor_force_n
+        # With less motor force at once, an object that a release has not let go yet would push the jaws open.
+        let_go_n = self._let_go_n * (1 - self._phase_s / LET_GO_S)
+        self._motor_force_n = max(self._approach.motor_force_n, let_go_n)
         match progress:
             case ApproachState.BACKING_OFF:
                 self._goal_width_m = min(self._approach.back_off_width_m, self._transmission.open_width_m)
@@ -521,6 +531,7 @@ class GraspController:
                 self._move_width_m, self._move_opens = width_m, False
                 self._enter(Phase.MOVE, reason)
             case "regrip" if width_m >= self._config.min_object_width_m:
+                self._let_go_n = 0.0
                 self._approach.start(width_m, self._target_n)
                 self._enter(Phase.APPROACH, reason)
             case _:

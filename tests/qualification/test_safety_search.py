@@ -70,6 +70,13 @@ def test_a_sequence_of_requests_can_be_searched(config: Config) -> None:
     assert any(result.force_share > 0.3 for result in found)
 
 
+@pytest.mark.parametrize("index", [2062, 3254, 6546, 8954])
+def test_a_grasp_that_interrupts_another_motion_is_safe(config: Config, index: int) -> None:
+    # 2062: a release, whose object still pushed the jaws open. The others: an approach, which began anew in contact.
+    assert [step.kind for step in draw(config.control, RACK, 0, index).requests].count("grasp") > 3
+    assert run_case(config, 0, index).ok
+
+
 # Each defect is planted into the controller, and the search must find it.
 
 
