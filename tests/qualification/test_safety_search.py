@@ -13,7 +13,6 @@ from gripper_force.cli import app
 from gripper_force.config import Config, load_config
 from gripper_force.control.limits import Limits
 from gripper_force.control.speed_limit import SpeedLimit
-from gripper_force.control.travel import Travel
 from gripper_force.control.visual_check import VisualCheck
 from gripper_force.errors import DataError
 from gripper_force.qualification import safety_search
@@ -89,15 +88,6 @@ def test_a_current_beyond_its_limit_is_found(config: Config, monkeypatch: pytest
 
     monkeypatch.setattr(Limits, "apply", doubled)
     assert any(result.force_share > 1.05 for result in results(config, 0, 60))
-
-
-def test_a_grip_that_a_release_after_a_stop_forgets_is_found(
-    config: Config, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    start = Travel.start
-    monkeypatch.setattr(Travel, "start", lambda travel, width_m, _: start(travel, width_m, 0.0))
-    cases = [i for i in range(400) if draw(config.control, RACK, 0, i).requests]
-    assert any(run_case(config, 0, i).speed_share > 1.5 for i in cases)
 
 
 def test_a_missing_speed_limit_is_found(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -44,15 +44,20 @@ def test_force_counts_against_the_limit() -> None:
         (Phase.HOLD, 0.03, 1, 1.5),
         (Phase.APPROACH, -0.03, 1, 0.75),
         (Phase.RELEASE, -0.03, 1, 0.75),
-        (Phase.MOVE, 0.03, 1, 1.5),
+        (Phase.MOVE, 0.03, 1, 0.75),
         (Phase.MOVE, -0.03, 1, 0.75),
-        (Phase.APPROACH, -0.03, -1, 1.5),
+        (Phase.APPROACH, -0.03, -1, 0.75),
+        (Phase.RELEASE, 0.03, -1, 0.75),
     ],
 )
 def test_speed_counts_against_that_of_the_direction(
     phase: Phase, closing_m_s: float, sign: int, share: float
 ) -> None:
     assert shown(phase, closing_m_s=closing_m_s, sign=sign).speed_share == pytest.approx(share)
+
+
+def test_jaws_that_keep_their_width_after_a_loss_may_not_close_faster_than_a_grasp() -> None:
+    assert shown(Phase.MOVE, Outcome.SLIP, closing_m_s=0.03).speed_share == pytest.approx(1.5)
 
 
 def test_speed_in_contact_does_not_count() -> None:
