@@ -136,7 +136,7 @@ def test_no_linkage_exceeds_the_force_limit(name: str) -> None:
     config = load_config(GRIPPERS / f"{name}.yaml")
     found = results(config, 0, 15)
     assert not any(result.force_share > 1.05 or result.held_nothing for result in found)
-    assert any(result.force_share > 0.3 for result in found)
+    assert any(result.force_share > 0.1 for result in found)
 
 
 def test_long_fingers_open_at_the_speed_of_a_release() -> None:
