@@ -33,7 +33,7 @@ class Phase(StrEnum):
 
 
 class Outcome(StrEnum):
-    """Result of a grasp or a move; ``NONE`` while it is under way."""
+    """Result of a grasp, of a move, or of a release that fails (``BLOCKED``); ``NONE`` while it is under way."""
 
     NONE = ""
     HELD = "held"

@@ -7,25 +7,26 @@ FREE_NOISE_N: Final = 0.5
 """Standard deviation of motor force about friction in one cycle of free travel. Inertia correlates the
 cycles."""
 
-_FREE_CYCLES = (10, 40)
+_LEAST_CYCLES = 10
+_MOST_CYCLES = 40
 """Least and greatest number of cycles of free travel that prove friction. Later ones may press a soft object."""
 
 
 class FreeTravel:
     """Mean motor force of jaws that move without contact: their friction."""
 
-    def __init__(self) -> None:
-        self._cycles, self._sum_n = 0, 0.0
+    def __init__(self, most_cycles: int = _MOST_CYCLES) -> None:
+        self._most_cycles, self._cycles, self._sum_n = most_cycles, 0, 0.0
 
     def add(self, motor_force_n: float) -> None:
         """Adds the motor force of one cycle in the direction of the motion."""
-        if self._cycles < _FREE_CYCLES[1]:
+        if self._cycles < self._most_cycles:
             self._cycles += 1
             self._sum_n += motor_force_n
 
     @property
     def friction_n(self) -> float | None:
         """Least friction that the motion proves; None before enough cycles."""
-        if self._cycles < _FREE_CYCLES[0]:
+        if self._cycles < _LEAST_CYCLES:
             return None
         return max(self._sum_n / self._cycles - 2 * FREE_NOISE_N / math.sqrt(self._cycles), 0.0)

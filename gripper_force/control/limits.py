@@ -104,9 +104,15 @@ class Limits:
         position_rad = min(max(command.goal_position_rad, self._low_rad), self._high_rad)
         return ServoCommand(command.t_ns, position_rad, self._last_a), over
 
-    def reset(self) -> None:
-        """Removes the ceiling that an over-force set. Called at the start and the end of a grasp."""
+    def reset(self, *, reverses: bool = False) -> None:
+        """Removes the ceiling that an over-force set. Called at the start and the end of a grasp.
+
+        Args:
+            reverses: True if opening jaws are to close: the motor force then rises from zero.
+        """
         self._over_force_ceiling_a = self._over_force_motor_n = math.inf
+        if reverses:
+            self._unrounded_a = self._last_a = 0.0
 
     @property
     def is_at_current_limit(self) -> bool:

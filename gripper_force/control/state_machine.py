@@ -1,6 +1,7 @@
 """State machine of the grasp: phases, outcomes, and the command of each phase."""
 
 import dataclasses
+import math
 from dataclasses import dataclass
 
 from gripper_force.config import ControlConfig
@@ -45,10 +46,11 @@ _DWELL_S = 0.12
 _SETTLE_FILTER_S = 0.25
 """Time constant of the filter on the force error that decides on `held`: vision alone is noisy."""
 
-_STALLED_SHARE = 0.1
-_STALLED_S = 0.3
-"""Closing jaws that are slower than this share of their speed for this time may press on an object: only friction that
-a free travel has shown is then credited. Until then they may be coming loose."""
+_SLOW_SHARE = 0.4
+_SLOW_S = 0.3
+_SLOWED_S = 0.05
+"""Open jaws that have not travelled yet may need their configured friction to come loose. Slower than this share of
+their speed for this time, they may press on an object; after they have moved, for the shorter time."""
 
 _OPEN_M = 0.003
 """Distance from the open width at which the jaws count as open."""
@@ -65,6 +67,10 @@ servo's proportional gain leave (80 um)."""
 
 _MOVE_SPARE_S = 1.0
 """Time a move may take beyond its speed profile before an obstacle is reported."""
+
+_UNKNOWN_SHARE = 0.5
+"""Largest motor force of jaws that may touch an object while their friction is unknown, as a share of the one that the
+force limit allows: they may be moving when they hit it."""
 
 _GRIPPING = (Phase.CONTACT, Phase.RAMP, Phase.HOLD)
 
@@ -103,7 +109,8 @@ class GraspController:
 
     *A hot servo* holds less force, and an event reports it.
 
-    *The outcome* stays until the next grasp or move. After ``held`` it may become ``slip``. The controller
+    *The outcome* stays until the next grasp or move. After ``held`` it may become ``slip``, and after a release that
+    does not open the jaws ``blocked``. The controller
     opens the jaws without a request after ``no_object`` and ``stuck``. When the object has left the jaws, it
     does what ``on_slip`` says. After another ``slip``, and after ``timeout``, it continues.
 
@@ -157,9 +164,11 @@ class GraspController:
         self._move_opens = False
         self._let_go_n = 0.0
         self._grasp_ns = 0
-        self._phase_s = self._stalled_s = self._settled_s = self._error_n = 0.0
-        self._was_over_force = False
-        self._was_held = False
+        self._phase_s = self._slow_s = self._settled_s = self._error_n = 0.0
+        self._proven_friction_n: float | None = None
+        self._friction_before_n = math.inf
+        self._starts_open = self._is_loose = False
+        self._was_over_force = self._was_held = False
         self._goal_current_a = self._measured_motor_force_n = 0.0
         self._derating = 1.0
 
@@ -277,6 +286,8 @@ class GraspController:
         elif request.kind == RequestKind.RELEASE:
             if cause := self._safety.reset():
                 return cause
+            if self._outcome == Outcome.BLOCKED:
+                self._outcome = Outcome.NONE
             self._start_release("release requested")
         elif request.kind == RequestKind.MOVE:
             open_width_m = self._transmission.open_width_m
@@ -296,8 +307,11 @@ class GraspController:
     # Phase changes.
 
     def _enter(self, phase: Phase, reason: str) -> None:
+        starts_open = is_open(self._transmission.open_width_m, self._present_width_m)
+        self._starts_open = starts_open and self._phase not in _GRIPPING
         self._phase, self._reason = phase, reason
-        self._phase_s = self._stalled_s = self._settled_s = 0.0
+        self._friction_before_n = math.inf if self._proven_friction_n is None else self._proven_friction_n
+        self._phase_s = self._settled_s = 0.0
 
     def _set_outcome(self, outcome: Outcome, reason: str) -> None:
         self._outcome, self._reason = outcome, reason
@@ -319,29 +333,30 @@ class GraspController:
         self._let_go_n = self._travel.grip_left_n(self._phase_s) if self._is_travelling else 0.0
         self._fusion.restart(was_held=self._was_held, new_object=new_object)
         self._was_held = False
-        self._limits.reset()
+        self._limits.reset(reverses=self._is_opening and self._let_go_n == 0)
         self._approach.start(self._present_width_m, target_n)
         self._enter(Phase.APPROACH, f"grasp with {target_n:g} N requested")
 
     def _start_release(self, reason: str) -> None:
-        self._start_travel()
+        self._start_travel(opens=True)
         self._enter(Phase.RELEASE, reason)
 
     def _start_move(self, width_m: float) -> None:
-        self._start_travel()
-        self._outcome = Outcome.NONE
         distance_m = width_m - self._present_width_m
+        self._start_travel(opens=distance_m > 0)
+        self._outcome = Outcome.NONE
         self._move_width_m, self._move_opens = width_m, distance_m > 0
         self._move_time_s = abs(distance_m) / self._travel.speed_m_s + ACCELERATION_S + _MOVE_SPARE_S
         self._enter(Phase.MOVE, f"move to {1e3 * width_m:.1f} mm requested")
 
-    def _start_travel(self) -> None:
+    def _start_travel(self, *, opens: bool) -> None:
         if self._phase in _GRIPPING:
             self._was_held = self._outcome == Outcome.HELD
         grip_n = self._motor_force_n if self._phase in (*_GRIPPING, Phase.FAULT) else 0.0
+        reverses = self._is_opening and not opens and self._travel.grip_left_n(self._phase_s) == 0
+        self._limits.reset(reverses=reverses)
         self._goal_width_m = self._present_width_m  # in the cycle that loses an object, the jaws still close
-        self._travel.start(self._goal_width_m, grip_n)
-        self._limits.reset()
+        self._travel.start(self._goal_width_m, grip_n, opens=opens)
 
     def _enter_fault(self) -> None:
         reason = self._safety.reason
@@ -374,6 +389,18 @@ class GraspController:
     @property
     def _is_closing(self) -> bool:
         return self._phase in (Phase.APPROACH, Phase.MOVE) and not self._is_opening
+
+    @property
+    def _comes_loose(self) -> bool:
+        """True if the jaws may need their configured friction to start: no travel has shown another yet.
+
+        Jaws that are partly closed may touch an object, so they open a little first (see `Approach`).
+        """
+        return (
+            self._is_closing
+            and self._starts_open
+            and self._slow_s <= (_SLOWED_S if self._is_loose else _SLOW_S)
+        )
 
     @property
     def _speed_m_s(self) -> float:
@@ -417,8 +444,10 @@ class GraspController:
 
     def _run_phase(self, t_ns: int, dt_s: float, width_m: float, closing_m_s: float) -> None:
         self._phase_s += dt_s
-        is_stalled = closing_m_s < _STALLED_SHARE * self._speed_m_s
-        self._stalled_s = self._stalled_s + dt_s if is_stalled else 0.0
+        # Kept from one closing phase to the next: the jaws may press on an object already.
+        is_slow = closing_m_s < _SLOW_SHARE * self._speed_m_s
+        self._slow_s = self._slow_s + dt_s if is_slow and self._is_closing else 0.0
+        self._is_loose = self._is_closing and (self._is_loose or not is_slow)
         match self._phase:
             case Phase.APPROACH:
                 self._run_approach(dt_s, width_m, closing_m_s)
@@ -440,15 +469,29 @@ class GraspController:
             self._goal_width_m = width_m - 2 * GOAL_OFFSET_M
         if self._phase in (Phase.APPROACH, *_GRIPPING) and self._outcome == Outcome.NONE:
             self._check_timeout(t_ns)
+        self._note_friction(closing_m_s)
+
+    def _note_friction(self, closing_m_s: float) -> None:
+        """Takes over what this motion shows of friction."""
+        free_travel = self._fusion.free_travel
         if self._is_travelling:
+            free_travel = self._travel.free_travel
             self._travel.note_friction(
                 self._phase_s, closing_m_s, self._measured_motor_force_n, opens=self._is_opening
             )
+        elif self._phase != Phase.APPROACH:
+            return
+        if free_travel.friction_n is None:
+            return
+        # Closing jaws may press a soft object: only an opening shows that friction has risen.
+        before_n = math.inf if self._is_opening else self._friction_before_n
+        self._proven_friction_n = min(free_travel.friction_n, before_n)
 
     def _run_approach(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
         # The goal position leads far enough that the goal current alone drives the jaws. A goal that moved in
         # steps with the jaws would cause a current ripple, and the current is sampled at one phase of it.
         self._goal_width_m = width_m - 2 * GOAL_OFFSET_M
+        was_backing_off = self._approach.is_backing_off
         progress = self._approach.step(
             dt_s, width_m, closing_m_s, self._measured_motor_force_n, self._estimate
         )
@@ -457,6 +500,8 @@ class GraspController:
         self._motor_force_n = max(self._approach.motor_force_n, let_go_n)
         match progress:
             case ApproachState.BACKING_OFF:
+                if not was_backing_off:
+                    self._travel.start(width_m, 0.0, opens=True)
                 self._goal_width_m = min(self._approach.back_off_width_m, self._transmission.open_width_m)
             case ApproachState.CONTACT:
                 self._visual_check.start()
@@ -527,7 +572,7 @@ class GraspController:
             self._set_outcome(Outcome.SLIP, reason)
         match self._config.on_slip:
             case "hold":
-                self._start_travel()
+                self._start_travel(opens=False)
                 self._move_width_m, self._move_opens = width_m, False
                 self._enter(Phase.MOVE, reason)
             case "regrip" if width_m >= self._config.min_object_width_m:
@@ -545,6 +590,13 @@ class GraspController:
             self._goal_width_m = open_width_m
             if self._phase == Phase.RELEASE:
                 self._enter(Phase.OPEN, "open")
+        elif self._phase_s - dt_s < self.opening_s <= self._phase_s:
+            if self._phase == Phase.RELEASE:
+                self._outcome = Outcome.BLOCKED
+            self._reason = (
+                f"the jaws are {1e3 * width_m:.1f} mm apart and have not opened within {self.opening_s:.1f} s; check "
+                "for an obstacle, that gripper.friction_n is not too small, and that control.force_limit_n is not"
+            )
 
     def _run_move(self, dt_s: float, width_m: float) -> None:
         self._travel.move(dt_s, self._phase_s, width_m, self._move_width_m)
@@ -575,19 +627,22 @@ class GraspController:
     # Outputs.
 
     def _limit_command(self, t_ns: int, dt_s: float) -> tuple[ServoCommand, bool]:
+        may_rise = self._phase != Phase.FAULT or self._opens_at_fault
+        force_n, friction_n = self._estimate.force_n, self._estimate.friction_n
+        motor_force_n = self._motor_force_n
+        # Friction that is smaller than believed would be force, also of an opening with a wrong closing direction.
+        if self._proven_friction_n is not None:
+            friction_n = min(friction_n, self._proven_friction_n)
+        elif not self._is_opening and not self._comes_loose:
+            friction_n = 0.0
+            if self._is_closing:
+                allowed_n = self._config.force_limit_n / self._transmission.gain_bound
+                motor_force_n = min(motor_force_n, _UNKNOWN_SHARE * allowed_n)
         wanted = ServoCommand(
             t_ns,
             self._transmission.position_rad(self._goal_width_m),
-            abs(self._transmission.current_a(self._motor_force_n, self._present_rad)),
+            abs(self._transmission.current_a(motor_force_n, self._present_rad)),
         )
-        may_rise = self._phase != Phase.FAULT or self._opens_at_fault
-        force_n, friction_n = self._estimate.force_n, self._estimate.friction_n
-        # Friction that is smaller than believed would be force, also of an opening with a wrong closing direction.
-        travels = (self._fusion.free_travel, *((self._travel.free_travel,) if self._is_travelling else ()))
-        proven_n = [travel.friction_n for travel in travels if travel.friction_n is not None]
-        may_press = self._phase in _GRIPPING or (self._is_closing and self._stalled_s > _STALLED_S)
-        if may_press or (self._is_travelling and proven_n):
-            friction_n = min(friction_n, *proven_n) if proven_n else 0.0
         command, is_over = self._limits.apply(
             wanted,
             force_n,

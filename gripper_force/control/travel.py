@@ -22,6 +22,9 @@ _MOVES_FREELY_SHARE = 0.4
 """Shares of the largest speed above which an opening, or a move that closes, meets no resistance: the motor force is
 then friction. A move has half of that speed."""
 
+_CLOSING_CYCLES = 10
+"""Number of cycles in which a move that closes shows friction: after them it may press a soft object."""
+
 _OPENS_SHARE = 0.25
 _PUSH_N_S = 5.0
 _PUSH_SHARE = 3.0
@@ -44,18 +47,19 @@ class Travel:
         self._free_motor_force_n = free_motor_force_n
         self._open_width_m = open_width_m
         self._profile = TrapezoidalProfile(ACCELERATION_S)
-        self.start(open_width_m, 0.0)
+        self.start(open_width_m, 0.0, opens=True)
 
-    def start(self, width_m: float, grip_n: float) -> None:
+    def start(self, width_m: float, grip_n: float, *, opens: bool) -> None:
         """Starts from rest.
 
         Args:
             width_m: Present distance between the jaws.
             grip_n: Motor force of the grip that ends; 0 for none.
+            opens: True if the jaws are to open.
         """
         self.goal_width_m = width_m
         self.motor_force_n = self._free_motor_force_n
-        self.free_travel = FreeTravel()
+        self.free_travel = FreeTravel() if opens else FreeTravel(_CLOSING_CYCLES)
         self._profile.start(width_m, self.speed_m_s)
         self._grip_n, self._push_n = grip_n, 0.0
 

@@ -351,7 +351,8 @@ def summarise(path: Path) -> Summary:
     vision = vision_in_hold(statuses, records[FusedForce], visuals, records[Event])
     shown = vision if controls_with_vision(config) else None
     expects_vision = controls_with_vision(config) or config.control.feedback == "vision"
-    outcomes = [s.outcome for s in statuses if s.outcome != Outcome.NONE]
+    # A release that fails does not change what the grasp reached.
+    outcomes = [s.outcome for s in statuses if s.outcome not in (Outcome.NONE, Outcome.BLOCKED)]
     gains = [fused for fused in records[FusedForce] if fused.object_gain]
     span_s = (cycles_ns[-1] - cycles_ns[0]) / NS_PER_S if len(cycles_ns) > 1 else 0.0
     return {

@@ -210,7 +210,7 @@ class ControlLoop:
         self.state, result = self._tracker.update(
             decision, session.servo_state, session.last_load_cell_sample, restart=starts
         )
-        self._requests.finish_cycle(request, refusal, self.state, result, session.opening_s)
+        self._requests.finish_cycle(request, refusal, self.state, result)
         return self.state
 
 

@@ -178,7 +178,8 @@ class Gripper:
             wait: False returns at once.
 
         Returns:
-            The width reached, in metres. An object that catches on the jaws can keep them from opening.
+            The width reached, in metres. If the jaws did not open, the outcome of `state` is ``blocked``, and its
+            reason names what to check.
 
         Raises:
             RequestError: The cause of a fault persists.

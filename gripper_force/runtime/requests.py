@@ -10,7 +10,7 @@ from typing import Final
 
 from gripper_force.errors import RequestError
 from gripper_force.runtime.state import GRIPPING, GraspResult, GripperState
-from gripper_force.types import NS_PER_S, Outcome, Phase, RequestKind
+from gripper_force.types import Outcome, Phase, RequestKind
 
 CLOSED: Final = "the gripper is closed; open it again with open_gripper"
 
@@ -26,7 +26,6 @@ class PendingRequest:
         new_object: True for a grasp of another object than in the grasps before.
         needs_object: True for a change of force, which must not close the jaws on nothing.
         is_awaited: True if a caller waits for the result.
-        start_ns: Time of the cycle that handled it.
         result: The result, or the `RequestError` of this request alone.
     """
 
@@ -36,13 +35,12 @@ class PendingRequest:
     new_object: bool = False
     needs_object: bool = False
     is_awaited: bool = False
-    start_ns: int = 0
     result: Future[GraspResult] = field(default_factory=Future)
 
-    def is_done(self, state: GripperState, opening_s: float) -> bool:
-        """Returns True if the cycle with this state has ended the request. Opening takes at most ``opening_s``."""
+    def is_done(self, state: GripperState) -> bool:
+        """Returns True if the cycle with this state has ended the request."""
         if self.kind == RequestKind.RELEASE:
-            return state.phase != Phase.RELEASE or state.t_ns - self.start_ns > opening_s * NS_PER_S
+            return state.phase != Phase.RELEASE or state.outcome == Outcome.BLOCKED
         return state.outcome != Outcome.NONE
 
     def is_like(self, other: PendingRequest) -> bool:
@@ -109,7 +107,6 @@ class RequestQueue:
         refusal: str,
         state: GripperState,
         result: GraspResult,
-        opening_s: float,
     ) -> None:
         """Ends the requests that a cycle has refused, replaced or brought to a result.
 
@@ -118,14 +115,13 @@ class RequestQueue:
             refusal: Reason why it was refused, or an empty text.
             state: State after the cycle.
             result: Result for the requests that end with this state.
-            opening_s: Longest time in which the jaws open.
         """
         with self._lock:
             self._phase = state.phase
             if request is not None and not self._is_closed:
-                self._start(request, refusal, state.t_ns)
+                self._start(request, refusal)
             for started in self._started:
-                if started.is_done(state, opening_s):
+                if started.is_done(state):
                     started.result.set_result(result)
             self._started = [started for started in self._started if not started.result.done()]
 
@@ -144,7 +140,7 @@ class RequestQueue:
                 at_fault = request.kind == RequestKind.STOP
         return at_fault
 
-    def _start(self, request: PendingRequest, refusal: str, t_ns: int) -> None:
+    def _start(self, request: PendingRequest, refusal: str) -> None:
         index = self._queued.index(request)
         overridden = self._queued[:index]  # none, unless the request is a stop
         del self._queued[: index + 1]
@@ -153,7 +149,6 @@ class RequestQueue:
             request.fail(f"the {request.kind} request was refused: {refusal}")
         elif request.kind != RequestKind.STOP:
             self._replace(request)
-            request.start_ns = t_ns
             self._started += [request] if request.is_awaited else []
 
     def _replace(self, request: PendingRequest) -> None:

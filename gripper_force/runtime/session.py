@@ -37,6 +37,7 @@ from gripper_force.types import (
     Frame,
     GraspStatus,
     LoadCellSample,
+    Outcome,
     Phase,
     Record,
     Request,
@@ -52,6 +53,9 @@ _VISION_WAIT_NS: Final = 2 * NS_PER_S
 
 _REFERENCE_NS: Final = NS_PER_S // 10
 """Every run starts with frames without contact, so that its log can be replayed with vision."""
+
+_OPENING_SPARE_S: Final = 0.5
+"""Wait for opening jaws beyond the time after which the controller says that they are blocked."""
 
 _GAP_CYCLES: Final = 2.5
 """A gap between two readings that is longer than this many cycles is logged."""
@@ -255,14 +259,17 @@ class Session:
         return state
 
     def release(self) -> GraspStatus:
-        """Opens the jaws and returns the last status. An object that catches on them can keep them closed."""
+        """Opens the jaws. Returns the last status; its outcome is ``blocked`` if they did not open."""
         return self.wait_until_open(self.cycle(RequestKind.RELEASE).status)
 
     def wait_until_open(self, status: GraspStatus) -> GraspStatus:
-        """Runs cycles until opening jaws are open, or for `opening_s`. Returns the last status."""
-        end_ns = status.t_ns + round(self.opening_s * NS_PER_S)
-        while status.t_ns < end_ns and not is_open(self.run.config.gripper.open_width_m, status.width_m):
+        """Runs cycles until opening jaws are open or blocked, or for `opening_s`. Returns the last status."""
+        open_width_m = self.run.config.gripper.open_width_m
+        end_ns = status.t_ns + round((self.opening_s + _OPENING_SPARE_S) * NS_PER_S)
+        while status.t_ns < end_ns and not is_open(open_width_m, status.width_m):
             status = self.cycle().status
+            if status.outcome == Outcome.BLOCKED:
+                break
         return status
 
     def fail(self, error: BaseException) -> None:

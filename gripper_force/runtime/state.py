@@ -49,7 +49,7 @@ class GripperState:
     Attributes:
         t_ns: Time of the cycle on the run's clock, in nanoseconds.
         phase: What the controller is doing (a `Phase`).
-        outcome: Result of the newest grasp or move; ``Outcome.NONE`` while it is under way.
+        outcome: Result of the newest grasp or move (see `Outcome`); ``Outcome.NONE`` while it is under way.
         reason: Newest reason of a change of phase or outcome.
         reference_n: Force that the loop steers to in this cycle, in newtons.
         force_n: Estimated contact force, in newtons.

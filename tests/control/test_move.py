@@ -106,8 +106,8 @@ def test_force_on_an_obstacle_is_bounded(make_run, stiffness_n_m, gain, friction
     assert max(forces_n) <= impact_n + motor_n
     assert forces_n[-1] <= motor_n + friction_n
     assert max(d.command.goal_current_a for d in run.decisions) <= motor_limit_a(run)
-    stopped = [reason for reason in run.reasons if reason.startswith("stopped at")]
-    assert stopped == [f"stopped at {1e3 * run.last.status.width_m:.1f} mm by an obstacle"]
+    stopped_m = [s.width_m for s in run.statuses if s.reason.startswith("stopped at")]
+    assert stopped_m == [pytest.approx(run.last.status.width_m, abs=1e-4)]
     assert run.last.status.phase == "move"
 
 

@@ -1,3 +1,4 @@
+import itertools
 import math
 from dataclasses import replace
 from itertools import pairwise
@@ -139,6 +140,52 @@ def test_loss_under_a_small_force_limit_opens_soon(make_run, limit_n):
     assert run.last.status.phase == "hold"
     run.plant.contact_m = 1.0
     assert run.go(0.2).last.status.phase == "release"
+
+
+@pytest.mark.parametrize(
+    ("limit_n", "friction", "gain"), [(0.8, 2.0, 1.0), (2.0, 3.0, 1.0), (10.0, 5.0, 0.7)]
+)
+def test_a_release_that_cannot_open_the_jaws_is_blocked(make_run, limit_n, friction, gain):
+    plant = {"x_m": 0.02, "jaw_m": 0.02, "contact_m": 1.0, "gain": gain}
+    plant |= {"friction_n": friction * make_run().transmission.friction_n}
+    run = make_run(plant=plant, force_limit_n=limit_n)
+    run.go(run.controller.opening_s - 0.1, "release")
+    assert run.last.status.outcome == ""
+    run.go(0.2)
+    assert (run.last.status.phase, run.last.status.outcome) == ("release", "blocked")
+    [reason] = [reason for reason in run.reasons if "not opened" in reason]
+    assert "gripper.friction_n" in reason
+    assert "control.force_limit_n" in reason
+    # It goes on trying, and another release begins anew.
+    assert run.go(0.1, "release").last.status.outcome == ""
+    run.plant.friction_n /= friction
+    assert run.go(run.controller.opening_s).last.status.phase == "open"
+
+
+SMALL = {
+    "k": [1000.0, 20_000.0],
+    "limit_n": [0.8, 1.06, 2.0],
+    "x_m": [0.0, 0.005],
+    "gap_m": [0.0, 0.0003, 0.001],
+}
+
+
+@pytest.mark.parametrize("then", ["grasp", "move", "move at once"])
+@pytest.mark.parametrize(("friction", "gain"), [(0.3, 1.4), (0.63, 1.38), (1.0, 1.0)])
+def test_jaws_near_an_object_keep_a_small_force_limit_whatever_is_requested(make_run, friction, gain, then):
+    friction_n = friction * make_run().transmission.friction_n
+    for k, limit_n, x_m, gap_m in itertools.product(*SMALL.values()):
+        plant = {"x_m": x_m, "jaw_m": x_m, "contact_m": x_m + gap_m, "stiffness_n_m": k}
+        run = make_run(
+            plant={**plant, "friction_n": friction_n, "gain": gain},
+            force_limit_n=limit_n,
+            approach_speed_m_s=0.029,
+            feedback="current",
+        )
+        run.grasp(0.6 * limit_n, 0.2 if then == "move at once" else 4.0)
+        run.grasp(0.64 * limit_n, 2.0) if then == "grasp" else run.move(0.02, 2.0)
+        peak_n = max(sample.force_n for sample in run.cell)
+        assert peak_n <= 1.05 * limit_n, (k, limit_n, x_m, gap_m)
 
 
 @pytest.mark.parametrize("limit_n", [0.8, 1.2, 2.0])

@@ -10,7 +10,7 @@ CYCLE_S = 0.005
 
 def make_travel(grip_n=0.0):
     travel = Travel(SPEED_M_S, FREE_N, OPEN_M)
-    travel.start(0.04, grip_n)
+    travel.start(0.04, grip_n, opens=True)
     return travel
 
 
@@ -29,7 +29,7 @@ def test_an_opening_without_an_object_leads_by_8_mm_with_the_free_motor_force():
 def test_slow_jaws_get_more_motor_force_up_to_four_times():
     travel = opened(make_travel(), 10.0, 0.04, 0.0)
     assert travel.motor_force_n == travel.free_motor_force_n == pytest.approx(4 * FREE_N)
-    travel.start(0.04, 0.0)
+    travel.start(0.04, 0.0, opens=True)
     assert travel.free_motor_force_n == FREE_N
 
 
@@ -88,5 +88,5 @@ def test_free_travel_shows_the_friction(grip_n, t_s, closing_share, is_friction)
         assert 1.0 < travel.free_travel.friction_n <= 1.3
     else:
         assert travel.free_travel.friction_n is None
-    travel.start(0.04, 0.0)
+    travel.start(0.04, 0.0, opens=True)
     assert travel.free_travel.friction_n is None

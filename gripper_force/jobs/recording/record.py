@@ -34,6 +34,7 @@ from gripper_force.types import (
     NS_PER_S,
     GraspStatus,
     LoadCellSample,
+    Outcome,
     Phase,
     RequestKind,
 )
@@ -178,7 +179,9 @@ def _check_same(path: Path, config: Config) -> None:
 def _open_jaws(run: ResolvedConfig, devices: Devices) -> None:
     """Opens the jaws in a session without a log, because the log of a set must begin with open jaws."""
     with open_session(run, devices, None) as session:
-        session.release()
+        status = session.release()
+    if status.outcome == Outcome.BLOCKED:
+        raise DeviceError(status.reason)
     devices.servo.close()  # the set's own session opens it again
 
 
