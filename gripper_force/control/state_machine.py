@@ -14,7 +14,7 @@ from gripper_force.control.slip import SlipMonitor
 from gripper_force.control.speed_limit import PositionLoop, SpeedLimit
 from gripper_force.control.trajectory import ACCELERATION_S
 from gripper_force.control.transmission import GOAL_OFFSET_M, Transmission
-from gripper_force.control.travel import LET_GO_S, Travel
+from gripper_force.control.travel import Travel
 from gripper_force.control.visual_check import VisualCheck
 from gripper_force.types import (
     NS_PER_S,
@@ -162,11 +162,10 @@ class GraspController:
         self._move_width_m = transmission.open_width_m
         self._move_time_s = 0.0
         self._move_opens = False
-        self._let_go_n = 0.0
+        self._released_s = math.inf
         self._grasp_ns = 0
         self._phase_s = self._slow_s = self._settled_s = self._error_n = 0.0
-        self._proven_friction_n: float | None = None
-        self._friction_before_n = math.inf
+        self._proven_friction_n = math.inf
         self._starts_open = self._is_loose = False
         self._was_over_force = self._was_held = False
         self._goal_current_a = self._measured_motor_force_n = 0.0
@@ -310,7 +309,6 @@ class GraspController:
         starts_open = is_open(self._transmission.open_width_m, self._present_width_m)
         self._starts_open = starts_open and self._phase not in _GRIPPING
         self._phase, self._reason = phase, reason
-        self._friction_before_n = math.inf if self._proven_friction_n is None else self._proven_friction_n
         self._phase_s = self._settled_s = 0.0
 
     def _set_outcome(self, outcome: Outcome, reason: str) -> None:
@@ -330,10 +328,10 @@ class GraspController:
             self._approach.set_target(target_n)
             self._reason = f"new target {target_n:g} N"
             return
-        self._let_go_n = self._travel.grip_left_n(self._phase_s) if self._is_travelling else 0.0
+        self._released_s = self._phase_s if self._is_travelling else math.inf
         self._fusion.restart(was_held=self._was_held, new_object=new_object)
         self._was_held = False
-        self._limits.reset(reverses=self._is_opening and self._let_go_n == 0)
+        self._limits.reset(reverses=self._is_opening and self._travel.grip_left_n(self._phase_s) == 0)
         self._approach.start(self._present_width_m, target_n)
         self._enter(Phase.APPROACH, f"grasp with {target_n:g} N requested")
 
@@ -473,19 +471,17 @@ class GraspController:
 
     def _note_friction(self, closing_m_s: float) -> None:
         """Takes over what this motion shows of friction."""
-        free_travel = self._fusion.free_travel
         if self._is_travelling:
-            free_travel = self._travel.free_travel
             self._travel.note_friction(
                 self._phase_s, closing_m_s, self._measured_motor_force_n, opens=self._is_opening
             )
-        elif self._phase != Phase.APPROACH:
-            return
-        if free_travel.friction_n is None:
-            return
-        # Closing jaws may press a soft object: only an opening shows that friction has risen.
-        before_n = math.inf if self._is_opening else self._friction_before_n
-        self._proven_friction_n = min(free_travel.friction_n, before_n)
+            shown_n = self._travel.free_travel.friction_n
+        else:
+            shown_n = self._fusion.free_travel.friction_n if self._phase == Phase.APPROACH else None
+        if shown_n is not None:
+            # A move that closes may press on a soft object, so it does not show that friction has risen.
+            closes = self._phase == Phase.MOVE and not self._is_opening
+            self._proven_friction_n = min(shown_n, self._proven_friction_n) if closes else shown_n
 
     def _run_approach(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
         # The goal position leads far enough that the goal current alone drives the jaws. A goal that moved in
@@ -496,7 +492,7 @@ class GraspController:
             dt_s, width_m, closing_m_s, self._measured_motor_force_n, self._estimate
         )
         # With less motor force at once, an object that a release has not let go yet would push the jaws open.
-        let_go_n = self._let_go_n * (1 - self._phase_s / LET_GO_S)
+        let_go_n = self._travel.grip_left_n(self._released_s + self._phase_s)
         self._motor_force_n = max(self._approach.motor_force_n, let_go_n)
         match progress:
             case ApproachState.BACKING_OFF:
@@ -576,7 +572,7 @@ class GraspController:
                 self._move_width_m, self._move_opens = width_m, False
                 self._enter(Phase.MOVE, reason)
             case "regrip" if width_m >= self._config.min_object_width_m:
-                self._let_go_n = 0.0
+                self._released_s = math.inf
                 self._approach.start(width_m, self._target_n)
                 self._enter(Phase.APPROACH, reason)
             case _:
@@ -631,7 +627,7 @@ class GraspController:
         force_n, friction_n = self._estimate.force_n, self._estimate.friction_n
         motor_force_n = self._motor_force_n
         # Friction that is smaller than believed would be force, also of an opening with a wrong closing direction.
-        if self._proven_friction_n is not None:
+        if self._proven_friction_n < math.inf:
             friction_n = min(friction_n, self._proven_friction_n)
         elif not self._is_opening and not self._comes_loose:
             friction_n = 0.0

@@ -1,14 +1,12 @@
 """Motion of the jaws in a release or a move."""
 
-from typing import Final
-
 from gripper_force.control.free_travel import FreeTravel
 from gripper_force.control.trajectory import ACCELERATION_S, TrapezoidalProfile
 
 _LEAD_M = 0.004
 """Largest lead of the profile over one jaw in free travel, so that jaws that were held back do not jump."""
 
-LET_GO_S: Final = 0.6
+_LET_GO_S = 0.6
 """Time in which the largest motor force of a grip falls to that of free travel after a release. With less motor
 force at once, the servo could not brake the jaws, and a springy object pushed them open at four times the wanted
 speed."""
@@ -111,11 +109,11 @@ class Travel:
 
     def grip_left_n(self, t_s: float) -> float:
         """Returns what is left of the motor force of a grip, ``t_s`` after the start."""
-        return self._grip_n * max(1 - t_s / LET_GO_S, 0.0)
+        return self._grip_n * max(1 - t_s / _LET_GO_S, 0.0)
 
     def _is_letting_go(self, t_s: float) -> bool:
         """Returns True while the object may push the jaws open."""
-        return self._grip_n > 0 and t_s < LET_GO_S
+        return self._grip_n > 0 and t_s < _LET_GO_S
 
     def _force_n(self, t_s: float) -> float:
         """Returns the motor force of free travel, and at first what remains of a grip."""
