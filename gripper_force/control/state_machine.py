@@ -603,7 +603,10 @@ class GraspController:
         if is_there and self._goal_width_m == self._move_width_m:
             self._set_outcome(Outcome.MOVED, f"moved to {self._move_width_m * 1e3:.1f} mm")
         elif self._phase_s >= self._move_time_s:
-            self._set_outcome(Outcome.BLOCKED, f"stopped at {width_m * 1e3:.1f} mm by an obstacle")
+            reason = f"stopped at {width_m * 1e3:.1f} mm by an obstacle"
+            if self._proven_friction_n == math.inf:
+                reason += ", or by friction, which no motion has shown yet: request a release first"
+            self._set_outcome(Outcome.BLOCKED, reason)
 
     def _check_timeout(self, t_ns: int) -> None:
         if t_ns - self._grasp_ns > self.timeout_s * NS_PER_S:
