@@ -1,7 +1,8 @@
 """Random search for wrong configurations and plants with which a grasp is not safe.
 
 Every case draws a plant and a configuration that is wrong about it. Three of four cases grasp, half of the time change
-the force, and release. The fourth draws a sequence of requests, at any time and from any phase. The statements of
+the force, and release. The fourth draws a sequence of requests, at any time and from any phase. Some cases begin with
+jaws that touch the object or nearly do. The statements of
 `safety_statements` must hold. With motor current alone an end stop cannot be told from a rigid object. So such cases
 are counted, but are no violations; `calibrate jaws` prevents them.
 """
@@ -42,7 +43,16 @@ _GRASP_S: Final = 5.0
 _RELEASE_S: Final = 1.5
 _CHUNK: Final = 20
 _SEQUENCE: Final = 4
-"""One case of so many is a sequence of requests."""
+"""One case of so many is a sequence of requests: those with the remainder 2."""
+
+_NEAR: Final = 32
+_NEAR_REMAINDERS: Final = (2, 5, 10, 13, 21, 29)
+"""Cases with these remainders begin near the object or in contact with it: a quarter of the sequences, an eighth of the
+others."""
+
+_GAP_M: Final = 0.002
+_NEAR_LIMIT_N: Final = (0.8, 3.0)
+"""Largest gap of such a case, and range of its force limit: a large limit leaves room for any friction."""
 
 _REACH_SHARE: Final = 0.2
 """The object of such a case is nearer by this factor, so that requests meet jaws that hold it. Its closing direction is
@@ -101,6 +111,7 @@ class Draw:
         seed: Seed of the noise.
         on_fault: As ``control.on_fault``.
         requests: Requests instead of a grasp and a change of its force; none in most cases.
+        begins_m: Travel of a jaw at which it begins; 0 for open jaws.
     """
 
     target_n: float
@@ -129,6 +140,7 @@ class Draw:
     seed: int
     on_fault: str
     requests: tuple[Step, ...]
+    begins_m: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,7 +234,7 @@ def draw(config: ControlConfig, truth: Transmission, seed: int, index: int) -> D
     force_limit_n = rarely(0.5, log_between(0.8, 20.0), config.force_limit_n)
     most_n = largest_target_n(force_limit_n, truth.gain_bound)
     open_m_per_rad = truth.jaw_m_per_rad(truth.open_position_rad)
-    return Draw(
+    drawn = Draw(
         force_limit_n=force_limit_n,
         approach_m_s=rarely(0.5, log_between(0.01, 0.04), config.approach_speed_m_s),
         target_n=between(0.5, most_n),
@@ -249,6 +261,24 @@ def draw(config: ControlConfig, truth: Transmission, seed: int, index: int) -> D
         away_s=rarely(0.5, log_between(0.02, 1.5), math.inf),
         on_fault=str(rng.choice(["limp", "hold", "open"])),
         requests=tuple(draw_step() for _ in range(int(rng.integers(3, 9)) if is_sequence else 0)),
+        begins_m=0.0,
+    )
+    if index % _NEAR not in _NEAR_REMAINDERS:
+        return drawn
+    gap_m = rarely(0.3, 0.0, between(0.0, _GAP_M))
+    to_m = between(0.0, truth.open_width_m / 4) if drawn.contact_m == _GONE_M else drawn.contact_m
+    limit_n = log_between(*_NEAR_LIMIT_N)
+    scale = limit_n / force_limit_n
+    return replace(
+        drawn,
+        begins_m=max(to_m - gap_m, 0.0),
+        force_limit_n=limit_n,
+        target_n=scale * drawn.target_n,
+        then_n=scale * drawn.then_n,
+        requests=tuple(
+            step._replace(value=scale * step.value) if step.kind == RequestKind.GRASP else step
+            for step in drawn.requests
+        ),
     )
 
 
@@ -283,6 +313,7 @@ def run_case(config: Config, seed: int, index: int) -> CaseResult:
         contact_m=drawn.contact_m,
         stops_m=(0.0, truth.open_width_m / 2 - _STOP_MARGIN_M),
     )
+    plant.x_m = plant.jaw_m = drawn.begins_m
     controller = GraspController(control, believed, config.servo.current_limit_a, POSITION_LOOP)
     offset_rad = drawn.start_m / truth.jaw_m_per_rad(truth.open_position_rad)
     run = _Run(plant, controller, drawn, offset_rad, control)
