@@ -1,5 +1,6 @@
 """Approach of the jaws to the object: closing at a bounded speed until they touch it."""
 
+import math
 from enum import Enum, auto
 
 from gripper_force.config import ControlConfig
@@ -118,7 +119,13 @@ class Approach:
         return steady_speed and self._mean_force_n - self.motor_force_n < _STEADY_FORCE_N
 
     def step(
-        self, dt_s: float, width_m: float, closing_m_s: float, measured_n: float, estimate: FusedForce
+        self,
+        dt_s: float,
+        width_m: float,
+        closing_m_s: float,
+        measured_n: float,
+        estimate: FusedForce,
+        most_n: float = math.inf,
     ) -> ApproachState:
         """Runs one cycle: sets `motor_force_n`, and returns how far the approach is.
 
@@ -128,12 +135,13 @@ class Approach:
             closing_m_s: Closing speed of one jaw.
             measured_n: Motor force at each jaw by the measured current.
             estimate: The force estimate.
+            most_n: Largest motor force.
         """
         self._time_s += dt_s
         if self.is_backing_off:
             return self._step_back(width_m)
         self._mean_force_n += (measured_n - self._mean_force_n) * dt_s / (dt_s + _STEADY_FILTER_S)
-        self._drive(dt_s, closing_m_s, estimate)
+        self._drive(dt_s, closing_m_s, estimate, most_n)
         self._has_moved |= closing_m_s > _SLOWED_SHARE * self.speed_m_s
         if width_m < self._config.min_object_width_m:
             return ApproachState.CLOSED
@@ -169,7 +177,7 @@ class Approach:
         """Width to which the jaws open while they back off."""
         return self._start_m + _BACK_OFF_M
 
-    def _drive(self, dt_s: float, closing_m_s: float, estimate: FusedForce) -> None:
+    def _drive(self, dt_s: float, closing_m_s: float, estimate: FusedForce, most_n: float) -> None:
         """Speed loop whose motor force is limited to friction, damping and the contact limit."""
         wanted_m_s = self.speed_m_s * min(self._time_s / ACCELERATION_S, 1.0)
         error_m_s = wanted_m_s - closing_m_s
@@ -179,7 +187,7 @@ class Approach:
         )
         # Force that the current estimate counts as contact and vision does not is friction, too.
         friction_n = estimate.friction_n - estimate.bias_n + 2 * estimate.std_n
-        max_n = friction_n + self._limit_n + damping_n_s_m * max(closing_m_s, 0.0)
+        max_n = min(friction_n + self._limit_n + damping_n_s_m * max(closing_m_s, 0.0), most_n)
         self._integral_n += _SPEED_INTEGRAL_N_M * error_m_s * dt_s
         if closing_m_s > _OVERSPEED * self.speed_m_s:
             self._integral_n -= self.motor_force_n * dt_s / _OVERSPEED_DECAY_S

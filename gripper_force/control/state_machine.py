@@ -68,6 +68,9 @@ servo's proportional gain leave (80 um)."""
 _MOVE_SPARE_S = 1.0
 """Time a move may take beyond its speed profile before an obstacle is reported."""
 
+_LOOSE_N = 0.1
+"""Motor force beyond the configured friction of jaws that come loose in a move."""
+
 _UNKNOWN_SHARE = 0.5
 """Largest motor force of jaws that may touch an object while their friction is unknown, as a share of the one that the
 force limit allows: they may be moving when they hit it."""
@@ -401,6 +404,15 @@ class GraspController:
         )
 
     @property
+    def _closing_limit_n(self) -> float:
+        """Largest motor force of closing jaws: half of what the limit allows if they may touch an object unnoticed."""
+        if self._proven_friction_n < math.inf or (self._comes_loose and self._phase == Phase.APPROACH):
+            return math.inf
+        if self._comes_loose:
+            return self._transmission.friction_n + _LOOSE_N
+        return _UNKNOWN_SHARE * self._config.force_limit_n / self._transmission.gain_bound
+
+    @property
     def _speed_m_s(self) -> float:
         """Largest speed of one jaw in the present phase."""
         full_m_s = self._config.approach_speed_m_s
@@ -442,10 +454,7 @@ class GraspController:
 
     def _run_phase(self, t_ns: int, dt_s: float, width_m: float, closing_m_s: float) -> None:
         self._phase_s += dt_s
-        # Kept from one closing phase to the next: the jaws may press on an object already.
-        is_slow = closing_m_s < _SLOW_SHARE * self._speed_m_s
-        self._slow_s = self._slow_s + dt_s if is_slow and self._is_closing else 0.0
-        self._is_loose = self._is_closing and (self._is_loose or not is_slow)
+        self._note_slow(dt_s, closing_m_s)
         match self._phase:
             case Phase.APPROACH:
                 self._run_approach(dt_s, width_m, closing_m_s)
@@ -469,6 +478,15 @@ class GraspController:
             self._check_timeout(t_ns)
         self._note_friction(closing_m_s)
 
+    def _note_slow(self, dt_s: float, closing_m_s: float) -> None:
+        """Counts the time of slow closing, across phases: the jaws may press on an object already."""
+        if not self._is_closing:
+            self._is_loose = False
+            return
+        is_slow = closing_m_s < _SLOW_SHARE * self._speed_m_s
+        self._slow_s = self._slow_s + dt_s if is_slow else 0.0
+        self._is_loose |= not is_slow
+
     def _note_friction(self, closing_m_s: float) -> None:
         """Takes over what this motion shows of friction."""
         if self._is_travelling:
@@ -489,7 +507,7 @@ class GraspController:
         self._goal_width_m = width_m - 2 * GOAL_OFFSET_M
         was_backing_off = self._approach.is_backing_off
         progress = self._approach.step(
-            dt_s, width_m, closing_m_s, self._measured_motor_force_n, self._estimate
+            dt_s, width_m, closing_m_s, self._measured_motor_force_n, self._estimate, self._closing_limit_n
         )
         # With less motor force at once, an object that a release has not let go yet would push the jaws open.
         let_go_n = self._travel.grip_left_n(self._released_s + self._phase_s)
@@ -506,6 +524,7 @@ class GraspController:
             case ApproachState.CLOSED:
                 self._end_approach(Outcome.NO_OBJECT, "closed without contact")
             case ApproachState.STUCK:
+                self._slow_s = 0.0  # a person may have removed what held them
                 self._end_approach(
                     Outcome.STUCK,
                     f"the jaws do not move at {width_m * 1e3:.1f} mm; check for an obstacle, and that "
@@ -634,9 +653,8 @@ class GraspController:
             friction_n = min(friction_n, self._proven_friction_n)
         elif not self._is_opening and not self._comes_loose:
             friction_n = 0.0
-            if self._is_closing:
-                allowed_n = self._config.force_limit_n / self._transmission.gain_bound
-                motor_force_n = min(motor_force_n, _UNKNOWN_SHARE * allowed_n)
+        if self._is_closing:
+            motor_force_n = min(motor_force_n, self._closing_limit_n)
         wanted = ServoCommand(
             t_ns,
             self._transmission.position_rad(self._goal_width_m),
