@@ -135,7 +135,7 @@ class Approach:
             closing_m_s: Closing speed of one jaw.
             measured_n: Motor force at each jaw by the measured current.
             estimate: The force estimate.
-            most_n: Largest motor force.
+            most_n: Largest motor force while friction is unknown.
         """
         self._time_s += dt_s
         if self.is_backing_off:
@@ -150,8 +150,11 @@ class Approach:
         self._contact_s = self._contact_s + dt_s if is_contact else 0.0
         if self._contact_s >= _DEBOUNCE_S:
             return ApproachState.CONTACT
-        stands = self._at_limit and closing_m_s < _STALLED_SHARE * self.speed_m_s
-        self._stuck_s = self._stuck_s + dt_s if stands and not has_travelled else 0.0
+        # Little motor force hardly moves the jaws. So they open, which shows friction.
+        share = _STALLED_SHARE if most_n == math.inf else _SLOWED_SHARE
+        stands = self._at_limit and closing_m_s < share * self.speed_m_s
+        may_be_stuck = not has_travelled or most_n < math.inf
+        self._stuck_s = self._stuck_s + dt_s if stands and may_be_stuck else 0.0
         if self._stuck_s < _STUCK_S:
             return ApproachState.CLOSING
         if self._has_backed_off:
@@ -193,7 +196,7 @@ class Approach:
             self._integral_n -= self.motor_force_n * dt_s / _OVERSPEED_DECAY_S
         self._integral_n = min(max(self._integral_n, -unlimited_n), max_n - unlimited_n)
         self.motor_force_n = unlimited_n + self._integral_n
-        self._at_limit = self.motor_force_n > 0.99 * max_n
+        self._at_limit = self.motor_force_n > (0.99 if most_n == math.inf else 0.9) * max_n
 
     def _detects_contact(self, closing_m_s: float, estimate: FusedForce) -> bool:
         pressing = estimate.current_n + estimate.bias_n > 0.5 * self._limit_n

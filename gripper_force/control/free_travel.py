@@ -25,8 +25,12 @@ class FreeTravel:
             self._sum_n += motor_force_n
 
     @property
+    def mean_n(self) -> float | None:
+        """Mean motor force; None before enough cycles."""
+        return self._sum_n / self._cycles if self._cycles >= _LEAST_CYCLES else None
+
+    @property
     def friction_n(self) -> float | None:
         """Least friction that the motion proves; None before enough cycles."""
-        if self._cycles < _LEAST_CYCLES:
-            return None
-        return max(self._sum_n / self._cycles - 2 * FREE_NOISE_N / math.sqrt(self._cycles), 0.0)
+        mean_n = self.mean_n
+        return None if mean_n is None else max(mean_n - 2 * FREE_NOISE_N / math.sqrt(self._cycles), 0.0)

@@ -141,6 +141,10 @@ class Fusion:
         self._was_lowering = self._has_lowered = False
         self.reset_variance()
 
+    def take_friction(self, friction_n: float) -> None:
+        """Takes over friction that an opening of this grasp has shown."""
+        self._friction_n, self._friction_n2 = max(friction_n, 0.0), _FREE_FLOOR_N**2
+
     def end_grasp(self, *, was_held: bool) -> tuple[float, float] | None:
         """Ends the present grasp, and returns the ratio that the object's gain rests on (see `ObjectGain.ratio`)."""
         self._gain_event = self._gain.finish_grasp(counts=was_held)

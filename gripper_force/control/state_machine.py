@@ -168,7 +168,7 @@ class GraspController:
         self._released_s = math.inf
         self._grasp_ns = 0
         self._phase_s = self._slow_s = self._settled_s = self._error_n = 0.0
-        self._proven_friction_n = math.inf
+        self._proven_friction_n, self._knows_friction = math.inf, False
         self._starts_open = self._is_loose = False
         self._was_over_force = self._was_held = False
         self._goal_current_a = self._measured_motor_force_n = 0.0
@@ -332,6 +332,7 @@ class GraspController:
             self._reason = f"new target {target_n:g} N"
             return
         self._released_s = self._phase_s if self._is_travelling else math.inf
+        self._knows_friction = False
         self._fusion.restart(was_held=self._was_held, new_object=new_object)
         self._was_held = False
         self._limits.reset(reverses=self._is_opening and self._travel.grip_left_n(self._phase_s) == 0)
@@ -408,9 +409,8 @@ class GraspController:
         """Largest motor force of closing jaws: half of what the limit allows if they may touch an object unnoticed."""
         if self._proven_friction_n < math.inf or (self._comes_loose and self._phase == Phase.APPROACH):
             return math.inf
-        if self._comes_loose:
-            return self._transmission.friction_n + _LOOSE_N
-        return _UNKNOWN_SHARE * self._config.force_limit_n / self._transmission.gain_bound
+        safe_n = _UNKNOWN_SHARE * self._config.force_limit_n / self._transmission.gain_bound
+        return max(safe_n, self._transmission.friction_n + _LOOSE_N) if self._comes_loose else safe_n
 
     @property
     def _speed_m_s(self) -> float:
@@ -497,6 +497,7 @@ class GraspController:
         else:
             shown_n = self._fusion.free_travel.friction_n if self._phase == Phase.APPROACH else None
         if shown_n is not None:
+            self._knows_friction = True
             # A move that closes may press on a soft object, so it does not show that friction has risen.
             closes = self._phase == Phase.MOVE and not self._is_opening
             self._proven_friction_n = min(shown_n, self._proven_friction_n) if closes else shown_n
@@ -512,6 +513,12 @@ class GraspController:
         # With less motor force at once, an object that a release has not let go yet would push the jaws open.
         let_go_n = self._travel.grip_left_n(self._released_s + self._phase_s)
         self._motor_force_n = max(self._approach.motor_force_n, let_go_n)
+        if (
+            was_backing_off
+            and not self._approach.is_backing_off
+            and self._travel.free_travel.mean_n is not None
+        ):
+            self._fusion.take_friction(self._travel.free_travel.mean_n)
         match progress:
             case ApproachState.BACKING_OFF:
                 if not was_backing_off:
@@ -649,11 +656,12 @@ class GraspController:
         force_n, friction_n = self._estimate.force_n, self._estimate.friction_n
         motor_force_n = self._motor_force_n
         # Friction that is smaller than believed would be force, also of an opening with a wrong closing direction.
-        if self._proven_friction_n < math.inf:
+        # A grip needs what its own grasp has shown: a sudden motion in it adds to the static force.
+        if self._proven_friction_n < math.inf and (self._knows_friction or self._phase not in _GRIPPING):
             friction_n = min(friction_n, self._proven_friction_n)
         elif not self._is_opening and not self._comes_loose:
             friction_n = 0.0
-        if self._is_closing:
+        if self._is_closing or self._phase == Phase.CONTACT:
             motor_force_n = min(motor_force_n, self._closing_limit_n)
         wanted = ServoCommand(
             t_ns,

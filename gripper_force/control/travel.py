@@ -15,10 +15,9 @@ _LET_GO_LEAD_S = 0.03
 """Time in which the lead of the goal position reaches its full length after a release. With a full lead at once, the
 motor would add to the force of a springy object."""
 
-_FREELY_SHARE = 0.8
-_MOVES_FREELY_SHARE = 0.4
-"""Shares of the largest speed above which an opening, or a move that closes, meets no resistance: the motor force is
-then friction. A move has half of that speed."""
+_FREELY_SHARE = 0.4
+"""Share of the largest speed above which nothing resists: the motor force is then friction. The profile has half of
+that speed."""
 
 _CLOSING_CYCLES = 10
 """Number of cycles in which a move that closes shows friction: after them it may press a soft object."""
@@ -103,8 +102,8 @@ class Travel:
             motor_force_n: Measured motor force at each jaw.
             opens: True if the jaws are to open.
         """
-        side, share = (-1, _FREELY_SHARE) if opens else (1, _MOVES_FREELY_SHARE)
-        if not self._is_letting_go(t_s) and side * closing_m_s > share * self.speed_m_s:
+        side = -1 if opens else 1
+        if not self._is_letting_go(t_s) and side * closing_m_s > _FREELY_SHARE * self.speed_m_s:
             self.free_travel.add(side * motor_force_n)
 
     def grip_left_n(self, t_s: float) -> float:

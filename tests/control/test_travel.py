@@ -72,7 +72,8 @@ def test_a_move_ends_at_its_width():
     ("grip_n", "t_s", "closing_share", "is_friction"),
     [
         (0.0, 0.0, -0.9, True),
-        (0.0, 0.0, -0.7, False),  # something resists
+        (0.0, 0.0, -0.5, True),
+        (0.0, 0.0, -0.3, False),  # something resists
         (6.0, 0.3, -0.9, False),  # the object may help
         (6.0, 0.6, -0.9, True),
         (0.0, 0.0, 0.5, True),
