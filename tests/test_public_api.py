@@ -170,7 +170,7 @@ def test_the_code_that_an_embedding_program_reaches_is_small() -> None:
     assert not packages & {f"gripper_force.{name}" for name in ("cli", "qualification", "jobs", "testing")}
 
     assert "gripper_hw.sim.world" in reached - core
-    assert 6_000 < sum(map(_lines, core)) <= 13_300
+    assert 6_000 < sum(map(_lines, core)) <= 13_350
     assert sum(map(_lines, reached - core)) <= 4_200
 
 

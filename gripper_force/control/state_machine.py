@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from gripper_force.config import ControlConfig
 from gripper_force.control.approach import Approach, ApproachState
 from gripper_force.control.force_loop import ForceLoop, Margin, tolerance_n
+from gripper_force.control.friction_credit import FrictionCredit
 from gripper_force.control.fusion import Fusion
 from gripper_force.control.limits import Limits, largest_target_n
 from gripper_force.control.safety import Safety, is_sound
@@ -46,12 +47,6 @@ _DWELL_S = 0.12
 _SETTLE_FILTER_S = 0.25
 """Time constant of the filter on the force error that decides on `held`: vision alone is noisy."""
 
-_SLOW_SHARE = 0.4
-_SLOW_S = 0.3
-_SLOWED_S = 0.05
-"""Open jaws that have not travelled yet may need their configured friction to come loose. Slower than this share of
-their speed for this time, they may press on an object; after they have moved, for the shorter time."""
-
 _OPEN_M = 0.003
 """Distance from the open width at which the jaws count as open."""
 
@@ -67,13 +62,6 @@ servo's proportional gain leave (80 um)."""
 
 _MOVE_SPARE_S = 1.0
 """Time a move may take beyond its speed profile before an obstacle is reported."""
-
-_LOOSE_N = 0.1
-"""Motor force beyond the configured friction of jaws that come loose in a move."""
-
-_UNKNOWN_SHARE = 0.5
-"""Largest motor force of jaws that may touch an object while their friction is unknown, as a share of the one that the
-force limit allows: they may be moving when they hit it."""
 
 _GRIPPING = (Phase.CONTACT, Phase.RAMP, Phase.HOLD)
 
@@ -113,9 +101,9 @@ class GraspController:
     *A hot servo* holds less force, and an event reports it.
 
     *The outcome* stays until the next grasp or move. After ``held`` it may become ``slip``, and after a release that
-    does not open the jaws ``blocked``. The controller
-    opens the jaws without a request after ``no_object`` and ``stuck``. When the object has left the jaws, it
-    does what ``on_slip`` says. After another ``slip``, and after ``timeout``, it continues.
+    does not open the jaws ``blocked``. The controller opens the jaws without a request after ``no_object`` and
+    ``stuck``. When the object has left the jaws, it does what ``on_slip`` says. After another ``slip``, and after
+    ``timeout``, it continues.
 
     *Speed.* Every command passes `SpeedLimit`, so the jaws are never much faster than the phase allows. Jaws on their
     way to an object are so slow that their impact stays within the force limit. A ramp or hold has the object already.
@@ -147,6 +135,7 @@ class GraspController:
         self._loop = ForceLoop(config, transmission)
         self._limits = Limits(config, transmission, current_limit_a)
         self._speed_limit = SpeedLimit(transmission, position_loop)
+        self._credit = FrictionCredit(config, transmission)
         self._safety = Safety(config)
         self._approach = Approach(config, transmission, approach_m_s)
         self._slip = SlipMonitor(config)
@@ -167,9 +156,7 @@ class GraspController:
         self._move_opens = False
         self._released_s = math.inf
         self._grasp_ns = 0
-        self._phase_s = self._slow_s = self._settled_s = self._error_n = 0.0
-        self._proven_friction_n, self._knows_friction = math.inf, False
-        self._starts_open = self._is_loose = False
+        self._phase_s = self._settled_s = self._error_n = 0.0
         self._was_over_force = self._was_held = False
         self._goal_current_a = self._measured_motor_force_n = 0.0
         self._derating = 1.0
@@ -309,8 +296,8 @@ class GraspController:
     # Phase changes.
 
     def _enter(self, phase: Phase, reason: str) -> None:
-        starts_open = is_open(self._transmission.open_width_m, self._present_width_m)
-        self._starts_open = starts_open and self._phase not in _GRIPPING
+        is_open_now = is_open(self._transmission.open_width_m, self._present_width_m)
+        self._credit.start_phase(from_open=is_open_now and self._phase not in _GRIPPING)
         self._phase, self._reason = phase, reason
         self._phase_s = self._settled_s = 0.0
 
@@ -332,7 +319,7 @@ class GraspController:
             self._reason = f"new target {target_n:g} N"
             return
         self._released_s = self._phase_s if self._is_travelling else math.inf
-        self._knows_friction = False
+        self._credit.start_grasp()
         self._fusion.restart(was_held=self._was_held, new_object=new_object)
         self._was_held = False
         self._limits.reset(reverses=self._is_opening and self._travel.grip_left_n(self._phase_s) == 0)
@@ -393,26 +380,6 @@ class GraspController:
         return self._phase in (Phase.APPROACH, Phase.MOVE) and not self._is_opening
 
     @property
-    def _comes_loose(self) -> bool:
-        """True if the jaws may need their configured friction to start: no travel has shown another yet.
-
-        Jaws that are partly closed may touch an object, so they open a little first (see `Approach`).
-        """
-        return (
-            self._is_closing
-            and self._starts_open
-            and self._slow_s <= (_SLOWED_S if self._is_loose else _SLOW_S)
-        )
-
-    @property
-    def _closing_limit_n(self) -> float:
-        """Largest motor force of closing jaws: half of what the limit allows if they may touch an object unnoticed."""
-        if self._proven_friction_n < math.inf or (self._comes_loose and self._phase == Phase.APPROACH):
-            return math.inf
-        safe_n = _UNKNOWN_SHARE * self._config.force_limit_n / self._transmission.gain_bound
-        return max(safe_n, self._transmission.friction_n + _LOOSE_N) if self._comes_loose else safe_n
-
-    @property
     def _speed_m_s(self) -> float:
         """Largest speed of one jaw in the present phase."""
         full_m_s = self._config.approach_speed_m_s
@@ -454,7 +421,7 @@ class GraspController:
 
     def _run_phase(self, t_ns: int, dt_s: float, width_m: float, closing_m_s: float) -> None:
         self._phase_s += dt_s
-        self._note_slow(dt_s, closing_m_s)
+        self._credit.run(dt_s, closing_m_s, self._speed_m_s, closing=self._is_closing)
         match self._phase:
             case Phase.APPROACH:
                 self._run_approach(dt_s, width_m, closing_m_s)
@@ -478,15 +445,6 @@ class GraspController:
             self._check_timeout(t_ns)
         self._note_friction(closing_m_s)
 
-    def _note_slow(self, dt_s: float, closing_m_s: float) -> None:
-        """Counts the time of slow closing, across phases: the jaws may press on an object already."""
-        if not self._is_closing:
-            self._is_loose = False
-            return
-        is_slow = closing_m_s < _SLOW_SHARE * self._speed_m_s
-        self._slow_s = self._slow_s + dt_s if is_slow else 0.0
-        self._is_loose |= not is_slow
-
     def _note_friction(self, closing_m_s: float) -> None:
         """Takes over what this motion shows of friction."""
         if self._is_travelling:
@@ -496,11 +454,7 @@ class GraspController:
             shown_n = self._travel.free_travel.friction_n
         else:
             shown_n = self._fusion.free_travel.friction_n if self._phase == Phase.APPROACH else None
-        if shown_n is not None:
-            self._knows_friction = True
-            # A move that closes may press on a soft object, so it does not show that friction has risen.
-            closes = self._phase == Phase.MOVE and not self._is_opening
-            self._proven_friction_n = min(shown_n, self._proven_friction_n) if closes else shown_n
+        self._credit.take(shown_n, only_lower=self._phase == Phase.MOVE and not self._is_opening)
 
     def _run_approach(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
         # The goal position leads far enough that the goal current alone drives the jaws. A goal that moved in
@@ -508,7 +462,12 @@ class GraspController:
         self._goal_width_m = width_m - 2 * GOAL_OFFSET_M
         was_backing_off = self._approach.is_backing_off
         progress = self._approach.step(
-            dt_s, width_m, closing_m_s, self._measured_motor_force_n, self._estimate, self._closing_limit_n
+            dt_s,
+            width_m,
+            closing_m_s,
+            self._measured_motor_force_n,
+            self._estimate,
+            self._credit.closing_limit_n(closing=self._is_closing, approaching=True),
         )
         # With less motor force at once, an object that a release has not let go yet would push the jaws open.
         let_go_n = self._travel.grip_left_n(self._released_s + self._phase_s)
@@ -531,7 +490,7 @@ class GraspController:
             case ApproachState.CLOSED:
                 self._end_approach(Outcome.NO_OBJECT, "closed without contact")
             case ApproachState.STUCK:
-                self._slow_s = 0.0  # a person may have removed what held them
+                self._credit.end_stuck()
                 self._end_approach(
                     Outcome.STUCK,
                     f"the jaws do not move at {width_m * 1e3:.1f} mm; check for an obstacle, and that "
@@ -630,7 +589,7 @@ class GraspController:
             self._set_outcome(Outcome.MOVED, f"moved to {self._move_width_m * 1e3:.1f} mm")
         elif self._phase_s >= self._move_time_s:
             reason = f"stopped at {width_m * 1e3:.1f} mm by an obstacle"
-            if self._proven_friction_n == math.inf:
+            if self._credit.shown_n == math.inf:
                 reason += ", or by friction, which no motion has shown yet: request a release first"
             self._set_outcome(Outcome.BLOCKED, reason)
 
@@ -653,16 +612,17 @@ class GraspController:
 
     def _limit_command(self, t_ns: int, dt_s: float) -> tuple[ServoCommand, bool]:
         may_rise = self._phase != Phase.FAULT or self._opens_at_fault
-        force_n, friction_n = self._estimate.force_n, self._estimate.friction_n
-        motor_force_n = self._motor_force_n
-        # Friction that is smaller than believed would be force, also of an opening with a wrong closing direction.
-        # A grip needs what its own grasp has shown: a sudden motion in it adds to the static force.
-        if self._proven_friction_n < math.inf and (self._knows_friction or self._phase not in _GRIPPING):
-            friction_n = min(friction_n, self._proven_friction_n)
-        elif not self._is_opening and not self._comes_loose:
-            friction_n = 0.0
-        if self._is_closing or self._phase == Phase.CONTACT:
-            motor_force_n = min(motor_force_n, self._closing_limit_n)
+        force_n, motor_force_n = self._estimate.force_n, self._motor_force_n
+        closing = self._is_closing
+        friction_n = self._credit.credit_n(
+            self._estimate.friction_n,
+            opening=self._is_opening,
+            closing=closing,
+            gripping=self._phase in _GRIPPING,
+        )
+        if closing or self._phase == Phase.CONTACT:
+            limit_n = self._credit.closing_limit_n(closing=closing, approaching=self._phase == Phase.APPROACH)
+            motor_force_n = min(motor_force_n, limit_n)
         wanted = ServoCommand(
             t_ns,
             self._transmission.position_rad(self._goal_width_m),

@@ -1,0 +1,94 @@
+"""Friction that a command may count on, and the motor force of jaws whose friction is unknown."""
+
+import math
+
+from gripper_force.config import ControlConfig
+from gripper_force.control.transmission import Transmission
+
+_SLOW_SHARE = 0.4
+_SLOW_S = 0.3
+_SLOWED_S = 0.05
+"""Open jaws that have not travelled yet may need their configured friction to come loose. Slower than this share of
+their speed for this time, they may press on an object; after they have moved, for the shorter time."""
+
+_LOOSE_N = 0.1
+"""Motor force beyond the configured friction of jaws that come loose in a move."""
+
+_UNKNOWN_SHARE = 0.5
+"""Largest motor force of jaws that may touch an object while their friction is unknown, as a share of the one that the
+force limit allows: they may be moving when they hit it."""
+
+
+class FrictionCredit:
+    """Friction that the limit on the current allows for: only what a motion of this run has shown.
+
+    Friction that is smaller than believed would be force, also of an opening with a wrong closing direction. Jaws that
+    have not moved yet may touch an object, and then a standstill shows nothing. Only open ones may come loose with
+    the configured friction; others open a little first (see `Approach`).
+
+    Attributes:
+        shown_n: Least friction that a motion has shown; infinite before.
+    """
+
+    def __init__(self, config: ControlConfig, transmission: Transmission) -> None:
+        self._safe_n = _UNKNOWN_SHARE * config.force_limit_n / transmission.gain_bound
+        self._loose_n = transmission.friction_n + _LOOSE_N
+        self.shown_n = math.inf
+        self._is_of_grasp = self._starts_open = self._is_loose = False
+        self._slow_s = 0.0
+
+    def start_grasp(self) -> None:
+        """Starts a grasp: what was shown before does not count in its grip."""
+        self._is_of_grasp = False
+
+    def start_phase(self, *, from_open: bool) -> None:
+        """Starts a phase; ``from_open`` is True if its jaws are open and grip nothing."""
+        self._starts_open = from_open
+
+    def end_stuck(self) -> None:
+        """Lets stuck jaws try again: a person may have removed what held them."""
+        self._slow_s = 0.0
+
+    def run(self, dt_s: float, closing_m_s: float, speed_m_s: float, *, closing: bool) -> None:
+        """Counts the time of slow closing, across phases: the jaws may press on an object already.
+
+        Args:
+            dt_s: Time since the last cycle.
+            closing_m_s: Closing speed of one jaw.
+            speed_m_s: Its largest speed in this phase.
+            closing: True if the jaws are to close, and grip nothing yet.
+        """
+        if not closing:
+            self._is_loose = False
+            return
+        is_slow = closing_m_s < _SLOW_SHARE * speed_m_s
+        self._slow_s = self._slow_s + dt_s if is_slow else 0.0
+        self._is_loose |= not is_slow
+
+    def take(self, friction_n: float | None, *, only_lower: bool) -> None:
+        """Takes over what a motion shows, None for nothing.
+
+        With ``only_lower`` it does not show that friction has risen: jaws that close may press on a soft object.
+        """
+        if friction_n is not None:
+            self._is_of_grasp = True
+            self.shown_n = min(friction_n, self.shown_n) if only_lower else friction_n
+
+    def credit_n(self, friction_n: float, *, opening: bool, closing: bool, gripping: bool) -> float:
+        """Returns the friction that may be counted on, of ``friction_n`` that is believed."""
+        # In a grip, a sudden motion adds to the static force.
+        if self.shown_n < math.inf and (self._is_of_grasp or not gripping):
+            return min(friction_n, self.shown_n)
+        return friction_n if opening or (closing and self._may_be_tight) else 0.0
+
+    def closing_limit_n(self, *, closing: bool, approaching: bool) -> float:
+        """Returns the largest motor force of jaws that are to close; the speed loop of an approach raises it slowly."""
+        is_tight = closing and self._may_be_tight
+        if self.shown_n < math.inf or (is_tight and approaching):
+            return math.inf
+        return max(self._safe_n, self._loose_n) if is_tight else self._safe_n
+
+    @property
+    def _may_be_tight(self) -> bool:
+        """True if friction may be all that holds closing jaws."""
+        return self._starts_open and self._slow_s <= (_SLOWED_S if self._is_loose else _SLOW_S)

@@ -1,0 +1,98 @@
+"""Friction that a command may count on."""
+
+import math
+
+import pytest
+
+from gripper_force.config import ControlConfig
+from gripper_force.control.friction_credit import FrictionCredit
+
+SPEED_M_S = 0.01
+
+
+@pytest.fixture
+def credit(transmission):
+    """Open jaws whose friction no motion has shown, with a force limit below it."""
+    credit = FrictionCredit(ControlConfig(force_limit_n=0.8), transmission)
+    credit.start_phase(from_open=True)
+    return credit
+
+
+def close(credit, time_s, closing_m_s=0.0):
+    for _ in range(round(time_s / 0.005)):
+        credit.run(0.005, closing_m_s, SPEED_M_S, closing=True)
+
+
+def closing_n(credit):
+    return credit.credit_n(0.95, opening=False, closing=True, gripping=False)
+
+
+def test_open_jaws_come_loose_with_the_configured_friction_for_a_while(credit):
+    close(credit, 0.25)
+    assert closing_n(credit) == 0.95
+    close(credit, 0.1)
+    assert closing_n(credit) == 0.0
+
+
+def test_jaws_that_have_moved_and_stop_are_in_contact(credit):
+    close(credit, 0.1, SPEED_M_S)
+    close(credit, 0.045)
+    assert closing_n(credit) == 0.95
+    close(credit, 0.02)
+    assert closing_n(credit) == 0.0
+
+
+def test_another_phase_does_not_begin_the_time_anew(credit):
+    close(credit, 0.35)
+    credit.start_phase(from_open=True)
+    credit.run(0.005, 0.0, SPEED_M_S, closing=False)
+    close(credit, 0.005)
+    assert closing_n(credit) == 0.0
+    credit.end_stuck()
+    close(credit, 0.005)
+    assert closing_n(credit) == 0.95
+
+
+def test_partly_closed_jaws_get_half_of_the_limit(credit, transmission):
+    credit.start_phase(from_open=False)
+    close(credit, 0.005)
+    assert closing_n(credit) == 0.0
+    most_n = credit.closing_limit_n(closing=True, approaching=True)
+    assert most_n == pytest.approx(0.4 / transmission.gain_bound)
+    credit.take(0.3, only_lower=False)
+    assert credit.closing_limit_n(closing=True, approaching=True) == math.inf
+
+
+def test_a_move_that_comes_loose_gets_hardly_more_than_friction(credit, transmission):
+    close(credit, 0.005)
+    assert credit.closing_limit_n(closing=True, approaching=True) == math.inf
+    most_n = credit.closing_limit_n(closing=True, approaching=False)
+    assert most_n == pytest.approx(transmission.friction_n + 0.1)
+
+
+def test_what_a_motion_shows_counts_from_then_on(credit):
+    credit.take(None, only_lower=False)
+    assert credit.shown_n == math.inf
+    credit.take(0.4, only_lower=False)
+    assert closing_n(credit) == 0.4
+    assert credit.credit_n(0.3, opening=True, closing=False, gripping=False) == 0.3
+    credit.take(0.6, only_lower=True)  # the jaws may press on a soft object
+    assert closing_n(credit) == 0.4
+    credit.take(0.6, only_lower=False)
+    assert closing_n(credit) == 0.6
+
+
+def test_a_grip_counts_on_what_its_own_grasp_has_shown(credit):
+    credit.take(0.4, only_lower=False)
+    credit.start_grasp()
+    gripping = {"opening": False, "closing": False, "gripping": True}
+    assert credit.credit_n(0.95, **gripping) == 0.0
+    credit.take(0.4, only_lower=False)
+    assert credit.credit_n(0.95, **gripping) == 0.4
+
+
+def test_an_opening_counts_on_the_configured_friction_until_one_is_shown(credit):
+    opening = {"opening": True, "closing": False, "gripping": False}
+    assert credit.credit_n(0.95, **opening) == 0.95
+    credit.take(0.4, only_lower=False)
+    assert credit.credit_n(0.95, **opening) == 0.4
