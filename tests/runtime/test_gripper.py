@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import gripper_force as gf
+from gripper_force.control import state_machine
 from gripper_force.control.limits import largest_target_n
 from gripper_force.runtime import control_loop
 from gripper_force.runtime.control_loop import ControlLoop
@@ -143,6 +144,19 @@ def test_move_positions_the_jaws_and_names_an_obstacle(simulated: Open) -> None:
     assert blocked.outcome == gf.Outcome.BLOCKED
     assert gripper.force_n < 1.5
     assert gripper.grasp(3.0).held
+
+
+def test_a_release_that_does_not_open_the_jaws_in_its_time_is_blocked(
+    simulated: Open, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(state_machine, "_OPENING_SPARE_S", -1.7)
+    gripper = simulated()
+    gripper.move(0.05)
+    assert gripper.release() < 0.08
+    assert gripper.state.outcome == gf.Outcome.BLOCKED
+    assert "not opened within 0.1 s" in gripper.state.reason
+    gripper.sleep(2.0)
+    assert gripper.state.phase == gf.Phase.OPEN  # it has gone on
 
 
 def test_no_log_is_written_without_a_path(

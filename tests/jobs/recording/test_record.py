@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from gripper_force.config import Config, config_from_text, load_config
+from gripper_force.control import state_machine
 from gripper_force.errors import ConfigError, DataError, DeviceError
 from gripper_force.interfaces import Devices, LoadCell
 from gripper_force.jobs.dataset import load_clip
@@ -166,6 +167,17 @@ def test_board_that_is_silent_at_first_is_waited_for(
         made(config, RecordingPlan(1, 1, 3.0), tmp_path / "again")
     first = next(iter(LogReader(path).records(Request)))
     assert next(iter(LogReader(path).records(LoadCellSample))).t_ns < first.t_ns
+
+
+def test_jaws_that_do_not_open_first_are_named(
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(state_machine, "_OPENING_SPARE_S", -1.8)
+    gripper = config.gripper.model_copy(
+        update={"open_position_rad": -0.3}
+    )  # open jaws seem to be 80 mm apart
+    with pytest.raises(DeviceError, match="have not opened within"):
+        made(config.model_copy(update={"gripper": gripper}), RecordingPlan(1), tmp_path)
 
 
 def test_jaws_open_after_fault_if_configured(config: Config, tmp_path: Path) -> None:
