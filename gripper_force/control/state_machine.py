@@ -428,6 +428,7 @@ class GraspController:
             case Phase.CONTACT if self._phase_s >= _DWELL_S:
                 self._loop.start(self._estimate.force_n, self._derated_target_n)
                 self._slip.start()
+                self._visual_check.settle(self._estimate.friction_n)
                 self._enter(Phase.RAMP, "contact has settled")
             case Phase.RAMP:
                 self._run_ramp(dt_s, width_m, closing_m_s)

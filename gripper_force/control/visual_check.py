@@ -34,6 +34,14 @@ class VisualCheck:
         self._has_seen = self._has_unsure = False
         self._before_n = max(self._force_n or 0.0, 0.0)
 
+    def settle(self, friction_n: float) -> None:
+        """Ends the contact, before the force rises: until then a network that sees a force in motion lags behind.
+
+        Args:
+            friction_n: Contact force that friction may hold after the impact.
+        """
+        self._before_n = max(self._before_n, (self._force_n or 0.0) - friction_n)
+
     def add(self, t_ns: int, visual: VisualForce | None, *, gripping: bool) -> None:
         """Filters a new estimate.
 

@@ -67,3 +67,16 @@ def test_a_camera_that_has_stopped_objects_to_nothing():
 def test_by_motor_current_alone_the_camera_has_no_say():
     check, _ = seen(0.0, config=CONFIG.model_copy(update={"feedback": "current"}))
     assert not check.objection(4.0, 4.0)
+
+
+@pytest.mark.parametrize(("friction_n", "objects"), [(0.2, True), (1.0, False)])
+def test_a_rise_before_the_ramp_counts_only_as_far_as_friction_may_hold_it(friction_n, objects):
+    check = VisualCheck(CONFIG)
+    for cycle in range(1, 31):
+        check.add(cycle * FRAME_NS, visual(cycle * FRAME_NS, 6.8), gripping=False)
+    check.start()
+    for cycle in range(31, 91):
+        if cycle == 60:
+            check.settle(friction_n)
+        check.add(cycle * FRAME_NS, visual(cycle * FRAME_NS, 7.7), gripping=True)
+    assert bool(check.objection(4.5, 4.5)) == objects

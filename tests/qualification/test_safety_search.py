@@ -86,6 +86,11 @@ def test_jaws_that_begin_near_an_object_keep_a_small_limit(config: Config, index
     assert run_case(config, 0, index).ok
 
 
+def test_a_network_that_lags_behind_the_jaws_confirms_no_end_stop(config: Config) -> None:
+    assert draw(config.control, RACK, 0, 9326).motion_n > 4.0
+    assert run_case(config, 0, 9326).ok
+
+
 @pytest.mark.parametrize("index", [2062, 3254, 6546, 8954])
 def test_a_grasp_that_interrupts_another_motion_is_safe(config: Config, index: int) -> None:
     # 2062: a release, whose object still pushed the jaws open. The others: an approach, which began anew in contact.
