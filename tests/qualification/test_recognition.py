@@ -40,7 +40,7 @@ def test_a_covered_view_is_rejected_and_an_existing_press_is_used_again(
     still, blob = json.loads(first.stdout)["rows"]
     assert (still["name"], blob["name"]) == ("still", "blob")
     assert still["frames"] > blob["frames"] > 10
-    assert still["rejected"] < 0.1 < 0.9 < blob["rejected"]
+    assert still["rejected"] < 0.25 < 0.9 < blob["rejected"]  # 3 % over many logs, but up to a fourth of one
     assert still["mae_n"] > 0
     assert len(list(tmp_path.rglob("*.mcap"))) == 1
 
