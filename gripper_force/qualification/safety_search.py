@@ -39,6 +39,9 @@ from gripper_force.types import NS_PER_S, Outcome, Request, RequestKind, ServoCo
 WORST: Final = 5
 """Cases listed for each statement."""
 
+_LEAST_N: Final = 0.3
+"""Least target of a sequence, and of a case near the object."""
+
 _GRASP_S: Final = 5.0
 _RELEASE_S: Final = 1.5
 _CHUNK: Final = 20
@@ -226,7 +229,7 @@ def draw(config: ControlConfig, truth: Transmission, seed: int, index: int) -> D
     def draw_step() -> Step:
         kinds = [RequestKind.GRASP, RequestKind.RELEASE, RequestKind.MOVE, RequestKind.STOP]
         kind = RequestKind(rng.choice(kinds, p=[0.6, 0.2, 0.12, 0.08]))
-        value = between(0.3, most_n) if kind == RequestKind.GRASP else between(0.0, truth.open_width_m)
+        value = between(_LEAST_N, most_n) if kind == RequestKind.GRASP else between(0.0, truth.open_width_m)
         return Step(log_between(0.05, 8.0), kind, value)
 
     is_sequence = index % _SEQUENCE == _SEQUENCE - 2
@@ -273,10 +276,10 @@ def draw(config: ControlConfig, truth: Transmission, seed: int, index: int) -> D
         drawn,
         begins_m=max(to_m - gap_m, 0.0),
         force_limit_n=limit_n,
-        target_n=scale * drawn.target_n,
-        then_n=scale * drawn.then_n,
+        target_n=max(scale * drawn.target_n, _LEAST_N),
+        then_n=max(scale * drawn.then_n, _LEAST_N),  # not a number stays
         requests=tuple(
-            step._replace(value=scale * step.value) if step.kind == RequestKind.GRASP else step
+            step._replace(value=max(scale * step.value, _LEAST_N)) if step.kind == RequestKind.GRASP else step
             for step in drawn.requests
         ),
     )
