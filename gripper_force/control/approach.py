@@ -99,7 +99,7 @@ class Approach:
         self._start_m = width_m
         self._time_s = self._contact_s = self._stuck_s = 0.0
         self._integral_n = self._mean_force_n = 0.0
-        self._has_moved = self._at_limit = False
+        self._has_moved = self._at_limit = self._is_weak = False
 
     @property
     def _limit_n(self) -> float:
@@ -150,10 +150,10 @@ class Approach:
         self._contact_s = self._contact_s + dt_s if is_contact else 0.0
         if self._contact_s >= _DEBOUNCE_S:
             return ApproachState.CONTACT
-        # Little motor force hardly moves the jaws. So they open, which shows friction.
-        share = _STALLED_SHARE if most_n == math.inf else _SLOWED_SHARE
+        # Too little motor force lets the jaws creep. So they open, which shows friction.
+        share = _SLOWED_SHARE if self._is_weak else _STALLED_SHARE
         stands = self._at_limit and closing_m_s < share * self.speed_m_s
-        may_be_stuck = not has_travelled or most_n < math.inf
+        may_be_stuck = not has_travelled or self._is_weak
         self._stuck_s = self._stuck_s + dt_s if stands and may_be_stuck else 0.0
         if self._stuck_s < _STUCK_S:
             return ApproachState.CLOSING
@@ -190,13 +190,15 @@ class Approach:
         )
         # Force that the current estimate counts as contact and vision does not is friction, too.
         friction_n = estimate.friction_n - estimate.bias_n + 2 * estimate.std_n
-        max_n = min(friction_n + self._limit_n + damping_n_s_m * max(closing_m_s, 0.0), most_n)
+        max_n = friction_n + self._limit_n + damping_n_s_m * max(closing_m_s, 0.0)
+        self._is_weak = most_n < max_n
+        max_n = min(max_n, most_n)
         self._integral_n += _SPEED_INTEGRAL_N_M * error_m_s * dt_s
         if closing_m_s > _OVERSPEED * self.speed_m_s:
             self._integral_n -= self.motor_force_n * dt_s / _OVERSPEED_DECAY_S
         self._integral_n = min(max(self._integral_n, -unlimited_n), max_n - unlimited_n)
         self.motor_force_n = unlimited_n + self._integral_n
-        self._at_limit = self.motor_force_n > (0.99 if most_n == math.inf else 0.9) * max_n
+        self._at_limit = self.motor_force_n > (0.9 if self._is_weak else 0.99) * max_n
 
     def _detects_contact(self, closing_m_s: float, estimate: FusedForce) -> bool:
         pressing = estimate.current_n + estimate.bias_n > 0.5 * self._limit_n

@@ -84,7 +84,7 @@ class FrictionCredit:
     def closing_limit_n(self, *, closing: bool, approaching: bool) -> float:
         """Returns the largest motor force of jaws that are to close; the speed loop of an approach raises it slowly."""
         is_tight = closing and self._may_be_tight
-        if self.shown_n < math.inf or (is_tight and approaching):
+        if self.shown_n < math.inf or (self._starts_open and (approaching or not is_tight)):
             return math.inf
         return max(self._safe_n, self._loose_n) if is_tight else self._safe_n
 
