@@ -63,6 +63,7 @@ def test_late_camera_timestamps_are_detected(log: Path, tmp_path: Path) -> None:
     assert result.overall.lag_ms is not None
     assert result.overall.lag_ms - before.lag_ms == pytest.approx(20, abs=2)
     assert before.camera_lag_ms is not None
+    assert result.overall.camera_lag_ms is not None
     assert result.overall.camera_lag_ms - before.camera_lag_ms == pytest.approx(20, abs=2)
     (warning,) = result.warnings
     assert "ms late against the load cell's, more than half a frame (17 ms)" in warning
