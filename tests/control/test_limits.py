@@ -166,3 +166,14 @@ def test_a_motor_that_draws_more_than_its_goal_does_not_return_to_an_over_force(
     assert goal_a(0.5 * limit_n) > low_a
     limits.reset()
     assert goal_a(0.95 * (limit_n + 1.0)) > low_a
+
+
+@pytest.mark.parametrize("reverses", [False, True])
+def test_the_motor_force_of_opening_jaws_that_are_to_close_rises_from_zero(reverses):
+    limits, wanted = Limits(CONFIG, FINE, 1.0), ServoCommand(0, 0.0, 0.1)
+    for _ in range(100):
+        limits.apply(wanted, 0.0, 0.95, 0.0, 0.0, 0.005, may_rise=True)
+    limits.reset(reverses=reverses)
+    first_a = limits.apply(wanted, 0.0, 0.95, 0.0, 0.0, 0.005, may_rise=True)[0].goal_current_a
+    rise_a = 4 * CONFIG.ramp_n_s * 0.005 / FINE.n_per_a(0.0)
+    assert first_a == pytest.approx(rise_a if reverses else 0.1)
