@@ -53,7 +53,8 @@ def test_no_output_ever_leaves_the_limits(cycles, transmission, limit_a):
             assert out.goal_current_a <= last_a
         if over and not opens and motor_force_n > CONFIG.force_limit_n - friction_n:
             assert out.goal_current_a <= 0.85 * last_a
-        rise_a = 4 * CONFIG.ramp_n_s / transmission.n_per_a(0.0) * dt_s + 1.5 * transmission.current_step_a
+        # An output is off by at most one step from what it rounds: half of it is the carried rounding error.
+        rise_a = 4 * CONFIG.ramp_n_s / transmission.n_per_a(0.0) * dt_s + 2 * transmission.current_step_a
         assert out.goal_current_a <= last_a + rise_a + 1e-12
         last_a = out.goal_current_a
 
