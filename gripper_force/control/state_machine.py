@@ -322,7 +322,7 @@ class GraspController:
         self._credit.start_grasp()
         self._fusion.restart(was_held=self._was_held, new_object=new_object)
         self._was_held = False
-        self._limits.reset(reverses=self._is_opening and self._travel.grip_left_n(self._phase_s) == 0)
+        self._limits.reset(reverses=self._opens_freely)
         self._approach.start(self._present_width_m, target_n)
         self._enter(Phase.APPROACH, f"grasp with {target_n:g} N requested")
 
@@ -342,8 +342,7 @@ class GraspController:
         if self._phase in _GRIPPING:
             self._was_held = self._outcome == Outcome.HELD
         grip_n = self._motor_force_n if self._phase in (*_GRIPPING, Phase.FAULT) else 0.0
-        reverses = self._is_opening and not opens and self._travel.grip_left_n(self._phase_s) == 0
-        self._limits.reset(reverses=reverses)
+        self._limits.reset(reverses=self._opens_freely and not opens)
         self._goal_width_m = self._present_width_m  # in the cycle that loses an object, the jaws still close
         self._travel.start(self._goal_width_m, grip_n, opens=opens)
 
@@ -370,6 +369,11 @@ class GraspController:
             or (self._phase == Phase.APPROACH and self._approach.is_backing_off)
             or self._opens_at_fault
         )
+
+    @property
+    def _opens_freely(self) -> bool:
+        """True if the jaws open, and have let go of what they held."""
+        return self._is_opening and self._travel.grip_left_n(self._phase_s) == 0
 
     @property
     def _is_travelling(self) -> bool:

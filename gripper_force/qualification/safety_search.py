@@ -2,9 +2,9 @@
 
 Every case draws a plant and a configuration that is wrong about it. Three of four cases grasp, half of the time change
 the force, and release. The fourth draws a sequence of requests, at any time and from any phase. Some cases begin with
-jaws that touch the object or nearly do. The statements of
-`safety_statements` must hold. With motor current alone an end stop cannot be told from a rigid object. So such cases
-are counted, but are no violations; `calibrate jaws` prevents them.
+jaws that touch the object or nearly do. The statements of `safety_statements` must hold. With motor current alone an
+end stop cannot be told from a rigid object. So such cases are counted, but are no violations; `calibrate jaws`
+prevents them.
 """
 
 import json
