@@ -343,7 +343,7 @@ class ControlConfig(Section):
     approach_speed_m_s: Positive = Field(
         0.025,
         description="closing speed of one jaw before contact; a release is twice as fast. So that no impact exceeds "
-        "force_limit_n, both are at most 3.6 mm/s per newton of it with a pinion of 20 mm",
+        "force_limit_n, both are at most 3.6 mm/s per newton of it with a pinion of 20 mm radius",
     )
     approach_force_n: Positive = Field(0.5, description="largest grip force before contact")
     ramp_n_s: Positive = Field(8.0, description="rate at which the reference force rises after contact")
@@ -506,7 +506,9 @@ class SimConfig(Section):
         description="mesh and time step; auto: the fastest level that keeps budget.sim_error_n and "
         "budget.sim_speed by the table of `gripper-force bench scene`",
     )
-    lux: Positive | None = Field(None, description="light level 350, 550 or 750; None: drawn from the seed")
+    lux: Positive | None = Field(
+        None, description="light level in lux; None: 350, 550 or 750, drawn from the seed"
+    )
     tool: Literal["pads", "discs", "rods"] = Field(
         "pads",
         description="jaw tips: flat pads, flat round discs, or rods with round tips, which press the wall of a turned "

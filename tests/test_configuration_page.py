@@ -10,7 +10,7 @@ from gripper_force.schema import keys
 PAGE = Path(__file__).parents[1] / "docs" / "configuration.md"
 HEAD = """# Configuration
 
-All keys and their defaults; `-` is none (`null` in YAML). A `--config` file is YAML
+All keys and their defaults. `-` as a default and *None* in a meaning are no value, `null` in YAML. A `--config` file is YAML
 (`control: {force_limit_n: 8}`); `--set control.force_limit_n=8` overrides it. Units are part of the names.
 An unknown key is an error. `gripper-force config schema` prints the JSON schema for editors.
 

@@ -40,7 +40,7 @@ RigPath = Annotated[
     typer.Option(
         "--rig",
         help="Rig profile to write; only the calibrated section is replaced. Default: calibration.rig, or "
-        "rig.yaml.",
+        "rig.yaml, or rig_profile.yaml where --config is rig.yaml.",
     ),
 ]
 Fresh = Annotated[
@@ -476,7 +476,10 @@ def _rig_settings(
     settings, new = load_settings_before_rig(config, set_, options)
     if new is not None and rig is not None and rig.resolve() != new.resolve():
         read_rig(new)  # raises: this command does not write it
-    return settings, rig or new or settings.calibration.rig or Path("rig.yaml")
+    default = Path("rig.yaml")
+    if config is not None and config.resolve() == default.resolve():  # the file of `setup` has this name, too
+        default = Path("rig_profile.yaml")
+    return settings, rig or new or settings.calibration.rig or default
 
 
 def _next_step(

@@ -645,6 +645,16 @@ def test_options_win_over_overrides() -> None:
         load_settings(None, None, {"target_n": -1.0})
 
 
+def test_a_calibration_does_not_write_its_rig_profile_over_the_rig_file_of_setup(run: Run) -> None:
+    rig = Path("rig.yaml")
+    rig.write_text("object: block\nsim: {detail: coarse}\n")
+    text = rig.read_text()
+    done = run("calibrate", "servo", "--gauge-mm", "30", "--yes", "--config", "rig.yaml")
+    assert done.code == 0, done.err
+    assert "calibration.rig=rig_profile.yaml" in done.err
+    assert (rig.read_text(), Path("rig_profile.yaml").exists()) == (text, True)
+
+
 def test_commands_before_the_first_calibration_need_no_rig_profile(run: Run) -> None:
     new = ("--set", "calibration.rig=rig.yaml", "--set", "object=none", "--set", "sim.detail=coarse")
     assert "closing_sign: 1" in run("calibrate", "jaws", "--yes", *new).out
