@@ -424,7 +424,7 @@ class ControlConfig(Section):
         return _DEFAULT_FRAME_HZ if self.vision_rate_hz is None else self.vision_rate_hz
 
     @property
-    def timeout_ms(self) -> float:
+    def vision_gap_ms(self) -> float:
         """Time without an estimate after which vision drops out."""
         return (
             _TIMEOUT_FRAMES * 1e3 / self.frame_hz
@@ -433,7 +433,7 @@ class ControlConfig(Section):
         )
 
     @property
-    def max_age_ms(self) -> float:
+    def max_frame_age_ms(self) -> float:
         """Frame age above which an estimate is rejected."""
         return _MAX_LATENCY_MS + 1e3 / self.frame_hz if self.vision_age_ms is None else self.vision_age_ms
 
@@ -675,6 +675,9 @@ def load_config(
         path: YAML file; None: defaults.
         overrides: Assignments such as ``["control.rate_hz=100"]``, or ``{"control.rate_hz": 100}``.
         new_rig: True if ``calibration.rig`` may name a file that does not exist, because it is yet to be written.
+
+    Returns:
+        The configuration, with each ``auto`` still open: `Gripper.config` has what a run uses.
 
     Raises:
         ConfigError: A file, key or value is wrong. The message names it.

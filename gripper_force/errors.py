@@ -17,6 +17,8 @@
     └── NonFiniteError          NaN or infinity where a finite number is required
 """
 
+import math
+
 
 class GripperError(Exception):
     """Base class of all errors that this project raises; the command line exits with code 2."""
@@ -65,8 +67,10 @@ class UnfamiliarFrameError(DataError):
         force_n: The network's output for this frame: not the contact force, but it rises when a grip gets firmer.
     """
 
-    def __init__(self, message: str, force_n: float) -> None:
-        super().__init__(message)
+    def __init__(self, message: str, force_n: float = math.nan) -> None:
+        super().__init__(
+            message
+        )  # a worker's error is unpickled with the message alone, then gets its attributes
         self.force_n = force_n
 
 

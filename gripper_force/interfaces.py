@@ -14,7 +14,14 @@ if TYPE_CHECKING:
 
 @dataclass(slots=True)
 class BusStats:
-    """Counters of one servo bus since it was opened."""
+    """Counters of one servo bus since it was opened.
+
+    Attributes:
+        cycles: Successful reads.
+        retries: Repeated attempts.
+        timeouts: Attempts without a reply, or without the lock of a shared port.
+        corrupt: Attempts with a corrupt reply.
+    """
 
     cycles: int = 0
     retries: int = 0

@@ -15,6 +15,7 @@ import sys
 from typing import Annotated, NoReturn
 
 import typer
+from rich.markup import escape
 
 from gripper_force import __version__
 from gripper_force.cli import (
@@ -76,9 +77,13 @@ def main() -> NoReturn:
         with importing("this command"):
             app(prog_name="gripper-force")
     except GripperError as error:
-        console.err.print(f"[bold red]error:[/] {console.plain(error)}", soft_wrap=True)
-        _print_json_error(str(error))
-        sys.exit(2)
+        _fail(str(error))
+    except OSError as error:
+        if error.filename is None:
+            raise
+        no_folder = isinstance(error, FileExistsError | NotADirectoryError)
+        reason = "a file is where a folder must be" if no_folder else error.strerror
+        _fail(f"can't use {error.filename}: {reason}; check the path, and who may read and write there")
     except BaseException as end:
         if isinstance(end, SystemExit):
             interrupted = end.code == _INTERRUPTED  # typer's code after an interrupt
@@ -95,6 +100,12 @@ def main() -> NoReturn:
             sys.exit(process.interrupt_exit_code())
         raise
     sys.exit(0)
+
+
+def _fail(message: str) -> NoReturn:
+    console.err.print(f"[bold red]error:[/] {escape(message)}", soft_wrap=True)
+    _print_json_error(message)
+    sys.exit(2)
 
 
 def _print_json_error(message: str) -> None:

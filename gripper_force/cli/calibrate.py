@@ -433,7 +433,7 @@ def _tell_existing(settings: "Config", touches: int, folder: Path, fresh: bool) 
 
     if fresh:
         if (moved := job.move_away(settings, folder)) is not None:
-            console.err.print(f"the earlier touches are now in {moved}", soft_wrap=True)
+            console.err.print(f"the earlier touches are now in {moved}", soft_wrap=True, markup=False)
         return
     paths = job.touch_paths(settings, touches, folder)
     if existing := [str(number) for number, path in enumerate(paths, 1) if path.exists()]:
@@ -441,6 +441,7 @@ def _tell_existing(settings: "Config", touches: int, folder: Path, fresh: bool) 
             f"{len(existing)} of {touches} touches exist already in {folder} and are used: number "
             f"{', '.join(existing)}; --fresh records all of them again",
             soft_wrap=True,
+            markup=False,
         )
 
 
@@ -488,7 +489,7 @@ def _next_step(
     """Prints the step that follows, with the same configuration except the object, and the written rig profile."""
     dropped = ("object=", *([] if rig is None else ["calibration.rig="]))
     keys = [key for key in set_ or [] if not key.startswith(dropped)]
-    if rig is not None and load_settings_before_rig(config, None, {})[0].calibration.rig != rig:
+    if rig is not None:
         keys.append(f"calibration.rig={rig}")
     console.next_step(*words, *again(config, keys))
 

@@ -16,7 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, Tim
 from rich.progress import Progress as ProgressBar
 from rich.table import Column, Table
 
-from gripper_force.errors import ConfigError, GripperError
+from gripper_force.errors import ConfigError
 
 if TYPE_CHECKING:  # --help loads no NumPy
     from contextlib import AbstractContextManager
@@ -51,7 +51,7 @@ def bar(label: str, total: int, *, hidden: bool = False) -> "Iterator[Bar]":
     """Shows a progress bar with the remaining time on stderr, unless it is hidden, and gives its callback."""
     left = TimeRemainingColumn(elapsed_when_finished=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), left)
-    note = TextColumn("{task.fields[note]}")
+    note = TextColumn("{task.fields[note]}", markup=False)
     with ProgressBar(*columns, note, console=err, disable=hidden, speed_estimate_period=_SPEED_S) as shown:
         yield Bar(shown, shown.add_task(label, total=total, note=""))
 
@@ -188,10 +188,5 @@ def pairs(values: Mapping[str, object]) -> None:
     """Prints names and values."""
     table = Table("", Column("", overflow="fold"), box=None, show_header=False, pad_edge=False)
     for name, value in values.items():
-        table.add_row(f"[dim]{name}[/]", number(value))
+        table.add_row(f"[dim]{escape(name)}[/]", escape(number(value)))
     out.print(table)
-
-
-def plain(error: GripperError) -> str:
-    """An error's message with its brackets escaped, so that they are not markup."""
-    return str(error).replace("[", r"\[")

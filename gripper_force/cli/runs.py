@@ -125,7 +125,9 @@ def grasp(
         except KeyboardInterrupt:
             if log.exists():
                 console.err.print(
-                    f"the run until then is in {log}: gripper-force replay {log}", soft_wrap=True
+                    f"the run until then is in {log}: gripper-force replay {log}",
+                    soft_wrap=True,
+                    markup=False,
                 )
             raise
         console.show(result, as_json, grasp_table)
@@ -362,7 +364,9 @@ def doctor(
 
 def virtual_servo(
     model: Annotated[str | None, typer.Option(help="Servo model.")] = None,
-    ids: Annotated[list[int] | None, typer.Option("--id", help="Servo id. Repeatable.")] = None,
+    ids: Annotated[
+        list[int] | None, typer.Option("--id", min=0, max=252, help="Servo id. Repeatable.")
+    ] = None,
     set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:

@@ -57,7 +57,9 @@ def setup(
             status.stop()
             if running.rig.path.exists():
                 console.err.print(
-                    f"what was found so far is in {config}; the same command continues there", soft_wrap=True
+                    f"what was found so far is in {config}; the same command continues there",
+                    soft_wrap=True,
+                    markup=False,
                 )
             raise
     next_command = _next(running.config.load_cell.backend, running.config.uses_vision, config)

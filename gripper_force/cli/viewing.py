@@ -40,7 +40,7 @@ def view(
     save: Annotated[
         Path | None, typer.Option(help="Write a file for Rerun (.rrd) instead of opening a window.")
     ] = None,
-    port: Annotated[int, typer.Option(min=0, help="Port for Foxglove; 0: a free one.")] = 8765,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port for Foxglove; 0: a free one.")] = 8765,
     recover: Annotated[bool, typer.Option(help="Show the intact part of a truncated log.")] = False,
     set_: NoOverrides = None,
     as_json: AsJson = False,

@@ -87,7 +87,7 @@ class Fusion:
     estimate while the force changes, the friction that holds the jaws after the impact, until the force has risen by
     as much, and the bias while vision contradicts the motor current that it was to correct.
 
-    Without vision for `ControlConfig.timeout_ms` the source is the current alone, with the last bias
+    Without vision for `ControlConfig.vision_gap_ms` the source is the current alone, with the last bias
     and a growing variance.
 
     Attributes:
@@ -96,8 +96,8 @@ class Fusion:
 
     def __init__(self, config: ControlConfig, transmission: Transmission) -> None:
         self._feedback = config.feedback
-        self._timeout_ns = round(config.timeout_ms * NS_PER_MS)
-        self._max_age_ns = round(config.max_age_ms * NS_PER_MS)
+        self._timeout_ns = round(config.vision_gap_ms * NS_PER_MS)
+        self._max_age_ns = round(config.max_frame_age_ms * NS_PER_MS)
         _, self._lag_s, _ = config.plant
         self._std_limit_n = config.vision_std_n
         self._reentry = max(round(_REENTRY_S * config.frame_hz), _MIN_REENTRY)
@@ -105,7 +105,7 @@ class Fusion:
         self._transmission = transmission
         self._gain = ObjectGain(transmission.gain_std, config.object_ratio)
         self._learns_gain = config.learn_gain
-        cycles = math.ceil(config.rate_hz * config.max_age_ms / 1e3) + 2
+        cycles = math.ceil(config.rate_hz * config.max_frame_age_ms / 1e3) + 2
         self._history: deque[tuple[int, float]] = deque(maxlen=cycles)  # covers the age of any accepted frame
         self._motor_force_n = 0.0
         self._current_n = 0.0

@@ -50,7 +50,7 @@ class VisualCheck:
             visual: Newest visual estimate, or None. A repeated one is used once.
             gripping: True between contact and release.
         """
-        if t_ns - self._t_ns > (self._config.timeout_ms + self._config.max_age_ms) * NS_PER_MS:
+        if t_ns - self._t_ns > (self._config.vision_gap_ms + self._config.max_frame_age_ms) * NS_PER_MS:
             self._force_n = None
         if visual is None or visual.t_ns <= self._t_ns or self._config.feedback == "current":
             return

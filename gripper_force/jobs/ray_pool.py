@@ -62,7 +62,7 @@ def _connect(ray: Any, address: str) -> None:
     try:
         _knock(address)
         ray.init(address, log_to_driver=False, logging_level="error")
-    except (OSError, ValueError, RuntimeError) as error:
+    except (OSError, ValueError, OverflowError, RuntimeError) as error:  # OverflowError: a port above 65535
         reason = str(error).splitlines()[0]
         raise ConfigError(
             f"no Ray cluster answers at {address} ({reason}); start one with `ray start --head`, or leave out --ray"

@@ -99,8 +99,10 @@ class ControlLoop:
     def sleep(self, seconds: float) -> None:
         """Waits for a time on the run's clock, and runs the cycle where no thread does."""
         if self._background:
-            self._ended.wait(seconds)
+            has_ended = self._ended.wait(seconds)
             self._raise_error()
+            if has_ended:
+                raise RequestError(CLOSED)
             return
         end_ns = self.state.t_ns + round(seconds * NS_PER_S)
         while self.step().t_ns < end_ns:

@@ -46,7 +46,8 @@ def open_gripper(
             ``dynamixel_sdk.PortHandler`` or an object with the same methods. Packets are sent only to
             ``servo.id``, and the port is neither configured nor closed. None: opens ``servo.port``.
         port_lock: Lock of a shared port, such as a `threading.Lock`. Every user of the port holds it for one
-            transaction, a request and its replies.
+            transaction, a request and its replies. If it is not free within ``servo.bus_watchdog_ms``, the run ends
+            with `DeviceTimeoutError`.
 
     Raises:
         ConfigError: A key, value, profile or backend is wrong, ``background`` is True in lockstep, or a port
@@ -54,6 +55,9 @@ def open_gripper(
         DeviceError: A device is missing, in use, or does not answer.
         SimulationError: The simulated scene cannot be built.
         LogError: The log cannot be written.
+        CheckpointError: The network's file is missing, damaged, or of another network.
+        DataError: The first frames gave no estimate, or the log to play holds no frames.
+        RequestError: Another thread closed the gripper meanwhile.
     """
     if isinstance(config, Config):
         if overrides:
@@ -85,9 +89,13 @@ class Gripper:
     thread; between them the caller runs it with `step` or `sleep`. In real time the servo's Bus Watchdog
     stops the servo if no cycle runs for ``servo.bus_watchdog_ms``.
 
-    A newer request replaces an older one, and `stop` always wins. A refused request raises `RequestError`, a
-    failed device `DeviceError`. However the gripper is closed, the servo ends as configured: as ``on_exit``
-    says, or as ``control.on_fault`` says after a fault, a stop or an exception.
+    A newer request replaces an older one: a call that waits for one of another kind raises `RequestError`, and one
+    that waits for the same kind gets the newer one's result. `stop` always wins, and `close` raises `RequestError` in
+    each call that waits. A refused request raises `RequestError`, a failed device `DeviceError`, a simulation that is
+    too slow for real time `SimulationError`.
+
+    However the gripper is closed, the servo ends as configured: as ``on_exit`` says, or as ``control.on_fault`` says
+    after a fault, a stop or an exception.
 
     In asyncio, call the blocking methods in a thread: ``await asyncio.to_thread(gripper.grasp, 4.0)``.
 
@@ -217,6 +225,7 @@ class Gripper:
             seconds: Time on the run's clock.
 
         Raises:
+            RequestError: The gripper is closed.
             DeviceError: A device failed meanwhile.
         """
         self._loop.sleep(seconds)

@@ -68,7 +68,8 @@ class LogWriter:
             self._file = file if wrap_file is None else wrap_file(file)
         except OSError as error:
             there = "it exists already, and a log is never overwritten; move it away, or set log.directory"
-            reason = there if path.exists() else error.strerror
+            is_there = isinstance(error, FileExistsError) and error.filename == str(path)
+            reason = there if is_there else error.strerror
             raise LogError(f"can't write the log {path}: {reason}") from error
         self._writer = Writer(self._file)
         try:

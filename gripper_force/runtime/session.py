@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import re
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -94,7 +93,7 @@ class Session:
         self._controller, self._perception, self._log_queue = controller, perception, log_queue
         self._period_ns = round(NS_PER_S / run.config.control.rate_hz)
         self._due_ns = 0
-        self._stop = threading.Event()
+        self._stop = False
         self._raise_if_cancelled = raise_if_cancelled
         self._interrupted = False
         self._counter_monitors = {unit: CounterMonitor() for unit in ("servo", "camera", "load_cell")}
@@ -161,12 +160,12 @@ class Session:
 
     def stop_soon(self) -> None:
         """Makes the next cycle a stop, before any other request. Any thread or signal handler may call it."""
-        self._stop.set()
+        self._stop = True
 
     @property
     def stop_is_pending(self) -> bool:
         """True if a stop was requested and no cycle has handled it."""
-        return self._stop.is_set()
+        return self._stop
 
     def interrupt(self) -> None:
         """Makes the next cycle raise `KeyboardInterrupt` before it accesses the servo.
@@ -312,8 +311,8 @@ class Session:
     def _request(
         self, t_ns: int, kind: RequestKind | None, target_n: float, width_m: float, new_object: bool
     ) -> Request | None:
-        if self._stop.is_set():
-            self._stop.clear()
+        if self._stop:
+            self._stop = False
             return Request(t_ns, RequestKind.STOP)
         return None if kind is None else Request(t_ns, kind, target_n, width_m, new_object)
 

@@ -1,5 +1,6 @@
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -645,6 +646,33 @@ def test_options_win_over_overrides() -> None:
         load_settings(None, None, {"target_n": -1.0})
 
 
+def test_a_path_that_cannot_be_used_is_one_sentence(run: Run) -> None:
+    Path("notes.txt").write_text("mine")
+    for command in ("simulate --presses 1 --grasps 0 --out", "record --object stapler --out"):
+        done = run(*command.split(), "notes.txt", "--json", "--set", "sim.detail=coarse")
+        assert done.code == 2
+        assert re.search(r"error: can't use notes\.txt\S*: a file is where a folder must be; check", done.err)
+        assert "Traceback" not in done.err
+        assert set(json.loads(done.out)) == {"error"}
+    assert Path("notes.txt").read_text() == "mine"
+
+
+def test_a_number_beyond_its_range_is_refused(run: Run) -> None:
+    for words in (
+        ["virtual-servo", "--id", 300],
+        ["view", "a.mcap", "--viewer", "foxglove", "--port", 70000],
+    ):
+        assert run(*words).code == 2
+    done = run("replay", "runs", "--ray", "127.0.0.1:70000")
+    assert done.code == 2
+    assert "Traceback" not in done.err
+
+
+def test_paths_with_brackets_are_shown_whole(capsys: pytest.CaptureFixture[str]) -> None:
+    cli.console.pairs({"log": Path("data/[old]/a[/x].mcap")})
+    assert "data/[old]/a[/x].mcap" in capsys.readouterr().out
+
+
 def test_a_calibration_does_not_write_its_rig_profile_over_the_rig_file_of_setup(run: Run) -> None:
     rig = Path("rig.yaml")
     rig.write_text("object: block\nsim: {detail: coarse}\n")
@@ -653,6 +681,17 @@ def test_a_calibration_does_not_write_its_rig_profile_over_the_rig_file_of_setup
     assert done.code == 0, done.err
     assert "calibration.rig=rig_profile.yaml" in done.err
     assert (rig.read_text(), Path("rig_profile.yaml").exists()) == (text, True)
+
+
+def test_a_calibration_replaces_a_damaged_rig_profile_of_its_file(run: Run) -> None:
+    Path("old.yaml").write_text("format: gripper-force-rig/0")
+    Path("my.yaml").write_text("object: block\nsim: {detail: coarse}\ncalibration: {rig: old.yaml}\n")
+    options = ("--config", "my.yaml", "--set", "calibration.rig=new.yaml", "--json")
+    done = run("calibrate", "servo", "--gauge-mm", "30", "--yes", *options)
+    assert done.code == 0, done.err
+    assert "next:" in done.err
+    assert "calibration.rig=new.yaml" in done.err
+    assert "nm_per_a" in json.loads(done.out)
 
 
 def test_commands_before_the_first_calibration_need_no_rig_profile(run: Run) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from gripper_force.errors import DataError, GripperError
+from gripper_force.errors import DataError, GripperError, UnfamiliarFrameError
 from gripper_force.jobs.processes import Workers, process_pool
 from gripper_force.progress import no_progress
 
@@ -54,6 +54,16 @@ def test_an_error_is_raised_with_the_place_where_it_happened() -> None:
             pool.submit(raise_error).result()
         assert "in raise_error" in caught.value.__notes__[0]
         assert pool.submit(os.getpid).result() != os.getpid()
+
+
+def meet_something_unfamiliar() -> None:
+    raise UnfamiliarFrameError("no known object", 1.5)
+
+
+def test_an_error_with_attributes_arrives_whole() -> None:
+    with process_pool(1) as pool, pytest.raises(UnfamiliarFrameError, match="no known object") as caught:
+        pool.submit(meet_something_unfamiliar).result()
+    assert caught.value.force_n == 1.5
 
 
 def test_results_are_in_order_and_the_processes_end() -> None:

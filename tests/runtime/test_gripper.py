@@ -396,7 +396,10 @@ def test_the_background_thread_runs_the_cycle(real_time: Open, server: PtyServer
     assert gripper.release() > 0.085
     with pytest.raises(gf.RequestError, match="open with background=False"):
         gripper.step()
+    gripper.sleep(0.01)
     gripper.close()
+    with pytest.raises(gf.RequestError, match="closed"):
+        gripper.sleep(0.01)
     assert torque(server) == 0
     assert "control" not in {thread.name for thread in threading.enumerate()}
 

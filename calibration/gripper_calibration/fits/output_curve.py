@@ -113,9 +113,11 @@ def fit_line(touches: Touches) -> LinearFit:
             np.square(d) + v for d, v in zip(deviations, variances, strict=True)
         )
         touch_var = total / (_TOUCH_PRIOR_WEIGHT + len(parts))
+    # A correction never falls, also if the touches of a fold say so: then it is nearly constant.
+    gain = max(float(1 + line[0]), _MIN_SLOPE)
     return LinearFit(
-        gain=float(1 + line[0]),
-        offset_n=float(line[1]),
+        gain=gain,
+        offset_n=float(line[1] + (1 + line[0] - gain) * touches.estimate_n.mean()),
         covariance=np.asarray(np.linalg.inv(precision), np.float64),
         touch_std=np.sqrt(touch_var),
         degrees=len(parts) - 1 + _TOUCH_PRIOR_WEIGHT,

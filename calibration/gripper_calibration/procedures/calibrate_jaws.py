@@ -299,8 +299,17 @@ class _EmptyJaws:
         """Moves until a goal is passed, from either side, and at last towards ``side``."""
         self._progress("measuring friction", 0)
         for way in (-side, side):
+            still_rad, cycles = self.state.position_rad, 0
             while way * (goal_rad + way * 0.05 - self.state.position_rad) > 0:
                 self.cycle(way, self._end_a)
+                cycles += 1
+                if abs(self.state.position_rad - still_rad) > _STILL_RAD:
+                    still_rad, cycles = self.state.position_rad, 0
+                elif cycles > _STILL_S * RATE_HZ:
+                    raise DataError(
+                        f"the jaws stopped at {still_rad:.2f} rad, although they moved there before; check that "
+                        "nothing blocks them"
+                    )
 
     def _break_away(self, side: int) -> float:
         begin_rad, current_a = self.state.position_rad, 0.0

@@ -11,9 +11,6 @@ from gripper_force.profiles.rig_profile import CalibratedValue
 PROFILE: Final = "measured.yaml"
 """Rig profile in the setup's folder, in which the procedures keep their results."""
 
-_GOOD_RATE_HZ: Final = 40.0
-"""With fewer samples per second presses become slow, and the camera's lag can't be measured."""
-
 WITHOUT: Final = (
     "Without a load cell everything works but what needs newtons measured at the jaws: `calibrate servo`, "
     "`calibrate object` and training. Motor current measures the force instead; the next step can compare it with a "

@@ -104,17 +104,17 @@ def export_lerobot(
     if fps < 1:
         raise ConfigError(f"a rate of {fps} rows per second is too low; set --fps to 1 or more")
     shape = _image_shape(logs[0])
-    dataset: Any = dataset_class.create(
-        repo_id=f"local/{folder.name}",
-        fps=fps,
-        features=_features(action, shape, video),
-        root=folder,
-        robot_type="gripper_force",
-        use_videos=video,
-        video_backend="pyav",  # nothing is decoded, and to look for another one can print a page of warnings
-    )
     frames = 0
     try:
+        dataset: Any = dataset_class.create(
+            repo_id=f"local/{folder.name}",
+            fps=fps,
+            features=_features(action, shape, video),
+            root=folder,
+            robot_type="gripper_force",
+            use_videos=video,
+            video_backend="pyav",  # nothing is decoded, and to look for another one can print a page of warnings
+        )
         for path in logs:
             frames += _add_episode(dataset, path, action, task, overrides, shape)
             progress(path.name)

@@ -41,7 +41,11 @@ def replay(
             ``["control.ramp_n_s=4"]``.
         recover: Read the intact part of a truncated log.
 
+    Returns:
+        The errors against the load cell, in newtons, and whether the replay equals the run.
+
     Raises:
+        ConfigError: An override is wrong, or the object profile belongs to another network or camera.
         LogError: The log cannot be read.
         CheckpointError: The network's file cannot be read.
         DataError: The log holds nothing to replay, or no load cell to compare with.

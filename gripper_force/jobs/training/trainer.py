@@ -231,13 +231,13 @@ class Trainer:
             return
         try:
             with safe_open(path, framework="pt", device=self._ranks.device) as file:
-                progress = file.metadata()
+                progress = file.metadata() or {}
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
         except (OSError, SafetensorError) as error:
             raise CheckpointError(
                 f"can't read the training state {path}: {error}; delete it or train without --resume"
             ) from error
-        if progress["identity"] != identity:
+        if progress.get("identity") != identity:
             raise CheckpointError(
                 f"the training state {path} belongs to another recipe or other data; train without --resume"
             )

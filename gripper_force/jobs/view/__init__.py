@@ -83,7 +83,7 @@ class GrowingLog(LogReader):
         try:
             super().__init__(path, recover=True)
         except LogError:
-            if path.stat().st_size > _HEAD_BYTES:
+            if path.exists() and path.stat().st_size > _HEAD_BYTES:  # a run without a cycle deletes it
                 raise
             return False
         return True

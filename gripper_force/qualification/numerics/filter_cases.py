@@ -47,7 +47,7 @@ class _DecimalFusion:
     def __init__(self, control: ControlConfig, transmission: Transmission) -> None:
         _, lag_s, _ = control.plant
         self._lag_s = Decimal(lag_s)
-        self._oldest_ns = control.max_age_ms * NS_PER_MS
+        self._oldest_ns = control.max_frame_age_ms * NS_PER_MS
         self._most_std_n = control.vision_std_n
         self._friction_n = Decimal(transmission.friction_n)
         self._friction_n2 = (Decimal(transmission.friction_std) * self._friction_n) ** 2
@@ -55,7 +55,7 @@ class _DecimalFusion:
         self._motor_force_n = self._force_n = self._difference_n = Decimal(0)
         self._share = Decimal(1)
         self._variance_n2 = self._prior_n2(self._force_n)
-        cycles = math.ceil(control.rate_hz * control.max_age_ms / 1e3) + 2
+        cycles = math.ceil(control.rate_hz * control.max_frame_age_ms / 1e3) + 2
         self._history: deque[tuple[int, Decimal]] = deque(maxlen=cycles)
         self._reentry = round(control.frame_hz / 3)
         self._newest_ns = -1

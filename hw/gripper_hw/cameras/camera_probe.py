@@ -11,6 +11,7 @@ from gripper_force.jobs.checks import Check, clock_name, gather, judged, keep_on
 from gripper_force.runtime.backends import open_devices
 from gripper_force.schema import Tree
 from gripper_force.types import NS_PER_MS, Frame
+from gripper_hw.cameras import uvc
 
 _SYSFS = Path("/sys")
 _LUXONIS_USB_ID = "03e7"
@@ -59,9 +60,9 @@ def probe(config: Config, sysfs: Path = _SYSFS) -> Iterator[Check]:
 def find(sysfs: Path = _SYSFS) -> list[Tree]:
     """Returns the section ``camera`` of each camera that is plugged in: OAK cameras, then USB cameras."""
     oaks: list[Tree] = [{"backend": "oak", "device": info.deviceId} for info in _oak_infos() or ()]
-    nodes = sorted((sysfs / "class/video4linux").glob("video*"))
-    captures = [node for node in nodes if (node / "index").read_text().strip() == "0"]  # others: metadata
-    return oaks + [{"backend": "uvc", "device": f"/dev/{node.name}"} for node in captures]
+    return oaks + [
+        {"backend": "uvc", "device": f"/dev/{node}"} for node in uvc.camera_names(sysfs / "class/video4linux")
+    ]
 
 
 def _settings_check(config: Config, settings: Mapping[str, float | str]) -> Check:
@@ -100,11 +101,10 @@ def _frame_checks(config: Config, frames: list[Frame]) -> Iterator[Check]:
         advice = "set camera.rate_hz to the measured rate, shorten camera.exposure_us, or add light"
         yield judged("camera", "rate", found, fast_enough, advice)
     latency_ms = float(np.median([frame.received_ns - frame.t_ns for frame in frames])) / NS_PER_MS
-    limit_ms = config.control.timeout_ms
+    estimate_hz = config.control.vision_rate_hz or configured_hz
+    limit_ms = config.control.model_copy(update={"vision_rate_hz": estimate_hz}).max_frame_age_ms
     found = f"median {latency_ms:.1f} ms from exposure to use"
-    advice = (
-        f"every estimate would be older than control.vision_timeout_ms={limit_ms:g}: shorten the exposure"
-    )
+    advice = f"every estimate would be older than control.vision_age_ms={limit_ms:.3g}: shorten the exposure"
     yield judged("camera", "latency", found, latency_ms < limit_ms, advice)
 
 
@@ -118,10 +118,10 @@ def _oak_devices() -> Iterator[str]:
 
 
 def _oak_infos() -> Sequence[Any] | None:
-    """Returns the free OAK devices; None if DepthAI is not installed."""
+    """Returns the free OAK devices; None if DepthAI is not installed or does not load."""
     try:
         import depthai as dai
-    except ModuleNotFoundError:
+    except ImportError:
         return None
     infos: Sequence[Any] = dai.Device.getAllAvailableDevices()
     return infos

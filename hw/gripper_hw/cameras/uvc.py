@@ -7,7 +7,7 @@ OpenCV's names: https://github.com/opencv/opencv/blob/4.x/modules/videoio/src/ca
 import math
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -119,6 +119,16 @@ class UvcCamera(BackgroundCamera):
         return RawFrame(stamp_ns - (self._config.exposure_us or 0) * 500, seq, small)
 
 
+def camera_names(sysfs: Path = _SYSFS) -> dict[str, str]:
+    """Returns the cameras' names by node, such as ``video0``; of a camera's nodes only the one that gives images."""
+    names = {}
+    for node in sorted(sysfs.glob("video*")):
+        with suppress(OSError):  # it is being unplugged
+            if (node / "index").read_text().strip() == "0":  # the others are metadata
+                names[node.name] = (node / "name").read_text().strip()
+    return names
+
+
 def find_device(device: int | str, sysfs: Path = _SYSFS) -> Path:
     """Returns the path of a camera.
 
@@ -136,9 +146,7 @@ def find_device(device: int | str, sysfs: Path = _SYSFS) -> Path:
                 f"camera {path} does not exist; check its cable, and camera.device (see ls /dev/video*)"
             )
         return path
-    # A camera has several nodes of one name: index 0 gives images, the others metadata.
-    nodes = [node for node in sorted(sysfs.glob("video*")) if (node / "index").read_text().strip() == "0"]
-    names = {node.name: (node / "name").read_text().strip() for node in nodes}
+    names = camera_names(sysfs)
     matches = [node for node, name in names.items() if name == device]
     if len(matches) == 1:
         return Path("/dev", matches[0])

@@ -150,6 +150,33 @@ def test_contradictory_friction_is_refused(
         procedure._check_friction(breakaway_n, running_n)
 
 
+def test_jaws_that_something_stops_meanwhile_end_the_measurement(monkeypatch: pytest.MonkeyPatch) -> None:
+    buses: list[VirtualBus | None] = []
+    stopped: list[ServoState] = []
+    is_blocked: list[bool] = []
+    read = DynamixelServo.read
+
+    def observed(servo: DynamixelServo) -> ServoState:
+        buses[:] = [find_bus("rig")]
+        state = read(servo)
+        if not is_blocked:
+            return state
+        stopped.append(state)
+        return replace(state, position_rad=stopped[0].position_rad, velocity_rad_s=0.0)
+
+    def progress(text: str, steps: int = 1) -> None:
+        if text == "measuring friction":
+            is_blocked.append(True)
+
+    monkeypatch.setattr(DynamixelServo, "read", observed)
+    with pytest.raises(
+        DataError, match="rad, although they moved there before; check that nothing blocks them"
+    ):
+        calibrate_jaws(config_of(), prompt=lambda text: None, progress=progress)
+    assert buses[0] is not None
+    assert buses[0].servos[0].get("torque_enable") == 0
+
+
 def test_device_failure_turns_torque_off(monkeypatch: pytest.MonkeyPatch) -> None:
     buses: list[VirtualBus | None] = []
     read = DynamixelServo.read

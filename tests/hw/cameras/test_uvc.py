@@ -228,6 +228,7 @@ def test_device_is_found_by_number_path_and_name(tmp_path: Path, video: Path) ->
         folder.mkdir()
         (folder / "index").write_text(f"{index}\n")
         (folder / "name").write_text(f"{name}\n")
+    (tmp_path / "video5").mkdir()  # being unplugged: its files are gone
     assert find_device("Webcam", tmp_path) == Path("/dev/video0")
     assert find_device(str(video), tmp_path) == video
     with pytest.raises(DeviceNotFoundError, match=r"2 cameras have the name 'Eye'; .*'Eye' at /dev/video4"):

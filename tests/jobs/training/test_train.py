@@ -7,6 +7,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import save_file
 from typer.testing import CliRunner
 
 from gripper_force import cli
@@ -204,6 +205,9 @@ def test_state_of_another_training_raises(
         train(small_recipe.model_copy(update={"steps": 5}), clips, out, resume=True)
     with pytest.raises(CheckpointError, match="other data"):
         train(small_recipe, clips[:-1], out, resume=True)
+    save_file({"weight": torch.zeros(1)}, out.with_suffix(".0.state"))  # without metadata
+    with pytest.raises(CheckpointError, match="another recipe"):
+        train(small_recipe, clips, out, resume=True)
     out.with_suffix(".0.state").write_bytes(b"damaged")
     with pytest.raises(CheckpointError, match="can't read"):
         train(small_recipe, clips, out, resume=True)

@@ -173,6 +173,21 @@ def test_a_growing_log_ends_with_its_writer(tmp_path: Path) -> None:
     assert 0 < len(read) < len(list(records()))
 
 
+def test_a_run_that_deletes_its_empty_log_ends_the_view(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "empty.mcap"
+    path.touch()
+
+    def deleted(self: object, path: Path, *, recover: bool) -> None:
+        path.unlink()
+        raise LogError(f"can't read {path}")
+
+    monkeypatch.setattr(LogReader, "__init__", deleted)
+    with pytest.raises(LogError, match="was not written"):
+        view.GrowingLog(path, lambda: False)
+
+
 def test_a_file_that_is_no_log_is_refused_while_it_is_followed(tmp_path: Path) -> None:
     path = tmp_path / "text.mcap"
     path.write_bytes(b"hello" * 300_000)
