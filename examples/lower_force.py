@@ -81,6 +81,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 for seed in range(1, given.seeds + 1)
             ]
             done = [case for case in cases if case is not None]
+            if not done:
+                print(f"| {feedback} | {name} | 0 of {len(cases)} | - | - | - | - |", flush=True)
+                continue
             shares = np.abs([errors for errors, _ in done])  # (K, 2)
             held_s = np.array([time for _, time in done])
             early, late = (

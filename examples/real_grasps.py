@@ -19,6 +19,7 @@ Each result is written to OUT/results.json at once; the same command continues a
 
 import argparse
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -190,8 +191,11 @@ def main() -> None:
 
 
 def _read(folder: Path, out: Path, jobs: int) -> list[Clip]:
-    if not any(out.glob("*.mcap")):
+    source = out / "folder.txt"  # a complete import of this folder
+    if not source.exists() or source.read_text() != str(folder.resolve()):
+        shutil.rmtree(out, ignore_errors=True)
         import_folder(folder, out)
+        source.write_text(str(folder.resolve()))
     clips = load_clips(sorted(out.glob("*.mcap")), PREPROCESS, workers=jobs)
     used = without_contact_starts(clips, PREPROCESS)
     print(f"{folder}: {len(used)} of {len(clips)} recordings are used; the others start in contact")

@@ -5,7 +5,7 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
-from pydantic import Field, PositiveInt, model_validator
+from pydantic import Field, PositiveInt, field_validator, model_validator
 
 from gripper_force.errors import ConfigError
 from gripper_force.fault_config import FaultConfig
@@ -265,6 +265,13 @@ class LoadCellConfig(Section):
     path: Path | None = Field(None, description="playback: the log to play")
     speed: Literal["recorded", "full"] = Field("recorded", description="playback: speed")
 
+    @field_validator("n_per_raw")
+    @classmethod
+    def _is_a_scale(cls, n_per_raw: float | None) -> float | None:
+        if n_per_raw == 0:
+            raise ValueError("0 would make each force 0 N")
+        return n_per_raw
+
     @property
     def sensor(self) -> str:
         """Sensor type that the raw unit belongs to: the backend, plus the format of a serial one."""
@@ -490,6 +497,13 @@ class SimLightConfig(Section):
     direction: Vector = Field((-0.40, 0.55, -0.75), description="direction in which the light shines")
     ambient: Share = Field(0.30, description="share of the light that comes from everywhere")
     background: float = Field(1.0, ge=0, le=2, description="factor on the brightness of table and wall")
+
+    @field_validator("direction")
+    @classmethod
+    def _is_a_direction(cls, direction: Vector) -> Vector:
+        if not any(direction):
+            raise ValueError("0, 0, 0 is no direction")
+        return direction
 
 
 class SimConfig(Section):

@@ -124,8 +124,9 @@ def faults(
             )
         if write is not None:
             write_between(write, "wrong", wrong_configurations.markdown(report["wrong"]))
-    report["ok"] = all(row["ok"] == row["runs"] for row in report["rows"]) and all(
-        row["ok"] == row["runs"] and row["live_ok"] == row["live_runs"] for row in report["wrong"]
+    report["ok"] = all(
+        row["ok"] == row["runs"] and row["live_ok"] == row["live_runs"]
+        for row in (*report["rows"], *report["wrong"])
     )
     _show(report, as_json, faults_tables)
 

@@ -188,14 +188,18 @@ def split_by(
     pools = (
         [clips] if key == "object" else [[c for c in clips if c.object == o] for o in _names(clips, "object")]
     )
-    held: set[str] = set()
+    held: set[tuple[str, str]] = set()  # object, and object or set: sets of two objects may have one name
     for pool in pools:
         names = _names(pool, key)
         count = min(max(1, round(fraction * len(names))), len(names) - 1)
-        held.update(rng.choice(names, count, replace=False))
+        drawn = set(rng.choice(names, count, replace=False)) if names else set()
+        held.update((clip.object, getattr(clip, key)) for clip in pool if getattr(clip, key) in drawn)
     if not held:
         raise DataError(f"a split by {key} needs at least two, got {_names(clips, key)}; add logs")
-    return [c for c in clips if getattr(c, key) not in held], [c for c in clips if getattr(c, key) in held]
+    is_held = [(clip.object, getattr(clip, key)) in held for clip in clips]
+    return [c for c, h in zip(clips, is_held, strict=True) if not h], [
+        c for c, h in zip(clips, is_held, strict=True) if h
+    ]
 
 
 def check_size(clips: Iterable[Clip], preprocess: "Preprocess") -> None:

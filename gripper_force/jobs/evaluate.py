@@ -110,7 +110,7 @@ def evaluate(
 ) -> Evaluation:
     """Compares a checkpoint's estimates with the load cell, over logs that training has not seen.
 
-    Every frame gets the estimate that a run would give.
+    Every frame gets the network's estimate, corrected as in a run; also the frames that a run would reject.
 
     Example:
         >>> result = evaluate("data/test", "small")  # doctest: +SKIP
@@ -146,6 +146,10 @@ def evaluate(
     """
     if out is not None:
         check_writable(out)
+    if plot is not None:
+        from gripper_force.jobs.report.plots import check_figure_path
+
+        check_figure_path(plot)
     config = Config() if config is None else config
     model = read_model(checkpoint)
     calibration = config.calibration

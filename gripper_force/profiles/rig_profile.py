@@ -65,6 +65,12 @@ class LoadCellCalibration(Section):
     noise_n: NonNegative
     drift_n_min: CalibratedValue
 
+    @model_validator(mode="after")
+    def _has_a_scale(self) -> Self:
+        if self.n_per_raw.value == 0:
+            raise ValueError("n_per_raw is 0: each force would be 0; calibrate the load cell again")
+        return self
+
 
 class ServoCalibration(Section):
     """Torque and friction of a servo, and the geometry of the jaws.
@@ -136,7 +142,9 @@ class CameraCalibration(Section):
         """Returns the differences between the calibration and a run's section ``camera``, as text."""
         named = {"backend", "side_px", "rate_hz", "gain", "exposure_us"}
         mine = {**self.model_dump(mode="json", include=named), **self.image}
-        return [f"camera.{key} {mine[key]}, not {camera[key]}" for key in mine if mine[key] != camera[key]]
+        return [
+            f"camera.{key} {mine[key]}, not {camera.get(key)}" for key in mine if mine[key] != camera.get(key)
+        ]
 
 
 class RigProfile(Section):

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from gripper_force.config import Config, config_from
+from gripper_force.config import Config, LogConfig, VisionConfig, config_from, dump_config
 from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import CONTACT_N, label_frames
 from gripper_force.jobs.processes import process_pool
@@ -252,16 +252,22 @@ def _press(row: int, index: int, folder: Path, tree: Tree) -> Tree:
     spec = ROWS[row]
     config = config_from(tree, "recognition")
     scene = "-".join(name for name, _ in spec.settings) or "still"
-    logs = folder / "logs" / scene
     log = plan("press", index + 1, FIRST_SEED, spec.objects)[index]
     sim = config.sim.model_copy(update=dict(spec.settings))
+    own = {
+        "vision": VisionConfig(region=config.vision.region),
+        "log": LogConfig(),
+    }  # no network and no folder
+    made = dump_config(config.model_copy(update={"sim": sim, **own}))
+    key = hashlib.sha256(made.encode()).hexdigest()[:12]
+    logs = folder / "logs" / f"{scene}-{key}"
     logs.mkdir(parents=True, exist_ok=True)
     path = logs / log.name
     if not path.exists():
         make_log(log, logs, config.model_copy(update={"sim": sim}).model_dump(mode="json"))
     checkpoint = load_checkpoint(config.vision.checkpoint)
     version = hashlib.sha256(checkpoint.header.model_dump_json().encode()).hexdigest()
-    name = "-".join([spec.group, spec.name, scene, log.name, version[:12]]).replace(" ", "_")
+    name = "-".join([spec.group, spec.name, scene, log.name, key, version[:12]]).replace(" ", "_")
     kept = folder / "estimates" / f"{name}.json"
     if kept.exists():
         try:

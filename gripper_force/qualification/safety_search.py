@@ -338,8 +338,8 @@ def run_case(config: Config, seed: int, index: int) -> CaseResult:
         str(run.outcome),
         shown.force_share,
         shown.speed_share,
-        shown.held_nothing and drawn.feedback != "current",
-        shown.held_nothing and drawn.feedback == "current",
+        shown.held_nothing and not (drawn.feedback == "current" and run.is_at_stop),
+        shown.held_nothing and drawn.feedback == "current" and run.is_at_stop,
     )
 
 
@@ -366,6 +366,7 @@ class _Run:
         )
         self.t_ns = 0
         self.outcome: str = Outcome.NONE
+        self.is_at_stop = False
         self.statements = SafetyStatements(control, drawn.target_n, drawn.sign)
 
     def read(self, t_ns: int, noise: float) -> ServoState:
@@ -404,6 +405,7 @@ class _Run:
             plant.advance(ServoCommand(self.t_ns, goal_rad, command.goal_current_a), CYCLE_NS / NS_PER_S)
             self.t_ns += CYCLE_NS
             self.outcome = decision.status.outcome
+            held_nothing = self.statements.held_nothing
             self.statements.observe(
                 CYCLE_NS / NS_PER_S,
                 decision.status.phase,
@@ -414,6 +416,8 @@ class _Run:
                 closing_m_s=plant.v_m_s,
                 has_torque=command.goal_current_a > 0,
             )
+            if self.statements.held_nothing and not held_nothing:
+                self.is_at_stop = plant.x_m in plant.stops_m
 
 
 def search(

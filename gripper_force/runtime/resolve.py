@@ -33,6 +33,9 @@ if TYPE_CHECKING:  # a run without vision imports none of these
 _SUPPLY_TOLERANCE_V = 0.5
 """A supply set to the end of the servo's range reads slightly beyond it."""
 
+_MOST_TIMES = 3.0
+"""Torque constant over that of the servo's model from which it can't be right: the largest `gripper.gain_bound`."""
+
 _CYCLES_PER_WATCHDOG = 2
 """One lost cycle must not make the servo stop."""
 
@@ -193,6 +196,13 @@ def position_loop(gripper: GripperConfig) -> PositionLoop | None:
 
 
 def _complete_gripper(gripper: GripperConfig, spec: ServoSpec) -> GripperConfig:
+    """Returns the section with the servo's data. Raises `ConfigError` for a torque constant that can't be right."""
+    times = 1.0 if gripper.nm_per_a is None else gripper.nm_per_a / spec.nm_per_a
+    if not 1 / _MOST_TIMES < times < _MOST_TIMES:
+        raise ConfigError(
+            f"gripper.nm_per_a={gripper.nm_per_a:g} is {times:.3g} times the {spec.nm_per_a:.3g} Nm/A of the servo's "
+            "model, so that no force limit would hold; correct it, or servo.model"
+        )
     known = {
         "nm_per_a": spec.nm_per_a,
         "current_step_a": spec.current_step_a,

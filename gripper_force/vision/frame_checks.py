@@ -171,8 +171,8 @@ _NOISE: Final = 1.0
 
 def _sampled(image: Floats) -> Floats:
     """Returns evenly spaced pixels, (N,)."""
-    step = len(image) // _SAMPLES
-    return image[step // 2 :: step, step // 2 :: step][:_SAMPLES, :_SAMPLES].ravel()
+    where = ((np.arange(_SAMPLES) + 0.5) * len(image) / _SAMPLES).astype(int)
+    return np.asarray(image[np.ix_(where, where)].ravel(), image.dtype)
 
 
 def _block_means(image: Floats) -> Floats:

@@ -123,8 +123,8 @@ def candidates(vision: VisionConfig, *, set_threads: bool = False) -> list[Candi
             known[key] = Candidate(_name(model), engine, precision, threads, p50_ms, p99_ms, error_n)
             if engine_version(engine):  # without a version, a measurement could outlive an update
                 update_cache({key: known[key]})
-        # A stated error can change without the digest, so it is not taken from the cache.
-        found.append(replace(known[key], error_n=error_n))
+        # The file and its stated error can change without the digest, so they are not taken from the cache.
+        found.append(replace(known[key], checkpoint=_name(setting.model), error_n=error_n))
     return found
 
 

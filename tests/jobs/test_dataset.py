@@ -147,6 +147,13 @@ def test_split_keeps_objects_or_sets_together(key: str) -> None:
     assert len(draws) > 1
 
 
+def test_sets_of_several_objects_may_have_one_name() -> None:
+    clips = [clip(f"{o}{s}", o, f"{s}") for o in "abcdefgh" for s in range(3)]
+    rest, held = split_by(clips, "set", 0.1, seed=1)
+    assert (len(rest), len(held)) == (16, 8)
+    assert {c.object for c in rest} == {c.object for c in held} == set("abcdefgh")
+
+
 def test_split_needs_two() -> None:
     with pytest.raises(DataError, match="two"):
         split_by([clip("a", "cup", "s"), clip("b", "cup", "s")], "set", 0.5)

@@ -6,6 +6,7 @@ import pytest
 
 from gripper_force.config import config_from
 from gripper_force.errors import DataError
+from gripper_force.jobs.evaluate import evaluate
 from gripper_force.jobs.grasp import Summary, overall, write_figure
 from gripper_force.jobs.report.plots import draw_estimates, draw_grasps, draw_training
 
@@ -87,6 +88,12 @@ def test_training_is_drawn_also_with_few_steps(tmp_path: Path) -> None:
     losses = {"ssam": np.array([[0.0, 3.0], [10.0, 2.0]]), "scam": np.zeros((0, 2))}
     draw_training(losses, force_n, force_n, np.full(50, "egg"), 2.5, "a title", tmp_path / "training.png")
     assert colours(tmp_path / "training.png") > 100
+
+
+def test_a_figure_of_an_unknown_kind_is_refused_before_the_work(tmp_path: Path) -> None:
+    logs = tmp_path / "no logs yet"
+    with pytest.raises(DataError, match=r"a figure can't be a \.foo file"):
+        evaluate(logs, "small", plot=tmp_path / "e.foo")
 
 
 def test_figure_that_cannot_be_written_raises(tmp_path: Path) -> None:

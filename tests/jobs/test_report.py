@@ -16,6 +16,7 @@ from mcap.stream_reader import breakup_chunk
 from gripper_force.config import config_from, dump_config
 from gripper_force.errors import LogError
 from gripper_force.jobs import report as report_module
+from gripper_force.jobs.report import data as data_module
 from gripper_force.jobs.report import pictures as pictures_module
 from gripper_force.jobs.report import write_report
 from gripper_force.jobs.report.data import SOURCES, Run, Series, histogram, read_run
@@ -349,6 +350,16 @@ def test_time_zero_is_the_first_request(grasp: Path) -> None:
     assert run.end_s == pytest.approx(5.5, abs=0.06)
     assert run.score is not None
     assert run.score.overshoot_n == pytest.approx(0.4, abs=0.15)
+
+
+def test_errors_leave_out_what_no_sample_is_near() -> None:
+    cell_s = np.array([0.0, 0.01, 9.99, 10.0])
+    estimate_s = np.linspace(0, 10, 601)
+    forces = {"load_cell": Series(cell_s, np.array([0.0, 0.0, 5.0, 5.0]))}
+    forces["visual"] = Series(estimate_s, np.where(estimate_s < 5, 0.0, 5.0))  # exact where there are samples
+    errors = data_module._errors(forces)["visual"]
+    assert np.abs(errors.value).max() < 0.05  # 50 ms of the line between two samples
+    assert 6 <= len(errors.value) <= 9
 
 
 def test_errors_use_valid_samples_only(grasp: Path) -> None:

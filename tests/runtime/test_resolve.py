@@ -77,6 +77,12 @@ def test_a_travel_outside_the_servos_turn_is_refused(key: str) -> None:
         resolve(load_config(None, [*NO_SENSORS, f"gripper.{key}", f"gripper.closing_sign={sign}"]))
 
 
+@pytest.mark.parametrize("nm_per_a", [0.178, 18.0])
+def test_a_torque_constant_of_another_order_is_refused(nm_per_a: float) -> None:
+    with pytest.raises(ConfigError, match=r"gripper\.nm_per_a=.* so that no force limit would hold"):
+        resolve(load_config(None, [f"gripper.nm_per_a={nm_per_a}"]))
+
+
 @pytest.mark.parametrize("key", ["camera.backend=none", "vision.checkpoint=none"])
 def test_a_run_without_vision_has_no_network(key: str) -> None:
     run = resolve(load_config(None, [key]))

@@ -1,3 +1,4 @@
+import shutil
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -83,6 +84,9 @@ def test_measurements_are_cached(cache: Path, tiny_checkpoint: Path, monkeypatch
     assert cache.exists()
     monkeypatch.setattr(selection, "open_engine", None)  # a second measurement would call it
     assert candidates(vision, set_threads=True) == first
+    copy = shutil.copy(tiny_checkpoint, tiny_checkpoint.with_name("copy.safetensors"))  # of the same digest
+    copied = candidates(VisionConfig(checkpoint=str(copy), engine="auto"), set_threads=True)
+    assert {candidate.checkpoint for candidate in copied} == {str(copy)}
     resolved, choice = resolve_auto(vision, BudgetConfig(), set_threads=True)
     assert isinstance(choice, Choice)
     assert choice.tested == len(first)

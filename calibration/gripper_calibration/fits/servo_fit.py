@@ -201,6 +201,7 @@ def fit_servo(presses: Sequence[ServoPress], passes: Sequence[FreePass], nominal
     nm_half = float(np.hypot(half[0] * 2 * radius[0], n_per_a * 2 * radius[1]))
     # The passes were converted to metres with the nominal radius; damping is force over speed.
     scale = nominal.pinion_radius_m / radius[0]
+    travelled = travelled / np.array([scale, 1.0])
     damping, damping_half = free[1] * scale, free_half[1] * scale
     sides = used.columns[:, 2]
     return ServoFit(
@@ -216,8 +217,8 @@ def fit_servo(presses: Sequence[ServoPress], passes: Sequence[FreePass], nominal
         open_position_rad=_estimate(*opening),
         force_n=(float(force_n.min()), float(force_n.max())),
         speed_m_s=(
-            float(np.abs(travelled[:, 0]).min()) / scale,
-            float(np.abs(travelled[:, 0]).max()) / scale,
+            float(np.abs(travelled[:, 0]).min()),
+            float(np.abs(travelled[:, 0]).max()),
         ),
         residual_n=rms_n,
         outliers=len(rows) - len(force_n),

@@ -65,7 +65,7 @@ def check(touches: Touches) -> None:
         DataError: Values are not finite, there are too few frames, the forces are too small, or the estimates
             do not correlate with the load cell.
     """
-    if not (np.isfinite(touches.force_n).all() and np.isfinite(touches.features).all()):
+    if not all(np.isfinite(x).all() for x in (touches.force_n, touches.estimate_n, touches.features)):
         raise DataError("the touches contain values that are not finite; check the load cell's samples")
     if len(touches.force_n) < _MIN_FRAMES:
         raise DataError(

@@ -62,14 +62,24 @@ def faults_tables(r: FaultsReport) -> None:
 
 def _faults_table(rows: "list[RowSummary]") -> None:
     table = Table(
-        "fault", "expected", "as expected", "worst ms", "within ms", "live ms", "peak over limit", box=None
+        "fault",
+        "expected",
+        "as expected",
+        "live",
+        "worst ms",
+        "within ms",
+        "live ms",
+        "peak over limit",
+        box=None,
     )
     for row in rows:
         colour = "green" if row["ok"] == row["runs"] else "bold red"
+        live = "green" if row["live_ok"] == row["live_runs"] else "bold red"
         table.add_row(
             row["row"],
             row["expected"],
             f"[{colour}]{row['ok']} of {row['runs']}[/]",
+            f"[{live}]{row['live_ok']} of {row['live_runs']}[/]" if row["live_runs"] else "-",
             number(row["worst_ms"], digits=1),
             number(row["within_ms"], digits=0),
             number(row["live_worst_ms"], digits=1),

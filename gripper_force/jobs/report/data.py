@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from gripper_force.config import Config, config_from_text, dump_config
 from gripper_force.errors import DataError
-from gripper_force.jobs.dataset import CONTACT_N
+from gripper_force.jobs.dataset import CONTACT_N, label_at
 from gripper_force.jobs.replay.feed import Replayed
 from gripper_force.jobs.score import (
     NO_ESTIMATE,
@@ -401,12 +401,16 @@ def _errors(forces: dict[str, Series]) -> dict[str, Series]:
     if cell is None:
         return {}
     errors = {}
+    cell_ns = _ns(cell.t_s)
     for source, series in forces.items():
-        shared = (series.t_s >= cell.t_s[0]) & (series.t_s <= cell.t_s[-1])
-        if source != "load_cell" and shared.any():
-            t_s = series.t_s[shared]
-            errors[source] = Series(t_s, series.value[shared] - np.interp(t_s, cell.t_s, cell.value))
+        measured_n, is_near = label_at(_ns(series.t_s), cell_ns, cell.value, 0)
+        if source != "load_cell" and is_near.any():
+            errors[source] = Series(series.t_s[is_near], series.value[is_near] - measured_n[is_near])
     return errors
+
+
+def _ns(t_s: Floats) -> npt.NDArray[np.int64]:
+    return np.round(t_s * NS_PER_S).astype(np.int64)
 
 
 def _phases(zero_ns: int, end_s: float, status: list[GraspStatus]) -> list[Span]:

@@ -28,6 +28,7 @@ WIDTH_COLOURS: Final = {"light": "#7a5195", "dark": "#b794d6"}
 
 STYLE: Final[dict[Any, Any]] = {
     "font.size": 9.0,
+    "text.parse_math": False,  # an object's name may have two dollar signs
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.edgecolor": _LINE,

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib import rc_context
 from matplotlib.axes import Axes
+from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.figure import Figure
 
 from gripper_force.errors import DataError
@@ -27,6 +28,13 @@ _POINTS: Final = 4000
 Floats = npt.NDArray[np.floating]
 
 
+def check_figure_path(path: Path) -> None:
+    """Raises `DataError` if figures can't have the suffix of a path."""
+    known = FigureCanvasBase.get_supported_filetypes()
+    if path.suffix and path.suffix[1:].lower() not in known:
+        raise DataError(f"a figure can't be a {path.suffix} file, as of {path}; name a .png, .svg or .pdf")
+
+
 @contextmanager
 def saved_figure(path: Path, title: str, height_in: float, width_in: float = 10.0) -> Iterator[Figure]:
     """Yields an empty figure, and saves it to ``path`` at the end.
@@ -34,6 +42,7 @@ def saved_figure(path: Path, title: str, height_in: float, width_in: float = 10.
     Raises:
         DataError: The file can't be written.
     """
+    check_figure_path(path)
     with rc_context(STYLE):
         figure = Figure(figsize=(width_in, height_in), layout="constrained")
         figure.suptitle(title, x=0.008, ha="left", fontsize=13, fontweight="bold")

@@ -124,6 +124,10 @@ class _Data:
         kept = _kept(forces_n, points)
         every = torch.cat([x[torch.from_numpy(c.valid)] for x, c in zip(images, clips, strict=True)])
         frames = every[torch.from_numpy(kept)]
+        if not bool((frames != frames[0]).any()):
+            raise DataError(
+                "all frames with a label show the same image; check the camera, its light and vision.region"
+            )
         self._centre, spread = frames.mean(0), frames.std(0) + 1e-3 * frames.std() + 1e-6
         centred = (frames - self._centre) / spread
         axes = torch.linalg.eigh(centred.T @ centred)[1].flip(1)[:, :COMPONENTS]

@@ -284,7 +284,7 @@ def continued(config: TrainConfig, header: Header) -> TrainConfig:
     same = validated(TrainConfig, tree, "--init", "recipe")
     for member, shape in enumerate(header.members):
         own = same.network(member)
-        for key in NetworkConfig.model_fields.keys() - {"outputs"}:  # `Trainer.load_weights` adds new ones
+        for key in NetworkConfig.model_fields.keys() - {"outputs"}:  # `Trainer.start_from` adds new ones
             if getattr(own, key) != getattr(shape, key):
                 raise ConfigError(
                     f"network {member} of the initial checkpoint has {key}={_shown(getattr(shape, key))}, but a "

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from gripper_force.errors import ConfigError
+from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import Clip, check_size, digest, split_by
 from gripper_force.jobs.report.plots import draw_training
@@ -90,6 +90,9 @@ def train(
         ConfigError: The recipe sets a key in which ``init`` differs, ``init`` or ``replay_clips`` are given for
             a Gaussian process, or the processes can't train together, for example because their recipes differ.
     """
+    if not clips or (validation_clips is not None and not validation_clips):
+        use = "validate with" if clips else "train on"
+        raise DataError(f"no recording is left to {use}; add logs, or hold out fewer objects")
     if config.method == "process":
         if init is not None or replay_clips:
             raise ConfigError(FITTED_AT_ONCE)
@@ -128,7 +131,10 @@ def train(
             _add_ood(out, networks, held_out, ranks.device, warn)
             if figure:
                 draw_training(
-                    {t.network.config.attention: np.array(t.losses).reshape(-1, 2) for t in trainers},
+                    {
+                        f"{i}, {t.network.config.attention}": np.array(t.losses).reshape(-1, 2)
+                        for i, t in enumerate(trainers, 1)
+                    },
                     measured_n,
                     forces_n,
                     np.concatenate([np.full(int(clip.valid.sum()), clip.object) for clip in held_out]),
@@ -230,7 +236,8 @@ def _trained(
     progress: Progress,
     warn: Callable[[str], None],
 ) -> list[Trainer]:
-    if ranks.count > config.clips:
+    old = round(config.replay_share * config.clips) if replay_clips else 0
+    if any(0 < part < ranks.count for part in (config.clips - old, old)):
         raise ConfigError(
             f"{ranks.count} processes can't share {config.clips} clips per step; increase clips"
         )
@@ -243,7 +250,9 @@ def _trained(
     identity = f"{config.model_dump_json(exclude={'device', 'compile'})} {data} {start}"
     trainers = []
     for member, state in enumerate(states):
-        trainer = Trainer(config, member, batches, ranks, teacher.networks if teacher is not None else ())
+        trainer = Trainer(
+            config, member, batches, ranks, teacher.force_networks if teacher is not None else ()
+        )
         trainers.append(trainer)
         if init is not None:
             trainer.start_from(init.force_networks[member])

@@ -128,11 +128,10 @@ class Trainer:
         self._ranks.add_up([labels])
         with torch.autocast(batch.inputs.device.type, torch.bfloat16, enabled=config.precision == "bfloat16"):
             features = self._features(batch.inputs, first)  # (B, T - first, head)
-            if self._teacher:
-                batch = batch._replace(forces_n=self._taught(batch, first))
+            learned_n = self._taught(batch, first) if self._teacher else batch.forces_n  # (B, T)
         force, *others = self.network.outputs(features.flatten(0, 1)).view(*features.shape[:2], -1).unbind(2)
         scale_n = self.network.config.label_scale_n
-        error = squared_error(force * scale_n, batch.forces_n[:, first:], batch.valid[:, first:])
+        error = squared_error(force * scale_n, learned_n[:, first:], batch.valid[:, first:])
         force_loss = error / scale_n**2 / labels.clamp_min(1)
         loss = force_loss + self._other_losses(others, batch, first) / labels.clamp_min(1)
         self._optimizer.zero_grad()

@@ -35,6 +35,7 @@ class Grasp:
         cycles: Control cycles run.
         lost: Records that the log lacks.
         peak_n: Highest load-cell force.
+        true_peak_n: Highest force in the simulated world.
         log: The log.
     """
 
@@ -43,6 +44,7 @@ class Grasp:
     cycles: int
     lost: int
     peak_n: float
+    true_peak_n: float
     log: LogReader
 
     def records(self, kind: type) -> list[Any]:
@@ -162,12 +164,17 @@ def _judge_vision(row: FaultCase, run: Grasp, config: Config, at_ns: int) -> tup
 
 
 def _judge_lowering(run: Grasp, limit_n: float) -> tuple[float | None, str]:
-    """Longest time from an estimate rising over the limit to a lower goal current."""
+    """Longest time from an estimate rising over the limit to a lower goal current; None if none rose over it."""
     over = {f.t_ns: f.force_n > limit_n for f in run.records(FusedForce)}
-    worst_ns, since_ns = 0, None
+    worst_ns: int | None = None
+    since_ns: int | None = None
     for before, now in pairwise(run.records(ServoCommand)):
-        if over[now.t_ns] and not over[before.t_ns]:
+        if not over[now.t_ns]:
+            since_ns = None
+        elif not over[before.t_ns]:
             since_ns = now.t_ns
         if since_ns is not None and (now.goal_current_a < before.goal_current_a or now.goal_current_a == 0):
-            worst_ns, since_ns = max(worst_ns, now.t_ns - since_ns), None
-    return _ms(worst_ns), ""
+            worst_ns, since_ns = max(worst_ns or 0, now.t_ns - since_ns), None
+    if since_ns is not None:
+        return None, "the goal current was not lowered"
+    return None if worst_ns is None else _ms(worst_ns), ""

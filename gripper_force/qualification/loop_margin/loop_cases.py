@@ -48,6 +48,9 @@ _VISION_NOISE_N: Final = 0.1
 _OVER_SHARE: Final = 0.05
 """Share over the force limit from which a grasp crushes; `Limits` allows no more."""
 
+_CEILING_SHARE: Final = 1.04
+"""Largest static force over the force limit, for the largest torque constant."""
+
 _LOST_SHARE: Final = 0.1
 """Error of the mean force, as a share of the target, from which a grasp does not hold."""
 
@@ -114,7 +117,8 @@ class _Bounds:
         most_friction_n = rig.friction_n * (1 + 3 * rig.friction_std)
         self._most_a = min(
             config.servo.current_limit_a,
-            (config.control.force_limit_n + most_friction_n) / rig.n_per_a(rig.open_position_rad),
+            (_CEILING_SHARE * config.control.force_limit_n / rig.gain_bound + most_friction_n)
+            / rig.n_per_a(rig.open_position_rad),
         )
         self._low_rad, self._high_rad = rig.goal_range_rad
 

@@ -322,7 +322,7 @@ FAMILIES: dict[str, type[ObjectKind]] = {"solid": Solid, "shell": Shell, "spring
 def kind_from(record: Tree, where: str) -> ObjectKind:
     """Builds a kind from its record. Raises `ConfigError` that names ``where`` and the key."""
     family = record.get("family")
-    if family not in FAMILIES:
+    if not isinstance(family, str) or family not in FAMILIES:
         raise ConfigError(
             f"simulated object key 'family' (from {where}): got {family!r}; set one of {', '.join(FAMILIES)}"
         )

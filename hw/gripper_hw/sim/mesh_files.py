@@ -44,9 +44,10 @@ def read_bytes(path: Path, what: str) -> bytes:
     """Reads a file of an object. Raises `ConfigError` that names it."""
     try:
         return path.read_bytes()
-    except OSError as error:
+    except (OSError, ValueError) as error:  # ValueError: a path with a null byte
+        reason = error.strerror if isinstance(error, OSError) else error
         raise ConfigError(
-            f"can't read the {what} {path}: {error.strerror}; its path is relative to the object's file"
+            f"can't read the {what} {path}: {reason}; its path is relative to the object's file"
         ) from error
 
 

@@ -1,6 +1,7 @@
 """Files of simulated objects: a record of a kind as YAML, or a body as MJCF (docs/simulation.md)."""
 
 import hashlib
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -72,10 +73,17 @@ def digest(path: Path) -> str:
 
 def attach(scene: str, model: ObjectModel, images: dict[str, bytes]) -> str:
     """Returns the MJCF of a scene, whose images are given, with a user's body in its body ``object``."""
-    whole, spec = mujoco.MjSpec.from_string(scene), model.spec
-    whole.assets = images | model.files
-    whole.body("object").add_frame().attach_body(spec.body("object"), _PREFIX, "")
-    return str(whole.to_xml())
+    try:
+        whole, spec = mujoco.MjSpec.from_string(scene), model.spec
+        whole.assets = images | model.files
+        with warnings.catch_warnings():  # of options of the file, which the scene replaces
+            warnings.simplefilter("ignore", UserWarning)
+            whole.body("object").add_frame().attach_body(spec.body("object"), _PREFIX, "")
+            return str(whole.to_xml())
+    except ValueError as error:
+        raise ConfigError(
+            f"MuJoCo can't put the simulated object into the scene: {' '.join(str(error).split())}; correct its file"
+        ) from error
 
 
 def _read_spec(path: Path) -> Any:
@@ -95,6 +103,11 @@ def _read_spec(path: Path) -> Any:
             joint.type not in (kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE) for joint in spec.joints
         ),
         "no flex; describe an elastic object as YAML": bool(len(spec.flexes)),
+        "no mocap body, which nothing moves": any(body.mocap for body in spec.bodies),
+        "meshes or 2d textures instead of height fields and cube textures from files": any(
+            field.file for field in spec.hfields
+        )
+        or any(any(texture.cubefiles) for texture in spec.textures),
         "a geom with conaffinity, which the pads can touch": not any(
             geom.conaffinity & 1 or geom.contype & 1 for geom in spec.geoms
         ),

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from string import Template
+from xml.sax.saxutils import escape
 
 import numpy as np
 import numpy.typing as npt
@@ -307,7 +308,7 @@ def scene_mjcf(
     radius_m, rails = gripper.pinion_radius_m, 2 if second is None else 1
     inertia, damping, friction_nm, rail_friction_nm = horn_dynamics(scene, radius_m, rails)
     text = template.substitute(
-        object=scene.object,
+        object=escape(scene.object, {'"': "&quot;"}),
         timestep_s=model.timestep_s,
         object_material=_material(model),
         light_direction=_text(scene.light_direction),

@@ -128,7 +128,7 @@ class World:
             self._model: Any = mujoco.MjModel.from_xml_string(text, assets)
         except ValueError as error:
             raise SimulationError(
-                f"MuJoCo refuses the scene of {scene.object!r} ({error}); take another seed or object"
+                f"MuJoCo refuses the scene of {scene.object!r} ({error}); check the object's file and the keys of sim"
             ) from error
         if step_s is not None:
             self._model.opt.timestep = step_s

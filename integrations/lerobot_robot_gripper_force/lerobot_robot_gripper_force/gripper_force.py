@@ -15,6 +15,9 @@ from lerobot_robot_gripper_force.config_gripper_force import ACTION_KEYS, Grippe
 
 logger = logging.getLogger(__name__)
 
+_SIMULATED_PX = 128
+"""Side of the simulated camera's image, which ``camera.side_px`` does not change."""
+
 
 class GripperForce(Robot):
     """A gripper with force control as a LeRobot robot.
@@ -59,7 +62,8 @@ class GripperForce(Robot):
             ("gripper.force_n", "gripper.std_n", "gripper.width_m", "gripper.current_a"), float
         )
         if self.settings.camera.backend != "none":
-            side_px = self.settings.camera.side_px
+            camera = self.settings.camera
+            side_px = _SIMULATED_PX if camera.backend == "simulated" else camera.side_px
             features["gripper.frame"] = (side_px, side_px, 3)
         for name, camera in self.cameras.items():
             features[name] = (camera.height, camera.width, 3)

@@ -125,6 +125,8 @@ def test_every_key_of_an_object_is_on_the_page() -> None:
     ("text", "reason"),
     [
         ("- 3", "must hold a mapping"),
+        ("family: [solid]", "'family'.*set one of solid, shell, spring"),
+        (SOLID + 'texture: "x\\0.png"', "can't read the texture"),
         ("size_m: [0.05, 0.05, 0.05]", "'family'.*set one of solid, shell, spring"),
         (SOLID + "modulos_pa: 3", "unknown simulated object key 'modulos_pa'"),
         ("family: solid\nsize_m: [0.05, 0.05, 0.05]", "'modulus_pa'.*required"),
@@ -183,6 +185,7 @@ BODY = '<body name="object" pos="0 0 .03"><site name="grip"/>{}</body>'
         (BODY.format('<geom size=".06"/>'), "does not fit between jaws"),
         (BODY.format('<geom size=".004" pos="0 0 .05"/>'), "jaws would pass"),
         (BODY.format('<geom type="mesh" mesh="no"/>'), "MuJoCo can't read|MuJoCo refuses"),
+        (BODY.format('<geom size=".02"/>').replace("pos", 'mocap="true" pos'), "no mocap body"),
     ],
 )
 def test_an_mjcf_body_that_cannot_be_gripped_is_refused(body: str, reason: str, tmp_path: Path) -> None:
@@ -190,6 +193,17 @@ def test_an_mjcf_body_that_cannot_be_gripped_is_refused(body: str, reason: str, 
     path.write_text(f"<mujoco><worldbody>{body}</worldbody></mujoco>", encoding="utf-8")
     with pytest.raises(ConfigError, match=reason):
         world(path)
+
+
+def test_a_file_with_a_quote_in_its_name_and_options_of_its_own_is_simulated(tmp_path: Path) -> None:
+    path = tmp_path / 'a"b.yaml'
+    path.write_text(SOLID, encoding="utf-8")
+    assert world(path).unknowns > 0
+    path = tmp_path / "own.xml"
+    body = BODY.format('<geom size=".02"/>')
+    text = f'<mujoco><option timestep="0.01"/><worldbody>{body}</worldbody></mujoco>'
+    path.write_text(text, encoding="utf-8")
+    assert world(path).unknowns > 0  # without a warning that the scene's options win
 
 
 def test_an_mjcf_body_may_have_a_tendon_of_its_own(tmp_path: Path) -> None:

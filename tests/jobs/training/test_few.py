@@ -40,6 +40,18 @@ def process(six: list[Clip], tmp_path: Path) -> Path:
     return tmp_path / "few.safetensors"
 
 
+def test_one_image_throughout_is_named(six: list[Clip]) -> None:
+    same = [replace(clip, frames=np.zeros_like(clip.frames)) for clip in six]
+    with pytest.raises(DataError, match="all frames with a label show the same image"):
+        few.fit(same, recipe("few", ["preprocess.size=16"]).preprocess)
+
+
+def test_a_process_is_no_teacher(process: Path, six: list[Clip], tmp_path: Path) -> None:
+    config = recipe("short_clips", ["preprocess.size=16", "preprocess.magnitude=true", "steps=1"])
+    with pytest.raises(ConfigError, match="Gaussian process"):
+        train(config, six, tmp_path / "taught.safetensors", teacher=load_checkpoint(process))
+
+
 def test_a_process_learns_from_six_recordings_of_six_objects(
     process: Path, six: list[Clip], press: Callable[..., Clip]
 ) -> None:

@@ -194,6 +194,13 @@ def test_command_tells_what_to_do_next(
     assert f"warning: {too_short}" in short.stderr
 
 
+def test_no_recording_is_one_sentence(clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig) -> None:
+    with pytest.raises(DataError, match="no recording is left to train on"):
+        train(small_recipe, [], tmp_path / "out.safetensors", validation_clips=clips)
+    with pytest.raises(DataError, match="no recording is left to validate with"):
+        train(small_recipe, clips, tmp_path / "out.safetensors", validation_clips=[])
+
+
 def test_state_of_another_training_raises(
     clips: list[Clip], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_recipe: TrainConfig
 ) -> None:

@@ -1,14 +1,20 @@
+from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from gripper_force.config import load_config
 from gripper_force.fault_config import FAULTS
+from gripper_force.qualification.fault_matrix import judge as judge_module
 from gripper_force.qualification.fault_matrix import matrix as faults
 from gripper_force.qualification.fault_matrix.cases import ROWS, Expected, FaultCase
 from gripper_force.qualification.fault_matrix.judge import FaultFreeGrasp
+from gripper_force.qualification.fault_matrix.kill_process import KillTrial
 from gripper_force.qualification.fault_matrix.matrix import count_grasps, markdown, run_matrix
 from gripper_force.qualification.markdown_blocks import write_between
+from gripper_force.types import FusedForce, ServoCommand
 
 SIMULATED = [row for row in ROWS if row.unit != "process"]
 SHORT = ["object=stapler", "sim.detail=coarse", "control.settle_s=0.4", "control.hold_s=0.4", "seed=5"]
@@ -68,6 +74,74 @@ def test_an_unexpected_reaction_is_reported(
     assert faults._run_with_fault(tree, fault_free, too_slow)["failure"].startswith("the reaction took")
 
 
+@pytest.mark.parametrize(
+    ("trial", "failure"),
+    [
+        (KillTrial(tripped_ms=41.0, peak_n=1.0, lost_ms=90.0), ""),
+        (KillTrial(tripped_ms=None, peak_n=1.0, lost_ms=90.0), "the watchdog did not trip"),
+        (KillTrial(tripped_ms=900.0, peak_n=1.0, lost_ms=90.0), "the watchdog took 900 ms"),
+        (KillTrial(tripped_ms=41.0, peak_n=99.0, lost_ms=90.0), "over the limit"),
+        (KillTrial(tripped_ms=41.0, peak_n=1.0, lost_ms=300.0), "the log lacks the last 300 ms"),
+    ],
+)
+def test_a_killed_process_is_judged_by_time_force_and_log(
+    trial: KillTrial, failure: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(faults, "kill_trial", lambda *_: trial)
+    (row,) = [row for row in ROWS if row.name == "process killed"]
+    found = faults._run_process_row(FAST.model_dump(mode="json"), row)["failure"]
+    assert found == failure if not failure else failure in found
+
+
+def test_a_failure_in_real_time_counts() -> None:
+    (row,) = [row for row in ROWS if row.name == "bus: adapter unplugged"]
+
+    def outcome(failure: str) -> faults.Outcome:
+        return {
+            "seed": 3,
+            "result": "held",
+            "peak_over_limit": -0.1,
+            "took_ms": 1.0,
+            "lost_records": 0,
+            "failure": failure,
+        }
+
+    summary = faults._summary(row, [outcome("")], [outcome("the grasp was not stopped: held")])
+    assert (summary["ok"], summary["live_ok"]) == (1, 0)
+    assert summary["failures"] == {"3 in real time": "the grasp was not stopped: held"}
+    assert "| 1 of 1, 0 of 1 |" in markdown([summary])
+
+
+@dataclass
+class Commanded:
+    """The forces and goal currents of a run."""
+
+    forces_n: list[float]
+    currents_a: list[float]
+
+    def records(self, kind: type) -> list[object]:
+        if kind is FusedForce:
+            return [SimpleNamespace(t_ns=i * 5_000_000, force_n=f) for i, f in enumerate(self.forces_n)]
+        return [ServoCommand(i * 5_000_000, 0.0, a) for i, a in enumerate(self.currents_a)]
+
+
+@pytest.mark.parametrize(
+    ("forces_n", "currents_a", "result"),
+    [
+        ([1, 6, 6, 6], [1, 1, 0.5, 0.4], (5.0, "")),
+        ([1, 6, 6, 6], [1, 1, 1, 1], (None, "the goal current was not lowered")),
+        ([1, 6, 1, 1], [1, 1, 1, 1], (None, "")),
+        ([1, 1, 1, 1], [1, 1, 1, 1], (None, "")),
+    ],
+    ids=["lowered", "never lowered", "fell by itself", "never over"],
+)
+def test_a_current_that_is_not_lowered_is_found(
+    forces_n: list[float], currents_a: list[float], result: tuple[float | None, str]
+) -> None:
+    run: Any = Commanded(forces_n, currents_a)
+    assert judge_module._judge_lowering(run, 5.0) == result
+
+
 @pytest.fixture(scope="module")
 def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("matrix") / "faults.jsonl"
@@ -106,7 +180,10 @@ def test_the_matrix_summarises_each_row(matrix: list[faults.RowSummary]) -> None
 
 def test_markdown_has_a_line_per_row(matrix: list[faults.RowSummary]) -> None:
     text = markdown(matrix)
-    assert text.count("| bus: adapter unplugged | stop, latched | 20 ms | 1 of 1 | DeviceLostError 1 |") == 1
+    assert (
+        text.count("| bus: adapter unplugged | stop, latched | 20 ms | 1 of 1, 1 of 1 | DeviceLostError 1 |")
+        == 1
+    )
 
 
 def test_the_shipped_page_shows_every_row(tmp_path: Path) -> None:
