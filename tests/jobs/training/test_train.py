@@ -120,7 +120,7 @@ def test_resumed_training_gives_the_same_result(
     assert broken.read_bytes() == whole.read_bytes()
     assert not list(tmp_path.glob("*.state"))
     losses = drawn.call_args.args[0]
-    assert set(losses) == {"ssam", "scam"}
+    assert set(losses) == {"1, ssam", "2, scam"}
     assert losses["ssam"][0, 0] == 0, "the error before the interruption is drawn, too"
     assert whole.with_suffix(".png").is_file()
 
