@@ -1,6 +1,7 @@
 """The examples of the library, run as a user runs them: in lockstep, and in real time behind a pseudo-terminal."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -137,3 +138,10 @@ def test_lower_force_prints_a_row_per_object_and_feedback() -> None:
     assert len(shown) == 3
     assert shown[2].startswith("| current | tube | 1 of 1 |")
     assert shown[2].endswith("| 0 |")
+
+
+def test_lost_object_prints_the_time_to_slip() -> None:
+    arguments = ["--feedback", "current", "--object", "tube", "--target-n", "3", "--seeds", "1"]
+    shown = run_beside_examples(EXAMPLES / "lost_object.py", *arguments).stdout.splitlines()
+    assert len(shown) == 3
+    assert re.fullmatch(r"\| current \| 3 N \| 1 of 1 \| (\d+), \1 \| [01] \| 0 \|", shown[2])
