@@ -121,7 +121,7 @@ def test_resumed_training_gives_the_same_result(
     assert not list(tmp_path.glob("*.state"))
     losses = drawn.call_args.args[0]
     assert set(losses) == {"1, ssam", "2, scam"}
-    assert losses["ssam"][0, 0] == 0, "the error before the interruption is drawn, too"
+    assert losses["1, ssam"][0, 0] == 0, "the error before the interruption is drawn, too"
     assert whole.with_suffix(".png").is_file()
 
 
