@@ -319,7 +319,10 @@ currents = st.floats(-0.8, 0.8)
 @st.composite
 def states(draw: st.DrawFn) -> tuple[ServoState, ServoState]:
     """Servo states of fingers that do not differ too much."""
-    first_rad, apart_rad = draw(angles), draw(st.floats(-0.25, 0.25))
+    first_rad, apart_rad = (
+        draw(angles),
+        draw(st.floats(-0.2499, 0.2499)),
+    )  # 0.25 is the bound, and angles are rounded
     common = {"t_ns": 0, "hardware_error": 0}
     return tuple(  # type: ignore[return-value]
         ServoState(
