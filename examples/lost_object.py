@@ -26,9 +26,8 @@ def time_to_slip_ms(keys: dict[str, object], target_n: float) -> float | None:
     with gf.open_gripper(overrides=overrides) as gripper:
         if gripper.grasp(target_n).outcome != "held":
             return None
-        while (
-            now_s := gripper.state.t_ns / 1e9
-        ) < LOST_S + MOST_S:  # in lockstep, the clock begins with the run
+        # In lockstep, the clock begins with the run.
+        while (now_s := gripper.state.t_ns / 1e9) < LOST_S + MOST_S:
             if gripper.state.outcome == "slip":
                 return 1e3 * (now_s - LOST_S) if now_s >= LOST_S else None
             gripper.step()

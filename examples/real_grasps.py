@@ -19,7 +19,6 @@ Each result is written to OUT/results.json at once; the same command continues a
 
 import argparse
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -35,7 +34,7 @@ from gripper_calibration.fits.touches import Touches
 from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import Clip, load_clips, without_contact_starts
 from gripper_force.jobs.evaluate import compare, estimates, ridge_baseline
-from gripper_force.jobs.imports.video import import_folder
+from gripper_force.jobs.imports.video import find_recordings, import_video
 from gripper_force.jobs.training import few
 from gripper_force.jobs.training.recipe import TrainConfig, recipe
 from gripper_force.jobs.training.train import train
@@ -171,7 +170,9 @@ def main() -> None:
     results = json.loads(path.read_text()) if path.exists() else {}
     done = {}
     for name, (training, test) in track(parts.items(), "left out", console=Console(stderr=True)):
-        key = f"{options.test or options.by}, {name}, network {options.minutes}"
+        key = (
+            f"{options.recordings.resolve()}, {options.test or options.by}, {name}, network {options.minutes}"
+        )
         if key not in results:
             results[key] = run(training, test, options.minutes, options.out)
             path.write_text(json.dumps(results, indent=1))
@@ -191,12 +192,12 @@ def main() -> None:
 
 
 def _read(folder: Path, out: Path, jobs: int) -> list[Clip]:
-    source = out / "folder.txt"  # a complete import of this folder
-    if not source.exists() or source.read_text() != str(folder.resolve()):
-        shutil.rmtree(out, ignore_errors=True)
-        import_folder(folder, out)
-        source.write_text(str(folder.resolve()))
-    clips = load_clips(sorted(out.glob("*.mcap")), PREPROCESS, workers=jobs)
+    paths = []
+    for name, video, forces in find_recordings(folder):
+        paths.append(out / f"{name}.mcap")
+        if not paths[-1].exists():
+            import_video(video, forces, paths[-1], name=name)
+    clips = load_clips(paths, PREPROCESS, workers=jobs)
     used = without_contact_starts(clips, PREPROCESS)
     print(f"{folder}: {len(used)} of {len(clips)} recordings are used; the others start in contact")
     return used

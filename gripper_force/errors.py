@@ -68,9 +68,7 @@ class UnfamiliarFrameError(DataError):
     """
 
     def __init__(self, message: str, force_n: float = math.nan) -> None:
-        super().__init__(
-            message
-        )  # a worker's error is unpickled with the message alone, then gets its attributes
+        super().__init__(message)  # a worker's error is made again from its message, then gets its attributes
         self.force_n = force_n
 
 

@@ -96,6 +96,12 @@ def test_a_figure_of_an_unknown_kind_is_refused_before_the_work(tmp_path: Path) 
         evaluate(logs, "small", plot=tmp_path / "e.foo")
 
 
+def test_an_objects_name_is_no_formula(tmp_path: Path) -> None:
+    force_n = np.linspace(0, 5, 50)
+    draw_estimates(force_n, force_n, np.full(50, "a$_$b"), "a title of a$_$b", tmp_path / "names.png")
+    assert colours(tmp_path / "names.png") > 100
+
+
 def test_figure_that_cannot_be_written_raises(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(DataError, match="can't write the figure"):

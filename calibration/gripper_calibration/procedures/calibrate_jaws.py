@@ -204,6 +204,20 @@ def _torque_on(config: Config, devices: Devices, progress: Progress) -> Iterator
         yield _EmptyJaws(config, BusCycles(config, devices, state, raise_if_interrupted), progress)
 
 
+class _Standstill:
+    """Tells whether the jaws have stood still for `_STILL_S`."""
+
+    def __init__(self, position_rad: float) -> None:
+        self._still_rad, self._cycles = position_rad, 0
+
+    def lasts(self, position_rad: float) -> bool:
+        """Takes the position of each cycle."""
+        self._cycles += 1
+        if abs(position_rad - self._still_rad) > _STILL_RAD:
+            self._still_rad, self._cycles = position_rad, 0
+        return self._cycles > _STILL_S * RATE_HZ
+
+
 class _EmptyJaws:
     """Moves jaws whose ends are unknown. Directions are those of the servo's angle."""
 
@@ -271,13 +285,10 @@ class _EmptyJaws:
                 )
 
     def _run_to_standstill(self, side: int) -> None:
-        begin_rad = still_rad = self.state.position_rad
-        cycles = 0
-        while cycles < _STILL_S * RATE_HZ:
+        begin_rad = self.state.position_rad
+        still = _Standstill(begin_rad)
+        while not still.lasts(self.state.position_rad):
             self.cycle(side, self._end_a)
-            cycles += 1
-            if abs(self.state.position_rad - still_rad) > _STILL_RAD:
-                still_rad, cycles = self.state.position_rad, 0
             if abs(self.state.position_rad - begin_rad) > _MOST_TRAVEL_RAD:
                 raise DataError(
                     f"the horn turned by {_MOST_TRAVEL_RAD:.0f} rad without an end; check that it is screwed to the "
@@ -299,16 +310,13 @@ class _EmptyJaws:
         """Moves until a goal is passed, from either side, and at last towards ``side``."""
         self._progress("measuring friction", 0)
         for way in (-side, side):
-            still_rad, cycles = self.state.position_rad, 0
+            still = _Standstill(self.state.position_rad)
             while way * (goal_rad + way * 0.05 - self.state.position_rad) > 0:
                 self.cycle(way, self._end_a)
-                cycles += 1
-                if abs(self.state.position_rad - still_rad) > _STILL_RAD:
-                    still_rad, cycles = self.state.position_rad, 0
-                elif cycles > _STILL_S * RATE_HZ:
+                if still.lasts(self.state.position_rad):
                     raise DataError(
-                        f"the jaws stopped at {still_rad:.2f} rad, although they moved there before; check that "
-                        "nothing blocks them"
+                        f"the jaws stopped at {self.state.position_rad:.2f} rad, although they moved there before; "
+                        "check that nothing blocks them"
                     )
 
     def _break_away(self, side: int) -> float:

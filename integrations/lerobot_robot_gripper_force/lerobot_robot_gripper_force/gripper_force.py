@@ -62,8 +62,8 @@ class GripperForce(Robot):
             ("gripper.force_n", "gripper.std_n", "gripper.width_m", "gripper.current_a"), float
         )
         if self.settings.camera.backend != "none":
-            camera = self.settings.camera
-            side_px = _SIMULATED_PX if camera.backend == "simulated" else camera.side_px
+            is_simulated = self.settings.camera.backend == "simulated"
+            side_px = _SIMULATED_PX if is_simulated else self.settings.camera.side_px
             features["gripper.frame"] = (side_px, side_px, 3)
         for name, camera in self.cameras.items():
             features[name] = (camera.height, camera.width, 3)
