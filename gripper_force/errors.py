@@ -64,7 +64,8 @@ class UnfamiliarFrameError(DataError):
     """A frame shows what a network does not know.
 
     Attributes:
-        force_n: The network's output for this frame: not the contact force, but it rises when a grip gets firmer.
+        force_n: The network's output for this frame: not the contact force, but it rises when a grip gets firmer. NaN
+            if the network has not run, because part of the view is covered, or the object that was there is gone.
     """
 
     def __init__(self, message: str, force_n: float = math.nan) -> None:

@@ -1,5 +1,7 @@
 """Check of a grip against the camera."""
 
+import math
+
 from gripper_force.config import ControlConfig
 from gripper_force.types import NS_PER_MS, NS_PER_S, VisualForce
 
@@ -21,17 +23,21 @@ class VisualCheck:
     Jaws may press on an end stop or be held by friction, which the motor current cannot tell from an object. The check
     also uses estimates that fusion does not: those of unfamiliar frames, and those that differ from the motor current.
     A grip makes them rise, too.
+
+    A frame whose estimate is NaN shows that the view is covered, or that the object is gone: an empty place lost its
+    detail, too. The motor current then has to prove the grip.
     """
 
     def __init__(self, config: ControlConfig) -> None:
         self._config = config
         self._force_n: float | None = None
         self._t_ns, self._before_n = 0, 0.0
+        self._is_covered = False
         self._has_seen = self._has_unsure = False
 
     def start(self) -> None:
         """Starts at the beginning of a grip."""
-        self._has_seen = self._has_unsure = False
+        self._has_seen = self._has_unsure = self._is_covered = False
         self._before_n = max(self._force_n or 0.0, 0.0)
 
     def settle(self, friction_n: float) -> None:
@@ -54,12 +60,16 @@ class VisualCheck:
             self._force_n = None
         if visual is None or visual.t_ns <= self._t_ns or self._config.feedback == "current":
             return
+        if math.isnan(visual.force_n) and not visual.is_familiar:
+            self._is_covered = self._has_seen  # a view that is covered all the time tells nothing
+            return
         # A comparison with NaN is false.
         is_sure = not visual.is_familiar or 0 <= visual.std_n <= self._config.vision_std_n
         if not (abs(visual.force_n) <= 1e9 and is_sure):
             self._has_unsure |= gripping
             return
         self._has_seen |= gripping
+        self._is_covered = False
         dt_s = (visual.t_ns - self._t_ns) / NS_PER_S
         before_n = visual.force_n if self._force_n is None else self._force_n
         self._force_n = before_n + (visual.force_n - before_n) * dt_s / (dt_s + _FILTER_S)
@@ -69,15 +79,18 @@ class VisualCheck:
         """Returns the observation that speaks against a grip, or an empty text.
 
         It sees next to no rise of the force, has been too uncertain throughout this grip, or sees far more than the
-        target while friction may hold the jaws: a network can give any force for an empty scene.
+        target while friction may hold the jaws: a network can give any force for an empty scene. Or friction may hold the
+        jaws, and the view was covered after the camera had seen this grip.
 
         Args:
             target_n: Target force.
             current_n: Motor force beyond friction.
         """
+        by_friction = current_n < _PROVEN_SHARE * target_n
+        if by_friction and self._is_covered:
+            return "the object is gone or the camera is covered"
         if self._force_n is None:
             return "the camera is uncertain" if self._has_unsure and not self._has_seen else ""
-        by_friction = current_n < _PROVEN_SHARE * target_n
         beyond_n = max(_BEYOND_SHARE * target_n, _BEYOND_N)
         has_risen = self._force_n - self._before_n >= _RISE_SHARE * target_n
         if has_risen and not (by_friction and self._force_n - target_n > beyond_n):

@@ -128,7 +128,7 @@ class ForceEstimator:
         Raises:
             DataError: The frame is not a gray image of bytes, or is implausible (see `FrameChecks`).
             UnfamiliarFrameError: The frame's out-of-distribution score exceeds the limit of the object profile or
-                of the checkpoint.
+                of the checkpoint, or part of the view is covered (see `FrameChecks`).
             ConfigError: The region of interest reaches beyond the frame.
             NonFiniteError: A network returned NaN or infinity.
         """
@@ -139,6 +139,7 @@ class ForceEstimator:
 
     def prepare(self, gray: Gray) -> list[Floats]:
         """Checks the next frame, and returns the network's inputs that are ready: the first half of `update`."""
+        self._attention = None  # a frame that is rejected has none
         self._frame_checks.check(small := downscale(gray, self._region, self._preprocess.size))
         return self._normaliser.push(small)
 

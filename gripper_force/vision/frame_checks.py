@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from gripper_force.errors import DataError
+from gripper_force.errors import DataError, UnfamiliarFrameError
 from gripper_force.types import Gray
 from gripper_force.vision.preprocess import FLAT_STD
 
@@ -68,6 +68,8 @@ class FrameChecks:
 
         Raises:
             DataError: The frame is flat, or differs from the first frame by more than a grasp explains.
+            UnfamiliarFrameError: Part of the image lost its fine detail: something covers the view, or the object that
+                was there is gone. Its force is NaN.
         """
         pixels = small.astype(np.float32)
         contrast = float(pixels.std())
@@ -94,12 +96,15 @@ class FrameChecks:
                     f"the image's {name} changed from {first:.3g} to {now:.3g} since the first frame; check "
                     "the camera and the light"
                 )
-        for change, most, cause in self.changes(pixels) if len(pixels) >= _LEAST_PX else ():
-            if change > most:
-                raise DataError(f"{cause} since the first frame; check the camera, its lens and the light")
+        changes = self.changes(pixels) if len(pixels) >= _LEAST_PX else {}
+        exceeded = {name: cause for name, (change, most, cause) in changes.items() if change > most}
+        if exceeded:
+            cause = next(iter(exceeded.values()))
+            problem = f"{cause} since the first frame; check the camera, its lens and the light"
+            raise UnfamiliarFrameError(problem) if "covered" in exceeded else DataError(problem)
 
-    def changes(self, pixels: Floats) -> list[tuple[float, float, str]]:
-        """Returns each measured change of a frame since the first one, its limit, and a clause that names it.
+    def changes(self, pixels: Floats) -> dict[str, tuple[float, float, str]]:
+        """Returns each measured change of a frame since the first one by name, its limit, and a clause that names it.
 
         Args:
             pixels: Cropped and resized frame, (S, S).
@@ -121,13 +126,17 @@ class FrameChecks:
         kept = ratio[_block_means(still.reshape(_SAMPLES, -1).astype(np.float32)) > 0.7]
         sharpness = float(np.median(kept)) if len(kept) else 1.0
         covered = float((ratio < 0.3).mean())
-        return [
-            (shift, SHIFT, f"the camera's view moved by {shift:.1%} of its side"),
-            (zoom, ZOOM, f"the camera's view was zoomed by {zoom:.1%}"),
-            (slope, SLOPE, f"the light changed by {slope:.0%} more at one side than in the middle"),
-            (1 - sharpness, 1 - SHARPNESS, f"the image lost {1 - sharpness:.0%} of its fine detail"),
-            (covered, COVERED, f"{covered:.0%} of the image lost its detail, as if it was covered,"),
-        ]
+        return {
+            "shift": (shift, SHIFT, f"the camera's view moved by {shift:.1%} of its side"),
+            "zoom": (zoom, ZOOM, f"the camera's view was zoomed by {zoom:.1%}"),
+            "slope": (slope, SLOPE, f"the light changed by {slope:.0%} more at one side than in the middle"),
+            "blur": (1 - sharpness, 1 - SHARPNESS, f"the image lost {1 - sharpness:.0%} of its fine detail"),
+            "covered": (
+                covered,
+                COVERED,
+                f"{covered:.0%} of the image lost its detail, as if it was covered,",
+            ),
+        }
 
     def _begin(self, pixels: Floats) -> None:
         """Prepares the comparison with the first frame."""

@@ -64,6 +64,49 @@ def test_a_camera_that_has_stopped_objects_to_nothing():
     assert not check.objection(4.0, 4.0)
 
 
+def covered(check, t_ns, cycles=3):
+    """Adds covered frames in the grip, and returns the present time."""
+    for _ in range(cycles):
+        t_ns += FRAME_NS
+        check.add(t_ns, visual(t_ns, math.nan, math.inf), gripping=True)
+    return t_ns
+
+
+def test_once_the_view_is_covered_the_motor_current_has_to_prove_the_grip():
+    check, t_ns = seen(4.0)
+    t_ns = covered(check, t_ns, 1)
+    assert check.objection(4.0, 1.9) == "the object is gone or the camera is covered"
+    assert not check.objection(4.0, 2.0)
+    covered(check, t_ns, 100)  # longer than an estimate is valid
+    assert "covered" in check.objection(4.0, 1.9)
+    assert not check.objection(4.0, 2.0)
+
+
+def test_a_view_that_is_clear_again_counts_again():
+    check, t_ns = seen(4.0)
+    t_ns = covered(check, t_ns) + FRAME_NS
+    check.add(t_ns, visual(t_ns, 4.0), gripping=True)
+    assert not check.objection(4.0, 1.9)
+
+
+@pytest.mark.parametrize("before", ["covered before", "covered in the grip before"])
+def test_a_view_that_was_covered_before_the_grip_objects_to_nothing(before):
+    check = VisualCheck(CONFIG)
+    t_ns = 0
+    if before == "covered in the grip before":
+        check, t_ns = seen(4.0)
+    t_ns = covered(check, t_ns)
+    check.start()
+    covered(check, t_ns, 100)
+    assert not check.objection(4.0, 1.9)
+
+
+def test_by_motor_current_alone_a_covered_view_is_no_objection():
+    check, t_ns = seen(4.0, config=CONFIG.model_copy(update={"feedback": "current"}))
+    covered(check, t_ns)
+    assert not check.objection(4.0, 0.0)
+
+
 def test_by_motor_current_alone_the_camera_has_no_say():
     check, _ = seen(0.0, config=CONFIG.model_copy(update={"feedback": "current"}))
     assert not check.objection(4.0, 4.0)

@@ -35,6 +35,7 @@ from gripper_force.types import (
     NS_PER_MS,
     NS_PER_S,
     Frame,
+    Gray,
     FusedForce,
     GraspStatus,
     LoadCellSample,
@@ -307,13 +308,29 @@ def test_frames_that_a_network_does_not_know_are_the_same_in_batches(fused_log: 
         tmp_path / "dark.mcap",
         lambda r: dataclasses.replace(r, gray=r.gray // 4) if isinstance(r, Frame) and r.seq == 40 else r,
     )
-    reader = LogReader(dark)
+    covered = tampered(
+        dark,
+        tmp_path / "covered.mcap",
+        lambda r: (
+            dataclasses.replace(r, gray=half_covered(r.gray))
+            if isinstance(r, Frame) and r.seq in (30, 45)
+            else r
+        ),
+    )
+    reader = LogReader(covered)
     run = resolve_replay(changed_config(reader, str(strict)))
     single, batch = run_again(reader, run).visual, run_again(reader, run, in_batches=True).visual
     assert {v.is_familiar for v in single} == {True, False}
     assert 40 not in {v.seq for v in single}
+    assert [v.seq for v in single if np.isnan(v.force_n)] == [30, 45]
     assert [(v.seq, v.is_familiar) for v in batch] == [(v.seq, v.is_familiar) for v in single]
-    assert [v.force_n for v in batch] == pytest.approx([v.force_n for v in single], abs=1e-4)
+    assert [v.force_n for v in batch] == pytest.approx([v.force_n for v in single], abs=1e-4, nan_ok=True)
+
+
+def half_covered(gray: Gray) -> Gray:
+    covered = gray.copy()
+    covered[:, : gray.shape[1] // 2] = round(float(gray.mean()))
+    return covered
 
 
 def test_the_columns_hold_each_estimate(fused_log: Path) -> None:

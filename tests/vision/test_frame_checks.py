@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gripper_force.config import load_config
-from gripper_force.errors import DataError
+from gripper_force.errors import DataError, UnfamiliarFrameError
 from gripper_force.jobs.simulate import plan, simulate
 from gripper_force.qualification import recognition
 from gripper_force.runtime.log_reader import LogReader
@@ -95,5 +95,16 @@ def test_disturbed_frames_of_a_press_are_refused(
         check(checks, frame)
     disturbed = change(press[10::5], np.random.default_rng(0))
     for frame in disturbed:
-        with pytest.raises(DataError, match=remark):
+        with pytest.raises(DataError, match=remark) as caught:
             check(checks, frame)
+        assert not isinstance(caught.value, UnfamiliarFrameError)
+
+
+def test_a_covered_view_is_told_from_other_disturbances(press: Gray) -> None:
+    checks = FrameChecks()
+    check(checks, press[0])
+    for frame in recognition.blob(press[10::5], np.random.default_rng(0)):
+        with pytest.raises(UnfamiliarFrameError, match="lost its detail, as if it was covered") as caught:
+            check(checks, frame)
+        assert np.isnan(caught.value.force_n)
+    check(checks, press[10])

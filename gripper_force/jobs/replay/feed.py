@@ -292,7 +292,7 @@ def _in_batches(
         known = done + len(features)
         while waiting and waiting[0][2] <= known:
             record, visual, count = waiting.popleft()
-            if visual is not None:
+            if visual is not None and visual.is_familiar:  # the network has not run on covered frames
                 try:
                     last = count - 1 - done
                     estimate = estimator.finish(Step(forces_n[:, last], features[last], None))
