@@ -65,7 +65,7 @@ class UnfamiliarFrameError(DataError):
 
     Attributes:
         force_n: The network's output for this frame: not the contact force, but it rises when a grip gets firmer. NaN
-            if the network has not run, because part of the view is covered, or the object that was there is gone.
+            if the network has not run, because the view is covered or blurred, or the object is gone.
     """
 
     def __init__(self, message: str, force_n: float = math.nan) -> None:

@@ -173,7 +173,7 @@ class VisualForce:
         t_ns: Capture time of the frame.
         ready_ns: Host time at which the estimate became available.
         seq: Number of the frame.
-        force_n: Estimated contact force; NaN if part of the view is covered, or the object that was there is gone.
+        force_n: Estimated contact force; NaN if the view is covered or blurred, or the object is gone.
         std_n: Standard deviation claimed by the estimator; infinite if the frame shows what it does not know.
         compute_ms: Computing time of the estimator.
     """

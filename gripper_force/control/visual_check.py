@@ -24,8 +24,8 @@ class VisualCheck:
     also uses estimates that fusion does not: those of unfamiliar frames, and those that differ from the motor current.
     A grip makes them rise, too.
 
-    A frame whose estimate is NaN shows that the view is covered, or that the object is gone: an empty place lost its
-    detail, too. The motor current then has to prove the grip.
+    A frame whose estimate is NaN shows that the view is covered or blurred, or that the object is gone: an empty place
+    lost its detail, too. The motor current then has to prove the grip.
     """
 
     def __init__(self, config: ControlConfig) -> None:
@@ -79,8 +79,8 @@ class VisualCheck:
         """Returns the observation that speaks against a grip, or an empty text.
 
         It sees next to no rise of the force, has been too uncertain throughout this grip, or sees far more than the
-        target while friction may hold the jaws: a network can give any force for an empty scene. Or friction may hold the
-        jaws, and the view was covered after the camera had seen this grip.
+        target while friction may hold the jaws: a network can give any force for an empty scene. Or the view was covered
+        after the camera had seen this grip, while friction may hold the jaws.
 
         Args:
             target_n: Target force.
@@ -88,7 +88,7 @@ class VisualCheck:
         """
         by_friction = current_n < _PROVEN_SHARE * target_n
         if by_friction and self._is_covered:
-            return "the object is gone or the camera is covered"
+            return "the object is gone, or the view is covered or blurred"
         if self._force_n is None:
             return "the camera is uncertain" if self._has_unsure and not self._has_seen else ""
         beyond_n = max(_BEYOND_SHARE * target_n, _BEYOND_N)

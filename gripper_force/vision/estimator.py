@@ -128,7 +128,7 @@ class ForceEstimator:
         Raises:
             DataError: The frame is not a gray image of bytes, or is implausible (see `FrameChecks`).
             UnfamiliarFrameError: The frame's out-of-distribution score exceeds the limit of the object profile or
-                of the checkpoint, or part of the view is covered (see `FrameChecks`).
+                of the checkpoint, or the view is covered or blurred (see `FrameChecks`).
             ConfigError: The region of interest reaches beyond the frame.
             NonFiniteError: A network returned NaN or infinity.
         """

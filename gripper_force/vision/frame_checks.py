@@ -68,8 +68,8 @@ class FrameChecks:
 
         Raises:
             DataError: The frame is flat, or differs from the first frame by more than a grasp explains.
-            UnfamiliarFrameError: Part of the image lost its fine detail: something covers the view, or the object that
-                was there is gone. Its force is NaN.
+            UnfamiliarFrameError: Part of the image lost its fine detail: something covers or blurs the view, or the
+                object that was there is gone. Its force is NaN.
         """
         pixels = small.astype(np.float32)
         contrast = float(pixels.std())

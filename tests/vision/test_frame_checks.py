@@ -97,10 +97,11 @@ def test_disturbed_frames_of_a_press_are_refused(
     for frame in disturbed:
         with pytest.raises(DataError, match=remark) as caught:
             check(checks, frame)
-        assert not isinstance(caught.value, UnfamiliarFrameError)
+        if change is not recognition.refocus:  # a strong blur covers
+            assert not isinstance(caught.value, UnfamiliarFrameError)
 
 
-def test_a_covered_view_is_told_from_other_disturbances(press: Gray) -> None:
+def test_a_covered_view_is_an_unfamiliar_frame(press: Gray) -> None:
     checks = FrameChecks()
     check(checks, press[0])
     for frame in recognition.blob(press[10::5], np.random.default_rng(0)):
