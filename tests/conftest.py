@@ -28,8 +28,10 @@ for _number, _handler in (
     if signal.getsignal(_number) is signal.SIG_IGN:
         signal.signal(_number, _handler)
 
-# A machine may be busy: how long an example takes says nothing about what it tests.
-settings.register_profile("unhurried", deadline=None)
+# A machine may be busy: how long an example takes says nothing about what it tests. The same commit has the same result:
+# `pytest --hypothesis-profile=search` draws new examples.
+settings.register_profile("search", deadline=None)
+settings.register_profile("unhurried", deadline=None, derandomize=True)
 settings.load_profile("unhurried")
 
 

@@ -79,8 +79,8 @@ class VisualCheck:
         """Returns the observation that speaks against a grip, or an empty text.
 
         It sees next to no rise of the force, has been too uncertain throughout this grip, or sees far more than the
-        target while friction may hold the jaws: a network can give any force for an empty scene. Or the view was covered
-        after the camera had seen this grip, while friction may hold the jaws.
+        target while friction may hold the jaws: a network can give any force for an empty scene. Or the view was
+        covered after the camera had seen this grip, while friction may hold the jaws.
 
         Args:
             target_n: Target force.
