@@ -85,7 +85,9 @@ class FrameProcessor:
         self._works = True
         ready_ns = frame.received_ns if now_ns is None else now_ns()
         visual = VisualForce(frame.t_ns, ready_ns, frame.seq, result.force_n, result.std_n, compute_ms)
-        return ProcessedFrame(frame, visual, problem, _attention(frame, ready_ns, self._estimator))
+        # The network has not run on a covered view.
+        attention = None if math.isnan(result.force_n) else _attention(frame, ready_ns, self._estimator)
+        return ProcessedFrame(frame, visual, problem, attention)
 
 
 def _attention(frame: Frame, ready_ns: int, estimator: Estimator) -> AttentionMap | None:

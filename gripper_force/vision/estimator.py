@@ -139,7 +139,6 @@ class ForceEstimator:
 
     def prepare(self, gray: Gray) -> list[Floats]:
         """Checks the next frame, and returns the network's inputs that are ready: the first half of `update`."""
-        self._attention = None  # a frame that is rejected has none
         self._frame_checks.check(small := downscale(gray, self._region, self._preprocess.size))
         return self._normaliser.push(small)
 

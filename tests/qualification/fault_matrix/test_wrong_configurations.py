@@ -125,7 +125,7 @@ def test_draws_cover_the_range_with_every_object(case: WrongCase) -> None:
     trees = [draw(config, case, index)[0] for index in range(20)]
     assert trees == [draw(config, case, index)[0] for index in range(20)]
     configs = [config_from(tree, "test") for tree in trees]
-    assert len({c.target_n for c in configs}) == 20
+    assert len({c.target_n for c in configs}) == (3 if "light hold" in case.name else 20)
     assert {c.uses_vision for c in configs} == {"fused": {True}, "current": {False}}.get(
         case.feedback, {True, False}
     )
