@@ -32,7 +32,7 @@ class VisualCheck:
         self._config = config
         self._force_n: float | None = None
         self._t_ns, self._before_n = 0, 0.0
-        self._is_covered = False
+        self._is_covered, self._covered_ns = False, 0
         self._has_seen = self._has_unsure = False
 
     def start(self) -> None:
@@ -56,20 +56,23 @@ class VisualCheck:
             visual: Newest visual estimate, or None. A repeated one is used once.
             gripping: True between contact and release.
         """
-        if t_ns - self._t_ns > (self._config.vision_gap_ms + self._config.max_frame_age_ms) * NS_PER_MS:
+        valid_ns = (self._config.vision_gap_ms + self._config.max_frame_age_ms) * NS_PER_MS
+        if t_ns - self._t_ns > valid_ns:
             self._force_n = None
+        self._is_covered = self._is_covered and t_ns - self._covered_ns <= valid_ns
         if visual is None or visual.t_ns <= self._t_ns or self._config.feedback == "current":
             return
         if math.isnan(visual.force_n) and not visual.is_familiar:
-            self._is_covered = self._has_seen  # a view that is covered all the time tells nothing
+            # A view that is covered all the time tells nothing.
+            self._is_covered, self._covered_ns = self._has_seen, visual.t_ns
             return
+        self._is_covered = False
         # A comparison with NaN is false.
         is_sure = not visual.is_familiar or 0 <= visual.std_n <= self._config.vision_std_n
         if not (abs(visual.force_n) <= 1e9 and is_sure):
             self._has_unsure |= gripping
             return
         self._has_seen |= gripping
-        self._is_covered = False
         dt_s = (visual.t_ns - self._t_ns) / NS_PER_S
         before_n = visual.force_n if self._force_n is None else self._force_n
         self._force_n = before_n + (visual.force_n - before_n) * dt_s / (dt_s + _FILTER_S)

@@ -89,6 +89,21 @@ def test_a_view_that_is_clear_again_counts_again():
     assert not check.objection(4.0, 1.9)
 
 
+def test_a_camera_that_stops_after_a_covered_frame_objects_to_nothing():
+    check, t_ns = seen(4.0)
+    check.add(t_ns + 1, visual(t_ns + 1, math.nan, math.inf), gripping=True)
+    assert check.objection(4.0, 1.9)
+    check.add(t_ns + 1000 * NS_PER_MS, None, gripping=True)
+    assert not check.objection(4.0, 1.9)
+
+
+def test_a_clear_view_with_an_uncertain_estimate_is_not_covered():
+    check, t_ns = seen(4.0)
+    t_ns = covered(check, t_ns) + FRAME_NS
+    check.add(t_ns, visual(t_ns, 4.0, 2 * CONFIG.vision_std_n), gripping=True)
+    assert not check.objection(4.0, 1.9)
+
+
 @pytest.mark.parametrize("before", ["covered before", "covered in the grip before"])
 def test_a_view_that_was_covered_before_the_grip_objects_to_nothing(before):
     check = VisualCheck(CONFIG)

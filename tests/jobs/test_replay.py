@@ -327,6 +327,25 @@ def test_frames_that_a_network_does_not_know_are_the_same_in_batches(fused_log: 
     assert [v.force_n for v in batch] == pytest.approx([v.force_n for v in single], abs=1e-4, nan_ok=True)
 
 
+def test_the_replay_of_a_log_with_covered_frames_is_identical(fused_log: Path, tmp_path: Path) -> None:
+    def cover(record: Record) -> Record:
+        hidden = isinstance(record, Frame) and record.seq == 45
+        return dataclasses.replace(record, gray=half_covered(record.gray)) if hidden else record
+
+    covered = tampered(fused_log, tmp_path / "covered.mcap", cover)
+    run = resolve_replay(
+        changed_config(LogReader(covered), "small")
+    )  # the log's own network has small images
+    again = {v.seq: v for v in run_again(LogReader(covered), run).visual}
+    assert np.isnan(again[45].force_n)
+    logged = tampered(
+        covered,
+        tmp_path / "logged.mcap",
+        lambda r: again.get(r.seq) if isinstance(r, VisualForce) else r,
+    )
+    assert run_again(LogReader(logged), run).estimates_identical is True
+
+
 def half_covered(gray: Gray) -> Gray:
     covered = gray.copy()
     covered[:, : gray.shape[1] // 2] = round(float(gray.mean()))

@@ -149,7 +149,8 @@ def feed(reader: LogReader, run: ResolvedConfig, sink: Sink, *, in_batches: bool
     newest: VisualForce | None = None
     request: Request | None = None
     pending: dict[int, VisualForce] = {}
-    estimates = _Pairs(lambda v: (v.seq, v.force_n, v.std_n))
+    # NaN, of a covered view, does not equal itself.
+    estimates = _Pairs(lambda v: (v.seq, None if math.isnan(v.force_n) else v.force_n, v.std_n))
     commands = _Pairs(lambda c: c, lambda a, b: abs(a.goal_current_a - b.goal_current_a))
     fused = _Pairs(lambda f: f, lambda a, b: abs(a.force_n - b.force_n))
     status = _Pairs(lambda s: s)

@@ -158,7 +158,9 @@ def _judge_vision(row: FaultCase, run: Grasp, config: Config, at_ns: int) -> tup
     ]
     due_ns = max(at_ns, good[-1] + round(NS_PER_S / config.camera.rate_hz)) if good else at_ns
     if row.unit == "estimator" and row.kind == "garbage":
-        bad_ns = [v.ready_ns for v in run.records(VisualForce) if not math.isfinite(v.force_n)]
+        bad_ns = [
+            v.ready_ns for v in run.records(VisualForce) if v.is_familiar and not math.isfinite(v.force_n)
+        ]
         due_ns = min(bad_ns, default=at_ns)  # none if the frames were unfamiliar
     return max(_ms(alone[0] - due_ns), 0.0), "" if run.result in _FINISHED else run.result
 
