@@ -329,8 +329,9 @@ def test_frames_that_a_network_does_not_know_are_the_same_in_batches(fused_log: 
 
 def test_the_replay_of_a_log_with_covered_frames_is_identical(fused_log: Path, tmp_path: Path) -> None:
     def cover(record: Record) -> Record:
-        hidden = isinstance(record, Frame) and record.seq == 45
-        return dataclasses.replace(record, gray=half_covered(record.gray)) if hidden else record
+        if isinstance(record, Frame) and record.seq == 45:
+            return dataclasses.replace(record, gray=half_covered(record.gray))
+        return record
 
     covered = tampered(fused_log, tmp_path / "covered.mcap", cover)
     run = resolve_replay(
