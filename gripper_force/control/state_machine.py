@@ -603,8 +603,9 @@ class GraspController:
             reason = f"not held within {self.timeout_s:.3g} s"
             if objection := self._objection:
                 reason += (
-                    f": {objection}. The jaws may press on an end stop: check "
-                    "gripper.open_width_m with `calibrate jaws`. If there is an object, calibrate it, or set "
+                    f": {objection}. Look whether there is an object, in full view. "
+                    "The jaws may press on an end stop: check gripper.open_width_m with `calibrate jaws`. "
+                    "If there is an object, calibrate it, or set "
                     "control.feedback=current"
                 )
             elif self._limits.is_at_current_limit:

@@ -25,19 +25,20 @@ class VisualCheck:
     A grip makes them rise, too.
 
     A frame whose estimate is NaN shows that the view is covered or blurred, or that the object is gone: an empty place
-    lost its detail, too. The motor current then has to prove the grip.
+    lost its detail, too. If the camera has seen the grip before, the motor current then has to prove it.
     """
 
     def __init__(self, config: ControlConfig) -> None:
         self._config = config
         self._force_n: float | None = None
         self._t_ns, self._before_n = 0, 0.0
-        self._is_covered, self._covered_ns = False, 0
+        self._covered_ns: int | None = None
         self._has_seen = self._has_unsure = False
 
     def start(self) -> None:
         """Starts at the beginning of a grip."""
-        self._has_seen = self._has_unsure = self._is_covered = False
+        self._has_seen = self._has_unsure = False
+        self._covered_ns = None
         self._before_n = max(self._force_n or 0.0, 0.0)
 
     def settle(self, friction_n: float) -> None:
@@ -59,14 +60,15 @@ class VisualCheck:
         valid_ns = (self._config.vision_gap_ms + self._config.max_frame_age_ms) * NS_PER_MS
         if t_ns - self._t_ns > valid_ns:
             self._force_n = None
-        self._is_covered = self._is_covered and t_ns - self._covered_ns <= valid_ns
+        if self._covered_ns is not None and t_ns - self._covered_ns > valid_ns:
+            self._covered_ns = None
         if visual is None or visual.t_ns <= self._t_ns or self._config.feedback == "current":
             return
         if math.isnan(visual.force_n) and not visual.is_familiar:
             # A view that is covered all the time tells nothing.
-            self._is_covered, self._covered_ns = self._has_seen, visual.t_ns
+            self._covered_ns = visual.t_ns if self._has_seen else None
             return
-        self._is_covered = False
+        self._covered_ns = None
         # A comparison with NaN is false.
         is_sure = not visual.is_familiar or 0 <= visual.std_n <= self._config.vision_std_n
         if not (abs(visual.force_n) <= 1e9 and is_sure):
@@ -90,7 +92,7 @@ class VisualCheck:
             current_n: Motor force beyond friction.
         """
         by_friction = current_n < _PROVEN_SHARE * target_n
-        if by_friction and self._is_covered:
+        if by_friction and self._covered_ns is not None:
             return "the object is gone, or the view is covered or blurred"
         if self._force_n is None:
             return "the camera is uncertain" if self._has_unsure and not self._has_seen else ""

@@ -40,8 +40,9 @@ class FrameProcessor:
     """Runs the estimator on frames, and contains its errors.
 
     An error before the first estimate means that the run is set up wrongly; it is raised. A later error only
-    costs the estimate of its frame: the controller continues on motor current. The same holds for a frame
-    that equals the previous one bit for bit, because sensors have noise and a camera that hangs has none. If
+    costs the estimate of its frame: the controller continues on motor current. An unfamiliar frame keeps the
+    network's output, with an infinite claimed error; of a covered view it is NaN. A frame that equals the
+    previous one bit for bit gives no estimate, because sensors have noise and a camera that hangs has none. If
     all frames up to the first estimate are equal, as in a recording without noise, repeats are accepted.
     """
 

@@ -147,9 +147,7 @@ def test_lost_object_prints_the_time_to_slip() -> None:
     assert re.fullmatch(r"\| current \| 3 N \| 1 of 1 \| (\d+), \1 \| [01] \| 0 \|", shown[2])
 
 
-def test_the_loss_of_an_object_is_reported_although_friction_holds_the_jaws_and_the_frames_seem_covered() -> (
-    None
-):
+def test_a_loss_is_reported_although_friction_holds_the_jaws_and_the_view_seems_covered() -> None:
     arguments = ["--feedback", "fused", "--object", "paper_cup", "--target-n", "1", "--seeds", "1"]
     shown = run_beside_examples(EXAMPLES / "lost_object.py", *arguments).stdout.splitlines()
     assert re.fullmatch(r"\| fused \| 1 N \| 1 of 1 \| (\d+), \1 \| [01] \| 0 \|", shown[2])

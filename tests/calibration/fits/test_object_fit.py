@@ -159,6 +159,5 @@ def test_any_fit_is_refused_or_finite_and_monotone(
     assert 0 < fitted.interval.base_n < 100
     if fitted.after_n is not None:
         as_it_is_n = fitted.errors_n["the network as it is"]
-        assert (
-            fitted.after_n <= as_it_is_n + 3 * noise_n + 3 * max(1.0, gain) * scatter + 0.1
-        )  # touches that differ mislead it
+        # Touches that differ mislead it: by up to twice the scatter in 400 draws.
+        assert fitted.after_n <= as_it_is_n + 3 * noise_n + 3 * max(1.0, gain) * scatter + 0.1
