@@ -35,6 +35,9 @@ Floats = npt.NDArray[np.float64]
 _ANY_NET: Final = "plain"
 """All networks of a scale share their preprocessing; this one stands for them."""
 
+_GPU_BYTES: Final = 6 * 2**30
+"""Memory of a GPU that the training of one network takes besides the training sets, at full scale."""
+
 _MIN_SETS: Final = 6
 """Fewest test sets with which a signed-rank test can reach p < 0.05."""
 
@@ -157,7 +160,7 @@ def run(
         data: Folder with the protocol's logs, in ``train`` and ``test``.
         out: Folder for the networks. Those of the same recipe and data are not trained again, and interrupted
             trainings continue.
-        jobs: Processes; on the CPU each trains with one thread. A GPU trains one network after the other.
+        jobs: Processes; each trains one network, with one thread. On a GPU no more than its memory holds.
         end_s: Time of `time.monotonic` at which training is interrupted.
         progress: Called after each network, with its steps.
 
@@ -176,10 +179,14 @@ def run(
     for task in tasks:
         if task not in missing:
             progress(_text(task), task[0].steps)
-    if missing:
-        _train_all(missing, files, jobs, end_s, progress)
     preprocess = scales[0].recipe(_ANY_NET, 0).preprocess
     clips = _clips(files, "test", preprocess, jobs)
+    if missing:
+        if torch.cuda.is_available():
+            log_bytes = float(np.mean([clip.frames.nbytes for clip in clips]))
+            needed_bytes = _GPU_BYTES + len(_logs(data, "train")) * log_bytes
+            jobs = min(jobs, max(1, int(torch.cuda.mem_get_info()[0] / needed_bytes)))
+        _train_all(missing, files, jobs, end_s, progress)
     keep = [_labelled(clip, preprocess) for clip in clips]
     measured_n = np.concatenate([clip.forces_n[k] for clip, k in zip(clips, keep, strict=True)])
     counts = [int(k.sum()) for k in keep]
@@ -255,7 +262,7 @@ def _logs(data: Path, side: str) -> list[Path]:
 
 def _train_all(tasks: Sequence[_Task], files: _Files, jobs: int, end_s: float, progress: Progress) -> None:
     """Trains networks until all are done or time is up; one that is interrupted has saved its state."""
-    count = 1 if torch.cuda.is_available() else min(jobs, len(tasks))
+    count = min(jobs, len(tasks))
     reading = max(1, jobs // count)
     begin_s, left, done = time.monotonic(), sum(scale.steps for scale, *_ in tasks), 0
     with suppress(FutureTimeout), process_pool(count) as pool:
@@ -291,14 +298,14 @@ def _clips(files: _Files, side: str, preprocess: Preprocess, workers: int) -> li
 
 
 def _train(task: _Task, files: _Files, workers: int) -> None:
-    if not torch.cuda.is_available():
-        torch.set_num_threads(1)
+    torch.set_num_threads(1)
+    torch.backends.cudnn.benchmark = True  # all steps have one of two shapes
     scale, net, seed = task
     recipe = scale.recipe(net, seed)
     path = files.checkpoint(scale, net, seed)
     training, testing = (_clips(files, side, recipe.preprocess, workers) for side in ("train", "test"))
     checkpoint = load_checkpoint(str(path)) if path.exists() else None
-    checkpoint = checkpoint or train(recipe, training, path, resume=True)
+    checkpoint = checkpoint or train(recipe, training, path, resume=True, figure=False)
     forces_n = estimates(checkpoint, testing)
     labelled = [
         force_n[0, _labelled(clip, recipe.preprocess)]
