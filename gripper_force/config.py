@@ -173,7 +173,7 @@ class CameraConfig(Section):
         "simulated", description=f"simulated, oak, uvc, playback, none, {_BACKEND} (gripper_force.cameras)"
     )
     options: Tree = Field({}, description="keys of a third-party camera backend")
-    rate_hz: Positive = Field(60.0, description="requested frames per second")
+    rate_hz: float = Field(60.0, ge=0.1, le=1000, description="requested frames per second")
     path: Path | None = Field(None, description="playback: the log to play")
     speed: Literal["recorded", "full"] = Field("recorded", description="playback: speed")
     device: int | str | None = Field(
@@ -247,8 +247,11 @@ class LoadCellConfig(Section):
         description=f"simulated, playback, serial, phidget, none, {_BACKEND} (gripper_force.load_cells)",
     )
     options: Tree = Field({}, description="keys of a third-party load cell backend")
-    rate_hz: Positive = Field(
-        200.0, description="simulated, phidget (at most 122): samples per second; serial boards set their own"
+    rate_hz: float = Field(
+        200.0,
+        ge=0.1,
+        le=10_000,
+        description="simulated, phidget (at most 122): samples per second; serial boards set their own",
     )
     port: str | None = Field(None, description="serial: device path")
     baud_rate: int = Field(115_200, gt=0, description="serial: bits per second")
@@ -335,7 +338,7 @@ class ControlConfig(Section):
         "`gripper-force calibrate object` measures"
     )
 
-    rate_hz: Positive = Field(200.0, description="rate of the control loop")
+    rate_hz: float = Field(200.0, ge=0.1, le=1000, description="rate of the control loop")
     feedback: Literal["fused", "current", "vision"] = Field(
         "fused", description="feedback of the force loop: vision fused with motor current, or one of them"
     )
