@@ -141,7 +141,8 @@ def _errors(clips: list[Clip], forces_n: list[Floats]) -> dict[str, list[float]]
     return {name: [errors.mae_n, errors.contact_mae_n] for name, errors in per_object.items()}
 
 
-def _minutes(text: str) -> float:
+def positive_minutes(text: str) -> float:
+    """Parses the training time. Its name is part of the message for a text that is no number."""
     minutes = float(text)
     if not 0 < minutes < float("inf"):
         raise argparse.ArgumentTypeError(f"the time must be above 0, got {text}")
@@ -155,7 +156,7 @@ def main() -> None:
     parser.add_argument("--by", choices=("object", "day"), default="object")
     parser.add_argument("--test", type=Path, help="recordings to test on, instead of leaving some out")
     parser.add_argument(
-        "--minutes", type=_minutes, help="also train a network, for each part that is left out"
+        "--minutes", type=positive_minutes, help="also train a network, for each part that is left out"
     )
     parser.add_argument("--jobs", type=int, default=2, help="processes that read the logs")
     parser.add_argument("--out", type=Path, default=Path("data/real"))

@@ -36,7 +36,7 @@ _ANY_NET: Final = "plain"
 """All networks of a scale share their preprocessing; this one stands for them."""
 
 _GPU_BYTES: Final = 6 * 2**30
-"""Memory of a GPU that the training of one network takes besides the training sets, at full scale."""
+"""Memory of a GPU for one network besides its training sets, with room: about 2.5 GiB were seen at full scale."""
 
 _MIN_SETS: Final = 6
 """Fewest test sets with which a signed-rank test can reach p < 0.05."""
@@ -48,9 +48,9 @@ class Test:
 
     Attributes:
         scale: Size of the reproduction.
-        clips: Test sets.
+        clips: Logs of the test sets.
         measured_n: Load-cell forces, (N,).
-        set: Number of each frame's set, (N,).
+        clip: Index of each frame's log in ``clips``, (N,).
         object: Each frame's object, (N,).
         estimates_n: Estimates by network and seed, (N,) each; without the networks that are not trained yet.
     """
@@ -58,7 +58,7 @@ class Test:
     scale: Scale
     clips: Sequence[Clip]
     measured_n: Floats
-    set: npt.NDArray[np.int64]
+    clip: npt.NDArray[np.int64]
     object: npt.NDArray[np.str_]
     estimates_n: dict[tuple[str, int], Floats]
 
@@ -97,7 +97,8 @@ class Test:
     def mae_by_set_n(self, model: str, *others: str) -> Floats:
         """MAE of each test set, over its frames and all seeds that the model and the others have, (sets,)."""
         frame_n = self.absolute_n(model, *others).mean(0)
-        return np.array([frame_n[self.set == i].mean() for i in range(len(self.clips))])
+        sets = self.set_of_clip[self.clip]
+        return np.array([frame_n[sets == i].mean() for i in np.unique(sets)])
 
     def p_value(self, model: str, other: str) -> float:
         """Two-sided p-value of Wilcoxon's signed-rank test of the two models' MAE, paired by test set.
@@ -108,6 +109,15 @@ class Test:
         if len(a) < _MIN_SETS or (a == b).all():
             return float("nan")
         return float(stats.wilcoxon(a, b).pvalue)
+
+    @property
+    def set_of_clip(self) -> npt.NDArray[np.int64]:
+        """Number of each log's set, from 0, (clips,).
+
+        All light levels of a simulation are one set: they show the same touches, so they are not independent.
+        """
+        names = [f"{clip.object} {clip.set}" for clip in self.clips]
+        return np.unique(names, return_inverse=True)[1].astype(np.int64)
 
     @property
     def contact(self) -> npt.NDArray[np.bool_]:
@@ -183,9 +193,7 @@ def run(
     clips = _clips(files, "test", preprocess, jobs)
     if missing:
         if torch.cuda.is_available():
-            log_bytes = float(np.mean([clip.frames.nbytes for clip in clips]))
-            needed_bytes = _GPU_BYTES + len(_logs(data, "train")) * log_bytes
-            jobs = min(jobs, max(1, int(torch.cuda.mem_get_info()[0] / needed_bytes)))
+            jobs = min(jobs, _networks_in_gpu(clips, len(_logs(data, "train"))))
         _train_all(missing, files, jobs, end_s, progress)
     keep = [_labelled(clip, preprocess) for clip in clips]
     measured_n = np.concatenate([clip.forces_n[k] for clip, k in zip(clips, keep, strict=True)])
@@ -199,7 +207,7 @@ def run(
             scale=scale,
             clips=clips,
             measured_n=measured_n.astype(np.float64),
-            set=np.repeat(np.arange(len(clips)), counts),
+            clip=np.repeat(np.arange(len(clips)), counts),
             object=np.repeat([clip.object for clip in clips], counts),
             estimates_n=estimates_n[scale],
         )
@@ -260,6 +268,17 @@ def _logs(data: Path, side: str) -> list[Path]:
     raise DataError(f"no logs in {data / side}; simulate the paper's protocol or import its database first")
 
 
+def _networks_in_gpu(clips: Sequence[Clip], logs: int) -> int:
+    """Number of networks whose training the GPU's free memory holds, at least 1.
+
+    Args:
+        clips: Test sets, whose mean size stands for that of a training log.
+        logs: Number of training logs. Each process has a copy of them.
+    """
+    log_bytes = float(np.mean([clip.frames.nbytes for clip in clips]))
+    return max(1, int(torch.cuda.mem_get_info()[0] / (_GPU_BYTES + logs * log_bytes)))
+
+
 def _train_all(tasks: Sequence[_Task], files: _Files, jobs: int, end_s: float, progress: Progress) -> None:
     """Trains networks until all are done or time is up; one that is interrupted has saved its state."""
     count = min(jobs, len(tasks))
@@ -299,7 +318,6 @@ def _clips(files: _Files, side: str, preprocess: Preprocess, workers: int) -> li
 
 def _train(task: _Task, files: _Files, workers: int) -> None:
     torch.set_num_threads(1)
-    torch.backends.cudnn.benchmark = True  # all steps have one of two shapes
     scale, net, seed = task
     recipe = scale.recipe(net, seed)
     path = files.checkpoint(scale, net, seed)

@@ -65,7 +65,7 @@ def force_over_time(test: Test, models: Sequence[str], title: str) -> Figure:
         figure = Figure(figsize=(10, 6), layout="constrained")
         figure.suptitle(title, x=0.008, ha="left", fontsize=12, fontweight="bold")
         for axes, number in zip(figure.subplots(2, 2).flat, _one_of_each(test), strict=False):
-            frames = test.set == number
+            frames = test.clip == number
             axes.plot(test.measured_n[frames], color="#22262b", lw=1.6, ls=":", label="load cell")
             for model in models:
                 axes.plot(test.estimate_n(model, 0)[frames], color=_COLOURS[model], lw=1.0, label=model)

@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from gripper_force.errors import ConfigError
@@ -150,7 +151,7 @@ def markdown(result: PaperResult, scale_name: str, scale: Scale, pictures: str) 
         lines = [
             f"Made by `gripper-force reproduce --scale {scale_name} --instances {scale.instances}`:",
             f"{scale.size}x{scale.size} pixels, width {scale.width:g}.",
-            f"Tested on {len(test.clips)} sets: {len(test.measured_n)} frames, of which",
+            f"Tested on {len(np.unique(test.set_of_clip))} sets: {len(test.measured_n)} frames, of which",
             f"{100 * test.contact.mean():.0f} % in contact. MAE: mean ± s.d. over seeds. Ratio: MAE of the",
             "baseline over that of the model. p: Wilcoxon's signed-rank test against the baseline, paired by test set,",
             "of the errors averaged over the seeds.",

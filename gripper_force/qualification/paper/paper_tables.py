@@ -297,7 +297,9 @@ def _percent(baseline_n: float | None, mae_n: float | None) -> str:
 
 
 def _spread(values_n: np.ndarray) -> str:
-    return f"{values_n.mean():.3f} ± {values_n.std():.3f}"
+    """Text of the mean and the spread over seeds. One seed has no spread."""
+    mean = f"{values_n.mean():.3f}"
+    return mean if len(values_n) == 1 else f"{mean} ± {values_n.std():.3f}"
 
 
 def _p(value: float) -> str:

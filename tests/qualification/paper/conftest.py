@@ -62,7 +62,7 @@ def estimates() -> Estimates:
         scale=Scale(seeds=SEEDS),
         clips=clips,
         measured_n=measured_n,
-        set=np.repeat(np.arange(len(clips)), FRAMES),
+        clip=np.repeat(np.arange(len(clips)), FRAMES),
         object=np.repeat([clip.object for clip in clips], FRAMES),
         estimates_n={
             (net, seed): measured_n + (0.4 if net == "plain" else 0.2) + noise_n(len(measured_n))

@@ -190,3 +190,12 @@ def test_p_value_is_paired_by_test_set(estimates: Estimates) -> None:
 
 def test_models_share_networks() -> None:
     assert networks([BASELINE, TWO_PLAIN, PROPOSED]) == ["plain", "ssam-1", "scam-1"]
+
+
+def test_logs_of_one_set_under_several_lights_count_once(estimates: Estimates) -> None:
+    lit = replace(estimates, clips=[replace(clip, set=clip.object) for clip in estimates.clips])
+    by_log_n, by_set_n = estimates.mae_by_set_n(PROPOSED), lit.mae_by_set_n(PROPOSED)
+    assert len(by_log_n) == 8
+    assert np.sort(by_set_n) == pytest.approx(np.sort(by_log_n.reshape(4, 2).mean(1)))
+    assert estimates.p_value(PROPOSED, BASELINE) < 0.05
+    assert math.isnan(lit.p_value(PROPOSED, BASELINE))  # four sets are too few

@@ -1,7 +1,10 @@
+from dataclasses import replace
+
 import pytest
 
 from gripper_force.qualification.paper import paper_tables as tables
 from gripper_force.qualification.paper.experiment import Test as Estimates
+from gripper_force.qualification.paper.models import Scale
 from gripper_force.qualification.paper.paper_tables import COMPARISONS, Table
 
 
@@ -75,3 +78,8 @@ def test_markdown_of_a_table() -> None:
     assert (
         table.markdown() == "**T**\n\n| a | b |\n|---|---|\n| x | 0.123 |\n| y | – |\n| z | – |\n\nA note.\n"
     )
+
+
+def test_one_seed_has_no_spread(estimates: Estimates) -> None:
+    one = replace(estimates, scale=Scale(seeds=1))
+    assert tables.comparison(one, "3").rows[0][5] == "0.400"
