@@ -2,9 +2,10 @@
 
 The candidates are, from the simplest: the configured network as it is, a network trained further on the touches, and a
 Gaussian process fitted to them. The trained one is the configured one, or the small one instead of the default, which
-costs five times as much a step and is no better (decision 32). Each is calibrated as `calibrate_object` does it. The logs of the touches are divided
-into folds; a fold is estimated by what was trained and calibrated on the others. The simplest candidate that is about
-as good as the best is taken, as in `cross_validation`, trained on all touches, and calibrated.
+costs five times as much a step and is no better (decision 32). Each candidate is calibrated as `calibrate_object` does
+it. The logs of the touches are divided into folds; a fold is estimated by what was trained and calibrated on the
+others. The simplest candidate that is about as good as the best is taken, as in `cross_validation`, trained on all
+touches, and calibrated.
 
 The expected error and the interval are nested, as in `cross_validation`: each fold is estimated by the candidate that
 the other folds alone select, by trainings without that fold.
