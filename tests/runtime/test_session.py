@@ -562,6 +562,19 @@ def test_stop_soon_leads_to_fault_within_a_cycle(open_rig: tuple[ExitStack, Open
     assert all(d.command.goal_current_a <= before_a for d in after)
 
 
+@pytest.mark.parametrize("stopped", [False, True])
+def test_a_stop_after_the_last_cycle_ends_the_run_like_a_fault(quick: list[str], stopped: bool) -> None:
+    settings = resolve(load_config(None, [*quick, "on_exit=hold", "control.on_fault=limp"]))
+    with open_devices(settings.config) as devices:
+        bus = virtual.find_bus("rig")
+        assert bus is not None
+        with open_session(settings, devices, None) as session:
+            session.cycle(RequestKind.GRASP, 3.0)
+            if stopped:
+                session.stop_soon()
+        assert bus.servos[0].get("torque_enable") == (not stopped)
+
+
 @pytest.mark.usefixtures("own_process")
 @pytest.mark.parametrize("number", SIGNALS)
 def test_a_signal_waits_for_the_end_of_the_cycle(

@@ -102,6 +102,16 @@ def test_two_gauges_determine_the_pinion_radius() -> None:
     assert fit.open_position_rad.value == pytest.approx(OPEN_RAD, abs=2e-3)
 
 
+def test_speeds_of_free_travel_are_those_of_the_fitted_radius() -> None:
+    rng = np.random.default_rng(0)
+    both = [*presses(rng), *presses(rng, gauge_m=0.06)]
+    fit = fit_servo(both, passes(rng), replace(NOMINAL, pinion_radius_m=0.024))
+    speed_m_s, motor_force_n = fit.travelled.T
+    assert fit.speed_m_s[1] == np.abs(speed_m_s).max() == pytest.approx(0.052, rel=0.02)
+    expected_n = FRICTION_N * np.sign(speed_m_s) + DAMPING * speed_m_s
+    assert np.abs(motor_force_n - expected_n).mean() < 0.1
+
+
 def test_friction_growing_with_force_is_fitted() -> None:
     rng = np.random.default_rng(0)
     fit = fit_servo(presses(rng, growth=0.05), passes(rng), NOMINAL)

@@ -146,6 +146,21 @@ def test_without_lerobot_the_extra_is_named(
     assert not (tmp_path / "out").exists()
 
 
+def test_a_dataset_that_cannot_be_made_leaves_nothing(
+    fused_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Failing:
+        @staticmethod
+        def create(*, root: Path, **_: object) -> None:
+            root.mkdir()
+            raise OSError("no space left")
+
+    monkeypatch.setattr(job, "_dataset_class", lambda: Failing)
+    with pytest.raises(OSError, match="no space left"):
+        job.export_lerobot([fused_log], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_an_unknown_kind_of_action_is_named(fused_log: Path) -> None:
     done = export(fused_log, "--action", "torque")
     assert isinstance(done.exception, ConfigError)
