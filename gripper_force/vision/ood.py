@@ -98,16 +98,19 @@ class OodScore:
 
 
 class Smooth:
-    """Geometric mean over the last frames, with weights that decay by 1/e in `FRAMES` frames."""
+    """Geometric mean over the last frames, with weights that decay by 1/e in `FRAMES` frames.
+
+    It starts at 1: the first frames of a stream show no contact, so nothing in them can be unfamiliar, and a single
+    frame varies too much to be judged alone.
+    """
 
     def __init__(self) -> None:
-        self._mean, self._weight = 0.0, 0.0
+        self._mean = 0.0
 
     def step(self, ratios: Floats) -> Floats:
         """Returns the mean up to each of the next ratios, (N,)."""
         means = np.empty(len(ratios))
         for i, value in enumerate(np.log(ratios.clip(1e-9))):
-            self._weight = self._weight * (1 - 1 / FRAMES) + 1
-            self._mean += (value - self._mean) / self._weight
+            self._mean += (value - self._mean) / FRAMES
             means[i] = self._mean
         return np.exp(means)
