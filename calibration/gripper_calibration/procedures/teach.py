@@ -1,9 +1,11 @@
 """Teaching of an object: the estimator that is best on touches left out, calibrated, in one bundle.
 
-The candidates are, from the simplest: the configured network as it is, networks trained further on the touches, and a
-Gaussian process fitted to them. Each is calibrated as `calibrate_object` does it. The logs of the touches are divided
-into folds; a fold is estimated by what was trained and calibrated on the others. The simplest candidate that is about
-as good as the best is taken, as in `cross_validation`, trained on all touches, and calibrated.
+The candidates are, from the simplest: the configured network as it is, a network trained further on the touches, and a
+Gaussian process fitted to them. The trained one is the configured one, or the small one instead of the default, which
+costs five times as much a step and is no better (decision 32). Each candidate is calibrated as `calibrate_object` does
+it. The logs of the touches are divided into folds; a fold is estimated by what was trained and calibrated on the
+others. The simplest candidate that is about as good as the best is taken, as in `cross_validation`, trained on all
+touches, and calibrated.
 
 The expected error and the interval are nested, as in `cross_validation`: each fold is estimated by the candidate that
 the other folds alone select, by trainings without that fold.
@@ -75,8 +77,8 @@ MIN_LOGS: Final = 4
 FOLDS: Final = 3
 """Parts of the logs, each left out once, and each two of them. More would take longer than a user waits."""
 
-STEPS: Final = 4 * 2 * FOLDS + 3
-"""Steps of progress that `teach` reports after the touches: four candidates, without one fold and without two."""
+STEPS: Final = 3 * 2 * FOLDS + 3
+"""Steps of progress that `teach` reports after the touches: three candidates, without one fold and without two."""
 
 _HELPS: Final = 0.85
 """More touches help if the error after two of three folds is less than this share of that after one."""
@@ -436,8 +438,8 @@ def _candidates(config: Config, model: Model, logs: int) -> list[_Candidate]:
     named = base if base in SHIPPED else Path(base).name
     found = [_Candidate(f"{named} as it is", base, "")]
     if not any(isinstance(member, ProcessConfig) for member in model.header.members):
-        smaller = ["small"] if base == "default" else []
-        found += [_Candidate(f"{Path(one).name}, trained", one, "touches") for one in (*smaller, base)]
+        trained = "small" if base == "default" else base
+        found.append(_Candidate(f"{Path(trained).name}, trained", trained, "touches"))
     if logs >= 2 * FOLDS:  # a process chooses its settings on logs left out, and so needs two in a fold
         found.append(_Candidate("Gaussian process", base, "few"))
     return found

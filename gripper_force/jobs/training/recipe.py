@@ -52,7 +52,7 @@ RECIPES: Final[dict[str, Tree]] = {
         "precision": "float32",
     },
     "touches": {
-        "steps": 100,
+        "steps": 300,
         "clips": 8,
         "warmup": 0.1,
         "short_share": 0.0,

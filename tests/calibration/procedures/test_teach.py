@@ -274,6 +274,13 @@ def test_a_fold_takes_no_part_in_the_choice_that_estimates_it() -> None:
     assert not found.within[np.isin(found.measured.touch, (0, 3))].any()
 
 
+@pytest.mark.parametrize("checkpoint", ["default", "small"])
+def test_one_network_is_trained_and_never_the_default_one(checkpoint: str, tmp_path: Path) -> None:
+    config, model = job.check(load_config(None, [f"vision.checkpoint={checkpoint}"]), tmp_path / "out")
+    names = [candidate.name for candidate in job._candidates(config, model, logs=16)]
+    assert [name for name in names if "trained" in name] == ["small, trained"]
+
+
 def test_logs_without_contact_and_too_few_logs(
     config: Config,
     logs: list[Path],
