@@ -46,11 +46,21 @@ def fit_ood(touches: Touches, model: OodModel) -> KnownFrames:
         return known._replace(
             limits=tuple(one.model_copy(update={"limit": widened * one.limit}) for one in known.limits)
         )
-    shares = []
-    for number, left_out in zip(numbers, parts, strict=True):
-        shares.append(residual_share(left_out.features, *object_subspace(touches.without([number]))))
-    limits = object_limits(shares, [part.estimate_n for part in parts])
-    return KnownFrames(*object_subspace(touches), limits)
+    return KnownFrames(*object_subspace(touches), object_limits(*left_out_shares(touches)))
+
+
+def left_out_shares(touches: Touches) -> tuple[list[Floats], list[Floats]]:
+    """Returns the shares of the residual of the frames of each touch, by the subspace of the others, and its estimates.
+
+    Args:
+        touches: Two or more touches.
+    """
+    parts = [touches.only([number]) for number in touches.numbers]
+    subspaces = [object_subspace(touches.without([number])) for number in touches.numbers]
+    shares = [
+        residual_share(part.features, *subspace) for part, subspace in zip(parts, subspaces, strict=True)
+    ]
+    return shares, [part.estimate_n for part in parts]
 
 
 def object_limits(shares: Sequence[Floats], estimates_n: Sequence[Floats]) -> tuple[OodLimit, ...]:

@@ -36,7 +36,7 @@ from gripper_calibration.fits.cross_validation import (
 )
 from gripper_calibration.fits.interval_fit import touch_interval
 from gripper_calibration.fits.object_fit import COVERAGE, fit_correction
-from gripper_calibration.fits.ood_fit import object_limits, object_subspace
+from gripper_calibration.fits.ood_fit import left_out_shares, object_limits, object_subspace
 from gripper_calibration.fits.touches import Floats
 from gripper_calibration.plots.taught_plot import draw
 from gripper_calibration.procedures.calibrate_object import (
@@ -288,7 +288,11 @@ class _Work:
         progress(f"trained on all touches: {chosen.name}")
         learned = load_checkpoint(checkpoint)
         recorded = join({path: read_log(path, learned) for path in self._logs})
-        limits = object_limits([one.share for one in found.left], [one.raw_n for one in found.left])
+        # The folds' networks have not seen the touches they score, but each network has its own scale of scores.
+        shares, estimates_n = left_out_shares(recorded.touches)
+        limits = object_limits(
+            [one.share for one in found.left] + shares, [one.raw_n for one in found.left] + estimates_n
+        )
         known = KnownFrames(*object_subspace(recorded.touches), limits)
         fit = fit_correction(recorded.touches, COVERAGE)
         error_n, contact = (
