@@ -16,7 +16,9 @@ from importlib import import_module as _import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from gripper_calibration.procedures.calibrate_object import ObjectCalibration as ObjectCalibration
     from gripper_calibration.procedures.calibrate_object import calibrate_object as calibrate_object
+    from gripper_calibration.procedures.teach import Taught as Taught
     from gripper_calibration.procedures.teach import teach as teach
     from gripper_force.config import CameraConfig as CameraConfig
     from gripper_force.config import Config as Config
@@ -36,15 +38,22 @@ if TYPE_CHECKING:
     from gripper_force.errors import NonFiniteError as NonFiniteError
     from gripper_force.errors import RequestError as RequestError
     from gripper_force.errors import SimulationError as SimulationError
+    from gripper_force.errors import UnfamiliarFrameError as UnfamiliarFrameError
     from gripper_force.interfaces import BusStats as BusStats
     from gripper_force.interfaces import Camera as Camera
     from gripper_force.interfaces import Clock as Clock
     from gripper_force.interfaces import LoadCell as LoadCell
+    from gripper_force.interfaces import Lock as Lock
     from gripper_force.interfaces import Servo as Servo
     from gripper_force.interfaces import ServoSpec as ServoSpec
+    from gripper_force.interfaces import SharedPort as SharedPort
+    from gripper_force.jobs.evaluate import Evaluation as Evaluation
     from gripper_force.jobs.evaluate import evaluate as evaluate
     from gripper_force.jobs.replay import replay as replay
+    from gripper_force.jobs.replay.comparison import Comparison as Comparison
+    from gripper_force.jobs.replay.comparison import ReplayResult as ReplayResult
     from gripper_force.progress import Progress as Progress
+    from gripper_force.progress import Prompt as Prompt
     from gripper_force.runtime.gripper import Gripper as Gripper
     from gripper_force.runtime.gripper import open_gripper as open_gripper
     from gripper_force.runtime.log_reader import LogReader as LogReader
@@ -72,8 +81,8 @@ if TYPE_CHECKING:
 __version__ = "0.2.0.dev0"
 
 _MODULES = {
-    "gripper_calibration.procedures.calibrate_object": ("calibrate_object",),
-    "gripper_calibration.procedures.teach": ("teach",),
+    "gripper_calibration.procedures.calibrate_object": ("ObjectCalibration", "calibrate_object"),
+    "gripper_calibration.procedures.teach": ("Taught", "teach"),
     "gripper_force.config": ("CameraConfig", "Config", "LoadCellConfig", "ServoConfig", "load_config"),
     "gripper_force.errors": (
         "CheckpointError",
@@ -89,11 +98,22 @@ _MODULES = {
         "NonFiniteError",
         "RequestError",
         "SimulationError",
+        "UnfamiliarFrameError",
     ),
-    "gripper_force.interfaces": ("BusStats", "Camera", "Clock", "LoadCell", "Servo", "ServoSpec"),
-    "gripper_force.jobs.evaluate": ("evaluate",),
+    "gripper_force.interfaces": (
+        "BusStats",
+        "Camera",
+        "Clock",
+        "LoadCell",
+        "Lock",
+        "Servo",
+        "ServoSpec",
+        "SharedPort",
+    ),
+    "gripper_force.jobs.evaluate": ("Evaluation", "evaluate"),
     "gripper_force.jobs.replay": ("replay",),
-    "gripper_force.progress": ("Progress",),
+    "gripper_force.jobs.replay.comparison": ("Comparison", "ReplayResult"),
+    "gripper_force.progress": ("Progress", "Prompt"),
     "gripper_force.runtime.gripper": ("Gripper", "open_gripper"),
     "gripper_force.runtime.log_reader": ("LogReader",),
     "gripper_force.runtime.process": ("own_process",),

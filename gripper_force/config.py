@@ -286,7 +286,7 @@ class VisionConfig(Section):
 
     checkpoint: str = Field(
         "default",
-        description="path of a checkpoint or of a file made by `gripper-force export`; default or small "
+        description="path of a checkpoint or of a file made by `gripper-force export network`; default or small "
         "(shipped); none; or auto: the cheapest shipped one within `budget`",
     )
     engine: str = Field(

@@ -11,7 +11,8 @@
     │   └── HardwareFaultError  the device reports a fault
     ├── SimulationError         a simulated scene can't be built or rendered, or failed while running
     ├── LogError                a log can't be read or written
-    ├── DataError               a recording or data set is incomplete or unusable
+    ├── DataError               a recording, data set or camera frame is incomplete or unusable
+    │   └── UnfamiliarFrameError  a frame is unlike all known ones, or the view is covered or blurred
     ├── CheckpointError         a checkpoint is missing, damaged, or of another network
     ├── RequestError            a request was refused: a target out of range, or nothing to hold
     └── NonFiniteError          NaN or infinity where a finite number is required
@@ -57,11 +58,11 @@ class LogError(GripperError):
 
 
 class DataError(GripperError):
-    """A recording or data set is incomplete or unusable."""
+    """A recording, data set or camera frame is incomplete or unusable."""
 
 
 class UnfamiliarFrameError(DataError):
-    """A frame shows what a network does not know.
+    """A frame is unlike all known ones, the view is covered or blurred, or the object is gone.
 
     Attributes:
         force_n: The network's output for this frame: not the contact force, but it rises when a grip gets firmer. NaN

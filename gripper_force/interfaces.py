@@ -78,6 +78,9 @@ class SharedPort:
 class Servo(Protocol):
     """The gripper's servo. One thread alone may call it.
 
+    Constructed as ``Class(config.servo, now_ns)``: ``now_ns()`` returns the time on the run's clock. A
+    `SharedPort` is a third argument.
+
     Every method may raise `DeviceLostError`, `DeviceTimeoutError` or `HardwareFaultError`.
     """
 
@@ -118,6 +121,8 @@ class Servo(Protocol):
 class Camera(Protocol):
     """A gray camera. With the class attribute ``supports_lockstep = True`` it follows simulated time.
 
+    Constructed as ``Class(config.camera, clock)``, with the run's `Clock`.
+
     A method ``settings() -> dict[str, float | str]`` is optional: the settings in force by key of the section
     ``camera``, for ``doctor`` and the log.
     """
@@ -142,7 +147,8 @@ class Camera(Protocol):
 class LoadCell(Protocol):
     """A force reference for calibration and checks; no control decision depends on it.
 
-    With the class attribute ``supports_lockstep = True`` it follows simulated time.
+    With the class attribute ``supports_lockstep = True`` it follows simulated time. Constructed as
+    ``Class(config.load_cell, clock)``, with the run's `Clock`.
     """
 
     def start(self) -> None:

@@ -32,6 +32,10 @@ class Phase(StrEnum):
     FAULT = "fault"
 
 
+GRIPPING: Final = (Phase.CONTACT, Phase.RAMP, Phase.HOLD)
+"""Phases in which the jaws grip an object."""
+
+
 class Outcome(StrEnum):
     """Result of a grasp, of a move, or of a release that fails (``BLOCKED``); ``NONE`` while it is under way."""
 
@@ -174,7 +178,7 @@ class VisualForce:
         ready_ns: Host time at which the estimate became available.
         seq: Number of the frame.
         force_n: Estimated contact force; NaN if the view is covered or blurred, or the object is gone.
-        std_n: Standard deviation claimed by the estimator; infinite if the frame shows what it does not know.
+        std_n: Standard deviation claimed by the estimator; infinite if the frame is unfamiliar.
         compute_ms: Computing time of the estimator.
     """
 
@@ -187,7 +191,7 @@ class VisualForce:
 
     @property
     def is_familiar(self) -> bool:
-        """False if the frame shows what the estimator does not know: the force is not that of the contact."""
+        """False if the frame raised `UnfamiliarFrameError`; ``force_n`` is then not the contact force."""
         return self.std_n != float("inf")
 
 

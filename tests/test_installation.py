@@ -259,7 +259,7 @@ def test_a_checkpoint_without_export_says_what_to_do(tmp_path: Path) -> None:
     done = without_extras(cwd=tmp_path, code=code)
     assert "needs torch, which is not installed" in done.stderr
     assert (
-        "or run `gripper-force export` on another machine and set vision.checkpoint to its file"
+        "or run `gripper-force export network` on another machine and set vision.checkpoint to its file"
         in done.stderr
     )
 

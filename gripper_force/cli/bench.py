@@ -432,7 +432,7 @@ def checkpoints(
     from gripper_force.vision.preprocess import Preprocess
 
     _reject_overrides("checkpoints", set_)
-    logs = [path for folder in data for path in find_logs(folder)]
+    logs = find_logs(data)
 
     def read(preprocess: Preprocess) -> Sequence[Clip]:
         with console.bar("reading logs", len(logs)) as progress:

@@ -250,6 +250,7 @@ def object_(
     require("torch", "calibrate object")
     from gripper_calibration.fits.interval_fit import MIN_TOUCHES
     from gripper_calibration.procedures import calibrate_object as job
+    from gripper_force.jobs.dataset import find_logs
     from gripper_force.profiles.object_profile import find_object
 
     if fresh and logs is not None:
@@ -261,7 +262,7 @@ def object_(
         _tell_existing(settings, touches, folder, fresh)
         logs = _touches(settings, touches, peak_n, folder, pause)
     else:
-        logs = job.find_logs(logs)
+        logs = find_logs(logs)
     with console.bar("calibrating", len(logs) + 2) as progress:
         result = job.calibrate_object(settings, name, logs=logs, out=out, progress=progress)
     if result.mae_after_n is None:
@@ -320,7 +321,10 @@ def gain(
         typer.Option("--from", help="Log of grasps of this object, or a folder of them. Repeatable."),
     ],
     out: Annotated[
-        Path | None, typer.Option(help="Profile to write. Default: NAME.yaml in your folder of profiles.")
+        Path | None,
+        typer.Option(
+            help="Profile to write. Default: the profile in the bundle, otherwise NAME.yaml in your folder of profiles."
+        ),
     ] = None,
     set_: Overrides = None,
     as_json: AsJson = False,
@@ -329,7 +333,7 @@ def gain(
     from gripper_force.jobs.dataset import find_logs
     from gripper_force.jobs.object_gain import save_gain
 
-    paths = [path for given in logs for path in (find_logs(given) if given.is_dir() else [given])]
+    paths = find_logs(logs)
     saved = save_gain(name, paths, out, set_)
     console.show(saved, as_json)
     console.next_step("grasp", "--object", saved.object, "--profile", out or name)

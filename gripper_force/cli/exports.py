@@ -55,7 +55,7 @@ def export_lerobot(
 
     if action not in job.ACTIONS:
         raise ConfigError(f"--action {action!r} is unknown; use {' or '.join(job.ACTIONS)}")
-    paths = [path for given in logs for path in (find_logs(given) if given.is_dir() else [given])]
+    paths = find_logs(logs)
     with console.bar("exporting", len(paths)) as progress:
         result = job.export_lerobot(
             paths,

@@ -81,7 +81,7 @@ def train(
         settings = continued(settings, start.header)
     quiet = os.environ.get("RANK", "0") != "0"  # only the first process of torchrun prints
     folders = [
-        [path for folder in given for path in find_logs(folder)]
+        find_logs(given) if given else []
         for given in (data, [validation] if validation else [], [replay] if replay else [])
     ]
     with console.bar("reading logs", sum(map(len, folders)), hidden=quiet) as progress:

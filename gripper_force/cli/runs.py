@@ -234,7 +234,7 @@ def replay(
     from gripper_force.jobs.summary_files import check_writable, replay_tables, write_summary
     from gripper_force.vision.model_files import read_model
 
-    paths = [path for given in logs for path in (find_logs(given) if given.is_dir() else [given])]
+    paths = find_logs(logs)
     replay_all = partial(job.replay_each, paths, recover=recover, workers=jobs, ray=ray)
     if out is not None:
         check_writable(out)

@@ -6,8 +6,10 @@ estimates the difference.
 """
 
 import math
+import re
 from collections import deque
 from dataclasses import replace
+from typing import Final
 
 from gripper_force.config import ControlConfig
 from gripper_force.control.free_travel import FREE_NOISE_N, FreeTravel
@@ -59,6 +61,18 @@ _GATE = 3.29
 _REENTRY_S = 1 / 3
 _MIN_REENTRY = 4
 """Time, and least number of consecutive rejected estimates on the same side, after which the filter accepts them."""
+
+
+NO_NEW_ESTIMATE: Final = "no new estimate"
+"""Reason of a drop-out of vision without a rejected estimate."""
+
+_DROP_OUT_END = "; using motor current alone"
+
+
+def drop_out_reason(text: str) -> str | None:
+    """Returns the reason in the text of an event that says that vision dropped out; None for other events."""
+    found = re.fullmatch(f"vision (?:dropped out|is not used): (.*){re.escape(_DROP_OUT_END)}", text)
+    return None if found is None else found[1]
 
 
 def observer_lag_s(frame_hz: float) -> float:
@@ -347,8 +361,7 @@ class Fusion:
         self._source, self._is_silent = source, False
         if source != EstimateSource.CURRENT:
             return (Event(t_ns, "vision", f"vision in use; the force estimate is {source}"),)
-        reason = self._rejection or "no new estimate"
-        return (Event(t_ns, "vision", f"vision {news}: {reason}; using motor current alone"),)
+        return (Event(t_ns, "vision", f"vision {news}: {self._rejection or NO_NEW_ESTIMATE}{_DROP_OUT_END}"),)
 
     def _estimate(self, t_ns: int) -> FusedForce:
         share = 1 / (1 + self._variance_ratio)

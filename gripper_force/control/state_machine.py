@@ -18,6 +18,7 @@ from gripper_force.control.transmission import GOAL_OFFSET_M, Transmission
 from gripper_force.control.travel import Travel
 from gripper_force.control.visual_check import VisualCheck
 from gripper_force.types import (
+    GRIPPING,
     NS_PER_S,
     EstimateSource,
     Event,
@@ -62,8 +63,6 @@ servo's proportional gain leave (80 um)."""
 
 _MOVE_SPARE_S = 1.0
 """Time a move may take beyond its speed profile before an obstacle is reported."""
-
-_GRIPPING = (Phase.CONTACT, Phase.RAMP, Phase.HOLD)
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +167,7 @@ class GraspController:
 
     def end_grasps(self) -> tuple[float, float] | None:
         """Ends the last grasp, and returns the ratio of all grasps (see `ObjectGain.ratio`); None without any."""
-        is_held = self._phase in _GRIPPING and self._outcome == Outcome.HELD
+        is_held = self._phase in GRIPPING and self._outcome == Outcome.HELD
         return self._fusion.end_grasp(was_held=self._was_held or is_held)
 
     def start_problem(self, servo: ServoState) -> str:
@@ -248,12 +247,12 @@ class GraspController:
             servo,
             visual if visual is not None and visual.is_familiar else None,
             free=is_free,
-            gripping=self._phase in _GRIPPING,
+            gripping=self._phase in GRIPPING,
             holding=self._phase == Phase.HOLD,
             opening=self._is_opening,
             lowering=self._phase in (Phase.RAMP, Phase.HOLD) and self._loop.is_lowering,
         )
-        self._visual_check.add(t_ns, visual, gripping=self._phase in _GRIPPING)
+        self._visual_check.add(t_ns, visual, gripping=self._phase in GRIPPING)
         return [*fusion_events, *self._derate(t_ns, servo.temperature_c)]
 
     def _derate(self, t_ns: int, temperature_c: float) -> list[Event]:
@@ -288,7 +287,7 @@ class GraspController:
         elif not 0 < request.target_n <= self._largest_target_n:
             return f"the target {request.target_n} N is outside 0 to {self._largest_target_n:g} N"
         else:
-            if request.new_object and self._phase in _GRIPPING:
+            if request.new_object and self._phase in GRIPPING:
                 return "an object is held; request a release before the grasp of a new one"
             self._start_grasp(t_ns, request.target_n, new_object=request.new_object)
         return ""
@@ -297,7 +296,7 @@ class GraspController:
 
     def _enter(self, phase: Phase, reason: str) -> None:
         is_open_now = is_open(self._transmission.open_width_m, self._present_width_m)
-        self._credit.start_phase(from_open=is_open_now and self._phase not in _GRIPPING)
+        self._credit.start_phase(from_open=is_open_now and self._phase not in GRIPPING)
         self._phase, self._reason = phase, reason
         self._phase_s = self._settled_s = 0.0
 
@@ -339,9 +338,9 @@ class GraspController:
         self._enter(Phase.MOVE, f"move to {1e3 * width_m:.1f} mm requested")
 
     def _start_travel(self, *, opens: bool) -> None:
-        if self._phase in _GRIPPING:
+        if self._phase in GRIPPING:
             self._was_held = self._outcome == Outcome.HELD
-        grip_n = self._motor_force_n if self._phase in (*_GRIPPING, Phase.FAULT) else 0.0
+        grip_n = self._motor_force_n if self._phase in (*GRIPPING, Phase.FAULT) else 0.0
         self._limits.reset(reverses=self._opens_freely and not opens)
         self._goal_width_m = self._present_width_m  # in the cycle that loses an object, the jaws still close
         self._travel.start(self._goal_width_m, grip_n, opens=opens)
@@ -350,7 +349,7 @@ class GraspController:
         reason = self._safety.reason
         if self._config.on_fault == "open":
             self._start_release(reason)
-        elif self._phase not in _GRIPPING:
+        elif self._phase not in GRIPPING:
             self._goal_width_m = self._present_width_m
         if self._config.on_fault == "limp":
             self._motor_force_n = 0.0
@@ -444,9 +443,9 @@ class GraspController:
                 self._run_move(dt_s, width_m)
             case Phase.FAULT if self._opens_at_fault:
                 self._run_release(dt_s, width_m, closing_m_s)
-        if self._phase in _GRIPPING:
+        if self._phase in GRIPPING:
             self._goal_width_m = width_m - 2 * GOAL_OFFSET_M
-        if self._phase in (Phase.APPROACH, *_GRIPPING) and self._outcome == Outcome.NONE:
+        if self._phase in (Phase.APPROACH, *GRIPPING) and self._outcome == Outcome.NONE:
             self._check_timeout(t_ns)
         self._note_friction(closing_m_s)
 
@@ -624,7 +623,7 @@ class GraspController:
             self._estimate.friction_n,
             opening=self._is_opening,
             closing=closing,
-            gripping=self._phase in _GRIPPING,
+            gripping=self._phase in GRIPPING,
         )
         if closing or self._phase == Phase.CONTACT:
             limit_n = self._credit.closing_limit_n(closing=closing, approaching=self._phase == Phase.APPROACH)

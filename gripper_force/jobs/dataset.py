@@ -89,20 +89,24 @@ class Clip:
 
 
 def find_logs(source: str | Path | Sequence[str | Path]) -> list[Path]:
-    """Returns the logs of a folder, or the given logs, sorted by path.
+    """Returns the given logs in their order, with each folder replaced by its logs, sorted by path.
 
     Args:
-        source: A folder, searched for ``*.mcap``, or the logs themselves.
+        source: Logs, and folders that are searched for ``*.mcap``; one or several.
 
     Raises:
-        DataError: There are no logs.
+        DataError: There are no logs at all, or none in a folder.
     """
-    paths = sorted(
-        Path(source).rglob("*.mcap") if isinstance(source, str | Path) else (Path(path) for path in source)
-    )
-    if not paths:
-        raise DataError(f"no logs (*.mcap) in {source}; record, simulate or import some")
-    return paths
+    given = [source] if isinstance(source, str | Path) else source
+    found: list[Path] = []
+    for path in map(Path, given):
+        logs = sorted(path.rglob("*.mcap")) if path.is_dir() else [path]
+        if not logs:
+            raise DataError(f"no logs (*.mcap) in {path}; record, simulate or import some")
+        found += logs
+    if not found:
+        raise DataError("no logs are given; name some, or a folder of them")
+    return found
 
 
 def load_clips(
@@ -122,7 +126,7 @@ def load_clips(
         progress: Called after each log.
 
     Returns:
-        One clip per log, sorted by path.
+        One clip per log, in the order of `find_logs`.
 
     Raises:
         DataError: There are no logs, or a log has no frames or no labels.

@@ -10,7 +10,6 @@ from typing import Any, Final, TypedDict
 import numpy as np
 
 from gripper_force.config import Config, config_from, config_from_text
-from gripper_force.control.limits import largest_target_n
 from gripper_force.errors import ConfigError, DataError, DeviceError
 from gripper_force.jobs.dataset import stiffness_floor_n, stiffness_of
 from gripper_force.jobs.object_gain import learned_ratio
@@ -73,10 +72,11 @@ class Summary(_Score):
         object_gain_std: Its relative standard deviation.
         object_gain_true: Stiffness of the simulated object over that of its kind; None for a real one.
         fell_back: True if the feedback includes vision, but less than half of the hold used it.
-        load_cell_mean_n: Mean of the load cell during the hold.
+        load_cell_mean_n: Mean of the load cell over the last second of the hold.
         steady_error_n: That mean, less the target.
         overshoot_n: Highest force above the target.
-        settle_s: Time from contact until the force stays within tolerance.
+        settle_s: Time from the start of the ramp until the force stays within 5 % of the target, or 0.1 N if that is
+            more.
         peak_n: Highest force.
         estimator_p50_ms: Median time of an estimate.
         estimator_p99_ms: 99th percentile of it.
@@ -288,8 +288,7 @@ def trials(
     for name in objects:
         run = resolve(config.model_copy(update={"object": name}))  # measures what `auto` needs once, here
         run.check_target(least_n if target_n is None else target_n)
-        limit_n = largest_target_n(run.config.control.force_limit_n, run.config.gripper.gain_bound)
-        largest_n[name] = min(most_n, limit_n, *run.target_limits_n.values())
+        largest_n[name] = min(most_n, run.largest_target_n)
     rng = np.random.default_rng([config.seed, 20])
     quiet = config.log.model_copy(update={"report": False})  # `replay LOG --report` draws any of them later
     plan = []

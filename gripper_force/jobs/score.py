@@ -12,7 +12,9 @@ from typing import Final
 import numpy as np
 
 from gripper_force.config import Config
+from gripper_force.control.fusion import NO_NEW_ESTIMATE, drop_out_reason
 from gripper_force.errors import DataError
+from gripper_force.runtime.session import NO_ESTIMATE
 from gripper_force.types import (
     NS_PER_S,
     EstimateSource,
@@ -43,7 +45,8 @@ class GraspScore:
         steady_n: Mean force over the last `STEADY_S` of the hold.
         steady_error_n: ``steady_n - target_n``.
         overshoot_n: Largest force above the target, from the approach on; 0 if it never was above.
-        settle_s: Time from the start of the ramp until the force stays within 5 % or 0.1 N; NaN if never.
+        settle_s: Time from the start of the ramp until the force stays within 5 % of the target, or 0.1 N if that is
+            more; NaN if never.
     """
 
     target_n: float
@@ -55,11 +58,6 @@ class GraspScore:
 
 LEAST_VISION_SHARE: Final = 0.5
 """A grasp that is configured to use vision fell back if a smaller share of its hold used it."""
-
-NO_ESTIMATE: Final = "no estimate: "
-_NO_NEW_ESTIMATE: Final = "no new estimate"
-_DROP_OUT: Final = re.compile("vision (?:dropped out|is not used): (.*); using motor current alone")
-"""Events of `runtime/session.py` and `control/fusion.py`."""
 
 _NUMBER: Final = re.compile(r"-?\d+(\.\d+)?")
 
@@ -182,11 +180,10 @@ def drop_out_reasons(visuals: Sequence[VisualForce], events: Sequence[Event]) ->
     for event in sorted(events, key=lambda event: event.t_ns):
         if event.text.startswith(NO_ESTIMATE):
             problem_ns, problem = event.t_ns, event.text.removeprefix(NO_ESTIMATE)
-        elif found := _DROP_OUT.fullmatch(event.text):
-            reason = found[1]
+        elif (reason := drop_out_reason(event.text)) is not None:
             # The controller does not know why a frame gave no estimate; the session does.
             recovered = bisect_right(ready_ns, event.t_ns) > bisect_right(ready_ns, problem_ns)
-            if reason == _NO_NEW_ESTIMATE and problem and not recovered:
+            if reason == NO_NEW_ESTIMATE and problem and not recovered:
                 reason = problem
             reasons.append((event.t_ns, reason))
     return reasons

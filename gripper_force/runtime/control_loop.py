@@ -17,8 +17,8 @@ from gripper_force.runtime.process import deferred_signals
 from gripper_force.runtime.requests import CLOSED, PendingRequest, RequestQueue
 from gripper_force.runtime.resolve import ResolvedConfig, resolve
 from gripper_force.runtime.session import Session, open_run
-from gripper_force.runtime.state import GRIPPING, GraspResult, GripperState, StateTracker
-from gripper_force.types import NS_PER_S, RequestKind
+from gripper_force.runtime.state import GraspResult, GripperState, StateTracker
+from gripper_force.types import GRIPPING, NS_PER_S, RequestKind
 
 _END_S: Final = 25.0
 """Longest wait for the end of the control thread, which may wait 20 s for a disk that does not answer."""

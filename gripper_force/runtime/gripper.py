@@ -7,7 +7,6 @@ from types import TracebackType
 from typing import Any, Literal, Self, overload
 
 from gripper_force.config import Config, Overrides, load_config
-from gripper_force.control.limits import largest_target_n
 from gripper_force.errors import ConfigError
 from gripper_force.interfaces import Lock, SharedPort
 from gripper_force.runtime.control_loop import ControlLoop
@@ -94,7 +93,7 @@ class Gripper:
     each call that waits. A refused request raises `RequestError`, a failed device `DeviceError`, a simulation that is
     too slow for real time `SimulationError`.
 
-    However the gripper is closed, the servo ends as configured: as ``on_exit`` says, or as ``control.on_fault`` says
+    However the gripper is closed, the servo is left as configured: as ``on_exit`` says, or as ``control.on_fault`` says
     after a fault, a stop or an exception.
 
     In asyncio, call the blocking methods in a thread: ``await asyncio.to_thread(gripper.grasp, 4.0)``.
@@ -250,8 +249,7 @@ class Gripper:
     @property
     def largest_force_n(self) -> float:
         """Largest force that `grasp` accepts, in newtons."""
-        limit_n = largest_target_n(self.config.control.force_limit_n, self.config.gripper.gain_bound)
-        return min([limit_n, *self._run.target_limits_n.values()])
+        return self._run.largest_target_n
 
     @property
     def frame(self) -> Frame | None:
@@ -266,7 +264,7 @@ class Gripper:
     # The end.
 
     def close(self) -> None:
-        """Ends the run: the servo ends as configured, devices and log are closed. May be called twice.
+        """Ends the run: the servo is left as configured, devices and log are closed. May be called twice.
 
         Raises:
             DeviceError: A device failed since the last call, or the servo could not be stopped.

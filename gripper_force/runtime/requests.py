@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gripper_force.errors import RequestError
-from gripper_force.runtime.state import GRIPPING, GraspResult, GripperState
-from gripper_force.types import Outcome, Phase, RequestKind
+from gripper_force.runtime.state import GraspResult, GripperState
+from gripper_force.types import GRIPPING, Outcome, Phase, RequestKind
 
 CLOSED: Final = "the gripper is closed; open it again with open_gripper"
 
@@ -57,7 +57,8 @@ class RequestQueue:
 
     A newer request of another kind replaces the one that callers wait for; a refused one replaces none. One
     that waits for a cycle, and no caller for it, is dropped for a newer one of the same kind. A
-    stop overrides all older requests, which end with its outcome. Requests after it are handled after it.
+    stop overrides all older requests, which end with its outcome. Requests made after it are handled
+    once it has taken effect.
     """
 
     def __init__(self) -> None:

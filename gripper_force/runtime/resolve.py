@@ -60,6 +60,12 @@ class ResolvedConfig:
     notes: tuple[tuple[str, str], ...] = ()
     choices: tuple[str, ...] = ()
 
+    @property
+    def largest_target_n(self) -> float:
+        """Largest target that `check_target` accepts."""
+        limit_n = largest_target_n(self.config.control.force_limit_n, self.config.gripper.gain_bound)
+        return min([limit_n, *self.target_limits_n.values()])
+
     def check_target(self, target_n: float) -> None:
         """Raises `RequestError` if a target is beyond the force limit or a profile's calibrated range."""
         limit_n, gain_bound = self.config.control.force_limit_n, self.config.gripper.gain_bound

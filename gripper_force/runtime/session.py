@@ -59,6 +59,9 @@ _OPENING_SPARE_S: Final = 0.5
 _GAP_CYCLES: Final = 2.5
 """A gap between two readings that is longer than this many cycles is logged."""
 
+NO_ESTIMATE: Final = "no estimate: "
+"""Begin of the text of an event that says why a frame gave no estimate."""
+
 _NUMBER: Final = re.compile(r"[\d.]+")
 
 _PACKAGES: Final = ("gripper-force", "dynamixel-sdk", "mujoco", "numpy", "torch")
@@ -222,7 +225,7 @@ class Session:
                 log(processed.attention)
             kind_of_problem = _NUMBER.sub("", processed.problem)  # one event, although its numbers change
             if kind_of_problem not in ("", self._problem):
-                log(Event(processed.frame.received_ns, "vision", f"no estimate: {processed.problem}"))
+                log(Event(processed.frame.received_ns, "vision", NO_ESTIMATE + processed.problem))
             self._problem = kind_of_problem
         state = self.servo_state = self._read_servo()
         request = self._request(state.t_ns, kind, target_n, width_m, new_object)

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 from gripper_force.control.state_machine import Decision
 from gripper_force.types import EstimateSource, LoadCellSample, Outcome, Phase, ServoState
 
-GRIPPING: Final = (Phase.CONTACT, Phase.RAMP, Phase.HOLD)
 """Phases in which the jaws press on an object."""
 
 
@@ -21,10 +19,11 @@ class GraspResult:
         force_n: Estimated contact force when the outcome was reached, in newtons.
         std_n: Standard deviation of this estimate, in newtons.
         width_m: Distance between the jaws, in metres.
-        vision_share: Share of the control cycles of the hold in which vision was used, 0 to 1.
+        vision_share: Share of the control cycles of the hold in which vision was used, 0 to 1; 0 without a hold.
         reason: The controller's reason for the outcome, one sentence.
-        object_gain: Gain of the object (its stiffness over that of its kind) by motor current; 0 if it is not known.
-        object_gain_std: Its relative standard deviation.
+        object_gain: Gain of the object (its stiffness over that of its kind) by motor current; None if it is not
+            known.
+        object_gain_std: Its relative standard deviation; None if it is not known.
     """
 
     outcome: Outcome
@@ -33,8 +32,8 @@ class GraspResult:
     width_m: float
     vision_share: float
     reason: str
-    object_gain: float = 0.0
-    object_gain_std: float = 0.0
+    object_gain: float | None = None
+    object_gain_std: float | None = None
 
     @property
     def held(self) -> bool:
@@ -124,7 +123,7 @@ class StateTracker:
             state.width_m,
             share,
             state.reason,
-            estimate.object_gain,
-            estimate.object_gain_std,
+            estimate.object_gain or None,
+            estimate.object_gain_std if estimate.object_gain else None,
         )
         return state, result

@@ -15,10 +15,10 @@ class EngineContract:
 
     Subclass it and override the fixture `engine`::
 
-    class TestMyEngine(EngineContract):
-        @pytest.fixture
-        def engine(self) -> Engine:
-            return open_engine(read_model("small"), "my_package.engines:MyEngine")
+        class TestMyEngine(EngineContract):
+            @pytest.fixture
+            def engine(self) -> Engine:
+                return open_engine(read_model("small"), "my_package.engines:MyEngine")
     """
 
     @pytest.fixture

@@ -9,7 +9,7 @@ Subclass `ServoContract` in a test module and override its fixtures::
 
         @pytest.fixture
         def servo(self, config):
-            return MyServo(config)
+            return MyServo(config, time.monotonic_ns)
 
         @pytest.fixture
         def spec(self, config):

@@ -75,14 +75,17 @@ class ForceEstimator:
 
             estimator = ForceEstimator.load("default", region=(40, 40, 400, 400))
             for frame in frames:  # (H, W) uint8; no contact in the first ones
-                estimate = estimator.update(frame)
-                if estimate is None:
-                    continue  # the reference is being collected
-                print(f"{estimate.force_n:.2f} N +- {estimate.std_n:.2f} N")
+                try:
+                    estimate = estimator.update(frame)
+                except DataError as error:  # an unfamiliar or covered view, a moved camera
+                    print(error)
+                    continue
+                if estimate is not None:  # None while the reference is collected
+                    print(f"{estimate.force_n:.2f} N +- {estimate.std_n:.2f} N")
 
         Args:
             checkpoint: ``default`` or ``small`` for a shipped network, the path of a checkpoint, or the path
-                of a file that `gripper-force export` wrote.
+                of a file that `gripper-force export network` wrote.
             region: Region of interest of the frames in pixels: left, top, width, height. None: the whole
                 frame.
             profile: Object profile: a name such as ``sponge``, or the path of a YAML file. Its network must

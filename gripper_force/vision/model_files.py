@@ -40,11 +40,11 @@ def read_model(source: str | Path) -> Model:
         return Model(path, header, digest_of(data, header))
     path = Path(source)
     if not path.is_file():
-        raise CheckpointError(f"no network at {path}; make one with `gripper-force export`")
+        raise CheckpointError(f"no network at {path}; make one with `gripper-force export network`")
     metadata = _openvino_metadata(path) if path.suffix == ".xml" else _onnx_metadata(path)
     if not {"header", "digest"} <= metadata.keys():
         raise CheckpointError(
-            f"{path} was not made by `gripper-force export`; make one with it from a checkpoint"
+            f"{path} was not made by `gripper-force export network`; make one with it from a checkpoint"
         )
     return Model(path, header_from(metadata["header"], path), metadata["digest"])
 
@@ -72,7 +72,7 @@ def exported_file(model: Model, suffix: str) -> Path:
     if not path.exists():
         with importing(
             f"exporting {model.path.name} for {EXPORTED[suffix]}",
-            ", or run `gripper-force export` on another machine and set vision.checkpoint to its file",
+            ", or run `gripper-force export network` on another machine and set vision.checkpoint to its file",
         ):
             exporter = import_module("gripper_force.vision.export")  # no part of a robot's installation
         exporter.export(model, path)

@@ -24,6 +24,7 @@ from gripper_calibration.plots.object_plot import draw
 from gripper_calibration.touch_logs import TouchRecording, join, read_log
 from gripper_force.config import Config
 from gripper_force.errors import DataError
+from gripper_force.jobs.dataset import find_logs
 from gripper_force.jobs.profile_files import check_place, pack, write_object
 from gripper_force.jobs.recording.record import RecordingPlan, record
 from gripper_force.profiles.object_profile import ObjectProfile, user_folder
@@ -158,7 +159,7 @@ def calibrate_object(
             paths.append(path)
             progress(f"touch {len(paths)} of {touches}")
     else:
-        paths = find_logs([Path(path) for path in logs])
+        paths = find_logs(logs)
     if not paths:
         raise DataError(f"there is no log to calibrate {name!r} from; record touches of it first")
     return _fit_and_write(config, name, paths, out, progress)
@@ -236,11 +237,6 @@ def move_away(config: Config, folder: Path) -> Path | None:
             f"can't move the touches in {folder} to {beside}: {error}; move them yourself"
         ) from error
     return beside
-
-
-def find_logs(paths: Sequence[Path]) -> list[Path]:
-    """Returns the logs among the paths, and those in folders among them, sorted within each folder."""
-    return [log for path in paths for log in (sorted(path.rglob("*.mcap")) if path.is_dir() else [path])]
 
 
 def default_folder(name: str) -> Path:

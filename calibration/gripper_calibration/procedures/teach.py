@@ -41,7 +41,6 @@ from gripper_calibration.fits.touches import Floats
 from gripper_calibration.plots.taught_plot import draw
 from gripper_calibration.procedures.calibrate_object import (
     default_folder,
-    find_logs,
     make_profile,
     record_touches,
 )
@@ -49,7 +48,7 @@ from gripper_calibration.touch_logs import TouchRecording, join, read_log
 from gripper_force import __version__
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DataError
-from gripper_force.jobs.dataset import CONTACT_N, Clip, load_clips
+from gripper_force.jobs.dataset import CONTACT_N, Clip, find_logs, load_clips
 from gripper_force.jobs.processes import process_pool
 from gripper_force.jobs.profile_files import check_place, pack, write_all, write_object
 from gripper_force.jobs.training.ood_fit import model_of_scores
@@ -186,12 +185,12 @@ def teach(
             paths.append(path)
             progress(f"touch {len(paths)} of {touches}")
     else:
-        paths = find_logs([Path(path) for path in logs])
+        paths = find_logs(logs)
     used = [path for path in paths if _has_contact(path, model)]
     without_contact = tuple(path for path in paths if path not in used)
     # The same touch in two folds would be both learned and left out.
     logs_by_digest = {_digest_of(path): path for path in used}
-    work = _Work(logs_by_digest, find_logs([Path(path) for path in replay]), place / "teach", workers)
+    work = _Work(logs_by_digest, find_logs(replay) if replay else [], place / "teach", workers)
     return work.run(config, model, name, out, without_contact, progress)
 
 

@@ -13,7 +13,6 @@ from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import CONTACT_N, label_at
 from gripper_force.jobs.replay.feed import Replayed
 from gripper_force.jobs.score import (
-    NO_ESTIMATE,
     GraspScore,
     HoldVision,
     controls_with_vision,
@@ -23,7 +22,9 @@ from gripper_force.jobs.score import (
 )
 from gripper_force.runtime.backends import is_simulated
 from gripper_force.runtime.log_reader import LogReader
+from gripper_force.runtime.session import NO_ESTIMATE
 from gripper_force.types import (
+    GRIPPING,
     NS_PER_MS,
     NS_PER_S,
     EstimateSource,
@@ -39,8 +40,6 @@ from gripper_force.types import (
     ServoState,
     VisualForce,
 )
-
-_GRIPPING: Final = (Phase.CONTACT, Phase.RAMP, Phase.HOLD)
 
 _CONTROLLER: Final = ("control", "vision")
 """Units of the controller's events."""
@@ -352,7 +351,7 @@ def _losses(
     begin_ns: int | None = None
     for s in status:
         is_lost = (
-            s.phase in _GRIPPING and sources.get(s.t_ns, EstimateSource.CURRENT) == EstimateSource.CURRENT
+            s.phase in GRIPPING and sources.get(s.t_ns, EstimateSource.CURRENT) == EstimateSource.CURRENT
         )
         if is_lost and begin_ns is None:
             begin_ns = s.t_ns

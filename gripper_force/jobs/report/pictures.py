@@ -13,7 +13,7 @@ from gripper_force.config import config_from_text
 from gripper_force.errors import CheckpointError, DataError
 from gripper_force.jobs.report.data import Run
 from gripper_force.runtime.log_reader import LogReader
-from gripper_force.types import NS_PER_S, Frame, Gray, Phase
+from gripper_force.types import GRIPPING, NS_PER_S, Frame, Gray
 from gripper_force.vision.preprocess import downscale
 
 if TYPE_CHECKING:
@@ -149,7 +149,7 @@ class FrameSampler:
 
 def _grip(run: Run) -> tuple[float, float]:
     """Start and end of the grip: by the phases, else by the load cell, else the whole log."""
-    phases = [span for span in run.phases if span.phase in {Phase.CONTACT, Phase.RAMP, Phase.HOLD}]
+    phases = [span for span in run.phases if span.phase in GRIPPING]
     if phases:
         return phases[0].start_s, phases[-1].end_s
     cell = run.forces.get("load_cell")

@@ -31,11 +31,11 @@ from gripper_force.runtime.resolve import resolve
 from gripper_force.runtime.session import open_session
 from gripper_force.schema import Tree
 from gripper_force.types import (
+    GRIPPING,
     NS_PER_MS,
     NS_PER_S,
     GraspStatus,
     LoadCellSample,
-    Phase,
     ServoCommand,
 )
 
@@ -56,8 +56,6 @@ _MOST_LOST_MS: Final = 100 + 5
 
 _ONLY_LIVE: Final = frozenset(row.name for row in ROWS if row.unit == "process")
 """Rows whose processes run in real time only: their runs are not counted twice."""
-
-_GRIPPING: Final = (Phase.CONTACT, Phase.RAMP, Phase.HOLD)
 
 
 class Outcome(TypedDict):
@@ -218,7 +216,7 @@ def _run_without_fault(tree: Tree) -> FaultFreeGrasp:
     config = config_from(tree, "stability")
     with tempfile.TemporaryDirectory() as folder:
         run = _grasp(config, Path(folder))
-        gripping = [s.t_ns / NS_PER_S for s in run.records(GraspStatus) if s.phase in _GRIPPING]
+        gripping = [s.t_ns / NS_PER_S for s in run.records(GraspStatus) if s.phase in GRIPPING]
         if not gripping:
             raise GripperError(
                 f"the grasp of {config.object!r} with seed {config.seed} fails even without a fault; "

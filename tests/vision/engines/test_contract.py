@@ -137,7 +137,7 @@ def test_damaged_file_is_named_in_error(ensemble: Path, tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="damaged or not an OpenVINO file"):
         read_model(tmp_path / "cut.xml")
     (tmp_path / "cut.xml").write_text("<net/>", encoding="utf-8")
-    with pytest.raises(CheckpointError, match="not made by `gripper-force export`"):
+    with pytest.raises(CheckpointError, match="not made by `gripper-force export network`"):
         read_model(tmp_path / "cut.xml")
     needs("onnxruntime")
     (tmp_path / "cut.onnx").write_bytes(b"no network")
