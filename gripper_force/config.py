@@ -35,7 +35,7 @@ class SecondServoConfig(Section):
     """The servo of the second finger, of the same model and on the same bus as the first one's."""
 
     id: int | None = Field(
-        None, ge=0, le=252, description="id of the second finger's servo; None: one servo drives both jaws"
+        None, ge=0, le=252, description="id of the second finger's servo; null: one servo drives both jaws"
     )
     mirrored: bool = Field(
         True, description="true if it turns the other way than the first servo while the jaws close"
@@ -135,17 +135,17 @@ class GripperConfig(Section):
     open_width_m: Positive = Field(0.092, description="distance between the open jaws")
     nm_per_a: Positive | None = Field(
         None,
-        description="torque constant at the horn, of both servos together if there are two; None: value of the "
+        description="torque constant at the horn, of both servos together if there are two; null: value of the "
         "servo model",
     )
     current_step_a: Positive | None = Field(
-        None, description="resolution of the goal current; None: value of the servo model"
+        None, description="resolution of the goal current; null: value of the servo model"
     )
     position_loop_a_per_rad: Positive | None = Field(
-        None, description="motor current per radian of position error; None: value of the servo model"
+        None, description="motor current per radian of position error; null: value of the servo model"
     )
     position_loop_gain_per_s: Positive | None = Field(
-        None, description="speed without load per radian of position error; None: value of the servo model"
+        None, description="speed without load per radian of position error; null: value of the servo model"
     )
     friction_n: NonNegative = Field(0.95, description="Coulomb friction of one jaw while closing")
     damping_n_s_m: NonNegative = Field(14.5, description="viscous friction of one jaw, including the motor")
@@ -175,25 +175,27 @@ class CameraConfig(Section):
     options: Tree = Field({}, description="keys of a third-party camera backend")
     rate_hz: float = Field(60.0, ge=0.1, le=1000, description="requested frames per second")
     path: Path | None = Field(None, description="playback: the log to play")
-    speed: Literal["recorded", "full"] = Field("recorded", description="playback: speed")
+    speed: Literal["recorded", "full"] = Field(
+        "recorded", description="playback: recorded: at the recorded pace; full: one frame per call"
+    )
     device: int | str | None = Field(
-        None, description="oak: id or address (None: the only one); uvc: index, /dev path or name"
+        None, description="oak: id or address (null: the only one); uvc: index, /dev path or name"
     )
     sensor: str | None = Field(
         None,
-        description="oak: socket (CAM_B) or name (OV7251); None: the mono sensor on the lowest socket, else the "
+        description="oak: socket (CAM_B) or name (OV7251); null: the mono sensor on the lowest socket, else the "
         "colour sensor there",
     )
     resolution_px: tuple[PositiveInt, PositiveInt] | None = Field(
         None,
-        description="width and height of the sensor image; oak: a mode of the sensor (None: its largest of at "
-        "most 1280x800 that reaches rate_hz); uvc: None: 640x480, if available",
+        description="width and height of the sensor image; oak: a mode of the sensor (null: its largest of at "
+        "most 1280x800 that reaches rate_hz); uvc: null: 640x480, if available",
     )
     fourcc: str | None = Field(
         None,
         pattern="^[ -~]{4}$",
         description="uvc: pixel format, e.g. MJPG, which most webcams need for 60 frames per second, or YUYV; "
-        "None: chosen by OpenCV",
+        "null: chosen by OpenCV",
     )
     region: tuple[int, int, int, int] | None = Field(
         None,
@@ -202,29 +204,29 @@ class CameraConfig(Section):
     )
     side_px: int = Field(128, ge=16, le=800, description="oak, uvc: side of the square frame")
     exposure_us: int | None = Field(
-        4000, gt=0, description="exposure time; None: automatic (simulated camera: as 4000)"
+        4000, gt=0, description="exposure time; null: automatic (simulated camera: as 4000)"
     )
     gain: int | None = Field(
         None,
         ge=0,
-        description="oak: ISO (None: 100); uvc: in the driver's unit (None: unchanged); needs exposure_us",
+        description="oak: ISO (null: 100); uvc: in the driver's unit (null: unchanged); needs exposure_us",
     )
     lens_position: int | None = Field(
         None,
         ge=0,
         description="focus of a lens with autofocus, which is off; larger is nearer; oak: 0 to 255, needed by "
-        "such a lens; uvc: in the driver's unit (None: unchanged)",
+        "such a lens; uvc: in the driver's unit (null: unchanged)",
     )
     white_balance_k: int | None = Field(
         None,
         ge=1000,
         le=12_000,
         description="colour temperature of the white balance of a colour camera, which is not automatic; oak: "
-        "None: 5000; uvc: None: unchanged",
+        "null: 5000; uvc: null: unchanged",
     )
     timeout_ms: Positive | None = Field(
         None,
-        description="oak, uvc: age of the newest frame after which the camera counts as lost; None: 250, or four frame "
+        description="oak, uvc: age of the newest frame after which the camera counts as lost; null: 250, or four frame "
         "periods if they are longer",
     )
 
@@ -262,11 +264,13 @@ class LoadCellConfig(Section):
     tare_raw: Finite = Field(0.0, description="raw reading without load: counts, kg, or V/V")
     n_per_raw: Finite | None = Field(
         None,
-        description="newtons per unit of the raw reading; None: 9.80665 for an indicator in kg; any other "
+        description="newtons per unit of the raw reading; null: 9.80665 for an indicator in kg; any other "
         "load cell is then uncalibrated and its samples are invalid",
     )
     path: Path | None = Field(None, description="playback: the log to play")
-    speed: Literal["recorded", "full"] = Field("recorded", description="playback: speed")
+    speed: Literal["recorded", "full"] = Field(
+        "recorded", description="playback: recorded: at the recorded pace; full: all samples at once"
+    )
 
     @field_validator("n_per_raw")
     @classmethod
@@ -334,7 +338,7 @@ class ControlConfig(Section):
     """Fusion, force loop, phases and limits."""
 
     unknown_hint: ClassVar[str] = (
-        "The gains of the force loop are no keys: they follow from plant_gain, plant_lag_ms and plant_delay_ms, which "
+        "The gains of the force loop are not keys: they follow from plant_gain, plant_lag_ms and plant_delay_ms, which "
         "`gripper-force calibrate object` measures"
     )
 
@@ -361,14 +365,14 @@ class ControlConfig(Section):
     hold_s: NonNegative = Field(1.5, description="time for which `grasp` holds before it releases")
     timeout_s: Positive = Field(8.0, description="time after which a grasp that is not held has timed out")
     vision_rate_hz: Positive | None = Field(
-        None, description="estimates per second that the loop is tuned for; None: camera.rate_hz"
+        None, description="estimates per second that the loop is tuned for; null: camera.rate_hz"
     )
     vision_timeout_ms: Positive | None = Field(
-        None, description="time without an estimate after which vision drops out; None: 2.7 frame periods"
+        None, description="time without an estimate after which vision drops out; null: 2.7 frame periods"
     )
     vision_age_ms: Positive | None = Field(
         None,
-        description="frame age above which an estimate is rejected; None: 83 ms and a frame period",
+        description="frame age above which an estimate is rejected; null: 83 ms and a frame period",
     )
     vision_std_n: Positive = Field(1.5, description="standard deviation above which an estimate is rejected")
     learn_gain: bool = Field(
@@ -379,7 +383,7 @@ class ControlConfig(Section):
     object_ratio: tuple[Positive, Positive] | None = Field(
         None,
         description="motor current over vision in earlier grasps of the object, and its relative standard deviation "
-        "without that of the torque constant; None: from the object profile, or unknown",
+        "without that of the torque constant; null: from the object profile, or unknown",
     )
     min_object_width_m: Finite = Field(
         0.002,
@@ -403,17 +407,17 @@ class ControlConfig(Section):
     )
     temperature_limit_c: Positive = Field(70.0, description="servo temperature that ends a grasp as a fault")
     voltage_limits_v: tuple[Positive, Positive] | None = Field(
-        None, description="lowest and highest supply voltage; None: range of the servo model"
+        None, description="lowest and highest supply voltage; null: range of the servo model"
     )
     plant_gain: Positive | None = Field(
-        None, description="contact force per newton of motor force; None: from the object profile, or 1"
+        None, description="contact force per newton of motor force; null: from the object profile, or 1"
     )
     plant_lag_ms: Positive | None = Field(
-        None, description="lag from motor current to contact force; None: from the object profile, or 60"
+        None, description="lag from motor current to contact force; null: from the object profile, or 60"
     )
     plant_delay_ms: Positive | None = Field(
         None,
-        description="delay from contact force to estimate (exposure to use, plus half a frame); None: from "
+        description="delay from contact force to estimate (exposure to use, plus half a frame); null: from "
         "the object profile, or 52 and half a frame period. With feedback=vision at least this default is "
         "used, and a lag of at most 60",
     )
@@ -481,7 +485,7 @@ class SimCameraConfig(Section):
     roll_deg: float = Field(0.0, ge=-180, le=180, description="rotation of the camera about its optical axis")
     blur_px: float = Field(0.0, ge=0, le=10, description="standard deviation of the lens's blur")
     noise: Share | None = Field(
-        None, description="photon noise of a white pixel; None: drawn, 0.012 to 0.024"
+        None, description="photon noise of a white pixel; null: drawn, 0.012 to 0.024"
     )
 
 
@@ -505,7 +509,7 @@ class SimLightConfig(Section):
     @classmethod
     def _is_a_direction(cls, direction: Vector) -> Vector:
         if not any(direction):
-            raise ValueError("0, 0, 0 is no direction")
+            raise ValueError("0, 0, 0 is not a direction")
         return direction
 
 
@@ -524,7 +528,7 @@ class SimConfig(Section):
         "budget.sim_speed by the table of `gripper-force bench scene`",
     )
     lux: Positive | None = Field(
-        None, description="light level in lux; None: 350, 550 or 750, drawn from the seed"
+        None, description="light level in lux; null: 350, 550 or 750, drawn from the seed"
     )
     tool: Literal["pads", "discs", "rods"] = Field(
         "pads",
@@ -535,11 +539,11 @@ class SimConfig(Section):
     randomise: bool = Field(
         True, description="draw size, pose, camera, texture, light and motor from the seed"
     )
-    object_seed: int | None = Field(None, ge=0, description="seed of size, stiffness and texture; None: seed")
+    object_seed: int | None = Field(None, ge=0, description="seed of size, stiffness and texture; null: seed")
     rig_seed: int | None = Field(
         None,
         ge=0,
-        description="seed of the gripper and its surroundings (camera, light, table, motor, gears, rods); None: seed",
+        description="seed of the gripper and its surroundings (camera, light, table, motor, gears, rods); null: seed",
     )
     size_spread: float = Field(
         0.04, ge=0, le=0.15, description="half-width of the uniform spread of the size"
@@ -567,10 +571,10 @@ class SimConfig(Section):
     moving_background: bool = Field(False, description="things that move behind the object")
     camera_latency_ms: NonNegative = Field(15.0, description="time from mid-exposure to the frame")
     exposure_ms: Positive = Field(4.0, description="exposure at camera.exposure_us 4000")
-    friction: Positive | None = Field(None, description="true friction over the default rig's; None: drawn")
-    gain: Positive | None = Field(None, description="true torque constant over the model's; None: drawn")
-    stiffness: Positive | None = Field(None, description="true stiffness over that of the kind; None: drawn")
-    open_width_m: Positive | None = Field(None, description="true open width; None: gripper.open_width_m")
+    friction: Positive | None = Field(None, description="true friction over the default rig's; null: drawn")
+    gain: Positive | None = Field(None, description="true torque constant over the model's; null: drawn")
+    stiffness: Positive | None = Field(None, description="true stiffness over that of the kind; null: drawn")
+    open_width_m: Positive | None = Field(None, description="true open width; null: gripper.open_width_m")
     hanging_mass_kg: NonNegative = Field(
         0.0, description="mass that pulls one jaw open; 0: none, and in `calibrate weight` the stated one"
     )
@@ -586,8 +590,8 @@ class CalibrationConfig(Section):
     )
     object: str | None = Field(
         None,
-        description="object profile or bundle: a name or a path; own: the one named like `object`; none: none; None: "
-        "the bundle that `gripper-force teach` made of `object`, if there is one",
+        description="object profile or bundle: a name or a path; own: the one named like `object`; none: no profile; "
+        "null: the bundle that `gripper-force teach` made of `object`, if there is one",
     )
     on_mismatch: Literal["refuse", "warn"] = Field(
         "refuse", description="what to do if a profile belongs to another device than the run's"

@@ -10,8 +10,8 @@ from gripper_force.schema import keys
 PAGE = Path(__file__).parents[1] / "docs" / "configuration.md"
 HEAD = """# Configuration
 
-All keys and their defaults. `-` as a default and *None* in a meaning are no value, `null` in YAML. A `--config` file is YAML
-(`control: {force_limit_n: 8}`); `--set control.force_limit_n=8` overrides it. Units are part of the names.
+All keys and their defaults. A default of `null` means no value. A `--config` file is YAML (`control: {force_limit_n: 8}`);
+`--set control.force_limit_n=8` overrides it. Units are part of the names.
 An unknown key is an error. `gripper-force config schema` prints the JSON schema for editors.
 
 | key | default | meaning |
@@ -29,7 +29,7 @@ FAULTS_HEAD = """
 
 def shown(value: Any) -> str:
     if value is None:
-        return "-"
+        return "null"
     if value == {}:
         return "-"
     if isinstance(value, bool):
