@@ -93,7 +93,11 @@ class Approach:
     def set_target(self, target_n: float) -> None:
         """Changes the target force during the approach."""
         self._target_n = target_n
-        self.speed_m_s = min(self._most_m_s, _IMPACT_M_S_PER_N * target_n)
+        self.speed_m_s = self.speed_for_m_s(target_n)
+
+    def speed_for_m_s(self, target_n: float) -> float:
+        """Returns the wanted speed of one jaw for a target force."""
+        return min(self._most_m_s, _IMPACT_M_S_PER_N * target_n)
 
     def _begin(self, width_m: float) -> None:
         self._start_m = width_m

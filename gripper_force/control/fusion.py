@@ -213,7 +213,8 @@ class Fusion:
         self._note_change(gripping or opening, gripping)
         self._variance_n2 = max(self._variance_n2, self._opening_variance_n2)
         if visual is not None and visual.t_ns > self._newest_visual_ns and self._feedback != "current":
-            self._newest_visual_ns = visual.t_ns
+            if visual.t_ns <= t_ns:  # a wrong time in the future would hide all later frames
+                self._newest_visual_ns = visual.t_ns
             self._rejection = self._update(t_ns, visual)
             if not self._rejection:
                 self._used_ns = t_ns
@@ -289,7 +290,9 @@ class Fusion:
         if not (abs(visual.force_n) <= 1e9 and abs(visual.std_n) <= 1e9):
             self._used_ns = None  # the earlier estimates of such a network are not trusted either
             return "it is not finite"
-        if not 0 <= age_ns <= self._max_age_ns:
+        if age_ns < 0:
+            return "its frame has a time in the future"
+        if age_ns > self._max_age_ns:
             return f"it is {age_ns / NS_PER_MS:.0f} ms old"
         if visual.std_n > self._std_limit_n:
             return f"its standard deviation is {visual.std_n:.2f} N"

@@ -61,6 +61,9 @@ _AT_WIDTH_M = 0.0005
 """Distance from the requested width at which a move has arrived: six times what Coulomb friction and the
 servo's proportional gain leave (80 um)."""
 
+_LEAST_SPEED_M_S = 1e-4
+"""Speed of one jaw, for a target of 0.01 N, below which a grasp does not get more time."""
+
 _MOVE_SPARE_S = 1.0
 """Time a move may take beyond its speed profile before an obstacle is reported."""
 
@@ -108,7 +111,6 @@ class GraspController:
     way to an object are so slow that their impact stays within the force limit. A ramp or hold has the object already.
 
     Attributes:
-        timeout_s: Time after which a grasp has timed out: as configured, and what slower jaws need.
         opening_s: Longest time in which the jaws open.
     """
 
@@ -126,7 +128,6 @@ class GraspController:
         self._travel = Travel(
             min(_TRAVEL_SPEED_SHARE * full_m_s, impact_m_s), free_motor_force_n, transmission.open_width_m
         )
-        self.timeout_s = config.timeout_s + transmission.open_width_m / 2 * (1 / approach_m_s - 1 / full_m_s)
         self.opening_s = _OPENING_SPARE_S + transmission.open_width_m / self._travel.speed_m_s
         self._config = config
         self._transmission = transmission
@@ -597,9 +598,20 @@ class GraspController:
                 reason += ", or by friction, which no motion has shown yet: request a release first"
             self._set_outcome(Outcome.BLOCKED, reason)
 
+    def timeout_s(self, target_n: float) -> float:
+        """Returns the time after which a grasp has timed out: as configured, and what slower jaws need.
+
+        Args:
+            target_n: Target force. Jaws are slower for a small one, and for a small force limit.
+        """
+        speed_m_s = max(self._approach.speed_for_m_s(target_n), _LEAST_SPEED_M_S)
+        slower_s_m = 1 / speed_m_s - 1 / self._config.approach_speed_m_s
+        return self._config.timeout_s + self._transmission.open_width_m / 2 * slower_s_m
+
     def _check_timeout(self, t_ns: int) -> None:
-        if t_ns - self._grasp_ns > self.timeout_s * NS_PER_S:
-            reason = f"not held within {self.timeout_s:.3g} s"
+        timeout_s = self.timeout_s(self._target_n)
+        if t_ns - self._grasp_ns > timeout_s * NS_PER_S:
+            reason = f"not held within {timeout_s:.3g} s"
             if objection := self._objection:
                 reason += (
                     f": {objection}. Look whether there is an object, in full view. "

@@ -62,7 +62,7 @@ class VisualCheck:
             self._force_n = None
         if self._covered_ns is not None and t_ns - self._covered_ns > valid_ns:
             self._covered_ns = None
-        if visual is None or visual.t_ns <= self._t_ns or self._config.feedback == "current":
+        if visual is None or self._config.feedback == "current" or not self._t_ns < visual.t_ns <= t_ns:
             return
         if math.isnan(visual.force_n) and not visual.is_familiar:
             # A view that is covered all the time tells nothing.

@@ -78,7 +78,7 @@ def save_gain(
         ConfigError: The profile or its second file can't be read, or the new one can't be written.
         LogError: A log can't be read.
     """
-    from gripper_force.jobs.profile_files import write_object
+    from gripper_force.jobs.profile_files import write_all, write_object
 
     source = find_object(name)
     profile = read_object(source)
@@ -97,7 +97,14 @@ def save_gain(
     if gain.problem:
         raise DataError(f"the gain is not saved: {gain.problem}")
     target = out or (source if source.name == BUNDLED else user_folder() / f"{source.stem}.yaml")
-    write_object(target, profile.model_copy(update={"ratio": total}), weights_path(source).read_bytes())
+    changed = profile.model_copy(update={"ratio": total})
+    if (
+        profile.network is not None and target.parent != source.parent
+    ):  # a bundle's network goes with its profile
+        network = target.with_suffix(".network.safetensors")
+        write_all({network: (source.parent / profile.network).read_bytes()})
+        changed = changed.model_copy(update={"network": network.name})
+    write_object(target, changed, weights_path(source).read_bytes())
     return SavedGain(profile.object, estimate.gain, estimate.std, *total, target)
 
 

@@ -357,7 +357,7 @@ class _Run:
         self._plant, self._controller, self._drawn = plant, controller, drawn
         self._offset_rad = offset_rad
         # Jaws with a small force limit are slow, so that all else happens later.
-        self.slower_s = controller.timeout_s - control.timeout_s
+        self.slower_s = controller.timeout_s(math.inf) - control.timeout_s
         self._leaves_ns = (self.slower_s + drawn.leaves_s) * NS_PER_S
         self._returns_ns = self._leaves_ns + drawn.away_s * NS_PER_S
         self._rng = np.random.default_rng(drawn.seed)

@@ -85,7 +85,7 @@ class RequestQueue:
                 raise RequestError(f"no object is gripped (phase {self._phase}); call grasp first")
             # Requests faster than the cycle would be handled later and later. The first may be handled now.
             if self._queued[1:] and not self._queued[-1].is_awaited and self._queued[-1].is_like(request):
-                del self._queued[-1]
+                request.new_object |= self._queued.pop().new_object
             self._queued.append(request)
 
     def stop(self, stop_soon: Callable[[], None]) -> None:

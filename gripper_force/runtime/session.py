@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from gripper_force.config import Config, dump_config
 from gripper_force.control.state_machine import Decision, GraspController, is_open
-from gripper_force.errors import DeviceError, GripperError
+from gripper_force.errors import DeviceError, DeviceTimeoutError, GripperError
 from gripper_force.interfaces import Devices, SharedPort
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log_codecs import UTC_NAME
@@ -47,8 +47,8 @@ from gripper_force.types import (
 if TYPE_CHECKING:  # a run without vision imports none of it
     from gripper_force.vision.estimator import ForceEstimator
 
-_VISION_WAIT_NS: Final = 2 * NS_PER_S
-"""Longest wait for the first visual estimate."""
+_VISION_WAIT_NS: Final = 5 * NS_PER_S
+"""Longest wait for the first visual estimate, beside the time of its frames."""
 
 _REFERENCE_NS: Final = NS_PER_S // 10
 """Every run starts with frames without contact, so that its log can be replayed with vision."""
@@ -111,10 +111,9 @@ class Session:
         self.servo_state: ServoState | None = None
         self.last_load_cell_sample: LoadCellSample | None = None
 
-    @property
-    def timeout_s(self) -> float:
-        """Time after which a grasp has timed out."""
-        return self._controller.timeout_s
+    def timeout_s(self, target_n: float) -> float:
+        """Returns the time after which a grasp with a target force has timed out."""
+        return self._controller.timeout_s(target_n)
 
     @property
     def opening_s(self) -> float:
@@ -149,16 +148,25 @@ class Session:
         self._raise_if_cancelled()
 
     def wait_for_reference(self) -> Decision:
-        """Runs cycles until the reference frames are taken and, with vision, an estimate exists."""
+        """Runs cycles until the reference frames are taken and, with vision, an estimate exists.
+
+        Raises:
+            DeviceTimeoutError: The camera gives too few frames. Later ones may show contact, so they are no reference.
+        """
         decision = self.cycle()
         start_ns = last_ns = decision.status.t_ns
-        with_vision = self.run.model is not None
-        while last_ns - start_ns < (
-            _VISION_WAIT_NS if with_vision and not self.has_vision else _REFERENCE_NS
-        ):
+        frames = 0 if self.run.model is None else self.run.model.header.preprocess.lead_in + 1
+        wait_ns = _VISION_WAIT_NS + round(frames / self.run.config.camera.rate_hz * NS_PER_S)
+        while last_ns - start_ns < (wait_ns if frames and not self.has_vision else _REFERENCE_NS):
             self._raise_if_cancelled()
             decision = self.cycle()
             last_ns = decision.status.t_ns
+        if frames and not self.has_vision:
+            raise DeviceTimeoutError(
+                f"no visual estimate {wait_ns / NS_PER_S:.3g} s after the start: the camera gave {self.frames} "
+                f"of the {frames} frames that the network needs before the first contact; check the camera and "
+                "camera.rate_hz, or set vision.checkpoint=none"
+            )
         return decision
 
     def stop_soon(self) -> None:

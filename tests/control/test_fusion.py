@@ -154,7 +154,7 @@ def test_friction_is_never_negative_for_any_motor_force(transmission, motor_forc
         (3.0, math.inf, 40, "finite"),
         (1e300, 0.3, 40, "finite"),
         (3.0, 0.1, 61, "61 ms old"),
-        (3.0, 0.1, -10, "-10 ms old"),
+        (3.0, 0.1, -10, "in the future"),
         (3.0, 1.6, 40, "standard deviation is 1.60 N"),
         (9.0, 0.1, 40, "differs from the motor current by"),
     ],
@@ -170,6 +170,14 @@ def test_bad_vision_drops_out_with_its_reason(bench, seen_n, std_n, latency_ms, 
     assert reason in b.events[-1]
     b.run(0.2, lambda _: 4.0, lambda _: 3.2)
     assert b.events[-1] == "vision in use; the force estimate is fused"
+
+
+def test_one_frame_from_the_future_does_not_hide_later_ones(bench):
+    b = bench()
+    b.run(1.0, lambda _: 4.0, lambda _: 3.2)
+    b.run(0.015, lambda _: 4.0, lambda _: 3.2, latency_ms=-3_600_000)
+    b.run(0.5, lambda _: 4.0, lambda _: 3.2)
+    assert b.estimate.source == "fused"
 
 
 def test_vision_that_is_rejected_from_the_start_has_one_event_with_its_reason(bench):

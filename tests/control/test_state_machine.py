@@ -118,12 +118,22 @@ def test_no_impact_on_a_hard_object_exceeds_the_force_limit(make_run, limit_n):
 
 def test_slower_jaws_have_more_time(make_run, transmission):
     usual, slow = make_run().controller, make_run(force_limit_n=1.0).controller
-    assert (usual.timeout_s, usual.opening_s) == (8.0, pytest.approx(5.84))
+    assert (usual.timeout_s(5.0), usual.opening_s) == (8.0, pytest.approx(5.84))
     travel_s = transmission.open_width_m / 2 / transmission.impact_m_s(1.0)
-    assert slow.timeout_s == pytest.approx(8.0 + travel_s - transmission.open_width_m / 2 / 0.025)
+    assert slow.timeout_s(math.inf) == pytest.approx(8.0 + travel_s - transmission.open_width_m / 2 / 0.025)
     assert slow.opening_s == pytest.approx(4.0 + 2 * travel_s)
+    # The jaws are at least as slow as the target demands.
+    assert usual.timeout_s(0.5) == pytest.approx(
+        8.0 + transmission.open_width_m / 2 * (1 / 0.005 - 1 / 0.025)
+    )
+    assert usual.timeout_s(5e-324) < 500
     run = make_run(force_limit_n=1.0, timeout_s=3.0).grasp(0.6, 7.0)  # 4.4 s to the object
     assert run.last.status.outcome == "held"
+
+
+def test_a_small_target_without_an_object_is_no_object_and_no_timeout(make_run):
+    run = make_run(plant={"contact_m": 1.0}).grasp(0.5, 16.0)
+    assert run.last.status.outcome == "no_object"
 
 
 @pytest.mark.parametrize("limit_n", [0.8, 1.0, 1.5, 14.0])

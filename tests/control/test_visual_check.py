@@ -57,6 +57,14 @@ def test_estimates_that_are_not_finite_do_not_count(strange):
     assert not check.objection(4.0, 4.0)
 
 
+def test_a_frame_from_the_future_does_not_count():
+    check, t_ns = seen(0.0)
+    check.add(t_ns + 1, visual(t_ns + 3600 * 1000 * NS_PER_MS, 9.0), gripping=True)
+    for cycle in range(1, 31):
+        check.add(t_ns + cycle * FRAME_NS, visual(t_ns + cycle * FRAME_NS, 4.0), gripping=True)
+    assert not check.objection(4.0, 0.0)
+
+
 def test_a_camera_that_has_stopped_objects_to_nothing():
     check, t_ns = seen(0.0)
     assert check.objection(4.0, 4.0)

@@ -5,6 +5,7 @@ import pytest
 from gripper_force.errors import DataError
 from gripper_force.jobs import object_gain
 from gripper_force.jobs.object_gain import gain_of, learned_ratio, save_gain
+from gripper_force.jobs.profile_files import write_object
 from gripper_force.profiles.object_profile import find_object, read_object, weights_path
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import FusedForce
@@ -32,6 +33,28 @@ def test_a_gain_is_saved_beside_the_correction(tmp_path: Path, monkeypatch: pyte
     assert after.ratio == pytest.approx((1.6, 0.05 / 2**0.5))
     assert after.model_copy(update={"ratio": None}) == before
     assert weights_path(tmp_path / "mine.yaml").exists()
+
+
+def test_the_network_of_a_bundle_goes_with_the_profile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(object_gain, "learned_ratio", lambda path, _: (1.6, 0.05))
+    monkeypatch.setattr(object_gain, "_torque_std", lambda path, _: 0.06)
+    source = find_object("sponge")
+    bundle = tmp_path / "mug" / "profile.yaml"
+    bundle.parent.mkdir()
+    write_object(
+        bundle,
+        read_object(source).model_copy(update={"network": "network.safetensors"}),
+        weights_path(source).read_bytes(),
+    )
+    (bundle.parent / "network.safetensors").write_bytes(b"weights")
+    save_gain(str(bundle.parent), [tmp_path], tmp_path / "mine.yaml")
+    saved = read_object(tmp_path / "mine.yaml")
+    assert saved.network is not None
+    assert (tmp_path / saved.network).read_bytes() == b"weights"
+    assert save_gain(str(bundle.parent), [tmp_path]).profile == bundle
+    assert read_object(bundle).network == "network.safetensors"
 
 
 @pytest.mark.parametrize(("ratio", "words"), [(None, "no log holds a grasp"), ((9.0, 0.05), "is not saved")])

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from gripper_force import cli
 from gripper_force.config import load_config
-from gripper_force.errors import CheckpointError, ConfigError, DataError, LogError
+from gripper_force.errors import CheckpointError, ConfigError, LogError
 from gripper_force.jobs import metrics, report
 from gripper_force.jobs import replay as job
 from gripper_force.jobs.evaluate import evaluate
@@ -148,10 +148,45 @@ def test_a_truncated_log_is_read_only_where_that_is_asked_for(fused_log: Path, t
     assert 100 < result.frames < replay(fused_log).frames
 
 
-def test_what_can_not_be_compared_is_named(fused_log: Path, tmp_path: Path) -> None:
-    blind = tampered(fused_log, tmp_path / "run.mcap", lambda r: None if isinstance(r, LoadCellSample) else r)
-    with pytest.raises(DataError, match="no estimate to compare with a load cell"):
-        replay(blind)
+RIG = """
+format: gripper-force-rig/1
+servo:
+  date: 2025-01-01T00:00:00Z
+  model: XM430-W350
+  nm_per_a: {value: 1.78}
+  friction_n: {value: 0.95}
+  damping_n_s_m: {value: 14.5}
+  pinion_radius_m: {value: 0.02}
+  open_position_rad: {value: 0.0}
+  open_width_m: 0.092
+  force_n: [0, 12]
+  speed_m_s: [0, 0.05]
+  residual_n: 0.1
+"""
+
+
+def test_log_without_a_load_cell_has_no_errors(fused_log: Path, tmp_path: Path) -> None:
+    bare = tampered(fused_log, tmp_path / "run.mcap", lambda r: None if isinstance(r, LoadCellSample) else r)
+    result = replay(bare)
+    assert (result.identical, result.mae_n, result.frames, result.sources) == (True, None, 0, {})
+    done = CliRunner().invoke(cli.app, ["replay", str(bare), "--report"], catch_exceptions=False)
+    assert (done.exit_code, bare.with_suffix(".html").exists()) == (0, True), done.stderr
+    assert "No load cell: force errors can't be measured." in done.stdout
+    results, _, failed = replay_each([fused_log, bare], workers=1)
+    assert not failed
+    assert summary(results).sources["fused"].frames == results[0].sources["fused"].frames
+
+
+def test_log_is_replayed_without_the_file_of_its_rig_profile(quick: list[str], tmp_path: Path) -> None:
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(RIG)
+    log = tmp_path / "run.mcap"
+    run_grasp(load_config(None, [*quick, f"calibration.rig={rig}"]), log)
+    rig.unlink()
+    assert replay(log).identical is True
+
+
+def test_what_can_not_be_read_is_named(fused_log: Path, tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"no checkpoint at gone\.safetensors"):
         replay(fused_log, "gone.safetensors")
     with pytest.raises(LogError, match="No such file"):

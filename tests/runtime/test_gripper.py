@@ -194,6 +194,19 @@ def test_vision_share_counts_the_hold(quick_vision: list[str]) -> None:
         assert gripper.config.gripper.nm_per_a is not None  # the resolved configuration
 
 
+def test_a_camera_without_reference_frames_is_an_error_before_the_first_motion(
+    quick_vision: list[str],
+) -> None:
+    """Frames that come later may show contact, so they are no reference."""
+    fault = "faults=[{unit: camera, kind: 'off', at_s: 0.03, for_s: 30}]"
+    error = r"the camera gave \d of the 4 frames .* before the first contact; check the camera"
+    with pytest.raises(gf.DeviceTimeoutError, match=error):
+        gf.open_gripper(overrides=[*quick_vision, fault])
+    late = "faults=[{unit: camera, kind: 'off', at_s: 0.03, for_s: 3}]"
+    with gf.open_gripper(overrides=[*quick_vision, late]) as gripper:
+        assert gripper.state.t_ns > 3e9
+
+
 @pytest.mark.parametrize("target_n", [0.0, -1.0, 9.1, math.nan, math.inf])
 def test_a_force_out_of_range_is_refused(simulated: Open, target_n: float) -> None:
     gripper = simulated()

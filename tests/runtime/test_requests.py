@@ -35,8 +35,10 @@ class Cycle:
         self.queue, self.state = RequestQueue(), STATE
         self.stops = 0
 
-    def submit(self, kind: RequestKind, *, needs_object: bool = False, wait: bool = True) -> PendingRequest:
-        request = PendingRequest(kind, needs_object=needs_object, is_awaited=wait)
+    def submit(
+        self, kind: RequestKind, *, needs_object: bool = False, new_object: bool = False, wait: bool = True
+    ) -> PendingRequest:
+        request = PendingRequest(kind, needs_object=needs_object, new_object=new_object, is_awaited=wait)
         self.queue.submit(request)
         return request
 
@@ -104,6 +106,15 @@ def test_a_newer_request_of_another_kind_replaces(cycle: Cycle) -> None:
     release = cycle.submit(RequestKind.RELEASE, wait=False)
     assert cycle.run(Phase.RELEASE) is release
     assert failure(grasp) == "the grasp request was replaced by a release request"
+
+
+def test_the_request_that_replaces_a_grasp_of_a_new_object_is_one_too(cycle: Cycle) -> None:
+    cycle.submit(RequestKind.RELEASE, wait=False)
+    cycle.submit(RequestKind.GRASP, new_object=True, wait=False)
+    last = cycle.submit(RequestKind.GRASP, wait=False)
+    cycle.run(Phase.RELEASE)
+    assert cycle.run(Phase.APPROACH) is last
+    assert last.new_object
 
 
 def test_callers_of_the_same_kind_get_the_same_result(cycle: Cycle) -> None:

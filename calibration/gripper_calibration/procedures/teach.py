@@ -551,6 +551,8 @@ def _write_bundle(
     out = taught.bundle
     part, old = out.with_name(f".{out.name}.part"), out.with_name(f".{out.name}.old")
     try:
+        if old.exists() and not out.exists():  # an earlier replacement was interrupted
+            old.rename(out)
         for folder in (part, old):
             shutil.rmtree(folder, ignore_errors=True)
         part.mkdir(parents=True)
@@ -569,9 +571,14 @@ def _write_bundle(
             taught.learned,
             part / _FIGURE,
         )
-        if out.exists():
-            out.rename(old)
-        part.rename(out)
+        try:
+            if out.exists():
+                out.rename(old)
+            part.rename(out)
+        except BaseException:
+            if old.exists() and not out.exists():
+                old.rename(out)
+            raise
         shutil.rmtree(old, ignore_errors=True)
     except OSError as error:
         raise ConfigError(f"can't write the bundle {out}: {error.strerror}; name another folder") from error

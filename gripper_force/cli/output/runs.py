@@ -128,6 +128,9 @@ def replay_table(r: "ReplayResult", report: str | None = None) -> None:
         found["commands"] = f"at most {1e3 * r.changed['goal_current_a']:.0f} mA from the run's"
         found["fused force"] = f"at most {r.changed['fused_n']:.2f} N from the run's"
     pairs({**found, "log": r.log, **({} if report is None else {"report": report})})
+    if not r.sources:
+        out.print("No load cell: force errors can't be measured.")
+        return
     table = Table("source", "MAE N", "RMSE N", "bias N", "contact MAE N", "lag ms", "samples", box=None)
     for name, s in r.sources.items():
         figures = (s.mae_n, s.rmse_n, s.bias_n, s.contact_mae_n)

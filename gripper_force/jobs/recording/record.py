@@ -139,8 +139,9 @@ def record(
     config, peak_n = _checked(config, plan)
     for number, path in enumerate(plan.paths(config, out), start=1):
         one = config.model_copy(update={"seed": config.seed + number - 1, "target_n": peak_n})
+        run = resolve(one, vision=False)
         if path.exists():
-            _check_same(path, one)
+            _check_same(path, run.config)
             yield path
             continue
         if prompt is not None:
@@ -151,7 +152,6 @@ def record(
         notes |= {"split": split} if (split := plan.split(number)) else {}
         notes |= {} if plan.degrees is None else {"degrees": f"{plan.degrees:g}"}
         notes |= {} if plan.lux is None else {"lux": f"{plan.lux:g}"}
-        run = resolve(one, vision=False)
         with open_devices(run.config) as devices:
             devices.notes.update(notes)
             _open_jaws(run, devices)
@@ -307,7 +307,7 @@ def _touch_all(session: _MonitoredSession, touches: int) -> None:
             peak_n,
             float(rng.uniform(*_HOLD_S)),
             free_n=free_n,
-            timeout_s=session.timeout_s,
+            timeout_s=session.timeout_s(peak_n),
             release_timeout_s=session.opening_s,
         )
         which = f"touch {session.touch} of set {session.number}"

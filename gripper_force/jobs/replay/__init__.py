@@ -48,7 +48,7 @@ def replay(
         ConfigError: An override is wrong, or the object profile belongs to another network or camera.
         LogError: The log cannot be read.
         CheckpointError: The network's file cannot be read.
-        DataError: The log holds nothing to replay, or no load cell to compare with.
+        DataError: The log holds nothing to replay.
     """
     return replay_frames(path, checkpoint, overrides=overrides, recover=recover)[0]
 
@@ -73,17 +73,17 @@ def replay_frames(
     cells = series.cells.sorted()
     sources = errors_by_source(series, cells)
     best = next((sources[name] for name in ("fused", "visual") if name in sources), None)
-    if best is None:
-        raise DataError(
-            f"{path} holds no estimate to compare with a load cell; replay a log of a run with a load cell"
-        )
-    overall = {"mae_n": best.mae_n, "rmse_n": best.rmse_n, "bias_n": best.bias_n, "frames": best.frames}
+    if not (series.seq or series.fused_ns):
+        raise DataError(f"{path} holds nothing to replay: neither frames of a network nor control cycles")
+    overall = (
+        {} if best is None else {key: getattr(best, key) for key in ("mae_n", "rmse_n", "bias_n", "frames")}
+    )
     result = ReplayResult(
-        mae_n=best.mae_n,
-        rmse_n=best.rmse_n,
-        bias_n=best.bias_n,
-        per_bin=best.per_bin,
-        frames=best.frames,
+        mae_n=None if best is None else best.mae_n,
+        rmse_n=None if best is None else best.rmse_n,
+        bias_n=None if best is None else best.bias_n,
+        per_bin=[] if best is None else best.per_bin,
+        frames=0 if best is None else best.frames,
         per_object={run.config.object: overall},
         identical=all(flags) if flags else None,
         note=_note(reader, run),

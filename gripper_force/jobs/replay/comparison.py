@@ -63,9 +63,9 @@ class ReplayResult:
         log: Path of the log.
     """
 
-    mae_n: float
-    rmse_n: float
-    bias_n: float
+    mae_n: float | None
+    rmse_n: float | None
+    bias_n: float | None
     per_bin: list[ForceBin]
     frames: int
     per_object: dict[str, dict[str, float]]

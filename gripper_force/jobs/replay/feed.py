@@ -76,10 +76,13 @@ def resolve_replay(config: Config) -> ResolvedConfig:
         CheckpointError: The network's file cannot be read.
     """
     config, model, choice = resolve_vision(config)
+    # The log's configuration contains the values of the rig profile, whose file may be gone.
+    calibration = config.calibration.model_copy(update={"rig": None})
+    profiles = read_profiles(config.model_copy(update={"calibration": calibration}))
     return ResolvedConfig(
         config,
         model,
-        read_correction(config, read_profiles(config), model),
+        read_correction(config, profiles, model),
         choices=(choice,) if choice else (),
     )
 

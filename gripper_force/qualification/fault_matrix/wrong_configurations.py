@@ -368,7 +368,7 @@ def _grasp_and_release(
     add(session.wait_for_reference().status)
     status = cycle(RequestKind.GRASP, target_n)
     begin_ns = changed_ns = status.t_ns
-    longest_ns = round(session.timeout_s * NS_PER_S) + 2 * _AFTER_OUTCOME_NS
+    longest_ns = round(session.timeout_s(target_n) * NS_PER_S) + 2 * _AFTER_OUTCOME_NS
     while status.t_ns - begin_ns < longest_ns and (
         status.outcome == Outcome.NONE or status.t_ns - changed_ns < _AFTER_OUTCOME_NS
     ):

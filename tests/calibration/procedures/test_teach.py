@@ -1,6 +1,7 @@
 """Teaching from logs of a synthetic press, with tiny networks: what is chosen, kept, written and used."""
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -335,6 +336,33 @@ def test_a_missing_network_is_found_before_the_first_touch(config: Config, tmp_p
     with pytest.raises(ConfigError, match="teach needs a network to begin with"):
         teach(config.model_copy(update={"vision": vision}), "disc", folder=tmp_path / "touches")
     assert not (tmp_path / "touches").exists()
+
+
+def test_an_interrupted_replacement_keeps_the_old_bundle(
+    taught: Taught,
+    config: Config,
+    logs: list[Path],
+    work: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    out = tmp_path / "disc"
+    shutil.copytree(taught.bundle, out)
+    rename = Path.rename
+
+    def interrupted(path: Path, target: Path) -> Path:
+        if target == out and path.name.endswith(".part"):
+            raise KeyboardInterrupt
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        teach(config, "disc", logs=logs, folder=work, out=out)
+    assert read_object(out / "profile.yaml") == taught.profile
+    rename(out, out.with_name(".disc.old"))  # as a kill between the two leaves it
+    with pytest.raises(KeyboardInterrupt):
+        teach(config, "disc", logs=logs, folder=work, out=out)
+    assert read_object(out / "profile.yaml") == taught.profile
 
 
 def test_folder_that_is_no_bundle_is_not_replaced(config: Config, logs: list[Path], tmp_path: Path) -> None:

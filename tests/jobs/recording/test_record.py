@@ -241,6 +241,13 @@ def test_touch_that_load_cell_does_not_measure_raises(
         made(config, RecordingPlan(1), tmp_path)
 
 
+def test_recording_continues_with_the_detail_that_auto_chose(config: Config, tmp_path: Path) -> None:
+    sim, budget = config.sim.model_copy(update={"detail": "auto"}), {"sim_speed": 0.01}
+    auto = config.model_copy(update={"sim": sim, "budget": config.budget.model_copy(update=budget)})
+    first = made(auto, RecordingPlan(1, touches=1), tmp_path)
+    assert made(auto, RecordingPlan(2, touches=1), tmp_path)[0] == first[0]
+
+
 def test_touch_that_reaches_no_force_raises(config: Config, tmp_path: Path) -> None:
     control = config.control.model_copy(update={"timeout_s": 0.3})
     with pytest.raises(DataError, match=r"touch 1 of set 1 reached no force: .* is between the jaws"):
