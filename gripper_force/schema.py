@@ -1,6 +1,6 @@
 """Shared base of YAML-backed models: base class, number types, loading, and error messages."""
 
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from difflib import get_close_matches
 from inspect import isclass
 from math import isclose
@@ -141,9 +141,24 @@ def keys(section: type[Section], under: str = "") -> Iterator[tuple[str, FieldIn
             yield f"{under}{name}", field
 
 
+class _Loader(yaml.SafeLoader):
+    """YAML loader that refuses a key that occurs twice: the first one would be lost."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        seen: list[object] = []
+        for key_node, _ in node.value:
+            key = key_node.value if isinstance(key_node, yaml.ScalarNode) else key_node
+            if key in seen and key != "<<":
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key {key!r} occurs twice; join its two parts", key_node.start_mark
+                )
+            seen.append(key)
+        return super().construct_mapping(node, deep)
+
+
 def _parse(text: str, what_fails: str) -> Any:
     try:
-        return yaml.safe_load(text)
+        return yaml.load(text, _Loader)  # noqa: S506  # it is a safe loader
     except _NO_YAML as error:
         raise ConfigError(f"{what_fails}: {' '.join(str(error).split())}") from error
 

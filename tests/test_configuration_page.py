@@ -11,8 +11,8 @@ PAGE = Path(__file__).parents[1] / "docs" / "configuration.md"
 HEAD = """# Configuration
 
 All keys and their defaults. A default of `null` means no value. A `--config` file is YAML (`control: {force_limit_n: 8}`);
-`--set control.force_limit_n=8` overrides it. Units are part of the names.
-An unknown key is an error. `gripper-force config schema` prints the JSON schema for editors.
+`--set control.force_limit_n=8` overrides it. Units are part of the names. A relative path is
+relative to the folder of the command, not to that of the file. An unknown key is an error. `gripper-force config schema` prints the JSON schema for editors.
 
 | key | default | meaning |
 |---|---|---|

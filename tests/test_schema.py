@@ -4,6 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gripper_force.config import load_config
 from gripper_force.errors import ConfigError
 from gripper_force.schema import (
     Section,
@@ -68,3 +69,13 @@ def test_an_assignment_makes_the_sections_it_needs() -> None:
     tree: Tree = {}
     assign(tree, "a.b=[1, 2]")
     assert tree == {"a": {"b": [1, 2]}}
+
+
+def test_a_key_that_occurs_twice_is_refused(tmp_path: Path) -> None:
+    """The first section would be lost, and with it a force limit."""
+    path = tmp_path / "rig.yaml"
+    path.write_text("control: {force_limit_n: 8}\ncamera: {}\ncontrol: {hold_s: 3}\n")
+    with pytest.raises(ConfigError, match=r"the key 'control' occurs twice; join its two parts.*line 3"):
+        load_config(path)
+    path.write_text("a: &base {x: 1}\nb: {<<: *base, x: 2}\n")
+    assert read_tree(path)["b"] == {"x": 2}

@@ -105,7 +105,10 @@ def main() -> NoReturn:
 def _fail(message: str) -> NoReturn:
     console.err.print(f"[bold red]error:[/] {escape(message)}", soft_wrap=True)
     _print_json_error(message)
-    sys.exit(2)
+    from gripper_force.runtime import process
+
+    # An interrupt can appear as an error of what it met, such as an import.
+    sys.exit(process.interrupt_exit_code() if process.is_interrupted() else 2)
 
 
 def _print_json_error(message: str) -> None:

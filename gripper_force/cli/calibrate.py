@@ -1,6 +1,6 @@
 """The commands that calibrate a rig and objects."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -263,6 +263,7 @@ def object_(
         logs = _touches(settings, touches, peak_n, folder, pause)
     else:
         logs = find_logs(logs)
+        _tell_other_objects(name, logs)
     with console.bar("calibrating", len(logs) + 2) as progress:
         result = job.calibrate_object(settings, name, logs=logs, out=out, progress=progress)
     if result.mae_after_n is None:
@@ -332,8 +333,10 @@ def gain(
     """Save the object's gain, learned from motor current in grasps with the profile, to an object profile."""
     from gripper_force.jobs.dataset import find_logs
     from gripper_force.jobs.object_gain import save_gain
+    from gripper_force.profiles.object_profile import find_object, read_object
 
     paths = find_logs(logs)
+    _tell_other_objects(read_object(find_object(name)).object, paths)
     saved = save_gain(name, paths, out, set_)
     console.show(saved, as_json)
     console.next_step("grasp", "--object", saved.object, "--profile", out or name)
@@ -379,6 +382,7 @@ def teach(
     require("torch", "teach")
     from gripper_calibration.procedures import calibrate_object
     from gripper_calibration.procedures import teach as job
+    from gripper_force.jobs.dataset import find_logs
     from gripper_force.profiles.object_profile import user_folder
 
     if fresh and logs is not None:
@@ -399,6 +403,9 @@ def teach(
                 ):
                     logs.append(path)
                     touching(path.name)
+        else:
+            logs = find_logs(logs)
+            _tell_other_objects(name, logs)
         with console.bar_or_lines("teaching", job.STEPS) as progress:
             result = job.teach(
                 settings,
@@ -447,6 +454,15 @@ def _tell_existing(settings: "Config", touches: int, folder: Path, fresh: bool) 
             soft_wrap=True,
             markup=False,
         )
+
+
+def _tell_other_objects(name: str, logs: Sequence[Path]) -> None:
+    from gripper_force.config import config_from_text
+    from gripper_force.runtime.log_reader import LogReader
+
+    others = {config_from_text(LogReader(path).config, str(path)).object for path in logs} - {name}
+    if others:
+        console.err.print(f"warning: there are logs of {', '.join(sorted(others))} among those for {name}")
 
 
 def _touches(settings: "Config", touches: int, peak_n: float | None, folder: Path, pause: bool) -> list[Path]:

@@ -51,7 +51,7 @@ def schema(set_: Overrides = None, as_json: AsJson = False) -> None:
 
 @app.command()
 def file(
-    name: Annotated[str | None, typer.Argument(help="Name of a file.  [default: list all]")] = None,
+    name: Annotated[str | None, typer.Argument(help="Name of a file. Default: list all.")] = None,
     set_: NoOverrides = None,
     as_json: AsJson = False,
 ) -> None:

@@ -21,23 +21,23 @@ def simulate(
     folder: Annotated[Path, typer.Option("--out", help="Folder for the logs.")] = Path("data/sim"),
     presses: Annotated[
         int | None,
-        typer.Option(min=0, help="Logs of presses: one to three random forces in turn.  [default: 200]"),
+        typer.Option(min=0, help="Logs of presses: one to three random forces in turn. Default: 200."),
     ] = None,
     taps: Annotated[
         int | None,
-        typer.Option(min=0, help="Logs of taps: one fast touch, for more scenes in less time.  [default: 0]"),
+        typer.Option(min=0, help="Logs of taps: one fast touch, for more scenes in less time. Default: 0."),
     ] = None,
-    grasps: Annotated[int | None, typer.Option(min=0, help="Logs of grasps.  [default: 20]")] = None,
+    grasps: Annotated[int | None, typer.Option(min=0, help="Logs of grasps. Default: 20.")] = None,
     first_seed: Annotated[
         int | None,
-        typer.Option(min=0, help="Seed of the first log. Training data starts at 100000.  [default: 100000]"),
+        typer.Option(min=0, help="Seed of the first log. Training data starts at 100000. Default: 100000."),
     ] = None,
     object_: Annotated[
         list[str] | None,
         typer.Option(
             "--object",
             help="Simulate this object (a name, or the path of its file), or a group: training-kinds, "
-            "held-out-kinds. Repeatable.  [default: all four, in turn]",
+            "held-out-kinds. Repeatable. Default: all four, in turn.",
         ),
     ] = None,
     protocol: Annotated[
@@ -47,14 +47,14 @@ def simulate(
         str | None,
         typer.Option(
             help="With --protocol: full (720 logs) or small (80: 0 and 30 degrees, one light).  "
-            "[default: full]"
+            "Default: full."
         ),
     ] = None,
     instances: Annotated[
         str | None,
         typer.Option(
             help="With --protocol: same (one instance of each object and one rig in all sets, as in the paper) "
-            "or redrawn (for each set).  [default: same]"
+            "or redrawn (for each set). Default: same."
         ),
     ] = None,
     jobs: Jobs = CORES,

@@ -43,7 +43,7 @@ def export_lerobot(
         str, typer.Option(help="force: actions are target forces, 0 for open jaws; width: target widths.")
     ] = "force",
     task: Annotated[
-        str | None, typer.Option(help='Description of the task.  [default: "grasp the" and the object]')
+        str | None, typer.Option(help='Description of the task. Default: "grasp the" and the object.')
     ] = None,
     video: Annotated[bool, typer.Option(help="Images as video; otherwise as PNG, without loss.")] = True,
     set_: Overrides = None,

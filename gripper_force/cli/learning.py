@@ -89,6 +89,11 @@ def train(
             load_clips(logs, settings.preprocess, workers=jobs, progress=progress) if logs else []
             for logs in folders
         )
+    there = {clip.object for clip in (*clips, *old)}
+    if unknown := sorted(set(hold_out or []) - there):
+        raise ConfigError(
+            f"--hold-out: no log is of {', '.join(unknown)}; there are {', '.join(sorted(there))}"
+        )
     clips, old = ([clip for clip in part if clip.object not in (hold_out or [])] for part in (clips, old))
     left_out = 0
     if not include_contact_starts:
@@ -254,10 +259,10 @@ def reproduce(
     ] = "same",
     steps: Annotated[
         str | None,
-        typer.Option(help="Steps of training; several lengths with commas.  [default: 1100; 2000 at full]"),
+        typer.Option(help="Steps of training; several lengths with commas. Default: 1100; 2000 at full."),
     ] = None,
     seeds: Annotated[
-        int | None, typer.Option(help="Seeds with which each network is trained.  [default: 3]")
+        int | None, typer.Option(help="Seeds with which each network is trained. Default: 3.")
     ] = None,
     minutes: Annotated[
         float | None,

@@ -77,7 +77,7 @@ def grasp(
         int | None,
         typer.Option(
             min=1,
-            help=f"Processes for simulated trials. A real device has one.  [default: {CORES}]",
+            help=f"Processes for simulated trials. A real device has one. Default: {CORES}.",
         ),
     ] = None,
     yes: Annotated[
@@ -178,6 +178,8 @@ def grasp(
         raise failure
     worst = max(results, key=lambda one: abs(one["steady_error_n"] or 0.0))
     console.next_step("replay", worst["log"], "--report")
+    if all(one["result"] != "held" for one in results):
+        raise typer.Exit(1)
 
 
 def _notes(settings: "Config", name: str) -> list[str]:
@@ -231,7 +233,9 @@ def replay(
     from gripper_force.jobs import replay as job
     from gripper_force.jobs.dataset import find_logs
     from gripper_force.jobs.replay.comparison import paired_differences, summary
+    from gripper_force.jobs.replay.feed import changed_config
     from gripper_force.jobs.summary_files import check_writable, replay_tables, write_summary
+    from gripper_force.runtime.log_reader import LogReader
     from gripper_force.vision.model_files import read_model
 
     paths = find_logs(logs)
@@ -247,9 +251,10 @@ def replay(
         if compare[0] == compare[1]:
             raise ConfigError(f"--compare {compare[0]} {compare[1]} compares a setting with itself; name two")
         sides = [_choice(text) for text in compare]
-        for other, _ in sides:
+        for other, changes in sides:
             if other is not None:
-                read_model(other)  # a missing one ends the command before the first side is computed
+                read_model(other)  # a wrong side ends the command before the first one is computed
+            changed_config(LogReader(paths[0], recover=recover), other, [*(set_ or []), *changes])
         with console.bar("replaying", 2 * len(paths)) as progress:
             first, second = (
                 replay_all(checkpoint=other, overrides=[*(set_ or []), *changes], progress=progress)

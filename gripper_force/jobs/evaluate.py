@@ -161,13 +161,14 @@ def evaluate(
         _evaluate_log,
         checkpoint=(model.path, model.digest),
         config=settings.model_dump(mode="json"),
-        objects=tuple(objects),
+        objects=(objects,) if isinstance(objects, str) else tuple(objects),
         include_contact_starts=include_contact_starts,
     )
     found, failed = Workers(workers, ray).read_logs(one, paths, "evaluated", progress)
     chosen = {paths[number]: log for number, log in found.items() if log is not None}
     if not chosen:
-        raise DataError(f"no log in {logs} is of {', '.join(objects)}; choose among the logs' own objects")
+        there = sorted({config_from_text(LogReader(path).config, str(path)).object for path in paths})
+        raise DataError(f"no log is of {', '.join(objects)}; there are {', '.join(there)}")
     used = {path: one for path, one in chosen.items() if one.forces_n is not None}
     if not used:
         without_contact_starts([one.clip for one in chosen.values()], model.header.preprocess)  # raises

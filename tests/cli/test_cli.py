@@ -19,6 +19,8 @@ from typer.testing import CliRunner
 from gripper_force import cli
 from gripper_force.cli import console
 from gripper_force.cli.options import load_settings
+from gripper_force.config import load_config
+from gripper_force.control.limits import largest_target_n
 from gripper_force.errors import ConfigError
 from gripper_force.runtime import process
 from gripper_force.runtime.log_reader import LogReader
@@ -26,6 +28,8 @@ from gripper_hw.dynamixel.control_table import load_model
 from gripper_hw.dynamixel.firmware import VirtualServo
 from gripper_hw.dynamixel.pty_server import BenchMotor, PtyServer
 from gripper_hw.dynamixel.virtual import VirtualBus
+
+ROOT = Path(__file__).parents[2]
 
 
 class Done(NamedTuple):
@@ -87,6 +91,44 @@ def test_every_command_explains_itself(path: tuple[str, ...]) -> None:
     result = CliRunner().invoke(cli.app, [*path, "--help"])
     assert result.exit_code == 0
     assert "Usage:" in result.output
+
+
+def test_every_default_in_a_help_text_is_shown() -> None:
+    """Square brackets are markup of the help's renderer, which drops them."""
+    for path, command in LEAVES.items():
+        for parameter in command.params:
+            assert "[default" not in (getattr(parameter, "help", None) or ""), path
+
+
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "examples").glob("[gs][re]*/*.yaml")), ids=lambda path: path.name
+)
+def test_every_configuration_that_ships_accepts_its_target(path: Path) -> None:
+    config = load_config(path)
+    assert config.target_n <= largest_target_n(config.control.force_limit_n, config.gripper.gain_bound)
+
+
+def test_trials_that_hold_nothing_end_with_code_1(run: Run, sets: list[str]) -> None:
+    assert run("grasp", "--trials", 1, "--jobs", 1, "--object", "none", *sets).code == 1
+
+
+def test_wrong_names_end_the_command_before_its_work(run: Run, fused_log: Path, tmp_path: Path) -> None:
+    found = run("train", fused_log, "--hold-out", "spnge")
+    assert (found.code, "--hold-out: no log is of spnge; there are stapler" in found.err) == (2, True), (
+        found.err
+    )
+    found = run("evaluate", fused_log, "--object", "nope", "--checkpoint", "small")
+    assert (found.code, "no log is of nope; there are stapler" in found.err) == (2, True), found.err
+    found = run("replay", fused_log, "--compare", "log", "bogus.key=3")
+    assert (found.code, "unknown configuration key 'bogus'" in found.err) == (2, True), found.err
+    assert "replaying" not in found.err
+    for out, words in (
+        (tmp_path, "it is a folder"),
+        (tmp_path / "a.onnx", "the ending of an exported network"),
+    ):
+        found = run("train", fused_log, "--out", out)
+        assert (found.code, words in found.err) == (2, True), found.err
+        assert "0/200" in found.err  # steps of the training
 
 
 def test_every_command_can_be_set_and_read_by_a_script() -> None:

@@ -74,7 +74,12 @@ def _line(servo: FoundServo) -> str:
 def _scan_ports(task: Task) -> tuple[list[str], list[PortScan]]:
     """Returns all real ports, and what answers: on the given port, or else on all of them."""
     given, ports = task.given.get("servo.port"), doctor.serial_ports()
-    first = [given] if given is not None and (_is_virtual(given) or Path(given).exists()) else []
+    if given is not None and not _is_virtual(given) and not Path(given).exists():
+        raise DeviceNotFoundError(
+            f"there is no port {given}; there are {', '.join(ports) or 'none'}: name one with --set servo.port=PATH, "
+            "or leave servo.port out to search all of them"
+        )
+    first = [] if given is None else [given]
     scans = doctor.scan_servos(task.config, first, task.progress)
     if not any(one.servos for one in scans) and not (given and _is_virtual(given)):
         searched = {str(Path(one).resolve()) for one in first}

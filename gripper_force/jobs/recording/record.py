@@ -170,9 +170,10 @@ def _check_same(path: Path, config: Config) -> None:
             if isinstance(new, BaseModel):
                 name = next(n for n in type(new).model_fields if getattr(old, n) != getattr(new, n))
                 key, old, new = f"{key}.{name}", getattr(old, name), getattr(new, name)
+            remedy = f"pass --peak-n {old:g}" if key == "target_n" else f"set {key} to {old}"
             raise DataError(
                 f"{path} exists already and was recorded with {key} {old}, not {new}; use another folder, "
-                f"set {key} to {old}, or move that log away"
+                f"{remedy}, or move that log away"
             )
 
 

@@ -64,6 +64,22 @@ def test_the_command_saves_the_gain_of_the_last_log(
     assert weights_path(out).read_bytes() == weights_path(source).read_bytes()
 
 
+def test_the_command_warns_of_logs_of_another_object(
+    row: dict[str, Any], folder: Path, tmp_path: Path
+) -> None:
+    call = [
+        "calibrate",
+        "gain",
+        "tube",
+        "--from",
+        str(grasp_logs(folder)[-1]),
+        "--out",
+        str(tmp_path / "tube.yaml"),
+    ]
+    result = CliRunner().invoke(cli.app, call, catch_exceptions=False)
+    assert "warning: there are logs of sponge among those for tube" in result.stderr
+
+
 def test_the_command_refuses_presses_without_vision(
     row: dict[str, Any], folder: Path, tmp_path: Path
 ) -> None:
