@@ -145,14 +145,11 @@ class _Loader(yaml.SafeLoader):
     """YAML loader that refuses a key that occurs twice: the first one would be lost."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        seen: list[object] = []
-        for key_node, _ in node.value:
-            key = key_node.value if isinstance(key_node, yaml.ScalarNode) else key_node
-            if key in seen and key != "<<":
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"the key {key!r} occurs twice; join its two parts", key_node.start_mark
-                )
-            seen.append(key)
+        names = [key.value for key, _ in node.value]
+        for i, (key, _) in enumerate(node.value):
+            if key.value in names[:i] and key.value != "<<":
+                problem = f"the key {key.value!r} occurs twice; join its two parts"
+                raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
         return super().construct_mapping(node, deep)
 
 

@@ -66,12 +66,10 @@ _MIN_REENTRY = 4
 NO_NEW_ESTIMATE: Final = "no new estimate"
 """Reason of a drop-out of vision without a rejected estimate."""
 
-_DROP_OUT_END = "; using motor current alone"
-
 
 def drop_out_reason(text: str) -> str | None:
     """Returns the reason in the text of an event that says that vision dropped out; None for other events."""
-    found = re.fullmatch(f"vision (?:dropped out|is not used): (.*){re.escape(_DROP_OUT_END)}", text)
+    found = re.fullmatch("vision (?:dropped out|is not used): (.*); using motor current alone", text)
     return None if found is None else found[1]
 
 
@@ -290,10 +288,12 @@ class Fusion:
         if not (abs(visual.force_n) <= 1e9 and abs(visual.std_n) <= 1e9):
             self._used_ns = None  # the earlier estimates of such a network are not trusted either
             return "it is not finite"
-        if age_ns < 0:
-            return "its frame has a time in the future"
-        if age_ns > self._max_age_ns:
-            return f"it is {age_ns / NS_PER_MS:.0f} ms old"
+        if not 0 <= age_ns <= self._max_age_ns:
+            return (
+                f"it is {age_ns / NS_PER_MS:.0f} ms old"
+                if age_ns > 0
+                else "its frame has a time in the future"
+            )
         if visual.std_n > self._std_limit_n:
             return f"its standard deviation is {visual.std_n:.2f} N"
         if self._learns_gain and (problem := self._gain.problem):
@@ -364,7 +364,8 @@ class Fusion:
         self._source, self._is_silent = source, False
         if source != EstimateSource.CURRENT:
             return (Event(t_ns, "vision", f"vision in use; the force estimate is {source}"),)
-        return (Event(t_ns, "vision", f"vision {news}: {self._rejection or NO_NEW_ESTIMATE}{_DROP_OUT_END}"),)
+        text = f"vision {news}: {self._rejection or NO_NEW_ESTIMATE}; using motor current alone"
+        return (Event(t_ns, "vision", text),)
 
     def _estimate(self, t_ns: int) -> FusedForce:
         share = 1 / (1 + self._variance_ratio)

@@ -163,9 +163,8 @@ class Session:
             last_ns = decision.status.t_ns
         if frames and not self.has_vision:
             raise DeviceTimeoutError(
-                f"no visual estimate {wait_ns / NS_PER_S:.3g} s after the start: the camera gave {self.frames} "
-                f"of the {frames} frames that the network needs before the first contact; check the camera and "
-                "camera.rate_hz, or set vision.checkpoint=none"
+                f"no visual estimate after {wait_ns / NS_PER_S:.3g} s and {self.frames} frames; the network needs "
+                f"{frames} before the first contact: check the camera and camera.rate_hz, or set vision.checkpoint=none"
             )
         return decision
 

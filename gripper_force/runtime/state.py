@@ -116,7 +116,7 @@ class StateTracker:
             load_cell_n=None if cell is None else cell.force_n,
         )
         share = self._vision_cycles / self._hold_cycles if self._hold_cycles else 0.0
-        result = GraspResult(
+        return state, GraspResult(
             state.outcome,
             state.force_n,
             state.std_n,
@@ -126,4 +126,3 @@ class StateTracker:
             estimate.object_gain or None,
             estimate.object_gain_std if estimate.object_gain else None,
         )
-        return state, result
