@@ -289,11 +289,7 @@ class Fusion:
             self._used_ns = None  # the earlier estimates of such a network are not trusted either
             return "it is not finite"
         if not 0 <= age_ns <= self._max_age_ns:
-            return (
-                f"it is {age_ns / NS_PER_MS:.0f} ms old"
-                if age_ns > 0
-                else "its frame has a time in the future"
-            )
+            return "its time is in the future" if age_ns < 0 else f"it is {age_ns / NS_PER_MS:.0f} ms old"
         if visual.std_n > self._std_limit_n:
             return f"its standard deviation is {visual.std_n:.2f} N"
         if self._learns_gain and (problem := self._gain.problem):
