@@ -462,7 +462,7 @@ def _tell_other_objects(name: str, logs: Sequence[Path]) -> None:
 
     others = {config_from_text(LogReader(path).config, str(path)).object for path in logs} - {name}
     if others:
-        console.err.print(f"warning: there are logs of {', '.join(sorted(others))} among those for {name}")
+        console.warn(f"there are logs of {', '.join(sorted(others))} among those for {name}")
 
 
 def _touches(settings: "Config", touches: int, peak_n: float | None, folder: Path, pause: bool) -> list[Path]:

@@ -24,14 +24,17 @@ def show(config: ConfigPath = None, set_: Overrides = None, as_json: AsJson = Fa
 
 @app.command()
 def check(config: ConfigPath = None, set_: Overrides = None, as_json: AsJson = False) -> None:
-    """Check keys, values, profiles, backends, network and budgets without opening a device."""
-    from gripper_force.runtime.backends import check_devices
+    """Check keys, values, profiles, backends, network, budgets and simulated scene without opening a real device."""
+    from gripper_force.runtime.backends import check_devices, is_simulated, open_devices
     from gripper_force.runtime.resolve import make_estimator, resolve
 
     run = resolve(load_settings(config, set_, {}))
     run.check_target(run.config.target_n)
     check_devices(run.config)
     make_estimator(run)
+    if is_simulated(run.config):
+        with open_devices(run.config):
+            pass
     notes = [text for _, text in run.notes]
     result = {"ok": True, "choices": list(run.choices), "notes": notes}
     console.show(result, as_json, lambda _: console.out.print("\n".join(["ok", *notes])))

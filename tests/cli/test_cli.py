@@ -108,6 +108,12 @@ def test_every_configuration_that_ships_accepts_its_target(path: Path) -> None:
     assert config.target_n <= largest_target_n(config.control.force_limit_n, config.gripper.gain_bound)
 
 
+def test_config_check_finds_what_can_not_be_simulated(run: Run, sets: list[str]) -> None:
+    found = run("config", "check", *sets, "--set", "object=spnge")
+    assert (found.code, "no simulated object 'spnge'" in found.err) == (2, True), found.err
+    assert run("config", "check", *sets).code == 0
+
+
 def test_trials_that_hold_nothing_end_with_code_1(run: Run, sets: list[str]) -> None:
     assert run("grasp", "--trials", 1, "--jobs", 1, "--object", "none", *sets).code == 1
 
