@@ -29,7 +29,7 @@ from gripper_force.cli.output.runs import (
     replays_table,
     trials_table,
 )
-from gripper_force.errors import ConfigError, GripperError
+from gripper_force.errors import ConfigError, DataError, GripperError
 from gripper_force.plugins import require
 
 if TYPE_CHECKING:
@@ -267,6 +267,8 @@ def replay(
         )
         frames = [one for _, one in kept], [one for _, one in others]
         found = paired_differences([r for r, _ in kept], [r for r, _ in others], frames)
+        if not found and not failed:
+            raise DataError("the logs have no load cell to compare with; replay logs of runs with one")
         printed = {"logs": len(kept), "first": compare[0], "second": compare[1], "differences": found}
         if failed:
             printed["failed"] = {log: str(error) for log, error in failed.items()}

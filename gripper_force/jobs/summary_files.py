@@ -4,7 +4,7 @@ import csv
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from html import escape
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -81,7 +81,7 @@ def replay_tables(
 ) -> dict[str, Rows]:
     """Returns the tables of one replay of logs, or of the two sides of a comparison, by the name of each side."""
     from gripper_force.jobs.metrics import mean_interval
-    from gripper_force.jobs.replay.comparison import summary
+    from gripper_force.jobs.replay.comparison import Comparison, summary
 
     tables: dict[str, Rows] = {name: [] for name in ("differences", "sources", "objects", "logs", "failed")}
     for side, replays in sides.items():
@@ -96,8 +96,14 @@ def replay_tables(
             for source, errors in sources.items():
                 tables["objects"].append({**head, "object": name, "source": source, **asdict(errors)})
         for result in replays.results:
-            for source, found in result.sources.items():
-                figures = {key: value for key, value in asdict(found).items() if key != "per_bin"}
+            # A log without a load cell has a row, too, without errors.
+            known: Mapping[str, Comparison | None] = result.sources or {"": None}
+            for source, found in known.items():
+                figures = {
+                    field.name: None if found is None else getattr(found, field.name)
+                    for field in fields(Comparison)
+                    if field.name != "per_bin"
+                }
                 about = {
                     "log": result.log,
                     "object": next(iter(result.per_object)),

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from gripper_force import cli
 from gripper_force.config import load_config
-from gripper_force.errors import CheckpointError, ConfigError, LogError
+from gripper_force.errors import CheckpointError, ConfigError, DataError, LogError
 from gripper_force.jobs import metrics, report
 from gripper_force.jobs import replay as job
 from gripper_force.jobs.evaluate import evaluate
@@ -174,6 +174,17 @@ def test_log_without_a_load_cell_has_no_errors(fused_log: Path, tmp_path: Path) 
     assert "No load cell: force errors can't be measured." in done.stdout
     results, _, failed = replay_each([fused_log, bare], workers=1)
     assert not failed
+    call = ["replay", str(bare), str(bare), "--out", str(tmp_path / "summary"), "--jobs", "1"]
+    done = CliRunner().invoke(cli.app, call, catch_exceptions=False)
+    assert done.exit_code == 0, done.stderr
+    assert "No load cell: force errors can't be measured." in done.stdout
+    rows = json.loads((tmp_path / "summary" / "summary.json").read_text())["logs"]
+    assert [row["mae_n"] for row in rows] == [None, None]
+    done = CliRunner().invoke(
+        cli.app, ["replay", str(bare), "--compare", "log", "control.ramp_n_s=4", "--jobs", "1"]
+    )
+    assert isinstance(done.exception, DataError)
+    assert "no load cell to compare with" in str(done.exception)
     assert summary(results).sources["fused"].frames == results[0].sources["fused"].frames
 
 

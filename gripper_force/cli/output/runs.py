@@ -165,6 +165,8 @@ def replays_table(
         for source, e in sources.items():
             table.add_row(name, source, number(e.mae_n), number(e.rmse_n), number(e.bias_n), str(e.frames))
     out.print(table)
+    if not summary.sources:
+        out.print("No load cell: force errors can't be measured.")
     if reports:
         pairs({"reports": reports[0] + (f" and {len(reports) - 1} more" if len(reports) > 1 else "")})
 
