@@ -98,9 +98,8 @@ def save_gain(
         raise DataError(f"the gain is not saved: {gain.problem}")
     target = out or (source if source.name == BUNDLED else user_folder() / f"{source.stem}.yaml")
     changed = profile.model_copy(update={"ratio": total})
-    if (
-        profile.network is not None and target.parent != source.parent
-    ):  # a bundle's network goes with its profile
+    # The network of a bundle goes with its profile.
+    if profile.network is not None and target.parent != source.parent:
         network = target.with_suffix(".network.safetensors")
         write_all({network: (source.parent / profile.network).read_bytes()})
         changed = changed.model_copy(update={"network": network.name})

@@ -55,6 +55,7 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp
 
     def call(*arguments: object) -> Done:
         monkeypatch.setattr(sys, "argv", ["gripper-force", *map(str, arguments)])
+        process._received.clear()  # each command is a process of its own
         with pytest.raises(SystemExit) as end:
             cli.main()
         said = capsys.readouterr()
