@@ -95,7 +95,7 @@ def find_logs(source: str | Path | Sequence[str | Path]) -> list[Path]:
         source: Logs, and folders that are searched for ``*.mcap``; one or several.
 
     Raises:
-        DataError: There are no logs at all, or none in a folder.
+        DataError: There are no logs, or none in a folder.
     """
     given = [source] if isinstance(source, str | Path) else source
     found: list[Path] = []

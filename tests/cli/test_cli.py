@@ -115,6 +115,14 @@ def test_config_check_finds_what_can_not_be_simulated(run: Run, sets: list[str])
     assert run("config", "check", *sets).code == 0
 
 
+def test_an_error_that_an_interrupt_caused_has_the_code_of_the_interrupt(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(process, "is_interrupted", lambda: True)
+    monkeypatch.setattr(process, "interrupt_exit_code", lambda: 130)
+    assert run("config", "show", "--set", "bogus=1").code == 130
+
+
 def test_trials_that_hold_nothing_end_with_code_1(run: Run, sets: list[str]) -> None:
     assert run("grasp", "--trials", 1, "--jobs", 1, "--object", "none", *sets).code == 1
 
