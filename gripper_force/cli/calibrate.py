@@ -1,5 +1,6 @@
 """The commands that calibrate a rig and objects."""
 
+import signal
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -20,6 +21,7 @@ from gripper_force.cli.options import (
 from gripper_force.cli.output.calibrate import jaws_table, object_table, rig_table, taught_table, weight_table
 from gripper_force.errors import ConfigError
 from gripper_force.plugins import require
+from gripper_force.runtime import process
 
 if TYPE_CHECKING:
     from rich.status import Status
@@ -40,7 +42,7 @@ RigPath = Annotated[
     typer.Option(
         "--rig",
         help="Rig profile to write; only the calibrated section is replaced. Default: calibration.rig, or "
-        "rig.yaml, or rig_profile.yaml where --config is rig.yaml.",
+        "rig_profile.yaml.",
     ),
 ]
 Fresh = Annotated[
@@ -50,6 +52,9 @@ Fresh = Annotated[
 Pause = Annotated[
     bool, typer.Option("--pause", help="Wait for Enter before each touch, to place the object again.")
 ]
+_NOTED_SHIFT_M = 0.003
+"""Change of the widths by `calibrate servo` that a person should hear of."""
+
 TouchSeed = Annotated[int | None, typer.Option(help="Seed of the touches, and of a simulated scene.")]
 
 
@@ -140,6 +145,12 @@ def servo(
             progress=_progress(status),
         )
     _show_rig(result, as_json)
+    if abs(result.width_shift_m) > _NOTED_SHIFT_M:
+        console.warn(
+            f"with this calibration every width is {1e3 * abs(result.width_shift_m):.0f} mm "
+            f"{'larger' if result.width_shift_m > 0 else 'smaller'} than the configuration said; if its widths were "
+            "right, the gauge has another width than --gauge-mm"
+        )
     words = (
         ["calibrate", "camera", "--object", "NAME"] if settings.uses_vision else ["grasp", "--object", "NAME"]
     )
@@ -478,8 +489,8 @@ def _touches(settings: "Config", touches: int, peak_n: float | None, folder: Pat
                 paths.append(path)
                 progress(path.name)
         except KeyboardInterrupt:
-            if not paths:
-                raise
+            if not paths or process.interrupt_exit_code() != 128 + signal.SIGINT:
+                raise  # SIGTERM and a lost terminal end the command, Ctrl-C only the touches
             console.err.print(f"stopped after {len(paths)} of {touches} touches; calibrating with these")
     return paths
 
@@ -497,10 +508,7 @@ def _rig_settings(
     settings, new = load_settings_before_rig(config, set_, options)
     if new is not None and rig is not None and rig.resolve() != new.resolve():
         read_rig(new)  # raises: this command does not write it
-    default = Path("rig.yaml")
-    if config is not None and config.resolve() == default.resolve():  # the file of `setup` has this name, too
-        default = Path("rig_profile.yaml")
-    return settings, rig or new or settings.calibration.rig or default
+    return settings, rig or new or settings.calibration.rig or Path("rig_profile.yaml")
 
 
 def _next_step(

@@ -85,6 +85,7 @@ class ServoResult:
         offset_a: Offset of the measured current.
         presses: Number of presses.
         passes: Number of passes of free travel.
+        width_shift_m: Width with the calibrated angle of the open jaws, less that with the configured one.
         rig: The rig profile.
         report: The figure, PNG.
     """
@@ -97,6 +98,7 @@ class ServoResult:
     offset_a: CalibratedValue
     presses: int
     passes: int
+    width_shift_m: float
     rig: Path
     report: Path
 
@@ -168,6 +170,9 @@ def calibrate_servo(
         offset_a=fit.offset_a,
         presses=len(presses),
         passes=len(passes),
+        width_shift_m=2
+        * given.pinion_radius_m
+        * (fit.open_position_rad.value - config.gripper.closing_sign * config.gripper.open_position_rad),
         rig=rig,
         report=report,
     )

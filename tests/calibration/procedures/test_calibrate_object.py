@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -22,6 +23,7 @@ from gripper_force.jobs.dataset import load_clip
 from gripper_force.jobs.grasp import grasp
 from gripper_force.jobs.replay import replay
 from gripper_force.profiles.object_profile import read_object, weights_path
+from gripper_force.runtime import process
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import resolve
 from gripper_force.types import NS_PER_S, Event, Frame, GraspStatus, LoadCellSample, Phase, ServoState
@@ -316,6 +318,10 @@ def interrupt() -> str:
     raise KeyboardInterrupt
 
 
+def terminate() -> str:
+    process.raise_interrupt(signal.SIGTERM, None)
+
+
 class SysWithTerminal:
     """The module `sys` with another standard input."""
 
@@ -342,6 +348,11 @@ def test_interrupted_command_calibrates_and_continues_later(
     assert json.loads(stopped.stdout)["touches"] == 2
     assert "stopped after 2 of 3 touches" in stopped.stderr
     assert "Put the object between the jaws for touch 3, then press Enter" in stopped.stderr
+    profile = tmp_path / "it.yaml"
+    profile.unlink()
+    ended = by_hand(tmp_path, monkeypatch, Terminal(0, terminate))
+    assert (ended.stdout, profile.exists()) == ("", False), "SIGTERM ends the command, not the touches alone"
+    process._received.clear()
     finished = by_hand(tmp_path, monkeypatch, Terminal(1, interrupt))
     assert json.loads(finished.stdout)["touches"] == 3
     assert "2 of 3 touches exist already" in finished.stderr

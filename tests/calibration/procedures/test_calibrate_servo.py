@@ -1,5 +1,6 @@
 """Servo calibration on the simulated rig, with known friction and torque."""
 
+import json
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -51,6 +52,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert asked == ["Put the load cell with its width of 30 mm between the open jaws"]
     assert Path(result.report).stat().st_size > 20_000
     assert (result.presses, result.passes) == (6, 12)
+    assert abs(result.width_shift_m) < 0.002
     return path
 
 
@@ -76,6 +78,14 @@ def test_torque_and_friction_of_the_scene_are_found(rig: Path) -> None:
     assert found.force_n[0] < 1
     assert 9 < found.force_n[1] < 10
     assert load_config(None, [f"calibration.rig={rig}"]).gripper.nm_per_a == found.nm_per_a.value
+
+
+def test_a_gauge_of_another_width_than_named_is_noticed(tmp_path: Path) -> None:
+    sets = [part for one in QUICK for part in ("--set", one)]
+    rig = ["--rig", str(tmp_path / "rig.yaml")]
+    end = CliRunner().invoke(app, ["calibrate", "servo", "--gauge-mm", "36", "--yes", "--json", *rig, *sets])
+    assert json.loads(end.stdout)["width_shift_m"] == pytest.approx(0.006, abs=0.002)
+    assert "every width is 6 mm larger than the configuration said" in " ".join(end.stderr.split())
 
 
 @pytest.mark.parametrize("name", ["rotary_finger", "four_bar"])
