@@ -13,6 +13,9 @@ Signal = npt.ArrayLike
 MAX_SPAN_S: Final = 7200.0
 """Longest span that `lag_s` accepts. No run is longer, and a damaged time would need unlimited memory."""
 
+MAX_LAG_S: Final = 1.0
+"""Largest lag that `lag_s` believes. Estimates are 0.05 to 0.3 s late, and a force that hardly changes shows no lag."""
+
 
 @dataclass(frozen=True, slots=True)
 class ForceBin:
@@ -92,8 +95,8 @@ def lag_s(
         step_s: Resolution. Both signals are interpolated to it over the span they share.
 
     Returns:
-        Lag in s, positive if the signal is later. NaN if either is constant, or if their shared span is
-        shorter than two steps or longer than `MAX_SPAN_S`.
+        Lag in s, positive if the signal is later. NaN if either is constant, if the lag is longer than `MAX_LAG_S`,
+        or if their shared span is shorter than two steps or longer than `MAX_SPAN_S`.
     """
     t, t_ref = np.asarray(t_s, np.float64), np.asarray(reference_t_s, np.float64)
     begin, end = max(t[0], t_ref[0]), min(t[-1], t_ref[-1])
@@ -107,7 +110,8 @@ def lag_s(
     size = 1 << (2 * len(grid)).bit_length()  # zero padding for both, against circular wrap-around
     spectrum = np.fft.rfft(a - a.mean(), size) * np.fft.rfft(b - b.mean(), size).conj()
     shift = int(np.fft.irfft(spectrum, size).argmax())
-    return float((shift if shift < size // 2 else shift - size) * step_s)
+    found_s = (shift if shift < size // 2 else shift - size) * step_s
+    return found_s if abs(found_s) <= MAX_LAG_S else float("nan")
 
 
 def _error(predicted: Signal, measured: Signal) -> npt.NDArray[np.float64]:

@@ -108,6 +108,8 @@ def replay_tables(
                     "log": result.log,
                     "object": next(iter(result.per_object)),
                     "identical": result.identical,
+                    "seen": result.seen,
+                    "refused": result.refused,
                 }
                 tables["logs"].append({**head, **about, "source": source, **figures})
         tables["failed"] += [{**head, "log": log, "problem": str(e)} for log, e in replays.failed.items()]

@@ -45,6 +45,12 @@ def test_no_lag_without_movement_or_overlap() -> None:
     assert np.isnan(metrics.lag_s(t_s, np.sin(t_s), t_s + 5, np.sin(t_s)))
 
 
+def test_a_lag_that_nothing_estimated_has_is_nan() -> None:
+    t_s = np.arange(0, 20, 0.01)
+    early, late = np.exp(-((t_s - 3) ** 2)), np.exp(-((t_s - 17) ** 2))
+    assert np.isnan(metrics.lag_s(t_s, late, t_s, early))
+
+
 def test_lag_with_damaged_time_is_nan() -> None:
     t_s = np.array([0.0, 1.0, 1e9])
     assert np.isnan(metrics.lag_s(t_s, t_s, t_s, t_s))

@@ -241,7 +241,7 @@ def test_several_logs_give_the_errors_over_all(fused_log: Path, tmp_path: Path) 
 
 def result_with(mae_n: float) -> ReplayResult:
     errors = Comparison(mae_n, mae_n, 0.0, mae_n, 0.0, 100, [])
-    return ReplayResult(mae_n, mae_n, 0.0, [], 100, {}, None, "", {}, {"fused": errors}, "a.mcap")
+    return ReplayResult(mae_n, mae_n, 0.0, [], 100, 0, 0, {}, None, "", {}, {"fused": errors}, "a.mcap")
 
 
 def test_differences_are_those_of_each_log() -> None:
@@ -371,6 +371,11 @@ def test_frames_that_a_network_does_not_know_are_the_same_in_batches(fused_log: 
     assert [v.seq for v in single if np.isnan(v.force_n)] == [30, 45]
     assert [(v.seq, v.is_familiar) for v in batch] == [(v.seq, v.is_familiar) for v in single]
     assert [v.force_n for v in batch] == pytest.approx([v.force_n for v in single], abs=1e-4, nan_ok=True)
+    found = replay(covered, strict)
+    assert (found.seen, found.refused) == (len(single), sum(not v.is_familiar for v in single))
+    assert found.sources["visual"].frames <= found.seen - found.refused
+    done = CliRunner().invoke(cli.app, ["replay", str(covered), "--checkpoint", str(strict)])
+    assert f"does not know {found.refused} of {found.seen} frames" in " ".join(done.stdout.split())
 
 
 def test_the_replay_of_a_log_with_covered_frames_is_identical(fused_log: Path, tmp_path: Path) -> None:

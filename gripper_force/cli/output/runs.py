@@ -15,6 +15,12 @@ if TYPE_CHECKING:  # --help loads neither NumPy nor PyTorch
     from gripper_force.jobs.replay.comparison import PairedDifference, ReplayResult, ReplaySummary
 
 
+_REFUSED = (
+    "The network does not know {} of {} frames. A run refuses them, so they have no part in the errors of vision; "
+    "evaluate counts them."
+)
+
+
 def grasp_table(r: "Summary") -> None:
     """Prints the figures of a grasp."""
     share = ""
@@ -131,10 +137,12 @@ def replay_table(r: "ReplayResult", report: str | None = None) -> None:
     if not r.sources:
         out.print("No load cell: force errors can't be measured.")
         return
+    if r.refused:
+        out.print(_REFUSED.format(r.refused, r.seen), soft_wrap=True)
     table = Table("source", "MAE N", "RMSE N", "bias N", "contact MAE N", "lag ms", "samples", box=None)
     for name, s in r.sources.items():
         figures = (s.mae_n, s.rmse_n, s.bias_n, s.contact_mae_n)
-        lag = number(1e3 * s.lag_s, digits=0)
+        lag = number(None if s.lag_s is None else 1e3 * s.lag_s, digits=0)
         table.add_row(name, *(number(value) for value in figures), lag, str(s.frames))
     out.print(table)
     _bins_table(r.per_bin)
@@ -160,6 +168,8 @@ def replays_table(
     if notes := sorted({r.note for r in results if r.note}):
         out.print("\n".join(notes), soft_wrap=True)
     pairs({"logs": str(summary.logs), "identical": str(summary.identical)})
+    if summary.refused:
+        out.print(_REFUSED.format(summary.refused, summary.seen), soft_wrap=True)
     table = Table("object", "source", "MAE N", "RMSE N", "bias N", "samples", box=None)
     for name, sources in {"all": summary.sources, **summary.per_object}.items():
         for source, e in sources.items():

@@ -1,5 +1,6 @@
 """Replay of logs: the same functions over the same inputs, and every estimate against the load cell."""
 
+import math
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -84,6 +85,8 @@ def replay_frames(
         bias_n=None if best is None else best.bias_n,
         per_bin=[] if best is None else best.per_bin,
         frames=0 if best is None else best.frames,
+        seen=len(series.seq),
+        refused=series.visual_std_n.count(math.inf),
         per_object={run.config.object: overall},
         identical=all(flags) if flags else None,
         note=_note(reader, run),

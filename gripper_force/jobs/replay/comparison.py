@@ -1,5 +1,6 @@
 """Errors of the estimates of a replay against the load cell, of one log and of several."""
 
+import math
 from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -31,8 +32,8 @@ class Comparison:
         rmse_n: Root mean square error.
         bias_n: Mean error.
         contact_mae_n: Mean absolute error in contact; None without contact.
-        lag_s: Lag of the estimate, in seconds.
-        frames: Number of estimates compared.
+        lag_s: Lag of the estimate, in seconds; None if the forces do not show it.
+        frames: Number of estimates compared; frames that the network does not know are not among them.
         per_bin: Errors by force: ``from_n``, ``to_n``, ``mae_n``, ``bias_n``, ``frames``.
     """
 
@@ -40,7 +41,7 @@ class Comparison:
     rmse_n: float
     bias_n: float
     contact_mae_n: float | None
-    lag_s: float
+    lag_s: float | None
     frames: int
     per_bin: list[ForceBin]
 
@@ -55,6 +56,8 @@ class ReplayResult:
         bias_n: Its mean error.
         per_bin: Its errors by force.
         frames: Number of estimates compared.
+        seen: Frames that vision has an estimate for, or has refused.
+        refused: Those that the network does not know. They have no part in the errors of vision.
         per_object: The same figures by object.
         identical: True if the replay gave the log's estimates and decisions; None if the log holds no run.
         note: Reason why it cannot be identical; empty without one.
@@ -68,6 +71,8 @@ class ReplayResult:
     bias_n: float | None
     per_bin: list[ForceBin]
     frames: int
+    seen: int
+    refused: int
     per_object: dict[str, dict[str, float]]
     identical: bool | None
     note: str
@@ -93,12 +98,16 @@ class ReplaySummary:
     Attributes:
         logs: Number of logs.
         identical: Number of logs of which the replay gave the same estimates and decisions.
+        seen: As in `ReplayResult`, over all logs.
+        refused: Likewise.
         sources: Errors by source, as in `ReplayResult`.
         per_object: The same by object.
     """
 
     logs: int
     identical: int
+    seen: int
+    refused: int
     sources: dict[str, SourceErrors]
     per_object: dict[str, dict[str, SourceErrors]]
 
@@ -227,13 +236,13 @@ def _compare(
     if not valid.any():
         return None
     t_s, predicted_n, measured_n = times_ns[valid] / NS_PER_S, estimates_n[valid], measured_n[valid]
-    contact = measured_n > CONTACT_N
+    contact, lag_s = measured_n > CONTACT_N, metrics.lag_s(t_s, predicted_n, t_s, measured_n)
     return Comparison(
         mae_n=metrics.mae(predicted_n, measured_n),
         rmse_n=metrics.rmse(predicted_n, measured_n),
         bias_n=metrics.bias(predicted_n, measured_n),
         contact_mae_n=metrics.mae(predicted_n[contact], measured_n[contact]) if contact.any() else None,
-        lag_s=metrics.lag_s(t_s, predicted_n, t_s, measured_n),
+        lag_s=None if math.isnan(lag_s) else lag_s,
         frames=len(predicted_n),
         per_bin=metrics.per_bin(predicted_n, measured_n),
     )
@@ -245,6 +254,8 @@ def summary(results: Sequence[ReplayResult]) -> ReplaySummary:
     return ReplaySummary(
         logs=len(results),
         identical=sum(result.identical is True for result in results),
+        seen=sum(result.seen for result in results),
+        refused=sum(result.refused for result in results),
         sources=_pooled(results),
         per_object={name: _pooled([r for r in results if name in r.per_object]) for name in objects},
     )
