@@ -72,6 +72,7 @@ def estimator(
     from gripper_force.qualification.bench import estimator_bench
     from gripper_force.qualification.markdown_blocks import write_between
     from gripper_force.vision.header import SHIPPED
+    from gripper_force.vision.model_files import read_model
 
     if (data is None) != (scale_on is None):
         raise ConfigError(
@@ -82,6 +83,8 @@ def estimator(
         raise ConfigError("--config and --set apply to simulated logs only; leave them out with --data")
     settings = load_settings(config, set_, {})
     sources, counts = checkpoints or list(SHIPPED), threads or sorted({1, CORES})
+    for source in sources:
+        read_model(source)  # a wrong name ends the command before its simulation
     with TemporaryDirectory() as name:
         if data is None or scale_on is None:
             data, scale_on = Path(name) / "data", Path(name) / "scale"
@@ -129,11 +132,11 @@ def gain(
     as_json: AsJson = False,
 ) -> None:
     """Measure the error of vision on single simulated objects without and with the gain learned from grasps."""
-    from gripper_force.jobs.grasp import TRIAL_OBJECTS
+    from gripper_force.jobs.grasp import PAPER_OBJECTS
     from gripper_force.qualification.bench import gain_bench
 
     settings = load_settings(config, set_, {"seed": seed})
-    kinds = objects or list(TRIAL_OBJECTS)
+    kinds = objects or list(PAPER_OBJECTS)
     folder.mkdir(parents=True, exist_ok=True)
     rows = []
     with console.bar("grasping", rounds * len(kinds) * (grasps + presses)) as progress:

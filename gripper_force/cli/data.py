@@ -66,6 +66,7 @@ def simulate(
     """Simulate logs of random touches, for training and evaluation. Continues if it was interrupted."""
     from gripper_force.jobs import paper_protocol
     from gripper_force.jobs import simulate as job
+    from gripper_force.jobs.grasp import PAPER_OBJECTS
     from gripper_hw.sim.kinds import held_out_kinds, training_kinds
 
     plans: list[job.Plan]
@@ -80,7 +81,7 @@ def simulate(
         groups = {"training-kinds": training_kinds, "held-out-kinds": held_out_kinds}
         objects = tuple(
             name
-            for given in object_ or job.OBJECTS
+            for given in object_ or PAPER_OBJECTS
             for name in (groups[given]() if given in groups else (given,))
         )
         plans += job.plan("press", 200 if presses is None else presses, seed, objects)

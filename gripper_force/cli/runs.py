@@ -112,7 +112,7 @@ def grasp(
     device = job.exclusive_device(settings)
     named = object_ is not None or settings.sim.object is not None
     one_object = not trials or bool(device) or same_object or named
-    objects = (settings.object,) if one_object else job.TRIAL_OBJECTS
+    objects = (settings.object,) if one_object else job.PAPER_OBJECTS
     for text in dict.fromkeys(text for name in objects for text in _notes(settings, name)):
         console.line(text)
     if not trials:

@@ -40,7 +40,9 @@ from gripper_force.types import (
     VisualForce,
 )
 
-TRIAL_OBJECTS: Final = ("sponge", "paper_cup", "tube", "stapler")
+PAPER_OBJECTS: Final = ("sponge", "paper_cup", "tube", "stapler")
+"""Simulated objects like the four of the dataset of Shin et al. 2019."""
+
 TRIAL_TARGETS_N: Final = (1.0, 8.0)
 WITHIN_SHARE, WITHIN_N = 0.08, 0.25
 """A trial counts as good if its error is within this share of its target, or within this force."""
@@ -244,7 +246,7 @@ def trials(
     count: int,
     jobs: int,
     *,
-    objects: Sequence[str] = TRIAL_OBJECTS,
+    objects: Sequence[str] = PAPER_OBJECTS,
     target_n: float | None = None,
     same_object: bool = False,
     prompt: Prompt | None = None,

@@ -19,8 +19,10 @@ import numpy as np
 from gripper_force.config import HARD_FORCE_LIMIT_N, Config, config_from, config_from_text, dump_config
 from gripper_force.errors import ConfigError, SimulationError
 from gripper_force.interfaces import Camera
+from gripper_force.jobs.grasp import PAPER_OBJECTS
+from gripper_force.jobs.recording.record import check_same
 from gripper_force.jobs.recording.touches import touch, wait
-from gripper_force.jobs.simulate import OBJECTS
+from gripper_force.jobs.simulate import SAME
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.log_writer import LogWriter
@@ -121,6 +123,16 @@ class SetPlan:
         stem = f"{self.split}/{self.object}-{self.degrees:02d}-{self.number:02d}"
         return tuple(f"{stem}-{lux}.mcap" for lux in self.lux)
 
+    def check(self, out: Path, config: Tree) -> None:
+        """Raises `DataError` if the existing logs were made with another configuration."""
+        for lux, name in zip(self.lux, self.names, strict=True):
+            path = out / name
+            seed = config_from_text(LogReader(path).config, str(path)).seed  # of the draw that succeeded
+            drawn = _set_config(
+                config_from(config, "simulate"), self, seed, lux, np.random.default_rng([seed, 11])
+            )
+            check_same(path, resolve(drawn, vision=False).config, SAME)
+
     def make(self, out: Path, config: Tree) -> list[Path]:
         """Makes the logs that do not exist yet; see `make_set`."""
         return make_set(self, out, config)
@@ -161,7 +173,7 @@ def plan_protocol(scale: str, instances: str) -> list[SetPlan]:
         )
         for number in part.numbers
         for degrees in part.degrees
-        for i, name in enumerate(OBJECTS)
+        for i, name in enumerate(PAPER_OBJECTS)
     ]
 
 

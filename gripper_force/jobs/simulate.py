@@ -18,17 +18,32 @@ from typing import Final, Literal, Protocol
 import numpy as np
 
 from gripper_force.config import Config, config_from
-from gripper_force.jobs.grasp import run_grasp
+from gripper_force.jobs.grasp import PAPER_OBJECTS, run_grasp
 from gripper_force.jobs.processes import Workers
+from gripper_force.jobs.recording.record import check_same
 from gripper_force.jobs.recording.touches import ramp, wait
+from gripper_force.runtime.resolve import resolve
 from gripper_force.runtime.session import open_run
 from gripper_force.schema import Tree
 
 Kind = Literal["press", "tap", "grasp"]
 
-OBJECTS: Final = ("sponge", "paper_cup", "tube", "stapler")
 PEAK_N: Final = 12.5
 """Largest force of a touch: a little over the 12 N of the paper's."""
+
+SAME: Final = (
+    "object",
+    "seed",
+    "target_n",
+    "gripper",
+    "servo",
+    "camera",
+    "load_cell",
+    "sim",
+    "faults",
+    "clock",
+)
+"""Keys and sections of the configuration that decide what a log contains; most of ``control`` is drawn."""
 
 _MIN_TARGET_N: Final = 0.5
 _MAX_TARGETS: Final = 3
@@ -44,6 +59,10 @@ class Plan(Protocol):
     @property
     def names(self) -> tuple[str, ...]:
         """File names of the logs, relative to the output folder."""
+        ...
+
+    def check(self, out: Path, config: Tree) -> None:
+        """Raises `DataError` if existing logs were made with another configuration; see `make`."""
         ...
 
     def make(self, out: Path, config: Tree) -> list[Path]:
@@ -81,12 +100,20 @@ class SimulationPlan:
         """The file name, as the only one."""
         return (self.name,)
 
+    def check(self, out: Path, config: Tree) -> None:
+        """Raises `DataError` if the existing log was made with another configuration."""
+        rng = np.random.default_rng([self.seed, 10])
+        drawn = _randomised(config_from({**config, "object": self.object}, "simulate"), self, rng)
+        check_same(out / self.name, resolve(drawn, vision=False).config, SAME)
+
     def make(self, out: Path, config: Tree) -> list[Path]:
         """Makes the log; see `make_log`."""
         return [make_log(self, out, config)]
 
 
-def plan(kind: Kind, count: int, first_seed: int, objects: tuple[str, ...] = OBJECTS) -> list[SimulationPlan]:
+def plan(
+    kind: Kind, count: int, first_seed: int, objects: tuple[str, ...] = PAPER_OBJECTS
+) -> list[SimulationPlan]:
     """Plans ``count`` logs, with the objects in turn and one seed per log."""
     return [SimulationPlan(kind, objects[i % len(objects)], first_seed + i) for i in range(count)]
 
@@ -104,11 +131,15 @@ def simulate(
         ray: Address of a Ray cluster to use instead, see `gripper_force.jobs.ray_pool`; None for none.
 
     Raises:
+        DataError: An existing log was made with another configuration.
         GripperError: A simulation failed; logs made so far are kept.
     """
     out.mkdir(parents=True, exist_ok=True)
-    missing = [p for p in plans if not all((out / name).exists() for name in p.names)]
     tree = config.model_dump(mode="json")
+    is_made = [all((out / name).exists() for name in p.names) for p in plans]
+    if any(is_made):  # the others were made with the same, or they would have been refused
+        plans[is_made.index(True)].check(out, tree)
+    missing = [p for p, made in zip(plans, is_made, strict=True) if not made]
     with Workers(jobs, ray).pool() as pool:
         futures = [pool.submit(p.make, out, tree) for p in missing]
         for future in as_completed(futures):

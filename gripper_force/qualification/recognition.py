@@ -19,8 +19,9 @@ import numpy.typing as npt
 from gripper_force.config import Config, LogConfig, VisionConfig, config_from, dump_config
 from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import CONTACT_N, label_frames
+from gripper_force.jobs.grasp import PAPER_OBJECTS
 from gripper_force.jobs.processes import process_pool
-from gripper_force.jobs.simulate import OBJECTS, make_log, plan
+from gripper_force.jobs.simulate import make_log, plan
 from gripper_force.progress import Progress, no_progress
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.schema import Tree
@@ -145,7 +146,7 @@ class Row(NamedTuple):
 
     group: str
     name: str
-    objects: tuple[str, ...] = OBJECTS
+    objects: tuple[str, ...] = PAPER_OBJECTS
     settings: tuple[tuple[str, object], ...] = ()
     change: Change | None = None
     throughout: bool = False

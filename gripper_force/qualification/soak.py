@@ -12,7 +12,7 @@ from typing import Final, TypedDict
 import numpy as np
 
 from gripper_force.config import Config
-from gripper_force.jobs.grasp import TRIAL_OBJECTS, TRIAL_TARGETS_N, grasp
+from gripper_force.jobs.grasp import PAPER_OBJECTS, TRIAL_TARGETS_N, grasp
 from gripper_force.progress import Progress, no_progress
 from gripper_force.qualification.proc_files import process_text
 from gripper_force.runtime.log_reader import LogReader
@@ -102,7 +102,7 @@ def soak(config: Config, simulated_s: float, progress: Progress = no_progress) -
         while done_s < simulated_s or len(samples) < fewest:
             number = len(samples) - 1
             drawn = {
-                "object": TRIAL_OBJECTS[number % len(TRIAL_OBJECTS)],
+                "object": PAPER_OBJECTS[number % len(PAPER_OBJECTS)],
                 "target_n": round(float(rng.uniform(*TRIAL_TARGETS_N)), 3),
                 "seed": config.seed + number,
             }
@@ -137,7 +137,7 @@ def measure_growth(samples: list[Sample]) -> Growth:
     """Growth of memory, files and threads after the warm-up."""
     warm = samples[WARM_UP:]
     memory_mb = [sample.memory_mb for sample in warm]
-    each = len(TRIAL_OBJECTS)  # objects take different amounts, so compare medians over one round of all
+    each = len(PAPER_OBJECTS)  # objects take different amounts, so compare medians over one round of all
     growth_mb = float(np.median(memory_mb[-each:]) - np.median(memory_mb[:each]))
     hours = [sample.simulated_s / 3600 for sample in warm]
     slope_mb_h = np.polyfit(hours, memory_mb, 1)[0]

@@ -3,13 +3,13 @@ from pathlib import Path
 import pytest
 
 from gripper_force.config import load_config
-from gripper_force.jobs.grasp import TRIAL_OBJECTS
+from gripper_force.jobs.grasp import PAPER_OBJECTS
 from gripper_force.profiles.apply import read_correction, read_profiles
 from gripper_force.profiles.object_profile import find_object, read_object
 from gripper_force.vision.checkpoint import load_checkpoint
 
 
-@pytest.mark.parametrize("name", TRIAL_OBJECTS)
+@pytest.mark.parametrize("name", PAPER_OBJECTS)
 def test_shipped_profiles_match_the_shipped_network_and_the_default_camera(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from gripper_force.config import Config, config_from_text, load_config
-from gripper_force.errors import ConfigError, SimulationError
+from gripper_force.errors import ConfigError, DataError, SimulationError
 from gripper_force.jobs import paper_protocol as module
+from gripper_force.jobs.grasp import PAPER_OBJECTS
 from gripper_force.jobs.paper_protocol import INSTANCES, SetPlan, make_set, plan_protocol
-from gripper_force.jobs.simulate import OBJECTS, simulate
+from gripper_force.jobs.simulate import simulate
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import Frame, GraspStatus, LoadCellSample, Phase, Record
 from gripper_hw.sim.scene import Scene, draw_scene
@@ -34,7 +35,7 @@ def test_full_protocol_is_the_papers(instances: str) -> None:
     assert (len(sets), len(set(names)), len({one.seed for one in sets})) == (240, 720, 240)
     assert {one.degrees for one in sets} == {0, 10, 20, 30}
     assert {lux for one in sets for lux in one.lux} == {350, 550, 750}
-    assert {one.object for one in sets} == set(OBJECTS)
+    assert {one.object for one in sets} == set(PAPER_OBJECTS)
     assert sum(one.split == "test" for one in sets) == 240 * 3 // 15
     assert "test/stapler-30-15-750.mcap" in names
     with pytest.raises(ConfigError, match="no scale 'huge' of the protocol; use one of full, small"):
@@ -151,7 +152,14 @@ def test_only_missing_logs_are_made_and_failed_draws_are_repeated(
     assert LogReader(made).metadata["set"] == "stapler-1005"
     assert kept.read_bytes() == b"made before"
     assert sorted(kept.parent.iterdir()) == [kept, made]
+    kept.unlink()
+    assert list(simulate([task], tmp_path, seeing, jobs=1)) == [kept]
     assert list(simulate([task], tmp_path, seeing, jobs=1)) == []
+    other = seeing.model_copy(
+        update={"sim": seeing.sim.model_copy(update={"rig_seed": 3, "view_spread": 3.0})}
+    )
+    with pytest.raises(DataError, match=r"recorded with sim\.view_spread 1\.0, not 3\.0; use another folder"):
+        list(simulate([task], tmp_path, other, jobs=1))
 
 
 def test_protocol_needs_simulated_camera(config: Config, tmp_path: Path) -> None:

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from gripper_force.config import Config, config_from_text, load_config
-from gripper_force.errors import ConfigError
+from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs import simulate as module
+from gripper_force.jobs.grasp import PAPER_OBJECTS
 from gripper_force.jobs.simulate import (
-    OBJECTS,
     PEAK_N,
     Kind,
     SimulationPlan,
@@ -27,7 +27,7 @@ def config(quick: list[str]) -> Config:
 def test_plan_is_deterministic_and_cycles_through_objects() -> None:
     plans = plan("press", 6, 100)
     assert plans == plan("press", 6, 100)
-    assert [p.object for p in plans] == [*OBJECTS, *OBJECTS[:2]]
+    assert [p.object for p in plans] == [*PAPER_OBJECTS, *PAPER_OBJECTS[:2]]
     assert [p.seed for p in plans] == list(range(100, 106))
     assert len({p.name for p in plans + plan("grasp", 6, 100)}) == 12
     assert plan("grasp", 2, 7, ("tube",)) == [
@@ -79,14 +79,25 @@ def test_log_holds_frames(config: Config, tmp_path: Path) -> None:
 def test_interrupted_simulation_continues(config: Config, tmp_path: Path) -> None:
     plans = plan("press", 2, 5, ("stapler",))
     kept, missing = (tmp_path / p.name for p in plans)
-    kept.write_bytes(b"made before")
+    make_log(plans[0], tmp_path, config.model_dump(mode="json"))
+    before = kept.read_bytes()
     leftover = tmp_path / f".{missing.name}.part"
     leftover.write_bytes(b"half a log")
     assert list(simulate(plans, tmp_path, config, jobs=1)) == [missing]
-    assert kept.read_bytes() == b"made before"
+    assert kept.read_bytes() == before
     assert LogReader(missing).complete
     assert not leftover.exists()
     assert list(simulate(plans, tmp_path, config, jobs=1)) == []
+
+
+@pytest.mark.parametrize("kind", ["press", "tap", "grasp"])
+def test_logs_of_other_settings_are_not_taken_for_these(kind: Kind, config: Config, tmp_path: Path) -> None:
+    plans = plan(kind, 1, 5, ("stapler",))
+    assert len(list(simulate(plans, tmp_path, config, jobs=1))) == 1
+    assert list(simulate(plans, tmp_path, config, jobs=1)) == []
+    other = config.model_copy(update={"sim": config.sim.model_copy(update={"gain": 1.1})})
+    with pytest.raises(DataError, match=r"recorded with sim\.gain None, not 1\.1; use another folder"):
+        list(simulate(plans, tmp_path, other, jobs=1))
 
 
 def test_failed_simulation_leaves_no_log(config: Config, tmp_path: Path) -> None:

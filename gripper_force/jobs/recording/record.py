@@ -9,7 +9,7 @@ if the camera or the load cell gives no more data, or if the load cell does not 
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -141,7 +141,7 @@ def record(
         one = config.model_copy(update={"seed": config.seed + number - 1, "target_n": peak_n})
         run = resolve(one, vision=False)
         if path.exists():
-            _check_same(path, run.config)
+            check_same(path, run.config, _SAME)
             yield path
             continue
         if prompt is not None:
@@ -161,10 +161,10 @@ def record(
         yield unfinished.rename(path)
 
 
-def _check_same(path: Path, config: Config) -> None:
-    """Raises `DataError` if the log has another object, light, camera or peak than the configuration."""
+def check_same(path: Path, config: Config, keys: Sequence[str]) -> None:
+    """Raises `DataError` if the log was recorded with other values of these keys or sections than the configuration."""
     recorded = config_from_text(LogReader(path).config, str(path))
-    for key in _SAME:
+    for key in keys:
         old, new = getattr(recorded, key), getattr(config, key)
         if old != new:
             if isinstance(new, BaseModel):

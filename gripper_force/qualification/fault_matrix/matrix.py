@@ -18,7 +18,7 @@ import numpy as np
 from gripper_force.config import Config, config_from
 from gripper_force.errors import GripperError, LogError
 from gripper_force.interfaces import Devices
-from gripper_force.jobs.grasp import TRIAL_OBJECTS, TRIAL_TARGETS_N, grasp_and_release
+from gripper_force.jobs.grasp import PAPER_OBJECTS, TRIAL_TARGETS_N, grasp_and_release
 from gripper_force.jobs.processes import process_pool
 from gripper_force.progress import Progress, no_progress
 from gripper_force.qualification.fault_matrix.cases import ROWS, Expected, FaultCase
@@ -203,7 +203,7 @@ def _draw(config: Config, index: int) -> Config:
     target_n = round(float(rng.uniform(*TRIAL_TARGETS_N)), 3)
     return config.model_copy(
         update={
-            "object": TRIAL_OBJECTS[index % len(TRIAL_OBJECTS)],
+            "object": PAPER_OBJECTS[index % len(PAPER_OBJECTS)],
             "target_n": target_n,
             "seed": config.seed + index,
             "control": config.control.model_copy(update={"force_limit_n": LIMIT_SHARE * target_n}),

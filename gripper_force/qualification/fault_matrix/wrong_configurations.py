@@ -18,7 +18,7 @@ from gripper_force.control.limits import largest_target_n
 from gripper_force.control.state_machine import is_open
 from gripper_force.errors import ConfigError, DeviceError, GripperError, SimulationError
 from gripper_force.interfaces import WorldState
-from gripper_force.jobs.grasp import TRIAL_OBJECTS, TRIAL_TARGETS_N
+from gripper_force.jobs.grasp import PAPER_OBJECTS, TRIAL_TARGETS_N
 from gripper_force.jobs.processes import process_pool
 from gripper_force.progress import Progress, no_progress
 from gripper_force.qualification.fault_matrix.outcome_file import OutcomeFile
@@ -285,7 +285,7 @@ def draw(config: Config, row: WrongCase, index: int) -> tuple[Tree, dict[str, An
     lowest_limit_n = target_n / largest_target_n(1.0, config.gripper.gain_bound)
     is_blind = row.feedback == "current" or (row.feedback == "both" and index // 4 % 2)
     keys = {
-        "object": TRIAL_OBJECTS[index % len(TRIAL_OBJECTS)],
+        "object": PAPER_OBJECTS[index % len(PAPER_OBJECTS)],
         "target_n": target_n,
         "seed": config.seed + index,
         "control.force_limit_n": round(_LIMIT_SPARE * lowest_limit_n, 4),

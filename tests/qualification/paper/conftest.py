@@ -5,7 +5,7 @@ import pytest
 
 from gripper_force.config import dump_config, load_config
 from gripper_force.jobs.dataset import Clip
-from gripper_force.jobs.simulate import OBJECTS
+from gripper_force.jobs.grasp import PAPER_OBJECTS
 from gripper_force.qualification.paper.experiment import Test as Estimates
 from gripper_force.qualification.paper.experiment import networks
 from gripper_force.qualification.paper.models import MODELS, Scale
@@ -26,7 +26,7 @@ def touches(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("touches")
     rng = np.random.default_rng(0)
     for side in ("train", "test"):
-        for name in OBJECTS:
+        for name in PAPER_OBJECTS:
             for number in range(2):
                 config = load_config(None, [f"object={name}"])
                 path = folder / side / f"{name}-{number}.mcap"
@@ -54,7 +54,7 @@ def estimates() -> Estimates:
     frames = np.full((FRAMES, 32, 32), 100, np.uint8)
     clips = [
         Clip(frames, forces_n(), np.ones(FRAMES, np.bool_), f"{name}-{i}", name, f"{name}-{i}")
-        for name in OBJECTS
+        for name in PAPER_OBJECTS
         for i in range(2)
     ]
     measured_n = np.concatenate([clip.forces_n for clip in clips]).astype(np.float64)
