@@ -1,7 +1,6 @@
 """The examples of the library, run as a user runs them: in lockstep, and in real time behind a pseudo-terminal."""
 
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -130,24 +129,3 @@ def test_own_camera_satisfies_the_contract(tmp_path: Path) -> None:
     (tmp_path / "test_own.py").write_text(program)
     done = run_beside_examples("-m", "pytest", "-q", "-p", "no:cacheprovider", tmp_path / "test_own.py")
     assert done.returncode == 0, done.stdout
-
-
-def test_lower_force_prints_a_row_per_object_and_feedback() -> None:
-    arguments = ["--feedback", "current", "--object", "tube", "--friction", "1", "--seeds", "1"]
-    shown = run_beside_examples(EXAMPLES / "lower_force.py", *arguments).stdout.splitlines()
-    assert len(shown) == 3
-    assert shown[2].startswith("| current | tube | 1 of 1 |")
-    assert shown[2].endswith("| 0 |")
-
-
-def test_lost_object_prints_the_time_to_slip() -> None:
-    arguments = ["--feedback", "current", "--object", "tube", "--target-n", "3", "--seeds", "1"]
-    shown = run_beside_examples(EXAMPLES / "lost_object.py", *arguments).stdout.splitlines()
-    assert len(shown) == 3
-    assert re.fullmatch(r"\| current \| 3 N \| 1 of 1 \| (\d+), \1 \| [01] \| 0 \|", shown[2])
-
-
-def test_a_loss_is_reported_although_friction_holds_the_jaws_and_the_view_seems_covered() -> None:
-    arguments = ["--feedback", "fused", "--object", "paper_cup", "--target-n", "1", "--seeds", "1"]
-    shown = run_beside_examples(EXAMPLES / "lost_object.py", *arguments).stdout.splitlines()
-    assert re.fullmatch(r"\| fused \| 1 N \| 1 of 1 \| (\d+), \1 \| [01] \| 0 \|", shown[2])

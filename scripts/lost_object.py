@@ -1,6 +1,6 @@
 """Time until a lost object is reported as `slip`, for the four objects of the paper and several forces.
 
-    python examples/lost_object.py
+    python scripts/lost_object.py
 
 The object of a simulated gripper vanishes during a hold. Prints the time to the outcome `slip`, median and largest, and
 how many losses were reported within 50 ms.

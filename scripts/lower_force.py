@@ -1,6 +1,6 @@
 """Force error after the target is lowered during a hold, for the four objects of the paper and wrong friction.
 
-    python examples/lower_force.py
+    python scripts/lower_force.py
 
 Each simulated gripper holds 5 N, and then gets the target 2 N. Prints the error of the load cell's force 0.5 s and 1 s
 after the request, and the time until the new target counts as held. The simulated friction is 0.7, 1 and 1.4 times that

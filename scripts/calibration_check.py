@@ -4,8 +4,8 @@ The objects differ from those in training in stiffness (up to 50 %, training 5 %
 4 %) and texture; a fifth one, a ball, is of another kind. Each object is touched many times on one rig, and
 placed again each time. The last touches are used for testing only.
 
-    python examples/calibration_check.py                # error and interval by number of touches
-    python examples/calibration_check.py --grasps 40    # grasps with a profile of 8 touches, and without
+    python scripts/calibration_check.py                # error and interval by number of touches
+    python scripts/calibration_check.py --grasps 40    # grasps with a profile of 8 touches, and without
 
 Results that exist in OUT are reused.
 """

@@ -4,7 +4,7 @@ Each is fitted in closed form on train/ (ridge regression on random Fourier feat
 with the penalty that is best there: the printed error is a lower bound.
 
     gripper-force simulate --protocol shin2019 --scale small --out data/paper
-    python examples/protocol_check.py data/paper
+    python scripts/protocol_check.py data/paper
 """
 
 import sys

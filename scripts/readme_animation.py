@@ -1,6 +1,6 @@
 """Animates a simulated grasp: the camera's frames beside the growing force curve.
 
-    python examples/readme_animation.py docs/grasp.webp
+    python scripts/readme_animation.py docs/grasp.webp
 
 The file's suffix selects the format: .webp or .gif. Takes about 40 s.
 """

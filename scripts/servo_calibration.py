@@ -1,6 +1,6 @@
 """Coverage of the intervals of `gripper-force calibrate servo`, over simulated rigs.
 
-    python examples/servo_calibration.py --seeds 100
+    python scripts/servo_calibration.py --seeds 100
 
 Motor, friction and gear play differ from rig to rig. A 95 % interval should contain 95 of 100 true values.
 """

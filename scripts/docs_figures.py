@@ -1,6 +1,6 @@
 """Draws the figures of the documentation into a folder.
 
-    python examples/docs_figures.py docs/figures
+    python scripts/docs_figures.py docs/figures
 
 ``loop``, ``calibration``, ``safety`` and ``wiring`` are diagrams. ``fusion`` and ``terminal`` show simulated grasps,
 which the script runs first (about 30 s).

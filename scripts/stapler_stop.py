@@ -1,7 +1,7 @@
 """Visual information on a stapler pressed against its stop, and the resulting error of the network.
 
     gripper-force simulate --out data/test --presses 48 --grasps 0 --first-seed 900000
-    python examples/stapler_stop.py data/test
+    python scripts/stapler_stop.py data/test
 
 Prints the travel of the jaws per newton by force, from the logs, and in the same bins the error of the
 network, of its output on the line that fits best within the bin (least squares), and of the best constant. Past the

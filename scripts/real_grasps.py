@@ -10,9 +10,9 @@ corrects the process as `calibrate object` does, *taught* adds the trial to the 
 
 Recordings that start in contact are left out, as in `train` and `evaluate`: their reference frame is wrong.
 
-    python examples/real_grasps.py FOLDER                              # each object left out
-    python examples/real_grasps.py FOLDER --by day                     # each day left out
-    python examples/real_grasps.py FOLDER --test OTHERS --minutes 5    # other recordings, looked at once
+    python scripts/real_grasps.py FOLDER                              # each object left out
+    python scripts/real_grasps.py FOLDER --by day                     # each day left out
+    python scripts/real_grasps.py FOLDER --test OTHERS --minutes 5    # other recordings, looked at once
 
 Each result is written to OUT/results.json at once; the same command continues after an interruption.
 """
