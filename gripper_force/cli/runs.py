@@ -2,6 +2,7 @@
 
 import signal
 import sys
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -35,6 +36,7 @@ from gripper_force.plugins import require
 if TYPE_CHECKING:
     from gripper_force.config import Config
     from gripper_force.jobs.checks import RegisterChange
+    from gripper_force.jobs.replay import Replays
     from gripper_force.progress import Progress, Prompt
 
 _OPEN_LOOP = (
@@ -90,11 +92,7 @@ def grasp(
     ] = None,
 ) -> None:
     """Grasp with a target force and report the error. Exit code 1 if nothing was held."""
-    from contextlib import nullcontext
-
     from gripper_force.jobs import grasp as job
-    from gripper_force.jobs.view import beside_run
-    from gripper_force.progress import no_progress
 
     if view is not None and trials:
         raise ConfigError("--view shows one grasp; leave out --trials")
@@ -109,35 +107,60 @@ def grasp(
             "calibration.object": profile,
         },
     )
-    device = job.exclusive_device(settings)
     named = object_ is not None or settings.sim.object is not None
-    one_object = not trials or bool(device) or same_object or named
+    one_object = not trials or bool(job.exclusive_device(settings)) or same_object or named
     objects = (settings.object,) if one_object else job.PAPER_OBJECTS
     for text in dict.fromkeys(text for name in objects for text in _notes(settings, name)):
         console.line(text)
     if not trials:
-        log = job.new_log(settings)
-        viewer = nullcontext() if view is None else beside_run(log, view, console.line)
-        try:
-            with viewer:
-                job.run_grasp(settings, log, console.line)
-            result = job.summary_and_report(settings, log)
-        except KeyboardInterrupt:
-            if log.exists():
-                console.err.print(
-                    f"the run until then is in {log}: gripper-force replay {log}",
-                    soft_wrap=True,
-                    markup=False,
-                )
-            raise
-        console.show(result, as_json, grasp_table)
-        if result["report"] is None:
-            console.next_step("replay", log, "--report")
-        else:
-            console.err.print(f"next: open {result['report']}", soft_wrap=True, markup=False)
-        if result["result"] != "held":
-            raise typer.Exit(1)
-        return
+        _grasp_once(settings, view, as_json)
+    else:
+        _grasp_trials(settings, trials, objects, target_n, same_object, jobs, yes, as_json)
+
+
+def _grasp_once(settings: "Config", view: str | None, as_json: bool) -> None:
+    from contextlib import nullcontext
+
+    from gripper_force.jobs import grasp as job
+    from gripper_force.jobs.view import beside_run
+
+    log = job.new_log(settings)
+    viewer = nullcontext() if view is None else beside_run(log, view, console.line)
+    try:
+        with viewer:
+            job.run_grasp(settings, log, console.line)
+        result = job.summary_and_report(settings, log)
+    except KeyboardInterrupt:
+        if log.exists():
+            console.err.print(
+                f"the run until then is in {log}: gripper-force replay {log}",
+                soft_wrap=True,
+                markup=False,
+            )
+        raise
+    console.show(result, as_json, grasp_table)
+    if result["report"] is None:
+        console.next_step("replay", log, "--report")
+    else:
+        console.err.print(f"next: open {result['report']}", soft_wrap=True, markup=False)
+    if result["result"] != "held":
+        raise typer.Exit(1)
+
+
+def _grasp_trials(
+    settings: "Config",
+    count: int,
+    objects: Sequence[str],
+    target_n: float | None,
+    same_object: bool,
+    jobs: int | None,
+    yes: bool,
+    as_json: bool,
+) -> None:
+    from gripper_force.jobs import grasp as job
+    from gripper_force.progress import no_progress
+
+    device = job.exclusive_device(settings)
     jobs = jobs or (1 if device or same_object else CORES)
     prompt: Prompt | None = None
     lines: Progress = no_progress
@@ -151,11 +174,11 @@ def grasp(
         prompt, lines = (console.prompt(yes) if pause else None), console.line
     results: list[job.Summary] = []
     failure: BaseException | None = None
-    with console.bar("grasping", trials, hidden=bool(device)) as progress:
+    with console.bar("grasping", count, hidden=bool(device)) as progress:
         try:
             running = job.trials(
                 settings,
-                trials,
+                count,
                 jobs,
                 objects=objects,
                 target_n=target_n,
@@ -223,109 +246,140 @@ def replay(
     """
     from functools import partial
 
+    from gripper_force.jobs import replay as job
+    from gripper_force.jobs.dataset import find_logs
+    from gripper_force.jobs.summary_files import check_writable, replay_tables, write_summary
+
+    if compare is not None and (checkpoint or report):
+        raise ConfigError(
+            "--compare names its checkpoints and writes no report; leave out --checkpoint and --report"
+        )
     if report:
         require("matplotlib", "--report")
     if compare is not None:
         require("scipy", "--compare")
-
-    import numpy as np
-
-    from gripper_force.jobs import replay as job
-    from gripper_force.jobs.dataset import find_logs
-    from gripper_force.jobs.replay.comparison import paired_differences, summary
-    from gripper_force.jobs.replay.feed import changed_config
-    from gripper_force.jobs.summary_files import check_writable, replay_tables, write_summary
-    from gripper_force.runtime.log_reader import LogReader
-    from gripper_force.vision.model_files import read_model
-
     paths = find_logs(logs)
     replay_all = partial(job.replay_each, paths, recover=recover, workers=jobs, ray=ray)
     if out is not None:
         check_writable(out)
     console.tell_missing_parquet(out)
     if compare is not None:
-        if checkpoint or report:
-            raise ConfigError(
-                "--compare names its checkpoints and writes no report; leave out --checkpoint and --report"
-            )
-        if compare[0] == compare[1]:
-            raise ConfigError(f"--compare {compare[0]} {compare[1]} compares a setting with itself; name two")
-        sides = [_choice(text) for text in compare]
-        for other, changes in sides:
-            if other is not None:
-                read_model(other)  # a wrong side ends the command before the first one is computed
-            changed_config(LogReader(paths[0], recover=recover), other, [*(set_ or []), *changes])
-        with console.bar("replaying", 2 * len(paths)) as progress:
-            first, second = (
-                replay_all(checkpoint=other, overrides=[*(set_ or []), *changes], progress=progress)
-                for other, changes in sides
-            )
-        failed = {**first.failed, **second.failed}
-        kept, others = (
-            [(r, one) for r, one in zip(side.results, side.columns, strict=True) if r.log not in failed]
-            for side in (first, second)
-        )
-        frames = [one for _, one in kept], [one for _, one in others]
-        found = paired_differences([r for r, _ in kept], [r for r, _ in others], frames)
-        if not found and not failed:
-            raise DataError("the logs have no load cell to compare with; replay logs of runs with one")
-        printed = {"logs": len(kept), "first": compare[0], "second": compare[1], "differences": found}
-        if failed:
-            printed["failed"] = {log: str(error) for log, error in failed.items()}
-        console.show(printed, as_json, lambda _: differences_table(*compare, found))
-        if out is not None:
-            tables = replay_tables(dict(zip(compare, (first, second), strict=True)), found)
-            columns = [
-                {"setting": np.full(len(one["log"]), name), **one}
-                for name, side in zip(compare, (first, second), strict=True)
-                for one in side.columns
-            ]
-            write_summary(out, f"Replay with {compare[0]} and with {compare[1]}", tables, columns)
-            console.err.print(f"summary: {out / 'summary.html'}", soft_wrap=True, markup=False)
-        console.err.print(_OPEN_LOOP, soft_wrap=True)
-        console.end_with_failures(failed, len(paths))
+        _compare(compare, paths, replay_all, set_, recover, out, as_json)
         return
     with console.bar("replaying", len(paths), hidden=len(paths) == 1) as progress:
         replays = replay_all(checkpoint=checkpoint, overrides=set_, progress=progress)
-    results = replays.results
     pages: list[str] = []
     unreported: dict[str, GripperError] = {}
     if report:
-        from gripper_force.jobs.processes import Workers
-        from gripper_force.jobs.report import write_report
-
         whole = [path for path in paths if str(path) not in replays.failed]
-        write = partial(write_report, recover=recover, checkpoint=checkpoint, overrides=set_)
-        with console.bar("writing reports", len(whole), hidden=len(paths) == 1) as progress:
-            try:
-                written, problems = Workers().read_logs(write, whole, "report of", progress)
-            except GripperError as error:  # all failed: the figures are shown all the same
-                written, problems = {}, {0: error}
-        pages = [str(one.html) for one in written.values()]
-        unreported = {str(whole[number]): error for number, error in problems.items()}
-    if len(paths) == 1:
-        shown = {**console.jsonable(results[0]), **({"report": pages[0]} if pages else {})}
-        console.show(shown, as_json, lambda _: replay_table(results[0], pages[0] if pages else None))
-    else:
-        overall = summary(results)
-        unread = {log: str(error) for log, error in replays.failed.items()}
-        printed = {
-            "logs": results,
-            "summary": overall,
-            **({"failed": unread} if unread else {}),
-            **({"reports": pages} if pages else {}),
-        }
-        console.show(printed, as_json, lambda _: replays_table(results, overall, pages))
+        pages, unreported = _write_reports(whole, checkpoint, set_, recover)
+    _show_replays(replays, pages, as_json, alone=len(paths) == 1)
     if out is not None:
-        write_summary(out, f"Replay of {len(results)} logs", replay_tables({"": replays}), replays.columns)
+        title = f"Replay of {len(replays.results)} logs"
+        write_summary(out, title, replay_tables({"": replays}), replays.columns)
         console.err.print(f"summary: {out / 'summary.html'}", soft_wrap=True, markup=False)
     if set_ or checkpoint:
         console.err.print(_OPEN_LOOP, soft_wrap=True)
     if pages:
         console.err.print(f"next: open {pages[0]}", soft_wrap=True, markup=False)
-    elif len(results) == 1:
+    elif len(replays.results) == 1:
         console.next_step("replay", *logs, *_changes(checkpoint, set_), "--report")
     console.end_with_failures(replays.failed, len(paths), unreported)
+
+
+def _write_reports(
+    logs: Sequence[Path], checkpoint: str | None, overrides: list[str] | None, recover: bool
+) -> tuple[list[str], dict[str, GripperError]]:
+    """Writes the report of each log. Returns the pages, and the problem of each log without one."""
+    from functools import partial
+
+    from gripper_force.jobs.processes import Workers
+    from gripper_force.jobs.report import write_report
+
+    write = partial(write_report, recover=recover, checkpoint=checkpoint, overrides=overrides)
+    with console.bar("writing reports", len(logs), hidden=len(logs) == 1) as progress:
+        try:
+            written, problems = Workers().read_logs(write, logs, "report of", progress)
+        except GripperError as error:  # all failed: the figures are shown all the same
+            written, problems = {}, {0: error}
+    pages = [str(one.html) for one in written.values()]
+    return pages, {str(logs[number]): error for number, error in problems.items()}
+
+
+def _show_replays(replays: "Replays", pages: list[str], as_json: bool, *, alone: bool) -> None:
+    """Shows one result, or with several logs the results and the errors over all."""
+    from gripper_force.jobs.replay.comparison import summary
+
+    results = replays.results
+    if alone:
+        shown = {**console.jsonable(results[0]), **({"report": pages[0]} if pages else {})}
+        console.show(shown, as_json, lambda _: replay_table(results[0], pages[0] if pages else None))
+        return
+    overall = summary(results)
+    unread = {log: str(error) for log, error in replays.failed.items()}
+    printed = {
+        "logs": results,
+        "summary": overall,
+        **({"failed": unread} if unread else {}),
+        **({"reports": pages} if pages else {}),
+    }
+    console.show(printed, as_json, lambda _: replays_table(results, overall, pages))
+
+
+def _compare(
+    names: tuple[str, str],
+    paths: Sequence[Path],
+    replay_all: "Callable[..., Replays]",
+    set_: list[str] | None,
+    recover: bool,
+    out: Path | None,
+    as_json: bool,
+) -> None:
+    """Replays the logs with two settings, and shows how the errors differ."""
+    import numpy as np
+
+    from gripper_force.jobs.replay.comparison import paired_differences
+    from gripper_force.jobs.replay.feed import changed_config
+    from gripper_force.jobs.summary_files import replay_tables, write_summary
+    from gripper_force.runtime.log_reader import LogReader
+    from gripper_force.vision.model_files import read_model
+
+    if names[0] == names[1]:
+        raise ConfigError(f"--compare {names[0]} {names[1]} compares a setting with itself; name two")
+    sides = [_choice(text) for text in names]
+    for other, changes in sides:
+        if other is not None:
+            read_model(other)  # a wrong side ends the command before the first one is computed
+        changed_config(LogReader(paths[0], recover=recover), other, [*(set_ or []), *changes])
+    with console.bar("replaying", 2 * len(paths)) as progress:
+        first, second = (
+            replay_all(checkpoint=other, overrides=[*(set_ or []), *changes], progress=progress)
+            for other, changes in sides
+        )
+    failed = {**first.failed, **second.failed}
+    kept, others = (
+        [(r, one) for r, one in zip(side.results, side.columns, strict=True) if r.log not in failed]
+        for side in (first, second)
+    )
+    frames = [one for _, one in kept], [one for _, one in others]
+    found = paired_differences([r for r, _ in kept], [r for r, _ in others], frames)
+    if not found and not failed:
+        raise DataError("the logs have no load cell to compare with; replay logs of runs with one")
+    printed = {"logs": len(kept), "first": names[0], "second": names[1], "differences": found}
+    if failed:
+        printed["failed"] = {log: str(error) for log, error in failed.items()}
+    console.show(printed, as_json, lambda _: differences_table(*names, found))
+    if out is not None:
+        tables = replay_tables(dict(zip(names, (first, second), strict=True)), found)
+        columns = [
+            {"setting": np.full(len(one["log"]), name), **one}
+            for name, side in zip(names, (first, second), strict=True)
+            for one in side.columns
+        ]
+        write_summary(out, f"Replay with {names[0]} and with {names[1]}", tables, columns)
+        console.err.print(f"summary: {out / 'summary.html'}", soft_wrap=True, markup=False)
+    console.err.print(_OPEN_LOOP, soft_wrap=True)
+    console.end_with_failures(failed, len(paths))
 
 
 def _changes(checkpoint: str | None, overrides: list[str] | None) -> list[str]:
