@@ -162,7 +162,7 @@ class GripperConfig(Section):
         ge=1.0,
         le=3.0,
         description="largest plausible ratio of the true torque constant to nm_per_a, which the force limit "
-        "allows for; 1.1 after calibrate servo",
+        "allows for; calibrate servo permits 1.1",
     )
 
 

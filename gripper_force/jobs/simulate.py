@@ -31,18 +31,7 @@ Kind = Literal["press", "tap", "grasp"]
 PEAK_N: Final = 12.5
 """Largest force of a touch: a little over the 12 N of the paper's."""
 
-SAME: Final = (
-    "object",
-    "seed",
-    "target_n",
-    "gripper",
-    "servo",
-    "camera",
-    "load_cell",
-    "sim",
-    "faults",
-    "clock",
-)
+SAME: Final = ("object", "seed", "target_n", "gripper", "servo", "camera", "load_cell", "sim", "faults")
 """Keys and sections of the configuration that decide what a log contains; most of ``control`` is drawn."""
 
 _MIN_TARGET_N: Final = 0.5

@@ -119,6 +119,14 @@ def read_correction(
     return load_correction(profiles.object_path, profiles.object, features, mismatches)
 
 
+def overridden(config: Config, profiles: Profiles) -> str:
+    """Names the values of the rig profile that the configuration overrides with others; empty without any."""
+    known = {} if profiles.rig is None else profiles.rig.settings()
+    used = config.model_dump(mode="json")
+    keys = ", ".join(f"{a}.{b}" for a in known for b, value in known[a].items() if used[a][b] != value)
+    return keys and f"the configuration overrides {keys} of the rig profile; delete them to use its values"
+
+
 def rig_mismatches(config: Config, profiles: Profiles) -> list[str]:
     """Describes the differences between the rig profile's devices and the run's.
 

@@ -6,6 +6,7 @@ import atexit
 import contextlib
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -18,7 +19,7 @@ from gripper_force.runtime.requests import CLOSED, PendingRequest, RequestQueue
 from gripper_force.runtime.resolve import ResolvedConfig, resolve
 from gripper_force.runtime.session import Session, open_run
 from gripper_force.runtime.state import GraspResult, GripperState, StateTracker
-from gripper_force.types import GRIPPING, NS_PER_S, RequestKind
+from gripper_force.types import GRIPPING, NS_PER_S, Outcome, RequestKind
 
 _END_S: Final = 25.0
 """Longest wait for the end of the control thread, which may wait 20 s for a disk that does not answer."""
@@ -95,6 +96,13 @@ class ControlLoop:
         except BaseException as error:
             self._error, self._error_was_raised = error, True
             raise
+
+    def shown_state(self) -> GripperState:
+        """Returns the newest state, without an outcome if a grasp or a move was requested after it."""
+        is_waiting = (
+            self._requests.is_waiting()
+        )  # first, because a cycle sets the state and then ends the request
+        return replace(self.state, outcome=Outcome.NONE) if is_waiting else self.state
 
     def sleep(self, seconds: float) -> None:
         """Waits for a time on the run's clock, and runs the cycle where no thread does."""

@@ -233,8 +233,8 @@ class Gripper:
 
     @property
     def state(self) -> GripperState:
-        """State after the newest control cycle."""
-        return self._loop.state
+        """State after the newest control cycle. Its outcome is empty from the request of a grasp or a move on."""
+        return self._loop.shown_state()
 
     @property
     def force_n(self) -> float:

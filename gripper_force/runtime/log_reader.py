@@ -34,14 +34,7 @@ _MAGIC: Final = b"\x89MCAP0\r\n"
 _FRAMING: Final = struct.Struct("<BQ")
 _TIMES: Final = struct.Struct("<QQ")
 _MAX_CHUNK: Final = 1 << 28
-_DAMAGE: Final = (
-    McapError,
-    DecodeError,
-    zstandard.ZstdError,
-    struct.error,
-    ValueError,
-    OverflowError,
-)
+_DAMAGE: Final = (McapError, DecodeError, zstandard.ZstdError, struct.error, ValueError, OverflowError)
 """Exceptions of the decoders on damaged bytes."""
 
 A = TypeVar("A", bound=Record)

@@ -98,16 +98,15 @@ class RequestQueue:
         """Returns the request of the next cycle: the newest stop, or else the oldest request."""
         with self._lock:
             stops = [request for request in self._queued if request.kind == RequestKind.STOP]
-            if stops:
-                return stops[-1]
-            return self._queued[0] if self._queued else None
+            return stops[-1] if stops else next(iter(self._queued), None)
+
+    def is_waiting(self) -> bool:
+        """Returns True if no cycle has begun a grasp or a move that was requested."""
+        with self._lock:
+            return any(request.kind in (RequestKind.GRASP, RequestKind.MOVE) for request in self._queued)
 
     def finish_cycle(
-        self,
-        request: PendingRequest | None,
-        refusal: str,
-        state: GripperState,
-        result: GraspResult,
+        self, request: PendingRequest | None, refusal: str, state: GripperState, result: GraspResult
     ) -> None:
         """Ends the requests that a cycle has refused, replaced or brought to a result.
 

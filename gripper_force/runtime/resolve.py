@@ -15,13 +15,7 @@ from gripper_force.control.transmission import Transmission
 from gripper_force.errors import ConfigError, RequestError
 from gripper_force.interfaces import ServoSpec
 from gripper_force.plugins import importing
-from gripper_force.profiles.apply import (
-    read_correction,
-    read_profiles,
-    rig_mismatches,
-    with_bundle,
-    with_object,
-)
+from gripper_force.profiles import apply
 from gripper_force.runtime.backends import load_servo_class, resolve_simulation, with_camera_rate
 from gripper_force.runtime.process import allowed
 
@@ -110,28 +104,29 @@ def resolve(config: Config, *, vision: bool = True) -> ResolvedConfig:
         config = config.model_copy(update={"vision": config.vision.model_copy(update={"checkpoint": "none"})})
     _check_rate(config)
     config = with_camera_rate(config)
-    config, bundle = with_bundle(config)
+    config, bundle = apply.with_bundle(config)
     config, model, choice = resolve_vision(config)
     config, detail = resolve_simulation(config)
     spec = load_servo_class(config).spec(config.servo)
     _check_travel(config.gripper, spec)
-    profiles = read_profiles(config)
+    profiles = apply.read_profiles(config)
     config = config.model_copy(
         update={
             "gripper": _complete_gripper(config.gripper, spec),
-            "control": with_object(_complete_control(config, spec), profiles),
+            "control": apply.with_object(_complete_control(config, spec), profiles),
         }
     )
-    correction = read_correction(config, profiles, model)
+    correction = apply.read_correction(config, profiles, model)
     mismatches = {
         "object profile": () if correction is None else correction.differs,
-        "rig profile": rig_mismatches(config, profiles),
+        "rig profile": apply.rig_mismatches(config, profiles),
         "network": () if model is None or correction else model.header.mismatches(config.rig_settings()),
     }
     notes = [
         ("vision", choice),
         ("session", bundle),
         ("simulation", detail),
+        ("session", apply.overridden(config, profiles)),
         *(
             ("session", f"the {profile} was made with {'; '.join(found)}")
             for profile, found in mismatches.items()

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from gripper_force.control.state_machine import Decision
 from gripper_force.types import EstimateSource, LoadCellSample, Outcome, Phase, ServoState
 
-"""Phases in which the jaws press on an object."""
-
 
 @dataclass(frozen=True, slots=True)
 class GraspResult:

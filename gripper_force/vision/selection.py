@@ -148,12 +148,9 @@ def _settings(vision: VisionConfig, set_threads: bool) -> Iterator[_Setting]:
         for engine in installed() if vision.engine == "auto" else [vision.engine]:
             if model.path.suffix in EXPORTED and engine != EXPORTED[model.path.suffix]:
                 continue
+            threads = [t for t in (1, 2, 4, 8) if t <= cores] if vision.engine == "auto" else [vision.threads]
             if engine == "torch" and not set_threads:
                 threads = [_own_threads()]
-            else:
-                threads = (
-                    [t for t in (1, 2, 4, 8) if t <= cores] if vision.engine == "auto" else [vision.threads]
-                )
             any_precision = vision.checkpoint == "auto" and engine == "openvino"
             for precision in get_args(Precision) if any_precision else [vision.precision]:
                 if precision != "float32" and engine in ENGINES and engine != "openvino":

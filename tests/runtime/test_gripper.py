@@ -122,6 +122,7 @@ def test_the_same_configuration_gives_the_same_result(simulated: Open) -> None:
 def test_wait_false_returns_at_once_and_steps_go_on(simulated: Open) -> None:
     gripper = simulated()
     assert gripper.grasp(3.0, wait=False) is None
+    assert gripper.state.outcome == gf.Outcome.NONE
     before = gripper.state
     phases = {gripper.step().phase for _ in range(300)}
     assert gripper.state.t_ns - before.t_ns == 300 * 5_000_000

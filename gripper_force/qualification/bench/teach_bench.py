@@ -263,7 +263,7 @@ def _with(config: Config, section: str, **values: object) -> Config:
 def markdown(cells: Sequence[Cell]) -> str:
     """Returns the table for a page: medians over rigs and objects, and the worst of them."""
     lines = [
-        "| method | touches | cells | MAE N, median | worst | grasps, fused % | by vision % | minutes |",
+        "| method | touches | measured | MAE N, median | worst | grasps, fused % | by vision % | minutes |",
         "|---|---|---|---|---|---|---|---|",
     ]
     groups = dict.fromkeys((cell.method, cell.touches) for cell in cells)
