@@ -371,8 +371,7 @@ class ControlConfig(Section):
         None, description="time without an estimate after which vision drops out; null: 2.7 frame periods"
     )
     vision_age_ms: Positive | None = Field(
-        None,
-        description="frame age above which an estimate is rejected; null: 83 ms and a frame period",
+        None, description="frame age above which an estimate is rejected; null: 83 ms and a frame period"
     )
     vision_std_n: Positive = Field(1.5, description="standard deviation above which an estimate is rejected")
     learn_gain: bool = Field(

@@ -12,6 +12,7 @@ import gc
 import json
 import signal
 import sys
+from io import TextIOWrapper
 from typing import Annotated, NoReturn
 
 import typer
@@ -70,6 +71,8 @@ def main() -> NoReturn:
     from gripper_force.runtime import process
 
     process.own_process()
+    if isinstance(sys.stdout, TextIOWrapper):  # a file's name may be no text
+        sys.stdout.reconfigure(errors="backslashreplace")
     for number in process.SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup sets it
             signal.signal(number, process.raise_interrupt)

@@ -185,6 +185,11 @@ def import_video(
     region = load_settings(None, set_, {}).vision.region
 
     if video.is_dir():
+        if forces is not None or object_ is not None:
+            raise ConfigError(
+                f"{video} is a folder, whose recordings have their own tables and names of objects; leave out "
+                f"{'--object' if forces is None else forces}"
+            )
         with console.bar("importing", len(job.find_recordings(video))) as progress:
             summaries = job.import_folder(video, folder, region=region, align=align, progress=progress)
     elif forces is None:

@@ -3,7 +3,7 @@
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -30,7 +30,7 @@ from gripper_force.cli.output.runs import (
     replays_table,
     trials_table,
 )
-from gripper_force.errors import ConfigError, DataError, GripperError
+from gripper_force.errors import ConfigError, DataError, GripperError, LogError
 from gripper_force.plugins import require
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from gripper_force.jobs.checks import RegisterChange
     from gripper_force.jobs.replay import Replays
     from gripper_force.progress import Progress, Prompt
+    from gripper_force.runtime.log_reader import LogReader
 
 _OPEN_LOOP = (
     "A replay is open loop: estimates and commands are computed again, but servo, camera and load cell keep what they "
@@ -273,10 +274,11 @@ def replay(
     if report:
         whole = [path for path in paths if str(path) not in replays.failed]
         pages, unreported = _write_reports(whole, checkpoint, set_, recover)
-    _show_replays(replays, pages, as_json, alone=len(paths) == 1)
     if out is not None:
         title = f"Replay of {len(replays.results)} logs"
         write_summary(out, title, replay_tables({"": replays}), replays.columns)
+    _show_replays(replays, pages, as_json, alone=len(paths) == 1)
+    if out is not None:
         console.err.print(f"summary: {out / 'summary.html'}", soft_wrap=True, markup=False)
     if set_ or checkpoint:
         console.err.print(_OPEN_LOOP, soft_wrap=True)
@@ -341,16 +343,17 @@ def _compare(
     from gripper_force.jobs.replay.comparison import paired_differences
     from gripper_force.jobs.replay.feed import changed_config
     from gripper_force.jobs.summary_files import replay_tables, write_summary
-    from gripper_force.runtime.log_reader import LogReader
     from gripper_force.vision.model_files import read_model
 
     if names[0] == names[1]:
         raise ConfigError(f"--compare {names[0]} {names[1]} compares a setting with itself; name two")
     sides = [_choice(text) for text in names]
+    first_log = _first_readable(paths, recover)
     for other, changes in sides:
         if other is not None:
             read_model(other)  # a wrong side ends the command before the first one is computed
-        changed_config(LogReader(paths[0], recover=recover), other, [*(set_ or []), *changes])
+        if first_log is not None:
+            changed_config(first_log, other, [*(set_ or []), *changes])
     with console.bar("replaying", 2 * len(paths)) as progress:
         first, second = (
             replay_all(checkpoint=other, overrides=[*(set_ or []), *changes], progress=progress)
@@ -368,7 +371,6 @@ def _compare(
     printed = {"logs": len(kept), "first": names[0], "second": names[1], "differences": found}
     if failed:
         printed["failed"] = {log: str(error) for log, error in failed.items()}
-    console.show(printed, as_json, lambda _: differences_table(*names, found))
     if out is not None:
         tables = replay_tables(dict(zip(names, (first, second), strict=True)), found)
         columns = [
@@ -377,6 +379,8 @@ def _compare(
             for one in side.columns
         ]
         write_summary(out, f"Replay with {names[0]} and with {names[1]}", tables, columns)
+    console.show(printed, as_json, lambda _: differences_table(*names, found))
+    if out is not None:
         console.err.print(f"summary: {out / 'summary.html'}", soft_wrap=True, markup=False)
     console.err.print(_OPEN_LOOP, soft_wrap=True)
     console.end_with_failures(failed, len(paths))
@@ -384,6 +388,15 @@ def _compare(
 
 def _changes(checkpoint: str | None, overrides: list[str] | None) -> list[str]:
     return [*(() if checkpoint is None else ("--checkpoint", checkpoint)), *again(None, overrides)]
+
+
+def _first_readable(paths: Sequence[Path], recover: bool) -> "LogReader | None":
+    from gripper_force.runtime.log_reader import LogReader
+
+    for path in paths:
+        with suppress(LogError):
+            return LogReader(path, recover=recover)
+    return None
 
 
 def _choice(text: str) -> tuple[str | None, list[str]]:

@@ -50,6 +50,8 @@ def view(
 
     if set_:
         raise ConfigError(f"view uses no configuration; leave out --set {set_[0]}")
+    if save is not None and save.suffix != ".rrd":
+        raise ConfigError(f"--save writes a file for Rerun, not {save}; name one that ends with .rrd")
     job.require(viewer)
     if viewer == "foxglove":
         if save is not None:
@@ -60,7 +62,7 @@ def view(
     from gripper_force.runtime.log_reader import LogReader
 
     reader = None if follow else LogReader(log, recover=recover)
-    shown = RerunViewer(log.stem, save, live=follow)
+    shown = RerunViewer(log, save, live=follow)
     if follow:
         _ready(as_json)
     job.show(reader or job.GrowingLog(log, job.wait_for_writer()), shown)

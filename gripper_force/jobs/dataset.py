@@ -89,7 +89,7 @@ class Clip:
 
 
 def find_logs(source: str | Path | Sequence[str | Path]) -> list[Path]:
-    """Returns the given logs in their order, with each folder replaced by its logs, sorted by path.
+    """Returns the given logs in their order, each once, with each folder replaced by its logs, sorted by path.
 
     Args:
         source: Logs, and folders that are searched for ``*.mcap``; one or several.
@@ -98,15 +98,16 @@ def find_logs(source: str | Path | Sequence[str | Path]) -> list[Path]:
         DataError: There are no logs, or none in a folder.
     """
     given = [source] if isinstance(source, str | Path) else source
-    found: list[Path] = []
+    found: dict[Path, Path] = {}
     for path in map(Path, given):
         logs = sorted(path.rglob("*.mcap")) if path.is_dir() else [path]
         if not logs:
             raise DataError(f"no logs (*.mcap) in {path}; record, simulate or import some")
-        found += logs
+        for log in logs:
+            found.setdefault(log.resolve(), log)
     if not found:
         raise DataError("no logs are given; name some, or a folder of them")
-    return found
+    return list(found.values())
 
 
 def load_clips(

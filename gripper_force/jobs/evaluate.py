@@ -182,14 +182,14 @@ def evaluate(
         per_log={str(path): _log_errors(clip, force_n, lead_in) for path, clip, force_n in each},
         failed={str(paths[number]): str(error) for number, error in failed.items()},
     )
+    if out is not None:
+        columns = [_columns(*one) for one in each]
+        write_summary(out, f"Evaluation of {checkpoint}", evaluation_tables(result), columns)
     if plot is not None:
         from gripper_force.jobs.report.plots import draw_estimates
 
         title = f"{checkpoint}: MAE {result.mae_n:.3f} N on {len(clips)} logs"
         draw_estimates(*_labelled(clips, forces_n, lead_in), title, plot)
-    if out is not None:
-        columns = [_columns(*one) for one in each]
-        write_summary(out, f"Evaluation of {checkpoint}", evaluation_tables(result), columns)
     return result
 
 

@@ -460,9 +460,11 @@ def _mae_n(estimates: list[tuple[int, float]], cells: list[LoadCellSample]) -> f
 
 def _floor_n(metadata: Mapping[str, str], cells: list[LoadCellSample]) -> float | None:
     """Mean error floor from the spread of stiffness; None for a real object."""
-    if "scene" not in metadata or not cells:
+    if "scene" not in metadata:
         return None
-    forces_n = np.array([c.force_n for c in cells])
+    forces_n = np.array([c.force_n for c in cells if c.valid and math.isfinite(c.force_n)])
+    if not len(forces_n):
+        return None
     return float(stiffness_floor_n(forces_n, stiffness_of(metadata)).mean())
 
 

@@ -84,18 +84,22 @@ class HoldVision:
 
 
 def score_grasp(
-    samples: Sequence[LoadCellSample], statuses: Sequence[GraspStatus], target_n: float
+    samples: Sequence[LoadCellSample], statuses: Sequence[GraspStatus], target_n: float, begin_ns: int = 0
 ) -> GraspScore:
     """Scores the last grasp of a run.
+
+    The overshoot of a force that was lowered begins where the new one is reached.
 
     Args:
         samples: Load-cell samples in order of time; rejected ones are ignored.
         statuses: States of the controller in order of time.
         target_n: Target force.
+        begin_ns: Time of the request of this force. What was before it does not count.
 
     Raises:
         DataError: The target was never held, or the load cell has no or too few valid samples in the hold.
     """
+    statuses = [s for s in statuses if s.t_ns >= begin_ns]
     held_ns = [s.t_ns for s in statuses if s.phase == Phase.HOLD]
     if not held_ns:
         raise DataError(
@@ -104,7 +108,11 @@ def score_grasp(
     end_ns = held_ns[-1]
     ramp_ns = _start_ns(_RAMP_PHASES, statuses, end_ns)
     touch_ns = _start_ns(_GRASP_PHASES, statuses, end_ns)
-    peak_n = max((s.force_n for s in samples if s.valid and touch_ns <= s.t_ns <= end_ns), default=0.0)
+    gripped_n = [s.force_n for s in samples if s.valid and touch_ns <= s.t_ns <= end_ns]
+    if begin_ns and statuses[0].phase in _RAMP_PHASES:  # a force was changed
+        reached = next((i for i, force_n in enumerate(gripped_n) if force_n <= target_n), 0)
+        gripped_n = gripped_n[reached:]
+    peak_n = max(gripped_n, default=0.0)
     cell = [(s.t_ns, s.force_n) for s in samples if s.valid and ramp_ns <= s.t_ns <= end_ns]
     if not cell or cell[-1][0] < held_ns[0]:
         raise DataError("the load cell has no valid sample during the hold; check it in the log")

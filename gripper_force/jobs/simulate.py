@@ -18,7 +18,8 @@ from typing import Final, Literal, Protocol
 import numpy as np
 
 from gripper_force.config import Config, config_from
-from gripper_force.jobs.grasp import PAPER_OBJECTS, run_grasp
+from gripper_force.errors import ConfigError
+from gripper_force.jobs.grasp import PAPER_OBJECTS, exclusive_device, run_grasp
 from gripper_force.jobs.processes import Workers
 from gripper_force.jobs.recording.record import check_same
 from gripper_force.jobs.recording.touches import ramp, wait
@@ -120,15 +121,20 @@ def simulate(
         ray: Address of a Ray cluster to use instead, see `gripper_force.jobs.ray_pool`; None for none.
 
     Raises:
+        ConfigError: A device is not simulated.
         DataError: An existing log was made with another configuration.
         GripperError: A simulation failed; logs made so far are kept.
     """
+    if device := exclusive_device(config):
+        raise ConfigError(f"simulate moves no real gripper, but the configuration has {device}; leave it out")
     out.mkdir(parents=True, exist_ok=True)
     tree = config.model_dump(mode="json")
-    is_made = [all((out / name).exists() for name in p.names) for p in plans]
-    if any(is_made):  # the others were made with the same, or they would have been refused
-        plans[is_made.index(True)].check(out, tree)
-    missing = [p for p, made in zip(plans, is_made, strict=True) if not made]
+    missing = []
+    for one in plans:
+        if all((out / name).exists() for name in one.names):
+            one.check(out, tree)
+        else:
+            missing.append(one)
     with Workers(jobs, ray).pool() as pool:
         futures = [pool.submit(p.make, out, tree) for p in missing]
         for future in as_completed(futures):

@@ -38,6 +38,9 @@ td.number {{ text-align: right; }}
 </body></html>
 """
 
+_UNPRINTABLE: Final = "backslashreplace"
+"""Treatment of bytes of a file's name that are not UTF-8."""
+
 _NOTES: Final = {
     "sources": "Errors against the load cell over all estimates, without frames that a network does not know. The mean "
     "over logs counts each log once; low and high are the ends of its 95 % interval (Student's t).",
@@ -159,8 +162,12 @@ def write_summary(
     files, frames = [page, table, tree], folder / _FRAMES
     try:
         sections = [_section(name, rows) for name, rows in tables.items() if rows]
-        page.write_text(_PAGE.format(title=escape(title), sections="\n".join(sections)), encoding="utf-8")
-        with table.open("w", newline="", encoding="utf-8") as file:
+        page.write_text(
+            _PAGE.format(title=escape(title), sections="\n".join(sections)),
+            encoding="utf-8",
+            errors=_UNPRINTABLE,
+        )
+        with table.open("w", newline="", encoding="utf-8", errors=_UNPRINTABLE) as file:
             writer = csv.DictWriter(file, list(tables["logs"][0]))
             writer.writeheader()
             writer.writerows({key: _known(value) for key, value in row.items()} for row in tables["logs"])
@@ -186,6 +193,7 @@ def _write_parquet(path: Path, columns: "Sequence[Columns]") -> None:
 
     names = columns[0].keys()
     joined = {name: np.concatenate([one[name] for one in columns]) for name in names}
+    joined["log"] = np.array([str(log).encode(errors=_UNPRINTABLE).decode() for log in joined["log"]], object)
     parquet.write_table(pa.table(joined), path, compression="zstd")
 
 

@@ -99,9 +99,7 @@ class ControlLoop:
 
     def shown_state(self) -> GripperState:
         """Returns the newest state, without an outcome if a grasp or a move was requested after it."""
-        is_waiting = (
-            self._requests.is_waiting()
-        )  # first, because a cycle sets the state and then ends the request
+        is_waiting = self._requests.is_waiting()  # first: a cycle sets the state, then ends the request
         return replace(self.state, outcome=Outcome.NONE) if is_waiting else self.state
 
     def sleep(self, seconds: float) -> None:
@@ -152,6 +150,8 @@ class ControlLoop:
 
     def _raise_error(self) -> None:
         if self._error is not None:
+            if self._error_was_raised and not isinstance(self._error, Exception):
+                raise RequestError("an interrupt has ended the run; close the gripper, and open it again")
             self._error_was_raised = True
             raise self._error
 

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import struct
+import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from io import BytesIO
@@ -14,7 +15,7 @@ from google.protobuf.message import DecodeError
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, Metadata, Schema, Statistics
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import breakup_chunk
 
@@ -64,6 +65,7 @@ class LogReader:
         metadata: Versions, digests and other facts.
         attachments: Files by name, the configuration among them.
         complete: False where the file ends before its footer.
+        damaged: Positions of the chunks of about a tenth of a second that were read and left out as damaged.
         utc_offset_ns: UTC less the clock of the records, in nanoseconds; 0 if that clock is simulated.
 
     Raises:
@@ -76,6 +78,7 @@ class LogReader:
         self.utc_offset_ns = 0
         self.metadata: dict[str, str] = {}
         self.attachments: dict[str, bytes] = {}
+        self.damaged: set[int] = set()
         self._recover = recover
         self._chunks: list[_Chunk] = []
         self._scanned = 0
@@ -114,8 +117,8 @@ class LogReader:
         """Yields the records of the given types, or all of them, in the order in which they were written.
 
         Raises:
-            LogError: A chunk is damaged (without ``recover``; with it the records end there), or a topic is
-                not as this version writes it.
+            LogError: A chunk is damaged (without ``recover``; with it the chunk is left out), or a topic is not as this
+                version writes it.
         """
         try:
             for channel, message in self._messages(frozenset(types or CODECS)):
@@ -124,7 +127,9 @@ class LogReader:
             raise LogError(f"can't read the log {self.path}: {error.strerror}") from error
         except _DAMAGE as error:
             if not self._recover:
-                raise LogError(f"{self.path} is damaged ({error}); --recover reads it up to there") from error
+                raise LogError(
+                    f"{self.path} is damaged ({error}); --recover leaves out what is damaged"
+                ) from error
 
     def _messages(self, wanted: frozenset[type[Record]]) -> Iterator[tuple[Codec, McapMessage]]:
         schemas: dict[int, Schema] = {}
@@ -132,8 +137,15 @@ class LogReader:
         with self.path.open("rb") as file:
             for chunk in self._each_chunk():
                 file.seek(chunk.offset)
-                chunk_data = _checked(Chunk.read(_stream(file.read(chunk.length))))
-                for item in breakup_chunk(chunk_data, validate_crc=True):
+                try:
+                    whole = _checked(Chunk.read(_stream(file.read(chunk.length))))
+                    items = breakup_chunk(whole, validate_crc=True)
+                except _DAMAGE:
+                    if not self._recover:
+                        raise
+                    self.damaged.add(chunk.offset)
+                    continue
+                for item in items:
                     if isinstance(item, McapMessage):
                         if item.channel_id not in codecs:
                             raise ValueError("a message before its channel")
@@ -185,8 +197,14 @@ class LogReader:
             start_ns, end_ns = _TIMES.unpack(file.read(_TIMES.size))
             self._chunks.append(_Chunk(start, length, start_ns, end_ns))
         elif opcode == Opcode.ATTACHMENT:
-            attachment = Attachment.read(_stream(file.read(length)))
+            data = file.read(length)
+            if zlib.crc32(data[:-4]) != int.from_bytes(data[-4:], "little"):
+                raise ValueError("an attachment is damaged")
+            attachment = Attachment.read(_stream(data))
             self.attachments[attachment.name] = attachment.data
+        elif opcode == Opcode.STATISTICS:
+            if Statistics.read(_stream(file.read(length))).chunk_count != len(self._chunks):
+                raise ValueError("a chunk is missing")
         elif opcode == Opcode.METADATA:
             metadata = Metadata.read(_stream(file.read(length)))
             if metadata.name == METADATA_NAME:
@@ -204,13 +222,9 @@ class LogReader:
 
 def _checked(chunk: Chunk) -> Chunk:
     """Returns the chunk after a check that unpacking it takes the stated and a limited amount of memory."""
-    match chunk.compression:
-        case "zstd":
-            size = zstandard.frame_content_size(chunk.data)
-        case "":
-            size = len(chunk.data)
-        case other:
-            raise ValueError(f"a chunk is compressed as {other!r}")
+    if chunk.compression not in ("zstd", ""):
+        raise ValueError(f"a chunk is compressed as {chunk.compression!r}")
+    size = zstandard.frame_content_size(chunk.data) if chunk.compression else len(chunk.data)
     if size != chunk.uncompressed_size or size > _MAX_CHUNK:
         raise ValueError(f"a chunk says that it holds {chunk.uncompressed_size} bytes, and holds {size}")
     return chunk

@@ -36,10 +36,7 @@ class ForceEstimator:
     """
 
     def __init__(
-        self,
-        engine: Engine,
-        region: Region | None = None,
-        correction: Correction | None = None,
+        self, engine: Engine, region: Region | None = None, correction: Correction | None = None
     ) -> None:
         """Starts a stream on an engine that is open; `load` opens one.
 

@@ -760,3 +760,55 @@ def test_commands_before_the_first_calibration_need_no_rig_profile(run: Run) -> 
     refused = run("grasp", *new)
     assert refused.code == 2
     assert "there is no rig profile rig.yaml yet; `calibrate load-cell`" in refused.err
+
+
+@pytest.mark.parametrize("name", ["run.mcap", "run"])
+def test_a_view_is_not_saved_over_a_log(run: Run, fused_log: Path, name: str) -> None:
+    log = Path("run.mcap")
+    log.write_bytes(fused_log.read_bytes())
+    done = run("view", log, "--save", name)
+    assert (done.code, "name one that ends with .rrd" in done.err) == (2, True)
+    assert log.read_bytes() == fused_log.read_bytes()
+
+
+def test_a_folder_of_videos_takes_neither_an_object_nor_a_table(run: Run, tmp_path: Path) -> None:
+    for more in (["--object", "mug"], ["forces.csv"]):
+        done = run("import", "video", tmp_path, *more)
+        assert (done.code, f"leave out {more[0]}" in done.err) == (2, True)
+
+
+def test_names_are_shown_as_they_are(run: Run, fused_log: Path) -> None:
+    named = Path("[red] [b].mcap")
+    named.write_bytes(fused_log.read_bytes())
+    done = run("replay", named, fused_log, "--jobs", "1")
+    assert (done.code, "[red] [b].mcap" in done.out) == (0, True)
+
+
+def test_a_log_given_twice_is_replayed_once(run: Run, fused_log: Path) -> None:
+    Path("run.mcap").write_bytes(fused_log.read_bytes())
+    done = run("replay", "run.mcap", ".", Path("run.mcap").resolve(), "--json")
+    assert json.loads(done.out)["log"] == "run.mcap", "one result, not a list"
+
+
+def test_a_summary_that_cannot_be_written_gives_one_json_object(run: Run, fused_log: Path) -> None:
+    Path("out/summary.csv").mkdir(parents=True)
+    for more in ([], ["--compare", "log", "control.ramp_n_s=4"]):
+        done = run("replay", fused_log, "--out", "out", "--json", "--jobs", "1", *more)
+        assert (done.code, list(json.loads(done.out))) == (2, ["error"])
+
+
+def test_a_comparison_goes_on_without_a_broken_first_log(run: Run, fused_log: Path) -> None:
+    Path("a.mcap").write_bytes(fused_log.read_bytes()[:5000])
+    Path("b.mcap").write_bytes(fused_log.read_bytes())
+    done = run("replay", ".", "--compare", "log", "control.ramp_n_s=4", "--json", "--jobs", "1")
+    found = json.loads(done.out)
+    assert (done.code, found["logs"], list(found["failed"])) == (2, 1, ["a.mcap"])
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="macOS has no such file names")
+def test_a_summary_names_a_file_whose_name_is_no_text(run: Run, fused_log: Path) -> None:
+    Path(os.fsdecode(b"a\xff.mcap")).write_bytes(fused_log.read_bytes())
+    done = run("replay", ".", "--out", "out", "--jobs", "1")
+    assert done.code == 0, done.err
+    assert "a\\udcff.mcap" in Path("out/summary.html").read_text()
+    assert "a\\udcff.mcap" in Path("out/summary.csv").read_text()

@@ -133,6 +133,21 @@ def test_estimates_are_drawn(few_logs: Path, tiny_checkpoint: Path, tmp_path: Pa
     assert figure.is_file()
 
 
+def test_a_figure_that_cannot_be_written_ends_the_evaluation_before_its_work(
+    few_logs: Path, tiny_checkpoint: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("")
+    done: list[str] = []
+    with pytest.raises(DataError, match=r"can't write the figure .*; choose another path"):
+        evaluate(
+            few_logs,
+            tiny_checkpoint,
+            plot=tmp_path / "file" / "x.png",
+            progress=lambda text, steps=1: done.append(text),
+        )
+    assert not done
+
+
 def test_profile_of_another_checkpoint_raises(few_logs: Path, tiny_checkpoint: Path) -> None:
     with pytest.raises(ConfigError, match="object profile"):
         evaluate(few_logs, tiny_checkpoint, profile="sponge")

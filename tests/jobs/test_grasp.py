@@ -1,4 +1,6 @@
+import math
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -65,6 +67,20 @@ def test_what_was_not_measured_is_none(fused_log: Path, tmp_path: Path) -> None:
     ):
         assert summary[name] is None
     assert summary["loop_hz"] == pytest.approx(200.0)
+
+
+def test_the_error_floor_is_that_of_valid_samples(fused_log: Path, tmp_path: Path) -> None:
+    reader = LogReader(fused_log)
+    path = tmp_path / "spoilt.mcap"
+    with LogWriter(path, config=reader.config, metadata=reader.metadata) as writer:
+        for number, record in enumerate(reader.records()):
+            if isinstance(record, LoadCellSample) and number % 3 == 0:
+                writer.write(replace(record, force_n=math.nan, valid=False))
+            else:
+                writer.write(record)
+    floor_n = summarise(fused_log)["estimate_mae_n"]["floor"]
+    assert floor_n is not None
+    assert summarise(path)["estimate_mae_n"]["floor"] == pytest.approx(floor_n, rel=0.1)
 
 
 def test_a_run_that_ended_before_anything_was_interrupted(tmp_path: Path) -> None:

@@ -34,6 +34,7 @@ from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import (
     NS_PER_MS,
     NS_PER_S,
+    EstimateSource,
     Frame,
     FusedForce,
     GraspStatus,
@@ -122,10 +123,37 @@ def test_another_checkpoint_estimates_otherwise(
     assert moved == pytest.approx(1.0, abs=0.05)
 
 
-def test_without_a_checkpoint_the_logged_estimates_are_used(fused_log: Path) -> None:
+def test_without_a_network_motor_current_is_alone(fused_log: Path) -> None:
     result = replay(fused_log, "none")
     assert set(result.sources) == {"current", "fused"}
-    assert result.sources["fused"] == replay(fused_log).sources["fused"]
+    assert result.sources["fused"] == result.sources["current"] == replay(fused_log).sources["current"]
+    assert result.sources["fused"] != replay(fused_log).sources["fused"]
+    assert (result.identical, result.note) == (False, "the run had a network, this has none")
+
+
+def test_a_run_without_a_network_is_replayed_with_one(quick: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    run_grasp(load_config(None, [*quick, "camera.backend=simulated"]), path)
+    found = replay(path, "small", overrides=["control.feedback=fused"])
+    assert found.sources["visual"].frames > 100
+    assert found.sources["fused"].mae_n != found.sources["current"].mae_n
+    assert (found.identical, found.note) == (False, "the run had no network, this has one")
+
+
+def test_an_estimate_that_the_replay_lacks_is_not_taken_from_the_log(fused_log: Path, tmp_path: Path) -> None:
+    def darken(
+        record: Record,
+    ) -> Record:  # `small` refuses these frames; the log has estimates of its own network
+        if isinstance(record, Frame) and record.seq >= 40:
+            return dataclasses.replace(record, gray=record.gray // 4)
+        return record
+
+    reader = LogReader(tampered(fused_log, tmp_path / "dark.mcap", darken))
+    again = run_again(reader, resolve_replay(changed_config(reader, "small")))
+    assert max(v.seq for v in again.visual) < 40
+    last_ns = again.visual[-1].t_ns + 300_000_000
+    sources = {d.estimate.source for d in again.decisions if d.estimate.t_ns > last_ns}
+    assert sources == {EstimateSource.CURRENT}
 
 
 def test_an_override_changes_decisions(fused_log: Path) -> None:
@@ -174,7 +202,9 @@ def test_log_without_a_load_cell_has_no_errors(fused_log: Path, tmp_path: Path) 
     assert "No load cell: force errors can't be measured." in done.stdout
     results, _, failed = replay_each([fused_log, bare], workers=1)
     assert not failed
-    call = ["replay", str(bare), str(bare), "--out", str(tmp_path / "summary"), "--jobs", "1"]
+    other = bare.with_name("other.mcap")
+    other.write_bytes(bare.read_bytes())
+    call = ["replay", str(bare), str(other), "--out", str(tmp_path / "summary"), "--jobs", "1"]
     done = CliRunner().invoke(cli.app, call, catch_exceptions=False)
     assert done.exit_code == 0, done.stderr
     assert "No load cell: force errors can't be measured." in done.stdout

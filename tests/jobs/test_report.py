@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from mcap.records import Chunk, McapRecord
 from mcap.stream_reader import breakup_chunk
 
+import gripper_force as gf
 from gripper_force.config import config_from, dump_config
 from gripper_force.errors import LogError
 from gripper_force.jobs import report as report_module
@@ -60,6 +61,28 @@ def force_n(t_s: float) -> float:
     return float(
         np.interp(t_s, [1.1, 1.4, 2.2, 5.0, 5.4], [0, 0.5, TARGET_N, TARGET_N + 0.05, 0]) + overshoot
     )
+
+
+def test_a_report_scores_the_last_request_alone(quick: list[str], tmp_path: Path) -> None:
+    scores = []
+    for name, second_n in (("lowered", 2.0), ("released", 6.0)):
+        with gf.open_gripper(overrides=quick, log=tmp_path / f"{name}.mcap") as gripper:
+            gripper.grasp(4.0)
+            if name == "lowered":
+                gripper.set_force(second_n)
+            else:
+                gripper.release()
+                gripper.grasp(second_n, wait=False)
+            gripper.sleep(0.5)
+            gripper.release()
+        run = read_run(LogReader(tmp_path / f"{name}.mcap"))
+        assert run.target_n == second_n
+        scores.append((run.outcome, run.score))
+    (outcome, lowered), (none, nothing) = scores
+    assert (outcome, none, nothing) == ("held", "", None)
+    assert lowered is not None
+    assert lowered.steady_n == pytest.approx(2.0, abs=0.4)
+    assert lowered.overshoot_n < 0.5, "the 4 N before the request are none"
 
 
 def picture(force: float) -> Gray:

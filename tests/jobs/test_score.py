@@ -39,6 +39,21 @@ def test_score_uses_last_grasp_and_valid_samples():
     assert (score.steady_error_n, score.overshoot_n, score.settle_s) == (0.0, 0.0, 0.0)
 
 
+def test_a_changed_force_is_scored_from_its_request_on():
+    states = statuses(Phase.RAMP, Phase.HOLD, Phase.HOLD, Phase.RAMP, Phase.HOLD)
+    lowered = cell(lambda t: 6.0 if t < 3 else max(6.0 - 4 * (t - 3), 2.9 if t < 4.2 else 3.0), 5)
+    score = score_grasp(lowered, states, 3.0, 3_000 * MS)
+    assert score.overshoot_n == 0.0
+    assert score.settle_s == pytest.approx(0.72, abs=0.02)
+    assert score_grasp(lowered, states, 3.0).overshoot_n == pytest.approx(3.0)
+
+
+def test_a_later_grasp_that_held_nothing_has_no_score():
+    states = statuses(Phase.RAMP, Phase.HOLD, Phase.RELEASE, Phase.APPROACH, Phase.RAMP)
+    with pytest.raises(DataError, match="no hold to score"):
+        score_grasp(cell(lambda _: 3.0, 5), states, 6.0, 3_000 * MS)
+
+
 def test_hard_contact_is_overshoot():
     states = statuses(Phase.APPROACH, Phase.CONTACT, Phase.RAMP, Phase.HOLD)
     score = score_grasp(cell(lambda t: 3.0 if 0.5 < t < 1.5 else 2.0, 4), states, 2.0)

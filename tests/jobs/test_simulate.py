@@ -100,6 +100,22 @@ def test_logs_of_other_settings_are_not_taken_for_these(kind: Kind, config: Conf
         list(simulate(plans, tmp_path, other, jobs=1))
 
 
+def test_a_log_of_other_settings_is_found_among_others(config: Config, tmp_path: Path) -> None:
+    plans = plan("tap", 2, 5, ("stapler",))
+    other = config.model_copy(update={"sim": config.sim.model_copy(update={"gain": 1.1})})
+    for one, settings in zip(plans, (config, other), strict=True):
+        list(simulate([one], tmp_path, settings, jobs=1))
+    with pytest.raises(DataError, match=r"tap-stapler-000006\.mcap .* recorded with sim\.gain 1\.1"):
+        list(simulate(plans, tmp_path, config, jobs=1))
+
+
+def test_a_real_gripper_is_refused(config: Config, tmp_path: Path) -> None:
+    real = config.model_copy(update={"servo": config.servo.model_copy(update={"port": "/dev/ttyUSB0"})})
+    with pytest.raises(ConfigError, match=r"simulate moves no real gripper, .* servo\.port=/dev/ttyUSB0"):
+        list(simulate(plan("tap", 1, 5), tmp_path / "out", real, jobs=1))
+    assert not (tmp_path / "out").exists()
+
+
 def test_failed_simulation_leaves_no_log(config: Config, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no simulated object 'egg'"):
         make_log(SimulationPlan("press", "egg", 5), tmp_path, config.model_dump(mode="json"))

@@ -50,7 +50,7 @@ def test_commands_write_them(
         monkeypatch.setitem(sys.modules, "pyarrow", None)
     call = {
         "evaluate": ["evaluate", str(few_logs), "--checkpoint", "small"],
-        "replay": ["replay", str(fused_log), str(fused_log)],
+        "replay": ["replay", str(fused_log)],
         "compare": ["replay", str(fused_log), "--compare", "log", "small"],
     }[command]
     out = tmp_path / "out"

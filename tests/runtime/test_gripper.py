@@ -876,6 +876,18 @@ finally:
 """
 
 
+def test_a_handled_interrupt_is_raised_once(simulated: Open, monkeypatch: pytest.MonkeyPatch) -> None:
+    gripper = simulated()
+    with monkeypatch.context() as patch:
+        patch.setattr(ControlLoop, "_cycle", lambda *_: signal.raise_signal(signal.SIGINT))
+        with pytest.raises(KeyboardInterrupt):
+            gripper.sleep(1.0)
+    for call in (gripper.release, lambda: gripper.grasp(2.0), gripper.step):
+        with pytest.raises(gf.RequestError, match="an interrupt has ended the run; close the gripper"):
+            call()
+    gripper.close()
+
+
 @pytest.mark.parametrize("background", [False, True])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signals_work_as_before_once_another_thread_has_closed_the_gripper(

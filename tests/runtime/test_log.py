@@ -313,7 +313,7 @@ def test_flipped_bytes_are_told_or_harmless_never_an_untyped_error(
             assert str(path) in str(error)  # noqa: PT017
 
 
-def test_a_damaged_chunk_ends_the_recovered_records(tmp_path: Path) -> None:
+def test_recovery_leaves_out_a_damaged_chunk_alone(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     written = run(path)
     log = LogReader(path)
@@ -323,9 +323,26 @@ def test_a_damaged_chunk_ends_the_recovered_records(tmp_path: Path) -> None:
     path.write_bytes(content)
     with pytest.raises(LogError, match="is damaged"):
         list(LogReader(path).records())
-    rest = [image(r) for r in LogReader(path, recover=True).records()]
-    assert 0 < len(rest) < len(written)
-    assert rest == [image(r) for r in written[: len(rest)]]
+    reader = LogReader(path, recover=True)
+    rest = [image(r) for r in reader.records()]
+    assert reader.damaged == {chunk.offset}
+    whole = [image(r) for r in written]
+    first = next(i for i, (a, b) in enumerate(zip(rest, whole, strict=False)) if a != b)
+    assert 0 < first < len(rest) < len(whole), "there are records before and after it"
+    assert rest[first:] == whole[first - len(rest) :]
+
+
+def test_damage_outside_of_the_chunks_is_found(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    run(path)
+    whole = path.read_bytes()
+    chunk = LogReader(path)._chunks[1]
+    for position in (whole.index(b"target_n: 4"), chunk.offset - 9):  # in the configuration; kind of a record
+        content = bytearray(whole)
+        content[position] ^= 1
+        path.write_bytes(content)
+        with pytest.raises(LogError, match="is cut short or damaged"):
+            LogReader(path)
 
 
 @pytest.mark.parametrize("recover", [False, True])

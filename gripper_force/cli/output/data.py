@@ -51,7 +51,7 @@ def imports_table(logs: "Sequence[ImportSummary]") -> None:
     for row in logs:
         figures = (number(row.tare_n, digits=3), f"{1e3 * row.force_lag_s:.0f}")
         counts = (str(getattr(row, name)) for name in ("frames", "frames_without_force", "spikes_rejected"))
-        table.add_row(row.log.name, *counts, *figures)
+        table.add_row(escape(row.log.name), *counts, *figures)
     out.print(table)
     for row in logs:
         if row.tare_note:
@@ -67,7 +67,7 @@ def database_table(environments: "Sequence[EnvironmentSummary]", ignored: Sequen
     columns = ("object", "degrees", "lux", "logs", "kept", "touches", "frames", "spikes_rejected")
     table = Table("folder", *(name.removesuffix("_rejected") for name in columns), box=None)
     for row in environments:
-        table.add_row(row.folder, *(str(getattr(row, name)) for name in columns))
+        table.add_row(escape(row.folder), *(str(getattr(row, name)) for name in columns))
     out.print(table)
     for row in environments:
         for problem in row.problems:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rich.markup import escape
 from rich.table import Column, Table
 
 from gripper_force.cli.console import number, out, pairs
@@ -74,7 +75,7 @@ def trials_table(trials: "Sequence[Summary]", summary: "Overall", figure: str | 
     for t in trials:
         error = None if t["steady_error_n"] is None else 100 * t["steady_error_n"] / t["target_n"]
         table.add_row(
-            t["object"],
+            escape(t["object"]),
             number(t["target_n"], digits=2),
             number(t["load_cell_mean_n"], digits=2),
             number(error, digits=1),
@@ -99,7 +100,7 @@ def trials_table(trials: "Sequence[Summary]", summary: "Overall", figure: str | 
     pairs(plain)
     table = Table("MAE over the run, N", "vision", "current", "fused", "floor", box=None)
     for name, e in summary["estimate_mae_n"].items():
-        table.add_row(name, *(number(e[key]) for key in ("visual", "current", "fused", "floor")))
+        table.add_row(escape(name), *(number(e[key]) for key in ("visual", "current", "fused", "floor")))
     out.print(table)
     if figure is not None:
         pairs({"figure": figure})
@@ -111,7 +112,7 @@ def errors_table(r: "Evaluation") -> None:
     table = Table("object", "MAE N", "RMSE N", "contact MAE N", "floor N", "frames", box=None)
     for name, o in r.per_object.items():
         figures = (o.mae_n, o.rmse_n, o.contact_mae_n, o.floor_n)
-        table.add_row(name, *(number(value) for value in figures), str(o.frames))
+        table.add_row(escape(name), *(number(value) for value in figures), str(o.frames))
     out.print(table)
     _bins_table(r.per_bin)
 
@@ -159,8 +160,8 @@ def replays_table(
             r.sources[name].mae_n if name in r.sources else None for name in ("visual", "current", "fused")
         )
         table.add_row(
-            Path(r.log).name,
-            ", ".join(r.per_object),
+            escape(Path(r.log).name),
+            escape(", ".join(r.per_object)),
             marks[r.identical],
             *(number(value) for value in errors),
         )
@@ -173,7 +174,9 @@ def replays_table(
     table = Table("object", "source", "MAE N", "RMSE N", "bias N", "samples", box=None)
     for name, sources in {"all": summary.sources, **summary.per_object}.items():
         for source, e in sources.items():
-            table.add_row(name, source, number(e.mae_n), number(e.rmse_n), number(e.bias_n), str(e.frames))
+            table.add_row(
+                escape(name), source, number(e.mae_n), number(e.rmse_n), number(e.bias_n), str(e.frames)
+            )
     out.print(table)
     if not summary.sources:
         out.print("No load cell: force errors can't be measured.")
@@ -184,7 +187,13 @@ def replays_table(
 def differences_table(first: str, second: str, differences: "dict[str, PairedDifference]") -> None:
     """Prints how the errors of two replays differ."""
     table = Table(
-        "source", "logs", f"{first}: MAE N", f"{second}: MAE N", "difference N", "95 % interval", box=None
+        "source",
+        "logs",
+        f"{escape(first)}: MAE N",
+        f"{escape(second)}: MAE N",
+        "difference N",
+        "95 % interval",
+        box=None,
     )
     for name, d in differences.items():
         interval = "-" if d.low_n is None or d.high_n is None else f"{d.low_n:+.3f} to {d.high_n:+.3f}"

@@ -104,6 +104,10 @@ def export_lerobot(
     if fps < 1:
         raise ConfigError(f"a rate of {fps} rows per second is too low; set --fps to 1 or more")
     shape = _image_shape(logs[0])
+    for path in logs[1:]:
+        if (_image_shape(path) is None) != (shape is None):
+            which = "no images, and the first log has some" if shape else "images, and the first log has none"
+            raise DataError(f"{path} has {which}; export them apart")
     frames = 0
     try:
         dataset: Any = dataset_class.create(

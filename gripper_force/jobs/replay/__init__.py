@@ -152,14 +152,27 @@ def replay_each(
     )
 
 
+def _other_vision(run: ResolvedConfig) -> str:
+    """Returns the difference where only the log or the replay has a network; empty without a controller."""
+    if run.config.gripper.nm_per_a is None:
+        return ""
+    return (
+        "the run had a network, this has none"
+        if run.model is None
+        else "the run had no network, this has one"
+    )
+
+
 def _note(reader: LogReader, run: ResolvedConfig) -> str:
     """Returns the reason why estimates or decisions may differ from the logged ones, or an empty text."""
+    if reader.damaged:
+        return f"{len(reader.damaged)} damaged parts of the log, of 0.1 s each, are left out"
     wrote = reader.metadata.get("version gripper-force", "")
     if wrote != __version__:
         return f"version {wrote or 'unknown'} wrote the log, this is {__version__}: its controller may decide otherwise"
     used = reader.metadata.get("checkpoint", "")
     if run.model is None or used == "":
-        return ""
+        return "" if (run.model is None) == (used == "") else _other_vision(run)
     if has_faulty_estimates(run.config):
         return "faults were injected into the run's estimator, so only decisions are compared"
     if used != run.model.digest:

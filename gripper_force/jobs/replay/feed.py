@@ -151,7 +151,8 @@ def feed(reader: LogReader, run: ResolvedConfig, sink: Sink, *, in_batches: bool
     controller = make_controller(config) if had_controller else None
     newest: VisualForce | None = None
     request: Request | None = None
-    pending: dict[int, VisualForce] = {}
+    pending: dict[int, VisualForce | None] = {}
+    had_network = bool(reader.metadata.get("checkpoint"))
     # NaN, of a covered view, does not equal itself.
     estimates = _Pairs(lambda v: (v.seq, None if math.isnan(v.force_n) else v.force_n, v.std_n))
     commands = _Pairs(lambda c: c, lambda a, b: abs(a.goal_current_a - b.goal_current_a))
@@ -164,16 +165,20 @@ def feed(reader: LogReader, run: ResolvedConfig, sink: Sink, *, in_batches: bool
             if estimate is not None:
                 sink.add_visual(estimate)
                 estimates.add_again(estimate)
-                pending[record.seq] = estimate
-                if len(pending) > _BACKLOG:
-                    del pending[next(iter(pending))]
+                if not had_network:  # so the log has no time at which an estimate was ready
+                    newest = replace(estimate, ready_ns=record.received_ns)
+            pending[record.seq] = estimate
+            if len(pending) > _BACKLOG:
+                del pending[next(iter(pending))]
             continue
         if (pairs := pairs_of.get(type(record))) is not None:
             pairs.add_logged(record)
         if isinstance(record, VisualForce):
-            again = None if is_faulty else pending.pop(record.seq, None)
-            # The time at which an estimate was ready is the run's, not this computer's.
-            newest = record if again is None else replace(again, ready_ns=record.ready_ns)
+            # A log whose disk was slow lacks frames; only their estimates are the logged ones.
+            is_logged = is_faulty or (run.model is not None and record.seq not in pending)
+            again = record if is_logged else pending.pop(record.seq, None)
+            if again is not None:  # the time at which it was ready is the run's, not this computer's
+                newest = replace(again, ready_ns=record.ready_ns)
         elif isinstance(record, Request):
             request = record
         elif isinstance(record, ServoState) and controller is not None:

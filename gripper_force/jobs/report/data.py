@@ -252,7 +252,7 @@ def read_run(
     requests = records[Request]
     grasps = [request for request in requests if request.kind == RequestKind.GRASP]
     zero_ns = grasps[0].t_ns if grasps else log.start_ns
-    target_n = grasps[-1].target_n if grasps else None
+    target_n, begin_ns = (grasps[-1].target_n, grasps[-1].t_ns) if grasps else (None, 0)
     samples = sorted((s for s in records[LoadCellSample] if s.valid), key=lambda s: s.t_ns)
     forces = {
         "current": _series(zero_ns, ((r.t_ns, r.current_n) for r in fused)),
@@ -278,9 +278,11 @@ def read_run(
         begin_s=(log.start_ns - zero_ns) / NS_PER_S,
         end_s=end_s,
         target_n=target_n,
-        outcome=next((s.outcome for s in reversed(status) if s.outcome), ""),
-        score=_score(samples, logged_status, target_n),
-        vision=vision_in_hold(status, fused, vision, records[Event]) if uses_vision else None,
+        outcome=next((s.outcome for s in reversed(status) if s.outcome and s.t_ns >= begin_ns), ""),
+        score=_score(samples, logged_status, target_n, begin_ns),
+        vision=vision_in_hold([s for s in status if s.t_ns >= begin_ns], fused, vision, records[Event])
+        if uses_vision
+        else None,
         object_gain=next(
             ((f.object_gain, f.object_gain_std) for f in reversed(fused) if f.object_gain), None
         ),
@@ -385,12 +387,12 @@ def _touches(cell: Series | None, errors: dict[str, Series]) -> list[Touch]:
 
 
 def _score(
-    samples: list[LoadCellSample], status: list[GraspStatus], target_n: float | None
+    samples: list[LoadCellSample], status: list[GraspStatus], target_n: float | None, begin_ns: int
 ) -> GraspScore | None:
     if target_n is None:
         return None
     try:
-        return score_grasp(samples, status, target_n)
+        return score_grasp(samples, status, target_n, begin_ns)
     except DataError:
         return None
 

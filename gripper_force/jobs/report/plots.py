@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -29,10 +30,16 @@ Floats = npt.NDArray[np.floating]
 
 
 def check_figure_path(path: Path) -> None:
-    """Raises `DataError` if figures can't have the suffix of a path."""
+    """Makes the folder of a figure. Raises `DataError` if it can't be made, or figures can't have the path's suffix."""
     known = FigureCanvasBase.get_supported_filetypes()
     if path.suffix and path.suffix[1:].lower() not in known:
         raise DataError(f"a figure can't be a {path.suffix} file, as of {path}; name a .png, .svg or .pdf")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=path.parent):
+            pass
+    except OSError as error:
+        raise DataError(f"can't write the figure {path}: {error.strerror}; choose another path") from error
 
 
 @contextmanager
@@ -48,7 +55,6 @@ def saved_figure(path: Path, title: str, height_in: float, width_in: float = 10.
         figure.suptitle(title, x=0.008, ha="left", fontsize=13, fontweight="bold")
         yield figure
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
             figure.savefig(path)
         except OSError as error:
             raise DataError(f"can't write the figure {path}: {error}; check its folder") from error

@@ -5,6 +5,7 @@ import sys
 from collections import defaultdict
 from pathlib import Path
 from typing import Final
+from uuid import NAMESPACE_URL, uuid5
 
 import numpy as np
 import rerun as rr
@@ -100,7 +101,7 @@ class RerunViewer:
     """Sends records to the Rerun viewer, or to a file for it.
 
     Args:
-        name: Name of the recording.
+        log: The log; its name is that of the recording.
         save: File (``.rrd``) to write; None: the viewer is started.
         live: True if the log is still being written.
 
@@ -108,8 +109,12 @@ class RerunViewer:
         DataError: The viewer can't start, or the file can't be written.
     """
 
-    def __init__(self, name: str, save: Path | None = None, *, live: bool = False) -> None:
-        self._recording = rr.RecordingStream("gripper-force", recording_id=name)
+    def __init__(self, log: Path, save: Path | None = None, *, live: bool = False) -> None:
+        name = log.stem
+        # Rerun merges recordings with one id: two logs of one name in two folders must have two.
+        self._recording = rr.RecordingStream(
+            "gripper-force", recording_id=uuid5(NAMESPACE_URL, log.resolve().as_uri())
+        )
         self._saves = save is not None
         self._first_ns: int | None = None
         self._sent_ns = 0

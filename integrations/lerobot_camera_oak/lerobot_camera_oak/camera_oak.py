@@ -111,11 +111,12 @@ class OakCamera(Camera):
         camera = self._device(self.settings)
         try:
             camera.start()
+            self._newest, self._is_unread, self._camera = None, False, camera
+            self._take()
         except BaseException:
+            self._camera = None
             camera.close()
             raise
-        self._newest, self._is_unread, self._camera = None, False, camera
-        self._take()
 
     @check_if_not_connected
     def read(self) -> Image:

@@ -139,6 +139,25 @@ def test_a_missing_device_is_an_error_and_nothing_stays_open(cameras: ModuleType
     assert not camera.is_connected
 
 
+def test_a_camera_that_fails_at_its_first_frame_is_closed(cameras: ModuleType) -> None:
+    closed: list[bool] = []
+
+    class Failing:
+        def start(self) -> None:
+            pass
+
+        def newest(self) -> None:
+            raise gf.DeviceLostError("the cable is out")
+
+        def close(self) -> None:
+            closed.append(True)
+
+    camera = cameras.OakCamera(cameras.OakCameraConfig(), lambda config: Failing())
+    with pytest.raises(gf.DeviceLostError):
+        camera.connect()
+    assert (camera.is_connected, closed) == (False, [True])
+
+
 def test_wrong_configurations_are_named(cameras: ModuleType) -> None:
     with pytest.raises(ValueError, match="a square, not 640x480"):
         cameras.OakCameraConfig(width=640, height=480)

@@ -162,6 +162,7 @@ class GripperForce(Robot):
         wanted = float(action[key])
         state = gripper.state
         if state.phase == gf.Phase.FAULT:
+            self._sent = None  # after a release, the same action has to be sent again
             raise gf.RequestError(
                 f"the action was refused: the gripper was stopped or is at fault ({state.reason}); call "
                 "robot.gripper.release() once the cause is gone"

@@ -143,6 +143,19 @@ def test_no_action_resets_a_stop(make_robot: Make, action: float) -> None:
     assert robot.gripper.state.phase != gf.Phase.FAULT
 
 
+def test_an_action_from_before_a_stop_is_sent_again_after_the_release(make_robot: Make) -> None:
+    robot = make_robot("camera.backend=none")
+    robot.connect()
+    run(robot, 60, force_n=3.0)
+    robot.gripper.stop()
+    robot.get_observation()
+    with pytest.raises(gf.RequestError, match="stopped or is at fault"):
+        robot.send_action({FORCE: 3.0})
+    robot.gripper.release()
+    run(robot, 90, force_n=3.0)
+    assert robot.gripper.state.phase == gf.Phase.HOLD
+
+
 @pytest.mark.parametrize("on_exit", ["release", "hold"])
 def test_disconnect_turns_torque_off_whatever_is_configured(make_robot: Make, on_exit: str) -> None:
     robot = make_robot("camera.backend=none", f"on_exit={on_exit}")

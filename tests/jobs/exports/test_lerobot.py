@@ -161,6 +161,17 @@ def test_a_dataset_that_cannot_be_made_leaves_nothing(
     assert not (tmp_path / "out").exists()
 
 
+def test_logs_with_and_without_images_are_exported_apart(
+    fused_log: Path, moves_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(job, "_dataset_class", lambda: None)
+    for logs, which in (([fused_log, moves_log], "has no images"), ([moves_log, fused_log], "has images")):
+        with pytest.raises(
+            DataError, match=rf"{logs[1].name} {which}, and the first log .*; export them apart"
+        ):
+            job.export_lerobot(logs, tmp_path / "out")
+
+
 def test_an_unknown_kind_of_action_is_named(fused_log: Path) -> None:
     done = export(fused_log, "--action", "torque")
     assert isinstance(done.exception, ConfigError)

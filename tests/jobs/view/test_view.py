@@ -238,6 +238,20 @@ def columns(path: Path) -> dict[str, list[tuple[int, int, Any]]]:
     return {name: sorted(rows, key=lambda row: row[0]) for name, rows in found.items()}
 
 
+def test_logs_of_one_name_in_two_folders_are_two_recordings(log: Path, tmp_path: Path) -> None:
+    pytest.importorskip("rerun")
+    from rerun.chunk import RrdReader
+
+    ids = set()
+    for name in ("a", "b"):
+        copy = tmp_path / name / "run.mcap"
+        copy.parent.mkdir()
+        copy.write_bytes(log.read_bytes())
+        assert run("view", copy, "--save", copy.with_suffix(".rrd"), "--json").exit_code == 0
+        ids.add(RrdReader(copy.with_suffix(".rrd")).recordings()[0].recording_id)
+    assert len(ids) == 2
+
+
 def test_rerun_reads_what_the_log_holds(log: Path, tmp_path: Path) -> None:
     rerun_program()
     done = run("view", log, "--save", tmp_path / "run.rrd", "--json")
