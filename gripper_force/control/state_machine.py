@@ -274,6 +274,8 @@ class GraspController:
             return "stopped or in fault; request a release first"
         elif request.kind == RequestKind.RELEASE:
             if cause := self._safety.reset():
+                if not self._opens_at_fault:
+                    self._motor_force_n = 0.0  # what can't be reset is let go, also with on_fault=hold
                 return cause
             if self._outcome == Outcome.BLOCKED:
                 self._outcome = Outcome.NONE

@@ -587,6 +587,19 @@ def test_at_fault_the_hold_is_kept(make_run):
     assert run.plant.force_n == pytest.approx(before_n, abs=0.1)
 
 
+def test_a_release_of_a_hot_servo_that_holds_lets_go(make_run):
+    run = make_run(on_fault="hold").to_phase("hold").go(1.0)
+    run.spoil = lambda _, servo: replace(servo, temperature_c=75.0)
+    run.go(1.0)
+    assert (run.last.status.phase, run.last.command.goal_current_a > 0) == ("fault", True)
+    run.go(0.5, "release")
+    assert run.last.status.phase == "fault", "its cause persists"
+    assert run.last.command.goal_current_a == 0.0
+    run.spoil = lambda _, servo: servo
+    run.go(4.0, "release")
+    assert run.last.status.phase == "open"
+
+
 @pytest.mark.parametrize("phase", ["approach", "ramp", "hold"])
 def test_at_fault_the_jaws_open(make_run, phase):
     run = make_run(on_fault="open").to_phase(phase).go(3.0, "stop")

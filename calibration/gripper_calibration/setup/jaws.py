@@ -1,9 +1,11 @@
 """Step ``jaws``: finds the ends of the travel, the closing direction and friction."""
 
+import math
 from datetime import date
 
 from gripper_calibration.procedures.calibrate_jaws import calibrate_jaws
-from gripper_calibration.setup.step import Found, Outcome, Task, with_keys
+from gripper_calibration.setup.step import ANSWERED, Found, Outcome, Task, with_keys
+from gripper_force.config import GripperConfig
 from gripper_force.runtime.backends import is_simulated
 from gripper_force.runtime.resolve import resolve
 
@@ -29,7 +31,8 @@ def jaws(task: Task) -> Outcome:
         default_mm = 1e3 * getattr(config.gripper, key)
         answer_m = 1e-3 * task.person.number(question, f"--set gripper.{key}=METRES", default_mm)
         config = with_keys(config, "gripper", **{key: answer_m})
-        origin = "default, not measured" if answer_m == 1e-3 * default_mm else "as you answered"
+        is_default = math.isclose(answer_m, getattr(GripperConfig(), key))
+        origin = "default, not measured" if is_default else ANSWERED
         values[f"gripper.{key}"] = Found(round(answer_m, 6), origin)
     homed = config
     if is_simulated(config):
@@ -44,7 +47,10 @@ def jaws(task: Task) -> Outcome:
         "gripper.closing_sign": Found(found.closing_sign, f"homed {today}"),
         "gripper.open_position_rad": Found(round(found.open_position_rad, 4), origin),
         "gripper.open_width_m": Found(
-            round(found.open_width_m, 4), f"travel between the ends, homed {today}"
+            round(found.open_width_m, 4),
+            f"travel between the ends, homed {today}"
+            if config.gripper.linkage.kind == "rack"
+            else "of the linkage",
         ),
         "gripper.friction_n": Found(
             round(found.friction_n, 2),

@@ -7,7 +7,7 @@ from typing import Any, Final, Self
 
 import yaml
 
-from gripper_calibration.setup.step import Found
+from gripper_calibration.setup.step import ANSWERED, Found
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError
 from gripper_force.jobs.profile_files import write_all
@@ -85,6 +85,43 @@ class RigFile:
                 self.given.pop(key, None)
                 self.found[key] = found
 
+    def forget(self, name: str) -> None:
+        """Drops what a step found when it ran before, but not a person's answers.
+
+        What an earlier step found of the same key is back.
+        """
+        for key, value in self.steps.get(name, {}).get("values", {}).items():
+            if key in self.found and self.found[key].value == value[0] and value[1] != ANSWERED:
+                before = [
+                    s["values"][key]
+                    for n, s in self.steps.items()
+                    if n != name and key in s.get("values", {})
+                ]
+                if before:
+                    self.found[key] = Found(*before[-1])
+                else:
+                    del self.found[key]
+
+    def outdate(self, name: str) -> list[str]:
+        """Marks the later steps that refine what a step has found anew: they run again. Returns their names."""
+        order = list(self.steps)
+        own = self.steps[name]["values"]
+        later = [
+            one
+            for one in order[order.index(name) + 1 :]
+            if own.keys() & self.steps[one].get("values", {}).keys()
+        ]
+        for one in later:
+            self.steps[one]["outdated_by"] = name
+        if later:
+            self._write()
+        return later
+
+    def keep(self, values: Mapping[str, Found]) -> None:
+        """Takes values at once, because a device has them already, and writes the rig file."""
+        self.take(values)
+        self._write()
+
     def finish(self, name: str, step: Tree) -> None:
         """Notes a finished step, and writes the rig file and the state.
 
@@ -92,6 +129,9 @@ class RigFile:
             ConfigError: One can't be written.
         """
         self.steps[name] = step
+        self._write()
+
+    def _write(self) -> None:
         files = {self.path: self._text().encode(), self._state: self._state_text().encode()}
         if self._keep_original:
             files[self.folder / "original.yaml"] = self.path.read_bytes()

@@ -36,6 +36,14 @@ class Step:
     but: tuple[str, ...] = ()
 
 
+_SERVO: Final = (
+    "servo.backend",
+    "servo.port",
+    "servo.id",
+    "servo.second",
+    "servo.model",
+    "servo.homing_offset",
+)
 _GEOMETRY: Final = ("gripper.linkage", "gripper.pinion_radius_m")
 
 STEPS: Final = {
@@ -48,7 +56,7 @@ STEPS: Final = {
     "jaws": Step(
         "the empty jaws move to both ends",
         jaws,
-        ("servo.id", "servo.second", "servo.model", *_GEOMETRY),
+        (*_SERVO, *_GEOMETRY),
         ("gripper.pinion_radius_m",),
     ),
     "camera": Step(
@@ -63,7 +71,7 @@ STEPS: Final = {
     "torque": Step(
         "motor current is compared with newtons",
         torque,
-        ("servo.id", "servo.second", "servo.model", "load_cell", *_GEOMETRY, "gripper.closing_sign"),
+        (*_SERVO, "load_cell", *_GEOMETRY, "gripper.closing_sign"),
     ),
 }
 """The steps by name, in their order."""
@@ -151,6 +159,7 @@ class Setup:
                     continue
                 person.tell(f"{name} runs again, because these changed: {', '.join(changed)}")
             person.tell(f"[{number} of {len(STEPS)}] {name}: {step.title}")
+            self.rig.forget(name)
             task = Task(
                 config=self.config,
                 given={key: one.value for key, one in self.rig.given.items()},
@@ -159,9 +168,14 @@ class Setup:
                 progress=progress,
                 mass_kg=self._mass_kg,
                 gauge_mm=self._gauge_mm,
+                keep=self.rig.keep,
             )
             outcome = step.run(task)
-            yield self._finish(name, step, outcome)
+            report = self._finish(name, step, outcome)
+            outdated = self.rig.outdate(name)
+            if self._only and outdated:
+                person.tell(f"{', '.join(outdated)} rests on what {name} found: run setup without --step")
+            yield report
 
     def _finish(self, name: str, step: Step, outcome: Outcome) -> StepReport:
         files = {what: str(path) for what, path in outcome.files.items()}
@@ -174,6 +188,7 @@ class Setup:
                 "remarks": list(outcome.remarks),
                 "files": files,
                 "rests_on": self._inputs(step),
+                "values": outcome.values,
             },
         )
         values = {key: found.value for key, found in outcome.values.items()}
@@ -197,6 +212,8 @@ class Setup:
 
     def _changed(self, name: str, step: Step) -> list[str]:
         """Keys whose values differ from those that a finished step rested on."""
+        if outdated_by := self.rig.steps[name].get("outdated_by"):
+            return [f"what {outdated_by} found"]
         before, now = self.rig.steps[name].get("rests_on", {}), self._inputs(step)
         return [key for key in now if now[key] != before.get(key)]
 

@@ -44,7 +44,8 @@ def scan(task: Task) -> Outcome:
     assert servo.max_current_a is not None
     if "servo.current_limit_a" not in task.given and task.config.servo.current_limit_a > servo.max_current_a:
         values["servo.current_limit_a"] = servo.max_current_a
-    others = [one.id for one in servos if one.port == servo.port and one.id != servo.id]
+    own = {servo.id, task.config.servo.second.id}
+    others = [one.id for one in servos if one.port == servo.port and one.id not in own]
     if others:
         remarks.append(f"other servos on this bus stay untouched: id {', '.join(map(str, sorted(others)))}")
     if (wanted := task.given.get("servo.model")) not in (None, servo.model):
@@ -100,16 +101,27 @@ def _gripper(task: Task, servos: list[FoundServo], scans: list[PortScan]) -> Fou
             "permission, name the port with --set servo.port=PATH, or try without hardware: "
             "--set servo.port=virtual:rig"
         )
-    wanted = task.given.get("servo.id")
-    if wanted is not None and any(servo.id == wanted for servo in usable):
-        usable = [servo for servo in usable if servo.id == wanted]
-    if len(usable) == 1:
+    named = {key: task.given[key] for key in ("servo.port", "servo.id") if key in task.given}
+    fitting = [servo for servo in usable if _is_named(servo, named)]
+    usable = fitting or usable
+    if fitting and len(usable) == 1:
         return usable[0]
+    if not fitting:  # the gripper may be without power, and these servos an arm's: never take one silently
+        task.person.tell(
+            f"no servo answers with {', '.join(f'{key}={value}' for key, value in named.items())}"
+        )
     answers = {f"{servo.id} on {servo.port}": servo for servo in usable}
     if len({servo.port for servo in usable}) == 1:
         answers = {str(servo.id): servo for servo in usable}
     option = "--set servo.id=ID and, with several ports, --set servo.port=PATH"
     return answers[task.person.choose("Which id is the gripper's servo?", list(answers), option)]
+
+
+def _is_named(servo: FoundServo, named: Mapping[str, Any]) -> bool:
+    """Returns True if a servo has the port and the id that are given."""
+    port = named.get("servo.port", servo.port)
+    same_port = port == servo.port or Path(port).resolve() == Path(servo.port).resolve()
+    return same_port and named.get("servo.id", servo.id) == servo.id
 
 
 def _real_sensors(task: Task, ports: list[str], servo_port: str, remarks: list[str]) -> dict[str, Any]:

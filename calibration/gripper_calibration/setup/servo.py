@@ -57,6 +57,7 @@ def _set_up(task: Task, id_: int) -> tuple[list[RegisterChange], dict[str, Found
     values: dict[str, Found] = {}
     if any(one.register == "baud_rate" for one in written):
         values["servo.baud_rate"] = Found(_FAST, "written to the servo")
+        task.keep(values)  # the servo answers at this rate only, whatever fails now
     for one in declined:
         if one.register == "homing_offset":
             values["servo.homing_offset"] = Found(int(one.old.split()[0]), "read from the servo")

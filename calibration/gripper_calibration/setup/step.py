@@ -1,9 +1,9 @@
 """Vocabulary of the steps of a setup: what a step gets, asks and finds."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 from gripper_force.config import Config
 from gripper_force.progress import Progress
@@ -33,6 +33,10 @@ class Person(Protocol):
         ...
 
 
+ANSWERED: Final = "as you answered"
+"""Origin of a value that a person gave when asked."""
+
+
 class Found(NamedTuple):
     """A value for the rig file and its origin, for the comment behind it."""
 
@@ -52,6 +56,7 @@ class Task:
         progress: Called with what the devices do.
         mass_kg: Known mass for the load cell, or without one for a jaw, if it was given.
         gauge_mm: Width of the load cell between the jaws, if it was given.
+        keep: Writes values into the rig file at once, because a device has them already.
     """
 
     config: Config
@@ -61,6 +66,7 @@ class Task:
     progress: Progress
     mass_kg: float | None = None
     gauge_mm: float | None = None
+    keep: Callable[[Mapping[str, Found]], None] = lambda values: None
 
 
 @dataclass(frozen=True, slots=True)

@@ -344,6 +344,7 @@ def by_hand(folder: Path, monkeypatch: pytest.MonkeyPatch, terminal: Terminal) -
 def test_interrupted_command_calibrates_and_continues_later(
     touched: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(process, "_received", [])
     stopped = by_hand(tmp_path, monkeypatch, Terminal(2, interrupt))
     assert json.loads(stopped.stdout)["touches"] == 2
     assert "stopped after 2 of 3 touches" in stopped.stderr

@@ -7,7 +7,7 @@ import pytest
 
 from gripper_calibration.setup.rig_file import RigFile, flat
 from gripper_calibration.setup.run import STEPS, Setup, check_step
-from gripper_calibration.setup.step import Found
+from gripper_calibration.setup.step import ANSWERED, Found
 from gripper_force.config import load_config
 from gripper_force.errors import ConfigError
 from gripper_hw.dynamixel.control_table import load_model
@@ -95,6 +95,47 @@ def test_values_that_a_person_writes_are_kept_and_named(tmp_path: Path) -> None:
     assert again.steps == {"scan": {"summary": "done"}}
     assert flat(again.tree()) == {"servo.id": 3, "servo.baud_rate": 57600, "camera.rate_hz": 30}
     assert not RigFile.load(path, None, fresh=True).found
+
+
+def test_a_step_that_runs_again_forgets_what_it_found_before(tmp_path: Path) -> None:
+    rig = RigFile(tmp_path / "rig.yaml")
+    jaws = {"gripper.friction_n": Found(0.5, "homed"), "gripper.pinion_radius_m": Found(0.015, ANSWERED)}
+    torque = {"gripper.friction_n": Found(0.7, "pressed"), "gripper.nm_per_a": Found(1.9, "pressed")}
+    for name, values in (("jaws", jaws), ("torque", torque)):
+        rig.take(values)
+        rig.finish(name, {"values": values, "rests_on": {}})
+    again = RigFile.load(rig.path, None, fresh=False)
+    again.forget("torque")
+    assert flat(again.tree()) == {"gripper.friction_n": 0.5, "gripper.pinion_radius_m": 0.015}
+    again = RigFile.load(rig.path, None, fresh=False)
+    again.forget("jaws")
+    assert flat(again.tree())["gripper.pinion_radius_m"] == 0.015, "an answer is kept"
+    assert again.outdate("jaws") == ["torque"]
+
+
+@pytest.mark.parametrize(
+    ("change", "steps"),
+    [
+        ("servo.port=virtual:other", {"servo", "jaws", "torque"}),
+        ("servo.homing_offset=500", {"jaws", "torque"}),
+        ("servo.model=XC330-T288", {"servo", "jaws", "torque"}),
+    ],
+)
+def test_what_the_jaws_are_found_with_decides_what_is_found_again(
+    tmp_path: Path, change: str, steps: set[str]
+) -> None:
+    first = Setup(tmp_path / "rig.yaml", SIMULATED)
+    for name in STEPS:
+        first.rig.finish(name, {"rests_on": first._inputs(STEPS[name])})
+    changed = Setup(tmp_path / "rig.yaml", [change])
+    assert {name for name in STEPS if changed._changed(name, STEPS[name])} >= steps
+
+
+def test_a_baud_rate_is_saved_though_the_step_fails(tmp_path: Path) -> None:
+    rig = RigFile.load(tmp_path / "rig.yaml", ["servo.baud_rate=57600"], fresh=False)
+    rig.keep({"servo.baud_rate": Found(1_000_000, "written to the servo")})
+    assert load_config(rig.path).servo.baud_rate == 1_000_000
+    assert RigFile.load(rig.path, None, fresh=False).steps == {}
 
 
 def test_a_damaged_state_and_an_unknown_step_are_named(tmp_path: Path) -> None:
