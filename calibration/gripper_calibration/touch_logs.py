@@ -52,6 +52,12 @@ class TouchRecording:
         return bool((self.touches.force_n > CONTACT_N).any())
 
 
+def started_ns(path: Path) -> int:
+    """Returns the time at which a log began, for the order of touches; the same for all logs in simulated time."""
+    reader = LogReader(path)
+    return reader.utc_offset_ns + reader.start_ns if reader.utc_offset_ns else 0
+
+
 def join(recordings: dict[Path, TouchRecording]) -> TouchRecording:
     """Joins the recordings of several logs and renumbers their touches.
 

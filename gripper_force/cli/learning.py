@@ -84,6 +84,12 @@ def train(
         find_logs(given) if given else []
         for given in (data, [validation] if validation else [], [replay] if replay else [])
     ]
+    seen = {path.resolve() for path in (*folders[0], *folders[2])}
+    if both := [path for path in folders[1] if path.resolve() in seen]:
+        raise ConfigError(
+            f"{len(both)} logs of --validation are among those to train on, such as {both[0]}; the error on them would "
+            "say nothing: name other folders"
+        )
     with console.bar("reading logs", sum(map(len, folders)), hidden=quiet) as progress:
         clips, unseen, old = (
             load_clips(logs, settings.preprocess, workers=jobs, progress=progress) if logs else []

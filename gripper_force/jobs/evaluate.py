@@ -232,7 +232,7 @@ def _evaluate_log(
         return None
     own = settings.model_copy(update={"object": logged.object})
     profiles = read_profiles(own)
-    gain = gain_of(with_object(own.control, profiles).object_ratio, settings.gripper.gain_std)
+    gain = gain_of(with_object(own.control, profiles).object_ratio, logged.gripper.gain_std)
     correction, device = None, "cuda" if torch.cuda.is_available() else "cpu"
     if settings.calibration.object is not None:
         correction, device = read_correction(own, profiles, loaded, logged.rig_settings()), "cpu"

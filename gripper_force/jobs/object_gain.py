@@ -1,8 +1,10 @@
 """The gain of an object, from the logs of grasps, and its place in an object profile."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 from gripper_force.config import Overrides, config_from_text
 from gripper_force.control.object_gain import GainEstimate, ObjectGain
@@ -11,6 +13,11 @@ from gripper_force.profiles.object_profile import BUNDLED, find_object, read_obj
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import make_controller
 from gripper_force.types import Request, ServoState, VisualForce
+
+_MOST_DEVIATIONS: Final = 3.29
+_REPEAT_STD: Final = 0.03
+"""As in `gripper_force.control.object_gain`: deviations at which two ratios are those of two objects, and the standard
+deviation of the ratio between grasps of one object."""
 
 
 def learned_ratio(path: Path, overrides: Overrides | None = None) -> tuple[float, float] | None:
@@ -87,6 +94,12 @@ def save_gain(
         raise DataError(
             "no log holds a grasp that was held for half a second with visual estimates; grasp the object with "
             "control.feedback=fused and control.learn_gain=true"
+        )
+    (low, low_std), (high, high_std) = min(ratios), max(ratios)
+    if math.log(high / low) > _MOST_DEVIATIONS * math.hypot(low_std, high_std, math.sqrt(2) * _REPEAT_STD):
+        raise DataError(
+            f"the logs contradict each other: motor current was {low:.2f} times the visual force in one, and "
+            f"{high:.2f} times in another; pass logs of one object"
         )
     gain = ObjectGain(_torque_std(logs[-1], overrides))
     for ratio in ratios:

@@ -20,8 +20,7 @@ from gripper_force.schema import dump
 
 def check_place(path: Path) -> None:
     """Creates the folder of a profile. Raises `ConfigError` if the profile can't be written there."""
-    if path.suffix != ".yaml":
-        raise ConfigError(f"can't write an object profile to {path}; name a file that ends in .yaml")
+    _check_names(path)
     probe = path.with_name(f".{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -33,8 +32,18 @@ def check_place(path: Path) -> None:
         ) from error
 
 
+def _check_names(path: Path) -> None:
+    if path.suffix != ".yaml":
+        raise ConfigError(f"can't write an object profile to {path}; name a file that ends in .yaml")
+    if (beside := weights_path(path)).exists() and not path.exists():
+        raise ConfigError(
+            f"an object profile {path} would replace {beside}, which belongs to no profile; name another file"
+        )
+
+
 def write_object(path: Path, profile: ObjectProfile, weights: bytes) -> None:
     """Writes an object profile and the safetensors file beside it. Raises `ConfigError` if it can't."""
+    _check_names(path)
     write_all({weights_path(path): weights, path: dump(profile).encode()})
 
 

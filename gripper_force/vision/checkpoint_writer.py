@@ -47,7 +47,9 @@ def _write(path: Path, tensors: dict[str, Tensor], header: Header) -> None:
     data = save(tensors, metadata={FORMAT: header.model_dump_json(exclude_none=True)})
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(data)
+        part = path.with_name(f".{path.name}.part")
+        part.write_bytes(data)  # a full disk must not damage the file that it replaces
+        part.replace(path)
     except OSError as error:
         raise CheckpointError(
             f"can't write the checkpoint {path}: {error.strerror}; name another file"

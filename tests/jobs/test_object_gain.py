@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from gripper_force.errors import DataError
+from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs import object_gain
 from gripper_force.jobs.object_gain import gain_of, learned_ratio, save_gain
 from gripper_force.jobs.profile_files import write_object
@@ -55,6 +55,26 @@ def test_the_network_of_a_bundle_goes_with_the_profile(
     assert (tmp_path / saved.network).read_bytes() == b"weights"
     assert save_gain(str(bundle.parent), [tmp_path]).profile == bundle
     assert read_object(bundle).network == "network.safetensors"
+
+
+def test_logs_of_two_objects_contradict_each_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ratios = iter([(0.6, 0.03), (1.6, 0.03)])
+    monkeypatch.setattr(object_gain, "learned_ratio", lambda path, _: next(ratios))
+    with pytest.raises(DataError, match=r"0\.60 times the visual force in one, and 1\.60 times in another"):
+        save_gain("sponge", [tmp_path, tmp_path], tmp_path / "mine.yaml")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_profile_does_not_replace_a_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(object_gain, "learned_ratio", lambda path, _: (1.6, 0.05))
+    monkeypatch.setattr(object_gain, "_torque_std", lambda path, _: 0.06)
+    network = tmp_path / "mug.safetensors"
+    network.write_bytes(b"a network")
+    with pytest.raises(ConfigError, match=r"would replace .*mug\.safetensors, which belongs to no profile"):
+        save_gain("sponge", [tmp_path], tmp_path / "mug.yaml")
+    with pytest.raises(ConfigError, match=r"name a file that ends in \.yaml"):
+        save_gain("sponge", [tmp_path], network)
+    assert network.read_bytes() == b"a network"
 
 
 @pytest.mark.parametrize(("ratio", "words"), [(None, "no log holds a grasp"), ((9.0, 0.05), "is not saved")])

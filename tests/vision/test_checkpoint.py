@@ -10,7 +10,7 @@ from safetensors.torch import save_file
 
 from gripper_force.errors import CheckpointError
 from gripper_force.vision.checkpoint import load_checkpoint
-from gripper_force.vision.checkpoint_writer import save_checkpoint
+from gripper_force.vision.checkpoint_writer import replace_header, save_checkpoint
 from gripper_force.vision.header import FORMAT, SHIPPED, Header, NetworkConfig, Residual
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import Preprocess
@@ -35,6 +35,21 @@ def file(tmp_path: Path) -> Path:
     path = tmp_path / "folder" / "two.safetensors"
     save_checkpoint(path, [ForceNetwork(SSAM), ForceNetwork(SCAM)], header(SSAM, SCAM))
     return path
+
+
+def test_a_full_disk_keeps_the_checkpoint_that_is_replaced(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, write = file.read_bytes(), Path.write_bytes
+
+    def full(path: Path, data: bytes) -> int:
+        write(path, data[:100])
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(CheckpointError, match="No space left on device; name another file"):
+        replace_header(file, header(SSAM, SCAM))
+    assert file.read_bytes() == before
 
 
 def test_round_trip(file: Path) -> None:

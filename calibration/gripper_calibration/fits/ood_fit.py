@@ -63,16 +63,19 @@ def left_out_shares(touches: Touches) -> tuple[list[Floats], list[Floats]]:
     return shares, [part.estimate_n for part in parts]
 
 
-def object_limits(shares: Sequence[Floats], estimates_n: Sequence[Floats]) -> tuple[OodLimit, ...]:
+def object_limits(
+    shares: Sequence[Floats], estimates_n: Sequence[Floats], touches: int | None = None
+) -> tuple[OodLimit, ...]:
     """Returns the limits that follow from touches, each scored against others.
 
     Args:
         shares: Shares of the residual of the frames of each touch, (N,) each.
         estimates_n: Their estimates, (N,) each.
+        touches: Number of different touches; None: each is scored once.
     """
     typical = typical_shares(shares, estimates_n)
     ratios = [smooth_ratios(typical, *touch) for touch in zip(shares, estimates_n, strict=True)]
-    limit = _margin(len(ratios)) * max(float(np.quantile(ratio, _QUANTILE)) for ratio in ratios)
+    limit = _margin(touches or len(ratios)) * max(float(np.quantile(ratio, _QUANTILE)) for ratio in ratios)
     return tuple(t.model_copy(update={"limit": limit}) for t in typical)
 
 

@@ -21,7 +21,7 @@ from gripper_calibration.fits.object_fit import (
 )
 from gripper_calibration.fits.plant_fit import crushing_touch, fit_plant, stiffness_n_m
 from gripper_calibration.plots.object_plot import draw
-from gripper_calibration.touch_logs import TouchRecording, join, read_log
+from gripper_calibration.touch_logs import TouchRecording, join, read_log, started_ns
 from gripper_force.config import Config
 from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import find_logs
@@ -254,7 +254,7 @@ def _fit_and_write(
     config, model, _ = resolve_vision(config)
     checkpoint = load_checkpoint(config.vision.checkpoint)
     recordings = {}
-    for path in paths:
+    for path in sorted(paths, key=started_ns):  # the order shows after which touch the object stayed narrower
         recordings[path] = read_log(path, checkpoint)
         progress(path.name)
     with_contact = {path: recording for path, recording in recordings.items() if recording.has_contact}

@@ -44,7 +44,7 @@ from gripper_calibration.procedures.calibrate_object import (
     make_profile,
     record_touches,
 )
-from gripper_calibration.touch_logs import TouchRecording, join, read_log
+from gripper_calibration.touch_logs import TouchRecording, join, read_log, started_ns
 from gripper_force import __version__
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DataError
@@ -190,7 +190,10 @@ def teach(
     without_contact = tuple(path for path in paths if path not in used)
     # The same touch in two folds would be both learned and left out.
     logs_by_digest = {_digest_of(path): path for path in used}
-    work = _Work(logs_by_digest, find_logs(replay) if replay else [], place / "teach", workers)
+    # A touch that is replayed would be learned where it is left out.
+    replayed = {} if not replay else {_digest_of(path): path for path in find_logs(replay)}
+    others = {digest: path for digest, path in replayed.items() if digest not in logs_by_digest}
+    work = _Work(logs_by_digest, others, place / "teach", workers)
     return work.run(config, model, name, out, without_contact, progress)
 
 
@@ -260,13 +263,16 @@ class _Task(NamedTuple):
 class _Work:
     """The work after the touches. Each part of it leaves a file, and is not repeated."""
 
-    def __init__(self, logs: Mapping[str, Path], replay: Sequence[Path], folder: Path, workers: int) -> None:
+    def __init__(
+        self, logs: Mapping[str, Path], replay: Mapping[str, Path], folder: Path, workers: int
+    ) -> None:
         if len(logs) < MIN_LOGS:
             raise DataError(
                 f"there are {len(logs)} different logs of touches with contact, but teach leaves some out to compare, "
                 f"and needs {MIN_LOGS}; touch the object more often, or use `gripper-force calibrate object`"
             )
-        self._logs, self._digests, self._replay = tuple(logs.values()), tuple(logs), tuple(replay)
+        self._logs, self._digests, self._replay = tuple(logs.values()), tuple(logs), tuple(replay.values())
+        self._replay_digests = tuple(replay)
         self._folder, self._workers = folder, workers
 
     def run(
@@ -286,11 +292,13 @@ class _Work:
         checkpoint = self._learned(chosen)
         progress(f"trained on all touches: {chosen.name}")
         learned = load_checkpoint(checkpoint)
-        recorded = join({path: read_log(path, learned) for path in self._logs})
+        recorded = join({path: read_log(path, learned) for path in sorted(self._logs, key=started_ns)})
         # The folds' networks have not seen the touches they score, but each network has its own scale of scores.
         shares, estimates_n = left_out_shares(recorded.touches)
         limits = object_limits(
-            [one.share for one in found.left] + shares, [one.raw_n for one in found.left] + estimates_n
+            [one.share for one in found.left] + shares,
+            [one.raw_n for one in found.left] + estimates_n,
+            touches=len(shares),
         )
         known = KnownFrames(*object_subspace(recorded.touches), limits)
         fit = fit_correction(recorded.touches, COVERAGE)
@@ -363,8 +371,7 @@ class _Work:
     def _task(self, candidate: _Candidate, splits: tuple[tuple[int, ...], ...]) -> _Task:
         digest = read_model(candidate.base).digest
         settings = recipe(candidate.recipe).model_dump_json() if candidate.recipe else ""
-        replay = [str(path) for path in self._replay]
-        parts = [candidate, digest, settings, splits, self._digests, replay, _Left._fields]
+        parts = [candidate, digest, settings, splits, self._digests, self._replay_digests, _Left._fields]
         key = sha256(json.dumps(parts).encode()).hexdigest()
         return _Task(candidate, self._logs, splits, self._replay, self._folder / f"{key[:16]}.left")
 

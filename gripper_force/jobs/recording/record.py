@@ -137,11 +137,13 @@ def record(
         GripperError: A device failed. The servo was stopped as configured, and completed sets are kept.
     """
     config, peak_n = _checked(config, plan)
+    first: tuple[Path, str] | None = None  # of the file of a simulated object
     for number, path in enumerate(plan.paths(config, out), start=1):
         one = config.model_copy(update={"seed": config.seed + number - 1, "target_n": peak_n})
         run = resolve(one, vision=False)
         if path.exists():
             check_same(path, run.config, _SAME)
+            first = _checked_object(path, first)
             yield path
             continue
         if prompt is not None:
@@ -158,7 +160,19 @@ def record(
             with open_session(run, devices, unfinished) as session:
                 _touch_all(_MonitoredSession(session, devices, one, plan, number, progress), plan.touches)
                 session.release()
-        yield unfinished.rename(path)
+        made = unfinished.rename(path)
+        first = _checked_object(made, first)
+        yield made
+
+
+def _checked_object(path: Path, first: tuple[Path, str] | None) -> tuple[Path, str]:
+    digest = LogReader(path).metadata.get("object file sha256", "")
+    if first is not None and first[1] != digest:
+        raise DataError(
+            f"the object's file has changed between {first[0]} and {path}; move the logs of the old one away, or use "
+            "another folder"
+        )
+    return first or (path, digest)
 
 
 def check_same(path: Path, config: Config, keys: Sequence[str]) -> None:

@@ -3,6 +3,7 @@
 Each family of kinds is a class, whose fields are the keys of a record and which builds the body.
 """
 
+import math
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -209,6 +210,11 @@ class Shell(ObjectKind):
     @model_validator(mode="after")
     def _is_stiff_enough(self) -> Self:
         length, radius = self.size_m[1 if self.lying else 2], self.size_m[0] / 2
+        if not math.isclose(across := self.size_m[2 if self.lying else 1], self.size_m[0]):
+            raise ValueError(
+                f"size_m {list(self.size_m)} says that a shell is {self.size_m[0]:g} m wide and {across:g} m "
+                f"{'high' if self.lying else 'deep'}, but shells are round; set both to the same"
+            )
         per_modulus = self.wall_m**3 * length / radius**3
         low, high = (bound / per_modulus for bound in _RING_N_M)
         if not low <= self.modulus_pa <= high:

@@ -167,6 +167,24 @@ def test_finished_parts_are_not_repeated(
     assert resumed.profile.weights == taught.profile.weights
 
 
+def test_a_replayed_touch_is_never_learned_where_it_is_left_out(
+    taught: Taught,
+    config: Config,
+    logs: list[Path],
+    tmp_path: Path,
+    press: Callable[..., Clip],
+    write_log: Any,
+) -> None:
+    again = tmp_path / "again"
+    again.mkdir()
+    for path in logs:
+        (again / path.name).write_bytes(path.read_bytes())
+    found = teach(
+        config, "disc", logs=logs, replay=[again], folder=tmp_path / "work", out=tmp_path / "bundle"
+    )
+    assert found.candidates_mae_n == taught.candidates_mae_n
+
+
 def test_more_touches_continue_with_the_old_ones(config: Config, logs: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "bundles" / "disc"
     first = teach(config, "disc", logs=logs[:4], folder=tmp_path / "work", out=out)

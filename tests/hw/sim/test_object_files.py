@@ -150,6 +150,10 @@ def test_every_key_of_an_object_is_on_the_page() -> None:
             "the wall would fold flat; set modulus_pa from",
         ),
         (
+            "family: shell\nsize_m: [0.06, 0.03, 0.08]\nradii: [1, 1]\nwall_m: 0.0006\nmodulus_pa: 20000000",
+            "0.06 m wide and 0.03 m deep, but shells are round",
+        ),
+        (
             "family: spring\nsize_m: [0.05, 0.05, 0.05]\nn_per_mm: 2\nstop_m: 0.03",
             "more than 0.4 of the width",
         ),

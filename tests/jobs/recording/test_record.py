@@ -241,6 +241,20 @@ def test_touch_that_load_cell_does_not_measure_raises(
         made(config, RecordingPlan(1), tmp_path)
 
 
+def test_sets_of_an_object_file_that_was_changed_are_not_mixed(config: Config, tmp_path: Path) -> None:
+    file = tmp_path / "foam.yaml"
+    text = "family: solid\nsize_m: [0.05, 0.05, 0.05]\nmodulus_pa: 30000\n"
+    file.write_text(text)
+    sim = config.sim.model_copy(update={"object": file})
+    own = config.model_copy(update={"object": "foam", "sim": sim})
+    list(record(own, RecordingPlan(1, touches=1, peak_n=3, test_every=None), tmp_path / "out"))
+    file.write_text(text.replace("30000", "60000"))
+    with pytest.raises(
+        DataError, match=r"file has changed between .*foam-01\.mcap and .*foam-02\.mcap"
+    ):
+        list(record(own, RecordingPlan(2, touches=1, peak_n=3, test_every=None), tmp_path / "out"))
+
+
 def test_recording_continues_with_the_detail_that_auto_chose(config: Config, tmp_path: Path) -> None:
     sim, budget = config.sim.model_copy(update={"detail": "auto"}), {"sim_speed": 0.01}
     auto = config.model_copy(update={"sim": sim, "budget": config.budget.model_copy(update=budget)})

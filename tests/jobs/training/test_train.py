@@ -298,6 +298,14 @@ def test_command_leaves_out_logs_that_start_in_contact(
     assert "all 1 recordings start in contact" in str(refused)
 
 
+def test_validation_on_what_is_trained_on_is_refused(few_logs: Path, tmp_path: Path) -> None:
+    (one, *_) = sorted(few_logs.glob("*.mcap"))
+    call = ["train", str(few_logs), "--validation", str(one), "--out", str(tmp_path / "x.safetensors")]
+    refused = CliRunner().invoke(cli.app, call).exception
+    assert isinstance(refused, ConfigError)
+    assert f"1 logs of --validation are among those to train on, such as {one}" in str(refused)
+
+
 def test_divergence_raises(clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig) -> None:
     clips[0].forces_n[:] = clips[1].forces_n[:] = clips[2].forces_n[:] = np.inf
     with pytest.raises(NonFiniteError, match="ssam diverged"):
