@@ -269,6 +269,7 @@ def object_(
     settings = load_settings(config, set_, {"object": name, "seed": seed})
     given, name = name, settings.object  # a path has become a name
     folder = folder or job.default_folder(name)
+    job.check(settings, name, out)
     if logs is None:
         _tell_existing(settings, touches, folder, fresh)
         logs = _touches(settings, touches, peak_n, folder, pause)

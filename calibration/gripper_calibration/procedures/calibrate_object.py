@@ -23,7 +23,7 @@ from gripper_calibration.fits.plant_fit import crushing_touch, fit_plant, stiffn
 from gripper_calibration.plots.object_plot import draw
 from gripper_calibration.touch_logs import TouchRecording, join, read_log, started_ns
 from gripper_force.config import Config
-from gripper_force.errors import DataError
+from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs.dataset import find_logs
 from gripper_force.jobs.profile_files import check_place, pack, write_object
 from gripper_force.jobs.recording.record import RecordingPlan, record
@@ -149,8 +149,7 @@ def calibrate_object(
             result = gripper_force.calibrate_object(config, "mug", touches=8)
             print(result.profile_path, result.mae_before_n, result.mae_after_n)
     """
-    out = user_folder() / f"{name}.yaml" if out is None else Path(out)
-    check_place(out)
+    out = check(config, name, out)
     if logs is None:
         named = config.model_copy(update={"object": name})
         paths = []
@@ -163,6 +162,22 @@ def calibrate_object(
     if not paths:
         raise DataError(f"there is no log to calibrate {name!r} from; record touches of it first")
     return _fit_and_write(config, name, paths, out, progress)
+
+
+def check(config: Config, name: str, out: str | Path | None = None) -> Path:
+    """Checks what a calibration needs before the first touch. Returns the path of the profile.
+
+    Raises:
+        ConfigError: There is no network to correct, or the profile can't be written.
+        CheckpointError: The network can't be read.
+    """
+    path = user_folder() / f"{name}.yaml" if out is None else Path(out)
+    check_place(path)
+    if resolve_vision(config)[1] is None:
+        raise ConfigError(
+            "calibrate object corrects a network, but vision.checkpoint is none; name a network, such as default"
+        )
+    return path
 
 
 def record_touches(

@@ -103,6 +103,9 @@ def _read_spec(path: Path) -> Any:
             joint.type not in (kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE) for joint in spec.joints
         ),
         "no flex; describe an elastic object as YAML": bool(len(spec.flexes)),
+        "no geom outside of that body, no light and no camera, which belong to the scene": bool(
+            len(spec.worldbody.geoms) + len(spec.lights) + len(spec.cameras)
+        ),
         "no mocap body, which nothing moves": any(body.mocap for body in spec.bodies),
         "meshes or 2d textures instead of height fields and cube textures from files": any(
             field.file for field in spec.hfields
@@ -126,13 +129,15 @@ def _compile(spec: Any, path: Path) -> Any:
 
 
 def _mjcf_files(spec: Any) -> dict[str, bytes]:
-    """Contents of a specification's meshes and textures, by the names that it has for them."""
+    """Contents of a specification's meshes and textures, by new names, which no file of the scene has."""
     folder = Path(spec.modelfiledir)
     files = [(spec.meshdir, mesh) for mesh in spec.meshes] + [
         (spec.texturedir, item) for item in spec.textures
     ]
-    return {
-        item.file: read_bytes(folder / (subfolder or "") / item.file, "file")
-        for subfolder, item in files
-        if item.file
-    }
+    contents = {}
+    for number, (subfolder, item) in enumerate(files):
+        if item.file:
+            content = read_bytes(folder / (subfolder or "") / item.file, "file")
+            item.file = f"own_{number}{Path(item.file).suffix}"
+            contents[item.file] = content
+    return contents

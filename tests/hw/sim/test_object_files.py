@@ -4,6 +4,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -186,6 +187,8 @@ BODY = '<body name="object" pos="0 0 .03"><site name="grip"/>{}</body>'
         (BODY.format('<geom size=".02"/>') + '<body name="more"/>', "it has object, more"),
         (BODY.format('<freejoint/><geom size=".02"/>'), "only hinge and slide joints"),
         (BODY.format('<geom size=".02" contype="0" conaffinity="0"/>'), "a geom with conaffinity"),
+        (BODY.format('<geom size=".02"/>') + '<geom size=".01"/>', "no geom outside of that body"),
+        (BODY.format('<light/><geom size=".02"/>'), "no light and no camera"),
         (BODY.format('<geom size=".06"/>'), "does not fit between jaws"),
         (BODY.format('<geom size=".004" pos="0 0 .05"/>'), "jaws would pass"),
         (BODY.format('<geom type="mesh" mesh="no"/>'), "MuJoCo can't read|MuJoCo refuses"),
@@ -208,6 +211,31 @@ def test_a_file_with_a_quote_in_its_name_and_options_of_its_own_is_simulated(tmp
     text = f'<mujoco><option timestep="0.01"/><worldbody>{body}</worldbody></mujoco>'
     path.write_text(text, encoding="utf-8")
     assert world(path).unknowns > 0  # without a warning that the scene's options win
+
+
+def test_files_of_an_mjcf_body_may_have_any_name(tmp_path: Path) -> None:
+    textures = ("one/a.png", "two/a.png", "table.png")
+    for name, shade in zip(textures, (40, 120, 250), strict=True):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / name), np.full((8, 8, 3), shade, np.uint8))
+    assets = "".join(
+        f'<texture name="t{i}" type="2d" file="{name}"/><material name="m{i}" texture="t{i}"/>'
+        for i, name in enumerate(textures)
+    )
+    geoms = "".join(
+        f'<geom type="box" size=".02 .015 .01" pos="0 0 {0.02 * i}" mass=".1" material="m{i}"/>'
+        for i in range(3)
+    )
+    path = tmp_path / "thing.xml"
+    path.write_text(
+        f"<mujoco><asset>{assets}</asset><worldbody>{BODY.format(geoms)}</worldbody></mujoco>",
+        encoding="utf-8",
+    )
+    text, files = scene_mjcf(draw_scene("thing", 3, SimConfig(object=path)), GRIPPER)
+    shades = {cv2.imdecode(np.frombuffer(files[n], np.uint8), 0)[0, 0] for n in files if n.startswith("own_")}
+    assert shades == {40, 120, 250}
+    assert "table.png" in text
+    assert cv2.imdecode(np.frombuffer(files["table.png"], np.uint8), 0).std() > 0, "the scene keeps its own"
 
 
 def test_an_mjcf_body_may_have_a_tendon_of_its_own(tmp_path: Path) -> None:

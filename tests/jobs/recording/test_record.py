@@ -249,9 +249,7 @@ def test_sets_of_an_object_file_that_was_changed_are_not_mixed(config: Config, t
     own = config.model_copy(update={"object": "foam", "sim": sim})
     list(record(own, RecordingPlan(1, touches=1, peak_n=3, test_every=None), tmp_path / "out"))
     file.write_text(text.replace("30000", "60000"))
-    with pytest.raises(
-        DataError, match=r"file has changed between .*foam-01\.mcap and .*foam-02\.mcap"
-    ):
+    with pytest.raises(DataError, match=r"file has changed between .*foam-01\.mcap and .*foam-02\.mcap"):
         list(record(own, RecordingPlan(2, touches=1, peak_n=3, test_every=None), tmp_path / "out"))
 
 
