@@ -183,11 +183,8 @@ def evaluate(
     """
     from gripper_force.jobs.dataset import find_logs
     from gripper_force.jobs.evaluate import evaluate as job
-    from gripper_force.profiles.apply import with_bundle
 
     settings = load_settings(None, set_, {"vision.checkpoint": checkpoint, "calibration.object": profile})
-    if settings.calibration.object not in (None, "own"):
-        settings, _ = with_bundle(settings)
     logs = find_logs(data)
     console.tell_missing_parquet(out)
     with console.bar("evaluating", len(logs)) as progress:

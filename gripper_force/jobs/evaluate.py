@@ -28,7 +28,7 @@ from gripper_force.jobs.dataset import (
 from gripper_force.jobs.object_gain import gain_of
 from gripper_force.jobs.processes import Workers
 from gripper_force.jobs.summary_files import check_writable, evaluation_tables, write_summary
-from gripper_force.profiles.apply import read_correction, read_profiles, with_object
+from gripper_force.profiles.apply import read_correction, read_profiles, with_bundle, with_object
 from gripper_force.progress import Progress, no_progress
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.schema import Tree
@@ -151,11 +151,14 @@ def evaluate(
 
         check_figure_path(plot)
     config = Config() if config is None else config
-    model = read_model(checkpoint)
     calibration = config.calibration
     if profile is not None:
         calibration = calibration.model_copy(update={"object": profile})
-    settings = config.model_copy(update={"calibration": calibration})
+    vision = config.vision.model_copy(update={"checkpoint": str(checkpoint)})
+    settings = config.model_copy(update={"calibration": calibration, "vision": vision})
+    if calibration.object not in (None, "own"):
+        settings, _ = with_bundle(settings)
+    model = read_model(settings.vision.checkpoint)
     paths = find_logs(logs)
     one = partial(
         _evaluate_log,
@@ -222,15 +225,20 @@ def _evaluate_log(
 ) -> _Evaluated | None:
     """Reads and estimates one log, with one thread: the last digits depend on their number. None: another object."""
     settings = config_from(config, "evaluate")
-    loaded = kept_checkpoint(*checkpoint)
-    preprocess = loaded.header.preprocess
     reader = LogReader(path)
     logged = config_from_text(reader.config, str(path))
+    own = settings.model_copy(update={"object": logged.object})
+    if settings.calibration.object == "own":
+        own, _ = with_bundle(own)
+        if own.vision.checkpoint != settings.vision.checkpoint:
+            model = read_model(own.vision.checkpoint)
+            checkpoint = model.path, model.digest
+    loaded = kept_checkpoint(*checkpoint)
+    preprocess = loaded.header.preprocess
     records = reader.records(Frame, LoadCellSample, ServoState)
     streamed = StreamedClip(reader, logged, records, preprocess, settings.vision.region)
     if objects and logged.object not in objects:
         return None
-    own = settings.model_copy(update={"object": logged.object})
     profiles = read_profiles(own)
     gain = gain_of(with_object(own.control, profiles).object_ratio, logged.gripper.gain_std)
     correction, device = None, "cuda" if torch.cuda.is_available() else "cpu"

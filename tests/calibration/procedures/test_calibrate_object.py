@@ -351,6 +351,7 @@ def test_interrupted_command_calibrates_and_continues_later(
     assert "Put the object between the jaws for touch 3, then press Enter" in stopped.stderr
     profile = tmp_path / "it.yaml"
     profile.unlink()
+    weights_path(profile).unlink()
     ended = by_hand(tmp_path, monkeypatch, Terminal(0, terminate))
     assert (ended.stdout, profile.exists()) == ("", False), "SIGTERM ends the command, not the touches alone"
     process._received.clear()

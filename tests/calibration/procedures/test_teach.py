@@ -211,6 +211,13 @@ def test_grasps_find_the_bundle_by_the_object_and_a_setting_prevents_it(taught: 
     assert with_bundle(again)[0] == used.model_copy(update={"object": "disc"})
 
 
+def test_own_profiles_bring_their_networks_to_an_evaluation(taught: Taught, logs: list[Path]) -> None:
+    network, profile = taught.bundle / "network.safetensors", taught.bundle / "profile.yaml"
+    named = evaluate(logs, network, profile=str(profile))
+    for given in ("own", "disc"):
+        assert evaluate(logs, profile=given).mae_n == named.mae_n
+
+
 @pytest.mark.parametrize(
     ("key", "sentence"),
     [
