@@ -37,7 +37,8 @@ def _check_names(path: Path) -> None:
         raise ConfigError(f"can't write an object profile to {path}; name a file that ends in .yaml")
     if (beside := weights_path(path)).exists() and not path.exists():
         raise ConfigError(
-            f"an object profile {path} would replace {beside}, which belongs to no profile; name another file, or move that one away"
+            f"an object profile {path} would replace {beside}, which belongs to no profile; name another file, or move "
+            "that one away"
         )
 
 
