@@ -39,7 +39,7 @@ test-lerobot:
 		--editable '.[dev,lerobot,oak,report,sim,train]' \
 		--editable integrations/lerobot_robot_gripper_force --editable integrations/lerobot_camera_oak \
 		lerobot==$(LEROBOT)
-	$(LEROBOT_VENV)/bin/pytest -m lerobot $(ARGS)
+	$(LEROBOT_VENV)/bin/pytest -m lerobot tests/jobs/exports integrations $(ARGS)
 
 docs: setup-dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet

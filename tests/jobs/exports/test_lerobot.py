@@ -205,7 +205,9 @@ class TestDataset:
     ) -> None:
         folder = tmp_path / "dataset"
         images = "--video" if video else "--no-video"
-        done = export(fused_log, fused_log, "--out", folder, "--fps", FPS, images, "--json")
+        other = tmp_path / "other.mcap"
+        other.write_bytes(fused_log.read_bytes())
+        done = export(fused_log, other, "--out", folder, "--fps", FPS, images, "--json")
         assert done.exception is None, done.output
         rows = rows_of(fused_log)
         result = json.loads(done.stdout.splitlines()[-1])
