@@ -162,7 +162,7 @@ class GripperConfig(Section):
         ge=1.0,
         le=3.0,
         description="largest plausible ratio of the true torque constant to nm_per_a, which the force limit "
-        "allows for; calibrate servo permits 1.1",
+        "allows for; may be set to 1.1 after calibrate servo",
     )
 
 

@@ -25,10 +25,10 @@ _LEAST_FRAMES: Final = 30
 _LEAST_FORCE_N: Final = 0.3
 """Least number of frames of a hold, and least mean force in them, that say something about the gain."""
 
-_GATE: Final = 3.29
+GATE: Final = 3.29
 """Deviations beyond which a ratio is implausible (0.1 % of good ones), or is that of another object."""
 
-_REPEAT_STD: Final = 0.03
+REPEAT_STD: Final = 0.03
 """Standard deviation of the ratio between grasps of one object in different places, beyond the claimed errors."""
 
 
@@ -105,7 +105,7 @@ class ObjectGain:
         text = ""
         if self._weight:
             before = self._weighted / self._weight
-            if abs(ratio - before) > _GATE * math.sqrt(variance + 1 / self._weight):
+            if abs(ratio - before) > GATE * math.sqrt(variance + 1 / self._weight):
                 text = (
                     f"vision and motor current differ by a factor of {math.exp(ratio):.2f}, in the grasps before by "
                     f"{math.exp(before):.2f}: another object, whose gain is learned anew"
@@ -128,7 +128,7 @@ class ObjectGain:
         if self._frames < _LEAST_FRAMES or min(self._current_n, self._visual_n) < least_n:
             return None
         variance = self._error_n2 * self._frames / min(self._current_n, self._visual_n) ** 2
-        return math.log(self._current_n / self._visual_n), variance + _REPEAT_STD**2
+        return math.log(self._current_n / self._visual_n), variance + REPEAT_STD**2
 
     @property
     def ratio(self) -> tuple[float, float] | None:
@@ -169,7 +169,7 @@ class ObjectGain:
         if not self._weight:
             return ""
         ratio = self._weighted / self._weight
-        limit = _GATE * math.sqrt(_ANY_STD**2 + self._torque_n2 + 1 / self._weight)
+        limit = GATE * math.sqrt(_ANY_STD**2 + self._torque_n2 + 1 / self._weight)
         if abs(ratio) <= limit:
             return ""
         return (

@@ -4,20 +4,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
 
 from gripper_force.config import Overrides, config_from_text
-from gripper_force.control.object_gain import GainEstimate, ObjectGain
+from gripper_force.control.object_gain import GATE, REPEAT_STD, GainEstimate, ObjectGain
 from gripper_force.errors import DataError
 from gripper_force.profiles.object_profile import BUNDLED, find_object, read_object, user_folder, weights_path
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import make_controller
 from gripper_force.types import Request, ServoState, VisualForce
-
-_MOST_DEVIATIONS: Final = 3.29
-_REPEAT_STD: Final = 0.03
-"""As in `gripper_force.control.object_gain`: deviations at which two ratios are those of two objects, and the standard
-deviation of the ratio between grasps of one object."""
 
 
 def learned_ratio(path: Path, overrides: Overrides | None = None) -> tuple[float, float] | None:
@@ -96,7 +90,7 @@ def save_gain(
             "control.feedback=fused and control.learn_gain=true"
         )
     (low, low_std), (high, high_std) = min(ratios), max(ratios)
-    if math.log(high / low) > _MOST_DEVIATIONS * math.hypot(low_std, high_std, math.sqrt(2) * _REPEAT_STD):
+    if math.log(high / low) > GATE * math.hypot(low_std, high_std, math.sqrt(2) * REPEAT_STD):
         raise DataError(
             f"the logs contradict each other: motor current was {low:.2f} times the visual force in one, and "
             f"{high:.2f} times in another; pass logs of one object"

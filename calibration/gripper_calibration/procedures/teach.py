@@ -271,8 +271,7 @@ class _Work:
                 f"there are {len(logs)} different logs of touches with contact, but teach leaves some out to compare, "
                 f"and needs {MIN_LOGS}; touch the object more often, or use `gripper-force calibrate object`"
             )
-        self._logs, self._digests, self._replay = tuple(logs.values()), tuple(logs), tuple(replay.values())
-        self._replay_digests = tuple(replay)
+        self._logs, self._digests, self._replay = tuple(logs.values()), tuple(logs), replay
         self._folder, self._workers = folder, workers
 
     def run(
@@ -371,9 +370,11 @@ class _Work:
     def _task(self, candidate: _Candidate, splits: tuple[tuple[int, ...], ...]) -> _Task:
         digest = read_model(candidate.base).digest
         settings = recipe(candidate.recipe).model_dump_json() if candidate.recipe else ""
-        parts = [candidate, digest, settings, splits, self._digests, self._replay_digests, _Left._fields]
+        parts = [candidate, digest, settings, splits, self._digests, tuple(self._replay), _Left._fields]
         key = sha256(json.dumps(parts).encode()).hexdigest()
-        return _Task(candidate, self._logs, splits, self._replay, self._folder / f"{key[:16]}.left")
+        return _Task(
+            candidate, self._logs, splits, tuple(self._replay.values()), self._folder / f"{key[:16]}.left"
+        )
 
     def _learned(self, candidate: _Candidate) -> Path:
         """Returns the checkpoint of a candidate that has learned from all logs."""
