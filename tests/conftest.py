@@ -3,6 +3,7 @@
 import signal
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from gripper_force.config import dump_config, load_config
 from gripper_force.interfaces import Clock
 from gripper_force.jobs.dataset import Clip
 from gripper_force.jobs.training.recipe import TrainConfig
+from gripper_force.profiles.rig_profile import CalibratedValue, ServoCalibration
 from gripper_force.runtime import process
 from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import NS_PER_MS, Frame, LoadCellSample
@@ -99,6 +101,24 @@ def quick_vision(quick: list[str], tiny_checkpoint: Path) -> list[str]:
     """As `quick`, with a camera and a network that take part."""
     eyes = ["camera.backend=simulated", f"vision.checkpoint={tiny_checkpoint}"]
     return [*quick, *eyes, "control.feedback=fused", "control.timeout_s=2.5"]
+
+
+@pytest.fixture(scope="session")
+def servo_calibration() -> ServoCalibration:
+    """A section of a rig profile."""
+    return ServoCalibration(
+        date=datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC),
+        model="XM430-W350",
+        nm_per_a=CalibratedValue(value=1.7, low=1.69, high=1.71),
+        friction_n=CalibratedValue(value=0.9, low=0.8, high=1.0),
+        damping_n_s_m=CalibratedValue(value=14, low=13, high=15),
+        pinion_radius_m=CalibratedValue(value=0.02),
+        open_position_rad=CalibratedValue(value=0.01, low=0.0, high=0.02),
+        open_width_m=0.09,
+        force_n=(1, 9),
+        speed_m_s=(0.01, 0.05),
+        residual_n=0.03,
+    )
 
 
 @pytest.fixture(scope="session")

@@ -24,34 +24,21 @@ CELL = LoadCellCalibration(
     noise_n=0.01,
     drift_n_min=CalibratedValue(value=0.0, low=-0.01, high=0.01),
 )
-SERVO = ServoCalibration(
-    date=NOW,
-    model="XM430-W350",
-    nm_per_a=CalibratedValue(value=1.7, low=1.69, high=1.71),
-    friction_n=CalibratedValue(value=0.9, low=0.8, high=1.0),
-    damping_n_s_m=CalibratedValue(value=14, low=13, high=15),
-    pinion_radius_m=CalibratedValue(value=0.02),
-    open_position_rad=CalibratedValue(value=0.01, low=0.0, high=0.02),
-    open_width_m=0.09,
-    force_n=(1, 9),
-    speed_m_s=(0.01, 0.05),
-    residual_n=0.03,
-)
 
 
-def test_update_replaces_only_its_section(tmp_path: Path) -> None:
+def test_update_replaces_only_its_section(servo_calibration: ServoCalibration, tmp_path: Path) -> None:
     path = tmp_path / "rigs" / "rig.yaml"
     update_rig(path, CELL)
-    update_rig(path, SERVO)
-    newer = SERVO.model_copy(update={"force_n": (2, 8)})
+    update_rig(path, servo_calibration)
+    newer = servo_calibration.model_copy(update={"force_n": (2, 8)})
     assert update_rig(path, newer) == RigProfile(load_cell=CELL, servo=newer) == read_rig(path)
     assert [file.name for file in path.parent.iterdir()] == ["rig.yaml"]
 
 
-def test_settings_are_keys_of_the_configuration(tmp_path: Path) -> None:
+def test_settings_are_keys_of_the_configuration(servo_calibration: ServoCalibration, tmp_path: Path) -> None:
     path = tmp_path / "rig.yaml"
     update_rig(path, CELL)
-    update_rig(path, SERVO)
+    update_rig(path, servo_calibration)
     config = load_config(None, [f"calibration.rig={path}"])
     assert (config.gripper.nm_per_a, config.gripper.open_width_m) == (1.7, 0.09)
     assert config.load_cell.tare_raw == 8000

@@ -1,6 +1,5 @@
 import math
 from dataclasses import FrozenInstanceError
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,7 @@ import pytest
 from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError, RequestError
 from gripper_force.jobs.profile_files import update_rig
-from gripper_force.profiles.rig_profile import CalibratedValue, ServoCalibration
+from gripper_force.profiles.rig_profile import ServoCalibration
 from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.runtime.resolve import ResolvedConfig, make_controller, make_estimator, resolve
 from gripper_force.types import NS_PER_S, Frame
@@ -17,19 +16,6 @@ from gripper_force.vision.checkpoint_writer import replace_header
 from gripper_force.vision.header import read_checkpoint
 from gripper_hw.dynamixel.servo import DynamixelServo
 
-SERVO = ServoCalibration(
-    date=datetime(2026, 1, 2, tzinfo=UTC),
-    model="XM430-W350",
-    nm_per_a=CalibratedValue(value=1.7, low=1.69, high=1.71),
-    friction_n=CalibratedValue(value=0.9, low=0.8, high=1.0),
-    damping_n_s_m=CalibratedValue(value=14, low=13, high=15),
-    pinion_radius_m=CalibratedValue(value=0.02),
-    open_position_rad=CalibratedValue(value=0.01, low=0.0, high=0.02),
-    open_width_m=0.09,
-    force_n=(1, 9),
-    speed_m_s=(0.01, 0.05),
-    residual_n=0.03,
-)
 NO_SENSORS = ["camera.backend=none", "load_cell.backend=none"]
 
 
@@ -202,9 +188,11 @@ def test_a_network_of_one_rig_says_so_on_another(tiny_checkpoint: Path, tmp_path
         assert not any("was made with" in text for _, text in notes)
 
 
-def test_a_configuration_that_overrides_what_was_measured_says_so(tmp_path: Path) -> None:
+def test_a_configuration_that_overrides_what_was_measured_says_so(
+    servo_calibration: ServoCalibration, tmp_path: Path
+) -> None:
     rig = tmp_path / "rig_profile.yaml"
-    update_rig(rig, SERVO)
+    update_rig(rig, servo_calibration)
     own = [*NO_SENSORS, f"calibration.rig={rig}", "target_n=2"]
     assert not any("overrides" in text for _, text in resolve(load_config(None, own)).notes)
     given = [*own, "gripper.friction_n=0.5", "gripper.open_width_m=0.08"]
