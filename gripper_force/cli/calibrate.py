@@ -205,7 +205,10 @@ def camera(
     ] = None,
     exposure_us: Annotated[
         list[int] | None,
-        typer.Option(min=1, help="Candidate exposure. Repeatable. Default: 500 to 16000."),
+        typer.Option(
+            min=1,
+            help="Candidate exposure. Repeatable. Default: 500 to 16000, or automatic with camera.exposure_us=null.",
+        ),
     ] = None,
     touches: Annotated[int, typer.Option(min=3, help="Number of touches.")] = 10,
     object_: Annotated[str | None, typer.Option("--object", help="Object between the jaws.")] = None,
@@ -223,7 +226,7 @@ def camera(
             settings,
             path,
             region=None if region is None else _region(region),
-            exposures_us=exposure_us or job.EXPOSURES_US,
+            exposures_us=exposure_us,
             touches=touches,
             progress=_progress(status),
         )

@@ -112,7 +112,7 @@ class CameraCalibration(Section):
         rate_hz: Frame rate.
         gain: Gain.
         image: The other keys of the camera on which its images depend; none in profiles of version 0.1.
-        exposure_us: Exposure at which the image is neither dark nor clipped.
+        exposure_us: Exposure at which the image is neither dark nor clipped; None for an automatic one.
         mean: Mean gray value at that exposure.
         clipped: Share of clipped pixels at that exposure.
         region: Region of interest of the frame: left, top, width, height in pixels.
@@ -129,7 +129,7 @@ class CameraCalibration(Section):
     rate_hz: Positive
     gain: int | None
     image: dict[str, Any] = Field({})
-    exposure_us: int
+    exposure_us: int | None
     mean: NonNegative
     clipped: NonNegative
     region: tuple[int, int, int, int]

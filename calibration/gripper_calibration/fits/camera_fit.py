@@ -49,19 +49,24 @@ class ExposureCandidate:
     """Gray values of an image at one candidate exposure.
 
     Attributes:
-        exposure_us: The exposure.
+        exposure_us: The exposure; None for an automatic one.
         mean: Mean gray value.
         clipped: Share of pixels that are clipped or nearly clipped.
     """
 
-    exposure_us: int
+    exposure_us: int | None
     mean: float
     clipped: float
 
     @classmethod
-    def measure(cls, exposure_us: int, gray: Gray) -> "ExposureCandidate":
+    def measure(cls, exposure_us: int | None, gray: Gray) -> "ExposureCandidate":
         """Returns the candidate with the gray values of an image (H, W) uint8."""
         return cls(exposure_us, float(gray.mean()), float(np.mean(gray >= _CLIPPED_GRAY)))
+
+    @property
+    def text(self) -> str:
+        """The exposure for a sentence."""
+        return "automatic exposure" if self.exposure_us is None else f"{self.exposure_us} us"
 
     @property
     def usable(self) -> bool:
@@ -94,7 +99,7 @@ def select_exposure(candidates: Sequence[ExposureCandidate]) -> ExposureCandidat
     usable = [candidate for candidate in candidates if candidate.usable]
     if not usable:
         measured = ", ".join(
-            f"{c.exposure_us} us: mean {c.mean:.0f}, {100 * c.clipped:.1f} % clipped" for c in candidates
+            f"{c.text}: mean {c.mean:.0f}, {100 * c.clipped:.1f} % clipped" for c in candidates
         )
         raise DataError(
             f"the image is dark or clipped at every exposure ({measured}); change the light, the gain or the "

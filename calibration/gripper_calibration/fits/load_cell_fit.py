@@ -1,5 +1,6 @@
 """Tare and scale of a load cell from three rests: empty, under a known force, and empty again."""
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
@@ -93,13 +94,15 @@ class LoadCellFit:
     statistics: tuple[RestStatistics, RestStatistics, RestStatistics]
 
 
-def rest_statistics(rest: Rest, scale: float, name: str) -> RestStatistics:
+def rest_statistics(rest: Rest, scale: float, name: str, step_raw: float = math.inf) -> RestStatistics:
     """Returns mean, noise and drift of a rest, without spikes.
 
     Args:
         rest: The readings.
         scale: Approximate newtons per unit of the reading, to detect spikes; 0 if unknown.
         name: Name of the rest, for the error message.
+        step_raw: Smallest difference of any two readings of the sensor; infinite if unknown. A display at rest does
+            not show its resolution.
 
     Raises:
         DataError: There are too few readings, or too many rejected ones.
@@ -136,7 +139,7 @@ def rest_statistics(rest: Rest, scale: float, name: str) -> RestStatistics:
     noise = float(np.std(raw - centre - offset - rate * (t_s - batches_t_s.mean())))
     return RestStatistics(
         raw=centre + float(offset),
-        half_raw=quantile * spread / np.sqrt(BATCHES) + _rounding(raw),
+        half_raw=quantile * spread / np.sqrt(BATCHES) + _rounding(raw, step_raw),
         range_raw=float(np.ptp(batches)),
         noise_raw=noise,
         drift_raw_min=float(rate) * _S_PER_MIN,
@@ -145,7 +148,9 @@ def rest_statistics(rest: Rest, scale: float, name: str) -> RestStatistics:
     )
 
 
-def fit_load_cell(empty: Rest, loaded: Rest, again: Rest, force_n: float) -> LoadCellFit:
+def fit_load_cell(
+    empty: Rest, loaded: Rest, again: Rest, force_n: float, step_raw: float = math.inf
+) -> LoadCellFit:
     """Fits tare and scale to three rests.
 
     The tare lies between the empty readings before and after. Their difference counts as uncertainty, not as
@@ -156,15 +161,16 @@ def fit_load_cell(empty: Rest, loaded: Rest, again: Rest, force_n: float) -> Loa
         loaded: Readings under the force.
         again: Readings after the load was removed.
         force_n: The force, positive.
+        step_raw: As for `rest_statistics`.
 
     Raises:
         DataError: There are too few readings, or they do not settle, hardly change with the load, or do not
             return to the empty value.
     """
     rough = _rough_scale(empty, loaded, force_n)
-    first = rest_statistics(empty, rough, "without load")
-    under = rest_statistics(loaded, rough, "under load")
-    last = rest_statistics(again, rough, "after unloading")
+    first = rest_statistics(empty, rough, "without load", step_raw)
+    under = rest_statistics(loaded, rough, "under load", step_raw)
+    last = rest_statistics(again, rough, "after unloading", step_raw)
     change = under.raw - (first.raw + last.raw) / 2
     unit = "units of the reading"
     largest = max(first.half_raw, under.half_raw, last.half_raw, force_n / _MAX_RAW)
@@ -253,10 +259,10 @@ def _trend(raw: Floats) -> Floats:
     return np.asarray(np.polyval(np.polyfit(middles, medians, 1), np.arange(len(raw))), np.float64)
 
 
-def _rounding(raw: Floats) -> float:
+def _rounding(raw: Floats, step_raw: float) -> float:
     """Half of the reading's resolution if noise is smaller than that, else 0."""
     values = np.unique(raw)
     if len(values) > 2:
         return 0.0
     digits = max(len(repr(float(value)).partition(".")[2]) for value in values)
-    return 0.5 * 10.0**-digits if len(values) == 1 else float(values[1] - values[0]) / 2
+    return 0.5 * min(10.0**-digits, step_raw) if len(values) == 1 else float(values[1] - values[0]) / 2

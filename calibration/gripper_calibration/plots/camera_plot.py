@@ -37,16 +37,15 @@ def draw(
     Raises:
         DataError: The file can't be written.
     """
-    title = (
-        f"Camera: {calibration.exposure_us} us, {value_text(calibration.delay_ms, 'ms from contact to use')}"
-    )
+    chosen = next(one for one in candidates if one.exposure_us == calibration.exposure_us)
+    title = f"Camera: {chosen.text}, {value_text(calibration.delay_ms, 'ms from contact to use')}"
     with saved_figure(path, title, 6.4) as figure:
         upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(1, 1.5))[:, 0]
         for axes, candidate, gray in zip(
             upper.subplots(1, len(candidates), squeeze=False)[0], candidates, images, strict=True
         ):
-            selected = candidate.exposure_us == calibration.exposure_us
-            _show(axes, gray, f"{candidate.exposure_us} us{', selected' if selected else ''}")
+            selected = candidate is chosen
+            _show(axes, gray, f"{candidate.text}{', selected' if selected else ''}")
             axes.set_xlabel(f"mean {candidate.mean:.0f}, clipped {100 * candidate.clipped:.1f} %")
             for spine in axes.spines.values():
                 spine.set(visible=True, color=FIT if selected else GRAY, linewidth=2.5 if selected else 0.5)

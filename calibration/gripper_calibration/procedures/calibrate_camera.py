@@ -121,7 +121,7 @@ def calibrate_camera(
     rig: Path,
     *,
     region: Region | None = None,
-    exposures_us: Sequence[int] = EXPOSURES_US,
+    exposures_us: Sequence[int] | None = None,
     touches: int = TOUCHES,
     progress: Progress = no_progress,
 ) -> CameraResult:
@@ -131,7 +131,7 @@ def calibrate_camera(
         config: The configuration. A compliant object, not wider than the image, is between the jaws.
         rig: Rig profile to write; an existing one keeps its other sections.
         region: Region of interest of the frame in pixels; None: from the markers on the jaws.
-        exposures_us: Candidate exposures.
+        exposures_us: Candidate exposures; None: `candidate_exposures_us`.
         touches: Number of touches.
         progress: Called with the step and the force a few times per second.
 
@@ -151,7 +151,7 @@ def calibrate_camera(
     before = config
     config = _with(config, "calibration", rig=None, object=None)  # their camera settings are replaced
     config = _with(config, "vision", region=region)
-    candidates, images = try_exposures(config, exposures_us, progress)
+    candidates, images = try_exposures(config, exposures_us or candidate_exposures_us(config), progress)
     selected = select_exposure(candidates)
     config = _with(config, "camera", exposure_us=selected.exposure_us)
     with TemporaryDirectory() as aside:
@@ -287,8 +287,13 @@ def _touch_lags(
     return touches
 
 
+def candidate_exposures_us(config: Config) -> Sequence[int | None]:
+    """Returns the exposures to try. ``camera.exposure_us=null`` stays: some cameras have no other."""
+    return EXPOSURES_US if config.camera.exposure_us is not None else (None,)
+
+
 def try_exposures(
-    config: Config, exposures_us: Sequence[int], progress: Progress
+    config: Config, exposures_us: Sequence[int | None], progress: Progress
 ) -> tuple[list[ExposureCandidate], list[Gray]]:
     """Returns the gray values and an image at each exposure that is at most half a frame's period.
 
@@ -299,9 +304,9 @@ def try_exposures(
     longest_us = 0.5e6 / config.camera.rate_hz
     candidates, images = [], []
     for exposure_us in exposures_us:
-        if exposure_us > longest_us:
+        if exposure_us is not None and exposure_us > longest_us:
             continue
-        progress(f"exposure of {exposure_us} us", 0)
+        progress("automatic exposure" if exposure_us is None else f"exposure of {exposure_us} us", 0)
         gray = _capture(_with(config, "camera", exposure_us=exposure_us))
         region = config.vision.region
         part = gray if region is None else downscale(gray, region, min(region[2:]))
@@ -331,8 +336,8 @@ def _capture(config: Config) -> Gray:
                 gray = frame.gray
             if gray is None and now_ns - begin_ns > _TIMEOUT_NS:
                 raise DeviceTimeoutError(
-                    f"the camera gave no frame for {_TIMEOUT_NS / NS_PER_S:g} s at an exposure of "
-                    f"{config.camera.exposure_us} us; check its cable, and run `gripper-force doctor`"
+                    f"the camera gave no frame for {_TIMEOUT_NS / NS_PER_S:g} s with camera.exposure_us="
+                    f"{config.camera.exposure_us}; check its cable, and run `gripper-force doctor`"
                 )
         return gray
 

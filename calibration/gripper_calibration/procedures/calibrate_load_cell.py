@@ -1,5 +1,6 @@
 """Calibration of a load cell with a known mass: empty, loaded, empty again."""
 
+import math
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
@@ -138,14 +139,15 @@ def weigh(
     reader = _RestReader(cell, clock, round(seconds * NS_PER_S), round(timeout_s * NS_PER_S), progress)
     prompt("Take everything off the load cell")
     empty = reader.read("empty", lambda _: True)
-    tare = rest_statistics(empty, 0.0, "without load")
+    tare_raw = rest_statistics(empty, 0.0, "without load").raw  # an error comes before anyone carries masses
     prompt(
         f"Put the mass of {force_n / STANDARD_GRAVITY_M_S2:.4g} kg ({force_n:.4g} N) on it and let it rest"
     )
 
     def is_loaded(rest: Rest) -> bool:
         try:
-            now = rest_statistics(rest, 0.0, "under load")
+            tare = rest_statistics(empty, 0.0, "without load", reader.step_raw)
+            now = rest_statistics(rest, 0.0, "under load", reader.step_raw)
         except DataError:
             return False
         change = abs(now.raw - tare.raw)
@@ -154,19 +156,18 @@ def weigh(
         )
 
     loaded = reader.read("loaded", is_loaded)
-    loaded_statistics = rest_statistics(loaded, 0.0, "under load")
+    change = abs(rest_statistics(loaded, 0.0, "under load").raw - tare_raw)
 
     def is_unloaded(rest: Rest) -> bool:
         try:
             now = rest_statistics(rest, 0.0, "after unloading")
         except DataError:
             return False
-        change = abs(loaded_statistics.raw - tare.raw)
-        return bool(abs(now.raw - tare.raw) < _MAX_RANGE * change and now.range_raw < _MAX_RANGE * change)
+        return bool(abs(now.raw - tare_raw) < _MAX_RANGE * change and now.range_raw < _MAX_RANGE * change)
 
     prompt("Take the mass off again")
     again = reader.read("empty again", is_unloaded)
-    return fit_load_cell(empty, loaded, again, force_n)
+    return fit_load_cell(empty, loaded, again, force_n, reader.step_raw)
 
 
 class _RestReader:
@@ -177,18 +178,24 @@ class _RestReader:
     ) -> None:
         self._cell, self._clock, self._progress = cell, clock, progress
         self._span_ns, self._timeout_ns = span_ns, timeout_ns
+        self._seen_raw: set[float] = set()
+
+    @property
+    def step_raw(self) -> float:
+        """Smallest difference of two readings so far."""
+        return float(min(np.diff(sorted(self._seen_raw)), default=math.inf))
 
     def read(self, step: str, is_good: Callable[[Rest], bool]) -> Rest:
         """Returns the first good span of readings, or after the timeout the last one."""
         begin_ns = newest_ns = self._clock.now_ns() + _SETTLE_NS
         end_ns = begin_ns + self._span_ns + self._timeout_ns
-        self._cell.drain()
+        self._drain()  # also what was shown while a person changed the load
         samples: list[LoadCellSample] = []
         check_ns = begin_ns + self._span_ns
         while True:
             now_ns = self._clock.now_ns() + _PERIOD_NS
             self._clock.sleep_until_ns(now_ns)
-            samples += [sample for sample in self._cell.drain() if sample.t_ns >= begin_ns]
+            samples += [sample for sample in self._drain() if sample.t_ns >= begin_ns]
             if samples:
                 newest_ns = max(newest_ns, samples[-1].t_ns)
                 self._progress(f"{step}: {samples[-1].raw:.6g}", 0)
@@ -205,6 +212,11 @@ class _RestReader:
             rest = _rest(samples)
             if is_good(rest) or now_ns > end_ns:
                 return rest
+
+    def _drain(self) -> list[LoadCellSample]:
+        samples = self._cell.drain()
+        self._seen_raw |= {sample.raw for sample in samples if sample.valid}
+        return samples
 
 
 def _rest(samples: list[LoadCellSample]) -> Rest:

@@ -17,7 +17,7 @@ from gripper_calibration.fits.camera_fit import (
     select_exposure,
 )
 from gripper_calibration.fits.focus import MOST_BLUR, blur
-from gripper_calibration.procedures.calibrate_camera import EXPOSURES_US, try_exposures
+from gripper_calibration.procedures.calibrate_camera import candidate_exposures_us, try_exposures
 from gripper_calibration.setup.step import Found, Outcome, Task, with_keys
 from gripper_force.errors import DataError
 from gripper_force.types import Gray
@@ -46,8 +46,8 @@ def camera(task: Task) -> Outcome:
         )
     task.person.do("Open the jaws, put an object between them as in use, and switch on the light")
     config = with_keys(config, "vision", region=None)
-    fixed = task.given.get("camera.exposure_us")
-    exposures_us = EXPOSURES_US if fixed is None else (fixed,)
+    is_given = "camera.exposure_us" in task.given
+    exposures_us = (config.camera.exposure_us,) if is_given else candidate_exposures_us(config)
     candidates, images = try_exposures(config, exposures_us, task.progress)
     best = nearest_exposure(candidates)
     gray = images[candidates.index(best)]
@@ -57,19 +57,19 @@ def camera(task: Task) -> Outcome:
     _save(gray, markers, region, picture)
     remarks = [*_light(gray, best), *_focus(gray, region), *_markers(markers, region, gray)]
     try:
-        select_exposure([best] if fixed is not None else candidates)
+        select_exposure([best] if is_given else candidates)
     except DataError as error:
         raise DataError(f"{error} (the picture: {picture})") from error
     today = date.today().isoformat()
     values = {}
-    if fixed is None:
+    if not is_given:
         origin = f"mean gray value {best.mean:.0f}, {100 * best.clipped:.1f} % clipped, {today}"
         values["camera.exposure_us"] = Found(best.exposure_us, origin)
     if region is not None and "vision.region" not in task.given:
         values["vision.region"] = Found(list(region), f"around the markers on the jaws, {today}")
     size = f"{gray.shape[1]}x{gray.shape[0]}"
     return Outcome(
-        f"{size} pixels, exposure {best.exposure_us} us, mean gray value {best.mean:.0f}",
+        f"{size} pixels, {best.text}, mean gray value {best.mean:.0f}",
         values,
         remarks,
         {"picture": picture},

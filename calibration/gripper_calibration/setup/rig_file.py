@@ -114,13 +114,13 @@ class RigFile:
         for one in later:
             self.steps[one]["outdated_by"] = name
         if later:
-            self._write()
+            self.write()
         return later
 
     def keep(self, values: Mapping[str, Found]) -> None:
         """Takes values at once, because a device has them already, and writes the rig file."""
         self.take(values)
-        self._write()
+        self.write()
 
     def finish(self, name: str, step: Tree) -> None:
         """Notes a finished step, and writes the rig file and the state.
@@ -129,9 +129,14 @@ class RigFile:
             ConfigError: One can't be written.
         """
         self.steps[name] = step
-        self._write()
+        self.write()
 
-    def _write(self) -> None:
+    def write(self) -> None:
+        """Writes the rig file and the state.
+
+        Raises:
+            ConfigError: One can't be written.
+        """
         files = {self.path: self._text().encode(), self._state: self._state_text().encode()}
         if self._keep_original:
             files[self.folder / "original.yaml"] = self.path.read_bytes()

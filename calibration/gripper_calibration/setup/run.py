@@ -132,6 +132,7 @@ class Setup:
         """
         load_config(path if path.exists() else None, overrides)  # its messages name the file
         self.rig = RigFile.load(path, overrides, fresh=fresh)
+        self._has_overrides = bool(overrides)
         self._only, self._mass_kg, self._gauge_mm = only, mass_kg, gauge_mm
 
     @property
@@ -176,6 +177,8 @@ class Setup:
             if self._only and outdated:
                 person.tell(f"{', '.join(outdated)} rests on what {name} found: run setup without --step")
             yield report
+        if self._has_overrides:  # also if no step had to run
+            self.rig.write()
 
     def _finish(self, name: str, step: Step, outcome: Outcome) -> StepReport:
         files = {what: str(path) for what, path in outcome.files.items()}

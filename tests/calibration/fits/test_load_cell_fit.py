@@ -107,6 +107,11 @@ def test_constant_reading_has_an_interval_of_its_last_digit() -> None:
     assert fit.tare_raw.low == pytest.approx(-0.05)
     fit = fit_load_cell(shows(0.01), shows(1.02), shows(0.01), 10.0)
     assert fit.tare_raw.low == pytest.approx(0.005)
+    with pytest.raises(DataError, match="only known to within"):
+        fit_load_cell(shows(0.0), shows(0.5), shows(0.0), 5.0)
+    assert fit_load_cell(
+        shows(0.0), shows(0.5), shows(0.0), 5.0, step_raw=0.001
+    ).tare_raw.high == pytest.approx(0.0005)
 
 
 numbers = st.floats(allow_nan=True, allow_infinity=True) | st.floats(-1e6, 1e6)

@@ -106,6 +106,17 @@ def test_command_writes_profile_reference_and_report(tmp_path: Path) -> None:
     assert config.control.plant_delay_ms == found.delay_ms.value
 
 
+def test_automatic_exposure_stays_automatic(tmp_path: Path) -> None:
+    rig = tmp_path / "rig.yaml"
+    calibrate_camera(load_config(None, [*QUICK, "camera.exposure_us=null"]), rig, region=WHOLE, touches=3)
+    found = read_rig(rig).camera
+    assert found is not None
+    assert found.exposure_us is None
+    named = load_config(None, [*QUICK, f"calibration.rig={rig}"])
+    assert named.camera.exposure_us is None
+    assert mismatches(named) == []
+
+
 def mismatches(config: Config) -> list[str]:
     return rig_mismatches(config, read_profiles(config))
 
@@ -171,7 +182,7 @@ def test_without_markers_nothing_is_written(tmp_path: Path) -> None:
             ["faults=[{unit: camera, kind: off}]"],
             [4000],
             DeviceTimeoutError,
-            "no frame for 3 s at an exposure",
+            "no frame for 3 s with camera.exposure_us=4000",
         ),
     ],
 )

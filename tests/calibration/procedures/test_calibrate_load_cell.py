@@ -90,7 +90,8 @@ def test_board_is_calibrated_through_its_driver(board: Board, tmp_path: Path) ->
 class Cell:
     """A load cell with its own clock. A function of the prompts and the time gives its reading."""
 
-    def __init__(self, reading: Callable[[int, float], float | None]) -> None:
+    def __init__(self, reading: Callable[[int, float], float | None], noise: float = 20) -> None:
+        self._noise = noise
         self._reading, self._now_ns, self._sampled_ns = reading, 0, 0
         self._asked, self._asked_ns = 0, 0
         self._rng = np.random.default_rng(0)
@@ -112,7 +113,7 @@ class Cell:
             self._sampled_ns += NS_PER_S // 80
             raw = self._reading(self._asked, (self._sampled_ns - self._asked_ns) / NS_PER_S)
             if raw is not None:
-                samples.append(LoadCellSample(self._sampled_ns, 0.0, raw + self._rng.normal(0, 20)))
+                samples.append(LoadCellSample(self._sampled_ns, 0.0, raw + self._rng.normal(0, self._noise)))
         return samples
 
     def counts(self) -> dict[str, int]:
@@ -136,6 +137,16 @@ def test_waits_until_a_late_swinging_load_is_at_rest() -> None:
     tare, scale = weighed(reading)
     assert tare == pytest.approx(500, abs=20)
     assert scale == pytest.approx(1e-4, rel=0.003)
+
+
+def test_display_shows_its_resolution_while_the_load_changes() -> None:
+    def shown_kg(asked: int, t_s: float) -> float:
+        return round((1 - np.exp(-9 * t_s) if asked == 2 else np.exp(-9 * t_s) * (asked == 3)) * 0.5, 3)
+
+    cell = Cell(shown_kg, noise=0)
+    fit = weigh(cell, cell, WEIGHT_N, prompt=cell.ask, seconds=3.0, timeout_s=30.0)
+    assert (fit.tare_raw.low, fit.tare_raw.high) == pytest.approx((-0.0005, 0.0005))
+    assert fit.n_per_raw.value == pytest.approx(10)
 
 
 @pytest.mark.parametrize(

@@ -66,6 +66,14 @@ def test_a_setup_without_a_load_cell_ends_with_a_rig_file_and_continues_there(tm
     # A changed key repeats only the steps that rest on it.
     again = Setup(path, ["camera.rate_hz=30"]).run(Script())
     assert [report.name for report in again if report.result == "done"] == ["camera"]
+    # Some cameras have no other exposure than an automatic one.
+    (changed,) = Setup(path, ["camera.exposure_us=null"], only="camera").run(Script())
+    assert "automatic exposure" in changed.summary
+    assert load_config(path).camera.exposure_us is None
+    # What a person sets is kept, also if no step has to run again.
+    kept = list(Setup(path, ["camera.exposure_us=3000"]).run(Script()))
+    assert [report.result for report in kept] == 6 * ["kept"]
+    assert load_config(path).camera.exposure_us == 3000
 
 
 def test_a_known_mass_takes_the_place_of_a_load_cell(tmp_path: Path) -> None:
