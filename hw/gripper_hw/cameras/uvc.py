@@ -98,8 +98,10 @@ class UvcCamera(BackgroundCamera):
             # Some drivers lose what was set before the stream began, and still read it back:
             # https://github.com/patjak/facetimehd/pull/329
             controls = _set_controls(capture, path, self._config)
+            for _ in range(_BUFFERS):  # filled before the controls were set
+                _image(capture, path)
             self._settings = {"fourcc": fourcc, "resolution_px": size_px, **controls}
-            numbers = count(1)  # the first image told the size
+            numbers = count(1 + _BUFFERS)  # the first image told the size
             yield lambda: self._read(capture, path, next(numbers))
         finally:
             capture.release()

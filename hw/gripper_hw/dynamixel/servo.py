@@ -294,6 +294,8 @@ class DynamixelBus:
             if not REGISTERS[name].eeprom or self._transport.get(id_, name) != value:  # limits EEPROM wear
                 self._transport.set(id_, name, value)
         pwm_limit = self._transport.get(id_, "pwm_limit")
+        if pwm_limit == 0:
+            raise DeviceError(f"servo {id_} has PWM Limit 0 and can't move; set the register to 885 (100 %)")
         self._transport.set(id_, "goal_pwm", pwm_limit)  # another program may have left 0
         pointers = struct.pack(f"<{len(_INDIRECT_ADDRESSES)}H", *_INDIRECT_ADDRESSES)
         self._transport.write(id_, window.address, pointers)

@@ -181,6 +181,13 @@ def test_spec_contains_the_models_data_and_needs_no_port():
         DynamixelServo.spec(ServoConfig(model="AX-12"))
 
 
+def test_a_servo_that_can_not_move_is_refused(make_memory_endpoint):
+    endpoint = make_memory_endpoint()
+    endpoint.bus.servos[0].set("pwm_limit", 0)
+    with pytest.raises(DeviceError, match=r"PWM Limit 0 and can't move; set the register to 885"):
+        drive(endpoint).start()
+
+
 def test_another_homing_offset_is_refused_with_torque_off(make_memory_endpoint):
     endpoint = make_memory_endpoint(VirtualServo(1, MODEL))
     endpoint.bus.servos[0].set("homing_offset", 1024)
