@@ -30,6 +30,8 @@ _SUPPLY_TOLERANCE_V = 0.5
 _MOST_TIMES = 3.0
 """Torque constant over that of the servo's model from which it can't be right: the largest `gripper.gain_bound`."""
 
+_NO_SCORE = "the network has no out-of-distribution score (int8 and bfloat16 have none): no unfamiliar object is noticed"
+
 _CYCLES_PER_WATCHDOG = 2
 """One lost cycle must not make the servo stop."""
 
@@ -127,6 +129,7 @@ def resolve(config: Config, *, vision: bool = True) -> ResolvedConfig:
         ("session", bundle),
         ("simulation", detail),
         ("session", apply.overridden(config, profiles)),
+        ("session", "" if model is None or _has_score(config, model) else _NO_SCORE),
         *(
             ("session", f"the {profile} was made with {'; '.join(found)}")
             for profile, found in mismatches.items()
@@ -141,6 +144,10 @@ def resolve(config: Config, *, vision: bool = True) -> ResolvedConfig:
         tuple((unit, text) for unit, text in notes if text),
         tuple(text for text in (choice, detail) if text),
     )
+
+
+def _has_score(config: Config, model: Model) -> bool:
+    return model.header.ood is not None and config.vision.precision == "float32"
 
 
 def resolve_vision(config: Config) -> tuple[Config, Model | None, str]:

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import NamedTuple, get_args
+from typing import NamedTuple
 
 from gripper_force.config import BudgetConfig, VisionConfig
 from gripper_force.errors import ConfigError
@@ -151,12 +151,10 @@ def _settings(vision: VisionConfig, set_threads: bool) -> Iterator[_Setting]:
             threads = [t for t in (1, 2, 4, 8) if t <= cores] if vision.engine == "auto" else [vision.threads]
             if engine == "torch" and not set_threads:
                 threads = [_own_threads()]
-            any_precision = vision.checkpoint == "auto" and engine == "openvino"
-            for precision in get_args(Precision) if any_precision else [vision.precision]:
-                if precision != "float32" and engine in ENGINES and engine != "openvino":
-                    continue
-                for count in threads:
-                    yield _Setting(model, engine, precision, count)
+            if vision.precision != "float32" and engine in ENGINES and engine != "openvino":
+                continue
+            for count in threads:
+                yield _Setting(model, engine, vision.precision, count)
 
 
 def _own_threads() -> int:

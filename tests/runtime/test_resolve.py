@@ -203,6 +203,16 @@ def test_a_configuration_that_overrides_what_was_measured_says_so(
     ) in resolve(load_config(None, given)).notes
 
 
+def test_a_run_says_that_nothing_notices_an_unfamiliar_object() -> None:
+    def warns(*keys: str) -> bool:
+        notes = resolve(load_config(None, list(keys))).notes
+        return any("no out-of-distribution score" in text for _, text in notes)
+
+    assert warns("vision.engine=openvino", "vision.precision=bfloat16")
+    assert not warns("vision.engine=openvino")
+    assert not warns("vision.checkpoint=none")
+
+
 @pytest.mark.parametrize("name", ["default", "small"])
 def test_shipped_networks_are_for_any_rig(name: str) -> None:
     keys = [

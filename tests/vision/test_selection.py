@@ -147,7 +147,9 @@ def test_damaged_cache_is_measured_again(
     assert candidates(VisionConfig(checkpoint=str(tiny_checkpoint), engine="auto"))
 
 
-def test_precision_is_only_chosen_together_with_the_checkpoint(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_precision_is_never_chosen_because_only_float32_has_the_score_of_unfamiliar_frames(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     if find_spec("openvino") is None:
         pytest.skip("openvino is not installed: pip install 'gripper-force[engines]'")
     monkeypatch.setattr(selection, "SHIPPED", {"default": SHIPPED["default"]})
@@ -155,5 +157,5 @@ def test_precision_is_only_chosen_together_with_the_checkpoint(monkeypatch: pyte
     def precisions(vision: VisionConfig) -> set[str]:
         return {setting.precision for setting in selection._settings(vision, set_threads=True)}
 
-    assert precisions(VisionConfig(engine="auto")) == {"float32"}
-    assert precisions(AUTO) == {"float32", "bfloat16"}
+    assert precisions(AUTO) == {"float32"}
+    assert precisions(VisionConfig(engine="auto", precision="bfloat16")) == {"bfloat16"}
