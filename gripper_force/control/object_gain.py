@@ -64,14 +64,14 @@ class ObjectGain:
     """
 
     def __init__(self, torque_std: float, known: tuple[float, float] | None = None) -> None:
-        self._torque_n2 = torque_std**2
+        self._torque_variance = torque_std**2
         self.reset()
         if known is not None:
             self.add(*known)
 
     def reset(self) -> None:
         """Forgets everything: the next grasp is of another object."""
-        self._weight = self._weighted = 0.0
+        self._weight = self._weighted_log = 0.0
         self._start_grasp()
 
     def _start_grasp(self) -> None:
@@ -97,33 +97,33 @@ class ObjectGain:
         Args:
             counts: False if the grasp does not count, because no object was held to its end.
         """
-        measured = self._measured() if counts else None
+        measured = self._measured_log_ratio() if counts else None
         self._start_grasp()
         if measured is None:
             return ""
-        ratio, variance = measured
+        log_ratio, variance = measured
         text = ""
         if self._weight:
-            before = self._weighted / self._weight
-            if abs(ratio - before) > GATE * math.sqrt(variance + 1 / self._weight):
+            before = self._weighted_log / self._weight
+            if abs(log_ratio - before) > GATE * math.sqrt(variance + 1 / self._weight):
                 text = (
-                    f"vision and motor current differ by a factor of {math.exp(ratio):.2f}, in the grasps before by "
-                    f"{math.exp(before):.2f}: another object, whose gain is learned anew"
+                    f"vision and motor current differ by a factor of {math.exp(log_ratio):.2f}, in the grasps before "
+                    f"by {math.exp(before):.2f}: another object, whose gain is learned anew"
                 )
                 self.reset()
-        self._add(ratio, variance)
+        self._add(log_ratio, variance)
         return text
 
     def add(self, ratio: float, std: float) -> None:
         """Adds the ratio of earlier grasps, with its relative standard deviation as for ``known``."""
         self._add(math.log(ratio), std**2)
 
-    def _add(self, ratio: float, variance: float) -> None:
+    def _add(self, log_ratio: float, variance: float) -> None:
         self._weight += 1 / variance
-        self._weighted += ratio / variance
+        self._weighted_log += log_ratio / variance
 
-    def _measured(self) -> tuple[float, float] | None:
-        """Returns logarithm and relative variance of the present grasp's ratio, or None."""
+    def _measured_log_ratio(self) -> tuple[float, float] | None:
+        """Returns logarithm and relative variance of the present grasp's ratio; None if it shows too little."""
         least_n = _LEAST_FORCE_N * self._frames
         if self._frames < _LEAST_FRAMES or min(self._current_n, self._visual_n) < least_n:
             return None
@@ -135,7 +135,7 @@ class ObjectGain:
         """Ratio of the finished grasps and its relative standard deviation, as for ``known``; None without any."""
         if not self._weight:
             return None
-        return math.exp(self._weighted / self._weight), 1 / math.sqrt(self._weight)
+        return math.exp(self._weighted_log / self._weight), 1 / math.sqrt(self._weight)
 
     def estimate(self, *, with_present: bool = False) -> GainEstimate | None:
         """Returns the posterior after the finished grasps; None before the first.
@@ -143,24 +143,27 @@ class ObjectGain:
         Args:
             with_present: Adds the present grasp.
         """
-        weight, weighted = self._weight, self._weighted
-        if with_present and (measured := self._measured()) is not None:
-            weight, weighted = weight + 1 / measured[1], weighted + measured[0] / measured[1]
+        weight, weighted_log = self._weight, self._weighted_log
+        if with_present and (measured := self._measured_log_ratio()) is not None:
+            weight += 1 / measured[1]
+            weighted_log += measured[0] / measured[1]
         if not weight:
             return None
-        ratio, variance = weighted / weight, self._torque_n2 + 1 / weight
+        log_ratio, variance = weighted_log / weight, self._torque_variance + 1 / weight
         parts = []
         for share, prior in ((1 - _ANY_SHARE, KIND_STD**2), (_ANY_SHARE, _ANY_STD**2)):
             total = prior + variance
-            density = share * math.exp(-0.5 * min(ratio**2 / total, 1400.0)) / math.sqrt(total)
-            parts.append((density, prior / total * ratio, prior * variance / total, prior / total))
+            density = share * math.exp(-0.5 * min(log_ratio**2 / total, 1400.0)) / math.sqrt(total)
+            parts.append((density, prior / total * log_ratio, prior * variance / total, prior / total))
         densities = [part[0] for part in parts]
         shares = [density / sum(densities) for density in densities]
         mean = sum(share * part[1] for share, part in zip(shares, parts, strict=True))
         spread = sum(
             share * (part[2] + (part[1] - mean) ** 2) for share, part in zip(shares, parts, strict=True)
         )
-        shared = self._torque_n2 * sum(share * part[3] for share, part in zip(shares, parts, strict=True))
+        shared = self._torque_variance * sum(
+            share * part[3] for share, part in zip(shares, parts, strict=True)
+        )
         return GainEstimate(math.exp(mean), math.sqrt(spread), math.sqrt(min(shared, spread)))
 
     @property
@@ -168,11 +171,11 @@ class ObjectGain:
         """Reason why the ratio is implausible for any object, or an empty text."""
         if not self._weight:
             return ""
-        ratio = self._weighted / self._weight
-        limit = GATE * math.sqrt(_ANY_STD**2 + self._torque_n2 + 1 / self._weight)
-        if abs(ratio) <= limit:
+        log_ratio = self._weighted_log / self._weight
+        limit = GATE * math.sqrt(_ANY_STD**2 + self._torque_variance + 1 / self._weight)
+        if abs(log_ratio) <= limit:
             return ""
         return (
-            f"motor current was {math.exp(ratio):.2f} times the visual force in earlier grasps, outside "
+            f"motor current was {math.exp(log_ratio):.2f} times the visual force in earlier grasps, outside "
             f"{math.exp(-limit):.2f} to {math.exp(limit):.2f}: the network does not know this object"
         )

@@ -30,7 +30,9 @@ _SUPPLY_TOLERANCE_V = 0.5
 _MOST_TIMES = 3.0
 """Torque constant over that of the servo's model from which it can't be right: the largest `gripper.gain_bound`."""
 
-_NO_SCORE = "the network has no out-of-distribution score (int8 and bfloat16 have none): no unfamiliar object is noticed"
+_NO_SCORE = (
+    "the network has no out-of-distribution score (int8, bfloat16): unfamiliar objects are not noticed"
+)
 
 _CYCLES_PER_WATCHDOG = 2
 """One lost cycle must not make the servo stop."""
