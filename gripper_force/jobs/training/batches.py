@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import CONTACT_N, Clip
-from gripper_force.jobs.training.parallel import Ranks
+from gripper_force.jobs.training.parallel import TrainingProcess
 from gripper_force.jobs.training.recipe import TrainConfig
 from gripper_force.vision.batch_inference import normalise
 
@@ -37,7 +37,7 @@ class Batches:
     Args:
         clips: Training data.
         config: The recipe.
-        ranks: This process among those that train together.
+        process: This process among those that train together.
 
     Attributes:
         unseen: Mask of the recordings from which no clip has been drawn, (recordings,) bool.
@@ -46,7 +46,7 @@ class Batches:
         DataError: A recording is too short for its reference frames, or no frame shows contact.
     """
 
-    def __init__(self, clips: Sequence[Clip], config: TrainConfig, ranks: Ranks) -> None:
+    def __init__(self, clips: Sequence[Clip], config: TrainConfig, process: TrainingProcess) -> None:
         for clip in clips:
             if len(clip.frames) < config.preprocess.reference_frames:
                 raise DataError(
@@ -58,8 +58,8 @@ class Batches:
         )
         valid = np.concatenate([clip.valid for clip in clips])
         self._config = config
-        self._device = ranks.device
-        self._share = ranks.share
+        self._device = process.device
+        self._share = process.own_clips
         self.unseen = np.array([clip.valid.any() for clip in clips])
         self._recording = np.repeat(np.arange(len(clips)), lengths)  # (N,)
         self._begin = np.repeat(np.cumsum([0, *lengths[:-1]]), lengths)  # (N,)

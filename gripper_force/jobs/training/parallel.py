@@ -21,18 +21,18 @@ from gripper_force.errors import ConfigError
 
 
 @dataclass(frozen=True, slots=True)
-class Ranks:
+class TrainingProcess:
     """This process among those that train together.
 
     Attributes:
         device: Device that it computes on.
         rank: Its number. The first process, 0, writes files and shows progress.
-        count: Number of processes.
+        world_size: Number of processes.
     """
 
     device: str
     rank: int = 0
-    count: int = 1
+    world_size: int = 1
 
     @property
     def first(self) -> bool:
@@ -40,13 +40,13 @@ class Ranks:
         return self.rank == 0
 
     @property
-    def share(self) -> slice:
+    def own_clips(self) -> slice:
         """Slice of a step's clips that this process takes."""
-        return slice(self.rank, None, self.count)
+        return slice(self.rank, None, self.world_size)
 
-    def add_up(self, tensors: Iterable[Tensor]) -> None:
+    def sum_over_all(self, tensors: Iterable[Tensor]) -> None:
         """Replaces tensors, all of one type, by their sums over all processes."""
-        if self.count == 1:
+        if self.world_size == 1:
             return
         tensors = list(tensors)
         flat = torch.cat([tensor.reshape(-1) for tensor in tensors])
@@ -54,9 +54,9 @@ class Ranks:
         for tensor, total in zip(tensors, torch.split(flat, [t.numel() for t in tensors]), strict=True):
             tensor.copy_(total.view_as(tensor))
 
-    def as_first(self, value: float) -> float:
+    def broadcast_from_first(self, value: float) -> float:
         """Returns the first process's value, for quantities that every process measures itself."""
-        if self.count == 1:
+        if self.world_size == 1:
             return value
         shared = torch.tensor([value], dtype=torch.float64, device=self.device)
         dist.broadcast(shared, 0)
@@ -64,14 +64,14 @@ class Ranks:
 
     def wait(self) -> None:
         """Waits for all processes."""
-        if self.count > 1:
+        if self.world_size > 1:
             dist.barrier()
 
     def check_equal(self, text: str, what: str) -> None:
         """Raises `ConfigError` unless all processes pass the same text."""
-        if self.count == 1:
+        if self.world_size == 1:
             return
-        texts: list[Any] = [None] * self.count
+        texts: list[Any] = [None] * self.world_size
         dist.all_gather_object(texts, text)
         if len(set(texts)) > 1:
             raise ConfigError(
@@ -80,7 +80,7 @@ class Ranks:
 
 
 @contextmanager
-def joined(device: str) -> Iterator[Ranks]:
+def join_training_processes(device: str) -> Iterator[TrainingProcess]:
     """Joins the processes that `torchrun` has started, if any, and leaves them at the end.
 
     Args:
@@ -94,7 +94,7 @@ def joined(device: str) -> Iterator[Ranks]:
         device = "cuda" if torch.cuda.is_available() else "cpu"
     count = int(os.environ.get("WORLD_SIZE", "1"))
     if count == 1:
-        yield Ranks(device)
+        yield TrainingProcess(device)
         return
     if device == "cuda":
         local, gpus = int(os.environ["LOCAL_RANK"]), torch.cuda.device_count()
@@ -116,7 +116,7 @@ def joined(device: str) -> Iterator[Ranks]:
             f"can't join the other training processes: {error}; start all of them with torchrun"
         ) from error
     try:
-        yield Ranks(device, rank, count)
+        yield TrainingProcess(device, rank, count)
     finally:
         dist.destroy_process_group()
 

@@ -21,7 +21,7 @@ from gripper_force.jobs.training import few
 from gripper_force.jobs.training.batches import Batches, Replay
 from gripper_force.jobs.training.few import PROGRESS_STEPS as PROGRESS_STEPS
 from gripper_force.jobs.training.ood_fit import MIN_LOGS, add_ood, fit_ood
-from gripper_force.jobs.training.parallel import Ranks, joined
+from gripper_force.jobs.training.parallel import TrainingProcess, join_training_processes
 from gripper_force.jobs.training.recipe import FITTED_AT_ONCE, continued
 from gripper_force.jobs.training.recipe import TrainConfig as TrainConfig
 from gripper_force.jobs.training.stated_errors import errors, estimates, residuals
@@ -97,10 +97,10 @@ def train(
     if config.method == "process":
         if init is not None or replay_clips:
             raise ConfigError(FITTED_AT_ONCE)
-        with joined("cpu") as ranks:
-            if ranks.first:
+        with join_training_processes("cpu") as process:
+            if process.first:
                 _fit(config, clips, out, validation_clips, progress)
-            ranks.wait()
+            process.wait()
             return load_checkpoint(out)
     if init is not None:
         config = continued(config, init.header)
@@ -119,17 +119,17 @@ def train(
         training, held_out = split_by(clips, "set" if repeated else "object", config.validation, config.seed)
     check_size([*training, *held_out, *replay_clips], config.preprocess)
     states = state_paths(config, out)
-    with joined(config.device) as ranks:
+    with join_training_processes(config.device) as process:
         trainers = _trained(
-            config, training, states, init, teacher, replay_clips, resume, ranks, progress, warn
+            config, training, states, init, teacher, replay_clips, resume, process, progress, warn
         )
-        if ranks.first:
+        if process.first:
             networks = [trainer.network for trainer in trainers]
-            forces_n, measured_n = estimates(held_out, networks, config.preprocess, ranks.device)
+            forces_n, measured_n = estimates(held_out, networks, config.preprocess, process.device)
             labels_n = np.concatenate([clip.forces_n[clip.valid] for clip in training])
             data = [*clips, *replay_clips]
             _save(out, networks, config, data, forces_n, measured_n, float(labels_n.mean()))
-            _add_ood(out, networks, held_out, ranks.device, warn)
+            _add_ood(out, networks, held_out, process.device, warn)
             if figure:
                 draw_training(
                     {
@@ -145,7 +145,7 @@ def train(
                 )
             for state in states:
                 state.unlink()
-        ranks.wait()
+        process.wait()
         return load_checkpoint(out)
 
 
@@ -252,45 +252,47 @@ def _trained(
     teacher: Checkpoint | None,
     replay_clips: Sequence[Clip],
     resume: bool,
-    ranks: Ranks,
+    process: TrainingProcess,
     progress: Progress,
     warn: Callable[[str], None],
 ) -> list[Trainer]:
     old = round(config.replay_share * config.clips) if replay_clips else 0
-    if any(0 < part < ranks.count for part in (config.clips - old, old)):
+    if any(0 < part < process.world_size for part in (config.clips - old, old)):
         raise ConfigError(
-            f"{ranks.count} processes can't share {config.clips} clips per step; increase clips"
+            f"{process.world_size} processes can't share {config.clips} clips per step; increase clips"
         )
-    if ranks.count > 1 and config.compile:
+    if process.world_size > 1 and config.compile:
         raise ConfigError("compile does not work with several processes; set compile=false")
-    new = Batches(clips, config, ranks)
-    batches = Replay(new, Batches(replay_clips, config, ranks), config.replay_share) if replay_clips else new
+    new = Batches(clips, config, process)
+    batches = (
+        Replay(new, Batches(replay_clips, config, process), config.replay_share) if replay_clips else new
+    )
     start = " ".join(checkpoint.digest if checkpoint is not None else "" for checkpoint in (init, teacher))
     data = digest([*clips, *replay_clips])
     identity = f"{config.model_dump_json(exclude={'device', 'compile'})} {data} {start}"
     trainers = []
     for member, state in enumerate(states):
         trainer = Trainer(
-            config, member, batches, ranks, teacher.force_networks if teacher is not None else ()
+            config, member, batches, process, teacher.force_networks if teacher is not None else ()
         )
         trainers.append(trainer)
         if init is not None:
             trainer.start_from(init.force_networks[member])
         if resume:
             trainer.restore(state, identity)
-        ranks.check_equal(f"{identity} {trainer.done}", "recipes, data or states")
+        process.check_equal(f"{identity} {trainer.done}", "recipes, data or states")
         saved = time.monotonic()
         reported = 0
         for rmse_n in trainer.steps():
             done = int(PROGRESS_STEPS * min(1.0, trainer.done))
             progress(f"{config.attentions[member]}: RMSE {rmse_n:.3f} N", done - reported)
             reported = done
-            if ranks.first and time.monotonic() - saved > STATE_EVERY_S:
+            if process.first and time.monotonic() - saved > STATE_EVERY_S:
                 trainer.save(state, identity)
                 saved = time.monotonic()
         progress(f"{config.attentions[member]}: done", PROGRESS_STEPS - reported)
         trainer.network.eval()
-        if ranks.first:
+        if process.first:
             trainer.save(state, identity)
     unseen = int(batches.unseen.sum())
     length = next(key for key in ("minutes", "epochs", "steps") if getattr(config, key) is not None)

@@ -15,7 +15,7 @@ from torch.nn.modules.batchnorm import _BatchNorm
 from gripper_force.errors import CheckpointError, NonFiniteError
 from gripper_force.jobs.dataset import CONTACT_N
 from gripper_force.jobs.training.batches import Batch, Batches, Replay
-from gripper_force.jobs.training.parallel import Ranks, share_statistics
+from gripper_force.jobs.training.parallel import TrainingProcess, share_statistics
 from gripper_force.jobs.training.recipe import TrainConfig
 from gripper_force.vision.checkpoint import Member
 from gripper_force.vision.header import INDENTATION_SCALE_M
@@ -29,7 +29,7 @@ class Trainer:
         config: The recipe.
         member: Index of the member.
         batches: Training data.
-        ranks: This process among those that train together.
+        process: This process among those that train together.
         teacher: Ensemble whose mean estimate is learned beside the labels, in evaluation mode; none if empty.
 
     Attributes:
@@ -43,19 +43,19 @@ class Trainer:
         config: TrainConfig,
         member: int,
         batches: Batches | Replay,
-        ranks: Ranks,
+        process: TrainingProcess,
         teacher: Sequence[Member] = (),
     ) -> None:
         torch.manual_seed(config.seed + member)
         self._config = config
         self._batches = batches
-        self._ranks = ranks
+        self._process = process
         self._name = config.attentions[member]
         self._total_steps = config.steps
         if config.epochs is not None:
             self._total_steps = math.ceil(config.epochs * batches.labels / config.clips)
-        self.network = ForceNetwork(config.network(member)).to(ranks.device)
-        if ranks.count > 1:
+        self.network = ForceNetwork(config.network(member)).to(process.device)
+        if process.world_size > 1:
             share_statistics(self.network)
         self._optimizer = torch.optim.AdamW(
             self.network.parameters(),
@@ -64,7 +64,7 @@ class Trainer:
             fused=True,
         )
         self._features = torch.compile(self.network.features) if config.compile else self.network.features
-        self._teacher = [network.to(ranks.device) for network in teacher]
+        self._teacher = [network.to(process.device) for network in teacher]
         self._freeze_statistics = False
         self.step = 0
         self.losses: list[float] = []
@@ -108,7 +108,7 @@ class Trainer:
                 )
                 self.losses += [float(self.step), self._smoothed_rmse_n]
             self.step += 1
-            self._elapsed_s = self._ranks.as_first(time.monotonic() - began)
+            self._elapsed_s = self._process.broadcast_from_first(time.monotonic() - began)
             yield self._smoothed_rmse_n
         self.network.eval()
 
@@ -125,7 +125,7 @@ class Trainer:
         first = length - 1 if config.windows == "separate" else min(window, length) - 1
         batch = self._batches.batch(self.step, count, length)
         labels = batch.valid[:, first:].sum()
-        self._ranks.add_up([labels])
+        self._process.sum_over_all([labels])
         with torch.autocast(batch.inputs.device.type, torch.bfloat16, enabled=config.precision == "bfloat16"):
             features = self._features(batch.inputs, first)  # (B, T - first, head)
             learned_n = self._taught(batch, first) if self._teacher else batch.forces_n  # (B, T)
@@ -138,7 +138,7 @@ class Trainer:
         loss.backward()  # type: ignore[no-untyped-call]
         gradients = [p.grad for p in self.network.parameters() if p.grad is not None]
         total = force_loss.detach()
-        self._ranks.add_up([*gradients, total])
+        self._process.sum_over_all([*gradients, total])
         if config.gradient_limit is not None:
             nn.utils.clip_grad_norm_(self.network.parameters(), config.gradient_limit)
         self._optimizer.step()
@@ -229,7 +229,7 @@ class Trainer:
         if not path.exists():
             return
         try:
-            with safe_open(path, framework="pt", device=self._ranks.device) as file:
+            with safe_open(path, framework="pt", device=self._process.device) as file:
                 progress = file.metadata() or {}
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
         except (OSError, SafetensorError) as error:

@@ -16,7 +16,7 @@ from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import Clip, split_by
 from gripper_force.jobs.report.figure import STYLE
 from gripper_force.jobs.training.batches import Batches
-from gripper_force.jobs.training.parallel import joined
+from gripper_force.jobs.training.parallel import join_training_processes
 from gripper_force.jobs.training.recipe import RECIPES, TrainConfig, section_from
 from gripper_force.jobs.training.stated_errors import estimates
 from gripper_force.jobs.training.trainer import Trainer
@@ -98,8 +98,8 @@ def learn(
         raise ConfigError("bench training trains one network with each recipe; set attentions to one module")
     points: list[Point] = []
     _save(points, configs, out)  # an unwritable folder must fail before the training
-    with joined(configs[PAPER].device) as ranks:
-        if ranks.count > 1:
+    with join_training_processes(configs[PAPER].device) as process:
+        if process.world_size > 1:
             raise ConfigError("bench training runs in one process; start it without torchrun")
         clips: dict[int, list[Clip]] = {}
         trainers, held_out = {}, {}
@@ -108,11 +108,11 @@ def learn(
             if size not in clips:
                 clips[size] = load(config.preprocess)
             training, held_out[recipe] = split_by(clips[size], "set", config.validation, config.seed)
-            trainers[recipe] = Trainer(config, 0, Batches(training, config, ranks), ranks)
+            trainers[recipe] = Trainer(config, 0, Batches(training, config, process), process)
         try:
             for recipe in _in_turns(trainers, minutes, budgets, progress):
                 trainer, preprocess = trainers[recipe], configs[recipe].preprocess
-                forces = estimates(held_out[recipe], [trainer.network], preprocess, ranks.device)
+                forces = estimates(held_out[recipe], [trainer.network], preprocess, process.device)
                 spent = trainer.done * budgets[recipe]
                 points.append(Point(recipe, spent, trainer.step, metrics.mae(*forces), metrics.rmse(*forces)))
                 _save(points, configs, out)

@@ -1,5 +1,6 @@
 """Load-cell calibration with a simulated board behind a pseudo-terminal."""
 
+import math
 import os
 import pty
 import threading
@@ -141,7 +142,7 @@ def test_waits_until_a_late_swinging_load_is_at_rest() -> None:
 
 def test_display_shows_its_resolution_while_the_load_changes() -> None:
     def shown_kg(asked: int, t_s: float) -> float:
-        return round((1 - np.exp(-9 * t_s) if asked == 2 else np.exp(-9 * t_s) * (asked == 3)) * 0.5, 3)
+        return round((1 - math.exp(-9 * t_s) if asked == 2 else math.exp(-9 * t_s) * (asked == 3)) * 0.5, 3)
 
     cell = Cell(shown_kg, noise=0)
     fit = weigh(cell, cell, WEIGHT_N, prompt=cell.ask, seconds=3.0, timeout_s=30.0)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from gripper_force.errors import ConfigError
-from gripper_force.jobs.training.parallel import Ranks, joined
+from gripper_force.jobs.training.parallel import TrainingProcess, join_training_processes
 from gripper_force.vision.checkpoint import load_checkpoint
 
 SCRIPT = Path(__file__).with_name("train_together.py")
@@ -54,24 +54,24 @@ def test_two_processes_train_like_one(tmp_path: Path) -> None:
 
 
 def test_one_process_needs_no_others() -> None:
-    with joined("cpu") as ranks:
-        assert ranks == Ranks("cpu")
-        assert ranks.first
+    with join_training_processes("cpu") as process:
+        assert process == TrainingProcess("cpu")
+        assert process.first
         total = torch.ones(3)
-        ranks.add_up([total])
-        ranks.check_equal("any", "thing")
-        ranks.wait()
+        process.sum_over_all([total])
+        process.check_equal("any", "thing")
+        process.wait()
         assert total.tolist() == [1, 1, 1]
-        assert ranks.as_first(0.5) == 0.5
-        assert list(range(4))[ranks.share] == [0, 1, 2, 3]
+        assert process.broadcast_from_first(0.5) == 0.5
+        assert list(range(4))[process.own_clips] == [0, 1, 2, 3]
 
 
 def test_processes_that_cannot_join_raise(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WORLD_SIZE", "2")
     monkeypatch.delenv("RANK", raising=False)
-    with pytest.raises(ConfigError, match="torchrun"), joined("cpu"):
+    with pytest.raises(ConfigError, match="torchrun"), join_training_processes("cpu"):
         pass
     monkeypatch.setenv("LOCAL_RANK", "1")
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    with pytest.raises(ConfigError, match="1 GPUs are too few"), joined("cuda"):
+    with pytest.raises(ConfigError, match="1 GPUs are too few"), join_training_processes("cuda"):
         pass

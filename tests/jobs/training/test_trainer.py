@@ -9,7 +9,7 @@ import torch
 
 from gripper_force.jobs.dataset import CONTACT_N, Clip
 from gripper_force.jobs.training.batches import Batches
-from gripper_force.jobs.training.parallel import Ranks
+from gripper_force.jobs.training.parallel import TrainingProcess
 from gripper_force.jobs.training.recipe import TrainConfig
 from gripper_force.jobs.training.train import train
 from gripper_force.jobs.training.trainer import Trainer, one_cycle, squared_error, step_decay
@@ -74,7 +74,7 @@ def test_every_precision_and_window_mode_trains(
 ) -> None:
     recipe = {"precision": precision, "windows": windows, "short_share": 0.0, "steps": 40}
     config = small_recipe.model_copy(update=recipe)
-    trainer = Trainer(config, 0, Batches(clips, config, Ranks("cpu")), Ranks("cpu"))
+    trainer = Trainer(config, 0, Batches(clips, config, TrainingProcess("cpu")), TrainingProcess("cpu"))
     errors_n = list(trainer.steps())
     assert len(errors_n) == 40
     assert errors_n[-1] < 0.95 * errors_n[0]
@@ -94,7 +94,7 @@ def test_indentation_and_contact_are_learned_beside_force(
 ) -> None:
     extra = {"indentation_weight": 0.5, "contact_weight": 0.05, "steps": 150, "clips": 8}
     config = small_recipe.model_copy(update=extra)
-    trainer = Trainer(config, 0, Batches(indented, config, Ranks("cpu")), Ranks("cpu"))
+    trainer = Trainer(config, 0, Batches(indented, config, TrainingProcess("cpu")), TrainingProcess("cpu"))
     list(trainer.steps())
     network, unseen = trainer.network, press(99)
     assert network.config.outputs == ("force", "indentation", "contact")
@@ -115,10 +115,10 @@ def test_new_outputs_leave_the_force_of_the_initial_network(
     indented: list[Clip], small_recipe: TrainConfig
 ) -> None:
     plain = Trainer(
-        small_recipe, 0, Batches(indented, small_recipe, Ranks("cpu")), Ranks("cpu")
+        small_recipe, 0, Batches(indented, small_recipe, TrainingProcess("cpu")), TrainingProcess("cpu")
     ).network.eval()
     config = small_recipe.model_copy(update={"contact_weight": 1.0})
-    trainer = Trainer(config, 0, Batches(indented, config, Ranks("cpu")), Ranks("cpu"))
+    trainer = Trainer(config, 0, Batches(indented, config, TrainingProcess("cpu")), TrainingProcess("cpu"))
     trainer.start_from(plain)
     inputs = torch.randn(2, 24, 1, 16, 16)
     with torch.no_grad():
@@ -131,7 +131,7 @@ def test_frozen_statistics_are_those_of_the_initial_network(
     frozen: bool, clips: list[Clip], small_recipe: TrainConfig
 ) -> None:
     config = small_recipe.model_copy(update={"freeze_statistics": frozen})
-    trainer = Trainer(config, 0, Batches(clips, config, Ranks("cpu")), Ranks("cpu"))
+    trainer = Trainer(config, 0, Batches(clips, config, TrainingProcess("cpu")), TrainingProcess("cpu"))
 
     def statistics() -> torch.Tensor:
         state = trainer.network.state_dict()
@@ -149,14 +149,14 @@ def test_teacher_is_imitated(
 ) -> None:
     """A teacher that says twice the measured force: the student learns its forces and not the labels."""
     config = small_recipe.model_copy(update={"steps": 120, "clips": 8, "teacher_share": 1.0})
-    batches = Batches(clips, config, Ranks("cpu"))
-    first = Trainer(config, 0, batches, Ranks("cpu"))
+    batches = Batches(clips, config, TrainingProcess("cpu"))
+    first = Trainer(config, 0, batches, TrainingProcess("cpu"))
     list(first.steps())
     with torch.no_grad():
         first.network.out.weight.mul_(2)
         first.network.out.bias.mul_(2)
     teacher = first.network.requires_grad_(False)
-    student = Trainer(config.model_copy(update={"seed": 7}), 0, batches, Ranks("cpu"), [teacher])
+    student = Trainer(config.model_copy(update={"seed": 7}), 0, batches, TrainingProcess("cpu"), [teacher])
     list(student.steps())
     unseen = press(99)
     taught_n = predict([teacher], config.preprocess, unseen.frames)[0]
@@ -166,8 +166,8 @@ def test_teacher_is_imitated(
 
 
 def test_training_in_parts(clips: list[Clip], small_recipe: TrainConfig) -> None:
-    batches = Batches(clips, small_recipe, Ranks("cpu"))
-    whole, parts = (Trainer(small_recipe, 0, batches, Ranks("cpu")) for _ in range(2))
+    batches = Batches(clips, small_recipe, TrainingProcess("cpu"))
+    whole, parts = (Trainer(small_recipe, 0, batches, TrainingProcess("cpu")) for _ in range(2))
     assert len(list(whole.steps())) == 4
     assert [len(list(parts.steps(until))) for until in (0.5, 0.5, 1.0)] == [2, 0, 2]
     for one, other in zip(whole.network.parameters(), parts.network.parameters(), strict=True):
@@ -176,9 +176,9 @@ def test_training_in_parts(clips: list[Clip], small_recipe: TrainConfig) -> None
 
 def test_epochs_count_passes(clips: list[Clip], small_recipe: TrainConfig) -> None:
     config = small_recipe.model_copy(update={"epochs": 0.1, "clips": 9})
-    batches = Batches(clips, config, Ranks("cpu"))
+    batches = Batches(clips, config, TrainingProcess("cpu"))
     assert batches.labels == 360
-    assert len(list(Trainer(config, 0, batches, Ranks("cpu")).steps())) == 4
+    assert len(list(Trainer(config, 0, batches, TrainingProcess("cpu")).steps())) == 4
 
 
 def test_time_budget_ends_training(
@@ -216,7 +216,7 @@ def test_network_is_as_good_in_evaluation_mode_as_in_training(
     config = small_recipe.model_copy(update={"steps": 60, "clips": 8})
     train(config, clips, tmp_path / "out.safetensors")
     (network,) = load_checkpoint(tmp_path / "out.safetensors").networks
-    inputs, forces_n, *_ = Batches(clips, config, Ranks("cpu")).batch(1000, 8, 22)
+    inputs, forces_n, *_ = Batches(clips, config, TrainingProcess("cpu")).batch(1000, 8, 22)
     with torch.no_grad():
         evaluated = (network(inputs, 19) - forces_n[:, 19:]).abs().mean()
         trained = (network.train()(inputs, 19) - forces_n[:, 19:]).abs().mean()
