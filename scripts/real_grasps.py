@@ -39,7 +39,7 @@ from gripper_force.jobs.training import few
 from gripper_force.jobs.training.recipe import TrainConfig, recipe
 from gripper_force.jobs.training.train import train
 from gripper_force.vision.batch_inference import features
-from gripper_force.vision.kernel_regression import ForceProcess
+from gripper_force.vision.gaussian_process import GaussianProcess
 
 Floats = npt.NDArray[np.floating]
 
@@ -63,7 +63,7 @@ NETWORK: dict[str, Any] = {
 def run(training: list[Clip], test: list[Clip], minutes: float | None, out: Path) -> dict[str, Any]:
     """Returns the errors of each method on the test recordings, by object."""
     fit = few.fit(training, PREPROCESS)
-    forces_n = {"Gaussian process": [_force_n(fit.process, clip) for clip in test]}
+    forces_n = {"Gaussian process": [_force_n(fit.model, clip) for clip in test]}
     if minutes is not None:
         config = TrainConfig(**NETWORK, minutes=minutes)
         network = train(config, training, out / "network.safetensors")
@@ -85,7 +85,7 @@ def run(training: list[Clip], test: list[Clip], minutes: float | None, out: Path
     return {"setting": fit.setting._asdict(), "errors": rows}
 
 
-Correct = Callable[[few.Fit, list[Clip], Clip], ForceProcess | Callable[[Clip], Floats]]
+Correct = Callable[[few.Fit, list[Clip], Clip], GaussianProcess | Callable[[Clip], Floats]]
 
 
 def _after_one_trial(
@@ -99,30 +99,30 @@ def _after_one_trial(
             if other is not one:
                 others.append(other)
                 forces_n.append(
-                    _force_n(corrected, other) if isinstance(corrected, ForceProcess) else corrected(other)
+                    _force_n(corrected, other) if isinstance(corrected, GaussianProcess) else corrected(other)
                 )
     return _errors(others, forces_n)[clips[0].object] if others else None
 
 
-def _taught(fit: few.Fit, training: list[Clip], one: Clip) -> ForceProcess:
+def _taught(fit: few.Fit, training: list[Clip], one: Clip) -> GaussianProcess:
     return few.fitted([*training, one], PREPROCESS, fit.setting)
 
 
 def _calibrated(fit: few.Fit, _: list[Clip], one: Clip) -> Callable[[Clip], Floats]:
     try:
-        correction = fit_correction(_touches(fit.process, one))
+        correction = fit_correction(_touches(fit.model, one))
     except DataError:  # unusable for calibration: the process stays uncorrected
-        return lambda clip: _force_n(fit.process, clip)
+        return lambda clip: _force_n(fit.model, clip)
 
     def predict(clip: Clip) -> Floats:
         every = Clip(clip.frames, clip.forces_n, np.ones_like(clip.valid), clip.name, clip.object, clip.set)
-        corrected: Floats = correction.predict(_touches(fit.process, every, lead_in=0))
+        corrected: Floats = correction.predict(_touches(fit.model, every, lead_in=0))
         return corrected
 
     return predict
 
 
-def _touches(process: ForceProcess, clip: Clip, lead_in: int = PREPROCESS.lead_in) -> Touches:
+def _touches(process: GaussianProcess, clip: Clip, lead_in: int = PREPROCESS.lead_in) -> Touches:
     forces_n, read_out = features([process], PREPROCESS, clip.frames)
     used = clip.valid & (np.arange(len(clip.frames)) >= lead_in)
     measured_n = clip.forces_n[used].astype(np.float64)
@@ -131,7 +131,7 @@ def _touches(process: ForceProcess, clip: Clip, lead_in: int = PREPROCESS.lead_i
     )
 
 
-def _force_n(process: ForceProcess, clip: Clip) -> Floats:
+def _force_n(process: GaussianProcess, clip: Clip) -> Floats:
     force_n: Floats = features([process], PREPROCESS, clip.frames)[0][0]
     return force_n
 

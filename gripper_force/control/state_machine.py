@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from gripper_force.config import ControlConfig
 from gripper_force.control.approach import Approach, ApproachState
 from gripper_force.control.force_loop import ForceLoop, Margin, tolerance_n
-from gripper_force.control.friction_credit import FrictionCredit
+from gripper_force.control.friction_allowance import FrictionAllowance
 from gripper_force.control.fusion import Fusion
 from gripper_force.control.limits import Limits, largest_target_n
 from gripper_force.control.safety import Safety, is_sound
@@ -135,7 +135,7 @@ class GraspController:
         self._loop = ForceLoop(config, transmission)
         self._limits = Limits(config, transmission, current_limit_a)
         self._speed_limit = SpeedLimit(transmission, position_loop)
-        self._credit = FrictionCredit(config, transmission)
+        self._friction = FrictionAllowance(config, transmission)
         self._safety = Safety(config)
         self._approach = Approach(config, transmission, approach_m_s)
         self._slip = SlipMonitor(config)
@@ -299,7 +299,7 @@ class GraspController:
 
     def _enter(self, phase: Phase, reason: str) -> None:
         is_open_now = is_open(self._transmission.open_width_m, self._present_width_m)
-        self._credit.start_phase(from_open=is_open_now and self._phase not in GRIPPING)
+        self._friction.start_phase(from_open=is_open_now and self._phase not in GRIPPING)
         self._phase, self._reason = phase, reason
         self._phase_s = self._settled_s = 0.0
 
@@ -321,7 +321,7 @@ class GraspController:
             self._reason = f"new target {target_n:g} N"
             return
         self._released_s = self._phase_s if self._is_travelling else math.inf
-        self._credit.start_grasp()
+        self._friction.start_grasp()
         self._fusion.restart(was_held=self._was_held, new_object=new_object)
         self._was_held = False
         self._limits.reset(reverses=self._opens_freely)
@@ -427,7 +427,7 @@ class GraspController:
 
     def _run_phase(self, t_ns: int, dt_s: float, width_m: float, closing_m_s: float) -> None:
         self._phase_s += dt_s
-        self._credit.run(dt_s, closing_m_s, self._speed_m_s, closing=self._is_closing)
+        self._friction.update(dt_s, closing_m_s, self._speed_m_s, closing=self._is_closing)
         match self._phase:
             case Phase.APPROACH:
                 self._run_approach(dt_s, width_m, closing_m_s)
@@ -461,7 +461,7 @@ class GraspController:
             shown_n = self._travel.free_travel.friction_n
         else:
             shown_n = self._fusion.free_travel.friction_n if self._phase == Phase.APPROACH else None
-        self._credit.take(shown_n, only_lower=self._phase == Phase.MOVE and not self._is_opening)
+        self._friction.learn(shown_n, only_lower=self._phase == Phase.MOVE and not self._is_opening)
 
     def _run_approach(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
         # The goal position leads far enough that the goal current alone drives the jaws. A goal that moved in
@@ -474,7 +474,7 @@ class GraspController:
             closing_m_s,
             self._measured_motor_force_n,
             self._estimate,
-            self._credit.closing_limit_n(closing=self._is_closing, approaching=True),
+            self._friction.max_closing_force_n(closing=self._is_closing, approaching=True),
         )
         # With less motor force at once, an object that a release has not let go yet would push the jaws open.
         let_go_n = self._travel.grip_left_n(self._released_s + self._phase_s)
@@ -497,7 +497,7 @@ class GraspController:
             case ApproachState.CLOSED:
                 self._end_approach(Outcome.NO_OBJECT, "closed without contact")
             case ApproachState.STUCK:
-                self._credit.end_stuck()
+                self._friction.end_stuck()
                 self._end_approach(
                     Outcome.STUCK,
                     f"the jaws do not move at {width_m * 1e3:.1f} mm; check for an obstacle, and that "
@@ -532,7 +532,7 @@ class GraspController:
         is_near = abs(self._error_n) <= self._tolerance_n
         if self._settled_s == 0.0:
             self._settling_width_m = width_m
-        # Jaws that come loose from friction close freely against viscous friction, which looks like a steady grip.
+        # Jaws that break away from friction close freely against viscous friction, which looks like a steady grip.
         is_still = self._settling_width_m - width_m <= self._config.slip_width_m
         is_settled = is_near and is_still and not self._objection
         self._settled_s = self._settled_s + dt_s if is_settled else 0.0
@@ -596,7 +596,7 @@ class GraspController:
             self._set_outcome(Outcome.MOVED, f"moved to {self._move_width_m * 1e3:.1f} mm")
         elif self._phase_s >= self._move_time_s:
             reason = f"stopped at {width_m * 1e3:.1f} mm by an obstacle"
-            if self._credit.shown_n == math.inf:
+            if self._friction.shown_n == math.inf:
                 reason += ", or by friction, which no motion has shown yet: request a release first"
             self._set_outcome(Outcome.BLOCKED, reason)
 
@@ -633,14 +633,16 @@ class GraspController:
         may_rise = self._phase != Phase.FAULT or self._opens_at_fault
         force_n, motor_force_n = self._estimate.force_n, self._motor_force_n
         closing = self._is_closing
-        friction_n = self._credit.credit_n(
+        friction_n = self._friction.allowance_n(
             self._estimate.friction_n,
             opening=self._is_opening,
             closing=closing,
             gripping=self._phase in GRIPPING,
         )
         if closing or self._phase == Phase.CONTACT:
-            limit_n = self._credit.closing_limit_n(closing=closing, approaching=self._phase == Phase.APPROACH)
+            limit_n = self._friction.max_closing_force_n(
+                closing=closing, approaching=self._phase == Phase.APPROACH
+            )
             motor_force_n = min(motor_force_n, limit_n)
         wanted = ServoCommand(
             t_ns,

@@ -9,11 +9,17 @@ from safetensors.torch import load
 from torch import Tensor
 
 from gripper_force.errors import CheckpointError, ConfigError
-from gripper_force.vision.header import Header, NetworkConfig, ProcessConfig, digest_of, read_checkpoint
-from gripper_force.vision.kernel_regression import ForceProcess
+from gripper_force.vision.gaussian_process import GaussianProcess
+from gripper_force.vision.header import (
+    GaussianProcessConfig,
+    Header,
+    NetworkConfig,
+    digest_of,
+    read_checkpoint,
+)
 from gripper_force.vision.network import ForceNetwork
 
-Member = ForceNetwork | ForceProcess
+Member = ForceNetwork | GaussianProcess
 """A member of an ensemble."""
 
 _RENAMED = {"blstm.onward.": "blstm.forward_lstm.", "blstm.backward_gates.": "blstm.backward_linear."}
@@ -70,11 +76,13 @@ def _current_name(name: str) -> str:
 
 
 def _member(
-    path: Path, index: int, config: NetworkConfig | ProcessConfig, tensors: dict[str, Tensor]
+    path: Path, index: int, config: NetworkConfig | GaussianProcessConfig, tensors: dict[str, Tensor]
 ) -> Member:
     prefix = f"{index}."
     with torch.device("meta"):  # a malformed header may claim any size; this allocates nothing
-        network = ForceProcess(config) if isinstance(config, ProcessConfig) else ForceNetwork(config)
+        network = (
+            GaussianProcess(config) if isinstance(config, GaussianProcessConfig) else ForceNetwork(config)
+        )
     dtypes = {name: tensor.dtype for name, tensor in network.state_dict().items()}
     own = {
         _current_name(name.removeprefix(prefix)): t for name, t in tensors.items() if name.startswith(prefix)

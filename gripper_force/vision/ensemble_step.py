@@ -7,8 +7,8 @@ import torch
 from torch import Tensor, nn
 
 from gripper_force.vision.checkpoint import Member
-from gripper_force.vision.header import NetworkConfig, ProcessConfig
-from gripper_force.vision.kernel_regression import ForceProcess
+from gripper_force.vision.gaussian_process import GaussianProcess
+from gripper_force.vision.header import GaussianProcessConfig, NetworkConfig
 from gripper_force.vision.network import ForceNetwork, StreamState
 
 FRAME: Final = "frame"
@@ -46,7 +46,7 @@ class EnsembleStep(nn.Module):
         next_states: list[Tensor] = []
         inputs = list(state)
         for member in self.members:
-            if isinstance(member, ForceProcess):
+            if isinstance(member, GaussianProcess):
                 output = member.step(frame)
                 forces.append(output.force_n)
                 features.append(output.features[0])
@@ -68,7 +68,7 @@ class EnsembleStep(nn.Module):
         """Returns states of zeros, in the order in which `forward` takes them."""
         states: list[Tensor] = []
         for member in self.members:
-            if isinstance(member, ForceProcess):
+            if isinstance(member, GaussianProcess):
                 continue
             assert isinstance(member, ForceNetwork)
             state = member.zero_state()
@@ -76,11 +76,11 @@ class EnsembleStep(nn.Module):
         return states
 
 
-def state_names(members: Sequence[NetworkConfig | ProcessConfig]) -> list[str]:
+def state_names(members: Sequence[NetworkConfig | GaussianProcessConfig]) -> list[str]:
     """Returns the names of an ensemble's states, in the order in which `EnsembleStep` takes them."""
     names = []
     for i, config in enumerate(members):
-        if isinstance(config, ProcessConfig):
+        if isinstance(config, GaussianProcessConfig):
             continue
         names += [f"maps_{i}"] if config.maps_kept else []
         names += [f"hidden_{i}", f"cell_{i}"]

@@ -92,8 +92,8 @@ class NetworkConfig(Section):
         return self.window - 1 + self.maps_kept
 
 
-class ProcessConfig(Section):
-    """Shape of a Gaussian process on single frames, see `kernel_regression`.
+class GaussianProcessConfig(Section):
+    """Shape of a Gaussian process on single frames, see `gaussian_process`.
 
     Attributes:
         size: Side of the input in pixels.
@@ -188,7 +188,7 @@ class Header(Section):
         trained_on: Number of ``rigs`` in the training set, and the settings of the first; None if unknown.
     """
 
-    members: tuple[NetworkConfig | ProcessConfig, ...]
+    members: tuple[NetworkConfig | GaussianProcessConfig, ...]
     preprocess: Preprocess
     residuals: tuple[Residual, ...]
     data_digest: str

@@ -62,7 +62,7 @@ from gripper_force.runtime.resolve import ResolvedConfig, resolve_vision
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
 from gripper_force.vision.checkpoint_writer import replace_header
 from gripper_force.vision.estimator import claimed_std_n
-from gripper_force.vision.header import SHIPPED, Header, Model, ProcessConfig
+from gripper_force.vision.header import SHIPPED, GaussianProcessConfig, Header, Model
 from gripper_force.vision.model_files import read_model
 from gripper_force.vision.ood import residual_share
 from gripper_force.vision.preprocess import Preprocess
@@ -448,7 +448,7 @@ def _candidates(config: Config, model: Model, logs: int) -> list[_Candidate]:
     base = config.vision.checkpoint
     named = base if base in SHIPPED else Path(base).name
     found = [_Candidate(f"{named} as it is", base, "")]
-    if not any(isinstance(member, ProcessConfig) for member in model.header.members):
+    if not any(isinstance(member, GaussianProcessConfig) for member in model.header.members):
         trained = "small" if base == "default" else base
         found.append(_Candidate(f"{Path(trained).name}, trained", trained, "touches"))
     if logs >= 2 * FOLDS:  # a process chooses its settings on logs left out, and so needs two in a fold

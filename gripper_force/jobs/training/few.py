@@ -13,8 +13,8 @@ from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import CONTACT_N, Clip
 from gripper_force.progress import Progress, no_progress
 from gripper_force.vision.batch_inference import normalise
-from gripper_force.vision.header import ProcessConfig
-from gripper_force.vision.kernel_regression import ForceProcess, matern, pooled
+from gripper_force.vision.gaussian_process import GaussianProcess, matern, pooled
+from gripper_force.vision.header import GaussianProcessConfig
 from gripper_force.vision.preprocess import Preprocess
 
 GRID: Final = 32
@@ -54,15 +54,15 @@ class Setting(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """A fitted process.
+    """A fitted Gaussian process.
 
     Attributes:
-        process: The process, fitted to all recordings.
+        model: The process, fitted to all recordings.
         setting: The settings with the smallest mean error over the folds.
         forces_n: Estimates for each recording by a process that was fitted without its fold, (T,) each.
     """
 
-    process: ForceProcess
+    model: GaussianProcess
     setting: Setting
     forces_n: list[npt.NDArray[np.float32]]
 
@@ -110,7 +110,7 @@ def fit(clips: Sequence[Clip], preprocess: Preprocess, progress: Progress = no_p
     return Fit(process, settings[best], [left_out[i][best] for i in range(len(clips))])
 
 
-def fitted(clips: Sequence[Clip], preprocess: Preprocess, setting: Setting) -> ForceProcess:
+def fitted(clips: Sequence[Clip], preprocess: Preprocess, setting: Setting) -> GaussianProcess:
     """Fits a process with given settings; arguments and errors are those of `fit`."""
     data = _Data([_images(clip, preprocess) for clip in clips], clips)
     return next(data.processes([setting], preprocess.size))
@@ -140,17 +140,17 @@ class _Data:
         features: Tensor = (images - self._centre) @ self._axes
         return features
 
-    def processes(self, settings: Sequence[Setting], size: int) -> Iterator[ForceProcess]:
+    def processes(self, settings: Sequence[Setting], size: int) -> Iterator[GaussianProcess]:
         points = self._points.double()
         linear = SLOPE / COMPONENTS * points @ points.T
         for length, noise in settings:
             covariance = matern(points, points, length) + linear
             covariance.diagonal().add_(noise)
             weights = torch.cholesky_solve(self._forces_n[:, None], torch.linalg.cholesky(covariance))[:, 0]
-            config = ProcessConfig(
+            config = GaussianProcessConfig(
                 size=size, grid=_grid(size), head=COMPONENTS, points=len(points), length=length
             )
-            process = ForceProcess(config)
+            process = GaussianProcess(config)
             process.load_state_dict(
                 {
                     "centre": self._centre,

@@ -20,10 +20,10 @@ from gripper_force.vision.header import (
     Attention,
     BackboneName,
     Count,
+    GaussianProcessConfig,
     Header,
     NetworkConfig,
     Pooling,
-    ProcessConfig,
     Quantity,
 )
 from gripper_force.vision.preprocess import Preprocess
@@ -260,7 +260,7 @@ def continued(config: TrainConfig, header: Header) -> TrainConfig:
     """
     if config.method == "process":
         raise ConfigError(FITTED_AT_ONCE)
-    if any(isinstance(member, ProcessConfig) for member in header.members):
+    if any(isinstance(member, GaussianProcessConfig) for member in header.members):
         raise ConfigError(
             "the initial checkpoint is a Gaussian process, which training can't continue; train it again on all "
             "recordings with --recipe few, or name a network"

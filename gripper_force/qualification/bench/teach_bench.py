@@ -30,7 +30,7 @@ from gripper_force.jobs.training.recipe import recipe
 from gripper_force.jobs.training.train import train
 from gripper_force.progress import Progress, no_progress
 from gripper_force.vision.batch_inference import features
-from gripper_force.vision.kernel_regression import ForceProcess
+from gripper_force.vision.gaussian_process import GaussianProcess
 from gripper_force.vision.model_files import read_model
 
 FIRST_SEED: Final = 98_000_000
@@ -354,14 +354,14 @@ def _recording_row(
     learned, test = own[:count], own[count:]
     preprocess = recipe("few").preprocess
     taught = few.fitted([*others, *learned], preprocess, fit.setting)
-    before = [_touches(fit.process, clip, i) for i, clip in enumerate(learned)]
+    before = [_touches(fit.model, clip, i) for i, clip in enumerate(learned)]
     try:
         corrected = fit_correction(
             Touches(*(np.concatenate([getattr(t, key) for t in before]) for key in Touches.__annotations__))
         ).predict
     except DataError:  # the estimates do not follow the load cell: they stay as they are
         corrected = lambda touches: touches.estimate_n  # noqa: E731
-    raw = [_touches(fit.process, clip, 0) for clip in test]
+    raw = [_touches(fit.model, clip, 0) for clip in test]
 
     def mae_n(estimates: Sequence[Floats], touches: Sequence[Touches]) -> float:
         error = np.concatenate([a - b.force_n for a, b in zip(estimates, touches, strict=True)])
@@ -378,7 +378,7 @@ def _recording_row(
     )
 
 
-def _touches(process: ForceProcess, clip: Clip, number: int) -> Touches:
+def _touches(process: GaussianProcess, clip: Clip, number: int) -> Touches:
     preprocess = recipe("few").preprocess
     forces_n, read_out = features([process], preprocess, clip.frames)
     used = clip.valid & (np.arange(len(clip.frames)) >= preprocess.lead_in)

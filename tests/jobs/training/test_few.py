@@ -21,7 +21,7 @@ from gripper_force.vision.batch_inference import predict
 from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.estimator import ForceEstimator
 from gripper_force.vision.export import export
-from gripper_force.vision.header import ProcessConfig
+from gripper_force.vision.header import GaussianProcessConfig
 from gripper_force.vision.model_files import read_model
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -88,9 +88,9 @@ def test_a_stream_equals_the_batch(process: Path, press: Callable[..., Clip]) ->
 
 def test_the_stored_process_is_the_fitted_one(six: list[Clip], process: Path) -> None:
     config = recipe("few", ["preprocess.size=16"])
-    fitted = few.fit(six, config.preprocess).process
+    fitted = few.fit(six, config.preprocess).model
     (loaded,) = load_checkpoint(process).networks
-    assert isinstance(loaded.config, ProcessConfig)
+    assert isinstance(loaded.config, GaussianProcessConfig)
     assert loaded.config == fitted.config
     for name, tensor in fitted.state_dict().items():
         assert torch.equal(loaded.state_dict()[name], tensor), name

@@ -11,14 +11,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from gripper_force.vision.header import ProcessConfig
+from gripper_force.vision.header import GaussianProcessConfig
 from gripper_force.vision.network import Output
 
 FAINT: Final = 0.04
 """Change of a pooled frame up to which it counts in proportion; a larger one counts by its logarithm."""
 
 
-class ForceProcess(nn.Module):
+class GaussianProcess(nn.Module):
     """Estimates the contact force for each frame alone.
 
     Attributes:
@@ -35,7 +35,7 @@ class ForceProcess(nn.Module):
     weights: Tensor
     slope: Tensor
 
-    def __init__(self, config: ProcessConfig) -> None:
+    def __init__(self, config: GaussianProcessConfig) -> None:
         super().__init__()
         self.config = config
         pixels, head, points = config.grid**2, config.head, config.points

@@ -1,4 +1,4 @@
-"""Friction that a command may count on, and the motor force of jaws whose friction is unknown."""
+"""Friction that the current limit allows for, and the largest motor force while the friction is unknown."""
 
 import math
 
@@ -8,23 +8,24 @@ from gripper_force.control.transmission import Transmission
 _SLOW_SHARE = 0.4
 _SLOW_S = 0.3
 _SLOWED_S = 0.05
-"""Open jaws that have not travelled yet may need their configured friction to come loose. Slower than this share of
-their speed for this time, they may press on an object; after they have moved, for the shorter time."""
+"""Open jaws that have not travelled yet may need their configured friction to break away. Jaws that are slower than
+this share of their speed for this time may press on an object; after they have moved, for the shorter time."""
 
-_LOOSE_N = 0.1
-"""Motor force beyond the configured friction of jaws that come loose in a move."""
+_BREAKAWAY_N = 0.1
+"""Motor force beyond the configured friction with which jaws may break away in a move."""
 
 _UNKNOWN_SHARE = 0.5
 """Largest motor force of jaws that may touch an object while their friction is unknown, as a share of the one that the
 force limit allows: they may be moving when they hit it."""
 
 
-class FrictionCredit:
+class FrictionAllowance:
     """Friction that the limit on the current allows for: only what a motion of this run has shown.
 
-    Friction that is smaller than believed would be force, also of an opening with a wrong closing direction. Jaws that
-    have not moved yet may touch an object, and then a standstill shows nothing. Only open ones may come loose with
-    the configured friction; others open a little first (see `Approach`).
+    If the true friction is smaller than assumed, the difference acts on an object as force; so it does in an opening
+    motion if the closing direction is configured wrongly. Jaws that have not moved yet may touch an object, so a
+    standstill shows nothing about friction. Only open jaws may break away with the configured friction; others open a
+    little first (see `Approach`).
 
     Attributes:
         shown_n: Least friction that a motion has shown; infinite before.
@@ -32,14 +33,14 @@ class FrictionCredit:
 
     def __init__(self, config: ControlConfig, transmission: Transmission) -> None:
         self._safe_n = _UNKNOWN_SHARE * config.force_limit_n / transmission.gain_bound
-        self._loose_n = transmission.friction_n + _LOOSE_N
+        self._breakaway_n = transmission.friction_n + _BREAKAWAY_N
         self.shown_n = math.inf
-        self._is_of_grasp = self._starts_open = self._is_loose = False
+        self._was_shown_in_grasp = self._starts_open = self._has_moved = False
         self._slow_s = 0.0
 
     def start_grasp(self) -> None:
         """Starts a grasp: what was shown before does not count in its grip."""
-        self._is_of_grasp = False
+        self._was_shown_in_grasp = False
 
     def start_phase(self, *, from_open: bool) -> None:
         """Starts a phase; ``from_open`` is True if its jaws are open and grip nothing."""
@@ -49,7 +50,7 @@ class FrictionCredit:
         """Lets stuck jaws try again: a person may have removed what held them."""
         self._slow_s = 0.0
 
-    def run(self, dt_s: float, closing_m_s: float, speed_m_s: float, *, closing: bool) -> None:
+    def update(self, dt_s: float, closing_m_s: float, speed_m_s: float, *, closing: bool) -> None:
         """Counts the time of slow closing, across phases: the jaws may press on an object already.
 
         Args:
@@ -59,36 +60,36 @@ class FrictionCredit:
             closing: True if the jaws are to close, and grip nothing yet.
         """
         if not closing:
-            self._is_loose = False
+            self._has_moved = False
             return
         is_slow = closing_m_s < _SLOW_SHARE * speed_m_s
         self._slow_s = self._slow_s + dt_s if is_slow else 0.0
-        self._is_loose |= not is_slow
+        self._has_moved |= not is_slow
 
-    def take(self, friction_n: float | None, *, only_lower: bool) -> None:
+    def learn(self, friction_n: float | None, *, only_lower: bool) -> None:
         """Takes over what a motion shows, None for nothing.
 
         With ``only_lower`` it does not show that friction has risen: jaws that close may press on a soft object.
         """
         if friction_n is not None:
-            self._is_of_grasp = True
+            self._was_shown_in_grasp = True
             self.shown_n = min(friction_n, self.shown_n) if only_lower else friction_n
 
-    def credit_n(self, friction_n: float, *, opening: bool, closing: bool, gripping: bool) -> float:
-        """Returns the friction that may be counted on, of ``friction_n`` that is believed."""
+    def allowance_n(self, friction_n: float, *, opening: bool, closing: bool, gripping: bool) -> float:
+        """Returns the part of the assumed ``friction_n`` that the current limit may allow for."""
         # In a grip, a sudden motion adds to the static force.
-        if self.shown_n < math.inf and (self._is_of_grasp or not gripping):
+        if self.shown_n < math.inf and (self._was_shown_in_grasp or not gripping):
             return min(friction_n, self.shown_n)
-        return friction_n if opening or (closing and self._may_be_tight) else 0.0
+        return friction_n if opening or (closing and self._may_be_stuck) else 0.0
 
-    def closing_limit_n(self, *, closing: bool, approaching: bool) -> float:
+    def max_closing_force_n(self, *, closing: bool, approaching: bool) -> float:
         """Returns the largest motor force of jaws that are to close; the speed loop of an approach raises it slowly."""
-        is_tight = closing and self._may_be_tight
-        if self.shown_n < math.inf or (self._starts_open and (approaching or not is_tight)):
+        may_be_stuck = closing and self._may_be_stuck
+        if self.shown_n < math.inf or (self._starts_open and (approaching or not may_be_stuck)):
             return math.inf
-        return max(self._safe_n, self._loose_n) if is_tight else self._safe_n
+        return max(self._safe_n, self._breakaway_n) if may_be_stuck else self._safe_n
 
     @property
-    def _may_be_tight(self) -> bool:
+    def _may_be_stuck(self) -> bool:
         """True if friction may be all that holds closing jaws."""
-        return self._starts_open and self._slow_s <= (_SLOWED_S if self._is_loose else _SLOW_S)
+        return self._starts_open and self._slow_s <= (_SLOWED_S if self._has_moved else _SLOW_S)
