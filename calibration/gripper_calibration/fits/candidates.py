@@ -90,5 +90,8 @@ def _candidates() -> list[Candidate]:
 CANDIDATES: Final = _candidates()
 """All candidates, from the simplest."""
 
+AS_IT_IS: Final = CANDIDATES[0]
+"""No correction."""
+
 LINE: Final = next(c for c in CANDIDATES if c.curve == "affine" and c.penalty is None)
 """The correction with too few touches for a choice."""

@@ -18,7 +18,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gripper_calibration.fits.candidates import CANDIDATES, LINE, Candidate, fit_candidates
+from gripper_calibration.fits.candidates import AS_IT_IS, CANDIDATES, LINE, Candidate, fit_candidates
 from gripper_calibration.fits.interval_fit import MIN_TOUCHES, touch_interval
 from gripper_calibration.fits.touches import Floats, Touches
 from gripper_force.jobs.dataset import CONTACT_N
@@ -67,6 +67,8 @@ class CrossValidation:
 def cross_validate(touches: Touches, coverage: float) -> CrossValidation:
     """Selects a correction, and estimates its error and the coverage of its interval.
 
+    If the corrections of touches left out are worse than none, the network stays as it is.
+
     Args:
         touches: At least `MIN_TOUCHES` touches.
         coverage: Coverage of the interval.
@@ -85,10 +87,17 @@ def cross_validate(touches: Touches, coverage: float) -> CrossValidation:
 
     measured = [Measured(part.force_n, part.touch) for part in parts]
     error_n = np.concatenate([touch_errors_n(estimates_n[i, i], measured[i]) for i in range(count)])
+    selected = CANDIDATES[select_simplest(error_n)] if nested else LINE
     by_touch_n, within = [estimates_n[k, k][CANDIDATES.index(LINE)] for k in range(count)], None
     if nested:
         by_touch_n, inside = estimate_left_out(estimates_n, measured, coverage)
         within = np.empty(len(touches.touch), bool)
+    as_it_is_n = [estimates_n[k, k][CANDIDATES.index(AS_IT_IS)] for k in range(count)]
+    if _sum_n(by_touch_n, measured) > _sum_n(as_it_is_n, measured):
+        selected, by_touch_n = AS_IT_IS, as_it_is_n
+        if nested:
+            alone_n = {key: one[:1] for key, one in estimates_n.items()}
+            by_touch_n, inside = estimate_left_out(alone_n, measured, coverage)
     result_n = np.empty(len(touches.touch))
     for k, number in enumerate(numbers):
         own = touches.touch == number
@@ -96,7 +105,7 @@ def cross_validate(touches: Touches, coverage: float) -> CrossValidation:
         if within is not None:
             within[own] = inside[k]
     return CrossValidation(
-        selected=CANDIDATES[select_simplest(error_n)] if nested else LINE,
+        selected=selected,
         errors_n={c.name: float(e) for c, e in zip(CANDIDATES, error_n.mean(0), strict=True)},
         estimates_n=result_n,
         within=within,
@@ -113,6 +122,13 @@ class Measured(NamedTuple):
 
     force_n: Floats
     touch: npt.NDArray[np.int64]
+
+
+def _sum_n(estimates_n: Sequence[Floats], parts: Sequence[Measured]) -> float:
+    """Returns the sum of the absolute errors."""
+    return sum(
+        float(np.abs(one - part.force_n).sum()) for one, part in zip(estimates_n, parts, strict=True)
+    )
 
 
 def estimate_left_out(

@@ -161,3 +161,16 @@ def test_any_fit_is_refused_or_finite_and_monotone(
         as_it_is_n = fitted.errors_n["the network as it is"]
         # Touches that differ mislead it: by up to twice the scatter in 400 draws.
         assert fitted.after_n <= as_it_is_n + 3 * noise_n + 3 * max(1.0, gain) * scatter + 0.1
+
+
+@pytest.mark.parametrize("count", [3, 6])
+def test_touches_that_contradict_each_other_leave_the_network_as_it_is(
+    touched: Callable[..., Touches], count: int
+) -> None:
+    left = 0
+    for seed in range(12):
+        fit = fit_correction(touched(count, scatter=0.5, seed=seed))
+        assert fit.after_n is not None
+        assert fit.after_n <= fit.before_n + 1e-9
+        left += fit.candidate == "the network as it is"
+    assert left > 0
