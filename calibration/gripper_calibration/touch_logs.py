@@ -13,7 +13,7 @@ from gripper_calibration.fits.touches import Floats, Touches
 from gripper_force.config import Config, config_from_text
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import DataError
-from gripper_force.jobs.dataset import CONTACT_N, read_clip
+from gripper_force.jobs.dataset import CONTACT_N, read_clip, starts_in_contact
 from gripper_force.jobs.metrics import lag_s
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.schema import Tree
@@ -37,6 +37,7 @@ class TouchRecording:
         width_m: Distance between the jaws in each press, (N,) each.
         delay_s: Delay from the contact force to a usable estimate, without the network's computing time.
         source: Origin of the labels: the object, the load cell and its scale.
+        starts_in_contact: True if a log begins in contact, so that its first frames are no reference.
     """
 
     touches: Touches
@@ -45,6 +46,7 @@ class TouchRecording:
     width_m: list[Floats]
     delay_s: float
     source: dict[str, str | float | None]
+    starts_in_contact: bool
 
     @property
     def has_contact(self) -> bool:
@@ -87,6 +89,7 @@ def join(recordings: dict[Path, TouchRecording]) -> TouchRecording:
         ),
         camera=first.camera,
         source=first.source,
+        starts_in_contact=any(part.starts_in_contact for part in parts),
         presses=[press for part in parts for press in part.presses],
         width_m=[width for part in parts for width in part.width_m],
         delay_s=float(np.median([part.delay_s for part in parts])),
@@ -129,6 +132,7 @@ def read_log(path: Path, checkpoint: Checkpoint) -> TouchRecording:
         delay_s=transport_ns / NS_PER_S
         + 0.5 / config.camera.rate_hz
         + (estimate_lag_s if estimate_lag_s > 0 else 0.0),
+        starts_in_contact=starts_in_contact(clip.forces_n, preprocess),
     )
 
 

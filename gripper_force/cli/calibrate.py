@@ -28,7 +28,9 @@ if TYPE_CHECKING:
 
     from gripper_calibration.procedures.calibrate_camera import CameraResult
     from gripper_calibration.procedures.calibrate_load_cell import LoadCellResult
+    from gripper_calibration.procedures.calibrate_object import ObjectCalibration
     from gripper_calibration.procedures.calibrate_servo import ServoResult
+    from gripper_calibration.procedures.teach import Taught
     from gripper_force.config import Config
     from gripper_force.progress import Progress
 
@@ -281,6 +283,7 @@ def object_(
         _tell_other_objects(name, logs)
     with console.bar("calibrating", len(logs) + 2) as progress:
         result = job.calibrate_object(settings, name, logs=logs, out=out, progress=progress)
+    _tell_left_out(result)
     if result.mae_after_n is None:
         console.err.print(
             f"a test of the correction on touches outside its fit needs at least {MIN_TOUCHES} touches; "
@@ -435,6 +438,7 @@ def teach(
     except KeyboardInterrupt:
         console.err.print("what was done until now is kept; the same command continues", soft_wrap=True)
         raise
+    _tell_left_out(result)
     shown = console.jsonable(result) | {"minutes": (time.monotonic() - begin_s) / 60}
     console.show(shown, as_json, lambda _: taught_table(result, shown["minutes"]))
     if result.more_touches_help:
@@ -469,6 +473,15 @@ def _tell_existing(settings: "Config", touches: int, folder: Path, fresh: bool) 
             soft_wrap=True,
             markup=False,
         )
+
+
+def _tell_left_out(result: "ObjectCalibration | Taught") -> None:
+    for why, paths in (
+        ("without contact", result.without_contact),
+        ("starting in contact", result.contact_starts),
+    ):
+        if paths:
+            console.warn(f"left out {len(paths)} logs {why}: {', '.join(path.name for path in paths)}")
 
 
 def _tell_other_objects(name: str, logs: Sequence[Path]) -> None:

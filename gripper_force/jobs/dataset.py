@@ -144,14 +144,14 @@ def load_clips(
     return clips
 
 
-def starts_in_contact(forces_n: npt.NDArray[np.floating], reference_frames: int) -> bool:
+def starts_in_contact(forces_n: npt.NDArray[np.floating], preprocess: "Preprocess") -> bool:
     """Returns True if one of a recording's reference frames shows contact, so that they are no reference.
 
     Args:
         forces_n: Load-cell force at each frame, (T,); 0 without a label.
-        reference_frames: Number of reference frames.
+        preprocess: Preparation of frames; it may use no reference.
     """
-    return bool((forces_n[:reference_frames] > CONTACT_N).any())
+    return preprocess.reference and bool((forces_n[: preprocess.reference_frames] > CONTACT_N).any())
 
 
 def without_contact_starts(clips: Sequence[Clip], preprocess: "Preprocess") -> list[Clip]:
@@ -160,9 +160,7 @@ def without_contact_starts(clips: Sequence[Clip], preprocess: "Preprocess") -> l
     Raises:
         DataError: No clip is left.
     """
-    if not preprocess.reference:
-        return list(clips)
-    kept = [clip for clip in clips if not starts_in_contact(clip.forces_n, preprocess.reference_frames)]
+    kept = [clip for clip in clips if not starts_in_contact(clip.forces_n, preprocess)]
     if clips and not kept:
         raise DataError(
             f"all {len(clips)} recordings start in contact (more than {CONTACT_N} N), so their first frames are no "

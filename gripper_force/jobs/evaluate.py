@@ -258,8 +258,7 @@ def _evaluate_log(
         for network in networks:
             network.cpu()  # they are kept for the next log, and for a replay
     clip = streamed.clip(streamed.no_images)
-    in_contact = preprocess.reference and starts_in_contact(clip.forces_n, preprocess.reference_frames)
-    if in_contact and not include_contact_starts:
+    if starts_in_contact(clip.forces_n, preprocess) and not include_contact_starts:
         return _Evaluated(clip, None)
     return _Evaluated(clip, (1.0 if gain is None else gain.gain) * np.concatenate(parts))
 

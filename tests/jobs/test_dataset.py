@@ -171,9 +171,11 @@ def test_digest_changes_with_every_part() -> None:
 def test_start_in_contact_is_judged_at_the_reference_frames(frame: int, in_contact: bool) -> None:
     forces_n = np.zeros(9, np.float32)
     forces_n[frame] = 1.01 * CONTACT_N
-    assert starts_in_contact(forces_n, 4) == in_contact
+    four = Preprocess(reference_frames=4)
+    assert starts_in_contact(forces_n, four) == in_contact
+    assert not starts_in_contact(forces_n, Preprocess(reference=False))
     forces_n[frame] = 0.99 * CONTACT_N
-    assert not starts_in_contact(forces_n, 4)
+    assert not starts_in_contact(forces_n, four)
 
 
 def test_clips_that_start_in_contact_are_left_out() -> None:

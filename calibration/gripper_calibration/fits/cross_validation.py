@@ -126,9 +126,7 @@ class Measured(NamedTuple):
 
 def _sum_n(estimates_n: Sequence[Floats], parts: Sequence[Measured]) -> float:
     """Returns the sum of the absolute errors."""
-    return sum(
-        float(np.abs(one - part.force_n).sum()) for one, part in zip(estimates_n, parts, strict=True)
-    )
+    return sum(float(np.abs(one - part.force_n).sum()) for one, part in zip(estimates_n, parts, strict=True))
 
 
 def estimate_left_out(

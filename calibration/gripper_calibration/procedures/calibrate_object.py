@@ -56,6 +56,7 @@ class ObjectCalibration:
         stiffness_std_n_m: Standard deviation of the stiffness over the touches; None with fewer than two.
         touches_needed: Learning curve: mean results of fits on fewer touches, tested on the other touches.
         without_contact: Logs that were not used because they show no contact.
+        contact_starts: Logs that were not used because they start in contact.
     """
 
     profile: ObjectProfile
@@ -68,6 +69,7 @@ class ObjectCalibration:
     stiffness_std_n_m: float | None
     touches_needed: tuple[LearningCurvePoint, ...]
     without_contact: tuple[Path, ...]
+    contact_starts: tuple[Path, ...]
 
     @property
     def mae_before_n(self) -> float:
@@ -95,6 +97,7 @@ class ObjectCalibration:
             "stiffness_std_n_m": self.stiffness_std_n_m,
             "touches_needed": [point._asdict() for point in self.touches_needed],
             "without_contact": list(self.without_contact),
+            "contact_starts": list(self.contact_starts),
             "profile": self.profile_path,
             "report": self.report_path,
         }
@@ -272,8 +275,14 @@ def _fit_and_write(
     for path in sorted(paths, key=started_ns):  # the order shows after which touch the object stayed narrower
         recordings[path] = read_log(path, checkpoint)
         progress(path.name)
-    with_contact = {path: recording for path, recording in recordings.items() if recording.has_contact}
-    recorded = join(with_contact or recordings)  # without any contact, the fit reports the largest force
+    with_reference = {path: one for path, one in recordings.items() if not one.starts_in_contact}
+    if not with_reference:
+        raise DataError(
+            f"all {len(recordings)} logs start in contact, so their first frames are no reference; touch the object "
+            "from open jaws"
+        )
+    with_contact = {path: one for path, one in with_reference.items() if one.has_contact}
+    recorded = join(with_contact or with_reference)  # without any contact, the fit reports the largest force
     touches = recorded.touches
     fit = fit_correction(touches, COVERAGE, checkpoint.header.ood)
     progress("fitted the correction")
@@ -294,7 +303,8 @@ def _fit_and_write(
         crushed_at_n=crushed_at_n,
         stiffness_std_n_m=float(stiffness.std(ddof=1)) if len(stiffness) > 1 else None,
         touches_needed=_mean_curve(curve),
-        without_contact=tuple(path for path in recordings if path not in with_contact),
+        without_contact=tuple(path for path in with_reference if path not in with_contact),
+        contact_starts=tuple(path for path in recordings if path not in with_reference),
     )
 
 

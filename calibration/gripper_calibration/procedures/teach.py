@@ -48,7 +48,7 @@ from gripper_calibration.touch_logs import TouchRecording, join, read_log, start
 from gripper_force import __version__
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DataError
-from gripper_force.jobs.dataset import CONTACT_N, Clip, find_logs, load_clips
+from gripper_force.jobs.dataset import CONTACT_N, Clip, find_logs, load_clips, starts_in_contact
 from gripper_force.jobs.processes import process_pool
 from gripper_force.jobs.profile_files import check_place, pack, write_all, write_object
 from gripper_force.jobs.training.ood_fit import model_of_scores
@@ -103,6 +103,7 @@ class Taught:
         coverages: Share of the frames of each touch within an interval that the other folds gave: in contact, and by
             force level.
         without_contact: Logs that were not used because they show no contact.
+        contact_starts: Logs that were not used because they start in contact.
     """
 
     bundle: Path
@@ -116,6 +117,7 @@ class Taught:
     more_touches_help: bool
     coverages: tuple[Coverage, ...]
     without_contact: tuple[Path, ...]
+    contact_starts: tuple[Path, ...]
 
     @property
     def figure(self) -> Path:
@@ -186,15 +188,17 @@ def teach(
             progress(f"touch {len(paths)} of {touches}")
     else:
         paths = find_logs(logs)
-    used = [path for path in paths if _has_contact(path, model)]
-    without_contact = tuple(path for path in paths if path not in used)
+    used, without_contact, contact_starts = _sorted_by_contact(paths, model)
     # The same touch in two folds would be both learned and left out.
     logs_by_digest = {_digest_of(path): path for path in used}
     # A touch that is replayed would be learned where it is left out.
     replayed = {} if not replay else {_digest_of(path): path for path in find_logs(replay)}
     others = {digest: path for digest, path in replayed.items() if digest not in logs_by_digest}
+    in_contact = _sorted_by_contact(list(others.values()), model)[2]
+    others = {digest: path for digest, path in others.items() if path not in in_contact}
     work = _Work(logs_by_digest, others, place / "teach", workers)
-    return work.run(config, model, name, out, without_contact, progress)
+    taught = work.run(config, model, name, out, progress)
+    return replace(taught, without_contact=without_contact, contact_starts=(*contact_starts, *in_contact))
 
 
 def check(config: Config, out: Path) -> tuple[Config, Model]:
@@ -280,7 +284,6 @@ class _Work:
         model: Model,
         name: str,
         out: Path,
-        without_contact: tuple[Path, ...],
         progress: Progress,
     ) -> Taught:
         candidates = _candidates(config, model, len(self._logs))
@@ -331,7 +334,8 @@ class _Work:
             fewer_mae_n=float(found.fewer_n[found.best]),
             more_touches_help=bool(found.error_n[found.best] < _HELPS * found.fewer_n[found.best]),
             coverages=coverages(found.measured, found.within),
-            without_contact=without_contact,
+            without_contact=(),
+            contact_starts=(),
         )
         header = _stated(learned.header, chosen, known, found.left)
         _write_bundle(taught, checkpoint, header, fit.arrays, found)
@@ -529,9 +533,20 @@ def _clips(logs: Sequence[Path], size: int, chosen: Sequence[int]) -> list[Clip]
     return [replace(clip, set=f"{i} {clip.name}") for i, clip in enumerate(clips)]
 
 
-def _has_contact(path: Path, model: Model) -> bool:
-    (clip,) = load_clips([path], model.header.preprocess)
-    return bool((clip.forces_n > CONTACT_N).any())
+def _sorted_by_contact(
+    paths: Sequence[Path], model: Model
+) -> tuple[list[Path], tuple[Path, ...], tuple[Path, ...]]:
+    """Returns the logs that can be used, those without contact, and those that start in contact."""
+    used, without_contact, contact_starts = [], [], []
+    for path in paths:
+        (clip,) = load_clips([path], model.header.preprocess)
+        if starts_in_contact(clip.forces_n, model.header.preprocess):
+            contact_starts.append(path)
+        elif (clip.forces_n > CONTACT_N).any():
+            used.append(path)
+        else:
+            without_contact.append(path)
+    return used, tuple(without_contact), tuple(contact_starts)
 
 
 def _digest_of(path: Path) -> str:

@@ -307,7 +307,7 @@ def write_recording(
     spikes = sum(not sample.valid for sample in samples)
     records: list[Frame | LoadCellSample] = [*frames, *samples]
     forces_n, _ = label_frames(np.array([frame.t_ns for frame in frames], np.int64), samples, 0)
-    in_contact = starts_in_contact(forces_n, Preprocess().reference_frames)
+    in_contact = starts_in_contact(forces_n, Preprocess())
     metadata = {**metadata, "spikes_rejected": str(spikes), "starts_in_contact": str(in_contact).lower()}
     with LogWriter(unfinished, config=dump_config(config), metadata=metadata) as log:
         if table is not None:

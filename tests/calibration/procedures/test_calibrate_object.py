@@ -25,6 +25,7 @@ from gripper_force.jobs.replay import replay
 from gripper_force.profiles.object_profile import read_object, weights_path
 from gripper_force.runtime import process
 from gripper_force.runtime.log_reader import LogReader
+from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.runtime.resolve import resolve
 from gripper_force.types import NS_PER_S, Event, Frame, GraspStatus, LoadCellSample, Phase, ServoState
 from gripper_force.vision.batch_inference import features
@@ -287,6 +288,24 @@ def test_command_calibrates_from_logs(touched: list[Path], tmp_path: Path) -> No
     assert found["touches"] == 3
     assert found["profile"] == str(out)
     assert [row["touches"] for row in found["touches_needed"]] == [1, 2]
+
+
+def test_logs_that_start_in_contact_are_left_out_with_a_warning(touched: list[Path], tmp_path: Path) -> None:
+    cut = tmp_path / "cut.mcap"
+    reader = LogReader(touched[0])
+    pressed_ns = next(sample.t_ns for sample in reader.records(LoadCellSample) if sample.force_n > 1)
+    with LogWriter(cut, config=reader.config, metadata=reader.metadata) as log:
+        for record in reader.records():
+            if record.t_ns >= pressed_ns:
+                log.write(record)
+    given = ["calibrate", "object", "stapler", "--out", str(tmp_path / "it.yaml"), "--json", "--from"]
+    result = CliRunner().invoke(app, [*given, str(cut), "--from", str(touched[0].parent)])
+    assert result.exit_code == 0, result.stderr
+    assert "left out 1 logs starting in contact: cut.mcap" in result.stderr
+    assert json.loads(result.stdout)["contact_starts"] == [str(cut)]
+    assert json.loads(result.stdout)["touches"] == 3
+    with pytest.raises(DataError, match="all 1 logs start in contact"):
+        calibrate_object(load_config(None, QUICK), "stapler", logs=[cut], out=tmp_path / "it.yaml")
 
 
 def test_range_ends_below_the_crushing_touch(

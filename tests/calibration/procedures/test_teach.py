@@ -348,8 +348,18 @@ def test_logs_without_contact_and_too_few_logs(
 ) -> None:
     clip = press(9)
     free = write_log(replace(clip, name="free", forces_n=0 * clip.forces_n), tmp_path / "free")
-    found = teach(config, "disc", logs=[*logs[:4], free], folder=tmp_path / "work", out=tmp_path / "b")
+    replayed = write_log(replace(clip, name="replayed", forces_n=clip.forces_n + 2), tmp_path / "replayed")
+    pressed = write_log(replace(clip, name="pressed", forces_n=clip.forces_n + 1), tmp_path / "pressed")
+    found = teach(
+        config,
+        "disc",
+        logs=[*logs[:4], free, pressed],
+        replay=[replayed],
+        folder=tmp_path / "work",
+        out=tmp_path / "b",
+    )
     assert found.without_contact == (free,)
+    assert found.contact_starts == (pressed, replayed)
     with pytest.raises(
         DataError, match=f"there are 3 different logs of touches with contact, but .* needs {MIN_LOGS}"
     ):
