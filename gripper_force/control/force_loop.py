@@ -12,6 +12,9 @@ from gripper_force.types import EstimateSource, FusedForce
 _RAMP_S = 0.4
 """Acceleration time of the ramp: longer than a quarter oscillation period of the softest object."""
 
+_MOST_RAMP_PER_S = 10.0
+"""Fastest ramp as a share of the force limit per second. Jaws that a faster one accelerates exceed the limit."""
+
 _LOWERING_S = 0.15
 _RETURN_S = 0.05
 """Lowering: the fall takes twice the first, half of it at full rate. After it the motor force returns to the
@@ -91,7 +94,8 @@ class ForceLoop:
         self._vision_alone = config.feedback == "vision"
         self._gains = self.margins["vision" if self._vision_alone else "hold"].gains
         self._transmission = transmission
-        self._ramp_n_s, self._largest_m_s = config.ramp_n_s, config.approach_speed_m_s
+        self._ramp_n_s = min(config.ramp_n_s, _MOST_RAMP_PER_S * config.force_limit_n)
+        self._largest_m_s = config.approach_speed_m_s
         self._profile = TrapezoidalProfile(_RAMP_S)
         self._trim_n = 0.0
         self._rising, self._side, self.is_lowering = True, 1.0, False
@@ -109,18 +113,25 @@ class ForceLoop:
         self._start(force_n, target_n)
 
     def retarget(self, target_n: float) -> None:
-        """Starts a ramp at the present reference and keeps the trim."""
+        """Starts a ramp at the present reference and keeps the trim.
+
+        A ramp in the same direction keeps its speed: targets that follow each other fast would never leave rest.
+        """
         self._lowers_again = target_n < self.reference_n
         self._repeat_s = _REPEAT_WITHIN_S if self._lowers_again else 0.0
-        self._highest_n, self._waited_s = self.reference_n, 0.0
-        self._start(self.reference_n, target_n)
+        goes_on = self.is_lowering == self._lowers_again
+        if not (goes_on and self.is_lowering):
+            self._highest_n, self._waited_s = self.reference_n, 0.0
+        self._start(self.reference_n, target_n, speed_n_s=self._profile.speed if goes_on else 0.0)
 
-    def _start(self, force_n: float, target_n: float, fall_s: float = _LOWERING_S) -> None:
+    def _start(
+        self, force_n: float, target_n: float, fall_s: float = _LOWERING_S, speed_n_s: float = 0.0
+    ) -> None:
         self._rising, self.is_lowering = True, target_n < force_n
         self._side = -1.0 if self.is_lowering else 1.0
         self._profile = TrapezoidalProfile(fall_s if self.is_lowering else _RAMP_S)
         rate_n_s = (force_n - target_n) / fall_s if self.is_lowering else self._ramp_n_s
-        self._profile.start(force_n, rate_n_s)
+        self._profile.start(force_n, rate_n_s, speed_n_s)
 
     def step(
         self,

@@ -59,6 +59,13 @@ class SpeedLimit:
         bounded_rad = min(max(distance_rad, -lead_rad), lead_rad)
         return replace(command, goal_position_rad=servo.position_rad + bounded_rad)
 
+    def rest_error_m(self, current_a: float, position_rad: float) -> float:
+        """Returns the distance from a goal width at which the servo's position loop may stop short of this current."""
+        if self._loop is None:
+            return 0.0
+        error_rad = _SPARE * abs(current_a) / self._loop.a_per_rad
+        return 2 * error_rad * self._transmission.jaw_m_per_rad(position_rad)
+
     def _lead_rad(self, goal_current_a: float, position_rad: float, speed_m_s: float) -> float:
         rad_per_m = 1 / self._transmission.jaw_m_per_rad(position_rad)
         if self._loop is None:

@@ -13,7 +13,6 @@ from gripper_force.control.limits import Limits, largest_target_n
 from gripper_force.control.safety import Safety, is_sound
 from gripper_force.control.slip import SlipMonitor
 from gripper_force.control.speed_limit import PositionLoop, SpeedLimit
-from gripper_force.control.trajectory import ACCELERATION_S
 from gripper_force.control.transmission import GOAL_OFFSET_M, Transmission
 from gripper_force.control.travel import Travel
 from gripper_force.control.visual_check import VisualCheck
@@ -58,14 +57,17 @@ _OPENING_SPARE_S = 4.0
 """Time for an opening beyond that of its distance: larger friction makes the jaws late."""
 
 _AT_WIDTH_M = 0.0005
-"""Distance from the requested width at which a move has arrived: six times what Coulomb friction and the
-servo's proportional gain leave (80 um)."""
+"""Distance from the requested width at which a move has arrived, unless the servo's proportional gain leaves more."""
 
 _LEAST_SPEED_M_S = 1e-4
 """Speed of one jaw, for a target of 0.01 N, below which a grasp does not get more time."""
 
-_MOVE_SPARE_S = 1.0
-"""Time a move may take beyond its speed profile before an obstacle is reported."""
+_BLOCKED_S = 1.0
+_NEARER_M = 0.002
+"""Time in which a move must come nearer to its width by this distance, or it is blocked."""
+
+_SAME_SHARE = 0.25
+"""Change of the target as a share of its tolerance that is none: the noise of a stream of requests."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +154,7 @@ class GraspController:
         self._servo: ServoState | None = None
         self._target_n = self._held_width_m = self._settling_width_m = 0.0
         self._move_width_m = transmission.open_width_m
-        self._move_time_s = 0.0
+        self._move_left_m = self._stopped_s = 0.0
         self._move_opens = False
         self._released_s = math.inf
         self._grasp_ns = 0
@@ -307,6 +309,9 @@ class GraspController:
         self._outcome, self._reason = outcome, reason
 
     def _start_grasp(self, t_ns: int, target_n: float, *, new_object: bool) -> None:
+        is_same = abs(target_n - self._target_n) <= _SAME_SHARE * tolerance_n(target_n) and not new_object
+        if is_same and self._is_grasping and self._outcome in (Outcome.NONE, Outcome.HELD):
+            return
         self._grasp_ns, self._target_n, self._outcome = t_ns, target_n, Outcome.NONE
         if self._phase == Phase.CONTACT:
             return
@@ -333,12 +338,17 @@ class GraspController:
         self._enter(Phase.RELEASE, reason)
 
     def _start_move(self, width_m: float) -> None:
-        distance_m = width_m - self._present_width_m
-        self._start_travel(opens=distance_m > 0)
-        self._outcome = Outcome.NONE
-        self._move_width_m, self._move_opens = width_m, distance_m > 0
-        self._move_time_s = abs(distance_m) / self._travel.speed_m_s + ACCELERATION_S + _MOVE_SPARE_S
-        self._enter(Phase.MOVE, f"move to {1e3 * width_m:.1f} mm requested")
+        opens = width_m > self._present_width_m
+        is_moving = self._phase == Phase.MOVE and self._outcome in (Outcome.NONE, Outcome.MOVED)
+        if is_moving and abs(width_m - self._move_width_m) <= _SAME_SHARE * _AT_WIDTH_M:
+            return
+        self._reason = f"move to {1e3 * width_m:.1f} mm requested"
+        if not (is_moving and opens == self._move_opens):  # a move in the same direction keeps its speed
+            self._start_travel(opens=opens)
+            self._move_opens = opens
+            self._enter(Phase.MOVE, self._reason)
+        self._outcome, self._move_width_m = Outcome.NONE, width_m
+        self._move_left_m, self._stopped_s = math.inf, 0.0
 
     def _start_travel(self, *, opens: bool) -> None:
         if self._phase in GRIPPING:
@@ -384,6 +394,10 @@ class GraspController:
     @property
     def _is_closing(self) -> bool:
         return self._phase in (Phase.APPROACH, Phase.MOVE) and not self._is_opening
+
+    @property
+    def _is_grasping(self) -> bool:
+        return self._phase in (Phase.APPROACH, *GRIPPING)
 
     @property
     def _speed_m_s(self) -> float:
@@ -448,7 +462,7 @@ class GraspController:
                 self._run_release(dt_s, width_m, closing_m_s)
         if self._phase in GRIPPING:
             self._goal_width_m = width_m - 2 * GOAL_OFFSET_M
-        if self._phase in (Phase.APPROACH, *GRIPPING) and self._outcome == Outcome.NONE:
+        if self._is_grasping and self._outcome == Outcome.NONE:
             self._check_timeout(t_ns)
         self._note_friction(closing_m_s)
 
@@ -538,7 +552,10 @@ class GraspController:
         self._settled_s = self._settled_s + dt_s if is_settled else 0.0
         if self._outcome == Outcome.NONE and self._settled_s >= self._config.settle_s:
             self._held_width_m = width_m
-            self._set_outcome(Outcome.HELD, f"{self._estimate.force_n:.2f} N for {self._settled_s:.2f} s")
+            reason = f"{self._estimate.force_n:.2f} N for {self._settled_s:.2f} s"
+            if self._derating < 1:
+                reason += f", reduced from {self._target_n:g} N because the servo is hot"
+            self._set_outcome(Outcome.HELD, reason)
         lost = self._slip.is_lost(dt_s, width_m, closing_m_s, shortfall_n, self._loop.reference_n)
         if not lost and self._outcome == Outcome.HELD:
             lost = self._slip.has_receded(width_m, self._held_width_m, closing_m_s, self._motor_force_n)
@@ -591,13 +608,18 @@ class GraspController:
         self._motor_force_n, self._goal_width_m = self._travel.motor_force_n, self._travel.goal_width_m
         if self._outcome != Outcome.NONE:
             return
-        is_there = abs(width_m - self._move_width_m) <= _AT_WIDTH_M
-        if is_there and self._goal_width_m == self._move_width_m:
+        left_m = abs(width_m - self._move_width_m)
+        friction_a = self._transmission.current_a(self._transmission.friction_n, self._present_rad)
+        rest_m = max(_AT_WIDTH_M, self._speed_limit.rest_error_m(friction_a, self._present_rad))
+        if left_m < self._move_left_m - _NEARER_M:
+            self._move_left_m, self._stopped_s = left_m, 0.0
+        self._stopped_s += dt_s
+        if left_m <= rest_m and self._goal_width_m == self._move_width_m:
             self._set_outcome(Outcome.MOVED, f"moved to {self._move_width_m * 1e3:.1f} mm")
-        elif self._phase_s >= self._move_time_s:
-            reason = f"stopped at {width_m * 1e3:.1f} mm by an obstacle"
-            if self._friction.shown_n == math.inf:
-                reason += ", or by friction, which no motion has shown yet: request a release first"
+        elif self._stopped_s >= _BLOCKED_S:
+            reason = f"stopped at {width_m * 1e3:.1f} mm by an obstacle, or by friction: "
+            is_unknown = self._friction.shown_n == math.inf
+            reason += "request a release first, which shows it" if is_unknown else "check gripper.friction_n"
             self._set_outcome(Outcome.BLOCKED, reason)
 
     def timeout_s(self, target_n: float) -> float:

@@ -14,6 +14,7 @@ class TrapezoidalProfile:
 
     Attributes:
         value: Present value.
+        speed: Present speed per second.
     """
 
     def __init__(self, ramp_s: float) -> None:
@@ -21,19 +22,17 @@ class TrapezoidalProfile:
         self._ramp_s = ramp_s
         self.start(0.0, 1.0)
 
-    def start(self, value: float, rate: float) -> None:
-        """Starts at rest at ``value``; ``rate`` is the full speed per second."""
-        self.value = value
-        self._rate = rate
-        self._speed = 0.0
+    def start(self, value: float, rate: float, speed: float = 0.0) -> None:
+        """Starts at ``value`` with a speed; ``rate`` is the full speed per second."""
+        self.value, self.speed, self._rate = value, speed, rate
 
     def step(self, target: float, dt_s: float) -> float:
         """Moves towards ``target`` for ``dt_s`` and returns the new value."""
         remaining = abs(target - self.value)
         acceleration = self._rate / self._ramp_s
         braking = math.sqrt(2 * acceleration * remaining)
-        self._speed = min(self._speed + acceleration * dt_s, self._rate, braking)
-        stride = self._speed * dt_s
+        self.speed = min(self.speed + acceleration * dt_s, self._rate, braking)
+        stride = self.speed * dt_s
         self.value = (
             target if stride >= remaining else self.value + math.copysign(stride, target - self.value)
         )

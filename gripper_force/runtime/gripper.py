@@ -143,6 +143,9 @@ class Gripper:
     def set_force(self, force_n: float, *, wait: bool = True) -> GraspResult | None:
         """Raises or lowers the force on a gripped object, without letting go.
 
+        A stream of targets with ``wait=False`` is followed: a ramp in progress takes a new target without a stop, and one
+        within 1 % (at least 0.025 N) of the present target changes nothing.
+
         Args:
             force_n: New target force, in newtons; limits as in `grasp`.
             wait: False returns at once.
@@ -159,8 +162,11 @@ class Gripper:
     def move(self, width_m: float, *, wait: bool = True) -> float:
         """Moves the jaws to a width, and lets go of an object if one is gripped.
 
-        The jaws move with the speed of a release (see ``control.approach_speed_m_s``) and press on an obstacle with
-        at most ``control.approach_force_n``.
+        The jaws move with the speed of a release (see ``control.approach_speed_m_s``), with a motor force of
+        ``control.approach_force_n`` and friction. So they press on an obstacle with ``control.approach_force_n`` and
+        the error of ``gripper.friction_n``, after an impact, and on an object that they held with up to twice the
+        friction more; always below ``control.force_limit_n``. A stream of widths with ``wait=False`` is followed: a
+        move in progress takes a new width without a stop.
 
         Args:
             width_m: Distance between the jaws, in metres: 0 to ``gripper.open_width_m``.
@@ -168,7 +174,7 @@ class Gripper:
 
         Returns:
             The width reached, in metres; the present width with ``wait=False``. `state` has the outcome:
-            ``moved``, or ``blocked`` by an obstacle.
+            ``moved``, or ``blocked``: an obstacle or friction stopped the jaws.
 
         Raises:
             RequestError: The width is out of range, or the gripper is at fault and needs a release first.

@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -93,6 +94,17 @@ def test_retarget_starts_at_the_present_reference(loop, transmission):
     assert loop.reference_n == 4.0
     loop.retarget(6.0)
     assert ramp(loop, 6.0) == pytest.approx(6.0 + transmission.friction_n)
+
+
+def test_the_ramp_is_not_faster_than_the_force_limit_allows(transmission):
+    def rise_n_s(**keys):
+        loop = ForceLoop(ControlConfig(**keys), transmission)
+        loop.start(0.0, 9.0)
+        values = [loop.step(0.005, 9.0, estimate(0.0)) and loop.reference_n for _ in range(400)]
+        return max(np.diff(values)) / 0.005
+
+    assert rise_n_s(force_limit_n=1.0, ramp_n_s=1e4) == pytest.approx(10.0, rel=0.01)
+    assert rise_n_s(force_limit_n=10.0, ramp_n_s=8.0) == pytest.approx(8.0, rel=0.01)
 
 
 def test_lowering_falls_below_friction_and_returns(loop, transmission):

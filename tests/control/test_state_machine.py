@@ -438,6 +438,30 @@ def test_retarget_without_letting_go(make_run):
     assert run.last.status.outcome == "held"
 
 
+@pytest.mark.parametrize("every", [1, 7, 20])
+def test_a_repeated_target_changes_nothing(make_run, every):
+    run, once = make_run(), make_run().grasp(2.0, 4.0).grasp(5.0, 3.0)
+    run.grasp(2.0, 4.0)
+    for i in range(round(3.0 / (0.005 * every))):
+        run.grasp(5.0 + (0.04 if i % 2 else 0.0), 0.005 * every)  # a policy's output has noise
+    assert run.last.status.outcome == "held"
+    assert run.decisions[: len(once.decisions)] == once.decisions[: len(run.decisions)]
+
+
+@pytest.mark.parametrize("feedback", ["fused", "current"])
+def test_a_stream_of_targets_is_followed(make_run, feedback):
+    run = make_run(feedback=feedback).grasp(3.5, 4.0)
+    errors_n = []
+    for i in range(240):  # 8 s at 30 Hz
+        target_n = 3.5 + 1.5 * math.sin(2 * math.pi * i / 120)
+        run.grasp(target_n, 1 / 30)
+        errors_n.append(run.plant.force_n - target_n)
+    # The force lags behind: the ramp has its rate, and a fall has to overcome friction twice.
+    assert np.sqrt(np.mean(np.square(errors_n))) < 0.6
+    run.go(1.5)
+    assert run.last.status.outcome == "held"
+
+
 @pytest.mark.parametrize("feedback", ["fused", "current"])
 @pytest.mark.parametrize(("before_n", "target_n"), [(5.0, 2.0), (8.0, 4.0)])
 def test_lower_target_is_reached_within_half_a_second(drawn_run, feedback, before_n, target_n):
@@ -607,6 +631,14 @@ def test_at_fault_the_jaws_open(make_run, phase):
     assert run.plant.x_m < 0.002
     run.go(0.1, "grasp", 3.0)
     assert run.last.status.phase == "fault"
+
+
+def test_a_result_says_that_a_hot_servo_holds_less(make_run):
+    run = make_run()
+    run.spoil = lambda _, servo: replace(servo, temperature_c=65.0)
+    run.grasp(4.0)
+    assert run.last.status.outcome == "held"
+    assert any(reason.endswith("reduced from 4 N because the servo is hot") for reason in run.reasons)
 
 
 def test_hot_servo_holds_less_and_reports_it(make_run):

@@ -24,6 +24,17 @@ def test_every_family_of_servos_is_tried() -> None:
     assert {name[:2] for name in MODELS} == {name[:2] for name in model_names()}
 
 
+@pytest.mark.parametrize("path", GRIPPERS, ids=lambda path: path.stem)
+def test_free_jaws_arrive_at_each_width(path: Path) -> None:
+    config = load_config(
+        path, ["object=none", "sim.detail=coarse", "camera.backend=none", "load_cell.backend=none"]
+    )
+    with gf.open_gripper(config) as gripper:
+        for share in (0.7, 0.2, 0.9):
+            gripper.move(share * config.gripper.open_width_m)
+            assert gripper.state.outcome == "moved"
+
+
 @pytest.mark.parametrize(
     ("model", "target_n"), [*((model, 2.0) for model in MODELS), (None, 3.5)], ids=[*MODELS, "own servo"]
 )
