@@ -143,8 +143,8 @@ class Gripper:
     def set_force(self, force_n: float, *, wait: bool = True) -> GraspResult | None:
         """Raises or lowers the force on a gripped object, without letting go.
 
-        A stream of targets with ``wait=False`` is followed: a ramp in progress takes a new target without a stop, and one
-        within 1 % (at least 0.025 N) of the present target changes nothing.
+        A stream of targets with ``wait=False`` is followed: a ramp in progress takes a new target without a stop, and
+        one within 1 % (at least 0.025 N) of the present target changes nothing.
 
         Args:
             force_n: New target force, in newtons; limits as in `grasp`.
