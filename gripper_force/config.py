@@ -42,8 +42,8 @@ class SecondServoConfig(Section):
     )
     offset_rad: Finite = Field(
         0.0,
-        description="its angle while the first servo stands at 0 rad and both fingers are equally far open; a "
-        "start with fingers that differ says which value makes them equal",
+        description="angle of the second servo when the first is at 0 rad and both fingers are equally far open; if "
+        "they differ at the start, the error names the value to set",
     )
     max_difference_rad: Positive = Field(
         0.5,
@@ -161,8 +161,8 @@ class GripperConfig(Section):
         1.4,
         ge=1.0,
         le=3.0,
-        description="largest plausible ratio of the true torque constant to nm_per_a, which the force limit "
-        "allows for; may be set to 1.1 after calibrate servo",
+        description="largest ratio of the true torque constant to nm_per_a that the force limit must allow for; 1.1 "
+        "is enough after calibrate servo",
     )
 
 
@@ -381,8 +381,8 @@ class ControlConfig(Section):
     )
     object_ratio: tuple[Positive, Positive] | None = Field(
         None,
-        description="motor current over vision in earlier grasps of the object, and its relative standard deviation "
-        "without that of the torque constant; null: from the object profile, or unknown",
+        description="ratio of motor current to vision in earlier grasps of the object, and its relative standard "
+        "deviation without that of the torque constant; null: from the object profile, or unknown",
     )
     min_object_width_m: Finite = Field(
         0.002,

@@ -12,7 +12,7 @@
     ├── SimulationError         a simulated scene can't be built or rendered, or failed while running
     ├── LogError                a log can't be read or written
     ├── DataError               a recording, data set or camera frame is incomplete or unusable
-    │   └── UnfamiliarFrameError  a frame is unlike all known ones, or the view is covered or blurred
+    │   └── UnfamiliarFrameError  a frame is unlike all known ones, or the object is gone, or the view is covered
     ├── CheckpointError         a checkpoint is missing, damaged, or of another network
     ├── RequestError            a request was refused: a target out of range, or nothing to hold
     └── NonFiniteError          NaN or infinity where a finite number is required

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     no_args_is_help=True,
-    help="Calibrate the jaws, the load cell, the servo, the camera, an object, or a network's claimed errors.",
+    help="Calibrate the gripper (jaws, load cell, servo, weight, camera), an object, or a network's claimed errors.",
 )
 
 RigPath = Annotated[
@@ -348,7 +348,7 @@ def gain(
     set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Save the object's gain, learned from motor current in grasps with the profile, to an object profile."""
+    """Save the gain that earlier grasps have shown of an object into its profile."""
     from gripper_force.jobs.dataset import find_logs
     from gripper_force.jobs.object_gain import save_gain
     from gripper_force.profiles.object_profile import find_object, read_object

@@ -95,9 +95,9 @@ class Fusion:
     plant's lag: one low-pass with that lag serves both. Vision is compared with the filtered current at its
     capture time. It is first multiplied by the object's gain, as far as earlier grasps have shown it.
 
-    The claimed error adds parts that the filter does not weigh, because they do not last: the lag of the current
-    estimate while the force changes, the friction that holds the jaws after the impact, until the force has risen by
-    as much, and the bias while vision contradicts the motor current that it was to correct.
+    The claimed error also contains three temporary parts that the filter itself does not use: the lag of the current
+    estimate while the force changes; after an impact, the friction that may hold the jaws, until the force has risen
+    by that much; and the bias, while vision differs from the motor current by more than both claimed errors allow.
 
     Without vision for `ControlConfig.vision_gap_ms` the source is the current alone, with the last bias
     and a growing variance.

@@ -13,9 +13,9 @@ _RISE_FACTOR = 4.0
 _OVER_FORCE_CEILING = 0.95
 """Until the grasp ends, the current stays below this share of a current that caused an over-force."""
 
-_OVER_FORCE_MEASURED = 0.9
-"""Until then, the goal current does not rise while the measured one is above this share of that at the over-force: the
-motor may draw more than its goal."""
+_OVER_FORCE_MOTOR_SHARE = 0.9
+"""Until then, the goal current does not rise while the measured motor force is above this share of its value at the
+over-force: the motor may draw more than its goal."""
 
 _CEILING_SHARE = 1.04
 """Share of the force limit that sets the current ceiling, for the largest torque constant. The force exceeds its
@@ -85,7 +85,7 @@ class Limits:
         """
         self._refuse_non_finite(command, force_n, friction_n, motor_force_n, present_rad)
         ceiling_a = min(self.ceiling_a(friction_n, present_rad), self._over_force_ceiling_a)
-        if not may_rise or motor_force_n > _OVER_FORCE_MEASURED * self._over_force_motor_n:
+        if not may_rise or motor_force_n > _OVER_FORCE_MOTOR_SHARE * self._over_force_motor_n:
             ceiling_a = min(ceiling_a, self._last_a)
         over = force_n > self._force_limit_n
         if over and not opening:

@@ -46,7 +46,7 @@ _GRASP_S: Final = 5.0
 _RELEASE_S: Final = 1.5
 _CHUNK: Final = 20
 _SEQUENCE: Final = 4
-"""One case of so many is a sequence of requests: those with the remainder 2."""
+"""Every fourth case is a sequence of requests: those with the remainder 2."""
 
 _NEAR: Final = 32
 _NEAR_REMAINDERS: Final = (2, 5, 10, 13, 21, 29)
@@ -89,7 +89,7 @@ class Draw:
 
     Attributes:
         target_n: Requested force.
-        then_n: Force requested after it; not a number for none.
+        then_n: Force requested after it; NaN for none.
         then_s: Time of this request.
         force_limit_n: As ``control.force_limit_n``.
         approach_m_s: As ``control.approach_speed_m_s``.

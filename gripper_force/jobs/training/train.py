@@ -38,7 +38,7 @@ STATE_EVERY_S: Final = 60.0
 """Time between two saved states: an interrupted training loses no more than this."""
 
 LEAST_STEPS: Final = 300
-"""Fewer steps give a warning. A complete schedule of so many reaches about 1.6 times the error of a long one."""
+"""Fewer steps give a warning. A complete schedule of this length has about 1.6 times the error of a long training."""
 
 
 def train(
