@@ -9,7 +9,8 @@ _FREE_S = 0.015
 _FREE_FILTER_S = 0.015
 """Free closing: the closing speed is above `_FREE_SPEED_SHARE` of the approach speed, and the motor force falls short
 of its goal by more than `_SHORTFALL_SHARE` of the reference and `_SHORTFALL_N`, both for `_FREE_S`. The jaws then
-press on nothing. Speed and shortfall are filtered: the speed limit brakes jaws without resistance in every second cycle."""
+press on nothing. Speed and shortfall are filtered: the speed limit brakes jaws without resistance in every second
+cycle."""
 
 _RECEDED_M = 0.0005
 _RECEDED_FORCE_N = 0.1
