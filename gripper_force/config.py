@@ -668,6 +668,11 @@ class Config(Section):
         """True if the run has a camera and a network."""
         return self.camera.backend != "none" and self.vision.checkpoint != "none"
 
+    def with_values(self, **values: Any) -> Self:
+        """Returns a copy with other values, which are not validated. A dict changes only the keys of that section."""
+        parts = {k: getattr(self, k).model_copy(update=v) for k, v in values.items() if isinstance(v, dict)}
+        return self.model_copy(update=values | parts)
+
     def rig_settings(self) -> Tree:
         """Keys and values of camera, view and gripper that networks and object profiles are bound to."""
         parts = {

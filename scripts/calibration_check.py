@@ -117,7 +117,7 @@ def one_grasp(
         known = [f"calibration.object={profile}"] if profile else []
         keys = [f"target_n={target_n}", f"control.feedback={feedback}", "log.report=false", *known]
         config = configure(kind, number, kept.with_suffix(""), *keys)
-        result = grasp(config.model_copy(update={"seed": config.seed + 50 + trial}))
+        result = grasp(config.with_values(seed=config.seed + 50 + trial))
         kept.write_text(json.dumps(result))
     return json.loads(kept.read_text())
 

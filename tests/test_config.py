@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from gripper_force.config import (
     HARD_FORCE_LIMIT_N,
     Config,
+    LogConfig,
     SimConfig,
     config_from,
     config_from_text,
@@ -233,6 +234,13 @@ def test_a_configuration_can_not_be_changed() -> None:
     config: Any = Config()
     with pytest.raises(ValueError, match="frozen"):
         config.seed = 3
+
+
+def test_a_copy_has_other_values_and_keeps_the_rest_of_a_section() -> None:
+    config = load_config(None, ["sim.rig_seed=3"])
+    other = config.with_values(seed=7, sim={"lux": 350.0}, log=LogConfig(report=False))
+    assert (other.seed, other.sim.lux, other.sim.rig_seed, other.log.report) == (7, 350.0, 3, False)
+    assert (config.seed, config.sim.lux, config.log.report) == (0, Config().sim.lux, True)
 
 
 @pytest.mark.parametrize(

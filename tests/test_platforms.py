@@ -97,9 +97,7 @@ def test_the_memory_of_a_command_is_counted_in_bytes(monkeypatch: pytest.MonkeyP
 @pytest.mark.usefixtures("macos")
 def test_doctor_has_a_row_for_everything(monkeypatch: pytest.MonkeyPatch, tiny_checkpoint: Any) -> None:
     monkeypatch.setattr(step_benchmark, "cpu_info", list)
-    config = Config().model_copy(
-        update={"vision": Config().vision.model_copy(update={"checkpoint": str(tiny_checkpoint)})}
-    )
+    config = Config().with_values(vision={"checkpoint": str(tiny_checkpoint)})
     checks = [
         *doctor._guarded("network", doctor._network(config)),
         *doctor._guarded("clock", doctor._clock(config)),

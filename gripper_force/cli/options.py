@@ -65,8 +65,7 @@ def load_settings_before_rig(
     rig = settings.calibration.rig
     if rig is None or rig.exists():
         return settings, None
-    calibration = settings.calibration.model_copy(update={"rig": None})
-    return settings.model_copy(update={"calibration": calibration}), rig
+    return settings.with_values(calibration={"rig": None}), rig
 
 
 def _load(

@@ -105,8 +105,7 @@ def keep_only(config: Config, unit: Literal["servo", "camera", "load_cell"]) -> 
     A simulated rig has no object, because one that does not fit would hide the unit, too.
     """
     others = {"camera", "load_cell"} - {unit}
-    none = {name: getattr(config, name).model_copy(update={"backend": "none"}) for name in others}
-    return config.model_copy(update={**none, "object": "none"})
+    return config.with_values(object="none", **{name: {"backend": "none"} for name in others})
 
 
 def gather(devices: Devices, take: Callable[[], Iterable[T]]) -> list[T]:

@@ -150,13 +150,10 @@ def evaluate(
         from gripper_force.jobs.report.plots import check_figure_path
 
         check_figure_path(plot)
-    config = Config() if config is None else config
-    calibration = config.calibration
+    settings = (Config() if config is None else config).with_values(vision={"checkpoint": str(checkpoint)})
     if profile is not None:
-        calibration = calibration.model_copy(update={"object": profile})
-    vision = config.vision.model_copy(update={"checkpoint": str(checkpoint)})
-    settings = config.model_copy(update={"calibration": calibration, "vision": vision})
-    if calibration.object not in (None, "own"):
+        settings = settings.with_values(calibration={"object": profile})
+    if settings.calibration.object not in (None, "own"):
         settings, _ = with_bundle(settings)
     model = read_model(settings.vision.checkpoint)
     paths = find_logs(logs)
@@ -227,7 +224,7 @@ def _evaluate_log(
     settings = config_from(config, "evaluate")
     reader = LogReader(path)
     logged = config_from_text(reader.config, str(path))
-    own = settings.model_copy(update={"object": logged.object})
+    own = settings.with_values(object=logged.object)
     if settings.calibration.object == "own":
         own, _ = with_bundle(own)
         if own.vision.checkpoint != settings.vision.checkpoint:

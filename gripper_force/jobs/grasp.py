@@ -288,22 +288,22 @@ def trials(
     least_n, most_n = TRIAL_TARGETS_N
     largest_n = {}
     for name in objects:
-        run = resolve(config.model_copy(update={"object": name}))  # measures what `auto` needs once, here
+        run = resolve(config.with_values(object=name))  # measures what `auto` needs once, here
         run.check_target(least_n if target_n is None else target_n)
         largest_n[name] = min(most_n, run.largest_target_n)
     rng = np.random.default_rng([config.seed, 20])
-    quiet = config.log.model_copy(update={"report": False})  # `replay LOG --report` draws any of them later
     plan = []
     for i in range(count):
         name = objects[i % len(objects)]
         drawn_n = min(round(float(rng.uniform(least_n, largest_n[name])), 3), largest_n[name])
-        update = {
-            "object": name,
-            "target_n": drawn_n if target_n is None else target_n,
-            "seed": config.seed + i,
-            "log": quiet,
-        }
-        plan.append(config.model_copy(update=update))
+        plan.append(
+            config.with_values(
+                object=name,
+                target_n=drawn_n if target_n is None else target_n,
+                seed=config.seed + i,
+                log={"report": False},  # `replay LOG --report` draws any of them later
+            )
+        )
     if jobs > 1:
         with process_pool(jobs) as pool:
             yield from pool.map(_trial, [trial.model_dump(mode="json") for trial in plan])
@@ -314,8 +314,7 @@ def trials(
             prompt(f"Put the {trial.object} between the jaws for trial {number} of {count}")
         progress(f"trial {number} of {count}: {trial.object}, {trial.target_n:g} N")
         if same_object:
-            control = trial.control.model_copy(update={"object_ratio": ratio})
-            trial = trial.model_copy(update={"control": control})
+            trial = trial.with_values(control={"object_ratio": ratio})
         result = grasp(trial, progress)
         if same_object:
             ratio = learned_ratio(Path(result["log"]))
@@ -330,11 +329,12 @@ def trials(
 def with_same_object(config: Config) -> Config:
     """Returns a configuration whose simulated object and gripper do not depend on the seed of the trial."""
     sim = config.sim
-    update = {
-        "object_seed": config.seed if sim.object_seed is None else sim.object_seed,
-        "rig_seed": config.seed if sim.rig_seed is None else sim.rig_seed,
-    }
-    return config.model_copy(update={"sim": sim.model_copy(update=update)})
+    return config.with_values(
+        sim={
+            "object_seed": config.seed if sim.object_seed is None else sim.object_seed,
+            "rig_seed": config.seed if sim.rig_seed is None else sim.rig_seed,
+        }
+    )
 
 
 def summarise(path: Path) -> Summary:

@@ -277,43 +277,36 @@ def _copy_under_light(
     """Copies a log with the images of another light, as if the set had been made under that light."""
     reader = LogReader(source)
     config = config_from_text(reader.config, str(source))
-    config = config.model_copy(update={"sim": config.sim.model_copy(update={"lux": float(lux)})})
+    config = config.with_values(sim={"lux": float(lux)})
     with LogWriter(path, config=dump_config(config), metadata={**reader.metadata, **notes}) as log:
         for record in reader.records():
             log.write(replace(record, gray=grays[record.seq]) if isinstance(record, Frame) else record)
 
 
 def _set_config(config: Config, task: SetPlan, seed: int, lux: int, rng: np.random.Generator) -> Config:
-    control = config.control.model_copy(
-        update={
+    return config.with_values(
+        object=task.object,
+        seed=seed,
+        target_n=_PEAK_N,
+        control={
             "feedback": "current",
             "force_limit_n": HARD_FORCE_LIMIT_N,  # so high that it does not bound the speed
             # Four touches in the paper's 500 frames leave 0.8 s for each.
             "approach_speed_m_s": 0.2,
             "approach_force_n": 1.5,
             "ramp_n_s": float(rng.uniform(*_RAMP_N_S.get(task.object, _USUAL_RAMP_N_S))),
-        }
-    )
-    return config.model_copy(
-        update={
-            "object": task.object,
-            "seed": seed,
-            "target_n": _PEAK_N,
-            "control": control,
-            "vision": config.vision.model_copy(update={"checkpoint": "none"}),
-            "sim": config.sim.model_copy(
-                update={
-                    "lux": float(lux),
-                    "yaw_deg": float(task.degrees),
-                    "tool": "rods",  # as the paper's
-                    "object_seed": task.instance_seed,
-                    "rig_seed": task.instance_seed,
-                    # What a camera can't see must not raise the peaks: the controller knows the motor exactly.
-                    "gain": 1.0,
-                    "friction": 1.0,
-                }
-            ),
-        }
+        },
+        vision={"checkpoint": "none"},
+        sim={
+            "lux": float(lux),
+            "yaw_deg": float(task.degrees),
+            "tool": "rods",  # as the paper's
+            "object_seed": task.instance_seed,
+            "rig_seed": task.instance_seed,
+            # What a camera can't see must not raise the peaks: the controller knows the motor exactly.
+            "gain": 1.0,
+            "friction": 1.0,
+        },
     )
 
 

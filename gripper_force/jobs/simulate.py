@@ -163,22 +163,17 @@ def make_log(task: SimulationPlan, out: Path, config: Tree) -> Path:
 
 
 def _randomised(config: Config, task: SimulationPlan, rng: np.random.Generator) -> Config:
-    control = config.control.model_copy(
-        update={
+    return config.with_values(
+        seed=task.seed,
+        control={  # drawn before the target: each seed keeps its draws
             "feedback": "current",
             "force_limit_n": 1.3 * PEAK_N * config.gripper.gain_bound,
             "approach_speed_m_s": float(rng.uniform(0.02, 0.05)),
             "ramp_n_s": float(np.exp(rng.uniform(np.log(3.0), np.log(25.0)))),
             "hold_s": float(rng.uniform(0.3, 1.0)),
-        }
-    )
-    return config.model_copy(
-        update={
-            "seed": task.seed,
-            "target_n": _draw_target_n(rng),
-            "control": control,
-            "vision": config.vision.model_copy(update={"checkpoint": "none"}),
-        }
+        },
+        target_n=_draw_target_n(rng),
+        vision={"checkpoint": "none"},
     )
 
 
@@ -197,7 +192,7 @@ def _press(config: Config, path: Path, rng: np.random.Generator) -> None:
 
 def _tap(config: Config, path: Path, rng: np.random.Generator) -> None:
     fast = {"approach_speed_m_s": 0.05, "ramp_n_s": float(np.exp(rng.uniform(np.log(10.0), np.log(30.0))))}
-    config = config.model_copy(update={"control": config.control.model_copy(update=fast)})
+    config = config.with_values(control=fast)
     with open_run(config, path, vision=False) as session:
         wait(session, 0.1)
         peak_n = float(rng.uniform(_MIN_TAP_N, PEAK_N))

@@ -65,8 +65,8 @@ def read_profiles(config: Config) -> Profiles:
 
 def with_bundle(config: Config) -> tuple[Config, str]:
     """Names a bundle's profile and network in a configuration that leaves the network open, and returns a note too."""
-    calibration, name = config.calibration, config.profile
-    if calibration.object is None and (user_folder() / config.object / BUNDLED).is_file():
+    name = config.profile
+    if config.calibration.object is None and (user_folder() / config.object / BUNDLED).is_file():
         name = config.object
     if name is None or not config.uses_vision:
         return config, ""
@@ -78,9 +78,7 @@ def with_bundle(config: Config) -> tuple[Config, str]:
     if config.vision.checkpoint != "default":
         named = f"vision.checkpoint is {config.vision.checkpoint!r}; set it to default to use the bundle"
         return config, f"did not use the network of the bundle {path.parent}, because {named}"
-    vision = config.vision.model_copy(update={"checkpoint": network})
-    calibration = calibration.model_copy(update={"object": str(path)})
-    config = config.model_copy(update={"calibration": calibration, "vision": vision})
+    config = config.with_values(calibration={"object": str(path)}, vision={"checkpoint": network})
     return config, f"used the bundle {path.parent}, made of {profile.touches} touches on {profile.date}"
 
 

@@ -254,18 +254,15 @@ def _press(row: int, index: int, folder: Path, tree: Tree) -> Tree:
     config = config_from(tree, "recognition")
     scene = "-".join(name for name, _ in spec.settings) or "still"
     log = plan("press", index + 1, FIRST_SEED, spec.objects)[index]
-    sim = config.sim.model_copy(update=dict(spec.settings))
-    own = {
-        "vision": VisionConfig(region=config.vision.region),
-        "log": LogConfig(),
-    }  # no network and no folder
-    made = dump_config(config.model_copy(update={"sim": sim, **own}))
+    pressed = config.with_values(sim=dict(spec.settings))
+    # The key of a press holds no network and no folder.
+    made = dump_config(pressed.with_values(vision=VisionConfig(region=config.vision.region), log=LogConfig()))
     key = hashlib.sha256(made.encode()).hexdigest()[:12]
     logs = folder / "logs" / f"{scene}-{key}"
     logs.mkdir(parents=True, exist_ok=True)
     path = logs / log.name
     if not path.exists():
-        make_log(log, logs, config.model_copy(update={"sim": sim}).model_dump(mode="json"))
+        make_log(log, logs, pressed.model_dump(mode="json"))
     checkpoint = load_checkpoint(config.vision.checkpoint)
     version = hashlib.sha256(checkpoint.header.model_dump_json().encode()).hexdigest()
     name = "-".join([spec.group, spec.name, scene, log.name, key, version[:12]]).replace(" ", "_")

@@ -98,16 +98,16 @@ def soak(config: Config, simulated_s: float, progress: Progress = no_progress) -
     outcomes: Counter[str] = Counter()
     done_s, fewest = 0.0, WARM_UP + 3
     with tempfile.TemporaryDirectory(prefix="soak-") as folder:
-        log = config.log.model_copy(update={"directory": Path(folder), "report": False})
+        quiet = config.with_values(log={"directory": Path(folder), "report": False})
         while done_s < simulated_s or len(samples) < fewest:
             number = len(samples) - 1
-            drawn = {
-                "object": PAPER_OBJECTS[number % len(PAPER_OBJECTS)],
-                "target_n": round(float(rng.uniform(*TRIAL_TARGETS_N)), 3),
-                "seed": config.seed + number,
-            }
+            drawn = quiet.with_values(
+                object=PAPER_OBJECTS[number % len(PAPER_OBJECTS)],
+                target_n=round(float(rng.uniform(*TRIAL_TARGETS_N)), 3),
+                seed=config.seed + number,
+            )
             try:
-                outcome = str(grasp(config.model_copy(update={"log": log, **drawn}))["result"])
+                outcome = str(grasp(drawn)["result"])
             except KeyboardInterrupt:
                 if len(samples) < fewest:
                     raise
@@ -118,7 +118,7 @@ def soak(config: Config, simulated_s: float, progress: Progress = no_progress) -
                 done_s += LogReader(path).duration_ns / NS_PER_S
                 path.unlink()
             samples.append(_sample(done_s))
-            text = f"{drawn['object']}: {outcome}, {samples[-1].memory_mb:.0f} MB"
+            text = f"{drawn.object}: {outcome}, {samples[-1].memory_mb:.0f} MB"
             progress(text, int(done_s) - int(before_s))
     growth = measure_growth(samples)
     return {

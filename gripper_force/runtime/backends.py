@@ -82,7 +82,7 @@ def with_camera_rate(config: Config) -> Config:
     if config.camera.backend != "playback":
         return config
     camera = load_class("cameras", CAMERAS, "playback", "camera.backend").resolve(config.camera)
-    return config.model_copy(update={"camera": camera})
+    return config.with_values(camera=camera)
 
 
 def check_devices(config: Config, port: SharedPort | None = None) -> None:

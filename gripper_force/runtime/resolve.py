@@ -105,7 +105,7 @@ def resolve(config: Config, *, vision: bool = True) -> ResolvedConfig:
         CheckpointError: The network's file cannot be read.
     """
     if not vision:
-        config = config.model_copy(update={"vision": config.vision.model_copy(update={"checkpoint": "none"})})
+        config = config.with_values(vision={"checkpoint": "none"})
     _check_rate(config)
     config = with_camera_rate(config)
     config, bundle = apply.with_bundle(config)
@@ -114,11 +114,9 @@ def resolve(config: Config, *, vision: bool = True) -> ResolvedConfig:
     spec = load_servo_class(config).spec(config.servo)
     _check_travel(config.gripper, spec)
     profiles = apply.read_profiles(config)
-    config = config.model_copy(
-        update={
-            "gripper": _complete_gripper(config.gripper, spec),
-            "control": apply.with_object(_complete_control(config, spec), profiles),
-        }
+    config = config.with_values(
+        gripper=_complete_gripper(config.gripper, spec),
+        control=apply.with_object(_complete_control(config, spec), profiles),
     )
     correction = apply.read_correction(config, profiles, model)
     mismatches = {
@@ -172,7 +170,7 @@ def resolve_vision(config: Config) -> tuple[Config, Model | None, str]:
         from gripper_force.vision.selection import resolve_auto
 
         vision, choice = resolve_auto(config.vision, config.budget, set_threads=allowed().torch_threads)
-        config = config.model_copy(update={"vision": vision})
+        config = config.with_values(vision=vision)
     return config, read_model(config.vision.checkpoint), "" if choice is None else str(choice)
 
 

@@ -24,8 +24,7 @@ def config(quick: list[str]) -> Config:
 @pytest.fixture
 def seeing(config: Config) -> Config:
     """A configuration with a camera of a low frame rate, which is cheap to render."""
-    camera = config.camera.model_copy(update={"backend": "simulated", "rate_hz": 20.0})
-    return config.model_copy(update={"camera": camera})
+    return config.with_values(camera={"backend": "simulated", "rate_hz": 20.0})
 
 
 @pytest.mark.parametrize("instances", INSTANCES)
@@ -155,9 +154,7 @@ def test_only_missing_logs_are_made_and_failed_draws_are_repeated(
     kept.unlink()
     assert list(simulate([task], tmp_path, seeing, jobs=1)) == [kept]
     assert list(simulate([task], tmp_path, seeing, jobs=1)) == []
-    other = seeing.model_copy(
-        update={"sim": seeing.sim.model_copy(update={"rig_seed": 3, "view_spread": 3.0})}
-    )
+    other = seeing.with_values(sim={"rig_seed": 3, "view_spread": 3.0})
     with pytest.raises(DataError, match=r"recorded with sim\.view_spread 1\.0, not 3\.0; use another folder"):
         list(simulate([task], tmp_path, other, jobs=1))
 

@@ -77,7 +77,7 @@ def test_trials_leave_a_figure_beside_their_logs(tmp_path: Path) -> None:
     figure = write_figure(config, results, overall(results, 10.0))
     assert figure is not None
     assert Path(figure).parent == tmp_path
-    quiet = config.model_copy(update={"log": config.log.model_copy(update={"report": False})})
+    quiet = config.with_values(log={"report": False})
     assert write_figure(quiet, results, overall(results, 10.0)) is None
     without_cell = [summary(4.0, None)]
     assert write_figure(config, without_cell, overall(without_cell, 10.0)) is None

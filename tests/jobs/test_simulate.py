@@ -68,8 +68,7 @@ def test_same_seed_gives_identical_logs(config: Config, tmp_path: Path) -> None:
 
 
 def test_log_holds_frames(config: Config, tmp_path: Path) -> None:
-    camera = config.camera.model_copy(update={"backend": "simulated", "rate_hz": 10.0})
-    seen = config.model_copy(update={"camera": camera})
+    seen = config.with_values(camera={"backend": "simulated", "rate_hz": 10.0})
     path = make_log(SimulationPlan("press", "stapler", 3), tmp_path, seen.model_dump(mode="json"))
     frames = list(LogReader(path).records(Frame))
     assert len(frames) > 5
@@ -95,14 +94,14 @@ def test_logs_of_other_settings_are_not_taken_for_these(kind: Kind, config: Conf
     plans = plan(kind, 1, 5, ("stapler",))
     assert len(list(simulate(plans, tmp_path, config, jobs=1))) == 1
     assert list(simulate(plans, tmp_path, config, jobs=1)) == []
-    other = config.model_copy(update={"sim": config.sim.model_copy(update={"gain": 1.1})})
+    other = config.with_values(sim={"gain": 1.1})
     with pytest.raises(DataError, match=r"recorded with sim\.gain None, not 1\.1; use another folder"):
         list(simulate(plans, tmp_path, other, jobs=1))
 
 
 def test_a_log_of_other_settings_is_found_among_others(config: Config, tmp_path: Path) -> None:
     plans = plan("tap", 2, 5, ("stapler",))
-    other = config.model_copy(update={"sim": config.sim.model_copy(update={"gain": 1.1})})
+    other = config.with_values(sim={"gain": 1.1})
     for one, settings in zip(plans, (config, other), strict=True):
         list(simulate([one], tmp_path, settings, jobs=1))
     with pytest.raises(DataError, match=r"tap-stapler-000006\.mcap .* recorded with sim\.gain 1\.1"):
@@ -110,7 +109,7 @@ def test_a_log_of_other_settings_is_found_among_others(config: Config, tmp_path:
 
 
 def test_a_real_gripper_is_refused(config: Config, tmp_path: Path) -> None:
-    real = config.model_copy(update={"servo": config.servo.model_copy(update={"port": "/dev/ttyUSB0"})})
+    real = config.with_values(servo={"port": "/dev/ttyUSB0"})
     with pytest.raises(ConfigError, match=r"simulate moves no real gripper, .* servo\.port=/dev/ttyUSB0"):
         list(simulate(plan("tap", 1, 5), tmp_path / "out", real, jobs=1))
     assert not (tmp_path / "out").exists()

@@ -145,7 +145,7 @@ def test_search_continues_where_it_was_interrupted(
     assert again == whole
     assert counts[0] == 3
     assert sum(counts) == 6
-    other = config.model_copy(update={"seed": 1})
+    other = config.with_values(seed=1)
     with pytest.raises(DataError, match="another configuration or seed"):
         search(other, 6, 1, keep, resume=True)
 

@@ -1,5 +1,4 @@
 import sys
-from collections.abc import Mapping
 from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,11 +19,6 @@ def config(quick: list[str]) -> Config:
     return load_config(None, quick)
 
 
-def changed(config: Config, **sections: Mapping[str, object]) -> Config:
-    parts = {name: getattr(config, name).model_copy(update=update) for name, update in sections.items()}
-    return config.model_copy(update=parts)
-
-
 @pytest.mark.parametrize(
     ("unit", "known"),
     [
@@ -37,14 +31,14 @@ def test_an_unknown_backend_is_named_with_the_known_ones(config: Config, unit: s
         pytest.raises(
             ConfigError, match=rf"unknown {unit}\.backend 'oak9'.*; use {known} or package\.module:Class"
         ),
-        open_devices(changed(config, **{unit: {"backend": "oak9"}})),
+        open_devices(config.with_values(**{unit: {"backend": "oak9"}})),
     ):
         pass
     assert find_bus("rig") is None
 
 
 def test_only_what_is_named_is_built(config: Config) -> None:
-    with open_devices(changed(config, load_cell={"backend": "none"})) as devices:
+    with open_devices(config.with_values(load_cell={"backend": "none"})) as devices:
         assert devices.camera is None
         assert devices.load_cell is None
         assert devices.lockstep
@@ -55,14 +49,14 @@ def test_only_what_is_named_is_built(config: Config) -> None:
 
 
 def test_lockstep_needs_a_simulated_servo(config: Config) -> None:
-    real = changed(config, servo={"port": "/dev/ttyUSB7"}, load_cell={"backend": "none"})
+    real = config.with_values(servo={"port": "/dev/ttyUSB7"}, load_cell={"backend": "none"})
     with pytest.raises(ConfigError, match=r"clock=lockstep .*'/dev/ttyUSB7'"), open_devices(real):
         pass
 
 
 @pytest.mark.parametrize(("unit", "backend"), [("camera", "oak"), ("load_cell", "serial")])
 def test_a_real_sensor_keeps_no_simulated_time(config: Config, unit: str, backend: str) -> None:
-    mixed = changed(config, **{unit: {"backend": backend, "port": "/dev/nowhere"}})
+    mixed = config.with_values(**{unit: {"backend": backend, "port": "/dev/nowhere"}})
     sentence = rf"{unit}\.backend={backend} cannot follow simulated time; set clock=realtime"
     with pytest.raises(ConfigError, match=sentence), open_devices(mixed):
         pass
@@ -71,14 +65,14 @@ def test_a_real_sensor_keeps_no_simulated_time(config: Config, unit: str, backen
 @pytest.mark.parametrize("unit", ["camera", "load_cell"])
 def test_a_simulated_sensor_needs_the_simulated_servo(config: Config, unit: str) -> None:
     none = {"camera": {"backend": "none"}, "load_cell": {"backend": "none"}}
-    mixed = changed(config, servo={"port": "/dev/ttyUSB7"}, **none | {unit: {"backend": "simulated"}})
+    mixed = config.with_values(servo={"port": "/dev/ttyUSB7"}, **none | {unit: {"backend": "simulated"}})
     with pytest.raises(ConfigError, match=r"set servo\.port to virtual:rig"), open_devices(mixed):
         pass
 
 
 def test_a_port_that_is_not_there_is_one_sentence(config: Config) -> None:
-    real = changed(config, servo={"port": "/dev/ttyUSB7"}, load_cell={"backend": "none"})
-    real = real.model_copy(update={"clock": "realtime"})
+    real = config.with_values(servo={"port": "/dev/ttyUSB7"}, load_cell={"backend": "none"})
+    real = real.with_values(clock="realtime")
     with (
         open_devices(real) as devices,
         pytest.raises(DeviceNotFoundError, match="there is no port /dev/ttyUSB7; ") as caught,
@@ -92,7 +86,7 @@ def test_a_port_that_is_not_there_is_one_sentence(config: Config) -> None:
 def test_a_recording_that_is_not_there_closes_what_was_open(
     config: Config, unit: str, tmp_path: Path
 ) -> None:
-    plays = changed(config, **{unit: {"backend": "playback", "path": tmp_path / "none.mcap"}})
+    plays = config.with_values(**{unit: {"backend": "playback", "path": tmp_path / "none.mcap"}})
     with pytest.raises(LogError, match="No such file"), open_devices(plays):
         pass
     assert find_bus("rig") is None
@@ -119,14 +113,14 @@ def closed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def test_playback_needs_the_log_to_play(config: Config) -> None:
-    plays = changed(config, camera={"backend": "playback"})
+    plays = config.with_values(camera={"backend": "playback"})
     with pytest.raises(ConfigError, match=r"camera\.path; set it to the log to play"), open_devices(plays):
         pass
 
 
 def test_a_recording_plays_as_camera_and_load_cell(config: Config, fused_log: Path) -> None:
     section = {"backend": "playback", "path": fused_log}
-    with open_devices(changed(config, camera=section, load_cell=section)) as devices:
+    with open_devices(config.with_values(camera=section, load_cell=section)) as devices:
         assert devices.camera is not None
         assert devices.load_cell is not None
         devices.camera.start()
@@ -137,7 +131,7 @@ def test_a_recording_plays_as_camera_and_load_cell(config: Config, fused_log: Pa
 
 
 def test_what_was_open_is_closed_where_the_next_can_not_be(config: Config, closed: list[str]) -> None:
-    no_log = changed(config, camera={"backend": "simulated"}, load_cell={"backend": "playback"})
+    no_log = config.with_values(camera={"backend": "simulated"}, load_cell={"backend": "playback"})
     with pytest.raises(ConfigError), open_devices(no_log):
         pass
     assert closed == ["camera", "rig"]
@@ -147,7 +141,7 @@ def test_what_was_open_is_closed_where_the_next_can_not_be(config: Config, close
 def test_everything_is_closed_on_every_way_out(
     config: Config, closed: list[str], error: type[BaseException]
 ) -> None:
-    config = changed(config, camera={"backend": "simulated"})
+    config = config.with_values(camera={"backend": "simulated"})
     with open_devices(config):
         assert closed == ["rig starts"]
     assert closed[1:] == ["servo", "load cell", "camera", "rig"]
@@ -189,7 +183,7 @@ def test_a_third_party_backend_is_opened_with_its_options(
 ) -> None:
     monkeypatch.setitem(sys.modules, "own_devices", sys.modules[__name__])
     section = {"backend": "own_devices:OwnLoadCell", "options": {"gain": 3}}
-    with open_devices(changed(config, load_cell=section)) as devices:
+    with open_devices(config.with_values(load_cell=section)) as devices:
         assert isinstance(devices.load_cell, OwnLoadCell)
         assert devices.load_cell.options == {"gain": 3}
         assert devices.load_cell.clock is devices.clock
@@ -201,10 +195,10 @@ def test_a_registered_backend_is_opened_by_its_name(config: Config, monkeypatch:
     monkeypatch.setattr(
         "gripper_force.plugins.entry_points", lambda group: EntryPoints([point]).select(group=group)
     )
-    with open_devices(changed(config, load_cell={"backend": "mine"})) as devices:
+    with open_devices(config.with_values(load_cell={"backend": "mine"})) as devices:
         assert isinstance(devices.load_cell, OwnLoadCell)
     with (
         pytest.raises(ConfigError, match=r"did you mean 'mine'.*phidget, mine or package"),
-        open_devices(changed(config, load_cell={"backend": "mines"})),
+        open_devices(config.with_values(load_cell={"backend": "mines"})),
     ):
         pass

@@ -149,18 +149,20 @@ def calibrate_camera(
     if rig.exists():
         read_rig(rig)  # a damaged profile is reported before anything moves
     before = config
-    config = _with(config, "calibration", rig=None, object=None)  # their camera settings are replaced
-    config = _with(config, "vision", region=region)
+    config = config.with_values(
+        calibration={"rig": None, "object": None},  # their camera settings are replaced
+        vision={"region": region},
+    )
     candidates, images = try_exposures(config, exposures_us or candidate_exposures_us(config), progress)
     selected = select_exposure(candidates)
-    config = _with(config, "camera", exposure_us=selected.exposure_us)
+    config = config.with_values(camera={"exposure_us": selected.exposure_us})
     with TemporaryDirectory() as aside:
         (log,) = record(config, RecordingPlan(1, touches), Path(aside), progress)
         observed = observe(log, region)
     height, width = observed.reference.shape
     found_region = region_around(observed.markers, width, height) if region is None else region
     lag = estimate_lag(observed.touches)
-    estimate_ms = compute_ms(_with(config, "vision", region=found_region), observed.reference)
+    estimate_ms = compute_ms(config.with_values(vision={"region": found_region}), observed.reference)
     wait_ms = observed.use_ms + estimate_ms + 500 / observed.rate_hz
     camera = config.camera
     found = CameraCalibration(
@@ -193,7 +195,7 @@ def calibrate_camera(
         touches_that_tell=len(correlations_ms),
         rig=rig,
         report=report,
-        outdated=_outdated(before, _with(config, "vision", region=found_region)),
+        outdated=_outdated(before, config.with_values(vision={"region": found_region})),
     )
 
 
@@ -307,7 +309,7 @@ def try_exposures(
         if exposure_us is not None and exposure_us > longest_us:
             continue
         progress("automatic exposure" if exposure_us is None else f"exposure of {exposure_us} us", 0)
-        gray = _capture(_with(config, "camera", exposure_us=exposure_us))
+        gray = _capture(config.with_values(camera={"exposure_us": exposure_us}))
         region = config.vision.region
         part = gray if region is None else downscale(gray, region, min(region[2:]))
         candidates.append(ExposureCandidate.measure(exposure_us, part))
@@ -356,10 +358,6 @@ def compute_ms(config: Config, gray: Gray) -> float:
         estimator.update(gray)
         times_ms.append((time.perf_counter_ns() - begin_ns) / NS_PER_MS)
     return float(np.median(times_ms))
-
-
-def _with(config: Config, section: str, **values: object) -> Config:
-    return config.model_copy(update={section: getattr(config, section).model_copy(update=values)})
 
 
 def _shifted(estimate: CalibratedValue, by: float) -> CalibratedValue:

@@ -116,8 +116,8 @@ def calibrate_jaws(config: Config, *, prompt: Prompt, progress: Progress = no_pr
     # The configured angle may be wrong, so the travel is assumed around zero, where every servo can be.
     linkage = Transmission.from_config(config.gripper, 1.0).linkage
     middle_rad = -config.gripper.closing_sign * linkage.closing_rad(0.0) / 2
-    gripper = config.gripper.model_copy(update={"open_position_rad": middle_rad})
-    config = resolve(servo_alone(config).model_copy(update={"gripper": gripper}), vision=False).config
+    config = servo_alone(config).with_values(gripper={"open_position_rad": middle_rad})
+    config = resolve(config, vision=False).config
     prompt("Take everything from between the jaws and open them by hand")
     with open_devices(config) as devices, _torque_on(config, devices, progress) as jaws:
         start_rad = jaws.state.position_rad

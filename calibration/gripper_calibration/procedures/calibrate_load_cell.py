@@ -91,8 +91,8 @@ def calibrate_load_cell(
     if rig.exists():
         read_rig(rig)  # a damaged profile is reported before anyone carries masses
     clock = MonotonicClock()
-    neutral = section.model_copy(update={"tare_raw": 0.0, "n_per_raw": NEUTRAL_N_PER_RAW})
-    cell: LoadCell = open_load_cell(config.model_copy(update={"load_cell": neutral}), clock)
+    neutral = config.with_values(load_cell={"tare_raw": 0.0, "n_per_raw": NEUTRAL_N_PER_RAW})
+    cell: LoadCell = open_load_cell(neutral, clock)
     with closing(cell):
         cell.start()
         fit = weigh(cell, clock, force_n, prompt=prompt, seconds=seconds, progress=progress)

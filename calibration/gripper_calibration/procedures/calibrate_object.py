@@ -25,6 +25,7 @@ from gripper_calibration.touch_logs import TouchRecording, join, read_log, start
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs.dataset import find_logs
+from gripper_force.jobs.grasp import with_same_object
 from gripper_force.jobs.profile_files import check_place, pack, write_object
 from gripper_force.jobs.recording.record import RecordingPlan, record
 from gripper_force.profiles.object_profile import ObjectProfile, user_folder
@@ -154,7 +155,7 @@ def calibrate_object(
     """
     out = check(config, name, out)
     if logs is None:
-        named = config.model_copy(update={"object": name})
+        named = config.with_values(object=name)
         paths = []
         place = None if folder is None else Path(folder)
         for path in record_touches(named, touches, peak_n, place, prompt=prompt, progress=progress):
@@ -210,12 +211,7 @@ def record_touches(
     Raises:
         GripperError: As `gripper_force.jobs.recording.record.record`. Completed touches are kept.
     """
-    sim = config.sim
-    seeds = {
-        key: config.seed if getattr(sim, key) is None else getattr(sim, key)
-        for key in ("object_seed", "rig_seed")
-    }
-    config = config.model_copy(update={"sim": sim.model_copy(update=seeds)})
+    config = with_same_object(config)
     folder = folder or default_folder(config.object)
     yield from record(config, _plan(touches, peak_n), folder, progress, prompt)
 

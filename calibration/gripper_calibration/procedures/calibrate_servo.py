@@ -146,8 +146,7 @@ def calibrate_servo(
     given = Nominal(
         _reference_m_per_rad(config.gripper), config.gripper.open_width_m, _scale_share(known, config, rig)
     )
-    config = config.model_copy(update={"camera": config.camera.model_copy(update={"backend": "none"})})
-    config = resolve(config, vision=False).config
+    config = resolve(config.with_values(camera={"backend": "none"}), vision=False).config
     presses: list[ServoPress] = []
     passes: list[FreePass] = []
     for width_m in gauges_m:

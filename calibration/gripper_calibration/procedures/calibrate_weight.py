@@ -160,8 +160,7 @@ def calibrate_weight(
 
 
 def _simulated(config: Config, hung_kg: float) -> Config:
-    sim = config.sim.model_copy(update={"hanging_mass_kg": hung_kg})
-    return config.model_copy(update={"object": "none", "sim": sim})
+    return config.with_values(object="none", sim={"hanging_mass_kg": hung_kg})
 
 
 def _fit(config: Config, empty: "_Balance", loaded: "_Balance", weight_n: float) -> WeightResult:

@@ -21,10 +21,7 @@ RATE_HZ: Final = 200.0
 
 def servo_alone(config: Config) -> Config:
     """Returns a configuration without camera and load cell."""
-    none = {
-        name: getattr(config, name).model_copy(update={"backend": "none"}) for name in ("camera", "load_cell")
-    }
-    return config.model_copy(update=none)
+    return config.with_values(camera={"backend": "none"}, load_cell={"backend": "none"})
 
 
 @contextmanager

@@ -181,7 +181,7 @@ def teach(
     place = default_folder(name) if folder is None else Path(folder)
     config, model = check(config, out)
     if logs is None:
-        named = config.model_copy(update={"object": name})
+        named = config.with_values(object=name)
         paths = []
         for path in record_touches(named, touches, peak_n, place, prompt=prompt, progress=progress):
             paths.append(path)
@@ -316,8 +316,8 @@ class _Work:
             before_n=float(np.abs(found.before_n - found.measured.force_n).mean()),
             after_n=mae_n,
         )
-        vision = config.vision.model_copy(update={"checkpoint": str(checkpoint)})
-        run = ResolvedConfig(config.model_copy(update={"vision": vision}), read_model(checkpoint))
+        config = config.with_values(vision={"checkpoint": str(checkpoint)})
+        run = ResolvedConfig(config, read_model(checkpoint))
         profile, _ = make_profile(name, recorded, fit, run)
         profile = profile.model_copy(
             update={"network": _NETWORK, "logs": self._digests, "version": __version__}

@@ -18,7 +18,7 @@ from gripper_calibration.fits.camera_fit import (
 )
 from gripper_calibration.fits.focus import MOST_BLUR, blur
 from gripper_calibration.procedures.calibrate_camera import candidate_exposures_us, try_exposures
-from gripper_calibration.setup.step import Found, Outcome, Task, with_keys
+from gripper_calibration.setup.step import Found, Outcome, Task
 from gripper_force.errors import DataError
 from gripper_force.types import Gray
 from gripper_force.vision.preprocess import Region
@@ -45,7 +45,7 @@ def camera(task: Task) -> Outcome:
             f"camera.backend={config.camera.backend}: no picture; a grasp controls force by motor current alone"
         )
     task.person.do("Open the jaws, put an object between them as in use, and switch on the light")
-    config = with_keys(config, "vision", region=None)
+    config = config.with_values(vision={"region": None})
     is_given = "camera.exposure_us" in task.given
     exposures_us = (config.camera.exposure_us,) if is_given else candidate_exposures_us(config)
     candidates, images = try_exposures(config, exposures_us, task.progress)

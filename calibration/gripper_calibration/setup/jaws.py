@@ -4,7 +4,7 @@ import math
 from datetime import date
 
 from gripper_calibration.procedures.calibrate_jaws import calibrate_jaws
-from gripper_calibration.setup.step import ANSWERED, Found, Outcome, Task, with_keys
+from gripper_calibration.setup.step import ANSWERED, Found, Outcome, Task
 from gripper_force.config import GripperConfig
 from gripper_force.runtime.backends import is_simulated
 from gripper_force.runtime.resolve import resolve
@@ -30,13 +30,13 @@ def jaws(task: Task) -> Outcome:
             continue
         default_mm = 1e3 * getattr(config.gripper, key)
         answer_m = 1e-3 * task.person.number(question, f"--set gripper.{key}=METRES", default_mm)
-        config = with_keys(config, "gripper", **{key: answer_m})
+        config = config.with_values(gripper={key: answer_m})
         is_default = math.isclose(answer_m, getattr(GripperConfig(), key))
         origin = "default, not measured" if is_default else ANSWERED
         values[f"gripper.{key}"] = Found(round(answer_m, 6), origin)
     homed = config
     if is_simulated(config):
-        homed = config.model_copy(update={"object": _AIR})
+        homed = config.with_values(object=_AIR)
         if config.sim.open_width_m is None:  # what is found must not change the simulated gripper
             true_m = config.gripper.open_width_m
             values["sim.open_width_m"] = Found(true_m, "true width of the simulated jaws")
@@ -59,9 +59,7 @@ def jaws(task: Task) -> Outcome:
     }
     found_keys = (key.partition(".") for key in values)
     gripper = {key: values[f"gripper.{key}"].value for part, _, key in found_keys if part == "gripper"}
-    resolve(
-        with_keys(config, "gripper", **gripper), vision=False
-    )  # the travel must lie within the servo's turn
+    resolve(config.with_values(gripper=gripper), vision=False)  # the travel must lie within the servo's turn
     return Outcome(
         f"the jaws open to {1e3 * found.open_width_m:.1f} mm, close with "
         f"{'rising' if found.closing_sign > 0 else 'falling'} angle, friction {found.friction_n:.2f} N",

@@ -3,7 +3,7 @@
 from typing import Final
 
 from gripper_calibration.procedures.calibrate_load_cell import STANDARD_GRAVITY_M_S2, calibrate_load_cell
-from gripper_calibration.setup.step import Found, Outcome, Task, with_keys
+from gripper_calibration.setup.step import Found, Outcome, Task
 from gripper_force.errors import ConfigError
 from gripper_force.jobs import doctor
 from gripper_force.profiles.rig_profile import CalibratedValue
@@ -44,7 +44,9 @@ def load_cell(task: Task) -> Outcome:
     )
     cell = found.calibration
     by = f"weighed with {1e3 * mass_kg:g} g, {cell.date.date().isoformat()}"
-    config = with_keys(task.config, "load_cell", tare_raw=cell.tare_raw.value, n_per_raw=cell.n_per_raw.value)
+    config = task.config.with_values(
+        load_cell={"tare_raw": cell.tare_raw.value, "n_per_raw": cell.n_per_raw.value}
+    )
     remarks = [f"load cell, {one.name}: {one.found}" for one in doctor.check(config, "load cell")]
     return Outcome(
         f"calibrated with {1e3 * mass_kg:g} g; noise {cell.noise_n:.3f} N",

@@ -1,6 +1,6 @@
 """Step ``servo``: shows the checks of `doctor` and sets the registers that survive power-off."""
 
-from gripper_calibration.setup.step import Found, Outcome, Task, with_keys
+from gripper_calibration.setup.step import Found, Outcome, Task
 from gripper_force.errors import ConfigError
 from gripper_force.jobs import doctor
 from gripper_force.jobs.checks import RegisterChange
@@ -26,9 +26,9 @@ def servo(task: Task) -> Outcome:
     values = {key: found for _, extra in results for key, found in extra.items()}
     config = task.config
     if "servo.baud_rate" in values:
-        config = with_keys(config, "servo", baud_rate=values["servo.baud_rate"].value)
+        config = config.with_values(servo={"baud_rate": values["servo.baud_rate"].value})
     if "servo.homing_offset" in values:
-        config = with_keys(config, "servo", homing_offset=values["servo.homing_offset"].value)
+        config = config.with_values(servo={"homing_offset": values["servo.homing_offset"].value})
     bad = [one for one in doctor.check(config, "servo") if one.ok is False]
     remarks = [f"{one.unit}, {one.name}: {one.found}; {one.advice}" for one in bad]
     if bad:
@@ -40,9 +40,7 @@ def servo(task: Task) -> Outcome:
 
 def _set_up(task: Task, id_: int) -> tuple[list[RegisterChange], dict[str, Found]]:
     """Returns the changes that were written, and the keys that follow from those that were not."""
-    alone = with_keys(
-        with_keys(task.config, "servo", id=id_), "servo", second=type(task.config.servo.second)()
-    )
+    alone = task.config.with_values(servo={"id": id_, "second": type(task.config.servo.second)()})
     written: list[RegisterChange] = []
     declined: list[RegisterChange] = []
 

@@ -86,8 +86,3 @@ class Outcome:
     remarks: Sequence[str] = ()
     files: Mapping[str, Path] = field(default_factory=dict)
     details: Mapping[str, Any] = field(default_factory=dict)
-
-
-def with_keys(config: Config, section: str, **values: object) -> Config:
-    """Returns a configuration with other values in one section."""
-    return config.model_copy(update={section: getattr(config, section).model_copy(update=values)})

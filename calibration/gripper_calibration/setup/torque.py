@@ -7,7 +7,7 @@ from typing import Any, Final
 from gripper_calibration.procedures.calibrate_servo import calibrate_servo
 from gripper_calibration.procedures.calibrate_weight import calibrate_weight, masses_kg
 from gripper_calibration.setup.load_cell import PROFILE, interval
-from gripper_calibration.setup.step import Found, Outcome, Task, with_keys
+from gripper_calibration.setup.step import Found, Outcome, Task
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError
 from gripper_force.profiles.rig_profile import FRICTION_DRIFT, RigProfile
@@ -39,7 +39,7 @@ def torque(task: Task) -> Outcome:
         gauge_mm = task.person.number(
             "Width of the load cell between the jaws in mm", "--gauge-mm MM", default
         )
-    pressed = config.model_copy(update={"object": _SIM_GAUGE}) if simulated else config
+    pressed = config.with_values(object=_SIM_GAUGE) if simulated else config
     found = calibrate_servo(
         pressed, [1e-3 * gauge_mm], task.folder / PROFILE, prompt=task.person.do, progress=task.progress
     )
@@ -57,7 +57,7 @@ def torque(task: Task) -> Outcome:
     values = {
         f"gripper.{key}": Found(round(settings[key], 5), f"{origin}, {by}") for key, origin in origins.items()
     }
-    after = with_keys(config, "gripper", **{key: settings[key] for key in origins})
+    after = config.with_values(gripper={key: settings[key] for key in origins})
     return Outcome(
         f"{servo.nm_per_a.value:.3f} Nm/A ({interval(servo.nm_per_a)})",
         values,
@@ -94,7 +94,7 @@ def _weight(task: Task) -> Outcome:
         "friction_std": "relative error of friction_n",
     }
     values = {f"gripper.{key}": Found(round(value, 5), origins[key]) for key, value in settings.items()}
-    after = with_keys(task.config, "gripper", **settings)
+    after = task.config.with_values(gripper=settings)
     return Outcome(
         f"{found.nm_per_a.value:.3f} Nm/A ({interval(found.nm_per_a)})",
         values,

@@ -139,7 +139,7 @@ def record(
     config, peak_n = _checked(config, plan)
     first: tuple[Path, str] | None = None  # of the file of a simulated object
     for number, path in enumerate(plan.paths(config, out), start=1):
-        one = config.model_copy(update={"seed": config.seed + number - 1, "target_n": peak_n})
+        one = config.with_values(seed=config.seed + number - 1, target_n=peak_n)
         run = resolve(one, vision=False)
         if path.exists():
             check_same(path, run.config, _SAME)
@@ -217,9 +217,7 @@ def _checked(config: Config, plan: RecordingPlan) -> tuple[Config, float]:
             f"peaks of up to {peak_n:g} N are not within {_MIN_PEAK_N:g} to {max_n:.4g} N, the range for "
             f"control.force_limit_n {limit_n:g} N; set another --peak-n or limit"
         )
-    control = config.control.model_copy(update={"feedback": "current"})
-    vision = config.vision.model_copy(update={"checkpoint": "none"})
-    return config.model_copy(update={"control": control, "vision": vision}), peak_n
+    return config.with_values(control={"feedback": "current"}, vision={"checkpoint": "none"}), peak_n
 
 
 class _MonitoredSession:

@@ -62,10 +62,7 @@ def changed_config(
 ) -> Config:
     """Returns the configuration of a log with changes."""
     config = config_from_text(reader.config, str(reader.path), overrides)
-    if checkpoint is None:
-        return config
-    vision = config.vision.model_copy(update={"checkpoint": str(checkpoint)})
-    return config.model_copy(update={"vision": vision})
+    return config if checkpoint is None else config.with_values(vision={"checkpoint": str(checkpoint)})
 
 
 def resolve_replay(config: Config) -> ResolvedConfig:
@@ -77,8 +74,7 @@ def resolve_replay(config: Config) -> ResolvedConfig:
     """
     config, model, choice = resolve_vision(config)
     # The log's configuration contains the values of the rig profile, whose file may be gone.
-    calibration = config.calibration.model_copy(update={"rig": None})
-    profiles = read_profiles(config.model_copy(update={"calibration": calibration}))
+    profiles = read_profiles(config.with_values(calibration={"rig": None}))
     return ResolvedConfig(
         config,
         model,

@@ -85,19 +85,13 @@ def bench(
         GripperError: A grasp failed, or a scene can't be simulated.
     """
     for number, name in enumerate([name for _ in range(rounds) for name in objects]):
-        log = config.log.model_copy(update={"directory": folder})
         seed = config.seed + _OBJECT_SEEDS * number
-        one = with_same_object(config.model_copy(update={"object": name, "seed": seed, "log": log}))
+        one = with_same_object(config.with_values(object=name, seed=seed, log={"directory": folder}))
         rng = np.random.default_rng([seed, 21])
         results = []
         ratio = None
         for place in range(grasps):
-            again = one.model_copy(
-                update={
-                    "seed": seed + place,
-                    "control": one.control.model_copy(update={"object_ratio": ratio}),
-                }
-            )
+            again = one.with_values(seed=seed + place, control={"object_ratio": ratio})
             target_n = round(float(rng.uniform(*TARGETS_N)), 2)
             results += list(trials(again, 1, 1, objects=(name,), target_n=target_n, same_object=True))
             ratio = learned_ratio(Path(results[-1]["log"]))
@@ -105,17 +99,17 @@ def bench(
         logs = []
         for place in range(presses):
             logs.append(folder / f"press-{name}-{seed + _PRESS_SEEDS + place}.mcap")
-            _press(one.model_copy(update={"seed": seed + _PRESS_SEEDS + place}), logs[-1], rng)
+            _press(one.with_values(seed=seed + _PRESS_SEEDS + place), logs[-1], rng)
             progress(f"{name}, seed {seed}: press {place + 1}")
         yield _row(one, results, ratio, logs)
 
 
 def _press(config: Config, path: Path, rng: np.random.Generator) -> None:
-    control = config.control.model_copy(update={"feedback": "current", "object_ratio": None})
-    with open_run(config.model_copy(update={"control": control}), path, vision=False) as session:
+    config = config.with_values(control={"feedback": "current", "object_ratio": None})
+    with open_run(config, path, vision=False) as session:
         wait(session, 0.2)
         for _ in range(2):
-            ramp(session, float(rng.uniform(*PEAKS_N)), control.timeout_s)
+            ramp(session, float(rng.uniform(*PEAKS_N)), config.control.timeout_s)
             wait(session, 0.2)
         session.release()
 

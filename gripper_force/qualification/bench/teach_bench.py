@@ -23,7 +23,7 @@ from gripper_force.config import Config, load_config
 from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import Clip, load_clips, without_contact_starts
 from gripper_force.jobs.evaluate import evaluate
-from gripper_force.jobs.grasp import overall, trials
+from gripper_force.jobs.grasp import overall, trials, with_same_object
 from gripper_force.jobs.imports.video import import_folder
 from gripper_force.jobs.training import few
 from gripper_force.jobs.training.recipe import recipe
@@ -108,16 +108,17 @@ def foreign_rigs(config: Config, count: int) -> list[Rig]:
     """Returns rigs that no network has seen: other mountings and lenses, other jaws, other light."""
     rigs = []
     for i in range(count):
-        sim = config.sim.model_copy(
-            update={
+        own = config.with_values(
+            seed=FIRST_SEED + 1000 * i,
+            sim={
                 "rig_seed": FIRST_SEED + i,
                 "object_seed": FIRST_SEED + i,
                 "view_spread": (3.0, 6.0, 10.0)[i % 3],
                 "jaw_spread": (0.3, 0.6, 1.0)[i // 2 % 3],
                 "lux": (None, 350.0, 750.0)[(i + i // 3) % 3],
-            }
+            },
         )
-        own = config.model_copy(update={"sim": sim, "seed": FIRST_SEED + 1000 * i})
+        sim = own.sim
         rigs.append(Rig(f"view {sim.view_spread:g}, jaws {sim.jaw_spread:g}, {sim.lux or 'any'} lux", own))
     return rigs
 
@@ -186,16 +187,17 @@ def _measured(
     cell: Cell, config: Config, grasps: int, folder: Path, workers: int, progress: Progress
 ) -> Cell:
     place = folder / f"{cell.rig} {cell.object}".replace(",", "").replace(" ", "-")
-    log = config.log.model_copy(update={"directory": place / "grasps", "report": False})
-    config = config.model_copy(update={"object": cell.object, "log": log})
-    config = _with(config, "calibration", object="none")
+    config = config.with_values(
+        object=cell.object,
+        log={"directory": place / "grasps", "report": False},
+        calibration={"object": "none"},
+    )
     touched = list(
         record_touches(config, cell.touches, PEAK_N, place / "touches", progress=progress)
         if cell.touches
         else ()
     )
-    other = config.model_copy(update={"seed": config.seed + _OTHER_SEEDS})
-    other = _with(other, "sim", object_seed=_seed(config, "object_seed"), rig_seed=_seed(config, "rig_seed"))
+    other = with_same_object(config).with_values(seed=config.seed + _OTHER_SEEDS)
     test = list(record_touches(other, TESTS, PEAK_N, place / "test", progress=progress))
     begin_s = time.monotonic()
     learned = ""
@@ -203,7 +205,7 @@ def _measured(
     try:
         if cell.method == "calibrated":
             profile = calibrate_object(config, cell.object, logs=touched, out=out.with_suffix(".yaml"))
-            config = _with(config, "calibration", object=str(profile.profile_path))
+            config = config.with_values(calibration={"object": str(profile.profile_path)})
         elif cell.method == "taught":
             taught = teach(
                 config,
@@ -214,8 +216,10 @@ def _measured(
                 workers=workers,
             )
             learned = taught.learned
-            config = _with(config, "calibration", object=str((taught.bundle / "profile.yaml").absolute()))
-            config = _with(config, "vision", checkpoint=str(taught.bundle / "network.safetensors"))
+            config = config.with_values(
+                calibration={"object": str((taught.bundle / "profile.yaml").absolute())},
+                vision={"checkpoint": str(taught.bundle / "network.safetensors")},
+            )
         elif cell.method == "from scratch":
             config = _scratch(config, cell.object, touched, out)
     except DataError as error:  # too little to learn from: the method has no figure here
@@ -227,9 +231,12 @@ def _measured(
     mae_n = float(np.average([b.mae_n for b in below], weights=[b.frames for b in below]))
     result = replace(cell, mae_n=mae_n, minutes=minutes, learned=learned)
     for feedback in ("fused", "vision") if grasps else ():
-        own = _with(other, "control", feedback=feedback)
-        own = own.model_copy(update={"vision": config.vision, "calibration": config.calibration})
-        own = own.model_copy(update={"seed": other.seed + _OTHER_SEEDS})
+        own = other.with_values(
+            seed=other.seed + _OTHER_SEEDS,
+            vision=config.vision,
+            calibration=config.calibration,
+            control={"feedback": feedback},
+        )
         done = list(trials(own, grasps, 1, objects=(cell.object,), progress=progress))
         figures = overall(done, own.control.force_limit_n)
         if feedback == "fused":
@@ -246,18 +253,9 @@ def _scratch(config: Config, name: str, touched: Sequence[Path], out: Path) -> C
     clips = [replace(clip, set=clip.name) for clip in load_clips(list(touched), settings.preprocess)]
     network = out.with_suffix(".network.safetensors")
     train(settings, clips, network, validation_clips=clips)
-    config = _with(config, "vision", checkpoint=str(network))
+    config = config.with_values(vision={"checkpoint": str(network)})
     profile = calibrate_object(config, name, logs=touched, out=out.with_suffix(".yaml"))
-    return _with(config, "calibration", object=str(profile.profile_path))
-
-
-def _seed(config: Config, key: str) -> int:
-    seed: int | None = getattr(config.sim, key)
-    return config.seed if seed is None else seed
-
-
-def _with(config: Config, section: str, **values: object) -> Config:
-    return config.model_copy(update={section: getattr(config, section).model_copy(update=values)})
+    return config.with_values(calibration={"object": str(profile.profile_path)})
 
 
 def markdown(cells: Sequence[Cell]) -> str:

@@ -60,13 +60,7 @@ def kill_trial(config: Config, folder: Path, number: Signals) -> KillTrial:
         DeviceTimeoutError: The process did not grip anything.
         SimulationError: This machine is too slow for the scene.
     """
-    world = config.model_copy(
-        update={
-            "clock": "realtime",
-            "faults": (),
-            "servo": config.servo.model_copy(update={"port": f"virtual:{_BUS}"}),
-        }
-    )
+    world = config.with_values(clock="realtime", faults=(), servo={"port": f"virtual:{_BUS}"})
     with ExitStack() as stack:
         rig = SimulatedRig(world)
         stack.callback(rig.close)
@@ -121,16 +115,16 @@ def _wait(condition: Callable[[], bool], running: Callable[[], bool], limit_ns: 
 
 
 def _command(config: Config, port: str, folder: Path) -> list[str]:
-    changes = {
+    grasp = config.with_values(
+        clock="realtime",
+        faults=(),
         # a long margin, as the processes and the simulated world share this machine
-        "servo": {"port": port, "reply_margin_ms": 20.0},
-        "camera": {"backend": "none"},
-        "load_cell": {"backend": "none"},
-        "control": {"feedback": "current", "hold_s": 30.0},
-        "log": {"directory": folder, "report": False},
-    }
-    sections = {name: getattr(config, name).model_copy(update=update) for name, update in changes.items()}
-    grasp = config.model_copy(update={"clock": "realtime", "faults": (), **sections})
+        servo={"port": port, "reply_margin_ms": 20.0},
+        camera={"backend": "none"},
+        load_cell={"backend": "none"},
+        control={"feedback": "current", "hold_s": 30.0},
+        log={"directory": folder, "report": False},
+    )
     path = folder / "grasp.yaml"
     path.write_text(dump_config(grasp), encoding="utf-8")
     program = "from gripper_force.cli import main; main()"

@@ -201,14 +201,12 @@ def count_grasps(seeds: int, live_seeds: int, rows: Sequence[FaultCase] = ROWS) 
 def _draw(config: Config, index: int) -> Config:
     rng = np.random.default_rng([config.seed, 30, index])
     target_n = round(float(rng.uniform(*TRIAL_TARGETS_N)), 3)
-    return config.model_copy(
-        update={
-            "object": PAPER_OBJECTS[index % len(PAPER_OBJECTS)],
-            "target_n": target_n,
-            "seed": config.seed + index,
-            "control": config.control.model_copy(update={"force_limit_n": LIMIT_SHARE * target_n}),
-            "gripper": config.gripper.model_copy(update={"gain_bound": _GAIN_BOUND}),
-        }
+    return config.with_values(
+        object=PAPER_OBJECTS[index % len(PAPER_OBJECTS)],
+        target_n=target_n,
+        seed=config.seed + index,
+        control={"force_limit_n": LIMIT_SHARE * target_n},
+        gripper={"gain_bound": _GAIN_BOUND},
     )
 
 

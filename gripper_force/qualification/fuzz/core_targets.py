@@ -200,7 +200,7 @@ def _assign(data: bytes, _path: Path) -> None:
 
 
 def _use_config(config: Config) -> None:
-    completed = config.model_copy(update={"gripper": _completed(config.gripper)})
+    completed = config.with_values(gripper=_completed(config.gripper))
     config_from_text(dump_config(completed), "a dumped configuration")
     make_controller(completed).step(0, _state(0), None, Request(0, RequestKind.GRASP, config.target_n))
 

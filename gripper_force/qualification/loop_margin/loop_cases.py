@@ -169,8 +169,7 @@ def cases(config: Config, maps: Path | None, grid: Grid = FULL) -> Iterator[Nume
 
 def _run_grid(config: Config, truth: Gripper, grid: Grid, feedback: str, factor: float) -> Trials:
     gain = config.control.plant[0] / factor
-    control = config.control.model_copy(update={"feedback": feedback, "plant_gain": gain})
-    config = config.model_copy(update={"control": control})
+    config = config.with_values(control={"feedback": feedback, "plant_gain": gain})
     return {
         (stiffness, delay_s): grasp(config, replace(truth, stiffness_n_m=stiffness), delay_s, seed)
         for seed, (stiffness, delay_s) in enumerate(product(grid.stiffness_n_m, grid.delay_s))
@@ -272,12 +271,13 @@ def _tuned_row(
     """Returns the case of vision alone with the gains of an object profile."""
     found, predicted = [], []
     for (stiffness, plant), delay_s in product(plants.items(), grid.tuned_delay_s):
-        known = {
-            "plant_gain": plant.gain,
-            "plant_lag_ms": 1e3 * plant.lag_s,
-            "plant_delay_ms": 1e3 * (delay_s + FRAME_S / 2),
-        }
-        tuned = config.model_copy(update={"control": config.control.model_copy(update=known)})
+        tuned = config.with_values(
+            control={
+                "plant_gain": plant.gain,
+                "plant_lag_ms": 1e3 * plant.lag_s,
+                "plant_delay_ms": 1e3 * (delay_s + FRAME_S / 2),
+            }
+        )
         found.append(observed_margin(tuned, replace(truth, stiffness_n_m=stiffness), "vision", delay_s))
         predicted.append(margin_by_lag(gains_of(tuned, "vision"), plant, delay_s))
     return NumericalCase(

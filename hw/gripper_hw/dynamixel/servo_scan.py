@@ -63,8 +63,7 @@ def _scan_port(config: Config, name: str, baud_rates: tuple[int, ...], progress:
     virtual = name.startswith(VIRTUAL_PREFIX)
     with ExitStack() as stack:
         if virtual:
-            servo = config.servo.model_copy(update={"port": name})
-            alone = keep_only(config.model_copy(update={"servo": servo}), "servo")
+            alone = keep_only(config.with_values(servo={"port": name}), "servo")
             stack.enter_context(open_devices(alone))
         # Bytes pass a virtual port at any rate.
         for rate in (config.servo.baud_rate,) if virtual else baud_rates:

@@ -84,8 +84,7 @@ def find(config: Config, ports: Iterable[str], progress: Progress) -> Tree | Non
 
 def _sends_readings(config: Config, keys: Tree) -> bool:
     clock = MonotonicClock()
-    section = config.load_cell.model_copy(update=keys)
-    with closing(open_load_cell(config.model_copy(update={"load_cell": section}), clock)) as cell:
+    with closing(open_load_cell(config.with_values(load_cell=keys), clock)) as cell:
         cell.start()
         end_ns, readings = clock.now_ns() + round(_SEARCH_S * NS_PER_S), 0
         while clock.now_ns() < end_ns:

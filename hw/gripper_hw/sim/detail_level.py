@@ -42,8 +42,7 @@ def resolve_detail(config: Config) -> tuple[Config, str]:
             "set sim.detail to a level"
         )
     detail, reason = select_level(table[config.object], config.budget, config.object)
-    sim = config.sim.model_copy(update={"detail": detail})
-    return config.model_copy(update={"sim": sim}), reason
+    return config.with_values(sim={"detail": detail}), reason
 
 
 def select_level(levels: Levels, budget: BudgetConfig, name: str) -> tuple[str, str]:

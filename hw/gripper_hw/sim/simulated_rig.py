@@ -325,7 +325,7 @@ class SimulatedRig:
 
     def render_under_light(self, lux: float) -> tuple[Camera, dict[str, str]]:
         """Returns a camera of this world with the images of a rig of this ``sim.lux``, and its notes."""
-        config = self._config.model_copy(update={"sim": self._config.sim.model_copy(update={"lux": lux})})
+        config = self._config.with_values(sim={"lux": lux})
         scene = draw_scene(config.object, config.seed, config.sim)
         camera = SimulatedCamera(self._world, scene, config, self.clock, self.start_ns)
         return camera, {**self.notes(), "scene": json.dumps(asdict(scene))}

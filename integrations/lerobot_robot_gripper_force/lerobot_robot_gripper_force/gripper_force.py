@@ -50,9 +50,7 @@ class GripperForce(Robot):
         super().__init__(config)
         self.config = config
         # LeRobot's users expect no torque after `disconnect`.
-        self.settings = gf.load_config(config.config, config.overrides).model_copy(
-            update={"on_exit": "release"}
-        )
+        self.settings = gf.load_config(config.config, config.overrides).with_values(on_exit="release")
         self.cameras = make_cameras_from_configs(config.cameras)
 
     @cached_property

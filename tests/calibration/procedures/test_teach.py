@@ -208,7 +208,7 @@ def test_grasps_find_the_bundle_by_the_object_and_a_setting_prevents_it(taught: 
     by_path = load_config(None, [f"calibration.object={taught.bundle}"])
     assert with_bundle(by_path)[0].vision.checkpoint == used.vision.checkpoint
     again = load_config(None, ["object=disc", f"calibration.object={taught.bundle}/profile.yaml"])
-    assert with_bundle(again)[0] == used.model_copy(update={"object": "disc"})
+    assert with_bundle(again)[0] == used.with_values(object="disc")
 
 
 def test_own_profiles_bring_their_networks_to_an_evaluation(taught: Taught, logs: list[Path]) -> None:
@@ -367,9 +367,9 @@ def test_logs_without_contact_and_too_few_logs(
 
 
 def test_a_missing_network_is_found_before_the_first_touch(config: Config, tmp_path: Path) -> None:
-    vision = config.vision.model_copy(update={"checkpoint": "none"})
+    blind = config.with_values(vision={"checkpoint": "none"})
     with pytest.raises(ConfigError, match="teach needs a network to begin with"):
-        teach(config.model_copy(update={"vision": vision}), "disc", folder=tmp_path / "touches")
+        teach(blind, "disc", folder=tmp_path / "touches")
     assert not (tmp_path / "touches").exists()
 
 

@@ -98,10 +98,10 @@ def test_existing_sets_are_kept(config: Config, tmp_path: Path) -> None:
     peak_n = next(LogReader(missing).records(Request)).target_n
     assert peak_n == np.random.default_rng([config.seed + 1, 12]).uniform(1, 9)
     missing_bytes = missing.read_bytes()
-    retared = config.model_copy(update={"load_cell": config.load_cell.model_copy(update={"tare_raw": 0.2})})
+    retared = config.with_values(load_cell={"tare_raw": 0.2})
     assert made(retared, plan, tmp_path) == [kept, missing]
     assert missing.read_bytes() == missing_bytes
-    dimmed = config.model_copy(update={"sim": config.sim.model_copy(update={"lux": 100.0})})
+    dimmed = config.with_values(sim={"lux": 100.0})
     with pytest.raises(DataError, match=r"stapler-01\.mcap exists already .* sim\.lux None, not 100"):
         made(dimmed, plan, tmp_path)
     with pytest.raises(DataError, match=r"target_n 9\.0, not 5\.0; use another folder"):
@@ -146,7 +146,7 @@ def test_device_failure_ends_recording(
 ) -> None:
     broken = load_config(None, [f"faults=[{{unit: {unit}, kind: {kind}, at_s: 0.2}}]"]).faults
     with pytest.raises(DeviceError, match=sentence):
-        made(config.model_copy(update={"faults": broken}), RecordingPlan(1), tmp_path)
+        made(config.with_values(faults=broken), RecordingPlan(1), tmp_path)
     assert not list(tmp_path.rglob("*.mcap"))
 
 
@@ -173,23 +173,17 @@ def test_jaws_that_do_not_open_first_are_named(
     config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(state_machine, "_OPENING_SPARE_S", -1.8)
-    gripper = config.gripper.model_copy(
-        update={"open_position_rad": -0.3}
-    )  # open jaws seem to be 80 mm apart
+    narrow = config.with_values(gripper={"open_position_rad": -0.3})  # open jaws seem to be 80 mm apart
     with pytest.raises(DeviceError, match="have not opened within"):
-        made(config.model_copy(update={"gripper": gripper}), RecordingPlan(1), tmp_path)
+        made(narrow, RecordingPlan(1), tmp_path)
 
 
 def test_jaws_open_after_fault_if_configured(config: Config, tmp_path: Path) -> None:
     overrides = ["faults=[{unit: plant, kind: wrong, at_s: 1.0}]", "control.on_fault=open"]
     faulty = load_config(None, overrides)
-    control = config.control.model_copy(update={"on_fault": faulty.control.on_fault})
+    opening = config.with_values(faults=faulty.faults, control={"on_fault": faulty.control.on_fault})
     with pytest.raises(DeviceError, match="set 1 ended with a fault"):
-        made(
-            config.model_copy(update={"faults": faulty.faults, "control": control}),
-            RecordingPlan(1),
-            tmp_path,
-        )
+        made(opening, RecordingPlan(1), tmp_path)
     (left,) = tmp_path.rglob("*.part")
     widths_m = [status.width_m for status in LogReader(left).records(GraspStatus)]
     assert min(widths_m) < 0.08
@@ -245,8 +239,7 @@ def test_sets_of_an_object_file_that_was_changed_are_not_mixed(config: Config, t
     file = tmp_path / "foam.yaml"
     text = "family: solid\nsize_m: [0.05, 0.05, 0.05]\nmodulus_pa: 30000\n"
     file.write_text(text)
-    sim = config.sim.model_copy(update={"object": file})
-    own = config.model_copy(update={"object": "foam", "sim": sim})
+    own = config.with_values(object="foam", sim={"object": file})
     list(record(own, RecordingPlan(1, touches=1, peak_n=3, test_every=None), tmp_path / "out"))
     file.write_text(text.replace("30000", "60000"))
     with pytest.raises(DataError, match=r"file has changed between .*foam-01\.mcap and .*foam-02\.mcap"):
@@ -254,16 +247,14 @@ def test_sets_of_an_object_file_that_was_changed_are_not_mixed(config: Config, t
 
 
 def test_recording_continues_with_the_detail_that_auto_chose(config: Config, tmp_path: Path) -> None:
-    sim, budget = config.sim.model_copy(update={"detail": "auto"}), {"sim_speed": 0.01}
-    auto = config.model_copy(update={"sim": sim, "budget": config.budget.model_copy(update=budget)})
+    auto = config.with_values(sim={"detail": "auto"}, budget={"sim_speed": 0.01})
     first = made(auto, RecordingPlan(1, touches=1), tmp_path)
     assert made(auto, RecordingPlan(2, touches=1), tmp_path)[0] == first[0]
 
 
 def test_touch_that_reaches_no_force_raises(config: Config, tmp_path: Path) -> None:
-    control = config.control.model_copy(update={"timeout_s": 0.3})
     with pytest.raises(DataError, match=r"touch 1 of set 1 reached no force: .* is between the jaws"):
-        made(config.model_copy(update={"control": control}), RecordingPlan(1), tmp_path)
+        made(config.with_values(control={"timeout_s": 0.3}), RecordingPlan(1), tmp_path)
     assert not list(tmp_path.rglob("*.mcap"))
 
 

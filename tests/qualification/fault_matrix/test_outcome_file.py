@@ -21,7 +21,7 @@ def test_outcomes_of_another_configuration_raise(tmp_path: Path) -> None:
     path = tmp_path / "outcomes.jsonl"
     OutcomeFile[int](path, CONFIG, resume=False).add("a", 1)
     with pytest.raises(DataError, match="with another configuration; run without --resume"):
-        OutcomeFile[int](path, CONFIG.model_copy(update={"seed": 6}), resume=True)
+        OutcomeFile[int](path, CONFIG.with_values(seed=6), resume=True)
 
 
 @pytest.mark.parametrize("damage", ["{", "[1, 2]", "7"])

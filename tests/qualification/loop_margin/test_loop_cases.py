@@ -30,7 +30,7 @@ SMALL = Grid(
 
 
 def verdict(truth: Gripper, delay_s: float = 0.035, **control: object) -> Verdict:
-    changed = CONFIG.model_copy(update={"control": CONFIG.control.model_copy(update=control)})
+    changed = CONFIG.with_values(control=control)
     return grasp(changed, truth, delay_s, 0).verdict
 
 
