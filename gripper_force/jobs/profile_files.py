@@ -1,11 +1,13 @@
 """Writing of profiles."""
 
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
 from safetensors.numpy import save
 
 from gripper_force.errors import ConfigError
+from gripper_force.files import unfinished
 from gripper_force.profiles.correction import ProfileArrays
 from gripper_force.profiles.object_profile import ObjectProfile, weights_path
 from gripper_force.profiles.rig_profile import (
@@ -78,13 +80,11 @@ def write_all(files: dict[Path, bytes]) -> None:
     Raises:
         ConfigError: One can't be written.
     """
-    parts = {path: path.with_name(f".{path.name}.part") for path in files}
     try:
-        for path, data in files.items():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            parts[path].write_bytes(data)
-        for path, part in parts.items():
-            part.replace(path)
+        with ExitStack() as stack:
+            for path, data in reversed(files.items()):  # the stack renames the last one first
+                path.parent.mkdir(parents=True, exist_ok=True)
+                stack.enter_context(unfinished(path)).write_bytes(data)
     except OSError as error:
         names = " and ".join(map(str, files))
         raise ConfigError(f"can't write {names}: {error.strerror}, {error.filename}") from error

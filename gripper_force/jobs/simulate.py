@@ -19,6 +19,7 @@ import numpy as np
 
 from gripper_force.config import Config, config_from
 from gripper_force.errors import ConfigError
+from gripper_force.files import unfinished
 from gripper_force.jobs.grasp import PAPER_OBJECTS, exclusive_device, run_grasp
 from gripper_force.jobs.processes import Workers
 from gripper_force.jobs.recording.record import check_same
@@ -153,13 +154,12 @@ def make_log(task: SimulationPlan, out: Path, config: Tree) -> Path:
     """
     rng = np.random.default_rng([task.seed, 10])
     drawn = _randomised(config_from({**config, "object": task.object}, "simulate"), task, rng)
-    path, unfinished = out / task.name, out / f".{task.name}.part"
-    unfinished.unlink(missing_ok=True)
-    if task.kind == "grasp":
-        run_grasp(drawn, unfinished)
-    else:
-        (_tap if task.kind == "tap" else _press)(drawn, unfinished, rng)
-    return unfinished.rename(path)
+    with unfinished(path := out / task.name) as part:
+        if task.kind == "grasp":
+            run_grasp(drawn, part)
+        else:
+            (_tap if task.kind == "tap" else _press)(drawn, part, rng)
+    return path
 
 
 def _randomised(config: Config, task: SimulationPlan, rng: np.random.Generator) -> Config:

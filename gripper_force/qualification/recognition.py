@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from gripper_force.config import Config, LogConfig, VisionConfig, config_from, dump_config
 from gripper_force.errors import DataError
+from gripper_force.files import unfinished
 from gripper_force.jobs.dataset import CONTACT_N, label_frames
 from gripper_force.jobs.grasp import PAPER_OBJECTS
 from gripper_force.jobs.processes import process_pool
@@ -287,8 +288,8 @@ def _press(row: int, index: int, folder: Path, tree: Tree) -> Tree:
         "rejected": rejected[used].tolist(),
     }
     kept.parent.mkdir(parents=True, exist_ok=True)
-    kept.with_suffix(".part").write_text(json.dumps(result), encoding="utf-8")
-    kept.with_suffix(".part").rename(kept)
+    with unfinished(kept) as part:
+        part.write_text(json.dumps(result), encoding="utf-8")
     return result
 
 

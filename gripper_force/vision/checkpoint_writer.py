@@ -7,6 +7,7 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from gripper_force.errors import CheckpointError
+from gripper_force.files import unfinished
 from gripper_force.vision.checkpoint import Member
 from gripper_force.vision.header import FORMAT, Header, digest_of, read_checkpoint
 
@@ -47,9 +48,8 @@ def _write(path: Path, tensors: dict[str, Tensor], header: Header) -> None:
     data = save(tensors, metadata={FORMAT: header.model_dump_json(exclude_none=True)})
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_name(f".{path.name}.part")
-        part.write_bytes(data)  # a full disk must not damage the file that it replaces
-        part.replace(path)
+        with unfinished(path) as part:
+            part.write_bytes(data)  # a full disk must not damage the file that it replaces
     except OSError as error:
         raise CheckpointError(
             f"can't write the checkpoint {path}: {error.strerror}; name another file"

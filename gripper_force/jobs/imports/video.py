@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from gripper_force.config import Config, dump_config
 from gripper_force.errors import DataError, LogError
+from gripper_force.files import unfinished
 from gripper_force.jobs.dataset import label_frames, starts_in_contact
 from gripper_force.jobs.recording.lag import force_lag_s
 from gripper_force.progress import Progress, no_progress
@@ -302,19 +303,16 @@ def write_recording(
     """
     if out.exists():
         raise LogError(f"can't write the log {out}: it exists already; move it away, or use another folder")
-    unfinished = out.with_name(f".{out.name}.part")
-    unfinished.unlink(missing_ok=True)
     spikes = sum(not sample.valid for sample in samples)
     records: list[Frame | LoadCellSample] = [*frames, *samples]
     forces_n, _ = label_frames(np.array([frame.t_ns for frame in frames], np.int64), samples, 0)
     in_contact = starts_in_contact(forces_n, Preprocess())
     metadata = {**metadata, "spikes_rejected": str(spikes), "starts_in_contact": str(in_contact).lower()}
-    with LogWriter(unfinished, config=dump_config(config), metadata=metadata) as log:
+    with unfinished(out) as part, LogWriter(part, config=dump_config(config), metadata=metadata) as log:
         if table is not None:
             log.attach(table.name, table.read_bytes(), "text/csv")
         for record in sorted(records, key=lambda record: record.t_ns):
             log.write(record)
-    unfinished.rename(out)
     return spikes, in_contact
 
 

@@ -21,6 +21,7 @@ from gripper_force.config import Config, config_from_text
 from gripper_force.control.limits import largest_target_n
 from gripper_force.control.state_machine import Decision
 from gripper_force.errors import ConfigError, DataError, DeviceError
+from gripper_force.files import unfinished
 from gripper_force.interfaces import Devices
 from gripper_force.jobs.dataset import CONTACT_N
 from gripper_force.jobs.recording.touches import touch
@@ -148,21 +149,18 @@ def record(
             continue
         if prompt is not None:
             prompt(f"Put the object between the jaws for {'touch' if plan.touches == 1 else 'set'} {number}")
-        unfinished = path.with_name(f".{path.name}.part")
-        unfinished.unlink(missing_ok=True)
         notes = {"set": path.stem}
         notes |= {"split": split} if (split := plan.split(number)) else {}
         notes |= {} if plan.degrees is None else {"degrees": f"{plan.degrees:g}"}
         notes |= {} if plan.lux is None else {"lux": f"{plan.lux:g}"}
-        with open_devices(run.config) as devices:
+        with unfinished(path) as part, open_devices(run.config) as devices:
             devices.notes.update(notes)
             _open_jaws(run, devices)
-            with open_session(run, devices, unfinished) as session:
+            with open_session(run, devices, part) as session:
                 _touch_all(_MonitoredSession(session, devices, one, plan, number, progress), plan.touches)
                 session.release()
-        made = unfinished.rename(path)
-        first = _checked_object(made, first)
-        yield made
+        first = _checked_object(path, first)
+        yield path
 
 
 def _checked_object(path: Path, first: tuple[Path, str] | None) -> tuple[Path, str]:

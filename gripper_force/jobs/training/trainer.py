@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from gripper_force.errors import CheckpointError, NonFiniteError
+from gripper_force.files import unfinished
 from gripper_force.jobs.dataset import CONTACT_N
 from gripper_force.jobs.training.batches import Batch, Batches, Replay
 from gripper_force.jobs.training.parallel import TrainingProcess, share_statistics
@@ -206,11 +207,10 @@ class Trainer:
             "smooth_n": str(self._smoothed_rmse_n),
             "identity": identity,
         }
-        partial = path.with_suffix(".partial")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            save_file(tensors, partial, metadata=progress)
-            partial.replace(path)
+            with unfinished(path) as part:
+                save_file(tensors, part, metadata=progress)
         except (OSError, SafetensorError) as error:
             raise CheckpointError(
                 f"can't write the training state {path}: {error}; check the folder and free space"

@@ -19,6 +19,7 @@ from scipy import stats
 
 from gripper_force.config import load_config
 from gripper_force.errors import DataError
+from gripper_force.files import unfinished
 from gripper_force.jobs.dataset import CONTACT_N, Clip, load_clips
 from gripper_force.jobs.evaluate import estimates
 from gripper_force.jobs.paper_protocol import RATE_HZ, SetPlan, plan_protocol
@@ -329,6 +330,5 @@ def _train(task: _Task, files: _Files, workers: int) -> None:
         force_n[0, _labelled(clip, recipe.preprocess)]
         for force_n, clip in zip(forces_n, testing, strict=True)
     ]
-    unfinished = path.with_suffix(".part.npy")
-    np.save(unfinished, np.concatenate(labelled).astype(np.float64), allow_pickle=False)
-    unfinished.rename(files.estimates(scale, net, seed))
+    with unfinished(files.estimates(scale, net, seed)) as part, part.open("wb") as file:
+        np.save(file, np.concatenate(labelled).astype(np.float64), allow_pickle=False)
