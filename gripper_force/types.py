@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 NS_PER_S: Final = 1_000_000_000
 NS_PER_MS: Final = 1_000_000
+STANDARD_GRAVITY_M_S2: Final = 9.80665
 
 Gray = npt.NDArray[np.uint8]
 """A gray image, (H, W) uint8."""

@@ -75,10 +75,11 @@ def load_cell(
 ) -> None:
     """Calibrate a load cell's tare and scale with a known mass: empty, loaded, empty again."""
     from gripper_calibration.procedures import calibrate_load_cell as job
+    from gripper_force.types import STANDARD_GRAVITY_M_S2
 
     if (mass_kg is None) == (force_n is None):
         raise ConfigError("pass the load that is put on the load cell: either --mass-kg or --force-n")
-    weight_n = force_n if force_n is not None else (mass_kg or 0.0) * job.STANDARD_GRAVITY_M_S2
+    weight_n = force_n if force_n is not None else (mass_kg or 0.0) * STANDARD_GRAVITY_M_S2
     settings, path = _rig_settings(config, set_, {}, rig)
     with console.err.status("reading") as status:
         result = job.calibrate_load_cell(

@@ -20,9 +20,8 @@ from gripper_force.jobs.profile_files import update_rig
 from gripper_force.profiles.rig_profile import LoadCellCalibration, read_rig
 from gripper_force.progress import Progress, Prompt, no_progress
 from gripper_force.runtime.backends import MonotonicClock
-from gripper_force.types import NS_PER_MS, NS_PER_S, LoadCellSample
+from gripper_force.types import NS_PER_MS, NS_PER_S, STANDARD_GRAVITY_M_S2, LoadCellSample
 
-STANDARD_GRAVITY_M_S2: Final = 9.80665
 NEUTRAL_N_PER_RAW: Final = 1e-9
 """A scale so small that no threshold in newtons acts: the driver then only rejects saturated and
 stuck readings. The fit rejects spikes, because it knows the scale."""

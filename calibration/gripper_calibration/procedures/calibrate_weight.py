@@ -8,7 +8,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import t as student
 
-from gripper_calibration.procedures.calibrate_load_cell import STANDARD_GRAVITY_M_S2
 from gripper_calibration.procedures.powered_servo import RATE_HZ, BusCycles, servo_alone, torque_on
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DataError, DeviceError
@@ -16,6 +15,7 @@ from gripper_force.profiles.rig_profile import CalibratedValue, torque_settings
 from gripper_force.progress import Progress, Prompt, no_progress
 from gripper_force.runtime.backends import is_simulated, open_devices
 from gripper_force.runtime.resolve import make_controller, resolve
+from gripper_force.types import STANDARD_GRAVITY_M_S2
 
 LINKAGES: Final = ("rack", "crank_slider", "table")
 """Linkages whose jaws move along a line, so that a weight on one jaw does the same work everywhere."""

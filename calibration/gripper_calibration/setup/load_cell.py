@@ -2,11 +2,12 @@
 
 from typing import Final
 
-from gripper_calibration.procedures.calibrate_load_cell import STANDARD_GRAVITY_M_S2, calibrate_load_cell
+from gripper_calibration.procedures.calibrate_load_cell import calibrate_load_cell
 from gripper_calibration.setup.step import Found, Outcome, Task
 from gripper_force.errors import ConfigError
 from gripper_force.jobs import doctor
 from gripper_force.profiles.rig_profile import CalibratedValue
+from gripper_force.types import STANDARD_GRAVITY_M_S2
 
 PROFILE: Final = "measured.yaml"
 """Rig profile in the setup's folder, in which the procedures keep their results."""

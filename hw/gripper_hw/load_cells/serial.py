@@ -11,14 +11,13 @@ import serial
 from gripper_force.config import LoadCellConfig
 from gripper_force.errors import ConfigError, DeviceError
 from gripper_force.interfaces import Clock
+from gripper_force.types import STANDARD_GRAVITY_M_S2
 from gripper_hw.load_cells.line_formats import PARSERS, LineSplitter
 from gripper_hw.load_cells.screening import LiveLoadCell
 from gripper_hw.serial_line import open_line
 
 RECONNECT_S: Final = 0.5
 """Pause between two attempts to open a lost port."""
-
-STANDARD_GRAVITY_M_S2: Final = 9.80665
 
 
 class SerialLoadCell(LiveLoadCell):

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from gripper_force.config import GripperConfig
 from gripper_force.control.linkage import Linkage, RackAndPinion, make_linkage
 from gripper_force.errors import ConfigError, SimulationError
-from gripper_force.types import NS_PER_S
+from gripper_force.types import NS_PER_S, STANDARD_GRAVITY_M_S2
 from gripper_hw.sim.engine import mujoco, new_renderer
 from gripper_hw.sim.objects import NO_OBJECT
 from gripper_hw.sim.scene import Scene, horn_dynamics, scene_mjcf
@@ -36,7 +36,6 @@ _MAX_STEP_S = 0.004
 
 _CURRENT_NOISE_A = 0.003
 _JAW_HALF_HEIGHT_M = 0.011
-_STANDARD_GRAVITY_M_S2 = 9.80665
 _AWAY_M = (1.0, 0.0, 0.0)
 """Position of an object that has left the jaws, outside the image."""
 
@@ -238,7 +237,7 @@ class World:
             return
         self._model.body_mass[self._model.body("right").id] += mass_kg
         mujoco.mj_setConst(self._model, self._data)
-        self._data.qfrc_applied[self._addresses("right")[1]] = -mass_kg * _STANDARD_GRAVITY_M_S2
+        self._data.qfrc_applied[self._addresses("right")[1]] = -mass_kg * STANDARD_GRAVITY_M_S2
 
     def _addresses(self, joint: str) -> tuple[int, int]:
         return int(self._model.joint(joint).qposadr[0]), int(self._model.joint(joint).dofadr[0])
