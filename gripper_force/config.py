@@ -28,6 +28,9 @@ from gripper_force.schema import (
 HARD_FORCE_LIMIT_N: Final = 70.0
 """Upper bound of control.force_limit_n: the lowest limit that is quoted for a clamped finger."""
 
+VIRTUAL_PREFIX: Final = "virtual:"
+"""Begin of the name of a simulated bus in this process, as servo.port."""
+
 _BACKEND: Final = "or package.module:Class, or a name that an installed package registers"
 
 
@@ -91,6 +94,11 @@ class ServoConfig(Section):
     def ids(self) -> tuple[int, ...]:
         """Ids of the gripper's servos: one, or one for each finger."""
         return (self.id,) if self.second.id is None else (self.id, self.second.id)
+
+    @property
+    def is_virtual(self) -> bool:
+        """True if the port is that of a simulated bus in this process."""
+        return self.port.startswith(VIRTUAL_PREFIX)
 
 
 class LinkageConfig(Section):

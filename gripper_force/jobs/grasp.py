@@ -233,7 +233,7 @@ def exclusive_device(config: Config) -> str:
     servo = config.servo
     if servo.backend != "dynamixel":
         return f"servo.backend={servo.backend}"
-    if not servo.port.startswith("virtual:"):
+    if not servo.is_virtual:
         return f"servo.port={servo.port}"
     for unit, backend in (("camera", config.camera.backend), ("load_cell", config.load_cell.backend)):
         if backend not in ("none", "simulated", "playback"):

@@ -57,9 +57,7 @@ def load_servo_class(config: Config) -> Any:
 def is_simulated(config: Config) -> bool:
     """Returns True if the run has a simulated world."""
     devices = (config.camera.backend, config.load_cell.backend)
-    return "simulated" in devices or (
-        config.servo.backend == "dynamixel" and config.servo.port.startswith("virtual:")
-    )
+    return "simulated" in devices or (config.servo.backend == "dynamixel" and config.servo.is_virtual)
 
 
 def resolve_simulation(config: Config) -> tuple[Config, str]:
@@ -87,13 +85,13 @@ def with_camera_rate(config: Config) -> Config:
 
 def check_devices(config: Config, port: SharedPort | None = None) -> None:
     """Checks that the configured backends exist and go together, without opening one. Raises `ConfigError`."""
-    if port is not None and (config.servo.backend not in SERVOS or config.servo.port.startswith("virtual:")):
+    if port is not None and (config.servo.backend not in SERVOS or config.servo.is_virtual):
         raise ConfigError(
             f"a shared port works with servo.backend=dynamixel and a real servo.port, not with "
             f"{config.servo.backend} and {config.servo.port}; set servo.port to the device path of the port"
         )
     if is_simulated(config):
-        if not config.servo.port.startswith("virtual:"):
+        if not config.servo.is_virtual:
             raise ConfigError(
                 f"servo.port {config.servo.port!r} is not virtual, but a simulated camera or load cell needs "
                 "the simulated servo; set camera.backend and load_cell.backend to real devices or none, or "

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from gripper_calibration.setup.step import Found, Outcome, Task
+from gripper_force.config import VIRTUAL_PREFIX
 from gripper_force.errors import DeviceNotFoundError
 from gripper_force.jobs import doctor
 from gripper_force.jobs.checks import FoundServo, PortScan
@@ -61,7 +62,7 @@ def scan(task: Task) -> Outcome:
 
 
 def _is_virtual(port: str) -> bool:
-    return port.startswith("virtual:")
+    return port.startswith(VIRTUAL_PREFIX)
 
 
 def _line(servo: FoundServo) -> str:

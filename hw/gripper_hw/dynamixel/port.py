@@ -14,10 +14,9 @@ from typing import Any, Final, NoReturn, Protocol, TypeVar
 import serial
 from dynamixel_sdk import PortHandler
 
+from gripper_force.config import VIRTUAL_PREFIX
 from gripper_force.errors import ConfigError, DeviceError, DeviceLostError
 from gripper_hw.serial_line import open_line
-
-VIRTUAL_PREFIX: Final = "virtual:"
 
 _MAX_REPLY_BYTES: Final = 4096  # a scan of all ids; more means that the other end never stops sending
 

@@ -19,7 +19,6 @@ from gripper_hw.dynamixel.control_table import (
     rad_from_ticks,
 )
 from gripper_hw.dynamixel.fingers import FingerPair
-from gripper_hw.dynamixel.port import VIRTUAL_PREFIX
 from gripper_hw.dynamixel.servo import CYCLE_BYTES, MIN_FIRMWARE, DynamixelBus, hardware_error_text
 from gripper_hw.dynamixel.servo_scan import BAUD_RATES, FAST_BAUD_RATE
 from gripper_hw.dynamixel.transport import Transport
@@ -53,7 +52,7 @@ def probe(config: Config, sysfs: Path = _SYSFS) -> Iterator[Check]:
     ports = [f"{port.device}: {port.description}" for port in list_ports.comports()]
     yield from (Check("servo", "listed", port, None) for port in ports or ["no serial port"])
     servo = config.servo
-    if config.clock == "lockstep" and not servo.port.startswith(VIRTUAL_PREFIX):
+    if config.clock == "lockstep" and not servo.is_virtual:
         advice = "a real servo does not follow simulated time: set clock=realtime"
         yield Check("servo", "clock", "lockstep", False, advice)
     with _opened(config) as inspection:
@@ -260,7 +259,7 @@ class _Inspection:
 @contextmanager
 def _opened(config: Config) -> Iterator[_Inspection]:
     with ExitStack() as stack:
-        if config.servo.port.startswith(VIRTUAL_PREFIX):
+        if config.servo.is_virtual:
             stack.enter_context(open_devices(keep_only(config, "servo")))
         inspection = _Inspection(config.servo)
         stack.callback(lambda: inspection.transport.close())
@@ -273,7 +272,7 @@ def _open(transport: Transport, servo: ServoConfig) -> None:
 
 
 def _other_baud_rate(servo: ServoConfig, id_: int) -> int | None:
-    if servo.port.startswith(VIRTUAL_PREFIX):
+    if servo.is_virtual:
         return None
     for rate in BAUD_RATES:
         if rate == servo.baud_rate:

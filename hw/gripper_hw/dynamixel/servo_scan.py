@@ -7,13 +7,12 @@ from typing import Final
 
 from serial.tools import list_ports
 
-from gripper_force.config import Config
+from gripper_force.config import VIRTUAL_PREFIX, Config
 from gripper_force.errors import ConfigError, GripperError
 from gripper_force.jobs.checks import FoundServo, PortScan, keep_only
 from gripper_force.progress import Progress, no_progress
 from gripper_force.runtime.backends import open_devices
 from gripper_hw.dynamixel.control_table import load_model, model_name
-from gripper_hw.dynamixel.port import VIRTUAL_PREFIX
 from gripper_hw.dynamixel.transport import Transport
 
 BAUD_RATES: Final = {

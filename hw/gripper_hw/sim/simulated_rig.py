@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, cast
 import numpy as np
 import numpy.typing as npt
 
-from gripper_force.config import Config
+from gripper_force.config import VIRTUAL_PREFIX, Config
 from gripper_force.errors import ConfigError, SimulationError
 from gripper_force.interfaces import Camera, Clock, LoadCell, WorldState
 from gripper_force.runtime.backends import MonotonicClock
@@ -252,7 +252,7 @@ class SimulatedRig:
         self._closing = ExitStack()
         if config.faults:
             self._wrap_in_faults(faults, config.seed)
-        self._bus_name = config.servo.port.removeprefix("virtual:")
+        self._bus_name = config.servo.port.removeprefix(VIRTUAL_PREFIX)
         register_bus(self._bus_name, bus)
         self.start_ns = start_ns
         self._failure: Exception | None = None
