@@ -78,13 +78,11 @@ class Correction:
     def __init__(self, profile: ObjectProfile, arrays: ProfileArrays, differs: Sequence[str] = ()) -> None:
         self.profile, self.differs = profile, tuple(differs)
         self._arrays, self.known = arrays, arrays.known
-        self._estimate_n = np.array(profile.output.estimate_n)
-        self._force_n = np.array(profile.output.force_n)
         self._z = NormalDist().inv_cdf(0.5 + profile.interval.coverage / 2)
 
     def force_n(self, estimate_n: npt.ArrayLike, features: Features) -> Floats:
         """Returns corrected forces, (N,), for the members' mean (N,) and their features (N, F)."""
-        return curve_n(self._estimate_n, self._force_n, estimate_n) + self._arrays.head_n(features)
+        return self.profile.output.at(estimate_n) + self._arrays.head_n(features)
 
     def half_width_n(self, force_n: npt.ArrayLike) -> Floats:
         """Returns the half-width of the interval, (N,), for corrected forces (N,).
@@ -100,21 +98,6 @@ class Correction:
     def std_n(self, force_n: npt.ArrayLike) -> Floats:
         """Returns the standard deviation of a normal error with that interval, (N,)."""
         return self.half_width_n(force_n) / self._z
-
-
-def curve_n(estimate_n: Floats, force_n: Floats, at_n: npt.ArrayLike) -> Floats:
-    """Evaluates a piecewise linear curve, extrapolated linearly beyond its ends.
-
-    Args:
-        estimate_n: Knots, rising, (K,).
-        force_n: Values at the knots, (K,).
-        at_n: Where to evaluate, (N,).
-    """
-    at = np.asarray(at_n, np.float64)
-    segment = np.clip(np.searchsorted(estimate_n, at) - 1, 0, len(estimate_n) - 2)
-    slope = np.diff(force_n) / np.diff(estimate_n)
-    value: Floats = force_n[segment] + slope[segment] * (at - estimate_n[segment])
-    return value
 
 
 def load_correction(

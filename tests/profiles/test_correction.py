@@ -14,7 +14,6 @@ from gripper_force.profiles.correction import (
     Correction,
     KnownFrames,
     ProfileArrays,
-    curve_n,
     load_correction,
 )
 from gripper_force.profiles.object_profile import (
@@ -60,7 +59,8 @@ def written(path: Path, arrays: ProfileArrays) -> str:
 
 @given(st.floats(-20, 40))
 def test_curve_is_extrapolated_linearly(at_n: float) -> None:
-    value_n = float(curve_n(np.array([0.0, 2.0, 4.0]), np.array([0.5, 1.5, 4.5]), [at_n])[0])
+    curve = OutputCurve(kind="monotone", estimate_n=(0.0, 2.0, 4.0), force_n=(0.5, 1.5, 4.5))
+    value_n = float(curve.at([at_n])[0])
     assert value_n == pytest.approx(0.5 + 0.5 * at_n if at_n < 2 else 1.5 + 1.5 * (at_n - 2))
 
 

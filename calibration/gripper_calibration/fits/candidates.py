@@ -3,12 +3,9 @@
 from collections.abc import Iterator, Sequence
 from typing import Final, NamedTuple
 
-import numpy as np
-
 from gripper_calibration.fits.output_curve import BENDS, fit_curve, fit_line, identity
 from gripper_calibration.fits.ridge import PENALTIES, Ridge
 from gripper_calibration.fits.touches import Floats, Touches
-from gripper_force.profiles.correction import curve_n
 from gripper_force.profiles.object_profile import OutputCurve
 
 
@@ -41,8 +38,7 @@ class FittedCandidate(NamedTuple):
 
     def predict(self, touches: Touches) -> Floats:
         """Returns the corrected forces, (N,)."""
-        knots = np.array(self.output.estimate_n), np.array(self.output.force_n)
-        force_n = curve_n(*knots, touches.estimate_n)
+        force_n = self.output.at(touches.estimate_n)
         return force_n if self.head is None else force_n + touches.features @ self.head + self.offset_n
 
 

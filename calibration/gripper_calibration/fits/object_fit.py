@@ -14,7 +14,7 @@ from gripper_calibration.fits.output_curve import fit_line
 from gripper_calibration.fits.touches import Floats, Touches, check
 from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import CONTACT_N
-from gripper_force.profiles.correction import ProfileArrays, curve_n
+from gripper_force.profiles.correction import ProfileArrays
 from gripper_force.profiles.object_profile import Interval, OutputCurve
 from gripper_force.vision.header import OodModel
 
@@ -57,8 +57,7 @@ class ObjectFit:
 
     def predict(self, touches: Touches) -> Floats:
         """Returns the corrected forces, (N,)."""
-        knots = np.array(self.output.estimate_n), np.array(self.output.force_n)
-        return curve_n(*knots, touches.estimate_n) + self.arrays.head_n(touches.features)
+        return self.output.at(touches.estimate_n) + self.arrays.head_n(touches.features)
 
 
 class LearningCurvePoint(NamedTuple):

@@ -11,7 +11,6 @@ from gripper_calibration.fits.object_fit import LearningCurvePoint, ObjectFit
 from gripper_calibration.fits.touches import Floats, Touches
 from gripper_calibration.plots.style import DATA, FIT, GRAY
 from gripper_force.jobs.report.plots import label_axes, saved_figure
-from gripper_force.profiles.correction import curve_n
 from gripper_force.profiles.object_profile import Interval, ObjectProfile
 
 
@@ -46,10 +45,9 @@ def draw(
         (before_plot, after_plot), (residual_plot, curve_plot) = figure.subplots(2, 2)
         before_plot.plot(touches.estimate_n, touches.force_n, ".", ms=2, color=DATA)
         before_plot.plot(line_n, line_n, color=GRAY, lw=0.8, label="equal")
-        knots = np.array(profile.output.estimate_n), np.array(profile.output.force_n)
         refitted = fit.arrays.head.any()
         label = "its line; the refitted last layer adds the rest" if refitted else fit.candidate
-        before_plot.plot(line_n, curve_n(*knots, line_n), color=FIT, label=label)
+        before_plot.plot(line_n, profile.output.at(line_n), color=FIT, label=label)
         label_axes(before_plot, "before", "visual estimate, N", "load cell, N")
         before_plot.legend()
         after_plot.plot(after_n, touches.force_n, ".", ms=2, color=DATA)
