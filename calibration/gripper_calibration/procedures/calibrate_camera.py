@@ -26,9 +26,9 @@ from gripper_calibration.plots.camera_plot import draw
 from gripper_force.config import CAMERA_OTHER_KEYS, Config
 from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
 from gripper_force.jobs.profile_files import update_rig
-from gripper_force.jobs.recording.lag import camera_lags_s, load_cell_lag_s
+from gripper_force.jobs.recording.lag import camera_lags_s
 from gripper_force.jobs.recording.record import RecordingPlan, record
-from gripper_force.jobs.recording.summary import releases_ns
+from gripper_force.jobs.recording.summary import releases_ns, touch_lags
 from gripper_force.profiles.object_profile import BUNDLED, read_object, user_folder
 from gripper_force.profiles.rig_profile import CalibratedValue, CameraCalibration, read_rig
 from gripper_force.progress import Progress, no_progress
@@ -271,22 +271,18 @@ def _touch_lags(
     statuses: list[GraspStatus],
     release_times_ns: list[int],
 ) -> list[CameraLag]:
-    frame_s = np.array([frame.t_ns for frame in frames]) / NS_PER_S
+    frame_ns = np.array([frame.t_ns for frame in frames], np.int64)
     images = np.stack([downscale(frame.gray, region, _SMALL_PX) for frame in frames])
-    valid = sorted((s for s in samples if s.valid), key=lambda sample: sample.t_ns)
-    cell_s = np.array([sample.t_ns for sample in valid]) / NS_PER_S
-    force_n = np.array([sample.force_n for sample in valid])
-    servo_s = np.array([status.t_ns for status in statuses]) / NS_PER_S
-    width_m = np.array([status.width_m for status in statuses])
+    samples = sorted(samples, key=lambda sample: sample.t_ns)
+    lags = touch_lags(frame_ns, images, samples, statuses, release_times_ns)
+    cell_s = np.array([sample.t_ns for sample in samples if sample.valid]) / NS_PER_S
+    force_n = np.array([sample.force_n for sample in samples if sample.valid])
     releases_s = [t_ns / NS_PER_S for t_ns in release_times_ns]
-    by_servo_s = camera_lags_s(frame_s, images, servo_s, width_m, releases_s)
-    by_force_s = camera_lags_s(frame_s, images, cell_s, force_n, releases_s)
-    touches = []
-    for release_s, camera_s, correlation_s in zip(releases_s, by_servo_s, by_force_s, strict=True):
-        cell_lag_s = load_cell_lag_s(cell_s, force_n, servo_s, width_m, release_s)
-        release_n = float(np.interp(release_s, cell_s, force_n))
-        touches.append(CameraLag(release_n, 1e3 * (float(camera_s) - cell_lag_s), 1e3 * float(correlation_s)))
-    return touches
+    by_force_s = camera_lags_s(frame_ns / NS_PER_S, images, cell_s, force_n, releases_s)
+    return [
+        CameraLag(lag.force_n, lag.lag_ms, 1e3 * float(correlation_s))
+        for lag, correlation_s in zip(lags, by_force_s, strict=True)
+    ]
 
 
 def candidate_exposures_us(config: Config) -> Sequence[int | None]:

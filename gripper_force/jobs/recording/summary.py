@@ -170,7 +170,7 @@ def _summary(path: Path) -> SetSummary:
     valid_ns = np.array([sample.t_ns for sample in samples if sample.valid], np.int64)
     forces_n, labelled = label_frames(frame_ns, samples, 0)
     release_ns = releases_ns(records[Request])
-    lags = _touch_lags(frame_ns, np.stack(images), samples, records[GraspStatus], release_ns)
+    lags = touch_lags(frame_ns, np.stack(images), samples, records[GraspStatus], release_ns)
     return SetSummary(
         log=path,
         object=config.object,
@@ -190,13 +190,22 @@ def _summary(path: Path) -> SetSummary:
     )
 
 
-def _touch_lags(
+def touch_lags(
     frame_ns: npt.NDArray[np.int64],
     images: npt.NDArray[np.uint8],
     samples: list[LoadCellSample],
     statuses: list[GraspStatus],
     release_ns: list[int],
 ) -> list[TouchLag]:
+    """Returns the lags of each touch.
+
+    Args:
+        frame_ns: Timestamps of the frames, (N,).
+        images: The frames, made small, (N, H, W).
+        samples: Load-cell samples by time.
+        statuses: A status per cycle.
+        release_ns: Start of the release of each touch.
+    """
     valid = [sample for sample in samples if sample.valid]
     cell_s = np.array([sample.t_ns for sample in valid]) / NS_PER_S
     force_n = np.array([sample.force_n for sample in valid])
