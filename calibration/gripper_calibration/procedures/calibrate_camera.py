@@ -1,10 +1,10 @@
 """Calibration of a camera: exposure, region of interest and lag, from touches of a compliant object."""
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
+from itertools import repeat
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
@@ -23,6 +23,7 @@ from gripper_calibration.fits.camera_fit import (
     usable_touches,
 )
 from gripper_calibration.plots.camera_plot import draw
+from gripper_calibration.procedures.estimate_time import estimate_ms
 from gripper_force.config import CAMERA_OTHER_KEYS, Config
 from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
 from gripper_force.jobs.profile_files import update_rig
@@ -34,7 +35,7 @@ from gripper_force.profiles.rig_profile import CalibratedValue, CameraCalibratio
 from gripper_force.progress import Progress, no_progress
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log_reader import LogReader
-from gripper_force.runtime.resolve import ResolvedConfig, make_estimator, resolve, resolve_vision
+from gripper_force.runtime.resolve import ResolvedConfig, resolve, resolve_vision
 from gripper_force.schema import Tree, differences
 from gripper_force.types import (
     NS_PER_MS,
@@ -162,8 +163,8 @@ def calibrate_camera(
     height, width = observed.reference.shape
     found_region = region_around(observed.markers, width, height) if region is None else region
     lag = estimate_lag(observed.touches)
-    estimate_ms = compute_ms(config.with_values(vision={"region": found_region}), observed.reference)
-    wait_ms = observed.use_ms + estimate_ms + 500 / observed.rate_hz
+    computing_ms = compute_ms(config.with_values(vision={"region": found_region}), observed.reference)
+    wait_ms = observed.use_ms + computing_ms + 500 / observed.rate_hz
     camera = config.camera
     found = CameraCalibration(
         date=datetime.now(UTC).replace(microsecond=0),
@@ -190,7 +191,7 @@ def calibrate_camera(
         calibration=found,
         correlation_lag_ms=float(np.nanmedian(correlations_ms)),
         use_ms=observed.use_ms,
-        compute_ms=estimate_ms,
+        compute_ms=computing_ms,
         touches=len(observed.touches),
         touches_that_tell=len(correlations_ms),
         rig=rig,
@@ -341,19 +342,9 @@ def _capture(config: Config) -> Gray:
 
 
 def compute_ms(config: Config, gray: Gray) -> float:
-    """Time of one estimate: configured on the simulated clock, otherwise measured; 0 without vision."""
+    """Time of one estimate of an image like this one."""
     config, model, _ = resolve_vision(config)
-    if config.clock == "lockstep" and model is not None:
-        return config.vision.lockstep_compute_ms
-    estimator = make_estimator(ResolvedConfig(config, model))
-    if estimator is None:
-        return 0.0
-    times_ms = []
-    for _ in range(_TIMED_FRAMES):
-        begin_ns = time.perf_counter_ns()
-        estimator.update(gray)
-        times_ms.append((time.perf_counter_ns() - begin_ns) / NS_PER_MS)
-    return float(np.median(times_ms))
+    return estimate_ms(ResolvedConfig(config, model), repeat(gray, _TIMED_FRAMES))
 
 
 def _shifted(estimate: CalibratedValue, by: float) -> CalibratedValue:

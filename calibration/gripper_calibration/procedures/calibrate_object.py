@@ -1,7 +1,6 @@
 """Calibration of an object: touches with the load cell in place, or logs of them, into an object profile."""
 
 import re
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -21,6 +20,7 @@ from gripper_calibration.fits.object_fit import (
 )
 from gripper_calibration.fits.plant_fit import crushing_touch, fit_plant, stiffness_n_m
 from gripper_calibration.plots.object_plot import draw
+from gripper_calibration.procedures.estimate_time import estimate_ms
 from gripper_calibration.touch_logs import TouchRecording, join, read_log, started_ns
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DataError
@@ -30,8 +30,7 @@ from gripper_force.jobs.profile_files import check_place, pack, write_object
 from gripper_force.jobs.recording.record import RecordingPlan, record
 from gripper_force.profiles.object_profile import ObjectProfile, user_folder
 from gripper_force.progress import Progress, Prompt, no_progress
-from gripper_force.runtime.resolve import ResolvedConfig, make_estimator, resolve_vision
-from gripper_force.types import NS_PER_MS
+from gripper_force.runtime.resolve import ResolvedConfig, resolve_vision
 from gripper_force.vision.checkpoint import load_checkpoint
 
 TOUCHES: Final = 8
@@ -324,6 +323,8 @@ def make_profile(
     stiffness = stiffness_n_m(recorded.width_m, forces_n)
     peaks_n = np.array([force_n.max() for force_n in forces_n])
     crushed = crushing_touch(np.array([width_m[0] for width_m in recorded.width_m]), peaks_n)
+    size = run.model.header.preprocess.size
+    frames = np.random.default_rng(0).integers(60, 180, (_TIMED_FRAMES, size, size), np.uint8)
     profile = ObjectProfile(
         object=name,
         date=datetime.now(UTC).date(),
@@ -336,29 +337,12 @@ def make_profile(
         interval=fit.interval,
         ood_limits=None if fit.arrays.known is None else fit.arrays.known.limits,
         stiffness_n_m=float(np.median(stiffness)) if len(stiffness) else None,
-        plant=fit_plant(recorded.presses, recorded.delay_s + _compute_s(run)),
+        plant=fit_plant(recorded.presses, recorded.delay_s + estimate_ms(run, frames) / 1e3),
         before_n=fit.before_n,
         after_n=fit.after_n,
         weights=sha256(pack(fit.arrays)).hexdigest(),
     )
     return profile, None if crushed is None else float(peaks_n[crushed])
-
-
-def _compute_s(run: ResolvedConfig) -> float:
-    """Computing time of an estimate: configured on the simulated clock, otherwise measured."""
-    if run.config.clock == "lockstep":
-        return run.config.vision.lockstep_compute_ms * NS_PER_MS / 1e9
-    estimator = make_estimator(run)
-    if run.model is None or estimator is None:
-        return 0.0
-    size = run.model.header.preprocess.size
-    rng = np.random.default_rng(0)
-    times_s = []
-    for frame in rng.integers(60, 180, (_TIMED_FRAMES, size, size), np.uint8):
-        begin_s = time.perf_counter()
-        estimator.update(frame)
-        times_s.append(time.perf_counter() - begin_s)
-    return float(np.median(times_s))
 
 
 def _mean_curve(curve: Sequence[LearningCurvePoint]) -> tuple[LearningCurvePoint, ...]:
