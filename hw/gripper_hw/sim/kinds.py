@@ -22,11 +22,11 @@ from gripper_hw.sim.meshes import (
     Indices,
     ObjectModel,
     Points,
+    numbers,
     outward,
     shell,
     shell_of_revolution,
     solid_cube,
-    text,
 )
 
 _SKIN_M = 0.001
@@ -147,9 +147,9 @@ class Solid(ObjectKind):
             np.zeros(3),
             f'material="object" mass=".05" {_RIGID}',
         )
-        body = f"""<flexcomp name="object" type="direct" dim="3" dof="{order}" cellcount="{text(cells)}" mass=".2"
-          radius="{_SKIN_M}" material="object" point="{text(points)}" element="{text(tetrahedra)}"
-          texcoord="{text(uv)}">
+        body = f"""<flexcomp name="object" type="direct" dim="3" dof="{order}" cellcount="{numbers(cells)}" mass=".2"
+          radius="{_SKIN_M}" material="object" point="{numbers(points)}" element="{numbers(tetrahedra)}"
+          texcoord="{numbers(uv)}">
           <contact selfcollide="none" contype="0" conaffinity="1" condim="3" friction=".6" {SOFT_CONTACT}/>
           <elasticity young="{self.modulus_pa * stiffness / size:.6g}" poisson=".2" damping=".01"/>
           <pin gridrange="0 0 0 {nodes * cells[0]} {nodes * cells[1]} 0"/></flexcomp>
@@ -307,7 +307,8 @@ class Spring(ObjectKind):
             axis = {None: [-side, 0, 0], "back": [0, 0, -side], "foot": [0, -side, 0]}[self.hinge]
             joint = "slide" if self.hinge is None else "hinge"
             travel = gap if self.hinge is None else np.rad2deg(gap / arm)
-            parts += f"""<body><joint type="{joint}" axis="{text(axis)}" pos="{text(hinge)}" range="-.001 {travel:.6g}"
+            place = numbers(hinge)
+            parts += f"""<body><joint type="{joint}" axis="{numbers(axis)}" pos="{place}" range="-.001 {travel:.6g}"
               stiffness="{linear * arm**2:.6g} 0 {cubic * arm**4:.6g}" damping="{6 * arm**2:.6g}"
               armature="{0.03 * arm**2:.6g}" solreflimit=".006 1"/>
               {_geom(self.shape, half, at, f'material="object" mass=".03" {_RIGID}')}</body>"""
@@ -338,8 +339,8 @@ def kind_from(record: Tree, where: str) -> ObjectKind:
 @cache
 def load_kinds() -> dict[str, ObjectKind]:
     """Returns the shipped kinds by name."""
-    text_ = resources.files(__package__).joinpath("kinds.yaml").read_text(encoding="utf-8")
-    records = tree_from(text_, "kinds.yaml", "kinds of objects")
+    text = resources.files(__package__).joinpath("kinds.yaml").read_text(encoding="utf-8")
+    records = tree_from(text, "kinds.yaml", "kinds of objects")
     return {name: kind_from(record, f"kinds.yaml, {name}") for name, record in records.items()}
 
 
@@ -376,4 +377,4 @@ def _geom(shape: str, half: Points, at: Points, rest: str) -> str:
         kind, size, turn = "cylinder", np.array([min(x, z), y]), 'euler="90 0 0"'
     else:
         kind, size, turn = "cylinder", np.array([min(x, y), z]), ""
-    return f'<geom type="{kind}" size="{text(size)}" pos="{text(at)}" {turn} {rest}/>'
+    return f'<geom type="{kind}" size="{numbers(size)}" pos="{numbers(at)}" {turn} {rest}/>'

@@ -126,13 +126,13 @@ def shell(
 ) -> str:
     """Returns the MJCF of a thin elastic shell."""
     return f"""<flexcomp name="object" type="direct" dim="2" mass=".2" radius="{radius}" material="object"
-      point="{text(points)}" element="{text(faces)}" texcoord="{text(uv)}">
+      point="{numbers(points)}" element="{numbers(faces)}" texcoord="{numbers(uv)}">
       <contact selfcollide="none" condim="3" friction=".6" {SHELL_CONTACT}/>
       <elasticity young="{young:.6g}" poisson=".3" thickness="{thickness}" damping="{damping}"
                   elastic2d="both"/>
-      <pin id="{text(pins)}"/></flexcomp>"""
+      <pin id="{numbers(pins)}"/></flexcomp>"""
 
 
-def text(values: npt.ArrayLike) -> str:
+def numbers(values: npt.ArrayLike) -> str:
     """Returns numbers as MJCF has them."""
     return " ".join(f"{value:.6g}" for value in np.asarray(values).ravel())

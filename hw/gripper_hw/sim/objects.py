@@ -16,10 +16,10 @@ from gripper_hw.sim.meshes import (
     SOFT_CONTACT,
     Detail,
     ObjectModel,
+    numbers,
     shell,
     shell_of_revolution,
     solid_ball,
-    text,
 )
 
 BLOCK_WIDTH_M = 0.030
@@ -93,9 +93,9 @@ def _sponge(detail: Detail, size: float, stiffness: float) -> ObjectModel:
     uv = np.c_[grid[:, 0] + 0.5 * grid[:, 1], grid[:, 2] + 0.5 * grid[:, 1]] / 0.1
     nodes = 1 if order == "trilinear" else 2
     young = 1.5e4 * stiffness / size  # stiffness of a block is proportional to E * area / length
-    body = f"""<flexcomp name="object" type="grid" dim="3" count="{text(counts)}" spacing="{text(spacing)}"
-      dof="{order}" cellcount="{text(cells)}" pos="0 0 {lengths[2] / 2 + 0.001:.6g}" mass=".2" radius=".001"
-      material="object" flatskin="true" texcoord="{text(uv)}">
+    body = f"""<flexcomp name="object" type="grid" dim="3" count="{numbers(counts)}" spacing="{numbers(spacing)}"
+      dof="{order}" cellcount="{numbers(cells)}" pos="0 0 {lengths[2] / 2 + 0.001:.6g}" mass=".2" radius=".001"
+      material="object" flatskin="true" texcoord="{numbers(uv)}">
       <contact selfcollide="none" condim="3" friction=".6" {contact}/>
       <elasticity young="{young:.6g}" poisson=".2" damping=".01"/>
       <pin gridrange="0 0 0 {nodes * cells[0]} {nodes * cells[1]} 0"/></flexcomp>"""
@@ -145,25 +145,25 @@ def _stapler(detail: Detail, size: float, stiffness: float) -> ObjectModel:
     ghost = 'contype="0" conaffinity="0"'
 
     def box(half: str, pos: str, material: str, extra: str) -> str:
-        lengths, centre = (text(np.array(part.split(), float) * s) for part in (half, pos))
+        lengths, centre = (numbers(np.array(part.split(), float) * s) for part in (half, pos))
         return f'<geom type="box" size="{lengths}" pos="{centre}" material="{material}" {extra}/>'
 
     solid = f'contype="0" conaffinity="1" condim="3" {SOFT_CONTACT}'
     tilt = 'euler="0 -7 0"'
     # It lies on its side, on a slide so that it centres itself: fixed to the world it would over-constrain
     # the jaws.
-    body = f"""<body pos="{text(np.array([-0.030, 0.045, 0.030]) * s)}" quat="-.5 .5 -.5 .5">
+    body = f"""<body pos="{numbers(np.array([-0.030, 0.045, 0.030]) * s)}" quat="-.5 .5 -.5 .5">
       <joint name="self_centre" type="slide" axis="0 0 1" stiffness="20" damping="8"/>
       <body pos="{-0.055 * s:.6g} 0 0">
         {box(".062 .017 .004", ".06 0 .004", "pad", solid)}
         {box(".052 .009 .006", ".062 0 .017", "steel", ghost)}
         {box(".008 .016 .014", ".006 0 .018", "pad", ghost)}
-        <body pos="{text(np.array([0.004, 0, 0.030]) * s)}">
+        <body pos="{numbers(np.array([0.004, 0, 0.030]) * s)}">
           <joint name="arm" type="hinge" axis="0 1 0" range="-1 8" stiffness="{linear:.6g} 0 {cubic:.6g}"
                  springref="{-preload_deg:.6g}" damping=".05" armature="2e-5" solreflimit=".004 1"/>
           {box(".056 .012 .005", ".058 0 .010", "object", f'{tilt} mass=".05" {SOFT_CONTACT}')}
           <geom type="capsule" size="{0.011 * s:.6g}" material="object" mass=".005" {SOFT_CONTACT}
-                fromto="{text(np.array([0.10, -0.004, 0.018, 0.10, 0.004, 0.018]) * s)}"/>
+                fromto="{numbers(np.array([0.10, -0.004, 0.018, 0.10, 0.004, 0.018]) * s)}"/>
           {box(".020 .0122 .0006", ".058 0 .0155", "finger", f'{tilt} mass="0" {ghost}')}
         </body>
       </body></body>"""
@@ -177,7 +177,7 @@ def _block(detail: Detail, size: float, _stiffness: float) -> ObjectModel:
     body = f"""<body pos="0 0 {0.030 * size:.6g}">
       <joint name="self_centre" type="slide" axis="1 0 0" stiffness="20" damping="8"/>
       <joint name="self_align" type="hinge" axis="0 0 1" stiffness=".002" damping=".002"/>
-      <geom type="box" size="{text(half)}" material="steel" mass=".1" contype="0" conaffinity="1" condim="3"
+      <geom type="box" size="{numbers(half)}" material="steel" mass=".1" contype="0" conaffinity="1" condim="3"
             {SOFT_CONTACT}/></body>"""
     return ObjectModel(body, SOFT_CONTACT, None, 0.030 * size, dt)
 
@@ -195,10 +195,10 @@ def _ball(detail: Detail, size: float, stiffness: float) -> ObjectModel:
         9.0e4 * stiffness / size**0.75
     )  # exponent between 1 (a block) and 1/2 (two spheres in point contact)
     body = f"""<flexcomp name="object" type="direct" dim="3" mass=".2" radius=".001" material="object"
-      point="{text(points)}" element="{text(tetrahedra)}" texcoord="{text(uv)}">
+      point="{numbers(points)}" element="{numbers(tetrahedra)}" texcoord="{numbers(uv)}">
       <contact selfcollide="none" condim="3" friction=".6" {SHELL_CONTACT}/>
       <elasticity young="{young:.6g}" poisson=".2" damping=".01"/>
-      <pin id="{text(pins)}"/></flexcomp>"""
+      <pin id="{numbers(pins)}"/></flexcomp>"""
     return ObjectModel(body, SHELL_CONTACT, "ball.png", radius, dt)
 
 

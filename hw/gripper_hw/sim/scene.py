@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from gripper_force.config import Config, GripperConfig, SimConfig
 from gripper_force.errors import ConfigError
-from gripper_hw.sim.meshes import ObjectModel
+from gripper_hw.sim.meshes import ObjectModel, numbers
 from gripper_hw.sim.objects import GAUGES, PADS_ONLY, build_object, object_file
 
 LUX_LEVELS = (350.0, 550.0, 750.0)
@@ -311,33 +311,33 @@ def scene_mjcf(
         object=escape(scene.object, {'"': "&quot;"}),
         timestep_s=model.timestep_s,
         object_material=_material(model),
-        light_direction=_text(scene.light_direction),
-        light_diffuse=_text([1.0 - scene.light_ambient] * 3),
-        light_ambient=_text([scene.light_ambient] * 3),
-        camera_position=_text(position),
-        camera_axes=_text(_camera_axes(position, target, scene.camera_roll_deg)),
+        light_direction=numbers(scene.light_direction),
+        light_diffuse=numbers([1.0 - scene.light_ambient] * 3),
+        light_ambient=numbers([scene.light_ambient] * 3),
+        camera_position=numbers(position),
+        camera_axes=numbers(_camera_axes(position, target, scene.camera_roll_deg)),
         camera_fovy=scene.camera_fovy_deg,
-        object_position=_text([*scene.offset_m, 0.0]),
+        object_position=numbers([*scene.offset_m, 0.0]),
         object_yaw=scene.yaw_deg,
         object_body=model.body,
         contact=model.contact,
-        jaw_start=_text([gripper.open_width_m / 2 + _PAD_HALF_THICKNESS_M]),
+        jaw_start=numbers([gripper.open_width_m / 2 + _PAD_HALF_THICKNESS_M]),
         open_spare=_OPEN_SPARE_M["rack" if gripper.linkage.kind == "rack" else "other"],
-        jaw_travel=_text([gripper.open_width_m / 2 - 0.001]),
+        jaw_travel=numbers([gripper.open_width_m / 2 - 0.001]),
         background=_background(scene),
         left_tool=_tool(scene, -1),
         right_tool=_tool(scene, 1),
-        finger_half=_text([scene.finger_half_m]),
-        pad_rgb=_text(np.array(scene.pad_rgb) * scene.pad_gray / Scene.pad_gray),
-        finger_rgb=_text(np.array(scene.finger_rgb) * scene.finger_gray / Scene.finger_gray),
-        table_rgb="" if scene.background == 1.0 else f' rgba="{_text([*3 * [scene.background], 1])}"',
-        wall_rgb=_text(np.array([0.33, 0.35, 0.38]) * scene.background),
+        finger_half=numbers([scene.finger_half_m]),
+        pad_rgb=numbers(np.array(scene.pad_rgb) * scene.pad_gray / Scene.pad_gray),
+        finger_rgb=numbers(np.array(scene.finger_rgb) * scene.finger_gray / Scene.finger_gray),
+        table_rgb="" if scene.background == 1.0 else f' rgba="{numbers([*3 * [scene.background], 1])}"',
+        wall_rgb=numbers(np.array([0.33, 0.35, 0.38]) * scene.background),
         left_marker=_marker(scene, -1),
         right_marker=_marker(scene, 1),
         marker_materials=_MARKER_MATERIALS if scene.markers else "",
         finger_x=_FINGER_X_M[scene.tool],
-        grip_height=_text([model.grip_height_m]),
-        rail_height=_text([model.grip_height_m + 0.085]),
+        grip_height=numbers([model.grip_height_m]),
+        rail_height=numbers([model.grip_height_m + 0.085]),
         rotor_inertia=inertia,
         servo_damping=damping,
         friction_nm=friction_nm + rail_friction_nm,
@@ -365,7 +365,7 @@ def scene_mjcf(
 def _second_horn(scene: Scene, radius_m: float, height_m: float) -> str:
     inertia, damping, friction_nm, rail_friction_nm = horn_dynamics(scene, radius_m, rails=1)
     return (
-        f'<body name="second_horn" pos="-.03 0 {_text([height_m])}"><joint name="second_servo" type="hinge" '
+        f'<body name="second_horn" pos="-.03 0 {numbers([height_m])}"><joint name="second_servo" type="hinge" '
         f'axis="0 -1 0" armature="{inertia}" damping="{damping}" frictionloss="{friction_nm + rail_friction_nm}" '
         f'{_HARD_FRICTION}/><geom type="cylinder" size=".012 .006" euler="90 0 0" material="steel" contype="0" '
         'conaffinity="0" mass=".005"/></body>'
@@ -381,14 +381,14 @@ def _second_rack(scene: Scene, radius_m: float) -> str:
 
 def _tool(scene: Scene, side: int) -> str:
     if scene.tool == "pads":
-        return f'type="box" size="{_text([_PAD_HALF_THICKNESS_M, *scene.pad_half_m])}"'
+        return f'type="box" size="{numbers([_PAD_HALF_THICKNESS_M, *scene.pad_half_m])}"'
     if scene.tool == "discs":
         return (
-            f'type="cylinder" size="{_text([min(scene.pad_half_m), _PAD_HALF_THICKNESS_M])}" euler="0 90 0"'
+            f'type="cylinder" size="{numbers([min(scene.pad_half_m), _PAD_HALF_THICKNESS_M])}" euler="0 90 0"'
         )
     # The tip of a rod of 20 mm is at the position of a pad's face.
     root = _ROD_RADIUS_M - _PAD_HALF_THICKNESS_M + 0.020
-    ends = _text([side * (root - scene.rod_length_m), 0, 0, side * root, 0, 0])
+    ends = numbers([side * (root - scene.rod_length_m), 0, 0, side * root, 0, 0])
     return f'type="capsule" size="{_ROD_RADIUS_M}" fromto="{ends}"'
 
 
@@ -396,7 +396,7 @@ def _marker(scene: Scene, side: int) -> str:
     """Plate on a jaw, at the position of a pad's finger: nearer to the object it would hide the contact."""
     if not scene.markers:
         return ""
-    place = _text([side * _FINGER_X_M["pads"], -0.0125, 0.0])
+    place = numbers([side * _FINGER_X_M["pads"], -0.0125, 0.0])
     return (
         f'<geom type="box" size=".008 .008 .0003" euler="90 0 0" pos="{place}" contype="0" conaffinity="0" '
         f'mass="0" material="marker_{(side + 1) // 2}"/>'
@@ -408,8 +408,8 @@ def _background(scene: Scene) -> str:
     if not scene.moving_background:
         return ""
     return "".join(
-        f'<geom name="background_{i}" type="{"ellipsoid" if i % 2 else "box"}" size="{_text(size)}" '
-        f'rgba="{_text([*(3 * [(i + 1) / BACKGROUND_OBJECTS]), 1])}" contype="0" conaffinity="0"/>'
+        f'<geom name="background_{i}" type="{"ellipsoid" if i % 2 else "box"}" size="{numbers(size)}" '
+        f'rgba="{numbers([*(3 * [(i + 1) / BACKGROUND_OBJECTS]), 1])}" contype="0" conaffinity="0"/>'
         for i, size in enumerate(
             np.random.default_rng(scene.table_seed).uniform(0.008, 0.025, (BACKGROUND_OBJECTS, 3))
         )
@@ -442,7 +442,3 @@ def _camera_axes(
         c, s = np.cos(np.deg2rad(roll_deg)), np.sin(np.deg2rad(roll_deg))
         right, up = c * right + s * up, c * up - s * right
     return np.concatenate([right, up])
-
-
-def _text(values: npt.ArrayLike) -> str:
-    return " ".join(f"{value:.6g}" for value in np.asarray(values, float).ravel())
