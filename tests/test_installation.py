@@ -222,7 +222,7 @@ LINKAGE = "gripper.linkage={kind: table, table: [[0, 0.092], [1, 0.05], [2, 0]]}
         (["replay", "frames.mcap", "--compare", "log", "small"], "--compare needs scipy", "calibrate"),
         (["replay", "frames.mcap", "--ray=auto"], "--ray needs ray", "ray"),
         (["simulate", "--presses=1"], "needs mujoco", "sim"),
-        (["view", "frames.mcap"], "rerun needs the package rerun-sdk", "view"),
+        (["view", "frames.mcap"], "the viewer rerun needs rerun", "view"),
     ],
 )
 def test_a_missing_package_is_named_with_its_extra(

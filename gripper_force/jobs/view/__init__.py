@@ -10,16 +10,16 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final, Protocol
 
+from gripper_force import plugins
 from gripper_force.errors import ConfigError, DataError, LogError
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import Record
 
-VIEWERS: Final = {"rerun": ("rerun", "rerun-sdk"), "foxglove": ("foxglove", "foxglove-sdk")}
-"""Module and package by viewer. The first is the default."""
+VIEWERS: Final = ("rerun", "foxglove")
+"""Viewers, each with the name of the module that it needs. The first is the default."""
 
 FOXGLOVE_LAYOUT: Final = Path(__file__).with_name("foxglove_layout.json")
 """Layout to import in Foxglove, for live data and for log files."""
@@ -52,11 +52,7 @@ def require(viewer: str) -> None:
     """
     if viewer not in VIEWERS:
         raise ConfigError(f"{viewer!r} is not a viewer; use one of {', '.join(VIEWERS)}")
-    module, package = VIEWERS[viewer]
-    if find_spec(module) is None:
-        raise ConfigError(
-            f"{viewer} needs the package {package}, which is not installed; pip install 'gripper-force[view]'"
-        )
+    plugins.require(viewer, f"the viewer {viewer}")
 
 
 class GrowingLog(LogReader):
@@ -140,7 +136,7 @@ def beside_run(
 
     Args:
         path: The log that the run will write.
-        viewer: A key of `VIEWERS`.
+        viewer: One of `VIEWERS`.
         tell: Called with one sentence for a person.
         save: File for Rerun (``.rrd``) to write instead of opening a window.
         connect: Called with the address of Foxglove's server, instead of ``tell``, to connect a client: the server

@@ -190,7 +190,7 @@ def loop(
         seconds: Duration of each of the two, or three.
         overrides: Configuration keys, such as ``vision.threads=2``.
         path: Configuration file, or None.
-        viewer: Viewer to measure as well, with vision; a key of `gripper_force.jobs.view.VIEWERS`. Rerun writes a
+        viewer: Viewer to measure as well, with vision; one of `gripper_force.jobs.view.VIEWERS`. Rerun writes a
             file then, because a window's cost depends on the graphics. Foxglove has a client that shows nothing.
 
     Raises:

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from gripper_force import cli
+from gripper_force import cli, plugins
 from gripper_force.errors import ConfigError, DataError, LogError
 from gripper_force.jobs import view
 from gripper_force.runtime.log_codecs import CODECS, UTC_NAME
@@ -104,9 +104,9 @@ def test_view_without_a_value_means_rerun(given: list[str], meant: list[str]) ->
 
 
 def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch, log: Path) -> None:
-    monkeypatch.setattr(view, "find_spec", lambda _: None)
-    for viewer, package in (("rerun", "rerun-sdk"), ("foxglove", "foxglove-sdk")):
-        message = rf"needs the package {package}, .*pip install 'gripper-force\[view\]'"
+    monkeypatch.setattr(plugins, "find_spec", lambda _: None)
+    for viewer in view.VIEWERS:
+        message = rf"the viewer {viewer} needs {viewer}, .*pip install 'gripper-force\[view\]'"
         fails(ConfigError, message, "view", log, "--viewer", viewer)
         fails(
             ConfigError, message, "grasp", "--view", viewer, "--set", f"log.directory={log.parent / 'none'}"
