@@ -2,10 +2,10 @@
 
 import hashlib
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from gripper_force.config import GripperConfig, SimConfig
@@ -24,7 +24,7 @@ from gripper_hw.sim.kinds import (
 from gripper_hw.sim.objects import OBJECTS
 from gripper_hw.sim.scene import Scene, draw_scene, scene_mjcf
 from gripper_hw.sim.textures import PATTERNS
-from gripper_hw.sim.world import World
+from gripper_hw.sim.world import Motor, World
 
 PAGE = Path(__file__).parents[3] / "docs" / "simulation.md"
 KINDS = load_kinds()
@@ -48,18 +48,6 @@ OLD_SCENES = {
     ("block", 100_000): "67a96f705c1a3f39",
 }
 """Digests of MJCF and textures of the objects that networks and profiles were made with, before there were kinds."""
-
-
-class Squeeze:
-    """Motor that closes the jaws by 50 mm/s, up to a force."""
-
-    def __init__(self, force_n: float) -> None:
-        self._limit_nm = 2 * force_n * GRIPPER.pinion_radius_m
-
-    def control(self, t_ns: int, position_rad: float, velocity_rad_s: float, current_noise_a: float) -> float:
-        goal_rad = 0.05 / GRIPPER.pinion_radius_m * t_ns * 1e-9
-        limit = self._limit_nm
-        return float(np.clip(8 * (goal_rad - position_rad) - 0.3 * velocity_rad_s, -limit, limit))
 
 
 def table() -> str:
@@ -98,22 +86,24 @@ def test_training_and_held_out_kinds_are_many_and_cover_each_family() -> None:
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_each_kind_fits_between_the_jaws_at_any_size(name: str) -> None:
+def test_each_kind_fits_between_the_jaws_at_any_size(name: str, squeeze: Callable[[float], Motor]) -> None:
     for seed in (1, 2):
         scene = draw_scene(name, seed, WIDE)
         assert scene == draw_scene(name, seed, WIDE)
         text, assets = scene_mjcf(scene, GRIPPER)
         assert (text, assets) == scene_mjcf(scene, GRIPPER)
-        World(replace(scene, size=1.15), GRIPPER, Squeeze(0), 1.0, seed, textured=False)
+        World(replace(scene, size=1.15), GRIPPER, squeeze(0), 1.0, seed, textured=False)
         mujoco.MjModel.from_xml_string(text, assets)
 
 
 @pytest.mark.parametrize("stiffness", [0.5, 2.0])
 @pytest.mark.parametrize("name", ["soft_box", "pear", "ridge", "can", "thin_ring", "peg", "knobs"])
-def test_a_squeeze_reaches_its_force_and_ends(name: str, stiffness: float) -> None:
+def test_a_squeeze_reaches_its_force_and_ends(
+    name: str, stiffness: float, squeeze: Callable[[float], Motor]
+) -> None:
     scene = Scene(name, "coarse", stiffness=stiffness, yaw_deg=4, offset_m=(0.0015, 0.003), nm_per_a=1.0)
     scene = replace(scene, servo_friction_nm=0.0, jaw_friction_n=0.0)
-    world = World(scene, GRIPPER, Squeeze(12.5), 1.0, 0, textured=False)
+    world = World(scene, GRIPPER, squeeze(12.5), 1.0, 0, textured=False)
     world.advance_to(1_200_000_000)
     assert world.force_n == pytest.approx(12.5, abs=1.0)
 

@@ -1,6 +1,7 @@
 """Objects and rigs of a user: the shipped examples, the examples of docs/simulation.md, and files that are refused."""
 
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from gripper_hw.sim.kinds import Solid
 from gripper_hw.sim.object_files import digest, read_object
 from gripper_hw.sim.scene import draw_scene, scene_mjcf
 from gripper_hw.sim.simulated_rig import SimulatedRig
-from gripper_hw.sim.world import World
+from gripper_hw.sim.world import Motor, World
 
 ROOT = Path(__file__).parents[3]
 OBJECTS = sorted(path for path in (ROOT / "examples/objects").iterdir() if path.suffix in (".yaml", ".xml"))
@@ -46,23 +47,17 @@ f 4 8 6
 """
 
 
-class Squeeze:
-    """Motor that closes the jaws by 50 mm/s, up to a force."""
+@pytest.fixture
+def world(squeeze: Callable[[float], Motor]) -> Callable[..., World]:
+    """Makes a world with an object's file."""
 
-    def __init__(self, force_n: float) -> None:
-        self._limit_nm = 2 * force_n * GRIPPER.pinion_radius_m
+    def make(path: Path, seed: int = 0, **sim: object) -> World:
+        config = config_from({"object": str(path), "sim": {"detail": "medium", **sim}}, "test")
+        scene = draw_scene(config.object, seed, config.sim)
+        scene = replace(scene, nm_per_a=1.0, servo_friction_nm=0.0, jaw_friction_n=0.0)
+        return World(scene, GRIPPER, squeeze(8.0), 1.0, seed, textured=False)
 
-    def control(self, t_ns: int, position_rad: float, velocity_rad_s: float, current_noise_a: float) -> float:
-        goal_rad = 0.05 / GRIPPER.pinion_radius_m * t_ns * 1e-9
-        limit = self._limit_nm
-        return float(np.clip(8 * (goal_rad - position_rad) - 0.3 * velocity_rad_s, -limit, limit))
-
-
-def world(path: Path, seed: int = 0, **sim: object) -> World:
-    config = config_from({"object": str(path), "sim": {"detail": "medium", **sim}}, "test")
-    scene = draw_scene(config.object, seed, config.sim)
-    scene = replace(scene, nm_per_a=1.0, servo_friction_nm=0.0, jaw_friction_n=0.0)
-    return World(scene, GRIPPER, Squeeze(8.0), 1.0, seed, textured=False)
+    return make
 
 
 def frame(config: Config) -> np.ndarray:
@@ -85,7 +80,7 @@ def on_page(name: str) -> str:
 
 
 @pytest.mark.parametrize("path", OBJECTS, ids=lambda path: path.stem)
-def test_a_squeeze_of_an_example_ends_at_its_force(path: Path) -> None:
+def test_a_squeeze_of_an_example_ends_at_its_force(path: Path, world: Callable[..., World]) -> None:
     for seed in (0, 3):
         squeezed = world(path, seed)
         squeezed.advance_to(1_200_000_000)
@@ -102,7 +97,7 @@ def test_an_example_rig_shows_the_object(path: Path) -> None:
     assert 0.03 < changed.mean() < 0.7
 
 
-def test_the_examples_of_the_page_are_complete(tmp_path: Path) -> None:
+def test_the_examples_of_the_page_are_complete(tmp_path: Path, world: Callable[..., World]) -> None:
     (tmp_path / "peach.yaml").write_text(on_page("peach.yaml"), encoding="utf-8")
     (tmp_path / "bench.yaml").write_text(on_page("bench.yaml"), encoding="utf-8")
     squeezed = world(tmp_path / "peach.yaml")
@@ -165,7 +160,9 @@ def test_every_key_of_an_object_is_on_the_page() -> None:
         ("format: gripper-force-object/1", r"not a simulated object; pass an object profile with --profile"),
     ],
 )
-def test_an_object_that_cannot_be_simulated_is_refused(text: str, reason: str, tmp_path: Path) -> None:
+def test_an_object_that_cannot_be_simulated_is_refused(
+    text: str, reason: str, tmp_path: Path, world: Callable[..., World]
+) -> None:
     (tmp_path / "thing.yaml").write_text(text, encoding="utf-8")
     (tmp_path / "cube.obj").write_text(CUBE, encoding="utf-8")
     (tmp_path / "open.obj").write_text(CUBE.rsplit("f ", 1)[0], encoding="utf-8")
@@ -195,14 +192,18 @@ BODY = '<body name="object" pos="0 0 .03"><site name="grip"/>{}</body>'
         (BODY.format('<geom size=".02"/>').replace("pos", 'mocap="true" pos'), "no mocap body"),
     ],
 )
-def test_an_mjcf_body_that_cannot_be_gripped_is_refused(body: str, reason: str, tmp_path: Path) -> None:
+def test_an_mjcf_body_that_cannot_be_gripped_is_refused(
+    body: str, reason: str, tmp_path: Path, world: Callable[..., World]
+) -> None:
     path = tmp_path / "thing.xml"
     path.write_text(f"<mujoco><worldbody>{body}</worldbody></mujoco>", encoding="utf-8")
     with pytest.raises(ConfigError, match=reason):
         world(path)
 
 
-def test_a_file_with_a_quote_in_its_name_and_options_of_its_own_is_simulated(tmp_path: Path) -> None:
+def test_a_file_with_a_quote_in_its_name_and_options_of_its_own_is_simulated(
+    tmp_path: Path, world: Callable[..., World]
+) -> None:
     path = tmp_path / 'a"b.yaml'
     path.write_text(SOLID, encoding="utf-8")
     assert world(path).unknowns > 0
@@ -240,7 +241,7 @@ def test_files_of_an_mjcf_body_may_have_any_name(tmp_path: Path) -> None:
     assert images["table.png"].std() > 0, "the scene keeps its own"
 
 
-def test_an_mjcf_body_may_have_a_tendon_of_its_own(tmp_path: Path) -> None:
+def test_an_mjcf_body_may_have_a_tendon_of_its_own(tmp_path: Path, world: Callable[..., World]) -> None:
     slide = 'type="slide" range="-.001 .02" limited="true" damping="5" armature=".02"'
     parts = "".join(
         f'<body pos="{side * 0.02} 0 0"><joint name="{name}" axis="{-side} 0 0" {slide}/>'
@@ -259,7 +260,7 @@ def test_an_mjcf_body_may_have_a_tendon_of_its_own(tmp_path: Path) -> None:
     assert squeezed.force_n == pytest.approx(8.0, abs=0.3)
 
 
-def test_stiffness_multiplies_that_of_the_joints() -> None:
+def test_stiffness_multiplies_that_of_the_joints(world: Callable[..., World]) -> None:
     def width_m(stiffness: float) -> float:
         pressed = world(ROOT / "examples/objects/spring_clamp.xml", stiffness=stiffness)
         pressed.advance_to(1_200_000_000)
@@ -271,7 +272,7 @@ def test_stiffness_multiplies_that_of_the_joints() -> None:
     assert soft - plain == pytest.approx(0.001, abs=2e-4)
 
 
-def test_a_mesh_is_a_box_if_it_has_the_corners_of_one(tmp_path: Path) -> None:
+def test_a_mesh_is_a_box_if_it_has_the_corners_of_one(tmp_path: Path, world: Callable[..., World]) -> None:
     (tmp_path / "cube.obj").write_text(CUBE, encoding="utf-8")
     text = "family: solid\nmodulus_pa: 30000\nmesh: {file: cube.obj, unit: mm, turn_deg: [0, 0, 90]}"
     (tmp_path / "crate.yaml").write_text(text, encoding="utf-8")
@@ -305,7 +306,9 @@ def test_paths_in_an_object_file_are_relative_to_it() -> None:
 
 
 @pytest.mark.parametrize("name", ["sponge", "soft_box", "none"])
-def test_a_file_with_the_name_of_a_shipped_object_is_refused(name: str, tmp_path: Path) -> None:
+def test_a_file_with_the_name_of_a_shipped_object_is_refused(
+    name: str, tmp_path: Path, world: Callable[..., World]
+) -> None:
     path = tmp_path / f"{name}.yaml"
     path.write_text(SOLID, encoding="utf-8")
     with pytest.raises(ConfigError, match="has the name of a shipped one; rename the file"):
@@ -328,11 +331,13 @@ def test_another_object_than_that_of_the_file_is_refused() -> None:
         ({"position_m": [0, -0.3, 0], "aim_m": [0, -0.3, 0]}, "aimed at itself"),
     ],
 )
-def test_a_camera_that_sees_nothing_is_refused(camera: dict[str, object], reason: str) -> None:
+def test_a_camera_that_sees_nothing_is_refused(
+    camera: dict[str, object], reason: str, squeeze: Callable[[float], Motor]
+) -> None:
     config = config_from({"sim": {"camera": camera, "randomise": False}}, "test")
     scene = draw_scene("sponge", 0, config.sim)
     with pytest.raises(ConfigError, match=rf"{reason}.*sim\.camera|sim\.camera.*{reason}"):
-        World(scene, GRIPPER, Squeeze(0), 1.0, 0)
+        World(scene, GRIPPER, squeeze(0), 1.0, 0)
 
 
 def test_the_log_names_the_file_and_its_digest() -> None:
