@@ -5,7 +5,7 @@ from difflib import get_close_matches
 from inspect import isclass
 from math import isclose
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, TypeVar, get_args
+from typing import Annotated, Any, ClassVar, Self, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -31,6 +31,10 @@ class Section(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     unknown_hint: ClassVar[str] = ""
+
+    def filled(self, **values: Any) -> Self:
+        """Returns a copy with these values, which are not validated, for those of the keys that are None."""
+        return self.model_copy(update={k: v for k, v in values.items() if getattr(self, k) is None})
 
 
 S = TypeVar("S", bound=Section)

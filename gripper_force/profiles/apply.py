@@ -89,7 +89,7 @@ def with_object(control: ControlConfig, profiles: Profiles) -> ControlConfig:
     known: dict[str, object] = {"object_ratio": profiles.object.ratio}
     if (plant := profiles.object.plant) is not None:
         known |= {"plant_gain": plant.gain, "plant_lag_ms": plant.lag_ms, "plant_delay_ms": plant.delay_ms}
-    return control.model_copy(update={k: v for k, v in known.items() if getattr(control, k) is None})
+    return control.filled(**known)
 
 
 def read_correction(

@@ -211,13 +211,12 @@ def _complete_gripper(gripper: GripperConfig, spec: ServoSpec) -> GripperConfig:
             f"gripper.nm_per_a={gripper.nm_per_a:g} is {times:.3g} times the {spec.nm_per_a:.3g} Nm/A of the servo's "
             "model, so that no force limit would hold; correct it, or servo.model"
         )
-    known = {
-        "nm_per_a": spec.nm_per_a,
-        "current_step_a": spec.current_step_a,
-        "position_loop_a_per_rad": spec.position_loop_a_per_rad,
-        "position_loop_gain_per_s": spec.position_loop_gain_per_s,
-    }
-    return gripper.model_copy(update={k: v for k, v in known.items() if getattr(gripper, k) is None})
+    return gripper.filled(
+        nm_per_a=spec.nm_per_a,
+        current_step_a=spec.current_step_a,
+        position_loop_a_per_rad=spec.position_loop_a_per_rad,
+        position_loop_gain_per_s=spec.position_loop_gain_per_s,
+    )
 
 
 def _check_travel(gripper: GripperConfig, spec: ServoSpec) -> None:
@@ -239,12 +238,10 @@ def _check_travel(gripper: GripperConfig, spec: ServoSpec) -> None:
 
 def _complete_control(config: Config, spec: ServoSpec) -> ControlConfig:
     low_v, high_v = spec.voltage_range_v
-    control = config.control
-    known = {
-        "voltage_limits_v": (low_v - _SUPPLY_TOLERANCE_V, high_v + _SUPPLY_TOLERANCE_V),
-        "vision_rate_hz": config.camera.rate_hz,
-    }
-    return control.model_copy(update={k: v for k, v in known.items() if getattr(control, k) is None})
+    return config.control.filled(
+        voltage_limits_v=(low_v - _SUPPLY_TOLERANCE_V, high_v + _SUPPLY_TOLERANCE_V),
+        vision_rate_hz=config.camera.rate_hz,
+    )
 
 
 def _check_rate(config: Config) -> None:
