@@ -71,9 +71,8 @@ def with_bundle(config: Config) -> tuple[Config, str]:
     if name is None or not config.uses_vision:
         return config, ""
     profile = read_object(path := find_object(name))
-    if profile.network is None or config.vision.checkpoint == (
-        network := str(path.with_name(profile.network))
-    ):
+    network = None if profile.network is None else str(path.with_name(profile.network))
+    if network in (None, config.vision.checkpoint):
         return config, ""
     if config.vision.checkpoint != "default":
         named = f"vision.checkpoint is {config.vision.checkpoint!r}; set it to default to use the bundle"

@@ -53,12 +53,11 @@ class OutputCurve(Section):
 
     def at(self, estimate_n: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """Returns the forces, (N,), for estimates (N,)."""
-        known_n, force_n = np.array(self.estimate_n), np.array(self.force_n)
+        known_n, force_n = np.array(self.estimate_n, np.float64), np.array(self.force_n, np.float64)
         at_n = np.asarray(estimate_n, np.float64)
         segment = np.clip(np.searchsorted(known_n, at_n) - 1, 0, len(known_n) - 2)
         slope = np.diff(force_n) / np.diff(known_n)
-        value: npt.NDArray[np.float64] = force_n[segment] + slope[segment] * (at_n - known_n[segment])
-        return value
+        return force_n[segment] + slope[segment] * (at_n - known_n[segment])
 
 
 class Interval(Section):

@@ -114,10 +114,8 @@ def resolve(config: Config, *, vision: bool = True) -> ResolvedConfig:
     spec = load_servo_class(config).spec(config.servo)
     _check_travel(config.gripper, spec)
     profiles = apply.read_profiles(config)
-    config = config.with_values(
-        gripper=_complete_gripper(config.gripper, spec),
-        control=apply.with_object(_complete_control(config, spec), profiles),
-    )
+    control = apply.with_object(_complete_control(config, spec), profiles)
+    config = config.with_values(gripper=_complete_gripper(config.gripper, spec), control=control)
     correction = apply.read_correction(config, profiles, model)
     mismatches = {
         "object profile": () if correction is None else correction.differs,
