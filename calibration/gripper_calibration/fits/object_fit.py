@@ -9,7 +9,7 @@ import numpy as np
 from gripper_calibration.fits.candidates import LINE, fit_candidates
 from gripper_calibration.fits.cross_validation import Coverage, Measured, coverages, cross_validate
 from gripper_calibration.fits.interval_fit import MIN_TOUCHES, model_interval, touch_interval
-from gripper_calibration.fits.ood_fit import fit_ood
+from gripper_calibration.fits.object_ood_fit import fit_object_ood
 from gripper_calibration.fits.output_curve import fit_line
 from gripper_calibration.fits.touches import Floats, Touches, check
 from gripper_force.errors import DataError
@@ -99,7 +99,7 @@ def fit_correction(touches: Touches, coverage: float = COVERAGE, ood: OodModel |
     arrays = ProfileArrays(
         head=head.astype(np.float32),
         offset=np.array([fitted.offset_n], np.float32),
-        known=None if ood is None else fit_ood(touches, ood),
+        known=None if ood is None else fit_object_ood(touches, ood),
     )
     before_n = float(np.abs(touches.estimate_n - touches.force_n).mean())
     if tested is None:

@@ -36,7 +36,7 @@ from gripper_calibration.fits.cross_validation import (
 )
 from gripper_calibration.fits.interval_fit import touch_interval
 from gripper_calibration.fits.object_fit import COVERAGE, fit_correction
-from gripper_calibration.fits.ood_fit import left_out_shares, object_limits, object_subspace
+from gripper_calibration.fits.object_ood_fit import left_out_shares, object_limits, object_subspace
 from gripper_calibration.fits.touches import Floats
 from gripper_calibration.plots.taught_plot import draw
 from gripper_calibration.procedures.calibrate_object import (

@@ -30,7 +30,7 @@ _MAX_FRAMES: Final = 600
 _QUANTILE: Final = 0.995
 
 
-def fit_ood(touches: Touches, model: OodModel) -> KnownFrames:
+def fit_object_ood(touches: Touches, model: OodModel) -> KnownFrames:
     """Returns the known frames of an object.
 
     Args:
