@@ -69,7 +69,7 @@ _STOP_MARGIN_M: Final = 0.0005
 """Distance of each jaw from the middle at the end stop."""
 
 
-class Step(NamedTuple):
+class TimedRequest(NamedTuple):
     """A request, and the time until the next one.
 
     Attributes:
@@ -142,7 +142,7 @@ class Draw:
     motion_n: float
     seed: int
     on_fault: str
-    requests: tuple[Step, ...]
+    requests: tuple[TimedRequest, ...]
     begins_m: float
 
 
@@ -226,11 +226,11 @@ def draw(config: ControlConfig, truth: Transmission, seed: int, index: int) -> D
     def rarely(share: float, value: float, otherwise: float) -> float:
         return value if rng.uniform() < share else otherwise
 
-    def draw_step() -> Step:
+    def draw_request() -> TimedRequest:
         kinds = [RequestKind.GRASP, RequestKind.RELEASE, RequestKind.MOVE, RequestKind.STOP]
         kind = RequestKind(rng.choice(kinds, p=[0.6, 0.2, 0.12, 0.08]))
         value = between(_LEAST_N, most_n) if kind == RequestKind.GRASP else between(0.0, truth.open_width_m)
-        return Step(log_between(0.05, 8.0), kind, value)
+        return TimedRequest(log_between(0.05, 8.0), kind, value)
 
     is_sequence = index % _SEQUENCE == _SEQUENCE - 2
     reach = _REACH_SHARE if is_sequence else 1.0
@@ -263,7 +263,7 @@ def draw(config: ControlConfig, truth: Transmission, seed: int, index: int) -> D
         motion_n=rarely(0.3, between(0.0, 6.0), 0.0),
         away_s=rarely(0.5, log_between(0.02, 1.5), math.inf),
         on_fault=str(rng.choice(["limp", "hold", "open"])),
-        requests=tuple(draw_step() for _ in range(int(rng.integers(3, 9)) if is_sequence else 0)),
+        requests=tuple(draw_request() for _ in range(int(rng.integers(3, 9)) if is_sequence else 0)),
         begins_m=0.0,
     )
     if index % _NEAR not in _NEAR_REMAINDERS:
@@ -326,9 +326,9 @@ def run_case(config: Config, seed: int, index: int) -> CaseResult:
         for step in drawn.requests:
             run.request(step)
     else:
-        run.request(Step(run.slower_s + drawn.then_s, RequestKind.GRASP, drawn.target_n))
+        run.request(TimedRequest(run.slower_s + drawn.then_s, RequestKind.GRASP, drawn.target_n))
         if math.isfinite(drawn.then_n) and run.outcome in (Outcome.NONE, Outcome.HELD):
-            run.request(Step(_GRASP_S - drawn.then_s, RequestKind.GRASP, drawn.then_n))
+            run.request(TimedRequest(_GRASP_S - drawn.then_s, RequestKind.GRASP, drawn.then_n))
         else:
             run.go(_GRASP_S - drawn.then_s, None)
     run.go(run.slower_s + _RELEASE_S, Request(run.t_ns, RequestKind.RELEASE))
@@ -379,7 +379,7 @@ class _Run:
             current_a=sign * state.current_a,
         )
 
-    def request(self, step: Step) -> None:
+    def request(self, step: TimedRequest) -> None:
         if step.kind == RequestKind.GRASP:
             self.statements.change_target(step.value)
         self.go(step.time_s, Request(self.t_ns, step.kind, target_n=step.value, width_m=step.value))

@@ -58,8 +58,8 @@ _ONLY_LIVE: Final = frozenset(row.name for row in ROWS if row.unit == "process")
 """Rows whose processes run in real time only: their runs are not counted twice."""
 
 
-class Outcome(TypedDict):
-    """Outcome of one grasp with a fault.
+class FaultRunResult(TypedDict):
+    """Result of one grasp with a fault.
 
     Attributes:
         seed: Seed of the grasp.
@@ -156,10 +156,10 @@ def run_matrix(
     """
     drawn = [_draw(config, i).model_dump(mode="json") for i in range(seeds)]
     simulated = [row for row in rows if row.unit != "process"]
-    file = OutcomeFile[Outcome](keep, config, resume=resume)
+    file = OutcomeFile[FaultRunResult](keep, config, resume=resume)
     with process_pool(jobs) as pool:
 
-        def begin(row: FaultCase, index: int, clock: str) -> Callable[[], Outcome]:
+        def begin(row: FaultCase, index: int, clock: str) -> Callable[[], FaultRunResult]:
             """Starts a grasp unless its outcome is in the file. Returns a function that waits for it."""
             key = f"{row.name}, {clock}, {index}"
             if key in file.outcomes:
@@ -170,7 +170,7 @@ def run_matrix(
                 run = pool.submit(_run_with_fault, drawn[index], fault_free[index], row, clock)
             return lambda: file.add(key, run.result())
 
-        def end(runs: Iterable[Callable[[], Outcome]], name: str) -> list[Outcome]:
+        def end(runs: Iterable[Callable[[], FaultRunResult]], name: str) -> list[FaultRunResult]:
             outcomes = []
             for run in runs:
                 outcomes.append(run())
@@ -227,7 +227,7 @@ def _run_without_fault(tree: Tree) -> FaultFreeGrasp:
 
 def _run_with_fault(
     tree: Tree, fault_free: FaultFreeGrasp, row: FaultCase, clock: str = "lockstep"
-) -> Outcome:
+) -> FaultRunResult:
     config = config_from(tree, "stability")
     rng = np.random.default_rng([config.seed, 31])
     earliest_s, latest_s = fault_free.begin_s + 0.05, max(fault_free.end_s - 0.5, fault_free.begin_s + 0.06)
@@ -293,7 +293,7 @@ def _peak_after(devices: Devices) -> float:
     return max((sample.force_n for sample in samples if sample.valid), default=0.0)
 
 
-def _run_process_row(tree: Tree, row: FaultCase) -> Outcome:
+def _run_process_row(tree: Tree, row: FaultCase) -> FaultRunResult:
     config = config_from(tree, "stability")
     with tempfile.TemporaryDirectory() as folder:
         try:
@@ -326,7 +326,7 @@ def _run_process_row(tree: Tree, row: FaultCase) -> Outcome:
     }
 
 
-def _summary(row: FaultCase, outcomes: list[Outcome], live: list[Outcome]) -> RowSummary:
+def _summary(row: FaultCase, outcomes: list[FaultRunResult], live: list[FaultRunResult]) -> RowSummary:
     both = outcomes or live
     return {
         "row": row.name,
@@ -355,12 +355,12 @@ def _summary(row: FaultCase, outcomes: list[Outcome], live: list[Outcome]) -> Ro
     }
 
 
-def _median_ms(outcomes: list[Outcome]) -> float | None:
+def _median_ms(outcomes: list[FaultRunResult]) -> float | None:
     took_ms = [o["took_ms"] for o in outcomes if o["took_ms"] is not None]
     return median(took_ms) if took_ms else None
 
 
-def _worst_ms(outcomes: list[Outcome]) -> float | None:
+def _worst_ms(outcomes: list[FaultRunResult]) -> float | None:
     return max((o["took_ms"] for o in outcomes if o["took_ms"] is not None), default=None)
 
 
