@@ -96,7 +96,7 @@ def test_a_killed_process_is_judged_by_time_force_and_log(
 def test_a_failure_in_real_time_counts() -> None:
     (row,) = [row for row in ROWS if row.name == "bus: adapter unplugged"]
 
-    def outcome(failure: str) -> faults.Outcome:
+    def outcome(failure: str) -> faults.FaultRunResult:
         return {
             "seed": 3,
             "result": "held",
