@@ -5,12 +5,13 @@ touches up to `PEAK_N`, the median error of grasps, and the minutes that the met
 cell is one line of a file, and is not repeated.
 """
 
+import hashlib
 import json
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -21,10 +22,10 @@ from gripper_calibration.procedures.calibrate_object import calibrate_object, re
 from gripper_calibration.procedures.teach import teach
 from gripper_force.config import Config, load_config
 from gripper_force.errors import DataError
-from gripper_force.jobs.dataset import Clip, load_clips, without_contact_starts
+from gripper_force.jobs.dataset import Clip, digest, load_clips, without_contact_starts
 from gripper_force.jobs.evaluate import evaluate
 from gripper_force.jobs.grasp import overall, trials, with_same_object
-from gripper_force.jobs.imports.video import import_folder
+from gripper_force.jobs.imports.video import find_recordings, import_video
 from gripper_force.jobs.training import few
 from gripper_force.jobs.training.recipe import recipe
 from gripper_force.jobs.training.train import train
@@ -258,6 +259,19 @@ def _scratch(config: Config, name: str, touched: Sequence[Path], out: Path) -> C
     return config.with_values(calibration={"object": str(profile.profile_path)})
 
 
+def _rows(file: Path) -> list[dict[str, Any]]:
+    """Returns the lines of a file of results. A last line that an interruption cut is removed from it."""
+    text = file.read_text() if file.exists() else ""
+    whole = text[: text.rfind("\n") + 1]
+    if whole != text:
+        file.write_text(whole)
+    return [json.loads(line) for line in whole.splitlines()]
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
 def markdown(cells: Sequence[Cell]) -> str:
     """Returns the table for a page: medians over rigs and objects, and the worst of them."""
     lines = [
@@ -294,6 +308,7 @@ class RecordingRow(NamedTuple):
         untaught_n: MAE of the process that was fitted to the other objects.
         calibrated_n: The same, calibrated on the trials.
         taught_n: MAE of a process fitted to the other objects and the trials.
+        recordings: Digest of all recordings; empty in files of earlier versions, whose rows are not used again.
     """
 
     object: str
@@ -302,6 +317,7 @@ class RecordingRow(NamedTuple):
     untaught_n: float
     calibrated_n: float
     taught_n: float
+    recordings: str = ""
 
 
 def bench_recordings(
@@ -314,7 +330,7 @@ def bench_recordings(
 
     Args:
         recordings: Folder as for `import video`.
-        folder: Folder of logs and results; finished rows are not repeated.
+        folder: Folder of logs and results; finished rows of the same recordings are not repeated.
         progress: Called before each object.
 
     Yields:
@@ -323,24 +339,30 @@ def bench_recordings(
     Raises:
         DataError: The recordings can't be used.
     """
-    logs = folder / "recordings"
-    if not any(logs.glob("*.mcap")):
-        import_folder(recordings, logs)
+    # Another folder may have recordings of the same names.
+    logs = folder / f"recordings-{_digest(str(recordings.resolve()))[:8]}"
+    paths = []
+    for name, video, forces in find_recordings(recordings):
+        paths.append(logs / f"{name}.mcap")
+        if not paths[-1].exists():
+            progress(f"importing {name}")
+            import_video(video, forces, paths[-1], name=name)
     preprocess = recipe("few").preprocess
-    clips = without_contact_starts(load_clips(logs, preprocess), preprocess)
+    clips = without_contact_starts(load_clips(paths, preprocess), preprocess)
+    key = _digest(f"{digest(clips)} {[clip.object for clip in clips]}")
     file = folder / "recordings.jsonl"
-    rows = (
-        [RecordingRow(**json.loads(line)) for line in file.read_text().splitlines()] if file.exists() else []
-    )
+    rows = [RecordingRow(**row) for row in _rows(file)]
     for name in sorted({clip.object for clip in clips}):
         own = [clip for clip in clips if clip.object == name]
         counts = [count for count in (1, 2) if count < len(own)]
-        found = [row for row in rows if row.object == name]
+        found = [row for row in rows if (row.object, row.recordings) == (name, key)]
         if len(found) < len(counts):
             progress(f"{name}: fitting the others")
             others = [clip for clip in clips if clip.object != name]
             fit = few.fit(others, preprocess)
-            found = [_recording_row(name, own, count, others, fit) for count in counts]
+            found = [
+                _recording_row(name, own, count, others, fit)._replace(recordings=key) for count in counts
+            ]
             with file.open("a") as out:
                 out.writelines(json.dumps(row._asdict()) + "\n" for row in found)
         yield from found

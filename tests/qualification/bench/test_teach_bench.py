@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -62,22 +63,60 @@ def test_table_has_medians_and_the_worst_of_what_was_measured() -> None:
     ]
 
 
-def test_real_recordings_are_left_out_by_object_and_taught_in_order(
-    press: Callable[..., Clip], write_log: Callable[[Clip, Path], Path], tmp_path: Path
-) -> None:
+@pytest.fixture
+def recordings(
+    press: Callable[..., Clip],
+    write_log: Callable[[Clip, Path], Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> Path:
+    """A folder with three recordings each of three objects, whose import writes pressed discs."""
+
+    def import_video(video: Path, forces: Path, out: Path, *, name: str) -> None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        number = int(name.removesuffix("b"))
+        write_log(replace(press(number), name=name, object=f"o{number // 3}"), out.parent)
+
+    folder = tmp_path / "real"
+    folder.mkdir()
     for number in range(9):
-        write_log(replace(press(number), object=f"o{number // 3}"), tmp_path / "recordings")
-    call = ["bench", "teach", "--recordings", str(tmp_path), "--out", str(tmp_path), "--json"]
-    result = CliRunner().invoke(app, call, catch_exceptions=False)
-    rows = json.loads(result.stdout)["recordings"]
+        (folder / f"{number}.avi").touch()
+        (folder / f"{number}.csv").touch()
+    monkeypatch.setattr(job, "import_video", import_video)
+    return folder
+
+
+def measured(folder: Path, out: Path) -> list[dict[str, Any]]:
+    call = ["bench", "teach", "--recordings", str(folder), "--out", str(out), "--json"]
+    rows: list[dict[str, Any]] = json.loads(CliRunner().invoke(app, call, catch_exceptions=False).stdout)[
+        "recordings"
+    ]
+    return rows
+
+
+def test_real_recordings_are_left_out_by_object_and_taught_in_order(recordings: Path, tmp_path: Path) -> None:
+    rows = measured(recordings, tmp_path)
     assert [(row["object"], row["trials"], row["tested"]) for row in rows] == [
         (name, trials, 3 - trials) for name in ("o0", "o1", "o2") for trials in (1, 2)
     ]
     assert all(0 < row["taught_n"] < 3 for row in rows)
     kept = (tmp_path / "recordings.jsonl").read_text()
-    again = CliRunner().invoke(app, call, catch_exceptions=False)
-    assert json.loads(again.stdout)["recordings"] == rows
+    assert measured(recordings, tmp_path) == rows
     assert (tmp_path / "recordings.jsonl").read_text() == kept
+
+
+def test_missing_recordings_are_imported_and_rows_of_others_are_not_used(
+    recordings: Path, tmp_path: Path
+) -> None:
+    rows = measured(recordings, tmp_path)
+    next(tmp_path.rglob("4.mcap")).unlink()  # as after an interrupted import
+    assert measured(recordings, tmp_path) == rows
+    for name in ("0.avi", "0.csv"):
+        (recordings / name).rename(recordings / f"{name[0]}b{name[1:]}")
+    (recordings / "8.avi").unlink()
+    fewer = measured(recordings, tmp_path)
+    assert [row["tested"] for row in fewer] == [2, 1, 2, 1, 1]
+    assert {row["recordings"] for row in fewer}.isdisjoint({row["recordings"] for row in rows})
 
 
 def test_unknown_method_is_named() -> None:
