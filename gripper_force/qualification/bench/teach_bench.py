@@ -2,7 +2,7 @@
 
 A *cell* is one rig, one object, one number of touches and one method. Its figures are the error of vision on fresh
 touches up to `PEAK_N`, the median error of grasps, and the minutes that the method took after the touches. A finished
-cell is one line of a file, and is not repeated.
+cell is one line of a file, and is not repeated with the same settings and number of grasps.
 """
 
 import hashlib
@@ -20,7 +20,7 @@ from gripper_calibration.fits.object_fit import fit_correction
 from gripper_calibration.fits.touches import Touches
 from gripper_calibration.procedures.calibrate_object import calibrate_object, record_touches
 from gripper_calibration.procedures.teach import teach
-from gripper_force.config import Config, load_config
+from gripper_force.config import Config, dump_config, load_config
 from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import Clip, digest, load_clips, without_contact_starts
 from gripper_force.jobs.evaluate import evaluate
@@ -89,6 +89,8 @@ class Cell:
         minutes: Time of the method after the touches.
         learned: What `teach` took.
         problem: Reason why the method gave nothing; empty if it did.
+        grasps: Grasps with each feedback.
+        settings: Digest of the rig's configuration; empty in files of earlier versions, whose cells are measured again.
     """
 
     rig: str
@@ -103,6 +105,8 @@ class Cell:
     minutes: float = 0.0
     learned: str = ""
     problem: str = ""
+    grasps: int = 0
+    settings: str = ""
 
 
 def foreign_rigs(config: Config, count: int) -> list[Rig]:
@@ -142,11 +146,12 @@ def list_cells(
     """
     cells = []
     for rig in rigs:
-        digest = read_model(rig.config.vision.checkpoint).digest
+        network = read_model(rig.config.vision.checkpoint).digest
+        settings = _digest(dump_config(rig.config))
         for name in objects:
             for method in methods:
                 for count in (0,) if method == "shipped" else counts:
-                    cells.append((rig, Cell(rig.name, name, count, method, digest)))
+                    cells.append((rig, Cell(rig.name, name, count, method, network, settings=settings)))
     return cells
 
 
@@ -172,10 +177,10 @@ def bench(
     """
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / "cells.jsonl"
-    done = [Cell(**json.loads(line)) for line in file.read_text().splitlines()] if file.exists() else []
-    known = {(c.rig, c.object, c.touches, c.method, c.network): c for c in done}
+    known = {_key(cell): cell for cell in (Cell(**row) for row in _rows(file))}
     for rig, cell in cells:
-        key = (cell.rig, cell.object, cell.touches, cell.method, cell.network)
+        cell = replace(cell, grasps=grasps)
+        key = _key(cell)
         if key not in known:
             progress(f"{cell.object}, {cell.rig}: {cell.method}, {cell.touches} touches")
             known[key] = _measured(cell, rig.config, grasps, folder, workers, progress)
@@ -184,10 +189,14 @@ def bench(
         yield known[key]
 
 
+def _key(cell: Cell) -> tuple[object, ...]:
+    return cell.rig, cell.object, cell.touches, cell.method, cell.network, cell.grasps, cell.settings
+
+
 def _measured(
     cell: Cell, config: Config, grasps: int, folder: Path, workers: int, progress: Progress
 ) -> Cell:
-    place = folder / f"{cell.rig} {cell.object}".replace(",", "").replace(" ", "-")
+    place = folder / f"{cell.rig} {cell.object} {cell.settings[:8]}".replace(",", "").replace(" ", "-")
     config = config.with_values(
         object=cell.object,
         log={"directory": place / "grasps", "report": False},

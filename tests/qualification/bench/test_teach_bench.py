@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +47,28 @@ def test_a_finished_cell_is_not_measured_again(
     assert not log.exists()
     (kept,) = (tmp_path / "cells.jsonl").read_text().splitlines()
     assert Cell(**json.loads(kept)) == first[0]
+
+
+def test_a_cell_of_other_settings_or_of_an_earlier_version_is_measured_again(
+    tiny_checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(job, "_measured", lambda cell, *_: replace(cell, mae_n=0.1))
+    file = tmp_path / "cells.jsonl"
+
+    def cell(grasps: int, *keys: str) -> Cell:
+        rigs = foreign_rigs(load_config(None, [f"vision.checkpoint={tiny_checkpoint}", *keys]), 1)
+        (found,) = bench(list_cells(rigs, ["peg"], [16], ["taught"]), grasps=grasps, folder=tmp_path)
+        return found
+
+    first = cell(4)
+    old = asdict(replace(first, mae_n=0.9))
+    del old["grasps"], old["settings"]
+    file.write_text(json.dumps(old) + "\n" + json.dumps(asdict(first)) + "\n" + json.dumps(old)[:40])
+    assert cell(4) == first  # whose file an interruption has cut
+    assert cell(6).grasps == 6
+    assert cell(4, "control.force_limit_n=5").settings != first.settings
+    assert len(file.read_text().splitlines()) == 4
+    assert cell(4) == first
 
 
 def test_table_has_medians_and_the_worst_of_what_was_measured() -> None:
