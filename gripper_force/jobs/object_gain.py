@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 
 from gripper_force.config import Overrides, config_from_text
@@ -89,8 +90,10 @@ def save_gain(
             "no log holds a grasp that was held for half a second with visual estimates; grasp the object with "
             "control.feedback=fused and control.learn_gain=true"
         )
-    (low, low_std), (high, high_std) = min(ratios), max(ratios)
-    if math.log(high / low) > GATE * math.hypot(low_std, high_std, math.sqrt(2) * REPEAT_STD):
+    # The smallest and the largest ratio may be uncertain, and agree, where others do not.
+    worst = max(combinations(sorted(ratios), 2), key=_contradiction, default=None)
+    if worst is not None and _contradiction(worst) > GATE:
+        (low, _), (high, _) = worst
         raise DataError(
             f"the logs contradict each other: motor current was {low:.2f} times the visual force in one, and "
             f"{high:.2f} times in another; pass logs of one object"
@@ -112,6 +115,12 @@ def save_gain(
         changed = changed.model_copy(update={"network": network.name})
     write_object(target, changed, weights_path(source).read_bytes())
     return SavedGain(profile.object, estimate.gain, estimate.std, *total, target)
+
+
+def _contradiction(pair: tuple[tuple[float, float], tuple[float, float]]) -> float:
+    """Returns the difference of two rising ratios, in standard deviations."""
+    (low, low_std), (high, high_std) = pair
+    return math.log(high / low) / math.hypot(low_std, high_std, math.sqrt(2) * REPEAT_STD)
 
 
 def _torque_std(path: Path, overrides: Overrides | None) -> float:

@@ -57,11 +57,14 @@ def test_the_network_of_a_bundle_goes_with_the_profile(
     assert read_object(bundle).network == "network.safetensors"
 
 
-def test_logs_of_two_objects_contradict_each_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ratios = iter([(0.6, 0.03), (1.6, 0.03)])
+@pytest.mark.parametrize("uncertain", [[], [(0.5, 0.9)], [(2.0, 0.9), (0.5, 0.9)]])
+def test_logs_of_two_objects_contradict_each_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, uncertain: list[tuple[float, float]]
+) -> None:
+    ratios = iter([(0.6, 0.03), *uncertain, (1.6, 0.03)])
     monkeypatch.setattr(object_gain, "learned_ratio", lambda path, _: next(ratios))
     with pytest.raises(DataError, match=r"0\.60 times the visual force in one, and 1\.60 times in another"):
-        save_gain("sponge", [tmp_path, tmp_path], tmp_path / "mine.yaml")
+        save_gain("sponge", [tmp_path] * (2 + len(uncertain)), tmp_path / "mine.yaml")
     assert not list(tmp_path.iterdir())
 
 
