@@ -267,7 +267,7 @@ def _press(row: int, index: int, folder: Path, tree: Tree) -> Tree:
     checkpoint = load_checkpoint(config.vision.checkpoint)
     version = hashlib.sha256(checkpoint.header.model_dump_json().encode()).hexdigest()
     name = "-".join([spec.group, spec.name, scene, log.name, key, version[:12]]).replace(" ", "_")
-    kept = folder / "estimates" / f"{name}.json"
+    kept = folder / "judged" / f"{name}.json"
     if kept.exists():
         try:
             loaded: Tree = json.loads(kept.read_text(encoding="utf-8"))
@@ -309,20 +309,25 @@ def judge(
     header = checkpoint.header
     small = np.stack([downscale(frame, config.vision.region, header.preprocess.size) for frame in frames])
     forces_n, read_out = features(checkpoint.networks, header.preprocess, small)
-    estimate_n = forces_n.mean(0).astype(np.float64)
-    std_n = claimed_std_n(header, forces_n)
-    rejected = np.zeros(len(frames), bool)
-    if header.ood is not None:
-        ood = OodScore(header.ood)
-        score = ood.score(read_out, estimate_n)
-        std_n, rejected = std_n * ood.std_factor(score), score > 1
+    refused = np.zeros(len(frames), bool)
     checks = FrameChecks()
     for i, frame in enumerate(small):
         try:
             checks.check(frame)
         except DataError:
-            rejected[i] = True
-    return estimate_n, std_n, rejected
+            refused[i] = True
+    if refused.any() and not refused.all():
+        # In a run the network does not see these frames, and they do not change its later estimates.
+        forces_n[:, ~refused], read_out[~refused] = features(
+            checkpoint.networks, header.preprocess, small[~refused]
+        )
+    estimate_n = forces_n.mean(0).astype(np.float64)
+    std_n = claimed_std_n(header, forces_n)
+    if header.ood is None:
+        return estimate_n, std_n, refused
+    ood = OodScore(header.ood)
+    score = ood.score(read_out, estimate_n)
+    return estimate_n, std_n * ood.std_factor(score), refused | (score > 1)
 
 
 def _read(path: Path) -> tuple[Gray, Floats, npt.NDArray[np.bool_]]:

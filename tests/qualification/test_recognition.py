@@ -1,17 +1,22 @@
 """`bench recognition` on one simulated press."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from gripper_force import cli
+from gripper_force.config import load_config
 from gripper_force.errors import DataError
+from gripper_force.jobs.dataset import Clip
 from gripper_force.qualification import recognition
+from gripper_force.vision.checkpoint import load_checkpoint
+from gripper_force.vision.estimator import ForceEstimator
 
 ROWS = (
     recognition.Row("known kinds", "still"),
@@ -58,3 +63,15 @@ def test_a_covered_view_is_rejected_and_an_existing_press_is_used_again(
     error = CliRunner().invoke(cli.app, command).exception
     assert isinstance(error, DataError)
     assert "delete it" in str(error)
+
+
+def test_frames_are_judged_as_in_a_run(press: Callable[..., Clip], tiny_checkpoint: Path) -> None:
+    frames = press(3).frames.repeat(2, 1).repeat(2, 2)
+    frames[30:33] = 255  # flat: the network does not see them
+    checkpoint = load_checkpoint(tiny_checkpoint)
+    estimate_n, std_n, rejected = recognition.judge(frames, load_config(), checkpoint)
+    assert np.flatnonzero(rejected).tolist() == [30, 31, 32]
+    estimator = ForceEstimator.load(tiny_checkpoint)
+    for i in np.flatnonzero(~rejected):
+        if (found := estimator.update(frames[i])) is not None:
+            assert (estimate_n[i], std_n[i]) == pytest.approx((found.force_n, found.std_n), abs=1e-3)
