@@ -197,7 +197,7 @@ def main() -> None:
     print("|---" * (3 + len(columns)) + "|")
     for method in methods:
         found = [done[part]["errors"][method].get(name, [np.nan] * 2) for part, name in columns]
-        pairs = [np.nanmean(found, 0), np.nanstd(found, 0), *found]
+        pairs = [np.nanmean(found, 0), np.nanstd(found, 0, ddof=1), *found]
         print(f"| {method} | {' | '.join(f'{a:.2f} / {b:.2f}' for a, b in pairs)} |")
 
 

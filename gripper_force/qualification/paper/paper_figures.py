@@ -41,7 +41,8 @@ def error_by_force(test: Test) -> Figure:
             error_n = test.absolute_n(model)
             by_bin = [error_n[:, level == n].mean(1) for n in filled]  # (bins, seeds)
             where = np.array(filled) + 0.5 + 0.27 * (i - 1)
-            spread = [values.std() for values in by_bin]
+            one_seed = len(error_n) == 1  # which has no spread
+            spread = None if one_seed else [values.std(ddof=1) for values in by_bin]
             axes.bar(
                 where,
                 [v.mean() for v in by_bin],

@@ -299,7 +299,7 @@ def _percent(baseline_n: float | None, mae_n: float | None) -> str:
 def _spread(values_n: np.ndarray) -> str:
     """Text of the mean and the spread over seeds. One seed has no spread."""
     mean = f"{values_n.mean():.3f}"
-    return mean if len(values_n) == 1 else f"{mean} ± {values_n.std():.3f}"
+    return mean if len(values_n) == 1 else f"{mean} ± {values_n.std(ddof=1):.3f}"
 
 
 def _p(value: float) -> str:

@@ -80,6 +80,12 @@ def test_markdown_of_a_table() -> None:
     )
 
 
+def test_the_spread_is_that_of_a_sample_of_seeds(estimates: Estimates) -> None:
+    for seed in range(3):
+        estimates.estimates_n["plain", seed] = estimates.measured_n + 0.4 + 0.1 * seed
+    assert tables.comparison(estimates, "3").rows[0][5] == "0.500 ± 0.100"
+
+
 def test_one_seed_has_no_spread(estimates: Estimates) -> None:
     one = replace(estimates, scale=Scale(seeds=1))
     assert tables.comparison(one, "3").rows[0][5] == "0.400"
