@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
@@ -11,6 +12,7 @@ from gripper_force import cli
 from gripper_force.errors import DataError
 from gripper_force.jobs.object_gain import gain_of
 from gripper_force.profiles.object_profile import find_object, read_object, weights_path
+from gripper_force.qualification.bench.gain_bench import best_gain
 
 SETTINGS = ("vision.checkpoint=small", "sim.detail=coarse", "sim.stiffness=1.5")
 
@@ -41,6 +43,17 @@ def test_the_gain_of_a_stiff_sponge_is_learned_and_reduces_the_error_of_vision(r
     assert row["stiffness"] == pytest.approx(1.5)
     assert row["gain"] > 1.2
     assert row["perfect_n"] < row["learned_n"] < 0.8 * row["mae_n"]
+
+
+def test_the_best_gain_has_the_lowest_error() -> None:
+    rng = np.random.default_rng(0)
+    true_n = np.linspace(0, 8, 400)
+    seen_n = np.where(true_n > 6, 0.7, 0.9) * true_n + rng.normal(
+        0, 0.03, 400
+    )  # a stop, beyond which nothing shows
+    seen_n[0] = 0.0
+    errors_n = [np.abs(gain * seen_n - true_n).mean() for gain in np.linspace(1, 1.5, 2001)]
+    assert np.abs(best_gain(seen_n, true_n) * seen_n - true_n).mean() <= min(errors_n)
 
 
 def test_the_command_saves_the_gain_of_the_last_log(
