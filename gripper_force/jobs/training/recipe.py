@@ -95,8 +95,9 @@ class TrainConfig(Section):
         head: Units of the dense layer.
         preprocess: Preparation of frames.
         steps: Optimiser steps per member.
-        epochs: Passes over the training set per member; replaces ``steps``. In a pass every frame with a
-            label is the last of one clip.
+        epochs: Passes over the new recordings per member; replaces ``steps``. A pass has as many of their clips as
+            they have frames with a label. Without ``contact_share`` and ``force_share`` each frame is the last of one.
+            Not with ``short_share``, whose steps have more clips.
         minutes: Training time of the whole ensemble; replaces ``steps`` and ``epochs``.
         windows: ``shared``: all windows of a clip contribute to the loss, and each frame passes the backbone
             once for all of them. ``separate``: a clip is one window and its n earlier frames, with one loss.
@@ -187,6 +188,14 @@ class TrainConfig(Section):
             raise ValueError(error.errors()[0]["msg"].removeprefix("Value error, ")) from error
         if self.windows == "separate" and self.short_share:
             raise ValueError("short_share only applies to shared windows; set it to 0 for separate ones")
+        if self.epochs is not None and self.short_share:
+            raise ValueError(
+                "epochs are not counted with short clips; set short_share to 0, or epochs to null"
+            )
+        if self.replayed == self.clips:
+            raise ValueError(
+                f"replay_share {self.replay_share} leaves none of {self.clips} clips for the new recordings; reduce it"
+            )
         if self.short_share and self.short_frames > self.clip_frames:
             raise ValueError(
                 f"short_frames {self.short_frames} is more than clip_frames {self.clip_frames}; reduce it"
@@ -199,6 +208,11 @@ class TrainConfig(Section):
         indentation: tuple[Quantity, ...] = ("indentation",) if self.indentation_weight else ()
         contact: tuple[Quantity, ...] = ("contact",) if self.contact_weight else ()
         return ("force", *indentation, *contact)
+
+    @property
+    def replayed(self) -> int:
+        """Clips of a step, but for short ones, that are of an earlier training if its recordings are mixed in."""
+        return round(self.replay_share * self.clips)
 
     def network(self, member: int) -> NetworkConfig:
         """Returns the configuration of one member."""

@@ -54,7 +54,8 @@ class Trainer:
         self._name = config.attentions[member]
         self._total_steps = config.steps
         if config.epochs is not None:
-            self._total_steps = math.ceil(config.epochs * batches.labels / config.clips)
+            replayed = config.replayed if isinstance(batches, Replay) else 0
+            self._total_steps = math.ceil(config.epochs * batches.labels / (config.clips - replayed))
         self.network = ForceNetwork(config.network(member)).to(process.device)
         if process.world_size > 1:
             share_statistics(self.network)

@@ -35,6 +35,8 @@ def test_keys_of_a_recipe_can_be_set() -> None:
         (["backbone=resnet18", "preprocess.size=48"], "backbone resnet18; use a multiple of 32"),
         (["attentions=[]"], "attentions"),
         (["windows=separate"], "short_share only applies to shared windows"),
+        (["epochs=3"], "epochs are not counted with short clips"),
+        (["clips=2", "replay_share=0.9"], "replay_share 0.9 leaves none of 2 clips for the new recordings"),
         (["short_frames=30"], "short_frames 30 is more than clip_frames 22"),
     ],
 )

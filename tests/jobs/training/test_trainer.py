@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gripper_force.jobs.dataset import CONTACT_N, Clip
-from gripper_force.jobs.training.batches import Batches
+from gripper_force.jobs.training.batches import Batches, Replay
 from gripper_force.jobs.training.parallel import TrainingProcess
 from gripper_force.jobs.training.recipe import TrainConfig
 from gripper_force.jobs.training.train import train
@@ -179,6 +179,8 @@ def test_epochs_count_passes(clips: list[Clip], small_recipe: TrainConfig) -> No
     batches = Batches(clips, config, TrainingProcess("cpu"))
     assert batches.labels == 360
     assert len(list(Trainer(config, 0, batches, TrainingProcess("cpu")).steps())) == 4
+    mixed = Replay(batches, batches, config.replay_share)  # 4 of 9 clips
+    assert len(list(Trainer(config, 0, mixed, TrainingProcess("cpu")).steps())) == 8
 
 
 def test_time_budget_ends_training(
