@@ -17,14 +17,15 @@ from gripper_force.errors import CheckpointError, ConfigError
 from gripper_force.plugins import importing
 from gripper_force.types import Gray
 from gripper_force.vision.checkpoint import load_checkpoint
-from gripper_force.vision.engines import Engine, Floats, open_engine
+from gripper_force.vision.engines import Engine, Floats, Step, open_engine
 from gripper_force.vision.engines.pytorch import TorchEngine, restored_threads
 from gripper_force.vision.ensemble_step import FRAME, EnsembleStep, state_names
 from gripper_force.vision.header import EXPORTED, KEY, Model, exported_metadata
 from gripper_force.vision.preprocess import Normaliser
 
 TOLERANCE: Final = 1e-4
-"""Largest difference of an exported network from PyTorch in float32, as a share of the label scale."""
+"""Largest difference of an exported network from PyTorch in float32: of forces as a share of the label scale, of
+features and attention as a share of the largest value."""
 
 _CHECKED: Final = 30
 """Frames of noise that an exported network is checked on: more than a window."""
@@ -155,8 +156,12 @@ def inputs_of(model: Model, clip: Gray) -> Iterator[Floats]:
 def compare(model: Model, path: Path, frames: Sequence[Gray] | None = None) -> ExportErrors:
     """Compares an exported file with PyTorch, on recordings, (T, S, S) uint8 each, or on noise.
 
+    Returns:
+        The difference of the ensemble's estimates.
+
     Raises:
-        CheckpointError: The file computes something else; on recordings, only if its estimates are not finite.
+        CheckpointError: The file computes another force of a member, other features or another attention; on
+            recordings, only if they are not finite.
     """
     exact = frames is None
     if frames is None:
@@ -164,17 +169,25 @@ def compare(model: Model, path: Path, frames: Sequence[Gray] | None = None) -> E
         frames = [np.random.default_rng(0).integers(0, 256, (_CHECKED, size, size), np.uint8)]
     made = Model(path, model.header, model.digest)
     frames = frames[:_CLIPS]
-    expected_n, exported_n = (
-        np.concatenate([_estimates(engine, model, clip) for clip in frames])
+    expected, exported = (
+        [step for clip in frames for step in _steps(engine, model, clip)]
         for engine in (TorchEngine(model), open_engine(made, EXPORTED[path.suffix]))
     )
-    error_n = np.abs(expected_n - exported_n)
-    scale_n = max(member.label_scale_n for member in model.header.members)
-    if not np.isfinite(error_n).all() or (exact and error_n.max() > TOLERANCE * scale_n):
-        raise CheckpointError(
-            f"the exported {path.suffix} file differs from PyTorch by {error_n.max():.2g} N; "
-            "install other versions of the packages of gripper-force[engines], or use vision.engine=torch"
-        )
+    for name in ("forces_n", "features", "attention"):
+        if getattr(expected[0], name) is None:  # no attention
+            continue
+        theirs, ours = (np.stack([getattr(step, name) for step in steps]) for steps in (expected, exported))
+        scale = np.abs(theirs).max()
+        if name == "forces_n":
+            scale = max(member.label_scale_n for member in model.header.members)
+        largest = np.abs(theirs - ours).max()
+        if not np.isfinite(largest) or (exact and largest > TOLERANCE * scale):
+            raise CheckpointError(
+                f"the exported {path.suffix} file differs from PyTorch by {largest:.2g} in {name}; "
+                "install other versions of the packages of gripper-force[engines], or use vision.engine=torch"
+            )
+    means_n = [np.array([step.forces_n.mean() for step in steps]) for steps in (expected, exported)]
+    error_n = np.abs(means_n[0] - means_n[1])
     return {
         "largest_n": float(error_n.max()),
         "mean_n": float(error_n.mean()),
@@ -182,9 +195,9 @@ def compare(model: Model, path: Path, frames: Sequence[Gray] | None = None) -> E
     }
 
 
-def _estimates(engine: Engine, model: Model, clip: Gray) -> Floats:
+def _steps(engine: Engine, model: Model, clip: Gray) -> list[Step]:
     engine.reset()
-    return np.stack([engine.step(frame).forces_n.mean() for frame in inputs_of(model, clip)])
+    return [engine.step(frame) for frame in inputs_of(model, clip)]
 
 
 @contextmanager
