@@ -86,9 +86,10 @@ def test_a_report_scores_the_last_request_alone(quick: list[str], tmp_path: Path
 
 
 def picture(force: float) -> Gray:
-    """An image of a blob that spreads with the force."""
+    """An image of a blob that spreads with the force, before a pattern that shows that the camera stays."""
     y, x = np.mgrid[-1:1:128j, -1:1:128j]
-    return np.asarray(60 + 25 * x + 120 * np.exp(-(x**2 + y**2) / (0.05 + 0.05 * force)), np.uint8)
+    pattern = 60 + 25 * x + 8 * np.sin(40 * x) * np.sin(37 * y)
+    return np.asarray(pattern + 120 * np.exp(-(x**2 + y**2) / (0.02 + 0.01 * force)), np.uint8)
 
 
 REAL = {
@@ -439,6 +440,18 @@ def test_frames_span_the_grip_and_show_attention(grasp: Path) -> None:
     assert pictures[3].overlay is not None
     assert np.ptp(pictures[3].overlay, axis=2).max() > 20, "the attention is in colour"
     assert pictures[3].load_cell_n == pytest.approx(TARGET_N, abs=0.2)
+
+
+def test_a_frame_that_the_network_did_not_see_has_no_attention(grasp: Path) -> None:
+    log = LogReader(grasp)
+    sampler = FrameSampler(log)
+    frames = list(log.records(Frame))
+    for i, frame in enumerate(frames):
+        covered = i >= 100
+        sampler.add(dataclasses.replace(frame, gray=np.full_like(frame.gray, 90)) if covered else frame)
+    attention = [kept.attention is not None for kept in sampler._kept]
+    assert any(attention[:100])
+    assert not any(attention[100:])
 
 
 def test_frames_of_recording_span_its_touch(tmp_path: Path) -> None:

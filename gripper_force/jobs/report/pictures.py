@@ -1,6 +1,6 @@
 """Camera frames over a grasp, with the network's spatial attention over them."""
 
-from contextlib import suppress
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -10,7 +10,7 @@ import numpy.typing as npt
 from matplotlib import colormaps
 
 from gripper_force.config import config_from_text
-from gripper_force.errors import CheckpointError, DataError
+from gripper_force.errors import CheckpointError, DataError, UnfamiliarFrameError
 from gripper_force.jobs.report.data import Run
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import GRIPPING, NS_PER_S, Frame, Gray
@@ -116,9 +116,16 @@ class FrameSampler:
         """
         attention = None
         if self._estimator is not None:
-            with suppress(DataError):  # the run continued without an estimate for this frame, too
+            # The run continued without an estimate for such a frame, too. If the checks rejected it, the network did
+            # not see it, and the newest attention is that of an earlier frame.
+            seen = True
+            try:
                 self._estimator.update(frame.gray)
-            attention = self._estimator.attention_map()
+            except UnfamiliarFrameError as error:
+                seen = math.isfinite(error.force_n)
+            except DataError:
+                seen = False
+            attention = self._estimator.attention_map() if seen else None
         if self._count % self._step == 0:
             gray = downscale(frame.gray, self._region, _SIDE_PX)
             kept = None if attention is None else attention.copy()
