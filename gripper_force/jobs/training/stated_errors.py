@@ -60,9 +60,14 @@ def state_errors(
 def estimates(
     clips: Sequence[Clip], networks: Sequence[Member], preprocess: Preprocess, device: str
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """Returns the ensemble's and the measured forces in N, (N,) each, over all frames with a label."""
-    forces_n = [predict(networks, preprocess, clip.frames, device).mean(0)[clip.valid] for clip in clips]
-    return np.concatenate(forces_n), np.concatenate([clip.forces_n[clip.valid] for clip in clips])
+    """Returns the ensemble's and the measured forces in N, (N,) each, over all frames with a label.
+
+    The first frames of a clip are left out, for which a run gives no estimate.
+    """
+    used = [clip.valid & (np.arange(len(clip.frames)) >= preprocess.lead_in) for clip in clips]
+    pairs = list(zip(clips, used, strict=True))
+    forces_n = [predict(networks, preprocess, clip.frames, device).mean(0)[mask] for clip, mask in pairs]
+    return np.concatenate(forces_n), np.concatenate([clip.forces_n[mask] for clip, mask in pairs])
 
 
 def errors(forces_n: npt.NDArray[np.float32], measured_n: npt.NDArray[np.float32]) -> dict[str, float]:

@@ -131,6 +131,7 @@ def train(
             _save(out, networks, config, data, forces_n, measured_n, float(labels_n.mean()))
             _add_ood(out, networks, held_out, process.device, warn)
             if figure:
+                lead_in = config.preprocess.lead_in
                 draw_training(
                     {
                         f"{i}, {t.network.config.attention}": np.array(t.losses).reshape(-1, 2)
@@ -138,7 +139,9 @@ def train(
                     },
                     measured_n,
                     forces_n,
-                    np.concatenate([np.full(int(clip.valid.sum()), clip.object) for clip in held_out]),
+                    np.concatenate(
+                        [np.full(int(clip.valid[lead_in:].sum()), clip.object) for clip in held_out]
+                    ),
                     float(labels_n.std()),
                     f"{out.name}: MAE {metrics.mae(forces_n, measured_n):.3f} N on validation data",
                     out.with_suffix(".png"),
