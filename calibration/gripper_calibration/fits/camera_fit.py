@@ -170,7 +170,9 @@ def estimate_lag(touches: Sequence[CameraLag]) -> CalibratedValue:
             "samples/s"
         )
     value = float(np.median(lags_ms))
-    scatter_ms = float(student.ppf(0.975, count - 1) * lags_ms.std(ddof=1) / np.sqrt(count))
+    mean_ms = float(student.ppf(0.975, count - 1) * lags_ms.std(ddof=1) / np.sqrt(count))
+    # The median of many normal draws scatters sqrt(pi / 2) times as much as their mean, that of few a bit less.
+    scatter_ms = np.sqrt(np.pi / 2) * mean_ms
     half_ms = float(np.hypot(scatter_ms, METHOD_ERROR_MS))
     return CalibratedValue(value=value, low=value - half_ms, high=value + half_ms)
 

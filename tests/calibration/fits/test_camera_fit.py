@@ -128,6 +128,12 @@ def test_scattered_touches_widen_the_lag_interval() -> None:
     assert estimate_lag(touches(18, 19, 20, 21)).half < 6
 
 
+def test_the_lag_interval_covers_the_scatter_of_a_median() -> None:
+    rng = np.random.default_rng(0)
+    lags = [estimate_lag(touches(*rng.normal(0, 1000, 20))) for _ in range(2000)]
+    assert np.mean([abs(lag.value) <= lag.half for lag in lags]) > 0.94
+
+
 def test_weak_touches_are_not_used() -> None:
     assert estimate_lag([*touches(10, 11, 12), *touches(90, 95, 99, force_n=2.0)]).value == 11
 
