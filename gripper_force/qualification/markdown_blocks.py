@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from gripper_force.errors import DataError
+from gripper_force.files import unfinished
 
 
 def write_between(page: Path, name: str, text: str) -> None:
@@ -15,7 +16,10 @@ def write_between(page: Path, name: str, text: str) -> None:
     try:
         before, rest = page.read_text(encoding="utf-8").split(begin)
         _, after = rest.split(end)
-        page.write_text(f"{before}{begin}\n\n{text}\n{end}{after}", encoding="utf-8")
+        with unfinished(
+            page
+        ) as part:  # an interruption must not leave half of a page that is written by hand
+            part.write_text(f"{before}{begin}\n\n{text}\n{end}{after}", encoding="utf-8")
     except (OSError, ValueError) as error:
         raise DataError(
             f"can't write into {page}: it needs one line {begin!r} and after it one line {end!r}"

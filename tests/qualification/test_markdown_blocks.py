@@ -14,6 +14,21 @@ def test_text_between_the_lines_is_replaced(tmp_path: Path) -> None:
     assert page.read_text() == "# Before\n<!-- here -->\n\n| new |\n\n<!-- end of here -->\nafter\n"
 
 
+def test_an_interruption_leaves_the_page_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(before := "<!-- here -->\nold\n<!-- end of here -->\nby hand\n")
+
+    def write_half(path: Path, text: str, encoding: str) -> None:
+        with path.open("w", encoding=encoding) as file:
+            file.write(text[:20])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Path, "write_text", write_half)
+    with pytest.raises(KeyboardInterrupt):
+        write_between(page, "here", "new")
+    assert page.read_text() == before
+
+
 @pytest.mark.parametrize("text", [None, "", "<!-- here -->", "<!-- end of here --> <!-- here -->"])
 def test_a_page_without_the_lines_raises(text: str | None, tmp_path: Path) -> None:
     page = tmp_path / "page.md"
