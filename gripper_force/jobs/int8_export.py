@@ -23,7 +23,10 @@ from gripper_force.vision.export import (
 from gripper_force.vision.header import KEY, Header, Model, Residual
 
 _SAMPLES: Final = 300
-"""Frames that int8 ranges are calibrated on; NNCF's default."""
+"""Frames that the recordings must hold, and about the largest number to calibrate on; NNCF's default."""
+
+_HELD_OUT: Final = 4
+"""Largest number of recordings that the error is measured on."""
 
 
 def export_int8(model: Model, path: Path, frames: Sequence[Gray]) -> ExportErrors:
@@ -35,10 +38,11 @@ def export_int8(model: Model, path: Path, frames: Sequence[Gray]) -> ExportError
     Args:
         model: The checkpoint.
         path: File to write, ``.xml``; see `gripper_force.vision.export.export`.
-        frames: Recordings, (T, S, S) uint8 each, to calibrate the ranges on.
+        frames: Recordings, (T, S, S) uint8 each. The last ones, or the second half of a single one, are held out; the
+            ranges are calibrated on the others.
 
     Returns:
-        The difference from PyTorch, on the recordings. The header of the file claims errors that include it.
+        The difference from PyTorch, on the recordings held out. The header of the file claims errors that include it.
 
     Raises:
         ConfigError: The suffix is another one, or a package is not installed.
@@ -47,23 +51,34 @@ def export_int8(model: Model, path: Path, frames: Sequence[Gray]) -> ExportError
     """
     if path.suffix != ".xml":
         raise ConfigError(f"int8 is exported to OpenVINO only, not to {path}; name a file that ends in .xml")
+    total = sum(len(clip) for clip in frames)
+    if total < _SAMPLES:
+        raise DataError(
+            f"int8 needs at least {_SAMPLES} frames, and the recordings hold {total}; record more"
+        )
+    calibrated, held_out = _split(frames, model.header.preprocess.reference_frames)
     with written(path) as made:
-        save_openvino(_quantised(openvino_network(model), model, frames), model, made)
-        errors = compare(model, made, frames)
+        save_openvino(_quantised(openvino_network(model), model, calibrated), model, made)
+        errors = compare(model, made, held_out)
         _replace_header(with_added_error(model.header, errors), made)
     return errors
+
+
+def _split(frames: Sequence[Gray], reference_frames: int) -> tuple[list[Gray], list[Gray]]:
+    """Returns the recordings to calibrate on, and those to measure the error on."""
+    if len(frames) == 1:
+        (clip,) = frames
+        middle = len(clip) // 2
+        return [clip[:middle]], [np.concatenate([clip[:reference_frames], clip[middle:]])]
+    count = min(_HELD_OUT, len(frames) // 2)
+    return list(frames[:-count]), list(frames[-count:])
 
 
 def _quantised(network: Any, model: Model, frames: Sequence[Gray]) -> Any:
     """Quantises the convolutions to int8: weights with a scale per channel, inputs calibrated on frames."""
     import nncf
 
-    total = sum(len(clip) for clip in frames)
-    if total < _SAMPLES:
-        raise DataError(
-            f"int8 needs at least {_SAMPLES} frames, and the recordings hold {total}; record more"
-        )
-    engine = _InputRecorder(model, total // _SAMPLES)
+    engine = _InputRecorder(model, max(1, sum(len(clip) for clip in frames) // _SAMPLES))
     for clip in frames:
         engine.reset()
         for frame in inputs_of(model, clip):

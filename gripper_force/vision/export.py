@@ -30,9 +30,6 @@ features and attention as a share of the largest value."""
 _CHECKED: Final = 30
 """Frames of noise that an exported network is checked on: more than a window."""
 
-_CLIPS: Final = 4
-"""Recordings that a quantised network is checked on."""
-
 
 class ExportErrors(TypedDict):
     """Difference of an exported network's estimates from PyTorch's.
@@ -168,7 +165,6 @@ def compare(model: Model, path: Path, frames: Sequence[Gray] | None = None) -> E
         size = model.header.preprocess.size
         frames = [np.random.default_rng(0).integers(0, 256, (_CHECKED, size, size), np.uint8)]
     made = Model(path, model.header, model.digest)
-    frames = frames[:_CLIPS]
     expected, exported = (
         [step for clip in frames for step in _steps(engine, model, clip)]
         for engine in (TorchEngine(model), open_engine(made, EXPORTED[path.suffix]))

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from gripper_force.errors import ConfigError, DataError
+from gripper_force.jobs import int8_export
 from gripper_force.jobs.int8_export import export_int8, with_added_error
 from gripper_force.vision.engines import open_engine
+from gripper_force.vision.export import ExportErrors
 from gripper_force.vision.header import Model
 from gripper_force.vision.model_files import read_model
 
@@ -21,7 +23,7 @@ def recordings() -> list[np.ndarray]:
     rng = np.random.default_rng(0)
     clips = []
     for _ in range(3):
-        clip = rng.integers(90, 110, (130, 32, 32), np.uint8)
+        clip = rng.integers(90, 110, (160, 32, 32), np.uint8)
         for i, frame in enumerate(clip[10:]):
             frame[8:16, i % 20 : i % 20 + 8] += 60
         clips.append(clip)
@@ -40,6 +42,40 @@ def test_int8_is_calibrated_on_recordings(model: Model, tmp_path: Path, recordin
     for before, after in zip(model.header.residuals, opened.header.residuals, strict=True):
         assert after.std_n**2 == pytest.approx(before.std_n**2 + errors["rms_n"] ** 2)
         assert after.std_n > before.std_n
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_the_error_is_measured_on_what_the_ranges_have_not_seen(
+    model: Model,
+    tmp_path: Path,
+    recordings: list[np.ndarray],
+    monkeypatch: pytest.MonkeyPatch,
+    count: int,
+) -> None:
+    if count == 1:
+        recordings = [np.concatenate([*recordings, *recordings])]
+    seen: dict[str, list[np.ndarray]] = {}
+
+    def save(network: object, _: Model, path: Path) -> None:
+        path.write_text("")
+
+    def quantised(network: object, _: Model, frames: list[np.ndarray]) -> None:
+        seen["calibrated"] = frames
+
+    def compare(_: Model, path: Path, frames: list[np.ndarray]) -> ExportErrors:
+        seen["held out"] = frames
+        return ExportErrors(largest_n=0, mean_n=0, rms_n=0)
+
+    for name, stub in (("save_openvino", save), ("_quantised", quantised), ("compare", compare)):
+        monkeypatch.setattr(int8_export, name, stub)
+    for name in ("openvino_network", "_replace_header"):
+        monkeypatch.setattr(int8_export, name, lambda *_: None)
+    export_int8(model, tmp_path / "int8.xml", recordings)
+    reference = model.header.preprocess.reference_frames
+    (held_out,) = seen["held out"]
+    assert sum(map(len, seen["calibrated"])) == sum(map(len, recordings)) - 160 * (3 if count == 1 else 1)
+    assert len(held_out) == (480 + reference if count == 1 else 160)
+    assert np.array_equal(held_out[-160:], recordings[-1][-160:])
 
 
 def test_impossible_exports_are_refused(model: Model, tmp_path: Path, recordings: list[np.ndarray]) -> None:
