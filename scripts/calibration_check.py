@@ -7,7 +7,7 @@ placed again each time. The last touches are used for testing only.
     python scripts/calibration_check.py                # error and interval by number of touches
     python scripts/calibration_check.py --grasps 40    # grasps with a profile of 8 touches, and without
 
-Results that exist in OUT are reused.
+Results of the same network that exist in OUT are reused.
 """
 
 import argparse
@@ -33,6 +33,7 @@ from gripper_force.jobs.dataset import CONTACT_N
 from gripper_force.jobs.grasp import grasp
 from gripper_force.profiles.object_profile import read_object
 from gripper_force.vision.checkpoint import load_checkpoint
+from gripper_force.vision.model_files import read_model
 from gripper_force.vision.ood import OodScore
 
 KINDS = ("sponge", "paper_cup", "tube", "stapler", "ball")
@@ -58,9 +59,15 @@ def configure(kind: str, number: int, out: Path, *more: str) -> Config:
     )
 
 
+def kept_file(out: Path, *parts: object, suffix: str = ".json") -> Path:
+    """Returns the file of a result, which belongs to the shipped network."""
+    digest = read_model("default").digest
+    return out / f"{'-'.join(map(str, parts))}-{digest[:8]}{suffix}"
+
+
 def errors(kind: str, number: int, out: Path, touched: int, tested: int) -> list[dict[str, Any]]:
     """Touches an object and calibrates on increasing numbers of touches. Returns a row for each draw."""
-    kept = out / f"{kind}-{number}-{touched}-{tested}.json"
+    kept = kept_file(out, kind, number, touched, tested)
     if kept.exists():
         rows: list[dict[str, Any]] = json.loads(kept.read_text())
         return rows
@@ -112,7 +119,7 @@ def one_grasp(
     kind: str, number: int, trial: int, target_n: float, profile: str, feedback: str, out: Path
 ) -> Any:
     """Runs one grasp with a profile of the object, or without one, and returns its summary."""
-    kept = out / f"grasp-{kind}-{number}-{trial}-{'profile' if profile else 'none'}-{feedback}.json"
+    kept = kept_file(out, "grasp", kind, number, trial, "profile" if profile else "none", feedback)
     if not kept.exists():
         known = [f"calibration.object={profile}"] if profile else []
         keys = [f"target_n={target_n}", f"control.feedback={feedback}", "log.report=false", *known]
@@ -124,7 +131,7 @@ def one_grasp(
 
 def profile_of(kind: str, number: int, out: Path) -> str:
     """Makes a profile of the first touches of an object, and returns its path."""
-    path = out / f"{kind}-{number}.yaml"
+    path = kept_file(out, kind, number, suffix=".yaml")
     if not path.exists():
         config = configure(kind, number, out)
         calibrate_object(config, kind, touches=PROFILE, folder=out / f"{kind}-{number}", out=path)
@@ -165,6 +172,7 @@ def errors_table(rows: list[dict[str, Any]]) -> None:
 
 def grasps_table(results: dict[tuple[str, str], list[dict[str, Any]]]) -> None:
     """Prints the results of the grasps."""
+    limit_n = load_config().control.force_limit_n
     print(
         "| feedback | profile | median error | within 8 % or 0.25 N | MAE of estimate | held | over limit |"
     )
@@ -177,7 +185,7 @@ def grasps_table(results: dict[tuple[str, str], list[dict[str, Any]]]) -> None:
         source = "fused" if feedback == "fused" else "visual"
         mae_n = np.mean([v for g in grasps if (v := g["estimate_mae_n"][source]) is not None])
         held = sum(g["result"] == "held" for g in grasps)
-        over = sum(g["peak_n"] > 10 for g in grasps)
+        over = sum(g["peak_n"] > limit_n for g in grasps)
         print(
             f"| {feedback} | {known} | {100 * np.median(share):.1f} % | "
             f"{100 * good.sum() / len(grasps):.0f} % | {mae_n:.3f} N | {held} of {len(grasps)} | {over} |"

@@ -1,9 +1,14 @@
 """Scripts that measure figures of the documentation, run as a user runs them."""
 
+import importlib.util
 import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
 
 SCRIPTS = Path(__file__).parents[2] / "scripts"
 
@@ -32,3 +37,48 @@ def test_a_loss_is_reported_although_friction_holds_the_jaws_and_the_view_seems_
     arguments = ["--feedback", "fused", "--object", "paper_cup", "--target-n", "1", "--seeds", "1"]
     shown = run("lost_object.py", *arguments).stdout.splitlines()
     assert re.fullmatch(r"\| fused \| 1 N \| 1 of 1 \| (\d+), \1 \| [01] \| 0 \|", shown[2])
+
+
+@pytest.fixture
+def calibration_check() -> Any:
+    """The script as a module."""
+    spec = importlib.util.spec_from_file_location("calibration_check", SCRIPTS / "calibration_check.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_results_of_another_network_are_not_used(
+    calibration_check: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def result(digest: str) -> Any:
+        monkeypatch.setattr(calibration_check, "read_model", lambda _: SimpleNamespace(digest=digest))
+        monkeypatch.setattr(calibration_check, "grasp", lambda _: {"network": digest})
+        return calibration_check.one_grasp("sponge", 0, 1, 2.0, "", "fused", tmp_path)
+
+    assert [result(digest)["network"] for digest in ("a" * 64, "b" * 64, "a" * 64)] == [
+        "a" * 64,
+        "b" * 64,
+        "a" * 64,
+    ]
+    names = {
+        calibration_check.kept_file(tmp_path, "sponge", 0, suffix=end).name for end in (".json", ".yaml")
+    }
+    assert names == {"sponge-0-aaaaaaaa.json", "sponge-0-aaaaaaaa.yaml"}
+    assert len(list(tmp_path.glob("*.json"))) == 2
+
+
+def test_the_limit_of_a_grasp_is_that_of_the_configuration(
+    calibration_check: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    summary = {
+        "steady_error_n": 0.1,
+        "target_n": 4.0,
+        "estimate_mae_n": {"fused": 0.1},
+        "result": "held",
+    }
+    grasps = [{**summary, "peak_n": peak_n} for peak_n in (9.0, 13.9, 14.1)]
+    calibration_check.grasps_table({("fused", "no"): grasps})
+    assert capsys.readouterr().out.splitlines()[-1].endswith("| 3 of 3 | 1 |")
