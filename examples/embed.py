@@ -3,6 +3,7 @@
 Give the path of your configuration, or nothing for the simulated rig.
 """
 
+import contextlib
 import sys
 import threading
 import time
@@ -11,9 +12,10 @@ import gripper_force as gf
 
 
 def print_forces(gripper: gf.Gripper) -> None:
-    while True:
-        print(f"{gripper.force_n:.2f} N at {gripper.width_m * 1e3:.1f} mm, {gripper.state.phase}")
-        time.sleep(0.1)
+    with contextlib.suppress(gf.RequestError):  # raised once the gripper is closed
+        while True:
+            print(f"{gripper.force_n:.2f} N at {gripper.width_m * 1e3:.1f} mm, {gripper.state.phase}")
+            time.sleep(0.1)
 
 
 with gf.open_gripper(*sys.argv[1:2]) as gripper:

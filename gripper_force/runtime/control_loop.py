@@ -81,34 +81,52 @@ class ControlLoop:
         return request.result.result()
 
     def stop(self) -> None:
-        """Stops the gripper in the next cycle that reads the servo, before any other request."""
-        self._requests.stop(self.session.stop_soon)
+        """Stops the gripper in the next cycle that reads the servo, before any other request.
+
+        Raises:
+            GripperError: The run has ended, see `live_session`.
+        """
+        self._requests.stop(self.live_session().stop_soon)
 
     def step(self) -> GripperState:
         """Runs one cycle in the caller's thread."""
         if self._background:
             raise RequestError("a background thread runs the control cycle; open with background=False")
-        self._raise_error()
-        if self._closing.is_set():
-            raise RequestError(CLOSED)
+        session = self.live_session()
         try:
-            return self._cycle(self.session)
+            return self._cycle(session)
         except BaseException as error:
             self._error, self._error_was_raised = error, True
             raise
 
     def shown_state(self) -> GripperState:
-        """Returns the newest state, without an outcome if a grasp or a move was requested after it."""
+        """Returns the newest state, without an outcome if a grasp or a move was requested after it.
+
+        Raises:
+            GripperError: The run has ended, see `live_session`. A program that polls would wait for ever.
+        """
+        self.live_session()
         is_waiting = self._requests.is_waiting()  # first: a cycle sets the state, then ends the request
         return replace(self.state, outcome=Outcome.NONE) if is_waiting else self.state
+
+    def live_session(self) -> Session:
+        """The session of a run that goes on.
+
+        Raises:
+            RequestError: The gripper was closed.
+            GripperError: The error that ended the run.
+        """
+        has_ended = self._ended.is_set()  # first: the control thread sets its error, then this
+        self._raise_error()
+        if has_ended:
+            raise RequestError(CLOSED)
+        return self.session
 
     def sleep(self, seconds: float) -> None:
         """Waits for a time on the run's clock, and runs the cycle where no thread does."""
         if self._background:
-            has_ended = self._ended.wait(seconds)
-            self._raise_error()
-            if has_ended:
-                raise RequestError(CLOSED)
+            self._ended.wait(seconds)
+            self.live_session()
             return
         end_ns = self.state.t_ns + round(seconds * NS_PER_S)
         while self.step().t_ns < end_ns:
@@ -120,6 +138,7 @@ class ControlLoop:
             self._end_error = error
             self._closing.set()
         if self._thread is None:
+            self._ended.set()
             self._requests.close()
             atexit.unregister(self._close_at_exit)
             # An error of an earlier step ends the run as a fault even if the caller has handled it.

@@ -96,6 +96,9 @@ class Gripper:
     However the gripper is closed, the servo is left as configured: as ``on_exit`` says, or as ``control.on_fault`` says
     after a fault, a stop or an exception.
 
+    Once the run has ended, every method but `close`, and every newest value, raises the error that ended it, or
+    `RequestError` after `close`.
+
     In asyncio, call the blocking methods in a thread: ``await asyncio.to_thread(gripper.grasp, 4.0)``.
 
     Attributes:
@@ -206,6 +209,10 @@ class Gripper:
 
         The gripper is then at fault: a waiting `grasp` returns the outcome ``fault``, and only `release`
         resets it. With ``background=False`` the stop takes effect in the next `step`.
+
+        Raises:
+            RequestError: The gripper is closed.
+            DeviceError: A device failed, which has ended the run.
         """
         self._loop.stop()
 
@@ -235,11 +242,16 @@ class Gripper:
         """
         self._loop.sleep(seconds)
 
-    # Newest values. None of them blocks.
+    # Newest values. None of them blocks. All raise what ended the run, or a program that polls would wait for ever.
 
     @property
     def state(self) -> GripperState:
-        """State after the newest control cycle. Its outcome is empty from the request of a grasp or a move on."""
+        """State after the newest control cycle. Its outcome is empty from the request of a grasp or a move on.
+
+        Raises:
+            RequestError: The gripper is closed.
+            DeviceError: A device failed, which has ended the run.
+        """
         return self._loop.shown_state()
 
     @property
@@ -260,12 +272,12 @@ class Gripper:
     @property
     def frame(self) -> Frame | None:
         """The newest camera frame, (H, W) uint8 in its ``gray``; None without a camera."""
-        return self._loop.session.newest_frame
+        return self._loop.live_session().newest_frame
 
     @property
     def load_cell(self) -> LoadCellSample | None:
         """The newest valid load cell sample; None without a load cell."""
-        return self._loop.session.last_load_cell_sample
+        return self._loop.live_session().last_load_cell_sample
 
     # The end.
 

@@ -254,6 +254,11 @@ def test_a_closed_gripper_refuses(simulated: Open) -> None:
         lambda: gripper.move(0.05),
         lambda: gripper.move(0.05, wait=False),
         lambda: gripper.grasp(2.0, wait=False),
+        gripper.stop,
+        lambda: gripper.state,
+        lambda: gripper.force_n,
+        lambda: gripper.width_m,
+        lambda: gripper.load_cell,
     ]
     for call in calls:
         with pytest.raises(gf.RequestError, match="closed"):
@@ -498,6 +503,22 @@ def test_a_lost_device_is_raised_in_the_waiting_call(real_time: Open, server: Pt
     timer.join()
     with pytest.raises(gf.DeviceLostError):
         gripper.sleep(1.0)
+
+
+def test_a_lost_device_is_raised_by_the_state_that_a_program_polls(
+    real_time: Open, server: PtyServer
+) -> None:
+    gripper = real_time("control.approach_speed_m_s=0.005")
+    gripper.grasp(3.0, wait=False)
+    server.unplug()
+    with pytest.raises(gf.DeviceLostError):
+        while not gripper.state.outcome:
+            time.sleep(0.01)
+    values: list[Callable[[], object]] = [gripper.stop, lambda: gripper.force_n, lambda: gripper.frame]
+    for value in values:
+        with pytest.raises(gf.DeviceLostError):
+            value()
+    gripper.close()  # which raises only what no call has raised
 
 
 def test_a_device_lost_meanwhile_is_raised_when_the_gripper_is_closed(
