@@ -6,6 +6,7 @@ import atexit
 import contextlib
 import sys
 import threading
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -44,6 +45,7 @@ class ControlLoop:
         self._requests, self._tracker = RequestQueue(), StateTracker()
         self._resources = contextlib.ExitStack()  # of the caller's thread
         self._thread: threading.Thread | None = None
+        self._cycle_lock = threading.RLock()  # of the thread that runs the cycle with background=False
         # Written by the thread that runs the control cycle; the first two exist once the loop is open:
         self.session: Session
         self.state: GripperState
@@ -71,11 +73,12 @@ class ControlLoop:
     def request(self, request: PendingRequest) -> GraspResult | None:
         """Submits a request. Returns the result of an awaited one; where no thread runs the cycle, it does."""
         self._raise_error()
-        self._requests.submit(request)
-        if not request.is_awaited:
-            return None
-        while self._thread is None and not request.result.done():
-            self.step()
+        with self._own_cycle() if request.is_awaited and not self._background else contextlib.nullcontext():
+            self._requests.submit(request)
+            if not request.is_awaited:
+                return None
+            while not (self._background or request.result.done()):
+                self.step()
         request.result.exception()  # waits
         self._raise_error()
         return request.result.result()
@@ -92,12 +95,13 @@ class ControlLoop:
         """Runs one cycle in the caller's thread."""
         if self._background:
             raise RequestError("a background thread runs the control cycle; open with background=False")
-        session = self.live_session()
-        try:
-            return self._cycle(session)
-        except BaseException as error:
-            self._error, self._error_was_raised = error, True
-            raise
+        with self._own_cycle():
+            session = self.live_session()
+            try:
+                return self._cycle(session)
+            except BaseException as error:
+                self._error, self._error_was_raised = error, True
+                raise
 
     def shown_state(self) -> GripperState:
         """Returns the newest state, without an outcome if a grasp or a move was requested after it.
@@ -128,9 +132,10 @@ class ControlLoop:
             self._ended.wait(seconds)
             self.live_session()
             return
-        end_ns = self.state.t_ns + round(seconds * NS_PER_S)
-        while self.step().t_ns < end_ns:
-            pass
+        with self._own_cycle():
+            end_ns = self.state.t_ns + round(seconds * NS_PER_S)
+            while self.step().t_ns < end_ns:
+                pass
 
     def close(self, error: BaseException | None) -> None:
         """Ends the session, with the exception of the caller's code if there is one. May be called again."""
@@ -143,10 +148,11 @@ class ControlLoop:
             atexit.unregister(self._close_at_exit)
             # An error of an earlier step ends the run as a fault even if the caller has handled it.
             cause = self._error if error is None else error
-            if cause is None:
-                self._resources.close()
-            else:
-                self._resources.__exit__(type(cause), cause, cause.__traceback__)
+            with self._cycle_lock:  # a cycle of another thread, which is its last one, uses the devices
+                if cause is None:
+                    self._resources.close()
+                else:
+                    self._resources.__exit__(type(cause), cause, cause.__traceback__)
             return
         with self._resources:
             trace = None if error is None else error.__traceback__
@@ -161,6 +167,19 @@ class ControlLoop:
                 error.with_traceback(trace)  # without the frames of the control thread
             if not self._error_was_raised:
                 self._raise_error()
+
+    @contextlib.contextmanager
+    def _own_cycle(self) -> Iterator[None]:
+        """Keeps the cycle to the caller's thread: a second one would use the servo's port at the same time."""
+        if not self._cycle_lock.acquire(blocking=False):
+            raise RequestError(
+                "another thread runs the control cycle; pass wait=False to the request, or use background=True, "
+                "which needs clock=realtime"
+            )
+        try:
+            yield
+        finally:
+            self._cycle_lock.release()
 
     def _close_at_exit(self) -> None:
         """Closes a gripper that the program forgot. The exception that ended the program is the cause."""

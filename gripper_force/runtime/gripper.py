@@ -85,8 +85,9 @@ class Gripper:
 
     In real time a background thread runs the control cycle, and every method and attribute may be used from
     any thread. In lockstep, or with ``background=False``, the blocking methods run the cycle in the caller's
-    thread; between them the caller runs it with `step` or `sleep`. In real time the servo's Bus Watchdog
-    stops the servo if no cycle runs for ``servo.bus_watchdog_ms``.
+    thread; between them the caller runs it with `step` or `sleep`. A call of another thread that would run it
+    meanwhile raises `RequestError`; requests with ``wait=False``, `stop` and `close` do not. In real time the servo's
+    Bus Watchdog stops the servo if no cycle runs for ``servo.bus_watchdog_ms``.
 
     A newer request replaces an older one: a call that waits for one of another kind raises `RequestError`, and one
     that waits for the same kind gets the newer one's result. `stop` always wins, and `close` raises `RequestError` in

@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
@@ -22,6 +23,7 @@ from gripper_force.control.limits import largest_target_n
 from gripper_force.runtime import control_loop
 from gripper_force.runtime.control_loop import ControlLoop
 from gripper_force.runtime.log_reader import LogReader
+from gripper_force.runtime.session import Session
 from gripper_hw.dynamixel.packets import Instruction, Parser
 from gripper_hw.dynamixel.pty_server import PtyServer, serve_virtual_servo
 from gripper_hw.dynamixel.virtual import VirtualBus, find_bus, unregister_bus
@@ -431,6 +433,47 @@ def test_the_callers_own_loop(real_time: Open, server: PtyServer) -> None:
     assert {b.t_ns > a.t_ns for a, b in pairwise(states)} == {True}
     gripper.close()
     assert torque(server) == 0
+
+
+def in_thread(call: Callable[[], object]) -> BaseException | None:
+    """Returns what a call in another thread raises."""
+    with ThreadPoolExecutor() as pool:
+        return pool.submit(call).exception()
+
+
+def test_one_thread_at_a_time_runs_the_cycle(simulated: Open, monkeypatch: pytest.MonkeyPatch) -> None:
+    gripper = simulated()
+    cycle = Session.cycle
+    raised: list[BaseException | None] = []
+
+    def meddled(session: Session, *request: Any, **options: Any) -> Any:
+        if not raised:
+            calls: list[Callable[[], object]] = [lambda: gripper.grasp(2.0), gripper.step]
+            raised.extend(in_thread(call) for call in [*calls, lambda: gripper.sleep(0.1)])
+            assert in_thread(lambda: gripper.set_force(2.0, wait=False)) is None
+        return cycle(session, *request, **options)
+
+    gripper.grasp(3.0)
+    monkeypatch.setattr(Session, "cycle", meddled)
+    gripper.step()
+    assert [type(error) for error in raised] == 3 * [gf.RequestError]
+    assert "another thread runs the control cycle; pass wait=False" in str(raised[0])
+    gripper.sleep(2.0)
+    assert gripper.state.reference_n == 2.0  # that of wait=False, and not of a refused request
+    assert in_thread(gripper.step) is None  # the cycle is free again
+
+
+def test_closing_waits_for_the_cycle_of_another_thread(simulated: Open) -> None:
+    gripper = simulated()
+    errors: list[BaseException | None] = []
+    thread = threading.Thread(target=lambda: errors.append(in_thread(lambda: gripper.sleep(1e6))))
+    thread.start()
+    start_ns = gripper.state.t_ns
+    while gripper.state.t_ns == start_ns:
+        time.sleep(0.001)
+    gripper.close()
+    thread.join(20.0)
+    assert "the gripper is closed" in str(errors[0])
 
 
 def test_another_thread_stops_a_waiting_call(real_time: Open, server: PtyServer) -> None:
