@@ -212,12 +212,8 @@ def grasp_and_release(session: Session, target_n: float, progress: Progress = no
             if status.t_ns - ended_ns >= hold_s * NS_PER_S:
                 break
         status = session.cycle().status
-    if status.outcome == Outcome.FAULT:
-        if config.control.on_fault == "open":
-            session.wait_until_open(status)
-        return status.outcome  # otherwise nothing moves until a person has looked
-    if config.on_exit == "hold":
-        return status.outcome
+    if status.outcome == Outcome.FAULT or config.on_exit == "hold":
+        return status.outcome  # the session ends as configured
     status = session.release()
     _report_phase(progress, status, begin_ns)
     return status.outcome

@@ -23,7 +23,7 @@ from gripper_force.runtime.state import GraspResult, GripperState, StateTracker
 from gripper_force.types import GRIPPING, NS_PER_S, Outcome, RequestKind
 
 _END_S: Final = 25.0
-"""Longest wait for the end of the control thread, which may wait 20 s for a disk that does not answer."""
+"""Longest wait for the end of the control thread, beside opening jaws: 20 s for a disk that does not answer."""
 
 
 class ControlLoop:
@@ -156,9 +156,10 @@ class ControlLoop:
             return
         with self._resources:
             trace = None if error is None else error.__traceback__
-            if not self._ended.wait(_END_S):
+            end_s = _END_S + (self.session.opening_s if hasattr(self, "session") else 0.0)
+            if not self._ended.wait(end_s):
                 raise DeviceTimeoutError(
-                    f"the control thread did not end within {_END_S:g} s; if it did not stop the servo, the "
+                    f"the control thread did not end within {end_s:.3g} s; if it did not stop the servo, the "
                     "servo's Bus Watchdog did; check cables and disk, and see what `gripper-force doctor` says"
                 )
             self._thread.join()

@@ -103,7 +103,7 @@ class Session:
         self._load_cell_monitor = LoadCellMonitor()
         self._problem = ""
         self._error: BaseException | None = None
-        self._armed = False
+        self._armed = self._may_open = False
         self.failed = False
         self.has_vision = False
         self.cycles = self.frames = 0
@@ -220,7 +220,9 @@ class Session:
         self.raise_if_interrupted()
         devices.check()
         visual = None
-        for processed in self._perception.poll():
+        for processed in (
+            self._perception.poll() if self._error is None else ()
+        ):  # a lost camera raises each time
             log(processed.frame)
             self.frames += 1
             self.newest_frame = processed.frame
@@ -234,12 +236,14 @@ class Session:
             if kind_of_problem not in ("", self._problem):
                 log(Event(processed.frame.received_ns, "vision", NO_ESTIMATE + processed.problem))
             self._problem = kind_of_problem
+        self._may_open = False  # if this cycle fails from here on, nothing is known of the servo
         state = self.servo_state = self._read_servo()
         request = self._request(state.t_ns, kind, target_n, width_m, new_object)
         decision = self._controller.step(state.t_ns, state, visual, request)
         devices.servo.write(decision.command)
         self.cycles += 1
         self.failed = decision.status.phase == Phase.FAULT
+        self._may_open = decision.status.phase != Phase.OPEN and not state.hardware_error
         if request is not None:
             log(request)
         log(state)
@@ -287,13 +291,29 @@ class Session:
         self.failed |= isinstance(error, Exception)
         self.log_event("session", f"{type(error).__name__}: {error}")
 
+    @property
+    def _end(self) -> str:
+        config = self.run.config
+        return config.control.on_fault if self.failed or self.stop_is_pending else config.on_exit
+
+    def open_at_fault(self) -> None:
+        """Opens the jaws at the end of a run, with ``control.on_fault=open`` after a fault, a stop or an exception.
+
+        Not if the servo is lost or has switched off, nor if nothing was requested since the jaws were open. It takes
+        `opening_s` at most.
+        """
+        if self._end == "open" and self._may_open:
+            self.stop_soon()
+            try:
+                self.wait_until_open(self.cycle().status)
+            except GripperError as error:
+                self.log_event("session", f"the jaws did not open: {error}")
+
     def close(self) -> None:
         """Turns torque off, or holds, as configured, and logs the camera's settings and the last samples."""
-        config = self.run.config
-        hold = config.control.on_fault if self.failed or self.stop_is_pending else config.on_exit
         try:
             if self._armed:
-                self._devices.servo.stop(hold=hold == "hold")
+                self._devices.servo.stop(hold=self._end == "hold")
         except DeviceError as second:
             first = self._error
             if not isinstance(first, GripperError):
@@ -413,6 +433,7 @@ def open_session(
         stack.callback(_attach_reference, session, estimator)
         stack.enter_context(_interruptible(session))
         stack.callback(session.close)
+        stack.callback(session.open_at_fault)
         try:
             session.start()
             yield session

@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from contextlib import closing, suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from gripper_force.runtime.session import Session
 from gripper_hw.dynamixel.packets import Instruction, Parser
 from gripper_hw.dynamixel.pty_server import PtyServer, serve_virtual_servo
 from gripper_hw.dynamixel.virtual import VirtualBus, find_bus, unregister_bus
+from gripper_hw.sim import simulated_rig as rig
 
 Open = Callable[..., gf.Gripper]
 
@@ -306,6 +307,54 @@ def test_an_exception_in_the_callers_code_is_a_fault(
         gripper.grasp(3.0)
         raise error
     assert ended == [after]
+
+
+@pytest.mark.parametrize(
+    "end", ["exception", "stop", "stop and cycle", "lost camera", "lost servo", "interrupt"]
+)
+def test_the_jaws_open_at_a_fault_if_configured(
+    quick: list[str], end: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They stay as they are after Ctrl-C, which is no fault, and if the servo does not answer."""
+    ended: list[float] = []
+
+    def note(name: str) -> None:
+        servo = bus().servos[0]
+        ended.extend([servo.get("torque_enable"), servo.get("present_position")])
+        unregister_bus(name)
+
+    monkeypatch.setattr(rig, "unregister_bus", note)
+    settings = ["control.on_fault=open", "control.settle_s=0.2"]
+    expected = suppress(ValueError, gf.DeviceError, KeyboardInterrupt)
+    with expected, gf.open_gripper(overrides=[*quick, *settings]) as gripper:
+        gripper.step()
+        opened = bus().servos[0].get("present_position")
+        gripper.grasp(3.0)
+        gripped = bus().servos[0].get("present_position")
+        if "stop" in end:
+            gripper.stop()
+        match end:
+            case "exception":
+                raise ValueError
+            case "interrupt":
+                raise KeyboardInterrupt
+            case "stop and cycle":
+                gripper.step()
+            case "lost camera":
+                monkeypatch.setattr(gripper._loop.session._perception, "poll", raise_lost)
+                gripper.step()
+            case "lost servo":
+                bus().tamper = lambda _: None
+                gripper.step()
+    torque_on, position = ended
+    assert torque_on == 0 or end == "lost servo"
+    is_open = end not in ("lost servo", "interrupt")
+    assert abs(position - (opened if is_open else gripped)) < 100
+    assert abs(opened - gripped) > 200
+
+
+def raise_lost() -> None:
+    raise gf.DeviceLostError("the camera is gone")
 
 
 def test_ctrl_c_is_no_fault(quick: list[str]) -> None:

@@ -277,8 +277,6 @@ class _MonitoredSession:
 
     def _check(self, status: GraspStatus) -> None:
         if status.phase == Phase.FAULT:
-            if self.config.control.on_fault == "open":
-                self._session.wait_until_open(status)
             raise DeviceError(f"set {self.number} ended with a fault: {status.reason}; remove its cause")
         if self._saturations() - self._saturated > _MAX_SATURATED:
             last = self.last_load_cell_sample
