@@ -264,7 +264,7 @@ class LoadCellConfig(Section):
         description="simulated, phidget (at most 122): samples per second; serial boards set their own",
     )
     port: str | None = Field(None, description="serial: device path")
-    baud_rate: int = Field(115_200, gt=0, description="serial: bits per second")
+    baud_rate: int = Field(115_200, gt=0, le=4_500_000, description="serial: bits per second")
     format: Literal["hx711", "cas"] = Field(
         "hx711", description="serial: counts of an HX711 board, or frames of a CAS weighing indicator"
     )

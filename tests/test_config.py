@@ -82,6 +82,7 @@ def test_an_unknown_key_is_named_with_the_known_ones(tmp_path: Path, key: str, k
         ("seed=-1", "seed"),
         ("clock=late", "clock"),
         ("servo.id=253", "servo.id"),
+        ("load_cell.baud_rate=3000000000", "load_cell.baud_rate"),
         ("servo.bus_watchdog_ms=10", "servo.bus_watchdog_ms"),
         ("gripper.closing_sign=0", "gripper.closing_sign"),
         ("vision.region=[1, 2, 3]", "vision.region"),

@@ -33,6 +33,11 @@ def largest_target_n(force_limit_n: float, gain_bound: float) -> float:
     return _TARGET_SHARE * force_limit_n / gain_bound
 
 
+def rounded_down(force_n: float) -> str:
+    """A force as text that is not above ``force_n``: the largest target is accepted as it is written in a message."""
+    return f"{math.floor(1e3 * force_n) / 1e3:g}"
+
+
 class Limits:
     """Limits goal position and goal current, and quantises the current to the servo's steps.
 

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import AwareDatetime, Field, model_validator
+from pydantic import AfterValidator, AwareDatetime, Field, PositiveInt, model_validator
 
 from gripper_force.errors import ConfigError
 from gripper_force.schema import Finite, NonNegative, Positive, Section, Tree, read_section
@@ -20,7 +20,16 @@ FRICTION_DRIFT: Final = 0.1
 _NORMAL: Final = 1.96
 """Half-width of a 95 % interval in standard deviations."""
 
-Range = Annotated[tuple[NonNegative, NonNegative], Field(description="least and most")]
+
+def _in_order(bounds: tuple[float, float]) -> tuple[float, float]:
+    if bounds[0] > bounds[1] or bounds[1] == 0:
+        raise ValueError("the second value must be above 0, and not below the first; calibrate again")
+    return bounds
+
+
+Range = Annotated[
+    tuple[NonNegative, NonNegative], Field(description="least and most"), AfterValidator(_in_order)
+]
 
 
 class CalibratedValue(Section):
@@ -42,6 +51,15 @@ class CalibratedValue(Section):
     def half(self) -> float:
         """Half of the interval's width; 0 if the value was given."""
         return 0.0 if self.low is None or self.high is None else (self.high - self.low) / 2
+
+
+def _positive(calibrated: CalibratedValue) -> CalibratedValue:
+    if calibrated.value <= 0:
+        raise ValueError("value must be above 0; calibrate again")
+    return calibrated
+
+
+PositiveValue = Annotated[CalibratedValue, AfterValidator(_positive)]
 
 
 class LoadCellCalibration(Section):
@@ -91,10 +109,10 @@ class ServoCalibration(Section):
 
     date: AwareDatetime
     model: str
-    nm_per_a: CalibratedValue
+    nm_per_a: PositiveValue
     friction_n: CalibratedValue
     damping_n_s_m: CalibratedValue
-    pinion_radius_m: CalibratedValue
+    pinion_radius_m: PositiveValue
     open_position_rad: CalibratedValue
     open_width_m: Positive
     force_n: Range
@@ -129,13 +147,13 @@ class CameraCalibration(Section):
     rate_hz: Positive
     gain: int | None
     image: dict[str, Any] = Field({})
-    exposure_us: int | None
+    exposure_us: PositiveInt | None
     mean: NonNegative
     clipped: NonNegative
     region: tuple[int, int, int, int]
     markers: bool
     lag_ms: CalibratedValue
-    delay_ms: CalibratedValue
+    delay_ms: PositiveValue
     reference: str
 
     def mismatches(self, camera: Tree) -> list[str]:

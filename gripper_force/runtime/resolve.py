@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from gripper_force.config import Config, ControlConfig, GripperConfig
-from gripper_force.control.limits import largest_target_n
+from gripper_force.control.limits import largest_target_n, rounded_down
 from gripper_force.control.speed_limit import PositionLoop
 from gripper_force.control.state_machine import MAX_CYCLE_S, GraspController
 from gripper_force.control.transmission import Transmission
@@ -73,13 +73,13 @@ class ResolvedConfig:
         if target_n > largest_n:
             raise RequestError(
                 f"a target of {target_n:g} N is too close to control.force_limit_n {limit_n:g} N with "
-                f"gripper.gain_bound {gain_bound:g}; request at most {largest_n:.4g} N, raise the limit, or "
+                f"gripper.gain_bound {gain_bound:g}; request at most {rounded_down(largest_n)} N, raise the limit, or "
                 "lower the bound after calibrate servo"
             )
         for name, most_n in self.target_limits_n.items():
             if target_n > most_n:
                 raise RequestError(
-                    f"a target of {target_n:g} N is above the {most_n:.1f} N that the {name} was calibrated "
+                    f"a target of {target_n:g} N is above the {rounded_down(most_n)} N that the {name} was calibrated "
                     "with; request less, or calibrate with larger forces"
                 )
 
@@ -207,7 +207,7 @@ def _complete_gripper(gripper: GripperConfig, spec: ServoSpec) -> GripperConfig:
     if not 1 / _MOST_TIMES < times < _MOST_TIMES:
         raise ConfigError(
             f"gripper.nm_per_a={gripper.nm_per_a:g} is {times:.3g} times the {spec.nm_per_a:.3g} Nm/A of the servo's "
-            "model, so that no force limit would hold; correct it, or servo.model"
+            "model, so that no force limit would hold; correct it, here or in the rig profile, or servo.model"
         )
     return gripper.filled(
         nm_per_a=spec.nm_per_a,
@@ -229,8 +229,8 @@ def _check_travel(gripper: GripperConfig, spec: ServoSpec) -> None:
         raise ConfigError(
             f"the jaws' travel from {open_rad:.2f} rad (open) to {closed_rad:.2f} rad (closed) leaves the "
             f"servo's turn, {low_rad:.2f} to {high_rad:.2f} rad: after power-on the position would be off by a "
-            "turn; check gripper.open_position_rad, closing_sign, open_width_m and pinion_radius_m, or mount "
-            "the horn so that the travel lies within the turn"
+            "turn; check gripper.open_position_rad, closing_sign, open_width_m and pinion_radius_m, also in the rig "
+            "profile, or mount the horn so that the travel lies within the turn"
         )
 
 

@@ -2,6 +2,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+import yaml
 
 from gripper_force.config import load_config
 from gripper_force.errors import ConfigError
@@ -74,6 +75,26 @@ def test_invalid_file_is_refused_and_kept(tmp_path: Path, text: str, sentence: s
         assert str(path) in str(caught.value)
         assert "\n" not in str(caught.value)
     assert path.read_text() == text
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("nm_per_a", {"value": -1.0}),
+        ("pinion_radius_m", {"value": 0.0}),
+        ("force_n", [9, 0]),
+        ("force_n", [0, 0]),
+        ("speed_m_s", [0.03, 0.01]),
+    ],
+)
+def test_a_value_that_no_configuration_takes_is_blamed_on_the_profile(
+    servo_calibration: ServoCalibration, tmp_path: Path, key: str, value: object
+) -> None:
+    path = tmp_path / "rig.yaml"
+    servo = servo_calibration.model_dump(mode="json") | {key: value}
+    path.write_text(yaml.safe_dump({"format": "gripper-force-rig/1", "servo": servo}))
+    with pytest.raises(ConfigError, match=rf"rig profile key 'servo\.{key}' \(from .*rig\.yaml\)"):
+        load_config(None, [f"calibration.rig={path}"])
 
 
 def test_unwritable_folder_is_named(tmp_path: Path) -> None:

@@ -1,4 +1,5 @@
 import math
+import re
 from dataclasses import FrozenInstanceError
 from pathlib import Path
 
@@ -137,6 +138,17 @@ def test_a_loop_too_slow_for_itself_or_for_the_servo_is_refused(slow: list[str],
 def test_a_target_out_of_range_is_refused(target_n: float) -> None:
     with pytest.raises(RequestError, match="target of"):
         ResolvedConfig(Config()).check_target(target_n)
+
+
+def test_the_largest_target_that_a_message_names_is_accepted() -> None:
+    config = load_config(None, ["control.force_limit_n=10", "object=none"])
+    profile = ResolvedConfig(config, target_limits_n={"rig profile": 5.0599})
+    for run, target_n in ((ResolvedConfig(config), 8.0), (profile, 6.0)):
+        with pytest.raises(RequestError) as caught:
+            run.check_target(target_n)
+        named = re.search(r"(?:at most|above the) ([\d.]+) N", str(caught.value))
+        assert named is not None
+        run.check_target(float(named[1]))
 
 
 def test_a_target_beyond_a_profile_is_refused() -> None:

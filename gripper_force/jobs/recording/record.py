@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from gripper_force.config import Config, config_from_text
-from gripper_force.control.limits import largest_target_n
+from gripper_force.control.limits import largest_target_n, rounded_down
 from gripper_force.control.state_machine import Decision
 from gripper_force.errors import ConfigError, DataError, DeviceError
 from gripper_force.files import unfinished
@@ -212,7 +212,7 @@ def _checked(config: Config, plan: RecordingPlan) -> tuple[Config, float]:
     peak_n = min(PEAK_N, max_n) if plan.peak_n is None else plan.peak_n
     if not _MIN_PEAK_N < peak_n <= max_n:
         raise ConfigError(
-            f"peaks of up to {peak_n:g} N are not within {_MIN_PEAK_N:g} to {max_n:.4g} N, the range for "
+            f"peaks of up to {peak_n:g} N are not within {_MIN_PEAK_N:g} to {rounded_down(max_n)} N, the range for "
             f"control.force_limit_n {limit_n:g} N; set another --peak-n or limit"
         )
     return config.with_values(control={"feedback": "current"}, vision={"checkpoint": "none"}), peak_n
