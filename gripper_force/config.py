@@ -85,9 +85,14 @@ class ServoConfig(Section):
     second: SecondServoConfig = SecondServoConfig()
 
     @model_validator(mode="after")
-    def _check_ids(self) -> Self:
+    def _check_servo(self) -> Self:
         if self.second.id == self.id:
             raise ValueError(f"second.id {self.id} is servo.id, too; give each servo its own id")
+        if self.reply_margin_ms >= self.bus_watchdog_ms:
+            raise ValueError(
+                f"reply_margin_ms {self.reply_margin_ms:g} must be below bus_watchdog_ms {self.bus_watchdog_ms}: "
+                "the servo would stop by itself before a retry"
+            )
         return self
 
     @property
@@ -431,10 +436,14 @@ class ControlConfig(Section):
 
     @model_validator(mode="after")
     def _check_order_of_limits(self) -> Self:
-        if self.warm_c >= self.temperature_limit_c:
-            raise ValueError(
-                f"warm_c {self.warm_c:g} must be below temperature_limit_c {self.temperature_limit_c:g}"
-            )
+        ordered = (
+            ("warm_c", "temperature_limit_c"),
+            ("settle_s", "timeout_s"),
+            ("approach_force_n", "force_limit_n"),
+        )
+        for low, high in ordered:
+            if getattr(self, low) >= getattr(self, high):
+                raise ValueError(f"{low} {getattr(self, low):g} must be below {high} {getattr(self, high):g}")
         if self.voltage_limits_v is not None and self.voltage_limits_v[0] >= self.voltage_limits_v[1]:
             raise ValueError("the first value of voltage_limits_v must be below the second")
         return self
@@ -653,7 +662,13 @@ class Config(Section):
         return tree | {"object": Path(str(path)).stem, "sim": {**dict(sim), "object": path}}
 
     @model_validator(mode="after")
-    def _check_fingers(self) -> Self:
+    def _check_sections(self) -> Self:
+        least_m, open_m = self.control.min_object_width_m, self.gripper.open_width_m
+        if least_m >= open_m:
+            raise ValueError(
+                f"control.min_object_width_m {least_m:g} is not below gripper.open_width_m {open_m:g}, so that "
+                "no object would be held; set both in metres"
+            )
         if self.gripper.linkage.kind == "finger" and len(self.servo.ids) > 1:
             raise ValueError(
                 "gripper.linkage.kind=finger has one moving finger, but servo.second.id names the servo of a "

@@ -30,6 +30,9 @@ _SUPPLY_TOLERANCE_V = 0.5
 _MOST_TIMES = 3.0
 """Torque constant over that of the servo's model from which it can't be right: the largest `gripper.gain_bound`."""
 
+_LEAST_TRAVEL_RAD = 0.8
+"""Rotation of the horn for the whole travel of a rack, below which the pinion's radius can't be right."""
+
 _NO_SCORE = (
     "the network has no out-of-distribution score (int8, bfloat16): unfamiliar objects are not noticed"
 )
@@ -218,13 +221,19 @@ def _complete_gripper(gripper: GripperConfig, spec: ServoSpec) -> GripperConfig:
 
 
 def _check_travel(gripper: GripperConfig, spec: ServoSpec) -> None:
-    """Raises if the travel leaves the turn in which the servo reports its position after power-on."""
+    """Raises if a rack's travel is too short, or if one leaves the turn that the servo knows after power-on."""
     with importing(f"gripper.linkage.kind={gripper.linkage.kind}"):
         transmission = Transmission.from_config(gripper, spec.nm_per_a)
+    open_rad, closed_rad = transmission.open_position_rad, transmission.closed_position_rad
+    if gripper.linkage.kind == "rack" and abs(closed_rad - open_rad) < _LEAST_TRAVEL_RAD:
+        raise ConfigError(
+            f"gripper.pinion_radius_m={gripper.pinion_radius_m:g} moves the jaws over all of gripper.open_width_m="
+            f"{gripper.open_width_m:g} in {abs(closed_rad - open_rad):.2g} rad, so that no force limit would hold; set "
+            "the radius in metres (not the diameter), here or in the rig profile"
+        )
     if spec.position_range_rad is None:
         return
     low_rad, high_rad = spec.position_range_rad
-    open_rad, closed_rad = transmission.open_position_rad, transmission.closed_position_rad
     if min(open_rad, closed_rad) < low_rad or max(open_rad, closed_rad) > high_rad:
         raise ConfigError(
             f"the jaws' travel from {open_rad:.2f} rad (open) to {closed_rad:.2f} rad (closed) leaves the "

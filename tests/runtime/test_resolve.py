@@ -80,6 +80,16 @@ def test_a_travel_outside_the_servos_turn_is_refused(key: str) -> None:
         resolve(load_config(None, [*NO_SENSORS, f"gripper.{key}", f"gripper.closing_sign={sign}"]))
 
 
+FINGER = Path(__file__).parents[2] / "examples" / "grippers" / "rotary_finger.yaml"
+
+
+def test_a_pinion_radius_of_another_order_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"gripper\.pinion_radius_m=0\.2 moves the jaws .* in 0\.23 rad"):
+        resolve(load_config(None, [*NO_SENSORS, "gripper.pinion_radius_m=0.2"]))
+    finger = load_config(FINGER, [*NO_SENSORS, "gripper.pinion_radius_m=0.2"])
+    assert resolve(finger).config.gripper.linkage.kind == "finger"
+
+
 @pytest.mark.parametrize("nm_per_a", [0.178, 18.0])
 def test_a_torque_constant_of_another_order_is_refused(nm_per_a: float) -> None:
     with pytest.raises(ConfigError, match=r"gripper\.nm_per_a=.* so that no force limit would hold"):
