@@ -44,6 +44,7 @@ class ProcessOptions:
 _allowed = ProcessOptions()
 _interrupts: list[Callable[[], None]] = []  # of the open grippers, the newest last
 _earlier_handlers: dict[int, signal._HANDLER] = {}
+_switch_intervals: list[float] = []  # before each open gripper, the program's own first
 _received: list[int] = []  # signals since the first gripper was opened
 
 
@@ -86,7 +87,10 @@ def real_time_settings() -> Iterator[str]:
     """
     with ExitStack() as stack:
         if _allowed.switch_interval:
-            stack.callback(sys.setswitchinterval, sys.getswitchinterval())
+            _switch_intervals.append(sys.getswitchinterval())
+            stack.callback(
+                lambda: sys.setswitchinterval(_switch_intervals.pop())
+            )  # the program's one comes last
             sys.setswitchinterval(SWITCH_INTERVAL_S)
         yield stack.enter_context(real_time_priority()) if _allowed.real_time_priority else ""
 
