@@ -257,7 +257,7 @@ class ControlLoop:
         assert session.servo_state is not None  # the cycle has read it
         starts = request is not None and request.kind != RequestKind.STOP and not refusal
         self.state, result = self._tracker.update(
-            decision, session.servo_state, session.last_load_cell_sample, restart=starts
+            decision, session.servo_state, session.last_load_cell_sample, session.reason, restart=starts
         )
         self._requests.finish_cycle(request, refusal, self.state, result)
         return self.state

@@ -65,7 +65,7 @@ class RequestQueue:
         self._lock = threading.RLock()  # a signal handler may stop the gripper
         self._queued: list[PendingRequest] = []
         self._started: list[PendingRequest] = []  # only those that a caller waits for
-        self._phase = Phase.OPEN
+        self._phase, self._why = Phase.OPEN, ""
         self._is_closed = False
 
     def submit(self, request: PendingRequest) -> None:
@@ -79,7 +79,7 @@ class RequestQueue:
                 raise RequestError(CLOSED)
             if request.kind != RequestKind.RELEASE and self._will_be_at_fault():
                 raise RequestError(
-                    f"the {request.kind} request was refused: stopped or in fault; call release first"
+                    f"the {request.kind} request was refused: stopped or in fault{self._why}; call release first"
                 )
             if request.needs_object and self._phase not in GRIPPING:
                 raise RequestError(f"no object is gripped (phase {self._phase}); call grasp first")
@@ -117,7 +117,7 @@ class RequestQueue:
             result: Result for the requests that end with this state.
         """
         with self._lock:
-            self._phase = state.phase
+            self._phase, self._why = state.phase, f" ({state.reason})" if state.phase == Phase.FAULT else ""
             if request is not None and not self._is_closed:
                 self._start(request, refusal)
             for started in self._started:

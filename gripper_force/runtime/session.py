@@ -76,6 +76,7 @@ class Session:
         run: The resolved configuration.
         has_vision: True once there was a visual estimate.
         failed: True if the run is at fault, so that it ends as ``control.on_fault`` says.
+        reason: Newest reason of a change of phase or outcome.
         cycles: Number of cycles so far.
         frames: Number of frames so far.
         newest_frame: The newest frame, or None.
@@ -105,6 +106,7 @@ class Session:
         self._error: BaseException | None = None
         self._armed = self._may_open = False
         self.failed = False
+        self.reason = ""
         self.has_vision = False
         self.cycles = self.frames = 0
         self.newest_frame: Frame | None = None
@@ -243,6 +245,7 @@ class Session:
         devices.servo.write(decision.command)
         self.cycles += 1
         self.failed = decision.status.phase == Phase.FAULT
+        self.reason = decision.status.reason or self.reason
         self._may_open = decision.status.phase != Phase.OPEN and not state.hardware_error
         if request is not None:
             log(request)

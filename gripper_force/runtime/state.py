@@ -80,15 +80,21 @@ class StateTracker:
     """Builds state and result after each control cycle, and counts the cycles of a hold."""
 
     def __init__(self) -> None:
-        self._reason = ""
         self._hold_cycles = self._vision_cycles = 0
 
     def update(
-        self, decision: Decision, servo: ServoState, cell: LoadCellSample | None, *, restart: bool
+        self,
+        decision: Decision,
+        servo: ServoState,
+        cell: LoadCellSample | None,
+        reason: str,
+        *,
+        restart: bool,
     ) -> tuple[GripperState, GraspResult]:
         """Returns the state after a cycle, and the result of a request that ends with it.
 
-        ``restart`` is True if the cycle started a new request, whose hold is counted from zero.
+        ``reason`` is the newest one of the run, which may be older than the first cycle that is shown. ``restart`` is
+        True if the cycle started a new request, whose hold is counted from zero.
         """
         status, estimate = decision.status, decision.estimate
         if restart:
@@ -96,12 +102,11 @@ class StateTracker:
         if status.phase == Phase.HOLD:
             self._hold_cycles += 1
             self._vision_cycles += estimate.source != EstimateSource.CURRENT
-        self._reason = status.reason or self._reason
         state = GripperState(
             t_ns=status.t_ns,
             phase=Phase(status.phase),
             outcome=Outcome(status.outcome),
-            reason=self._reason,
+            reason=reason,
             reference_n=status.reference_n,
             force_n=estimate.force_n,
             std_n=estimate.std_n,

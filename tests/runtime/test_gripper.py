@@ -1,5 +1,6 @@
 import asyncio
 import math
+import re
 import signal
 import subprocess
 import sys
@@ -7,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from hypothesis import strategies as st
 import gripper_force as gf
 from gripper_force.control import state_machine
 from gripper_force.control.limits import largest_target_n
-from gripper_force.runtime import control_loop
+from gripper_force.runtime import control_loop, process
 from gripper_force.runtime.control_loop import ControlLoop
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.session import Session
@@ -795,6 +796,15 @@ def test_a_fault_whose_cause_persists_refuses_each_request_on_its_own(simulated:
     assert gripper.grasp(3.0).held
 
 
+def test_a_gripper_that_is_at_fault_when_it_opens_says_why(simulated: Open) -> None:
+    gripper = simulated("control.warm_c=10", "control.temperature_limit_c=20")
+    why = r"the servo is at \d+ C, above control\.temperature_limit_c 20"
+    assert gripper.state.phase == gf.Phase.FAULT
+    assert re.fullmatch(why, gripper.state.reason)
+    with pytest.raises(gf.RequestError, match=rf"stopped or in fault \({why}\); call release first"):
+        gripper.grasp(3.0)
+
+
 def test_a_later_refusal_is_in_the_log(simulated: Open, tmp_path: Path) -> None:
     gripper = simulated(log=tmp_path / "run.mcap")
     gripper.grasp(3.0)
@@ -971,6 +981,19 @@ def test_a_program_may_ask_for_signals_and_timing(real_time: Open) -> None:
     timer.join()
     assert sys.getswitchinterval() == pytest.approx(before)
     assert signal.getsignal(signal.SIGTERM) == handler
+
+
+@pytest.mark.usefixtures("own_process")
+@pytest.mark.parametrize("first", [0, 1])
+def test_the_switch_interval_stays_short_until_the_last_gripper_is_closed(first: int) -> None:
+    before = sys.getswitchinterval()
+    runs = [ExitStack(), ExitStack()]
+    for run in runs:
+        run.enter_context(process.real_time_settings())
+    runs[first].close()
+    assert sys.getswitchinterval() == pytest.approx(process.SWITCH_INTERVAL_S, rel=0.01)
+    runs[1 - first].close()
+    assert sys.getswitchinterval() == pytest.approx(before)
 
 
 CLOSED_IN_A_THREAD = """
