@@ -16,6 +16,7 @@ from gripper_force.schema import (
     Positive,
     Section,
     Tree,
+    as_path,
     assign,
     assign_value,
     dump,
@@ -731,7 +732,7 @@ def load_config(
         ConfigError: A file, key or value is wrong. The message names it.
     """
     where = str(path) if path else "--set"
-    tree = read_tree(Path(path)) if path is not None else {}
+    tree = {} if path is None else read_tree(as_path(path, "the configuration"))
     if "format" in tree:
         raise ConfigError(
             f"{path} is a {tree['format']} file, not a configuration; pass a rig profile with --set "
@@ -780,11 +781,16 @@ def _assign_all(tree: Tree, overrides: Overrides | None) -> None:
         raise ConfigError(
             f"overrides are a list or a mapping; pass [{overrides!r}] instead of the text alone"
         )
-    for item in overrides.items() if isinstance(overrides, Mapping) else overrides or ():
-        if isinstance(item, str):
-            assign(tree, item)
-        else:
-            assign_value(tree, *item)
+    try:
+        for item in overrides.items() if isinstance(overrides, Mapping) else overrides or ():
+            if isinstance(item, str):
+                assign(tree, item)
+            else:
+                assign_value(tree, *item)
+    except TypeError as error:
+        raise ConfigError(
+            f"overrides are a mapping, or a list of texts key.path=value or of pairs, not {overrides!r}"
+        ) from error
 
 
 def _with_overrides(

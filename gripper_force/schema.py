@@ -4,6 +4,7 @@ from collections.abc import Hashable, Iterator
 from difflib import get_close_matches
 from inspect import isclass
 from math import isclose
+from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self, TypeVar, get_args
 
@@ -41,6 +42,13 @@ S = TypeVar("S", bound=Section)
 
 _NO_YAML = (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, RecursionError)
 """Exceptions of the YAML parser, among others for a date 2001-99-99, a number 0b, and a tag !!bool x."""
+
+
+def as_path(path: object, what: str) -> Path:
+    """Returns an argument as a path. Raises `ConfigError` for what can't be one."""
+    if not isinstance(path, str | PathLike) or "\0" in str(path):
+        raise ConfigError(f"{what} must be a path, not {path!r}; pass keys and values as overrides")
+    return Path(path)
 
 
 def read_tree(path: Path, what: str = "configuration") -> Tree:

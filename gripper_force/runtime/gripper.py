@@ -12,6 +12,7 @@ from gripper_force.interfaces import Lock, SharedPort
 from gripper_force.runtime.control_loop import ControlLoop
 from gripper_force.runtime.requests import PendingRequest
 from gripper_force.runtime.state import GraspResult, GripperState
+from gripper_force.schema import as_path
 from gripper_force.types import Frame, LoadCellSample, RequestKind
 
 
@@ -74,7 +75,7 @@ def open_gripper(
     if (port is None) != (port_lock is None):
         raise ConfigError("a shared port needs port and port_lock; pass both to open_gripper")
     shared = None if port is None or port_lock is None else SharedPort(port, port_lock)
-    path = None if log is None else Path(log)
+    path = None if log is None else as_path(log, "the log")
     loop = ControlLoop(settings, path, background=background, port=shared)
     loop.open()
     return Gripper(loop, path)
@@ -238,7 +239,7 @@ class Gripper:
             seconds: Time on the run's clock.
 
         Raises:
-            RequestError: The gripper is closed.
+            RequestError: The gripper is closed, or the time is not a number of at most 1e9.
             DeviceError: A device failed meanwhile.
         """
         self._loop.sleep(seconds)

@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Any, Final
 
 from gripper_force.errors import RequestError
 from gripper_force.runtime.state import GraspResult, GripperState
 from gripper_force.types import GRIPPING, Outcome, Phase, RequestKind
 
 CLOSED: Final = "the gripper is closed; open it again with open_gripper"
+_MOST: Final = 1e9
+
+
+def number(value: Any, name: str) -> float:
+    """Returns an argument as a float. Raises `RequestError` for what is no number, or no quantity of a gripper."""
+    found = math.nan
+    with suppress(TypeError, ValueError, OverflowError):
+        found = math.nan if isinstance(value, str | bytes) else float(value)
+    if not abs(found) <= _MOST:
+        raise RequestError(f"{name} of {value!r} is not a number of at most {_MOST:g}; pass a float")
+    return found
 
 
 @dataclass(eq=False, slots=True)

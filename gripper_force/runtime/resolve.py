@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -18,6 +17,7 @@ from gripper_force.plugins import importing
 from gripper_force.profiles import apply
 from gripper_force.runtime.backends import load_servo_class, resolve_simulation, with_camera_rate
 from gripper_force.runtime.process import allowed
+from gripper_force.runtime.requests import number
 
 if TYPE_CHECKING:  # a run without vision imports none of these
     from gripper_force.profiles.correction import Correction
@@ -71,7 +71,7 @@ class ResolvedConfig:
         """Raises `RequestError` if a target is beyond the force limit or a profile's calibrated range."""
         limit_n, gain_bound = self.config.control.force_limit_n, self.config.gripper.gain_bound
         largest_n = largest_target_n(limit_n, gain_bound)
-        if not (math.isfinite(target_n) and target_n > 0):
+        if not number(target_n, "a target") > 0:
             raise RequestError(f"a target of {target_n} N is not a positive force; request more than 0 N")
         if target_n > largest_n:
             raise RequestError(
@@ -89,7 +89,7 @@ class ResolvedConfig:
     def check_width(self, width_m: float) -> None:
         """Raises `RequestError` if a width is outside the travel of the jaws."""
         open_width_m = self.config.gripper.open_width_m
-        if not 0 <= width_m <= open_width_m:
+        if not 0 <= number(width_m, "a width") <= open_width_m:
             raise RequestError(
                 f"a width of {1e3 * width_m:g} mm is outside 0 to {1e3 * open_width_m:g} mm, the travel of the "
                 "jaws; request a width in metres within gripper.open_width_m"

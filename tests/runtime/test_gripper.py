@@ -225,9 +225,35 @@ def test_a_force_out_of_range_is_refused(simulated: Open, target_n: float) -> No
 def test_a_width_out_of_range_is_refused(simulated: Open, width_m: float) -> None:
     gripper = simulated()
     for wait in (True, False):
-        with pytest.raises(gf.RequestError, match=r"a width of .* is outside 0 to 92 mm"):
+        with pytest.raises(gf.RequestError, match=r"a width of .* is (outside 0 to 92 mm|not a number)"):
             gripper.move(width_m, wait=wait)
     assert gripper.step().phase == gf.Phase.OPEN
+
+
+@pytest.mark.parametrize("value", [None, "4", math.nan, math.inf, 1e12, [1.0]])
+def test_what_is_no_number_is_refused(simulated: Open, value: Any) -> None:
+    gripper = simulated()
+    for call in (gripper.grasp, gripper.set_force, gripper.move, gripper.sleep):
+        with pytest.raises(gf.RequestError, match="is not a number of at most 1e"):
+            call(value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ({"config": {"control": {}}}, "the configuration must be a path, not"),
+        ({"config": 5}, "the configuration must be a path, not 5"),
+        ({"log": "a\0b"}, "the log must be a path, not 'a"),
+        ({"log": 5}, "the log must be a path, not 5"),
+        ({"overrides": 5}, "overrides are a mapping, or a list"),
+        ({"overrides": [5]}, "overrides are a mapping, or a list"),
+    ],
+)
+def test_an_argument_of_another_type_is_a_configuration_error(
+    arguments: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(gf.ConfigError, match=sentence):
+        gf.open_gripper(**arguments)
 
 
 def test_force_is_only_set_on_a_gripped_object(simulated: Open) -> None:
