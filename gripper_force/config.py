@@ -90,10 +90,7 @@ class ServoConfig(Section):
         if self.second.id == self.id:
             raise ValueError(f"second.id {self.id} is servo.id, too; give each servo its own id")
         if self.reply_margin_ms >= self.bus_watchdog_ms:
-            raise ValueError(
-                f"reply_margin_ms {self.reply_margin_ms:g} must be below bus_watchdog_ms {self.bus_watchdog_ms}: "
-                "the servo would stop by itself before a retry"
-            )
+            raise ValueError(f"reply_margin_ms must be below bus_watchdog_ms {self.bus_watchdog_ms}")
         return self
 
     @property
@@ -437,12 +434,12 @@ class ControlConfig(Section):
 
     @model_validator(mode="after")
     def _check_order_of_limits(self) -> Self:
-        ordered = (
-            ("warm_c", "temperature_limit_c"),
-            ("settle_s", "timeout_s"),
-            ("approach_force_n", "force_limit_n"),
-        )
-        for low, high in ordered:
+        above = {
+            "warm_c": "temperature_limit_c",
+            "settle_s": "timeout_s",
+            "approach_force_n": "force_limit_n",
+        }
+        for low, high in above.items():
             if getattr(self, low) >= getattr(self, high):
                 raise ValueError(f"{low} {getattr(self, low):g} must be below {high} {getattr(self, high):g}")
         if self.voltage_limits_v is not None and self.voltage_limits_v[0] >= self.voltage_limits_v[1]:
@@ -664,11 +661,9 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _check_sections(self) -> Self:
-        least_m, open_m = self.control.min_object_width_m, self.gripper.open_width_m
-        if least_m >= open_m:
+        if (open_m := self.gripper.open_width_m) <= self.control.min_object_width_m:
             raise ValueError(
-                f"control.min_object_width_m {least_m:g} is not below gripper.open_width_m {open_m:g}, so that "
-                "no object would be held; set both in metres"
+                f"control.min_object_width_m must be below gripper.open_width_m {open_m:g} (metres)"
             )
         if self.gripper.linkage.kind == "finger" and len(self.servo.ids) > 1:
             raise ValueError(
@@ -778,9 +773,7 @@ def _upgraded(tree: Tree) -> Tree:
 
 def _assign_all(tree: Tree, overrides: Overrides | None) -> None:
     if isinstance(overrides, str):
-        raise ConfigError(
-            f"overrides are a list or a mapping; pass [{overrides!r}] instead of the text alone"
-        )
+        raise ConfigError(f"overrides are a list or a mapping; pass [{overrides!r}] instead of the text")
     try:
         for item in overrides.items() if isinstance(overrides, Mapping) else overrides or ():
             if isinstance(item, str):
@@ -788,9 +781,7 @@ def _assign_all(tree: Tree, overrides: Overrides | None) -> None:
             else:
                 assign_value(tree, *item)
     except TypeError as error:
-        raise ConfigError(
-            f"overrides are a mapping, or a list of texts key.path=value or of pairs, not {overrides!r}"
-        ) from error
+        raise ConfigError(f"overrides are a list of assignments, or a mapping, not {overrides!r}") from error
 
 
 def _with_overrides(

@@ -91,9 +91,7 @@ class Safety:
             return f"the servo reports hardware error 0x{servo.hardware_error:02x}"
         if servo.temperature_c > self._config.temperature_limit_c:
             limit_c = self._config.temperature_limit_c
-            return (
-                f"the servo is at {servo.temperature_c:.0f} C, above control.temperature_limit_c {limit_c:g}"
-            )
+            return f"the servo is at {servo.temperature_c:.0f} C; control.temperature_limit_c is {limit_c:g}"
         low_v, high_v = self._config.voltage_limits_v or (-math.inf, math.inf)
         if not low_v <= servo.voltage_v <= high_v:
             return f"the servo's supply is at {servo.voltage_v:.1f} V, outside {low_v:g} to {high_v:g} V"

@@ -27,9 +27,7 @@ def _in_order(bounds: tuple[float, float]) -> tuple[float, float]:
     return bounds
 
 
-Range = Annotated[
-    tuple[NonNegative, NonNegative], Field(description="least and most"), AfterValidator(_in_order)
-]
+Range = Annotated[tuple[NonNegative, NonNegative], AfterValidator(_in_order)]
 
 
 class CalibratedValue(Section):

@@ -6,7 +6,6 @@ import atexit
 import contextlib
 import sys
 import threading
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -170,18 +169,15 @@ class ControlLoop:
             if not self._error_was_raised:
                 self._raise_error()
 
-    @contextlib.contextmanager
-    def _own_cycle(self) -> Iterator[None]:
+    def _own_cycle(self) -> contextlib.ExitStack:
         """Keeps the cycle to the caller's thread: a second one would use the servo's port at the same time."""
         if not self._cycle_lock.acquire(blocking=False):
             raise RequestError(
-                "another thread runs the control cycle; pass wait=False to the request, or use background=True, "
-                "which needs clock=realtime"
+                "another thread runs the control cycle; pass wait=False, or use background=True"
             )
-        try:
-            yield
-        finally:
-            self._cycle_lock.release()
+        owned = contextlib.ExitStack()
+        owned.callback(self._cycle_lock.release)
+        return owned
 
     def _close_at_exit(self) -> None:
         """Closes a gripper that the program forgot. The exception that ended the program is the cause."""
@@ -234,7 +230,9 @@ class ControlLoop:
     # The control cycle.
 
     def _start(self, session: Session) -> None:
-        self._publish(session, session.wait_for_reference())
+        decision = session.wait_for_reference()
+        self._tracker.reason = session.reason  # of a fault in one of these cycles
+        self._publish(session, decision)
         self.session = session
         self._opened.set()
 
@@ -258,7 +256,7 @@ class ControlLoop:
         assert session.servo_state is not None  # the cycle has read it
         starts = request is not None and request.kind != RequestKind.STOP and not refusal
         self.state, result = self._tracker.update(
-            decision, session.servo_state, session.last_load_cell_sample, session.reason, restart=starts
+            decision, session.servo_state, session.last_load_cell_sample, restart=starts
         )
         self._requests.finish_cycle(request, refusal, self.state, result)
         return self.state

@@ -88,9 +88,8 @@ def real_time_settings() -> Iterator[str]:
     with ExitStack() as stack:
         if _allowed.switch_interval:
             _switch_intervals.append(sys.getswitchinterval())
-            stack.callback(
-                lambda: sys.setswitchinterval(_switch_intervals.pop())
-            )  # the program's one comes last
+            # In whatever order grippers are closed, the last one brings the program's interval back.
+            stack.callback(lambda: sys.setswitchinterval(_switch_intervals.pop()))
             sys.setswitchinterval(SWITCH_INTERVAL_S)
         yield stack.enter_context(real_time_priority()) if _allowed.real_time_priority else ""
 

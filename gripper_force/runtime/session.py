@@ -174,11 +174,6 @@ class Session:
         """Makes the next cycle a stop, before any other request. Any thread or signal handler may call it."""
         self._stop = True
 
-    @property
-    def stop_is_pending(self) -> bool:
-        """True if a stop was requested and no cycle has handled it."""
-        return self._stop
-
     def interrupt(self) -> None:
         """Makes the next cycle raise `KeyboardInterrupt` before it accesses the servo.
 
@@ -222,9 +217,8 @@ class Session:
         self.raise_if_interrupted()
         devices.check()
         visual = None
-        for processed in (
-            self._perception.poll() if self._error is None else ()
-        ):  # a lost camera raises each time
+        # A lost camera would raise again while the jaws open at the end.
+        for processed in self._perception.poll() if self._error is None else ():
             log(processed.frame)
             self.frames += 1
             self.newest_frame = processed.frame
@@ -296,8 +290,7 @@ class Session:
 
     @property
     def _end(self) -> str:
-        config = self.run.config
-        return config.control.on_fault if self.failed or self.stop_is_pending else config.on_exit
+        return self.run.config.control.on_fault if self.failed or self._stop else self.run.config.on_exit
 
     def open_at_fault(self) -> None:
         """Opens the jaws at the end of a run, with ``control.on_fault=open`` after a fault, a stop or an exception.
