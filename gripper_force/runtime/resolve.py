@@ -253,6 +253,10 @@ def _complete_control(config: Config, spec: ServoSpec) -> ControlConfig:
 
 def _check_rate(config: Config) -> None:
     rate_hz, watchdog_ms = config.control.rate_hz, config.servo.bus_watchdog_ms
+    if config.servo.reply_margin_ms >= watchdog_ms:
+        raise ConfigError(
+            f"servo.reply_margin_ms must be below servo.bus_watchdog_ms {watchdog_ms}; lower it"
+        )
     if rate_hz < 1 / MAX_CYCLE_S:
         raise ConfigError(
             f"control.rate_hz {rate_hz:g} is too slow for a force loop; set at least {1 / MAX_CYCLE_S:g}"

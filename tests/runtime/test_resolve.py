@@ -135,6 +135,7 @@ def test_a_resolved_configuration_is_frozen() -> None:
 @pytest.mark.parametrize(
     ("slow", "message"),
     [
+        (["servo.reply_margin_ms=40"], r"reply_margin_ms must be below servo\.bus_watchdog_ms 40"),
         (["control.rate_hz=10", "servo.bus_watchdog_ms=500"], "too slow for a force loop; set at least 20"),
         (["control.rate_hz=40"], "would stop by itself; set the rate to at least 50"),
     ],
