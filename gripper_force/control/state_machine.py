@@ -279,6 +279,8 @@ class GraspController:
                 if not self._opens_at_fault:
                     self._motor_force_n = 0.0  # what can't be reset is let go, also with on_fault=hold
                 return cause
+            if self._phase == Phase.RELEASE and self._outcome != Outcome.BLOCKED:
+                return ""  # it goes on: from the start again, it would not brake what a springy object pushes open
             if self._outcome == Outcome.BLOCKED:
                 self._outcome = Outcome.NONE
             self._start_release("release requested")
@@ -353,7 +355,10 @@ class GraspController:
     def _start_travel(self, *, opens: bool) -> None:
         if self._phase in GRIPPING:
             self._was_held = self._outcome == Outcome.HELD
-        grip_n = self._motor_force_n if self._phase in (*GRIPPING, Phase.FAULT) else 0.0
+        if self._phase in (*GRIPPING, Phase.FAULT):
+            grip_n = self._motor_force_n
+        else:
+            grip_n = self._travel.grip_left_n(self._phase_s) if self._is_travelling else 0.0
         self._limits.reset(reverses=self._opens_freely and not opens)
         self._goal_width_m = self._present_width_m  # in the cycle that loses an object, the jaws still close
         self._travel.start(self._goal_width_m, grip_n, opens=opens)

@@ -1,10 +1,10 @@
 """Random search for wrong configurations and plants with which a grasp is not safe.
 
 Every case draws a plant and a configuration that is wrong about it. Three of four cases grasp, half of the time change
-the force, and release. The fourth draws a sequence of requests, at any time and from any phase. Some cases begin with
-jaws that touch the object or nearly do. The statements of `safety_statements` must hold. With motor current alone an
-end stop cannot be told from a rigid object. So such cases are counted, but are no violations; `calibrate jaws`
-prevents them.
+the force, and release. The fourth draws a sequence of requests, at any time and from any phase; an eighth of the
+sequences are streams of requests, as of a policy. Some cases begin with jaws that touch the object or nearly do. The
+statements of `safety_statements` must hold. With motor current alone an end stop cannot be told from a rigid object. So
+such cases are counted, but are no violations; `calibrate jaws` prevents them.
 """
 
 import json
@@ -52,6 +52,13 @@ _NEAR: Final = 32
 _NEAR_REMAINDERS: Final = (2, 5, 10, 13, 21, 29)
 """Cases with these remainders begin near the object or in contact with it: a quarter of the sequences, an eighth of the
 others."""
+
+_STREAM_REMAINDER: Final = 14
+_STREAM_S: Final = 8.0
+_STREAM_CHANGES_HZ: Final = 0.5
+_STREAM_NOISE: Final = 0.02
+"""Sequences with this remainder are streams of requests, as of a policy, for this time. Kind, target and width change
+at this rate; between the changes they have noise of this share of their range."""
 
 _GAP_M: Final = 0.002
 _NEAR_LIMIT_N: Final = (0.8, 3.0)
@@ -232,6 +239,18 @@ def draw(config: ControlConfig, truth: Transmission, seed: int, index: int) -> D
         value = between(_LEAST_N, most_n) if kind == RequestKind.GRASP else between(0.0, truth.open_width_m)
         return TimedRequest(log_between(0.05, 8.0), kind, value)
 
+    def draw_stream() -> Iterator[TimedRequest]:
+        period_s = log_between(0.005, 0.1)
+        ranges = {RequestKind.GRASP: (_LEAST_N, most_n), RequestKind.MOVE: (0.0, truth.open_width_m)}
+        kind, values = RequestKind.GRASP, {key: between(*bounds) for key, bounds in ranges.items()}
+        for _ in range(round(_STREAM_S / period_s)):
+            if rng.uniform() < _STREAM_CHANGES_HZ * period_s:
+                kind = RequestKind(rng.choice([*ranges, RequestKind.RELEASE], p=[0.6, 0.3, 0.1]))
+                values = {key: between(*bounds) for key, bounds in ranges.items()}
+            low, high = ranges.get(kind, (0.0, 0.0))
+            value = values.get(kind, 0.0) + _STREAM_NOISE * (high - low) * float(rng.standard_normal())
+            yield TimedRequest(period_s, kind, min(max(value, low), high))
+
     is_sequence = index % _SEQUENCE == _SEQUENCE - 2
     reach = _REACH_SHARE if is_sequence else 1.0
     force_limit_n = rarely(0.5, log_between(0.8, 20.0), config.force_limit_n)
@@ -266,6 +285,8 @@ def draw(config: ControlConfig, truth: Transmission, seed: int, index: int) -> D
         requests=tuple(draw_request() for _ in range(int(rng.integers(3, 9)) if is_sequence else 0)),
         begins_m=0.0,
     )
+    if index % _NEAR == _STREAM_REMAINDER:
+        return replace(drawn, requests=tuple(draw_stream()))
     if index % _NEAR not in _NEAR_REMAINDERS:
         return drawn
     gap_m = rarely(0.3, 0.0, between(0.0, _GAP_M))
