@@ -347,8 +347,7 @@ class SimulatedRig:
             self._thread = None
         unregister_bus(self._bus_name)
         self._closing.close()
-        if self._lockstep:
-            self._world.close()
+        self._world.close()
 
     def _bus_time_ns(self) -> int:
         # Simulated time, so that the watchdog of the firmware counts it.
@@ -376,7 +375,6 @@ class SimulatedRig:
             self._failure = error
         finally:
             self._is_prepared.set()
-            self._world.close()  # the rendering context belongs to this thread
 
 
 def _relative_exposure(config: Config) -> float:

@@ -1,6 +1,7 @@
 """MuJoCo world: physics, contact force and rendering of one scene."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -154,6 +155,7 @@ class World:
         self._left = int(self._model.sensor("left_force").adr[0]) + 1
         self._right = int(self._model.sensor("right_force").adr[0]) + 1
         self._periodic_calls: list[_PeriodicCall] = []
+        self._graphics: ThreadPoolExecutor | None = None  # the renderer's thread, once it is used
         self._renderer: Any = None
         self._image: tuple[int, npt.NDArray[np.uint8]] | None = None
         self.t_ns = 0
@@ -258,26 +260,36 @@ class World:
         return horn_rad, ratio
 
     def render(self, side_px: int) -> npt.NDArray[np.uint8]:
-        """Renders the present state, (side_px, side_px, 3) uint8. Raises `SimulationError` without EGL."""
-        if self._renderer is None:
-            self._renderer = self._new_renderer(side_px)
+        """Renders the present state, (side_px, side_px, 3) uint8. Raises `SimulationError` without EGL.
+
+        Any thread may call it. A rendering context can be used in one thread only, so it has a thread of its own.
+        """
         if self._image is None or self._image[0] != self.t_ns:  # one rendering serves all light levels
-            self._move_background()
-            self._renderer.update_scene(self._data, "camera")
-            self._image = self.t_ns, self._renderer.render()
+            self._graphics = self._graphics or ThreadPoolExecutor(1, "renderer")
+            self._image = self.t_ns, self._graphics.submit(self._rendered, side_px).result()
         return self._image[1]
 
     def close(self) -> None:
         """Frees the rendering context."""
+        graphics, self._graphics = self._graphics, None
+        if graphics is not None:
+            graphics.submit(self._close_renderer)
+            graphics.shutdown()
+
+    def _close_renderer(self) -> None:
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
 
-    def _new_renderer(self, side_px: int) -> Any:
-        renderer = new_renderer(self._model, side_px)
-        for flag in _DISABLED_RENDER_FLAGS:
-            renderer.scene.flags[flag] = 0
-        return renderer
+    def _rendered(self, side_px: int) -> npt.NDArray[np.uint8]:
+        if self._renderer is None:
+            self._renderer = new_renderer(self._model, side_px)
+            for flag in _DISABLED_RENDER_FLAGS:
+                self._renderer.scene.flags[flag] = 0
+        self._move_background()
+        self._renderer.update_scene(self._data, "camera")
+        image: npt.NDArray[np.uint8] = self._renderer.render()
+        return image
 
     def _move_background(self) -> None:
         """Moves the background objects. They have no contacts, so only the rendered positions change."""

@@ -4,6 +4,7 @@ import subprocess
 import sys
 import textwrap
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -138,6 +139,18 @@ def test_image_shows_motion_of_jaws(make_world: Callable[..., World]) -> None:
     assert (world.render(64) == before).all()
     world.advance_to(300 * NS_PER_MS)
     assert np.abs(world.render(64).astype(int) - before).max() > 40
+
+
+def test_any_thread_renders_the_same_images_and_closes(make_world: Callable[..., World]) -> None:
+    """`asyncio.to_thread` opens a gripper in one thread, grasps in others, and may close it in another still."""
+    alone, shared = make_world(Current(0.1)), make_world(Current(0.1))
+    with ThreadPoolExecutor(1) as one, ThreadPoolExecutor(1) as another:
+        for number, thread in enumerate((None, one, another, None), start=1):
+            for world in (alone, shared):
+                world.advance_to(10 * number * NS_PER_MS)
+            image = shared.render(64) if thread is None else thread.submit(shared.render, 64).result()
+            assert (image == alone.render(64)).all()
+        another.submit(shared.close).result()
 
 
 @pytest.mark.parametrize("tool", ["pads", "rods"])
