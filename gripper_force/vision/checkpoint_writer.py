@@ -28,6 +28,27 @@ def save_checkpoint(path: Path, networks: Sequence[Member], header: Header) -> N
     _write(path, tensors, header)
 
 
+def check_place(path: Path) -> None:
+    """Creates the folder of a checkpoint, before hours of work for it.
+
+    Raises:
+        CheckpointError: The file can't be written, or has another ending than ``.safetensors``.
+    """
+    if path.is_dir():
+        raise CheckpointError(f"can't write the checkpoint {path}: it is a folder; name a file")
+    if path.suffix != ".safetensors":  # of an exported network, or of the figure that is drawn beside
+        raise CheckpointError(f"can't write a checkpoint to {path}; name a file that ends in .safetensors")
+    probe = path.with_name(f".{path.name}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink(missing_ok=True)  # several processes may check at the same time
+    except OSError as error:
+        raise CheckpointError(
+            f"can't write the checkpoint {path}: {error.strerror}; name another file"
+        ) from error
+
+
 def replace_header(source: str | Path, header: Header, out: Path | None = None) -> None:
     """Writes a checkpoint with another header. It keeps its weights, bit for bit, and its digest.
 

@@ -137,13 +137,24 @@ def test_wrong_names_end_the_command_before_its_work(run: Run, fused_log: Path, 
     found = run("replay", fused_log, "--compare", "log", "bogus.key=3")
     assert (found.code, "unknown configuration key 'bogus'" in found.err) == (2, True), found.err
     assert "replaying" not in found.err
+
+
+@pytest.mark.parametrize("command", ["train", "calibrate network"])
+def test_a_checkpoint_that_cannot_be_written_is_refused_before_the_logs_are_read(
+    run: Run, fused_log: Path, tmp_path: Path, command: str
+) -> None:
+    """The figure of a training has the ending .png, so it would replace a checkpoint of this name."""
     for out, words in (
+        (".", "it is a folder"),
         (tmp_path, "it is a folder"),
-        (tmp_path / "a.onnx", "the ending of an exported network"),
+        ("a.png", "can't write a checkpoint to a.png; name a file that ends in .safetensors"),
+        ("a.onnx", "name a file that ends in .safetensors"),
+        ("a", "name a file that ends in .safetensors"),
+        (fused_log / "a.safetensors", "name another file"),
     ):
-        found = run("train", fused_log, "--out", out)
+        found = run(*command.split(), fused_log, "--out", out)
         assert (found.code, words in found.err) == (2, True), found.err
-        assert "0/200" in found.err  # steps of the training
+        assert "0/1" not in found.err  # logs
 
 
 def test_every_command_can_be_set_and_read_by_a_script() -> None:

@@ -177,7 +177,7 @@ def teach(
             result = gripper_force.teach(config, "mug", touches=16)
             print(result.bundle, result.mae_n, result.more_touches_help)
     """
-    out = user_folder() / name if out is None else Path(out)
+    out = (user_folder() / name if out is None else Path(out)).absolute()
     place = default_folder(name) if folder is None else Path(folder)
     config, model = check(config, out)
     if logs is None:
@@ -215,9 +215,10 @@ def check(config: Config, out: Path) -> tuple[Config, Model]:
         ConfigError: There is no network, or the bundle can't be written.
         CheckpointError: The network can't be read.
     """
-    check_place(out.with_name(f"{out.name}.yaml"))
+    out = out.absolute()  # `.` has a name then
     if out.exists() and not (out / BUNDLED).is_file():
         raise ConfigError(f"{out} exists and is not a bundle; name another folder")
+    check_place(out.with_name(f"{out.name}.yaml"))
     config, model, _ = resolve_vision(config)
     if model is None:
         raise ConfigError("teach needs a network to begin with; set vision.checkpoint, such as to default")

@@ -16,7 +16,7 @@ from gripper_force.profiles.object_profile import OodLimit
 from gripper_force.progress import Progress, no_progress
 from gripper_force.vision.batch_inference import features
 from gripper_force.vision.checkpoint import load_checkpoint
-from gripper_force.vision.checkpoint_writer import replace_header
+from gripper_force.vision.checkpoint_writer import check_place, replace_header
 from gripper_force.vision.estimator import claimed_std_n
 from gripper_force.vision.header import Header, OodModel, read_checkpoint
 from gripper_force.vision.network import ForceNetwork
@@ -170,6 +170,7 @@ def calibrate_network(
         LogError: A log can't be read.
         CheckpointError: The checkpoint can't be read or written.
     """
+    check_place(out)
     checkpoint = load_checkpoint(source)
     preprocess = checkpoint.header.preprocess
     clips = without_contact_starts(load_clips(logs, preprocess, None, workers, progress), preprocess)

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from gripper_force.errors import CheckpointError, ConfigError, DataError
+from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs import metrics
 from gripper_force.jobs.dataset import Clip, check_size, digest, split_by
 from gripper_force.jobs.report.plots import draw_training
@@ -30,8 +30,8 @@ from gripper_force.progress import Progress, no_progress
 from gripper_force.schema import Tree
 from gripper_force.vision.batch_inference import predict
 from gripper_force.vision.checkpoint import Checkpoint, Member, load_checkpoint
-from gripper_force.vision.checkpoint_writer import save_checkpoint
-from gripper_force.vision.header import EXPORTED, Header, read_checkpoint
+from gripper_force.vision.checkpoint_writer import check_place, save_checkpoint
+from gripper_force.vision.header import Header, read_checkpoint
 from gripper_force.vision.network import ForceNetwork
 
 STATE_EVERY_S: Final = 60.0
@@ -90,7 +90,7 @@ def train(
         ConfigError: The recipe sets a key in which ``init`` differs, ``init`` or ``replay_clips`` are given for
             a Gaussian process, or the processes can't train together, for example because their recipes differ.
     """
-    _check_out(out)
+    check_place(out)
     if not clips or (validation_clips is not None and not validation_clips):
         use = "validate with" if clips else "train on"
         raise DataError(f"no recording is left to {use}; add logs, or hold out fewer objects")
@@ -150,25 +150,6 @@ def train(
                 state.unlink()
         process.wait()
         return load_checkpoint(out)
-
-
-def _check_out(out: Path) -> None:
-    """Raises `CheckpointError` if the checkpoint can't be written, before hours of training."""
-    if out.suffix in EXPORTED:
-        raise CheckpointError(
-            f"{out} has the ending of an exported network; name a file that ends in .safetensors"
-        )
-    if out.is_dir():
-        raise CheckpointError(f"can't write the checkpoint {out}: it is a folder; name a file")
-    probe = out.with_name(f".{out.name}.part")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        probe.touch()
-        probe.unlink(missing_ok=True)  # several processes may check at the same time
-    except OSError as error:
-        raise CheckpointError(
-            f"can't write the checkpoint {out}: {error.strerror}; name another file"
-        ) from error
 
 
 def _add_ood(

@@ -400,10 +400,16 @@ def test_an_interrupted_replacement_keeps_the_old_bundle(
     assert read_object(out / "profile.yaml") == taught.profile
 
 
-def test_folder_that_is_no_bundle_is_not_replaced(config: Config, logs: list[Path], tmp_path: Path) -> None:
+def test_folder_that_is_no_bundle_is_not_replaced(
+    config: Config, logs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "mine").mkdir()
     with pytest.raises(ConfigError, match="exists and is not a bundle"):
         teach(config, "disc", logs=logs, folder=tmp_path / "work", out=tmp_path / "mine")
+    monkeypatch.chdir(tmp_path)
+    for out in (".", "/"):
+        with pytest.raises(ConfigError, match="exists and is not a bundle"):
+            teach(config, "disc", logs=logs, folder=tmp_path / "work", out=out)
 
 
 def test_command_prints_the_choice_and_the_next_command(
