@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from gripper_calibration.procedures.calibrate_servo import ServoResult
     from gripper_calibration.procedures.teach import Taught
     from gripper_force.config import Config
+    from gripper_force.profiles.object_profile import ObjectProfile
     from gripper_force.progress import Progress
 
 app = typer.Typer(
@@ -304,6 +305,7 @@ def object_(
         given,
         "--profile",
         str(profile),
+        *_safe_target(result.profile),
         *([] if seed is None else ["--seed", str(seed)]),
     ]
     _next_step(words, config, set_)
@@ -358,7 +360,8 @@ def gain(
     _tell_other_objects(read_object(find_object(name)).object, paths)
     saved = save_gain(name, paths, out, set_)
     console.show(saved, as_json)
-    console.next_step("grasp", "--object", saved.object, "--profile", out or name)
+    target = _safe_target(read_object(saved.profile))
+    console.next_step("grasp", "--object", saved.object, "--profile", out or name, *target)
 
 
 def teach(
@@ -447,8 +450,7 @@ def teach(
             f"more touches would reduce the error further: --touches {2 * len(result.profile.logs)} adds to these",
             soft_wrap=True,
         )
-    target_n = min(4.0, round(result.profile.force_n / 2, 1))
-    words = ["grasp", "--object", given, "--target-n", f"{target_n:g}"]
+    words = ["grasp", "--object", given, *_safe_target(result.profile)]
     words += [] if out is None else ["--profile", str(out.absolute())]
     words += [] if seed is None else ["--seed", str(seed)]
     # With another network than the default one a grasp would not use the bundle's.
@@ -456,6 +458,11 @@ def teach(
     if config is not None and load_settings(config, others, {}).vision.checkpoint != "default":
         others.append("vision.checkpoint=default")
     console.next_step(*words, *again(config, others))
+
+
+def _safe_target(profile: "ObjectProfile") -> list[str]:
+    """Returns the option with a target well within the forces of a profile: grasps refuse one beyond its largest."""
+    return ["--target-n", f"{min(4.0, round(profile.force_n / 2, 1)):g}"]
 
 
 def _tell_existing(settings: "Config", touches: int, folder: Path, fresh: bool) -> None:

@@ -107,7 +107,10 @@ def test_command_calibrates_from_one_touch(touched: list[Path], tmp_path: Path) 
     assert Path(found["report"]).stat().st_size > 10_000
     assert "needs at least 3 touches; 8 are recommended" in result.stderr
     profile = tmp_path / "it.yaml"
-    assert f"next: gripper-force grasp --object stapler --profile {profile} --set" in result.stderr
+    largest_n = read_object(profile).force_n
+    assert largest_n < 6.0
+    words = f"grasp --object stapler --profile {profile} --target-n {largest_n / 2:.1f} --set"
+    assert f"next: gripper-force {words}" in result.stderr
 
 
 def test_log_is_read_once_with_the_results_of_separate_reads(

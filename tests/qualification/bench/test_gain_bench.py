@@ -66,7 +66,7 @@ def test_the_command_saves_the_gain_of_the_last_log(
     printed = json.loads(result.stdout)
     assert printed["object"] == "sponge"
     assert printed["profile"] == str(out)
-    assert f"next: gripper-force grasp --object sponge --profile {out}\n" in result.stderr
+    assert f"next: gripper-force grasp --object sponge --profile {out} --target-n 4\n" in result.stderr
     assert printed["object_gain"] == pytest.approx(row["gain"], rel=1e-3)
     saved, source = read_object(out), find_object("sponge")
     assert saved.ratio == pytest.approx((printed["ratio"], printed["ratio_std"]))
