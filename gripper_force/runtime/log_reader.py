@@ -38,6 +38,10 @@ _MAX_CHUNK: Final = 1 << 28
 _DAMAGE: Final = (McapError, DecodeError, zstandard.ZstdError, struct.error, ValueError, OverflowError)
 """Exceptions of the decoders on damaged bytes."""
 
+_REMEDY: Final = (
+    "read what is whole with `gripper-force replay LOG --recover`, and leave this log out elsewhere"
+)
+
 A = TypeVar("A", bound=Record)
 B = TypeVar("B", bound=Record)
 C = TypeVar("C", bound=Record)
@@ -117,19 +121,24 @@ class LogReader:
         """Yields the records of the given types, or all of them, in the order in which they were written.
 
         Raises:
+            TypeError: One of the types is not among those that a log holds.
             LogError: A chunk is damaged (without ``recover``; with it the chunk is left out), or a topic is not as this
                 version writes it.
         """
+        if wrong := [one for one in types if one not in [*CODECS]]:  # at the call, not in the generator
+            known = ", ".join(sorted(one.__name__ for one in CODECS))
+            raise TypeError(f"{wrong[0]!r} is no type of the records in a log; pass some of {known}")
+        return self._decoded(frozenset(types or CODECS))
+
+    def _decoded(self, types: frozenset[type[Record]]) -> Iterator[Record]:
         try:
-            for channel, message in self._messages(frozenset(types or CODECS)):
+            for channel, message in self._messages(types):
                 yield channel.decode(message)
         except OSError as error:
             raise LogError(f"can't read the log {self.path}: {error.strerror}") from error
         except _DAMAGE as error:
             if not self._recover:
-                raise LogError(
-                    f"{self.path} is damaged ({error}); --recover leaves out what is damaged"
-                ) from error
+                raise LogError(f"{self.path} is damaged ({error}); {_REMEDY}") from error
 
     def _messages(self, wanted: frozenset[type[Record]]) -> Iterator[tuple[Codec, McapMessage]]:
         schemas: dict[int, Schema] = {}
@@ -217,7 +226,7 @@ class LogReader:
         count = sum(1 for _ in self.records())
         return (
             f"{self.path} is cut short or damaged: {count} records ({self.duration_ns / NS_PER_S:.2f} s) "
-            "can be recovered, --recover reads them"
+            f"can be recovered; {_REMEDY}"
         )
 
 

@@ -497,7 +497,8 @@ def test_a_truncated_log_is_refused_and_recovered_on_request(
     path.write_bytes(fused_log.read_bytes()[:-1000])
     done = run("replay", path)
     assert done.code == 2
-    assert "can be recovered, --recover reads them" in done.err
+    assert "can be recovered; read what is whole with `gripper-force replay LOG --recover`" in done.err
+    assert "leave this log out elsewhere" in run("evaluate", path, "--checkpoint", "small").err
     assert run("replay", path, "--recover", "--json").json()["frames"] > 100
 
 

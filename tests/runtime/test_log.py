@@ -25,6 +25,7 @@ from gripper_force.types import (
     NS_PER_MS,
     AttentionMap,
     Event,
+    ForceEstimate,
     Frame,
     FusedForce,
     GraspStatus,
@@ -311,6 +312,17 @@ def test_flipped_bytes_are_told_or_harmless_never_an_untyped_error(
             list(LogReader(path, recover=recover).records())
         except LogError as error:
             assert str(path) in str(error)  # noqa: PT017
+
+
+def test_what_is_no_type_of_record_is_refused_at_the_call(tmp_path: Path) -> None:
+    run(tmp_path / "run.mcap", count=1)
+    log: Any = LogReader(tmp_path / "run.mcap")
+    types: tuple[Any, ...] = ("FusedForce", "/fused_force", dict, {}, ForceEstimate)
+    for wrong in types:
+        with pytest.raises(
+            TypeError, match=r"is no type of the records in a log; pass some of .*, FusedForce, "
+        ):
+            log.records(Frame, wrong)
 
 
 def test_recovery_leaves_out_a_damaged_chunk_alone(tmp_path: Path) -> None:
