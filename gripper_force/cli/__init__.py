@@ -8,11 +8,14 @@ Ctrl-C.
 A command imports what it needs when it runs, so that ``gripper-force --help`` answers at once.
 """
 
+import errno
 import gc
 import json
+import os
 import signal
 import sys
 from io import TextIOWrapper
+from pathlib import Path
 from typing import Annotated, NoReturn
 
 import typer
@@ -78,12 +81,15 @@ def main() -> NoReturn:
             signal.signal(number, process.raise_interrupt)
     try:
         with importing("this command"):
-            app(prog_name="gripper-force")
+            try:
+                app(prog_name="gripper-force")
+            finally:
+                sys.stdout.flush()  # at the end of Python it would be too late for a message and an exit code
     except GripperError as error:
         _fail(str(error))
     except OSError as error:
         if error.filename is None:
-            raise
+            _fail_without_file(error)
         no_folder = isinstance(error, FileExistsError | NotADirectoryError)
         reason = "a file is where a folder must be" if no_folder else error.strerror
         _fail(f"can't use {error.filename}: {reason}; check the path, and who may read and write there")
@@ -103,6 +109,16 @@ def main() -> NoReturn:
             sys.exit(process.interrupt_exit_code())
         raise
     sys.exit(0)
+
+
+def _fail_without_file(error: OSError) -> NoReturn:
+    """Ends the command after an error that names no file; one of another kind than those of an output is raised."""
+    if error.errno not in (errno.EPIPE, errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        raise error
+    sys.stdout = Path(os.devnull).open("w")  # noqa: SIM115  # Python would write the rest at its end, and fail again
+    if error.errno == errno.EPIPE:  # of `gripper-force ... | head`
+        sys.exit(1)
+    _fail(f"can't write the output: {error.strerror}; make space, or send it elsewhere")
 
 
 def _fail(message: str) -> NoReturn:

@@ -60,6 +60,26 @@ def test_there_is_colour_unless_no_color_is_set(name: str, tmp_path: Path) -> No
     assert (done, COLOUR.search(shown)) == (code, None)
 
 
+@pytest.mark.parametrize("arguments", ["config show", "config show --json", "config file"])
+def test_an_output_on_a_full_disk_is_one_sentence(arguments: str, tmp_path: Path) -> None:
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [*COMMAND, *arguments.split()], cwd=tmp_path, stdout=full, stderr=subprocess.PIPE, text=True
+        )
+    sentence = "error: can't write the output: No space left on device; make space, or send it elsewhere\n"
+    assert (done.returncode, done.stderr) == (2, sentence)
+
+
+def test_an_output_that_nobody_reads_is_no_error(tmp_path: Path) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(
+        [*COMMAND, "config", "show"], cwd=tmp_path, stdout=writer, stderr=subprocess.PIPE, text=True
+    )
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (1, "")
+
+
 def test_without_a_terminal_a_bar_is_printed_once(tmp_path: Path) -> None:
     done = subprocess.run([*COMMAND, *TAP.split()], cwd=tmp_path, capture_output=True, text=True, check=True)
     assert "\r" not in done.stdout + done.stderr
