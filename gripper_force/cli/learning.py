@@ -81,6 +81,11 @@ def train(
     start = load_checkpoint(init) if init else None
     if start is not None:
         settings = continued(settings, start.header)
+    states = state_paths(settings, checkpoint)
+    before = _saved(states)
+    if resume and not before:
+        missing = f"there is no {states[0]}" if states else "a Gaussian process is fitted at once"
+        raise ConfigError(f"no training was interrupted that --resume can continue: {missing}; leave out --resume")
     quiet = os.environ.get("RANK", "0") != "0"  # only the first process of torchrun prints
     folders = [
         find_logs(given) if given else []
@@ -113,8 +118,6 @@ def train(
         if not quiet:
             _warn_left_out(left_out, loaded)
     warnings: list[str] = []
-    states = state_paths(settings, checkpoint)
-    before = [] if resume else _saved(states)  # of an earlier training
     try:
         with console.bar("training", PROGRESS_STEPS * max(1, len(states)), hidden=quiet) as progress:
             result = job(
@@ -131,7 +134,7 @@ def train(
             )
     except BaseException as end:
         interrupted = isinstance(end, KeyboardInterrupt) or process.is_interrupted()
-        if interrupted and not quiet and _saved(states) != before:
+        if interrupted and not quiet and (resume or _saved(states) != before):
             console.err.print("the training was saved; add --resume to the same command to continue it")
         raise
     if quiet:

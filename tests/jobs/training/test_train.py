@@ -175,6 +175,9 @@ def test_command_tells_what_to_do_next(
     call = ["train", str(few_logs), "--out", str(out), "--jobs", "1"]
     keys = ["preprocess.size=16", "attentions=[none]", "steps=3", "clips=1", "short_share=0", "device=cpu"]
     call += [part for key in keys for part in ("--set", key)]
+    refused = CliRunner().invoke(cli.app, [*call, "--resume"]).exception
+    assert isinstance(refused, ConfigError)
+    assert f"there is no {tmp_path / 'out.0.state'}; leave out --resume" in str(refused)
     interrupt_step(monkeypatch, 2)
     assert "--resume" not in CliRunner().invoke(cli.app, call).stderr  # nothing is saved in the first minute
     monkeypatch.setattr(train_module, "STATE_EVERY_S", 0.0)
