@@ -4,7 +4,7 @@ import json
 import math
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
@@ -14,6 +14,11 @@ from gripper_force.cli.output.paper import paper_tables
 from gripper_force.cli.output.runs import errors_table
 from gripper_force.errors import ConfigError
 from gripper_force.plugins import require
+
+if TYPE_CHECKING:
+    from gripper_force.jobs.dataset import Clip
+    from gripper_force.jobs.training.recipe import TrainConfig
+    from gripper_force.vision.checkpoint import Checkpoint
 
 ContactStarts = Annotated[
     bool,
@@ -67,7 +72,6 @@ def train(
 ) -> None:
     """Train the force network on logs; under `torchrun`, in several processes."""
     require("torch", "train")
-    from gripper_force.jobs.dataset import find_logs, load_clips, without_contact_starts
     from gripper_force.jobs.training.recipe import continued
     from gripper_force.jobs.training.recipe import recipe as named
     from gripper_force.jobs.training.train import PROGRESS_STEPS, state_paths
@@ -85,8 +89,87 @@ def train(
     before = _saved(states)
     if resume and not before:
         missing = f"there is no {states[0]}" if states else "a Gaussian process is fitted at once"
-        raise ConfigError(f"no training was interrupted that --resume can continue: {missing}; leave out --resume")
+        raise ConfigError(
+            f"no training was interrupted that --resume can continue: {missing}; leave out --resume"
+        )
     quiet = os.environ.get("RANK", "0") != "0"  # only the first process of torchrun prints
+    used = _read_for_training(data, validation, replay, settings, jobs, quiet=quiet)
+    used = used.without_objects(hold_out or [])
+    left_out = 0
+    if not include_contact_starts:
+        loaded = used.logs
+        used = used.without_contact_starts(settings)
+        left_out = loaded - used.logs
+        if not quiet:
+            _warn_left_out(left_out, loaded)
+    warnings: list[str] = []
+    try:
+        with console.bar("training", PROGRESS_STEPS * max(1, len(states)), hidden=quiet) as progress:
+            result = job(
+                settings,
+                used.training,
+                checkpoint,
+                validation_clips=used.validation if validation else None,
+                init=start,
+                teacher=load_checkpoint(teacher) if teacher else None,
+                replay_clips=used.replayed,
+                resume=resume,
+                progress=progress,
+                warn=warnings.append,
+            )
+    except BaseException as end:
+        interrupted = isinstance(end, KeyboardInterrupt) or process.is_interrupted()
+        if interrupted and not quiet and (resume or _saved(states) != before):
+            console.err.print("the training was saved; add --resume to the same command to continue it")
+        raise
+    if not quiet:
+        figure = (
+            checkpoint.with_suffix(".png") if states else None
+        )  # a Gaussian process has no course of training
+        _show_trained(result, checkpoint, figure, left_out, warnings, as_json)
+
+
+class _Clips(NamedTuple):
+    """Recordings of a training."""
+
+    training: "list[Clip]"
+    validation: "list[Clip]"
+    replayed: "list[Clip]"
+
+    def without_objects(self, names: list[str]) -> "_Clips":
+        """Returns the recordings without these objects, which stay in the validation."""
+        there = {clip.object for clip in (*self.training, *self.replayed)}
+        if unknown := sorted(set(names) - there):
+            raise ConfigError(
+                f"--hold-out: no log is of {', '.join(unknown)}; there are {', '.join(sorted(there))}"
+            )
+        training, replayed = (
+            [clip for clip in part if clip.object not in names] for part in (self.training, self.replayed)
+        )
+        return _Clips(training, self.validation, replayed)
+
+    def without_contact_starts(self, settings: "TrainConfig") -> "_Clips":
+        from gripper_force.jobs.dataset import without_contact_starts
+
+        return _Clips(*(without_contact_starts(part, settings.preprocess) for part in self))
+
+    @property
+    def logs(self) -> int:
+        return sum(map(len, self))
+
+
+def _read_for_training(
+    data: list[Path],
+    validation: Path | None,
+    replay: Path | None,
+    settings: "TrainConfig",
+    jobs: int,
+    *,
+    quiet: bool,
+) -> _Clips:
+    """Reads the logs of a training. Raises `ConfigError` if it would be validated on what it learns."""
+    from gripper_force.jobs.dataset import find_logs, load_clips
+
     folders = [
         find_logs(given) if given else []
         for given in (data, [validation] if validation else [], [replay] if replay else [])
@@ -98,56 +181,31 @@ def train(
             "say nothing: name other folders"
         )
     with console.bar("reading logs", sum(map(len, folders)), hidden=quiet) as progress:
-        clips, unseen, old = (
-            load_clips(logs, settings.preprocess, workers=jobs, progress=progress) if logs else []
-            for logs in folders
-        )
-    there = {clip.object for clip in (*clips, *old)}
-    if unknown := sorted(set(hold_out or []) - there):
-        raise ConfigError(
-            f"--hold-out: no log is of {', '.join(unknown)}; there are {', '.join(sorted(there))}"
-        )
-    clips, old = ([clip for clip in part if clip.object not in (hold_out or [])] for part in (clips, old))
-    left_out = 0
-    if not include_contact_starts:
-        loaded = len(clips) + len(unseen) + len(old)
-        clips, unseen, old = (
-            without_contact_starts(part, settings.preprocess) for part in (clips, unseen, old)
-        )
-        left_out = loaded - len(clips) - len(unseen) - len(old)
-        if not quiet:
-            _warn_left_out(left_out, loaded)
-    warnings: list[str] = []
-    try:
-        with console.bar("training", PROGRESS_STEPS * max(1, len(states)), hidden=quiet) as progress:
-            result = job(
-                settings,
-                clips,
-                checkpoint,
-                validation_clips=unseen if validation else None,
-                init=start,
-                teacher=load_checkpoint(teacher) if teacher else None,
-                replay_clips=old,
-                resume=resume,
-                progress=progress,
-                warn=warnings.append,
+        return _Clips(
+            *(
+                load_clips(logs, settings.preprocess, workers=jobs, progress=progress) if logs else []
+                for logs in folders
             )
-    except BaseException as end:
-        interrupted = isinstance(end, KeyboardInterrupt) or process.is_interrupted()
-        if interrupted and not quiet and (resume or _saved(states) != before):
-            console.err.print("the training was saved; add --resume to the same command to continue it")
-        raise
-    if quiet:
-        return
+        )
+
+
+def _show_trained(
+    result: "Checkpoint",
+    path: Path,
+    figure: Path | None,
+    left_out: int,
+    warnings: list[str],
+    as_json: bool,
+) -> None:
     for text in warnings:
         console.warn(text)
-    found = {"checkpoint": str(checkpoint), "digest": result.digest, **result.header.metrics}
-    if states:  # a Gaussian process has no course of training
-        found["figure"] = str(checkpoint.with_suffix(".png"))
+    found = {"checkpoint": str(path), "digest": result.digest, **result.header.metrics}
+    if figure is not None:
+        found["figure"] = str(figure)
     console.show(
         {**found, "left_out": left_out, "warnings": warnings}, as_json, lambda _: console.pairs(found)
     )
-    console.next_step("evaluate", "FOLDER", "--checkpoint", checkpoint)
+    console.next_step("evaluate", "FOLDER", "--checkpoint", path)
 
 
 def _warn_left_out(left_out: int, logs: int) -> None:
