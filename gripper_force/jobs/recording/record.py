@@ -37,6 +37,7 @@ from gripper_force.types import (
     LoadCellSample,
     Outcome,
     Phase,
+    Request,
     RequestKind,
 )
 
@@ -144,6 +145,7 @@ def record(
         run = resolve(one, vision=False)
         if path.exists():
             check_same(path, run.config, _SAME)
+            _check_touches(path, plan.touches)
             first = _checked_object(path, first)
             yield path
             continue
@@ -187,6 +189,15 @@ def check_same(path: Path, config: Config, keys: Sequence[str]) -> None:
                 f"{path} exists already and was recorded with {key} {old}, not {new}; use another folder, "
                 f"{remedy}, or move that log away"
             )
+
+
+def _check_touches(path: Path, touches: int) -> None:
+    recorded = sum(request.kind == RequestKind.GRASP for request in LogReader(path).records(Request))
+    if recorded != touches:
+        raise DataError(
+            f"{path} exists already and was recorded with {recorded} touches, not {touches}; use another folder, "
+            f"pass --touches {recorded}, or move that log away"
+        )
 
 
 def _open_jaws(run: ResolvedConfig, devices: Devices) -> None:

@@ -106,6 +106,8 @@ def test_existing_sets_are_kept(config: Config, tmp_path: Path) -> None:
         made(dimmed, plan, tmp_path)
     with pytest.raises(DataError, match=r"target_n 9\.0, not 5\.0; use another folder"):
         made(config, RecordingPlan(2, 1, peak_n=5.0), tmp_path)
+    with pytest.raises(DataError, match=r"with 1 touches, not 4; use another folder, pass --touches 1, or"):
+        made(config, RecordingPlan(2, 4), tmp_path)
 
 
 @pytest.mark.parametrize(
