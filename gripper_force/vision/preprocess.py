@@ -66,19 +66,20 @@ def downscale(gray: Gray, region: Region | None, size: int) -> Gray:
 
     Raises:
         DataError: The frame is not a gray image of bytes.
-        ConfigError: The region reaches beyond the frame.
+        ConfigError: The region is not four whole numbers, or reaches beyond the frame.
     """
-    if gray.ndim != 2 or gray.dtype != np.uint8:
-        raise DataError(
-            f"the frame is {gray.shape} {gray.dtype}, not (H, W) uint8; convert it to a gray image of bytes"
-        )
+    if not isinstance(gray, np.ndarray) or gray.ndim != 2 or gray.dtype != np.uint8:
+        found = f"{gray.shape} {gray.dtype}" if isinstance(gray, np.ndarray) else type(gray).__name__
+        raise DataError(f"the frame is {found}, not (H, W) uint8; convert it to a gray image of bytes")
     if region is not None:
-        left, top, width, height = region
+        given = np.ravel(region)
+        is_whole = given.shape == (4,) and given.dtype.kind in "iu"
+        left, top, width, height = given.tolist() if is_whole else (-1, 0, 0, 0)
         rows, columns = gray.shape
         inside = 0 <= left < left + width <= columns and 0 <= top < top + height <= rows
         if not inside:
             raise ConfigError(
-                f"vision.region {list(region)} (left, top, width, height) must lie within "
+                f"vision.region {given.tolist()} (left, top, width, height in whole pixels) must lie within "
                 f"the camera's frame of {columns}x{rows} pixels"
             )
         gray = gray[top : top + height, left : left + width]

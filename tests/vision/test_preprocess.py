@@ -1,3 +1,5 @@
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -30,8 +32,27 @@ def test_downscale_crops_then_resizes() -> None:
     assert downscale(gray, None, 16).shape == (16, 16)
 
 
-@pytest.mark.parametrize("region", [(-1, 0, 8, 8), (0, 0, 61, 8), (0, 33, 8, 8), (0, 0, 0, 8)])
-def test_region_beyond_the_frame_is_refused(region: tuple[int, int, int, int]) -> None:
+@pytest.mark.parametrize("frame", [None, [[1, 2], [3, 4]], np.zeros((4, 4)), np.zeros((4, 4, 3), np.uint8)])
+def test_what_is_no_gray_image_is_refused(frame: Any) -> None:
+    """OpenCV gives None when no frame comes."""
+    with pytest.raises(DataError, match=r"the frame is .*, not \(H, W\) uint8; convert it"):
+        downscale(frame, None, 16)
+
+
+@pytest.mark.parametrize(
+    "region",
+    [
+        (-1, 0, 8, 8),
+        (0, 0, 61, 8),
+        (0, 33, 8, 8),
+        (0, 0, 0, 8),
+        (0, 0, 50),
+        (0.0, 0.0, 8.0, 8.0),
+        "abc",
+        8,
+    ],
+)
+def test_region_that_is_not_within_the_frame_is_refused(region: Any) -> None:
     with pytest.raises(ConfigError, match=r"vision\.region.*60x40"):
         downscale(np.zeros((40, 60), np.uint8), region, 16)
 
