@@ -245,7 +245,7 @@ def camera(
 @app.command("object")
 def object_(
     name: Annotated[str, typer.Argument(help="Name of the object, or the file of a simulated one.")],
-    touches: Annotated[int, typer.Option(min=1, help="Number of touches.")] = 8,
+    touches: Annotated[int | None, typer.Option(min=1, help="Number of touches. Default: 8.")] = None,
     peak_n: Annotated[float | None, typer.Option(help="Largest force of a touch in newtons.")] = None,
     logs: Annotated[
         list[Path] | None,
@@ -271,8 +271,9 @@ def object_(
     from gripper_force.jobs.dataset import find_logs
     from gripper_force.profiles.object_profile import find_object
 
-    if fresh and logs is not None:
-        raise ConfigError("--fresh records touches and --from records none; leave out one of them")
+    if logs is not None:
+        _refuse_recording(touches=touches, peak_n=peak_n, folder=folder, fresh=fresh, pause=pause)
+    touches = touches or job.TOUCHES
     settings = load_settings(config, set_, {"object": name, "seed": seed})
     given, name = name, settings.object  # a path has become a name
     folder = folder or job.default_folder(name)
@@ -371,7 +372,9 @@ def teach(
             help="Name of the object; in simulation one of the known objects, or a file of your own."
         ),
     ],
-    touches: Annotated[int, typer.Option(min=4, help="Number of touches, with those of earlier calls.")] = 16,
+    touches: Annotated[
+        int | None, typer.Option(min=4, help="Number of touches, with those of earlier calls. Default: 16.")
+    ] = None,
     peak_n: Annotated[float | None, typer.Option(help="Largest force of a touch in newtons.")] = None,
     logs: Annotated[
         list[Path] | None,
@@ -407,8 +410,9 @@ def teach(
     from gripper_force.jobs.dataset import find_logs
     from gripper_force.profiles.object_profile import user_folder
 
-    if fresh and logs is not None:
-        raise ConfigError("--fresh records touches and --from records none; leave out one of them")
+    if logs is not None:
+        _refuse_recording(touches=touches, peak_n=peak_n, fresh=fresh, pause=pause)
+    touches = touches or job.TOUCHES
     settings = load_settings(config, set_, {"object": name, "seed": seed})
     given, name = name, settings.object  # a path has become a name
     folder = folder or calibrate_object.default_folder(name)
@@ -458,6 +462,13 @@ def teach(
     if config is not None and load_settings(config, others, {}).vision.checkpoint != "default":
         others.append("vision.checkpoint=default")
     console.next_step(*words, *again(config, others))
+
+
+def _refuse_recording(**options: object) -> None:
+    """Raises `ConfigError` if one of the options of a recording of touches is given."""
+    if given := [name for name, value in options.items() if value not in (None, False)]:
+        name = given[0].replace("_", "-")
+        raise ConfigError(f"--{name} is for recording touches and --from records none; leave out one of them")
 
 
 def _safe_target(profile: "ObjectProfile") -> list[str]:

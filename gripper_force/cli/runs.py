@@ -95,6 +95,9 @@ def grasp(
     """Grasp with a target force and report the error. Exit code 1 if nothing was held."""
     from gripper_force.jobs import grasp as job
 
+    if not trials and (same_object or jobs is not None):
+        name = "--same-object" if same_object else "--jobs"
+        raise ConfigError(f"{name} only applies to several grasps; add --trials, or leave out {name}")
     if view is not None and trials:
         raise ConfigError("--view shows one grasp; leave out --trials")
     settings = load_settings(

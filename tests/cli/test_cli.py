@@ -726,6 +726,13 @@ def test_a_path_that_cannot_be_used_is_one_sentence(run: Run) -> None:
     assert Path("notes.txt").read_text() == "mine"
 
 
+def test_options_without_effect_are_refused(run: Run) -> None:
+    for words, name in ((["--same-object"], "--same-object"), (["--jobs", 1], "--jobs")):
+        done = run("grasp", *words)
+        assert done.code == 2
+        assert f"{name} only applies to several grasps; add --trials, or leave out {name}" in done.err
+
+
 def test_a_number_beyond_its_range_is_refused(run: Run) -> None:
     for words in (
         ["virtual-servo", "--id", 300],
