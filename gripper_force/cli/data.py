@@ -105,6 +105,8 @@ def simulate(
     else:
         raise ConfigError(f"no protocol {protocol!r}; use shin2019")
     names = [name for p in plans for name in p.names]
+    if not names:
+        raise ConfigError("there is nothing to simulate; give --presses, --taps or --grasps a number above 0")
     made = 0
     with console.bar("simulating", len(names)) as progress:
         progress("", sum((folder / name).exists() for name in names))

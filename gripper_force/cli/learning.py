@@ -370,9 +370,8 @@ def reproduce(
     options += set_ or []
     lengths = [f"steps={text}" for text in steps.split(",")] if steps else []
     scales = [section_from(Scale, [*options, length]) for length in lengths] or [section_from(Scale, options)]
+    pictures = _checked_pictures(folder, write)
     result = page.reproduce(names, scales, data, folder, jobs, console.bar_or_lines, end_s)
-    pictures = write.with_suffix("") if write else folder
-    pictures.mkdir(parents=True, exist_ok=True)
     figures = {}
     for name, figure in result.figures.items():
         if figure is not None:
@@ -393,3 +392,18 @@ def reproduce(
     console.show(printed, as_json, lambda _: paper_tables(tables, figures))
     if result.missing:
         console.warn(f"{result.missing}; run the same command again to continue")
+
+
+def _checked_pictures(folder: Path, page: Path | None) -> Path:
+    """Returns the folder of the figures. Raises `ConfigError` before the work if its results can't be written."""
+    from gripper_force.jobs.summary_files import check_writable
+
+    check_writable(folder)
+    if page is None:
+        return folder
+    if not (page.is_file() and os.access(page, os.W_OK)):
+        raise ConfigError(
+            f"can't write the tables into {page}: it is no file that can be written; name a page that exists"
+        )
+    check_writable(pictures := page.with_suffix(""), "--write")
+    return pictures

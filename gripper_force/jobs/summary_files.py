@@ -51,20 +51,20 @@ _NOTES: Final = {
 }
 
 
-def check_writable(folder: Path) -> None:
-    """Makes the folder before the work begins.
+def check_writable(folder: Path, option: str = "--out") -> None:
+    """Makes the folder that an option of the command names, before the work begins.
 
     Raises:
         ConfigError: The folder can't be made, no file can be written there, or the package for intervals is missing.
     """
-    require("scipy", "--out", ", or leave out --out")
+    require("scipy", option, f", or leave out {option}")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with TemporaryFile(dir=folder):
             pass
     except OSError as error:
         raise ConfigError(
-            f"can't write in the folder {folder} of --out: {error.strerror}; choose another"
+            f"can't write in the folder {folder} of {option}: {error.strerror}; choose another"
         ) from error
 
 

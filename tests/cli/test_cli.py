@@ -733,6 +733,22 @@ def test_options_without_effect_are_refused(run: Run) -> None:
         assert f"{name} only applies to several grasps; add --trials, or leave out {name}" in done.err
 
 
+def test_a_simulation_of_nothing_is_refused(run: Run) -> None:
+    done = run("simulate", "--presses", 0, "--grasps", 0)
+    assert (done.code, "there is nothing to simulate; give --presses" in done.err) == (2, True)
+
+
+def test_reproduce_checks_where_it_writes_before_its_work(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for words, sentence in (
+        (["--out", "file"], "can't write in the folder file of --out: File exists"),
+        (["--write", "no.md"], "can't write the tables into no.md: it is no file that can be written"),
+        (["--write", "."], "can't write the tables into .: it is no file"),
+    ):
+        done = run("reproduce", "3", "--data", "missing", *words)
+        assert (done.code, sentence in done.err) == (2, True), done.err
+
+
 def test_a_number_beyond_its_range_is_refused(run: Run) -> None:
     for words in (
         ["virtual-servo", "--id", 300],

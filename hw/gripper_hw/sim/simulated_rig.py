@@ -364,9 +364,10 @@ class SimulatedRig:
                 due_ns = time.monotonic_ns() - self.start_ns
                 lag_ns = due_ns - self._world.t_ns
                 if lag_ns > _REALTIME_MAX_LAG_NS:
+                    simpler = "" if self.scene.detail == "coarse" else "sim.detail=coarse or "
                     raise SimulationError(  # noqa: TRY301
                         f"this machine is too slow to simulate {self.scene.object!r} ({self.scene.detail}) "
-                        "in real time; set sim.detail=coarse or clock=lockstep"
+                        f"in real time; set {simpler}clock=lockstep"
                     )
                 self._world.advance_to(min(due_ns, self._world.t_ns + _REALTIME_SLICE_NS))
                 if lag_ns < _REALTIME_SLICE_NS:
