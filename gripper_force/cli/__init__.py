@@ -104,11 +104,21 @@ def main() -> NoReturn:
         else:  # native code, such as pydantic's, can turn an interrupt into an exception of its own
             interrupted = isinstance(end, KeyboardInterrupt) or process.is_interrupted()
         if interrupted:
-            console.err.print("interrupted; the run was stopped as configured", soft_wrap=True)
+            stopped = "; the run was stopped as configured" if _uses_gripper(sys.argv[1:]) else ""
+            console.err.print(f"interrupted{stopped}", soft_wrap=True)
             gc.freeze()  # Python would search all of PyTorch's objects for garbage, up to 2 s long
             sys.exit(process.interrupt_exit_code())
         raise
     sys.exit(0)
+
+
+def _uses_gripper(words: list[str]) -> bool:
+    """Returns True for the commands that run a gripper, real or simulated."""
+    if words[:1] == ["calibrate"]:
+        return words[1:2] not in (["network"], ["gain"]) and "--from" not in words
+    return words[:1] in (["grasp"], ["record"], ["setup"]) or (
+        words[:1] == ["teach"] and "--from" not in words
+    )
 
 
 def _fail_without_file(error: OSError) -> NoReturn:

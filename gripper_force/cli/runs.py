@@ -448,15 +448,22 @@ def virtual_servo(
     as_json: AsJson = False,
 ) -> None:
     """Serve virtual servos at a device path that any Dynamixel client can open, until Ctrl-C."""
+    from gripper_force.runtime import process
     from gripper_hw.dynamixel.pty_server import serve_virtual_servo
 
+    if ids is not None and len(set(ids)) < len(ids):
+        raise ConfigError(f"--id {' --id '.join(map(str, ids))} names a servo twice; give each its own id")
     servo = load_settings(None, set_, {"servo.model": model}).servo
     servo_ids = ids or list(servo.ids)
     with serve_virtual_servo(servo.model, servo_ids) as server:
-        console.show({"port": server.device_path, "model": servo.model, "ids": servo_ids}, as_json)
-        sys.stdout.flush()
-        console.err.print("serving until Ctrl-C")
-        signal.pause()
+        try:
+            console.show({"port": server.device_path, "model": servo.model, "ids": servo_ids}, as_json)
+            sys.stdout.flush()
+            console.err.print("serving until Ctrl-C")
+            signal.pause()
+        except KeyboardInterrupt:
+            if process.interrupt_exit_code() != 128 + signal.SIGINT:
+                raise  # SIGTERM or a lost terminal; Ctrl-C is the way to end it
 
 
 def _confirmed(servo: str, changes: "list[RegisterChange]", yes: bool) -> bool:

@@ -749,6 +749,32 @@ def test_reproduce_checks_where_it_writes_before_its_work(run: Run, tmp_path: Pa
         assert (done.code, sentence in done.err) == (2, True), done.err
 
 
+def test_only_a_command_with_a_run_says_that_it_was_stopped(
+    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("gripper_force.config.load_config", interrupted)
+    monkeypatch.setattr("gripper_force.vision.checkpoint_writer.check_place", interrupted)
+    stopped = "interrupted; the run was stopped as configured"
+    for words, said in (
+        (["grasp"], stopped),
+        (["record"], stopped),
+        (["calibrate", "jaws"], stopped),
+        (["calibrate", "object", "mug"], stopped),
+        (["calibrate", "object", "mug", "--from", tmp_path], "interrupted"),
+        (["train", tmp_path], "interrupted"),
+        (["evaluate", tmp_path], "interrupted"),
+    ):
+        assert run(*words).err.splitlines()[-1] == said, words
+
+
+def test_a_virtual_servo_has_one_id(run: Run) -> None:
+    done = run("virtual-servo", "--id", 1, "--id", 1)
+    assert (done.code, "--id 1 --id 1 names a servo twice" in done.err) == (2, True)
+
+
 def test_a_number_beyond_its_range_is_refused(run: Run) -> None:
     for words in (
         ["virtual-servo", "--id", 300],
