@@ -438,6 +438,17 @@ def test_retarget_without_letting_go(make_run):
     assert run.last.status.outcome == "held"
 
 
+@pytest.mark.parametrize("first", ["release", "move"])
+def test_a_repeated_release_lets_go_of_a_springy_object_as_slowly_as_one(make_run, first):
+    run = make_run(plant={"stiffness_n_m": 1_700.0, "friction_n": 0.6}, force_limit_n=19.0).grasp(11.0, 5.0)
+    run.go(0.02, first, width_m=0.092)
+    for _ in range(50):
+        run.go(0.02, "release")
+    speeds_m_s = [abs(servo.velocity_rad_s) * 0.02 for _, servo, _, _ in run.inputs[-300:]]
+    assert max(speeds_m_s) < 1.5 * 2 * run.config.approach_speed_m_s
+    assert run.last.status.phase == "release" or run.plant.x_m < 0.002
+
+
 @pytest.mark.parametrize("every", [1, 7, 20])
 def test_a_repeated_target_changes_nothing(make_run, every):
     run, once = make_run(), make_run().grasp(2.0, 4.0).grasp(5.0, 3.0)

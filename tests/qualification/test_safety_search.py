@@ -86,6 +86,14 @@ def test_jaws_that_begin_near_an_object_keep_a_small_limit(config: Config, index
     assert run_case(config, 0, index).ok
 
 
+def test_a_stream_of_requests_is_safe(config: Config) -> None:
+    requests = draw(config.control, RACK, 0, 1550).requests
+    assert len(requests) > 300
+    assert {one.kind for one in requests} == {"grasp", "release", "move"}
+    # A release that was requested again and again let go of a springy object at once: 2.0 times too fast.
+    assert run_case(config, 0, 1550).ok
+
+
 def test_a_network_that_lags_behind_the_jaws_confirms_no_end_stop(config: Config) -> None:
     assert draw(config.control, RACK, 0, 9326).motion_n > 4.0
     assert run_case(config, 0, 9326).ok
