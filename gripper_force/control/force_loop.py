@@ -100,7 +100,7 @@ class ForceLoop:
         self._trim_n = 0.0
         self._rising, self._side, self.is_lowering = True, 1.0, False
         self._lowers_again = False
-        self._repeat_s = self._high_s = self._highest_n = self._waited_s = 0.0
+        self._repeat_s = self._high_s = self._highest_n = self._waited_s = self._risen_n = 0.0
 
     @property
     def reference_n(self) -> float:
@@ -110,24 +110,33 @@ class ForceLoop:
     def start(self, force_n: float, target_n: float) -> None:
         """Starts a ramp at the present force."""
         self._trim_n, self._repeat_s, self._lowers_again = 0.0, 0.0, False
-        self._start(force_n, target_n)
+        self._risen_n = force_n
+        self._start(force_n, target_n, lowers=target_n < force_n)
 
     def retarget(self, target_n: float) -> None:
         """Starts a ramp at the present reference and keeps the trim.
 
-        A ramp in the same direction keeps its speed: targets that follow each other fast would never leave rest.
+        A ramp in the same direction keeps its speed: targets that follow each other fast would never leave rest. For a
+        target that is lower by less than the tolerance the jaws do not open.
         """
-        self._lowers_again = target_n < self.reference_n
-        self._repeat_s = _REPEAT_WITHIN_S if self._lowers_again else 0.0
-        goes_on = self.is_lowering == self._lowers_again
-        if not (goes_on and self.is_lowering):
+        lowers = target_n < self._risen_n - tolerance_n(target_n)
+        self._lowers_again, self._repeat_s = lowers, _REPEAT_WITHIN_S if lowers else 0.0
+        goes_on = self.is_lowering == lowers
+        if not (goes_on and lowers):
             self._highest_n, self._waited_s = self.reference_n, 0.0
-        self._start(self.reference_n, target_n, speed_n_s=self._profile.speed if goes_on else 0.0)
+        speed_n_s = self._profile.speed if goes_on else 0.0
+        self._start(self.reference_n, target_n, lowers=lowers, speed_n_s=speed_n_s)
 
     def _start(
-        self, force_n: float, target_n: float, fall_s: float = _LOWERING_S, speed_n_s: float = 0.0
+        self,
+        force_n: float,
+        target_n: float,
+        fall_s: float = _LOWERING_S,
+        *,
+        lowers: bool,
+        speed_n_s: float = 0.0,
     ) -> None:
-        self._rising, self.is_lowering = True, target_n < force_n
+        self._rising, self.is_lowering = True, lowers
         self._side = -1.0 if self.is_lowering else 1.0
         self._profile = TrapezoidalProfile(fall_s if self.is_lowering else _RAMP_S)
         rate_n_s = (force_n - target_n) / fall_s if self.is_lowering else self._ramp_n_s
@@ -165,6 +174,7 @@ class ForceLoop:
         else:
             waits = shortfall_n > _WAIT_SHARE * self.reference_n + _WAIT_N
         reference_n = self._profile.step(target_n, 0.0 if waits else dt_s)
+        self._risen_n = reference_n if self.is_lowering else max(self._risen_n, reference_n)
         error_n = 0.0
         # A constant motor force holds a constant contact force. The current alone carries no new information
         # on friction, so it is not fed back.
@@ -185,7 +195,7 @@ class ForceLoop:
         """Lowers the force again if it is still too high by motor current; one visual estimate may be an outlier."""
         again, self._lowers_again = self._lowers_again and estimate.source != EstimateSource.VISION, False
         if again and estimate.force_n > target_n + tolerance_n(target_n):
-            self._start(min(estimate.force_n, self._highest_n), target_n, _AGAIN_S)
+            self._start(min(estimate.force_n, self._highest_n), target_n, _AGAIN_S, lowers=True)
 
     def _repeat_lowering(self, dt_s: float, target_n: float, estimate: FusedForce) -> None:
         """Lowers the force again if the camera shows that it has stayed too high."""
@@ -197,7 +207,7 @@ class ForceLoop:
             self._repeat_s -= dt_s
             if self._high_s > _REPEAT_S:
                 self._repeat_s = 0.0
-                self._start(min(estimate.force_n, self._highest_n), target_n)
+                self._start(min(estimate.force_n, self._highest_n), target_n, lowers=True)
 
     def _beyond_deadband(self, error_n: float, band_n: float) -> float:
         forward_n = error_n if self._rising else -error_n

@@ -96,6 +96,16 @@ def test_retarget_starts_at_the_present_reference(loop, transmission):
     assert ramp(loop, 6.0) == pytest.approx(6.0 + transmission.friction_n)
 
 
+def test_lower_targets_within_the_tolerance_add_up_before_the_jaws_open(loop):
+    ramp(loop, 4.0)
+    lowered = []
+    for target_n in (3.95, 3.9, 3.86, 3.8):
+        loop.retarget(target_n)
+        loop.step(0.005, target_n, estimate(4.0))
+        lowered.append(loop.is_lowering)
+    assert lowered == [False, False, False, True]
+
+
 def test_the_ramp_is_not_faster_than_the_force_limit_allows(transmission):
     def rise_n_s(**keys):
         loop = ForceLoop(ControlConfig(**keys), transmission)
