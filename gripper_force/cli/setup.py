@@ -26,7 +26,10 @@ def setup(
         typer.Option(help="Run only this step: scan, servo, jaws, camera, load-cell or torque."),
     ] = None,
     fresh: Annotated[
-        bool, typer.Option("--fresh", help="Start over: forget what earlier steps found.")
+        bool,
+        typer.Option(
+            "--fresh", help="Start over: forget what earlier steps found. A copy of the rig file is kept."
+        ),
     ] = False,
     mass_kg: Annotated[
         float | None, typer.Option(help="Known mass for the load cell, or to hang from one jaw without one.")
@@ -56,8 +59,9 @@ def setup(
         except (GripperError, KeyboardInterrupt):
             status.stop()
             if running.rig.path.exists():
+                same = "the same command without --fresh" if fresh else "the same command"
                 console.err.print(
-                    f"what was found so far is in {config}; the same command continues there",
+                    f"what was found so far is in {config}; {same} continues there",
                     soft_wrap=True,
                     markup=False,
                 )

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from itertools import count
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -61,6 +62,27 @@ class RigFile:
         if fresh:
             rig.steps = {}
         return rig
+
+    def copy_before_fresh(self) -> Path | None:
+        """Copies the rig file into the folder, before a fresh start replaces it.
+
+        Returns:
+            The copy; None if there is no rig file.
+
+        Raises:
+            ConfigError: The copy can't be written.
+        """
+        if not self.path.exists():
+            return None
+        content = self.path.read_bytes()
+        copies = (
+            self.folder / f"before-fresh{'' if number == 1 else f'-{number}'}.yaml" for number in count(1)
+        )
+        # The same content is there if a fresh start ended before its first step.
+        copy = next(one for one in copies if not one.exists() or one.read_bytes() == content)
+        if not copy.exists():
+            write_all({copy: content})
+        return copy
 
     @property
     def _state(self) -> Path:

@@ -123,16 +123,21 @@ class Setup:
             path: The rig file.
             overrides: Assignments ``key.path=value``; they go into the file.
             only: Name of the only step to run, even if it is finished; None: all that are not.
-            fresh: Forgets what earlier steps found.
+            fresh: Forgets what earlier steps found. `run` first copies the rig file into the setup's folder.
             mass_kg: Known mass for the load cell, or without one for a jaw; None: asked for.
             gauge_mm: Width of the load cell between the jaws; None: asked for.
 
         Raises:
             ConfigError: A file, key or value is wrong.
         """
+        if fresh and only is not None:
+            raise ConfigError(
+                f"--fresh forgets what all steps found, and --step {only} runs only this one; leave out --fresh to run "
+                "the step again, or --step to start over"
+            )
         load_config(path if path.exists() else None, overrides)  # its messages name the file
         self.rig = RigFile.load(path, overrides, fresh=fresh)
-        self._has_overrides = bool(overrides)
+        self._has_overrides, self._fresh = bool(overrides), fresh
         self._only, self._mass_kg, self._gauge_mm = only, mass_kg, gauge_mm
 
     @property
@@ -150,6 +155,8 @@ class Setup:
         Raises:
             GripperError: A step failed. What earlier steps found is in the rig file.
         """
+        if self._fresh and (copy := self.rig.copy_before_fresh()) is not None:
+            person.tell(f"the earlier rig file is kept as {copy}")
         for number, (name, step) in enumerate(STEPS.items(), 1):
             if self._only not in (None, name):
                 continue

@@ -105,6 +105,24 @@ def test_values_that_a_person_writes_are_kept_and_named(tmp_path: Path) -> None:
     assert not RigFile.load(path, None, fresh=True).found
 
 
+def test_a_fresh_start_keeps_a_copy_and_takes_no_step(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    copies = [tmp_path / "rig-setup" / name for name in ("before-fresh.yaml", "before-fresh-2.yaml")]
+    for number, copy in enumerate(copies):
+        path.write_text(f"servo: {{id: {number}}}\n", encoding="utf-8")
+        for _ in range(2):  # the second run copies nothing new
+            next(Setup(path, SIMULATED, fresh=True).run(script := Script()))
+            assert f"the earlier rig file is kept as {copy}" == script.told[0]
+            path.write_text(f"servo: {{id: {number}}}\n", encoding="utf-8")
+    assert [copy.read_text(encoding="utf-8") for copy in copies] == ["servo: {id: 0}\n", "servo: {id: 1}\n"]
+    assert len(list((tmp_path / "rig-setup").glob("before-fresh*"))) == 2
+    with pytest.raises(ConfigError, match=r"--fresh forgets .* --step torque .* leave out --fresh"):
+        Setup(path, fresh=True, only="torque")
+    next(Setup(new := tmp_path / "new.yaml", SIMULATED, fresh=True).run(script := Script()))
+    assert new.exists()
+    assert not any("kept" in text for text in script.told)
+
+
 def test_a_step_that_runs_again_forgets_what_it_found_before(tmp_path: Path) -> None:
     rig = RigFile(tmp_path / "rig.yaml")
     jaws = {"gripper.friction_n": Found(0.5, "homed"), "gripper.pinion_radius_m": Found(0.015, ANSWERED)}
