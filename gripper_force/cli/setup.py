@@ -22,8 +22,8 @@ def setup(
         Path, typer.Option("--config", help="Rig file to write; an existing one is continued.")
     ] = Path("rig.yaml"),
     step: Annotated[
-        str | None,
-        typer.Option(help="Run only this step: scan, servo, jaws, camera, load-cell or torque."),
+        list[str] | None,
+        typer.Option(help="Run only this step: scan, servo, jaws, camera, load-cell or torque. Repeatable."),
     ] = None,
     fresh: Annotated[
         bool,
@@ -45,9 +45,8 @@ def setup(
     as_json: AsJson = False,
 ) -> None:
     """Set up a rig step by step, and write one file for `grasp --config`. Continues after the last finished step."""
-    from gripper_calibration.setup.run import Setup, check_step
+    from gripper_calibration.setup.run import Setup
 
-    check_step(step)
     running = Setup(config, set_, only=step, fresh=fresh, mass_kg=mass_kg, gauge_mm=gauge_mm)
     reports = []
     with console.err.status("setting up") as status:

@@ -112,7 +112,7 @@ class Setup:
         path: Path,
         overrides: list[str] | None = None,
         *,
-        only: str | None = None,
+        only: str | Sequence[str] | None = None,
         fresh: bool = False,
         mass_kg: float | None = None,
         gauge_mm: float | None = None,
@@ -122,23 +122,26 @@ class Setup:
         Args:
             path: The rig file.
             overrides: Assignments ``key.path=value``; they go into the file.
-            only: Name of the only step to run, even if it is finished; None: all that are not.
+            only: Name of the only step to run, even if it is finished, or names of several, which run in the order of
+                `STEPS`; None: all that are not finished.
             fresh: Forgets what earlier steps found. `run` first copies the rig file into the setup's folder.
             mass_kg: Known mass for the load cell, or without one for a jaw; None: asked for.
             gauge_mm: Width of the load cell between the jaws; None: asked for.
 
         Raises:
-            ConfigError: A file, key or value is wrong.
+            ConfigError: A file, key, value or step is wrong.
         """
-        if fresh and only is not None:
+        steps = [only] if isinstance(only, str) else list(only or ())
+        check_steps(steps)
+        if fresh and steps:
             raise ConfigError(
-                f"--fresh forgets what all steps found, and --step {only} runs only this one; leave out --fresh to run "
-                "the step again, or --step to start over"
+                f"--fresh forgets what all steps found, but --step {steps[0]} does not run the others; leave out "
+                "--fresh to run the step again, or --step to start over"
             )
         load_config(path if path.exists() else None, overrides)  # its messages name the file
         self.rig = RigFile.load(path, overrides, fresh=fresh)
         self._has_overrides, self._fresh = bool(overrides), fresh
-        self._only, self._mass_kg, self._gauge_mm = only, mass_kg, gauge_mm
+        self._only, self._mass_kg, self._gauge_mm = steps, mass_kg, gauge_mm
 
     @property
     def config(self) -> Config:
@@ -158,9 +161,9 @@ class Setup:
         if self._fresh and (copy := self.rig.copy_before_fresh()) is not None:
             person.tell(f"the earlier rig file is kept as {copy}")
         for number, (name, step) in enumerate(STEPS.items(), 1):
-            if self._only not in (None, name):
+            if self._only and name not in self._only:
                 continue
-            if self._only is None and name in self.rig.steps:
+            if not self._only and name in self.rig.steps:
                 changed = self._changed(name, step)
                 if not changed:
                     yield self._kept(name)
@@ -180,7 +183,7 @@ class Setup:
             )
             outcome = step.run(task)
             report = self._finish(name, step, outcome)
-            outdated = self.rig.outdate(name)
+            outdated = [one for one in self.rig.outdate(name) if one not in self._only]
             if self._only and outdated:
                 person.tell(f"{', '.join(outdated)} rests on what {name} found: run setup without --step")
             yield report
@@ -228,7 +231,8 @@ class Setup:
         return [key for key in now if now[key] != before.get(key)]
 
 
-def check_step(name: str | None) -> None:
-    """Raises `ConfigError` if there is no step of this name."""
-    if name is not None and name not in STEPS:
-        raise ConfigError(f"there is no step {name!r}; use one of {', '.join(STEPS)}")
+def check_steps(names: Sequence[str]) -> None:
+    """Raises `ConfigError` if there is no step of one of these names."""
+    for name in names:
+        if name not in STEPS:
+            raise ConfigError(f"there is no step {name!r}; use one of {', '.join(STEPS)}")

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from gripper_calibration.setup.rig_file import RigFile, flat
-from gripper_calibration.setup.run import STEPS, Setup, check_step
+from gripper_calibration.setup.run import STEPS, Setup
 from gripper_calibration.setup.step import ANSWERED, Found
 from gripper_force.config import load_config
 from gripper_force.errors import ConfigError
@@ -164,6 +164,14 @@ def test_a_baud_rate_is_saved_though_the_step_fails(tmp_path: Path) -> None:
     assert RigFile.load(rig.path, None, fresh=False).steps == {}
 
 
+def test_named_steps_run_in_their_order(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    reports = Setup(path, ["servo.backend=simulated", "load_cell.backend=none"], only=["servo", "scan"]).run(
+        Script()
+    )
+    assert [report.name for report in reports] == ["scan", "servo"]
+
+
 def test_a_damaged_state_and_an_unknown_step_are_named(tmp_path: Path) -> None:
     path = tmp_path / "rig.yaml"
     rig = RigFile(path)
@@ -172,7 +180,7 @@ def test_a_damaged_state_and_an_unknown_step_are_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"state\.json.*delete it"):
         RigFile.load(path, None, fresh=False)
     with pytest.raises(ConfigError, match="no step 'jaw'; use one of scan, servo, jaws"):
-        check_step("jaw")
+        Setup(tmp_path / "new.yaml", only="jaw")
 
 
 @pytest.mark.parametrize("name", ["xm430_oak_hx711", "xl330_webcam_hx711", "viperx_oak"])
