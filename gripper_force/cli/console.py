@@ -84,9 +84,14 @@ def warn(text: str) -> None:
     err.print(f"[yellow]warning:[/] {escape(text)}", soft_wrap=True)
 
 
+def command(*words: object) -> str:
+    """Returns a command of gripper-force as a shell takes it, by its words."""
+    return shlex.join(map(str, ("gripper-force", *words)))
+
+
 def next_step(*words: object) -> None:
     """Prints the step that usually follows, as the last line: a command of gripper-force by its words."""
-    err.print(f"next: {shlex.join(map(str, ('gripper-force', *words)))}", soft_wrap=True, markup=False)
+    err.print(f"next: {command(*words)}", soft_wrap=True, markup=False)
 
 
 def prompt(yes: bool, status: "Status | Bar | None" = None) -> "Prompt":

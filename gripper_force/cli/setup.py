@@ -8,11 +8,13 @@ import typer
 
 from gripper_force.cli import console
 from gripper_force.cli.options import AsJson, Overrides
-from gripper_force.cli.output.setup import setup_report, step_lines
+from gripper_force.cli.output.setup import step_lines
 from gripper_force.errors import ConfigError, GripperError
 
 if TYPE_CHECKING:
     from rich.status import Status
+
+    from gripper_calibration.setup.run import Setup
 
 T = TypeVar("T")
 
@@ -65,16 +67,22 @@ def setup(
                     markup=False,
                 )
             raise
-    next_command = _next(running.config.load_cell.backend, running.config.uses_vision, config)
-    result = {"rig": config, "steps": reports, "next": next_command}
-    console.show(result, as_json, lambda _: setup_report(config, next_command))
+    words = _next(running, config)
+    result = {"rig": config, "steps": reports, "next": console.command(*words)}
+    console.show(
+        result, as_json, lambda _: console.out.print(f"rig file: {config}", soft_wrap=True, markup=False)
+    )
+    console.next_step(*words)
 
 
-def _next(load_cell: str, vision: bool, path: Path) -> str:
-    """The command that follows: teaching needs camera and load cell."""
-    if vision and load_cell != "none":
-        return f"gripper-force teach NAME --config {path}"
-    return f"gripper-force grasp --config {path} --target-n 3"
+def _next(running: "Setup", path: Path) -> list[str]:
+    """Returns the words of the command that follows: teaching needs camera and load cell, and all need each step."""
+    settings, place = running.config, ["--config", str(path)]
+    if running.pending:
+        return ["setup", *place]
+    if settings.uses_vision and settings.load_cell.backend != "none":
+        return ["teach", "NAME", *place]
+    return ["grasp", *place, "--target-n", "3"]
 
 
 class _Terminal:

@@ -1,7 +1,8 @@
 """The rig file of a setup: a configuration whose comments say where each value comes from; and its state."""
 
 import json
-from collections.abc import Mapping
+import shlex
+from collections.abc import Iterable, Mapping
 from itertools import count
 from pathlib import Path
 from typing import Any, Final, Self
@@ -144,13 +145,19 @@ class RigFile:
         self.take(values)
         self.write()
 
-    def finish(self, name: str, step: Tree) -> None:
+    def finish(self, name: str, step: Tree, order: Iterable[str] = ()) -> None:
         """Notes a finished step, and writes the rig file and the state.
+
+        Args:
+            name: Its name.
+            step: What is to be kept of it.
+            order: Names of all steps, in the order in which they refine each other's values.
 
         Raises:
             ConfigError: One can't be written.
         """
         self.steps[name] = step
+        self.steps = {one: self.steps[one] for one in (*order, *self.steps) if one in self.steps}
         self.write()
 
     def write(self) -> None:
@@ -192,7 +199,7 @@ class RigFile:
         origins = {key: found.origin for key, found in self.values.items()}
         head = (
             "# Written by `gripper-force setup`. You may change values; comments are lost when it runs again.\n"
-            f"# gripper-force grasp --config {self.path} --target-n 3\n"
+            f"# gripper-force grasp --config {shlex.quote(str(self.path))} --target-n 3\n"
         )
         return head + "".join(f"{line}\n" for line in _lines(self.tree(), origins, list(Config.model_fields)))
 

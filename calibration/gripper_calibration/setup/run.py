@@ -148,6 +148,13 @@ class Setup:
         """The configuration so far."""
         return load_config(None, self.rig.tree())
 
+    @property
+    def pending(self) -> list[str]:
+        """Names of the steps that are not finished, or rest on values which have changed since."""
+        return [
+            name for name, step in STEPS.items() if name not in self.rig.steps or self._changed(name, step)
+        ]
+
     def run(self, person: Person, progress: Progress = no_progress) -> Iterator[StepReport]:
         """Runs the steps and writes the rig file after each.
 
@@ -203,6 +210,7 @@ class Setup:
                 "rests_on": self._inputs(step),
                 "values": outcome.values,
             },
+            STEPS,
         )
         values = {key: found.value for key, found in outcome.values.items()}
         return StepReport(

@@ -1,9 +1,8 @@
-"""Lines of `setup`: what a step found, and the end."""
+"""Lines of `setup`: what a step found."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gripper_force.cli.console import err, out
+from gripper_force.cli.console import err
 
 if TYPE_CHECKING:  # --help loads no NumPy
     from gripper_calibration.setup.run import StepReport
@@ -19,9 +18,3 @@ def step_lines(report: "StepReport") -> None:
         err.print(f"  - {remark}", soft_wrap=True, markup=False)
     for what, path in report.files.items():
         err.print(f"  {what}: {path}", soft_wrap=True, markup=False)
-
-
-def setup_report(rig: Path, next_command: str) -> None:
-    """Prints the rig file and the next command."""
-    out.print(f"rig file: {rig}", soft_wrap=True, markup=False)
-    out.print(f"next: {next_command}", soft_wrap=True, markup=False)

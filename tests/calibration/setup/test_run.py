@@ -137,6 +137,10 @@ def test_a_step_that_runs_again_forgets_what_it_found_before(tmp_path: Path) -> 
     again.forget("jaws")
     assert flat(again.tree())["gripper.pinion_radius_m"] == 0.015, "an answer is kept"
     assert again.outdate("jaws") == ["torque"]
+    rig = RigFile(tmp_path / "other.yaml")  # the steps ran in another order
+    for name, values in (("torque", torque), ("jaws", jaws)):
+        rig.finish(name, {"values": values, "rests_on": {}}, STEPS)
+    assert rig.outdate("jaws") == ["torque"]
 
 
 @pytest.mark.parametrize(

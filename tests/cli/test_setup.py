@@ -1,0 +1,57 @@
+"""The command `setup` and its questions."""
+
+import json
+import shlex
+from pathlib import Path
+
+from typer.testing import CliRunner
+
+from gripper_calibration.setup.rig_file import RigFile
+from gripper_calibration.setup.run import STEPS, Setup
+from gripper_force.cli import app
+
+QUICK = [
+    "--set",
+    "servo.backend=simulated",
+    "--set",
+    "load_cell.backend=none",
+    "--set",
+    "camera.backend=none",
+]
+
+
+def finished(path: Path, *overrides: str) -> None:
+    """Writes a rig file all of whose steps are finished."""
+    rig = Setup(path, [*QUICK[1::2], *overrides])
+    for name, step in STEPS.items():
+        rig.rig.finish(
+            name,
+            {
+                "date": "2026-01-02",
+                "summary": f"{name} done",
+                "remarks": [],
+                "files": {},
+                "rests_on": rig._inputs(step),
+            },
+        )
+
+
+def test_the_next_command_finishes_the_setup_first_and_can_be_pasted(tmp_path: Path) -> None:
+    path = tmp_path / "my rig" / "rig.yaml"
+    path.parent.mkdir()
+    end = CliRunner().invoke(
+        app, ["setup", "--config", str(path), "--step", "servo", *QUICK, "--yes", "--json"]
+    )
+    assert end.exit_code == 0, end.stderr
+    command = f"gripper-force setup --config {shlex.quote(str(path))}"
+    assert end.stderr.splitlines()[-1] == f"next: {command}"
+    assert json.loads(end.stdout)["next"] == command
+    finished(path)
+    end = CliRunner().invoke(app, ["setup", "--config", str(path), "--step", "servo", "--yes"])
+    grasp = f"gripper-force grasp --config {shlex.quote(str(path))} --target-n 3"
+    assert end.stderr.splitlines()[-1] == f"next: {grasp}"
+    assert end.stdout == f"rig file: {path}\n"
+    assert f"# {grasp}\n" in path.read_text(encoding="utf-8")
+    RigFile.load(path, ["gripper.pinion_radius_m=0.01"], fresh=False).write()  # torque is outdated
+    end = CliRunner().invoke(app, ["setup", "--config", str(path), "--step", "servo", "--yes"])
+    assert end.stderr.splitlines()[-1] == f"next: {command}"
