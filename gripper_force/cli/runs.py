@@ -471,9 +471,9 @@ def _confirmed(servo: str, changes: "list[RegisterChange]", yes: bool) -> bool:
     try:
         return yes or typer.confirm(f"Write these to {servo}?", err=True)
     except typer.Abort as abort:
-        if not isinstance(abort.__context__, EOFError):
-            raise
         console.err.print()
+        if not isinstance(abort.__context__, EOFError):
+            raise KeyboardInterrupt from abort  # typer would end with code 1
         raise ConfigError(
             f"the question was not answered, so nothing was written to {servo}; pass --yes in scripts"
         ) from abort

@@ -126,9 +126,9 @@ class _Terminal:
         try:
             answer = ask()
         except typer.Abort as abort:
-            if not isinstance(abort.__context__, EOFError):
-                raise
             console.err.print()
+            if not isinstance(abort.__context__, EOFError):
+                raise KeyboardInterrupt from abort  # typer would end with code 1
             raise ConfigError(f"this was not answered: {question}; pass {option} in scripts") from abort
         self._status.start()
         return answer

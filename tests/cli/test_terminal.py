@@ -1,16 +1,23 @@
 """Terminal behaviour: escape codes only on a terminal that wants them, progress that a log file can hold, exit codes."""
 
+import fcntl
 import os
 import re
+import select
 import signal
 import subprocess
 import sys
+import termios
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 
 COMMAND = [sys.executable, "-c", "from gripper_force.cli import main; main()"]
 TAP = "simulate --presses 0 --grasps 0 --taps 1 --object stapler --set sim.detail=coarse --jobs 1"
+_AGAIN_S = 2.0
+"""Silence after which keys are pressed again: Python misses an interrupt just before it begins to read the terminal."""
+
 ESCAPE = re.compile(r"\x1b")
 COLOUR = re.compile(r"\x1b\[[0-9;]*\b([349]|10)[0-8](;[0-9;]*)?m")
 CALLS = {
@@ -21,20 +28,43 @@ CALLS = {
 }
 
 
-def on_terminal(arguments: str, folder: Path, **variables: str) -> tuple[int, str]:
-    """Runs the command in a terminal. Returns its exit code, and what the terminal got."""
+def on_terminal(
+    arguments: str, folder: Path, keys: Mapping[str, bytes] | None = None, **variables: str
+) -> tuple[int, str]:
+    """Runs the command in a terminal, and presses keys once it shows a text. Returns exit code and what it showed."""
+    left, pressed = dict(keys or {}), b""
     env = {key: value for key, value in os.environ.items() if key not in ("NO_COLOR", "FORCE_COLOR", "TERM")}
     master, slave = os.openpty()
     command = [*COMMAND, *arguments.split()]
     with subprocess.Popen(
-        command, cwd=folder, env=env | variables, stdin=slave, stdout=slave, stderr=slave
+        command,
+        cwd=folder,
+        env=env | variables,
+        stdin=slave,
+        stdout=slave,
+        stderr=slave,
+        preexec_fn=_own_terminal if keys else None,
     ) as child:
         os.close(slave)
         parts = []
-        while part := _read(master):
+        while True:
+            if pressed and not select.select([master], [], [], _AGAIN_S)[0]:
+                os.write(master, pressed)
+                continue
+            if not (part := _read(master)):
+                break
             parts.append(part)
+            for text in [one for one in left if one.encode() in b"".join(parts)]:
+                pressed = left.pop(text)
+                os.write(master, pressed)
     os.close(master)
     return child.returncode, b"".join(parts).decode()
+
+
+def _own_terminal() -> None:
+    """Makes stdin the terminal that sends Ctrl-C to this process."""
+    os.setsid()
+    fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 
 
 def _read(master: int) -> bytes:
@@ -88,6 +118,23 @@ def test_without_a_terminal_a_bar_is_printed_once(tmp_path: Path) -> None:
     assert " 1/1 " in done.stderr
     assert done.stderr.splitlines()[-1] == "next: gripper-force train data/sim --out force.safetensors"
     assert "logs" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "question"),
+    [
+        ("setup", "Write it (EEPROM)? "),
+        ("setup --step jaws", "Pitch radius of the pinion in mm"),
+        ("doctor --setup", "Write these to servo 1? "),
+    ],
+    ids=["a question of setup", "a number for setup", "the question of doctor"],
+)
+def test_ctrl_c_at_a_question_ends_with_130(arguments: str, question: str, tmp_path: Path) -> None:
+    options = "--set servo.port=virtual:asked --set load_cell.backend=none --set camera.backend=none"
+    code, shown = on_terminal(f"{arguments} {options}", tmp_path, keys={question: b"\x03"}, TERM="dumb")
+    assert code == 130
+    assert shown.splitlines()[-1].split(";")[0] == "interrupted"
+    assert ("what was found so far is in rig.yaml" in shown) == (arguments == "setup")
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
