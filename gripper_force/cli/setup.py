@@ -112,14 +112,20 @@ class _Terminal:
             self.tell(f"answer one of {', '.join(answers)}")
 
     def number(self, question: str, option: str, default: float | None = None) -> float:
+        from gripper_calibration.setup.step import is_answer
+
         if self._yes:
             if default is None:
                 raise ConfigError(f"this needs an answer: {question}; pass {option}")
             self.tell(f"{question}: {default:g} (default)")
             return default
-        return float(
-            self._ask(question, lambda: typer.prompt(question, default, type=float, err=True), option)
-        )
+        while True:
+            answer = self._ask(
+                question, lambda: typer.prompt(question, default, type=float, err=True), option
+            )
+            if is_answer(number := float(answer), default):
+                return number
+            self.tell(f"{number:g} is not possible; answer with a positive number")
 
     def _ask(self, question: str, ask: Callable[[], T], option: str) -> T:
         self._status.stop()

@@ -4,15 +4,17 @@ import json
 import shlex
 from pathlib import Path
 
+import pytest
 from typer.testing import CliRunner
 
 from gripper_calibration.setup.rig_file import RigFile
 from gripper_calibration.setup.run import STEPS, Setup
 from gripper_force.cli import app
+from gripper_force.errors import ConfigError
 
 QUICK = [
     "--set",
-    "servo.backend=simulated",
+    "servo.port=virtual:asked",
     "--set",
     "load_cell.backend=none",
     "--set",
@@ -34,6 +36,22 @@ def finished(path: Path, *overrides: str) -> None:
                 "rests_on": rig._inputs(step),
             },
         )
+
+
+@pytest.mark.parametrize("wrong", ["0", "-20", "nan", "inf"])
+def test_a_wrong_number_is_asked_for_again(tmp_path: Path, wrong: str) -> None:
+    arguments = ["setup", "--config", str(tmp_path / "rig.yaml"), "--step", "jaws", *QUICK]
+    end = CliRunner().invoke(app, arguments, input=f"{wrong}\n20\n{wrong}\n")
+    assert end.stderr.count(f"{float(wrong):g} is not possible; answer with a positive number") == 2
+    assert end.stderr.count("Pitch radius of the pinion in mm") == 2
+    assert isinstance(end.exception, ConfigError)
+    assert "was not answered: Distance between the open jaws" in str(end.exception)
+
+
+def test_nothing_is_an_answer_where_it_is_the_default(tmp_path: Path) -> None:
+    arguments = ["setup", "--config", str(tmp_path / "rig.yaml"), "--step", "torque", *QUICK]
+    end = CliRunner().invoke(app, arguments, input="0\n")
+    assert "torque constant of the data sheet" in end.stderr
 
 
 def test_the_next_command_finishes_the_setup_first_and_can_be_pasted(tmp_path: Path) -> None:

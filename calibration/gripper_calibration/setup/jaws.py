@@ -29,7 +29,7 @@ def jaws(task: Task) -> Outcome:
         if f"gripper.{key}" in task.given or rack_only:
             continue
         default_mm = 1e3 * getattr(config.gripper, key)
-        answer_m = 1e-3 * task.person.number(question, f"--set gripper.{key}=METRES", default_mm)
+        answer_m = 1e-3 * task.number(question, f"--set gripper.{key}=METRES", default_mm)
         config = config.with_values(gripper={key: answer_m})
         is_default = math.isclose(answer_m, getattr(GripperConfig(), key))
         origin = "default, not measured" if is_default else ANSWERED

@@ -4,7 +4,6 @@ from typing import Final
 
 from gripper_calibration.procedures.calibrate_load_cell import calibrate_load_cell
 from gripper_calibration.setup.step import Found, Outcome, Task
-from gripper_force.errors import ConfigError
 from gripper_force.jobs import doctor
 from gripper_force.profiles.rig_profile import CalibratedValue
 from gripper_force.types import STANDARD_GRAVITY_M_S2
@@ -33,9 +32,7 @@ def load_cell(task: Task) -> Outcome:
         return Outcome(f"the {backend} load cell gives newtons and needs no calibration")
     mass_kg = task.mass_kg
     if mass_kg is None:
-        mass_kg = 1e-3 * task.person.number("Known mass in grams", "--mass-kg KG")
-    if mass_kg <= 0:
-        raise ConfigError(f"a mass of {mass_kg:g} kg can't calibrate the load cell; use one of 0.2 to 1 kg")
+        mass_kg = 1e-3 * task.number("Known mass in grams", "--mass-kg KG")
     found = calibrate_load_cell(
         task.config,
         mass_kg * STANDARD_GRAVITY_M_S2,

@@ -12,7 +12,7 @@ from gripper_calibration.setup.load_cell import load_cell
 from gripper_calibration.setup.rig_file import RigFile, flat
 from gripper_calibration.setup.scan import scan
 from gripper_calibration.setup.servo import servo
-from gripper_calibration.setup.step import Outcome, Person, Task
+from gripper_calibration.setup.step import Outcome, Person, Task, is_answer
 from gripper_calibration.setup.torque import torque
 from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError
@@ -129,7 +129,7 @@ class Setup:
             gauge_mm: Width of the load cell between the jaws; None: asked for.
 
         Raises:
-            ConfigError: A file, key, value or step is wrong.
+            ConfigError: A file, key, value, step, mass or width is wrong.
         """
         steps = [only] if isinstance(only, str) else list(only or ())
         check_steps(steps)
@@ -138,6 +138,9 @@ class Setup:
                 f"--fresh forgets what all steps found, but --step {steps[0]} does not run the others; leave out "
                 "--fresh to run the step again, or --step to start over"
             )
+        for text, value in (("--mass-kg", mass_kg), ("--gauge-mm", gauge_mm)):
+            if value is not None and not is_answer(value, None):
+                raise ConfigError(f"{text} is {value:g}; pass a positive number, or leave {text} out")
         load_config(path if path.exists() else None, overrides)  # its messages name the file
         self.rig = RigFile.load(path, overrides, fresh=fresh)
         self._has_overrides, self._fresh = bool(overrides), fresh

@@ -1,11 +1,13 @@
 """Vocabulary of the steps of a setup: what a step gets, asks and finds."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
 
 from gripper_force.config import Config
+from gripper_force.errors import ConfigError
 from gripper_force.progress import Progress
 
 
@@ -29,8 +31,16 @@ class Person(Protocol):
         ...
 
     def number(self, question: str, option: str, default: float | None = None) -> float:
-        """Returns a number. A script takes the default; without one `ConfigError` names its ``option``."""
+        """Returns a number that `is_answer` accepts.
+
+        A script takes the default; without one `ConfigError` names its ``option``.
+        """
         ...
+
+
+def is_answer(number: float, default: float | None) -> bool:
+    """Returns True if a number can answer a question for a length or a mass: it is positive, or the default."""
+    return number == default or 0 < number < math.inf
 
 
 ANSWERED: Final = "as you answered"
@@ -67,6 +77,19 @@ class Task:
     mass_kg: float | None = None
     gauge_mm: float | None = None
     keep: Callable[[Mapping[str, Found]], None] = lambda values: None
+
+    def number(self, question: str, option: str, default: float | None = None) -> float:
+        """Asks the person for a number.
+
+        Raises:
+            ConfigError: The answer is not a positive number, or a script has no answer.
+        """
+        number = self.person.number(question, option, default)
+        if not is_answer(number, default):
+            raise ConfigError(
+                f"{number:g} can't answer this: {question}; give a positive number, or pass {option}"
+            )
+        return number
 
 
 @dataclass(frozen=True, slots=True)

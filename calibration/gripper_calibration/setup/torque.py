@@ -36,9 +36,7 @@ def torque(task: Task) -> Outcome:
     gauge_mm = task.gauge_mm
     if gauge_mm is None:
         default = _SIM_GAUGE_MM if simulated else None
-        gauge_mm = task.person.number(
-            "Width of the load cell between the jaws in mm", "--gauge-mm MM", default
-        )
+        gauge_mm = task.number("Width of the load cell between the jaws in mm", "--gauge-mm MM", default)
     pressed = config.with_values(object=_SIM_GAUGE) if simulated else config
     found = calibrate_servo(
         pressed, [1e-3 * gauge_mm], task.folder / PROFILE, prompt=task.person.do, progress=task.progress
@@ -75,7 +73,7 @@ def _weight(task: Task) -> Outcome:
         return _data_sheet(task)
     mass_kg = task.mass_kg
     if mass_kg is None:
-        mass_kg = 1e-3 * task.person.number(
+        mass_kg = 1e-3 * task.number(
             f"Known mass to hang from one jaw in grams, {1e3 * least_kg:.0f} to {1e3 * most_kg:.0f}; 0 for none",
             "--mass-kg KG",
             0.0,

@@ -168,9 +168,30 @@ def test_a_baud_rate_is_saved_though_the_step_fails(tmp_path: Path) -> None:
     assert RigFile.load(rig.path, None, fresh=False).steps == {}
 
 
+class Wrong(Script):
+    """Answers each question for a number with the same one."""
+
+    def __init__(self, answer: float) -> None:
+        super().__init__()
+        self._answer = answer
+
+    def number(self, question: str, option: str, default: float | None = None) -> float:
+        return self._answer
+
+
+@pytest.mark.parametrize("answer", [0.0, -20.0, float("nan"), float("inf")])
+def test_a_length_that_can_not_be_is_refused_before_the_jaws_move(tmp_path: Path, answer: float) -> None:
+    path = tmp_path / "rig.yaml"
+    with pytest.raises(ConfigError, match=r"can't answer this: Pitch radius .*--set gripper.pinion_radius_m"):
+        list(Setup(path, SIMULATED, only="jaws").run(Wrong(answer)))
+    for option, name in (("mass_kg", "--mass-kg"), ("gauge_mm", "--gauge-mm")):
+        with pytest.raises(ConfigError, match=f"{name} is .* pass a positive number"):
+            Setup(path, **{option: answer})  # type: ignore[arg-type]
+
+
 def test_named_steps_run_in_their_order(tmp_path: Path) -> None:
     path = tmp_path / "rig.yaml"
-    reports = Setup(path, ["servo.backend=simulated", "load_cell.backend=none"], only=["servo", "scan"]).run(
+    reports = Setup(path, ["servo.port=virtual:order", "load_cell.backend=none"], only=["servo", "scan"]).run(
         Script()
     )
     assert [report.name for report in reports] == ["scan", "servo"]
