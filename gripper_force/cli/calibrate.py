@@ -55,9 +55,6 @@ Fresh = Annotated[
 Pause = Annotated[
     bool, typer.Option("--pause", help="Wait for Enter before each touch, to place the object again.")
 ]
-_NOTED_SHIFT_M = 0.003
-"""Change of the widths by `calibrate servo` that a person should hear of."""
-
 TouchSeed = Annotated[int | None, typer.Option(help="Seed of the touches, and of a simulated scene.")]
 
 
@@ -149,12 +146,8 @@ def servo(
             progress=_progress(status),
         )
     _show_rig(result, as_json)
-    if abs(result.width_shift_m) > _NOTED_SHIFT_M:
-        console.warn(
-            f"with this calibration every width is {1e3 * abs(result.width_shift_m):.0f} mm "
-            f"{'larger' if result.width_shift_m > 0 else 'smaller'} than the configuration said; if its widths were "
-            "right, the gauge has another width than --gauge-mm"
-        )
+    if (text := result.width_remark) is not None:
+        console.warn(text)
     words = (
         ["calibrate", "camera", "--object", "NAME"] if settings.uses_vision else ["grasp", "--object", "NAME"]
     )

@@ -68,6 +68,8 @@ _FIRST_SAMPLE_NS: Final = 5 * NS_PER_S
 """Longest wait for the first sample: boards that reset when their port is opened are silent for 1.6 s."""
 _SILENT_NS: Final = 3 * NS_PER_S // 2
 """Longest silence during a motion. At 10 samples/s, a sample waits 0.3 s for those that show if it is a spike."""
+_NOTED_SHIFT_M: Final = 0.003
+"""Change of the widths that a person should hear of."""
 _BEYOND_RAD: Final = 1.0
 """Distance of the goal beyond the contact, so that only the current limits the force."""
 
@@ -101,6 +103,17 @@ class ServoResult:
     width_shift_m: float
     rig: Path
     report: Path
+
+    @property
+    def width_remark(self) -> str | None:
+        """Sentence about a shift of the widths that a person should hear of; None if there is none."""
+        if abs(self.width_shift_m) <= _NOTED_SHIFT_M:
+            return None
+        return (
+            f"with this calibration every width is {1e3 * abs(self.width_shift_m):.0f} mm "
+            f"{'larger' if self.width_shift_m > 0 else 'smaller'} than the configuration said; if its widths were "
+            "right, the gauge has another width than --gauge-mm"
+        )
 
 
 def calibrate_servo(

@@ -59,7 +59,7 @@ def torque(task: Task) -> Outcome:
     return Outcome(
         f"{servo.nm_per_a.value:.3f} Nm/A ({interval(servo.nm_per_a)})",
         values,
-        [_reference(after)],
+        [*([] if found.width_remark is None else [found.width_remark]), _reference(after)],
         {"figure": found.report},
         {"servo": servo, "intervals_n": _intervals_n(after)},
     )

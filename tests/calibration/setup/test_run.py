@@ -89,6 +89,16 @@ def test_a_known_mass_takes_the_place_of_a_load_cell(tmp_path: Path) -> None:
     assert "balanced 500 g" in path.read_text(encoding="utf-8")
 
 
+@pytest.mark.parametrize(("gauge_mm", "remarks"), [(30.0, 0), (36.0, 1)])
+def test_a_gauge_of_another_width_than_named_is_a_remark(
+    tmp_path: Path, gauge_mm: float, remarks: int
+) -> None:
+    keys = ["servo.port=virtual:gauge", "load_cell.backend=simulated", "sim.detail=coarse"]
+    (report,) = Setup(tmp_path / "rig.yaml", keys, only="torque", gauge_mm=gauge_mm).run(Script())
+    found = [text for text in report.remarks if "mm larger than the configuration said" in text]
+    assert (len(found), len(report.remarks)) == (remarks, remarks + 1)
+
+
 def test_values_that_a_person_writes_are_kept_and_named(tmp_path: Path) -> None:
     path = tmp_path / "rig.yaml"
     path.write_text("servo: {id: 3}\n", encoding="utf-8")
