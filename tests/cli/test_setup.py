@@ -23,7 +23,7 @@ QUICK = [
 
 
 def finished(path: Path, *overrides: str) -> None:
-    """Writes a rig file all of whose steps are finished."""
+    """Writes a rig file all of whose steps are finished, each with a remark."""
     rig = Setup(path, [*QUICK[1::2], *overrides])
     for name, step in STEPS.items():
         rig.rig.finish(
@@ -31,7 +31,7 @@ def finished(path: Path, *overrides: str) -> None:
             {
                 "date": "2026-01-02",
                 "summary": f"{name} done",
-                "remarks": [],
+                "remarks": [f"remark of {name}"],
                 "files": {},
                 "rests_on": rig._inputs(step),
             },
@@ -52,6 +52,18 @@ def test_nothing_is_an_answer_where_it_is_the_default(tmp_path: Path) -> None:
     arguments = ["setup", "--config", str(tmp_path / "rig.yaml"), "--step", "torque", *QUICK]
     end = CliRunner().invoke(app, arguments, input="0\n")
     assert "torque constant of the data sheet" in end.stderr
+
+
+def test_remarks_of_steps_that_were_finished_before_are_shown(tmp_path: Path) -> None:
+    finished(path := tmp_path / "rig.yaml")
+    end = CliRunner().invoke(app, ["setup", "--config", str(path), "--yes", "--json"])
+    assert [step["result"] for step in json.loads(end.stdout)["steps"]] == len(STEPS) * ["kept"]
+    lines = end.stderr.splitlines()
+    for name in STEPS:
+        assert (
+            lines[lines.index(f"{name}: finished before: {name} done (2026-01-02)") + 1]
+            == f"  - remark of {name}"
+        )
 
 
 def test_the_next_command_finishes_the_setup_first_and_can_be_pasted(tmp_path: Path) -> None:

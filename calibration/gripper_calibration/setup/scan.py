@@ -136,7 +136,8 @@ def _real_sensors(task: Task, ports: list[str], servo_port: str, remarks: list[s
         cell = doctor.find_load_cell(task.config, free, task.progress)
         if cell is None:
             remarks.append(
-                "no serial load cell was found; a Phidget bridge is not searched for: --set load_cell.backend=phidget"
+                "no serial load cell was found; once it is connected, `setup --step scan` looks again (a Phidget "
+                "bridge is not searched for: --set load_cell.backend=phidget)"
             )
         found |= _section("load_cell", cell or {"backend": "none"})
     return found
@@ -145,7 +146,10 @@ def _real_sensors(task: Task, ports: list[str], servo_port: str, remarks: list[s
 def _camera(task: Task, remarks: list[str]) -> Tree:
     cameras = doctor.find_cameras()
     if not cameras:
-        remarks.append("no camera was found; without one, a grasp controls force by motor current alone")
+        remarks.append(
+            "no camera was found; once it is connected, `setup --step scan` looks again; without one, a grasp controls "
+            "force by motor current alone"
+        )
         return {"backend": "none"}
     names = {f"{one['backend']} {one['device']}": one for one in cameras}
     if len(names) == 1:

@@ -50,6 +50,20 @@ def test_a_servo_that_is_not_the_named_one_is_never_taken_by_itself(
     assert "no servo answers with servo." in person.told[0]
 
 
+def test_a_device_that_is_not_found_is_looked_for_again_by_the_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gripper_force.jobs.doctor.find_cameras", list)
+    monkeypatch.setattr("gripper_force.jobs.doctor.find_load_cell", lambda *_: None)
+    task = SimpleNamespace(given={}, person=Script(), config=None, progress=None)
+    remarks: list[str] = []
+    found = scan._real_sensors(task, [], "/dev/a", remarks)  # type: ignore[arg-type]
+    assert (found["camera.backend"], found["load_cell.backend"]) == ("none", "none")
+    assert [text.split(";")[0] for text in remarks] == [
+        "no camera was found",
+        "no serial load cell was found",
+    ]
+    assert all("`setup --step scan` looks again" in text for text in remarks)
+
+
 def test_the_named_servo_is_taken_without_a_question() -> None:
     task = SimpleNamespace(given={"servo.port": "/dev/a", "servo.id": 7}, person=Script())
     servos = [found("/dev/a", 1), found("/dev/a", 7), found("/dev/b", 7)]
