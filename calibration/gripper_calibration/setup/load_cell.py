@@ -4,6 +4,7 @@ from typing import Final
 
 from gripper_calibration.procedures.calibrate_load_cell import calibrate_load_cell
 from gripper_calibration.setup.step import Found, Outcome, Task
+from gripper_force.config import Config
 from gripper_force.jobs import doctor
 from gripper_force.profiles.rig_profile import CalibratedValue
 from gripper_force.types import STANDARD_GRAVITY_M_S2
@@ -11,11 +12,19 @@ from gripper_force.types import STANDARD_GRAVITY_M_S2
 PROFILE: Final = "measured.yaml"
 """Rig profile in the setup's folder, in which the procedures keep their results."""
 
+_IN_NEWTONS: Final = ("simulated", "playback")
+"""Backends without raw readings."""
+
 WITHOUT: Final = (
     "Without a load cell everything works but what needs newtons measured at the jaws: `calibrate servo`, "
     "`calibrate object` and training. Motor current measures the force instead; the next step can compare it with a "
     "known mass, and states its error."
 )
+
+
+def load_cell_uses(config: Config) -> tuple[str, ...]:
+    """Returns the names in `Task` of what the step uses: a mass, if the load cell has raw readings."""
+    return () if config.load_cell.backend in ("none", *_IN_NEWTONS) else ("mass_kg",)
 
 
 def load_cell(task: Task) -> Outcome:
@@ -28,7 +37,7 @@ def load_cell(task: Task) -> Outcome:
     backend = task.config.load_cell.backend
     if backend == "none":
         return Outcome("no load cell", remarks=[WITHOUT])
-    if backend in ("simulated", "playback"):
+    if backend in _IN_NEWTONS:
         return Outcome(f"the {backend} load cell gives newtons and needs no calibration")
     mass_kg = task.mass_kg
     if mass_kg is None:
@@ -55,6 +64,7 @@ def load_cell(task: Task) -> Outcome:
         remarks,
         {"figure": found.report},
         {"load_cell": cell},
+        {"mass_kg": mass_kg},
     )
 
 

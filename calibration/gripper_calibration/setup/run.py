@@ -1,5 +1,6 @@
 """Runs the steps of a setup: those that are not finished, or that rest on values which have changed."""
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -8,12 +9,12 @@ from typing import Any, Final, Literal
 
 from gripper_calibration.setup.camera import camera
 from gripper_calibration.setup.jaws import jaws
-from gripper_calibration.setup.load_cell import load_cell
+from gripper_calibration.setup.load_cell import load_cell, load_cell_uses
 from gripper_calibration.setup.rig_file import RigFile, flat
 from gripper_calibration.setup.scan import scan
 from gripper_calibration.setup.servo import servo
 from gripper_calibration.setup.step import Outcome, Person, Task, is_answer
-from gripper_calibration.setup.torque import torque
+from gripper_calibration.setup.torque import torque, torque_uses
 from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError
 from gripper_force.progress import Progress, no_progress
@@ -28,12 +29,14 @@ class Step:
         run: Its function.
         rests_on: Sections and keys of the configuration; if one changes, the step runs again.
         but: Keys among them that the step sets itself.
+        uses: Returns which of mass and width the step uses with a configuration; another one makes it run again.
     """
 
     title: str
     run: Callable[[Task], Outcome]
     rests_on: tuple[str, ...] = ()
     but: tuple[str, ...] = ()
+    uses: Callable[[Config], tuple[str, ...]] = lambda config: ()
 
 
 _SERVO: Final = (
@@ -67,14 +70,22 @@ STEPS: Final = {
         load_cell,
         ("load_cell",),
         ("load_cell.tare_raw", "load_cell.n_per_raw", "load_cell.rate_hz"),
+        load_cell_uses,
     ),
     "torque": Step(
         "motor current is compared with newtons",
         torque,
         (*_SERVO, "load_cell", *_GEOMETRY, "gripper.closing_sign"),
+        uses=torque_uses,
     ),
 }
 """The steps by name, in their order."""
+
+_OPTIONS: Final = {
+    "mass_kg": ("--mass-kg", "weighs or hangs up a known mass"),
+    "gauge_mm": ("--gauge-mm", "presses a load cell"),
+}
+"""Mass and width by their names in `Task`: the option, and what a step that uses it does."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,13 +149,17 @@ class Setup:
                 f"--fresh forgets what all steps found, but --step {steps[0]} does not run the others; leave out "
                 "--fresh to run the step again, or --step to start over"
             )
-        for text, value in (("--mass-kg", mass_kg), ("--gauge-mm", gauge_mm)):
-            if value is not None and not is_answer(value, None):
+        self._options = {
+            name: value for name, value in (("mass_kg", mass_kg), ("gauge_mm", gauge_mm)) if value is not None
+        }
+        for name, value in self._options.items():
+            text, _ = _OPTIONS[name]
+            if not is_answer(value, None):
                 raise ConfigError(f"{text} is {value:g}; pass a positive number, or leave {text} out")
         load_config(path if path.exists() else None, overrides)  # its messages name the file
         self.rig = RigFile.load(path, overrides, fresh=fresh)
         self._has_overrides, self._fresh = bool(overrides), fresh
-        self._only, self._mass_kg, self._gauge_mm = steps, mass_kg, gauge_mm
+        self._only = steps
 
     @property
     def config(self) -> Config:
@@ -174,7 +189,7 @@ class Setup:
             if self._only and name not in self._only:
                 continue
             if not self._only and name in self.rig.steps:
-                changed = self._changed(name, step)
+                changed = [*self._changed(name, step), *self._changed_options(name, step)]
                 if not changed:
                     yield self._kept(name)
                     continue
@@ -187,8 +202,8 @@ class Setup:
                 folder=self.rig.folder,
                 person=person,
                 progress=progress,
-                mass_kg=self._mass_kg,
-                gauge_mm=self._gauge_mm,
+                mass_kg=self._options.get("mass_kg"),
+                gauge_mm=self._options.get("gauge_mm"),
                 keep=self.rig.keep,
             )
             outcome = step.run(task)
@@ -197,6 +212,7 @@ class Setup:
             if self._only and outdated:
                 person.tell(f"{', '.join(outdated)} rests on what {name} found: run setup without --step")
             yield report
+        self._tell_unused(person)
         if self._has_overrides:  # also if no step had to run
             self.rig.write()
 
@@ -212,6 +228,7 @@ class Setup:
                 "files": files,
                 "rests_on": self._inputs(step),
                 "values": outcome.values,
+                "used": outcome.used,
             },
             STEPS,
         )
@@ -240,6 +257,24 @@ class Setup:
             return [f"what {outdated_by} found"]
         before, now = self.rig.steps[name].get("rests_on", {}), self._inputs(step)
         return [key for key in now if now[key] != before.get(key)]
+
+    def _changed_options(self, name: str, step: Step) -> list[str]:
+        """Mass or width, if another one is given than the one that a finished step used."""
+        return [
+            f"{_OPTIONS[one][0]}, now {self._options[one]:g}"
+            for one in step.uses(self.config)
+            if one in self._options and not self._has_used(name, one)
+        ]
+
+    def _has_used(self, name: str, option: str) -> bool:
+        used = self.rig.steps.get(name, {}).get("used", {}).get(option)
+        return used is not None and math.isclose(used, self._options[option])
+
+    def _tell_unused(self, person: Person) -> None:
+        for option, value in self._options.items():
+            if not any(self._has_used(name, option) for name in self._only or STEPS):
+                text, does = _OPTIONS[option]
+                person.tell(f"{text} {value:g} was not used: with this rig, no step of this run {does}")
 
 
 def check_steps(names: Sequence[str]) -> None:

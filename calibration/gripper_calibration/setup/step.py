@@ -102,6 +102,7 @@ class Outcome:
         remarks: What a person should know.
         files: Pictures, by what they show.
         details: Anything else for scripts.
+        used: Mass or width that was given or asked for, by the name in `Task`.
     """
 
     summary: str
@@ -109,3 +110,4 @@ class Outcome:
     remarks: Sequence[str] = ()
     files: Mapping[str, Path] = field(default_factory=dict)
     details: Mapping[str, Any] = field(default_factory=dict)
+    used: Mapping[str, float] = field(default_factory=dict)

@@ -22,6 +22,21 @@ _NORMAL: Final = 1.96
 _FORCES_N: Final = (2.0, 4.0, 8.0)
 
 
+def torque_uses(config: Config) -> tuple[str, ...]:
+    """Returns the names in `Task` of what the step uses: a width to press a load cell, or a mass to balance."""
+    if _presses(config):
+        return ("gauge_mm",)
+    try:
+        masses_kg(config)
+    except ConfigError:
+        return ()
+    return ("mass_kg",)
+
+
+def _presses(config: Config) -> bool:
+    return config.load_cell.backend not in ("none", "playback") and len(config.servo.ids) == 1
+
+
 def torque(task: Task) -> Outcome:
     """Presses the load cell; without one, balances a known mass, or takes the data sheet's torque constant.
 
@@ -30,7 +45,7 @@ def torque(task: Task) -> Outcome:
         GripperError: See `calibrate_servo` and `calibrate_weight`.
     """
     config = task.config
-    if config.load_cell.backend in ("none", "playback") or len(config.servo.ids) > 1:
+    if not _presses(config):
         return _weight(task)
     simulated = is_simulated(config)
     gauge_mm = task.gauge_mm
@@ -62,6 +77,7 @@ def torque(task: Task) -> Outcome:
         [*([] if found.width_remark is None else [found.width_remark]), _reference(after)],
         {"figure": found.report},
         {"servo": servo, "intervals_n": _intervals_n(after)},
+        {"gauge_mm": gauge_mm},
     )
 
 
@@ -98,6 +114,7 @@ def _weight(task: Task) -> Outcome:
         values,
         [_reference(after)],
         details={"weight": found, "intervals_n": _intervals_n(after)},
+        used={"mass_kg": mass_kg},
     )
 
 

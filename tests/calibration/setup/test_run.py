@@ -171,6 +171,48 @@ def test_what_the_jaws_are_found_with_decides_what_is_found_again(
     assert {name for name in STEPS if changed._changed(name, STEPS[name])} >= steps
 
 
+@pytest.mark.parametrize(
+    ("keys", "option", "step"),
+    [
+        (["load_cell.backend=serial"], "mass_kg", "load-cell"),
+        (["load_cell.backend=serial"], "gauge_mm", "torque"),
+        (["load_cell.backend=simulated"], "gauge_mm", "torque"),
+        (["load_cell.backend=none"], "mass_kg", "torque"),
+        (["load_cell.backend=simulated"], "mass_kg", None),
+        (["load_cell.backend=none"], "gauge_mm", None),
+        (["load_cell.backend=none", "control.force_limit_n=1"], "mass_kg", None),
+    ],
+)
+def test_another_mass_or_width_repeats_the_step_that_uses_it(
+    tmp_path: Path, keys: list[str], option: str, step: str | None
+) -> None:
+    path = tmp_path / "rig.yaml"
+    first = Setup(path, ["servo.port=virtual:setup", *keys])
+    used = {name: {option: 0.3} if name == step else {} for name in STEPS}
+    for name in STEPS:
+        first.rig.finish(name, {"rests_on": first._inputs(STEPS[name]), "used": used[name]})
+    for value, changed in ((0.3, []), (0.5, [] if step is None else [step])):
+        again = Setup(path, **{option: value})  # type: ignore[arg-type]
+        assert [name for name in STEPS if again._changed_options(name, STEPS[name])] == changed
+        assert not again.pending, "without the option nothing has to run"
+        again._tell_unused(script := Script())
+        assert len(script.told) == (value == 0.5 or step is None)
+
+
+def test_a_mass_that_is_given_later_is_hung_up(tmp_path: Path) -> None:
+    path = tmp_path / "rig.yaml"
+    first = Setup(path, [*SIMULATED, "camera.backend=none"])
+    for name in STEPS:
+        state = {"date": "2026-01-02", "summary": "", "remarks": [], "files": {}}
+        first.rig.finish(name, state | {"rests_on": first._inputs(STEPS[name])})
+    for expected in ("done", "kept"):
+        reports = list(Setup(path, mass_kg=0.5, gauge_mm=30).run(script := Script()))
+        assert [report.result for report in reports] == [*5 * ["kept"], expected]
+        assert script.told[-1].startswith("--gauge-mm 30 was not used: with this rig, no step")
+        again = "torque runs again, because these changed: --mass-kg, now 0.5"
+        assert (again in script.told) == (expected == "done")
+
+
 def test_a_baud_rate_is_saved_though_the_step_fails(tmp_path: Path) -> None:
     rig = RigFile.load(tmp_path / "rig.yaml", ["servo.baud_rate=57600"], fresh=False)
     rig.keep({"servo.baud_rate": Found(1_000_000, "written to the servo")})
