@@ -47,7 +47,7 @@ _NO_YAML = (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, 
 def as_path(path: object, what: str) -> Path:
     """Returns an argument as a path. Raises `ConfigError` for what can't be one."""
     if not isinstance(path, str | PathLike) or "\0" in str(path):
-        raise ConfigError(f"{what} must be a path, not {path!r}; pass keys and values as overrides")
+        raise ConfigError(f"{what} must be a path, not {path!r}")
     return Path(path)
 
 

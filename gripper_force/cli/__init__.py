@@ -114,11 +114,10 @@ def main() -> NoReturn:
 
 def _uses_gripper(words: list[str]) -> bool:
     """Returns True for the commands that run a gripper, real or simulated."""
+    uses_logs = any(word.startswith("--from") for word in words)
     if words[:1] == ["calibrate"]:
-        return words[1:2] not in (["network"], ["gain"]) and "--from" not in words
-    return words[:1] in (["grasp"], ["record"], ["setup"]) or (
-        words[:1] == ["teach"] and "--from" not in words
-    )
+        return words[1:2] not in (["network"], ["gain"]) and not uses_logs
+    return words[:1] in (["grasp"], ["record"], ["setup"]) or (words[:1] == ["teach"] and not uses_logs)
 
 
 def _fail_without_file(error: OSError) -> NoReturn:

@@ -110,8 +110,9 @@ class ForceLoop:
     def start(self, force_n: float, target_n: float) -> None:
         """Starts a ramp at the present force."""
         self._trim_n, self._repeat_s, self._lowers_again = 0.0, 0.0, False
-        self._risen_n = force_n
-        self._start(force_n, target_n, lowers=target_n < force_n)
+        self._risen_n = self._highest_n = force_n
+        self._waited_s = 0.0
+        self._start(force_n, target_n, lowers=True)
 
     def retarget(self, target_n: float) -> None:
         """Starts a ramp at the present reference and keeps the trim.
@@ -122,8 +123,9 @@ class ForceLoop:
         lowers = target_n < self._risen_n - tolerance_n(target_n)
         self._lowers_again, self._repeat_s = lowers, _REPEAT_WITHIN_S if lowers else 0.0
         goes_on = self.is_lowering == lowers
+        self._waited_s = 0.0
         if not (goes_on and lowers):
-            self._highest_n, self._waited_s = self.reference_n, 0.0
+            self._highest_n = self.reference_n
         speed_n_s = self._profile.speed if goes_on else 0.0
         self._start(self.reference_n, target_n, lowers=lowers, speed_n_s=speed_n_s)
 
@@ -136,7 +138,7 @@ class ForceLoop:
         lowers: bool,
         speed_n_s: float = 0.0,
     ) -> None:
-        self._rising, self.is_lowering = True, lowers
+        self._rising, self.is_lowering = True, lowers and target_n < force_n
         self._side = -1.0 if self.is_lowering else 1.0
         self._profile = TrapezoidalProfile(fall_s if self.is_lowering else _RAMP_S)
         rate_n_s = (force_n - target_n) / fall_s if self.is_lowering else self._ramp_n_s

@@ -63,8 +63,10 @@ _LEAST_SPEED_M_S = 1e-4
 """Speed of one jaw, for a target of 0.01 N, below which a grasp does not get more time."""
 
 _BLOCKED_S = 1.0
-_NEARER_M = 0.002
-"""Time in which a move must come nearer to its width by this distance, or it is blocked."""
+_PASSED_M = 0.002
+_PASSED_SHARE = 0.25
+"""A move is blocked if the width does not change by this distance in this time; slow jaws: by this share of what their
+speed allows."""
 
 _SAME_SHARE = 0.25
 """Change of the target as a share of its tolerance that is none: the noise of a stream of requests."""
@@ -154,7 +156,7 @@ class GraspController:
         self._servo: ServoState | None = None
         self._target_n = self._held_width_m = self._settling_width_m = 0.0
         self._move_width_m = transmission.open_width_m
-        self._move_left_m = self._stopped_s = 0.0
+        self._passed_m = self._stopped_s = 0.0
         self._move_opens = False
         self._released_s = math.inf
         self._grasp_ns = 0
@@ -349,16 +351,13 @@ class GraspController:
             self._start_travel(opens=opens)
             self._move_opens = opens
             self._enter(Phase.MOVE, self._reason)
+            self._passed_m, self._stopped_s = self._present_width_m, 0.0
         self._outcome, self._move_width_m = Outcome.NONE, width_m
-        self._move_left_m, self._stopped_s = math.inf, 0.0
 
     def _start_travel(self, *, opens: bool) -> None:
         if self._phase in GRIPPING:
             self._was_held = self._outcome == Outcome.HELD
-        if self._phase in (*GRIPPING, Phase.FAULT):
-            grip_n = self._motor_force_n
-        else:
-            grip_n = self._travel.grip_left_n(self._phase_s) if self._is_travelling else 0.0
+        grip_n = self._motor_force_n if self._phase in (*GRIPPING, Phase.FAULT) else self._grip_left_n
         self._limits.reset(reverses=self._opens_freely and not opens)
         self._goal_width_m = self._present_width_m  # in the cycle that loses an object, the jaws still close
         self._travel.start(self._goal_width_m, grip_n, opens=opens)
@@ -391,6 +390,13 @@ class GraspController:
     def _opens_freely(self) -> bool:
         """True if the jaws open, and have let go of what they held."""
         return self._is_opening and self._travel.grip_left_n(self._phase_s) == 0
+
+    @property
+    def _grip_left_n(self) -> float:
+        """What a release, a move, or an approach after one has not let go yet of a grip's motor force."""
+        if self._phase == Phase.APPROACH:
+            return self._travel.grip_left_n(self._released_s + self._phase_s)
+        return self._travel.grip_left_n(self._phase_s) if self._is_travelling else 0.0
 
     @property
     def _is_travelling(self) -> bool:
@@ -496,8 +502,7 @@ class GraspController:
             self._friction.max_closing_force_n(closing=self._is_closing, approaching=True),
         )
         # With less motor force at once, an object that a release has not let go yet would push the jaws open.
-        let_go_n = self._travel.grip_left_n(self._released_s + self._phase_s)
-        self._motor_force_n = max(self._approach.motor_force_n, let_go_n)
+        self._motor_force_n = max(self._approach.motor_force_n, self._grip_left_n)
         if (
             was_backing_off
             and not self._approach.is_backing_off
@@ -616,10 +621,13 @@ class GraspController:
         left_m = abs(width_m - self._move_width_m)
         friction_a = self._transmission.current_a(self._transmission.friction_n, self._present_rad)
         rest_m = max(_AT_WIDTH_M, self._speed_limit.rest_error_m(friction_a, self._present_rad))
-        if left_m < self._move_left_m - _NEARER_M:
-            self._move_left_m, self._stopped_s = left_m, 0.0
+        if abs(width_m - self._passed_m) > min(
+            _PASSED_M, _PASSED_SHARE * self._travel.speed_m_s * _BLOCKED_S
+        ):
+            self._passed_m, self._stopped_s = width_m, 0.0
         self._stopped_s += dt_s
         if left_m <= rest_m and self._goal_width_m == self._move_width_m:
+            self._stopped_s = 0.0
             self._set_outcome(Outcome.MOVED, f"moved to {self._move_width_m * 1e3:.1f} mm")
         elif self._stopped_s >= _BLOCKED_S:
             reason = f"stopped at {width_m * 1e3:.1f} mm by an obstacle, or by friction: "

@@ -146,9 +146,9 @@ class ControlLoop:
             self._ended.set()
             self._requests.close()
             atexit.unregister(self._close_at_exit)
-            # An error of an earlier step ends the run as a fault even if the caller has handled it.
-            cause = self._error if error is None else error
             with self._cycle_lock:  # a cycle of another thread, which is its last one, uses the devices
+                # An error of an earlier step ends the run as a fault even if the caller has handled it.
+                cause = self._error if error is None else error
                 if cause is None:
                     self._resources.close()
                 else:
@@ -208,9 +208,13 @@ class ControlLoop:
             with open_run(
                 run, self._log, raise_if_cancelled=self._raise_if_closing, port=self._port
             ) as session:
-                self._start(session)
-                while not self._closing.is_set():
-                    self._cycle(session)
+                try:
+                    self._start(session)
+                    while not self._closing.is_set():
+                        self._cycle(session)
+                except BaseException as error:
+                    self._error = error  # before the end of the session, which may open the jaws first
+                    raise
                 if self._end_error is not None:  # the run ends with the caller's exception
                     raise self._end_error  # noqa: TRY301
         except BaseException as error:

@@ -149,7 +149,8 @@ class Gripper:
         """Raises or lowers the force on a gripped object, without letting go.
 
         A stream of targets with ``wait=False`` is followed: a ramp in progress takes a new target without a stop, and
-        one within 1 % (at least 0.025 N) of the present target changes nothing.
+        one within 1 % (at least 0.025 N) of the present target changes nothing. For a target that is lower by at most
+        4 % (at least 0.1 N), which friction can hide, the jaws do not open.
 
         Args:
             force_n: New target force, in newtons; limits as in `grasp`.

@@ -30,11 +30,12 @@ _SUPPLY_TOLERANCE_V = 0.5
 _MOST_TIMES = 3.0
 """Torque constant over that of the servo's model from which it can't be right: the largest `gripper.gain_bound`."""
 
-_LEAST_TRAVEL_RAD = 0.8
+_LEAST_TRAVEL_RAD = 0.3
 """Rotation of the horn for the whole travel of a rack, below which the pinion's radius can't be right."""
 
-_NO_SCORE = (
-    "the network has no out-of-distribution score (int8, bfloat16): unfamiliar objects are not noticed"
+_NO_SCORE = "the network has no out-of-distribution score: unfamiliar objects are not noticed"
+_NO_SCORE_WHY = (
+    "; bfloat16 and int8 have none, and `gripper-force calibrate network` fits that of other networks"
 )
 
 _CYCLES_PER_WATCHDOG = 2
@@ -130,7 +131,7 @@ def resolve(config: Config, *, vision: bool = True) -> ResolvedConfig:
         ("session", bundle),
         ("simulation", detail),
         ("session", apply.overridden(config, profiles)),
-        ("session", "" if model is None or _has_score(config, model) else _NO_SCORE),
+        ("session", "" if model is None or _has_score(config, model) else _NO_SCORE + _NO_SCORE_WHY),
         *(
             ("session", f"the {profile} was made with {'; '.join(found)}")
             for profile, found in mismatches.items()
@@ -229,7 +230,7 @@ def _check_travel(gripper: GripperConfig, spec: ServoSpec) -> None:
         raise ConfigError(
             f"gripper.pinion_radius_m={gripper.pinion_radius_m:g} moves the jaws over all of gripper.open_width_m="
             f"{gripper.open_width_m:g} in {abs(closed_rad - open_rad):.2g} rad, so that no force limit would hold; set "
-            "the radius in metres (not the diameter), here or in the rig profile"
+            "the radius in metres (not the diameter), or the width, here or in the rig profile"
         )
     if spec.position_range_rad is None:
         return

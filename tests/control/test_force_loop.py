@@ -106,6 +106,17 @@ def test_lower_targets_within_the_tolerance_add_up_before_the_jaws_open(loop):
     assert lowered == [False, False, False, True]
 
 
+def test_a_first_ramp_that_lowers_takes_a_still_lower_target(loop):
+    loop.start(1.5, 1.0)
+    for _ in range(5):
+        loop.step(0.005, 1.0, estimate(1.4))
+    loop.retarget(0.8)
+    for _ in range(400):
+        loop.step(0.005, 0.8, estimate(1.3))
+        assert loop.reference_n >= 0.8
+    assert loop.reference_n == 0.8
+
+
 def test_the_ramp_is_not_faster_than_the_force_limit_allows(transmission):
     def rise_n_s(**keys):
         loop = ForceLoop(ControlConfig(**keys), transmission)

@@ -132,6 +132,18 @@ def test_jaws_that_friction_makes_slow_arrive_and_are_not_blocked(make_run, shar
     assert run.last.status.outcome == "moved"
 
 
+def test_slow_jaws_are_not_blocked(make_run):
+    run = make_run(plant={**FAR, "friction_n": 0.5}, approach_speed_m_s=0.001).move(OPEN_M - 0.006, 8.0)
+    assert run.last.status.outcome == "moved"
+
+
+def test_a_noisy_stream_of_moves_onto_an_obstacle_is_blocked(make_run):
+    run = make_run(plant={"contact_m": 0.01})
+    for i in range(120):
+        run.move(0.042 + (1.5e-4 if i % 2 else 0.0), 1 / 30)
+    assert any(status.outcome == "blocked" for status in run.statuses)
+
+
 @pytest.mark.parametrize("every", [1, 7, 20])
 def test_a_stream_of_moves_is_as_fast_as_one(make_run, every):
     run = make_run(plant=FAR)

@@ -438,10 +438,11 @@ def test_retarget_without_letting_go(make_run):
     assert run.last.status.outcome == "held"
 
 
-@pytest.mark.parametrize("first", ["release", "move"])
+@pytest.mark.parametrize("first", ["release", "move", "release grasp"])
 def test_a_repeated_release_lets_go_of_a_springy_object_as_slowly_as_one(make_run, first):
     run = make_run(plant={"stiffness_n_m": 1_700.0, "friction_n": 0.6}, force_limit_n=19.0).grasp(11.0, 5.0)
-    run.go(0.02, first, width_m=0.092)
+    for kind in first.split():
+        run.go(0.02, kind, 5.0, width_m=0.092)
     for _ in range(50):
         run.go(0.02, "release")
     speeds_m_s = [abs(servo.velocity_rad_s) * 0.02 for _, servo, _, _ in run.inputs[-300:]]

@@ -749,6 +749,14 @@ def test_a_program_that_forgets_to_close_leaves_no_torque(
     assert server.bus.servos[0].get("hardware_error_status") == 0
 
 
+def test_a_program_that_forgets_to_close_a_rendered_rig_ends_in_silence() -> None:
+    program = "import gripper_force as gf; gripper = gf.open_gripper(overrides=['sim.detail=coarse']); gripper.sleep(0.1)"
+    ended = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
 # The order of requests.
 
 

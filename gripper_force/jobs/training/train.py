@@ -240,7 +240,7 @@ def _trained(
     progress: Progress,
     warn: Callable[[str], None],
 ) -> list[Trainer]:
-    old = round(config.replay_share * config.clips) if replay_clips else 0
+    old = config.replayed if replay_clips else 0
     if any(0 < part < process.world_size for part in (config.clips - old, old)):
         raise ConfigError(
             f"{process.world_size} processes can't share {config.clips} clips per step; increase clips"

@@ -1,10 +1,12 @@
 """MuJoCo world: physics, contact force and rendering of one scene."""
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any, Protocol
+from queue import SimpleQueue
+from threading import Thread
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -48,6 +50,35 @@ _DISABLED_RENDER_FLAGS = (
     mujoco.mjtRndFlag.mjRND_HAZE,
     mujoco.mjtRndFlag.mjRND_FOG,
 )
+
+
+_T = TypeVar("_T")
+
+
+class _OneThread:
+    """Runs functions in a thread of its own. An executor can't: Python ends it before a program's last cycles."""
+
+    def __init__(self) -> None:
+        self._calls: SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = SimpleQueue()
+        Thread(target=self._run, name="renderer", daemon=True).start()
+
+    def run(self, function: Callable[[], _T]) -> _T:
+        """Returns or raises what the function returns or raises."""
+        result: Future[_T] = Future()
+        self._calls.put((result, function))
+        return result.result()
+
+    def end(self) -> None:
+        """Ends the thread."""
+        self._calls.put(None)
+
+    def _run(self) -> None:
+        while (call := self._calls.get()) is not None:
+            result, function = call
+            try:
+                result.set_result(function())
+            except BaseException as error:  # raised in the thread that waits
+                result.set_exception(error)
 
 
 class Motor(Protocol):
@@ -155,7 +186,7 @@ class World:
         self._left = int(self._model.sensor("left_force").adr[0]) + 1
         self._right = int(self._model.sensor("right_force").adr[0]) + 1
         self._periodic_calls: list[_PeriodicCall] = []
-        self._graphics: ThreadPoolExecutor | None = None  # the renderer's thread, once it is used
+        self._graphics: _OneThread | None = None  # the renderer's thread, once it is used
         self._renderer: Any = None
         self._image: tuple[int, npt.NDArray[np.uint8]] | None = None
         self.t_ns = 0
@@ -265,16 +296,16 @@ class World:
         Any thread may call it. A rendering context can be used in one thread only, so it has a thread of its own.
         """
         if self._image is None or self._image[0] != self.t_ns:  # one rendering serves all light levels
-            self._graphics = self._graphics or ThreadPoolExecutor(1, "renderer")
-            self._image = self.t_ns, self._graphics.submit(self._rendered, side_px).result()
+            self._graphics = self._graphics or _OneThread()
+            self._image = self.t_ns, self._graphics.run(lambda: self._rendered(side_px))
         return self._image[1]
 
     def close(self) -> None:
         """Frees the rendering context."""
         graphics, self._graphics = self._graphics, None
         if graphics is not None:
-            graphics.submit(self._close_renderer)
-            graphics.shutdown()
+            graphics.run(self._close_renderer)
+            graphics.end()
 
     def _close_renderer(self) -> None:
         if self._renderer is not None:
