@@ -33,15 +33,17 @@ MAX_LAG_S: Final = 0.15
 
 _STEP_S: Final = 0.001
 _BEFORE_S: Final = 0.5
-_AFTER_S: Final = 0.25
-"""Part of a touch that is used, before and after its release."""
+_AFTER_S: Final = 0.15
+"""Part of a touch that is used, before and after its release. Later, the jaws travel without the object."""
 
 _COMPONENTS: Final = 20
 _FRAMES_PER_COMPONENT: Final = 4
 """Principal components of the images, at most, and frames needed for each."""
 
 _REST_S: Final = 0.12
-"""Part of the rest before an onset that is used."""
+_RISE_S: Final = 0.06
+"""Parts of the rest before an onset, and of the change after the latest one, that are used. With more of the way to the
+open jaws, the change of the width would be clear only later."""
 
 _MIN_SAMPLES: Final = 6
 _ONSET_STEP_S: Final = 0.0005
@@ -175,7 +177,7 @@ def _onset_s(
     t_s: Floats, values: Floats, release_s: float, fitted_s: float, powers: tuple[float, ...]
 ) -> float:
     """Onset of a signal's rise from rest: the fit of a constant, followed by ``a (t - onset)^p``."""
-    near = (t_s > release_s - MAX_LAG_S - _REST_S) & (t_s < release_s + MAX_LAG_S + _AFTER_S)
+    near = (t_s > release_s - MAX_LAG_S - _REST_S) & (t_s < release_s + MAX_LAG_S + _RISE_S)
     t, y = t_s[near] - release_s, values[near]
     if len(t) < _MIN_SAMPLES:
         return float("nan")
