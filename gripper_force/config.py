@@ -726,7 +726,9 @@ def load_config(
     """
     where = str(path) if path else "--set"
     tree = (
-        {} if path is None else read_tree(as_path(path, "the configuration (keys and values are overrides)"))
+        {}
+        if path is None
+        else read_tree(as_path(path, "the configuration", "pass keys and values as overrides"))
     )
     if "format" in tree:
         raise ConfigError(

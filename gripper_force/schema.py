@@ -44,10 +44,10 @@ _NO_YAML = (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, 
 """Exceptions of the YAML parser, among others for a date 2001-99-99, a number 0b, and a tag !!bool x."""
 
 
-def as_path(path: object, what: str) -> Path:
+def as_path(path: object, what: str, remedy: str = "name a file") -> Path:
     """Returns an argument as a path. Raises `ConfigError` for what can't be one."""
     if not isinstance(path, str | PathLike) or "\0" in str(path):
-        raise ConfigError(f"{what} must be a path, not {path!r}")
+        raise ConfigError(f"{what} must be a path, not {path!r}; {remedy}")
     return Path(path)
 
 

@@ -393,7 +393,7 @@ class GraspController:
 
     @property
     def _grip_left_n(self) -> float:
-        """What a release, a move, or an approach after one has not let go yet of a grip's motor force."""
+        """Motor force of a grip that a release, a move, or an approach after one has not let go yet."""
         if self._phase == Phase.APPROACH:
             return self._travel.grip_left_n(self._released_s + self._phase_s)
         return self._travel.grip_left_n(self._phase_s) if self._is_travelling else 0.0
