@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gripper_force.config import ControlConfig, GripperConfig
-from gripper_force.control.limits import Limits, largest_target_n
+from gripper_force.control.limits import Limits, largest_target_n, rounded_down
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import NonFiniteError
 from gripper_force.types import ServoCommand
@@ -178,3 +178,8 @@ def test_the_motor_force_of_opening_jaws_that_are_to_close_rises_from_zero(rever
     first_a = limits.apply(wanted, 0.0, 0.95, 0.0, 0.0, 0.005, may_rise=True)[0].goal_current_a
     rise_a = 4 * CONFIG.ramp_n_s * 0.005 / FINE.n_per_a(0.0)
     assert first_a == pytest.approx(rise_a if reverses else 0.1)
+
+
+@given(st.floats(0.01, 900.0))
+def test_a_force_in_a_message_is_not_above_the_largest_one(force_n):
+    assert force_n - 0.0011 <= float(rounded_down(force_n)) <= force_n
