@@ -123,9 +123,8 @@ def train(
             console.err.print("the training was saved; add --resume to the same command to continue it")
         raise
     if not quiet:
-        figure = (
-            checkpoint.with_suffix(".png") if states else None
-        )  # a Gaussian process has no course of training
+        # A Gaussian process has no course of training.
+        figure = checkpoint.with_suffix(".png") if states else None
         _show_trained(result, checkpoint, figure, left_out, warnings, as_json)
 
 

@@ -112,7 +112,7 @@ class ForceLoop:
         self._trim_n, self._repeat_s, self._lowers_again = 0.0, 0.0, False
         self._risen_n = self._highest_n = force_n
         self._waited_s = 0.0
-        self._start(force_n, target_n, lowers=True)
+        self._start(force_n, target_n)
 
     def retarget(self, target_n: float) -> None:
         """Starts a ramp at the present reference and keeps the trim.
@@ -135,7 +135,7 @@ class ForceLoop:
         target_n: float,
         fall_s: float = _LOWERING_S,
         *,
-        lowers: bool,
+        lowers: bool = True,
         speed_n_s: float = 0.0,
     ) -> None:
         self._rising, self.is_lowering = True, lowers and target_n < force_n
@@ -197,7 +197,7 @@ class ForceLoop:
         """Lowers the force again if it is still too high by motor current; one visual estimate may be an outlier."""
         again, self._lowers_again = self._lowers_again and estimate.source != EstimateSource.VISION, False
         if again and estimate.force_n > target_n + tolerance_n(target_n):
-            self._start(min(estimate.force_n, self._highest_n), target_n, _AGAIN_S, lowers=True)
+            self._start(min(estimate.force_n, self._highest_n), target_n, _AGAIN_S)
 
     def _repeat_lowering(self, dt_s: float, target_n: float, estimate: FusedForce) -> None:
         """Lowers the force again if the camera shows that it has stayed too high."""
@@ -209,7 +209,7 @@ class ForceLoop:
             self._repeat_s -= dt_s
             if self._high_s > _REPEAT_S:
                 self._repeat_s = 0.0
-                self._start(min(estimate.force_n, self._highest_n), target_n, lowers=True)
+                self._start(min(estimate.force_n, self._highest_n), target_n)
 
     def _beyond_deadband(self, error_n: float, band_n: float) -> float:
         forward_n = error_n if self._rising else -error_n

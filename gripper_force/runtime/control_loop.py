@@ -235,7 +235,6 @@ class ControlLoop:
 
     def _start(self, session: Session) -> None:
         decision = session.wait_for_reference()
-        self._tracker.reason = session.reason  # of a fault in one of these cycles
         self._publish(session, decision)
         self.session = session
         self._opened.set()
@@ -260,7 +259,11 @@ class ControlLoop:
         assert session.servo_state is not None  # the cycle has read it
         starts = request is not None and request.kind != RequestKind.STOP and not refusal
         self.state, result = self._tracker.update(
-            decision, session.servo_state, session.last_load_cell_sample, restart=starts
+            decision,
+            session.servo_state,
+            session.last_load_cell_sample,
+            reason=session.reason,
+            restart=starts,
         )
         self._requests.finish_cycle(request, refusal, self.state, result)
         return self.state

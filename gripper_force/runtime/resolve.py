@@ -33,9 +33,9 @@ _MOST_TIMES = 3.0
 _LEAST_TRAVEL_RAD = 0.3
 """Rotation of the horn for the whole travel of a rack, below which the pinion's radius can't be right."""
 
-_NO_SCORE = "the network has no out-of-distribution score: unfamiliar objects are not noticed"
-_NO_SCORE_WHY = (
-    "; bfloat16 and int8 have none, and `gripper-force calibrate network` fits that of other networks"
+_NO_SCORE = (
+    "the network has no out-of-distribution score, so unfamiliar objects are not noticed; bfloat16 and int8 have none, "
+    "and `gripper-force calibrate network` fits that of other networks"
 )
 
 _CYCLES_PER_WATCHDOG = 2
@@ -131,7 +131,7 @@ def resolve(config: Config, *, vision: bool = True) -> ResolvedConfig:
         ("session", bundle),
         ("simulation", detail),
         ("session", apply.overridden(config, profiles)),
-        ("session", "" if model is None or _has_score(config, model) else _NO_SCORE + _NO_SCORE_WHY),
+        ("session", "" if model is None or _has_score(config, model) else _NO_SCORE),
         *(
             ("session", f"the {profile} was made with {'; '.join(found)}")
             for profile, found in mismatches.items()

@@ -77,25 +77,26 @@ class GripperState:
 
 
 class StateTracker:
-    """Builds state and result after each control cycle, and counts the cycles of a hold.
-
-    Attributes:
-        reason: Newest reason of a change of phase or outcome.
-    """
+    """Builds state and result after each control cycle, and counts the cycles of a hold."""
 
     def __init__(self) -> None:
-        self.reason = ""
         self._hold_cycles = self._vision_cycles = 0
 
     def update(
-        self, decision: Decision, servo: ServoState, cell: LoadCellSample | None, *, restart: bool
+        self,
+        decision: Decision,
+        servo: ServoState,
+        cell: LoadCellSample | None,
+        *,
+        reason: str,
+        restart: bool,
     ) -> tuple[GripperState, GraspResult]:
         """Returns the state after a cycle, and the result of a request that ends with it.
 
-        ``restart`` is True if the cycle started a new request, whose hold is counted from zero.
+        ``reason`` is the newest reason of a change of phase or outcome. ``restart`` is True if the cycle started a new
+        request, whose hold is counted from zero.
         """
         status, estimate = decision.status, decision.estimate
-        self.reason = status.reason or self.reason
         if restart:
             self._hold_cycles = self._vision_cycles = 0
         if status.phase == Phase.HOLD:
@@ -105,7 +106,7 @@ class StateTracker:
             t_ns=status.t_ns,
             phase=Phase(status.phase),
             outcome=Outcome(status.outcome),
-            reason=self.reason,
+            reason=reason,
             reference_n=status.reference_n,
             force_n=estimate.force_n,
             std_n=estimate.std_n,
