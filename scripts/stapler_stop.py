@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gripper_force.jobs.dataset import load_clips
-from gripper_force.jobs.evaluate import estimates
+from gripper_force.jobs.estimates import estimate_clips
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import GraspStatus, LoadCellSample
 from gripper_force.vision.checkpoint import load_checkpoint
@@ -62,7 +62,7 @@ def main() -> None:
     preprocess = checkpoint.header.preprocess
     paths = sorted(options.data.rglob("*.mcap"))
     clips = load_clips(paths, preprocess)
-    forces_n = [members_n.mean(0) for members_n in estimates(checkpoint, clips)]
+    forces_n = [members_n.mean(0) for members_n in estimate_clips(checkpoint, clips)]
     used = [clip.valid & (np.arange(len(clip.frames)) >= preprocess.lead_in) for clip in clips]
     measured_n = np.concatenate([clip.forces_n[t] for clip, t in zip(clips, used, strict=True)])
     estimated_n = np.concatenate([f[t] for f, t in zip(forces_n, used, strict=True)])

@@ -5,12 +5,10 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
-import cv2
 import numpy as np
 import numpy.typing as npt
-import torch
 
 from gripper_force.config import Config, config_from, config_from_text
 from gripper_force.errors import DataError
@@ -19,7 +17,6 @@ from gripper_force.jobs.dataset import (
     CONTACT_N,
     Clip,
     StreamedClip,
-    check_size,
     find_logs,
     starts_in_contact,
     stiffness_floor_n,
@@ -33,15 +30,7 @@ from gripper_force.progress import Progress, no_progress
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.schema import Tree
 from gripper_force.types import Frame, LoadCellSample, ServoState
-from gripper_force.vision.batch_inference import kept_checkpoint, predict, stream_features
-from gripper_force.vision.checkpoint import Checkpoint
-from gripper_force.vision.engines.pytorch import restored_threads
 from gripper_force.vision.model_files import read_model
-
-RIDGE_SIZE_PX: Final = 32
-RIDGE_COMPONENTS: Final = 20
-RIDGE_PENALTY: Final = 0.2
-"""Penalty per frame; values from 0.02 to 0.2 transfer best between objects."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +166,7 @@ def evaluate(
     each = list(zip(used, clips, forces_n, strict=True))
     lead_in = model.header.preprocess.lead_in
     result = replace(
-        compare(clips, forces_n, lead_in),
+        errors_on(clips, forces_n, lead_in),
         left_out=len(chosen) - len(clips),
         per_log={str(path): _log_errors(clip, force_n, lead_in) for path, clip, force_n in each},
         failed={str(paths[number]): str(error) for number, error in failed.items()},
@@ -220,7 +209,11 @@ def _evaluate_log(
     objects: tuple[str, ...],
     include_contact_starts: bool,
 ) -> _Evaluated | None:
-    """Reads and estimates one log, with one thread: the last digits depend on their number. None: another object."""
+    """Reads and estimates one log. None: it is of another object."""
+    # The process that only collects the results of others needs no PyTorch, whose import takes seconds.
+    from gripper_force.jobs.estimates import estimate_frames
+    from gripper_force.vision.batch_inference import kept_checkpoint
+
     settings = config_from(config, "evaluate")
     reader = LogReader(path)
     logged = config_from_text(reader.config, str(path))
@@ -238,105 +231,24 @@ def _evaluate_log(
         return None
     profiles = read_profiles(own)
     gain = gain_of(with_object(own.control, profiles).object_ratio, logged.gripper.gain_std)
-    correction, device = None, "cuda" if torch.cuda.is_available() else "cpu"
+    correction = None
     if settings.calibration.object is not None:
-        correction, device = read_correction(own, profiles, loaded, logged.rig_settings()), "cpu"
-    networks = [network.to(device) for network in loaded.networks]
-    parts: list[npt.NDArray[np.floating]] = []
-    try:
-        with restored_threads():
-            torch.set_num_threads(1)
-            for forces_n, read_out in stream_features(networks, preprocess, streamed.frames(), device):
-                mean_n = forces_n.mean(0)
-                if correction is not None:
-                    mean_n = correction.force_n(mean_n, read_out).astype(np.float32)
-                parts.append(mean_n)
-    finally:
-        for network in networks:
-            network.cpu()  # they are kept for the next log, and for a replay
+        correction = read_correction(own, profiles, loaded, logged.rig_settings())
+    forces_n = estimate_frames(loaded, streamed.frames(), correction)
     clip = streamed.clip(streamed.no_images)
     if starts_in_contact(clip.forces_n, preprocess) and not include_contact_starts:
         return _Evaluated(clip, None)
-    return _Evaluated(clip, (1.0 if gain is None else gain.gain) * np.concatenate(parts))
+    return _Evaluated(clip, (1.0 if gain is None else gain.gain) * forces_n)
 
 
-def evaluate_clips(
-    checkpoint: Checkpoint, clips: Sequence[Clip], progress: Progress = no_progress
+def errors_on(
+    clips: Sequence[Clip], forces_n: Sequence[npt.NDArray[np.floating]], lead_in: int
 ) -> Evaluation:
-    """Compares a checkpoint's estimates with the load cell, over clips: `estimates` and `compare`."""
-    forces_n = [members_n.mean(0) for members_n in estimates(checkpoint, clips, progress)]
-    return compare(clips, forces_n, checkpoint.header.preprocess.lead_in)
-
-
-def estimates(
-    checkpoint: Checkpoint, clips: Sequence[Clip], progress: Progress = no_progress
-) -> list[npt.NDArray[np.float32]]:
-    """Returns each member's estimate for each frame, from which any ensemble of members can be formed.
-
-    Args:
-        checkpoint: The networks, computed on a GPU if there is one.
-        clips: Recordings, downscaled to the checkpoint's size.
-        progress: Called after each clip.
-
-    Returns:
-        Forces in N of each clip, (members, T).
-
-    Raises:
-        DataError: Frames are of another size.
-    """
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    preprocess = checkpoint.header.preprocess
-    check_size(clips, preprocess)
-    networks = [network.to(device) for network in checkpoint.networks]
-    forces_n = []
-    for clip in clips:
-        forces_n.append(predict(networks, preprocess, clip.frames, device))
-        progress(f"evaluated {clip.name}")
-    for network in networks:
-        network.cpu()
-    return forces_n
-
-
-def ridge_baseline(train_clips: Sequence[Clip], test_clips: Sequence[Clip]) -> Evaluation:
-    """Evaluates a linear baseline: ridge regression on products of 20 principal components.
-
-    The components are of 32x32 frames minus each recording's first frame.
-
-    Raises:
-        DataError: There are no clips or no labels.
-    """
-    labels_n, valid = _joined(train_clips)
-    images = np.concatenate([_first_frame_difference(clip) for clip in train_clips])[valid]
-    centre = images.mean(0)
-    _, axes = np.linalg.eigh((images - centre).T @ (images - centre))
-    axes = axes[:, -RIDGE_COMPONENTS:]  # (pixels, components)
-    scale = ((images - centre) @ axes).std(0) + 1e-6
-
-    def features(pixels: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
-        scores = ((pixels - centre) @ axes / scale).astype(np.float64)  # (N, components)
-        first, second = np.triu_indices(scores.shape[1])
-        return np.column_stack([scores, scores[:, first] * scores[:, second]])
-
-    x, y = features(images), labels_n[valid].astype(np.float64)
-    x_mean, y_mean = x.mean(0), y.mean()
-    covariance = (x - x_mean).T @ (x - x_mean) / len(x)
-    weights = np.linalg.solve(
-        covariance + RIDGE_PENALTY * np.eye(x.shape[1]), (x - x_mean).T @ (y - y_mean) / len(x)
-    )
-    predictions = [
-        (features(_first_frame_difference(clip)) - x_mean) @ weights + y_mean for clip in test_clips
-    ]
-    return compare(test_clips, predictions, lead_in=0)
-
-
-def compare(
-    clips: Sequence[Clip], predictions: Sequence[npt.NDArray[np.floating]], lead_in: int
-) -> Evaluation:
-    """Compares estimates with the load cell, over all frames with a label.
+    """Returns the errors of estimates against the load cell, over all frames with a label.
 
     Args:
         clips: Recordings.
-        predictions: Estimates for each clip's frames in N, (T,).
+        forces_n: Estimates for each clip's frames in N, (T,).
         lead_in: First frames of each clip to leave out. They only serve as reference, and a run gives no
             estimate for them.
 
@@ -344,7 +256,7 @@ def compare(
         DataError: There are no clips or no labels.
     """
     valid = _has_label(clips, lead_in)
-    measured_n, predicted_n, objects = _labelled(clips, predictions, lead_in)
+    measured_n, predicted_n, objects = _labelled(clips, forces_n, lead_in)
     floors_n = np.concatenate([stiffness_floor_n(clip.forces_n, clip.stiffness) for clip in clips])[valid]
     return Evaluation(
         mae_n=metrics.mae(predicted_n, measured_n),
@@ -389,8 +301,9 @@ def _log_errors(clip: Clip, forces_n: npt.NDArray[np.floating], lead_in: int) ->
 
 def _has_label(clips: Sequence[Clip], lead_in: int) -> npt.NDArray[np.bool_]:
     """Returns the mask of the frames with a label after each clip's first ``lead_in``, (N,)."""
-    _, valid = _joined(clips)
-    valid &= np.concatenate([np.arange(len(clip.frames)) >= lead_in for clip in clips])
+    if not any(clip.valid.any() for clip in clips):
+        raise DataError("no frame has a label; use recordings with a load cell")
+    valid = np.concatenate([clip.valid & (np.arange(len(clip.frames)) >= lead_in) for clip in clips])
     if not valid.any():
         raise DataError(
             f"no frame after a recording's first {lead_in} has a load-cell force; use longer recordings"
@@ -399,26 +312,10 @@ def _has_label(clips: Sequence[Clip], lead_in: int) -> npt.NDArray[np.bool_]:
 
 
 def _labelled(
-    clips: Sequence[Clip], predictions: Sequence[npt.NDArray[np.floating]], lead_in: int
+    clips: Sequence[Clip], forces_n: Sequence[npt.NDArray[np.floating]], lead_in: int
 ) -> tuple[npt.NDArray[np.floating], npt.NDArray[np.floating], npt.NDArray[np.str_]]:
     """Returns measured and estimated force in N, and the object, of each frame with a label; all (N,)."""
     valid = _has_label(clips, lead_in)
     measured_n = np.concatenate([clip.forces_n for clip in clips])[valid]
     objects = np.concatenate([np.full(len(clip.frames), clip.object) for clip in clips])[valid]
-    return measured_n, np.concatenate(predictions)[valid], objects
-
-
-def _joined(clips: Sequence[Clip]) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.bool_]]:
-    """Returns all forces in N, (N,), and the mask of frames with a label, (N,)."""
-    if not any(clip.valid.any() for clip in clips):
-        raise DataError("no frame has a label; use recordings with a load cell")
-    return np.concatenate([clip.forces_n for clip in clips]), np.concatenate([clip.valid for clip in clips])
-
-
-def _first_frame_difference(clip: Clip) -> npt.NDArray[np.float32]:
-    """Returns frames minus the first one, (T, 32 * 32), as fractions of full scale."""
-    size = (RIDGE_SIZE_PX, RIDGE_SIZE_PX)
-    small = [cv2.resize(frame, size, interpolation=cv2.INTER_AREA) for frame in clip.frames]
-    pixels = np.asarray(small, np.float32).reshape(len(small), -1) / 255
-    difference: npt.NDArray[np.float32] = pixels - pixels[0]
-    return difference
+    return measured_n, np.concatenate(forces_n)[valid], objects

@@ -12,7 +12,8 @@ from gripper_force import cli
 from gripper_force.config import load_config
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs.dataset import Clip, load_clips
-from gripper_force.jobs.evaluate import evaluate, evaluate_clips, ridge_baseline
+from gripper_force.jobs.estimates import estimate_clips
+from gripper_force.jobs.evaluate import Evaluation, errors_on, evaluate
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
 from gripper_force.vision.engines.pytorch import TorchEngine
 from gripper_force.vision.estimator import ForceEstimator
@@ -55,6 +56,11 @@ def clip(name: str, object_name: str, seed: int, size: int = 16) -> Clip:
     return Clip(
         frames.clip(0, 255).astype(np.uint8), forces_n, np.ones(30, np.bool_), name, object_name, name
     )
+
+
+def evaluate_clips(checkpoint: Checkpoint, clips: list[Clip]) -> Evaluation:
+    forces_n = [members_n.mean(0) for members_n in estimate_clips(checkpoint, clips)]
+    return errors_on(clips, forces_n, checkpoint.header.preprocess.lead_in)
 
 
 def test_estimates_equal_the_streaming_estimators(checkpoint: Checkpoint) -> None:
@@ -171,15 +177,4 @@ def test_clips_without_labels_or_of_another_size_raise(checkpoint: Checkpoint) -
     with pytest.raises(DataError, match="label"):
         evaluate_clips(checkpoint, [unlabelled])
     with pytest.raises(DataError, match="label"):
-        ridge_baseline([], [])
-
-
-def test_baseline_fits_a_smooth_function() -> None:
-    clips = [clip(str(i), "cup", seed=0) for i in range(9)]
-    rng = np.random.default_rng(0)
-    for one in clips:
-        one.frames[...] = (one.frames + rng.integers(0, 3, one.frames.shape)).clip(0, 255)
-    result = ridge_baseline(clips[:8], clips[8:])
-    constant = np.abs(clips[0].forces_n - clips[0].forces_n.mean()).mean()
-    assert result.mae_n < 0.4 * constant
-    assert result.frames == 30
+        errors_on([], [], 0)

@@ -45,7 +45,7 @@ def state_errors(
         preprocess = loaded.header.preprocess
         if preprocess not in clips:
             clips[preprocess] = read(preprocess)
-        forces_n, measured_n = estimates(clips[preprocess], loaded.networks, preprocess, "cpu")
+        forces_n, measured_n = labelled_estimates(clips[preprocess], loaded.networks, preprocess, "cpu")
         found[str(checkpoint)] = errors(forces_n, measured_n)
         if write:
             stated = {
@@ -57,7 +57,7 @@ def state_errors(
     return found
 
 
-def estimates(
+def labelled_estimates(
     clips: Sequence[Clip], networks: Sequence[Member], preprocess: Preprocess, device: str
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
     """Returns the ensemble's and the measured forces in N, (N,) each, over all frames with a label.

@@ -24,7 +24,7 @@ from gripper_force.jobs.training.ood_fit import MIN_LOGS, add_ood, fit_ood
 from gripper_force.jobs.training.parallel import TrainingProcess, join_training_processes
 from gripper_force.jobs.training.recipe import FITTED_AT_ONCE, continued
 from gripper_force.jobs.training.recipe import TrainConfig as TrainConfig
-from gripper_force.jobs.training.stated_errors import errors, estimates, residuals
+from gripper_force.jobs.training.stated_errors import errors, labelled_estimates, residuals
 from gripper_force.jobs.training.trainer import Trainer
 from gripper_force.progress import Progress, no_progress
 from gripper_force.schema import Tree
@@ -125,7 +125,7 @@ def train(
         )
         if process.first:
             networks = [trainer.network for trainer in trainers]
-            forces_n, measured_n = estimates(held_out, networks, config.preprocess, process.device)
+            forces_n, measured_n = labelled_estimates(held_out, networks, config.preprocess, process.device)
             labels_n = np.concatenate([clip.forces_n[clip.valid] for clip in training])
             data = [*clips, *replay_clips]
             _save(out, networks, config, data, forces_n, measured_n, float(labels_n.mean()))

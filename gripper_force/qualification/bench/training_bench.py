@@ -18,7 +18,7 @@ from gripper_force.jobs.report.figure import STYLE
 from gripper_force.jobs.training.batches import Batches
 from gripper_force.jobs.training.parallel import join_training_processes
 from gripper_force.jobs.training.recipe import RECIPES, TrainConfig, section_from
-from gripper_force.jobs.training.stated_errors import estimates
+from gripper_force.jobs.training.stated_errors import labelled_estimates
 from gripper_force.jobs.training.trainer import Trainer
 from gripper_force.progress import Progress, no_progress
 from gripper_force.schema import Tree
@@ -112,7 +112,7 @@ def learn(
         try:
             for recipe in _in_turns(trainers, minutes, budgets, progress):
                 trainer, preprocess = trainers[recipe], configs[recipe].preprocess
-                forces = estimates(held_out[recipe], [trainer.network], preprocess, process.device)
+                forces = labelled_estimates(held_out[recipe], [trainer.network], preprocess, process.device)
                 spent = trainer.done * budgets[recipe]
                 points.append(Point(recipe, spent, trainer.step, metrics.mae(*forces), metrics.rmse(*forces)))
                 _save(points, configs, out)

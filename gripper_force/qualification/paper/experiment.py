@@ -21,7 +21,7 @@ from gripper_force.config import load_config
 from gripper_force.errors import DataError
 from gripper_force.files import unfinished
 from gripper_force.jobs.dataset import CONTACT_N, Clip, load_clips
-from gripper_force.jobs.evaluate import estimates
+from gripper_force.jobs.estimates import estimate_clips
 from gripper_force.jobs.paper_protocol import RATE_HZ, SetPlan, plan_protocol
 from gripper_force.jobs.processes import process_pool
 from gripper_force.jobs.simulate import simulate
@@ -325,7 +325,7 @@ def _train(task: _Task, files: _Files, workers: int) -> None:
     training, testing = (_clips(files, side, recipe.preprocess, workers) for side in ("train", "test"))
     checkpoint = load_checkpoint(str(path)) if path.exists() else None
     checkpoint = checkpoint or train(recipe, training, path, resume=True, figure=False)
-    forces_n = estimates(checkpoint, testing)
+    forces_n = estimate_clips(checkpoint, testing)
     labelled = [
         force_n[0, _labelled(clip, recipe.preprocess)]
         for force_n, clip in zip(forces_n, testing, strict=True)
