@@ -7,17 +7,15 @@ estimates the difference.
 
 import math
 import re
-from collections import deque
 from dataclasses import replace
 from typing import Final
 
 from gripper_force.config import ControlConfig
-from gripper_force.control.free_travel import FREE_NOISE_N, FreeTravel
+from gripper_force.control.current_estimate import FREE_FLOOR_N, CurrentEstimate, combined_variance_n2
 from gripper_force.control.object_gain import KIND_STD, ObjectGain
 from gripper_force.control.transmission import Transmission
 from gripper_force.types import (
     NS_PER_MS,
-    NS_PER_S,
     EstimateSource,
     Event,
     FusedForce,
@@ -31,9 +29,6 @@ _DRIFT_N2_S = 0.03**2
 _OPENING_DRIFT_N2_S = 0.15**2
 """Additional growth for jaws that are about to open."""
 
-_FREE_FLOOR_N = 0.08
-"""Standard deviation of friction under load after free travel: viscous friction, variation with position."""
-
 _VISION_FLOOR_N = 0.05
 """Lower limit of the standard deviation of a visual estimate, whatever it claims."""
 
@@ -44,16 +39,9 @@ _INERTIA_SHARE = 0.4
 """Standard deviation of the current estimate after an impact, or after the force was lowered, as a share of friction:
 inertia carries the jaws to anywhere within it."""
 
-_LOWERING_LAG_SHARE = 0.1
-"""Lag of the motor force while the force is lowered, as a share of the plant's."""
-
 _PLAY_SHARE = 0.15
 """Error of a steady current estimate after the motor force has fallen within the play, as a share of friction and of
 the reversal: 0.11 N at 60 % in simulated grasps."""
-
-_SLIDES_SHARE = 0.2
-"""Share of the approach speed above which jaws slide during a steady hold: their object has left. If it returns at
-once, the motor force has stayed within the play all the time."""
 
 _GATE = 3.29
 """Innovation gate in standard deviations: 0.1 % of good estimates are rejected (chi-square, 10.8)."""
@@ -88,12 +76,8 @@ class Fusion:
     one object in one pose. The filter therefore tracks only the *difference*, and the estimate adds the share
     of it that follows from the two claimed variances.
 
-    Friction is the motor force in free travel. With friction known, the error of the current estimate is that
-    of the gearing.
-
-    The measured current is noisy and quantised (0.1 N per step), and the contact force follows it with the
-    plant's lag: one low-pass with that lag serves both. Vision is compared with the filtered current at its
-    capture time. It is first multiplied by the object's gain, as far as earlier grasps have shown it.
+    Vision is compared with the estimate of the current at its capture time. It is first multiplied by the object's
+    gain, as far as earlier grasps have shown it.
 
     The claimed error also contains three temporary parts that the filter itself does not use: the lag of the current
     estimate while the force changes; after an impact, the friction that may hold the jaws, until the force has risen
@@ -103,24 +87,19 @@ class Fusion:
     and a growing variance.
 
     Attributes:
-        free_travel: The approach of this grasp.
+        current: The estimate from motor current.
     """
 
     def __init__(self, config: ControlConfig, transmission: Transmission) -> None:
         self._feedback = config.feedback
         self._timeout_ns = round(config.vision_gap_ms * NS_PER_MS)
         self._max_age_ns = round(config.max_frame_age_ms * NS_PER_MS)
-        _, self._lag_s, _ = config.plant
         self._std_limit_n = config.vision_std_n
         self._reentry = max(round(_REENTRY_S * config.frame_hz), _MIN_REENTRY)
-        self._slides_m_s = _SLIDES_SHARE * config.approach_speed_m_s
         self._transmission = transmission
         self._gain = ObjectGain(transmission.gain_std, config.object_ratio)
         self._learns_gain = config.learn_gain
-        cycles = math.ceil(config.rate_hz * config.max_frame_age_ms / 1e3) + 2
-        self._history: deque[tuple[int, float]] = deque(maxlen=cycles)  # covers the age of any accepted frame
-        self._motor_force_n = 0.0
-        self._current_n = 0.0
+        self.current = CurrentEstimate(config, transmission)
         self._newest_visual_ns = -1
         self._used_ns: int | None = None
         self._visual_n = 0.0
@@ -146,16 +125,10 @@ class Fusion:
         self._variance_ratio = self._shared_n2 = self._slow_n = 0.0
         self._impact_n: float | None = None
         self._is_contradicted = False
-        self._friction_n = self._transmission.friction_n
-        self._friction_n2 = (self._transmission.friction_std * self._friction_n) ** 2
+        self.current.restart()
         self._opening_variance_n2 = 0.0
-        self.free_travel = FreeTravel()
         self._was_lowering = self._has_lowered = False
         self.reset_variance()
-
-    def take_friction(self, friction_n: float) -> None:
-        """Takes over friction that an opening of this grasp has shown."""
-        self._friction_n, self._friction_n2 = max(friction_n, 0.0), _FREE_FLOOR_N**2
 
     def end_grasp(self, *, was_held: bool) -> tuple[float, float] | None:
         """Ends the present grasp, and returns the ratio that the object's gain rests on (see `ObjectGain.ratio`)."""
@@ -167,7 +140,7 @@ class Fusion:
 
         At contact the friction force can be anywhere within +- Coulomb friction.
         """
-        self._variance_n2 = self._prior_n2(self._current_n)
+        self._variance_n2 = self._prior_n2(self.current.force_n)
         self._rejected = 0
 
     def step(
@@ -201,8 +174,8 @@ class Fusion:
             The estimate, and an event if vision drops out or returns, or if its first estimate is rejected.
         """
         self._has_lowered = (self._has_lowered or lowering) and not free
-        unknown_n = self._friction_n * (1.0 if opening else _INERTIA_SHARE if self._has_lowered else 0.0)
-        self._opening_variance_n2 = unknown_n**2
+        unknown_share = 1.0 if opening else _INERTIA_SHARE if self._has_lowered else 0.0
+        self._opening_variance_n2 = (self.current.friction_n * unknown_share) ** 2
         if self._was_lowering and not lowering:
             self.reset_variance()
         self._was_lowering = lowering
@@ -225,62 +198,32 @@ class Fusion:
     def _note_change(self, has_force: bool, gripping: bool) -> None:
         """Computes the parts of the claimed error that do not last."""
         if not has_force:
-            self._slow_n, self._impact_n, self._passing_n2 = self._current_n, None, 0.0
+            self._slow_n, self._impact_n, self._passing_n2 = self.current.force_n, None, 0.0
             return
         if self._impact_n is None:
-            self._impact_n = self._current_n
-        self._slow_n += (self._current_n - self._slow_n) * self._dt_s / (self._dt_s + self._lag_s)
-        left_n = _INERTIA_SHARE * self._friction_n - max(self._current_n - self._impact_n, 0.0)
+            self._impact_n = self.current.force_n
+        dt_s, lag_s = self.current.dt_s, self.current.lag_s
+        self._slow_n += (self.current.force_n - self._slow_n) * dt_s / (dt_s + lag_s)
+        left_n = _INERTIA_SHARE * self.current.friction_n - max(self.current.force_n - self._impact_n, 0.0)
         held_n = max(left_n, 0.0) if gripping else 0.0
-        self._passing_n2 = (self._current_n - self._slow_n) ** 2 + held_n**2
+        self._passing_n2 = (self.current.force_n - self._slow_n) ** 2 + held_n**2
         if self._is_contradicted:  # the bias came from estimates of the same network
             self._passing_n2 += (self._difference_n / (1 + self._variance_ratio)) ** 2
 
     def _predict(self, servo: ServoState, free: bool) -> None:
-        before_n = self._current_n
-        closing_m_s = self._transmission.closing_m_s(servo.velocity_rad_s, servo.position_rad)
-        damping_n = self._transmission.damping_n_s_m * closing_m_s
-        motor_force_n = self._transmission.force_n(servo.current_a, servo.position_rad) - damping_n
-        dt_s = 0.0
-        if self._history:
-            dt_s = max(servo.t_ns - self._history[-1][0], 0) / NS_PER_S
-            # Play keeps the lowest motor force, which the lag of a steady hold would hide.
-            lag_s = _LOWERING_LAG_SHARE * self._lag_s if self._was_lowering else self._lag_s
-            self._motor_force_n += (motor_force_n - self._motor_force_n) * dt_s / (dt_s + lag_s)
-        else:
-            self._motor_force_n = motor_force_n
+        before_n = self.current.force_n
+        self.current.step(servo, free=free, holding=self._holds, lowering=self._was_lowering)
+        current_n = self.current.force_n
         if free:
-            self._learn_friction()
-        # Coulomb friction acts as play: the contact force stays until the motor force differs by friction.
-        friction_n = self._friction_n
-        low_n, high_n = self._motor_force_n - friction_n, self._motor_force_n + friction_n
-        self._current_n = min(max(before_n, low_n), high_n)
-        if self._holds and closing_m_s > self._slides_m_s:  # friction acts in full against the motion
-            self._current_n = low_n
-        if free:
-            self._current_n = self._difference_n = 0.0
-        # The further the motor force has reversed within that play, the less certain the contact force is.
-        reversal = (
-            0.0
-            if friction_n == 0 or free
-            else 0.5 + (self._current_n - self._motor_force_n) / (2 * friction_n)
-        )
+            self._difference_n = 0.0
         if self._was_lowering and before_n > 0:  # the difference by the gearing falls with the force
             gain_n2 = (self._transmission.gain_std * before_n) ** 2
-            share = gain_n2 / (gain_n2 + self._friction_n2 + _FREE_FLOOR_N**2)
-            self._difference_n *= 1 - share * (1 - self._current_n / before_n)
-        drift_n2 = (_DRIFT_N2_S + _OPENING_DRIFT_N2_S * reversal) * dt_s
+            share = gain_n2 / (gain_n2 + self.current.friction_n2 + FREE_FLOOR_N**2)
+            self._difference_n *= 1 - share * (1 - current_n / before_n)
+        drift_n2 = (_DRIFT_N2_S + _OPENING_DRIFT_N2_S * self.current.reversal) * self.current.dt_s
         # An unknown gain error g gives a bias of g * force: its variance grows with the square of the force.
-        gain_n2 = self._transmission.gain_std**2 * abs(self._current_n**2 - before_n**2)
-        self._variance_n2 = min(self._variance_n2 + drift_n2 + gain_n2, self._prior_n2(self._current_n))
-        self._dt_s, self._reversal = dt_s, reversal
-        self._history.append((servo.t_ns, self._current_n))
-
-    def _learn_friction(self) -> None:
-        self.free_travel.add(self._motor_force_n)
-        gain = self._friction_n2 / (self._friction_n2 + FREE_NOISE_N**2)
-        self._friction_n = max(self._friction_n + gain * (self._motor_force_n - self._friction_n), 0.0)
-        self._friction_n2 = _combined_variance_n2(self._friction_n2, FREE_NOISE_N**2)
+        gain_n2 = self._transmission.gain_std**2 * abs(current_n**2 - before_n**2)
+        self._variance_n2 = min(self._variance_n2 + drift_n2 + gain_n2, self._prior_n2(current_n))
 
     def _update(self, t_ns: int, visual: VisualForce) -> str:
         """Updates the filter with one estimate. Returns the reason of a rejection, or an empty text."""
@@ -294,11 +237,11 @@ class Fusion:
             return f"its standard deviation is {visual.std_n:.2f} N"
         if self._learns_gain and (problem := self._gain.problem):
             return problem
-        current_n = self._current_at(visual.t_ns)
+        current_n = self.current.at(visual.t_ns)
         if self._holds and self._learns_gain:
             seen_n2 = max(visual.std_n**2 - (KIND_STD * visual.force_n) ** 2, _VISION_FLOOR_N**2)
-            play_n = _PLAY_SHARE * self._friction_n * self._reversal
-            unknown_n2 = self._friction_n2 + _FREE_FLOOR_N**2 + play_n**2
+            play_n = _PLAY_SHARE * self.current.friction_n * self.current.reversal
+            unknown_n2 = self.current.friction_n2 + FREE_FLOOR_N**2 + play_n**2
             self._gain.observe(current_n, visual.force_n, unknown_n2 + seen_n2)
         self._shared_n2 = 0.0
         if (gain := self._applied_gain) is not None:
@@ -331,23 +274,10 @@ class Fusion:
     def _correct(self, innovation_n: float, noise_n2: float) -> None:
         gain = self._variance_n2 / (self._variance_n2 + noise_n2)
         self._difference_n += gain * innovation_n
-        self._variance_n2 = _combined_variance_n2(self._variance_n2, noise_n2)
-
-    def _current_at(self, t_ns: int) -> float:
-        """Returns the current estimate at a past time, interpolated linearly and held beyond both ends."""
-        later_ns, later_n = self._history[-1]
-        for earlier_ns, earlier_n in reversed(self._history):
-            if earlier_ns <= t_ns:
-                if later_ns <= t_ns:
-                    return later_n
-                share = (t_ns - earlier_ns) / (later_ns - earlier_ns)
-                return earlier_n + share * (later_n - earlier_n)
-            later_ns, later_n = earlier_ns, earlier_n
-        return later_n
+        self._variance_n2 = combined_variance_n2(self._variance_n2, noise_n2)
 
     def _prior_n2(self, force_n: float) -> float:
-        gain_n2 = (self._transmission.gain_std * force_n) ** 2
-        return self._friction_n2 + _FREE_FLOOR_N**2 + gain_n2 + self._opening_variance_n2
+        return self.current.variance_n2(force_n) + self._opening_variance_n2
 
     def _switch(self, t_ns: int) -> tuple[Event, ...]:
         fresh = self._used_ns is not None and t_ns - self._used_ns <= self._timeout_ns
@@ -366,8 +296,8 @@ class Fusion:
     def _estimate(self, t_ns: int) -> FusedForce:
         share = 1 / (1 + self._variance_ratio)
         bias_n = share * self._difference_n
-        force_n = self._current_n + bias_n
-        prior_n2 = self._prior_n2(self._current_n)
+        force_n = self.current.force_n + bias_n
+        prior_n2 = self._prior_n2(self.current.force_n)
         shared_n2 = min(self._shared_n2, prior_n2)
         lasting_n2 = self._variance_n2 + self._variance_ratio * share * (prior_n2 - shared_n2) + shared_n2
         std_n = math.sqrt(lasting_n2 + self._passing_n2)
@@ -380,18 +310,13 @@ class Fusion:
             t_ns=t_ns,
             force_n=force_n,
             std_n=std_n,
-            current_n=self._current_n,
+            current_n=self.current.force_n,
             bias_n=bias_n,
-            friction_n=self._friction_n,
+            friction_n=self.current.friction_n,
             source=self._source,
             object_gain=0.0 if gain is None else gain.gain,
             object_gain_std=0.0 if gain is None else gain.std,
         )
-
-
-def _combined_variance_n2(one_n2: float, other_n2: float) -> float:
-    """Returns the variance of two combined estimates. `1 - gain` would cancel if one is much larger."""
-    return one_n2 * other_n2 / (one_n2 + other_n2)
 
 
 def _count_rejections(rejected: int, innovation_n: float) -> int:

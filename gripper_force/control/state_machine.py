@@ -485,7 +485,7 @@ class GraspController:
             )
             shown_n = self._travel.free_travel.friction_n
         else:
-            shown_n = self._fusion.free_travel.friction_n if self._phase == Phase.APPROACH else None
+            shown_n = self._fusion.current.free_travel.friction_n if self._phase == Phase.APPROACH else None
         self._friction.learn(shown_n, only_lower=self._phase == Phase.MOVE and not self._is_opening)
 
     def _run_approach(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
@@ -508,7 +508,7 @@ class GraspController:
             and not self._approach.is_backing_off
             and self._travel.free_travel.mean_n is not None
         ):
-            self._fusion.take_friction(self._travel.free_travel.mean_n)
+            self._fusion.current.take_friction(self._travel.free_travel.mean_n)
         match progress:
             case ApproachState.BACKING_OFF:
                 if not was_backing_off:

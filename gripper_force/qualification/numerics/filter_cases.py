@@ -18,6 +18,7 @@ import numpy as np
 
 from gripper_force.config import Config, ControlConfig, GripperConfig
 from gripper_force.control import fusion
+from gripper_force.control.current_estimate import FREE_FLOOR_N
 from gripper_force.control.fusion import Fusion
 from gripper_force.control.state_machine import GraspController
 from gripper_force.control.transmission import Transmission
@@ -124,7 +125,7 @@ class _DecimalFusion:
         return later_n
 
     def _prior_n2(self, force_n: Decimal) -> Decimal:
-        floor_n2 = Decimal(fusion._FREE_FLOOR_N) ** 2
+        floor_n2 = Decimal(FREE_FLOOR_N) ** 2
         return self._friction_n2 + floor_n2 + (self._gain_std * force_n) ** 2
 
 
