@@ -45,6 +45,7 @@ _allowed = ProcessOptions()
 _interrupts: list[Callable[[], None]] = []  # of the open grippers, the newest last
 _earlier_handlers: dict[int, signal._HANDLER] = {}
 _switch_intervals: list[float] = []  # before each open gripper, the program's own first
+_priorities = threading.local()  # the same for the priority of each thread
 _received: list[int] = []  # signals since the first gripper was opened
 
 
@@ -124,9 +125,13 @@ def real_time_priority() -> Iterator[str]:
             if is_ordinary:
                 _set_time_slice(0)
         return
+    earlier: list[tuple[int, os.sched_param]] = _priorities.__dict__.setdefault("earlier", [])
+    earlier.append((before, parameter))
     try:
         yield ""
     finally:
+        # In whatever order the grippers of a thread are closed, the last one brings the thread's priority back.
+        before, parameter = earlier.pop()
         # An unprivileged process cannot clear this flag once it is set.
         os.sched_setscheduler(0, before | os.SCHED_RESET_ON_FORK, parameter)
 

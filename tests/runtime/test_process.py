@@ -29,6 +29,18 @@ def test_is_this_threads_alone_and_for_as_long_as_asked() -> None:
     assert policy() == before
 
 
+def test_the_last_of_two_grippers_in_one_thread_brings_its_priority_back() -> None:
+    before = policy()
+    first, second = real_time_priority(), real_time_priority()
+    if first.__enter__():
+        pytest.skip("real-time priority is not allowed")
+    second.__enter__()
+    first.__exit__(None, None, None)
+    assert policy() == os.SCHED_FIFO
+    second.__exit__(None, None, None)
+    assert policy() == before
+
+
 @pytest.fixture
 def refused(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
