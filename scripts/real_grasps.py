@@ -130,7 +130,7 @@ def _calibrated(fit: few.Fit, _: list[Clip], one: Clip) -> Callable[[Clip], Floa
 
 def _touches(process: GaussianProcess, clip: Clip, lead_in: int = PREPROCESS.lead_in) -> Touches:
     forces_n, read_out = features([process], PREPROCESS, clip.frames)
-    used = clip.valid & (np.arange(len(clip.frames)) >= lead_in)
+    used = clip.labelled(lead_in)
     measured_n = clip.forces_n[used].astype(np.float64)
     return Touches(
         read_out[used], forces_n[0][used].astype(np.float64), measured_n, np.zeros(used.sum(), int)

@@ -63,7 +63,7 @@ def main() -> None:
     paths = sorted(options.data.rglob("*.mcap"))
     clips = load_clips(paths, preprocess)
     forces_n = [members_n.mean(0) for members_n in estimate_clips(checkpoint, clips)]
-    used = [clip.valid & (np.arange(len(clip.frames)) >= preprocess.lead_in) for clip in clips]
+    used = [clip.labelled(preprocess.lead_in) for clip in clips]
     measured_n = np.concatenate([clip.forces_n[t] for clip, t in zip(clips, used, strict=True)])
     estimated_n = np.concatenate([f[t] for f, t in zip(forces_n, used, strict=True)])
     error_n = np.abs(estimated_n - measured_n)

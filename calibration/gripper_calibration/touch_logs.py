@@ -109,7 +109,7 @@ def read_log(path: Path, checkpoint: Checkpoint) -> TouchRecording:
     preprocess = checkpoint.header.preprocess
     clip = read_clip(reader, config, records.tee(reader.records(*_record_types(config))), preprocess)
     forces_n, read_out = features(checkpoint.networks, preprocess, clip.frames)
-    labelled = clip.valid & (np.arange(len(clip.frames)) >= preprocess.lead_in)
+    labelled = clip.labelled(preprocess.lead_in)
     if not labelled.any():
         raise DataError(
             f"{path} has no label after its first {preprocess.lead_in} frames, which the network needs as "

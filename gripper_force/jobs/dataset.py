@@ -82,6 +82,10 @@ class Clip:
         if not len(self.indentation_m):
             object.__setattr__(self, "indentation_m", np.full(len(self.frames), np.nan, np.float32))
 
+    def labelled(self, lead_in: int) -> npt.NDArray[np.bool_]:
+        """Returns the mask of the frames with a label after the first ``lead_in``, which no run estimates; (T,)."""
+        return self.valid & (np.arange(len(self.frames)) >= lead_in)
+
     @property
     def nominal_n(self) -> npt.NDArray[np.float32]:
         """Forces with the nominal stiffness of the object's kind, (T,); as measured if stiffness is unknown."""

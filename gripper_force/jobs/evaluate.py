@@ -292,7 +292,7 @@ def _object_errors(
 
 
 def _log_errors(clip: Clip, forces_n: npt.NDArray[np.floating], lead_in: int) -> ObjectErrors:
-    valid = clip.valid & (np.arange(len(forces_n)) >= lead_in)
+    valid = clip.labelled(lead_in)
     if not valid.any():
         return ObjectErrors(math.nan, math.nan, math.nan, math.nan, 0)
     measured_n = clip.forces_n[valid]
@@ -303,7 +303,7 @@ def _has_label(clips: Sequence[Clip], lead_in: int) -> npt.NDArray[np.bool_]:
     """Returns the mask of the frames with a label after each clip's first ``lead_in``, (N,)."""
     if not any(clip.valid.any() for clip in clips):
         raise DataError("no frame has a label; use recordings with a load cell")
-    valid = np.concatenate([clip.valid & (np.arange(len(clip.frames)) >= lead_in) for clip in clips])
+    valid = np.concatenate([clip.labelled(lead_in) for clip in clips])
     if not valid.any():
         raise DataError(
             f"no frame after a recording's first {lead_in} has a load-cell force; use longer recordings"

@@ -76,7 +76,7 @@ def fit_ood(
     seen = []
     for clip in clips:
         forces_n, read_out = features(networks, header.preprocess, clip.frames, device)
-        used = clip.valid & (np.arange(len(clip.frames)) >= header.preprocess.lead_in)
+        used = clip.labelled(header.preprocess.lead_in)
         if (clip.forces_n[used] > CONTACT_N).any():
             std_n = claimed_std_n(header, forces_n[:, used])
             force_n = clip.forces_n[used].astype(np.float64)

@@ -64,7 +64,7 @@ def labelled_estimates(
 
     The first frames of a clip are left out, for which a run gives no estimate.
     """
-    used = [clip.valid & (np.arange(len(clip.frames)) >= preprocess.lead_in) for clip in clips]
+    used = [clip.labelled(preprocess.lead_in) for clip in clips]
     pairs = list(zip(clips, used, strict=True))
     forces_n = [predict(networks, preprocess, clip.frames, device).mean(0)[mask] for clip, mask in pairs]
     return np.concatenate(forces_n), np.concatenate([clip.forces_n[mask] for clip, mask in pairs])

@@ -230,7 +230,7 @@ def _errors(engine: Engine, model: Model, clips: Sequence[Clip]) -> dict[str, fl
     for clip in clips:
         engine.reset()
         forces_n = np.array([engine.step(frame).forces_n.mean() for frame in inputs_of(model, clip.frames)])
-        use = clip.valid & (np.arange(len(forces_n)) >= model.header.preprocess.lead_in)
+        use = clip.labelled(model.header.preprocess.lead_in)
         estimates.append(forces_n[use])
         measured.append(clip.forces_n[use])
     engine.reset()

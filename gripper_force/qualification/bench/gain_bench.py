@@ -10,10 +10,10 @@ import numpy.typing as npt
 
 from gripper_force.config import Config
 from gripper_force.jobs.dataset import load_clips
-from gripper_force.jobs.estimates import estimate_clips
 from gripper_force.jobs.grasp import Summary, trials, with_same_object
 from gripper_force.jobs.object_gain import gain_of, learned_ratio
 from gripper_force.jobs.recording.touches import ramp, wait
+from gripper_force.jobs.training.stated_errors import labelled_estimates
 from gripper_force.progress import Progress, no_progress
 from gripper_force.runtime.session import open_run
 from gripper_force.types import Outcome
@@ -123,11 +123,7 @@ def _row(
     checkpoint = load_checkpoint(config.vision.checkpoint)
     preprocess = checkpoint.header.preprocess
     clips = load_clips(logs, preprocess, config.vision.region)
-    pairs = []
-    for clip, members_n in zip(clips, estimate_clips(checkpoint, clips), strict=True):
-        used = clip.valid & (np.arange(len(clip.frames)) >= preprocess.lead_in)
-        pairs.append(np.stack([members_n.mean(0)[used], clip.forces_n[used]]))  # (2, T)
-    seen_n, true_n = np.concatenate(pairs, axis=1)
+    seen_n, true_n = labelled_estimates(clips, checkpoint.networks, preprocess, "cpu")
     gain = gain_of(ratio, config.gripper.gain_std)
 
     def mae_n(factor: float) -> float:

@@ -410,7 +410,7 @@ def _recording_row(
 def _touches(process: GaussianProcess, clip: Clip, number: int) -> Touches:
     preprocess = recipe("few").preprocess
     forces_n, read_out = features([process], preprocess, clip.frames)
-    used = clip.valid & (np.arange(len(clip.frames)) >= preprocess.lead_in)
+    used = clip.labelled(preprocess.lead_in)
     return Touches(
         read_out[used],
         forces_n[0][used].astype(np.float64),

@@ -196,7 +196,7 @@ def run(
         if torch.cuda.is_available():
             jobs = min(jobs, _networks_in_gpu(clips, len(_logs(data, "train"))))
         _train_all(missing, files, jobs, end_s, progress)
-    keep = [_labelled(clip, preprocess) for clip in clips]
+    keep = [clip.labelled(preprocess.lead_in) for clip in clips]
     measured_n = np.concatenate([clip.forces_n[k] for clip, k in zip(clips, keep, strict=True)])
     counts = [int(k.sum()) for k in keep]
     estimates_n: dict[Scale, dict[tuple[str, int], Floats]] = {scale: {} for scale in scales}
@@ -296,12 +296,6 @@ def _train_all(tasks: Sequence[_Task], files: _Files, jobs: int, end_s: float, p
             progress(f"{_text(futures[future])}; {hours:.1f} h left", steps)
 
 
-def _labelled(clip: Clip, preprocess: Preprocess) -> npt.NDArray[np.bool_]:
-    """True for frames with a label for which a run gives an estimate, (T,)."""
-    labelled: npt.NDArray[np.bool_] = clip.valid & (np.arange(len(clip.frames)) >= preprocess.lead_in)
-    return labelled
-
-
 def _load_estimates(path: Path, frames: int) -> Floats:
     estimates_n: Floats = np.load(path, allow_pickle=False)
     if estimates_n.shape != (frames,):
@@ -327,7 +321,7 @@ def _train(task: _Task, files: _Files, workers: int) -> None:
     checkpoint = checkpoint or train(recipe, training, path, resume=True, figure=False)
     forces_n = estimate_clips(checkpoint, testing)
     labelled = [
-        force_n[0, _labelled(clip, recipe.preprocess)]
+        force_n[0, clip.labelled(recipe.preprocess.lead_in)]
         for force_n, clip in zip(forces_n, testing, strict=True)
     ]
     with unfinished(files.estimates(scale, net, seed)) as part, part.open("wb") as file:
