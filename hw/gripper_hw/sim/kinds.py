@@ -268,7 +268,7 @@ class Spring(ObjectKind):
     Attributes:
         size_m: Width between the jaws, depth and height.
         shape: Of its parts, as for `Solid`.
-        n_per_mm: Force per travel of one jaw.
+        n_per_mm: Force per travel of one jaw; with a hinge, of one that touches the part in its middle.
         cubic_n_per_mm3: Further force per cube of the travel.
         stop_m: Travel of one part up to its stop.
         hinge: Axis of its parts, ``back`` (upright) or ``foot`` (horizontal); None: they slide.

@@ -107,13 +107,9 @@ def read_mesh(mesh: MeshFile) -> tuple[Points, Indices]:
             "orientation; repair it, for example with Make Manifold in Blender's 3D-Print Toolbox"
         )
     points = points[first] * _METRES[mesh.unit] * mesh.scale
-    for axis, angle in enumerate(np.deg2rad(mesh.turn_deg)):
-        i, j = [(1, 2), (2, 0), (0, 1)][axis]
-        u, v = points[:, i].copy(), points[:, j].copy()
-        points[:, i], points[:, j] = (
-            u * np.cos(angle) - v * np.sin(angle),
-            u * np.sin(angle) + v * np.cos(angle),
-        )
+    for plane, angle in zip(([1, 2], [2, 0], [0, 1]), np.deg2rad(mesh.turn_deg), strict=True):
+        c, s = np.cos(angle), np.sin(angle)
+        points[:, plane] = points[:, plane] @ [[c, s], [-s, c]]
     low, high = points.min(axis=0), points.max(axis=0)
     if (high - low).min() < LEAST_M or (high - low).max() > MOST_M:
         size = " x ".join(f"{1e3 * length:.6g}" for length in high - low)

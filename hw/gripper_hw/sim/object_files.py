@@ -1,6 +1,7 @@
 """Files of simulated objects: a record of a kind as YAML, or a body as MJCF (docs/simulation.md)."""
 
 import hashlib
+import re
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,19 +57,18 @@ def read_object(path: Path) -> ObjectKind | MjcfBody:
 
 def digest(path: Path) -> str:
     """Returns the SHA-256 of an object's file and of the files that it names."""
-    kind = read_object(path)
-    used = sorted(_mjcf_files(_read_spec(path)).items()) if isinstance(kind, MjcfBody) else []
-    if isinstance(kind, ObjectKind):
-        named = [Path(kind.texture)] if kind.texture.endswith(".png") else []
+    kind, parts = read_object(path), [path.read_bytes()]
+    if isinstance(kind, MjcfBody):
+        spec = _read_spec(path)
+        if re.search(rb"<(include|model)\s", parts[0]):
+            parts.append(spec.to_xml().encode())
+        parts += [data for _, data in sorted(_mjcf_files(spec).items())]
+    else:
         mesh = getattr(kind, "mesh", None)
-        used = [
-            (str(name), read_bytes(name, "file"))
-            for name in named + ([] if mesh is None else [Path(mesh.file)])
-        ]
-    content = hashlib.sha256(path.read_bytes())
-    for _, data in used:
-        content.update(data)
-    return content.hexdigest()
+        named = [kind.texture] if kind.texture.endswith(".png") else []
+        named += [] if mesh is None else [mesh.file]
+        parts += [read_bytes(Path(name), "file") for name in named]
+    return hashlib.sha256(b"".join(parts)).hexdigest()
 
 
 def attach(scene: str, model: ObjectModel, images: dict[str, bytes]) -> str:

@@ -112,9 +112,8 @@ def _tube(detail: Detail, size: float, stiffness: float) -> ObjectModel:
     points[:, 2] += radius + 0.0012
     # Pins a strip: a single pinned line would act as a hinge.
     pins = np.flatnonzero(points[:, 2] < 0.0012 + radius * (1 - np.cos(np.deg2rad(24))))
-    young = (
-        3.0e7 * stiffness * size**2
-    )  # stiffness of a ring is proportional to E * thickness^3 * length / radius^3
+    # Stiffness of a ring is proportional to E * thickness^3 * length / radius^3.
+    young = 3.0e7 * stiffness * size**2
     body = shell(points, uv, faces, pins, young, thickness=0.0022, damping=0.004, radius=0.0012)
     return ObjectModel(body, SHELL_CONTACT, "tube.png", 0.022 * size, dt)
 
@@ -191,9 +190,8 @@ def _ball(detail: Detail, size: float, stiffness: float) -> ObjectModel:
     uv = 0.5 + across * (np.arccos(np.clip(-points[:, 1], -1, 1)) / (2 * np.pi))[:, None]
     points = points * radius + [0, 0, radius + 0.001]
     pins = np.flatnonzero(points[:, 2] < 0.001 + 0.15 * radius)
-    young = (
-        9.0e4 * stiffness / size**0.75
-    )  # exponent between 1 (a block) and 1/2 (two spheres in point contact)
+    # The exponent is between 1 (a block) and 1/2 (two spheres in point contact).
+    young = 9.0e4 * stiffness / size**0.75
     body = f"""<flexcomp name="object" type="direct" dim="3" mass=".2" radius=".001" material="object"
       point="{numbers(points)}" element="{numbers(tetrahedra)}" texcoord="{numbers(uv)}">
       <contact selfcollide="none" condim="3" friction=".6" {SHELL_CONTACT}/>

@@ -204,8 +204,8 @@ class SimulatedRig:
         wrap_file: The same for the log's file.
 
     Raises:
-        ConfigError: ``servo.port`` is already in use, ``sim.detail`` is not resolved, or the object does not
-            exist.
+        ConfigError: ``servo.port`` is already in use, ``sim.detail`` is not resolved, the object does not exist,
+            or a sensor's rate is higher than that of the physics steps.
         SimulationError: The scene cannot be built.
     """
 
@@ -241,6 +241,14 @@ class SimulatedRig:
             second=None if self._second is None else (motors[1], self._second),
             hanging_mass_kg=config.sim.hanging_mass_kg,
         )
+        most_hz = NS_PER_S / self._world.step_ns
+        for unit in ("camera", "load_cell"):
+            device = getattr(config, unit)
+            if device.backend == "simulated" and device.rate_hz > most_hz:
+                raise ConfigError(
+                    f"{unit}.rate_hz {device.rate_hz:g} is more than the {most_hz:g} physics steps per second of the "
+                    f"simulated {config.object}; set at most that"
+                )
         self._object_digest = "" if config.sim.object is None else digest(config.sim.object)
         self._exposure_ms = config.sim.exposure_ms * _relative_exposure(config)
         clock: Clock = LockstepClock(self._world) if self._lockstep else MonotonicClock()

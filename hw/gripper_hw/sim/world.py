@@ -304,13 +304,10 @@ class World:
         """Frees the rendering context."""
         graphics, self._graphics = self._graphics, None
         if graphics is not None:
-            graphics.run(self._close_renderer)
+            if self._renderer is not None:
+                graphics.run(self._renderer.close)
+                self._renderer = None
             graphics.end()
-
-    def _close_renderer(self) -> None:
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
 
     def _rendered(self, side_px: int) -> npt.NDArray[np.uint8]:
         if self._renderer is None:
@@ -331,7 +328,9 @@ class World:
         # A shell has no contact with jaws inside it: its nodes at the jaws' height show that it is too wide.
         x_m, _, z_m = self._data.flexvert_xpos.T
         is_between = np.abs(z_m - self._data.body("left").xpos[2]) < _JAW_HALF_HEIGHT_M
-        if self._data.ncon or (np.abs(x_m[is_between]) > open_width_m / 2).any():
+        pads = [self._model.geom(f"pad_{side}").id for side in ("left", "right")]
+        touches = np.isin(self._data.contact.geom, pads).any()  # parts of the object may touch each other
+        if touches or (np.abs(x_m[is_between]) > open_width_m / 2).any():
             raise ConfigError(
                 f"the simulated object {self._scene.object!r} does not fit between jaws that open "
                 f"{1e3 * open_width_m:.0f} mm; take another object, another seed, or a larger gripper.open_width_m"
@@ -347,7 +346,7 @@ class World:
                 self._failure_text(f"MuJoCo warns {mujoco.mjtWarning(int(warnings[0])).name}")
             )
         if data.ncon and (depth := -float(data.contact.dist.min())) > _MAX_PENETRATION_M:
-            raise SimulationError(self._failure_text(f"a pad is {depth * 1e3:.1f} mm deep in the object"))
+            raise SimulationError(self._failure_text(f"a contact is {depth * 1e3:.1f} mm deep"))
         if (slip := float(np.abs(data.ten_length[self._racks]).max())) > _MAX_RACK_SLIP_M:
             raise SimulationError(
                 self._failure_text(f"the rack has slipped {slip * 1e3:.1f} mm on its pinion")

@@ -260,6 +260,19 @@ def test_an_mjcf_body_may_have_a_tendon_of_its_own(tmp_path: Path, world: Callab
     assert squeezed.force_n == pytest.approx(8.0, abs=0.3)
 
 
+def test_parts_of_an_mjcf_body_may_touch_each_other(tmp_path: Path, world: Callable[..., World]) -> None:
+    parts = "".join(
+        f'<body pos="{side * 0.01} 0 0"><joint type="slide" axis="1 0 0" stiffness="1000" damping="5"/>'
+        '<geom type="box" size=".0101 .015 .02" mass=".05"/></body>'
+        for side in (-1, 1)
+    )
+    path = tmp_path / "pair.xml"
+    path.write_text(f"<mujoco><worldbody>{BODY.format(parts)}</worldbody></mujoco>", encoding="utf-8")
+    squeezed = world(path)
+    squeezed.advance_to(1_200_000_000)
+    assert squeezed.force_n == pytest.approx(8.0, abs=0.3)
+
+
 def test_stiffness_multiplies_that_of_the_joints(world: Callable[..., World]) -> None:
     def width_m(stiffness: float) -> float:
         pressed = world(ROOT / "examples/objects/spring_clamp.xml", stiffness=stiffness)
@@ -298,6 +311,31 @@ def test_the_digest_covers_every_file(tmp_path: Path) -> None:
     assert digest(ROOT / "examples/objects/spring_clamp.xml") != before
 
 
+@pytest.mark.parametrize(
+    "body",
+    [
+        ('<include file="part.xml"/>', ""),
+        ('<frame><attach model="m" body="part" prefix="p"/></frame>', '<model name="m" file="part.xml"/>'),
+    ],
+    ids=["include", "model"],
+)
+def test_the_digest_of_an_mjcf_body_covers_what_it_includes(body: tuple[str, str], tmp_path: Path) -> None:
+    path = tmp_path / "whole.xml"
+    inner, asset = body
+    path.write_text(
+        f"<mujoco><asset>{asset}</asset><worldbody>{BODY.format(inner)}</worldbody></mujoco>",
+        encoding="utf-8",
+    )
+    digests = set()
+    for size in (0.02, 0.03):
+        part = f'<body name="part"><geom type="sphere" size="{size}"/></body>'
+        part = f"<worldbody>{part}</worldbody>" if asset else part
+        (tmp_path / "part.xml").write_text(f"<mujoco>{part}</mujoco>", encoding="utf-8")
+        assert digest(path) == digest(path)
+        digests.add(digest(path))
+    assert len(digests) == 2
+
+
 def test_paths_in_an_object_file_are_relative_to_it() -> None:
     kind = read_object(ROOT / "examples/objects/figurine.yaml")
     assert isinstance(kind, Solid)
@@ -318,6 +356,14 @@ def test_a_file_with_the_name_of_a_shipped_object_is_refused(
 def test_another_object_than_that_of_the_file_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"the object is 'tube', but sim\.object is peach\.yaml"):
         draw_scene("tube", 0, SimConfig(object=Path("peach.yaml")))
+
+
+@pytest.mark.parametrize("fov_deg", [2, 4, 17])
+def test_a_camera_that_sees_a_part_of_the_object_is_accepted(
+    fov_deg: float, squeeze: Callable[[float], Motor]
+) -> None:
+    config = config_from({"sim": {"camera": {"fov_deg": fov_deg}, "randomise": False}}, "test")
+    World(draw_scene("sponge", 0, config.sim), GRIPPER, squeeze(0), 1.0, 0).close()
 
 
 @pytest.mark.parametrize(

@@ -130,6 +130,16 @@ def test_load_cell_has_its_rate_and_noise(make_rig: MakeRig, rate_hz: int) -> No
     assert 0.007 < np.std(forces_n) < 0.013
 
 
+@pytest.mark.parametrize("unit", ["camera", "load_cell"])
+def test_a_rate_above_that_of_the_physics_steps_is_refused(make_rig: MakeRig, unit: str) -> None:
+    with pytest.raises(
+        ConfigError, match=rf"{unit}\.rate_hz 500 is more than the 400 physics steps per second"
+    ):
+        make_rig(f"{unit}.rate_hz=500", "object=sponge")
+    assert find_bus("rig") is None
+    make_rig(f"{unit}.rate_hz=500", "object=sponge", "camera.backend=none", "load_cell.backend=none")
+
+
 def test_notes_hold_scene_and_exposure(make_rig: MakeRig) -> None:
     rig = make_rig("sim.exposure_ms=7")
     notes = rig.notes()
