@@ -22,7 +22,7 @@ from gripper_force.errors import ConfigError
 from gripper_force.files import unfinished
 from gripper_force.jobs.grasp import PAPER_OBJECTS, exclusive_device, run_grasp
 from gripper_force.jobs.processes import Workers
-from gripper_force.jobs.recording.record import check_same
+from gripper_force.jobs.recording.record import check_object_file, check_same
 from gripper_force.jobs.recording.touches import ramp, wait
 from gripper_force.runtime.resolve import resolve
 from gripper_force.runtime.session import open_run
@@ -123,23 +123,27 @@ def simulate(
 
     Raises:
         ConfigError: A device is not simulated.
-        DataError: An existing log was made with another configuration.
+        DataError: An existing log was made with another configuration, or with another content of an object's file.
         GripperError: A simulation failed; logs made so far are kept.
     """
     if device := exclusive_device(config):
         raise ConfigError(f"simulate moves no real gripper, but the configuration has {device}; leave it out")
     out.mkdir(parents=True, exist_ok=True)
     tree = config.model_dump(mode="json")
-    missing = []
+    missing, objects = [], dict[str, tuple[Path, str]]()
     for one in plans:
         if all((out / name).exists() for name in one.names):
             one.check(out, tree)
+            for name in one.names:
+                check_object_file(out / name, objects)
         else:
             missing.append(one)
     with Workers(jobs, ray).pool() as pool:
         futures = [pool.submit(p.make, out, tree) for p in missing]
         for future in as_completed(futures):
-            yield from future.result()
+            for path in future.result():
+                check_object_file(path, objects)
+                yield path
 
 
 def make_log(task: SimulationPlan, out: Path, config: Tree) -> Path:

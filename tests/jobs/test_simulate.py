@@ -108,6 +108,20 @@ def test_a_log_of_other_settings_is_found_among_others(config: Config, tmp_path:
         list(simulate(plans, tmp_path, config, jobs=1))
 
 
+def test_logs_of_an_object_file_that_was_changed_are_not_mixed(config: Config, tmp_path: Path) -> None:
+    files = [tmp_path / "foam.yaml", tmp_path / "felt.yaml"]
+    text = "family: solid\nsize_m: [0.05, 0.05, 0.05]\nmodulus_pa: {}\n"
+    for file, modulus_pa in zip(files, (30000, 20000), strict=True):
+        file.write_text(text.format(modulus_pa))
+    plans = plan("tap", 3, 5, tuple(str(file) for file in files))
+    assert len(list(simulate(plans[:2], tmp_path / "out", config, jobs=1))) == 2
+    files[0].write_text(text.format(60000))
+    with pytest.raises(
+        DataError, match=r"file has changed between .*foam-000005\.mcap and .*foam-000007\.mcap"
+    ):
+        list(simulate(plans, tmp_path / "out", config, jobs=1))
+
+
 def test_a_real_gripper_is_refused(config: Config, tmp_path: Path) -> None:
     real = config.with_values(servo={"port": "/dev/ttyUSB0"})
     with pytest.raises(ConfigError, match=r"simulate moves no real gripper, .* servo\.port=/dev/ttyUSB0"):

@@ -139,14 +139,14 @@ def record(
         GripperError: A device failed. The servo was stopped as configured, and completed sets are kept.
     """
     config, peak_n = _checked(config, plan)
-    first: tuple[Path, str] | None = None  # of the file of a simulated object
+    objects: dict[str, tuple[Path, str]] = {}
     for number, path in enumerate(plan.paths(config, out), start=1):
         one = config.with_values(seed=config.seed + number - 1, target_n=peak_n)
         run = resolve(one, vision=False)
         if path.exists():
             check_same(path, run.config, _SAME)
             _check_touches(path, plan.touches)
-            first = _checked_object(path, first)
+            check_object_file(path, objects)
             yield path
             continue
         if prompt is not None:
@@ -161,18 +161,25 @@ def record(
             with open_session(run, devices, part) as session:
                 _touch_all(_MonitoredSession(session, devices, one, plan, number, progress), plan.touches)
                 session.release()
-        first = _checked_object(path, first)
+        check_object_file(path, objects)
         yield path
 
 
-def _checked_object(path: Path, first: tuple[Path, str] | None) -> tuple[Path, str]:
-    digest = LogReader(path).metadata.get("object file sha256", "")
-    if first is not None and first[1] != digest:
+def check_object_file(path: Path, seen: dict[str, tuple[Path, str]]) -> None:
+    """Raises `DataError` if the file of a log's simulated object was another one in an earlier log.
+
+    Args:
+        path: The log.
+        seen: The first log and the digest of each object's file, to which those of this log are added.
+    """
+    notes = LogReader(path).metadata
+    digest = notes.get("object file sha256", "")
+    first, first_digest = seen.setdefault(notes.get("object file", ""), (path, digest))
+    if digest != first_digest:
         raise DataError(
-            f"the object's file has changed between {first[0]} and {path}; move the logs of the old one away, or use "
+            f"the object's file has changed between {first} and {path}; move the logs of the old one away, or use "
             "another folder"
         )
-    return first or (path, digest)
 
 
 def check_same(path: Path, config: Config, keys: Sequence[str]) -> None:
