@@ -65,12 +65,14 @@ def downscale(gray: Gray, region: Region | None, size: int) -> Gray:
         (size, size) uint8.
 
     Raises:
-        DataError: The frame is not a gray image of bytes.
+        DataError: The frame is not a gray image of bytes, or has no pixels.
         ConfigError: The region is not four whole numbers, or reaches beyond the frame.
     """
     if not isinstance(gray, np.ndarray) or gray.ndim != 2 or gray.dtype != np.uint8:
         found = f"{gray.shape} {gray.dtype}" if isinstance(gray, np.ndarray) else type(gray).__name__
         raise DataError(f"the frame is {found}, not (H, W) uint8; convert it to a gray image of bytes")
+    if not gray.size:
+        raise DataError("the frame has no pixels; check the camera")
     if region is not None:
         given = np.ravel(region)
         is_whole = given.shape == (4,) and given.dtype.kind in "iu"

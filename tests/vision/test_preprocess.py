@@ -63,6 +63,12 @@ def test_frame_that_is_not_gray_bytes_is_refused(frame: np.ndarray) -> None:
         downscale(frame, None, 16)
 
 
+@pytest.mark.parametrize("region", [None, (0, 0, 1, 1)])
+def test_frame_without_pixels_is_refused(region: Any) -> None:
+    with pytest.raises(DataError, match="no pixels"):
+        downscale(np.zeros((0, 8), np.uint8), region, 16)
+
+
 def test_size_must_fit_the_backbone() -> None:
     with pytest.raises(ValidationError):
         Preprocess(size=20)
