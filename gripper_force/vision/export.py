@@ -21,6 +21,7 @@ from gripper_force.vision.engines import Engine, Floats, Step, open_engine
 from gripper_force.vision.engines.pytorch import TorchEngine, restored_threads
 from gripper_force.vision.ensemble_step import FRAME, EnsembleStep, state_names
 from gripper_force.vision.header import EXPORTED, KEY, Model, exported_metadata
+from gripper_force.vision.model_files import cache_folder
 from gripper_force.vision.preprocess import Normaliser
 
 TOLERANCE: Final = 1e-4
@@ -92,7 +93,9 @@ def written(path: Path) -> Iterator[Path]:
             for part in sorted(Path(folder).iterdir(), key=lambda part: part.suffix == path.suffix):
                 shutil.move(part, path.parent / part.name)
     except OSError as error:
-        raise CheckpointError(f"can't write {path}: {error.strerror}; name another file") from error
+        in_cache = path.parent == cache_folder()
+        remedy = "set XDG_CACHE_HOME to a folder that can be written" if in_cache else "name another file"
+        raise CheckpointError(f"can't write {path}: {error.strerror}; {remedy}") from error
 
 
 def _save_onnx(model: Model, path: Path) -> None:

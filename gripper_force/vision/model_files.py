@@ -79,6 +79,12 @@ def exported_file(model: Model, suffix: str) -> Path:
     return path
 
 
+def unusable(engine: str, path: Path, model: Model, error: Exception) -> CheckpointError:
+    """Returns the error of an engine that can't run the file that `exported_file` named for a model."""
+    remedy = "export it again" if path == model.path else "delete it: the next run makes it again"
+    return CheckpointError(f"{engine} can't run {path}: {' '.join(str(error).split())}; {remedy}")
+
+
 def exported_name(model: Model, suffix: str) -> str:
     """Returns the file name under which the export of a checkpoint is kept."""
     return f"{model.digest[:32]}{suffix}"

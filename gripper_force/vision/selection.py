@@ -57,11 +57,17 @@ def resolve_auto(
         The configuration without ``auto``, and the choice; None if there was no ``auto``.
 
     Raises:
-        ConfigError: No candidate keeps the budget.
+        ConfigError: No installed engine can run the network, or no candidate keeps the budget.
     """
     if vision.checkpoint == "none" or "auto" not in (vision.checkpoint, vision.engine):
         return vision, None
-    choice = select(candidates(vision, set_threads=set_threads), budget)
+    tested = candidates(vision, set_threads=set_threads)
+    if not tested:
+        raise ConfigError(
+            f"no installed engine runs vision.checkpoint={vision.checkpoint} with vision.engine={vision.engine} and "
+            f"vision.precision={vision.precision}; pip install 'gripper-force[engines]', or set other values"
+        )
+    choice = select(tested, budget)
     keys = ("checkpoint", "engine", "precision", "threads")
     return vision.model_copy(update={key: getattr(choice.candidate, key) for key in keys}), choice
 

@@ -1,5 +1,6 @@
 """Timing of an engine's step, and the cache of measurements of this machine."""
 
+import hashlib
 import json
 import os
 import platform
@@ -15,7 +16,7 @@ import numpy as np
 from gripper_force.plugins import registered
 from gripper_force.types import NS_PER_MS
 from gripper_force.vision.engines import ENGINES, Engine, Precision
-from gripper_force.vision.header import Model
+from gripper_force.vision.header import EXPORTED, Model
 from gripper_force.vision.model_files import cache_folder
 
 _STEPS: Final = 150
@@ -27,7 +28,7 @@ _WARM_UP_STEPS: Final = 20
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A network, an engine and its settings, with the time and error measured for them on this machine.
+    """A network, an engine and its settings, with the time measured on this machine, and the network's error.
 
     Attributes:
         checkpoint: Name or path.
@@ -36,8 +37,7 @@ class Candidate:
         threads: As ``vision.threads``.
         p50_ms: Median time of an estimate.
         p99_ms: 99th percentile of the time of an estimate.
-        error_n: Mean absolute error: on held-out logs where `gripper-force bench estimator` measured it, else
-            on the validation data of the training, as in the checkpoint's header.
+        error_n: Mean absolute error that the header of the checkpoint or exported file states.
     """
 
     checkpoint: str
@@ -96,7 +96,10 @@ def engine_version(engine: str) -> str:
 
 def cache_key(model: Model, engine: str, precision: str, threads: int) -> str:
     """Returns the key of a measurement: file, engine and its version, settings, and machine."""
-    parts = (model.digest[:16], model.path.suffix, engine, engine_version(engine))
+    digest = model.digest
+    if model.path.suffix in EXPORTED:  # int8 and float32 of one checkpoint have its digest, and other times
+        digest = hashlib.sha256(model.path.read_bytes()).hexdigest()
+    parts = (digest[:16], model.path.suffix, engine, engine_version(engine))
     return " ".join((*parts, precision, str(threads), _machine()))
 
 

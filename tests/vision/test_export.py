@@ -9,7 +9,7 @@ from gripper_force.vision import export as job
 from gripper_force.vision.ensemble_step import EnsembleStep
 from gripper_force.vision.export import export
 from gripper_force.vision.header import Model
-from gripper_force.vision.model_files import read_model
+from gripper_force.vision.model_files import exported_file, read_model
 
 
 @pytest.fixture
@@ -56,10 +56,15 @@ def test_a_file_with_another_output_is_refused(
     assert not list(tmp_path.iterdir())
 
 
-def test_impossible_exports_are_refused(model: Model, tmp_path: Path) -> None:
+def test_impossible_exports_are_refused(
+    model: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(ConfigError, match=r"name a file that ends in \.xml or \.onnx"):
         export(model, tmp_path / "force.trt")
     assert not list(tmp_path.iterdir())
     (tmp_path / "file").write_text("", encoding="utf-8")
-    with pytest.raises(CheckpointError, match="can't write"):
+    with pytest.raises(CheckpointError, match=r"can't write .*; name another file"):
         export(model, tmp_path / "file" / "force.xml")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    with pytest.raises(CheckpointError, match=r"can't write .*; set XDG_CACHE_HOME to a folder"):
+        exported_file(model, ".xml")

@@ -69,6 +69,14 @@ def test_no_candidate_beats_the_front(figures: list[tuple[float, float]]) -> Non
         assert not any(f.p50_ms < candidate.p50_ms and f.error_n < candidate.error_n for f in tested)
 
 
+def test_a_setting_that_no_installed_engine_runs_is_an_error_that_names_it() -> None:
+    vision = VisionConfig(checkpoint="auto", engine="onnxruntime", precision="bfloat16")
+    with pytest.raises(
+        ConfigError, match=r"no installed engine runs .*vision\.precision=bfloat16; pip install"
+    ):
+        resolve_auto(vision, BudgetConfig())
+
+
 def test_config_without_auto_is_unchanged(cache: Path) -> None:
     named = VisionConfig(checkpoint="default", engine="torch")
     assert resolve_auto(named, BudgetConfig()) == (named, None)

@@ -1,4 +1,5 @@
 from collections.abc import Iterator
+from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 
@@ -38,6 +39,18 @@ def test_key_names_file_engine_settings_and_machine(tiny_checkpoint: Path) -> No
     model = read_model(tiny_checkpoint)
     key = cache_key(model, "torch", "float32", 2)
     assert key.startswith(f"{model.digest[:16]} .safetensors torch {engine_version('torch')} float32 2 ")
+
+
+def test_exported_files_of_one_checkpoint_have_keys_of_their_own(
+    tiny_checkpoint: Path, tmp_path: Path
+) -> None:
+    """A file in int8 has the digest of the checkpoint, and other times than one in float32."""
+    model, keys = read_model(tiny_checkpoint), []
+    for text in ("<net/>", "<net int8='yes'/>"):
+        path = tmp_path / "force.xml"
+        path.write_text(text)
+        keys.append(cache_key(replace(model, path=path), "openvino", "float32", 1))
+    assert keys[0] != keys[1]
 
 
 def test_cache_keeps_earlier_measurements(cache: Path) -> None:

@@ -3,10 +3,9 @@
 import numpy as np
 import onnxruntime
 
-from gripper_force.errors import CheckpointError
 from gripper_force.vision.engines import Engine, Floats, Precision, Step
 from gripper_force.vision.header import Model
-from gripper_force.vision.model_files import exported_file
+from gripper_force.vision.model_files import exported_file, unusable
 
 
 class OnnxEngine(Engine):
@@ -33,7 +32,7 @@ class OnnxEngine(Engine):
         try:
             self._session = onnxruntime.InferenceSession(path, options, ["CPUExecutionProvider"])
         except Exception as error:  # ONNX Runtime's classes have no common base but Exception
-            raise CheckpointError(f"ONNX Runtime can't run {path}: {error}; export it again") from error
+            raise unusable("ONNX Runtime", path, model, error) from error
         frame, *states = self._session.get_inputs()
         self._frame_name = frame.name
         self._state_shapes = {port.name: port.shape for port in states}

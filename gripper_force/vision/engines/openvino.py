@@ -3,10 +3,9 @@
 import numpy as np
 import openvino
 
-from gripper_force.errors import CheckpointError
 from gripper_force.vision.engines import Engine, Floats, Precision, Step
 from gripper_force.vision.header import Model
-from gripper_force.vision.model_files import exported_file
+from gripper_force.vision.model_files import exported_file, unusable
 
 _PRECISIONS = {"float32": "f32", "bfloat16": "bf16"}
 
@@ -48,7 +47,7 @@ class OpenVinoEngine(Engine):
                 },
             )
         except RuntimeError as error:
-            raise CheckpointError(f"OpenVINO can't run {path}: {error}; export it again") from error
+            raise unusable("OpenVINO", path, model, error) from error
         frame, *states = compiled.inputs
         self._frame = openvino.Tensor(frame.element_type, frame.shape)
         self._states = [[openvino.Tensor(s.element_type, s.shape) for s in states] for _ in range(2)]

@@ -145,6 +145,22 @@ def test_damaged_file_is_named_in_error(ensemble: Path, tmp_path: Path) -> None:
         read_model(tmp_path / "cut.onnx")
 
 
+@pytest.mark.parametrize(("suffix", "name"), [(".xml", "openvino"), (".onnx", "onnxruntime")])
+def test_damaged_file_of_the_cache_is_to_be_deleted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, name: str
+) -> None:
+    needs(name)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    model = read_model(write(tmp_path / "own.safetensors", ("none", 1, "mobile")))
+    path = exported_file(model, suffix)
+    path.with_suffix(".bin" if suffix == ".xml" else suffix).write_bytes(b"")
+    with pytest.raises(CheckpointError, match=f"can't run {path}: .*; delete it") as raised:
+        open_engine(model, name)
+    assert "\n" not in str(raised.value)
+    path.unlink()
+    assert open_engine(model, name).step(frames(1)[0]).forces_n.shape == (1,)
+
+
 def test_incompatible_engine_file_and_precision_are_refused(ensemble: Path) -> None:
     model = read_model(ensemble)
     with pytest.raises(
