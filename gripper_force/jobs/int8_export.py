@@ -51,6 +51,9 @@ def export_int8(model: Model, path: Path, frames: Sequence[Gray]) -> ExportError
     """
     if path.suffix != ".xml":
         raise ConfigError(f"int8 is exported to OpenVINO only, not to {path}; name a file that ends in .xml")
+    frames = [
+        clip for clip in frames if len(clip) > model.header.preprocess.lead_in
+    ]  # others give no estimate
     total = sum(len(clip) for clip in frames)
     if total < _SAMPLES:
         raise DataError(

@@ -44,6 +44,24 @@ def test_int8_is_calibrated_on_recordings(model: Model, tmp_path: Path, recordin
         assert after.std_n > before.std_n
 
 
+def test_recordings_without_an_estimate_are_left_out(
+    model: Model, tmp_path: Path, recordings: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[np.ndarray] = []
+
+    def split(frames: list[np.ndarray], _: int) -> None:
+        seen.extend(frames)
+        raise DataError("not exported")
+
+    monkeypatch.setattr(int8_export, "_split", split)
+    short = recordings[0][: model.header.preprocess.lead_in]
+    with pytest.raises(DataError, match="not exported"):
+        export_int8(model, tmp_path / "int8.xml", [*recordings, short])
+    assert [len(clip) for clip in seen] == [len(clip) for clip in recordings]
+    with pytest.raises(DataError, match="the recordings hold 160; record more"):
+        export_int8(model, tmp_path / "int8.xml", [recordings[0], *[short] * 100])
+
+
 @pytest.mark.parametrize("count", [1, 3])
 def test_the_error_is_measured_on_what_the_ranges_have_not_seen(
     model: Model,
