@@ -513,7 +513,9 @@ class SimJawsConfig(Section):
 class SimLightConfig(Section):
     """Light and background of the simulated world, beside ``sim.lux``."""
 
-    direction: Vector = Field((-0.40, 0.55, -0.75), description="direction in which the light shines")
+    direction: Vector = Field(
+        (-0.40, 0.55, -0.75), description="direction in which the light shines, of length about 1"
+    )
     ambient: Share = Field(0.30, description="share of the light that comes from everywhere")
     background: float = Field(1.0, ge=0, le=2, description="factor on the brightness of table and wall")
 
