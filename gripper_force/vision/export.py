@@ -21,7 +21,7 @@ from gripper_force.vision.engines import Engine, Floats, Step, open_engine
 from gripper_force.vision.engines.pytorch import TorchEngine, restored_threads
 from gripper_force.vision.ensemble_step import FRAME, EnsembleStep, state_names
 from gripper_force.vision.header import EXPORTED, KEY, Model, exported_metadata
-from gripper_force.vision.model_files import cache_folder
+from gripper_force.vision.model_files import WEIGHTS, cache_folder, weights_digest
 from gripper_force.vision.preprocess import Normaliser
 
 TOLERANCE: Final = 1e-4
@@ -132,11 +132,13 @@ def openvino_network(model: Model) -> Any:
 
 
 def save_openvino(network: Any, model: Model, path: Path) -> None:
-    """Writes a network of OpenVINO with a model's header and digest."""
+    """Writes a network of OpenVINO with a model's header and digest, and the digest of its weights."""
     import openvino
 
     for name, text in exported_metadata(model).items():
         network.set_rt_info(text, [KEY, name])
+    openvino.save_model(network, path, compress_to_fp16=False)
+    network.set_rt_info(weights_digest(path), [KEY, WEIGHTS])
     openvino.save_model(network, path, compress_to_fp16=False)
 
 

@@ -3,6 +3,7 @@
 An ONNX file holds the header in its metadata, an OpenVINO file in its ``rt_info``.
 """
 
+import hashlib
 import os
 import xml.etree.ElementTree as ET
 from importlib import import_module
@@ -21,6 +22,9 @@ from gripper_force.vision.header import (
     header_from,
     read_checkpoint,
 )
+
+WEIGHTS: Final = "weights"
+"""Name in an OpenVINO file's metadata of the SHA-256 of its weights, which are in a file of their own."""
 
 SHIPPED_EXPORTS: Final = Path(__file__).with_name("exported")
 """Folder of the shipped checkpoints as ONNX files. It is in wheels, which `scripts/build-wheel` makes."""
@@ -83,6 +87,18 @@ def unusable(engine: str, path: Path, model: Model, error: Exception) -> Checkpo
     """Returns the error of an engine that can't run the file that `exported_file` named for a model."""
     remedy = "export it again" if path == model.path else "delete it: the next run makes it again"
     return CheckpointError(f"{engine} can't run {path}: {' '.join(str(error).split())}; {remedy}")
+
+
+def check_weights(path: Path) -> None:
+    """Raises `ValueError` if the weights beside an OpenVINO file are not those that it was exported with."""
+    if _openvino_metadata(path).get(WEIGHTS, found := weights_digest(path)) != found:
+        raise ValueError(f"{path.with_suffix('.bin').name} does not hold the weights of this file")
+
+
+def weights_digest(path: Path) -> str:
+    """Returns the SHA-256 of the weights beside an OpenVINO file; that of nothing if there are none."""
+    weights = path.with_suffix(".bin")
+    return hashlib.sha256(weights.read_bytes() if weights.exists() else b"").hexdigest()
 
 
 def exported_name(model: Model, suffix: str) -> str:

@@ -5,7 +5,7 @@ import openvino
 
 from gripper_force.vision.engines import Engine, Floats, Precision, Step
 from gripper_force.vision.header import Model
-from gripper_force.vision.model_files import exported_file, unusable
+from gripper_force.vision.model_files import check_weights, exported_file, unusable
 
 _PRECISIONS = {"float32": "f32", "bfloat16": "bf16"}
 
@@ -35,6 +35,7 @@ class OpenVinoEngine(Engine):
         path = exported_file(model, ".xml")
         core = openvino.Core()
         try:
+            check_weights(path)
             compiled = core.compile_model(
                 core.read_model(path),
                 "CPU",
@@ -46,7 +47,7 @@ class OpenVinoEngine(Engine):
                     "ENABLE_CPU_PINNING": False,
                 },
             )
-        except RuntimeError as error:
+        except (RuntimeError, ValueError) as error:
             raise unusable("OpenVINO", path, model, error) from error
         frame, *states = compiled.inputs
         self._frame = openvino.Tensor(frame.element_type, frame.shape)

@@ -130,7 +130,14 @@ def test_damaged_file_is_named_in_error(ensemble: Path, tmp_path: Path) -> None:
     for suffix in (".xml", ".bin"):
         whole = exported_file(model, ".xml").with_suffix(suffix)
         (tmp_path / "cut").with_suffix(suffix).write_bytes(whole.read_bytes())
-    (tmp_path / "cut.bin").write_bytes(b"")
+    other = np.frombuffer((tmp_path / "cut.bin").read_bytes(), np.uint8) ^ 1
+    for weights in (other.tobytes(), b""):
+        (tmp_path / "cut.bin").write_bytes(weights)
+        with pytest.raises(
+            CheckpointError, match=r"cut\.xml: cut\.bin does not hold the weights .*export it"
+        ):
+            open_engine(read_model(tmp_path / "cut.xml"), "openvino")
+    (tmp_path / "cut.bin").unlink()
     with pytest.raises(CheckpointError, match=r"cut\.xml"):
         open_engine(read_model(tmp_path / "cut.xml"), "openvino")
     (tmp_path / "cut.xml").write_text("<net", encoding="utf-8")
