@@ -14,7 +14,7 @@ from gripper_force.errors import ConfigError, DataError, DeviceError
 from gripper_force.jobs.dataset import stiffness_floor_n, stiffness_of
 from gripper_force.jobs.object_gain import learned_ratio
 from gripper_force.jobs.processes import process_pool
-from gripper_force.jobs.replay.comparison import compare
+from gripper_force.jobs.replay.comparison import load_cell_errors
 from gripper_force.jobs.score import (
     LEAST_VISION_SHARE,
     VisionLoss,
@@ -450,7 +450,7 @@ def _trial(tree: Tree) -> Summary:
 def _mae_n(estimates: list[tuple[int, float]], cells: list[LoadCellSample]) -> float | None:
     """Mean absolute error of the finite estimates over the whole run."""
     finite = [(t_ns, force_n) for t_ns, force_n in estimates if math.isfinite(force_n)]
-    figures = compare([t for t, _ in finite], [f for _, f in finite], cells)
+    figures = load_cell_errors([t for t, _ in finite], [f for _, f in finite], cells)
     return None if figures is None else figures.mae_n
 
 

@@ -14,7 +14,7 @@ from gripper_force.vision.engines import Floats, Step
 from gripper_force.vision.engines.pytorch import TorchEngine
 from gripper_force.vision.export import (
     ExportErrors,
-    compare,
+    export_errors,
     inputs_of,
     openvino_network,
     save_openvino,
@@ -62,7 +62,7 @@ def export_int8(model: Model, path: Path, frames: Sequence[Gray]) -> ExportError
     calibrated, held_out = _split(frames, model.header.preprocess.reference_frames)
     with written(path) as made:
         save_openvino(_quantised(openvino_network(model), model, calibrated), model, made)
-        errors = compare(model, made, held_out)
+        errors = export_errors(model, made, held_out)
         _replace_header(with_added_error(model.header, errors), made)
     return errors
 

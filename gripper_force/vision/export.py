@@ -66,7 +66,7 @@ def export(model: Model, path: Path) -> ExportErrors:
             save_openvino(openvino_network(model), model, made)
         else:
             _save_onnx(model, made)
-        return compare(model, made)
+        return export_errors(model, made)
 
 
 @contextmanager
@@ -155,7 +155,7 @@ def inputs_of(model: Model, clip: Gray) -> Iterator[Floats]:
         yield from normaliser.push(frame)
 
 
-def compare(model: Model, path: Path, frames: Sequence[Gray] | None = None) -> ExportErrors:
+def export_errors(model: Model, path: Path, frames: Sequence[Gray] | None = None) -> ExportErrors:
     """Compares an exported file with PyTorch, on recordings, (T, S, S) uint8 each, or on noise.
 
     Returns:

@@ -80,11 +80,11 @@ def test_the_error_is_measured_on_what_the_ranges_have_not_seen(
     def quantised(network: object, _: Model, frames: list[np.ndarray]) -> None:
         seen["calibrated"] = frames
 
-    def compare(_: Model, path: Path, frames: list[np.ndarray]) -> ExportErrors:
+    def export_errors(_: Model, path: Path, frames: list[np.ndarray]) -> ExportErrors:
         seen["held out"] = frames
         return ExportErrors(largest_n=0, mean_n=0, rms_n=0)
 
-    for name, stub in (("save_openvino", save), ("_quantised", quantised), ("compare", compare)):
+    for name, stub in (("save_openvino", save), ("_quantised", quantised), ("export_errors", export_errors)):
         monkeypatch.setattr(int8_export, name, stub)
     for name in ("openvino_network", "_replace_header"):
         monkeypatch.setattr(int8_export, name, lambda *_: None)

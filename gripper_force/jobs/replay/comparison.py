@@ -206,14 +206,14 @@ def errors_by_source(series: EstimateSeries, cells: Cells) -> dict[str, Comparis
     return {
         name: figures
         for name, (t_ns, force_n) in columns.items()
-        if (figures := _compare(t_ns, force_n, cells)) is not None
+        if (figures := _errors(t_ns, force_n, cells)) is not None
     }
 
 
-def compare(
+def load_cell_errors(
     t_ns: Sequence[int], force_n: Sequence[float], cells: Sequence[LoadCellSample]
 ) -> Comparison | None:
-    """Compares an estimate with the load cell.
+    """Returns the errors of an estimate against the load cell.
 
     Args:
         t_ns: Times of the estimates in nanoseconds, rising, (N,).
@@ -226,10 +226,10 @@ def compare(
     series = CellSeries()
     for sample in cells:
         series.add(sample)
-    return _compare(np.array(t_ns, np.int64), np.array(force_n), series.sorted())
+    return _errors(np.array(t_ns, np.int64), np.array(force_n), series.sorted())
 
 
-def _compare(
+def _errors(
     times_ns: npt.NDArray[np.int64], estimates_n: npt.NDArray[np.float64], cells: Cells
 ) -> Comparison | None:
     measured_n, valid = label_at(times_ns, *cells, 0)
