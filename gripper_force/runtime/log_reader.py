@@ -185,9 +185,11 @@ class LogReader:
 
     def _scan(self, file: BinaryIO) -> None:
         """Reads the framing of the records that were not read yet, and keeps the positions of complete ones."""
-        if not self._scanned and not _MAGIC.startswith(file.read(len(_MAGIC))):
-            raise LogError(f"{self.path} is not an MCAP file; pass a log that gripper-force wrote")
-        file.seek(self._scanned or len(_MAGIC))
+        if not self._scanned:
+            if not _MAGIC.startswith(file.read(len(_MAGIC))):
+                raise LogError(f"{self.path} is not an MCAP file; pass a log that gripper-force wrote")
+            self._scanned = len(_MAGIC)
+        file.seek(self._scanned)
         size = self.path.stat().st_size
         with contextlib.suppress(*_DAMAGE):
             while file.tell() + _FRAMING.size <= size:
@@ -255,4 +257,5 @@ def _is_readable(schema: bytes, codec: Codec) -> bool:
 
 
 def _version(metadata: Mapping[str, str]) -> str:
-    return f" ({metadata['version']})" if "version" in metadata else ""
+    version = metadata.get("version gripper-force")
+    return f" ({version})" if version else ""

@@ -373,7 +373,7 @@ def _foreign(path: Path, topic: str, schema: str, data: bytes) -> Path:
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
-        writer.add_metadata("gripper_force", {"version": "0.0.9"})
+        writer.add_metadata("gripper_force", {"version gripper-force": "0.0.9"})
         writer.add_attachment(0, 0, "config.yaml", "application/yaml", b"")
         channel = writer.register_channel(topic, "protobuf", writer.register_schema(schema, "protobuf", data))
         writer.add_message(channel, 1, b"", 1)

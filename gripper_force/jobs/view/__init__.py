@@ -79,7 +79,9 @@ class GrowingLog(LogReader):
         try:
             super().__init__(path, recover=True)
         except LogError:
-            if path.exists() and path.stat().st_size > _HEAD_BYTES:  # a run without a cycle deletes it
+            if not path.exists():  # a run without a cycle deletes it
+                return False
+            if not self._scanned or self.complete or path.stat().st_size > _HEAD_BYTES:
                 raise
             return False
         return True

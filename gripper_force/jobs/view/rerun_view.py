@@ -245,6 +245,6 @@ def _rgba(colour: str) -> int:
 def _require_display() -> None:
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise DataError(
-            "this machine has no display for Rerun; write a file with --save FILE.rrd and open it elsewhere with "
-            "`rerun FILE.rrd`, or use --viewer foxglove"
+            "this machine has no display for Rerun; write a file with `gripper-force view LOG --save FILE.rrd` and "
+            "open it elsewhere with `rerun FILE.rrd`, or use Foxglove"
         )

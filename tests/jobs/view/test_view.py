@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
 from typer.testing import CliRunner
 
 from gripper_force import cli, plugins
@@ -188,11 +189,33 @@ def test_a_run_that_deletes_its_empty_log_ends_the_view(
         view.GrowingLog(path, lambda: False)
 
 
-def test_a_file_that_is_no_log_is_refused_while_it_is_followed(tmp_path: Path) -> None:
+def test_what_is_no_log_is_refused_while_it_is_followed(tmp_path: Path) -> None:
+    def wait() -> bool:
+        pytest.fail("it waits")
+
     path = tmp_path / "text.mcap"
-    path.write_bytes(b"hello" * 300_000)
+    path.write_bytes(b"hello there")
     with pytest.raises(LogError, match="not an MCAP file"):
-        view.GrowingLog(path, lambda: True)
+        view.GrowingLog(path, wait)
+    with pytest.raises(LogError, match="Is a directory"):
+        view.GrowingLog(tmp_path, wait)
+    with path.open("wb") as file:
+        foreign = Writer(file)
+        foreign.start()
+        foreign.finish()
+    with pytest.raises(LogError, match="it holds no configuration"):
+        view.GrowingLog(path, wait)
+
+
+def test_a_growing_log_waits_for_its_configuration(log: Path, tmp_path: Path) -> None:
+    path, whole = tmp_path / "begun.mcap", log.read_bytes()
+    sizes = iter([0, 3, 20, 60, len(whole)])
+
+    def wait() -> bool:
+        path.write_bytes(whole[: next(sizes)])
+        return True
+
+    assert view.GrowingLog(path, wait).complete
 
 
 # Rerun.
@@ -303,7 +326,7 @@ def test_a_machine_without_a_display_is_told_what_to_do(log: Path, monkeypatch: 
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(sys, "platform", "linux")
-    fails(DataError, "no display for Rerun; write a file with --save", "view", log)
+    fails(DataError, "no display for Rerun; write a file with `gripper-force view LOG --save", "view", log)
 
 
 # Foxglove.
