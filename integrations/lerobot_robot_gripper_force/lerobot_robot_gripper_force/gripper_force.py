@@ -1,6 +1,7 @@
 """The robot ``gripper_force``: observations and actions of LeRobot, on the public interface of gripper-force."""
 
 import logging
+import math
 from contextlib import ExitStack
 from functools import cached_property
 from typing import Any
@@ -153,11 +154,18 @@ class GripperForce(Robot):
             The action that was sent: within the limits, and 0 for a force that opens the jaws.
 
         Raises:
-            RequestError: The gripper was stopped or is at fault, or the value is not finite.
+            RequestError: The gripper was stopped or is at fault, or the value is missing or not finite.
             DeviceError: A device failed.
         """
         gripper, (key,) = self.gripper, self.action_features
+        if key not in action:
+            raise gf.RequestError(
+                f"the action has no {key}, but {', '.join(action) or 'nothing'}; set --robot.action and "
+                "--teleop.action to the same kind"
+            )
         wanted = float(action[key])
+        if not math.isfinite(wanted):
+            raise gf.RequestError(f"the action {key}={wanted} is not finite; send a finite number")
         state = gripper.state
         if state.phase == gf.Phase.FAULT:
             self._sent = None  # after a release, the same action has to be sent again

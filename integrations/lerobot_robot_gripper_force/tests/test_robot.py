@@ -106,11 +106,21 @@ def test_no_number_is_refused_and_nothing_moves(make_robot: Make, kind: str) -> 
     robot = make_robot("camera.backend=none", action=kind)
     robot.connect()
     (key,) = robot.action_features
-    with pytest.raises(gf.RequestError):
-        robot.send_action({key: math.nan})
+    for value in (math.nan, math.inf, -math.inf):
+        with pytest.raises(gf.RequestError, match="is not finite"):
+            robot.send_action({key: value})
     width_m = robot.get_observation()[WIDTH]
     assert robot.get_observation()[WIDTH] == width_m
     assert robot.gripper.state.phase == gf.Phase.OPEN
+
+
+def test_an_action_of_the_other_kind_is_named(make_robot: Make) -> None:
+    robot = make_robot("camera.backend=none")
+    robot.connect()
+    with pytest.raises(
+        gf.RequestError, match=r"has no gripper\.force_n, but gripper\.width_m; set --robot\.action"
+    ):
+        robot.send_action({WIDTH: 0.05})
 
 
 def test_an_equal_action_makes_no_new_request(make_robot: Make, tmp_path: Path) -> None:
