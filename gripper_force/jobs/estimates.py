@@ -59,7 +59,7 @@ def estimate_frames(
     """
     device = "cuda" if torch.cuda.is_available() and correction is None else "cpu"
     networks = [network.to(device) for network in checkpoint.networks]
-    parts: list[npt.NDArray[np.floating]] = []
+    parts: list[npt.NDArray[np.floating]] = [np.empty(0, np.float32)]  # a recording may hold no frames
     try:
         with restored_threads():
             torch.set_num_threads(1)

@@ -14,6 +14,8 @@ from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs.dataset import Clip, load_clips
 from gripper_force.jobs.estimates import estimate_clips
 from gripper_force.jobs.evaluate import Evaluation, errors_on, evaluate
+from gripper_force.runtime.log_writer import LogWriter
+from gripper_force.types import LoadCellSample
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
 from gripper_force.vision.engines.pytorch import TorchEngine
 from gripper_force.vision.estimator import ForceEstimator
@@ -100,6 +102,15 @@ def test_logs_are_evaluated_like_their_clips(
         assert sum(steps) == len(list(few_logs.iterdir()))
     with pytest.raises(DataError, match="is of cup"):
         evaluate(few_logs, tiny_checkpoint, objects=["cup"])
+
+
+def test_a_log_without_frames_is_named(few_logs: Path, tiny_checkpoint: Path) -> None:
+    path = few_logs / "blind.mcap"
+    with LogWriter(path, config="object: sponge\n", metadata={}) as log:
+        log.write(LoadCellSample(1, 0.0, 0.0))
+    result = evaluate(few_logs, tiny_checkpoint)
+    assert result.failed == {str(path): f"{path} holds no camera frames; remove it from the logs"}
+    assert len(result.per_log) == 3
 
 
 def test_logs_that_start_in_contact_are_left_out(
