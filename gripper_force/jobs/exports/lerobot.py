@@ -17,6 +17,7 @@ from gripper_force.errors import ConfigError, DataError
 from gripper_force.progress import Progress, no_progress
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import (
+    GRIPPING,
     NS_PER_S,
     Frame,
     FusedForce,
@@ -241,19 +242,22 @@ def _cycles(reader: LogReader, config: Config, action: Action) -> Iterator[_Cycl
     servo: ServoState | None = None
     force: FusedForce | None = None
     target: float | None = None
+    phase: str = Phase.OPEN
     for record in reader.records(Frame, Request, ServoState, FusedForce, GraspStatus):
         if isinstance(record, Frame):
             frame = record
         elif isinstance(record, Request):
             if record.kind == RequestKind.STOP:
                 return
-            target = target_of(record)
+            if not (record.new_object and phase in GRIPPING):  # the controller refuses that one
+                target = target_of(record)
         elif isinstance(record, ServoState):
             servo = record
         elif isinstance(record, FusedForce):
             force = record
         elif isinstance(record, GraspStatus):  # the end of a cycle
-            if record.phase == Phase.FAULT:
+            phase = record.phase
+            if phase == Phase.FAULT:
                 return
             if target is None:
                 target = 0.0 if action == "force" else record.width_m

@@ -114,6 +114,17 @@ def test_a_grasp_is_no_width(fused_log: Path) -> None:
         rows_of(fused_log, "width")
 
 
+def test_a_grasp_that_was_refused_is_no_action(quick: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "refused.mcap"
+    with gf.open_gripper(overrides=quick, log=path) as gripper:
+        gripper.grasp(3.0)
+        with pytest.raises(gf.RequestError, match="an object is held"):
+            gripper.grasp(2.0, new_object=True)
+        gripper.sleep(0.2)
+        gripper.grasp(2.5)
+    assert {float(row["action"][0]) for row in rows_of(path, with_frames=False)} == {0.0, 3.0, 2.5}
+
+
 def test_an_episode_ends_before_a_stop(stopped_log: Path) -> None:
     records = gf.LogReader(stopped_log).records(gf.Request, gf.GraspStatus)
     stop_ns = next(r.t_ns for r in records if isinstance(r, gf.Request) and r.kind == gf.RequestKind.STOP)
