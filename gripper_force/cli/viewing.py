@@ -14,6 +14,7 @@ from gripper_force.cli.options import AsJson, NoOverrides
 from gripper_force.errors import ConfigError
 
 _NAMES = ("rerun", "foxglove")
+_PORT = 8765
 
 
 class ViewCommand(TyperCommand):
@@ -40,7 +41,10 @@ def view(
     save: Annotated[
         Path | None, typer.Option(help="Write a file for Rerun (.rrd) instead of opening a window.")
     ] = None,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="Port for Foxglove; 0: a free one.")] = 8765,
+    port: Annotated[
+        int | None,
+        typer.Option(min=0, max=65535, help=f"Port for Foxglove; 0: a free one. Default: {_PORT}."),
+    ] = None,
     recover: Annotated[bool, typer.Option(help="Show the intact part of a truncated log.")] = False,
     set_: NoOverrides = None,
     as_json: AsJson = False,
@@ -52,11 +56,13 @@ def view(
         raise ConfigError(f"view uses no configuration; leave out --set {set_[0]}")
     if save is not None and save.suffix != ".rrd":
         raise ConfigError(f"--save writes a file for Rerun, not {save}; name one that ends with .rrd")
+    if port is not None and viewer != "foxglove":
+        raise ConfigError("--port is for Foxglove; add --viewer foxglove, or leave out --port")
     job.require(viewer)
     if viewer == "foxglove":
         if save is not None:
             raise ConfigError(f"--save is for Rerun; Foxglove opens the log itself: {log}")
-        _serve_foxglove(log, port, follow=follow, recover=recover, as_json=as_json)
+        _serve_foxglove(log, _PORT if port is None else port, follow=follow, recover=recover, as_json=as_json)
         return
     from gripper_force.jobs.view.rerun_view import RerunViewer
     from gripper_force.runtime.log_reader import LogReader

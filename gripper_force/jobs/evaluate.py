@@ -156,7 +156,8 @@ def evaluate(
     found, failed = Workers(workers, ray).read_logs(one, paths, "evaluated", progress)
     chosen = {paths[number]: log for number, log in found.items() if log is not None}
     if not chosen:
-        there = sorted({config_from_text(LogReader(path).config, str(path)).object for path in paths})
+        others = [paths[number] for number in found]
+        there = sorted({config_from_text(LogReader(path).config, str(path)).object for path in others})
         raise DataError(f"no log is of {', '.join(objects)}; there are {', '.join(there)}")
     used = {path: one for path, one in chosen.items() if one.forces_n is not None}
     if not used:

@@ -100,7 +100,8 @@ def test_logs_are_evaluated_like_their_clips(
         assert (result.mae_n, result.per_bin) == (expected.mae_n, expected.per_bin)
         steps = [call.args[1] if len(call.args) > 1 else 1 for call in progress.call_args_list]
         assert sum(steps) == len(list(few_logs.iterdir()))
-    with pytest.raises(DataError, match="is of cup"):
+    (few_logs / "damaged.mcap").write_bytes(b"no log")
+    with pytest.raises(DataError, match="no log is of cup; there are disc"):
         evaluate(few_logs, tiny_checkpoint, objects=["cup"])
 
 

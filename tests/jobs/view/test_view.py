@@ -120,6 +120,10 @@ def test_an_unknown_viewer_and_a_view_of_trials_are_refused(log: Path) -> None:
     fails(ConfigError, "--view shows one grasp", "grasp", "--trials", "2", "--view")
 
 
+def test_a_port_for_rerun_is_refused(log: Path) -> None:
+    fails(ConfigError, "--port is for Foxglove; add --viewer foxglove", "view", log, "--port", "8765")
+
+
 def test_the_command_line_loads_no_viewer() -> None:
     program = "import sys, gripper_force.cli, gripper_force.jobs.view; print('rerun' in sys.modules or 'foxglove' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
