@@ -9,7 +9,14 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self, TypeVar, get_args
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    ValidatorFunctionWrapHandler,
+    field_validator,
+)
 from pydantic.fields import FieldInfo
 
 from gripper_force.errors import ConfigError
@@ -32,6 +39,14 @@ class Section(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
     unknown_hint: ClassVar[str] = ""
+
+    @field_validator("*", mode="wrap")
+    @classmethod
+    def _is_not_a_boolean(cls, value: Any, validate: ValidatorFunctionWrapHandler) -> Any:
+        valid = validate(value)
+        if isinstance(value, bool) and isinstance(valid, int | float) and not isinstance(valid, bool):
+            raise ValueError("it is a number, and YAML reads on and yes as true")  # noqa: TRY004  # as pydantic needs
+        return valid
 
     def filled(self, **values: Any) -> Self:
         """Returns a copy with these values, which are not validated, for those of the keys that are None."""

@@ -79,3 +79,15 @@ def test_a_key_that_occurs_twice_is_refused(tmp_path: Path) -> None:
         load_config(path)
     path.write_text("a: &base {x: 1}\nb: {<<: *base, x: 2}\n")
     assert read_tree(path)["b"] == {"x": 2}
+
+
+@pytest.mark.parametrize(
+    "key", ["target_n", "servo.id", "control.rate_hz", "camera.device", "budget.error_n"]
+)
+def test_a_boolean_is_no_number(key: str) -> None:
+    for value in ("on", "yes", "true"):
+        with pytest.raises(ConfigError, match=rf"key '{key}.*it is a number, and YAML reads on"):
+            load_config(None, [f"{key}={value}"])
+        assert load_config(None, [f"log.report={value}"]).log.report
+    with pytest.raises(ConfigError, match=rf"key '{key}"):
+        load_config(None, [f"{key}=off"])
