@@ -11,8 +11,13 @@ from typing import Any, Final
 
 from gripper_force.errors import ConfigError
 
-_METHODS: Final = {"servos": "spec", "cameras": "newest", "load_cells": "drain", "engines": "step"}
-"""A method of each interface, which tells its classes from others before one is called."""
+_METHODS: Final = {
+    "servos": ("spec", "start", "read", "write", "stop", "close"),
+    "cameras": ("newest", "start", "counts", "close"),
+    "load_cells": ("drain", "start", "counts", "close"),
+    "engines": ("step",),
+}
+"""Methods of each interface, which a class is checked for before one is called."""
 
 EXTRAS: Final = {
     "torch": "train",
@@ -70,9 +75,10 @@ def load_class(group: str, builtin: Mapping[str, str], name: str, key: str, alte
     try:
         with importing(f"{key}={name}", alternative):
             module = import_module(module_name)
-    except (ImportError, ValueError, TypeError) as error:  # the last two: an empty or relative name
+    except (ImportError, OSError, ValueError, TypeError) as error:  # the last two: an empty or relative name
         raise ConfigError(
-            f"{key}={name}: can't import {module_name!r}: {error}; name it as package.module:Class"
+            f"{key}={name}: can't import {module_name!r}: {error}; name it as package.module:Class, and install what "
+            "its module needs"
         ) from error
     try:
         found: Any = attrgetter(attribute)(module)
@@ -82,9 +88,10 @@ def load_class(group: str, builtin: Mapping[str, str], name: str, key: str, alte
         ) from error
     if not callable(found):
         raise ConfigError(f"{key}={name}: {target} is not a class; name a class")
-    if isinstance(found, type) and group in _METHODS and not hasattr(found, _METHODS[group]):
+    missing = [method for method in _METHODS.get(group, ()) if not hasattr(found, method)]
+    if isinstance(found, type) and missing:
         raise ConfigError(
-            f"{key}={name}: {target} has no method {_METHODS[group]!r}; name a class with the methods of the "
+            f"{key}={name}: {target} has no method {missing[0]!r}; name a class with the methods of the "
             "interface in gripper_force.interfaces"
         )
     return found

@@ -79,3 +79,19 @@ def test_a_missing_package_names_its_extra(monkeypatch: pytest.MonkeyPatch, name
     monkeypatch.setitem(EXTRAS, "no_such_package", "shapes")
     with pytest.raises(ConfigError, match=r"; pip install 'gripper-force\[shapes\]', or draw it$"):
         load(name, ", or draw it")
+
+
+def test_a_class_without_one_of_the_methods_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    methods = dict.fromkeys(("start", "newest", "close"), print)
+    monkeypatch.setattr("fractions.Half", type("Half", (), methods), raising=False)
+    with pytest.raises(ConfigError, match="fractions:Half has no method 'counts'"):
+        load_class("cameras", {}, "fractions:Half", "camera.backend")
+
+
+def test_a_missing_system_library_is_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "own_vendor.py").write_text("import ctypes\n\nctypes.CDLL('libvendor_is_missing.so')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(
+        ConfigError, match=r"can't import 'own_vendor': libvendor_is_missing\.so.*; .*install what"
+    ):
+        load("own_vendor:Camera")
