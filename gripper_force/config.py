@@ -98,8 +98,8 @@ class ServoConfig(Section):
 
     @property
     def is_virtual(self) -> bool:
-        """True if the port is that of a simulated bus in this process."""
-        return self.port.startswith(VIRTUAL_PREFIX)
+        """True if the servo is simulated in this process."""
+        return self.backend == "dynamixel" and self.port.startswith(VIRTUAL_PREFIX)
 
 
 class LinkageConfig(Section):

@@ -57,7 +57,7 @@ def load_servo_class(config: Config) -> Any:
 def is_simulated(config: Config) -> bool:
     """Returns True if the run has a simulated world."""
     devices = (config.camera.backend, config.load_cell.backend)
-    return "simulated" in devices or (config.servo.backend == "dynamixel" and config.servo.is_virtual)
+    return "simulated" in devices or config.servo.is_virtual
 
 
 def resolve_simulation(config: Config) -> tuple[Config, str]:
@@ -90,25 +90,27 @@ def check_devices(config: Config, port: SharedPort | None = None) -> None:
             f"a shared port works with servo.backend=dynamixel and a real servo.port, not with "
             f"{config.servo.backend} and {config.servo.port}; set servo.port to the device path of the port"
         )
+    load_servo_class(config)
+    servo = config.servo
+    if servo.backend in SERVOS:
+        key, value, simulated = "servo.port", servo.port, "servo.port=virtual:rig"
+    else:
+        key, value, simulated = "servo.backend", servo.backend, "servo.backend=dynamixel"
     if is_simulated(config):
-        if not config.servo.is_virtual:
+        if not servo.is_virtual:
             raise ConfigError(
-                f"servo.port {config.servo.port!r} is not virtual, but a simulated camera or load cell needs "
-                "the simulated servo; set camera.backend and load_cell.backend to real devices or none, or "
-                "set servo.port to virtual:rig"
+                f"{key} {value!r} is not virtual, but a simulated camera or load cell needs the simulated servo; "
+                f"set camera.backend and load_cell.backend to real devices or none, or set {simulated}"
             )
     else:
         if config.clock == "lockstep":
             raise ConfigError(
-                f"clock=lockstep needs a simulated servo, but servo.port is {config.servo.port!r}; set "
-                "clock=realtime, or servo.port=virtual:rig"
+                f"clock=lockstep needs a simulated servo, but {key} is {value!r}; set clock=realtime, or {simulated}"
             )
         if config.faults:
             raise ConfigError(
-                "faults are injected into simulated devices only, but servo.port is "
-                f"{config.servo.port!r}; set servo.port=virtual:rig, or faults=[]"
+                f"faults are for simulated devices only, but {key} is {value!r}; set {simulated}, or faults=[]"
             )
-    load_servo_class(config)
     sensors = (("camera", CAMERAS, config.camera), ("load_cell", LOAD_CELLS, config.load_cell))
     for unit, builtin, section in sensors:
         if section.backend not in ("none", "simulated"):

@@ -66,7 +66,7 @@ def test_a_real_sensor_keeps_no_simulated_time(config: Config, unit: str, backen
 def test_a_simulated_sensor_needs_the_simulated_servo(config: Config, unit: str) -> None:
     none = {"camera": {"backend": "none"}, "load_cell": {"backend": "none"}}
     mixed = config.with_values(servo={"port": "/dev/ttyUSB7"}, **none | {unit: {"backend": "simulated"}})
-    with pytest.raises(ConfigError, match=r"set servo\.port to virtual:rig"), open_devices(mixed):
+    with pytest.raises(ConfigError, match=r"set servo\.port=virtual:rig"), open_devices(mixed):
         pass
 
 
@@ -201,4 +201,30 @@ def test_a_registered_backend_is_opened_by_its_name(config: Config, monkeypatch:
         pytest.raises(ConfigError, match=r"did you mean 'mine'.*phidget, mine or package"),
         open_devices(config.with_values(load_cell={"backend": "mines"})),
     ):
+        pass
+
+
+OWN_SERVO = """
+class OwnServo:
+    spec = start = read = write = stop = close = print
+"""
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({}, "servo.backend 'own_servo:OwnServo' is not virtual, .* or set servo.backend=dynamixel$"),
+        (
+            {"camera": {"backend": "none"}, "load_cell": {"backend": "none"}},
+            "set clock=realtime, or servo.backend=dyn",
+        ),
+    ],
+)
+def test_simulated_sensors_and_time_need_the_simulated_servo_and_not_only_its_port(
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, keys: dict[str, object], message: str
+) -> None:
+    (tmp_path / "own_servo.py").write_text(OWN_SERVO)
+    monkeypatch.syspath_prepend(tmp_path)
+    own = config.with_values(servo={"backend": "own_servo:OwnServo"}, **keys)
+    with pytest.raises(ConfigError, match=message), open_devices(own):
         pass

@@ -10,7 +10,7 @@ from serial.tools import list_ports
 from gripper_force.config import Config, ServoConfig
 from gripper_force.errors import ConfigError, DeviceError, DeviceTimeoutError, GripperError
 from gripper_force.jobs.checks import Check, Confirm, RegisterChange, SetupResult, judged, keep_only, time_ms
-from gripper_force.runtime.backends import open_devices
+from gripper_force.runtime.backends import SERVOS, load_servo_class, open_devices
 from gripper_hw import UDEV_RULES
 from gripper_hw.dynamixel.control_table import (
     REGISTERS,
@@ -52,6 +52,10 @@ def probe(config: Config, sysfs: Path = _SYSFS) -> Iterator[Check]:
     ports = [f"{port.device}: {port.description}" for port in list_ports.comports()]
     yield from (Check("servo", "listed", port, None) for port in ports or ["no serial port"])
     servo = config.servo
+    if servo.backend not in SERVOS:
+        load_servo_class(config)
+        yield Check("servo", "backend", f"{servo.backend}, which only a run checks", None)
+        return
     if config.clock == "lockstep" and not servo.is_virtual:
         advice = "a real servo does not follow simulated time: set clock=realtime"
         yield Check("servo", "clock", "lockstep", False, advice)
@@ -97,6 +101,11 @@ def setup(config: Config, confirm: Confirm, *, commission: bool = False) -> Setu
     Raises:
         GripperError: See `gripper_force.jobs.doctor.setup`.
     """
+    if config.servo.backend not in SERVOS:
+        raise ConfigError(
+            f"only Dynamixel servos have these registers, not servo.backend={config.servo.backend}; set it up with its "
+            "vendor's program"
+        )
     if len(config.servo.ids) > 1:
         raise ConfigError(
             "doctor --setup sets up one servo at a time; pass --set servo.second.id=null, and then "
