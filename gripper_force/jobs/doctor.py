@@ -47,9 +47,11 @@ def doctor(config: Config) -> Iterator[Check]:
 
     A failure becomes a row of the table; nothing is raised.
     """
+    # PyTorch's Triton and Mesa's EGL each bring an LLVM; a process that loads Triton second crashes.
+    network = list(_guarded("network", _network(config)))
     for unit in PROBES:
         yield from check(config, unit)
-    yield from _guarded("network", _network(config))
+    yield from network
     yield from _guarded("clock", _clock(config))
     yield from _guarded("opencv", _opencv())
 

@@ -1,5 +1,6 @@
 import json
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -161,3 +162,35 @@ def test_advice_is_for_what_is_not_good() -> None:
     assert judged("u", "n", "f", True, "do") == Check("u", "n", "f", True, "")
     assert judged("u", "n", "f", False, "do") == Check("u", "n", "f", False, "do")
     assert judged("u", "n", "f", False, "do", harmless=True) == Check("u", "n", "f", True, "do")
+
+
+def test_a_third_party_servo_is_not_looked_for_on_a_dynamixel_bus(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "own_servo.py").write_text(
+        "class OwnServo:\n    spec = start = read = write = stop = close = print\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    config = load_config(None, ["servo.backend=own_servo:OwnServo"])
+    *_, last = doctor.check(config, "servo")
+    assert last == Check("servo", "backend", "own_servo:OwnServo, which only a run checks", None)
+    with pytest.raises(ConfigError, match="only Dynamixel servos"):
+        doctor.setup(config, lambda *_: True)
+    *_, last = doctor.check(config.with_values(servo={"backend": "own_servo:None"}), "servo")
+    assert (last.name, last.ok) == ("usable", False)
+
+
+def test_the_network_is_loaded_before_the_devices_and_listed_after_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    begun = []
+
+    def rows(unit: str) -> Iterator[Check]:
+        begun.append(unit)
+        yield Check(unit, "", "", True)
+
+    monkeypatch.setattr(doctor, "_network", lambda _: rows("network"))
+    monkeypatch.setattr(doctor, "check", lambda _, unit: rows(unit))
+    listed = [found.unit for found in doctor.doctor(load_config())]
+    assert begun == ["network", *doctor.PROBES]
+    assert listed[: len(begun)] == [*doctor.PROBES, "network"]

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 from gripper_force.config import Config
 from gripper_force.jobs.checks import Check, time_ms
+from gripper_force.plugins import require
 
 _SIDE_PX = 16
 
@@ -12,12 +13,13 @@ def probe(config: Config) -> Iterator[Check]:
     """Renders a small image of the configured scene, if its camera is simulated.
 
     Raises:
-        ConfigError: The object does not exist.
+        ConfigError: The object does not exist, or MuJoCo is not installed.
         SimulationError: EGL is missing.
     """
     if config.camera.backend != "simulated":
         yield Check("simulation", "EGL", "not needed: the camera is not simulated", None)
         return
+    require("mujoco", "camera.backend=simulated")
     from gripper_hw.dynamixel.control_table import load_model
     from gripper_hw.dynamixel.firmware import VirtualServo
     from gripper_hw.sim.scene import draw_scene, true_gripper

@@ -5,6 +5,7 @@ import sys
 import pytest
 
 from gripper_force.config import Config
+from gripper_force.errors import ConfigError
 from gripper_force.jobs.checks import Check
 from gripper_hw.sim.simulation_probe import probe
 from gripper_hw.sim.world import World
@@ -46,3 +47,9 @@ def test_simulation_is_not_checked_without_a_simulated_camera() -> None:
     assert list(probe(config)) == [
         Check("simulation", "EGL", "not needed: the camera is not simulated", None)
     ]
+
+
+def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gripper_force.plugins.find_spec", lambda _: None)
+    with pytest.raises(ConfigError, match=r"camera\.backend=simulated needs mujoco.*gripper-force\[sim\]"):
+        list(probe(Config()))
