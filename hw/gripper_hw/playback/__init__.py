@@ -83,7 +83,12 @@ class PlaybackCamera(_PlaybackDevice):
 
     @staticmethod
     def resolve(config: CameraConfig) -> CameraConfig:
-        """Replaces ``rate_hz`` by the frame rate of the log. Raises `LogError` if the log cannot be read."""
+        """Replaces ``rate_hz`` by the frame rate of the log.
+
+        Raises:
+            LogError: The log cannot be read.
+            DataError: Its frames do not have a rate that ``camera.rate_hz`` may have.
+        """
         if config.path is None:  # the constructor refuses it
             return config
         frames = list(islice(LogReader(config.path).records(Frame), _RATE_FRAMES))
@@ -91,6 +96,8 @@ class PlaybackCamera(_PlaybackDevice):
         if span_ns <= 0:
             return config
         rate_hz = (frames[-1].seq - frames[0].seq) * NS_PER_S / span_ns
+        if not 0.1 <= rate_hz <= 1000:
+            raise DataError(f"{config.path} has {rate_hz:.3g} frames/s; play a log with 0.1 to 1000 frames/s")
         return config.model_copy(update={"rate_hz": round(rate_hz, 2)})
 
     def newest(self) -> Frame | None:

@@ -158,3 +158,19 @@ def test_log_without_data_of_sensor_is_refused(tmp_path: Path) -> None:
         load_cell_of(path, ManualClock(0))
     with pytest.raises(LogError, match="No such file"):
         camera_of(tmp_path / "missing.mcap", ManualClock(0))
+
+
+@pytest.mark.parametrize(
+    ("period_ms", "numbers", "rate"),
+    [(20, (5, 5, 5), "0"), (20, (7, 6, 5), "-50"), (300_000, (5, 6, 7), "0.00333")],
+)
+def test_frames_without_a_rate_that_a_run_can_have_are_refused(
+    tmp_path: Path, period_ms: int, numbers: tuple[int, ...], rate: str
+) -> None:
+    path = tmp_path / "run.mcap"
+    with LogWriter(path, config="", metadata={}) as writer:
+        for i, number in enumerate(numbers):
+            t_ns = (FIRST_MS + i * period_ms) * NS_PER_MS
+            writer.write(Frame(t_ns, t_ns, number, np.zeros((4, 4), np.uint8)))
+    with pytest.raises(DataError, match=rf"run\.mcap has {rate} frames/s; play a log"):
+        PlaybackCamera.resolve(CameraConfig(backend="playback", path=path))
