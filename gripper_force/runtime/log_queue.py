@@ -32,7 +32,7 @@ class LogQueue:
     def __init__(self, log: LogWriter, *, lockstep: bool) -> None:
         self.lost = 0
         self._log = log
-        self._error = ""
+        self._error, self._remedy = "", "free some space, or set another log.directory"
         self._queue: queue.Queue[Callable[[], None] | None] = queue.Queue(ROOM)
         self._thread: threading.Thread | None = None
         if not lockstep:
@@ -70,8 +70,7 @@ class LogQueue:
         """
         if self._error:
             raise LogError(
-                f"{self._error}; the run went on, and its log lacks {self.lost} records: free some space, or "
-                "set another log.directory"
+                f"{self._error}; the run went on, and its log lacks {self.lost} records: {self._remedy}"
             )
 
     def _do(self, write: Callable[[], None]) -> None:
@@ -103,4 +102,6 @@ class LogQueue:
         if self._log.failed:
             self.lost += self._log.waiting
             self._log.waiting = 0
+        elif not self._error:
+            self._remedy = "correct the class of the device that gave them"
         self._error = self._error or why

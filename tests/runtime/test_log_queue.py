@@ -160,3 +160,13 @@ def test_records_of_a_chunk_that_is_not_written_count_as_lost(path: Path) -> Non
     kept = list(LogReader(path, recover=True).records(Event))
     assert len(kept) == 11
     assert log_queue.lost >= 9
+
+
+def test_records_that_do_not_fit_are_blamed_on_their_device(path: Path) -> None:
+    log_queue = LogQueue(LogWriter(path, config="", metadata={}), lockstep=True)
+    log_queue.write(Event(-5, "test", "before the beginning"))
+    log_queue.close()
+    with pytest.raises(
+        LogError, match=r"its time is -5 ns; .* lacks 1 records: correct the class of the device"
+    ):
+        log_queue.raise_losses()

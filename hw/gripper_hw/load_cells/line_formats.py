@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 MAX_LINE_BYTES: Final = 256
-"""Longest line in bytes; data without a line feed beyond this is discarded."""
+"""Longest line in bytes; longer ones are discarded."""
 
 HX711_MIN: Final = -0x800000
 HX711_MAX: Final = 0x7FFFFF
@@ -101,4 +101,4 @@ class LineSplitter:
             rest = bytearray()
             self._discard_next = True
         self._partial = bytearray(rest)
-        return [bytes(line) for line in lines]
+        return [bytes(line) for line in lines if len(line) <= MAX_LINE_BYTES]

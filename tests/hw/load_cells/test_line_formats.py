@@ -124,3 +124,7 @@ def test_long_data_without_line_feed_is_discarded() -> None:
     splitter = LineSplitter()
     splitter.feed(b"torn\n" + bytes(MAX_LINE_BYTES + 1))
     assert splitter.feed(b"end of it\n12\n") == [b"12"]
+
+
+def test_a_line_that_is_too_long_is_discarded_if_it_comes_at_once() -> None:
+    assert LineSplitter().feed(b"torn\n" + b" " * (MAX_LINE_BYTES + 1) + b"\n12\n") == [b"12"]
