@@ -22,13 +22,14 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from itertools import pairwise
 
 import pytest
 
 from gripper_force.config import ServoConfig
 from gripper_force.errors import DeviceError, NonFiniteError
 from gripper_force.interfaces import BusStats, Servo, ServoSpec
-from gripper_force.types import ServoCommand, ServoState
+from gripper_force.types import NS_PER_S, ServoCommand, ServoState
 
 _MAX_CYCLES = 4000
 """Cycles within which a commanded motion must happen."""
@@ -145,6 +146,32 @@ class ServoContract:
         start_rad = servo.start().position_rad
         servo.write(ServoCommand(0, start_rad + travel_rad, goal_current_a))
         _read_until(servo, wait, lambda state: (state.position_rad - start_rad) / travel_rad > 0.5)
+
+    def test_velocity_and_current_belong_to_the_motion(
+        self,
+        servo: Servo,
+        config: ServoConfig,
+        wait: Callable[[], None],
+        travel_rad: float,
+        goal_current_a: float,
+    ) -> None:
+        """Both have the sign and the size of the motion: rad/s and A, positive where the position rises."""
+        states = [servo.start()]
+        start_rad = states[0].position_rad
+
+        def is_half_way(state: ServoState) -> bool:
+            states.append(state)
+            return (state.position_rad - start_rad) / travel_rad > 0.5
+
+        servo.write(ServoCommand(0, start_rad + travel_rad, goal_current_a))
+        _read_until(servo, wait, is_half_way)
+        integral_rad = sum(
+            0.5 * (old.velocity_rad_s + new.velocity_rad_s) * (new.t_ns - old.t_ns) / NS_PER_S
+            for old, new in pairwise(states)
+        )
+        assert 0.3 < integral_rad / (states[-1].position_rad - start_rad) < 3
+        assert sum(state.current_a for state in states) / travel_rad > 0
+        assert max(abs(state.current_a) for state in states) < 3 * config.current_limit_a
 
     def test_start_turns_torque_on_and_keeps_the_position(
         self, servo: Servo, wait: Callable[[], None], torque_on: Callable[[], bool] | None
