@@ -208,7 +208,7 @@ LINKAGE = "gripper.linkage={kind: table, table: [[0, 0.092], [1, 0.05], [2, 0]]}
             "phidget",
         ),
         (["train", "data"], "train needs torch", "train"),
-        (["evaluate", "data"], "this command needs torch", "train"),
+        (["evaluate", "data"], "evaluate needs torch", "train"),
         (["teach", "mug"], "teach needs torch", "train"),
         (["calibrate", "object", "mug"], "calibrate object needs torch", "train"),
         (["calibrate", "load-cell", "--mass-kg=1", "--yes"], "this command needs scipy", "calibrate"),

@@ -246,6 +246,7 @@ def evaluate(
     from gripper_force.jobs.dataset import find_logs
     from gripper_force.jobs.evaluate import evaluate as job
 
+    require("torch", "evaluate")
     settings = load_settings(None, set_, {"vision.checkpoint": checkpoint, "calibration.object": profile})
     logs = find_logs(data)
     console.tell_missing_parquet(out)
