@@ -5,6 +5,7 @@ from difflib import get_close_matches
 from inspect import isclass
 from math import isclose
 from os import PathLike
+from os.path import expanduser
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self, TypeVar, get_args
 
@@ -42,11 +43,11 @@ class Section(BaseModel):
 
     @field_validator("*", mode="wrap")
     @classmethod
-    def _is_not_a_boolean(cls, value: Any, validate: ValidatorFunctionWrapHandler) -> Any:
+    def _checked(cls, value: Any, validate: ValidatorFunctionWrapHandler) -> Any:
         valid = validate(value)
         if isinstance(value, bool) and isinstance(valid, int | float) and not isinstance(valid, bool):
             raise ValueError("it is a number, and YAML reads on and yes as true")  # noqa: TRY004  # as pydantic needs
-        return valid
+        return Path(expanduser(valid)) if isinstance(valid, Path) else valid  # noqa: PTH111  # that one may raise
 
     def filled(self, **values: Any) -> Self:
         """Returns a copy with these values, which are not validated, for those of the keys that are None."""

@@ -91,3 +91,9 @@ def test_a_boolean_is_no_number(key: str) -> None:
         assert load_config(None, [f"log.report={value}"]).log.report
     with pytest.raises(ConfigError, match=rf"key '{key}"):
         load_config(None, [f"{key}=off"])
+
+
+def test_a_path_may_begin_with_the_home_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/home/me")
+    assert load_config(None, ["log.directory=~/runs"]).log.directory == Path("/home/me/runs")
+    assert load_config(None, ["log.directory=~nobody-known/runs"]).log.directory == Path("~nobody-known/runs")
