@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 EGL_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check
-# PyPI's PyTorch for Linux brings 2 GB of CUDA libraries. Where this index can't be reached, pip's own has to do.
+# PyPI's PyTorch for Linux brings 4 GB of CUDA libraries. Where this index can't be reached, pip's own has to do.
 CPU_INDEX := https://download.pytorch.org/whl/cpu
 TORCH := $(shell grep -om1 'torch>=[^"]*' pyproject.toml)
 
