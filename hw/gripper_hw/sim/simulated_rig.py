@@ -242,12 +242,10 @@ class SimulatedRig:
             hanging_mass_kg=config.sim.hanging_mass_kg,
         )
         most_hz = NS_PER_S / self._world.step_ns
-        for unit in ("camera", "load_cell"):
-            device = getattr(config, unit)
-            if device.backend == "simulated" and device.rate_hz > most_hz:
+        for unit, sensor in (("camera", config.camera), ("load_cell", config.load_cell)):
+            if sensor.backend == "simulated" and sensor.rate_hz > most_hz:
                 raise ConfigError(
-                    f"{unit}.rate_hz {device.rate_hz:g} is more than the {most_hz:g} physics steps per second of the "
-                    f"simulated {config.object}; set at most that"
+                    f"{unit}.rate_hz {sensor.rate_hz:g} is more than the {most_hz:g} physics steps per second; set less"
                 )
         self._object_digest = "" if config.sim.object is None else digest(config.sim.object)
         self._exposure_ms = config.sim.exposure_ms * _relative_exposure(config)

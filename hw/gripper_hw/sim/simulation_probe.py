@@ -1,6 +1,7 @@
 """Diagnostics of the simulator for `doctor`: renders the configured scene."""
 
 from collections.abc import Iterator
+from contextlib import closing
 
 from gripper_force.config import Config
 from gripper_force.jobs.checks import Check, time_ms
@@ -35,11 +36,8 @@ def probe(config: Config) -> Iterator[Check]:
         world.advance_to(world.t_ns + world.step_ns)  # without a step, `render` returns the last image
         world.render(_SIDE_PX)
 
-    try:
+    with closing(world):
         world.render(_SIDE_PX)  # makes the rendering context, and raises if EGL is missing
         median_ms, _ = time_ms(step_and_render, 5)
-    finally:
-        world.close()
-    size = f"{_SIDE_PX}x{_SIDE_PX} pixels"
-    found = f"renders {size} of {config.object!r}, with one physics step, in {median_ms:.1f} ms"
-    yield Check("simulation", "EGL", found, True)
+    size = f"{_SIDE_PX}x{_SIDE_PX} pixels of {config.object!r}"
+    yield Check("simulation", "EGL", f"renders {size}, with one physics step, in {median_ms:.1f} ms", True)

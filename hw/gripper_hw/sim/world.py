@@ -329,8 +329,8 @@ class World:
         x_m, _, z_m = self._data.flexvert_xpos.T
         is_between = np.abs(z_m - self._data.body("left").xpos[2]) < _JAW_HALF_HEIGHT_M
         pads = [self._model.geom(f"pad_{side}").id for side in ("left", "right")]
-        touches = np.isin(self._data.contact.geom, pads).any()  # parts of the object may touch each other
-        if touches or (np.abs(x_m[is_between]) > open_width_m / 2).any():
+        # Parts of the object may touch each other.
+        if np.isin(self._data.contact.geom, pads).any() or (np.abs(x_m[is_between]) > open_width_m / 2).any():
             raise ConfigError(
                 f"the simulated object {self._scene.object!r} does not fit between jaws that open "
                 f"{1e3 * open_width_m:.0f} mm; take another object, another seed, or a larger gripper.open_width_m"
