@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from gripper_force.config import ControlConfig
@@ -67,6 +68,9 @@ _PASSED_M = 0.002
 _PASSED_SHARE = 0.25
 """A move is blocked if the width does not change by this distance in this time; slow jaws: by this share of what their
 speed allows."""
+
+_REFUSED = "refused "
+"""Beginning of the event of a refused request."""
 
 _SAME_SHARE = 0.25
 """Change of the target as a share of its tolerance that is none: the noise of a stream of requests."""
@@ -215,7 +219,7 @@ class GraspController:
             self._enter_fault()
         refusal = "" if request is None else self._handle_request(t_ns, request)
         if request is not None and refusal:
-            events.append(Event(t_ns, "control", f"refused {str(request.kind)!r}: {refusal}"))
+            events.append(Event(t_ns, "control", f"{_REFUSED}{str(request.kind)!r}: {refusal}"))
         if self._width_m is not None:
             closing_m_s = self._transmission.closing_m_s(servo.velocity_rad_s, self._present_rad)
             self._run_phase(t_ns, dt_s, self._width_m, closing_m_s)
@@ -708,6 +712,11 @@ class GraspController:
             width_m=self._present_width_m,
             reason=self._reason,
         )
+
+
+def refused_ns(events: Iterable[Event]) -> set[int]:
+    """Returns the times of the requests that a controller has refused, from its events."""
+    return {event.t_ns for event in events if event.unit == "control" and event.text.startswith(_REFUSED)}
 
 
 def is_open(open_width_m: float, width_m: float) -> bool:

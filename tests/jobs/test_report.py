@@ -63,6 +63,18 @@ def force_n(t_s: float) -> float:
     )
 
 
+def test_a_refused_request_has_no_score(quick: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "refused.mcap"
+    with gf.open_gripper(overrides=[*quick, "camera.backend=none"], log=path) as gripper:
+        gripper.grasp(3.0)
+        with pytest.raises(gf.RequestError, match="an object is held"):
+            gripper.grasp(2.0, new_object=True)
+        gripper.sleep(0.2)
+    run = read_run(LogReader(path))
+    assert run.target_n == 3.0
+    assert any(row.text.startswith("refused") for row in run.event_rows)
+
+
 def test_a_report_scores_the_last_request_alone(quick: list[str], tmp_path: Path) -> None:
     scores = []
     for name, second_n in (("lowered", 2.0), ("released", 6.0)):

@@ -13,12 +13,13 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from gripper_force.config import Config, Overrides, config_from_text
+from gripper_force.control.state_machine import refused_ns
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.progress import Progress, no_progress
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import (
-    GRIPPING,
     NS_PER_S,
+    Event,
     Frame,
     FusedForce,
     GraspStatus,
@@ -242,22 +243,21 @@ def _cycles(reader: LogReader, config: Config, action: Action) -> Iterator[_Cycl
     servo: ServoState | None = None
     force: FusedForce | None = None
     target: float | None = None
-    phase: str = Phase.OPEN
+    refused = refused_ns(reader.records(Event))
     for record in reader.records(Frame, Request, ServoState, FusedForce, GraspStatus):
         if isinstance(record, Frame):
             frame = record
         elif isinstance(record, Request):
             if record.kind == RequestKind.STOP:
                 return
-            if not (record.new_object and phase in GRIPPING):  # the controller refuses that one
+            if record.t_ns not in refused:
                 target = target_of(record)
         elif isinstance(record, ServoState):
             servo = record
         elif isinstance(record, FusedForce):
             force = record
         elif isinstance(record, GraspStatus):  # the end of a cycle
-            phase = record.phase
-            if phase == Phase.FAULT:
+            if record.phase == Phase.FAULT:
                 return
             if target is None:
                 target = 0.0 if action == "force" else record.width_m

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gripper_force.config import Config, config_from_text, dump_config
+from gripper_force.control.state_machine import refused_ns
 from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import CONTACT_N, label_at
 from gripper_force.jobs.replay.feed import Replayed
@@ -249,8 +250,8 @@ def read_run(
         _replace(records, replayed)
     vision = [visual for visual in records[VisualForce] if visual.is_familiar]
     fused, status = records[FusedForce], records[GraspStatus]
-    requests = records[Request]
-    grasps = [request for request in requests if request.kind == RequestKind.GRASP]
+    refused = refused_ns(records[Event])
+    grasps = [r for r in records[Request] if r.kind == RequestKind.GRASP and r.t_ns not in refused]
     zero_ns = grasps[0].t_ns if grasps else log.start_ns
     target_n, begin_ns = (grasps[-1].target_n, grasps[-1].t_ns) if grasps else (None, 0)
     samples = sorted((s for s in records[LoadCellSample] if s.valid), key=lambda s: s.t_ns)
@@ -296,7 +297,7 @@ def read_run(
         else [],
         touches=_touches(forces.get("load_cell"), errors),
         phases=_phases(zero_ns, end_s, status),
-        event_rows=_event_rows(zero_ns, requests, status, records[Event]),
+        event_rows=_event_rows(zero_ns, records[Request], status, records[Event]),
         compute_ms=np.array([v.compute_ms for v in vision]),
         camera_age_ms=np.array([] if simulated_camera else ages_ns) / NS_PER_MS,
         latency_ms=np.array([] if simulated_camera else [v.ready_ns - v.t_ns for v in vision]) / NS_PER_MS,
