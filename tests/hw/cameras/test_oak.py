@@ -1,4 +1,6 @@
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -315,3 +317,17 @@ def test_camera_can_be_opened_repeatedly(make_oak: MakeOak, take: Take) -> None:
         camera.start()
         take(camera, 2)
         camera.close()
+
+
+def test_depthai_does_not_report_its_use() -> None:
+    environment = {name: value for name, value in os.environ.items() if name != "DEPTHAI_TELEMETRY"}
+    code = "from gripper_hw.cameras.oak import dai; dai.Device.getAllAvailableDevices()"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=environment | {"DEPTHAI_LEVEL": "debug"},
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=60,
+    )
+    assert "Telemetry disabled" in done.stdout

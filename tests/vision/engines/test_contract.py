@@ -1,5 +1,8 @@
 """Contract of the built-in engines: frame by frame the same forces as the whole window."""
 
+import os
+import subprocess
+import sys
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -224,3 +227,12 @@ def test_engine_of_another_package_gets_model_precision_and_threads(
     precision: Precision = "bfloat16"
     opened = open_engine(model, "other_engines:OtherEngine", precision, 2)
     assert opened.arguments == (model, precision, 2)  # type: ignore[attr-defined]
+
+
+def test_onnx_runtime_does_not_report_its_use(tmp_path: Path) -> None:
+    keys = ("CI", "ORT_DISABLE_TELEMETRY", "XDG_CACHE_HOME")  # the first turns telemetry off, too
+    environment = {name: value for name, value in os.environ.items() if name not in keys}
+    code = "import gripper_force.vision.engines.onnxruntime"
+    command = [sys.executable, "-c", code]
+    subprocess.run(command, env=environment | {"HOME": str(tmp_path)}, check=True, timeout=60)
+    assert not list(tmp_path.rglob("onnxruntime.db"))
