@@ -107,10 +107,15 @@ def _target(group: str, builtin: Mapping[str, str], name: str, key: str) -> str:
         return builtin[name]
     if ":" in name:
         return name
-    points = registered(group)
-    if name in points:
-        return f"{points[name].module}:{points[name].attr}"
-    known = [*builtin, *sorted(points.keys() - builtin.keys())]
+    points = list(entry_points(group=f"gripper_force.{group}"))
+    targets = sorted({f"{point.module}:{point.attr}" for point in points if point.name == name})
+    if len(targets) > 1:
+        raise ConfigError(
+            f"{key}={name} is registered for {' and '.join(targets)}; set {key} to one of these"
+        )
+    if targets:
+        return targets[0]
+    known = [*builtin, *sorted({point.name for point in points} - builtin.keys())]
     close = get_close_matches(name, known, n=1)
     hint = f" (did you mean {close[0]!r}?)" if close else ""
     raise ConfigError(f"unknown {key} {name!r}{hint}; use {', '.join(known)} or package.module:Class")

@@ -20,6 +20,8 @@ def points(monkeypatch: pytest.MonkeyPatch) -> None:
     found = [
         EntryPoint("fraction", "nowhere:Nothing", "gripper_force.shapes"),
         EntryPoint("path", "pathlib:Path", "gripper_force.shapes"),
+        EntryPoint("twice", "pathlib:PurePath", "gripper_force.shapes"),
+        EntryPoint("twice", "fractions:Fraction", "gripper_force.shapes"),
         EntryPoint("gone", "no_such_package.shapes:Shape", "gripper_force.shapes"),
     ]
     monkeypatch.setattr(
@@ -53,7 +55,11 @@ def test_a_class_of_another_kind_is_refused(group: str, method: str) -> None:
             "fractoin",
             r"^unknown shape\.kind 'fractoin' \(did you mean 'fraction'\?\); use fraction, decimal, ",
         ),
-        ("zzz", r"'zzz'; use fraction, decimal, gone, path or package\.module:Class$"),
+        ("zzz", r"'zzz'; use fraction, decimal, gone, path, twice or package\.module:Class$"),
+        (
+            "twice",
+            r"^shape\.kind=twice is registered for fractions:Fraction and pathlib:PurePath; set shape\.kind",
+        ),
         (
             "no_such_package.a:B",
             r"^shape\.kind=no_such_package\.a:B needs no_such_package, which is not inst",
