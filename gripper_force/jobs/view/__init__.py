@@ -159,6 +159,7 @@ def beside_run(
         preexec_fn=lambda: os.nice(_NICENESS),
     ) as process:
         try:
+            tell("starting the viewer; the run begins when it is ready")
             assert process.stdout is not None
             while not (state := json.loads(process.stdout.readline() or '{"ended": true}')).get("ready"):
                 if "ended" in state or "error" in state:
