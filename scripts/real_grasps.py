@@ -248,13 +248,13 @@ def main() -> None:
         print(f"| {method} | {' | '.join(f'{a:.2f} / {b:.2f}' for a, b in pairs)} |")
 
 
-def _read(folder: Path, out: Path, jobs: int) -> list[Clip]:
+def _read(folder: Path, out: Path, workers: int) -> list[Clip]:
     paths = []
     for name, video, forces in find_recordings(folder):
         paths.append(out / f"{name}.mcap")
         if not paths[-1].exists():
             import_video(video, forces, paths[-1], name=name)
-    clips = load_clips(paths, PREPROCESS, workers=jobs)
+    clips = load_clips(paths, PREPROCESS, workers=workers)
     used = without_contact_starts(clips, PREPROCESS)
     print(f"{folder}: {len(used)} of {len(clips)} recordings are used; the others start in contact")
     return used

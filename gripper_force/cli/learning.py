@@ -162,7 +162,7 @@ def _read_for_training(
     validation: Path | None,
     replay: Path | None,
     settings: "TrainConfig",
-    jobs: int,
+    workers: int,
     *,
     quiet: bool,
 ) -> _Clips:
@@ -182,7 +182,7 @@ def _read_for_training(
     with console.bar("reading logs", sum(map(len, folders)), hidden=quiet) as progress:
         return _Clips(
             *(
-                load_clips(logs, settings.preprocess, workers=jobs, progress=progress) if logs else []
+                load_clips(logs, settings.preprocess, workers=workers, progress=progress) if logs else []
                 for logs in folders
             )
         )

@@ -157,7 +157,7 @@ def _grasp_trials(
     objects: Sequence[str],
     target_n: float | None,
     same_object: bool,
-    jobs: int | None,
+    workers: int | None,
     yes: bool,
     as_json: bool,
 ) -> None:
@@ -165,10 +165,10 @@ def _grasp_trials(
     from gripper_force.progress import no_progress
 
     device = job.exclusive_device(settings)
-    jobs = jobs or (1 if device or same_object else CORES)
+    workers = workers or (1 if device or same_object else CORES)
     prompt: Prompt | None = None
     lines: Progress = no_progress
-    if device and jobs == 1:
+    if device and workers == 1:
         pause = not yes and sys.stdin.isatty()
         console.err.print(
             f"only one process can open {device}, so the trials follow one another, all of them of the object "
@@ -183,7 +183,7 @@ def _grasp_trials(
             running = job.trials(
                 settings,
                 count,
-                jobs,
+                workers,
                 objects=objects,
                 target_n=target_n,
                 same_object=same_object,

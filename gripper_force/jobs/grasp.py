@@ -240,7 +240,7 @@ def exclusive_device(config: Config) -> str:
 def trials(
     config: Config,
     count: int,
-    jobs: int,
+    workers: int,
     *,
     objects: Sequence[str] = PAPER_OBJECTS,
     target_n: float | None = None,
@@ -253,13 +253,13 @@ def trials(
     Args:
         config: Everything else.
         count: Number of grasps.
-        jobs: Processes; 1: the grasps run in this process. The results of lockstep runs do not depend on it.
+        workers: Processes; 1: the grasps run in this process. The results of lockstep runs do not depend on it.
         objects: Names of the objects.
         target_n: Target force of each grasp; None: drawn from 1 to 8 N, or to what the limits permit.
         same_object: Grasps one object with one gripper, in another place each time, and passes what was learned of
             its gain from grasp to grasp.
         prompt: Called before each grasp, so that a person can place the object; None for no pause.
-        progress: Called before each grasp and at each change of phase, if ``jobs`` is 1.
+        progress: Called before each grasp and at each change of phase, if ``workers`` is 1.
 
     Yields:
         The summary of each grasp, in order.
@@ -273,10 +273,12 @@ def trials(
     """
     require_report(config)
     device = exclusive_device(config)
-    if device and jobs > 1:
-        raise ConfigError(f"only one process can open {device}, not {jobs}; leave out --jobs, or set it to 1")
+    if device and workers > 1:
+        raise ConfigError(
+            f"only one process can open {device}, not {workers}; leave out --jobs, or set it to 1"
+        )
     if same_object:
-        if jobs > 1 or len(objects) > 1:
+        if workers > 1 or len(objects) > 1:
             raise ConfigError(
                 "grasps of the same object follow one another; pass one --object, and no --jobs but 1"
             )
@@ -300,8 +302,8 @@ def trials(
                 log={"report": False},  # `replay LOG --report` draws any of them later
             )
         )
-    if jobs > 1:
-        with process_pool(jobs) as pool:
+    if workers > 1:
+        with process_pool(workers) as pool:
             yield from pool.map(_trial, [trial.model_dump(mode="json") for trial in plan])
         return
     ratio = config.control.object_ratio

@@ -110,7 +110,7 @@ def plan(
 
 
 def simulate(
-    plans: Sequence[Plan], out: Path, config: Config, jobs: int, ray: str | None = None
+    plans: Sequence[Plan], out: Path, config: Config, workers: int, ray: str | None = None
 ) -> Generator[Path, None, None]:
     """Makes the logs that do not exist yet, in several processes, and yields each once it is complete.
 
@@ -118,7 +118,7 @@ def simulate(
         plans: Logs to make.
         out: Output folder.
         config: Configuration; the plans set object, seed, target and some of ``control``.
-        jobs: Number of processes.
+        workers: Number of processes.
         ray: Address of a Ray cluster to use instead, see `gripper_force.jobs.ray_pool`; None for none.
 
     Raises:
@@ -138,7 +138,7 @@ def simulate(
                 check_object_file(out / name, objects)
         else:
             missing.append(one)
-    with Workers(jobs, ray).pool() as pool:
+    with Workers(workers, ray).pool() as pool:
         futures = [pool.submit(p.make, out, tree) for p in missing]
         for future in as_completed(futures):
             for path in future.result():

@@ -190,7 +190,7 @@ class Figures(TypedDict):
 
 
 def measure(
-    config: Config, folder: Path, presses: int, jobs: int, progress: Progress = no_progress
+    config: Config, folder: Path, presses: int, workers: int, progress: Progress = no_progress
 ) -> list[Figures]:
     """Simulates the presses that do not exist yet, estimates all rows, and returns their figures.
 
@@ -198,7 +198,7 @@ def measure(
         config: Configuration; ``vision.checkpoint`` is the network.
         folder: Folder for logs and estimates; existing ones are used again.
         presses: Presses of each row.
-        jobs: Number of processes.
+        workers: Number of processes.
         progress: Called once for each press of each row.
 
     Raises:
@@ -208,7 +208,7 @@ def measure(
     tasks = [(row, index) for row in range(len(ROWS)) for index in range(presses)]
     tree = config.model_dump(mode="json")
     parts: dict[tuple[int, int], Tree] = {}
-    with process_pool(jobs) as pool:
+    with process_pool(workers) as pool:
         futures = {pool.submit(_press, row, index, folder, tree): (row, index) for row, index in tasks}
         for future in as_completed(futures):
             row, index = futures[future]

@@ -444,7 +444,7 @@ class _Run:
 def search(
     config: Config,
     cases: int,
-    jobs: int,
+    workers: int,
     keep: Path,
     *,
     resume: bool = False,
@@ -455,7 +455,7 @@ def search(
     Args:
         config: Gripper and control; the seed of all draws.
         cases: Number of cases.
-        jobs: Processes.
+        workers: Processes.
         keep: File for the results, one line each.
         resume: True to continue from the results in that file.
         progress: Called after each case.
@@ -472,7 +472,7 @@ def search(
             file.write(json.dumps(_identity(config)) + "\n")
             for result in results.values():
                 file.write(json.dumps(asdict(result)) + "\n")
-            with process_pool(jobs) as pool:
+            with process_pool(workers) as pool:
                 run = partial(run_case, config, config.seed)
                 for result in pool.map(run, missing, chunksize=_CHUNK):
                     results[result.index] = result

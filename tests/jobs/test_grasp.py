@@ -219,7 +219,7 @@ def ran(monkeypatch: pytest.MonkeyPatch) -> list[Config]:
 def test_trials_are_drawn_from_the_seed(ran: list[Config]) -> None:
     def plan(seed: int) -> list[tuple[str, float, int]]:
         ran.clear()
-        list(trials(load_config(None, [f"seed={seed}"]), 6, jobs=1))
+        list(trials(load_config(None, [f"seed={seed}"]), 6, workers=1))
         return [(c.object, c.target_n, c.seed) for c in ran]
 
     first = plan(40)
@@ -231,15 +231,15 @@ def test_trials_are_drawn_from_the_seed(ran: list[Config]) -> None:
 
 
 def test_targets_are_within_the_force_limit(ran: list[Config]) -> None:
-    list(trials(load_config(None, ["control.force_limit_n=5"]), 40, jobs=1))
+    list(trials(load_config(None, ["control.force_limit_n=5"]), 40, workers=1))
     largest_n = largest_target_n(5.0, ran[0].gripper.gain_bound)
     assert largest_n / 2 < max(config.target_n for config in ran) <= largest_n
     with pytest.raises(RequestError, match="a target of 1 N is too close to "):
-        next(trials(load_config(None, ["control.force_limit_n=1"]), 1, jobs=1))
+        next(trials(load_config(None, ["control.force_limit_n=1"]), 1, workers=1))
 
 
 def test_trials_of_one_object_with_one_target_are_unseen_scenes(ran: list[Config]) -> None:
-    list(trials(load_config(None, []), 3, jobs=1, objects=["tube"], target_n=2.5))
+    list(trials(load_config(None, []), 3, workers=1, objects=["tube"], target_n=2.5))
     assert [(c.object, c.target_n, c.seed) for c in ran] == [("tube", 2.5, seed) for seed in range(3)]
 
 
@@ -263,11 +263,11 @@ def test_a_device_that_only_one_process_can_open_is_named(overrides: list[str], 
 
 def test_several_processes_are_refused_with_a_real_device() -> None:
     with pytest.raises(ConfigError, match="only one process can open"):
-        next(trials(load_config(None, REAL), 2, jobs=2))
+        next(trials(load_config(None, REAL), 2, workers=2))
 
 
 def test_after_a_fault_of_a_real_gripper_nothing_moves(ran: list[Config]) -> None:
-    running = trials(load_config(None, REAL), 3, jobs=1, objects=["mug", "broken"])
+    running = trials(load_config(None, REAL), 3, workers=1, objects=["mug", "broken"])
     assert [next(running)["result"] for _ in range(2)] == ["held", "fault"]
     with pytest.raises(DeviceError, match="trial 2 of 3 ended with a fault"):
         next(running)
@@ -277,7 +277,7 @@ def test_after_a_fault_of_a_real_gripper_nothing_moves(ran: list[Config]) -> Non
 def test_a_person_places_the_object_before_each_trial(ran: list[Config]) -> None:
     asked: list[tuple[int, str]] = []
     config = load_config(None, REAL)
-    list(trials(config, 2, jobs=1, objects=["mug"], prompt=lambda text: asked.append((len(ran), text))))
+    list(trials(config, 2, workers=1, objects=["mug"], prompt=lambda text: asked.append((len(ran), text))))
     assert asked == [(n, f"Put the mug between the jaws for trial {n + 1} of 2") for n in range(2)]
 
 
@@ -302,7 +302,7 @@ def test_grasps_of_the_same_object_pass_on_what_was_learned(
     assert [one.control.object_ratio for one in ran] == [None, (1.1, 0.05), (1.2, 0.05)]
 
 
-@pytest.mark.parametrize(("jobs", "objects"), [(2, ("tube",)), (1, ("tube", "sponge"))])
-def test_the_same_object_is_grasped_by_one_process(jobs: int, objects: tuple[str, ...]) -> None:
+@pytest.mark.parametrize(("workers", "objects"), [(2, ("tube",)), (1, ("tube", "sponge"))])
+def test_the_same_object_is_grasped_by_one_process(workers: int, objects: tuple[str, ...]) -> None:
     with pytest.raises(ConfigError, match="follow one another"):
-        list(trials(load_config(), 2, jobs, objects=objects, same_object=True))
+        list(trials(load_config(), 2, workers, objects=objects, same_object=True))

@@ -152,11 +152,11 @@ def test_only_missing_logs_are_made_and_failed_draws_are_repeated(
     assert kept.read_bytes() == b"made before"
     assert sorted(kept.parent.iterdir()) == [kept, made]
     kept.unlink()
-    assert list(simulate([task], tmp_path, seeing, jobs=1)) == [kept]
-    assert list(simulate([task], tmp_path, seeing, jobs=1)) == []
+    assert list(simulate([task], tmp_path, seeing, workers=1)) == [kept]
+    assert list(simulate([task], tmp_path, seeing, workers=1)) == []
     other = seeing.with_values(sim={"rig_seed": 3, "view_spread": 3.0})
     with pytest.raises(DataError, match=r"recorded with sim\.view_spread 1\.0, not 3\.0; use another folder"):
-        list(simulate([task], tmp_path, other, jobs=1))
+        list(simulate([task], tmp_path, other, workers=1))
 
 
 def test_protocol_needs_simulated_camera(config: Config, tmp_path: Path) -> None:

@@ -82,30 +82,30 @@ def test_interrupted_simulation_continues(config: Config, tmp_path: Path) -> Non
     before = kept.read_bytes()
     leftover = tmp_path / f".{missing.name}.part"
     leftover.write_bytes(b"half a log")
-    assert list(simulate(plans, tmp_path, config, jobs=1)) == [missing]
+    assert list(simulate(plans, tmp_path, config, workers=1)) == [missing]
     assert kept.read_bytes() == before
     assert LogReader(missing).complete
     assert not leftover.exists()
-    assert list(simulate(plans, tmp_path, config, jobs=1)) == []
+    assert list(simulate(plans, tmp_path, config, workers=1)) == []
 
 
 @pytest.mark.parametrize("kind", ["press", "tap", "grasp"])
 def test_logs_of_other_settings_are_not_taken_for_these(kind: Kind, config: Config, tmp_path: Path) -> None:
     plans = plan(kind, 1, 5, ("stapler",))
-    assert len(list(simulate(plans, tmp_path, config, jobs=1))) == 1
-    assert list(simulate(plans, tmp_path, config, jobs=1)) == []
+    assert len(list(simulate(plans, tmp_path, config, workers=1))) == 1
+    assert list(simulate(plans, tmp_path, config, workers=1)) == []
     other = config.with_values(sim={"gain": 1.1})
     with pytest.raises(DataError, match=r"recorded with sim\.gain None, not 1\.1; use another folder"):
-        list(simulate(plans, tmp_path, other, jobs=1))
+        list(simulate(plans, tmp_path, other, workers=1))
 
 
 def test_a_log_of_other_settings_is_found_among_others(config: Config, tmp_path: Path) -> None:
     plans = plan("tap", 2, 5, ("stapler",))
     other = config.with_values(sim={"gain": 1.1})
     for one, settings in zip(plans, (config, other), strict=True):
-        list(simulate([one], tmp_path, settings, jobs=1))
+        list(simulate([one], tmp_path, settings, workers=1))
     with pytest.raises(DataError, match=r"tap-stapler-000006\.mcap .* recorded with sim\.gain 1\.1"):
-        list(simulate(plans, tmp_path, config, jobs=1))
+        list(simulate(plans, tmp_path, config, workers=1))
 
 
 def test_logs_of_an_object_file_that_was_changed_are_not_mixed(config: Config, tmp_path: Path) -> None:
@@ -114,18 +114,18 @@ def test_logs_of_an_object_file_that_was_changed_are_not_mixed(config: Config, t
     for file, modulus_pa in zip(files, (30000, 20000), strict=True):
         file.write_text(text.format(modulus_pa))
     plans = plan("tap", 3, 5, tuple(str(file) for file in files))
-    assert len(list(simulate(plans[:2], tmp_path / "out", config, jobs=1))) == 2
+    assert len(list(simulate(plans[:2], tmp_path / "out", config, workers=1))) == 2
     files[0].write_text(text.format(60000))
     with pytest.raises(
         DataError, match=r"file has changed between .*foam-000005\.mcap and .*foam-000007\.mcap"
     ):
-        list(simulate(plans, tmp_path / "out", config, jobs=1))
+        list(simulate(plans, tmp_path / "out", config, workers=1))
 
 
 def test_a_real_gripper_is_refused(config: Config, tmp_path: Path) -> None:
     real = config.with_values(servo={"port": "/dev/ttyUSB0"})
     with pytest.raises(ConfigError, match=r"simulate moves no real gripper, .* servo\.port=/dev/ttyUSB0"):
-        list(simulate(plan("tap", 1, 5), tmp_path / "out", real, jobs=1))
+        list(simulate(plan("tap", 1, 5), tmp_path / "out", real, workers=1))
     assert not (tmp_path / "out").exists()
 
 

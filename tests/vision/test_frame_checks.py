@@ -73,7 +73,7 @@ def test_moderate_light_change_passes(gain: float) -> None:
 def press(tmp_path_factory: pytest.TempPathFactory) -> Gray:
     """Frames of a simulated sponge, pressed, (T, 128, 128)."""
     plans = plan("tap", 1, 904_100, ("sponge",))
-    (path,) = simulate(plans, tmp_path_factory.mktemp("tap"), load_config(None, []), jobs=1)
+    (path,) = simulate(plans, tmp_path_factory.mktemp("tap"), load_config(None, []), workers=1)
     return np.stack([frame.gray for frame in LogReader(path).records(Frame)])
 
 

@@ -128,7 +128,7 @@ def run_matrix(
     config: Config,
     seeds: int,
     live_seeds: int,
-    jobs: int,
+    workers: int,
     keep: Path,
     *,
     resume: bool = False,
@@ -141,7 +141,7 @@ def run_matrix(
         config: Configuration; object, target, force limit, seed and faults are replaced.
         seeds: Grasps of each row, in lockstep.
         live_seeds: Grasps of each row in real time, one after the other.
-        jobs: Processes.
+        workers: Processes.
         keep: File for the outcomes, written one by one.
         resume: True to continue from the outcomes in that file.
         rows: Rows of the matrix.
@@ -157,7 +157,7 @@ def run_matrix(
     drawn = [_draw(config, i).model_dump(mode="json") for i in range(seeds)]
     simulated = [row for row in rows if row.unit != "process"]
     file = OutcomeFile[FaultRunResult](keep, config, resume=resume)
-    with process_pool(jobs) as pool:
+    with process_pool(workers) as pool:
 
         def begin(row: FaultCase, index: int, clock: str) -> Callable[[], FaultRunResult]:
             """Starts a grasp unless its outcome is in the file. Returns a function that waits for it."""

@@ -215,7 +215,7 @@ def run_rows(
     config: Config,
     seeds: int,
     live_seeds: int,
-    jobs: int,
+    workers: int,
     keep: "Path",
     *,
     resume: bool = False,
@@ -228,7 +228,7 @@ def run_rows(
         config: Configuration; object, target, force limit, seed and the keys of each row are replaced.
         seeds: Grasps of each row, in lockstep.
         live_seeds: Grasps of each row in real time, one after the other.
-        jobs: Processes.
+        workers: Processes.
         keep: File for the outcomes, written one by one.
         resume: True to continue from the outcomes in that file.
         rows: Rows of the table.
@@ -241,7 +241,7 @@ def run_rows(
         DataError: The file can't be read or written, or was made with another configuration.
     """
     file = OutcomeFile[WrongOutcome](keep, config, resume=resume)
-    with process_pool(jobs) as pool:
+    with process_pool(workers) as pool:
 
         def begin(row: WrongCase, index: int, clock: str) -> Callable[[], WrongOutcome]:
             """Starts a grasp unless its outcome is in the file. Returns a function that waits for it."""

@@ -120,7 +120,7 @@ def all_targets() -> list[Target]:
 def fuzz(
     count: int,
     seed: int,
-    jobs: int,
+    workers: int,
     out: Path,
     progress: Progress = no_progress,
     *,
@@ -131,7 +131,7 @@ def fuzz(
     Args:
         count: Inputs over all targets; each target gets at least one.
         seed: Seed of all inputs.
-        jobs: Processes.
+        workers: Processes.
         out: Folder for the inputs of findings.
         progress: Called several times a second; a step is an input.
         only: A target's name, which then gets all inputs, or ``<name>:<number>`` for that input alone.
@@ -147,23 +147,23 @@ def fuzz(
     findings: dict[tuple[str, str], Finding] = {}
     done = 0
     with tempfile.TemporaryDirectory(prefix="fuzz-") as folder:
-        workers = [_Worker(seed, plan, k, jobs, Path(folder)) for k in range(jobs)]
+        pool = [_Worker(seed, plan, k, workers, Path(folder)) for k in range(workers)]
         try:
-            while any(worker.busy for worker in workers):
-                connection.wait([w.process.sentinel for w in workers if w.busy], _POLL_S)
-                for t, index, error in [found for worker in workers for found in worker.poll()]:
+            while any(worker.busy for worker in pool):
+                connection.wait([w.process.sentinel for w in pool if w.busy], _POLL_S)
+                for t, index, error in [found for worker in pool for found in worker.poll()]:
                     target = targets[t]
                     if (key := (target.name, _kind(error))) not in findings:
                         file = _save_input(out, target, seed, index)
                         findings[key] = Finding(target.name, index, error, str(file))
-                now = sum(sum(worker.counts(t)) for worker in workers for t in range(len(targets)))
+                now = sum(sum(worker.counts(t)) for worker in pool for t in range(len(targets)))
                 progress(f"{len(findings)} findings", now - done)
                 done = now
         finally:
-            for worker in workers:
+            for worker in pool:
                 worker.kill()
     counts = {
-        target.name: [sum(row) for row in zip(*(worker.counts(t) for worker in workers), strict=True)]
+        target.name: [sum(row) for row in zip(*(worker.counts(t) for worker in pool), strict=True)]
         for t, target in enumerate(targets)
         if plan[t]
     }
@@ -289,9 +289,9 @@ def _plan(targets: Sequence[Target], count: int, only: str | None) -> list[range
 class _Worker:
     """A process that feeds its share of the inputs; it is replaced when it dies or hangs."""
 
-    def __init__(self, seed: int, plan: Sequence[range], number: int, jobs: int, folder: Path) -> None:
+    def __init__(self, seed: int, plan: Sequence[range], number: int, workers: int, folder: Path) -> None:
         self._context = get_context("spawn")
-        self._shares = [numbers[number::jobs] for numbers in plan]
+        self._shares = [numbers[number::workers] for numbers in plan]
         # Target, place in its share, start of the input in ns (0: none yet); then three counts per target.
         self._shared = self._context.RawArray("q", 3 + 3 * len(plan))
         self._task = (all_targets, seed, self._shares, folder / str(number), self._shared)

@@ -132,18 +132,18 @@ def missing_logs(scale: Scale, data: Path) -> int:
     return sum(not (data / name).exists() for name in names)
 
 
-def simulate_missing(scale: Scale, data: Path, jobs: int, end_s: float, progress: Progress) -> None:
+def simulate_missing(scale: Scale, data: Path, workers: int, end_s: float, progress: Progress) -> None:
     """Simulates the logs of the protocol that do not exist yet. Raises as `simulate.simulate` does.
 
     Args:
         scale: Size of the reproduction.
         data: Folder for the logs.
-        jobs: Processes.
+        workers: Processes.
         end_s: Time of `time.monotonic` after which no log is awaited.
         progress: Called after each log.
     """
     config = load_config(None, [f"camera.rate_hz={RATE_HZ}"])
-    with closing(simulate(_plans(scale), data, config, jobs)) as paths:
+    with closing(simulate(_plans(scale), data, config, workers)) as paths:
         for path in paths:
             progress(path.name)
             if time.monotonic() > end_s:
@@ -159,7 +159,7 @@ def run(
     models: Iterable[str],
     data: Path,
     out: Path,
-    jobs: int,
+    workers: int,
     end_s: float,
     progress: Progress,
 ) -> list[Test]:
@@ -171,7 +171,7 @@ def run(
         data: Folder with the protocol's logs, in ``train`` and ``test``.
         out: Folder for the networks. Those of the same recipe and data are not trained again, and interrupted
             trainings continue.
-        jobs: Processes; each trains one network, with one thread. On a GPU no more than its memory holds.
+        workers: Processes; each trains one network, with one thread. On a GPU no more than its memory holds.
         end_s: Time of `time.monotonic` at which training is interrupted.
         progress: Called after each network, with its steps.
 
@@ -191,11 +191,11 @@ def run(
         if task not in missing:
             progress(_text(task), task[0].steps)
     preprocess = scales[0].recipe(_ANY_NET, 0).preprocess
-    clips = _clips(files, "test", preprocess, jobs)
+    clips = _clips(files, "test", preprocess, workers)
     if missing:
         if torch.cuda.is_available():
-            jobs = min(jobs, _networks_in_gpu(clips, len(_logs(data, "train"))))
-        _train_all(missing, files, jobs, end_s, progress)
+            workers = min(workers, _networks_in_gpu(clips, len(_logs(data, "train"))))
+        _train_all(missing, files, workers, end_s, progress)
     keep = [clip.labelled(preprocess.lead_in) for clip in clips]
     measured_n = np.concatenate([clip.forces_n[k] for clip, k in zip(clips, keep, strict=True)])
     counts = [int(k.sum()) for k in keep]
@@ -280,10 +280,10 @@ def _networks_in_gpu(clips: Sequence[Clip], logs: int) -> int:
     return max(1, int(torch.cuda.mem_get_info()[0] / (_GPU_BYTES + logs * log_bytes)))
 
 
-def _train_all(tasks: Sequence[_Task], files: _Files, jobs: int, end_s: float, progress: Progress) -> None:
+def _train_all(tasks: Sequence[_Task], files: _Files, workers: int, end_s: float, progress: Progress) -> None:
     """Trains networks until all are done or time is up; one that is interrupted has saved its state."""
-    count = min(jobs, len(tasks))
-    reading = max(1, jobs // count)
+    count = min(workers, len(tasks))
+    reading = max(1, workers // count)
     begin_s, left, done = time.monotonic(), sum(scale.steps for scale, *_ in tasks), 0
     with suppress(FutureTimeout), process_pool(count) as pool:
         futures = {pool.submit(_train, task, files, reading): task for task in tasks}

@@ -55,7 +55,7 @@ def reproduce(
     scales: Sequence[Scale],
     data: Path | None,
     out: Path,
-    jobs: int,
+    workers: int,
     bar: ProgressBar,
     end_s: float = math.inf,
 ) -> PaperResult:
@@ -66,7 +66,7 @@ def reproduce(
         scales: Sizes of the reproduction, which differ only in their steps.
         data: Folder with logs in ``train`` and ``test``; None for simulated ones.
         out: Folder for the networks.
-        jobs: Processes.
+        workers: Processes.
         bar: Shows progress.
         end_s: Time of `time.monotonic` at which simulation and training are interrupted.
 
@@ -81,12 +81,12 @@ def reproduce(
             data = Path("data/shin2019") / scales[0].instances / scales[0].protocol
             logs = experiment.missing_logs(scales[0], data)
             with bar("simulating", logs) as progress:
-                experiment.simulate_missing(scales[0], data, jobs, end_s, progress)
+                experiment.simulate_missing(scales[0], data, workers, end_s, progress)
             if logs := experiment.missing_logs(scales[0], data):
                 return PaperResult({}, {}, [], f"{logs} logs are still missing")
         nets = len(experiment.networks(models))
         with bar("training", sum(scale.steps * scale.seeds for scale in scales) * nets) as progress:
-            tests = experiment.run(scales, models, data, out, jobs, end_s, progress)
+            tests = experiment.run(scales, models, data, out, workers, end_s, progress)
         if left := nets * sum(scale.seeds for scale in scales) - sum(len(test.estimates_n) for test in tests):
             missing = f"{left} networks are not trained yet"
     tables = {name: [_MAKERS[name](test) for test in tests] for name in names if name in _MAKERS}
