@@ -69,11 +69,11 @@ SCALES: Final = {
 """Scales by name. A log that is in both is the same in both."""
 
 _FIRST_SEED: Final = 700_000
-_PEAK_N: Final = 12.0
+_PAPER_PEAK_N: Final = 12.0
 """Largest force of the paper's touches."""
 
 _OVERSHOOT_N: Final = 0.75
-"""Largest load-cell force above `_PEAK_N`. A set with a higher one is drawn again."""
+"""Largest load-cell force above `_PAPER_PEAK_N`. A set with a higher one is drawn again."""
 
 _RAMP_N_S: Final = {"stapler": (30.0, 50.0)}
 """Lowest and highest speed of the ramps of an object, if it differs from `_USUAL_RAMP_N_S`.
@@ -234,7 +234,7 @@ def _run_set(config: Config, task: SetPlan, seed: int, logs: dict[int, Path]) ->
         with open_session(run, devices, logs[first]) as session:
             _touch_all(session, task, rng, config.control.timeout_s)
     peak_n = max(sample.force_n for sample in LogReader(logs[first]).records(LoadCellSample))
-    if peak_n > _PEAK_N + _OVERSHOOT_N:
+    if peak_n > _PAPER_PEAK_N + _OVERSHOOT_N:
         raise SimulationError(
             f"a touch of {task.object!r} at {task.degrees} degrees reached {peak_n:.1f} N; use another seed"
         )
@@ -287,7 +287,7 @@ def _set_config(config: Config, task: SetPlan, seed: int, lux: int, rng: np.rand
     return config.with_values(
         object=task.object,
         seed=seed,
-        target_n=_PEAK_N,
+        target_n=_PAPER_PEAK_N,
         control={
             "feedback": "current",
             "force_limit_n": HARD_FORCE_LIMIT_N,  # so high that it does not bound the speed
@@ -316,7 +316,7 @@ def _touch_all(session: Session, task: SetPlan, rng: np.random.Generator, timeou
         problem = touch(
             session,
             # High forces last only briefly. With the root, more high peaks are drawn than low ones.
-            _PEAK_N * float(np.sqrt(rng.uniform(0.01, 1.0))),
+            _PAPER_PEAK_N * float(np.sqrt(rng.uniform(0.01, 1.0))),
             float(rng.uniform(0.02, 0.1)),
             free_n=_FREE_N,
             timeout_s=timeout_s,

@@ -30,13 +30,13 @@ from gripper_force.schema import Tree
 
 Kind = Literal["press", "tap", "grasp"]
 
-PEAK_N: Final = 12.5
-"""Largest force of a touch: a little over the 12 N of the paper's."""
-
 SAME: Final = ("object", "seed", "target_n", "gripper", "servo", "camera", "load_cell", "sim", "faults")
 """Keys and sections of the configuration that decide what a log contains; most of ``control`` is drawn."""
 
 _MIN_TARGET_N: Final = 0.5
+MAX_TARGET_N: Final = 12.5
+"""Range of the forces that are drawn: up to a little over the 12 N of the paper's touches."""
+
 _MAX_TARGETS: Final = 3
 """Forces that a press holds in turn, at most."""
 
@@ -171,7 +171,7 @@ def _randomised(config: Config, task: SimulationPlan, rng: np.random.Generator) 
         seed=task.seed,
         control={  # drawn before the target: each seed keeps its draws
             "feedback": "current",
-            "force_limit_n": 1.3 * PEAK_N * config.gripper.gain_bound,
+            "force_limit_n": 1.3 * MAX_TARGET_N * config.gripper.gain_bound,
             "approach_speed_m_s": float(rng.uniform(0.02, 0.05)),
             "ramp_n_s": float(np.exp(rng.uniform(np.log(3.0), np.log(25.0)))),
             "hold_s": float(rng.uniform(0.3, 1.0)),
@@ -182,7 +182,7 @@ def _randomised(config: Config, task: SimulationPlan, rng: np.random.Generator) 
 
 
 def _draw_target_n(rng: np.random.Generator) -> float:
-    return float(rng.uniform(_MIN_TARGET_N, PEAK_N))
+    return float(rng.uniform(_MIN_TARGET_N, MAX_TARGET_N))
 
 
 def _press(config: Config, path: Path, rng: np.random.Generator) -> None:
@@ -199,7 +199,7 @@ def _tap(config: Config, path: Path, rng: np.random.Generator) -> None:
     config = config.with_values(control=fast)
     with open_run(config, path, vision=False) as session:
         wait(session, 0.1)
-        peak_n = float(rng.uniform(_MIN_TAP_N, PEAK_N))
+        peak_n = float(rng.uniform(_MIN_TAP_N, MAX_TARGET_N))
         ramp(session, peak_n, config.control.timeout_s)
         wait(session, float(rng.uniform(0.03, 0.2)))
         if rng.random() < 0.5:

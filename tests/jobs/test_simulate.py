@@ -8,7 +8,7 @@ from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs import simulate as module
 from gripper_force.jobs.grasp import PAPER_OBJECTS
 from gripper_force.jobs.simulate import (
-    PEAK_N,
+    MAX_TARGET_N,
     Kind,
     SimulationPlan,
     make_log,
@@ -51,7 +51,7 @@ def test_log_holds_a_touch_and_its_metadata(kind: Kind, config: Config, tmp_path
     assert phases.count("open") > 20  # what comes before the touch, for the reference
     made = config_from_text(log.config, str(path))
     assert made.control.feedback == "current"
-    assert 0.5 <= made.target_n <= PEAK_N
+    assert 0.5 <= made.target_n <= MAX_TARGET_N
 
 
 def test_same_seed_gives_identical_logs(config: Config, tmp_path: Path) -> None:

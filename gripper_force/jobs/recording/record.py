@@ -41,8 +41,8 @@ from gripper_force.types import (
     RequestKind,
 )
 
-PEAK_N: Final = 12.0
-"""Largest force of the paper's touches."""
+DEFAULT_PEAK_N: Final = 12.0
+"""Largest force of a touch if the plan names none: that of the paper's touches."""
 
 TEST_EVERY: Final = 5
 """Every fifth set is for test: 3 of 15, as in the paper."""
@@ -81,7 +81,7 @@ class RecordingPlan:
     Attributes:
         sets: Number of sets.
         touches: Touches in each set.
-        peak_n: Largest force of a touch; None for `PEAK_N`, or less if the force limit requires it.
+        peak_n: Largest force of a touch; None for `DEFAULT_PEAK_N`, or less if the force limit requires it.
         degrees: Angle of the press, noted in names and metadata; None: not noted.
         lux: Light level, noted likewise.
         test_every: Every n-th set is for test; None for no split into training and test sets.
@@ -227,7 +227,7 @@ def _checked(config: Config, plan: RecordingPlan) -> tuple[Config, float]:
         )
     limit_n = config.control.force_limit_n
     max_n = largest_target_n(limit_n, config.gripper.gain_bound)
-    peak_n = min(PEAK_N, max_n) if plan.peak_n is None else plan.peak_n
+    peak_n = min(DEFAULT_PEAK_N, max_n) if plan.peak_n is None else plan.peak_n
     if not _MIN_PEAK_N < peak_n <= max_n:
         raise ConfigError(
             f"peaks of up to {peak_n:g} N are not within {_MIN_PEAK_N:g} to {rounded_down(max_n)} N, the range for "

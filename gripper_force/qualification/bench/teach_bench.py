@@ -1,8 +1,8 @@
 """Errors of the shipped network, calibrated, taught, and of one trained from scratch, on foreign rigs and objects.
 
 A *cell* is one rig, one object, one number of touches and one method. Its figures are the error of vision on fresh
-touches up to `PEAK_N`, the median error of grasps, and the minutes that the method took after the touches. A finished
-cell is one line of a file, and is not repeated with the same settings and number of grasps.
+touches up to `TOUCH_PEAK_N`, the median error of grasps, and the minutes that the method took after the touches. A
+finished cell is one line of a file, and is not repeated with the same settings and number of grasps.
 """
 
 import hashlib
@@ -37,9 +37,11 @@ from gripper_force.vision.model_files import read_model
 FIRST_SEED: Final = 98_000_000
 """Seed of the first rig. No training uses the seeds from here on."""
 
-PEAK_N: Final = 8.0
+TOUCH_PEAK_N: Final = 8.0
+"""Largest force of all touches."""
+
 TESTS: Final = 6
-"""Largest force and number of the touches that vision is tested on."""
+"""Number of the touches that vision is tested on."""
 
 COUNTS: Final = (4, 8, 16, 32)
 METHODS: Final = ("shipped", "calibrated", "taught", "from scratch")
@@ -203,12 +205,12 @@ def _measured(
         calibration={"object": "none"},
     )
     touched = list(
-        record_touches(config, cell.touches, PEAK_N, place / "touches", progress=progress)
+        record_touches(config, cell.touches, TOUCH_PEAK_N, place / "touches", progress=progress)
         if cell.touches
         else ()
     )
     other = with_same_object(config).with_values(seed=config.seed + _OTHER_SEEDS)
-    test = list(record_touches(other, TESTS, PEAK_N, place / "test", progress=progress))
+    test = list(record_touches(other, TESTS, TOUCH_PEAK_N, place / "test", progress=progress))
     begin_s = time.monotonic()
     learned = ""
     out = place / f"{cell.method}-{cell.touches}-{cell.network[:8]}".replace(" ", "-")
@@ -237,7 +239,7 @@ def _measured(
     minutes = (time.monotonic() - begin_s) / 60
     progress(f"{cell.object}: testing {cell.method}")
     found = evaluate(test, config.vision.checkpoint, config=config)
-    below = [b for b in found.per_bin if b.from_n < PEAK_N]
+    below = [b for b in found.per_bin if b.from_n < TOUCH_PEAK_N]
     mae_n = float(np.average([b.mae_n for b in below], weights=[b.frames for b in below]))
     result = replace(cell, mae_n=mae_n, minutes=minutes, learned=learned)
     for feedback in ("fused", "vision") if grasps else ():
