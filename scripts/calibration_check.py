@@ -215,9 +215,9 @@ def main() -> None:
         made = [pool.submit(profile_of, *which, options.out) for which in objects]
         profiles = [future.result() for future in track(made, "profiles", console=console)]
         rng = np.random.default_rng(20)
-        most_n = [read_object(Path(profile)).force_n - 0.001 for profile in profiles]
+        max_n = [read_object(Path(profile)).force_n - 0.001 for profile in profiles]
         plan = [
-            (i % len(objects), i, round(min(float(rng.uniform(*TARGETS_N)), most_n[i % len(objects)]), 3))
+            (i % len(objects), i, round(min(float(rng.uniform(*TARGETS_N)), max_n[i % len(objects)]), 3))
             for i in range(options.grasps)
         ]
         pending = {

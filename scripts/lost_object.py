@@ -15,7 +15,7 @@ import gripper_force as gf
 
 OBJECTS = ("sponge", "paper_cup", "tube", "stapler")
 LOST_S = 6.0
-MOST_S = 2.0
+MAX_S = 2.0
 GOAL_MS = 50.0
 
 
@@ -27,7 +27,7 @@ def time_to_slip_ms(keys: dict[str, object], target_n: float) -> float | None:
         if gripper.grasp(target_n).outcome != "held":
             return None
         # In lockstep, the clock begins with the run.
-        while (now_s := gripper.state.t_ns / 1e9) < LOST_S + MOST_S:
+        while (now_s := gripper.state.t_ns / 1e9) < LOST_S + MAX_S:
             if gripper.state.outcome == "slip":
                 return 1e3 * (now_s - LOST_S) if now_s >= LOST_S else None
             gripper.step()

@@ -26,7 +26,7 @@ OBJECT = "stapler"
 EDGES_N = (1.0, 4.0, 8.0, 14.0)
 """Bins: soft, stiffer, and past the stop."""
 
-LEAST_FRAMES = 20
+MIN_FRAMES = 20
 """Least number of frames or cycles of a log for a figure of that log."""
 
 _RISE_N = 0.05
@@ -45,7 +45,7 @@ def travel(paths: list[Path], low_n: float, high_n: float) -> Floats:
         force_n = np.interp(table[:, 0], cells[:, 0], cells[:, 1])
         rising = np.concatenate([np.zeros(4), force_n[4:] - force_n[:-4]]) > _RISE_N
         in_bin = rising & (force_n > low_n) & (force_n < high_n)
-        if in_bin.sum() >= LEAST_FRAMES and np.ptp(force_n[in_bin]) > 1:
+        if in_bin.sum() >= MIN_FRAMES and np.ptp(force_n[in_bin]) > 1:
             slopes.append(1e3 * np.polyfit(force_n[in_bin], table[in_bin, 1], 1)[0])
     return np.array(slopes)
 
@@ -87,7 +87,7 @@ def main() -> None:
     by_log = [
         np.corrcoef(estimated_n[frames], measured_n[frames])[0, 1]
         for i in np.unique(log[past])
-        if (frames := past & (log == i)).sum() >= LEAST_FRAMES and np.ptp(measured_n[frames]) > 1
+        if (frames := past & (log == i)).sum() >= MIN_FRAMES and np.ptp(measured_n[frames]) > 1
     ]
     print(
         f"\nCorrelation of output and force from {EDGES_N[-2]:g} N on: {min(by_log):.2f} to {max(by_log):.2f} within "

@@ -66,7 +66,7 @@ class ApproachState(Enum):
 
 
 class Approach:
-    """Speed loop of the closing jaws, at most at ``most_m_s``, with the decision on contact.
+    """Speed loop of the closing jaws, at most at ``max_m_s``, with the decision on contact.
 
     A standstill is a contact only after the jaws have travelled: jaws whose friction is larger than configured
     do not move at all, and stand still without an object. Jaws that stand still from the start open a little
@@ -78,8 +78,8 @@ class Approach:
         is_backing_off: True while the jaws open to close again.
     """
 
-    def __init__(self, config: ControlConfig, transmission: Transmission, most_m_s: float) -> None:
-        self._config, self._transmission, self._most_m_s = config, transmission, most_m_s
+    def __init__(self, config: ControlConfig, transmission: Transmission, max_m_s: float) -> None:
+        self._config, self._transmission, self._max_m_s = config, transmission, max_m_s
         self.speed_m_s = self.motor_force_n = 0.0
         self.is_backing_off = False
         self._target_n = 0.0
@@ -97,7 +97,7 @@ class Approach:
 
     def speed_for_m_s(self, target_n: float) -> float:
         """Returns the wanted speed of one jaw for a target force."""
-        return min(self._most_m_s, _IMPACT_M_S_PER_N * target_n)
+        return min(self._max_m_s, _IMPACT_M_S_PER_N * target_n)
 
     def _begin(self, width_m: float) -> None:
         self._start_m = width_m
@@ -129,7 +129,7 @@ class Approach:
         closing_m_s: float,
         measured_n: float,
         estimate: FusedForce,
-        most_n: float = math.inf,
+        max_n: float = math.inf,
     ) -> ApproachState:
         """Runs one cycle: sets `motor_force_n`, and returns how far the approach is.
 
@@ -139,13 +139,13 @@ class Approach:
             closing_m_s: Closing speed of one jaw.
             measured_n: Motor force at each jaw by the measured current.
             estimate: The force estimate.
-            most_n: Largest motor force while friction is unknown.
+            max_n: Largest motor force while friction is unknown.
         """
         self._time_s += dt_s
         if self.is_backing_off:
             return self._step_back(width_m)
         self._mean_force_n += (measured_n - self._mean_force_n) * dt_s / (dt_s + _STEADY_FILTER_S)
-        self._drive(dt_s, closing_m_s, estimate, most_n)
+        self._drive(dt_s, closing_m_s, estimate, max_n)
         self._has_moved |= closing_m_s > _SLOWED_SHARE * self.speed_m_s
         if width_m < self._config.min_object_width_m:
             return ApproachState.CLOSED
@@ -184,7 +184,7 @@ class Approach:
         """Width to which the jaws open while they back off."""
         return self._start_m + _BACK_OFF_M
 
-    def _drive(self, dt_s: float, closing_m_s: float, estimate: FusedForce, most_n: float) -> None:
+    def _drive(self, dt_s: float, closing_m_s: float, estimate: FusedForce, max_n: float) -> None:
         """Speed loop whose motor force is limited to friction, damping and the contact limit."""
         wanted_m_s = self.speed_m_s * min(self._time_s / ACCELERATION_S, 1.0)
         error_m_s = wanted_m_s - closing_m_s
@@ -194,9 +194,9 @@ class Approach:
         )
         # Force that the current estimate counts as contact and vision does not is friction, too.
         friction_n = estimate.friction_n - estimate.bias_n + 2 * estimate.std_n
-        max_n = friction_n + self._limit_n + damping_n_s_m * max(closing_m_s, 0.0)
-        self._is_weak = most_n < max_n
-        max_n = min(max_n, most_n)
+        usual_max_n = friction_n + self._limit_n + damping_n_s_m * max(closing_m_s, 0.0)
+        self._is_weak = max_n < usual_max_n
+        max_n = min(usual_max_n, max_n)
         self._integral_n += _SPEED_INTEGRAL_N_M * error_m_s * dt_s
         if closing_m_s > _OVERSPEED * self.speed_m_s:
             self._integral_n -= self.motor_force_n * dt_s / _OVERSPEED_DECAY_S

@@ -12,7 +12,7 @@ from gripper_force.types import EstimateSource, FusedForce
 _RAMP_S = 0.4
 """Acceleration time of the ramp: longer than a quarter oscillation period of the softest object."""
 
-_MOST_RAMP_PER_S = 10.0
+_MAX_RAMP_PER_S = 10.0
 """Fastest ramp as a share of the force limit per second. Jaws that a faster one accelerates exceed the limit."""
 
 _LOWERING_S = 0.15
@@ -94,7 +94,7 @@ class ForceLoop:
         self._vision_alone = config.feedback == "vision"
         self._gains = self.margins["vision" if self._vision_alone else "hold"].gains
         self._transmission = transmission
-        self._ramp_n_s = min(config.ramp_n_s, _MOST_RAMP_PER_S * config.force_limit_n)
+        self._ramp_n_s = min(config.ramp_n_s, _MAX_RAMP_PER_S * config.force_limit_n)
         self._largest_m_s = config.approach_speed_m_s
         self._profile = TrapezoidalProfile(_RAMP_S)
         self._trim_n = 0.0

@@ -24,7 +24,7 @@ _LARGEST_ANGLE_RAD: Final = 255 * 2 * math.pi
 
 _DIFFERENCE_RAD: Final = 1e-5
 
-_LEAST_SHARE: Final = 0.1
+_MIN_SHARE: Final = 0.1
 """Least travel per radian as a share of the greatest. Below it the linkage is near its dead centre, where the
 force by the motor current is arbitrarily wrong."""
 
@@ -163,10 +163,10 @@ def _tabulate(closed_m: Callable[[float], float], open_width_m: float) -> Tabula
         / (4 * _DIFFERENCE_RAD)
         for angle_rad in angles_rad
     ]
-    if not min(slopes) > _LEAST_SHARE * max(slopes):
+    if not min(slopes) > _MIN_SHARE * max(slopes):
         raise ConfigError(
             f"gripper.linkage is near its dead centre: the travel per radian varies by more than a factor of "
-            f"{1 / _LEAST_SHARE:g} between open and closed; check the lengths, the angle of the open jaws and "
+            f"{1 / _MIN_SHARE:g} between open and closed; check the lengths, the angle of the open jaws and "
             "gripper.open_width_m"
         )
     widths_m = [open_width_m - closed_m(angle_rad) for angle_rad in angles_rad]

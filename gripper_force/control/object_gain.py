@@ -21,8 +21,8 @@ _ANY_STD: Final = 0.35
 _ANY_SHARE: Final = 0.1
 """Standard deviation of the logarithm, and share, of objects of any stiffness: a factor of 2 is two deviations."""
 
-_LEAST_FRAMES: Final = 30
-_LEAST_FORCE_N: Final = 0.3
+_MIN_FRAMES: Final = 30
+_MIN_FORCE_N: Final = 0.3
 """Least number of frames of a hold, and least mean force in them, that say something about the gain."""
 
 GATE: Final = 3.29
@@ -124,8 +124,8 @@ class ObjectGain:
 
     def _measured_log_ratio(self) -> tuple[float, float] | None:
         """Returns logarithm and relative variance of the present grasp's ratio; None if it shows too little."""
-        least_n = _LEAST_FORCE_N * self._frames
-        if self._frames < _LEAST_FRAMES or min(self._current_n, self._visual_n) < least_n:
+        min_n = _MIN_FORCE_N * self._frames
+        if self._frames < _MIN_FRAMES or min(self._current_n, self._visual_n) < min_n:
             return None
         variance = self._error_n2 * self._frames / min(self._current_n, self._visual_n) ** 2
         return math.log(self._current_n / self._visual_n), variance + REPEAT_STD**2

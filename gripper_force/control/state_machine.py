@@ -60,7 +60,7 @@ _OPENING_SPARE_S = 4.0
 _AT_WIDTH_M = 0.0005
 """Distance from the requested width at which a move has arrived, unless the servo's proportional gain leaves more."""
 
-_LEAST_SPEED_M_S = 1e-4
+_MIN_SPEED_M_S = 1e-4
 """Speed of one jaw, for a target of 0.01 N, below which a grasp does not get more time."""
 
 _BLOCKED_S = 1.0
@@ -645,7 +645,7 @@ class GraspController:
         Args:
             target_n: Target force. Jaws are slower for a small one, and for a small force limit.
         """
-        speed_m_s = max(self._approach.speed_for_m_s(target_n), _LEAST_SPEED_M_S)
+        speed_m_s = max(self._approach.speed_for_m_s(target_n), _MIN_SPEED_M_S)
         slower_s_m = 1 / speed_m_s - 1 / self._config.approach_speed_m_s
         return self._config.timeout_s + self._transmission.open_width_m / 2 * slower_s_m
 

@@ -16,7 +16,7 @@ from gripper_force.jobs.object_gain import learned_ratio
 from gripper_force.jobs.processes import process_pool
 from gripper_force.jobs.replay.comparison import load_cell_errors
 from gripper_force.jobs.score import (
-    LEAST_VISION_SHARE,
+    MIN_VISION_SHARE,
     VisionLoss,
     controls_with_vision,
     score_grasp,
@@ -283,17 +283,17 @@ def trials(
                 "grasps of the same object follow one another; pass one --object, and no --jobs but 1"
             )
         config = with_same_object(config)
-    least_n, most_n = TRIAL_TARGETS_N
+    min_n, max_n = TRIAL_TARGETS_N
     largest_n = {}
     for name in objects:
         run = resolve(config.with_values(object=name))  # measures what `auto` needs once, here
-        run.check_target(least_n if target_n is None else target_n)
-        largest_n[name] = min(most_n, run.largest_target_n)
+        run.check_target(min_n if target_n is None else target_n)
+        largest_n[name] = min(max_n, run.largest_target_n)
     rng = np.random.default_rng([config.seed, 20])
     plan = []
     for i in range(count):
         name = objects[i % len(objects)]
-        drawn_n = min(round(float(rng.uniform(least_n, largest_n[name])), 3), largest_n[name])
+        drawn_n = min(round(float(rng.uniform(min_n, largest_n[name])), 3), largest_n[name])
         plan.append(
             config.with_values(
                 object=name,
@@ -365,7 +365,7 @@ def summarise(path: Path) -> Summary:
         "object_gain": gains[-1].object_gain if gains else None,
         "object_gain_std": gains[-1].object_gain_std if gains else None,
         "object_gain_true": stiffness_of(reader.metadata) if "scene" in reader.metadata else None,
-        "fell_back": expects_vision and vision is not None and vision.share < LEAST_VISION_SHARE,
+        "fell_back": expects_vision and vision is not None and vision.share < MIN_VISION_SHARE,
         **_score(cells, statuses, config.target_n),
         "peak_n": max((c.force_n for c in cells if c.valid), default=None),
         "estimator_p50_ms": _percentile(compute_ms, 50),

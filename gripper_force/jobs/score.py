@@ -56,7 +56,7 @@ class GraspScore:
     settle_s: float
 
 
-LEAST_VISION_SHARE: Final = 0.5
+MIN_VISION_SHARE: Final = 0.5
 """A grasp that is configured to use vision fell back if a smaller share of its hold used it."""
 
 _NUMBER: Final = re.compile(r"-?\d+(\.\d+)?")

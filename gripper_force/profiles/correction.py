@@ -90,8 +90,8 @@ class Correction:
         Beyond the calibrated forces, 1 N per newton is added.
         """
         force = np.asarray(force_n, np.float64)
-        least_n = -self.profile.interval.half_width_n(0.0)  # only noise gives negative forces
-        known_n = np.clip(force, least_n, self.profile.force_n)
+        min_n = -self.profile.interval.half_width_n(0.0)  # only noise gives negative forces
+        known_n = np.clip(force, min_n, self.profile.force_n)
         beyond_n: Floats = np.abs(force - known_n)
         return self.profile.interval.half_width_n(force) + beyond_n
 

@@ -39,7 +39,7 @@ from gripper_force.types import NS_PER_S, Outcome, Request, RequestKind, ServoCo
 WORST: Final = 5
 """Cases listed for each statement."""
 
-_LEAST_N: Final = 0.3
+_MIN_N: Final = 0.3
 """Least target of a sequence, and of a case near the object."""
 
 _GRASP_S: Final = 5.0
@@ -236,12 +236,12 @@ def draw(config: ControlConfig, truth: Transmission, seed: int, index: int) -> D
     def draw_request() -> TimedRequest:
         kinds = [RequestKind.GRASP, RequestKind.RELEASE, RequestKind.MOVE, RequestKind.STOP]
         kind = RequestKind(rng.choice(kinds, p=[0.6, 0.2, 0.12, 0.08]))
-        value = between(_LEAST_N, most_n) if kind == RequestKind.GRASP else between(0.0, truth.open_width_m)
+        value = between(_MIN_N, max_n) if kind == RequestKind.GRASP else between(0.0, truth.open_width_m)
         return TimedRequest(log_between(0.05, 8.0), kind, value)
 
     def draw_stream() -> Iterator[TimedRequest]:
         period_s = log_between(0.005, 0.1)
-        ranges = {RequestKind.GRASP: (_LEAST_N, most_n), RequestKind.MOVE: (0.0, truth.open_width_m)}
+        ranges = {RequestKind.GRASP: (_MIN_N, max_n), RequestKind.MOVE: (0.0, truth.open_width_m)}
         kind, values = RequestKind.GRASP, {key: between(*bounds) for key, bounds in ranges.items()}
         for _ in range(round(_STREAM_S / period_s)):
             if rng.uniform() < _STREAM_CHANGES_HZ * period_s:
@@ -254,13 +254,13 @@ def draw(config: ControlConfig, truth: Transmission, seed: int, index: int) -> D
     is_sequence = index % _SEQUENCE == _SEQUENCE - 2
     reach = _REACH_SHARE if is_sequence else 1.0
     force_limit_n = rarely(0.5, log_between(0.8, 20.0), config.force_limit_n)
-    most_n = largest_target_n(force_limit_n, truth.gain_bound)
+    max_n = largest_target_n(force_limit_n, truth.gain_bound)
     open_m_per_rad = truth.jaw_m_per_rad(truth.open_position_rad)
     drawn = Draw(
         force_limit_n=force_limit_n,
         approach_m_s=rarely(0.5, log_between(0.01, 0.04), config.approach_speed_m_s),
-        target_n=between(0.5, most_n),
-        then_n=rarely(0.5, between(0.5, most_n), math.nan),
+        target_n=between(0.5, max_n),
+        then_n=rarely(0.5, between(0.5, max_n), math.nan),
         then_s=between(1.0, 4.0),
         feedback=str(rng.choice(["fused", "current", "vision"])),
         on_slip=str(rng.choice(["regrip", "hold", "open"])),
@@ -297,10 +297,10 @@ def draw(config: ControlConfig, truth: Transmission, seed: int, index: int) -> D
         drawn,
         begins_m=max(to_m - gap_m, 0.0),
         force_limit_n=limit_n,
-        target_n=max(scale * drawn.target_n, _LEAST_N),
-        then_n=max(scale * drawn.then_n, _LEAST_N),  # not a number stays
+        target_n=max(scale * drawn.target_n, _MIN_N),
+        then_n=max(scale * drawn.then_n, _MIN_N),  # not a number stays
         requests=tuple(
-            step._replace(value=max(scale * step.value, _LEAST_N)) if step.kind == RequestKind.GRASP else step
+            step._replace(value=max(scale * step.value, _MIN_N)) if step.kind == RequestKind.GRASP else step
             for step in drawn.requests
         ),
     )

@@ -15,7 +15,7 @@ from gripper_force.runtime.state import GraspResult, GripperState
 from gripper_force.types import GRIPPING, Outcome, Phase, RequestKind
 
 CLOSED: Final = "the gripper is closed; open it again with open_gripper"
-_MOST: Final = 1e9
+_MAX_MAGNITUDE: Final = 1e9
 
 
 def number(value: Any, name: str) -> float:
@@ -23,8 +23,8 @@ def number(value: Any, name: str) -> float:
     found = math.nan
     with suppress(TypeError, ValueError, OverflowError):
         found = math.nan if isinstance(value, str | bytes) else float(value)
-    if not abs(found) <= _MOST:
-        raise RequestError(f"{name} of {value!r} is not a number of at most {_MOST:g}; pass a float")
+    if not abs(found) <= _MAX_MAGNITUDE:
+        raise RequestError(f"{name} of {value!r} is not a number of at most {_MAX_MAGNITUDE:g}; pass a float")
     return found
 
 

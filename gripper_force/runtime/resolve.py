@@ -27,10 +27,10 @@ if TYPE_CHECKING:  # a run without vision imports none of these
 _SUPPLY_TOLERANCE_V = 0.5
 """A supply set to the end of the servo's range reads slightly beyond it."""
 
-_MOST_TIMES = 3.0
+_MAX_RATIO = 3.0
 """Torque constant over that of the servo's model from which it can't be right: the largest `gripper.gain_bound`."""
 
-_LEAST_TRAVEL_RAD = 0.3
+_MIN_TRAVEL_RAD = 0.3
 """Rotation of the horn for the whole travel of a rack, below which the pinion's radius can't be right."""
 
 _NO_SCORE = (
@@ -80,10 +80,10 @@ class ResolvedConfig:
                 f"gripper.gain_bound {gain_bound:g}; request at most {rounded_down(largest_n)} N, raise the limit, or "
                 "lower the bound after calibrate servo"
             )
-        for name, most_n in self.target_limits_n.items():
-            if target_n > most_n:
+        for name, max_n in self.target_limits_n.items():
+            if target_n > max_n:
                 raise RequestError(
-                    f"a target of {target_n:g} N is above the {rounded_down(most_n)} N that the {name} was calibrated "
+                    f"a target of {target_n:g} N is above the {rounded_down(max_n)} N that the {name} was calibrated "
                     "with; request less, or calibrate with larger forces"
                 )
 
@@ -207,10 +207,10 @@ def position_loop(gripper: GripperConfig) -> PositionLoop | None:
 
 def _complete_gripper(gripper: GripperConfig, spec: ServoSpec) -> GripperConfig:
     """Returns the section with the servo's data. Raises `ConfigError` for a torque constant that can't be right."""
-    times = 1.0 if gripper.nm_per_a is None else gripper.nm_per_a / spec.nm_per_a
-    if not 1 / _MOST_TIMES < times < _MOST_TIMES:
+    ratio = 1.0 if gripper.nm_per_a is None else gripper.nm_per_a / spec.nm_per_a
+    if not 1 / _MAX_RATIO < ratio < _MAX_RATIO:
         raise ConfigError(
-            f"gripper.nm_per_a={gripper.nm_per_a:g} is {times:.3g} times the {spec.nm_per_a:.3g} Nm/A of the servo's "
+            f"gripper.nm_per_a={gripper.nm_per_a:g} is {ratio:.3g} times the {spec.nm_per_a:.3g} Nm/A of the servo's "
             "model, so that no force limit would hold; correct it, here or in the rig profile, or servo.model"
         )
     return gripper.filled(
@@ -226,7 +226,7 @@ def _check_travel(gripper: GripperConfig, spec: ServoSpec) -> None:
     with importing(f"gripper.linkage.kind={gripper.linkage.kind}"):
         transmission = Transmission.from_config(gripper, spec.nm_per_a)
     open_rad, closed_rad = transmission.open_position_rad, transmission.closed_position_rad
-    if gripper.linkage.kind == "rack" and abs(closed_rad - open_rad) < _LEAST_TRAVEL_RAD:
+    if gripper.linkage.kind == "rack" and abs(closed_rad - open_rad) < _MIN_TRAVEL_RAD:
         raise ConfigError(
             f"gripper.pinion_radius_m={gripper.pinion_radius_m:g} moves the jaws over all of gripper.open_width_m="
             f"{gripper.open_width_m:g} in {abs(closed_rad - open_rad):.2g} rad, so that no force limit would hold; set "
@@ -262,8 +262,8 @@ def _check_rate(config: Config) -> None:
         raise ConfigError(
             f"control.rate_hz {rate_hz:g} is too slow for a force loop; set at least {1 / MAX_CYCLE_S:g}"
         )
-    if rate_hz < (least_hz := 1e3 * _CYCLES_PER_WATCHDOG / watchdog_ms):
+    if rate_hz < (min_hz := 1e3 * _CYCLES_PER_WATCHDOG / watchdog_ms):
         raise ConfigError(
             f"with control.rate_hz {rate_hz:g} and servo.bus_watchdog_ms {watchdog_ms} the servo would stop "
-            f"by itself; set the rate to at least {least_hz:.4g}, or a longer watchdog time"
+            f"by itself; set the rate to at least {min_hz:.4g}, or a longer watchdog time"
         )

@@ -82,7 +82,7 @@ class FrameChecks:
         roughness = float(np.abs(np.diff(pixels)).mean()) / contrast
         if self._first is None:
             self._first = brightness, contrast, roughness
-            if len(pixels) >= _LEAST_PX:
+            if len(pixels) >= _MIN_PX:
                 self._begin(pixels)
         for name, now, first, most in zip(
             ("brightness", "contrast", "roughness"),
@@ -96,7 +96,7 @@ class FrameChecks:
                     f"the image's {name} changed from {first:.3g} to {now:.3g} since the first frame; check "
                     "the camera and the light"
                 )
-        changes = self.changes(pixels) if len(pixels) >= _LEAST_PX else {}
+        changes = self.changes(pixels) if len(pixels) >= _MIN_PX else {}
         exceeded = {name: cause for name, (change, most, cause) in changes.items() if change > most}
         if exceeded:
             cause = next(iter(exceeded.values()))
@@ -165,7 +165,7 @@ class FrameChecks:
         self._prior = np.diag(np.array([side**2] * 3 + [1] * 4, np.float32) * len(self._directions) / 400)
 
 
-_LEAST_PX: Final = 64
+_MIN_PX: Final = 64
 """Side of the smallest image in which disturbances are looked for: the limits are half a pixel there."""
 
 _STILL: Final = 0.25

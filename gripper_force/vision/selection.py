@@ -89,8 +89,8 @@ def select(tested: Sequence[Candidate], budget: BudgetConfig) -> Choice:
         front = "; ".join(str(candidate) for candidate in pareto_front(tested))
         raise ConfigError(f"no network and engine keep {limits}; raise the budget, the best are: {front}")
     if budget.latency_ms is None and budget.error_n is None:
-        least_n = min(candidate.error_n for candidate in within)
-        most_accurate = (candidate for candidate in within if candidate.error_n == least_n)
+        min_error_n = min(candidate.error_n for candidate in within)
+        most_accurate = (candidate for candidate in within if candidate.error_n == min_error_n)
         fastest = min(most_accurate, key=lambda candidate: candidate.p50_ms)
         return Choice(fastest, len(tested), "the fastest of the most accurate")
     cheapest = min(within, key=lambda candidate: candidate.cost_ms)

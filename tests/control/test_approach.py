@@ -13,7 +13,7 @@ def estimate(current_n=0.0, force_n=0.0, friction_n=0.95, source=EstimateSource.
 
 @pytest.fixture
 def approach(transmission):
-    tested = Approach(ControlConfig(), transmission, most_m_s=0.025)
+    tested = Approach(ControlConfig(), transmission, max_m_s=0.025)
     tested.start(START_M, 4.0)
     return tested
 
@@ -65,7 +65,7 @@ def test_closed_jaws(approach):
 
 
 def test_too_much_motor_force_decays_within_a_tenth_of_a_second(transmission):
-    approach = Approach(ControlConfig(), transmission, most_m_s=0.025)
+    approach = Approach(ControlConfig(), transmission, max_m_s=0.025)
     approach.start(START_M, 4.0)
     run(approach, 40, START_M, 0.0, estimate(friction_n=5.0))
     strong_n = approach.motor_force_n
@@ -81,7 +81,7 @@ def test_motor_force_never_exceeds_friction_and_the_contact_limit(approach):
 
 @pytest.mark.parametrize(("target_n", "speed_m_s"), [(1.0, 0.010), (2.0, 0.020), (8.0, 0.025)])
 def test_small_targets_are_approached_slowly(transmission, target_n, speed_m_s):
-    approach = Approach(ControlConfig(), transmission, most_m_s=0.025)
+    approach = Approach(ControlConfig(), transmission, max_m_s=0.025)
     approach.start(START_M, target_n)
     assert approach.speed_m_s == pytest.approx(speed_m_s)
 

@@ -10,7 +10,7 @@ from gripper_force.types import Gray
 _TAPS: Final = 9
 """Length of the averaging filter, as in the paper."""
 
-MOST_BLUR: Final = 0.5
+MAX_BLUR: Final = 0.5
 """Blur above which contours are too soft: see tests/calibration/fits/test_focus.py."""
 
 

@@ -34,8 +34,8 @@ _END_RAD: Final = 0.03
 _GIVES_RAD: Final = 0.06
 """Largest motion at an end under more current: pads and stops are elastic, and a linkage presses harder there."""
 
-_LEAST_TRAVEL_RAD: Final = 0.2
-_MOST_TRAVEL_RAD: Final = 4 * math.pi
+_MIN_TRAVEL_RAD: Final = 0.2
+_MAX_TRAVEL_RAD: Final = 4 * math.pi
 _OPEN_SHARE: Final = 0.35
 """Largest distance of the start from the open end, as a share of the travel."""
 
@@ -57,7 +57,7 @@ _SPEED_INTEGRAL_N_M: Final = 40.0
 """Speed loop, as in the approach of a grasp."""
 
 _REST_S: Final = 0.3
-_MOST_ASYMMETRY: Final = 3.0
+_MAX_ASYMMETRY: Final = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +148,7 @@ def calibrate_jaws(config: Config, *, prompt: Prompt, progress: Progress = no_pr
 
 def _check_ends(start_rad: float, low_rad: float, high_rad: float, repeat_rad: float) -> None:
     travel_rad = high_rad - low_rad
-    if travel_rad < _LEAST_TRAVEL_RAD:
+    if travel_rad < _MIN_TRAVEL_RAD:
         raise DataError(
             f"the jaws move by {travel_rad:.2f} rad only, between {low_rad:.2f} and {high_rad:.2f} rad, with all the "
             "current that servo.current_limit_a and control.force_limit_n allow; remove what blocks them, and check "
@@ -167,12 +167,12 @@ def _check_ends(start_rad: float, low_rad: float, high_rad: float, repeat_rad: f
 
 
 def _check_friction(breakaway_n: tuple[float, float], running_n: tuple[float, float]) -> None:
-    if min(running_n) <= 0 or max(running_n) > _MOST_ASYMMETRY * min(running_n):
+    if min(running_n) <= 0 or max(running_n) > _MAX_ASYMMETRY * min(running_n):
         raise DataError(
             f"the friction is {running_n[0]:.2f} N while closing and {running_n[1]:.2f} N while opening; check for "
             "a cable or a weight that pulls the jaws, and start again"
         )
-    if min(breakaway_n) < min(running_n) / _MOST_ASYMMETRY:
+    if min(breakaway_n) < min(running_n) / _MAX_ASYMMETRY:
         raise DataError(
             f"the jaws begin to move at {min(breakaway_n):.2f} N and need {min(running_n):.2f} N to keep moving; "
             "check that nothing pushes them, and start again"
@@ -256,7 +256,7 @@ class _EmptyJaws:
         """Returns the angles at the upper and the lower end. Jaws that friction holds get more current."""
         while True:
             high_rad, low_rad = self._find_end(1), self._find_end(-1)
-            if high_rad - low_rad > _LEAST_TRAVEL_RAD or self._end_a >= self._ceiling_a:
+            if high_rad - low_rad > _MIN_TRAVEL_RAD or self._end_a >= self._ceiling_a:
                 return high_rad, low_rad
             self.raise_current()
 
@@ -289,9 +289,9 @@ class _EmptyJaws:
         still = _Standstill(begin_rad)
         while not still.lasts(self.state.position_rad):
             self.cycle(side, self._end_a)
-            if abs(self.state.position_rad - begin_rad) > _MOST_TRAVEL_RAD:
+            if abs(self.state.position_rad - begin_rad) > _MAX_TRAVEL_RAD:
                 raise DataError(
-                    f"the horn turned by {_MOST_TRAVEL_RAD:.0f} rad without an end; check that it is screwed to the "
+                    f"the horn turned by {_MAX_TRAVEL_RAD:.0f} rad without an end; check that it is screwed to the "
                     "gripper"
                 )
 

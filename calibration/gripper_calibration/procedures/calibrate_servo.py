@@ -52,11 +52,11 @@ _OVERSHOOT_SHARE: Final = 0.05
 """The first press is so slow that the force rises by at most this share until a sample shows it."""
 _PLAUSIBLE_RATIO: Final = 1.4
 """Largest ratio between the measured and the expected torque constant, either way; see gripper.gain_bound."""
-_LEAST_SHARE: Final = 0.7
+_MIN_SHARE: Final = 0.7
 """Least share of the peak force that a press at the current ceiling must reach."""
 _MAX_TARE_N: Final = 1.0
 _CLEARANCE_M: Final = 0.005
-_LEAST_TRAVEL_M: Final = 0.001
+_MIN_TRAVEL_M: Final = 0.001
 """Jaws that closed by less than this did not move."""
 _BRAKE_RAD: Final = 0.3
 """Distance from the goal at which the servo's own position control takes over, and at most a fifth of the pass."""
@@ -459,7 +459,7 @@ class _Jaws:
         return self.closing_rad
 
     def _raise_no_contact(self, moved_rad: float) -> NoReturn:
-        if moved_rad * self._jaw_m_per_rad < _LEAST_TRAVEL_M:
+        if moved_rad * self._jaw_m_per_rad < _MIN_TRAVEL_M:
             raise DataError(
                 f"the jaws do not move with {self._moving_current_a():.2f} A, twice gripper.friction_n; find their "
                 "friction with `calibrate jaws`, and check that they are not at the closed end already "
@@ -534,7 +534,7 @@ class _Jaws:
             if self.force_n >= peak_n:
                 return
             self.cycle(self.closing_rad + _BEYOND_RAD, current_a)
-        if self.force_n < _LEAST_SHARE * peak_n:
+        if self.force_n < _MIN_SHARE * peak_n:
             raise DataError(
                 f"{current_a:.2f} A give {self.force_n:.1f} N instead of {peak_n:.1f} N; check that the load "
                 "cell lies in the path of the force, its scale, and servo.current_limit_a; if the servo is that weak, "

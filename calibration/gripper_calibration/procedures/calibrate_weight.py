@@ -27,7 +27,7 @@ PLACES: Final = (0.3, 0.4, 0.5, 0.6)
 _RAMP_N_S: Final = 1.5
 _MOVED_RAD: Final = 0.01
 _REST_S: Final = 0.3
-_LEAST_N: Final = 1.0
+_MIN_N: Final = 1.0
 """Least force at both jaws that the weight is worth."""
 
 _BEHIND_M: Final = 0.006
@@ -91,16 +91,16 @@ def masses_kg(config: Config) -> tuple[float, float]:
             f"this gripper has {'two servos' if len(config.servo.ids) > 1 else f'linkage {kind}'}; use a load cell"
         )
     gripper = config.gripper
-    most_n = 2 * (config.control.force_limit_n / gripper.gain_bound / _FORCE_FACTOR - gripper.friction_n)
-    least_kg = math.ceil(1e3 * 2 * _LEAST_N / STANDARD_GRAVITY_M_S2) / 1e3
-    most_kg = math.floor(1e3 * most_n / STANDARD_GRAVITY_M_S2) / 1e3
-    if most_kg < least_kg:
+    max_n = 2 * (config.control.force_limit_n / gripper.gain_bound / _FORCE_FACTOR - gripper.friction_n)
+    min_kg = math.ceil(1e3 * 2 * _MIN_N / STANDARD_GRAVITY_M_S2) / 1e3
+    max_kg = math.floor(1e3 * max_n / STANDARD_GRAVITY_M_S2) / 1e3
+    if max_kg < min_kg:
         raise ConfigError(
             f"with control.force_limit_n {config.control.force_limit_n:g} and gripper.friction_n "
-            f"{gripper.friction_n:g} the jaws can't lift a mass of {least_kg:g} kg, the least that measures anything; "
+            f"{gripper.friction_n:g} the jaws can't lift a mass of {min_kg:g} kg, the least that measures anything; "
             "raise the limit, or use a load cell"
         )
-    return least_kg, most_kg
+    return min_kg, max_kg
 
 
 def is_servo_simulated(config: Config) -> bool:
@@ -128,11 +128,11 @@ def calibrate_weight(
         DeviceError: A device failed, or the jaws start outside their travel. The servo has no torque.
         DataError: The jaws do not lift the mass, or the result contradicts the configuration.
     """
-    least_kg, most_kg = masses_kg(config)
-    if not least_kg <= mass_kg <= most_kg:
+    min_kg, max_kg = masses_kg(config)
+    if not min_kg <= mass_kg <= max_kg:
         raise ConfigError(
             f"a mass of {mass_kg:g} kg does not suit this gripper and control.force_limit_n; use one of "
-            f"{least_kg:g} to {most_kg:g} kg"
+            f"{min_kg:g} to {max_kg:g} kg"
         )
     hung_kg = config.sim.hanging_mass_kg or mass_kg
     config = servo_alone(config)
@@ -237,7 +237,7 @@ class _Jaws:
         transmission, friction_n = cycles.transmission, config.gripper.friction_n
         middle_rad = transmission.position_rad(transmission.open_width_m / 2)
         ceiling_n = abs(transmission.force_n(cycles.limits.ceiling_a(0.0, middle_rad), middle_rad))
-        self._most_n = min(_FORCE_FACTOR * (weight_n / 2 + friction_n) + _SPARE_N, ceiling_n)
+        self._max_n = min(_FORCE_FACTOR * (weight_n / 2 + friction_n) + _SPARE_N, ceiling_n)
         self._expected_n, self._is_loaded = expected_n, weight_n > 0
         self._speed_m_s = min(_SPEED_M_S, cycles.approach_m_s)
 
@@ -253,7 +253,7 @@ class _Jaws:
         while rest > 0:
             rest -= next_m == goal_m
             next_m += min(max(goal_m - next_m, -step_m), step_m)
-            self._cycle(next_m, self._most_n)
+            self._cycle(next_m, self._max_n)
             if abs(self._width_m - next_m) / 2 > _BEHIND_M:
                 self._raise_stuck("are far behind their goal")
 
@@ -263,7 +263,7 @@ class _Jaws:
         moved_m = 2 * _MOVED_RAD * self._cycles.transmission.jaw_m_per_rad(self._cycles.state.position_rad)
         while side * (begin_m - self._width_m) < moved_m:
             force_n += side * _RAMP_N_S / RATE_HZ
-            if abs(force_n) > self._most_n:
+            if abs(force_n) > self._max_n:
                 self._raise_stuck("do not move")
             self._cycle(self._width_m - math.copysign(_LEAD_M, force_n), abs(force_n))
         return force_n
@@ -276,7 +276,7 @@ class _Jaws:
                 "blocks it"
             )
         raise DataError(
-            f"the jaws {problem} at {1e3 * self._width_m:.0f} mm with a motor force of {self._most_n:.1f} N; {remedy}"
+            f"the jaws {problem} at {1e3 * self._width_m:.0f} mm with a motor force of {self._max_n:.1f} N; {remedy}"
         )
 
     def _cycle(self, goal_width_m: float, force_n: float) -> None:

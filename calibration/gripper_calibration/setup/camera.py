@@ -16,7 +16,7 @@ from gripper_calibration.fits.camera_fit import (
     region_around,
     select_exposure,
 )
-from gripper_calibration.fits.focus import MOST_BLUR, blur
+from gripper_calibration.fits.focus import MAX_BLUR, blur
 from gripper_calibration.procedures.calibrate_camera import candidate_exposures_us, try_exposures
 from gripper_calibration.setup.step import Found, Outcome, Task
 from gripper_force.errors import DataError
@@ -25,8 +25,8 @@ from gripper_force.vision.preprocess import Region
 
 _SHOWN_PX: Final = 640
 _DARK_GRAY: Final = 5
-_MOST_DARK: Final = 0.2
-_LEAST_REGION_SHARE: Final = 0.35
+_MAX_DARK_SHARE: Final = 0.2
+_MIN_REGION_SHARE: Final = 0.35
 """Side of the region as a share of the frame's: with less, the jaws have few pixels."""
 
 _COLOURS: Final = {"region": (80, 200, 80), "marker": (60, 160, 255)}
@@ -110,7 +110,7 @@ def _light(gray: Gray, best: ExposureCandidate) -> list[str]:
     else:
         remarks.append("clipping: none")
     dark = float(np.mean(gray <= _DARK_GRAY))
-    if dark > _MOST_DARK:
+    if dark > _MAX_DARK_SHARE:
         remarks.append(
             f"light: {100 * dark:.0f} % of the pixels are black; light the jaws from the camera's side"
         )
@@ -119,12 +119,12 @@ def _light(gray: Gray, best: ExposureCandidate) -> list[str]:
 
 def _focus(gray: Gray, region: Region | None) -> list[str]:
     found = blur(_part(gray, region))
-    if found > MOST_BLUR:
+    if found > MAX_BLUR:
         return [
-            f"focus: blurred ({found:.2f}; above {MOST_BLUR:g}); turn the lens, or set camera.lens_position, until "
+            f"focus: blurred ({found:.2f}; above {MAX_BLUR:g}); turn the lens, or set camera.lens_position, until "
             "edges of object and jaws are sharp"
         ]
-    return [f"focus: sharp ({found:.2f}; blurred above {MOST_BLUR:g})"]
+    return [f"focus: sharp ({found:.2f}; blurred above {MAX_BLUR:g})"]
 
 
 def _markers(markers: Markers, region: Region | None, gray: Gray) -> list[str]:
@@ -140,7 +140,7 @@ def _markers(markers: Markers, region: Region | None, gray: Gray) -> list[str]:
     if region is None:
         return [*remarks, "region: the whole frame; set vision.region to the part that shows the jaws"]
     share = region[2] / min(gray.shape)
-    small = "; bring the camera nearer, so that the jaws fill it" if share < _LEAST_REGION_SHARE else ""
+    small = "; bring the camera nearer, so that the jaws fill it" if share < _MIN_REGION_SHARE else ""
     return [*remarks, f"region: {100 * share:.0f} % of the frame's side{small}"]
 
 

@@ -84,13 +84,13 @@ def torque(task: Task) -> Outcome:
 def _weight(task: Task) -> Outcome:
     """Balances a mass, if the gripper can and there is one."""
     try:
-        least_kg, most_kg = masses_kg(task.config)
+        min_kg, max_kg = masses_kg(task.config)
     except ConfigError:
         return _data_sheet(task)
     mass_kg = task.mass_kg
     if mass_kg is None:
         mass_kg = 1e-3 * task.number(
-            f"Known mass to hang from one jaw in grams, {1e3 * least_kg:.0f} to {1e3 * most_kg:.0f}; 0 for none",
+            f"Known mass to hang from one jaw in grams, {1e3 * min_kg:.0f} to {1e3 * max_kg:.0f}; 0 for none",
             "--mass-kg KG",
             0.0,
         )

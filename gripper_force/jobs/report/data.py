@@ -45,7 +45,7 @@ from gripper_force.types import (
 _CONTROLLER: Final = ("control", "vision")
 """Units of the controller's events."""
 
-_LEAST_LOSS_S: Final = 0.1
+_MIN_LOSS_S: Final = 0.1
 """Shorter times without vision are not marked."""
 
 _BETWEEN_TOUCHES_S: Final = 0.2
@@ -359,7 +359,7 @@ def _losses(
         if is_lost and begin_ns is None:
             begin_ns = s.t_ns
         if begin_ns is not None and (not is_lost or s is status[-1]):
-            if (s.t_ns - begin_ns) / NS_PER_S >= _LEAST_LOSS_S:
+            if (s.t_ns - begin_ns) / NS_PER_S >= _MIN_LOSS_S:
                 reason = next(
                     (text for t_ns, text in reversed(reasons) if t_ns <= s.t_ns), "no estimate was used"
                 )

@@ -172,8 +172,8 @@ def draw_training(
 
 
 def _estimates(axes: Axes, measured_n: Floats, estimated_n: Floats, objects: npt.NDArray[np.str_]) -> None:
-    most_n = float(max(measured_n.max(), estimated_n.max(), 0.1))
-    axes.plot([0, most_n], [0, most_n], color=_GRAY, lw=0.8)
+    max_n = float(max(measured_n.max(), estimated_n.max(), 0.1))
+    axes.plot([0, max_n], [0, max_n], color=_GRAY, lw=0.8)
     for name, colour, index in _by_object(objects):
         axes.plot(measured_n[index], estimated_n[index], ".", ms=1.5, color=colour, label=name)
     label_axes(axes, "Estimates", "load cell, N", "estimate, N")

@@ -37,7 +37,7 @@ from gripper_force.vision.network import ForceNetwork
 STATE_EVERY_S: Final = 60.0
 """Time between two saved states: an interrupted training loses no more than this."""
 
-LEAST_STEPS: Final = 300
+MIN_STEPS: Final = 300
 """Fewer steps give a warning. A complete schedule of this length has about 1.6 times the error of a long training."""
 
 
@@ -285,9 +285,9 @@ def _trained(
             f"the training was too short: it drew no clip from {unseen} of its {len(clips)} recordings; "
             f"increase {length}"
         )
-    elif (fewest := min(trainer.step for trainer in trainers)) < LEAST_STEPS:
+    elif (fewest := min(trainer.step for trainer in trainers)) < MIN_STEPS:
         warn(
-            f"the training made only {fewest} steps; a network needs at least {LEAST_STEPS}, so increase {length} or, "
+            f"the training made only {fewest} steps; a network needs at least {MIN_STEPS}, so increase {length} or, "
             "with a few recordings, use --recipe few"
         )
     return trainers

@@ -30,7 +30,7 @@ _WAIT_S: Final = 0.1
 _CLOCK_NS: Final = 20 * NS_PER_MS
 """The app's clock is set this often."""
 
-_LEAST_SPEED: Final = 0.01
+_MIN_SPEED: Final = 0.01
 
 
 class FoxgloveViewer(ServerListener):  # type: ignore[misc]  # the SDK is not checked
@@ -141,7 +141,7 @@ class FoxgloveViewer(ServerListener):  # type: ignore[misc]  # the SDK is not ch
         request = playback_control_request
         with self._changed:
             self._plays = request.playback_command == PlaybackCommand.Play
-            self._speed = max(request.playback_speed, _LEAST_SPEED)
+            self._speed = max(request.playback_speed, _MIN_SPEED)
             if request.seek_time is not None:
                 self._seek_ns = self._now_ns = request.seek_time
             self._changed.notify_all()

@@ -51,7 +51,7 @@ TOLERANCE: Final = 0.05
 _AFTER_NS: Final = 300 * NS_PER_MS
 """Time after the run in which the peak force is still observed."""
 
-_MOST_LOST_MS: Final = 100 + 5
+_MAX_LOST_MS: Final = 100 + 5
 """Longest allowed gap at the end of a log: one chunk and one control cycle."""
 
 _ONLY_LIVE: Final = frozenset(row.name for row in ROWS if row.unit == "process")
@@ -309,7 +309,7 @@ def _run_process_row(tree: Tree, row: FaultCase) -> FaultRunResult:
             }
     over = trial.peak_n / config.control.force_limit_n - 1
     failure = "" if trial.tripped_ms is not None else "the watchdog did not trip"
-    if trial.lost_ms > _MOST_LOST_MS:
+    if trial.lost_ms > _MAX_LOST_MS:
         failure = f"the log lacks the last {trial.lost_ms:.0f} ms"
     if trial.tripped_ms is not None and row.within_ms is not None and trial.tripped_ms > row.within_ms:
         failure = f"the watchdog took {trial.tripped_ms:.0f} ms"

@@ -56,7 +56,7 @@ _TARGET_N: Final = 20.0
 _OPEN_WIDTH_M: Final = 1.0  # room for the softest object
 _TIME_S: Final = 10.0
 _JUDGED_S: Final = 2.0  # time at the end over which the oscillation is judged
-_LEAST_AMPLITUDE_N: Final = 1.0
+_MIN_AMPLITUDE_N: Final = 1.0
 _NOISE_N: Final = 0.02
 _BISECTIONS: Final = 7
 _CYCLE_S: Final = CYCLE_NS / NS_PER_S
@@ -126,7 +126,7 @@ def margin_with_inertia(gains: Gains, plant: IdentifiedPlant, truth: Gripper, de
 
     def force(s: Complex) -> Complex:
         periods = np.abs(s.imag) * (delay_s + FRAME_S / 2) / (2 * math.pi)
-        remaining_n = np.maximum(AMPLITUDE_N - 4 * friction_n * periods, _LEAST_AMPLITUDE_N)
+        remaining_n = np.maximum(AMPLITUDE_N - 4 * friction_n * periods, _MIN_AMPLITUDE_N)
         braking = 1j * np.sign(s.imag) * 4 * friction_n / (math.pi * remaining_n)
         return plant.gain / (1 + (truth.mass_kg * s**2 + truth.damping_n_s_m * s) / stiffness_n_m + braking)
 

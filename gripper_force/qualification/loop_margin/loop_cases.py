@@ -114,17 +114,17 @@ class _Bounds:
 
     def __init__(self, config: Config, truth: Gripper) -> None:
         rig = truth.transmission
-        most_friction_n = rig.friction_n * (1 + 3 * rig.friction_std)
-        self._most_a = min(
+        max_friction_n = rig.friction_n * (1 + 3 * rig.friction_std)
+        self._max_a = min(
             config.servo.current_limit_a,
-            (_CEILING_SHARE * config.control.force_limit_n / rig.gain_bound + most_friction_n)
+            (_CEILING_SHARE * config.control.force_limit_n / rig.gain_bound + max_friction_n)
             / rig.n_per_a(rig.open_position_rad),
         )
         self._low_rad, self._high_rad = rig.goal_range_rad
 
     def contains(self, current_a: float, position_rad: float) -> bool:
         """Returns True if a command is within the limits; a non-finite one is not."""
-        return 0 <= current_a <= self._most_a and self._low_rad <= position_rad <= self._high_rad
+        return 0 <= current_a <= self._max_a and self._low_rad <= position_rad <= self._high_rad
 
 
 def crushing_n_m(control: ControlConfig, truth: Gripper) -> float:

@@ -49,7 +49,7 @@ class _DecimalFusion:
         _, lag_s, _ = control.plant
         self._lag_s = Decimal(lag_s)
         self._oldest_ns = control.max_frame_age_ms * NS_PER_MS
-        self._most_std_n = control.vision_std_n
+        self._max_std_n = control.vision_std_n
         self._friction_n = Decimal(transmission.friction_n)
         self._friction_n2 = (Decimal(transmission.friction_std) * self._friction_n) ** 2
         self._gain_std = Decimal(transmission.gain_std)
@@ -90,7 +90,7 @@ class _DecimalFusion:
 
     def _correct(self, t_ns: int, visual: VisualForce) -> None:
         usable = abs(visual.force_n) <= 1e9 and abs(visual.std_n) <= 1e9
-        if not (usable and 0 <= t_ns - visual.t_ns <= self._oldest_ns and visual.std_n <= self._most_std_n):
+        if not (usable and 0 <= t_ns - visual.t_ns <= self._oldest_ns and visual.std_n <= self._max_std_n):
             return
         claimed_n2 = Decimal(max(visual.std_n, fusion._VISION_FLOOR_N)) ** 2
         then_n = self._force_at(visual.t_ns)

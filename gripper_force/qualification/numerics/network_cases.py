@@ -415,8 +415,8 @@ def _range(folder: Path, grasp: Clip, config: Config) -> NumericalCase:
             ]
             total += len(frames) - reference.model.header.preprocess.lead_in
             used += len(forces_n)
-            least_n, most_n = KNOWN_N[0] - RESIDUAL_HALF_N, KNOWN_N[1] + RESIDUAL_HALF_N
-            beyond_n = max([beyond_n, *(max(least_n - f, f - most_n) for f in forces_n)])
+            min_n, max_n = KNOWN_N[0] - RESIDUAL_HALF_N, KNOWN_N[1] + RESIDUAL_HALF_N
+            beyond_n = max([beyond_n, *(max(min_n - f, f - max_n) for f in forces_n)])
     detail = (
         f"{total - used} of {total} estimates flagged; largest excess of the others over the validated range"
     )

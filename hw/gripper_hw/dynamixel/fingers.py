@@ -18,12 +18,12 @@ _STANDING_RAD_S: Final = 1.5 * VELOCITY_UNIT_RAD_S
 """A finger that is not faster stands: one unit is noise."""
 
 _EQUALISING_RAD: Final = 0.05
-_LEAST_SHARE: Final = 0.4
-_LEAST_MOVING_SHARE: Final = 0.2
+_MIN_SHARE: Final = 0.4
+_MIN_MOVING_SHARE: Final = 0.2
 """The lead of the finger that is ahead of the mean falls with its distance from it, to the first share, and to the
 second one if the other finger moves, too. With less, the mean speed would look like a standstill."""
 
-_MOST_CURRENT: Final = 1.3
+_MAX_CURRENT: Final = 1.3
 """Largest goal current of the finger that is behind, whose friction may be larger, as a share of the controller's."""
 
 _STATIC_SPARE: Final = 1.3
@@ -67,11 +67,11 @@ class FingerPair:
     def start_problem(self, first_rad: float, second_rad: float) -> str:
         """Returns why two servo positions are no start, or an empty text."""
         difference_rad = abs(self.difference_rad(first_rad, second_rad))
-        most_rad = self._config.max_difference_rad / 2
-        if difference_rad <= most_rad:
+        max_rad = self._config.max_difference_rad / 2
+        if difference_rad <= max_rad:
             return ""
         return (
-            f"the fingers are {difference_rad:.2f} rad apart, more than the {most_rad:g} rad, half of "
+            f"the fingers are {difference_rad:.2f} rad apart, more than the {max_rad:g} rad, half of "
             "servo.second.max_difference_rad, that a start allows; open both equally far by hand, or, if they are, set "
             f"servo.second.offset_rad={second_rad - self._sign * first_rad:.3f} and check servo.second.mirrored"
         )
@@ -127,21 +127,21 @@ class FingerPair:
         way = math.copysign(1.0, lead_rad)
         self._follow(way, mean_rad, half_rad)
         static_rad = _STATIC_SPARE * abs(goal_a) / self._a_per_rad
-        most_rad = max(abs(lead_rad), static_rad)
+        max_rad = max(abs(lead_rad), static_rad)
         shift_rad = self._kept_half_rad - half_rad
         leads_rad = [
-            min(max(lead, -most_rad), most_rad) for lead in (lead_rad - shift_rad, lead_rad + shift_rad)
+            min(max(lead, -max_rad), max_rad) for lead in (lead_rad - shift_rad, lead_rad + shift_rad)
         ]
         self._goals_a = [goal_a, goal_a]
         slowest_rad_s, fastest_rad_s = sorted(way * state.velocity_rad_s for state in self._states)
         if slowest_rad_s > -_STANDING_RAD_S and fastest_rad_s > _STANDING_RAD_S:
             ahead = int(way * half_rad > 0)
-            least_share = _LEAST_SHARE if slowest_rad_s < _STANDING_RAD_S else _LEAST_MOVING_SHARE
+            min_share = _MIN_SHARE if slowest_rad_s < _STANDING_RAD_S else _MIN_MOVING_SHARE
             share = 1 - abs(half_rad) / _EQUALISING_RAD
-            shorter_rad = max(max(share, least_share) * abs(lead_rad), static_rad)
+            shorter_rad = max(max(share, min_share) * abs(lead_rad), static_rad)
             leads_rad[ahead] = min(max(leads_rad[ahead], -shorter_rad), shorter_rad)
             left_a = max(goal_a - abs(self._states[ahead].current_a), 0.0)
-            self._goals_a[1 - ahead] = min(goal_a + (1 - max(share, 0.0)) * left_a, _MOST_CURRENT * goal_a)
+            self._goals_a[1 - ahead] = min(goal_a + (1 - max(share, 0.0)) * left_a, _MAX_CURRENT * goal_a)
         if any(state.hardware_error & ~_INPUT_VOLTAGE_ERROR for state in self._states):
             self._goals_a = [0.0, 0.0]  # one finger alone would push the object and the other one away
         goals_rad = (

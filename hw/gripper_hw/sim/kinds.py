@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 
 from gripper_force.errors import ConfigError
 from gripper_force.schema import Positive, Section, Tree, tree_from, validated
-from gripper_hw.sim.mesh_files import LEAST_M, MOST_M, MeshFile, read_image, read_mesh
+from gripper_hw.sim.mesh_files import MAX_SIZE_M, MIN_SIZE_M, MeshFile, read_image, read_mesh
 from gripper_hw.sim.meshes import (
     SHELL_CONTACT,
     SOFT_CONTACT,
@@ -46,7 +46,7 @@ a few newtons and chatters; a thicker one moves less than the pads' own contact.
 _SOLID_N_M = 100_000.0
 """Stiffness E * area / width of a solid that the simulation can follow: 10 N press it by 0.1 mm."""
 
-Length = Annotated[float, Field(ge=LEAST_M, le=MOST_M)]
+Length = Annotated[float, Field(ge=MIN_SIZE_M, le=MAX_SIZE_M)]
 Size = tuple[Length, Length, Length]
 Share = Annotated[float, Field(ge=0, le=1)]
 
@@ -132,11 +132,11 @@ class Solid(ObjectKind):
             (points, tetrahedra), lengths = self._shape(), np.array(self.size_m) * size
         else:
             points, tetrahedra, lengths = _mesh_shape(self.mesh, size)
-        most_pa = _SOLID_N_M * lengths[0] / (lengths[1] * lengths[2])
-        if self.modulus_pa > most_pa:
+        max_pa = _SOLID_N_M * lengths[0] / (lengths[1] * lengths[2])
+        if self.modulus_pa > max_pa:
             raise ConfigError(
                 f"modulus_pa {self.modulus_pa:g} of a simulated object of this size is too stiff to be simulated as "
-                f"elastic; set at most {most_pa:.2g}, or describe a rigid object as MJCF"
+                f"elastic; set at most {max_pa:.2g}, or describe a rigid object as MJCF"
             )
         points = points * lengths / 2 + [0, 0, lengths[2] / 2 + _SKIN_M]
         uv = np.c_[points[:, 0] + 0.5 * points[:, 1], points[:, 2] + 0.5 * points[:, 1]] / 0.1

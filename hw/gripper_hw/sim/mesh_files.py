@@ -17,7 +17,7 @@ MAX_VERTICES = 1000
 _LONGEST_M = 0.02
 """Longest edge of a triangle; a pad is 22 mm high."""
 
-LEAST_M, MOST_M = 0.004, 0.2
+MIN_SIZE_M, MAX_SIZE_M = 0.004, 0.2
 """Least and largest length of an object along an axis."""
 
 _METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
@@ -111,11 +111,11 @@ def read_mesh(mesh: MeshFile) -> tuple[Points, Indices]:
         c, s = np.cos(angle), np.sin(angle)
         points[:, plane] = points[:, plane] @ [[c, s], [-s, c]]
     low, high = points.min(axis=0), points.max(axis=0)
-    if (high - low).min() < LEAST_M or (high - low).max() > MOST_M:
+    if (high - low).min() < MIN_SIZE_M or (high - low).max() > MAX_SIZE_M:
         size = " x ".join(f"{1e3 * length:.6g}" for length in high - low)
         raise ConfigError(
-            f"the mesh {path} measures {size} mm, and from {1e3 * LEAST_M:g} to {1e3 * MOST_M:g} mm can be simulated; "
-            "correct mesh.unit or mesh.scale"
+            f"the mesh {path} measures {size} mm, and from {1e3 * MIN_SIZE_M:g} to {1e3 * MAX_SIZE_M:g} mm can be "
+            "simulated; correct mesh.unit or mesh.scale"
         )
     return _refined(points - [*(low + high)[:2] / 2, low[2]], triangles, path)
 

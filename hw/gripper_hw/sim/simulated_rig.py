@@ -241,11 +241,11 @@ class SimulatedRig:
             second=None if self._second is None else (motors[1], self._second),
             hanging_mass_kg=config.sim.hanging_mass_kg,
         )
-        most_hz = NS_PER_S / self._world.step_ns
+        max_hz = NS_PER_S / self._world.step_ns
         for unit, sensor in (("camera", config.camera), ("load_cell", config.load_cell)):
-            if sensor.backend == "simulated" and sensor.rate_hz > most_hz:
+            if sensor.backend == "simulated" and sensor.rate_hz > max_hz:
                 raise ConfigError(
-                    f"{unit}.rate_hz {sensor.rate_hz:g} is more than the {most_hz:g} physics steps per second; set less"
+                    f"{unit}.rate_hz {sensor.rate_hz:g} is more than the {max_hz:g} physics steps per second; set less"
                 )
         self._object_digest = "" if config.sim.object is None else digest(config.sim.object)
         self._exposure_ms = config.sim.exposure_ms * _relative_exposure(config)

@@ -30,7 +30,7 @@ _MAX_RACK_SLIP_M = 0.005
 _MAX_FORCE_N = 200.0
 """Largest plausible grip force."""
 
-_LEAST_NODE_KG = 0.004
+_MIN_NODE_KG = 0.004
 """Least mass of a node of an elastic solid that a pad presses; below 0.001 kg contacts can explode."""
 
 _CHECK_PERIOD_NS = 5_000_000
@@ -261,7 +261,7 @@ class World:
         """
         nodes = np.unique(self._model.flex_nodebodyid)
         nodes = nodes[self._model.body_dofnum[nodes] > 0]
-        self._model.body_mass[nodes] = np.maximum(self._model.body_mass[nodes], _LEAST_NODE_KG)
+        self._model.body_mass[nodes] = np.maximum(self._model.body_mass[nodes], _MIN_NODE_KG)
         mujoco.mj_setConst(self._model, self._data)
 
     def _hang_up(self, mass_kg: float) -> None:

@@ -192,7 +192,7 @@ def test_too_few_steps_warn(
     train(config, six, out, validation_clips=six, warn=warnings.append)
     (text,) = (w for w in warnings if "out-of-distribution" not in w)
     assert "only 8 steps" in text
-    monkeypatch.setattr(train_module, "LEAST_STEPS", 8)
+    monkeypatch.setattr(train_module, "MIN_STEPS", 8)
     train(config, six, out, validation_clips=six, warn=warnings.append)
     assert not [w for w in warnings[2:] if "out-of-distribution" not in w]
 

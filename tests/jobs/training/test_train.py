@@ -142,7 +142,7 @@ def test_training_too_short_for_all_recordings_warns(
     assert warnings == [
         "the training was too short: it drew no clip from 5 of its 6 recordings; increase steps"
     ]
-    monkeypatch.setattr(train_module, "LEAST_STEPS", 1)
+    monkeypatch.setattr(train_module, "MIN_STEPS", 1)
     train(small_recipe, clips, out, validation_clips=clips, warn=warn)
     assert len(warnings) == 1
     config = one_clip.model_copy(update={"steps": 3})
