@@ -26,7 +26,7 @@ _MIN_DERATING = 0.6
 """Share of the target force at the temperature limit: a third of the heat."""
 
 
-class Safety:
+class SafetyLatch:
     """Fault latch: tripped by a failed check, and cleared only by a reset once the cause is gone.
 
     Deterministic: the same readings give the same results.
@@ -55,12 +55,12 @@ class Safety:
             True if the latch tripped in this cycle.
         """
         self._over_s = self._over_s + dt_s if over_force else 0.0
-        if not is_excess(servo.current_a, goal_current_a):
+        if not exceeds_goal_current(servo.current_a, goal_current_a):
             self._excess_s = 0.0
         elif not is_back_driven(servo):
             self._excess_s += dt_s
         self._cause = self._find_fault(servo)
-        if is_sound(servo):
+        if is_plausible(servo):
             self._last = servo
         return self.trip(self._cause) if self._cause else False
 
@@ -85,7 +85,7 @@ class Safety:
         return max(1.0 - (1.0 - _MIN_DERATING) * (temperature_c - warm_c) / (limit_c - warm_c), _MIN_DERATING)
 
     def _find_fault(self, servo: ServoState) -> str:
-        if not is_sound(servo):
+        if not is_plausible(servo):
             return "the servo's reading is not finite"
         if servo.hardware_error:
             return f"the servo reports hardware error 0x{servo.hardware_error:02x}"
@@ -109,7 +109,7 @@ class Safety:
         return abs(now.position_rad - before.position_rad) > _JUMP_RAD + _JUMP_RAD_S * time_s
 
 
-def is_excess(current_a: float, goal_current_a: float) -> bool:
+def exceeds_goal_current(current_a: float, goal_current_a: float) -> bool:
     """Returns True if a motor takes more current than its goal allows."""
     return abs(current_a) > (1 + _EXCESS_SHARE) * goal_current_a + _EXCESS_A
 
@@ -119,7 +119,7 @@ def is_back_driven(servo: ServoState) -> bool:
     return servo.current_a * servo.velocity_rad_s < 0 and abs(servo.velocity_rad_s) > _BACK_DRIVEN_RAD_S
 
 
-def is_sound(servo: ServoState) -> bool:
+def is_plausible(servo: ServoState) -> bool:
     """Returns True if every number of a reading is finite and of a plausible magnitude."""
     numbers = (
         servo.position_rad,

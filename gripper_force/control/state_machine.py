@@ -11,7 +11,7 @@ from gripper_force.control.force_loop import ForceLoop, Margin, tolerance_n
 from gripper_force.control.friction_allowance import FrictionAllowance
 from gripper_force.control.fusion import Fusion
 from gripper_force.control.limits import Limits, largest_target_n
-from gripper_force.control.safety import Safety, is_sound
+from gripper_force.control.safety import SafetyLatch, is_plausible
 from gripper_force.control.slip import SlipMonitor
 from gripper_force.control.speed_limit import PositionLoop, SpeedLimit
 from gripper_force.control.transmission import GOAL_OFFSET_M, Transmission
@@ -104,7 +104,7 @@ class GraspController:
 
     *A move* positions the jaws at a width with the motor force of a release. It also lets go of an object.
 
-    *Fault* is latched. A stop request or a trip of `Safety` leads to it. The jaws then go limp, hold their
+    *Fault* is latched. A stop request or a trip of `SafetyLatch` leads to it. The jaws then go limp, hold their
     position with a current that can only fall, or open, as ``on_fault`` says. Only a release request ends it,
     and only once the cause is gone.
 
@@ -144,7 +144,7 @@ class GraspController:
         self._limits = Limits(config, transmission, current_limit_a)
         self._speed_limit = SpeedLimit(transmission, position_loop)
         self._friction = FrictionAllowance(config, transmission)
-        self._safety = Safety(config)
+        self._safety = SafetyLatch(config)
         self._approach = Approach(config, transmission, approach_m_s)
         self._slip = SlipMonitor(config)
         self._visual_check = VisualCheck(config)
@@ -188,7 +188,7 @@ class GraspController:
             self._transmission.width_m(servo.position_rad),
             self._transmission.open_width_m,
         )
-        if not is_sound(servo) or -_START_SPARE_M <= width_m <= open_width_m + _START_SPARE_M:
+        if not is_plausible(servo) or -_START_SPARE_M <= width_m <= open_width_m + _START_SPARE_M:
             return ""
         return (
             f"the servo starts at {servo.position_rad:.3f} rad, where the jaws would be {1e3 * width_m:.1f} mm "
@@ -239,7 +239,7 @@ class GraspController:
         return min(max(t_ns - before_ns, 0) / NS_PER_S, MAX_CYCLE_S)
 
     def _read_sensors(self, t_ns: int, servo: ServoState, visual: VisualForce | None) -> list[Event]:
-        if not is_sound(servo):
+        if not is_plausible(servo):
             self._estimate = dataclasses.replace(self._estimate, t_ns=t_ns)
             return []
         width_m = self._transmission.width_m(servo.position_rad)

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gripper_force.config import ControlConfig, config_from
-from gripper_force.control.safety import Safety, is_sound
+from gripper_force.control.safety import SafetyLatch, is_plausible
 from gripper_force.errors import ConfigError
 from gripper_force.types import ServoState
 
@@ -40,7 +40,7 @@ def check(safety, servo, dt_s=0.005, over_force=False, goal_current_a=0.1):
 
 
 def tripped_by(change):
-    safety = Safety(CONFIG)
+    safety = SafetyLatch(CONFIG)
     assert not check(safety, WELL)
     assert check(safety, replace(WELL, **change))
     return safety
@@ -57,7 +57,7 @@ def test_latch_clears_only_once_the_cause_is_gone(change, reason):
     assert reason in safety.reset()
     assert reason in safety.reason
     healed = replace(WELL, position_rad=change.get("position_rad", WELL.position_rad))
-    healed = healed if is_sound(healed) else WELL
+    healed = healed if is_plausible(healed) else WELL
     assert not check(safety, healed)
     assert reason in safety.reason  # kept until a reset
     assert safety.reset() == ""
@@ -65,7 +65,7 @@ def test_latch_clears_only_once_the_cause_is_gone(change, reason):
 
 
 def test_first_reason_is_kept():
-    safety = Safety(CONFIG)
+    safety = SafetyLatch(CONFIG)
     assert safety.trip("stop requested")
     assert not safety.trip("something else")
     assert not check(safety, replace(WELL, hardware_error=1))
@@ -73,25 +73,25 @@ def test_first_reason_is_kept():
 
 
 def test_any_voltage_is_allowed_without_limits():
-    assert not check(Safety(ControlConfig()), replace(WELL, voltage_v=3.0))
+    assert not check(SafetyLatch(ControlConfig()), replace(WELL, voltage_v=3.0))
 
 
 def test_fast_rotation_is_no_jump():
-    safety = Safety(CONFIG)
+    safety = SafetyLatch(CONFIG)
     for i in range(20):
         moved = replace(WELL, t_ns=i * 5_000_000, position_rad=0.3 + i * 0.005 * 11)
         assert not check(safety, moved)
 
 
 def test_force_that_stays_over_its_limit_trips():
-    safety = Safety(CONFIG)
+    safety = SafetyLatch(CONFIG)
     assert not any(check(safety, WELL, over_force=i % 40 != 0) for i in range(400))
     assert any(check(safety, WELL, over_force=True) for _ in range(60))
     assert "over its limit" in safety.reason
 
 
 def test_motor_current_above_its_goal_trips():
-    safety = Safety(CONFIG)
+    safety = SafetyLatch(CONFIG)
     assert not any(check(safety, replace(WELL, current_a=0.14)) for _ in range(100))
     assert not any(check(safety, replace(WELL, current_a=-0.3 if i % 4 else 0.1)) for i in range(100))
     assert any(check(safety, replace(WELL, current_a=-0.15)) for _ in range(6))
@@ -100,7 +100,7 @@ def test_motor_current_above_its_goal_trips():
 
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_motor_that_is_back_driven_may_draw_more_than_its_goal(sign):
-    safety = Safety(CONFIG)
+    safety = SafetyLatch(CONFIG)
     pulled, still = (
         replace(WELL, current_a=sign * 0.3, velocity_rad_s=-sign * rad_s) for rad_s in (0.3, 0.03)
     )
@@ -110,7 +110,7 @@ def test_motor_that_is_back_driven_may_draw_more_than_its_goal(sign):
 
 @given(st.integers(1, 5))
 def test_pulling_at_a_motor_with_too_much_current_does_not_hide_it(pulled_cycles):
-    safety = Safety(CONFIG)
+    safety = SafetyLatch(CONFIG)
     pulled = replace(WELL, current_a=0.3, velocity_rad_s=-0.3)
     for _ in range(3):
         check(safety, replace(WELL, current_a=0.3))
@@ -120,7 +120,7 @@ def test_pulling_at_a_motor_with_too_much_current_does_not_hide_it(pulled_cycles
 
 @given(st.floats(-40, 120), st.floats(0, 20))
 def test_a_hotter_servo_never_holds_more(temperature_c, hotter_c):
-    safety = Safety(CONFIG)
+    safety = SafetyLatch(CONFIG)
     cooler, hotter = safety.derating(temperature_c), safety.derating(temperature_c + hotter_c)
     assert 0.6 <= hotter <= cooler <= 1.0
     assert cooler == 1.0 or temperature_c > CONFIG.warm_c
@@ -140,12 +140,12 @@ readings = st.builds(
 
 @given(st.lists(st.tuples(readings, st.booleans(), st.booleans())))
 def test_latch_is_tripped_in_every_cycle_with_a_cause(cycles):
-    safety = Safety(CONFIG)
+    safety = SafetyLatch(CONFIG)
     for servo, over_force, asks in cycles:
         check(safety, servo, over_force=over_force)
         refused = safety.reset() if asks else ""
         assert not refused or safety.reason
-        assert safety.reason or (is_sound(servo) and not servo.hardware_error)
+        assert safety.reason or (is_plausible(servo) and not servo.hardware_error)
 
 
 @pytest.mark.parametrize("control", [{"warm_c": 70.0}, {"voltage_limits_v": [14.8, 10.0]}])

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gripper_force.config import ControlConfig
-from gripper_force.control.safety import is_sound
+from gripper_force.control.safety import is_plausible
 from gripper_force.control.state_machine import GraspController
 from gripper_force.jobs.score import score_grasp
 from gripper_force.qualification.loop_margin.analytic_plant import POSITION_LOOP
@@ -793,7 +793,7 @@ def test_command_is_within_limits_for_any_input(transmission, inputs, feedback):
         decision = controller.step(t_ns, replace(servo, t_ns=t_ns), visual, request)
         command = decision.command
         assert 0.0 <= command.goal_current_a <= 0.3
-        if is_sound(servo):
+        if is_plausible(servo):
             position_rad = servo.position_rad
         if position_rad is not None:
             low_rad = min(position_rad, transmission.goal_range_rad[0])

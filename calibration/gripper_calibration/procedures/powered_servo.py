@@ -6,7 +6,7 @@ from typing import Final
 
 from gripper_force.config import Config
 from gripper_force.control.limits import Limits
-from gripper_force.control.safety import Safety
+from gripper_force.control.safety import SafetyLatch
 from gripper_force.control.speed_limit import SpeedLimit
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import DeviceError
@@ -74,7 +74,7 @@ class BusCycles:
         self._config, self._devices = config, devices
         self._raise_if_interrupted = raise_if_interrupted
         self._speed_limit = SpeedLimit(self.transmission, position_loop(gripper))
-        self._safety = Safety(config.control)
+        self._safety = SafetyLatch(config.control)
         self._period_ns = round(NS_PER_S / RATE_HZ)
         self._due_ns = devices.clock.now_ns()
         self._goal_a = 0.0

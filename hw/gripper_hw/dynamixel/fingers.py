@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Final
 
 from gripper_force.config import ServoConfig
-from gripper_force.control.safety import is_back_driven, is_excess
+from gripper_force.control.safety import exceeds_goal_current, is_back_driven
 from gripper_force.errors import DeviceError, HardwareFaultError
 from gripper_force.types import ServoCommand, ServoState
 from gripper_hw.dynamixel.control_table import VELOCITY_UNIT_RAD_S, ServoModel
@@ -104,7 +104,7 @@ class FingerPair:
         excess_a = [
             state.current_a
             for state, goal_a in zip(self._states, self._goals_a, strict=True)
-            if is_excess(state.current_a, goal_a) and not is_back_driven(state)
+            if exceeds_goal_current(state.current_a, goal_a) and not is_back_driven(state)
         ]
         return ServoState(
             t_ns=first.t_ns,
