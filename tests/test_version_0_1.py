@@ -9,7 +9,7 @@ import yaml
 from safetensors.numpy import save
 
 import gripper_force as gf
-from gripper_force.jobs.grasp import summarise
+from gripper_force.jobs.grasp import summarise_grasp
 from gripper_force.profiles.correction import load_correction
 from gripper_force.profiles.object_profile import read_object
 from gripper_force.vision.checkpoint import load_checkpoint
@@ -29,7 +29,7 @@ def test_a_log_is_replayed_by_todays_controller() -> None:
 
 
 def test_a_log_is_summarised() -> None:
-    summary = summarise(LOG)
+    summary = summarise_grasp(LOG)
     assert (summary["result"], summary["object"], summary["target_n"]) == ("held", "stapler", 2.0)
 
 

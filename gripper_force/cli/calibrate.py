@@ -270,7 +270,7 @@ def object_(
     settings = load_settings(config, set_, {"object": name, "seed": seed})
     given, name = name, settings.object  # a path has become a name
     folder = folder or job.default_folder(name)
-    job.check(settings, name, out)
+    job.check_before_touches(settings, name, out)
     if logs is None:
         _tell_existing(settings, touches, folder, fresh)
         logs = _touches(settings, touches, peak_n, folder, pause)
@@ -409,7 +409,7 @@ def teach(
     settings = load_settings(config, set_, {"object": name, "seed": seed})
     given, name = name, settings.object  # a path has become a name
     folder = folder or calibrate_object.default_folder(name)
-    job.check(settings, out or user_folder() / name)
+    job.check_before_touches(settings, out or user_folder() / name)
     begin_s = time.monotonic()
     try:
         if logs is None:

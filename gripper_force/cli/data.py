@@ -153,7 +153,7 @@ def record(
     cell. Existing sets are kept, so an interrupted recording continues.
     """
     from gripper_force.jobs.recording import record as job
-    from gripper_force.jobs.recording.summary import summarise
+    from gripper_force.jobs.recording.summary import summarise_recording
 
     options = {"object": object_, "seed": seed, "sim.yaw_deg": degrees, "sim.lux": lux}
     settings = load_settings(config, set_, options)
@@ -164,7 +164,7 @@ def record(
             console.err.print(f"{existing} of {sets} sets exist already and are kept")
         for path in job.record(settings, plan, folder, progress):
             progress(path.name)
-    console.show(summarise(paths), as_json, sets_table)
+    console.show(summarise_recording(paths), as_json, sets_table)
     few = () if sets > _MANY_SETS else ("--recipe", "few")
     console.next_step("train", folder / "train", *few, "--out", "force.safetensors")
 

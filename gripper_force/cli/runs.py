@@ -176,7 +176,7 @@ def _grasp_trials(
             soft_wrap=True,
         )
         prompt, lines = (console.prompt(yes) if pause else None), console.line
-    results: list[job.Summary] = []
+    results: list[job.GraspSummary] = []
     failure: BaseException | None = None
     with console.bar("grasping", count, hidden=bool(device)) as progress:
         try:
@@ -197,7 +197,7 @@ def _grasp_trials(
         except (KeyboardInterrupt, GripperError) as end:
             failure = end
     if results and not (as_json and isinstance(failure, GripperError)):
-        summary = job.overall(results, settings.control.force_limit_n)
+        summary = job.summarise_trials(results, settings.control.force_limit_n)
         figure = job.write_figure(settings, results, summary)
         printed = {"trials": results, "summary": summary, "figure": figure}
         console.show(printed, as_json, lambda _: trials_table(results, summary, figure))
@@ -313,14 +313,14 @@ def _write_reports(
 
 def _show_replays(replays: "Replays", pages: list[str], as_json: bool, *, alone: bool) -> None:
     """Shows one result, or with several logs the results and the errors over all."""
-    from gripper_force.jobs.replay.comparison import summary
+    from gripper_force.jobs.replay.comparison import summarise_replays
 
     results = replays.results
     if alone:
         shown = {**console.jsonable(results[0]), **({"report": pages[0]} if pages else {})}
         console.show(shown, as_json, lambda _: replay_table(results[0], pages[0] if pages else None))
         return
-    overall = summary(results)
+    overall = summarise_replays(results)
     unread = {log: str(error) for log, error in replays.failed.items()}
     printed = {
         "logs": results,

@@ -50,13 +50,13 @@ def doctor(config: Config) -> Iterator[Check]:
     # PyTorch's Triton and Mesa's EGL each bring an LLVM; a process that loads Triton second crashes.
     network = list(_guarded("network", _network(config)))
     for unit in PROBES:
-        yield from check(config, unit)
+        yield from check_unit(config, unit)
     yield from network
     yield from _guarded("clock", _clock(config))
     yield from _guarded("opencv", _opencv())
 
 
-def check(config: Config, unit: str) -> Iterator[Check]:
+def check_unit(config: Config, unit: str) -> Iterator[Check]:
     """Checks one unit of `PROBES`, as `doctor` does."""
     yield from _guarded(unit, _probe(PROBES[unit], config))
 

@@ -58,7 +58,7 @@ class _Score(TypedDict):
     settle_s: float | None
 
 
-class Summary(_Score):
+class GraspSummary(_Score):
     """Figures of one grasp; None for a figure without a value, such as without a load cell.
 
     Attributes:
@@ -114,7 +114,7 @@ class Summary(_Score):
     report: str | None
 
 
-class Overall(TypedDict):
+class TrialsSummary(TypedDict):
     """Figures over all trials; None for a figure without a value, such as an error without a load cell.
 
     Errors, overshoot and settling time leave out the trials with the feedback ``vision`` that fell back.
@@ -136,7 +136,7 @@ class Overall(TypedDict):
     estimate_mae_n: dict[str, dict[str, float | None]]
 
 
-def grasp(config: Config, progress: Progress = no_progress, path: Path | None = None) -> Summary:
+def grasp(config: Config, progress: Progress = no_progress, path: Path | None = None) -> GraspSummary:
     """Runs one grasp, writes its log and its report, and summarises it.
 
     Args:
@@ -158,9 +158,9 @@ def require_report(config: Config) -> None:
         require("matplotlib", "log.report=true", ", or set log.report=false")
 
 
-def summary_and_report(config: Config, path: Path) -> Summary:
+def summary_and_report(config: Config, path: Path) -> GraspSummary:
     """Summarises the log of a grasp, and writes its report if ``log.report`` is set."""
-    result = summarise(path)
+    result = summarise_grasp(path)
     if config.log.report:
         from gripper_force.jobs.report import write_report
 
@@ -247,7 +247,7 @@ def trials(
     same_object: bool = False,
     prompt: Prompt | None = None,
     progress: Progress = no_progress,
-) -> Generator[Summary, None, None]:
+) -> Generator[GraspSummary, None, None]:
     """Runs grasps of the objects in turn, with targets and seeds drawn from ``config.seed``.
 
     Args:
@@ -335,7 +335,7 @@ def with_same_object(config: Config) -> Config:
     )
 
 
-def summarise(path: Path) -> Summary:
+def summarise_grasp(path: Path) -> GraspSummary:
     """Computes the figures of a grasp from its log."""
     reader = LogReader(path)
     records: dict[type, list[Any]] = defaultdict(list)
@@ -391,7 +391,7 @@ def _choices(metadata: Mapping[str, str], events: list[Event]) -> list[str]:
     return [event.text for event in events if event.text.startswith(_CHOICE_EVENT)]
 
 
-def overall(results: list[Summary], force_limit_n: float) -> Overall:
+def summarise_trials(results: list[GraspSummary], force_limit_n: float) -> TrialsSummary:
     """Computes the figures over all trials."""
     counted = [r for r in results if not (r["fell_back"] and r["feedback"] == "vision")]
     scored = [r for r in counted if r["steady_error_n"] is not None]
@@ -424,7 +424,7 @@ def overall(results: list[Summary], force_limit_n: float) -> Overall:
     }
 
 
-def write_figure(config: Config, results: Sequence[Summary], summary: Overall) -> str | None:
+def write_figure(config: Config, results: Sequence[GraspSummary], summary: TrialsSummary) -> str | None:
     """Draws the errors of trials over their targets, beside the logs. Returns the file.
 
     Returns None without a load cell, or with ``log.report=false``.
@@ -445,7 +445,7 @@ def write_figure(config: Config, results: Sequence[Summary], summary: Overall) -
     return str(path)
 
 
-def _trial(tree: Tree) -> Summary:
+def _trial(tree: Tree) -> GraspSummary:
     return grasp(config_from(tree, "trials"))
 
 
@@ -466,7 +466,7 @@ def _floor_n(metadata: Mapping[str, str], cells: list[LoadCellSample]) -> float 
     return float(stiffness_floor_n(forces_n, stiffness_of(metadata)).mean())
 
 
-def _mean_mae_n(results: list[Summary]) -> dict[str, float | None]:
+def _mean_mae_n(results: list[GraspSummary]) -> dict[str, float | None]:
     means = {}
     for source in results[0]["estimate_mae_n"]:
         values = [v for r in results if (v := r["estimate_mae_n"][source]) is not None]

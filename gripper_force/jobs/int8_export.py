@@ -10,7 +10,7 @@ import numpy as np
 
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.types import Gray
-from gripper_force.vision.engines import Floats, Step
+from gripper_force.vision.engines import Floats, StepOutput
 from gripper_force.vision.engines.pytorch import TorchEngine
 from gripper_force.vision.export import (
     ExportErrors,
@@ -112,7 +112,7 @@ class _InputRecorder(TorchEngine):
         self.recorded: list[list[Floats]] = []
         self._every, self._count = every, 0
 
-    def _infer(self, frame: Floats) -> Step:
+    def _infer(self, frame: Floats) -> StepOutput:
         self._count += self._begun
         if self._begun and self._count % self._every == 0:
             self.recorded.append([frame[None, None], *(np.array(tensor) for tensor in self._states)])

@@ -84,12 +84,12 @@ def replay_tables(
 ) -> dict[str, Rows]:
     """Returns the tables of one replay of logs, or of the two sides of a comparison, by the name of each side."""
     from gripper_force.jobs.metrics import mean_interval
-    from gripper_force.jobs.replay.comparison import Comparison, summary
+    from gripper_force.jobs.replay.comparison import Comparison, summarise_replays
 
     tables: dict[str, Rows] = {name: [] for name in ("differences", "sources", "objects", "logs", "failed")}
     for side, replays in sides.items():
         head = {"setting": side} if len(sides) > 1 else {}
-        over_all = summary(replays.results)
+        over_all = summarise_replays(replays.results)
         for source, errors in over_all.sources.items():
             each_n = [r.sources[source].mae_n for r in replays.results if source in r.sources]
             mean_n, low_n, high_n = mean_interval(each_n)

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 
 from gripper_force.errors import NonFiniteError
-from gripper_force.vision.engines import Engine, Floats, Step
+from gripper_force.vision.engines import Engine, Floats, StepOutput
 
 
 class EngineContract:
@@ -97,5 +97,5 @@ def _forces(engine: Engine, frames: Sequence[Floats] | Floats) -> Floats:
     return np.stack([engine.step(frame).forces_n for frame in frames])
 
 
-def _arrays(step: Step) -> list[Floats]:
+def _arrays(step: StepOutput) -> list[Floats]:
     return [step.forces_n, step.features, *([] if step.attention is None else [step.attention])]

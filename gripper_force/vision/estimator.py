@@ -12,7 +12,7 @@ from gripper_force.errors import ConfigError, NonFiniteError, UnfamiliarFrameErr
 from gripper_force.profiles.correction import Correction, load_correction
 from gripper_force.profiles.object_profile import find_object, read_object
 from gripper_force.types import ForceEstimate, Gray
-from gripper_force.vision.engines import Engine, Floats, Precision, Step, open_engine
+from gripper_force.vision.engines import Engine, Floats, Precision, StepOutput, open_engine
 from gripper_force.vision.frame_checks import FrameChecks
 from gripper_force.vision.header import RESIDUAL_HALF_N, Header, Model
 from gripper_force.vision.model_files import read_model
@@ -142,7 +142,7 @@ class ForceEstimator:
         self._frame_checks.check(small := downscale(gray, self._region, self._preprocess.size))
         return self._normaliser.push(small)
 
-    def finish(self, step: Step) -> ForceEstimate:
+    def finish(self, step: StepOutput) -> ForceEstimate:
         """Returns the estimate for the networks' next output: the second half of `update`."""
         forces: list[float] = step.forces_n.tolist()
         self._attention = step.attention

@@ -17,7 +17,7 @@ from gripper_force.errors import CheckpointError, ConfigError
 from gripper_force.plugins import importing
 from gripper_force.types import Gray
 from gripper_force.vision.checkpoint import load_checkpoint
-from gripper_force.vision.engines import Engine, Floats, Step, open_engine
+from gripper_force.vision.engines import Engine, Floats, StepOutput, open_engine
 from gripper_force.vision.engines.pytorch import TorchEngine, restored_threads
 from gripper_force.vision.ensemble_step import FRAME, EnsembleStep, state_names
 from gripper_force.vision.header import EXPORTED, KEY, Model, exported_metadata
@@ -196,7 +196,7 @@ def export_errors(model: Model, path: Path, frames: Sequence[Gray] | None = None
     }
 
 
-def _steps(engine: Engine, model: Model, clip: Gray) -> list[Step]:
+def _steps(engine: Engine, model: Model, clip: Gray) -> list[StepOutput]:
     engine.reset()
     return [engine.step(frame) for frame in inputs_of(model, clip)]
 

@@ -14,7 +14,7 @@ from gripper_force.vision.engines import ENGINES, Precision, open_engine
 from gripper_force.vision.header import EXPORTED, SHIPPED, Model
 from gripper_force.vision.model_files import read_model
 from gripper_force.vision.step_benchmark import (
-    Candidate,
+    EngineCandidate,
     cache_key,
     engine_version,
     read_cache,
@@ -33,7 +33,7 @@ class Choice:
         reason: Criterion of the choice.
     """
 
-    candidate: Candidate
+    candidate: EngineCandidate
     tested: int
     reason: str
 
@@ -72,7 +72,7 @@ def resolve_auto(
     return vision.model_copy(update={key: getattr(choice.candidate, key) for key in keys}), choice
 
 
-def select(tested: Sequence[Candidate], budget: BudgetConfig) -> Choice:
+def select(tested: Sequence[EngineCandidate], budget: BudgetConfig) -> Choice:
     """Selects the cheapest candidate within the budget; without a budget, the fastest of the most accurate.
 
     Raises:
@@ -97,16 +97,16 @@ def select(tested: Sequence[Candidate], budget: BudgetConfig) -> Choice:
     return Choice(cheapest, len(tested), f"the cheapest that keeps {limits}")
 
 
-def pareto_front(tested: Sequence[Candidate]) -> list[Candidate]:
+def pareto_front(tested: Sequence[EngineCandidate]) -> list[EngineCandidate]:
     """Returns the candidates that no other beats in both time and error, by rising time."""
-    front: list[Candidate] = []
+    front: list[EngineCandidate] = []
     for candidate in sorted(tested, key=lambda candidate: (candidate.p50_ms, candidate.error_n)):
         if not front or candidate.error_n < front[-1].error_n:
             front.append(candidate)
     return front
 
 
-def candidates(vision: VisionConfig, *, set_threads: bool = False) -> list[Candidate]:
+def candidates(vision: VisionConfig, *, set_threads: bool = False) -> list[EngineCandidate]:
     """Returns all candidates for a configuration with ``auto``, from the cache or measured now.
 
     Args:
@@ -126,7 +126,7 @@ def candidates(vision: VisionConfig, *, set_threads: bool = False) -> list[Candi
                 p50_ms, p99_ms = step_times_ms(
                     open_engine(model, engine, precision, None if keeps_threads else threads)
                 )
-            known[key] = Candidate(_name(model), engine, precision, threads, p50_ms, p99_ms, error_n)
+            known[key] = EngineCandidate(_name(model), engine, precision, threads, p50_ms, p99_ms, error_n)
             if engine_version(engine):  # without a version, a measurement could outlive an update
                 update_cache({key: known[key]})
         # The file and its stated error can change without the digest, so they are not taken from the cache.

@@ -27,7 +27,7 @@ _WARM_UP_STEPS: Final = 20
 
 
 @dataclass(frozen=True, slots=True)
-class Candidate:
+class EngineCandidate:
     """A network, an engine and its settings, with the time measured on this machine, and the network's error.
 
     Attributes:
@@ -103,18 +103,18 @@ def cache_key(model: Model, engine: str, precision: str, threads: int) -> str:
     return " ".join((*parts, precision, str(threads), _machine()))
 
 
-def read_cache() -> dict[str, Candidate]:
+def read_cache() -> dict[str, EngineCandidate]:
     """Returns the measurements of this machine by `cache_key`; none if the file is missing or malformed."""
     try:
         return {
-            key: Candidate(**candidate)
+            key: EngineCandidate(**candidate)
             for key, candidate in json.loads(_cache_file().read_text(encoding="utf-8")).items()
         }
     except (OSError, ValueError, TypeError, AttributeError):
         return {}
 
 
-def update_cache(measured: dict[str, Candidate]) -> None:
+def update_cache(measured: dict[str, EngineCandidate]) -> None:
     """Adds measurements to the cache. Does nothing if its folder is not writable."""
     path = _cache_file()
     entries = {key: asdict(candidate) for key, candidate in (read_cache() | measured).items()}

@@ -172,11 +172,11 @@ def test_a_third_party_servo_is_not_looked_for_on_a_dynamixel_bus(
     )
     monkeypatch.syspath_prepend(tmp_path)
     config = load_config(None, ["servo.backend=own_servo:OwnServo"])
-    *_, last = doctor.check(config, "servo")
+    *_, last = doctor.check_unit(config, "servo")
     assert last == Check("servo", "backend", "own_servo:OwnServo, which only a run checks", None)
     with pytest.raises(ConfigError, match="only Dynamixel servos"):
         doctor.setup(config, lambda *_: True)
-    *_, last = doctor.check(config.with_values(servo={"backend": "own_servo:None"}), "servo")
+    *_, last = doctor.check_unit(config.with_values(servo={"backend": "own_servo:None"}), "servo")
     assert (last.name, last.ok) == ("usable", False)
 
 
@@ -190,7 +190,7 @@ def test_the_network_is_loaded_before_the_devices_and_listed_after_them(
         yield Check(unit, "", "", True)
 
     monkeypatch.setattr(doctor, "_network", lambda _: rows("network"))
-    monkeypatch.setattr(doctor, "check", lambda _, unit: rows(unit))
+    monkeypatch.setattr(doctor, "check_unit", lambda _, unit: rows(unit))
     listed = [found.unit for found in doctor.doctor(load_config())]
     assert begun == ["network", *doctor.PROBES]
     assert listed[: len(begun)] == [*doctor.PROBES, "network"]

@@ -11,7 +11,7 @@ from gripper_force.config import Config, config_from_text, load_config
 from gripper_force.control.limits import largest_target_n
 from gripper_force.errors import ConfigError, DeviceError, RequestError
 from gripper_force.jobs import grasp as grasp_module
-from gripper_force.jobs.grasp import Summary, exclusive_device, overall, summarise, trials
+from gripper_force.jobs.grasp import GraspSummary, exclusive_device, summarise_grasp, summarise_trials, trials
 from gripper_force.progress import Progress
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.log_writer import LogWriter
@@ -19,7 +19,7 @@ from gripper_force.types import NS_PER_S, GraspStatus, LoadCellSample, VisualFor
 
 
 def test_a_summary_is_what_the_log_says(fused_log: Path) -> None:
-    summary = summarise(fused_log)
+    summary = summarise_grasp(fused_log)
     log = LogReader(fused_log)
     assert summary["log"] == str(fused_log)
     assert (summary["object"], summary["target_n"], summary["seed"]) == ("stapler", 3.0, 0)
@@ -54,7 +54,7 @@ def test_what_was_not_measured_is_none(fused_log: Path, tmp_path: Path) -> None:
         for record in reader.records():
             if not isinstance(record, LoadCellSample | VisualForce):
                 writer.write(record)
-    summary = summarise(path)
+    summary = summarise_grasp(path)
     for name in (
         "load_cell_mean_n",
         "steady_error_n",
@@ -78,20 +78,20 @@ def test_the_error_floor_is_that_of_valid_samples(fused_log: Path, tmp_path: Pat
                 writer.write(replace(record, force_n=math.nan, valid=False))
             else:
                 writer.write(record)
-    floor_n = summarise(fused_log)["estimate_mae_n"]["floor"]
+    floor_n = summarise_grasp(fused_log)["estimate_mae_n"]["floor"]
     assert floor_n is not None
-    assert summarise(path)["estimate_mae_n"]["floor"] == pytest.approx(floor_n, rel=0.1)
+    assert summarise_grasp(path)["estimate_mae_n"]["floor"] == pytest.approx(floor_n, rel=0.1)
 
 
 def test_a_run_that_ended_before_anything_was_interrupted(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with LogWriter(path, config="object: tube", metadata={}):
         pass
-    summary = summarise(path)
+    summary = summarise_grasp(path)
     assert (summary["result"], summary["object"], summary["loop_hz"]) == ("interrupted", "tube", None)
 
 
-def grasped(overrides: list[str], folder: Path) -> Summary:
+def grasped(overrides: list[str], folder: Path) -> GraspSummary:
     options = ["log.report=false", f"log.directory={folder}"]
     return grasp_module.grasp(load_config(None, [*overrides, *options]))
 
@@ -111,7 +111,7 @@ def test_a_camera_that_stops_during_the_hold_costs_vision_the_rest_of_it(
     held_s = (hold_ns[-1] - hold_ns[0]) / NS_PER_S + 0.005
     lost_s = sum(loss.time_s for loss in summary["vision_losses"])
     assert "no new estimate" in [loss.reason for loss in summary["vision_losses"]]
-    share, without_fault = summary["vision_share"] or 0, summarise(fused_log)["vision_share"] or 0
+    share, without_fault = summary["vision_share"] or 0, summarise_grasp(fused_log)["vision_share"] or 0
     assert share == pytest.approx(1 - lost_s / held_s)
     assert 0 < share < without_fault
     assert summary["fell_back"] == (share < 0.5)
@@ -123,7 +123,7 @@ def test_a_hold_without_vision_fell_back(quick_vision: list[str], tmp_path: Path
     assert (summary["feedback"], summary["vision_share"], summary["fell_back"]) == (feedback, 0.0, True)
     assert [loss.reason for loss in summary["vision_losses"]] == ["it is not finite"]
     assert summary["steady_error_n"] is not None
-    error = overall([summary], force_limit_n=12.0)["median_error_percent"]
+    error = summarise_trials([summary], force_limit_n=12.0)["median_error_percent"]
     assert (error is None) == (feedback == "vision")
 
 
@@ -140,7 +140,7 @@ def test_feedback_from_vision_without_a_camera_fell_back(quick: list[str], tmp_p
     assert (summary["vision_share"], summary["fell_back"]) == (None, True)
 
 
-def result(target_n: float, error_n: float | None, **more: Any) -> Summary:
+def result(target_n: float, error_n: float | None, **more: Any) -> GraspSummary:
     some = {
         "result": "held",
         "object": "tube",
@@ -154,7 +154,7 @@ def result(target_n: float, error_n: float | None, **more: Any) -> Summary:
         "feedback": "fused",
         "fell_back": False,
     }
-    return cast("Summary", some | more)
+    return cast("GraspSummary", some | more)
 
 
 def test_trials_are_summed_up_by_their_share_of_the_target() -> None:
@@ -164,7 +164,7 @@ def test_trials_are_summed_up_by_their_share_of_the_target() -> None:
         result(8.0, 0.8, result="timeout", peak_n=12.5),  # 10 %: no good
         result(4.0, None, result="no_object", settle_s=None, estimator_p50_ms=None, peak_n=None),
     ]
-    summary = overall(results, force_limit_n=12.0)
+    summary = summarise_trials(results, force_limit_n=12.0)
     assert (summary["trials"], summary["held"], summary["over_limit"]) == (4, 2, 1)
     assert summary["good_percent"] == 50
     assert summary["median_error_percent"] == pytest.approx(10.0)
@@ -179,7 +179,7 @@ def test_trials_that_fell_back_are_not_scored_as_vision() -> None:
             result(4.0, 0.4, feedback=feedback),
             result(4.0, 0.0, feedback=feedback, fell_back=True, peak_n=13.0),
         ]
-        summary = overall(results, force_limit_n=12.0)
+        summary = summarise_trials(results, force_limit_n=12.0)
         assert (summary["trials"], summary["held"], summary["over_limit"]) == (2, 2, 1)
         return summary["median_error_percent"], summary["good_percent"], summary["fell_back"]
 
@@ -190,14 +190,14 @@ def test_trials_that_fell_back_are_not_scored_as_vision() -> None:
 def test_estimates_are_averaged_by_object() -> None:
     errors = {"visual": None, "current": 0.5, "fused": 0.3, "floor": None}
     results = [result(2.0, 0.1), result(3.0, 0.1, object="sponge", estimate_mae_n=errors)]
-    means = overall(results, force_limit_n=12.0)["estimate_mae_n"]
+    means = summarise_trials(results, force_limit_n=12.0)["estimate_mae_n"]
     assert means["all"] == pytest.approx({"visual": None, "current": 0.4, "fused": 0.2, "floor": 0.05})
     assert means["sponge"] == errors
 
 
 def test_trials_without_any_figure_still_sum_up() -> None:
     nothing = result(4.0, None, overshoot_n=None, settle_s=None, estimator_p50_ms=None, peak_n=None)
-    summary = overall([nothing], force_limit_n=12.0)
+    summary = summarise_trials([nothing], force_limit_n=12.0)
     assert summary["good_percent"] is summary["over_limit"] is None
     assert summary["median_error_percent"] is None
     assert summary["peak_n"] is None

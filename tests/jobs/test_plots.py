@@ -7,13 +7,13 @@ import pytest
 from gripper_force.config import config_from
 from gripper_force.errors import DataError
 from gripper_force.jobs.evaluate import evaluate
-from gripper_force.jobs.grasp import Summary, overall, write_figure
+from gripper_force.jobs.grasp import GraspSummary, summarise_trials, write_figure
 from gripper_force.jobs.report.plots import draw_estimates, draw_grasps, draw_training
 
 
 def summary(
     target_n: float, error_n: float | None, result: str = "held", *, fell_back: bool = False
-) -> Summary:
+) -> GraspSummary:
     return {
         "result": result,
         "object": "sponge",
@@ -74,13 +74,13 @@ def test_grasps_are_drawn_also_those_that_were_not_held(tmp_path: Path) -> None:
 def test_trials_leave_a_figure_beside_their_logs(tmp_path: Path) -> None:
     config = config_from({"log": {"directory": str(tmp_path)}}, "the test")
     results = [summary(4.0, 0.1), summary(2.0, -0.1)]
-    figure = write_figure(config, results, overall(results, 10.0))
+    figure = write_figure(config, results, summarise_trials(results, 10.0))
     assert figure is not None
     assert Path(figure).parent == tmp_path
     quiet = config.with_values(log={"report": False})
-    assert write_figure(quiet, results, overall(results, 10.0)) is None
+    assert write_figure(quiet, results, summarise_trials(results, 10.0)) is None
     without_cell = [summary(4.0, None)]
-    assert write_figure(config, without_cell, overall(without_cell, 10.0)) is None
+    assert write_figure(config, without_cell, summarise_trials(without_cell, 10.0)) is None
 
 
 def test_training_is_drawn_also_with_few_steps(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from gripper_force.jobs.replay.comparison import (
     Comparison,
     ReplayResult,
     paired_differences,
-    summary,
+    summarise_replays,
 )
 from gripper_force.jobs.replay.feed import changed_config, resolve_replay, run_again
 from gripper_force.jobs.report import ReportPaths
@@ -215,7 +215,7 @@ def test_log_without_a_load_cell_has_no_errors(fused_log: Path, tmp_path: Path) 
     )
     assert isinstance(done.exception, DataError)
     assert "no load cell to compare with" in str(done.exception)
-    assert summary(results).sources["fused"].frames == results[0].sources["fused"].frames
+    assert summarise_replays(results).sources["fused"].frames == results[0].sources["fused"].frames
 
 
 def test_log_is_replayed_without_the_file_of_its_rig_profile(quick: list[str], tmp_path: Path) -> None:
@@ -260,7 +260,7 @@ def test_several_logs_give_the_errors_over_all(fused_log: Path, tmp_path: Path) 
     assert not failed
     assert [result.log for result in results] == [str(fused_log), str(half)]
     assert results[0] == replay(fused_log)
-    found = summary(results)
+    found = summarise_replays(results)
     assert (found.logs, found.identical) == (2, 2)
     parts = [result.sources["fused"] for result in results]
     assert found.sources["fused"].frames == sum(part.frames for part in parts)

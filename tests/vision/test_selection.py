@@ -15,13 +15,13 @@ from gripper_force.vision.engines import Engine, open_engine
 from gripper_force.vision.header import SHIPPED
 from gripper_force.vision.model_files import read_model
 from gripper_force.vision.selection import Choice, candidates, pareto_front, resolve_auto, select
-from gripper_force.vision.step_benchmark import Candidate, engine_version
+from gripper_force.vision.step_benchmark import EngineCandidate, engine_version
 
 AUTO = VisionConfig(checkpoint="auto", engine="auto")
-SLOW = Candidate("default", "torch", "float32", 1, 6.0, 8.0, 0.18)
-FAST = Candidate("default", "openvino", "bfloat16", 2, 1.0, 1.5, 0.19)
-LEAN = Candidate("default", "openvino", "bfloat16", 1, 1.4, 2.0, 0.19)
-SMALL = Candidate("small", "openvino", "float32", 1, 0.2, 0.3, 0.23)
+SLOW = EngineCandidate("default", "torch", "float32", 1, 6.0, 8.0, 0.18)
+FAST = EngineCandidate("default", "openvino", "bfloat16", 2, 1.0, 1.5, 0.19)
+LEAN = EngineCandidate("default", "openvino", "bfloat16", 1, 1.4, 2.0, 0.19)
+SMALL = EngineCandidate("small", "openvino", "float32", 1, 0.2, 0.3, 0.23)
 ALL = [SLOW, FAST, LEAN, SMALL]
 
 
@@ -45,7 +45,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ],
 )
 def test_selects_the_cheapest_within_the_budget(
-    latency_ms: float | None, error_n: float | None, chosen: Candidate
+    latency_ms: float | None, error_n: float | None, chosen: EngineCandidate
 ) -> None:
     choice = select(ALL, BudgetConfig(latency_ms=latency_ms, error_n=error_n))
     assert (choice.candidate, choice.tested) == (chosen, 4)
@@ -61,7 +61,7 @@ def test_budget_that_no_candidate_keeps_is_an_error_with_the_front() -> None:
 
 @given(st.lists(st.tuples(st.floats(0.1, 10), st.floats(0.1, 1)), min_size=1, max_size=20))
 def test_no_candidate_beats_the_front(figures: list[tuple[float, float]]) -> None:
-    tested = [Candidate("x", "torch", "float32", 1, ms, ms, error_n) for ms, error_n in figures]
+    tested = [EngineCandidate("x", "torch", "float32", 1, ms, ms, error_n) for ms, error_n in figures]
     front = pareto_front(tested)
     for candidate in tested:
         assert any(f.p50_ms <= candidate.p50_ms and f.error_n <= candidate.error_n for f in front)

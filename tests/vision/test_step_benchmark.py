@@ -9,7 +9,7 @@ from gripper_force.vision import step_benchmark
 from gripper_force.vision.engines import open_engine
 from gripper_force.vision.model_files import read_model
 from gripper_force.vision.step_benchmark import (
-    Candidate,
+    EngineCandidate,
     cache_key,
     engine_version,
     read_cache,
@@ -54,8 +54,8 @@ def test_exported_files_of_one_checkpoint_have_keys_of_their_own(
 
 
 def test_cache_keeps_earlier_measurements(cache: Path) -> None:
-    slow = Candidate("default", "torch", "float32", 1, 6.0, 8.0, 0.18)
-    fast = Candidate("default", "openvino", "bfloat16", 2, 1.0, 1.5, 0.19)
+    slow = EngineCandidate("default", "torch", "float32", 1, 6.0, 8.0, 0.18)
+    fast = EngineCandidate("default", "openvino", "bfloat16", 2, 1.0, 1.5, 0.19)
     assert read_cache() == {}
     update_cache({"a": slow})
     update_cache({"b": fast})
@@ -65,7 +65,7 @@ def test_cache_keeps_earlier_measurements(cache: Path) -> None:
 
 def test_unwritable_cache_is_ignored(cache: Path) -> None:
     cache.parent.write_text("")
-    update_cache({"a": Candidate("default", "torch", "float32", 1, 6.0, 8.0, 0.18)})
+    update_cache({"a": EngineCandidate("default", "torch", "float32", 1, 6.0, 8.0, 0.18)})
     assert read_cache() == {}
 
 

@@ -11,7 +11,7 @@ from gripper_calibration.fits.cross_validation import Coverage, Measured, covera
 from gripper_calibration.fits.interval_fit import MIN_TOUCHES, model_interval, touch_interval
 from gripper_calibration.fits.object_ood_fit import fit_object_ood
 from gripper_calibration.fits.output_curve import fit_line
-from gripper_calibration.fits.touches import Floats, Touches, check
+from gripper_calibration.fits.touches import Floats, Touches, check_touches
 from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import CONTACT_N
 from gripper_force.profiles.correction import ProfileArrays
@@ -85,7 +85,7 @@ def fit_correction(touches: Touches, coverage: float = COVERAGE, ood: OodModel |
     Raises:
         DataError: The touches are not sufficient, or the fitted gain is implausibly small.
     """
-    check(touches)
+    check_touches(touches)
     line = fit_line(touches)
     if line.gain < _MIN_GAIN:
         raise DataError(

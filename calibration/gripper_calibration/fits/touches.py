@@ -58,7 +58,7 @@ class Touches:
         return Touches(self.features[keep], self.estimate_n[keep], self.force_n[keep], self.touch[keep])
 
 
-def check(touches: Touches) -> None:
+def check_touches(touches: Touches) -> None:
     """Checks that the touches are sufficient for a calibration.
 
     Raises:

@@ -152,7 +152,7 @@ def calibrate_object(
             result = gripper_force.calibrate_object(config, "mug", touches=8)
             print(result.profile_path, result.mae_before_n, result.mae_after_n)
     """
-    out = check(config, name, out)
+    out = check_before_touches(config, name, out)
     if logs is None:
         named = config.with_values(object=name)
         paths = []
@@ -167,7 +167,7 @@ def calibrate_object(
     return _fit_and_write(config, name, paths, out, progress)
 
 
-def check(config: Config, name: str, out: str | Path | None = None) -> Path:
+def check_before_touches(config: Config, name: str, out: str | Path | None = None) -> Path:
     """Checks what a calibration needs before the first touch. Returns the path of the profile.
 
     Raises:

@@ -179,7 +179,7 @@ def teach(
     """
     out = (user_folder() / name if out is None else Path(out)).absolute()
     place = default_folder(name) if folder is None else Path(folder)
-    config, model = check(config, out)
+    config, model = check_before_touches(config, out)
     if logs is None:
         named = config.with_values(object=name)
         paths = []
@@ -201,7 +201,7 @@ def teach(
     return replace(taught, without_contact=without_contact, contact_starts=(*contact_starts, *in_contact))
 
 
-def check(config: Config, out: Path) -> tuple[Config, Model]:
+def check_before_touches(config: Config, out: Path) -> tuple[Config, Model]:
     """Checks what `teach` needs before the first touch.
 
     Args:

@@ -18,7 +18,7 @@ from gripper_calibration.fits.camera_fit import (
 )
 from gripper_calibration.fits.focus import MAX_BLUR, blur
 from gripper_calibration.procedures.calibrate_camera import candidate_exposures_us, try_exposures
-from gripper_calibration.setup.step import Found, Outcome, Task
+from gripper_calibration.setup.step import Found, StepResult, Task
 from gripper_force.errors import DataError
 from gripper_force.types import Gray
 from gripper_force.vision.preprocess import Region
@@ -32,7 +32,7 @@ _MIN_REGION_SHARE: Final = 0.35
 _COLOURS: Final = {"region": (80, 200, 80), "marker": (60, 160, 255)}
 
 
-def camera(task: Task) -> Outcome:
+def camera(task: Task) -> StepResult:
     """Takes pictures at several exposures and keeps the best one, with remarks.
 
     Raises:
@@ -41,7 +41,7 @@ def camera(task: Task) -> Outcome:
     """
     config = task.config
     if config.camera.backend in ("none", "playback"):
-        return Outcome(
+        return StepResult(
             f"camera.backend={config.camera.backend}: no picture; a grasp controls force by motor current alone"
         )
     task.person.do("Open the jaws, put an object between them as in use, and switch on the light")
@@ -68,7 +68,7 @@ def camera(task: Task) -> Outcome:
     if region is not None and "vision.region" not in task.given:
         values["vision.region"] = Found(list(region), f"around the markers on the jaws, {today}")
     size = f"{gray.shape[1]}x{gray.shape[0]}"
-    return Outcome(
+    return StepResult(
         f"{size} pixels, {best.text}, mean gray value {best.mean:.0f}",
         values,
         remarks,

@@ -4,7 +4,7 @@ import math
 from datetime import date
 
 from gripper_calibration.procedures.calibrate_jaws import calibrate_jaws
-from gripper_calibration.setup.step import ANSWERED, Found, Outcome, Task
+from gripper_calibration.setup.step import ANSWERED, Found, StepResult, Task
 from gripper_force.config import GripperConfig
 from gripper_force.runtime.backends import is_simulated
 from gripper_force.runtime.resolve import resolve
@@ -13,7 +13,7 @@ _AIR = "none"
 """The simulated object that is no object."""
 
 
-def jaws(task: Task) -> Outcome:
+def jaws(task: Task) -> StepResult:
     """Asks for the geometry that is not given, and moves the empty jaws to both ends.
 
     Raises:
@@ -60,7 +60,7 @@ def jaws(task: Task) -> Outcome:
     found_keys = (key.partition(".") for key in values)
     gripper = {key: values[f"gripper.{key}"].value for part, _, key in found_keys if part == "gripper"}
     resolve(config.with_values(gripper=gripper), vision=False)  # the travel must lie within the servo's turn
-    return Outcome(
+    return StepResult(
         f"the jaws open to {1e3 * found.open_width_m:.1f} mm, close with "
         f"{'rising' if found.closing_sign > 0 else 'falling'} angle, friction {found.friction_n:.2f} N",
         values,

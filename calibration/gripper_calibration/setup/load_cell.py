@@ -3,7 +3,7 @@
 from typing import Final
 
 from gripper_calibration.procedures.calibrate_load_cell import calibrate_load_cell
-from gripper_calibration.setup.step import Found, Outcome, Task
+from gripper_calibration.setup.step import Found, StepResult, Task
 from gripper_force.config import Config
 from gripper_force.jobs import doctor
 from gripper_force.profiles.rig_profile import CalibratedValue
@@ -27,7 +27,7 @@ def load_cell_uses(config: Config) -> tuple[str, ...]:
     return () if config.load_cell.backend in ("none", *_IN_NEWTONS) else ("mass_kg",)
 
 
-def load_cell(task: Task) -> Outcome:
+def load_cell(task: Task) -> StepResult:
     """Calibrates the load cell, or says what is possible without one.
 
     Raises:
@@ -36,9 +36,9 @@ def load_cell(task: Task) -> Outcome:
     """
     backend = task.config.load_cell.backend
     if backend == "none":
-        return Outcome("no load cell", remarks=[WITHOUT])
+        return StepResult("no load cell", remarks=[WITHOUT])
     if backend in _IN_NEWTONS:
-        return Outcome(f"the {backend} load cell gives newtons and needs no calibration")
+        return StepResult(f"the {backend} load cell gives newtons and needs no calibration")
     mass_kg = task.mass_kg
     if mass_kg is None:
         mass_kg = 1e-3 * task.number("Known mass in grams", "--mass-kg KG")
@@ -54,8 +54,8 @@ def load_cell(task: Task) -> Outcome:
     config = task.config.with_values(
         load_cell={"tare_raw": cell.tare_raw.value, "n_per_raw": cell.n_per_raw.value}
     )
-    remarks = [f"load cell, {one.name}: {one.found}" for one in doctor.check(config, "load cell")]
-    return Outcome(
+    remarks = [f"load cell, {one.name}: {one.found}" for one in doctor.check_unit(config, "load cell")]
+    return StepResult(
         f"calibrated with {1e3 * mass_kg:g} g; noise {cell.noise_n:.3f} N",
         {
             "load_cell.tare_raw": Found(cell.tare_raw.value, by),

@@ -13,7 +13,7 @@ from gripper_calibration.setup.load_cell import load_cell, load_cell_uses
 from gripper_calibration.setup.rig_file import RigFile, flat
 from gripper_calibration.setup.scan import scan
 from gripper_calibration.setup.servo import servo
-from gripper_calibration.setup.step import Outcome, Person, Task, is_answer
+from gripper_calibration.setup.step import Person, StepResult, Task, is_answer
 from gripper_calibration.setup.torque import torque, torque_uses
 from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError
@@ -33,7 +33,7 @@ class Step:
     """
 
     title: str
-    run: Callable[[Task], Outcome]
+    run: Callable[[Task], StepResult]
     rests_on: tuple[str, ...] = ()
     but: tuple[str, ...] = ()
     uses: Callable[[Config], tuple[str, ...]] = lambda config: ()
@@ -206,8 +206,8 @@ class Setup:
                 gauge_mm=self._options.get("gauge_mm"),
                 keep=self.rig.keep,
             )
-            outcome = step.run(task)
-            report = self._finish(name, step, outcome)
+            result = step.run(task)
+            report = self._finish(name, step, result)
             outdated = [one for one in self.rig.outdate(name) if one not in self._only]
             if self._only and outdated:
                 person.tell(f"{', '.join(outdated)} rests on what {name} found: run setup without --step")
@@ -216,26 +216,24 @@ class Setup:
         if self._has_overrides:  # also if no step had to run
             self.rig.write()
 
-    def _finish(self, name: str, step: Step, outcome: Outcome) -> StepReport:
-        files = {what: str(path) for what, path in outcome.files.items()}
-        self.rig.take(outcome.values)
+    def _finish(self, name: str, step: Step, result: StepResult) -> StepReport:
+        files = {what: str(path) for what, path in result.files.items()}
+        self.rig.take(result.values)
         self.rig.finish(
             name,
             {
                 "date": datetime.now(UTC).replace(microsecond=0).isoformat(),
-                "summary": outcome.summary,
-                "remarks": list(outcome.remarks),
+                "summary": result.summary,
+                "remarks": list(result.remarks),
                 "files": files,
                 "rests_on": self._inputs(step),
-                "values": outcome.values,
-                "used": outcome.used,
+                "values": result.values,
+                "used": result.used,
             },
             STEPS,
         )
-        values = {key: found.value for key, found in outcome.values.items()}
-        return StepReport(
-            name, "done", outcome.summary, outcome.remarks, values, files, dict(outcome.details)
-        )
+        values = {key: found.value for key, found in result.values.items()}
+        return StepReport(name, "done", result.summary, result.remarks, values, files, dict(result.details))
 
     def _kept(self, name: str) -> StepReport:
         state = self.rig.steps[name]

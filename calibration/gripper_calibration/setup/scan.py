@@ -5,7 +5,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from gripper_calibration.setup.step import Found, Outcome, Task
+from gripper_calibration.setup.step import Found, StepResult, Task
 from gripper_force.config import VIRTUAL_PREFIX
 from gripper_force.errors import DeviceNotFoundError
 from gripper_force.jobs import doctor
@@ -23,7 +23,7 @@ _CHECK = (
 )
 
 
-def scan(task: Task) -> Outcome:
+def scan(task: Task) -> StepResult:
     """Finds the gripper's servo on the serial ports, then a camera and a load cell, unless they are given.
 
     Nothing is written to any device. Other servos on the same bus are only pinged.
@@ -33,7 +33,7 @@ def scan(task: Task) -> Outcome:
         DeviceNotFoundError: No servo that can control force answers.
     """
     if task.config.servo.backend != "dynamixel":
-        return Outcome(f"servo.backend={task.config.servo.backend} is not searched for")
+        return StepResult(f"servo.backend={task.config.servo.backend} is not searched for")
     ports, scans = _scan_ports(task)
     servos = [servo for one in scans for servo in one.servos]
     for servo in servos:
@@ -53,7 +53,7 @@ def scan(task: Task) -> Outcome:
         remarks.append(f"servo.model was {wanted}, but the servo is {servo.model}")
     sensors = {} if _is_virtual(servo.port) else _real_sensors(task, ports, servo.port, remarks)
     found = {key: Found(value, ORIGIN) for key, value in {**values, **sensors}.items()}
-    return Outcome(
+    return StepResult(
         f"{servo.model} with id {servo.id} on {servo.port} at {servo.baud_rate} baud",
         found,
         remarks,

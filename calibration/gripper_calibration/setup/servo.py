@@ -1,6 +1,6 @@
 """Step ``servo``: shows the checks of `doctor` and sets the registers that survive power-off."""
 
-from gripper_calibration.setup.step import Found, Outcome, Task
+from gripper_calibration.setup.step import Found, StepResult, Task
 from gripper_force.errors import ConfigError
 from gripper_force.jobs import doctor
 from gripper_force.jobs.checks import RegisterChange
@@ -8,7 +8,7 @@ from gripper_force.jobs.checks import RegisterChange
 _FAST = 1_000_000
 
 
-def servo(task: Task) -> Outcome:
+def servo(task: Task) -> StepResult:
     """Checks the gripper's servo, and changes each register to which the person agrees.
 
     Raises:
@@ -16,7 +16,7 @@ def servo(task: Task) -> Outcome:
         GripperError: See `doctor.setup`.
     """
     if task.config.servo.backend != "dynamixel":
-        return Outcome(f"servo.backend={task.config.servo.backend} has no registers to check")
+        return StepResult(f"servo.backend={task.config.servo.backend} has no registers to check")
     if len(task.config.servo.ids) > 1:
         first, second = task.config.servo.ids
         results = [_set_up(task, first), _set_up(task, second)]
@@ -29,13 +29,13 @@ def servo(task: Task) -> Outcome:
         config = config.with_values(servo={"baud_rate": values["servo.baud_rate"].value})
     if "servo.homing_offset" in values:
         config = config.with_values(servo={"homing_offset": values["servo.homing_offset"].value})
-    bad = [one for one in doctor.check(config, "servo") if one.ok is False]
+    bad = [one for one in doctor.check_unit(config, "servo") if one.ok is False]
     remarks = [f"{one.unit}, {one.name}: {one.found}; {one.advice}" for one in bad]
     if bad:
         raise ConfigError(f"the servo is not ready for a run: {remarks[0]}")
     done = "; ".join(f"{one.register} {one.old} -> {one.new}" for one in written)
     summary = f"checked; {'written: ' + done if done else 'nothing to change'}"
-    return Outcome(summary, values, remarks, details={"written": written})
+    return StepResult(summary, values, remarks, details={"written": written})
 
 
 def _set_up(task: Task, id_: int) -> tuple[list[RegisterChange], dict[str, Found]]:

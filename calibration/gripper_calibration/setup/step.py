@@ -93,7 +93,7 @@ class Task:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class StepResult:
     """Result of a step.
 
     Attributes:

@@ -7,7 +7,7 @@ from typing import Any, Final
 from gripper_calibration.procedures.calibrate_servo import calibrate_servo
 from gripper_calibration.procedures.calibrate_weight import calibrate_weight, masses_kg
 from gripper_calibration.setup.load_cell import PROFILE, interval
-from gripper_calibration.setup.step import Found, Outcome, Task
+from gripper_calibration.setup.step import Found, StepResult, Task
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError
 from gripper_force.profiles.rig_profile import FRICTION_DRIFT, RigProfile
@@ -37,7 +37,7 @@ def _presses(config: Config) -> bool:
     return config.load_cell.backend not in ("none", "playback") and len(config.servo.ids) == 1
 
 
-def torque(task: Task) -> Outcome:
+def torque(task: Task) -> StepResult:
     """Presses the load cell; without one, balances a known mass, or takes the data sheet's torque constant.
 
     Raises:
@@ -71,7 +71,7 @@ def torque(task: Task) -> Outcome:
         f"gripper.{key}": Found(round(settings[key], 5), f"{origin}, {by}") for key, origin in origins.items()
     }
     after = config.with_values(gripper={key: settings[key] for key in origins})
-    return Outcome(
+    return StepResult(
         f"{servo.nm_per_a.value:.3f} Nm/A ({interval(servo.nm_per_a)})",
         values,
         [*([] if found.width_remark is None else [found.width_remark]), _reference(after)],
@@ -81,7 +81,7 @@ def torque(task: Task) -> Outcome:
     )
 
 
-def _weight(task: Task) -> Outcome:
+def _weight(task: Task) -> StepResult:
     """Balances a mass, if the gripper can and there is one."""
     try:
         min_kg, max_kg = masses_kg(task.config)
@@ -109,7 +109,7 @@ def _weight(task: Task) -> Outcome:
     }
     values = {f"gripper.{key}": Found(round(value, 5), origins[key]) for key, value in settings.items()}
     after = task.config.with_values(gripper=settings)
-    return Outcome(
+    return StepResult(
         f"{found.nm_per_a.value:.3f} Nm/A ({interval(found.nm_per_a)})",
         values,
         [_reference(after)],
@@ -118,9 +118,9 @@ def _weight(task: Task) -> Outcome:
     )
 
 
-def _data_sheet(task: Task) -> Outcome:
+def _data_sheet(task: Task) -> StepResult:
     config = resolve(task.config, vision=False).config
-    return Outcome(
+    return StepResult(
         f"torque constant of the data sheet, {config.gripper.nm_per_a:.3f} Nm/A, not measured",
         remarks=[_reference(config)],
         details={"intervals_n": _intervals_n(config)},

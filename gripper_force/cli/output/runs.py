@@ -11,7 +11,7 @@ from gripper_force.cli.console import number, out, pairs
 
 if TYPE_CHECKING:  # --help loads neither NumPy nor PyTorch
     from gripper_force.jobs.evaluate import Evaluation
-    from gripper_force.jobs.grasp import Overall, Summary
+    from gripper_force.jobs.grasp import GraspSummary, TrialsSummary
     from gripper_force.jobs.metrics import ForceBin
     from gripper_force.jobs.replay.comparison import PairedDifference, ReplayResult, ReplaySummary
 
@@ -22,7 +22,7 @@ _REFUSED = (
 )
 
 
-def grasp_table(r: "Summary") -> None:
+def grasp_table(r: "GraspSummary") -> None:
     """Prints the figures of a grasp."""
     share = ""
     if r["steady_error_n"] is not None:
@@ -49,7 +49,7 @@ def grasp_table(r: "Summary") -> None:
     )
 
 
-def _vision(r: "Summary") -> dict[str, str]:
+def _vision(r: "GraspSummary") -> dict[str, str]:
     if r["vision_share"] is None:
         return {}
     losses = "\n".join(f"for {loss.time_s:.1f} s: {loss.reason}" for loss in r["vision_losses"])
@@ -61,14 +61,16 @@ def _vision(r: "Summary") -> dict[str, str]:
     }
 
 
-def _gain(r: "Summary") -> str:
+def _gain(r: "GraspSummary") -> str:
     if r["object_gain"] is None:
         return "-"
     true = "" if r["object_gain_true"] is None else f" (true: {r['object_gain_true']:.2f})"
     return f"{r['object_gain']:.2f} +- {100 * (r['object_gain_std'] or 0.0):.0f} %{true}"
 
 
-def trials_table(trials: "Sequence[Summary]", summary: "Overall", figure: str | None = None) -> None:
+def trials_table(
+    trials: "Sequence[GraspSummary]", summary: "TrialsSummary", figure: str | None = None
+) -> None:
     """Prints the figures of each trial and over all trials."""
     names = ("object", "target N", "load cell N", "error %", "overshoot N", "settle s", "vision %", "gain")
     table = Table(*names, Column("result", no_wrap=True), box=None)

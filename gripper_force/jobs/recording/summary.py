@@ -116,7 +116,7 @@ class RecordingSummary:
     warnings: list[str]
 
 
-def summarise(paths: Sequence[Path]) -> RecordingSummary:
+def summarise_recording(paths: Sequence[Path]) -> RecordingSummary:
     """Summarises recorded sets and measures the lag between camera and load cell.
 
     Args:

@@ -248,7 +248,7 @@ def _errors(
     )
 
 
-def summary(results: Sequence[ReplayResult]) -> ReplaySummary:
+def summarise_replays(results: Sequence[ReplayResult]) -> ReplaySummary:
     """Computes the errors over several replays."""
     objects = sorted({name for result in results for name in result.per_object})
     return ReplaySummary(

@@ -260,7 +260,7 @@ def _in_batches(
     import torch
 
     from gripper_force.vision.batch_inference import BATCH, kept_checkpoint, prepared_features
-    from gripper_force.vision.engines import Step
+    from gripper_force.vision.engines import StepOutput
     from gripper_force.vision.engines.pytorch import TorchEngine, restored_threads
     from gripper_force.vision.estimator import ForceEstimator
 
@@ -300,7 +300,7 @@ def _in_batches(
             if visual is not None and visual.is_familiar:  # the network has not run on covered frames
                 try:
                     last = count - 1 - done
-                    estimate = estimator.finish(Step(forces_n[:, last], features[last], None))
+                    estimate = estimator.finish(StepOutput(forces_n[:, last], features[last], None))
                     visual = replace(visual, force_n=estimate.force_n, std_n=estimate.std_n)
                 except GripperError as error:  # as `FrameProcessor` treats it
                     if not works:

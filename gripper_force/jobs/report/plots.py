@@ -17,7 +17,7 @@ from gripper_force.errors import DataError
 from gripper_force.jobs.report.figure import STYLE
 
 if TYPE_CHECKING:
-    from gripper_force.jobs.grasp import Summary
+    from gripper_force.jobs.grasp import GraspSummary
 
 _COLOURS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7a5195", "#59606a")
 """Colours of objects in turn. Hues of Okabe and Ito, which colour-blind readers can distinguish."""
@@ -93,7 +93,7 @@ def draw_estimates(
         label_axes(errors, "Errors", "load cell, N", "error, N")
 
 
-def draw_grasps(results: "Sequence[Summary]", title: str, path: Path) -> None:
+def draw_grasps(results: "Sequence[GraspSummary]", title: str, path: Path) -> None:
     """Draws the steady error of each grasp against its target, with the tolerance of the summary.
 
     Args:

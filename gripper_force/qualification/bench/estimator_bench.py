@@ -33,7 +33,7 @@ from gripper_force.vision.export import inputs_of
 from gripper_force.vision.header import Model, NetworkConfig
 from gripper_force.vision.model_files import cache_folder, read_model
 from gripper_force.vision.selection import installed
-from gripper_force.vision.step_benchmark import Candidate, cache_key, update_cache
+from gripper_force.vision.step_benchmark import EngineCandidate, cache_key, update_cache
 
 WINDOW: Final = "torch, window"
 """The paper's method: for each frame, the network processes the whole window before it."""
@@ -218,7 +218,9 @@ def _measure(
             if not engine.startswith(WINDOW):
                 file, precision = next((f, p) for f, e, n, p in variants if (e, n) == (engine, name))
                 row = replace(row, memory_mb=_memory_mb(file, engine, precision, count))
-                candidate = Candidate(source, engine, precision, count, row.p50_ms, row.p99_ms, row.mae_n)
+                candidate = EngineCandidate(
+                    source, engine, precision, count, row.p50_ms, row.p99_ms, row.mae_n
+                )
                 if file is model:
                     update_cache({cache_key(model, engine, precision, count): candidate})
             yield row

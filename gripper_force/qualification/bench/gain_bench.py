@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from gripper_force.config import Config
 from gripper_force.jobs.dataset import load_clips
-from gripper_force.jobs.grasp import Summary, trials, with_same_object
+from gripper_force.jobs.grasp import GraspSummary, trials, with_same_object
 from gripper_force.jobs.object_gain import gain_of, learned_ratio
 from gripper_force.jobs.recording.touches import ramp, wait
 from gripper_force.jobs.training.stated_errors import labelled_estimates
@@ -118,7 +118,7 @@ def _press(config: Config, path: Path, rng: np.random.Generator) -> None:
 
 
 def _row(
-    config: Config, results: Sequence[Summary], ratio: tuple[float, float] | None, logs: list[Path]
+    config: Config, results: Sequence[GraspSummary], ratio: tuple[float, float] | None, logs: list[Path]
 ) -> GainRow:
     checkpoint = load_checkpoint(config.vision.checkpoint)
     preprocess = checkpoint.header.preprocess

@@ -24,7 +24,7 @@ from gripper_force.config import Config, dump_config, load_config
 from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import Clip, digest, load_clips, without_contact_starts
 from gripper_force.jobs.evaluate import evaluate
-from gripper_force.jobs.grasp import overall, trials, with_same_object
+from gripper_force.jobs.grasp import summarise_trials, trials, with_same_object
 from gripper_force.jobs.imports.video import find_recordings, import_video
 from gripper_force.jobs.training import few
 from gripper_force.jobs.training.recipe import recipe
@@ -250,7 +250,7 @@ def _measured(
             control={"feedback": feedback},
         )
         done = list(trials(own, grasps, 1, objects=(cell.object,), progress=progress))
-        figures = overall(done, own.control.force_limit_n)
+        figures = summarise_trials(done, own.control.force_limit_n)
         if feedback == "fused":
             result = replace(result, fused_percent=figures["median_error_percent"])
         else:

@@ -28,7 +28,7 @@ from gripper_force.config import (
 )
 from gripper_force.errors import GripperError
 from gripper_force.jobs.dataset import load_clip
-from gripper_force.jobs.grasp import summarise
+from gripper_force.jobs.grasp import summarise_grasp
 from gripper_force.jobs.imports.video import estimate_tare, read_forces
 from gripper_force.jobs.profile_files import pack
 from gripper_force.jobs.replay import replay
@@ -346,7 +346,7 @@ def _report_log(data: bytes, path: Path) -> None:
 
 def _summarise_log(data: bytes, path: Path) -> None:
     path.write_bytes(data)
-    summarise(path)
+    summarise_grasp(path)
 
 
 # Checkpoints.

@@ -26,7 +26,7 @@ ENGINES: Final = {
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class StepOutput:
     """Output of an ensemble for one frame.
 
     Attributes:
@@ -56,7 +56,7 @@ class Engine(ABC):
         """Forgets all frames; the next one is the first of a new stream."""
         self._begun = False
 
-    def step(self, frame: Floats) -> Step:
+    def step(self, frame: Floats) -> StepOutput:
         """Processes the next prepared frame of the stream.
 
         Args:
@@ -81,7 +81,7 @@ class Engine(ABC):
         """Sets all states of the networks to zero."""
 
     @abstractmethod
-    def _infer(self, frame: Floats) -> Step:
+    def _infer(self, frame: Floats) -> StepOutput:
         """Runs the networks on one frame, (S, S), and updates the states."""
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import onnxruntime
 
-from gripper_force.vision.engines import Engine, Floats, Precision, Step
+from gripper_force.vision.engines import Engine, Floats, Precision, StepOutput
 from gripper_force.vision.header import Model
 from gripper_force.vision.model_files import exported_file, unusable
 
@@ -41,8 +41,8 @@ class OnnxEngine(Engine):
     def _zero_states(self) -> None:
         self._states = [np.zeros(shape, np.float32) for shape in self._state_shapes.values()]
 
-    def _infer(self, frame: Floats) -> Step:
+    def _infer(self, frame: Floats) -> StepOutput:
         states = zip(self._state_shapes, self._states, strict=True)
         outputs = self._session.run(None, {self._frame_name: frame[None, None], **dict(states)})
         self._states = outputs[self._first_state :]
-        return Step(outputs[0], outputs[1], outputs[2] if self._first_state > 2 else None)
+        return StepOutput(outputs[0], outputs[1], outputs[2] if self._first_state > 2 else None)

@@ -3,7 +3,7 @@
 import numpy as np
 import openvino
 
-from gripper_force.vision.engines import Engine, Floats, Precision, Step
+from gripper_force.vision.engines import Engine, Floats, Precision, StepOutput
 from gripper_force.vision.header import Model
 from gripper_force.vision.model_files import check_weights, exported_file, unusable
 
@@ -68,10 +68,10 @@ class OpenVinoEngine(Engine):
         for tensor in self._states[self._turn]:
             tensor.data[...] = 0
 
-    def _infer(self, frame: Floats) -> Step:
+    def _infer(self, frame: Floats) -> StepOutput:
         self._frame.data[0, 0] = frame
         request = self._requests[self._turn]
         request.infer()
         self._turn = 1 - self._turn
         outputs = [np.array(request.get_output_tensor(i).data) for i in range(self._first_state)]
-        return Step(outputs[0], outputs[1], outputs[2] if len(outputs) > 2 else None)
+        return StepOutput(outputs[0], outputs[1], outputs[2] if len(outputs) > 2 else None)

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
-from gripper_force.vision.engines import Engine, Floats, Precision, Step
+from gripper_force.vision.engines import Engine, Floats, Precision, StepOutput
 from gripper_force.vision.ensemble_step import ATTENTION, EnsembleStep
 from gripper_force.vision.header import Model, check_not_exported
 
@@ -42,14 +42,14 @@ class TorchEngine(Engine):
         self._states = self._step.zero_states()
 
     @torch.inference_mode()
-    def _infer(self, frame: Floats) -> Step:
+    def _infer(self, frame: Floats) -> StepOutput:
         outputs = self._step.forward(torch.from_numpy(frame)[None, None], *self._states)
         first_state = len(outputs) - len(self._states)
         self._states = list(outputs[first_state:])
         forces_n, features, *attention = (
             np.asarray(tensor.numpy(), np.float32) for tensor in outputs[:first_state]
         )
-        return Step(forces_n, features, attention[0] if self._has_attention else None)
+        return StepOutput(forces_n, features, attention[0] if self._has_attention else None)
 
 
 @contextmanager

@@ -334,7 +334,9 @@ def test_a_fold_takes_no_part_in_the_choice_that_estimates_it() -> None:
 
 @pytest.mark.parametrize("checkpoint", ["default", "small"])
 def test_one_network_is_trained_and_never_the_default_one(checkpoint: str, tmp_path: Path) -> None:
-    config, model = job.check(load_config(None, [f"vision.checkpoint={checkpoint}"]), tmp_path / "out")
+    config, model = job.check_before_touches(
+        load_config(None, [f"vision.checkpoint={checkpoint}"]), tmp_path / "out"
+    )
     names = [candidate.name for candidate in job._candidates(config, model, logs=16)]
     assert [name for name in names if "trained" in name] == ["small, trained"]
 

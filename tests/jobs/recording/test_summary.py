@@ -9,7 +9,7 @@ from gripper_force.config import load_config
 from gripper_force.errors import DataError
 from gripper_force.jobs.recording import summary as module
 from gripper_force.jobs.recording.record import RecordingPlan, record
-from gripper_force.jobs.recording.summary import summarise
+from gripper_force.jobs.recording.summary import summarise_recording
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.types import NS_PER_MS, Frame, LoadCellSample, Record
@@ -35,7 +35,7 @@ def changed(log: Path, path: Path, change: Change) -> Path:
 
 
 def test_set_without_lag(log: Path) -> None:
-    result = summarise([log, log])
+    result = summarise_recording([log, log])
     one, overall = result.sets[0], result.overall
     assert (one.object, one.set, one.touches) == ("stapler", "stapler-01", 3)
     assert one.camera_hz == pytest.approx(30, rel=0.02)
@@ -57,8 +57,8 @@ def test_late_camera_timestamps_are_detected(log: Path, tmp_path: Path) -> None:
         for one in records:
             yield replace(one, t_ns=one.t_ns + 20 * NS_PER_MS) if isinstance(one, Frame) else one
 
-    before = summarise([log]).overall
-    result = summarise([changed(log, tmp_path / "late.mcap", late)])
+    before = summarise_recording([log]).overall
+    result = summarise_recording([changed(log, tmp_path / "late.mcap", late)])
     assert before.lag_ms is not None
     assert result.overall.lag_ms is not None
     assert result.overall.lag_ms - before.lag_ms == pytest.approx(20, abs=2)
@@ -74,7 +74,7 @@ def test_late_load_cell_timestamps_are_detected(log: Path, tmp_path: Path) -> No
         for one in records:
             yield replace(one, t_ns=one.t_ns + 30 * NS_PER_MS) if isinstance(one, LoadCellSample) else one
 
-    result = summarise([changed(log, tmp_path / "late.mcap", late)])
+    result = summarise_recording([changed(log, tmp_path / "late.mcap", late)])
     assert result.overall.lag_ms == pytest.approx(-30, abs=6)
     assert result.overall.load_cell_lag_ms == pytest.approx(30, abs=6)
     assert "ms early against the load cell's" in result.warnings[0]
@@ -95,9 +95,9 @@ def test_lost_frames_and_rejected_samples_are_counted(log: Path, tmp_path: Path)
             seq += isinstance(one, Frame)
             yield replace(one, seq=seq) if isinstance(one, Frame) else one
 
-    whole = summarise([log]).sets[0]
-    one = summarise([changed(log, tmp_path / "thin.mcap", thin_out)])
-    two = summarise([changed(log, tmp_path / "unnumbered.mcap", unnumbered)])
+    whole = summarise_recording([log]).sets[0]
+    one = summarise_recording([changed(log, tmp_path / "thin.mcap", thin_out)])
+    two = summarise_recording([changed(log, tmp_path / "unnumbered.mcap", unnumbered)])
     assert one.sets[0].samples_rejected > 0
     assert one.sets[0].frames_lost == whole.frames - one.sets[0].frames > 10
     assert two.sets[0].frames_lost == one.sets[0].frames_lost
@@ -115,7 +115,7 @@ def test_slow_load_cell_gives_a_warning(log: Path, tmp_path: Path) -> None:
     def slow(records: Iterator[Record]) -> Iterable[Record]:
         return (one for i, one in enumerate(records) if not isinstance(one, LoadCellSample) or i % 16 == 0)
 
-    result = summarise([changed(log, tmp_path / "slow.mcap", slow)])
+    result = summarise_recording([changed(log, tmp_path / "slow.mcap", slow)])
     assert "below 50 the lag is unreliable" in result.warnings[0]
 
 
@@ -124,13 +124,13 @@ def test_log_without_frames_raises(log: Path, tmp_path: Path) -> None:
         return (one for one in records if not isinstance(one, Frame))
 
     with pytest.raises(DataError, match=r"blind\.mcap holds no camera frames"):
-        summarise([changed(log, tmp_path / "blind.mcap", blind)])
+        summarise_recording([changed(log, tmp_path / "blind.mcap", blind)])
 
 
 def test_lag_without_touches_is_none(log: Path, tmp_path: Path) -> None:
     def at_rest(records: Iterator[Record]) -> Iterable[Record]:
         return (one for i, one in enumerate(records) if i < 300)
 
-    result = summarise([changed(log, tmp_path / "rest.mcap", at_rest)])
+    result = summarise_recording([changed(log, tmp_path / "rest.mcap", at_rest)])
     assert (result.overall.touches, result.overall.lag_ms) == (0, None)
     assert "no touch was clear enough" in result.warnings[-1]

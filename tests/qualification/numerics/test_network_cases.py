@@ -16,7 +16,7 @@ from gripper_force.qualification.numerics.reference import (
     ReferenceEnsemble,
 )
 from gripper_force.vision import estimator
-from gripper_force.vision.engines import Engine, Floats, Step
+from gripper_force.vision.engines import Engine, Floats, StepOutput
 from gripper_force.vision.frame_checks import FrameChecks
 from gripper_force.vision.model_files import read_model
 
@@ -97,7 +97,7 @@ def test_an_engine_that_accepts_nan_is_found(
 ) -> None:
     assert broken(list(suite._not_finite(tmp_path, TORCH, grasp))) == []
 
-    def step(self: Engine, frame: Floats) -> Step:
+    def step(self: Engine, frame: Floats) -> StepOutput:
         self._zero_states()
         return self._infer(frame)
 
@@ -115,10 +115,12 @@ def test_a_drifting_stream_is_found(
     right = Engine.step
     seen: dict[int, int] = {}
 
-    def step(self: Engine, frame: Floats) -> Step:
+    def step(self: Engine, frame: Floats) -> StepOutput:
         seen[id(self)] = seen.get(id(self), 0) + 1
         made = right(self, frame)
-        return Step(made.forces_n * np.float32(1 + 1e-3 * seen[id(self)]), made.features, made.attention)
+        return StepOutput(
+            made.forces_n * np.float32(1 + 1e-3 * seen[id(self)]), made.features, made.attention
+        )
 
     monkeypatch.setattr(Engine, "step", step)
     assert suite._stream(reference, ENGINE_VARIANTS[0], pool, 300)[0] > bound_n
