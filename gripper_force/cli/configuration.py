@@ -28,15 +28,15 @@ def check(config: ConfigPath = None, set_: Overrides = None, as_json: AsJson = F
     from gripper_force.runtime.backends import check_devices, is_simulated, open_devices
     from gripper_force.runtime.resolve import make_estimator, resolve
 
-    run = resolve(load_settings(config, set_, {}))
-    run.check_target(run.config.target_n)
-    check_devices(run.config)
-    make_estimator(run)
-    if is_simulated(run.config):
-        with open_devices(run.config):
+    resolved = resolve(load_settings(config, set_, {}))
+    resolved.check_target(resolved.config.target_n)
+    check_devices(resolved.config)
+    make_estimator(resolved)
+    if is_simulated(resolved.config):
+        with open_devices(resolved.config):
             pass
-    notes = [text for _, text in run.notes]
-    result = {"ok": True, "choices": list(run.choices), "notes": notes}
+    notes = [text for _, text in resolved.notes]
+    result = {"ok": True, "choices": list(resolved.choices), "notes": notes}
     console.show(result, as_json, lambda _: console.out.print("\n".join(["ok", *notes])))
 
 

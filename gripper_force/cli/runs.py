@@ -213,8 +213,8 @@ def _notes(settings: "Config", name: str) -> list[str]:
     """Returns the bundle that grasps of an object use, and what differs from the rig it or the network is for."""
     from gripper_force.runtime.resolve import resolve
 
-    run = resolve(settings.with_values(object=name))
-    return [text for unit, text in run.notes if unit == "session"]
+    resolved = resolve(settings.with_values(object=name))
+    return [text for unit, text in resolved.notes if unit == "session"]
 
 
 def replay(

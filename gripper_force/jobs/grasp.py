@@ -182,9 +182,9 @@ def run_grasp(config: Config, path: Path, progress: Progress = no_progress) -> N
             then.
     """
     require_report(config)
-    run = resolve(config)
-    run.check_target(config.target_n)
-    with open_run(run, path) as session:
+    resolved = resolve(config)
+    resolved.check_target(config.target_n)
+    with open_run(resolved, path) as session:
         grasp_and_release(session, config.target_n, progress)
 
 
@@ -196,7 +196,7 @@ def grasp_and_release(session: Session, target_n: float, progress: Progress = no
         target_n: Target force.
         progress: Called at each change of phase.
     """
-    config = session.run.config
+    config = session.resolved.config
     session.wait_for_reference()
     status = session.cycle(RequestKind.GRASP, target_n).status
     begin_ns, phase = status.t_ns, ""
@@ -286,9 +286,9 @@ def trials(
     min_n, max_n = TRIAL_TARGETS_N
     largest_n = {}
     for name in objects:
-        run = resolve(config.with_values(object=name))  # measures what `auto` needs once, here
-        run.check_target(min_n if target_n is None else target_n)
-        largest_n[name] = min(max_n, run.largest_target_n)
+        resolved = resolve(config.with_values(object=name))  # measures what `auto` needs once, here
+        resolved.check_target(min_n if target_n is None else target_n)
+        largest_n[name] = min(max_n, resolved.largest_target_n)
     rng = np.random.default_rng([config.seed, 20])
     plan = []
     for i in range(count):

@@ -214,8 +214,8 @@ def make_set(task: SetPlan, out: Path, config: Tree) -> list[Path]:
 def _run_set(config: Config, task: SetPlan, seed: int, logs: dict[int, Path]) -> None:
     first, *others = logs
     rng = np.random.default_rng([seed, 11])
-    run = resolve(_set_config(config, task, seed, first, rng), vision=False)
-    config = run.config
+    resolved = resolve(_set_config(config, task, seed, first, rng), vision=False)
+    config = resolved.config
     with open_devices(config) as devices:
         if (
             (config.camera.backend, config.load_cell.backend) != ("simulated", "simulated")
@@ -231,7 +231,7 @@ def _run_set(config: Config, task: SetPlan, seed: int, logs: dict[int, Path]) ->
         rendered = [devices.render_under_light(lux) for lux in others]
         devices.camera = cameras = _MultiLightCamera(devices.camera, [camera for camera, _ in rendered])
         devices.notes.update(protocol="shin2019", degrees=str(task.degrees), split=task.split, lux=str(first))
-        with open_session(run, devices, logs[first]) as session:
+        with open_session(resolved, devices, logs[first]) as session:
             _touch_all(session, task, rng, config.control.timeout_s)
     peak_n = max(sample.force_n for sample in LogReader(logs[first]).records(LoadCellSample))
     if peak_n > _PAPER_PEAK_N + _OVERSHOOT_N:

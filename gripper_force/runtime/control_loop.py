@@ -195,18 +195,18 @@ class ControlLoop:
 
     def _open_thread(self) -> None:
         self._resources.enter_context(deferred_signals(_interrupt))
-        run = resolve(self._config)
-        self._thread = threading.Thread(target=self._run_thread, args=(run,), name="control", daemon=True)
+        resolved = resolve(self._config)
+        self._thread = threading.Thread(target=self._run_thread, args=[resolved], name="control", daemon=True)
         self._thread.start()
         self._opened.wait()
         self._raise_error()
         if self._end_error is not None:
             raise self._end_error
 
-    def _run_thread(self, run: ResolvedConfig) -> None:
+    def _run_thread(self, resolved: ResolvedConfig) -> None:
         try:
             with open_run(
-                run, self._log, raise_if_cancelled=self._raise_if_closing, port=self._port
+                resolved, self._log, raise_if_cancelled=self._raise_if_closing, port=self._port
             ) as session:
                 try:
                     self._start(session)

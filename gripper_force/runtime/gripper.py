@@ -110,8 +110,8 @@ class Gripper:
 
     def __init__(self, loop: ControlLoop, log: Path | None) -> None:
         self._loop = loop
-        self._run = loop.session.run
-        self.config, self.log = self._run.config, log
+        self._resolved = loop.session.resolved
+        self.config, self.log = self._resolved.config, log
 
     # Requests.
 
@@ -186,7 +186,7 @@ class Gripper:
             RequestError: The width is out of range, or the gripper is at fault and needs a release first.
             DeviceError: A device failed.
         """
-        self._run.check_width(width_m)
+        self._resolved.check_width(width_m)
         self._loop.request(PendingRequest(RequestKind.MOVE, width_m=float(width_m), is_awaited=wait))
         return self.width_m
 
@@ -270,7 +270,7 @@ class Gripper:
     @property
     def largest_force_n(self) -> float:
         """Largest force that `grasp` accepts, in newtons."""
-        return self._run.largest_target_n
+        return self._resolved.largest_target_n
 
     @property
     def frame(self) -> Frame | None:
@@ -304,7 +304,7 @@ class Gripper:
     def _grip(
         self, force_n: float, *, wait: bool, new_object: bool = False, needs_object: bool = False
     ) -> GraspResult | None:
-        self._run.check_target(force_n)
+        self._resolved.check_target(force_n)
         return self._loop.request(
             PendingRequest(
                 RequestKind.GRASP,

@@ -176,13 +176,14 @@ def resolve_vision(config: Config) -> tuple[Config, Model | None, str]:
     return config, read_model(config.vision.checkpoint), "" if choice is None else str(choice)
 
 
-def make_estimator(run: ResolvedConfig) -> ForceEstimator | None:
+def make_estimator(resolved: ResolvedConfig) -> ForceEstimator | None:
     """Opens the estimator of a run, or returns None for a run without vision."""
-    if run.model is None:
+    if resolved.model is None:
         return None
     from gripper_force.vision.estimator import open_estimator
 
-    return open_estimator(run.model, run.config.vision, run.correction, set_threads=allowed().torch_threads)
+    vision, threads = resolved.config.vision, allowed().torch_threads
+    return open_estimator(resolved.model, vision, resolved.correction, set_threads=threads)
 
 
 def make_controller(config: Config) -> GraspController:

@@ -73,7 +73,7 @@ class Session:
     """One controller on one set of devices.
 
     Attributes:
-        run: The resolved configuration.
+        resolved: The resolved configuration.
         has_vision: True once there was a visual estimate.
         failed: True if the run is at fault, so that it ends as ``control.on_fault`` says.
         reason: Newest reason of a change of phase or outcome.
@@ -86,16 +86,16 @@ class Session:
 
     def __init__(
         self,
-        run: ResolvedConfig,
+        resolved: ResolvedConfig,
         devices: Devices,
         controller: GraspController,
         perception: Perception,
         log_queue: LogQueue | None,
         raise_if_cancelled: Callable[[], None],
     ) -> None:
-        self.run, self._devices = run, devices
+        self.resolved, self._devices = resolved, devices
         self._controller, self._perception, self._log_queue = controller, perception, log_queue
-        self._period_ns = round(NS_PER_S / run.config.control.rate_hz)
+        self._period_ns = round(NS_PER_S / resolved.config.control.rate_hz)
         self._due_ns = 0
         self._stop = False
         self._raise_if_cancelled = raise_if_cancelled
@@ -157,8 +157,8 @@ class Session:
         """
         decision = self.cycle()
         start_ns = last_ns = decision.status.t_ns
-        frames = 0 if self.run.model is None else self.run.model.header.preprocess.lead_in + 1
-        wait_ns = _VISION_WAIT_NS + round(frames / self.run.config.camera.rate_hz * NS_PER_S)
+        frames = 0 if self.resolved.model is None else self.resolved.model.header.preprocess.lead_in + 1
+        wait_ns = _VISION_WAIT_NS + round(frames / self.resolved.config.camera.rate_hz * NS_PER_S)
         while last_ns - start_ns < (wait_ns if frames and not self.has_vision else _REFERENCE_NS):
             self._raise_if_cancelled()
             decision = self.cycle()
@@ -259,7 +259,7 @@ class Session:
             devices.clock,
             self.servo_state,
             period_ns=self._period_ns,
-            patience_ns=self.run.config.servo.bus_watchdog_ms * NS_PER_MS,
+            patience_ns=self.resolved.config.servo.bus_watchdog_ms * NS_PER_MS,
             before_retry=self.raise_if_interrupted,
         )
         if self.servo_state is not None:
@@ -274,7 +274,7 @@ class Session:
 
     def wait_until_open(self, status: GraspStatus) -> GraspStatus:
         """Runs cycles until opening jaws are open or blocked, or for `opening_s`. Returns the last status."""
-        open_width_m = self.run.config.gripper.open_width_m
+        open_width_m = self.resolved.config.gripper.open_width_m
         end_ns = status.t_ns + round((self.opening_s + _OPENING_SPARE_S) * NS_PER_S)
         while status.t_ns < end_ns and not is_open(open_width_m, status.width_m):
             status = self.cycle().status
@@ -290,7 +290,8 @@ class Session:
 
     @property
     def _end(self) -> str:
-        return self.run.config.control.on_fault if self.failed or self._stop else self.run.config.on_exit
+        config = self.resolved.config
+        return config.control.on_fault if self.failed or self._stop else config.on_exit
 
     def open_at_fault(self) -> None:
         """Opens the jaws at the end of a run, with ``control.on_fault=open`` after a fault, a stop or an exception.
@@ -383,17 +384,17 @@ def open_run(
     Raises:
         GripperError: Something is missing or inconsistent, or a device failed.
     """
-    run = config if isinstance(config, ResolvedConfig) else resolve(config, vision=vision)
+    resolved = config if isinstance(config, ResolvedConfig) else resolve(config, vision=vision)
     with (
-        open_devices(run.config, port) as devices,
-        open_session(run, devices, path, raise_if_cancelled) as session,
+        open_devices(resolved.config, port) as devices,
+        open_session(resolved, devices, path, raise_if_cancelled) as session,
     ):
         yield session
 
 
 @contextmanager
 def open_session(
-    run: ResolvedConfig,
+    resolved: ResolvedConfig,
     devices: Devices,
     path: Path | None,
     raise_if_cancelled: Callable[[], None] = lambda: None,
@@ -403,7 +404,7 @@ def open_session(
     A session without a single cycle leaves no log.
 
     Args:
-        run: The resolved configuration.
+        resolved: The resolved configuration.
         devices: Its devices.
         path: Log to write; None: no log.
         raise_if_cancelled: Raises if the run is to end already. Called before each device starts, the servo
@@ -413,16 +414,16 @@ def open_session(
         GripperError: A device failed.
         LogError: After the run: records are missing from the log.
     """
-    controller = make_controller(run.config)
-    estimator = make_estimator(run)
+    controller = make_controller(resolved.config)
+    estimator = make_estimator(resolved)
     with ExitStack() as stack:
-        log_queue = None if path is None else _open_log(run, devices, path)
-        perception = _perception(run.config, devices, estimator)
-        session = Session(run, devices, controller, perception, log_queue, raise_if_cancelled)
+        log_queue = None if path is None else _open_log(resolved, devices, path)
+        perception = _perception(resolved.config, devices, estimator)
+        session = Session(resolved, devices, controller, perception, log_queue, raise_if_cancelled)
         if path is not None and log_queue is not None:
             stack.callback(_discard_unused, session, path)
             stack.callback(log_queue.close)
-            for unit, text in run.notes:
+            for unit, text in resolved.notes:
                 log_queue.write(Event(devices.start_ns, unit, text))
         if not devices.lockstep and (refusal := stack.enter_context(real_time_settings())):
             session._log(Event(devices.start_ns, "session", refusal))
@@ -447,10 +448,9 @@ def _interruptible(session: Session) -> Iterator[None]:
     session.raise_if_interrupted()
 
 
-def _open_log(run: ResolvedConfig, devices: Devices, path: Path) -> LogQueue:
-    log = LogWriter(
-        path, config=dump_config(run.config), metadata=_metadata(run, devices), wrap_file=devices.wrap_file
-    )
+def _open_log(resolved: ResolvedConfig, devices: Devices, path: Path) -> LogQueue:
+    config, metadata = dump_config(resolved.config), _metadata(resolved, devices)
+    log = LogWriter(path, config=config, metadata=metadata, wrap_file=devices.wrap_file)
     return LogQueue(log, lockstep=devices.lockstep)
 
 
@@ -462,18 +462,18 @@ def _perception(config: Config, devices: Devices, estimator: Estimator | None) -
     return ThreadedPerception(devices.camera, estimator, devices.clock)
 
 
-def _metadata(run: ResolvedConfig, devices: Devices) -> dict[str, str]:
-    config, clock = run.config, devices.clock
+def _metadata(resolved: ResolvedConfig, devices: Devices) -> dict[str, str]:
+    config, clock = resolved.config, devices.clock
     utc = {} if devices.lockstep else {UTC_NAME: str(time.time_ns() - clock.now_ns())}
-    engine = config.vision.engine if run.model else ""
+    engine = config.vision.engine if resolved.model else ""
     packages = (*_PACKAGES, engine) if engine in _ENGINE_PACKAGES else _PACKAGES
-    profile = {} if run.correction is None else {"profile": run.correction.profile.weights}
+    profile = {} if resolved.correction is None else {"profile": resolved.correction.profile.weights}
     return {
         "object": config.object,
         "set": f"{config.object}-{config.seed}",
         "clock": config.clock,
-        "checkpoint": run.model.digest if run.model else "",
-        "choices": "\n".join(run.choices),
+        "checkpoint": resolved.model.digest if resolved.model else "",
+        "choices": "\n".join(resolved.choices),
         "python": sys.version.split()[0],
         **{f"version {name}": d.version for name in packages for d in metadata.distributions(name=name)},
         **devices.notes,

@@ -304,7 +304,7 @@ def _fit_and_write(
 
 
 def make_profile(
-    name: str, recorded: TouchRecording, fit: ObjectFit, run: ResolvedConfig
+    name: str, recorded: TouchRecording, fit: ObjectFit, resolved: ResolvedConfig
 ) -> tuple[ObjectProfile, float | None]:
     """Makes an object profile of a fit.
 
@@ -312,23 +312,23 @@ def make_profile(
         name: Name of the object.
         recorded: The touches that it was fitted to.
         fit: The fit.
-        run: Configuration, and the network.
+        resolved: Configuration, and the network.
 
     Returns:
         The profile, and the largest force of the touch after which the object stayed narrower, or None.
     """
-    assert run.model is not None
+    assert resolved.model is not None
     touches = recorded.touches
     forces_n = [press.force_n for press in recorded.presses]
     stiffness = stiffness_n_m(recorded.width_m, forces_n)
     peaks_n = np.array([force_n.max() for force_n in forces_n])
     crushed = crushing_touch(np.array([width_m[0] for width_m in recorded.width_m]), peaks_n)
-    size = run.model.header.preprocess.size
+    size = resolved.model.header.preprocess.size
     frames = np.random.default_rng(0).integers(60, 180, (_TIMED_FRAMES, size, size), np.uint8)
     profile = ObjectProfile(
         object=name,
         date=datetime.now(UTC).date(),
-        checkpoint=run.model.digest,
+        checkpoint=resolved.model.digest,
         camera=recorded.camera,
         touches=len(touches.numbers),
         frames=len(touches.touch),
@@ -337,7 +337,7 @@ def make_profile(
         interval=fit.interval,
         ood_limits=None if fit.arrays.known is None else fit.arrays.known.limits,
         stiffness_n_m=float(np.median(stiffness)) if len(stiffness) else None,
-        plant=fit_plant(recorded.presses, recorded.delay_s + estimate_ms(run, frames) / 1e3),
+        plant=fit_plant(recorded.presses, recorded.delay_s + estimate_ms(resolved, frames) / 1e3),
         before_n=fit.before_n,
         after_n=fit.after_n,
         weights=sha256(pack(fit.arrays)).hexdigest(),

@@ -9,11 +9,11 @@ from gripper_force.runtime.resolve import ResolvedConfig, make_estimator
 from gripper_force.types import NS_PER_MS, Gray
 
 
-def estimate_ms(run: ResolvedConfig, frames: Iterable[Gray]) -> float:
+def estimate_ms(resolved: ResolvedConfig, frames: Iterable[Gray]) -> float:
     """Time of one estimate: configured on the simulated clock, otherwise measured with frames; 0 without vision."""
-    if run.config.clock == "lockstep" and run.model is not None:
-        return run.config.vision.lockstep_compute_ms
-    estimator = make_estimator(run)
+    if resolved.config.clock == "lockstep" and resolved.model is not None:
+        return resolved.config.vision.lockstep_compute_ms
+    estimator = make_estimator(resolved)
     if estimator is None:
         return 0.0
     times_ms = []

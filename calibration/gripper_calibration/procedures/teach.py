@@ -318,8 +318,8 @@ class _Work:
             after_n=mae_n,
         )
         config = config.with_values(vision={"checkpoint": str(checkpoint)})
-        run = ResolvedConfig(config, read_model(checkpoint))
-        profile, _ = make_profile(name, recorded, fit, run)
+        resolved = ResolvedConfig(config, read_model(checkpoint))
+        profile, _ = make_profile(name, recorded, fit, resolved)
         profile = profile.model_copy(
             update={"network": _NETWORK, "logs": self._digests, "version": __version__}
         )

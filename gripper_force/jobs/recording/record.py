@@ -142,9 +142,9 @@ def record(
     objects: dict[str, tuple[Path, str]] = {}
     for number, path in enumerate(plan.paths(config, out), start=1):
         one = config.with_values(seed=config.seed + number - 1, target_n=peak_n)
-        run = resolve(one, vision=False)
+        resolved = resolve(one, vision=False)
         if path.exists():
-            check_same(path, run.config, _SAME)
+            check_same(path, resolved.config, _SAME)
             _check_touches(path, plan.touches)
             check_object_file(path, objects)
             yield path
@@ -155,10 +155,10 @@ def record(
         notes |= {"split": split} if (split := plan.split(number)) else {}
         notes |= {} if plan.degrees is None else {"degrees": f"{plan.degrees:g}"}
         notes |= {} if plan.lux is None else {"lux": f"{plan.lux:g}"}
-        with unfinished(path) as part, open_devices(run.config) as devices:
+        with unfinished(path) as part, open_devices(resolved.config) as devices:
             devices.notes.update(notes)
-            _open_jaws(run, devices)
-            with open_session(run, devices, part) as session:
+            _open_jaws(resolved, devices)
+            with open_session(resolved, devices, part) as session:
                 _touch_all(_MonitoredSession(session, devices, one, plan, number, progress), plan.touches)
                 session.release()
         check_object_file(path, objects)
@@ -207,9 +207,9 @@ def _check_touches(path: Path, touches: int) -> None:
         )
 
 
-def _open_jaws(run: ResolvedConfig, devices: Devices) -> None:
+def _open_jaws(resolved: ResolvedConfig, devices: Devices) -> None:
     """Opens the jaws in a session without a log, because the log of a set must begin with open jaws."""
-    with open_session(run, devices, None) as session:
+    with open_session(resolved, devices, None) as session:
         status = session.release()
     if status.outcome == Outcome.BLOCKED:
         raise DeviceError(status.reason)

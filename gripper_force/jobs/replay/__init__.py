@@ -67,9 +67,9 @@ def replay_frames(
     ``measured_n`` (load cell), ``visual_n``, ``visual_std_n``, ``fused_n`` and ``current_n``; NaN where there is none.
     """
     reader = LogReader(Path(path), recover=recover)
-    run = resolve_replay(changed_config(reader, checkpoint, overrides))
+    resolved = resolve_replay(changed_config(reader, checkpoint, overrides))
     series = EstimateSeries()
-    agreement = feed(reader, run, series, in_batches=_may_batch(reader, run))
+    agreement = feed(reader, resolved, series, in_batches=_may_batch(reader, resolved))
     flags = [flag for flag in (agreement.estimates, agreement.decisions) if flag is not None]
     cells = series.cells.sorted()
     sources = errors_by_source(series, cells)
@@ -87,19 +87,19 @@ def replay_frames(
         frames=0 if best is None else best.frames,
         seen=len(series.seq),
         refused=series.visual_std_n.count(math.inf),
-        per_object={run.config.object: overall},
+        per_object={resolved.config.object: overall},
         identical=all(flags) if flags else None,
-        note=_note(reader, run),
+        note=_note(reader, resolved),
         changed=agreement.changed,
         sources=sources,
         log=str(path),
     )
-    return result, columns_of(result.log, run.config.object, series, cells)
+    return result, columns_of(result.log, resolved.config.object, series, cells)
 
 
-def _may_batch(reader: LogReader, run: ResolvedConfig) -> bool:
+def _may_batch(reader: LogReader, resolved: ResolvedConfig) -> bool:
     """Returns True if no estimate can equal a logged one bit for bit: then batches, which round otherwise, do."""
-    model, vision = run.model, run.config.vision
+    model, vision = resolved.model, resolved.config.vision
     if model is None or vision.engine != "torch":
         return False
     return reader.metadata.get("checkpoint", "") != model.digest
@@ -152,18 +152,18 @@ def replay_each(
     )
 
 
-def _other_vision(run: ResolvedConfig) -> str:
+def _other_vision(resolved: ResolvedConfig) -> str:
     """Returns the difference where only the log or the replay has a network; empty without a controller."""
-    if run.config.gripper.nm_per_a is None:
+    if resolved.config.gripper.nm_per_a is None:
         return ""
     return (
         "the run had a network, this has none"
-        if run.model is None
+        if resolved.model is None
         else "the run had no network, this has one"
     )
 
 
-def _note(reader: LogReader, run: ResolvedConfig) -> str:
+def _note(reader: LogReader, resolved: ResolvedConfig) -> str:
     """Returns the reason why estimates or decisions may differ from the logged ones, or an empty text."""
     if reader.damaged:
         return f"{len(reader.damaged)} damaged parts of the log, of 0.1 s each, are left out"
@@ -171,13 +171,13 @@ def _note(reader: LogReader, run: ResolvedConfig) -> str:
     if wrote != __version__:
         return f"version {wrote or 'unknown'} wrote the log, this is {__version__}: its controller may decide otherwise"
     used = reader.metadata.get("checkpoint", "")
-    if run.model is None or used == "":
-        return "" if (run.model is None) == (used == "") else _other_vision(run)
-    if has_faulty_estimates(run.config):
+    if resolved.model is None or used == "":
+        return "" if (resolved.model is None) == (used == "") else _other_vision(resolved)
+    if has_faulty_estimates(resolved.config):
         return "faults were injected into the run's estimator, so only decisions are compared"
-    if used != run.model.digest:
-        return f"the run's checkpoint was {used[:12]}, this one is {run.model.digest[:12]}: estimates differ"
-    profile = run.correction.profile.weights if run.correction else ""
+    if used != resolved.model.digest:
+        return f"the run's checkpoint was {used[:12]}, this one is {resolved.model.digest[:12]}: estimates differ"
+    profile = resolved.correction.profile.weights if resolved.correction else ""
     used = reader.metadata.get("profile", "")
     if used != profile:
         names = [text[:12] or "none" for text in (used, profile)]

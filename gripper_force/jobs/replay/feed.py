@@ -83,19 +83,19 @@ def resolve_replay(config: Config) -> ResolvedConfig:
     )
 
 
-def run_again(reader: LogReader, run: ResolvedConfig, *, in_batches: bool = False) -> Replayed:
+def run_again(reader: LogReader, resolved: ResolvedConfig, *, in_batches: bool = False) -> Replayed:
     """Feeds estimator and controller from a log, in the order in which the run had its inputs.
 
     If faults were injected into the run's estimator, the controller gets the logged estimates.
 
     Args:
         reader: The log.
-        run: Its configuration.
+        resolved: Its configuration.
         in_batches: Computes the networks on many frames at a time, with PyTorch. Its rounding differs in the last
             digits from that of a run, which has one frame at a time.
     """
     kept = _Kept([], [], [])
-    agreement = feed(reader, run, kept, in_batches=in_batches)
+    agreement = feed(reader, resolved, kept, in_batches=in_batches)
     return Replayed(
         agreement.estimates, agreement.decisions, agreement.changed, kept.visual, kept.decisions, kept.cells
     )
@@ -139,9 +139,9 @@ class Agreement(NamedTuple):
     changed: dict[str, float]
 
 
-def feed(reader: LogReader, run: ResolvedConfig, sink: Sink, *, in_batches: bool) -> Agreement:
+def feed(reader: LogReader, resolved: ResolvedConfig, sink: Sink, *, in_batches: bool) -> Agreement:
     """Runs estimator and controller on a log, as `run_again`. Keeps no record for longer than it is needed."""
-    config = run.config
+    config = resolved.config
     is_faulty = has_faulty_estimates(config)
     had_controller = config.gripper.nm_per_a is not None  # an imported recording had none
     controller = make_controller(config) if had_controller else None
@@ -155,8 +155,8 @@ def feed(reader: LogReader, run: ResolvedConfig, sink: Sink, *, in_batches: bool
     fused = _Pairs(lambda f: f, lambda a, b: abs(a.force_n - b.force_n))
     status = _Pairs(lambda s: s)
     pairs_of = {VisualForce: estimates, ServoCommand: commands, FusedForce: fused, GraspStatus: status}
-    estimated = _in_batches if in_batches and run.model is not None else _frame_by_frame
-    for record, estimate in estimated(reader.records(), run):
+    estimated = _in_batches if in_batches and resolved.model is not None else _frame_by_frame
+    for record, estimate in estimated(reader.records(), resolved):
         if isinstance(record, Frame):
             if estimate is not None:
                 sink.add_visual(estimate)
@@ -171,7 +171,7 @@ def feed(reader: LogReader, run: ResolvedConfig, sink: Sink, *, in_batches: bool
             pairs.add_logged(record)
         if isinstance(record, VisualForce):
             # A log whose disk was slow lacks frames; only their estimates are the logged ones.
-            is_logged = is_faulty or (run.model is not None and record.seq not in pending)
+            is_logged = is_faulty or (resolved.model is not None and record.seq not in pending)
             again = record if is_logged else pending.pop(record.seq, None)
             if again is not None:  # the time at which it was ready is the run's, not this computer's
                 newest = replace(again, ready_ns=record.ready_ns)
@@ -245,16 +245,16 @@ class _Pairs:
 
 
 def _frame_by_frame(
-    records: Iterable[Record], run: ResolvedConfig
+    records: Iterable[Record], resolved: ResolvedConfig
 ) -> Iterator[tuple[Record, VisualForce | None]]:
     """Yields each record, with the estimate of a frame."""
-    processor = FrameProcessor(make_estimator(run))
+    processor = FrameProcessor(make_estimator(resolved))
     for record in records:
         yield record, processor.process(record).visual if isinstance(record, Frame) else None
 
 
 def _in_batches(
-    records: Iterable[Record], run: ResolvedConfig
+    records: Iterable[Record], resolved: ResolvedConfig
 ) -> Iterator[tuple[Record, VisualForce | None]]:
     """Yields the records with their estimates, computed many frames at a time. Frames are empty."""
     import torch
@@ -264,10 +264,10 @@ def _in_batches(
     from gripper_force.vision.engines.pytorch import TorchEngine, restored_threads
     from gripper_force.vision.estimator import ForceEstimator
 
-    assert run.model is not None
-    vision, checkpoint = run.config.vision, kept_checkpoint(run.model.path, run.model.digest)
+    assert resolved.model is not None
+    vision, checkpoint = resolved.config.vision, kept_checkpoint(resolved.model.path, resolved.model.digest)
     engine = TorchEngine(checkpoint, threads=vision.threads if allowed().torch_threads else None)
-    estimator = ForceEstimator(engine, vision.region, run.correction)
+    estimator = ForceEstimator(engine, vision.region, resolved.correction)
     preparation = _Preparation(estimator)
     processor = FrameProcessor(preparation)
     waiting: deque[tuple[Record, VisualForce | None, int]] = deque()  # the last: inputs up to the record

@@ -221,8 +221,8 @@ def loop(
 
 def _run(config: Config, frames: list[Frame], seconds: float, path: Path, measured: _Measured) -> None:
     """Runs one turn, in which the jaws close and open."""
-    run = resolve(config)
-    config = run.config
+    resolved = resolve(config)
+    config = resolved.config
     clock = _Clock(round(NS_PER_S / config.control.rate_hz), measured)
     with ExitStack() as stack:
         servo = load_servo_class(config)(config.servo, clock.now_ns)
@@ -236,7 +236,7 @@ def _run(config: Config, frames: list[Frame], seconds: float, path: Path, measur
             start_ns=clock.now_ns(),
             check=lambda: None,
         )
-        session = stack.enter_context(open_session(run, devices, path))
+        session = stack.enter_context(open_session(resolved, devices, path))
         end_ns = clock.now_ns() + round(seconds * NS_PER_S)
         next_ns, kind = 0, RequestKind.RELEASE
         while (now_ns := clock.now_ns()) < end_ns:
@@ -317,9 +317,9 @@ def _log_cost(path: Path, again: Path, seconds: float) -> LogCost:
             log.write(record)
     writing_s = time.monotonic() - begin_s
     config = config_from_text(reader.config, str(path))
-    run = resolve_replay(config)
+    resolved = resolve_replay(config)
     begin_s = time.monotonic()
-    run_again(reader, run)
+    run_again(reader, resolved)
     replaying_s = time.monotonic() - begin_s
     return LogCost(
         run_mb_s=path.stat().st_size / 2**20 / seconds,

@@ -257,13 +257,13 @@ def _run_with_fault(
 
 def _grasp(config: Config, folder: Path) -> Grasp:
     """Runs a grasp, and observes the force for a while afterwards."""
-    path, run, result, session = folder / "run.mcap", resolve(config), "", None
+    path, resolved, result, session = folder / "run.mcap", resolve(config), "", None
     forces_n = [0.0]
-    with open_devices(run.config) as devices:
+    with open_devices(resolved.config) as devices:
         if devices.observe_world is not None:
             devices.observe_world(lambda state: forces_n.append(max(state.force_n, forces_n.pop())))
         try:
-            with open_session(run, devices, path) as session:
+            with open_session(resolved, devices, path) as session:
                 result = grasp_and_release(session, config.target_n)
         except LogError:
             pass  # reports lost records, which are counted below

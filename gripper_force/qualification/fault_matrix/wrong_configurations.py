@@ -320,11 +320,11 @@ def _run_once(config: Config, keys: dict[str, Any], expected: Sequence[str]) -> 
     world: list[WorldState] = []
     statuses: _Statuses = []
     try:
-        run = resolve(config)
-        with open_devices(run.config) as devices:
+        resolved = resolve(config)
+        with open_devices(resolved.config) as devices:
             assert devices.observe_world is not None
             devices.observe_world(world.append)
-            with open_session(run, devices, None) as session:
+            with open_session(resolved, devices, None) as session:
                 result = _grasp_and_release(session, config.target_n, statuses, world)
             devices.clock.sleep_until_ns(devices.clock.now_ns() + _AFTER_NS)
     except GripperError as error:
@@ -379,7 +379,9 @@ def _grasp_and_release(
     if status.phase != Phase.FAULT:  # after a fault nothing moves until a person has looked
         status = cycle(RequestKind.RELEASE)
         end_ns = status.t_ns + round(session.opening_s * NS_PER_S)
-        while status.t_ns < end_ns and not is_open(session.run.config.gripper.open_width_m, status.width_m):
+        while status.t_ns < end_ns and not is_open(
+            session.resolved.config.gripper.open_width_m, status.width_m
+        ):
             status = cycle()
     return result
 
