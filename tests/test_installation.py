@@ -362,7 +362,7 @@ def test_optional_packages_are_reached_only_lazily() -> None:
         "gripper_force.vision.engines.pytorch": {"torch"},
         "gripper_force.vision.engines.openvino": {"openvino"},
     }
-    jobs = ("grasp", "replay", "doctor", "recording.record", "view", "simulate")
+    jobs = ("trials", "replay", "doctor", "recording.record", "view", "simulate")
     starts = ["gripper_force.cli", "gripper_force.runtime.gripper", "gripper_force.vision.estimator"]
     starts += [f"gripper_force.jobs.{job}" for job in jobs] + own_class_modules()
     for start in starts:

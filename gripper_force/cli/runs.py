@@ -161,10 +161,11 @@ def _grasp_trials(
     yes: bool,
     as_json: bool,
 ) -> None:
-    from gripper_force.jobs import grasp as job
+    from gripper_force.jobs import trials as job
+    from gripper_force.jobs.grasp import GraspSummary, exclusive_device
     from gripper_force.progress import no_progress
 
-    device = job.exclusive_device(settings)
+    device = exclusive_device(settings)
     workers = workers or (1 if device or same_object else CORES)
     prompt: Prompt | None = None
     lines: Progress = no_progress
@@ -176,7 +177,7 @@ def _grasp_trials(
             soft_wrap=True,
         )
         prompt, lines = (console.prompt(yes) if pause else None), console.line
-    results: list[job.GraspSummary] = []
+    results: list[GraspSummary] = []
     failure: BaseException | None = None
     with console.bar("grasping", count, hidden=bool(device)) as progress:
         try:

@@ -1,4 +1,4 @@
-"""Errors and lag of a predicted signal against a measured one."""
+"""Errors and lag of a predicted signal against a measured one, and other statistics."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -46,6 +46,12 @@ def mean_interval(values: Signal) -> tuple[float, float | None, float | None]:
         return mean, None, None
     half = float(stats.t.ppf(0.975, len(each) - 1)) * float(each.std(ddof=1)) / len(each) ** 0.5
     return mean, mean - half, mean + half
+
+
+def percentile(values: Signal, q: float) -> float | None:
+    """Returns a percentile, or None without values."""
+    array = np.asarray(values, np.float64)
+    return float(np.percentile(array, q)) if array.size else None
 
 
 def mae(predicted: Signal, measured: Signal) -> float:

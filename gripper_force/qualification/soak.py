@@ -12,7 +12,8 @@ from typing import Final, TypedDict
 import numpy as np
 
 from gripper_force.config import Config
-from gripper_force.jobs.grasp import PAPER_OBJECTS, TRIAL_TARGETS_N, grasp
+from gripper_force.jobs.grasp import PAPER_OBJECTS, grasp
+from gripper_force.jobs.trials import TRIAL_TARGETS_N
 from gripper_force.progress import Progress, no_progress
 from gripper_force.qualification.proc_files import process_text
 from gripper_force.runtime.log_reader import LogReader

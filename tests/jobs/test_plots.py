@@ -7,8 +7,9 @@ import pytest
 from gripper_force.config import config_from
 from gripper_force.errors import DataError
 from gripper_force.jobs.evaluate import evaluate
-from gripper_force.jobs.grasp import GraspSummary, summarise_trials, write_figure
+from gripper_force.jobs.grasp import GraspSummary
 from gripper_force.jobs.report.plots import draw_estimates, draw_grasps, draw_training
+from gripper_force.jobs.trials import summarise_trials, write_figure
 
 
 def summary(

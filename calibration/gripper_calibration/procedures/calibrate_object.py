@@ -25,9 +25,9 @@ from gripper_calibration.touch_logs import TouchRecording, join, read_log, start
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs.dataset import find_logs
-from gripper_force.jobs.grasp import with_same_object
 from gripper_force.jobs.profile_files import check_place, pack, write_object
 from gripper_force.jobs.recording.record import RecordingPlan, record
+from gripper_force.jobs.trials import with_same_object
 from gripper_force.profiles.object_profile import ObjectProfile, user_folder
 from gripper_force.progress import Progress, Prompt, no_progress
 from gripper_force.runtime.resolve import ResolvedConfig, resolve_vision

@@ -11,9 +11,10 @@ from gripper_force.cli.console import number, out, pairs
 
 if TYPE_CHECKING:  # --help loads neither NumPy nor PyTorch
     from gripper_force.jobs.evaluate import Evaluation
-    from gripper_force.jobs.grasp import GraspSummary, TrialsSummary
+    from gripper_force.jobs.grasp import GraspSummary
     from gripper_force.jobs.metrics import ForceBin
     from gripper_force.jobs.replay.comparison import PairedDifference, ReplayResult, ReplaySummary
+    from gripper_force.jobs.trials import TrialsSummary
 
 
 _REFUSED = (

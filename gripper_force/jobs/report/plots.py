@@ -104,7 +104,7 @@ def draw_grasps(results: "Sequence[GraspSummary]", title: str, path: Path) -> No
     Raises:
         DataError: The file can't be written.
     """
-    from gripper_force.jobs.grasp import WITHIN_N, WITHIN_SHARE
+    from gripper_force.jobs.trials import WITHIN_N, WITHIN_SHARE
 
     names = np.array([result["object"] for result in results])
     targets_n = np.array([result["target_n"] for result in results])

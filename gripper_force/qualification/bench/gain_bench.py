@@ -10,10 +10,11 @@ import numpy.typing as npt
 
 from gripper_force.config import Config
 from gripper_force.jobs.dataset import load_clips
-from gripper_force.jobs.grasp import GraspSummary, trials, with_same_object
+from gripper_force.jobs.grasp import GraspSummary
 from gripper_force.jobs.object_gain import gain_of, learned_ratio
 from gripper_force.jobs.recording.touches import ramp, wait
 from gripper_force.jobs.training.stated_errors import labelled_estimates
+from gripper_force.jobs.trials import trials, with_same_object
 from gripper_force.progress import Progress, no_progress
 from gripper_force.runtime.session import open_run
 from gripper_force.types import Outcome

@@ -24,11 +24,11 @@ from gripper_force.config import Config, dump_config, load_config
 from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import Clip, digest, load_clips, without_contact_starts
 from gripper_force.jobs.evaluate import evaluate
-from gripper_force.jobs.grasp import summarise_trials, trials, with_same_object
 from gripper_force.jobs.imports.video import find_recordings, import_video
 from gripper_force.jobs.training import few
 from gripper_force.jobs.training.recipe import recipe
 from gripper_force.jobs.training.train import train
+from gripper_force.jobs.trials import summarise_trials, trials, with_same_object
 from gripper_force.progress import Progress, no_progress
 from gripper_force.vision.batch_inference import features
 from gripper_force.vision.gaussian_process import GaussianProcess

@@ -18,8 +18,9 @@ import numpy as np
 from gripper_force.config import Config, config_from
 from gripper_force.errors import GripperError, LogError
 from gripper_force.interfaces import Devices
-from gripper_force.jobs.grasp import PAPER_OBJECTS, TRIAL_TARGETS_N, grasp_and_release
+from gripper_force.jobs.grasp import PAPER_OBJECTS, grasp_and_release
 from gripper_force.jobs.processes import process_pool
+from gripper_force.jobs.trials import TRIAL_TARGETS_N
 from gripper_force.progress import Progress, no_progress
 from gripper_force.qualification.fault_matrix.cases import ROWS, Expected, FaultCase
 from gripper_force.qualification.fault_matrix.judge import FaultFreeGrasp, Grasp, judge

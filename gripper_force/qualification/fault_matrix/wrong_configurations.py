@@ -18,8 +18,9 @@ from gripper_force.control.limits import largest_target_n
 from gripper_force.control.state_machine import is_open
 from gripper_force.errors import ConfigError, DeviceError, GripperError, SimulationError
 from gripper_force.interfaces import WorldState
-from gripper_force.jobs.grasp import PAPER_OBJECTS, TRIAL_TARGETS_N
+from gripper_force.jobs.grasp import PAPER_OBJECTS
 from gripper_force.jobs.processes import process_pool
+from gripper_force.jobs.trials import TRIAL_TARGETS_N
 from gripper_force.progress import Progress, no_progress
 from gripper_force.qualification.fault_matrix.outcome_file import OutcomeFile
 from gripper_force.qualification.safety_statements import FORCE_SHARE, SPEED_SHARE, SafetyStatements
