@@ -31,7 +31,7 @@ import numpy.typing as npt
 from gripper_force.config import CameraConfig, Config
 from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import CONTACT_N
-from gripper_force.jobs.imports.video import load_cell_samples, write_recording
+from gripper_force.jobs.imports.imported_log import load_cell_samples, write_recording
 from gripper_force.jobs.paper_protocol import RATE_HZ, TOUCHES, split_of
 from gripper_force.types import NS_PER_S, Frame, Gray
 from gripper_force.vision.preprocess import Region, downscale

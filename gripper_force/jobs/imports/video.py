@@ -5,41 +5,27 @@ columns are allowed. It is either a folder with one video and one table, or a pa
 object is read from a name of the form ``<date>_<object>_<trial>``.
 """
 
-import csv
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from gripper_force.config import Config, dump_config
-from gripper_force.errors import DataError, LogError
-from gripper_force.files import unfinished
-from gripper_force.jobs.dataset import label_frames, starts_in_contact
+from gripper_force.config import Config
+from gripper_force.errors import DataError
+from gripper_force.jobs.imports.force_table import Floats, ForceTable, estimate_tare, read_forces
+from gripper_force.jobs.imports.imported_log import load_cell_samples, write_recording
 from gripper_force.jobs.recording.lag import force_lag_s
 from gripper_force.progress import Progress, no_progress
-from gripper_force.runtime.log_writer import LogWriter
 from gripper_force.spikes import find_spikes
-from gripper_force.types import NS_PER_S, Frame, Gray, LoadCellSample
-from gripper_force.vision.preprocess import Preprocess, Region, downscale
+from gripper_force.types import NS_PER_S, Frame, Gray
+from gripper_force.vision.preprocess import Region, downscale
 
 VIDEO_SUFFIXES: Final = frozenset({".avi", ".mp4", ".mkv", ".mov"})
-
-TARE_S: Final = 0.25
-"""Start of a recording that the tare is estimated from."""
-
-TARE_SPREAD_N: Final = 0.05
-"""Largest range of the force in that time."""
-
-TARE_RISE_N: Final = 1.0
-"""Smallest later rise of the force, and largest later fall, that a tare needs."""
-
-Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,21 +58,6 @@ class ImportSummary:
     frames_without_force: int
     forces_without_frame: int
     starts_in_contact: bool
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ForceTable:
-    """Rows of a table of forces.
-
-    Attributes:
-        frame: Frame numbers, (N,), rising.
-        t_s: Times, (N,), rising.
-        force_n: Forces as measured, (N,).
-    """
-
-    frame: npt.NDArray[np.int64]
-    t_s: Floats
-    force_n: Floats
 
 
 def import_folder(
@@ -198,124 +169,6 @@ def object_of(name: str) -> str:
     return found[1] if found else name
 
 
-def read_forces(path: Path) -> ForceTable:
-    """Reads a table with the columns ``frame``, ``t_s`` and ``force_n``.
-
-    Raises:
-        DataError: The table is missing or empty, lacks a column, or has a value that is not a finite number,
-            a repeated frame, or rows out of order. The message names the line.
-    """
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file)
-            columns = ("frame", "t_s", "force_n")
-            missing = [column for column in columns if column not in (reader.fieldnames or [])]
-            if missing:
-                raise DataError(f"{path} lacks the column {missing[0]!r}; add frame, t_s and force_n")
-            rows = [
-                [_number(path, reader.line_num, column, row[column]) for column in columns] for row in reader
-            ]
-    except OSError as error:
-        raise DataError(f"can't read the table of forces {path}: {error.strerror}; check the path") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise DataError(f"{path} is not a CSV table ({error}); export it as CSV in UTF-8") from error
-    if not rows:
-        raise DataError(f"{path} holds no rows; it needs one per frame")
-    values = np.array(rows)  # (N, 3)
-    unordered = np.flatnonzero((np.diff(values[:, 0]) <= 0) | (np.diff(values[:, 1]) <= 0))
-    if len(unordered):
-        row = int(unordered[0])
-        raise DataError(
-            f"{path}: frame {values[row + 1, 0]:.0f} at {values[row + 1, 1]:.4f} s follows frame "
-            f"{values[row, 0]:.0f} at {values[row, 1]:.4f} s; sort the rows by frame and time"
-        )
-    return ForceTable(values[:, 0].astype(np.int64), values[:, 1], values[:, 2])
-
-
-def estimate_tare(t_s: Floats, force_n: Floats) -> tuple[float, str]:
-    """Estimates the load cell's offset from the start of a recording that starts without contact.
-
-    Args:
-        t_s: Times, (N,).
-        force_n: Forces as measured, (N,).
-
-    Returns:
-        The offset in N and an empty text; or 0 and the reason why the start may not be unloaded.
-    """
-    start = force_n[t_s <= t_s[0] + TARE_S]
-    offset = float(np.median(start))
-    if len(start) < 3:
-        return (
-            0.0,
-            f"the first {TARE_S} s hold {len(start)} forces, too few to distinguish an offset from a touch",
-        )
-    if np.ptp(start) > TARE_SPREAD_N:
-        return (
-            0.0,
-            f"the force moves by {np.ptp(start):.2f} N in the first {TARE_S} s, so contact may be near",
-        )
-    if float(np.percentile(force_n, 25)) < offset - TARE_RISE_N:
-        return 0.0, "the force starts above its later level, so the gripper may start loaded"
-    if float(force_n.max()) < offset + TARE_RISE_N:
-        return 0.0, f"the force never rises by {TARE_RISE_N} N, so the start may not be unloaded"
-    return offset, ""
-
-
-def load_cell_samples(t_ns: Sequence[int], raw_n: Floats, tare_n: float = 0.0) -> list[LoadCellSample]:
-    """Returns samples with the tare subtracted and spikes marked as not valid.
-
-    Args:
-        t_ns: Times, (N,).
-        raw_n: Forces as measured, (N,).
-        tare_n: Offset to subtract.
-    """
-    force_n = raw_n - tare_n
-    return [
-        LoadCellSample(t, float(force), float(raw), not bad)
-        for t, force, raw, bad in zip(t_ns, force_n, raw_n, find_spikes(force_n), strict=True)
-    ]
-
-
-def write_recording(
-    out: Path,
-    config: Config,
-    metadata: dict[str, str],
-    frames: list[Frame],
-    samples: list[LoadCellSample],
-    table: Path | None = None,
-) -> tuple[int, bool]:
-    """Writes an imported recording as a log, which gets its name once it is complete.
-
-    Args:
-        out: The log to write.
-        config: Known configuration of the recording.
-        metadata: Metadata of the log.
-        frames: The frames.
-        samples: The forces.
-        table: File of the forces, to attach; None without one.
-
-    Returns:
-        Number of samples that are not valid, and True if the recording starts in contact. Both are also noted
-        in the log's metadata.
-
-    Raises:
-        LogError: The log exists already or can't be written.
-    """
-    if out.exists():
-        raise LogError(f"can't write the log {out}: it exists already; move it away, or use another folder")
-    spikes = sum(not sample.valid for sample in samples)
-    records: list[Frame | LoadCellSample] = [*frames, *samples]
-    forces_n, _ = label_frames(np.array([frame.t_ns for frame in frames], np.int64), samples, 0)
-    in_contact = starts_in_contact(forces_n, Preprocess())
-    metadata = {**metadata, "spikes_rejected": str(spikes), "starts_in_contact": str(in_contact).lower()}
-    with unfinished(out) as part, LogWriter(part, config=dump_config(config), metadata=metadata) as log:
-        if table is not None:
-            log.attach(table.name, table.read_bytes(), "text/csv")
-        for record in sorted(records, key=lambda record: record.t_ns):
-            log.write(record)
-    return spikes, in_contact
-
-
 def find_recordings(folder: Path) -> list[tuple[str, Path, Path]]:
     """Returns name, video and table of each recording of a folder, by name.
 
@@ -348,19 +201,6 @@ def _recordings(folder: Path) -> Iterator[tuple[str, Path, Path]]:
             if not table.is_file():
                 raise DataError(f"{entry} has no table of forces; put {table.name} next to it")
             yield entry.stem, entry, table
-
-
-def _number(path: Path, line: int, column: str, text: str | None) -> float:
-    try:
-        value = float(text or "")
-    except ValueError:
-        value = math.nan
-    # From 2**53 on a float can't represent every frame number.
-    whole = value.is_integer() and abs(value) < 2**53
-    if not math.isfinite(value) or (column == "frame" and not whole):
-        kind = "frame number" if column == "frame" else "finite number"
-        raise DataError(f"{path}, line {line}: {column} is {text!r} and not a {kind}; correct the line")
-    return value
 
 
 def _read_video(video: Path, region: Region | None, size: int) -> tuple[list[Gray], float]:

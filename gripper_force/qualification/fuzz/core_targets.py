@@ -29,7 +29,7 @@ from gripper_force.config import (
 from gripper_force.errors import GripperError
 from gripper_force.jobs.dataset import load_clip
 from gripper_force.jobs.grasp import summarise_grasp
-from gripper_force.jobs.imports.video import estimate_tare, read_forces
+from gripper_force.jobs.imports.force_table import estimate_tare, read_forces
 from gripper_force.jobs.profile_files import pack
 from gripper_force.jobs.replay import replay
 from gripper_force.jobs.report.data import read_run

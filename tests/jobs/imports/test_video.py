@@ -10,11 +10,9 @@ import yaml
 from gripper_force.config import config_from
 from gripper_force.errors import ConfigError, DataError, LogError
 from gripper_force.jobs.imports.video import (
-    estimate_tare,
     import_folder,
     import_video,
     object_of,
-    read_forces,
 )
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.log_writer import LogWriter
@@ -161,30 +159,6 @@ def test_unmatched_frames_and_rows_are_counted(folder: Path, tmp_path: Path) -> 
     assert np.diff(t_ns) == pytest.approx(np.full(59, 1e9 / RATE_HZ), rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("text", "sentence"),
-    [
-        ("", "lacks the column 'frame'"),
-        ("frame,t_s\n0,0\n", "lacks the column 'force_n'"),
-        ("frame,t_s,force_n\n", "holds no rows"),
-        ("frame,t_s,force_n\n0,0,1\n1,0.03,oops\n", "line 3: force_n is 'oops' and not a finite number"),
-        ("frame,t_s,force_n\n0,0,nan\n", "line 2: force_n is 'nan' and not a finite number"),
-        ("frame,t_s,force_n\n0,0\n", "line 2: force_n is None"),
-        ("frame,t_s,force_n\n0.5,0,1\n", "line 2: frame is '0.5' and not a frame number"),
-        ("frame,t_s,force_n\n1e19,0,1\n", "line 2: frame is '1e19' and not a frame number"),
-        ("frame,t_s,force_n\n0,0,1\n0,0.03,1\n", "frame 0 at 0.0300 s follows frame 0 at"),
-        ("frame,t_s,force_n\n0,0.03,1\n1,0,1\n", "frame 1 at 0.0000 s follows frame 0 at 0.0300 s"),
-        ("\0\xff", "lacks the column"),
-    ],
-)
-def test_malformed_table_raises_with_line(tmp_path: Path, text: str, sentence: str) -> None:
-    path = tmp_path / "forces.csv"
-    path.write_text(text, encoding="utf-8")
-    with pytest.raises(DataError, match=r"forces\.csv") as caught:
-        read_forces(path)
-    assert sentence in str(caught.value)
-
-
 def test_missing_files_raise(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"can't read the table .*gone\.csv: No such file"):
         import_video(folder / "video.avi", tmp_path / "gone.csv", tmp_path / "x.mcap")
@@ -280,29 +254,6 @@ def test_lag_of_forces_is_removed_unless_disabled(folder: Path, tmp_path: Path) 
         assert min(frame.t_ns, sample.t_ns) == 0
         (as_it_is,) = import_folder(tmp_path, tmp_path / f"{name}_as_it_is", align=False)
         assert as_it_is.force_lag_s == 0.0
-
-
-def test_large_times_give_no_tare() -> None:
-    tare_n, note = estimate_tare(np.array([1e18, 2e18]), np.array([0.0, 1.0]))
-    assert tare_n == 0.0
-    assert "too few" in note
-
-
-def test_tare_needs_quiet_unloaded_start() -> None:
-    t_s = np.arange(60) / RATE_HZ
-    tare_n, note = estimate_tare(t_s, grip() + 0.55)
-    assert tare_n == pytest.approx(0.55)
-    assert note == ""
-    for force_n, reason in [
-        (grip() + np.interp(t_s, [0, 0.3], [0, 3]), "contact may be near"),
-        (grip()[::-1] + np.interp(np.arange(60), [0, 40], [10, 0]), "contact may be near"),
-        (np.interp(np.arange(60), [0, 20, 25], [6, 6, 0]), "may start loaded"),
-        (np.full(60, 3.0), "never rises"),
-        (grip()[:2], "too few"),
-    ]:
-        tare_n, note = estimate_tare(t_s[: len(force_n)], force_n)
-        assert tare_n == 0.0
-        assert reason in note
 
 
 def test_known_problems_of_real_recordings_are_found(real_grasps: Path, tmp_path: Path) -> None:
