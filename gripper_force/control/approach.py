@@ -21,8 +21,8 @@ error is corrected after 40 ms; on stalled jaws the motor force rises by 1 N/s."
 
 _OVERSPEED = 1.12
 _OVERSPEED_DECAY_S = 0.05
-"""Above this share of the wanted speed the motor force decays with this time constant: it exceeds friction by
-far, because friction is smaller than configured."""
+"""Above this multiple of the wanted speed the motor force decays with this time constant. It is then far larger than
+friction, which must be smaller than configured."""
 
 _STALLED_SHARE = 0.1
 _SLOWED_SHARE = 0.6
@@ -51,8 +51,8 @@ _TRAVEL_M = 0.0015
 
 _BACK_OFF_M = 0.004
 _BACK_OFF_SPARE_S = 0.5
-"""Opening of jaws that stand still from the start, and the time for it beyond that of its distance. From there
-they close again: jaws that already touched an object then travel to it."""
+"""Jaws that stand still from the start open by this distance and close again: those that already touched an object
+then travel to it. The opening may take this much longer than its distance needs."""
 
 
 class ApproachState(Enum):

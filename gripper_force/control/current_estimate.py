@@ -16,8 +16,8 @@ _LOWERING_LAG_SHARE = 0.1
 """Lag of the motor force while the force is lowered, as a share of the plant's."""
 
 _SLIDES_SHARE = 0.2
-"""Share of the approach speed above which jaws slide during a steady hold: their object has left. If it returns at
-once, the motor force has stayed within the play all the time."""
+"""Jaws that close faster than this share of the approach speed during a steady hold have lost their object. The motor
+force alone does not show it if the object returns at once, because it then stays within the play."""
 
 
 class CurrentEstimate:

@@ -17,21 +17,23 @@ _MAX_RAMP_PER_S = 10.0
 
 _LOWERING_S = 0.15
 _RETURN_S = 0.05
-"""Lowering: the fall takes twice the first, half of it at full rate. After it the motor force returns to the
-closing side of friction in the third, which stops the jaws: later, their inertia carries them too far."""
+"""Lowering: the motor force falls during twice `_LOWERING_S`, half of that time at full rate. Then it returns to the
+closing side of friction within `_RETURN_S`, which stops the jaws. A later return would let their inertia carry them
+too far."""
 
 _AGAIN_S = 0.05
 """A lowering that ends above the tolerance is followed at once by a second one of twice this time. The first leaves a
 stiff object with too much force: the motor force returns before its lag lets it reach its lowest value."""
 
 _LOWERING_WAIT_S = 1.0
-"""A lowering waits no longer than this in all, whatever the measured speed is."""
+"""Longest total wait of a lowering, whatever the measured speed is."""
 
 _REPEAT_SHARE = 0.75
 _REPEAT_S = 0.5
 _REPEAT_WITHIN_S = 1.0
-"""If the camera soon shows that the force stays above the target by this share of the tolerance, for this time, it is
-lowered once more. The integral would have to overcome twice the friction first, which takes seconds."""
+"""In the first `_REPEAT_WITHIN_S` of rest after a lowering, the force is lowered once more if the camera sees it above
+the target by `_REPEAT_SHARE` of the tolerance for `_REPEAT_S`. Otherwise the integral would have to overcome twice the
+friction, which takes seconds."""
 
 _WAIT_SHARE = 0.2
 _WAIT_N = 0.2

@@ -8,24 +8,24 @@ from gripper_force.control.transmission import Transmission
 _SLOW_SHARE = 0.4
 _SLOW_S = 0.3
 _SLOWED_S = 0.05
-"""Open jaws that have not travelled yet may need their configured friction to break away. Jaws that are slower than
-this share of their speed for this time may press on an object; after they have moved, for the shorter time."""
+"""Open jaws that have not travelled yet may need their configured friction to break away. Jaws that stay slower than
+`_SLOW_SHARE` of their speed for `_SLOW_S`, or `_SLOWED_S` once they have moved, may press on an object."""
 
 _BREAKAWAY_N = 0.1
 """Motor force beyond the configured friction with which jaws may break away in a move."""
 
 _UNKNOWN_SHARE = 0.5
-"""Largest motor force of jaws that may touch an object while their friction is unknown, as a share of the one that the
-force limit allows: they may be moving when they hit it."""
+"""Largest motor force while the friction is unknown and the jaws may touch an object, as a share of what the force
+limit allows. It is below 1 because the jaws may hit the object at speed."""
 
 
 class FrictionAllowance:
     """Friction that the limit on the current allows for: only what a motion of this run has shown.
 
-    If the true friction is smaller than assumed, the difference acts on an object as force; so it does in an opening
-    motion if the closing direction is configured wrongly. Jaws that have not moved yet may touch an object, so a
-    standstill shows nothing about friction. Only open jaws may break away with the configured friction; others open a
-    little first (see `Approach`).
+    If the true friction is smaller than assumed, the difference acts on an object as force. That also happens in an
+    opening motion if the closing direction is configured wrongly. Jaws that have not moved yet may touch an object, so
+    a standstill shows nothing about friction. Only open jaws may break away with the configured friction; others open
+    a little first (see `Approach`).
 
     Attributes:
         shown_n: Least friction that a motion has shown; infinite before.

@@ -48,7 +48,8 @@ _GATE = 3.29
 
 _REENTRY_S = 1 / 3
 _MIN_REENTRY = 4
-"""Time, and least number of consecutive rejected estimates on the same side, after which the filter accepts them."""
+"""The filter accepts rejected estimates once they have been on the same side for this time, and at least this many in
+a row."""
 
 
 NO_NEW_ESTIMATE: Final = "no new estimate"

@@ -7,14 +7,14 @@ from gripper_force.control.transmission import Transmission
 from gripper_force.types import ServoCommand, ServoState
 
 _SPARE = 1.3
-"""Lead over the one that the wanted speed, or the goal current, needs. It is the largest steady speed over the
-wanted one."""
+"""Lead as a multiple of what the wanted speed, or the goal current, needs. The largest steady speed is this multiple of
+the wanted one."""
 
 _UNKNOWN_LEAD_M = 0.002
 """Lead of one jaw with a servo whose position loop is unknown."""
 
 _OVERSPEED = 1.4
-"""Measured over wanted speed above which the servo brakes."""
+"""Multiple of the wanted speed above which the servo brakes."""
 
 
 @dataclass(frozen=True, slots=True)

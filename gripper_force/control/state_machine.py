@@ -61,7 +61,7 @@ _AT_WIDTH_M = 0.0005
 """Distance from the requested width at which a move has arrived, unless the servo's proportional gain leaves more."""
 
 _MIN_SPEED_M_S = 1e-4
-"""Speed of one jaw, for a target of 0.01 N, below which a grasp does not get more time."""
+"""Lowest speed of one jaw that gives a grasp more time: that for a target of 0.01 N."""
 
 _BLOCKED_S = 1.0
 _PASSED_M = 0.002
@@ -116,7 +116,7 @@ class GraspController:
     ``timeout``, it continues.
 
     *Speed.* Every command passes `SpeedLimit`, so the jaws are never much faster than the phase allows. Jaws on their
-    way to an object are so slow that their impact stays within the force limit. A ramp or hold has the object already.
+    way to an object are so slow that their impact stays within the force limit.
 
     Attributes:
         opening_s: Longest time in which the jaws open.
@@ -286,7 +286,7 @@ class GraspController:
                     self._motor_force_n = 0.0  # what can't be reset is let go, also with on_fault=hold
                 return cause
             if self._phase == Phase.RELEASE and self._outcome != Outcome.BLOCKED:
-                return ""  # it goes on: from the start again, it would not brake what a springy object pushes open
+                return ""  # a new start would not brake jaws that a springy object pushes open
             if self._outcome == Outcome.BLOCKED:
                 self._outcome = Outcome.NONE
             self._start_release("release requested")
@@ -327,9 +327,8 @@ class GraspController:
             self._loop.retarget(self._derated_target_n)
             self._enter(Phase.RAMP, f"new target {target_n:g} N")
             return
-        if (
-            self._phase == Phase.APPROACH and not new_object
-        ):  # it keeps what it knows of friction and standstill
+        if self._phase == Phase.APPROACH and not new_object:
+            # The approach keeps what it knows of friction and standstill.
             self._approach.set_target(target_n)
             self._reason = f"new target {target_n:g} N"
             return
@@ -449,7 +448,7 @@ class GraspController:
 
     @property
     def _present_rad(self) -> float:
-        """Servo angle of the last sound reading."""
+        """Servo angle of the last plausible reading."""
         return self._transmission.open_position_rad if self._servo is None else self._servo.position_rad
 
     # Phases.

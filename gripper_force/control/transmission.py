@@ -7,12 +7,12 @@ from gripper_force.config import GripperConfig
 from gripper_force.control.linkage import Linkage, make_linkage
 
 GOAL_OFFSET_M = 0.010
-"""Distance of each jaw's goal inside the object, before the speed limit: the goal current sets the force. So the goal
-may lie this far beyond the closed jaws, or the servo could not press on a thin object."""
+"""Distance by which each jaw's goal lies inside the object, before the speed limit; the goal current sets the force.
+The goal may lie this far beyond the closed jaws, because the servo could not press on a thin object otherwise."""
 
 _IMPACT_RAD_S_PER_N = 0.18
-"""Speed of the horn per newton with which an object of 30 N/mm stops an XM430's rotor with a fifth to spare: at a
-pinion of 20 mm, 1.4 kg per jaw."""
+"""Speed of the horn per newton of impact force, with a fifth to spare: for an object of 30 N/mm and the rotor of an
+XM430, which acts like 1.4 kg per jaw at a pinion of 20 mm."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +99,7 @@ class Transmission:
         return self.linkage.jaw_m_per_rad(self._closing_rad(position_rad))
 
     def impact_m_s(self, force_n: float) -> float:
-        """Returns the largest speed of a jaw that a hard object stops within a force, anywhere in the travel."""
+        """Returns the largest jaw speed whose impact on a hard object stays within a force, anywhere in the travel."""
         positions_rad = (self.position_rad(self.open_width_m * i / 32) for i in range(33))
         return _IMPACT_RAD_S_PER_N * force_n * min(map(self.jaw_m_per_rad, positions_rad))
 

@@ -20,13 +20,13 @@ _FREELY_SHARE = 0.4
 that speed."""
 
 _CLOSING_CYCLES = 10
-"""Number of cycles in which a move that closes shows friction: after them it may press a soft object."""
+"""Number of cycles that show friction in a move that closes. In later ones it may press a soft object."""
 
 _OPENS_SHARE = 0.25
 _PUSH_N_S = 5.0
 _PUSH_SHARE = 3.0
-"""Jaws whose release is slower than this share of its speed get more motor force at this rate, up to this multiple of
-that of free travel: their friction may be larger than configured."""
+"""While a release is slower than `_OPENS_SHARE` of its speed, extra motor force grows at `_PUSH_N_S`, up to
+`_PUSH_SHARE` times the motor force of free travel: friction may be larger than configured."""
 
 
 class Travel:

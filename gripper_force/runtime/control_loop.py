@@ -22,7 +22,8 @@ from gripper_force.runtime.state import GraspResult, GripperState, StateTracker
 from gripper_force.types import GRIPPING, NS_PER_S, Outcome, RequestKind
 
 _END_S: Final = 25.0
-"""Longest wait for the end of the control thread, beside opening jaws: 20 s for a disk that does not answer."""
+"""Longest wait for the end of the control thread, in addition to the opening of the jaws. A disk that does not answer
+takes 20 s of it."""
 
 
 class ControlLoop:
@@ -170,7 +171,7 @@ class ControlLoop:
                 self._raise_error()
 
     def _own_cycle(self) -> contextlib.ExitStack:
-        """Keeps the cycle to the caller's thread: a second one would use the servo's port at the same time."""
+        """Lets only this thread run the control cycle: a second one would use the servo's port at the same time."""
         if not self._cycle_lock.acquire(blocking=False):
             raise RequestError(
                 "another thread runs the control cycle; pass wait=False, or use background=True"

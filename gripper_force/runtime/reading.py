@@ -1,4 +1,4 @@
-"""Reading of a servo that does not answer for a moment."""
+"""Reading of a servo, with further attempts if it does not answer."""
 
 from collections.abc import Callable
 
@@ -16,9 +16,9 @@ def read_patiently(
     patience_ns: int,
     before_retry: Callable[[], None] = lambda: None,
 ) -> ServoState:
-    """Reads a servo, again if it does not answer, for as long as its watchdog waits.
+    """Reads a servo. If it does not answer, tries again for as long as its watchdog waits.
 
-    Meanwhile the last command stands, which was within the limits.
+    Meanwhile the servo follows the last command, which was within the limits.
 
     Args:
         servo: The servo.

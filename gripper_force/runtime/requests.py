@@ -19,7 +19,7 @@ _MAX_MAGNITUDE: Final = 1e9
 
 
 def number(value: Any, name: str) -> float:
-    """Returns an argument as a float. Raises `RequestError` for what is no number, or no quantity of a gripper."""
+    """Returns an argument as a float. Raises `RequestError` if it is no number, or too large to be plausible."""
     found = math.nan
     with suppress(TypeError, ValueError, OverflowError):
         found = math.nan if isinstance(value, str | bytes) else float(value)
@@ -68,10 +68,9 @@ class PendingRequest:
 class RequestQueue:
     """Requests of all threads, in the order in which the control cycle handles them.
 
-    A newer request of another kind replaces the one that callers wait for; a refused one replaces none. One
-    that waits for a cycle, and no caller for it, is dropped for a newer one of the same kind. A
-    stop overrides all older requests, which end with its outcome. Requests made after it are handled
-    once it has taken effect.
+    A newer request of another kind replaces the one that callers wait for, unless it is refused. A queued request that
+    no caller waits for is dropped when a newer one of the same kind arrives. A stop overrides all older requests, which
+    end with its outcome. Requests made after it are handled once it has taken effect.
     """
 
     def __init__(self) -> None:

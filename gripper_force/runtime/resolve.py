@@ -28,10 +28,10 @@ _SUPPLY_TOLERANCE_V = 0.5
 """A supply set to the end of the servo's range reads slightly beyond it."""
 
 _MAX_RATIO = 3.0
-"""Torque constant over that of the servo's model from which it can't be right: the largest `gripper.gain_bound`."""
+"""A torque constant is plausible within this factor of the model's: the largest `gripper.gain_bound`."""
 
 _MIN_TRAVEL_RAD = 0.3
-"""Rotation of the horn for the whole travel of a rack, below which the pinion's radius can't be right."""
+"""Smallest plausible rotation of the horn for the whole travel of a rack. With less, the pinion's radius is wrong."""
 
 _NO_SCORE = (
     "the network has no out-of-distribution score, so unfamiliar objects are not noticed; bfloat16 and int8 have none, "
@@ -223,7 +223,7 @@ def _complete_gripper(gripper: GripperConfig, spec: ServoSpec) -> GripperConfig:
 
 
 def _check_travel(gripper: GripperConfig, spec: ServoSpec) -> None:
-    """Raises if a rack's travel is too short, or if one leaves the turn that the servo knows after power-on."""
+    """Raises `ConfigError` if a rack's travel is too short, or a travel leaves the turn that the servo starts in."""
     with importing(f"gripper.linkage.kind={gripper.linkage.kind}"):
         transmission = Transmission.from_config(gripper, spec.nm_per_a)
     open_rad, closed_rad = transmission.open_position_rad, transmission.closed_position_rad

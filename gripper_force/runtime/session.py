@@ -48,7 +48,7 @@ if TYPE_CHECKING:  # a run without vision imports none of it
     from gripper_force.vision.estimator import ForceEstimator
 
 _VISION_WAIT_NS: Final = 5 * NS_PER_S
-"""Longest wait for the first visual estimate, beside the time of its frames."""
+"""Longest wait for the first visual estimate, in addition to the time of its frames."""
 
 _REFERENCE_NS: Final = NS_PER_S // 10
 """Every run starts with frames without contact, so that its log can be replayed with vision."""
@@ -60,7 +60,7 @@ _GAP_CYCLES: Final = 2.5
 """A gap between two readings that is longer than this many cycles is logged."""
 
 NO_ESTIMATE: Final = "no estimate: "
-"""Begin of the text of an event that says why a frame gave no estimate."""
+"""Start of the text of an event that says why a frame gave no estimate."""
 
 _NUMBER: Final = re.compile(r"[\d.]+")
 

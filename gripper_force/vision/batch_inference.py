@@ -17,7 +17,7 @@ from gripper_force.vision.preprocess import DIFFERENCE_GAIN, FLAT_STD, Preproces
 
 BATCH = {"cpu": 32, "cuda": 256}
 """Frames that pass the backbone together. On a CPU, the maps of a few frames stay in its cache, and the process
-keeps their memory: where larger maps go back to the system each time, a batch takes a third longer."""
+reuses their memory. Larger maps go back to the system after each batch, which then takes a third longer."""
 
 CHUNK = 256
 """Frames whose windows are read together; limits memory."""
@@ -25,7 +25,7 @@ CHUNK = 256
 
 @lru_cache(maxsize=2)
 def kept_checkpoint(source: str | Path, digest: str) -> Checkpoint:
-    """Loads a checkpoint once for all logs that a process computes; ``digest`` tells a changed file."""
+    """Loads a checkpoint once for all logs of a process; a changed file has another ``digest`` and is loaded again."""
     return load_checkpoint(source)
 
 

@@ -29,7 +29,7 @@ SLOPE: Final = 0.06
 """Largest difference of the change of light between the middle and an edge, as a share of the mean brightness."""
 
 SHARPNESS: Final = 0.75
-"""Least fine detail of the still part of the image, as a share of the first frame's."""
+"""Smallest fine detail of the still part of the image, as a share of the first frame's."""
 
 COVERED: Final = 0.15
 """Largest share of the image that loses its fine detail. Flat jaws cover up to 0.125 in simulation."""
@@ -169,7 +169,7 @@ _MIN_PX: Final = 64
 """Side of the smallest image in which disturbances are looked for: the limits are half a pixel there."""
 
 _STILL: Final = 0.25
-"""Least share of the image that must follow the fitted change. In presses it is 0.5 or more."""
+"""Smallest share of the image that must follow the fitted change. In presses it is 0.5 or more."""
 
 _SMOOTHING: Final = 0.8
 """Standard deviation of the smoothing against noise, in pixels."""

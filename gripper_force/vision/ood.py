@@ -1,10 +1,10 @@
 """Out-of-distribution score of a stream of frames: the part of their features that no known frame shows.
 
-The features of known frames lie near a linear subspace of few dimensions. What counts is a frame's squared
-distance from that subspace, as a share of its squared distance from the mean without contact, over the median of
-known frames at that force. It compares what is unfamiliar in a frame with all that the frame shows; the distance
-alone, the Q statistic of J. E. Jackson and G. S. Mudholkar, Technometrics 21 (1979) 341-349,
-doi:10.1080/00401706.1979.10489779, grows with the force. An unknown object is unknown in all frames, so the
+The features of known frames lie near a linear subspace of few dimensions. The score of a frame is its
+squared distance from that subspace, divided by its squared distance from the mean without contact, and then by the
+median of this ratio over known frames at that force. The ratio compares what is unfamiliar in a frame with all that
+the frame shows. The distance alone, the Q statistic of J. E. Jackson and G. S. Mudholkar, Technometrics 21 (1979)
+341-349, doi:10.1080/00401706.1979.10489779, grows with the force. An unknown object is unknown in all frames, so the
 logarithm is averaged over the last frames: single known frames vary as much as known and unknown objects differ.
 docs/decisions/0024 compares the scores.
 """

@@ -19,7 +19,7 @@ Region = tuple[int, int, int, int]
 """Region of interest in pixels: left, top, width, height."""
 
 FLAT_STD: Final = 1.0
-"""Least standard deviation to divide by, in gray levels: the noise of a flat frame is not amplified."""
+"""Smallest standard deviation to divide by, in gray levels, so that the noise of a flat frame is not amplified."""
 
 DIFFERENCE_GAIN: Final = 2.0
 """Factor that brings a difference of standardised frames to about unit variance."""

@@ -1,6 +1,6 @@
 """Engines: libraries that compute an ensemble's streaming step. All give the same forces.
 
-An engine's library is imported when a run names the engine, and no other is.
+Only the library of the engine that a run names is imported.
 """
 
 from abc import ABC, abstractmethod
