@@ -9,6 +9,9 @@ PIP := $(BIN)/pip install --quiet --disable-pip-version-check
 CPU_INDEX := https://download.pytorch.org/whl/cpu
 TORCH := $(shell grep -om1 'torch>=[^"]*' pyproject.toml)
 
+# Tests of all lines of the safety monitor and the limits. `make test` runs them once, and counts the lines.
+COVERED := tests/control/test_safety.py tests/control/test_limits.py
+
 .PHONY: grasp test test-docs test-lerobot docs wheel setup setup-dev format clean
 
 grasp: setup
@@ -22,8 +25,8 @@ test: setup-dev
 	$(BIN)/mypy integrations/conftest.py integrations/*/tests
 	$(BIN)/lint-imports
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto $(ARGS)
-	$(BIN)/coverage run -m pytest -q tests/control/test_safety.py tests/control/test_limits.py
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto $(or $(ARGS),$(COVERED:%=--ignore=%))
+	$(BIN)/coverage run -m pytest -q $(COVERED)
 	$(BIN)/coverage report
 
 # Runs the commands of all pages; `make test` runs only those of short pages.
