@@ -1,5 +1,6 @@
 """Shared fixtures."""
 
+import gc
 import signal
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -35,6 +36,12 @@ for _number, _handler in (
 settings.register_profile("search", deadline=None, derandomize=False)
 settings.register_profile("unhurried", deadline=None, derandomize=True)
 settings.load_profile("unhurried")
+
+
+def pytest_collection_finish() -> None:
+    """Keeps the tests themselves, hundreds of thousands of objects, out of every later garbage collection."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")
