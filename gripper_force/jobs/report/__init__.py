@@ -66,6 +66,7 @@ def write_report(
     try:
         folder.mkdir(parents=True, exist_ok=True)
         figure.savefig(paths.png)
+        figure.set_layout_engine("none")  # the page shows the same figure, whose parts have their places now
         paths.html.write_text(render(run, to_svg(figure), note), encoding="utf-8")
     except OSError as error:
         raise LogError(
