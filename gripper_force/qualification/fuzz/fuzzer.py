@@ -5,6 +5,7 @@ and an allocation beyond `MEMORY_BYTES`. Input ``i`` of a target is a function o
 and ``i``, so a finding is reproduced by its number.
 """
 
+import os
 import random
 import re
 import resource
@@ -337,7 +338,9 @@ class _Worker:
             )
             found.append((target, self._shares[target][place], error))
             self._shared[5 + 3 * target] += 1
-            self._begin(target, place + 1)
+            self.busy = place + 1 < len(self._shares[target]) or any(self._shares[target + 1 :])
+            if self.busy:
+                self._begin(target, place + 1)
         return found
 
     def kill(self) -> None:
@@ -382,6 +385,9 @@ def _work(
             if error not in _COLUMNS and (kind := (t, _kind(error))) not in reported:
                 reported.add(kind)
                 pipe.send((t, index, error))
+    os._exit(
+        0
+    )  # the shutdown of the readers' libraries takes time, which would count as that of the last input
 
 
 _RESULT, _TYPED = "result", "typed error"
