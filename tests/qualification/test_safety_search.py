@@ -37,7 +37,7 @@ def test_the_first_cases_hold_all_three_statements(config: Config) -> None:
     found = results(config, 0, 40)
     assert all(result.ok for result in found)
     assert {"held", "refused", "no_object", "stuck"} <= {result.outcome for result in found}
-    assert found == results(config, 0, 40)
+    assert found[:10] == results(config, 0, 10)
 
 
 def test_a_lost_object_of_a_small_force_does_not_stay_held(config: Config) -> None:
@@ -117,12 +117,12 @@ def test_a_current_beyond_its_limit_is_found(config: Config, monkeypatch: pytest
         return replace(command, goal_current_a=2 * command.goal_current_a), over
 
     monkeypatch.setattr(Limits, "apply", doubled)
-    assert any(result.force_share > 1.05 for result in results(config, 0, 60))
+    assert any(run_case(config, 0, index).force_share > 1.05 for index in range(60))
 
 
 def test_a_missing_speed_limit_is_found(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SpeedLimit, "apply", lambda _self, command, *_: command)
-    assert any(result.speed_share > 1.5 for result in results(config, 0, 40))
+    assert any(run_case(config, 0, index).speed_share > 1.5 for index in range(40))
 
 
 def test_a_grip_on_nothing_is_found(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -132,9 +132,13 @@ def test_a_grip_on_nothing_is_found(config: Config, monkeypatch: pytest.MonkeyPa
         for i in range(1000)
         if (one := draw(config.control, RACK, 0, i)).width > 1.05 and one.contact_m == 1 and one.sign == 1
     ]
-    found = [run_case(config, 0, i) for i in wrong]
-    assert any(result.held_nothing for result in found)
-    assert any(result.held_stop for result in found)
+    nothing = stop = False
+    for i in wrong:
+        found = run_case(config, 0, i)
+        nothing, stop = nothing or found.held_nothing, stop or found.held_stop
+        if nothing and stop:
+            break
+    assert (nothing, stop) == (True, True)
 
 
 def test_search_continues_where_it_was_interrupted(
