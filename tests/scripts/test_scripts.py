@@ -19,15 +19,15 @@ def run(name: str, *arguments: str) -> "subprocess.CompletedProcess[str]":
 
 
 def test_lower_force_prints_a_row_per_object_and_feedback() -> None:
-    arguments = ["--feedback", "current", "--object", "tube", "--friction", "1", "--seeds", "1"]
+    arguments = ["--feedback", "current", "--object", "stapler", "--friction", "1", "--seeds", "1"]
     shown = run("lower_force.py", *arguments).stdout.splitlines()
     assert len(shown) == 3
-    assert shown[2].startswith("| current | tube | 1 of 1 |")
+    assert shown[2].startswith("| current | stapler | 1 of 1 |")
     assert shown[2].endswith("| 0 |")
 
 
 def test_lost_object_prints_the_time_to_slip() -> None:
-    arguments = ["--feedback", "current", "--object", "tube", "--target-n", "3", "--seeds", "1"]
+    arguments = ["--feedback", "current", "--object", "stapler", "--target-n", "3", "--seeds", "1"]
     shown = run("lost_object.py", *arguments).stdout.splitlines()
     assert len(shown) == 3
     assert re.fullmatch(r"\| current \| 3 N \| 1 of 1 \| (\d+), \1 \| [01] \| 0 \|", shown[2])

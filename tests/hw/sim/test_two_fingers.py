@@ -15,8 +15,9 @@ from gripper_calibration.procedures.calibrate_jaws import calibrate_jaws
 from gripper_calibration.procedures.calibrate_servo import calibrate_servo
 from gripper_force.config import Config, SimConfig, load_config
 from gripper_force.errors import ConfigError, GripperError, HardwareFaultError
-from gripper_force.profiles.rig_profile import read_rig
+from gripper_force.profiles.rig_profile import RigProfile, ServoCalibration, read_rig
 from gripper_force.runtime.resolve import resolve
+from gripper_force.schema import dump
 from gripper_force.types import NS_PER_MS, NS_PER_S
 from gripper_hw.dynamixel.virtual import VirtualBus, find_bus
 from gripper_hw.sim import simulated_rig
@@ -243,12 +244,10 @@ def test_calibrate_servo_refuses_two(tmp_path: Path) -> None:
         calibrate_servo(config_of(), [0.03], tmp_path / "rig.yaml", prompt=lambda text: None)
 
 
-def test_a_rig_profile_of_one_servo_is_refused(tmp_path: Path) -> None:
+def test_a_rig_profile_of_one_servo_is_refused(tmp_path: Path, servo_calibration: ServoCalibration) -> None:
     """Its torque constant is half of that of both."""
     rig = tmp_path / "rig.yaml"
-    calibrate_servo(
-        load_config(None, ["object=block", "sim.detail=coarse"]), [0.03], rig, prompt=lambda text: None
-    )
+    rig.write_text(dump(RigProfile(servo=servo_calibration)))
     assert read_rig(rig).servo is not None
     with pytest.raises(ConfigError, match="made with servo XM430-W350, not two XM430-W350"):
         resolve(config_of(f"calibration.rig={rig}"))
