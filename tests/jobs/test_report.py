@@ -246,28 +246,24 @@ def test_report_is_written_next_to_log_or_into_folder(grasp: Path, page: str) ->
     assert paths.html.read_text(encoding="utf-8") == page, "the same log gives the same page"
 
 
-def test_log_is_read_once(grasp: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    times_ns = []
+def test_log_is_read_and_figure_is_drawn_once(
+    grasp: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    times_ns, drawn = [], []
 
     def count(chunk: Chunk, **options: bool) -> list[McapRecord]:
         times_ns.append(chunk.message_start_time)
         records: list[McapRecord] = breakup_chunk(chunk, **options)
         return records
 
-    monkeypatch.setattr(log_reader_module, "breakup_chunk", count)
-    write_report(grasp, tmp_path)
-    assert len(times_ns) == len(set(times_ns)) > 50
-
-
-def test_figure_is_drawn_once(grasp: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn = []
-
     def kept(run: Run, pictures: list[Picture]) -> Figure:
         drawn.append(draw(run, pictures))
         return drawn[-1]
 
+    monkeypatch.setattr(log_reader_module, "breakup_chunk", count)
     monkeypatch.setattr(report_module, "draw", kept)
     write_report(grasp, tmp_path)
+    assert len(times_ns) == len(set(times_ns)) > 50
     assert len(drawn) == 1
 
 

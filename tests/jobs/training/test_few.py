@@ -170,9 +170,9 @@ def test_replayed_objects_are_not_forgotten(
     # The new object shows the opposite: less change, more force.
     old = [press(seed) for seed in range(6)]
     new = [replace(clip, forces_n=8 - clip.forces_n, object="new") for clip in (press(20), press(21))]
-    config = small_recipe.model_copy(update={"steps": 150, "clips": 8})
+    config = small_recipe.model_copy(update={"steps": 100, "clips": 6})
     first = train(config, old, tmp_path / "first.safetensors")
-    again = config.model_copy(update={"steps": 60})
+    again = config.model_copy(update={"steps": 40})
     errors_n = {}
     for name, replay in (("alone", []), ("replayed", old)):
         out = tmp_path / f"{name}.safetensors"

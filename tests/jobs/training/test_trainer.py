@@ -92,7 +92,7 @@ def indented(clips: list[Clip]) -> list[Clip]:
 def test_indentation_and_contact_are_learned_beside_force(
     indented: list[Clip], small_recipe: TrainConfig, press: Callable[..., Clip]
 ) -> None:
-    extra = {"indentation_weight": 0.5, "contact_weight": 0.05, "steps": 150, "clips": 8}
+    extra = {"indentation_weight": 0.5, "contact_weight": 0.05, "steps": 90, "clips": 8}
     config = small_recipe.model_copy(update=extra)
     trainer = Trainer(config, 0, Batches(indented, config, TrainingProcess("cpu")), TrainingProcess("cpu"))
     list(trainer.steps())
@@ -148,7 +148,7 @@ def test_teacher_is_imitated(
     clips: list[Clip], small_recipe: TrainConfig, press: Callable[..., Clip]
 ) -> None:
     """A teacher that says twice the measured force: the student learns its forces and not the labels."""
-    config = small_recipe.model_copy(update={"steps": 120, "clips": 8, "teacher_share": 1.0})
+    config = small_recipe.model_copy(update={"steps": 60, "clips": 8, "teacher_share": 1.0})
     batches = Batches(clips, config, TrainingProcess("cpu"))
     first = Trainer(config, 0, batches, TrainingProcess("cpu"))
     list(first.steps())

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gripper_force.jobs import int8_export
 from gripper_force.jobs.dataset import Clip
 from gripper_force.qualification.bench import estimator_bench as estimator
 from gripper_force.qualification.bench.estimator_bench import (
@@ -51,9 +52,9 @@ def recordings(seed: int) -> list[Clip]:
             name=f"{i}",
             object="tube",
             set=f"{i}",
-            frames=rng.integers(0, 256, (160, 32, 32), np.uint8),
-            forces_n=rng.uniform(0, 3, 160).astype(np.float32),
-            valid=np.ones(160, bool),
+            frames=rng.integers(0, 256, (40, 32, 32), np.uint8),
+            forces_n=rng.uniform(0, 3, 40).astype(np.float32),
+            valid=np.ones(40, bool),
             stiffness=1.0,
         )
         for i in range(2)
@@ -67,6 +68,7 @@ def test_bench_measures_every_variant(
         if find_spec(package) is None:
             pytest.skip(f"{package} is not installed: pip install 'gripper-force[engines]'")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(int8_export, "_SAMPLES", 80)
     monkeypatch.setattr(estimator, "_ROUNDS", 4)
     monkeypatch.setattr(estimator, "_STEPS", 2)
     monkeypatch.setattr(estimator, "_variants", lambda: [("torch", "float32", "float32")])
@@ -85,7 +87,7 @@ def test_bench_measures_every_variant(
         ("torch", "float32"),
         ("openvino", "int8"),
     ]
-    assert all(row.frames == 2 * 157 for row in rows)  # the first three of each are the reference
+    assert all(row.frames == 2 * 37 for row in rows)  # the first three of each are the reference
     assert rows[0].mae_n == rows[1].mae_n == rows[2].mae_n != rows[3].mae_n
     assert all(row.p99_ms >= row.p50_ms > 0 for row in rows)
     assert [row.memory_mb for row in rows[:2]] == [None, None]
