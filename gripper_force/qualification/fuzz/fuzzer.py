@@ -385,9 +385,8 @@ def _work(
             if error not in _COLUMNS and (kind := (t, _kind(error))) not in reported:
                 reported.add(kind)
                 pipe.send((t, index, error))
-    os._exit(
-        0
-    )  # the shutdown of the readers' libraries takes time, which would count as that of the last input
+    # The shutdown of the readers' libraries takes time, which would count as that of the last input.
+    os._exit(0)
 
 
 _RESULT, _TYPED = "result", "typed error"
