@@ -21,7 +21,7 @@ force alone does not show it if the object returns at once, because it then stay
 
 
 class CurrentEstimate:
-    """Contact force that the motor current shows: that of the gearing, less the play of Coulomb friction.
+    """Contact force from motor current, through the gearing and Coulomb friction, which acts as play.
 
     Friction is the motor force in free travel. With friction known, the error is that of the gearing.
 
@@ -60,7 +60,14 @@ class CurrentEstimate:
         self.friction_n, self.friction_n2 = max(friction_n, 0.0), FREE_FLOOR_N**2
 
     def step(self, servo: ServoState, *, free: bool, holding: bool, lowering: bool) -> None:
-        """Runs one cycle; arguments as for `Fusion.step`. ``holding``: the force was not lowered before."""
+        """Runs one cycle.
+
+        Args:
+            servo: This cycle's reading, with finite numbers.
+            free: True if the jaws move without contact: the force is zero and the motor force is friction.
+            holding: True while the force is to stay at the target, if it was not lowered to it.
+            lowering: True while the force falls to a lower target.
+        """
         before_n = self.force_n
         closing_m_s = self._transmission.closing_m_s(servo.velocity_rad_s, servo.position_rad)
         damping_n = self._transmission.damping_n_s_m * closing_m_s

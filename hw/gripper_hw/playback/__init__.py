@@ -89,9 +89,9 @@ class PlaybackCamera(_PlaybackDevice):
             LogError: The log cannot be read.
             DataError: Its frames do not have a rate that ``camera.rate_hz`` may have.
         """
-        frames: list[Frame] = []
-        if config.path is not None:  # the constructor refuses it otherwise
-            frames = list(islice(LogReader(config.path).records(Frame), _RATE_FRAMES))
+        if config.path is None:  # the constructor refuses it
+            return config
+        frames = list(islice(LogReader(config.path).records(Frame), _RATE_FRAMES))
         span_ns = frames[-1].t_ns - frames[0].t_ns if frames else 0
         if span_ns <= 0:
             return config
