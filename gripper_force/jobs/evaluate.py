@@ -25,6 +25,7 @@ from gripper_force.jobs.dataset import (
 from gripper_force.jobs.object_gain import gain_of
 from gripper_force.jobs.processes import Workers
 from gripper_force.jobs.summary_files import check_writable, evaluation_tables, write_summary
+from gripper_force.plugins import require
 from gripper_force.profiles.apply import read_correction, read_profiles, with_bundle, with_object
 from gripper_force.progress import Progress, no_progress
 from gripper_force.runtime.log_reader import LogReader
@@ -131,8 +132,9 @@ def evaluate(
         DataError: There are no logs, none of these objects, or all start in contact.
         LogError: No log can be read. The error is that of the first.
         CheckpointError: The checkpoint can't be read.
-        ConfigError: The profile can't be read, or belongs to another checkpoint or camera.
+        ConfigError: The profile can't be read, or belongs to another checkpoint or camera; or PyTorch is not installed.
     """
+    require("torch", "evaluate")
     if out is not None:
         check_writable(out)
     if plot is not None:

@@ -8,7 +8,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from gripper_force import cli
+from gripper_force import cli, plugins
 from gripper_force.config import load_config
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs.dataset import Clip, load_clips
@@ -190,3 +190,9 @@ def test_clips_without_labels_or_of_another_size_raise(checkpoint: Checkpoint) -
         evaluate_clips(checkpoint, [unlabelled])
     with pytest.raises(DataError, match="label"):
         errors_on([], [], 0)
+
+
+def test_without_pytorch_the_extra_is_named(few_logs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(plugins, "find_spec", lambda _: None)
+    with pytest.raises(ConfigError, match=r"^evaluate needs torch, .*gripper-force\[train\]"):
+        evaluate(few_logs)
