@@ -308,7 +308,7 @@ class VisionConfig(Section):
         f"threads, measured once per machine; {_BACKEND} (gripper_force.engines)",
     )
     precision: Literal["float32", "bfloat16"] = Field(
-        "float32", description="arithmetic precision; bfloat16 only with openvino"
+        "float32", description="arithmetic precision; bfloat16 only with openvino, and in `evaluate`"
     )
     threads: int = Field(1, ge=1, le=64, description="CPU threads; more than 1 only help on idle cores")
     region: tuple[int, int, int, int] | None = Field(

@@ -12,6 +12,7 @@ from gripper_force.progress import Progress, no_progress
 from gripper_force.types import Gray
 from gripper_force.vision.batch_inference import predict, stream_features
 from gripper_force.vision.checkpoint import Checkpoint
+from gripper_force.vision.engines import Precision
 from gripper_force.vision.engines.pytorch import restored_threads
 
 
@@ -45,7 +46,10 @@ def estimate_clips(
 
 
 def estimate_frames(
-    checkpoint: Checkpoint, frames: Iterable[Gray], correction: Correction | None
+    checkpoint: Checkpoint,
+    frames: Iterable[Gray],
+    correction: Correction | None,
+    precision: Precision = "float32",
 ) -> npt.NDArray[np.floating]:
     """Returns the ensemble's estimate for each frame of a recording, with one thread: the last digits depend on it.
 
@@ -53,6 +57,7 @@ def estimate_frames(
         checkpoint: The networks, computed on a GPU if there is one and no correction.
         frames: Frames of the checkpoint's size, (S, S) each; they are not kept.
         correction: That of an object profile; None for none.
+        precision: See `stream_features`.
 
     Returns:
         Forces in N, (T,).
@@ -64,7 +69,7 @@ def estimate_frames(
         with restored_threads():
             torch.set_num_threads(1)
             for members_n, features in stream_features(
-                networks, checkpoint.header.preprocess, frames, device
+                networks, checkpoint.header.preprocess, frames, device, precision
             ):
                 mean_n = members_n.mean(0)
                 if correction is not None:

@@ -113,8 +113,9 @@ def evaluate(
         profile: Object profile that corrects the estimates, by name or path; ``own`` for the profile with
             the name of each log's object; None for the configuration's, by default none.
         objects: Only logs of these objects are used; empty for all.
-        config: Its ``vision.region`` replaces the region in each log's own configuration, and its
-            ``calibration.on_mismatch`` applies to profiles of another rig than a log's. Default: the defaults.
+        config: Its ``vision.region`` replaces the region in each log's own configuration, ``vision.precision``
+            ``bfloat16`` rounds the convolutions for more speed, and its ``calibration.on_mismatch`` applies to
+            profiles of another rig than a log's. Default: the defaults.
         include_contact_starts: Also use logs that start in contact. Their reference frames are wrong, and so
             are the estimates.
         workers: Processes to use. Results do not depend on them.
@@ -237,7 +238,7 @@ def _evaluate_log(
     correction = None
     if settings.calibration.object is not None:
         correction = read_correction(own, profiles, loaded, logged.rig_settings())
-    forces_n = estimate_frames(loaded, streamed.frames(), correction)
+    forces_n = estimate_frames(loaded, streamed.frames(), correction, settings.vision.precision)
     clip = streamed.clip(streamed.no_images)
     if starts_in_contact(clip.forces_n, preprocess) and not include_contact_starts:
         return _Evaluated(clip, None)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gripper_force.types import Gray
 from gripper_force.vision.checkpoint import Checkpoint, Member, load_checkpoint
+from gripper_force.vision.engines import Precision
 from gripper_force.vision.network import ForceNetwork
 from gripper_force.vision.preprocess import DIFFERENCE_GAIN, FLAT_STD, Preprocess
 
@@ -88,13 +89,22 @@ def features(
 
 @torch.inference_mode()
 def stream_features(
-    networks: Sequence[Member], preprocess: Preprocess, frames: Iterable[Gray], device: str = "cpu"
+    networks: Sequence[Member],
+    preprocess: Preprocess,
+    frames: Iterable[Gray],
+    device: str = "cpu",
+    precision: Precision = "float32",
 ) -> Iterator[tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]]:
     """Yields `features` of the next `CHUNK` frames or the last ones, and keeps no others.
 
-    Arguments are those of `predict`; ``frames`` may be an iterator.
+    Args:
+        networks: As for `predict`.
+        preprocess: As for `predict`.
+        frames: As for `predict`; they may come from an iterator.
+        device: As for `predict`.
+        precision: Arithmetic of the backbone and attention of a network with windows; all else is float32.
     """
-    yield from _run(networks, _normalised(_batches(frames, torch.device(device)), preprocess))
+    yield from _run(networks, _normalised(_batches(frames, torch.device(device)), preprocess), precision)
 
 
 def _batches(frames: Iterable[Gray], device: torch.device) -> Iterator[Tensor]:
@@ -132,14 +142,14 @@ def prepared_features(
 
 
 def _run(
-    networks: Sequence[Member], batches: Iterable[Tensor]
+    networks: Sequence[Member], batches: Iterable[Tensor], precision: Precision = "float32"
 ) -> Iterator[tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]]:
     """Runs the networks on consecutive batches of a recording's prepared frames, (1, N, 1, S, S) each.
 
     Yields:
         Each member's forces, (M, K), and the members' features, (K, F), of the next `CHUNK` frames or the last ones.
     """
-    readers = [_Reader(network) for network in networks]
+    readers = [_Reader(network, precision) for network in networks]
     for batch in batches:
         for reader in readers:
             reader.push(batch)
@@ -157,8 +167,9 @@ def _read(readers: "Sequence[_Reader]") -> tuple[npt.NDArray[np.float32], npt.ND
 class _Reader:
     """Runs a network on the batches of a stream, and keeps only what the next ones need."""
 
-    def __init__(self, network: Member) -> None:
+    def __init__(self, network: Member, precision: Precision) -> None:
         self._network = network
+        self._rounds = precision == "bfloat16"
         self._parts: list[Tensor] = []
         self._maps: Tensor | None = None
         self._before: Tensor | None = None
@@ -167,10 +178,11 @@ class _Reader:
     def push(self, batch: Tensor) -> None:
         """Runs the network up to its averages, or a network without windows as a whole."""
         if isinstance(self._network, ForceNetwork):
-            part, self._maps = self._network.pooled(batch, self._maps)
+            with torch.autocast(batch.device.type, torch.bfloat16, enabled=self._rounds):
+                part, self._maps = self._network.pooled(batch, self._maps)
         else:
             part = self._network.features(batch)
-        self._parts.append(part[0])
+        self._parts.append(part[0].float())
         self.waiting += batch.shape[1]
 
     def read(self) -> tuple[Tensor, Tensor]:

@@ -9,7 +9,7 @@ import torch
 from typer.testing import CliRunner
 
 from gripper_force import cli, plugins
-from gripper_force.config import load_config
+from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs.dataset import Clip, load_clips
 from gripper_force.jobs.estimates import estimate_clips
@@ -103,6 +103,14 @@ def test_logs_are_evaluated_like_their_clips(
     (few_logs / "damaged.mcap").write_bytes(b"no log")
     with pytest.raises(DataError, match="no log is of cup; there are disc"):
         evaluate(few_logs, tiny_checkpoint, objects=["cup"])
+
+
+def test_bfloat16_rounds_the_estimates_a_little(few_logs: Path) -> None:
+    errors = [
+        evaluate(few_logs, "small", config=Config().with_values(vision={"precision": precision}))
+        for precision in ("float32", "bfloat16")
+    ]
+    assert 0 < abs(errors[0].rmse_n - errors[1].rmse_n) < 0.01 * errors[0].rmse_n
 
 
 def test_a_log_without_frames_is_named(few_logs: Path, tiny_checkpoint: Path) -> None:

@@ -16,7 +16,7 @@ from gripper_force.jobs.dataset import find_logs
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import NS_PER_S
 
-COMMANDS: Final = ("replay", "evaluate")
+COMMANDS: Final = ("replay", "evaluate", "evaluate --set vision.precision=bfloat16")
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,16 +24,18 @@ class ReplayRate:
     """Rate of a command.
 
     Attributes:
-        command: ``replay`` or ``evaluate``.
+        command: One of `COMMANDS`.
         checkpoint: The network. It is not the logs' own, so replays compute it in batches.
         where: ``1 process``, ``N processes`` or ``Ray, N workers``.
         rates: Seconds of log for each second of the command, its start included; one for each round.
+        mae_n: Mean absolute error of vision that `evaluate` found; None for a replay.
     """
 
     command: str
     checkpoint: str
     where: str
     rates: list[float]
+    mae_n: float | None = None
 
 
 def bench(
@@ -67,7 +69,7 @@ def bench(
                 for command in COMMANDS:
                     for where, options in ways.items():
                         call = [
-                            command,
+                            *command.split(),
                             str(folder),
                             "--checkpoint",
                             checkpoint,
@@ -81,16 +83,20 @@ def bench(
                         progress(f"{command}, {checkpoint}, {where}: {rate:.1f} times real time")
                         if result != expected.setdefault((command, checkpoint), result):
                             raise GripperError(f"{command} with {checkpoint} in {where} gave another result")
-    return [ReplayRate(*key, rates) for key, rates in rows.items()]
+    return [
+        ReplayRate(*key, rates, expected[key[:2]]["mae_n"] if key[0].startswith("evaluate") else None)
+        for key, rates in rows.items()
+    ]
 
 
 def markdown(rows: Sequence[ReplayRate], about: str) -> str:
     """Returns the table of the rates, with a sentence about the measurement."""
-    lines = ["| command | network | where | times real time |", "|---|---|---|---|"]
+    lines = ["| command | network | where | times real time | MAE, N |", "|---|---|---|---|---|"]
     for row in rows:
         spread = f" ({min(row.rates):.1f} to {max(row.rates):.1f})" if len(row.rates) > 1 else ""
+        mae = "" if row.mae_n is None else f"{row.mae_n:.4f}"
         lines.append(
-            f"| `{row.command}` | {row.checkpoint} | {row.where} | {median(row.rates):.1f}{spread} |"
+            f"| `{row.command}` | {row.checkpoint} | {row.where} | {median(row.rates):.1f}{spread} | {mae} |"
         )
     return "\n".join([*lines, "", about, ""])
 

@@ -26,7 +26,7 @@ def logs(fused_log: Path, tmp_path: Path) -> Path:
 
 @pytest.mark.filterwarnings("default")  # of Ray
 def test_the_commands_run_in_every_way(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(replay_bench, "COMMANDS", ("replay",))
+    monkeypatch.setattr(replay_bench, "COMMANDS", ("replay", "evaluate --set vision.precision=bfloat16"))
     page = tmp_path / "page.md"
     page.write_text("<!-- rates -->\n<!-- end of rates -->\n")
     call = ["bench", "replay", "--logs", str(logs), "--checkpoint", "small", "--rounds", "1", "--jobs", "2"]
@@ -34,8 +34,12 @@ def test_the_commands_run_in_every_way(logs: Path, tmp_path: Path, monkeypatch: 
     assert done.exit_code == 0, done.output
     rows = json.loads(done.stdout)["replay"]
     with_ray = ["Ray, 2 workers"] if find_spec("ray") else []
-    assert [row["where"] for row in rows] == ["1 process", "2 processes", *with_ray]
+    assert [row["where"] for row in rows] == 2 * ["1 process", "2 processes", *with_ray]
     assert all(row["rates"][0] > 0 for row in rows)
+    assert {row["command"]: row["mae_n"] is None for row in rows} == {
+        "replay": True,
+        "evaluate --set vision.precision=bfloat16": False,
+    }
     assert "| `replay` | small | 2 processes |" in page.read_text()
     assert "2 logs, median of 1 rounds" in page.read_text()
 
@@ -43,11 +47,11 @@ def test_the_commands_run_in_every_way(logs: Path, tmp_path: Path, monkeypatch: 
 def test_the_table_has_the_median_and_the_range_of_the_rounds() -> None:
     rows = [
         ReplayRate("replay", "small", "1 process", [2.0, 3.06, 2.5]),
-        ReplayRate("evaluate", "small", "1 process", [4.0]),
+        ReplayRate("evaluate", "small", "1 process", [4.0], 0.12345),
     ]
     assert replay_bench.markdown(rows, "About it.").splitlines()[2:] == [
-        "| `replay` | small | 1 process | 2.5 (2.0 to 3.1) |",
-        "| `evaluate` | small | 1 process | 4.0 |",
+        "| `replay` | small | 1 process | 2.5 (2.0 to 3.1) |  |",
+        "| `evaluate` | small | 1 process | 4.0 | 0.1235 |",
         "",
         "About it.",
     ]
