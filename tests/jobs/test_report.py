@@ -17,12 +17,13 @@ import gripper_force as gf
 from gripper_force.config import config_from, dump_config
 from gripper_force.errors import LogError
 from gripper_force.jobs import report as report_module
-from gripper_force.jobs.report import data as data_module
 from gripper_force.jobs.report import pictures as pictures_module
+from gripper_force.jobs.report import reading as reading_module
 from gripper_force.jobs.report import write_report
-from gripper_force.jobs.report.data import SOURCES, Run, Series, histogram, read_run
-from gripper_force.jobs.report.figure import CSS_COLOURS, draw, with_gaps
+from gripper_force.jobs.report.figure import CSS_COLOURS, draw, histogram, with_gaps
 from gripper_force.jobs.report.pictures import FrameSampler, Picture, overlay
+from gripper_force.jobs.report.reading import read_run
+from gripper_force.jobs.report.run import SOURCES, Run, Series
 from gripper_force.jobs.score import HoldVision, VisionLoss
 from gripper_force.runtime import log_reader as log_reader_module
 from gripper_force.runtime.log_reader import LogReader
@@ -389,7 +390,7 @@ def test_errors_leave_out_what_no_sample_is_near() -> None:
     estimate_s = np.linspace(0, 10, 601)
     forces = {"load_cell": Series(cell_s, np.array([0.0, 0.0, 5.0, 5.0]))}
     forces["visual"] = Series(estimate_s, np.where(estimate_s < 5, 0.0, 5.0))  # exact where there are samples
-    errors = data_module._errors(forces)["visual"]
+    errors = reading_module._errors(forces)["visual"]
     assert np.abs(errors.value).max() < 0.05  # 50 ms of the line between two samples
     assert 6 <= len(errors.value) <= 9
 

@@ -6,10 +6,10 @@ from pathlib import Path
 from gripper_force.config import Overrides
 from gripper_force.errors import LogError
 from gripper_force.jobs.replay.feed import changed_config, resolve_replay, run_again
-from gripper_force.jobs.report.data import read_run
 from gripper_force.jobs.report.figure import draw, to_svg
 from gripper_force.jobs.report.page import render
 from gripper_force.jobs.report.pictures import FrameSampler
+from gripper_force.jobs.report.reading import read_run
 from gripper_force.runtime.log_reader import LogReader
 
 __all__ = ["ReportPaths", "write_report"]

@@ -14,8 +14,8 @@ from matplotlib.figure import Figure, SubFigure
 from matplotlib.transforms import Bbox
 
 from gripper_force.control.force_loop import tolerance_n
-from gripper_force.jobs.report.data import SOURCES, Floats, Run, Series, histogram
 from gripper_force.jobs.report.pictures import ATTENTION_MAP, Picture
+from gripper_force.jobs.report.run import SOURCES, Floats, Run, Series
 from gripper_force.runtime.log_codecs import INTERVAL_STD
 from gripper_force.types import Phase
 
@@ -347,6 +347,17 @@ def _error(axes: Axes, run: Run) -> None:
 def _curve(axes: Axes, series: Series, **style: Any) -> None:
     drawn = with_gaps(thin(series))
     axes.plot(drawn.t_s, drawn.value, **style)
+
+
+def histogram(values: Floats) -> tuple[Floats, Floats]:
+    """Histogram up to just above the 99.5th percentile; the last bin also counts all larger values.
+
+    Returns:
+        Counts, (30,), and edges, (31,).
+    """
+    top = max(float(np.percentile(values, 99.5)) * 1.15, 1e-3)
+    counts, edges = np.histogram(np.clip(values, 0, top), bins=30, range=(0, top))
+    return counts.astype(np.float64), edges
 
 
 def _histogram(axes: Axes, values_ms: Floats, name: str, colour: str) -> None:

@@ -8,8 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from gripper_force.jobs.report.data import SOURCES, Run
 from gripper_force.jobs.report.figure import WIDTH_COLOURS, Svg, thin
+from gripper_force.jobs.report.run import SOURCES, Run
 
 _MAX_EVENT_ROWS: Final = 300
 

@@ -11,7 +11,7 @@ from matplotlib import colormaps
 
 from gripper_force.config import config_from_text
 from gripper_force.errors import CheckpointError, DataError, UnfamiliarFrameError
-from gripper_force.jobs.report.data import Run
+from gripper_force.jobs.report.run import Run
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.types import GRIPPING, NS_PER_S, Frame, Gray
 from gripper_force.vision.preprocess import downscale

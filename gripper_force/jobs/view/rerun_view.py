@@ -12,8 +12,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from gripper_force.errors import DataError
-from gripper_force.jobs.report.data import SOURCES, request_text
 from gripper_force.jobs.report.figure import WIDTH_COLOURS
+from gripper_force.jobs.report.run import SOURCES, request_text
 from gripper_force.runtime.log_codecs import INTERVAL_STD
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.log_writer import available_ns

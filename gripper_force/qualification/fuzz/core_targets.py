@@ -32,7 +32,7 @@ from gripper_force.jobs.grasp import summarise_grasp
 from gripper_force.jobs.imports.force_table import estimate_tare, read_forces
 from gripper_force.jobs.profile_files import pack
 from gripper_force.jobs.replay import replay
-from gripper_force.jobs.report.data import read_run
+from gripper_force.jobs.report.reading import read_run
 from gripper_force.profiles.correction import Correction, KnownFrames, ProfileArrays, load_correction
 from gripper_force.profiles.object_profile import (
     Interval,

@@ -1,8 +1,7 @@
-"""Data of a report, read from a log in one pass."""
+"""Reader of the run that a report shows, from a log in one pass."""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -13,15 +12,14 @@ from gripper_force.control.state_machine import refused_ns
 from gripper_force.errors import DataError
 from gripper_force.jobs.dataset import CONTACT_N, label_at
 from gripper_force.jobs.replay.feed import Replayed
+from gripper_force.jobs.report.run import EventRow, Floats, Loss, Run, Series, Span, Touch, request_text
 from gripper_force.jobs.score import (
     GraspScore,
-    HoldVision,
     controls_with_vision,
     drop_out_reasons,
     score_grasp,
     vision_in_hold,
 )
-from gripper_force.runtime.backends import is_simulated
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.session import NO_ESTIMATE
 from gripper_force.types import (
@@ -42,6 +40,18 @@ from gripper_force.types import (
     VisualForce,
 )
 
+_KINDS: Final = (
+    VisualForce,
+    FusedForce,
+    GraspStatus,
+    Request,
+    ServoState,
+    ServoCommand,
+    LoadCellSample,
+    Event,
+    Frame,
+)
+
 _CONTROLLER: Final = ("control", "vision")
 """Units of the controller's events."""
 
@@ -50,162 +60,6 @@ _MIN_LOSS_S: Final = 0.1
 
 _BETWEEN_TOUCHES_S: Final = 0.2
 """Time without contact that separates two touches."""
-
-Floats = npt.NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class SourceStyle:
-    """Label and colours of a source of force, on a light and on a dark background."""
-
-    label: str
-    light: str
-    dark: str
-
-
-SOURCES: Final = {
-    "current": SourceStyle("motor current", "#d55e00", "#f08c4a"),
-    "vision": SourceStyle("vision", "#009e73", "#35c79c"),
-    "fused": SourceStyle("fusion", "#0072b2", "#56b4e9"),
-    "load_cell": SourceStyle("load cell", "#1b1f24", "#f2f4f7"),
-}
-"""Sources in drawing order. Hues of Okabe and Ito, which colour-blind readers can distinguish."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Series:
-    """A quantity over time: seconds since the request, (N,), and values in the unit of the quantity, (N,)."""
-
-    t_s: Floats
-    value: Floats
-
-
-@dataclass(frozen=True, slots=True)
-class Span:
-    """A phase of the grasp."""
-
-    start_s: float
-    end_s: float
-    phase: str
-
-
-@dataclass(frozen=True, slots=True)
-class Loss:
-    """A time of the grip in which the force estimate did not use vision, and its reason."""
-
-    start_s: float
-    end_s: float
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class Touch:
-    """A time in contact by the load cell.
-
-    Attributes:
-        start_s: First contact.
-        end_s: Last contact.
-        peak_n: Largest force.
-        mae_n: Mean absolute error by source.
-    """
-
-    start_s: float
-    end_s: float
-    peak_n: float
-    mae_n: dict[str, float]
-
-
-@dataclass(frozen=True, slots=True)
-class EventRow:
-    """A row of the table of phases and events."""
-
-    t_s: float
-    unit: str
-    text: str
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Run:
-    """A run as a report shows it.
-
-    Attributes:
-        name: File name of the log without its suffix.
-        config: Configuration of the run.
-        config_text: The same as YAML.
-        metadata: Versions, digests and other facts.
-        replayed: True if estimates and decisions are those of an open-loop replay with changes.
-        zero_ns: Log time of 0 s: the first grasp request, or the log's start.
-        begin_s: Time of the first record.
-        end_s: Time of the last record.
-        target_n: Target force of the last grasp request; None in a recording without a request.
-        outcome: Last outcome; empty without one.
-        score: Grasp compared with the load cell; None without a hold or a load cell.
-        vision: Use of vision in the hold; None without a hold or without vision.
-        object_gain: Last gain of the object by motor current, and its relative standard deviation; None without one.
-        forces: Force by source; sources that the log lacks are absent.
-        errors: Force minus the load cell's force, by source; only where the load cell gives valid samples.
-        std_n: Claimed standard deviation of the fused estimate.
-        motor: ``current_a``, ``goal_a`` (the largest allowed current), ``width_mm`` and ``temperature_c``, as far as
-            the log has them.
-        reference: Target force, shaped by the ramp.
-        losses: Times of the grip without vision, if it was to be used.
-        touches: Touches by the load cell.
-        phases: Phases in order, without the open ones.
-        event_rows: Requests, phases and events in order.
-        compute_ms: Computing time of each estimate, (N,).
-        camera_age_ms: Age of each frame when it was received, (N,); empty with a simulated camera.
-        latency_ms: Time from the middle of the exposure to the estimate, (N,); empty with a simulated camera.
-    """
-
-    name: str
-    config: Config
-    config_text: str
-    metadata: dict[str, str]
-    replayed: bool
-    zero_ns: int
-    begin_s: float
-    end_s: float
-    target_n: float | None
-    outcome: str
-    score: GraspScore | None
-    vision: HoldVision | None
-    object_gain: tuple[float, float] | None
-    forces: dict[str, Series]
-    errors: dict[str, Series]
-    std_n: Series
-    motor: dict[str, Series]
-    reference: Series
-    losses: list[Loss]
-    touches: list[Touch]
-    phases: list[Span]
-    event_rows: list[EventRow]
-    compute_ms: Floats
-    camera_age_ms: Floats
-    latency_ms: Floats
-
-    @property
-    def object(self) -> str:
-        """Name of the object, for a heading."""
-        return self.config.object.replace("_", " ").capitalize()
-
-    @property
-    def simulated(self) -> bool:
-        """True if the run has a simulated world."""
-        return is_simulated(self.config)
-
-    @property
-    def title(self) -> str:
-        """Object, target, outcome and origin, in one line."""
-        parts = [self.object]
-        if self.target_n is not None:
-            parts.append(f"target {self.target_n:g} N")
-        if self.outcome:
-            parts.append(self.outcome.replace("_", " "))
-        if self.simulated:
-            parts.append("simulated")
-        if self.replayed:
-            parts.append("replayed with changes, open loop")
-        return " · ".join(parts)
 
 
 def read_run(
@@ -226,49 +80,27 @@ def read_run(
         LogError: The log can't be read.
         ConfigError: The log holds a configuration that this version does not understand.
     """
-    records: dict[type, list[Any]] = defaultdict(list)
-    ages_ns = []
-    kinds = (
-        VisualForce,
-        FusedForce,
-        GraspStatus,
-        Request,
-        ServoState,
-        ServoCommand,
-        LoadCellSample,
-        Event,
-        Frame,
-    )
-    for record in log.records(*kinds):
-        if isinstance(record, Frame):
-            ages_ns.append(record.received_ns - record.t_ns)
-            on_frame(record)
-        else:
-            records[type(record)].append(record)
+    records, ages_ns = _records(log, on_frame)
     logged_status = records[GraspStatus]
     if replayed is not None:
         _replace(records, replayed)
+    if config is None:
+        config = config_from_text(log.config, str(log.path))
     vision = [visual for visual in records[VisualForce] if visual.is_familiar]
-    fused, status = records[FusedForce], records[GraspStatus]
-    refused = refused_ns(records[Event])
+    fused, status, events = records[FusedForce], records[GraspStatus], records[Event]
+    refused = refused_ns(events)
     grasps = [r for r in records[Request] if r.kind == RequestKind.GRASP and r.t_ns not in refused]
     zero_ns = grasps[0].t_ns if grasps else log.start_ns
     target_n, begin_ns = (grasps[-1].target_n, grasps[-1].t_ns) if grasps else (None, 0)
-    samples = sorted((s for s in records[LoadCellSample] if s.valid), key=lambda s: s.t_ns)
-    forces = {
-        "current": _series(zero_ns, ((r.t_ns, r.current_n) for r in fused)),
-        "vision": _series(zero_ns, ((r.t_ns, r.force_n) for r in vision)),
-        "fused": _series(zero_ns, ((r.t_ns, r.force_n) for r in fused)),
-        "load_cell": _series(zero_ns, ((r.t_ns, r.force_n) for r in samples)),
-    }
-    forces = {source: series for source, series in forces.items() if len(series.t_s)}
+    of_grasp = [s for s in status if s.t_ns >= begin_ns]
     # An empty log still needs a time axis.
     end_s = (log.start_ns + max(log.duration_ns, NS_PER_MS) - zero_ns) / NS_PER_S
-    if config is None:
-        config = config_from_text(log.config, str(log.path))
+    samples = sorted((s for s in records[LoadCellSample] if s.valid), key=lambda s: s.t_ns)
+    forces = _forces(zero_ns, samples, fused, vision)
     errors = _errors(forces)
     uses_vision = controls_with_vision(config)
-    simulated_camera = config.camera.backend == "simulated"
+    # A simulated camera's latency is a constant, and no measurement.
+    measured = config.camera.backend != "simulated"
     return Run(
         name=log.path.stem,
         config=config,
@@ -279,29 +111,36 @@ def read_run(
         begin_s=(log.start_ns - zero_ns) / NS_PER_S,
         end_s=end_s,
         target_n=target_n,
-        outcome=next((s.outcome for s in reversed(status) if s.outcome and s.t_ns >= begin_ns), ""),
+        outcome=next((s.outcome for s in reversed(of_grasp) if s.outcome), ""),
         score=_score(samples, logged_status, target_n, begin_ns),
-        vision=vision_in_hold([s for s in status if s.t_ns >= begin_ns], fused, vision, records[Event])
-        if uses_vision
-        else None,
-        object_gain=next(
-            ((f.object_gain, f.object_gain_std) for f in reversed(fused) if f.object_gain), None
-        ),
+        vision=vision_in_hold(of_grasp, fused, vision, events) if uses_vision else None,
+        object_gain=_object_gain(fused),
         forces=forces,
         errors=errors,
         std_n=_series(zero_ns, ((r.t_ns, r.std_n) for r in fused)),
         motor=_motor(zero_ns, records[ServoState], records[ServoCommand], status),
         reference=_series(zero_ns, ((s.t_ns, s.reference_n) for s in status)),
-        losses=_losses(zero_ns, status, fused, drop_out_reasons(vision, records[Event]))
-        if uses_vision
-        else [],
+        losses=_losses(zero_ns, status, fused, drop_out_reasons(vision, events)) if uses_vision else [],
         touches=_touches(forces.get("load_cell"), errors),
         phases=_phases(zero_ns, end_s, status),
-        event_rows=_event_rows(zero_ns, records[Request], status, records[Event]),
+        event_rows=_event_rows(zero_ns, records[Request], status, events),
         compute_ms=np.array([v.compute_ms for v in vision]),
-        camera_age_ms=np.array([] if simulated_camera else ages_ns) / NS_PER_MS,
-        latency_ms=np.array([] if simulated_camera else [v.ready_ns - v.t_ns for v in vision]) / NS_PER_MS,
+        camera_age_ms=np.array(ages_ns if measured else []) / NS_PER_MS,
+        latency_ms=np.array([v.ready_ns - v.t_ns for v in vision] if measured else []) / NS_PER_MS,
     )
+
+
+def _records(log: LogReader, on_frame: Callable[[Frame], None]) -> tuple[dict[type, list[Any]], list[int]]:
+    """Returns all records but the frames by type, and each frame's age when it was received, in nanoseconds."""
+    records: dict[type, list[Any]] = defaultdict(list)
+    ages_ns = []
+    for record in log.records(*_KINDS):
+        if isinstance(record, Frame):
+            ages_ns.append(record.received_ns - record.t_ns)
+            on_frame(record)
+        else:
+            records[type(record)].append(record)
+    return records, ages_ns
 
 
 def _replace(records: dict[type, list[Any]], replayed: Replayed) -> None:
@@ -316,21 +155,28 @@ def _replace(records: dict[type, list[Any]], replayed: Replayed) -> None:
         records[Event] = kept + [event for decision in replayed.decisions for event in decision.events]
 
 
-def histogram(values: Floats) -> tuple[Floats, Floats]:
-    """Histogram up to just above the 99.5th percentile; the last bin also counts all larger values.
-
-    Returns:
-        Counts, (30,), and edges, (31,).
-    """
-    top = max(float(np.percentile(values, 99.5)) * 1.15, 1e-3)
-    counts, edges = np.histogram(np.clip(values, 0, top), bins=30, range=(0, top))
-    return counts.astype(np.float64), edges
-
-
 def _series(zero_ns: int, pairs: Iterable[tuple[int, float]]) -> Series:
     values = sorted((pair for pair in pairs if np.isfinite(pair[1])), key=lambda pair: pair[0])
     t_s = np.array([t_ns - zero_ns for t_ns, _ in values], np.float64) / NS_PER_S
     return Series(t_s, np.array([value for _, value in values], np.float64))
+
+
+def _forces(
+    zero_ns: int, samples: list[LoadCellSample], fused: list[FusedForce], vision: list[VisualForce]
+) -> dict[str, Series]:
+    """Returns the force by source, for each source that the log has."""
+    forces = {
+        "current": _series(zero_ns, ((r.t_ns, r.current_n) for r in fused)),
+        "vision": _series(zero_ns, ((r.t_ns, r.force_n) for r in vision)),
+        "fused": _series(zero_ns, ((r.t_ns, r.force_n) for r in fused)),
+        "load_cell": _series(zero_ns, ((r.t_ns, r.force_n) for r in samples)),
+    }
+    return {source: series for source, series in forces.items() if len(series.t_s)}
+
+
+def _object_gain(fused: list[FusedForce]) -> tuple[float, float] | None:
+    """Returns the last gain of the object, and its relative standard deviation; None without one."""
+    return next(((f.object_gain, f.object_gain_std) for f in reversed(fused) if f.object_gain), None)
 
 
 def _motor(
@@ -440,8 +286,3 @@ def _event_rows(
     entries += [(e.t_ns, e.unit, e.text) for e in events]
     entries.sort(key=lambda entry: entry[0])
     return [EventRow((t_ns - zero_ns) / NS_PER_S, unit, text) for t_ns, unit, text in entries]
-
-
-def request_text(request: Request) -> str:
-    """Returns a request in words."""
-    return f"{request.kind} at {request.target_n:g} N" if request.kind == RequestKind.GRASP else request.kind
