@@ -2,27 +2,21 @@
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol
-
-import numpy as np
+from typing import Any, Final, NamedTuple, Protocol
 
 from gripper_force.config import Config, Overrides, config_from_text
 from gripper_force.control.state_machine import Decision
-from gripper_force.errors import GripperError, UnfamiliarFrameError
+from gripper_force.jobs.replay.estimates import estimates_by_frame, estimates_in_batches
 from gripper_force.profiles.apply import read_correction, read_profiles
 from gripper_force.runtime.log_reader import LogReader
-from gripper_force.runtime.perception import FrameProcessor
-from gripper_force.runtime.process import allowed
-from gripper_force.runtime.resolve import ResolvedConfig, make_controller, make_estimator, resolve_vision
+from gripper_force.runtime.resolve import ResolvedConfig, make_controller, resolve_vision
 from gripper_force.types import (
-    ForceEstimate,
     Frame,
     FusedForce,
     GraspStatus,
-    Gray,
     LoadCellSample,
     Record,
     Request,
@@ -30,10 +24,6 @@ from gripper_force.types import (
     ServoState,
     VisualForce,
 )
-
-if TYPE_CHECKING:  # a log without vision needs no estimator
-    from gripper_force.vision.engines import Floats
-    from gripper_force.vision.estimator import ForceEstimator
 
 
 @dataclass(frozen=True)
@@ -155,7 +145,7 @@ def feed(reader: LogReader, resolved: ResolvedConfig, sink: Sink, *, in_batches:
     fused = _Pairs(lambda f: f, lambda a, b: abs(a.force_n - b.force_n))
     status = _Pairs(lambda s: s)
     pairs_of = {VisualForce: estimates, ServoCommand: commands, FusedForce: fused, GraspStatus: status}
-    estimated = _in_batches if in_batches and resolved.model is not None else _frame_by_frame
+    estimated = estimates_in_batches if in_batches and resolved.model is not None else estimates_by_frame
     for record, estimate in estimated(reader.records(), resolved):
         if isinstance(record, Frame):
             if estimate is not None:
@@ -242,104 +232,6 @@ class _Pairs:
             self._same, self._ended = False, True
             self._logged.clear()
             self._again.clear()
-
-
-def _frame_by_frame(
-    records: Iterable[Record], resolved: ResolvedConfig
-) -> Iterator[tuple[Record, VisualForce | None]]:
-    """Yields each record, with the estimate of a frame."""
-    processor = FrameProcessor(make_estimator(resolved))
-    for record in records:
-        yield record, processor.process(record).visual if isinstance(record, Frame) else None
-
-
-def _in_batches(
-    records: Iterable[Record], resolved: ResolvedConfig
-) -> Iterator[tuple[Record, VisualForce | None]]:
-    """Yields the records with their estimates, computed many frames at a time. Frames are empty."""
-    import torch
-
-    from gripper_force.vision.batch_inference import BATCH, kept_checkpoint, prepared_features
-    from gripper_force.vision.engines import StepOutput
-    from gripper_force.vision.engines.pytorch import TorchEngine, restored_threads
-    from gripper_force.vision.estimator import ForceEstimator
-
-    assert resolved.model is not None
-    vision, checkpoint = resolved.config.vision, kept_checkpoint(resolved.model.path, resolved.model.digest)
-    engine = TorchEngine(checkpoint, threads=vision.threads if allowed().torch_threads else None)
-    estimator = ForceEstimator(engine, vision.region, resolved.correction)
-    preparation = _Preparation(estimator)
-    processor = FrameProcessor(preparation)
-    waiting: deque[tuple[Record, VisualForce | None, int]] = deque()  # the last: inputs up to the record
-
-    def batches() -> "Iterator[Floats]":
-        """Reads records until there are frames enough."""
-        inputs, count = preparation.inputs, 0
-        for record in records:
-            visual, before = None, len(inputs)
-            if isinstance(record, Frame):
-                visual = processor.process(record).visual
-                record = replace(record, gray=_NO_IMAGE)
-            count += len(inputs) - before
-            waiting.append((record, visual, count))
-            while len(inputs) >= BATCH["cpu"]:
-                yield np.stack(inputs[: BATCH["cpu"]])  # (N, S, S)
-                del inputs[: BATCH["cpu"]]
-        if inputs:
-            yield np.stack(inputs)
-
-    chunks = prepared_features(checkpoint.networks, batches())
-    works, done = False, 0
-    while True:
-        with restored_threads():
-            torch.set_num_threads(1)  # the last digits depend on their number
-            forces_n, features = next(chunks, (_NOTHING, _NOTHING))  # (M, K), (K, F)
-        known = done + len(features)
-        while waiting and waiting[0][2] <= known:
-            record, visual, count = waiting.popleft()
-            if visual is not None and visual.is_familiar:  # the network has not run on covered frames
-                try:
-                    last = count - 1 - done
-                    estimate = estimator.finish(StepOutput(forces_n[:, last], features[last], None))
-                    visual = replace(visual, force_n=estimate.force_n, std_n=estimate.std_n)
-                except GripperError as error:  # as `FrameProcessor` treats it
-                    if not works:
-                        raise
-                    if isinstance(error, UnfamiliarFrameError):
-                        visual = replace(visual, force_n=error.force_n, std_n=math.inf)
-                    else:
-                        visual = None
-                works = True
-            yield record, visual
-        if not len(features):
-            return
-        done = known
-
-
-class _Preparation:
-    """Takes the place of an estimator in `FrameProcessor`, and only prepares the frames for the networks."""
-
-    def __init__(self, estimator: "ForceEstimator") -> None:
-        self._estimator = estimator
-        self.inputs: list[Floats] = []
-
-    def update(self, gray: Gray) -> ForceEstimate | None:
-        """Prepares the next frame; returns None while the reference is being collected."""
-        ready = self._estimator.prepare(gray)
-        self.inputs += ready
-        return _UNKNOWN if ready else None
-
-    def attention_map(self) -> None:
-        """Returns None: nothing was computed yet."""
-
-
-_UNKNOWN: Final = ForceEstimate(math.nan, math.nan)
-
-
-_NO_IMAGE: Final = np.zeros((0, 0), np.uint8)
-
-
-_NOTHING: Final = np.zeros((0, 0), np.float32)
 
 
 def has_faulty_estimates(config: Config) -> bool:
