@@ -1,8 +1,9 @@
 """Commands that make logs: `simulate`, `record`, `import video` and `import database`."""
 
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -10,6 +11,9 @@ from gripper_force.cli import console
 from gripper_force.cli.options import CORES, AsJson, ConfigPath, Jobs, Overrides, Ray, load_settings
 from gripper_force.cli.output.data import database_table, imports_table, sets_table
 from gripper_force.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    from gripper_force.jobs.simulate import Kind, SimulationPlan
 
 import_app = typer.Typer(no_args_is_help=True, help="Convert other recordings to logs.")
 
@@ -66,40 +70,29 @@ def simulate(
     """Simulate logs of random touches, for training and evaluation. Continues if it was interrupted."""
     from gripper_force.jobs import paper_protocol
     from gripper_force.jobs import simulate as job
-    from gripper_force.jobs.grasp import PAPER_OBJECTS
-    from gripper_hw.sim.kinds import held_out_kinds, training_kinds
 
     plans: list[job.Plan]
     if protocol is None:
-        for name, value in (("--scale", scale), ("--instances", instances)):
-            if value is not None:
-                raise ConfigError(
-                    f"{name} only applies with --protocol; add --protocol shin2019, or omit {name}"
-                )
-        settings = load_settings(config, set_, {})
-        seed, plans = 100_000 if first_seed is None else first_seed, []
-        groups = {"training-kinds": training_kinds, "held-out-kinds": held_out_kinds}
-        objects = tuple(
-            name
-            for given in object_ or PAPER_OBJECTS
-            for name in (groups[given]() if given in groups else (given,))
+        _refuse(
+            {"--scale": scale, "--instances": instances},
+            "can only be used with --protocol; add --protocol shin2019, or leave this out",
         )
-        plans += job.plan("press", 200 if presses is None else presses, seed, objects)
-        plans += job.plan("tap", taps or 0, seed + len(plans), objects)
-        plans += job.plan("grasp", 20 if grasps is None else grasps, seed + len(plans), objects)
+        settings = load_settings(config, set_, {})
+        counts: dict[job.Kind, int] = {
+            "press": 200 if presses is None else presses,
+            "tap": taps or 0,
+            "grasp": 20 if grasps is None else grasps,
+        }
+        plans = [*_plans(counts, 100_000 if first_seed is None else first_seed, object_)]
     elif protocol == "shin2019":
-        given = {
+        own = {
             "--presses": presses,
             "--taps": taps,
             "--grasps": grasps,
             "--first-seed": first_seed,
             "--object": object_,
         }
-        if unused := [name for name, value in given.items() if value is not None]:
-            raise ConfigError(
-                f"{' and '.join(unused)} can't be combined with --protocol, whose sets are fixed; omit one of "
-                "them"
-            )
+        _refuse(own, "can't be combined with --protocol, whose sets are fixed; omit one of them")
         settings = load_settings(config, [f"camera.rate_hz={paper_protocol.RATE_HZ}", *(set_ or [])], {})
         plans = list(paper_protocol.plan_protocol(scale or "full", instances or "same"))
     else:
@@ -119,6 +112,27 @@ def simulate(
         console.next_step("train", folder, "--out", "force.safetensors")
     else:
         console.next_step("reproduce", "3", "--data", folder)
+
+
+def _refuse(options: Mapping[str, object], problem: str) -> None:
+    """Raises `ConfigError` if one of the options is given."""
+    if given := [name for name, value in options.items() if value is not None]:
+        raise ConfigError(f"{' and '.join(given)} {problem}")
+
+
+def _plans(counts: "Mapping[Kind, int]", seed: int, given: list[str] | None) -> "Iterator[SimulationPlan]":
+    """Yields the logs of each kind in turn, with the given objects and groups, or the paper's objects."""
+    from gripper_force.jobs.grasp import PAPER_OBJECTS
+    from gripper_force.jobs.simulate import plan
+    from gripper_hw.sim.kinds import held_out_kinds, training_kinds
+
+    groups = {"training-kinds": training_kinds, "held-out-kinds": held_out_kinds}
+    objects: list[str] = []
+    for name in given or PAPER_OBJECTS:
+        objects += groups[name]() if name in groups else (name,)
+    for kind, count in counts.items():
+        yield from plan(kind, count, seed, tuple(objects))
+        seed += count
 
 
 def record(

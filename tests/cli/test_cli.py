@@ -646,7 +646,7 @@ def test_a_protocol_and_its_scale_are_known_by_name(run: Run) -> None:
     ("args", "sentence"),
     [
         (["--scale", "small"], "add --protocol shin2019"),
-        (["--instances", "redrawn"], "--instances only applies with --protocol"),
+        (["--instances", "redrawn"], "--instances can only be used with --protocol"),
         (["--protocol", "shin2019", "--presses", "9"], "--presses can't be combined"),
         (["--protocol", "shin2019", "--grasps", "0", "--first-seed", "7"], "--grasps and --first-seed can't"),
         (["--protocol", "shin2019", "--object", "tube"], "--object can't be combined"),

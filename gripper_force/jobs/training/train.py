@@ -131,25 +131,33 @@ def train(
             _save(out, networks, config, data, forces_n, measured_n, float(labels_n.mean()))
             _add_ood(out, networks, held_out, process.device, warn)
             if figure:
-                lead_in = config.preprocess.lead_in
-                draw_training(
-                    {
-                        f"{i}, {t.network.config.attention}": np.array(t.losses).reshape(-1, 2)
-                        for i, t in enumerate(trainers, 1)
-                    },
-                    measured_n,
-                    forces_n,
-                    np.concatenate(
-                        [np.full(int(clip.valid[lead_in:].sum()), clip.object) for clip in held_out]
-                    ),
-                    float(labels_n.std()),
-                    f"{out.name}: MAE {metrics.mae(forces_n, measured_n):.3f} N on validation data",
-                    out.with_suffix(".png"),
-                )
+                _draw(out, trainers, config, held_out, forces_n, measured_n, float(labels_n.std()))
             for state in states:
                 state.unlink()
         process.wait()
         return load_checkpoint(out)
+
+
+def _draw(
+    out: Path,
+    trainers: Sequence[Trainer],
+    config: TrainConfig,
+    clips: Sequence[Clip],
+    forces_n: npt.NDArray[np.float32],
+    measured_n: npt.NDArray[np.float32],
+    constant_rmse_n: float,
+) -> None:
+    """Draws the training error, and the estimates of the labelled frames of the validation clips."""
+    losses = {
+        f"{i}, {trainer.network.config.attention}": np.array(trainer.losses).reshape(-1, 2)
+        for i, trainer in enumerate(trainers, 1)
+    }
+    labelled = [clip.labelled(config.preprocess.lead_in) for clip in clips]
+    objects = np.concatenate(
+        [np.full(int(mask.sum()), clip.object) for clip, mask in zip(clips, labelled, strict=True)]
+    )
+    title = f"{out.name}: MAE {metrics.mae(forces_n, measured_n):.3f} N on validation data"
+    draw_training(losses, measured_n, forces_n, objects, constant_rmse_n, title, out.with_suffix(".png"))
 
 
 def _add_ood(
@@ -265,24 +273,43 @@ def _trained(
         if resume:
             trainer.restore(state, identity)
         process.check_equal(f"{identity} {trainer.done}", "recipes, data or states")
-        saved = time.monotonic()
-        reported = 0
-        for rmse_n in trainer.steps():
-            done = int(PROGRESS_STEPS * min(1.0, trainer.done))
-            progress(f"{config.attentions[member]}: RMSE {rmse_n:.3f} N", done - reported)
-            reported = done
-            if process.first and time.monotonic() - saved > STATE_EVERY_S:
-                trainer.save(state, identity)
-                saved = time.monotonic()
-        progress(f"{config.attentions[member]}: done", PROGRESS_STEPS - reported)
-        trainer.network.eval()
-        if process.first:
+        _run(trainer, config.attentions[member], state, identity, process, progress)
+    _warn_of_a_short_training(config, trainers, int(batches.unseen.sum()), len(clips), warn)
+    return trainers
+
+
+def _run(
+    trainer: Trainer,
+    name: str,
+    state: Path,
+    identity: str,
+    process: TrainingProcess,
+    progress: Progress,
+) -> None:
+    """Makes all steps of a network's training; saves its state every minute and at the end."""
+    saved = time.monotonic()
+    reported = 0
+    for rmse_n in trainer.steps():
+        done = int(PROGRESS_STEPS * min(1.0, trainer.done))
+        progress(f"{name}: RMSE {rmse_n:.3f} N", done - reported)
+        reported = done
+        if process.first and time.monotonic() - saved > STATE_EVERY_S:
             trainer.save(state, identity)
-    unseen = int(batches.unseen.sum())
+            saved = time.monotonic()
+    progress(f"{name}: done", PROGRESS_STEPS - reported)
+    trainer.network.eval()
+    if process.first:
+        trainer.save(state, identity)
+
+
+def _warn_of_a_short_training(
+    config: TrainConfig, trainers: Sequence[Trainer], unseen: int, clips: int, warn: Callable[[str], None]
+) -> None:
+    """Warns if no part of ``unseen`` of the ``clips`` was drawn, or if there were few steps."""
     length = next(key for key in ("minutes", "epochs", "steps") if getattr(config, key) is not None)
     if unseen:
         warn(
-            f"the training was too short: it drew no clip from {unseen} of its {len(clips)} recordings; "
+            f"the training was too short: it drew no clip from {unseen} of its {clips} recordings; "
             f"increase {length}"
         )
     elif (fewest := min(trainer.step for trainer in trainers)) < MIN_STEPS:
@@ -290,4 +317,3 @@ def _trained(
             f"the training made only {fewest} steps; a network needs at least {MIN_STEPS}, so increase {length} or, "
             "with a few recordings, use --recipe few"
         )
-    return trainers
