@@ -4,7 +4,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 EGL_PACKAGES := libegl1 libegl-mesa0 libgl1-mesa-dri libopengl0
-PIP := $(BIN)/pip install --quiet --disable-pip-version-check
+# Python compiles each module when it is first imported. Compiling all of them here takes longer than the installation.
+PIP := $(BIN)/pip install --quiet --disable-pip-version-check --no-compile
 # PyPI's PyTorch for Linux brings 4 GB of CUDA libraries. Where this index can't be reached, pip's own has to do.
 CPU_INDEX := https://download.pytorch.org/whl/cpu
 TORCH := $(shell grep -om1 'torch>=[^"]*' pyproject.toml)
@@ -38,7 +39,7 @@ LEROBOT ?= 0.4.4
 LEROBOT_VENV := .venv-lerobot-$(LEROBOT)
 test-lerobot:
 	test -x $(LEROBOT_VENV)/bin/pip || $(PYTHON) -m venv $(LEROBOT_VENV)
-	$(LEROBOT_VENV)/bin/pip install --quiet --disable-pip-version-check \
+	$(LEROBOT_VENV)/bin/pip install --quiet --disable-pip-version-check --no-compile \
 		--editable '.[dev,lerobot,oak,report,sim,train]' \
 		--editable integrations/lerobot_robot_gripper_force --editable integrations/lerobot_camera_oak \
 		lerobot==$(LEROBOT)
