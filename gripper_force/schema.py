@@ -1,5 +1,6 @@
 """Shared base of YAML-backed models: base class, number types, loading, and error messages."""
 
+import re
 from collections.abc import Hashable, Iterator
 from difflib import get_close_matches
 from inspect import isclass
@@ -46,7 +47,7 @@ class Section(BaseModel):
     def _checked(cls, value: Any, validate: ValidatorFunctionWrapHandler) -> Any:
         valid = validate(value)
         if isinstance(value, bool) and isinstance(valid, int | float) and not isinstance(valid, bool):
-            raise ValueError("it is a number, and YAML reads on and yes as true")  # noqa: TRY004  # as pydantic needs
+            raise ValueError("it is a number, not true or false")  # noqa: TRY004  # as pydantic needs
         return Path(expanduser(valid)) if isinstance(valid, Path) else valid  # noqa: PTH111  # that one may raise
 
     def filled(self, **values: Any) -> Self:
@@ -57,7 +58,20 @@ class Section(BaseModel):
 S = TypeVar("S", bound=Section)
 
 _NO_YAML = (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, RecursionError)
-"""Exceptions of the YAML parser, among others for a date 2001-99-99, a number 0b, and a tag !!bool x."""
+"""Exceptions of the YAML parser, among others for a date !!timestamp 2001-99-99, and a tag !!bool x."""
+
+_SCALARS = {
+    "bool": "true|True|TRUE|false|False|FALSE",
+    "int": "[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+",
+    "float": r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+    "null": "~|null|Null|NULL|",
+    "merge": "<<",
+}
+"""Patterns of values without quotes that are no text, by tag.
+
+They are those of YAML 1.2's core schema (https://yaml.org/spec/1.2.2/#103-core-schema) and ``<<``. PyYAML's are those
+of YAML 1.1, where 010 is 8, 1:30 is 90, and 1e-3 is text.
+"""
 
 
 def as_path(path: object, what: str, remedy: str = "name a file") -> Path:
@@ -87,7 +101,12 @@ def tree_from(text: str, where: str, what: str = "configuration") -> Tree:
 
 def dump(section: Section) -> str:
     """A complete section as YAML."""
-    return yaml.safe_dump(section.model_dump(mode="json"), sort_keys=False)
+    return to_yaml(section.model_dump(mode="json"))
+
+
+def to_yaml(value: Any, **options: Any) -> str:
+    """A value as YAML, with the options of ``yaml.dump``. Text that any YAML reads as a number is in quotes."""
+    return yaml.dump(value, Dumper=_Dumper, sort_keys=False, **options)
 
 
 def assign(tree: Tree, assignment: str) -> None:
@@ -169,8 +188,14 @@ def keys(section: type[Section], under: str = "") -> Iterator[tuple[str, FieldIn
             yield f"{under}{name}", field
 
 
+class _Dumper(yaml.SafeDumper):
+    """YAML writer, for readers of YAML 1.1 and 1.2."""
+
+
 class _Loader(yaml.SafeLoader):
-    """YAML loader that refuses a key that occurs twice: the first one would be lost."""
+    """YAML 1.2 loader that refuses a key that occurs twice: the first one would be lost."""
+
+    yaml_implicit_resolvers: ClassVar[dict[str, list[Any]]] = {}  # in place of those of YAML 1.1
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         names = [key.value for key, _ in node.value]
@@ -179,6 +204,16 @@ class _Loader(yaml.SafeLoader):
                 problem = f"the key {key.value!r} occurs twice; join its two parts"
                 raise yaml.constructor.ConstructorError(None, None, problem, key.start_mark)
         return super().construct_mapping(node, deep)
+
+    def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
+        text = str(self.construct_scalar(node))
+        return int(text, 0 if text[:2] in ("0o", "0x") else 10)
+
+
+_Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
+for _tag, _pattern in _SCALARS.items():
+    for _kind in (_Dumper, _Loader):
+        _kind.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"({_pattern})$"), None)
 
 
 def _parse(text: str, what_fails: str) -> Any:

@@ -7,13 +7,11 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Final, Self
 
-import yaml
-
 from gripper_calibration.setup.step import ANSWERED, Found
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError
 from gripper_force.jobs.profile_files import write_all
-from gripper_force.schema import Tree, assign, assign_value, read_tree
+from gripper_force.schema import Tree, assign, assign_value, read_tree, to_yaml
 
 FORMAT: Final = "gripper-force-setup/1"
 _COMMENT_COLUMN: Final = 44
@@ -223,6 +221,6 @@ def _lines(tree: Tree, origins: Mapping[str, str], order: list[str], under: str 
         if isinstance(value, dict) and value:
             lines += [f"{indent}{name}:", *_lines(value, origins, [], f"{under}{name}.")]
             continue
-        text = yaml.safe_dump(value, default_flow_style=True, width=10_000).removesuffix("...\n").strip()
+        text = to_yaml(value, default_flow_style=True, width=10_000).removesuffix("...\n").strip()
         lines.append(f"{f'{indent}{name}: {text}':{_COMMENT_COLUMN}}  # {origins[f'{under}{name}']}")
     return lines

@@ -3,11 +3,9 @@
 import math
 import re
 from functools import cache
-from importlib import resources
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Self, TypedDict
 
-import yaml
 from pydantic import Field, model_validator
 
 from gripper_force.errors import ConfigError
@@ -22,7 +20,7 @@ CURRENT_BASED_POSITION_MODE: Final = 5
 CYCLE_WINDOW_BYTES: Final = 20  # of indirect data that a cycle reads and writes
 
 _TICKS_PER_RAD: Final = TICKS_PER_REV / (2 * math.pi)
-_FOLDER: Final = resources.files("gripper_hw.dynamixel") / "servos"
+_FOLDER: Final = Path(__file__).with_name("servos")
 _SHARED: Final = "x_series.yaml"
 
 
@@ -207,7 +205,7 @@ def _shipped_model(name: str) -> ServoModel:
         raise ConfigError(
             f"unknown servo.model {name!r}; use one of {', '.join(model_names())}, or the path of a YAML file"
         )
-    return _model(name, _load(f"{name}.yaml"), name)
+    return _model(name, read_tree(_FOLDER / f"{name}.yaml"), name)
 
 
 def _model(name: str, tree: Tree, where: str) -> ServoModel:
@@ -251,13 +249,9 @@ class _SharedFile(TypedDict):
     without_current_control: dict[str, int]
 
 
-def _load(file_name: str) -> Any:
-    return yaml.safe_load((_FOLDER / file_name).read_text(encoding="utf-8"))
-
-
 @cache
 def _shared() -> _SharedFile:
-    shared: _SharedFile = _load(_SHARED)
+    shared: Any = read_tree(_FOLDER / _SHARED)
     return shared
 
 

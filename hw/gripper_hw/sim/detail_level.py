@@ -7,10 +7,9 @@ gives the same log everywhere.
 from pathlib import Path
 from typing import Final
 
-import yaml
-
 from gripper_force.config import BudgetConfig, Config
 from gripper_force.errors import ConfigError
+from gripper_force.schema import read_tree, to_yaml
 
 _TABLE: Final = Path(__file__).with_name("detail_level.yaml")
 _HEADER: Final = "# Made by `gripper-force bench scene --write docs/simulation.md`. Do not edit by hand.\n"
@@ -21,7 +20,7 @@ Levels = dict[str, dict[str, float]]
 
 def write_table(table: dict[str, Levels]) -> None:
     """Writes the shipped table; its keys are names of objects."""
-    _TABLE.write_text(_HEADER + yaml.safe_dump(table, sort_keys=False), encoding="utf-8")
+    _TABLE.write_text(_HEADER + to_yaml(table), encoding="utf-8")
 
 
 def resolve_detail(config: Config) -> tuple[Config, str]:
@@ -35,7 +34,7 @@ def resolve_detail(config: Config) -> tuple[Config, str]:
     """
     if config.sim.detail != "auto":
         return config, ""
-    table: dict[str, Levels] = yaml.safe_load(_TABLE.read_text(encoding="utf-8"))
+    table: dict[str, Levels] = read_tree(_TABLE)
     if config.object not in table:
         raise ConfigError(
             f"sim.detail=auto has no data of {config.object!r}, only of {', '.join(table)}; "
