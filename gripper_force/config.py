@@ -727,11 +727,7 @@ def load_config(
         ConfigError: A file, key or value is wrong. The message names it.
     """
     where = str(path) if path else "--set"
-    tree = (
-        {}
-        if path is None
-        else read_tree(as_path(path, "the configuration", "pass keys and values as overrides"))
-    )
+    tree = {} if path is None else read_tree(as_path(path, "the configuration", "or pass keys and values"))
     if "format" in tree:
         raise ConfigError(
             f"{path} is a {tree['format']} file, not a configuration; pass a rig profile with --set "

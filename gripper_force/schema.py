@@ -1,7 +1,7 @@
 """Shared base of YAML-backed models: base class, number types, loading, and error messages."""
 
 import re
-from collections.abc import Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from difflib import get_close_matches
 from inspect import isclass
 from math import isclose
@@ -11,14 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self, TypeVar, get_args
 
 import yaml
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    ValidationError,
-    ValidatorFunctionWrapHandler,
-    field_validator,
-)
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 from pydantic.fields import FieldInfo
 
 from gripper_force.errors import ConfigError
@@ -44,7 +37,7 @@ class Section(BaseModel):
 
     @field_validator("*", mode="wrap")
     @classmethod
-    def _checked(cls, value: Any, validate: ValidatorFunctionWrapHandler) -> Any:
+    def _checked(cls, value: Any, validate: Callable[[Any], Any]) -> Any:
         valid = validate(value)
         if isinstance(value, bool) and isinstance(valid, int | float) and not isinstance(valid, bool):
             raise ValueError("it is a number, not true or false")  # noqa: TRY004  # as pydantic needs

@@ -14,14 +14,7 @@ from gripper_force.config import ControlConfig
 from gripper_force.control.current_estimate import FREE_FLOOR_N, CurrentEstimate, combined_variance_n2
 from gripper_force.control.object_gain import KIND_STD, ObjectGain
 from gripper_force.control.transmission import Transmission
-from gripper_force.types import (
-    NS_PER_MS,
-    EstimateSource,
-    Event,
-    FusedForce,
-    ServoState,
-    VisualForce,
-)
+from gripper_force.types import NS_PER_MS, EstimateSource, Event, FusedForce, ServoState, VisualForce
 
 _DRIFT_N2_S = 0.03**2
 """Growth of the bias variance per second: friction drifts."""

@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from gripper_force.types import Gray
 from gripper_force.vision.checkpoint import Checkpoint, Member, load_checkpoint
 from gripper_force.vision.engines import Precision
-from gripper_force.vision.network import ForceNetwork
+from gripper_force.vision.network import ForceNetwork, LastStepBlstm, lstm_cell
 from gripper_force.vision.preprocess import DIFFERENCE_GAIN, FLAT_STD, Preprocess
 
 BATCH = {"cpu": 32, "cuda": 256}
@@ -194,5 +195,27 @@ class _Reader:
             before = features[:1].expand(earlier, -1) if self._before is None else self._before
             pooled = torch.cat([before, features])
             self._before = pooled[len(pooled) - earlier :]
-            features = self._network.read_pooled(pooled)
+            features = torch.tanh(
+                self._network.dense(_over_windows(self._network.blstm, pooled, earlier + 1))
+            )
         return self._network.force_n(features), features
+
+
+def _over_windows(blstm: LastStepBlstm, vectors: Tensor, window: int) -> Tensor:
+    """Returns the output of ``blstm`` for each window of a sequence, (T - window + 1, 2*hidden).
+
+    The products with the input weights are computed once for each vector, not for each window that contains it.
+
+    Args:
+        blstm: The layer.
+        vectors: The sequence, (T, F).
+        window: Length of the windows.
+    """
+    input_weight, hidden_weight, input_bias, hidden_bias = blstm.forward_lstm.all_weights[0]
+    from_input = F.linear(vectors, input_weight, input_bias + hidden_bias)  # (T, 4*hidden)
+    count = len(vectors) - window + 1
+    hidden = cell = vectors.new_zeros(count, blstm.forward_lstm.hidden_size)
+    for k in range(window):
+        gates = torch.addmm(from_input[k : k + count], hidden, hidden_weight.t())  # (count, 4*hidden)
+        hidden, cell = lstm_cell(gates, cell)
+    return torch.cat([hidden, blstm.backward_output(vectors[window - 1 :])], dim=1)

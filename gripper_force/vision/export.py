@@ -20,7 +20,7 @@ from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.engines import Engine, Floats, StepOutput, open_engine
 from gripper_force.vision.engines.pytorch import TorchEngine, restored_threads
 from gripper_force.vision.ensemble_step import FRAME, EnsembleStep, state_names
-from gripper_force.vision.header import EXPORTED, KEY, Model, exported_metadata
+from gripper_force.vision.header import EXPORTED, KEY, Model
 from gripper_force.vision.model_files import WEIGHTS, cache_folder, weights_digest
 from gripper_force.vision.preprocess import Normaliser
 
@@ -109,7 +109,7 @@ def _save_onnx(model: Model, path: Path) -> None:
         output_names=step.outputs,
     )
     assert program is not None
-    for name, text in exported_metadata(model).items():
+    for name, text in _metadata(model).items():
         program.model.metadata_props[f"{KEY}.{name}"] = text
     program.save(str(path))
 
@@ -135,7 +135,7 @@ def save_openvino(network: Any, model: Model, path: Path) -> None:
     """Writes a network of OpenVINO with a model's header and digest, and the digest of its weights."""
     import openvino
 
-    for name, text in exported_metadata(model).items():
+    for name, text in _metadata(model).items():
         network.set_rt_info(text, [KEY, name])
     openvino.save_model(network, path, compress_to_fp16=False)
     network.set_rt_info(weights_digest(path), [KEY, WEIGHTS])
@@ -215,3 +215,8 @@ def _quiet() -> Iterator[None]:
     finally:
         for name, level in levels.items():
             logging.getLogger(name).setLevel(level)
+
+
+def _metadata(model: Model) -> dict[str, str]:
+    """Returns the metadata of a file exported from a model."""
+    return {"header": model.header.model_dump_json(exclude_none=True), "digest": model.digest}

@@ -148,19 +148,11 @@ class FrameChecks:
         right, down = (
             cv2.Sobel(self._smooth, cv2.CV_32F, *axis, scale=-side / 8) for axis in ((1, 0), (0, 1))
         )
-        parts = (
-            right,
-            down,
-            (right * x + down * y) / 2,
-            np.ones_like(x),
-            self._smooth - self._smooth.mean(),
-            x,
-            y,
-        )
+        zoom = (right * x + down * y) / 2
+        parts = (right, down, zoom, np.ones_like(x), self._smooth - self._smooth.mean(), x, y)
         self._directions = np.stack([_sampled(part) for part in parts], axis=1)  # (N, 7)
-        self._weighted = np.empty_like(
-            self._directions
-        )  # a new array for each step would take longer than the step
+        # A new array for each step would take longer than the step.
+        self._weighted = np.empty_like(self._directions)
         # A direction that no texture shows stays at zero.
         self._prior = np.diag(np.array([side**2] * 3 + [1] * 4, np.float32) * len(self._directions) / 400)
 

@@ -281,11 +281,6 @@ def header_from(text: str, path: Path) -> Header:
         ) from error
 
 
-def exported_metadata(model: Model) -> dict[str, str]:
-    """Returns the metadata of a file exported from a model."""
-    return {"header": model.header.model_dump_json(exclude_none=True), "digest": model.digest}
-
-
 def digest_of(data: bytes, header: Header) -> str:
     """Returns the digest by which object profiles know a checkpoint.
 

@@ -14,7 +14,6 @@ from typing import Final, NamedTuple, Self
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from torch.utils.flop_counter import FlopCounterMode
 
 from gripper_force.vision.attention import Cbam, ChannelAttention, SpatialAttention, SqueezeExcitation
 from gripper_force.vision.backbones import Backbone, Mobile, ResNet18, Vgg
@@ -42,7 +41,7 @@ class LastStepBlstm(nn.Module):
     def forward(self, windows: Tensor) -> Tensor:
         """Maps windows (N, L, F) to the last step's two hidden states (N, 2*hidden)."""
         forward_hidden = self.forward_lstm(windows)[0][:, -1]  # (N, hidden)
-        return torch.cat([forward_hidden, self._backward(windows[:, -1])], dim=1)
+        return torch.cat([forward_hidden, self.backward_output(windows[:, -1])], dim=1)
 
     def advance(self, newest: Tensor, hidden: Tensor, cell: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Processes the next vector of a stream in all windows that contain it.
@@ -58,37 +57,20 @@ class LastStepBlstm(nn.Module):
         input_weight, hidden_weight, input_bias, hidden_bias = self.forward_lstm.all_weights[0]
         from_input = F.linear(newest, input_weight, input_bias + hidden_bias)  # (B, 4*hidden)
         gates = from_input[:, None] + F.linear(hidden, hidden_weight)  # (B, L, 4*hidden)
-        next_hidden, next_cell = _lstm_cell(gates, cell)  # (B, L, hidden) each
-        output = torch.cat([next_hidden[:, -1], self._backward(newest)], dim=1)
+        next_hidden, next_cell = lstm_cell(gates, cell)  # (B, L, hidden) each
+        output = torch.cat([next_hidden[:, -1], self.backward_output(newest)], dim=1)
         # Row 0 has processed nothing and stays zero; every other row moves on by one.
         hidden = torch.cat([hidden[:, :1], next_hidden[:, :-1]], 1)
         return output, hidden, torch.cat([cell[:, :1], next_cell[:, :-1]], 1)
 
-    def over_windows(self, vectors: Tensor, window: int) -> Tensor:
-        """Returns the output of `forward` for each window of a sequence, (T - window + 1, 2*hidden).
-
-        The products with the input weights are computed once for each vector, not for each window that contains it.
-
-        Args:
-            vectors: The sequence, (T, F).
-            window: Length of the windows.
-        """
-        input_weight, hidden_weight, input_bias, hidden_bias = self.forward_lstm.all_weights[0]
-        from_input = F.linear(vectors, input_weight, input_bias + hidden_bias)  # (T, 4*hidden)
-        count = len(vectors) - window + 1
-        hidden = cell = vectors.new_zeros(count, self.forward_lstm.hidden_size)
-        for k in range(window):
-            gates = torch.addmm(from_input[k : k + count], hidden, hidden_weight.t())  # (count, 4*hidden)
-            hidden, cell = _lstm_cell(gates, cell)
-        return torch.cat([hidden, self._backward(vectors[window - 1 :])], dim=1)
-
-    def _backward(self, newest: Tensor) -> Tensor:
+    def backward_output(self, newest: Tensor) -> Tensor:
+        """Returns the backward direction's hidden state at the last vector of each window, (N, hidden)."""
         gate_in, candidate, gate_out = self.backward_linear(newest).chunk(3, dim=1)
         cell = torch.sigmoid(gate_in) * torch.tanh(candidate)
         return torch.sigmoid(gate_out) * torch.tanh(cell)
 
 
-def _lstm_cell(gates: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
+def lstm_cell(gates: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
     """Returns the next hidden and cell states, (..., hidden), for the sums before the gates, (..., 4*hidden)."""
     gate_in, forget, candidate, gate_out = gates.chunk(4, dim=-1)
     next_cell = torch.sigmoid(forget) * cell + torch.sigmoid(gate_in) * torch.tanh(candidate)
@@ -187,10 +169,6 @@ class ForceNetwork(nn.Module):
             stack = torch.cat([padded[:, k : k + length] for k in range(n + 1)], dim=2).flatten(0, 1)
         return self._pool(stack, flat)[0].view(batch, length, -1), earlier
 
-    def read_pooled(self, pooled: Tensor) -> Tensor:
-        """Maps consecutive averages (T, C) to the inputs of the last layer of each window, (T - window + 1, head)."""
-        return torch.tanh(self.dense(self.blstm.over_windows(pooled, self.config.window)))
-
     def force_n(self, features: Tensor) -> Tensor:
         """Applies the last layer: features (N, head) to forces in N, (N,)."""
         with torch.autocast(features.device.type, enabled=False):
@@ -270,17 +248,3 @@ def _attention(config: NetworkConfig, channels: int) -> nn.Module | None:
             return Cbam(channels, config.reduction)
         case "none":
             return None
-
-
-def cost(config: NetworkConfig) -> tuple[int, int]:
-    """Computes the size and arithmetic of a network.
-
-    Returns:
-        The number of parameters, and of multiply-adds of one `ForceNetwork.step` in convolutions and matrix
-        products. SCAM's weighted pooling, a few thousand, is not included.
-    """
-    network = ForceNetwork(config).eval()
-    with torch.no_grad(), FlopCounterMode(display=False) as counter:
-        network.step(torch.zeros(1, 1, config.size, config.size), network.zero_state())
-    parameters = sum(parameter.numel() for parameter in network.parameters())
-    return parameters, counter.get_total_flops() // 2

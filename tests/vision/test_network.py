@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 from torch import Tensor, nn
 
+from gripper_force.qualification.bench.roofline import cost
 from gripper_force.vision.header import NetworkConfig
-from gripper_force.vision.network import ForceNetwork, LastStepBlstm, StreamState, cost
+from gripper_force.vision.network import ForceNetwork, LastStepBlstm, StreamState
 
 TINY = NetworkConfig(size=16, width=0.25, window=5, hidden=6, head=7, reduction=4)
 SIZES = {"vgg": 32, "resnet18": 64, "mobile": 32}

@@ -12,9 +12,11 @@ from io import StringIO
 from typing import Any, Final
 
 import numpy as np
+import torch
+from torch.utils.flop_counter import FlopCounterMode
 
 from gripper_force.vision.header import NetworkConfig
-from gripper_force.vision.network import cost
+from gripper_force.vision.network import ForceNetwork
 
 _SIDE: Final = 1024
 """Side of the matrices for the arithmetic rate; products of this size are limited by arithmetic only."""
@@ -87,3 +89,17 @@ def _least_s(precision: str, threads: int, rows: int, columns: int = _SIDE) -> f
         request.infer()
         taken_s.append(time.perf_counter() - begin_s)
     return min(taken_s)
+
+
+def cost(config: NetworkConfig) -> tuple[int, int]:
+    """Computes the size and arithmetic of a network.
+
+    Returns:
+        The number of parameters, and of multiply-adds of one `ForceNetwork.step` in convolutions and matrix
+        products. SCAM's weighted pooling, a few thousand, is not included.
+    """
+    network = ForceNetwork(config).eval()
+    with torch.no_grad(), FlopCounterMode(display=False) as counter:
+        network.step(torch.zeros(1, 1, config.size, config.size), network.zero_state())
+    parameters = sum(parameter.numel() for parameter in network.parameters())
+    return parameters, counter.get_total_flops() // 2

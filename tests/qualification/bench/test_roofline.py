@@ -2,9 +2,8 @@ from importlib.util import find_spec
 
 import pytest
 
-from gripper_force.qualification.bench.roofline import Roofline, measure
+from gripper_force.qualification.bench.roofline import Roofline, cost, measure
 from gripper_force.vision.header import NetworkConfig
-from gripper_force.vision.network import cost
 
 SMALL = NetworkConfig(size=32, width=0.25)
 
