@@ -1,15 +1,16 @@
 """Lookup of classes by name: built-in ones, registered entry points, and ``package.module:Class``."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from difflib import get_close_matches
+from functools import partial
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
 from operator import attrgetter
 from typing import Any, Final
 
-from gripper_force.errors import ConfigError
+from gripper_force.errors import ConfigError, DeviceError, GripperError
 
 _METHODS: Final = {
     "servos": ("spec", "start", "read", "write", "stop", "close"),
@@ -66,6 +67,10 @@ def load_class(group: str, builtin: Mapping[str, str], name: str, key: str, alte
         key: The configuration key that holds ``name``, for error messages.
         alternative: Another remedy if a package is not installed; see `importing`.
 
+    Returns:
+        The class. One that is not built in is wrapped, and so are its objects: what their methods raise becomes one
+        sentence, a `DeviceError`, or a `ConfigError` of an engine.
+
     Raises:
         ConfigError: The name is unknown, its module or a package that it needs is not installed, or what it
             names does not exist or is not a class.
@@ -75,7 +80,9 @@ def load_class(group: str, builtin: Mapping[str, str], name: str, key: str, alte
     try:
         with importing(f"{key}={name}", alternative):
             module = import_module(module_name)
-    except (ImportError, OSError, ValueError, TypeError) as error:  # the last two: an empty or relative name
+    except ConfigError:
+        raise
+    except Exception as error:  # also of an empty or relative name, and of the module's own code
         raise ConfigError(
             f"{key}={name}: can't import {module_name!r}: {error}; name it as package.module:Class, and install what "
             "its module needs"
@@ -94,7 +101,35 @@ def load_class(group: str, builtin: Mapping[str, str], name: str, key: str, alte
             f"{key}={name}: {target} has no method {missing[0]!r}; name a class with the methods of the "
             "interface in gripper_force.interfaces"
         )
-    return found
+    if name in builtin:
+        return found
+    return _Plugin(found, f"{key}={name}: {attribute}", ConfigError if group == "engines" else DeviceError)
+
+
+class _Plugin:
+    """A third-party class, or an object that it made: an error of its code names it, its method and the error."""
+
+    def __init__(self, part: Any, name: str, error_type: type[GripperError]) -> None:
+        self._part, self._name, self._error_type = part, name, error_type
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(self._part, name)
+        return partial(self._call, value, f"{self._name}.{name}") if callable(value) else value
+
+    def __call__(self, *arguments: Any) -> Any:
+        made = self._call(self._part, self._name, *arguments)
+        return _Plugin(made, self._name, self._error_type)
+
+    def _call(self, function: Callable[..., Any], called: str, *arguments: Any, **named: Any) -> Any:
+        try:
+            return function(*arguments, **named)
+        except GripperError:
+            raise
+        except Exception as error:
+            raise self._error_type(
+                f"{called}() raised {type(error).__name__}: {' '.join(str(error).split())}; it is no part of "
+                "gripper-force: correct it, or tell its author"
+            ) from error
 
 
 def registered(group: str) -> dict[str, EntryPoint]:

@@ -319,7 +319,10 @@ class Session:
         finally:
             self._perception.close()
             if (settings := getattr(self._devices.camera, "settings", None)) is not None:
-                self.attach("camera.json", json.dumps(settings()).encode(), "application/json")
+                text = json.dumps(
+                    settings(), default=lambda value: getattr(value, "tolist", value.__repr__)()
+                )
+                self.attach("camera.json", text.encode(), "application/json")
         self._log_sensors(self._devices.clock.now_ns(), at_end=True)
 
     def log_event(self, unit: str, text: str) -> None:

@@ -1,0 +1,178 @@
+"""Devices of other packages: what their code raises ends a run as any device's fault does."""
+
+import json
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from gripper_force.config import Config, load_config
+from gripper_force.errors import ConfigError, DeviceError
+from gripper_force.jobs import doctor
+from gripper_force.jobs.grasp import run_grasp
+from gripper_force.plugins import load_class
+from gripper_force.runtime.backends import open_devices
+from gripper_force.runtime.log_reader import LogReader
+from gripper_force.runtime.resolve import resolve
+from gripper_force.runtime.session import open_session
+from gripper_force.types import Event, Frame, GraspStatus
+from gripper_hw.dynamixel import virtual
+
+DEVICES = """
+import numpy as np
+
+from gripper_force.interfaces import BusStats, ServoSpec
+from gripper_force.types import Frame, ServoState
+
+class Device:
+    supports_lockstep = True
+    calls = 0
+
+    def __init__(self, config, clock):
+        self.fails, self.clock = config.options["fails"], clock
+        self.at("__init__")
+
+    def at(self, method):
+        if self.fails == method and (method in ("__init__", "start", "settings") or self.calls > 9):
+            raise ValueError(f"no {method}\\nhere")
+
+    def start(self):
+        self.at("start")
+
+    def counts(self):
+        self.at("counts")
+        return {}
+
+    def close(self): ...
+
+class Cell(Device):
+    def drain(self):
+        self.calls += 1
+        self.at("drain")
+        return []
+
+class Camera(Device):
+    def newest(self):
+        self.calls += 1
+        self.at("newest")
+        now_ns = self.clock.now_ns()
+        return Frame(now_ns, now_ns, self.calls, np.full((48, 64), self.calls % 250, np.uint8))
+
+    def settings(self):
+        self.at("settings")
+        return {"gain": np.float32(2.5), "resolution_px": np.array([64, 48]), "mode": np.str_("day")}
+
+class Servo(Device):
+    stats = BusStats()
+    stopped = []
+
+    @staticmethod
+    def spec(config):
+        return ServoSpec(1.8, 0.00269, (10.0, 14.8))
+
+    def start(self):
+        return self.read()
+
+    def read(self):
+        self.at("read")
+        return ServoState(self.clock(), 0.0, 0.0, 0.0, 12.0, 30.0, 0)
+
+    def write(self, command):
+        self.calls += 1
+        self.at("write")
+
+    def stop(self, *, hold):
+        self.stopped.append(hold)
+"""
+UNITS = {"camera": "own_devices:Camera", "load_cell": "own_devices:Cell", "servo": "own_devices:Servo"}
+REMEDY = "; it is no part of gripper-force: correct it, or tell its author$"
+
+
+@pytest.fixture
+def config(quick: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Config:
+    (tmp_path / "own_devices.py").write_text(DEVICES)
+    monkeypatch.syspath_prepend(tmp_path)
+    return load_config(None, [*quick, "log.report=false"])
+
+
+def with_own(config: Config, unit: str, fails: str, **keys: object) -> Config:
+    return config.with_values(**{unit: {"backend": UNITS[unit], "options": {"fails": fails}}}, **keys)
+
+
+@pytest.mark.parametrize("unit", ["camera", "load_cell"])
+@pytest.mark.parametrize("method", ["__init__", "start"])
+def test_a_device_that_can_not_be_opened_is_named(
+    config: Config, tmp_path: Path, unit: str, method: str
+) -> None:
+    named = UNITS[unit].partition(":")[2] + ("" if method == "__init__" else ".start")
+    sentence = rf"^{unit}\.backend={UNITS[unit]}: {named}\(\) raised ValueError: no {method} here{REMEDY}"
+    with pytest.raises(DeviceError, match=sentence):
+        run_grasp(with_own(config, unit, method), tmp_path / "run.mcap")
+    assert virtual.find_bus("rig") is None
+    assert not (tmp_path / "run.mcap").exists()
+    *_, last = doctor.check_unit(with_own(config, unit, method), unit.replace("_", " "))
+    assert (last.ok, "raised ValueError" in last.found) == (False, True)
+
+
+@pytest.mark.parametrize(
+    ("unit", "method"),
+    [("camera", "newest"), ("camera", "counts"), ("load_cell", "drain"), ("load_cell", "counts")],
+)
+@pytest.mark.parametrize("on_fault", ["limp", "open"])
+def test_a_device_that_fails_in_a_run_ends_it_as_configured(
+    config: Config, tmp_path: Path, unit: str, method: str, on_fault: str
+) -> None:
+    path = tmp_path / "run.mcap"
+    settings = resolve(with_own(config, unit, method, control={"on_fault": on_fault}))
+    with open_devices(settings.config) as devices:
+        bus = virtual.find_bus("rig")
+        assert bus is not None
+        with (
+            pytest.raises(DeviceError, match=rf"\.{method}\(\) raised ValueError: no {method} here{REMEDY}"),
+            open_session(settings, devices, path) as session,
+        ):
+            while True:
+                session.cycle()
+        assert bus.servos[0].get("torque_enable") == 0
+    log = LogReader(path)
+    assert log.complete
+    told = [event.text for event in log.records(Event)]
+    assert any(text.startswith(f"DeviceError: {unit}.backend={UNITS[unit]}") for text in told)
+    assert len(list(log.records(GraspStatus))) >= 9
+
+
+def test_the_settings_of_a_camera_may_be_of_numpy(config: Config, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    run_grasp(with_own(config, "camera", ""), path)
+    assert len(list(LogReader(path).records(Frame))) > 40
+    settings = json.loads(LogReader(path).attachments["camera.json"])
+    assert settings == {"gain": 2.5, "resolution_px": [64, 48], "mode": "day"}
+
+
+def test_settings_that_fail_do_not_cost_the_log(config: Config, tmp_path: Path) -> None:
+    with pytest.raises(DeviceError, match=r"Camera\.settings\(\) raised ValueError: no settings here"):
+        run_grasp(with_own(config, "camera", "settings"), tmp_path / "run.mcap")
+    assert LogReader(tmp_path / "run.mcap").complete
+
+
+def test_a_servo_that_fails_is_told_to_stop(config: Config, tmp_path: Path) -> None:
+    none = {"camera": {"backend": "none"}, "load_cell": {"backend": "none"}}
+    path = tmp_path / "run.mcap"
+    own = with_own(config, "servo", "write", clock="realtime", **none)
+    with pytest.raises(DeviceError, match=rf"^servo\.backend=own_devices:Servo: Servo\.write\(\) .*{REMEDY}"):
+        run_grasp(own, path)
+    assert import_module("own_devices").Servo.stopped == [False]
+    assert LogReader(path).complete
+
+
+def test_an_engine_and_a_module_that_fail_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "own_engine.py").write_text(
+        "class Engine:\n    def __init__(self, *_): 1 / 0\n    def step(self, frame): ...\n"
+    )
+    (tmp_path / "own_module.py").write_text("1 / 0")
+    monkeypatch.syspath_prepend(tmp_path)
+    engine = load_class("engines", {}, "own_engine:Engine", "vision.engine")
+    with pytest.raises(ConfigError, match=r"^vision\.engine=own_engine:Engine: Engine\(\) raised ZeroDiv"):
+        engine(None, "float32", 1)
+    with pytest.raises(ConfigError, match=r"can't import 'own_module': division by zero; "):
+        load_class("engines", {}, "own_module:Engine", "vision.engine")
