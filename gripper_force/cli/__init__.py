@@ -104,20 +104,12 @@ def main() -> NoReturn:
         else:  # native code, such as pydantic's, can turn an interrupt into an exception of its own
             interrupted = isinstance(end, KeyboardInterrupt) or process.is_interrupted()
         if interrupted:
-            stopped = "; the run was stopped as configured" if _uses_gripper(sys.argv[1:]) else ""
+            stopped = "; the run was stopped as configured" if process.has_stopped_run() else ""
             console.err.print(f"interrupted{stopped}", soft_wrap=True)
             gc.freeze()  # Python would search all of PyTorch's objects for garbage, up to 2 s long
             sys.exit(process.interrupt_exit_code())
         raise
     sys.exit(0)
-
-
-def _uses_gripper(words: list[str]) -> bool:
-    """Returns True for the commands that run a gripper, real or simulated."""
-    uses_logs = any(word.startswith("--from") for word in words)
-    if words[:1] == ["calibrate"]:
-        return words[1:2] not in (["network"], ["gain"]) and not uses_logs
-    return words[:1] in (["grasp"], ["record"], ["setup"]) or (words[:1] == ["teach"] and not uses_logs)
 
 
 def _fail_without_file(error: OSError) -> NoReturn:

@@ -46,7 +46,7 @@ _interrupts: list[Callable[[], None]] = []  # of the open grippers, the newest l
 _earlier_handlers: dict[int, signal._HANDLER] = {}
 _switch_intervals: list[float] = []  # before each open gripper, the program's own first
 _priorities = threading.local()  # the same for the priority of each thread
-_received: list[int] = []  # signals since the first gripper was opened
+_received: list[tuple[int, bool]] = []  # signals since the first gripper was opened; True: while one was open
 
 
 def own_process(
@@ -185,12 +185,17 @@ def raise_interrupt(number: int, _frame: FrameType | None) -> NoReturn:
 
 def interrupt_exit_code() -> int:
     """Returns 128 plus the number of the first signal that ended the run, as shells do; 130 for Ctrl-C."""
-    return 128 + (_received or [signal.SIGINT])[0]
+    return 128 + (_received[0][0] if _received else signal.SIGINT)
 
 
 def is_interrupted() -> bool:
     """Returns True if a signal of `SIGNALS` has been received, so that a run ends."""
     return bool(_received)
+
+
+def has_stopped_run() -> bool:
+    """Returns True if a signal of `SIGNALS` has come while a gripper was open."""
+    return any(in_run for _, in_run in _received)
 
 
 def _handle_signal(number: int, frame: FrameType | None) -> None:
@@ -219,7 +224,7 @@ def _restore_handlers() -> None:
 
 
 def _receive(number: int) -> None:
-    _received.append(number)
+    _received.append((number, bool(_interrupts)))
     if number == signal.SIGHUP:
         _discard_output_to_lost_terminal()
 
