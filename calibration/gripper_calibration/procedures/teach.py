@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import as_completed
 from dataclasses import dataclass, replace
 from hashlib import sha256
-from itertools import combinations
+from itertools import combinations, islice
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -46,9 +46,9 @@ from gripper_calibration.procedures.calibrate_object import (
 )
 from gripper_calibration.touch_logs import TouchRecording, join, read_log, started_ns
 from gripper_force import __version__
-from gripper_force.config import Config
+from gripper_force.config import Config, config_from_text
 from gripper_force.errors import ConfigError, DataError
-from gripper_force.jobs.dataset import CONTACT_N, Clip, find_logs, load_clips, starts_in_contact
+from gripper_force.jobs.dataset import CONTACT_N, Clip, StreamedClip, find_logs, load_clips, starts_in_contact
 from gripper_force.jobs.processes import process_pool
 from gripper_force.jobs.profile_files import check_place, pack, write_all, write_object
 from gripper_force.jobs.training.ood_fit import model_of_scores
@@ -58,7 +58,9 @@ from gripper_force.jobs.training.train import train
 from gripper_force.profiles.correction import KnownFrames, ProfileArrays
 from gripper_force.profiles.object_profile import BUNDLED, ObjectProfile, user_folder
 from gripper_force.progress import Progress, Prompt, no_progress
+from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import ResolvedConfig, resolve_vision
+from gripper_force.types import Frame, LoadCellSample
 from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
 from gripper_force.vision.checkpoint_writer import replace_header
 from gripper_force.vision.estimator import claimed_std_n
@@ -81,6 +83,9 @@ STEPS: Final = 3 * 2 * FOLDS + 3
 
 _HELPS: Final = 0.85
 """More touches help if the error after two of three folds is less than this share of that after one."""
+
+_FRAMES_AFTER: Final = 10
+"""Frames after the reference frames until whose time the load cell's samples of these are in a log."""
 
 _NETWORK: Final = "network.safetensors"
 _FIGURE: Final = "teach.png"
@@ -194,7 +199,7 @@ def teach(
     # A touch that is replayed would be learned where it is left out.
     replayed = {} if not replay else {_digest_of(path): path for path in find_logs(replay)}
     others = {digest: path for digest, path in replayed.items() if digest not in logs_by_digest}
-    in_contact = _sorted_by_contact(list(others.values()), model)[2]
+    in_contact = [path for path in others.values() if _starts_in_contact(path, model.header.preprocess)]
     others = {digest: path for digest, path in others.items() if path not in in_contact}
     work = _Work(logs_by_digest, others, place / "teach", workers)
     taught = work.run(config, model, name, out, progress)
@@ -548,6 +553,23 @@ def _sorted_by_contact(
         else:
             without_contact.append(path)
     return used, tuple(without_contact), tuple(contact_starts)
+
+
+def _starts_in_contact(path: Path, preprocess: Preprocess) -> bool:
+    """Returns `starts_in_contact` of a log, of which only the first frames are read: a training reads all of it."""
+    reader = LogReader(path)
+    config = config_from_text(reader.config, str(path))
+    streamed = StreamedClip(reader, config, reader.records(Frame, LoadCellSample), preprocess)
+    for _ in islice(streamed.frames(), preprocess.reference_frames + _FRAMES_AFTER):
+        pass
+    try:
+        clip = streamed.clip(streamed.no_images)
+        is_whole = bool(clip.valid[: preprocess.reference_frames].all())
+    except DataError:
+        is_whole = False
+    if not is_whole:  # the labels may come later in the log, or never
+        (clip,) = load_clips([path], preprocess)
+    return starts_in_contact(clip.forces_n, preprocess)
 
 
 def _digest_of(path: Path) -> str:

@@ -181,6 +181,23 @@ def test_a_replayed_touch_is_never_learned_where_it_is_left_out(
     assert {path: path.stat().st_mtime_ns for path in work.rglob("*.left")} == parts
 
 
+def test_replayed_logs_are_read_by_the_trainings_alone(
+    write_log: Callable[[Clip, Path], Path],
+    press: Callable[..., Clip],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    clip = press(9)
+    free = write_log(replace(clip, name="free"), tmp_path)
+    pressed = write_log(replace(clip, name="pressed", forces_n=clip.forces_n + 1), tmp_path)
+
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("the whole log was read")
+
+    monkeypatch.setattr(job, "load_clips", refuse)
+    assert [job._starts_in_contact(path, Preprocess()) for path in (free, pressed)] == [False, True]
+
+
 @pytest.fixture
 def as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leaves the network as it is as the only candidate, for tests of the logs that are used."""
