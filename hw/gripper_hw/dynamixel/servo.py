@@ -103,7 +103,7 @@ class DynamixelBus:
             )
         self.ids = tuple(ids)
         self.firmware: tuple[int, ...] = ()
-        self._config = config
+        self._config, self._is_shared = config, port is not None
         self._transport = Transport(config, clock_ns, port)
         self._current_limit = math.floor(config.current_limit_a / self.model.current_unit_a)
         self._watchdog_setting = math.ceil(config.bus_watchdog_ms / WATCHDOG_UNIT_MS)
@@ -245,9 +245,14 @@ class DynamixelBus:
             raise
         except DeviceTimeoutError as error:
             key = "servo.second.id" if id_ == self._config.second.id else "servo.id"
+            rate, rate_key = f"{self._config.baud_rate} baud", "servo.baud_rate"
+            if self._is_shared:
+                rate, rate_key = (
+                    "the shared port's baud rate",
+                    "the rate that your program sets by setBaudRate()",
+                )
             raise DeviceNotFoundError(
-                f"{label} does not answer at {self._config.baud_rate} baud; "
-                f"check its power, {key} and servo.baud_rate"
+                f"{label} does not answer at {rate}; check its power, {key} and {rate_key}"
             ) from error
         if number != self.model.number:  # a late reply can be mistaken for a ping's, not for a read's
             number = self._transport.get(id_, "model_number")

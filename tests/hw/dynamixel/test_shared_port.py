@@ -8,7 +8,13 @@ import pytest
 from dynamixel_sdk import COMM_SUCCESS, GroupSyncRead, GroupSyncWrite, PacketHandler, PortHandler
 
 import gripper_force as gf
-from gripper_force.errors import ConfigError, DeviceError, DeviceLostError, DeviceTimeoutError
+from gripper_force.errors import (
+    ConfigError,
+    DeviceError,
+    DeviceLostError,
+    DeviceNotFoundError,
+    DeviceTimeoutError,
+)
 from gripper_force.interfaces import SharedPort
 from gripper_force.types import ServoCommand
 from gripper_hw.dynamixel.control_table import REGISTERS, load_model
@@ -222,6 +228,17 @@ def test_gripper_on_a_shared_port(shared: SharedBus) -> None:
     ids = {frozenset(addressed(packet)) for packet in shared.bus.packets}
     assert ids == {frozenset((GRIPPER,)), frozenset(ARM)}
     assert shared.handler.is_open
+
+
+def test_a_servo_that_does_not_answer_is_not_blamed_on_a_key_without_effect(shared: SharedBus) -> None:
+    """The owner of a shared port sets its baud rate; `servo.baud_rate` has no effect."""
+    servo = DynamixelServo(shared.config(id=33, reply_margin_ms=5.0, retries=0), port=shared.port)
+    with pytest.raises(
+        DeviceNotFoundError,
+        match=r"does not answer at the shared port's baud rate; check its power, servo\.id and the rate that your "
+        r"program sets by setBaudRate\(\)$",
+    ):
+        servo.start()
 
 
 def test_port_without_lock_is_refused(shared: SharedBus) -> None:
