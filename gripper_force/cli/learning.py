@@ -3,6 +3,7 @@
 import json
 import math
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
 
@@ -167,24 +168,31 @@ def _read_for_training(
     quiet: bool,
 ) -> _Clips:
     """Reads the logs of a training. Raises `ConfigError` if it would be validated on what it learns."""
-    from gripper_force.jobs.dataset import find_logs, load_clips
+    from gripper_force.jobs.dataset import digest, find_logs, load_clips
 
     folders = [
         find_logs(given) if given else []
         for given in (data, [validation] if validation else [], [replay] if replay else [])
     ]
-    seen = {path.resolve() for path in (*folders[0], *folders[2])}
-    if both := [path for path in folders[1] if path.resolve() in seen]:
+    _refuse_learned([[path.resolve() for path in logs] for logs in folders], folders[1])
+    with console.bar("reading logs", sum(map(len, folders)), hidden=quiet) as progress:
+        clips = [
+            load_clips(logs, settings.preprocess, workers=workers, progress=progress) if logs else []
+            for logs in folders
+        ]
+    if validation is not None:  # a copy of a log has another path
+        _refuse_learned([[digest([clip]) for clip in part] for part in clips], folders[1])
+    return _Clips(*clips)
+
+
+def _refuse_learned(keys: Sequence[Sequence[object]], validation: list[Path]) -> None:
+    """Raises `ConfigError` if logs of the validation have keys of those to train on or to replay."""
+    training, tested, replayed = keys
+    seen = {*training, *replayed}
+    if both := [path for key, path in zip(tested, validation, strict=True) if key in seen]:
         raise ConfigError(
             f"{len(both)} logs of --validation are among those to train on, such as {both[0]}; the error on them would "
             "say nothing: name other folders"
-        )
-    with console.bar("reading logs", sum(map(len, folders)), hidden=quiet) as progress:
-        return _Clips(
-            *(
-                load_clips(logs, settings.preprocess, workers=workers, progress=progress) if logs else []
-                for logs in folders
-            )
         )
 
 

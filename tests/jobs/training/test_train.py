@@ -1,4 +1,5 @@
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -305,10 +306,13 @@ def test_command_leaves_out_logs_that_start_in_contact(
 
 def test_validation_on_what_is_trained_on_is_refused(few_logs: Path, tmp_path: Path) -> None:
     (one, *_) = sorted(few_logs.glob("*.mcap"))
-    call = ["train", str(few_logs), "--validation", str(one), "--out", str(tmp_path / "x.safetensors")]
-    refused = CliRunner().invoke(cli.app, call).exception
-    assert isinstance(refused, ConfigError)
-    assert f"1 logs of --validation are among those to train on, such as {one}" in str(refused)
+    copy = tmp_path / "copy.mcap"
+    shutil.copy(one, copy)
+    for path in (one, copy):
+        call = ["train", str(few_logs), "--validation", str(path), "--out", str(tmp_path / "x.safetensors")]
+        refused = CliRunner().invoke(cli.app, [*call, "--jobs", "1"]).exception
+        assert isinstance(refused, ConfigError)
+        assert f"1 logs of --validation are among those to train on, such as {path}" in str(refused)
 
 
 def test_divergence_raises(clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig) -> None:
