@@ -2,13 +2,18 @@
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from gripper_force.cli import console
 from gripper_force.cli.options import AsJson, ConfigPath, NoOverrides, Overrides, load_settings
 from gripper_force.errors import ConfigError
+
+if TYPE_CHECKING:  # --help loads no NumPy
+    from gripper_force.config import Config
+    from gripper_force.interfaces import Devices
+    from gripper_force.types import Gray
 
 app = typer.Typer(help="Show, check or describe the configuration.", no_args_is_help=True)
 
@@ -32,12 +37,46 @@ def check(config: ConfigPath = None, set_: Overrides = None, as_json: AsJson = F
     resolved.check_target(resolved.config.target_n)
     check_devices(resolved.config)
     make_estimator(resolved)
+    gray = _known_frame(resolved.config)
     if is_simulated(resolved.config):
-        with open_devices(resolved.config):
-            pass
+        with open_devices(resolved.config) as devices:
+            if resolved.config.camera.backend == "simulated" and resolved.config.vision.region is not None:
+                gray = _simulated_frame(devices)
+    if gray is not None and resolved.config.uses_vision:
+        from gripper_force.vision.preprocess import downscale
+
+        downscale(gray, resolved.config.vision.region, 1)  # raises if the region reaches beyond the frame
     notes = [text for _, text in resolved.notes]
     result = {"ok": True, "choices": list(resolved.choices), "notes": notes}
     console.show(result, as_json, lambda _: console.out.print("\n".join(["ok", *notes])))
+
+
+def _known_frame(config: "Config") -> "Gray | None":
+    """Returns a frame of a camera that need not be opened for its size; None for another one."""
+    import numpy as np
+
+    from gripper_force.runtime.log_reader import LogReader
+    from gripper_force.types import Frame
+
+    camera = config.camera
+    if camera.backend in ("oak", "uvc"):
+        return np.zeros((camera.side_px, camera.side_px), np.uint8)
+    if camera.backend == "playback" and camera.path is not None:
+        return next((frame.gray for frame in LogReader(camera.path).records(Frame)), None)
+    return None
+
+
+def _simulated_frame(devices: "Devices") -> "Gray | None":
+    """Returns the first frame of a simulated camera; None if its faults let it give none within a second."""
+    from gripper_force.types import NS_PER_MS
+
+    assert devices.camera is not None
+    devices.camera.start()
+    for _ in range(100):
+        if (frame := devices.camera.newest()) is not None:
+            return frame.gray
+        devices.clock.sleep_until_ns(devices.clock.now_ns() + 10 * NS_PER_MS)
+    return None
 
 
 @app.command()

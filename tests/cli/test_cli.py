@@ -194,6 +194,30 @@ def test_config_check_finds_what_a_run_would_refuse(run: Run, assignment: str, m
     assert message in done.err
 
 
+REAL = ["clock=realtime", "servo.port=/dev/ttyUSB0", "load_cell.backend=none"]
+
+
+@pytest.mark.parametrize(
+    ("camera", "frame"),
+    [
+        ("camera.backend=simulated", "128x128"),
+        ("camera.backend=uvc camera.device=0 camera.side_px=100", "100x100"),
+        ("camera.backend=playback", "128x128"),
+    ],
+)
+def test_config_check_finds_a_region_beyond_the_frame(
+    run: Run, quick_vision: list[str], fused_log: Path, camera: str, frame: str
+) -> None:
+    keys = [*quick_vision, *(REAL if "uvc" in camera else ()), *camera.split()]
+    keys += [f"camera.path={fused_log}"] if "playback" in camera else []
+    sets = [part for key in keys for part in ("--set", key)]
+    done = run("config", "check", *sets, "--set", "vision.region=[0,0,90,300]")
+    assert (done.code, f"must lie within the camera's frame of {frame} pixels" in done.err) == (2, True), (
+        done.err
+    )
+    assert run("config", "check", *sets, "--set", "vision.region=[0,0,90,90]").code == 0
+
+
 GRASP_KEYS = {"result", "object", "target_n", "load_cell_mean_n", "steady_error_n", "overshoot_n", "settle_s"}
 GRASP_KEYS |= {"estimator_p50_ms", "estimator_p99_ms", "loop_hz", "log", "report"}
 ERROR_KEYS = {"mae_n", "rmse_n", "bias_n", "per_object", "per_bin", "frames"}
