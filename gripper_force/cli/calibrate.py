@@ -409,7 +409,7 @@ def teach(
     settings = load_settings(config, set_, {"object": name, "seed": seed})
     given, name = name, settings.object  # a path has become a name
     folder = folder or calibrate_object.default_folder(name)
-    job.check_before_touches(settings, out or user_folder() / name)
+    job.check_before_touches(settings, name, out or user_folder() / name)
     begin_s = time.monotonic()
     try:
         if logs is None:

@@ -140,6 +140,7 @@ class ObjectProfile(Section):
         network: File beside it with the network, if it is the profile of a bundle (see `BUNDLED`).
         logs: SHA-256 of each log of the touches.
         version: Version of this software that made it.
+        file: Path of the simulated object's file if the profile is that of a bundle; None if the object has none.
     """
 
     format: Literal["gripper-force-object/1"] = FORMAT
@@ -162,6 +163,7 @@ class ObjectProfile(Section):
     network: str | None = None
     logs: tuple[str, ...] = ()
     version: str = ""
+    file: str | None = None
 
     @model_validator(mode="before")
     @classmethod

@@ -26,7 +26,7 @@ from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs.dataset import find_logs
 from gripper_force.jobs.profile_files import check_place, pack, write_object
-from gripper_force.jobs.recording.record import RecordingPlan, record
+from gripper_force.jobs.recording.record import RecordingPlan, check_name, record
 from gripper_force.jobs.trials import with_same_object
 from gripper_force.profiles.object_profile import ObjectProfile, user_folder
 from gripper_force.progress import Progress, Prompt, no_progress
@@ -171,9 +171,11 @@ def check_before_touches(config: Config, name: str, out: str | Path | None = Non
     """Checks what a calibration needs before the first touch. Returns the path of the profile.
 
     Raises:
-        ConfigError: There is no network to correct, or the profile can't be written.
+        ConfigError: There is no network to correct, the name can't be part of a file name, or the profile can't be
+            written.
         CheckpointError: The network can't be read.
     """
+    check_name(name)
     path = user_folder() / f"{name}.yaml" if out is None else Path(out)
     check_place(path)
     if resolve_vision(config)[1] is None:

@@ -51,12 +51,13 @@ from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs.dataset import CONTACT_N, Clip, StreamedClip, find_logs, load_clips, starts_in_contact
 from gripper_force.jobs.processes import process_pool
 from gripper_force.jobs.profile_files import check_place, pack, write_all, write_object
+from gripper_force.jobs.recording.record import check_name
 from gripper_force.jobs.training.ood_fit import model_of_scores
 from gripper_force.jobs.training.recipe import recipe
 from gripper_force.jobs.training.stated_errors import errors, residuals
 from gripper_force.jobs.training.train import train
 from gripper_force.profiles.correction import KnownFrames, ProfileArrays
-from gripper_force.profiles.object_profile import BUNDLED, ObjectProfile, user_folder
+from gripper_force.profiles.object_profile import BUNDLED, ObjectProfile, read_object, user_folder
 from gripper_force.progress import Progress, Prompt, no_progress
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import ResolvedConfig, resolve_vision
@@ -184,7 +185,7 @@ def teach(
     """
     out = (user_folder() / name if out is None else Path(out)).absolute()
     place = default_folder(name) if folder is None else Path(folder)
-    config, model = check_before_touches(config, out)
+    config, model = check_before_touches(config, name, out)
     if logs is None:
         named = config.with_values(object=name)
         paths = []
@@ -206,28 +207,42 @@ def teach(
     return replace(taught, without_contact=without_contact, contact_starts=(*contact_starts, *in_contact))
 
 
-def check_before_touches(config: Config, out: Path) -> tuple[Config, Model]:
+def check_before_touches(config: Config, name: str, out: Path) -> tuple[Config, Model]:
     """Checks what `teach` needs before the first touch.
 
     Args:
         config: The configuration.
+        name: Name of the object.
         out: Folder of the bundle.
 
     Returns:
         The configuration with the choice of the network made, and the network to begin with.
 
     Raises:
-        ConfigError: There is no network, or the bundle can't be written.
+        ConfigError: There is no network, the name can't be part of a file name, the bundle can't be written, or it is
+            that of another object.
         CheckpointError: The network can't be read.
     """
+    check_name(name)
     out = out.absolute()  # `.` has a name then
     if out.exists() and not (out / BUNDLED).is_file():
         raise ConfigError(f"{out} exists and is not a bundle; name another folder")
+    file = _object_file(config)
+    if file is not None and out.exists() and (other := read_object(out / BUNDLED).file) not in (None, file):
+        raise ConfigError(
+            f"the bundle {out} is that of the object in {other}, not of {file}; rename one of the files, or name "
+            "another folder with --out"
+        )
     check_place(out.with_name(f"{out.name}.yaml"))
     config, model, _ = resolve_vision(config)
     if model is None:
         raise ConfigError("teach needs a network to begin with; set vision.checkpoint, such as to default")
     return config, model
+
+
+def _object_file(config: Config) -> str | None:
+    """Returns the path of a simulated object's file; None for an object known by name."""
+    return None if config.sim.object is None else str(config.sim.object.absolute())
 
 
 class _Left(NamedTuple):
@@ -326,7 +341,12 @@ class _Work:
         resolved = ResolvedConfig(config, read_model(checkpoint))
         profile, _ = make_profile(name, recorded, fit, resolved)
         profile = profile.model_copy(
-            update={"network": _NETWORK, "logs": self._digests, "version": __version__}
+            update={
+                "network": _NETWORK,
+                "logs": self._digests,
+                "version": __version__,
+                "file": _object_file(config),
+            }
         )
         progress("calibrated")
         taught = Taught(

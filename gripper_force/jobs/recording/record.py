@@ -165,6 +165,14 @@ def record(
         yield path
 
 
+def check_name(name: str) -> None:
+    """Raises `ConfigError` if the name of an object can't be part of a file name."""
+    if not _NAME.fullmatch(name):
+        raise ConfigError(
+            f"object {name!r} can't be part of a file name; use letters, digits, spaces and _ . + -"
+        )
+
+
 def check_object_file(path: Path, seen: dict[str, tuple[Path, str]]) -> None:
     """Raises `DataError` if the file of a log's simulated object was another one in an earlier log.
 
@@ -221,10 +229,7 @@ def _checked(config: Config, plan: RecordingPlan) -> tuple[Config, float]:
         if backend == "none":
             name = unit.replace("_", " ")
             raise ConfigError(f"record needs a {name}, but {unit}.backend is none; set {unit}.backend")
-    if not _NAME.fullmatch(config.object):
-        raise ConfigError(
-            f"object {config.object!r} can't be part of a file name; use letters, digits, spaces and _ . + -"
-        )
+    check_name(config.object)
     limit_n = config.control.force_limit_n
     max_n = largest_target_n(limit_n, config.gripper.gain_bound)
     peak_n = min(DEFAULT_PEAK_N, max_n) if plan.peak_n is None else plan.peak_n

@@ -1,6 +1,7 @@
 """Teaching from logs of a synthetic press, with tiny networks: what is chosen, kept, written and used."""
 
 import json
+import re
 import shutil
 import signal
 import subprocess
@@ -356,10 +357,40 @@ def test_a_fold_takes_no_part_in_the_choice_that_estimates_it() -> None:
 @pytest.mark.parametrize("checkpoint", ["default", "small"])
 def test_one_network_is_trained_and_never_the_default_one(checkpoint: str, tmp_path: Path) -> None:
     config, model = job.check_before_touches(
-        load_config(None, [f"vision.checkpoint={checkpoint}"]), tmp_path / "out"
+        load_config(None, [f"vision.checkpoint={checkpoint}"]), "disc", tmp_path / "out"
     )
     names = [candidate.name for candidate in job._candidates(config, model, logs=16)]
     assert [name for name in names if "trained" in name] == ["small, trained"]
+
+
+@pytest.mark.usefixtures("as_it_is")
+def test_two_files_of_one_name_share_no_bundle(
+    network: Path, logs: list[Path], tmp_path: Path, home: Path
+) -> None:
+    files = [tmp_path / folder / "part.yaml" for folder in "ab"]
+    for path in files:
+        path.parent.mkdir()
+        path.write_text((OBJECTS / "avocado.yaml").read_text(encoding="utf-8"), encoding="utf-8")
+    first, second = (load_config(None, [f"object={path}", f"vision.checkpoint={network}"]) for path in files)
+    for _ in range(2):  # one that exists is replaced
+        assert teach(first, "part", logs=logs, folder=tmp_path / "work").bundle == home / "part"
+    with pytest.raises(
+        ConfigError, match=r"part is that of the object in .*a/part\.yaml, not of .*b/part\.yaml; "
+    ):
+        teach(second, "part", logs=logs, folder=tmp_path / "work")
+    used, declined = (with_bundle(load_config(None, [f"object={path}"])) for path in files)
+    assert used[0].vision.checkpoint == str(home / "part" / "network.safetensors")
+    assert declined[0].vision.checkpoint == "default"
+    assert declined[1] == f"did not use the bundle {home / 'part'}, which is that of the object in {files[0]}"
+    shutil.rmtree(home / "part")
+
+
+@pytest.mark.parametrize("name", ["a/b", "..", ""])
+def test_a_name_that_is_a_path_is_refused(name: str, config: Config, logs: list[Path]) -> None:
+    with pytest.raises(
+        ConfigError, match=rf"^object '{re.escape(name)}' can't be part of a file name; use letters"
+    ):
+        teach(config, name, logs=logs)
 
 
 @pytest.mark.usefixtures("as_it_is")
