@@ -99,7 +99,7 @@ def dump(section: Section) -> str:
 
 def to_yaml(value: Any, **options: Any) -> str:
     """A value as YAML, with the options of ``yaml.dump``. Text that any YAML reads as a number is in quotes."""
-    return yaml.dump(value, Dumper=_Dumper, sort_keys=False, **options)
+    return str(yaml.dump(value, Dumper=_Dumper, sort_keys=False, **options))
 
 
 def assign(tree: Tree, assignment: str) -> None:
@@ -188,7 +188,7 @@ class _Dumper(yaml.SafeDumper):
 class _Loader(yaml.SafeLoader):
     """YAML 1.2 loader that refuses a key that occurs twice: the first one would be lost."""
 
-    yaml_implicit_resolvers: ClassVar[dict[str, list[Any]]] = {}  # in place of those of YAML 1.1
+    yaml_implicit_resolvers = dict[str, list[Any]]()  # noqa: RUF012  # in place of those of YAML 1.1
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         names = [key.value for key, _ in node.value]

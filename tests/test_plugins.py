@@ -1,5 +1,6 @@
 from importlib.metadata import EntryPoint
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -10,7 +11,7 @@ from gripper_force.plugins import EXTRAS, load_class
 BUILTIN = {"fraction": "fractions:Fraction", "decimal": "decimal:Decimal"}
 
 
-def load(name: str, alternative: str = "") -> object:
+def load(name: str, alternative: str = "") -> Any:
     return load_class("shapes", BUILTIN, name, "shape.kind", alternative)
 
 

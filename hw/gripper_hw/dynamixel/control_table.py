@@ -4,7 +4,7 @@ import math
 import re
 from functools import cache
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Self, TypedDict
+from typing import Any, Final, NamedTuple, Self, TypedDict, cast
 
 from pydantic import Field, model_validator
 
@@ -251,8 +251,7 @@ class _SharedFile(TypedDict):
 
 @cache
 def _shared() -> _SharedFile:
-    shared: Any = read_tree(_FOLDER / _SHARED)
-    return shared
+    return cast(_SharedFile, read_tree(_FOLDER / _SHARED))
 
 
 def _registers() -> dict[str, Register]:
