@@ -15,7 +15,7 @@ from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import resolve
 from gripper_force.runtime.session import open_session
-from gripper_force.types import Event, Frame, GraspStatus
+from gripper_force.types import Event, Frame, GraspStatus, Phase, RequestKind
 from gripper_hw.dynamixel import virtual
 
 DEVICES = """
@@ -139,6 +139,23 @@ def test_a_device_that_fails_in_a_run_ends_it_as_configured(
     told = [event.text for event in log.records(Event)]
     assert any(text.startswith(f"DeviceError: {unit}.backend={UNITS[unit]}") for text in told)
     assert len(list(log.records(GraspStatus))) >= 9
+
+
+@pytest.mark.parametrize(("unit", "method"), [("camera", "counts"), ("load_cell", "drain")])
+def test_the_jaws_open_after_a_fault_although_a_sensor_fails_again(
+    config: Config, tmp_path: Path, unit: str, method: str
+) -> None:
+    path = tmp_path / "run.mcap"
+    settings = resolve(with_own(config, unit, "", control={"on_fault": "open"}))
+    with open_devices(settings.config) as devices:
+        with pytest.raises(DeviceError, match=method), open_session(settings, devices, path) as session:
+            session.wait_for_reference()
+            status = session.cycle(RequestKind.GRASP, 3.0).status
+            while status.phase != Phase.HOLD:
+                status = session.cycle().status
+            getattr(devices, unit)._part.fails = method
+            session.cycle()
+        assert list(LogReader(path).records(GraspStatus))[-1].width_m > 0.085
 
 
 def test_the_settings_of_a_camera_may_be_of_numpy(config: Config, tmp_path: Path) -> None:
