@@ -184,7 +184,12 @@ SMALL = {
 @pytest.mark.parametrize(("friction", "gain"), [(0.3, 1.4), (0.63, 1.38), (1.0, 1.0)])
 def test_jaws_near_an_object_keep_a_small_force_limit_whatever_is_requested(make_run, friction, gain, then):
     friction_n = friction * make_run().transmission.friction_n
-    for k, limit_n, x_m, gap_m in itertools.product(*SMALL.values()):
+    # With the friction that once failed each case, else a third of them, in which any two values of parameters meet.
+    part = ["grasp", "move", "move at once"].index(then)
+    for indices in itertools.product(*(range(len(values)) for values in SMALL.values())):
+        if friction != 0.63 and (sum(indices) + (friction < 1.0)) % 3 != part:
+            continue
+        k, limit_n, x_m, gap_m = (values[i] for values, i in zip(SMALL.values(), indices, strict=True))
         plant = {"x_m": x_m, "jaw_m": x_m, "contact_m": x_m + gap_m, "stiffness_n_m": k}
         run = make_run(
             plant={**plant, "friction_n": friction_n, "gain": gain},

@@ -37,7 +37,7 @@ SIMULATED = {"README.md", "docs/your-own-rig.md"}
 
 ADDED = {
     "setup": "--yes --set servo.port=virtual:rig",
-    "grasp": "--set sim.detail=coarse --set log.report=false --set control.hold_s=0.3",
+    "grasp": "--set sim.detail=coarse --set log.report=false --set control.hold_s=0.3 --set vision.checkpoint=small",
     "calibrate object": "--touches 4 --set sim.detail=coarse",
     "teach": "--touches 4 --set sim.detail=coarse --set vision.checkpoint=small",
     "simulate": "--presses 0 --grasps 0 --set sim.detail=coarse",
@@ -49,6 +49,7 @@ ADDED = {
 """Options that shorten a command. They stand before its own, which win."""
 
 REPLACED = {
+    r'overrides=\["object=sponge"\]': 'overrides=["object=sponge", "sim.detail=coarse", "vision.checkpoint=small"]',
     r"\bmug\b": "lemon",
     r"--trials \d+": "--trials 2",
     r"--(presses|taps|grasps) [1-9]\d*": r"--\1 5",

@@ -31,7 +31,7 @@ CLOSED_END_RAD = (0.046 - 0.001) / 0.020
 
 
 def config_of(*overrides: str) -> Config:
-    return load_config(None, ["object=none", "sim.detail=coarse", *overrides])
+    return load_config(None, ["object=none", "sim.detail=coarse", "camera.backend=none", *overrides])
 
 
 def home(*overrides: str) -> JawsResult:
@@ -60,7 +60,7 @@ def test_ends_direction_and_friction_are_found_with_any_configuration(overrides:
 
 @pytest.mark.parametrize("path", sorted(GRIPPERS.glob("*.yaml")), ids=lambda path: path.stem)
 def test_every_ready_gripper_is_homed(path: Path) -> None:
-    config = load_config(path, ["object=none", "sim.detail=coarse", "seed=5"])
+    config = load_config(path, ["object=none", "sim.detail=coarse", "camera.backend=none", "seed=5"])
     result = calibrate_jaws(config, prompt=lambda text: None)
     assert result.closing_sign == config.gripper.closing_sign
     spare_m = result.open_width_m - config.gripper.open_width_m  # a rack opens by 4 mm of each jaw more
@@ -79,10 +79,9 @@ def test_its_proposal_makes_a_grasp_possible() -> None:
         assert gripper.grasp(3.0).outcome == "held"
 
 
-@pytest.mark.parametrize("times", [3, 5])
-def test_friction_beyond_the_configured_one_is_overcome(times: int) -> None:
-    result = home("seed=3", f"sim.friction={times}")
-    assert result.friction_n == pytest.approx(0.95 * times, rel=0.15)
+def test_friction_beyond_the_configured_one_is_overcome() -> None:
+    result = home("seed=3", "sim.friction=5")
+    assert result.friction_n == pytest.approx(0.95 * 5, rel=0.15)
     # The simulated stops give by 2 mm under the current that this friction needs.
     assert result.closed_end_rad == pytest.approx(CLOSED_END_RAD, abs=0.1)
 
