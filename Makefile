@@ -26,7 +26,7 @@ test: setup-dev
 	$(BIN)/mypy integrations/conftest.py integrations/*/tests
 	$(BIN)/lint-imports
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto $(or $(ARGS),$(COVERED:%=--ignore=%))
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n auto --dist worksteal $(or $(ARGS),$(COVERED:%=--ignore=%))
 	$(BIN)/coverage run -m pytest -q $(COVERED)
 	$(BIN)/coverage report
 

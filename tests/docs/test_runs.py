@@ -37,7 +37,7 @@ SIMULATED = {"README.md", "docs/your-own-rig.md"}
 
 ADDED = {
     "setup": "--yes --set servo.port=virtual:rig",
-    "grasp": "--set sim.detail=coarse --set log.report=false --set control.hold_s=0.3 --set vision.checkpoint=small",
+    "grasp": "--set sim.detail=coarse --set log.report=false --set control.hold_s=0.3",
     "calibrate object": "--touches 4 --set sim.detail=coarse",
     "teach": "--touches 4 --set sim.detail=coarse --set vision.checkpoint=small",
     "simulate": "--presses 0 --grasps 0 --set sim.detail=coarse",

@@ -168,7 +168,7 @@ def test_search_continues_where_it_was_interrupted(
 def test_no_linkage_exceeds_the_force_limit(name: str) -> None:
     # The speed depends on the travel per radian, which a wrong start makes wrong for linkages (docs/reliability.md).
     config = load_config(GRIPPERS / f"{name}.yaml")
-    found = results(config, 0, 15)
+    found = results(config, 0, 10)
     assert not any(result.force_share > 1.05 or result.held_nothing for result in found)
     assert any(result.force_share > 0.1 for result in found)
 

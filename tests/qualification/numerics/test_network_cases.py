@@ -52,7 +52,7 @@ def broken(rows: list[NumericalCase]) -> list[str]:
 
 def test_every_case_is_within_its_bound(tiny_checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Covers the cases that need no export. Those of the head's fit have a test of their own."""
-    monkeypatch.setattr(suite.head_fit_cases, "cases", lambda: iter(()))
+    monkeypatch.setattr("gripper_force.qualification.numerics.head_fit_cases.cases", lambda: iter(()))
     config = Config.model_validate({"vision": {"checkpoint": str(tiny_checkpoint)}})
     rows = list(suite.cases(config, None, streamed=300, long=300, variants=TORCH))
     assert broken(rows) == []
