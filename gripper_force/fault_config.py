@@ -2,7 +2,7 @@
 
 from typing import Annotated, Final, Literal, Self
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from gripper_force.schema import NonNegative, Section
 
@@ -69,10 +69,7 @@ class FaultConfig(Section):
     """A fault to inject; `FAULTS` lists units, kinds and their meaning."""
 
     unit: Literal["servo", "bus", "plant", "camera", "load_cell", "estimator", "clock", "disk"]
-    kind: Annotated[
-        Literal["ok", "off", "stuck", "garbage", "wrong", "slow", "delayed", "intermittent"],
-        BeforeValidator(lambda kind: "off" if kind is False else kind),  # what YAML makes of a bare off
-    ]
+    kind: Literal["ok", "off", "stuck", "garbage", "wrong", "slow", "delayed", "intermittent"]
     at_s: NonNegative = Field(0.0, description="start, seconds after the start of the run")
     for_s: Annotated[float, Field(gt=0)] = Field(float("inf"), description="duration in seconds")
     id: int | None = Field(
@@ -86,4 +83,6 @@ class FaultConfig(Section):
             raise ValueError(f"unit {self.unit} has no fault kind {self.kind}; choose one of {known}")
         if self.id is not None and self.unit not in ("servo", "plant"):
             raise ValueError(f"unit {self.unit} has no id; leave it out")
+        if (self.unit, self.kind) == ("clock", "stuck") and self.for_s == float("inf"):
+            raise ValueError("a clock that stands still for good lets no run end; give for_s")
         return self

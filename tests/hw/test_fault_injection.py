@@ -38,12 +38,17 @@ def faults(unit: str, kind: str, at_s: float = 1.0, for_s: float = 1.0) -> Fault
 @pytest.mark.parametrize("unit", FAULTS)
 @pytest.mark.parametrize("kind", KINDS)
 def test_unsupported_pairs_are_refused(unit: str, kind: str) -> None:
-    tree = {"faults": [{"unit": unit, "kind": kind}]}
+    tree = {"faults": [{"unit": unit, "kind": kind, "for_s": 1.0}]}
     if kind in FAULTS[unit]:
         assert config_from(tree, "test").faults[0].kind == kind
     else:
         with pytest.raises(ConfigError, match=f"unit {unit} has no fault kind {kind}; choose one of ok, "):
             config_from(tree, "test")
+
+
+def test_a_clock_that_stands_still_for_good_is_refused() -> None:
+    with pytest.raises(ConfigError, match="lets no run end; give for_s"):
+        load_config(None, ["faults=[{unit: clock, kind: stuck, at_s: 0}]"])
 
 
 def test_faults_are_set_on_the_command_line() -> None:
