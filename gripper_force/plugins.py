@@ -113,7 +113,8 @@ class _Plugin:
         self._part, self._name, self._error_type = part, name, error_type
 
     def __getattr__(self, name: str) -> Any:
-        value = getattr(self._part, name)
+        # Not self._part: copy and pickle ask an object that has none yet.
+        value = getattr(object.__getattribute__(self, "_part"), name)
         return partial(self._call, value, f"{self._name}.{name}") if callable(value) else value
 
     def __call__(self, *arguments: Any) -> Any:
@@ -122,7 +123,8 @@ class _Plugin:
 
     def _call(self, function: Callable[..., Any], called: str, *arguments: Any, **named: Any) -> Any:
         try:
-            return function(*arguments, **named)
+            with importing(called):  # a package may be imported only now
+                return function(*arguments, **named)
         except GripperError:
             raise
         except Exception as error:

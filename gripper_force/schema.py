@@ -55,15 +55,16 @@ _NO_YAML = (yaml.YAMLError, ValueError, LookupError, AttributeError, TypeError, 
 
 _SCALARS = {
     "bool": "true|True|TRUE|false|False|FALSE",
-    "int": "[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+",
-    "float": r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
+    "int": "[-+]?(?!0[0-9]*[89])[0-9]+|0x[0-9a-fA-F]+",
+    "float": r"([-+]?[0-9]+\.[0-9]*|\.[0-9]+)([eE][-+][0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
     "null": "~|null|Null|NULL|",
     "merge": "<<",
 }
 """Patterns of values without quotes that are no text, by tag.
 
-They are those of YAML 1.2's core schema (https://yaml.org/spec/1.2.2/#103-core-schema) and ``<<``. PyYAML's are those
-of YAML 1.1, where 010 is 8, 1:30 is 90, and 1e-3 is text.
+They are what YAML 1.1, as PyYAML writes it without quotes, and YAML 1.2's core schema
+(https://yaml.org/spec/1.2.2/#103-core-schema) both read so, and 010, which is 10. Others, such as 1e-3 and 08, are
+text, and numbers of a key that wants one.
 """
 
 
@@ -200,7 +201,7 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
 
     def construct_yaml_int(self, node: yaml.ScalarNode) -> int:
         text = str(self.construct_scalar(node))
-        return int(text, 0 if text[:2] in ("0o", "0x") else 10)
+        return int(text, 16 if text.startswith("0x") else 10)
 
 
 _Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)

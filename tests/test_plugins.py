@@ -1,3 +1,4 @@
+from copy import copy
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
@@ -101,3 +102,19 @@ def test_a_missing_system_library_is_one_sentence(tmp_path: Path, monkeypatch: p
         ConfigError, match=r"can't import 'own_vendor': libvendor_is_missing\.so.*; .*install what"
     ):
         load("own_vendor:Camera")
+
+
+def test_a_package_that_a_third_party_class_imports_late_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = "class Shape:\n    def __init__(self):\n        import vendor_is_missing\n"
+    (tmp_path / "own_late.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ConfigError, match="needs vendor_is_missing, which is not installed; install it"):
+        load("own_late:Shape")()
+
+
+def test_a_third_party_object_can_be_copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "own_shape.py").write_text("class Shape:\n    sides = 3\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert copy(load("own_shape:Shape")()).sides == 3

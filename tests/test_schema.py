@@ -5,7 +5,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gripper_force.config import load_config
+from gripper_force.config import config_from_text, load_config
 from gripper_force.errors import ConfigError
 from gripper_force.schema import (
     Section,
@@ -96,21 +96,32 @@ def test_a_boolean_is_no_number(key: str) -> None:
     ("text", "value"),
     [
         ("010", 10),
-        ("-08", -8),
         ("0x1F", 31),
-        ("0o17", 15),
-        ("1e-3", 1e-3),
+        ("1.5e-3", 1.5e-3),
         ("1.", 1.0),
         (".5", 0.5),
         ("-.inf", float("-inf")),
         ("true", True),
         ("", None),
         *((text, text) for text in ("1:30", "0b", "no", "2026-01-02", "1e", ".", "0o8")),
+        *((text, text) for text in ("08", "-09", "0o17", "1e5", "18443010E2", "1.5e3", "-.5")),
     ],
 )
-def test_a_value_is_read_by_yaml_1_2(text: str, value: object) -> None:
-    """YAML 1.1 reads 010 as 8, 1:30 as 90, 1e-3 as text, no as false, and 0b not at all."""
+def test_a_value_is_read_as_versions_1_1_and_1_2_of_yaml_agree(text: str, value: object) -> None:
+    """YAML 1.1 reads 010 as 8, 1:30 as 90, no as false, and 0b not at all; 08 and 1e5 are text there."""
     assert repr(tree_from(f"key: {text}", "there")["key"]) == repr(value)
+
+
+@pytest.mark.parametrize("name", ["08", "018", "1e5", "18443010E2", "0o17"])
+def test_text_that_yaml_1_1_left_without_quotes_is_still_text(name: str) -> None:
+    config = load_config(None, {"object": name, "camera.options": {"serial": name}})
+    written_earlier = yaml.safe_dump(config.model_dump(mode="json"))
+    assert config_from_text(written_earlier, "the log") == config
+
+
+def test_a_key_that_wants_a_number_takes_each_form_of_it() -> None:
+    config = load_config(None, ["servo.id=08", "control.rate_hz=2e2", "gripper.friction_n=1e-3"])
+    assert (config.servo.id, config.control.rate_hz, config.gripper.friction_n) == (8, 200.0, 1e-3)
 
 
 def test_a_number_with_a_leading_zero_is_decimal_and_minutes_are_none(tmp_path: Path) -> None:

@@ -39,7 +39,8 @@ def check(config: ConfigPath = None, set_: Overrides = None, as_json: AsJson = F
     make_estimator(resolved)
     gray = _known_frame(resolved.config)
     if is_simulated(resolved.config):
-        with open_devices(resolved.config) as devices:
+        # An injected fault could keep back the frame, and the clock.
+        with open_devices(resolved.config.with_values(faults=())) as devices:
             if resolved.config.camera.backend == "simulated" and resolved.config.vision.region is not None:
                 gray = _simulated_frame(devices)
     if gray is not None and resolved.config.uses_vision:
@@ -67,7 +68,7 @@ def _known_frame(config: "Config") -> "Gray | None":
 
 
 def _simulated_frame(devices: "Devices") -> "Gray | None":
-    """Returns the first frame of a simulated camera; None if its faults let it give none within a second."""
+    """Returns the first frame of a simulated camera; None if it gives none within a second."""
     from gripper_force.types import NS_PER_MS
 
     assert devices.camera is not None

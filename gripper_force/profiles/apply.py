@@ -71,7 +71,7 @@ def with_bundle(config: Config) -> tuple[Config, str]:
     if name is None or not config.uses_vision:
         return config, ""
     profile = read_object(path := find_object(name))
-    file = config.sim.object and str(config.sim.object.absolute())
+    file = config.sim.object and str(config.sim.object.resolve())
     if config.calibration.object is None and None not in (file, profile.file) and file != profile.file:
         return config, f"did not use the bundle {path.parent}, which is that of the object in {profile.file}"
     network = None if profile.network is None else str(path.with_name(profile.network))

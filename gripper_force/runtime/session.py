@@ -322,7 +322,7 @@ class Session:
             self._perception.close()
             if (settings := getattr(self._devices.camera, "settings", None)) is not None:
                 text = json.dumps(
-                    settings(), default=lambda value: getattr(value, "tolist", value.__repr__)()
+                    settings(), default=lambda v: getattr(v, "tolist", v.__repr__)(), skipkeys=True
                 )
                 self.attach("camera.json", text.encode(), "application/json")
         self._log_sensors(self._devices.clock.now_ns(), at_end=True)

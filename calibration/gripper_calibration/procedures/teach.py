@@ -242,7 +242,7 @@ def check_before_touches(config: Config, name: str, out: Path) -> tuple[Config, 
 
 def _object_file(config: Config) -> str | None:
     """Returns the path of a simulated object's file; None for an object known by name."""
-    return None if config.sim.object is None else str(config.sim.object.absolute())
+    return None if config.sim.object is None else str(config.sim.object.resolve())
 
 
 class _Left(NamedTuple):

@@ -378,8 +378,11 @@ def test_two_files_of_one_name_share_no_bundle(
         ConfigError, match=r"part is that of the object in .*a/part\.yaml, not of .*b/part\.yaml; "
     ):
         teach(second, "part", logs=logs, folder=tmp_path / "work")
-    used, declined = (with_bundle(load_config(None, [f"object={path}"])) for path in files)
-    assert used[0].vision.checkpoint == str(home / "part" / "network.safetensors")
+    (tmp_path / "linked").symlink_to(files[0].parent)
+    paths = (files[0], tmp_path / "linked" / "part.yaml", tmp_path / "b" / ".." / "a" / "part.yaml", files[1])
+    *used, declined = (with_bundle(load_config(None, [f"object={path}"])) for path in paths)
+    for config, _ in used:
+        assert config.vision.checkpoint == str(home / "part" / "network.safetensors")
     assert declined[0].vision.checkpoint == "default"
     assert declined[1] == f"did not use the bundle {home / 'part'}, which is that of the object in {files[0]}"
     shutil.rmtree(home / "part")
