@@ -103,7 +103,8 @@ def prompt(yes: bool, status: "Status | Bar | None" = None) -> "Prompt":
             return
         if not sys.stdin.isatty():
             raise ConfigError(
-                f"this needs a person at a terminal: {text}; run it in a terminal, or pass --yes if it is done"
+                f"this needs a person at a terminal: {text}; run it in a terminal or, if it is done, pass --yes or "
+                "leave out --pause"
             )
         if status is not None:
             status.stop()

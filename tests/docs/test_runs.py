@@ -51,6 +51,7 @@ ADDED = {
 REPLACED = {
     r'overrides=\["object=sponge"\]': 'overrides=["object=sponge", "sim.detail=coarse", "vision.checkpoint=small"]',
     r"\bmug\b": "lemon",
+    " --pause": "",  # nobody is there to press Enter
     r"--trials \d+": "--trials 2",
     r"--(presses|taps|grasps) [1-9]\d*": r"--\1 5",
     r"--sets \d+": "--sets 2",
