@@ -320,7 +320,7 @@ class Session:
             raise type(first)(f"{first}; and the servo could not be stopped: {second}") from first
         finally:
             self._perception.close()
-            if (settings := getattr(self._devices.camera, "settings", None)) is not None:
+            if callable(settings := getattr(self._devices.camera, "settings", None)):
                 text = json.dumps(
                     settings(), default=lambda v: getattr(v, "tolist", v.__repr__)(), skipkeys=True
                 )

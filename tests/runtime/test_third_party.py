@@ -3,6 +3,7 @@
 import json
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -164,6 +165,19 @@ def test_the_settings_of_a_camera_may_be_of_numpy(config: Config, tmp_path: Path
     assert len(list(LogReader(path).records(Frame))) > 40
     settings = json.loads(LogReader(path).attachments["camera.json"])
     assert settings == {"gain": 2.5, "resolution_px": [64, 48], "mode": "day"}
+
+
+def test_an_attribute_settings_of_a_camera_is_its_own(
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "run.mcap"
+    settings = resolve(with_own(config, "camera", ""))
+    with open_devices(settings.config) as devices:
+        camera: Any = devices.camera
+        monkeypatch.setattr(camera._part, "settings", {"gain": 2})
+        with open_session(settings, devices, path) as session:
+            session.wait_for_reference()
+    assert "camera.json" not in LogReader(path).attachments
 
 
 def test_settings_that_fail_do_not_cost_the_log(config: Config, tmp_path: Path) -> None:
