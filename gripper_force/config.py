@@ -294,6 +294,10 @@ class LoadCellConfig(Section):
         return f"{self.backend} {self.format}" if self.backend == "serial" else self.backend
 
 
+MAX_COVERED: Final = 0.15
+"""Default of ``vision.max_covered``. Flat jaws cover up to 0.125 in simulation, the widest drawn ones 0.16."""
+
+
 class VisionConfig(Section):
     """The force estimator and its input."""
 
@@ -313,6 +317,13 @@ class VisionConfig(Section):
     threads: int = Field(1, ge=1, le=64, description="CPU threads; more than 1 only help on idle cores")
     region: tuple[int, int, int, int] | None = Field(
         None, description="region of interest of the camera frame as left, top, width, height in pixels"
+    )
+    max_covered: float = Field(
+        MAX_COVERED,
+        ge=0,
+        le=1,
+        description="largest share of the image that may lose its fine detail, as behind a cover; raise it for "
+        "jaws that fill more of the view",
     )
     lockstep_compute_ms: NonNegative = Field(
         12.0, description="simulated time that one estimate takes in a lockstep run"

@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from gripper_force.config import VisionConfig
+from gripper_force.config import MAX_COVERED, VisionConfig
 from gripper_force.errors import ConfigError, NonFiniteError, UnfamiliarFrameError
 from gripper_force.profiles.correction import Correction, load_correction
 from gripper_force.profiles.object_profile import find_object, read_object
@@ -36,7 +36,11 @@ class ForceEstimator:
     """
 
     def __init__(
-        self, engine: Engine, region: Region | None = None, correction: Correction | None = None
+        self,
+        engine: Engine,
+        region: Region | None = None,
+        correction: Correction | None = None,
+        max_covered: float = MAX_COVERED,
     ) -> None:
         """Starts a stream on an engine that is open; `load` opens one.
 
@@ -45,8 +49,9 @@ class ForceEstimator:
             region: Region of interest of the frames in pixels: left, top, width, height. None: the whole
                 frame.
             correction: Correction by an object profile.
+            max_covered: Largest share of the image that may lose its fine detail, as behind a cover.
         """
-        self._region = region
+        self._region, self._max_covered = region, max_covered
         self._engine = engine
         self._preprocess = engine.header.preprocess
         self._correction = correction
@@ -60,6 +65,7 @@ class ForceEstimator:
         checkpoint: str | Path = "default",
         *,
         region: Region | None = None,
+        max_covered: float = MAX_COVERED,
         profile: str | Path | None = None,
         engine: str = "torch",
         precision: Precision = "float32",
@@ -85,6 +91,8 @@ class ForceEstimator:
                 of a file that `gripper-force export network` wrote.
             region: Region of interest of the frames in pixels: left, top, width, height. None: the whole
                 frame.
+            max_covered: Largest share of the image that may lose its fine detail, as behind a cover. Raise it for
+                jaws that fill more of the view.
             profile: Object profile: a name such as ``sponge``, or the path of a YAML file. Its network must
                 be this one; its camera settings are not checked.
             engine: ``torch``, ``openvino``, ``onnxruntime``, or an engine of another package: the name of an
@@ -100,11 +108,11 @@ class ForceEstimator:
         """
         model = read_model(checkpoint)
         correction = None if profile is None else _profile_correction(model, str(profile))
-        return cls(open_engine(model, engine, precision, threads), region, correction)
+        return cls(open_engine(model, engine, precision, threads), region, correction, max_covered)
 
     def reset(self) -> None:
         """Starts a new stream: the next frames must show no contact and become its reference."""
-        self._frame_checks = FrameChecks()
+        self._frame_checks = FrameChecks(self._max_covered)
         self._normaliser = Normaliser(self._preprocess)
         self._engine.reset()
         if self._ood is not None:
@@ -214,9 +222,8 @@ def open_estimator(
         CheckpointError: The file is damaged.
     """
     threads = None if vision.engine == "torch" and not set_threads else vision.threads
-    return ForceEstimator(
-        open_engine(model, vision.engine, vision.precision, threads), vision.region, correction
-    )
+    engine = open_engine(model, vision.engine, vision.precision, threads)
+    return ForceEstimator(engine, vision.region, correction, vision.max_covered)
 
 
 def _profile_correction(model: Model, name: str) -> Correction:

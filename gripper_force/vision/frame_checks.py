@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from gripper_force.config import MAX_COVERED
 from gripper_force.errors import DataError, UnfamiliarFrameError
 from gripper_force.types import Gray
 from gripper_force.vision.preprocess import FLAT_STD
@@ -30,9 +31,6 @@ SLOPE: Final = 0.06
 
 SHARPNESS: Final = 0.75
 """Smallest fine detail of the still part of the image, as a share of the first frame's."""
-
-COVERED: Final = 0.15
-"""Largest share of the image that loses its fine detail. Flat jaws cover up to 0.125 in simulation."""
 
 _GRID: Final = 8
 """Blocks along a side, in which fine detail is compared."""
@@ -57,7 +55,9 @@ class FrameChecks:
     (1996) 75-104, doi:10.1006/cviu.1996.0006).
     """
 
-    def __init__(self) -> None:
+    def __init__(self, max_covered: float = MAX_COVERED) -> None:
+        """Starts a stream; ``max_covered`` is the largest share of the image that may lose its fine detail."""
+        self._max_covered = max_covered
         self._first: tuple[float, float, float] | None = None
 
     def check(self, small: Gray) -> None:
@@ -133,8 +133,9 @@ class FrameChecks:
             "blur": (1 - sharpness, 1 - SHARPNESS, f"the image lost {1 - sharpness:.0%} of its fine detail"),
             "covered": (
                 covered,
-                COVERED,
-                f"{covered:.0%} of the image lost its detail, as if it was covered,",
+                self._max_covered,
+                f"{covered:.0%} of the image lost its detail, as if it was covered, more than vision.max_covered "
+                f"({self._max_covered:.0%}),",
             ),
         }
 

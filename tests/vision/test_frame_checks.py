@@ -109,3 +109,10 @@ def test_a_covered_view_is_an_unfamiliar_frame(press: Gray) -> None:
             check(checks, frame)
         assert np.isnan(caught.value.force_n)
     check(checks, press[10])
+
+
+def test_the_share_that_may_be_covered_is_a_setting(press: Gray) -> None:
+    checks = FrameChecks(max_covered=1.0)
+    check(checks, press[0])
+    for frame in recognition.blob(press[10::5], np.random.default_rng(0)):
+        check(checks, frame)

@@ -49,7 +49,7 @@ def estimates_in_batches(
     assert resolved.model is not None
     vision, checkpoint = resolved.config.vision, kept_checkpoint(resolved.model.path, resolved.model.digest)
     engine = TorchEngine(checkpoint, threads=vision.threads if allowed().torch_threads else None)
-    estimator = ForceEstimator(engine, vision.region, resolved.correction)
+    estimator = ForceEstimator(engine, vision.region, resolved.correction, vision.max_covered)
     waiting: deque[_Waiting] = deque()
     chunks = prepared_features(checkpoint.networks, _batches(records, estimator, waiting))
     works, done = False, 0
