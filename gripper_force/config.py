@@ -322,8 +322,7 @@ class VisionConfig(Section):
         MAX_COVERED,
         ge=0,
         le=1,
-        description="largest share of the image that may lose its fine detail, as behind a cover; raise it for "
-        "jaws that fill more of the view",
+        description="largest share of the image that may lose its detail, as if covered; raise it for wide jaws",
     )
     lockstep_compute_ms: NonNegative = Field(
         12.0, description="simulated time that one estimate takes in a lockstep run"

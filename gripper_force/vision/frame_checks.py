@@ -14,9 +14,7 @@ from gripper_force.errors import DataError, UnfamiliarFrameError
 from gripper_force.types import Gray
 from gripper_force.vision.preprocess import FLAT_STD
 
-BRIGHTNESS: Final = 1.6
-CONTRAST: Final = 2.5
-ROUGHNESS: Final = 2.5
+RATIOS: Final = {"brightness": 1.6, "contrast": 2.5, "roughness": 2.5}
 """Largest ratios of a frame to the first frame of the stream, in either direction. The extremes observed in
 presses are 1.15, 1.33 and 1.2 in simulation, and 1.06, 1.04 and 1.1 with a finger camera."""
 
@@ -78,19 +76,13 @@ class FrameChecks:
             raise DataError(
                 f"the camera's image is flat (gray level {level:.0f}); check its lens, light and exposure"
             )
-        brightness = float(pixels.mean())
         roughness = float(np.abs(np.diff(pixels)).mean()) / contrast
+        present = float(pixels.mean()), contrast, roughness
         if self._first is None:
-            self._first = brightness, contrast, roughness
+            self._first = present
             if len(pixels) >= _MIN_PX:
                 self._begin(pixels)
-        for name, now, first, most in zip(
-            ("brightness", "contrast", "roughness"),
-            (brightness, contrast, roughness),
-            self._first,
-            (BRIGHTNESS, CONTRAST, ROUGHNESS),
-            strict=True,
-        ):
+        for (name, most), now, first in zip(RATIOS.items(), present, self._first, strict=True):
             if not first / most <= now <= first * most:
                 raise DataError(
                     f"the image's {name} changed from {first:.3g} to {now:.3g} since the first frame; check "
@@ -126,17 +118,13 @@ class FrameChecks:
         kept = ratio[_block_means(still.reshape(_SAMPLES, -1).astype(np.float32)) > 0.7]
         sharpness = float(np.median(kept)) if len(kept) else 1.0
         covered = float((ratio < 0.3).mean())
+        hidden = f"{covered:.0%} of the image lost its detail, as if it was covered, over vision.max_covered,"
         return {
             "shift": (shift, SHIFT, f"the camera's view moved by {shift:.1%} of its side"),
             "zoom": (zoom, ZOOM, f"the camera's view was zoomed by {zoom:.1%}"),
             "slope": (slope, SLOPE, f"the light changed by {slope:.0%} more at one side than in the middle"),
             "blur": (1 - sharpness, 1 - SHARPNESS, f"the image lost {1 - sharpness:.0%} of its fine detail"),
-            "covered": (
-                covered,
-                self._max_covered,
-                f"{covered:.0%} of the image lost its detail, as if it was covered, more than vision.max_covered "
-                f"({self._max_covered:.0%}),",
-            ),
+            "covered": (covered, self._max_covered, hidden),
         }
 
     def _begin(self, pixels: Floats) -> None:
