@@ -437,7 +437,7 @@ def teach(
                 progress=progress,
             )
     except KeyboardInterrupt:
-        console.err.print("what was done until now is kept; the same command continues", soft_wrap=True)
+        console.tell_kept(f"what was done until now is in {folder}", fresh=fresh)
         raise
     _tell_left_out(result)
     shown = console.jsonable(result) | {"minutes": (time.monotonic() - begin_s) / 60}

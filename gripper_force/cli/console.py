@@ -94,6 +94,12 @@ def next_step(*words: object) -> None:
     err.print(f"next: {command(*words)}", soft_wrap=True, markup=False)
 
 
+def tell_kept(what: str, *, fresh: bool) -> None:
+    """Prints after an interruption that the same command continues; with ``--fresh`` it would start over."""
+    same = "the same command without --fresh" if fresh else "the same command"
+    err.print(f"{what}; {same} continues there", soft_wrap=True, markup=False)
+
+
 def prompt(yes: bool, status: "Status | Bar | None" = None) -> "Prompt":
     """Returns a prompt that waits for Enter, or with ``yes`` only prints. Meanwhile ``status`` is hidden."""
 

@@ -209,6 +209,8 @@ def import_video(
         with console.bar("importing", len(job.find_recordings(video))) as progress:
             summaries = job.import_folder(video, folder, region=region, align=align, progress=progress)
     elif forces is None:
+        if not video.exists():
+            raise DataError(f"there is no {video}; name a video, or a folder of recordings")
         raise DataError(f"{video} needs its load-cell table; add it: import video CLIP.avi FORCES.csv")
     else:
         log = folder / f"{video.stem}.mcap"

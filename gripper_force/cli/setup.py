@@ -60,12 +60,7 @@ def setup(
         except (GripperError, KeyboardInterrupt):
             status.stop()
             if running.rig.path.exists():
-                same = "the same command without --fresh" if fresh else "the same command"
-                console.err.print(
-                    f"what was found so far is in {config}; {same} continues there",
-                    soft_wrap=True,
-                    markup=False,
-                )
+                console.tell_kept(f"what was found so far is in {config}", fresh=fresh)
             raise
     words = _next(running, config)
     result = {"rig": config, "steps": reports, "next": console.command(*words)}

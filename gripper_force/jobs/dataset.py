@@ -104,7 +104,7 @@ def find_logs(source: str | Path | Sequence[str | Path]) -> list[Path]:
     given = [source] if isinstance(source, str | Path) else source
     found: dict[Path, Path] = {}
     for path in map(Path, given):
-        logs = sorted(path.rglob("*.mcap")) if path.is_dir() else [path]
+        logs = sorted(p for p in path.rglob("*.mcap") if not p.is_dir()) if path.is_dir() else [path]
         if not logs:
             raise DataError(f"no logs (*.mcap) in {path}; record, simulate or import some")
         for log in logs:

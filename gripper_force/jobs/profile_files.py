@@ -20,9 +20,14 @@ from gripper_force.profiles.rig_profile import (
 from gripper_force.schema import dump
 
 
-def check_place(path: Path) -> None:
-    """Creates the folder of a profile. Raises `ConfigError` if the profile can't be written there."""
+def check_object_place(path: Path) -> None:
+    """Creates the folder of an object profile. Raises `ConfigError` if the profile can't be written there."""
     _check_names(path)
+    check_place(path)
+
+
+def check_place(path: Path) -> None:
+    """Creates the folder of a file. Raises `ConfigError` if the file can't be written there."""
     probe = path.with_name(f".{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -61,13 +66,23 @@ def pack(arrays: ProfileArrays) -> bytes:
     return data
 
 
+def rig_to_update(path: Path) -> RigProfile:
+    """Returns the rig profile that a calibration will update, or a new one, before anything moves.
+
+    Raises:
+        ConfigError: The file exists and is not a rig profile, or it can't be written.
+    """
+    check_place(path)
+    return read_rig(path) if path.exists() else RigProfile()
+
+
 def update_rig(path: Path, section: LoadCellCalibration | ServoCalibration | CameraCalibration) -> RigProfile:
     """Replaces one section of a rig profile, or creates the profile, and writes it.
 
     Raises:
         ConfigError: The file exists and is not a rig profile, or it can't be written.
     """
-    profile = read_rig(path) if path.exists() else RigProfile()
+    profile = rig_to_update(path)
     names = {LoadCellCalibration: "load_cell", ServoCalibration: "servo", CameraCalibration: "camera"}
     profile = profile.model_copy(update={names[type(section)]: section})
     write_all({path: dump(profile).encode()})

@@ -32,7 +32,7 @@ class LogQueue:
     def __init__(self, log: LogWriter, *, lockstep: bool) -> None:
         self.lost = 0
         self._log = log
-        self._error, self._remedy = "", "free some space, or set another log.directory"
+        self._error, self._remedy = "", "free some space, or name another folder (log.directory or --out)"
         self._queue: queue.Queue[Callable[[], None] | None] = queue.Queue(ROOM)
         self._thread: threading.Thread | None = None
         if not lockstep:

@@ -713,6 +713,8 @@ def test_a_video_needs_its_table(run: Run, tmp_path: Path) -> None:
     video, table = write_recording(tmp_path)
     table.unlink()
     assert "needs its load-cell table" in run("import", "video", video).err
+    missing = tmp_path / "missing.avi"
+    assert f"there is no {missing}" in run("import", "video", missing).err
     done = run("import", "video", video, table)
     assert done.code == 2
     assert "can't read the table" in done.err

@@ -137,6 +137,16 @@ def test_ctrl_c_at_a_question_ends_with_130(arguments: str, question: str, tmp_p
     assert ("what was found so far is in rig.yaml" in shown) == (arguments == "setup")
 
 
+@pytest.mark.parametrize(("option", "same"), [("", ""), (" --fresh", " without --fresh")])
+def test_the_command_that_continues_an_interrupted_teaching_starts_nothing_over(
+    option: str, same: str, tmp_path: Path
+) -> None:
+    arguments = "teach stapler --touches 4 --pause --set vision.checkpoint=small --out bundle" + option
+    code, shown = on_terminal(arguments, tmp_path, keys={"press Enter": b"\x03"}, TERM="dumb")
+    assert code == 130
+    assert f"is in data/touches/stapler; the same command{same} continues there" in shown
+
+
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
 def test_ctrl_c_is_the_way_to_end_a_virtual_servo(number: int, code: int, tmp_path: Path) -> None:
     command = [*COMMAND, "virtual-servo", "--json"]

@@ -109,7 +109,8 @@ def test_logs_become_clips(tmp_path: Path) -> None:
 
 
 def test_missing_logs_frames_or_labels_raise(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="no logs"):
+    (tmp_path / "folder.mcap").mkdir()
+    with pytest.raises(DataError, match=f"no logs .* in {tmp_path};"):
         load_clips(tmp_path, SMALL)
     write_log(tmp_path / "dark.mcap", [sample(0, 1.0)], {})
     with pytest.raises(DataError, match=r"dark\.mcap holds no camera frames"):

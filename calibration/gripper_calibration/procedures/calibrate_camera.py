@@ -26,12 +26,12 @@ from gripper_calibration.plots.camera_plot import draw
 from gripper_calibration.procedures.estimate_time import estimate_ms
 from gripper_force.config import CAMERA_OTHER_KEYS, Config
 from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
-from gripper_force.jobs.profile_files import update_rig
+from gripper_force.jobs.profile_files import rig_to_update, update_rig
 from gripper_force.jobs.recording.lag import camera_lags_s
 from gripper_force.jobs.recording.record import RecordingPlan, record
 from gripper_force.jobs.recording.summary import releases_ns, touch_lags
 from gripper_force.profiles.object_profile import BUNDLED, read_object, user_folder
-from gripper_force.profiles.rig_profile import CalibratedValue, CameraCalibration, read_rig
+from gripper_force.profiles.rig_profile import CalibratedValue, CameraCalibration
 from gripper_force.progress import Progress, no_progress
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log_reader import LogReader
@@ -147,8 +147,7 @@ def calibrate_camera(
             f"calibrate camera needs a camera with settings, but camera.backend is {config.camera.backend}; "
             "set the backend of yours"
         )
-    if rig.exists():
-        read_rig(rig)  # a damaged profile is reported before anything moves
+    rig_to_update(rig)  # raises if it can't be read or written
     before = config
     config = config.with_values(
         calibration={"rig": None, "object": None},  # their camera settings are replaced

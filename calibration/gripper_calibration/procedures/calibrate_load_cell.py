@@ -16,8 +16,8 @@ from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DataError, DeviceTimeoutError
 from gripper_force.interfaces import Clock, LoadCell
 from gripper_force.jobs.checks import open_load_cell
-from gripper_force.jobs.profile_files import update_rig
-from gripper_force.profiles.rig_profile import LoadCellCalibration, read_rig
+from gripper_force.jobs.profile_files import rig_to_update, update_rig
+from gripper_force.profiles.rig_profile import LoadCellCalibration
 from gripper_force.progress import Progress, Prompt, no_progress
 from gripper_force.runtime.backends import MonotonicClock
 from gripper_force.types import NS_PER_MS, NS_PER_S, STANDARD_GRAVITY_M_S2, LoadCellSample
@@ -87,8 +87,7 @@ def calibrate_load_cell(
         )
     if not 0 < force_n <= _MAX_FORCE_N:
         raise ConfigError(f"a mass of {force_n:g} N can't be weighed; use one of up to {_MAX_FORCE_N:g} N")
-    if rig.exists():
-        read_rig(rig)  # a damaged profile is reported before anyone carries masses
+    rig_to_update(rig)  # raises if it can't be read or written
     clock = MonotonicClock()
     neutral = config.with_values(load_cell={"tare_raw": 0.0, "n_per_raw": NEUTRAL_N_PER_RAW})
     cell: LoadCell = open_load_cell(neutral, clock)

@@ -25,7 +25,7 @@ from gripper_calibration.touch_logs import TouchRecording, join, read_log, start
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DataError
 from gripper_force.jobs.dataset import find_logs
-from gripper_force.jobs.profile_files import check_place, pack, write_object
+from gripper_force.jobs.profile_files import check_object_place, pack, write_object
 from gripper_force.jobs.recording.record import RecordingPlan, check_name, record
 from gripper_force.jobs.trials import with_same_object
 from gripper_force.profiles.object_profile import ObjectProfile, user_folder
@@ -177,7 +177,7 @@ def check_before_touches(config: Config, name: str, out: str | Path | None = Non
     """
     check_name(name)
     path = user_folder() / f"{name}.yaml" if out is None else Path(out)
-    check_place(path)
+    check_object_place(path)
     if resolve_vision(config)[1] is None:
         raise ConfigError(
             "calibrate object corrects a network, but vision.checkpoint is none; name a network, such as default"

@@ -19,12 +19,11 @@ from gripper_force.control.linkage import make_linkage
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import ConfigError, DataError, DeviceError
 from gripper_force.interfaces import Devices, LoadCell
-from gripper_force.jobs.profile_files import update_rig
+from gripper_force.jobs.profile_files import rig_to_update, update_rig
 from gripper_force.profiles.rig_profile import (
     CalibratedValue,
     RigProfile,
     ServoCalibration,
-    read_rig,
 )
 from gripper_force.progress import Progress, Prompt, no_progress
 from gripper_force.runtime.backends import open_devices
@@ -155,7 +154,7 @@ def calibrate_servo(
                 f"a gauge of {1e3 * width_m:g} mm does not fit between jaws that open to "
                 f"{1e3 * config.gripper.open_width_m:g} mm (gripper.open_width_m); use a narrower one"
             )
-    known = read_rig(rig) if rig.exists() else RigProfile()
+    known = rig_to_update(rig)
     given = Nominal(
         _reference_m_per_rad(config.gripper), config.gripper.open_width_m, _scale_share(known, config, rig)
     )

@@ -228,7 +228,7 @@ def check_before_touches(config: Config, name: str, out: Path) -> tuple[Config, 
     if out.exists() and not (out / BUNDLED).is_file():
         raise ConfigError(f"{out} exists and is not a bundle; name another folder")
     file = _object_file(config)
-    if file is not None and out.exists() and (other := read_object(out / BUNDLED).file) not in (None, file):
+    if file is not None and out.exists() and (other := _file_of(out)) not in (None, file):
         raise ConfigError(
             f"the bundle {out} is that of the object in {other}, not of {file}; rename one of the files, or name "
             "another folder with --out"
@@ -238,6 +238,17 @@ def check_before_touches(config: Config, name: str, out: Path) -> tuple[Config, 
     if model is None:
         raise ConfigError("teach needs a network to begin with; set vision.checkpoint, such as to default")
     return config, model
+
+
+def _file_of(bundle: Path) -> str | None:
+    """Returns the path of the simulated object's file that a bundle is of; None for an object known by name."""
+    try:
+        return read_object(bundle / BUNDLED).file
+    except ConfigError as error:
+        raise ConfigError(
+            f"the bundle {bundle} can't be read, so it may be that of another object; move it away, or name another "
+            f"folder with --out ({error})"
+        ) from error
 
 
 def _object_file(config: Config) -> str | None:

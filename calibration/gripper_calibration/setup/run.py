@@ -185,6 +185,7 @@ class Setup:
         """
         if self._fresh and (copy := self.rig.copy_before_fresh()) is not None:
             person.tell(f"the earlier rig file is kept as {copy}")
+        self.rig.check_place()  # before a step writes to the servo
         for number, (name, step) in enumerate(STEPS.items(), 1):
             if self._only and name not in self._only:
                 continue

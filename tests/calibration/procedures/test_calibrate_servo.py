@@ -10,6 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 from gripper_calibration.procedures import calibrate_servo as procedure
+from gripper_calibration.procedures.calibrate_camera import calibrate_camera
+from gripper_calibration.procedures.calibrate_load_cell import calibrate_load_cell
 from gripper_calibration.procedures.calibrate_servo import calibrate_servo
 from gripper_force.cli import app
 from gripper_force.cli.output.calibrate import rig_table
@@ -289,6 +291,21 @@ def test_rig_profile_in_the_configuration_is_written_though_it_does_not_exist(
     update_rig(named, MADE_UP)
     CliRunner().invoke(app, [*arguments, "--rig", str(other)])
     assert (asked[-1][0].calibration.rig, asked[-1][1]) == (named, other)
+
+
+@pytest.mark.parametrize("calibrate", ["servo", "camera", "load_cell"])
+def test_a_rig_profile_that_can_not_be_written_is_named_before_anything_happens(
+    calibrate: str, tmp_path: Path
+) -> None:
+    (tmp_path / "file").touch()
+    rig = tmp_path / "file" / "rig.yaml"
+    with pytest.raises(ConfigError, match=r"can't write .*rig\.yaml: .*; name another file"):
+        if calibrate == "servo":
+            calibrate_servo(config_of(), [0.03], rig, prompt=pytest.fail)
+        elif calibrate == "camera":
+            calibrate_camera(config_of(), rig, progress=pytest.fail)
+        else:
+            calibrate_load_cell(config_of("load_cell.backend=serial"), 5.0, rig, prompt=pytest.fail)
 
 
 def test_without_a_terminal_the_command_is_refused(tmp_path: Path) -> None:

@@ -385,6 +385,11 @@ def test_two_files_of_one_name_share_no_bundle(
         assert config.vision.checkpoint == str(home / "part" / "network.safetensors")
     assert declined[0].vision.checkpoint == "default"
     assert declined[1] == f"did not use the bundle {home / 'part'}, which is that of the object in {files[0]}"
+    (home / "part" / "profile.yaml").write_text("no profile", encoding="utf-8")
+    with pytest.raises(
+        ConfigError, match=r"the bundle .*part can't be read, .*; move it away, or name another"
+    ):
+        teach(first, "part", logs=logs, folder=tmp_path / "work")
     shutil.rmtree(home / "part")
 
 

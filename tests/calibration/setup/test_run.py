@@ -133,6 +133,18 @@ def test_a_fresh_start_keeps_a_copy_and_takes_no_step(tmp_path: Path) -> None:
     assert not any("kept" in text for text in script.told)
 
 
+@pytest.mark.parametrize("place", ["file/rig.yaml", "rig.yaml"])
+def test_a_place_that_can_not_be_written_is_named_before_the_servo_is_changed(
+    tmp_path: Path, place: str
+) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "rig-setup").touch()  # where the state would be
+    script = Script()
+    with pytest.raises(ConfigError, match=r"can't write .*; name another file"):
+        next(Setup(tmp_path / place, SIMULATED, only="servo").run(script))
+    assert script.told == []
+
+
 def test_a_step_that_runs_again_forgets_what_it_found_before(tmp_path: Path) -> None:
     rig = RigFile(tmp_path / "rig.yaml")
     jaws = {"gripper.friction_n": Found(0.5, "homed"), "gripper.pinion_radius_m": Found(0.015, ANSWERED)}
