@@ -10,6 +10,8 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+import numpy as np
+
 from gripper_force.errors import RequestError
 from gripper_force.runtime.state import GraspResult, GripperState
 from gripper_force.types import GRIPPING, Outcome, Phase, RequestKind
@@ -22,7 +24,7 @@ def number(value: Any, name: str) -> float:
     """Returns an argument as a float. Raises `RequestError` if it is no number, or too large to be plausible."""
     found = math.nan
     with suppress(TypeError, ValueError, OverflowError):
-        found = math.nan if isinstance(value, str | bytes) else float(value)
+        found = math.nan if isinstance(value, str | bytes | bool | np.bool_) else float(value)
     if not abs(found) <= _MAX_MAGNITUDE:
         raise RequestError(f"{name} of {value!r} is not a number of at most {_MAX_MAGNITUDE:g}; pass a float")
     return found

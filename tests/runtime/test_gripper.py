@@ -230,7 +230,7 @@ def test_a_width_out_of_range_is_refused(simulated: Open, width_m: float) -> Non
     assert gripper.step().phase == gf.Phase.OPEN
 
 
-@pytest.mark.parametrize("value", [None, "4", math.nan, math.inf, 1e12, [1.0]])
+@pytest.mark.parametrize("value", [None, "4", math.nan, math.inf, 1e12, [1.0], True, np.False_])
 def test_what_is_no_number_is_refused(simulated: Open, value: Any) -> None:
     gripper = simulated()
     for call in (gripper.grasp, gripper.set_force, gripper.move, gripper.sleep):

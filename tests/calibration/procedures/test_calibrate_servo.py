@@ -297,15 +297,18 @@ def test_rig_profile_in_the_configuration_is_written_though_it_does_not_exist(
 def test_a_rig_profile_that_can_not_be_written_is_named_before_anything_happens(
     calibrate: str, tmp_path: Path
 ) -> None:
+    def refuse(text: str, steps: int = 1) -> None:
+        pytest.fail(text)
+
     (tmp_path / "file").touch()
     rig = tmp_path / "file" / "rig.yaml"
     with pytest.raises(ConfigError, match=r"can't write .*rig\.yaml: .*; name another file"):
         if calibrate == "servo":
-            calibrate_servo(config_of(), [0.03], rig, prompt=pytest.fail)
+            calibrate_servo(config_of(), [0.03], rig, prompt=refuse)
         elif calibrate == "camera":
-            calibrate_camera(config_of(), rig, progress=pytest.fail)
+            calibrate_camera(config_of(), rig, progress=refuse)
         else:
-            calibrate_load_cell(config_of("load_cell.backend=serial"), 5.0, rig, prompt=pytest.fail)
+            calibrate_load_cell(config_of("load_cell.backend=serial"), 5.0, rig, prompt=refuse)
 
 
 def test_without_a_terminal_the_command_is_refused(tmp_path: Path) -> None:
