@@ -1,83 +1,58 @@
 """Teaching of an object: the estimator that is best on touches left out, calibrated, in one bundle.
 
-The candidates are, from the simplest: the configured network as it is, a network trained further on the touches, and a
-Gaussian process fitted to them. The trained one is the configured one, or the small one instead of the default, which
-costs five times as much a step and is no better (decision 32). Each candidate is calibrated as `calibrate_object` does
-it. The logs of the touches are divided into folds; a fold is estimated by what was trained and calibrated on the
-others. The simplest candidate that is about as good as the best is taken, as in `cross_validation`, trained on all
-touches, and calibrated.
-
-The expected error and the interval are nested, as in `cross_validation`: each fold is estimated by the candidate that
-the other folds alone select, by trainings without that fold.
+The best of the `candidates` is trained on all touches, and calibrated.
 """
 
-import json
 import shutil
-from collections.abc import Mapping, Sequence
-from concurrent.futures import as_completed
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
-from itertools import combinations, islice
+from itertools import islice
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final
 
 import numpy as np
-import numpy.typing as npt
-import torch
-from safetensors.numpy import load, save
 
-from gripper_calibration.fits.cross_validation import (
-    Coverage,
-    Measured,
-    coverages,
-    estimate_left_out,
-    select_simplest,
-    touch_errors_n,
-)
+from gripper_calibration.fits.cross_validation import Coverage, coverages
 from gripper_calibration.fits.interval_fit import touch_interval
-from gripper_calibration.fits.object_fit import COVERAGE, fit_correction
+from gripper_calibration.fits.object_fit import COVERAGE, ObjectFit, fit_correction
 from gripper_calibration.fits.object_ood_fit import left_out_shares, object_limits, object_subspace
-from gripper_calibration.fits.touches import Floats
+from gripper_calibration.fits.touches import Touches
 from gripper_calibration.plots.taught_plot import draw
-from gripper_calibration.procedures.calibrate_object import (
-    default_folder,
-    make_profile,
-    record_touches,
+from gripper_calibration.procedures.calibrate_object import default_folder, make_profile, record_touches
+from gripper_calibration.procedures.candidates import (
+    FOLDS,
+    Candidate,
+    CandidateWork,
+    Comparison,
+    LeftOut,
+    compare,
+    make_candidates,
 )
-from gripper_calibration.touch_logs import TouchRecording, join, read_log, started_ns
+from gripper_calibration.touch_logs import join, read_log, started_ns
 from gripper_force import __version__
 from gripper_force.config import Config, config_from_text
 from gripper_force.errors import ConfigError, DataError
-from gripper_force.jobs.dataset import CONTACT_N, Clip, StreamedClip, find_logs, load_clips, starts_in_contact
-from gripper_force.jobs.processes import process_pool
-from gripper_force.jobs.profile_files import check_place, pack, write_all, write_object
+from gripper_force.jobs.dataset import CONTACT_N, StreamedClip, find_logs, load_clips, starts_in_contact
+from gripper_force.jobs.profile_files import check_place, pack, write_object
 from gripper_force.jobs.recording.record import check_name
 from gripper_force.jobs.training.ood_fit import model_of_scores
-from gripper_force.jobs.training.recipe import recipe
 from gripper_force.jobs.training.stated_errors import errors, residuals
-from gripper_force.jobs.training.train import train
 from gripper_force.profiles.correction import KnownFrames, ProfileArrays
 from gripper_force.profiles.object_profile import BUNDLED, ObjectProfile, read_object, user_folder
 from gripper_force.progress import Progress, Prompt, no_progress
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import ResolvedConfig, resolve_vision
 from gripper_force.types import Frame, LoadCellSample
-from gripper_force.vision.checkpoint import Checkpoint, load_checkpoint
+from gripper_force.vision.checkpoint import load_checkpoint
 from gripper_force.vision.checkpoint_writer import replace_header
 from gripper_force.vision.estimator import claimed_std_n
-from gripper_force.vision.header import SHIPPED, GaussianProcessConfig, Header, Model
+from gripper_force.vision.header import Header, Model
 from gripper_force.vision.model_files import read_model
-from gripper_force.vision.ood import residual_share
 from gripper_force.vision.preprocess import Preprocess
 
 TOUCHES: Final = 16
 """Default number of touches."""
-
-MIN_LOGS: Final = 4
-"""Fewer logs of touches can't be divided into halves that are calibrated."""
-
-FOLDS: Final = 3
-"""Parts of the logs, each left out once, and each two of them. More would take longer than a user waits."""
 
 STEPS: Final = 3 * 2 * FOLDS + 3
 """Steps of progress that `teach` reports after the touches: three candidates, without one fold and without two."""
@@ -170,7 +145,7 @@ def teach(
     Raises:
         ConfigError: There is no camera, load cell or network, the peak is not within the force limit, or the bundle
             can't be written.
-        DataError: The load cell reads a force at rest, a touch failed, or there are fewer than `MIN_LOGS` logs with
+        DataError: The load cell reads a force at rest, a touch failed, or there are fewer than four logs with
             contact.
         LogError: A log can't be read.
         CheckpointError: The network can't be read.
@@ -202,8 +177,8 @@ def teach(
     others = {digest: path for digest, path in replayed.items() if digest not in logs_by_digest}
     in_contact = [path for path in others.values() if _starts_in_contact(path, model.header.preprocess)]
     others = {digest: path for digest, path in others.items() if path not in in_contact}
-    work = _Work(logs_by_digest, others, place / "teach", workers)
-    taught = work.run(config, model, name, out, progress)
+    work = CandidateWork(logs_by_digest, others, place / "teach", workers)
+    taught = _taught(work, config, model, name, out, progress)
     return replace(taught, without_contact=without_contact, contact_starts=(*contact_starts, *in_contact))
 
 
@@ -256,318 +231,62 @@ def _object_file(config: Config) -> str | None:
     return None if config.sim.object is None else str(config.sim.object.resolve())
 
 
-class _Left(NamedTuple):
-    """Results on a log by what was made without it."""
-
-    raw_n: Floats  # (N,), not corrected
-    estimate_n: Floats  # (N,)
-    force_n: Floats  # (N,), of the load cell
-    share: Floats  # (N,), of the residual of the features, see `residual_share`
-    touch: npt.NDArray[np.int64]  # (N,), number of the touch
-
-    def last(self, frames: int) -> "_Left":
-        """Returns the results on the last frames."""
-        return _Left(*(values[-frames:] for values in self))  # type: ignore[arg-type]  # of two types
-
-
-_Results = Sequence[Mapping[frozenset[int], Mapping[int, _Left]]]
-"""Results of each candidate, by the folds left out and the log."""
-
-
-class _Candidate(NamedTuple):
-    """Network and recipe that an estimator is made of."""
-
-    name: str
-    base: str  # the network to begin with
-    recipe: str  # name of the recipe of a training; empty for none
-
-
-class _Task(NamedTuple):
-    """A candidate, and the splits in which it is judged."""
-
-    candidate: _Candidate
-    logs: tuple[Path, ...]
-    splits: tuple[tuple[int, ...], ...]  # of each split the logs to learn from; all others are the test
-    replay: tuple[Path, ...]
-    file: Path  # of the result; the state of a training lies beside it
-
-    @property
-    def tests(self) -> list[list[int]]:
-        return [[i for i in range(len(self.logs)) if i not in split] for split in self.splits]
-
-
-class _Work:
-    """The work after the touches. Each part of it leaves a file, and is not repeated."""
-
-    def __init__(
-        self, logs: Mapping[str, Path], replay: Mapping[str, Path], folder: Path, workers: int
-    ) -> None:
-        if len(logs) < MIN_LOGS:
-            raise DataError(
-                f"there are {len(logs)} different logs of touches with contact, but teach leaves some out to compare, "
-                f"and needs {MIN_LOGS}; touch the object more often, or use `gripper-force calibrate object`"
-            )
-        self._logs, self._digests, self._replay = tuple(logs.values()), tuple(logs), replay
-        self._folder, self._workers = folder, workers
-
-    def run(
-        self,
-        config: Config,
-        model: Model,
-        name: str,
-        out: Path,
-        progress: Progress,
-    ) -> Taught:
-        candidates = _candidates(config, model, len(self._logs))
-        results = self._judged(candidates, progress)
-        found = _compare(results, len(self._logs))
-        progress("compared the candidates", STEPS - 3 - 2 * FOLDS * len(candidates))
-        chosen = candidates[found.best]
-        checkpoint = self._learned(chosen)
-        progress(f"trained on all touches: {chosen.name}")
-        learned = load_checkpoint(checkpoint)
-        recorded = join({path: read_log(path, learned) for path in sorted(self._logs, key=started_ns)})
-        # The folds' networks have not seen the touches they score, but each network has its own scale of scores.
-        shares, estimates_n = left_out_shares(recorded.touches)
-        limits = object_limits(
-            [one.share for one in found.left] + shares,
-            [one.raw_n for one in found.left] + estimates_n,
-            touches=len(shares),
-        )
-        known = KnownFrames(*object_subspace(recorded.touches), limits)
-        fit = fit_correction(recorded.touches, COVERAGE)
-        error_n, contact = (
-            np.abs(found.estimate_n - found.measured.force_n),
-            found.measured.force_n > CONTACT_N,
-        )
-        mae_n, contact_mae_n = float(error_n.mean()), float(error_n[contact].mean())
-        fit = replace(
-            fit,
-            arrays=replace(fit.arrays, known=known),
-            interval=touch_interval(found.estimate_n, *found.measured, COVERAGE),
-            before_n=float(np.abs(found.before_n - found.measured.force_n).mean()),
-            after_n=mae_n,
-        )
-        config = config.with_values(vision={"checkpoint": str(checkpoint)})
-        resolved = ResolvedConfig(config, read_model(checkpoint))
-        profile, _ = make_profile(name, recorded, fit, resolved)
-        profile = profile.model_copy(
-            update={
-                "network": _NETWORK,
-                "logs": self._digests,
-                "version": __version__,
-                "file": _object_file(config),
-            }
-        )
-        progress("calibrated")
-        taught = Taught(
-            bundle=out,
-            profile=profile,
-            learned=chosen.name,
-            candidates_mae_n={c.name: float(e) for c, e in zip(candidates, found.error_n, strict=True)},
-            before_n=fit.before_n,
-            mae_n=mae_n,
-            contact_mae_n=contact_mae_n,
-            fewer_mae_n=float(found.fewer_n[found.best]),
-            more_touches_help=bool(found.error_n[found.best] < _HELPS * found.fewer_n[found.best]),
-            coverages=coverages(found.measured, found.within),
-            without_contact=(),
-            contact_starts=(),
-        )
-        header = _stated(learned.header, chosen, known, found.left)
-        _write_bundle(taught, checkpoint, header, fit.arrays, found)
-        progress("wrote the bundle")
-        return taught
-
-    def _judged(self, candidates: Sequence[_Candidate], progress: Progress) -> _Results:
-        """Returns the results of the candidates on the logs left out."""
-        outs = [frozenset(out) for n in (1, 2) for out in combinations(range(FOLDS), n)]
-        splits = [tuple(i for i in range(len(self._logs)) if i % FOLDS not in out) for out in outs]
-        tasks = []
-        for candidate in candidates:
-            # A network is trained for each split alone; all else is quick.
-            groups = [(split,) for split in splits] if candidate.recipe == "touches" else [tuple(splits)]
-            tasks += [self._task(candidate, group) for group in groups]
-        missing = [task for task in tasks if not task.file.exists()]
-        for task in tasks:
-            if task not in missing:
-                progress(f"{task.candidate.name}: known", len(task.splits))
-        if self._workers == 1:
-            for task in missing:
-                _judge(task)
-                progress(task.candidate.name, len(task.splits))
-        else:
-            with process_pool(self._workers) as pool:
-                futures = {pool.submit(_judge_in_process, task): task for task in missing}
-                for future in as_completed(futures):
-                    future.result()
-                    progress(futures[future].candidate.name, len(futures[future].splits))
-        parts = [
-            [part for task in tasks if task.candidate == candidate for part in _read(task)]
-            for candidate in candidates
-        ]
-        return [dict(zip(outs, one, strict=True)) for one in parts]
-
-    def _task(self, candidate: _Candidate, splits: tuple[tuple[int, ...], ...]) -> _Task:
-        digest = read_model(candidate.base).digest
-        settings = recipe(candidate.recipe).model_dump_json() if candidate.recipe else ""
-        parts = [candidate, digest, settings, splits, self._digests, tuple(self._replay), _Left._fields]
-        key = sha256(json.dumps(parts).encode()).hexdigest()
-        return _Task(
-            candidate, self._logs, splits, tuple(self._replay.values()), self._folder / f"{key[:16]}.left"
-        )
-
-    def _learned(self, candidate: _Candidate) -> Path:
-        """Returns the checkpoint of a candidate that has learned from all logs."""
-        if not candidate.recipe:
-            return read_model(candidate.base).path
-        task = self._task(candidate, (tuple(range(len(self._logs))),))
-        checkpoint = task.file.with_suffix(".safetensors")
-        if not checkpoint.exists():
-            part = checkpoint.with_name(f"all-{checkpoint.name}")
-            _make(task, task.splits[0], part)
-            part.rename(checkpoint)
-        return checkpoint
-
-
-class _Compared(NamedTuple):
-    """Comparison of the candidates. The frames of all logs are in the order of the folds."""
-
-    best: int  # the candidate to take
-    error_n: Floats  # (candidates,), MAE without one fold
-    fewer_n: Floats  # (candidates,), MAE without two folds
-    left: list[_Left]  # results of the best candidate without one fold
-    measured: Measured
-    before_n: Floats  # (N,), by the configured network, not corrected
-    estimate_n: Floats  # (N,), nested
-    within: npt.NDArray[np.bool_]  # (N,), nested
-
-
-def _compare(results: _Results, count: int) -> _Compared:
-    folds = [[log for log in range(count) if log % FOLDS == fold] for fold in range(FOLDS)]
-    # Networks with other reference frames have other first estimates; the last frames are the same.
-    frames = [
-        min(len(part[log].force_n) for one in results for part in one.values() if log in part)
-        for log in range(count)
-    ]
-
-    def left(candidate: int, fold: int, other: int) -> list[_Left]:
-        part = results[candidate][frozenset((fold, other))]
-        return [part[log].last(frames[log]) for log in folds[fold]]
-
-    def joined(key: str, candidate: int, fold: int, other: int) -> Floats:
-        return np.concatenate([getattr(one, key) for one in left(candidate, fold, other)])
-
-    each = range(FOLDS)
-    parts = [Measured(joined("force_n", 0, i, i), joined("touch", 0, i, i).astype(np.int64)) for i in each]
-    estimates_n = {
-        (i, j): np.stack([joined("estimate_n", one, i, j) for one in range(len(results))])
-        for i in each
-        for j in each
-    }
-    error_n, fewer_n = (
-        np.concatenate(
-            [touch_errors_n(estimates_n[i, j], parts[i]) for i in each for j in each if (i == j) == same]
-        )
-        for same in (True, False)
+def _taught(
+    work: CandidateWork, config: Config, model: Model, name: str, out: Path, progress: Progress
+) -> Taught:
+    """Takes the best candidate, makes it of all logs, calibrates it, and writes the bundle."""
+    candidates = make_candidates(config, model, len(work.logs))
+    found = compare(work.left_out(candidates, progress), len(work.logs))
+    progress("compared the candidates", STEPS - 3 - 2 * FOLDS * len(candidates))
+    chosen = candidates[found.best]
+    checkpoint = work.learned(chosen)
+    progress(f"trained on all touches: {chosen.name}")
+    learned = load_checkpoint(checkpoint)
+    recorded = join({path: read_log(path, learned) for path in sorted(work.logs, key=started_ns)})
+    fit = _fit(recorded.touches, found)
+    config = config.with_values(vision={"checkpoint": str(checkpoint)})
+    profile, _ = make_profile(name, recorded, fit, ResolvedConfig(config, read_model(checkpoint)))
+    origin = {"network": _NETWORK, "logs": work.digests, "version": __version__, "file": _object_file(config)}
+    progress("calibrated")
+    error_n = np.abs(found.estimate_n - found.measured.force_n)
+    taught = Taught(
+        bundle=out,
+        profile=profile.model_copy(update=origin),
+        learned=chosen.name,
+        candidates_mae_n={c.name: float(e) for c, e in zip(candidates, found.error_n, strict=True)},
+        before_n=fit.before_n,
+        mae_n=float(error_n.mean()),
+        contact_mae_n=float(error_n[found.measured.force_n > CONTACT_N].mean()),
+        fewer_mae_n=float(found.fewer_n[found.best]),
+        more_touches_help=bool(found.error_n[found.best] < _HELPS * found.fewer_n[found.best]),
+        coverages=coverages(found.measured, found.within),
+        without_contact=(),
+        contact_starts=(),
     )
-    nested_n, within = estimate_left_out(estimates_n, parts, COVERAGE)
-    best = select_simplest(error_n)
-    return _Compared(
-        best,
-        error_n.mean(0),
-        fewer_n.mean(0),
-        [one for i in each for one in left(best, i, i)],
-        Measured(*(np.concatenate(values) for values in zip(*parts, strict=True))),
-        np.concatenate([joined("raw_n", 0, i, i) for i in each]),
-        np.concatenate(nested_n),
-        np.concatenate(within),
+    assert fit.arrays.known is not None
+    header = _stated(learned.header, chosen, fit.arrays.known, found.left)
+    _write_bundle(taught, checkpoint, header, fit.arrays, found)
+    progress("wrote the bundle")
+    return taught
+
+
+def _fit(touches: Touches, found: Comparison) -> ObjectFit:
+    """Fits the correction to all touches; its errors, interval and limits are those of touches left out."""
+    # The folds' networks have not seen the touches they score, but each network has its own scale of scores.
+    shares, estimates_n = left_out_shares(touches)
+    limits = object_limits(
+        [one.share for one in found.left] + shares,
+        [one.raw_n for one in found.left] + estimates_n,
+        touches=len(shares),
     )
-
-
-def _candidates(config: Config, model: Model, logs: int) -> list[_Candidate]:
-    base = config.vision.checkpoint
-    named = base if base in SHIPPED else Path(base).name
-    found = [_Candidate(f"{named} as it is", base, "")]
-    if not any(isinstance(member, GaussianProcessConfig) for member in model.header.members):
-        trained = "small" if base == "default" else base
-        found.append(_Candidate(f"{Path(trained).name}, trained", trained, "touches"))
-    if logs >= 2 * FOLDS:  # a process chooses its settings on logs left out, and so needs two in a fold
-        found.append(_Candidate("Gaussian process", base, "few"))
-    return found
-
-
-def _judge_in_process(task: _Task) -> None:
-    torch.set_num_threads(1)  # of this process of the pool; the processes share the cores
-    _judge(task)
-
-
-def _judge(task: _Task) -> None:
-    """Makes the candidate for each split, calibrates it, and writes its estimates of the logs left out."""
-    arrays: dict[str, npt.NDArray[Any]] = {}
-    recorded: list[TouchRecording] = []
-    task.file.parent.mkdir(parents=True, exist_ok=True)
-    for number, (split, test) in enumerate(zip(task.splits, task.tests, strict=True)):
-        file = task.file.with_suffix(f".{number}.safetensors")
-        if task.candidate.recipe or not recorded:  # a network as it is sees the same in every split
-            made = _make(task, split, file)
-            recorded = [read_log(path, made) for path in task.logs]
-        known = join({task.logs[i]: recorded[i] for i in split}).touches
-        subspace = object_subspace(known)
-        try:
-            fit = fit_correction(known, COVERAGE)
-        except DataError:  # the estimates do not follow the load cell: they stay as they are
-            fit = None
-        begins = np.cumsum([0, *(len(one.touches.numbers) for one in recorded)])
-        for i in test:
-            touches = recorded[i].touches
-            left = _Left(
-                touches.estimate_n,
-                touches.estimate_n if fit is None else fit.predict(touches),
-                touches.force_n,
-                residual_share(touches.features, *subspace),
-                touches.touch + begins[i],
-            )
-            arrays |= {f"{number} {i} {key}": value for key, value in left._asdict().items()}
-        file.unlink(missing_ok=True)
-    write_all({task.file: save(arrays)})
-
-
-def _read(task: _Task) -> list[dict[int, _Left]]:
-    arrays = load(task.file.read_bytes())
-    return [
-        {i: _Left(*(arrays[f"{number} {i} {key}"] for key in _Left._fields)) for i in test}
-        for number, test in enumerate(task.tests)
-    ]
-
-
-def _make(task: _Task, split: Sequence[int], file: Path) -> Checkpoint:
-    """Returns the candidate that has learned from the logs of a split. A training continues if it was interrupted."""
-    base = load_checkpoint(task.candidate.base)
-    if not task.candidate.recipe:
-        return base
-    preprocess = base.header.preprocess
-    clips = _clips(task.logs, preprocess.size, split)
-    replayed = load_clips(list(task.replay), preprocess) if task.replay else []
-    if task.candidate.recipe == "few":
-        settings = recipe("few", [f"preprocess.size={preprocess.size}"])
-        return train(settings, [*clips, *replayed], file)
-    return train(
-        recipe("touches"),
-        clips,
-        file,
-        validation_clips=clips[:1],  # the errors of the folds replace what the checkpoint states
-        init=base,
-        replay_clips=replayed,
-        resume=True,
-        figure=False,
+    fit = fit_correction(touches, COVERAGE)
+    return replace(
+        fit,
+        arrays=replace(fit.arrays, known=KnownFrames(*object_subspace(touches), limits)),
+        interval=touch_interval(found.estimate_n, *found.measured, COVERAGE),
+        before_n=float(np.abs(found.before_n - found.measured.force_n).mean()),
+        after_n=float(np.abs(found.estimate_n - found.measured.force_n).mean()),
     )
-
-
-def _clips(logs: Sequence[Path], size: int, chosen: Sequence[int]) -> list[Clip]:
-    """Returns clips of the chosen logs, each a set of its own."""
-    clips = load_clips([logs[i] for i in chosen], Preprocess(size=size))
-    return [replace(clip, set=f"{i} {clip.name}") for i, clip in enumerate(clips)]
 
 
 def _sorted_by_contact(
@@ -607,7 +326,7 @@ def _digest_of(path: Path) -> str:
     return sha256(path.read_bytes()).hexdigest()
 
 
-def _stated(header: Header, candidate: _Candidate, known: KnownFrames, left: Sequence[_Left]) -> Header:
+def _stated(header: Header, candidate: Candidate, known: KnownFrames, left: Sequence[LeftOut]) -> Header:
     """Returns a header with the errors, and the out-of-distribution score, that logs left out show."""
     raw_n, force_n = (np.concatenate([getattr(one, key) for one in left]) for key in ("raw_n", "force_n"))
     if candidate.recipe:
@@ -622,7 +341,7 @@ def _stated(header: Header, candidate: _Candidate, known: KnownFrames, left: Seq
 
 
 def _write_bundle(
-    taught: Taught, checkpoint: Path, header: Header, arrays: ProfileArrays, found: _Compared
+    taught: Taught, checkpoint: Path, header: Header, arrays: ProfileArrays, found: Comparison
 ) -> None:
     """Writes the folder of a bundle. An earlier one is replaced once the new one is complete."""
     out = taught.bundle

@@ -9,7 +9,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +16,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from gripper_calibration.procedures import candidates
 from gripper_calibration.procedures import teach as job
-from gripper_calibration.procedures.teach import MIN_LOGS, STEPS, Taught, teach
+from gripper_calibration.procedures.candidates import MIN_LOGS
+from gripper_calibration.procedures.teach import STEPS, Taught, teach
 from gripper_force.cli import app
 from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError, DataError
@@ -135,24 +136,24 @@ def test_best_candidate_is_taken_and_its_error_is_that_on_new_touches(
 def test_finished_parts_are_not_repeated(
     taught: Taught, config: Config, logs: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    judged: list[str] = []
-    judge = job._judge
+    evaluated: list[str] = []
+    evaluate = candidates._evaluate
 
-    def counting(task: job._Task) -> None:
-        judged.append("again")
-        judge(task)
+    def counting(task: candidates._Task) -> None:
+        evaluated.append("again")
+        evaluate(task)
 
-    def stopping(task: job._Task) -> None:
-        if len(judged) == 3:
+    def stopping(task: candidates._Task) -> None:
+        if len(evaluated) == 3:
             raise KeyboardInterrupt
-        judge(task)
-        judged.append(task.candidate.name)
+        evaluate(task)
+        evaluated.append(task.candidate.name)
 
-    monkeypatch.setattr(job, "_judge", stopping)
+    monkeypatch.setattr(candidates, "_evaluate", stopping)
     with pytest.raises(KeyboardInterrupt):
         teach(config, "disc", logs=logs, folder=tmp_path / "work", out=tmp_path / "bundle")
     assert not (tmp_path / "bundle").exists()
-    monkeypatch.setattr(job, "_judge", counting)
+    monkeypatch.setattr(candidates, "_evaluate", counting)
     steps: list[int] = []
     resumed = teach(
         config,
@@ -162,7 +163,7 @@ def test_finished_parts_are_not_repeated(
         out=tmp_path / "bundle",
         progress=lambda _text, steps_done=1: steps.append(steps_done),
     )
-    assert judged.count("again") == 8 - 3  # the network as it is, six trainings, and the process
+    assert evaluated.count("again") == 8 - 3  # the network as it is, six trainings, and the process
     assert sum(steps) == STEPS
     assert resumed.candidates_mae_n == taught.candidates_mae_n
     assert resumed.profile.weights == taught.profile.weights
@@ -202,8 +203,8 @@ def test_replayed_logs_are_read_by_the_trainings_alone(
 @pytest.fixture
 def as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leaves the network as it is as the only candidate, for tests of the logs that are used."""
-    candidates = job._candidates
-    monkeypatch.setattr(job, "_candidates", lambda *arguments, **named: candidates(*arguments, **named)[:1])
+    make = candidates.make_candidates
+    monkeypatch.setattr(job, "make_candidates", lambda *arguments, **named: make(*arguments, **named)[:1])
 
 
 @pytest.mark.usefixtures("as_it_is")
@@ -270,7 +271,7 @@ def test_any_learned_estimator_states_errors_and_a_score_from_touches_left_out(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A trained network, and a process: neither is what `taught` takes."""
-    monkeypatch.setattr(job, "select_simplest", lambda _: taken)
+    monkeypatch.setattr(candidates, "select_simplest", lambda _: taken)
     found = teach(config, "disc", logs=logs, folder=work, out=tmp_path / "disc")
     assert found.learned == list(taught.candidates_mae_n)[taken]
     header = read_checkpoint(found.bundle / "network.safetensors")[2]
@@ -295,13 +296,13 @@ def test_limits_fit_the_final_network_if_those_of_the_folds_have_smaller_scores(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def scaled(*args: Any) -> job._Compared:
+    def scaled(*args: Any) -> candidates.Comparison:
         found = compare(*args)
         return found._replace(left=[one._replace(share=one.share / 1000) for one in found.left])
 
-    compare = job._compare
-    monkeypatch.setattr(job, "_compare", scaled)
-    monkeypatch.setattr(job, "select_simplest", lambda _: 1)  # the trained network
+    compare = candidates.compare
+    monkeypatch.setattr(job, "compare", scaled)
+    monkeypatch.setattr(candidates, "select_simplest", lambda _: 1)  # the trained network
     found = teach(config, "disc", logs=logs, folder=work, out=tmp_path / "disc")
     run = load_config(
         None,
@@ -330,37 +331,6 @@ def _is_rejected(estimator: ForceEstimator, frame: Gray) -> bool:
     except DataError:
         return True
     return False
-
-
-def test_a_fold_takes_no_part_in_the_choice_that_estimates_it() -> None:
-    """The second candidate is the best of all, but only because of the first fold: the others choose the first one."""
-    force_n = np.linspace(0, 4, 30)
-    errors_n = {0: {0: 1.0, 1: 0.1, 2: 0.1}, 1: {0: 0.0, 1: 0.2, 2: 0.2}}  # by candidate and fold
-
-    def left(candidate: int, log: int) -> job._Left:
-        error_n = errors_n[candidate][log % job.FOLDS]
-        touch = np.full(30, log)
-        return job._Left(force_n, force_n + error_n, force_n, np.full(30, 1e-4), touch)
-
-    outs = [frozenset(out) for n in (1, 2) for out in combinations(range(job.FOLDS), n)]
-    results = [
-        {out: {log: left(candidate, log) for log in range(6) if log % job.FOLDS in out} for out in outs}
-        for candidate in range(2)
-    ]
-    found = job._compare(results, 6)
-    assert found.best == 1
-    error_n = found.estimate_n - found.measured.force_n
-    np.testing.assert_allclose([error_n[found.measured.touch == log].mean() for log in (0, 3)], 1.0)
-    assert not found.within[np.isin(found.measured.touch, (0, 3))].any()
-
-
-@pytest.mark.parametrize("checkpoint", ["default", "small"])
-def test_one_network_is_trained_and_never_the_default_one(checkpoint: str, tmp_path: Path) -> None:
-    config, model = job.check_before_touches(
-        load_config(None, [f"vision.checkpoint={checkpoint}"]), "disc", tmp_path / "out"
-    )
-    names = [candidate.name for candidate in job._candidates(config, model, logs=16)]
-    assert [name for name in names if "trained" in name] == ["small, trained"]
 
 
 @pytest.mark.usefixtures("as_it_is")
