@@ -35,7 +35,7 @@ class SlipMonitor:
         self._closing_m_s = self._shortfall_n = 0.0
         self._rest: tuple[float, float] | None = None
 
-    def is_lost(
+    def loss_reason(
         self, dt_s: float, width_m: float, closing_m_s: float, shortfall_n: float, reference_n: float
     ) -> str:
         """Returns why there is nothing between the jaws, or an empty text.
@@ -53,14 +53,16 @@ class SlipMonitor:
         share = dt_s / (dt_s + _FREE_FILTER_S)
         self._closing_m_s += (closing_m_s - self._closing_m_s) * share
         self._shortfall_n += (shortfall_n - self._shortfall_n) * share
-        runs = self._moves(self._closing_m_s)
-        runs = runs and self._shortfall_n > max(_SHORTFALL_SHARE * reference_n, _SHORTFALL_N)
-        self._free_s = self._free_s + dt_s if runs else 0.0
+        closes_freely = self._closes(self._closing_m_s)
+        closes_freely = closes_freely and self._shortfall_n > max(
+            _SHORTFALL_SHARE * reference_n, _SHORTFALL_N
+        )
+        self._free_s = self._free_s + dt_s if closes_freely else 0.0
         if self._free_s >= _FREE_S:
             return "the jaws close without resistance"
         return "the jaws closed" if width_m < self._config.min_object_width_m else ""
 
-    def has_receded(
+    def recession_reason(
         self, width_m: float, held_width_m: float, closing_m_s: float, motor_force_n: float
     ) -> str:
         """Returns why a held object is no longer there, or an empty text. To be called in each cycle after ``held``.
@@ -73,7 +75,7 @@ class SlipMonitor:
             closing_m_s: Closing speed of one jaw.
             motor_force_n: Commanded motor force at each jaw.
         """
-        if not self._moves(closing_m_s):
+        if not self._closes(closing_m_s):
             self._rest = min(width_m, held_width_m), motor_force_n
         if self._rest is None:
             return ""
@@ -82,10 +84,10 @@ class SlipMonitor:
             return "the jaws close without more motor force"
         return ""
 
-    def _moves(self, closing_m_s: float) -> bool:
+    def _closes(self, closing_m_s: float) -> bool:
         return closing_m_s > _FREE_SPEED_SHARE * self._config.approach_speed_m_s
 
-    def has_slipped(
+    def slip_reason(
         self, dt_s: float, force_n: float, target_n: float, closed_m: float, closing_m_s: float
     ) -> str:
         """Returns why the object slips, or an empty text.
@@ -97,7 +99,7 @@ class SlipMonitor:
             closed_m: Closing of the jaws since the object was held.
             closing_m_s: Closing speed of one jaw.
         """
-        counted_s = 2 * dt_s if self._moves(closing_m_s) else dt_s
+        counted_s = 2 * dt_s if self._closes(closing_m_s) else dt_s
         self._collapsed_s = self._collapsed_s + counted_s if force_n < _COLLAPSE_SHARE * target_n else 0.0
         if self._collapsed_s >= _COLLAPSE_S:
             return f"the force fell to {force_n:.2f} N"

@@ -543,7 +543,7 @@ class GraspController:
         if width_m < self._config.min_object_width_m and self._outcome == Outcome.NONE:
             self._set_outcome(Outcome.NO_OBJECT, "closed while the force was to rise")
             self._start_release(self._reason)
-        elif lost := self._slip.is_lost(dt_s, width_m, closing_m_s, shortfall_n, self._loop.reference_n):
+        elif lost := self._slip.loss_reason(dt_s, width_m, closing_m_s, shortfall_n, self._loop.reference_n):
             self._handle_loss(width_m, lost)
         elif self._loop.reference_n == self._derated_target_n and not self._loop.is_lowering:
             self._error_n = self._estimate.force_n - self._derated_target_n
@@ -569,14 +569,14 @@ class GraspController:
             if self._derating < 1:
                 reason += f", reduced from {self._target_n:g} N because the servo is hot"
             self._set_outcome(Outcome.HELD, reason)
-        lost = self._slip.is_lost(dt_s, width_m, closing_m_s, shortfall_n, self._loop.reference_n)
+        lost = self._slip.loss_reason(dt_s, width_m, closing_m_s, shortfall_n, self._loop.reference_n)
         if not lost and self._outcome == Outcome.HELD:
-            lost = self._slip.has_receded(width_m, self._held_width_m, closing_m_s, self._motor_force_n)
+            lost = self._slip.recession_reason(width_m, self._held_width_m, closing_m_s, self._motor_force_n)
         if lost:
             self._handle_loss(width_m, lost)
             return
         closed_m = self._held_width_m - width_m if self._outcome == Outcome.HELD else 0.0
-        slip = self._slip.has_slipped(
+        slip = self._slip.slip_reason(
             dt_s, self._estimate.force_n, self._derated_target_n, closed_m, closing_m_s
         )
         if not slip and self._outcome == Outcome.HELD and (objection := self._objection):

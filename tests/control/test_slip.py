@@ -10,7 +10,7 @@ FREE = {"width_m": 0.05, "closing_m_s": 0.01, "shortfall_n": 3.0, "reference_n":
 def cycles_until_lost(**changes):
     monitor = SlipMonitor(CONFIG)
     for cycle in range(1, 41):
-        if monitor.is_lost(0.005, **{**FREE, **changes}):
+        if monitor.loss_reason(0.005, **{**FREE, **changes}):
             return cycle
     return None
 
@@ -22,7 +22,9 @@ def test_closing_without_resistance_is_a_loss_within_50_ms():
 def test_jaws_that_the_speed_limit_brakes_in_every_second_cycle_are_a_loss():
     monitor = SlipMonitor(CONFIG)
     cycles = [(0.02, 6.0), (-0.005, 13.0)] * 5
-    found = [monitor.is_lost(0.005, 0.05, speed_m_s, shortfall_n, 8.5) for speed_m_s, shortfall_n in cycles]
+    found = [
+        monitor.loss_reason(0.005, 0.05, speed_m_s, shortfall_n, 8.5) for speed_m_s, shortfall_n in cycles
+    ]
     assert "without resistance" in found[9]
 
 
@@ -42,23 +44,23 @@ def test_a_grip_is_no_loss(changes):
 def test_signs_must_persist():
     monitor = SlipMonitor(CONFIG)
     for _ in range(20):
-        assert not monitor.is_lost(0.005, **FREE)
-        assert not monitor.is_lost(0.005, **FREE)
-        assert not monitor.is_lost(0.005, **{**FREE, "shortfall_n": 0.0})
+        assert not monitor.loss_reason(0.005, **FREE)
+        assert not monitor.loss_reason(0.005, **FREE)
+        assert not monitor.loss_reason(0.005, **{**FREE, "shortfall_n": 0.0})
 
 
 def test_closed_jaws_hold_nothing():
     assert cycles_until_lost(width_m=0.001, closing_m_s=0.0) == 1
     thin = SlipMonitor(ControlConfig(min_object_width_m=0.0001))
-    assert not thin.is_lost(0.005, 0.0003, 0.0, 0.0, 4.0)
+    assert not thin.loss_reason(0.005, 0.0003, 0.0, 0.0, 4.0)
 
 
 def receding(monitor, *, motor_force_n, speed_m_s=0.01, rest_m=0.05):
     """Jaws at rest, then closing by 1 mm of width in 50 ms, with a motor force that rises to ``motor_force_n``."""
-    found = [monitor.has_receded(rest_m, 0.05, 0.0, 0.5)] if rest_m else []
+    found = [monitor.recession_reason(rest_m, 0.05, 0.0, 0.5)] if rest_m else []
     for cycle in range(1, 11):
         width_m, share = (rest_m or 0.05) - 2 * speed_m_s * 0.005 * cycle, cycle / 10
-        found.append(monitor.has_receded(width_m, 0.05, speed_m_s, 0.5 + share * (motor_force_n - 0.5)))
+        found.append(monitor.recession_reason(width_m, 0.05, speed_m_s, 0.5 + share * (motor_force_n - 0.5)))
     return [text for text in found if text]
 
 
@@ -84,20 +86,20 @@ def test_creep_of_a_soft_object_is_no_loss():
 
 def test_collapsed_force_is_a_slip_after_its_time():
     monitor = SlipMonitor(CONFIG)
-    found = [monitor.has_slipped(0.005, 1.9, 4.0, 0.0, closing_m_s=0.0) for _ in range(25)]
+    found = [monitor.slip_reason(0.005, 1.9, 4.0, 0.0, closing_m_s=0.0) for _ in range(25)]
     assert not any(found[:19])
     assert "fell to 1.90 N" in found[20]
     monitor.start()
-    assert not monitor.has_slipped(0.005, 1.9, 4.0, 0.0, closing_m_s=0.0)
+    assert not monitor.slip_reason(0.005, 1.9, 4.0, 0.0, closing_m_s=0.0)
 
 
 def test_collapsed_force_of_closing_jaws_is_a_slip_after_half_the_time():
     monitor = SlipMonitor(CONFIG)
-    found = [monitor.has_slipped(0.005, 1.9, 4.0, 0.0, closing_m_s=0.01) for _ in range(15)]
+    found = [monitor.slip_reason(0.005, 1.9, 4.0, 0.0, closing_m_s=0.01) for _ in range(15)]
     assert not any(found[:9])
     assert "fell to 1.90 N" in found[10]
 
 
 def test_closing_while_held_is_a_slip():
-    assert "closed by 5.0 mm" in SlipMonitor(CONFIG).has_slipped(0.005, 4.0, 4.0, 0.005, 0.0)
-    assert not SlipMonitor(CONFIG).has_slipped(0.005, 4.0, 4.0, 0.003, 0.0)
+    assert "closed by 5.0 mm" in SlipMonitor(CONFIG).slip_reason(0.005, 4.0, 4.0, 0.005, 0.0)
+    assert not SlipMonitor(CONFIG).slip_reason(0.005, 4.0, 4.0, 0.003, 0.0)

@@ -87,7 +87,7 @@ def test_other_rows_without_camera_are_as_expected() -> None:
 
 def test_a_missing_speed_limit_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SpeedLimit, "apply", lambda _self, command, *_: command)
-    monkeypatch.setattr(SlipMonitor, "has_receded", lambda *_: "")  # it reacts before the jaws are fast
+    monkeypatch.setattr(SlipMonitor, "recession_reason", lambda *_: "")  # it reacts before the jaws are fast
     found = outcome(leaving(2.4))
     assert found["speed_share"] > 1.5
     assert "times as fast as configured" in found["failure"]
