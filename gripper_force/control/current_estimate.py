@@ -110,7 +110,7 @@ class CurrentEstimate:
 
     def variance_n2(self, force_n: float) -> float:
         """Returns the variance of the estimate of a force, from the errors of friction and gearing."""
-        return self.friction_n2 + FREE_FLOOR_N**2 + (self._transmission.gain_std * force_n) ** 2
+        return self.friction_n2 + FREE_FLOOR_N**2 + (self._transmission.torque_constant_std * force_n) ** 2
 
     def _learn_friction(self) -> None:
         self.free_travel.add(self._motor_force_n)

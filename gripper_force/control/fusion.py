@@ -91,7 +91,7 @@ class Fusion:
         self._std_limit_n = config.vision_std_n
         self._reentry = max(round(_REENTRY_S * config.frame_hz), _MIN_REENTRY)
         self._transmission = transmission
-        self._gain = ObjectGain(transmission.gain_std, config.object_ratio)
+        self._gain = ObjectGain(transmission.torque_constant_std, config.object_ratio)
         self._learns_gain = config.learn_gain
         self.current = CurrentEstimate(config, transmission)
         self._newest_visual_ns = -1
@@ -211,12 +211,12 @@ class Fusion:
         if free:
             self._difference_n = 0.0
         if self._was_lowering and before_n > 0:  # the difference by the gearing falls with the force
-            gain_n2 = (self._transmission.gain_std * before_n) ** 2
+            gain_n2 = (self._transmission.torque_constant_std * before_n) ** 2
             share = gain_n2 / (gain_n2 + self.current.friction_n2 + FREE_FLOOR_N**2)
             self._difference_n *= 1 - share * (1 - current_n / before_n)
         drift_n2 = (_DRIFT_N2_S + _OPENING_DRIFT_N2_S * self.current.reversal) * self.current.dt_s
         # An unknown gain error g gives a bias of g * force: its variance grows with the square of the force.
-        gain_n2 = self._transmission.gain_std**2 * abs(current_n**2 - before_n**2)
+        gain_n2 = self._transmission.torque_constant_std**2 * abs(current_n**2 - before_n**2)
         self._variance_n2 = min(self._variance_n2 + drift_n2 + gain_n2, self._prior_n2(current_n))
 
     def _update(self, t_ns: int, visual: VisualForce) -> str:

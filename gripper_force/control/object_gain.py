@@ -58,13 +58,13 @@ class ObjectGain:
     """The gain of one object, from one ratio per grasp.
 
     Args:
-        torque_std: Relative standard deviation of the torque constant.
+        torque_constant_std: Relative standard deviation of the torque constant.
         known: Ratio of earlier grasps, and its relative standard deviation without that of the torque constant;
             None without any.
     """
 
-    def __init__(self, torque_std: float, known: tuple[float, float] | None = None) -> None:
-        self._torque_variance = torque_std**2
+    def __init__(self, torque_constant_std: float, known: tuple[float, float] | None = None) -> None:
+        self._torque_variance = torque_constant_std**2
         self.reset()
         if known is not None:
             self.add(*known)

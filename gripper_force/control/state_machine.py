@@ -148,7 +148,7 @@ class GraspController:
         self._approach = Approach(config, transmission, approach_m_s)
         self._slip = SlipMonitor(config)
         self._visual_check = VisualCheck(config)
-        self._largest_target_n = largest_target_n(config.force_limit_n, transmission.gain_bound)
+        self._largest_target_n = largest_target_n(config.force_limit_n, transmission.torque_constant_bound)
         self._phase, self._outcome, self._reason = Phase.OPEN, Outcome.NONE, ""
         self._estimate = FusedForce(
             0, 0.0, transmission.bias_std_n(0.0), 0.0, 0.0, transmission.friction_n, EstimateSource.CURRENT

@@ -32,8 +32,8 @@ class Transmission:
         damping_n_s_m: Viscous friction at each jaw.
         current_step_a: Resolution of the servo's goal current; 0 if unknown.
         friction_std: Standard deviation of true friction, as a share of `friction_n`.
-        gain_std: Standard deviation of the true torque constant, as a share of the nominal.
-        gain_bound: Largest plausible ratio of the true torque constant to the nominal.
+        torque_constant_std: Standard deviation of the true torque constant, as a share of the nominal.
+        torque_constant_bound: Largest plausible ratio of the true torque constant to the nominal.
     """
 
     linkage: Linkage
@@ -44,8 +44,8 @@ class Transmission:
     damping_n_s_m: float
     current_step_a: float = 0.0
     friction_std: float = 0.25
-    gain_std: float = 0.06
-    gain_bound: float = 1.4
+    torque_constant_std: float = 0.06
+    torque_constant_bound: float = 1.4
 
     @classmethod
     def from_config(
@@ -66,8 +66,8 @@ class Transmission:
             damping_n_s_m=gripper.damping_n_s_m,
             current_step_a=current_step_a,
             friction_std=gripper.friction_std,
-            gain_std=gripper.gain_std,
-            gain_bound=gripper.gain_bound,
+            torque_constant_std=gripper.gain_std,
+            torque_constant_bound=gripper.gain_bound,
         )
 
     @property
@@ -121,7 +121,7 @@ class Transmission:
 
     def bias_std_n(self, force_n: float) -> float:
         """Returns the standard deviation of the contact force about the current estimate."""
-        return math.hypot(self.friction_std * self.friction_n, self.gain_std * force_n)
+        return math.hypot(self.friction_std * self.friction_n, self.torque_constant_std * force_n)
 
     def _closing_rad(self, position_rad: float) -> float:
         return self.closing_sign * (position_rad - self.open_position_rad)

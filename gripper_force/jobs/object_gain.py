@@ -98,7 +98,7 @@ def save_gain(
             f"the logs contradict each other: motor current was {low:.2f} times the visual force in one, and "
             f"{high:.2f} times in another; pass logs of one object"
         )
-    gain = ObjectGain(_torque_std(logs[-1], overrides))
+    gain = ObjectGain(_torque_constant_std(logs[-1], overrides))
     for ratio in ratios:
         gain.add(*ratio)
     total, estimate = gain.ratio, gain.estimate()
@@ -123,10 +123,10 @@ def _contradiction(pair: tuple[tuple[float, float], tuple[float, float]]) -> flo
     return math.log(high / low) / math.hypot(low_std, high_std, math.sqrt(2) * REPEAT_STD)
 
 
-def _torque_std(path: Path, overrides: Overrides | None) -> float:
+def _torque_constant_std(path: Path, overrides: Overrides | None) -> float:
     return config_from_text(LogReader(path).config, str(path), overrides).gripper.gain_std
 
 
-def gain_of(ratio: tuple[float, float] | None, torque_std: float) -> GainEstimate | None:
+def gain_of(ratio: tuple[float, float] | None, torque_constant_std: float) -> GainEstimate | None:
     """Returns the gain that follows from a ratio; None without one."""
-    return ObjectGain(torque_std, ratio).estimate()
+    return ObjectGain(torque_constant_std, ratio).estimate()

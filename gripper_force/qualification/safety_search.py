@@ -254,7 +254,7 @@ def draw(config: ControlConfig, truth: Transmission, seed: int, index: int) -> D
     is_sequence = index % _SEQUENCE == _SEQUENCE - 2
     reach = _REACH_SHARE if is_sequence else 1.0
     force_limit_n = rarely(0.5, log_between(0.8, 20.0), config.force_limit_n)
-    max_n = largest_target_n(force_limit_n, truth.gain_bound)
+    max_n = largest_target_n(force_limit_n, truth.torque_constant_bound)
     open_m_per_rad = truth.jaw_m_per_rad(truth.open_position_rad)
     drawn = Draw(
         force_limit_n=force_limit_n,

@@ -58,7 +58,7 @@ def test_partly_closed_jaws_get_half_of_the_limit(allowance, transmission):
     close(allowance, 0.005)
     assert closing_n(allowance) == 0.0
     most_n = allowance.max_closing_force_n(closing=True, approaching=True)
-    assert most_n == pytest.approx(0.4 / transmission.gain_bound)
+    assert most_n == pytest.approx(0.4 / transmission.torque_constant_bound)
     allowance.learn(0.3, only_lower=False)
     assert allowance.max_closing_force_n(closing=True, approaching=True) == math.inf
 

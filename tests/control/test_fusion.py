@@ -337,7 +337,7 @@ def test_what_vision_and_current_share_stays_in_the_claim(bench, transmission):
     b = bench(object_ratio=(2.0, 0.01))
     estimate = grip(b, transmission, 6.0, 2.0)
     assert estimate.source == "fused"
-    assert estimate.std_n > 0.9 * transmission.gain_std * 6.0
+    assert estimate.std_n > 0.9 * transmission.torque_constant_std * 6.0
 
 
 def test_a_changing_force_is_claimed_to_be_less_certain(bench, transmission):

@@ -43,7 +43,7 @@ def test_no_output_ever_leaves_the_limits(cycles, transmission, limit_a):
             wanted, force_n, friction_n, motor_force_n, 0.0, dt_s, may_rise=may_rise, opening=opens
         )
         believed_n = min(max(friction_n, 0.0), 2 * transmission.friction_n)
-        cap_n = 1.05 * CONFIG.force_limit_n / transmission.gain_bound + believed_n
+        cap_n = 1.05 * CONFIG.force_limit_n / transmission.torque_constant_bound + believed_n
         cap_a = min(limit_a, cap_n / transmission.n_per_a(0.0))
         assert 0.0 <= out.goal_current_a <= cap_a
         low, high = transmission.goal_range_rad
@@ -106,7 +106,7 @@ def test_over_force_halves_within_five_cycles():
 @given(st.floats(1.0, 2.0), st.floats(0.0, 1.0), st.floats(0.0, 1.5), st.floats(2.0, 60.0))
 def test_ceiling_keeps_the_force_limit_for_any_torque_constant(bound, share, believed_n, limit_n):
     gain = 1.0 + share * (bound - 1.0)
-    rig = replace(FINE, gain_bound=bound)
+    rig = replace(FINE, torque_constant_bound=bound)
     ceiling_a = Limits(ControlConfig(force_limit_n=limit_n), rig, 99.0).ceiling_a(believed_n, 0.0)
     friction_n = gain * believed_n  # measured in free travel, with the believed torque constant
     assert gain * rig.force_n(ceiling_a, 0.0) - friction_n <= 1.05 * limit_n

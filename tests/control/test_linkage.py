@@ -211,7 +211,7 @@ def test_no_linkage_leaves_its_travel_or_the_force_limit(
     low_rad, high_rad = one.goal_range_rad
     assert low_rad <= command.goal_position_rad <= high_rad
     force_n = one.force_n(sign * command.goal_current_a, at_rad)
-    assert force_n * one.gain_bound <= 1.05 * control.force_limit_n
+    assert force_n * one.torque_constant_bound <= 1.05 * control.force_limit_n
 
 
 CRANK = {"kind": "crank_slider", "crank_m": 0.022, "rod_m": 0.036, "open_crank_rad": 1.1}

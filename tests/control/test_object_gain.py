@@ -9,11 +9,11 @@ from gripper_force.control.object_gain import KIND_STD, GainEstimate, ObjectGain
 ratios = st.floats(0.2, 5.0)
 stds = st.floats(0.02, 0.5)
 measurements = st.lists(st.tuples(ratios, stds), min_size=1, max_size=20)
-torque_stds = st.floats(0.005, 0.2)
+torque_constant_stds = st.floats(0.005, 0.2)
 
 
-def learned(torque_std: float, pairs: list[tuple[float, float]]) -> ObjectGain:
-    gain = ObjectGain(torque_std)
+def learned(torque_constant_std: float, pairs: list[tuple[float, float]]) -> ObjectGain:
+    gain = ObjectGain(torque_constant_std)
     for pair in pairs:
         gain.add(*pair)
     return gain
@@ -35,12 +35,12 @@ def hold(gain: ObjectGain, current_n: float, visual_n: float, frames: int = 60) 
         gain.observe(current_n, visual_n, 0.02)
 
 
-@given(torque_stds, measurements)
-def test_the_posterior_is_never_narrower_than_torque_constant_and_kind_together(torque_std, pairs):
-    estimate = posterior(learned(torque_std, pairs))
-    least = 1 / math.sqrt(1 / torque_std**2 + 1 / KIND_STD**2)
+@given(torque_constant_stds, measurements)
+def test_the_posterior_is_never_narrower_than_torque_constant_and_kind_together(torque_constant_std, pairs):
+    estimate = posterior(learned(torque_constant_std, pairs))
+    least = 1 / math.sqrt(1 / torque_constant_std**2 + 1 / KIND_STD**2)
     assert estimate.std >= least * (1 - 1e-9)
-    assert estimate.shared_std <= min(estimate.std, torque_std) * (1 + 1e-9)
+    assert estimate.shared_std <= min(estimate.std, torque_constant_std) * (1 + 1e-9)
 
 
 def test_a_thousand_grasps_do_not_average_out_the_torque_constant():
@@ -49,18 +49,21 @@ def test_a_thousand_grasps_do_not_average_out_the_torque_constant():
     assert estimate.gain == pytest.approx(1.5, rel=0.05)
 
 
-@given(torque_stds, measurements, st.randoms())
-def test_the_order_of_the_grasps_does_not_matter(torque_std, pairs, random):
+@given(torque_constant_stds, measurements, st.randoms())
+def test_the_order_of_the_grasps_does_not_matter(torque_constant_std, pairs, random):
     mixed = list(pairs)
     random.shuffle(mixed)
-    one, other = posterior(learned(torque_std, pairs)), posterior(learned(torque_std, mixed))
+    one, other = (
+        posterior(learned(torque_constant_std, pairs)),
+        posterior(learned(torque_constant_std, mixed)),
+    )
     assert other.gain == pytest.approx(one.gain, rel=1e-9)
     assert other.std == pytest.approx(one.std, rel=1e-6)
 
 
-@given(torque_stds, ratios, stds)
-def test_the_gain_lies_between_that_of_the_kind_and_what_was_measured(torque_std, ratio, std):
-    estimate = posterior(learned(torque_std, [(ratio, std)]))
+@given(torque_constant_stds, ratios, stds)
+def test_the_gain_lies_between_that_of_the_kind_and_what_was_measured(torque_constant_std, ratio, std):
+    estimate = posterior(learned(torque_constant_std, [(ratio, std)]))
     assert min(1.0, ratio) <= estimate.gain <= max(1.0, ratio)
 
 

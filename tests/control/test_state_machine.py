@@ -595,7 +595,7 @@ def test_stop_has_priority_in_every_phase(make_run, phase):
 @pytest.mark.parametrize("on_fault", ["limp", "hold"])
 def test_estimate_over_the_limit_never_prevents_opening(make_run, on_fault):
     run = make_run(vision={"noise_n": 0.7}, feedback="vision", on_fault=on_fault, force_limit_n=4.5)
-    run = replace(run, transmission=replace(run.transmission, gain_bound=1.0))
+    run = replace(run, transmission=replace(run.transmission, torque_constant_bound=1.0))
     run.to_phase("hold")
     run.vision.gain = 1.3  # estimates in flight when the stop comes
     run.go(0.02).go(0.5, "stop")

@@ -17,7 +17,7 @@ def test_a_log_tells_what_its_grasp_has_shown(fused_log: Path) -> None:
     if last.object_gain == 0:  # too few frames
         assert ratio is None
         return
-    found = gain_of(ratio, torque_std=0.06)
+    found = gain_of(ratio, torque_constant_std=0.06)
     assert found is not None
     assert found.gain == pytest.approx(last.object_gain)
     assert found.std == pytest.approx(last.object_gain_std)
@@ -26,7 +26,7 @@ def test_a_log_tells_what_its_grasp_has_shown(fused_log: Path) -> None:
 def test_a_gain_is_saved_beside_the_correction(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     log = Path(__file__).parents[1] / "data"
     monkeypatch.setattr(object_gain, "learned_ratio", lambda path, _: (1.6, 0.05))
-    monkeypatch.setattr(object_gain, "_torque_std", lambda path, _: 0.06)
+    monkeypatch.setattr(object_gain, "_torque_constant_std", lambda path, _: 0.06)
     saved = save_gain("sponge", [log, log], tmp_path / "mine.yaml")
     assert saved.object_gain == pytest.approx(1.6, rel=0.03)
     before, after = read_object(find_object("sponge")), read_object(tmp_path / "mine.yaml")
@@ -39,7 +39,7 @@ def test_the_network_of_a_bundle_goes_with_the_profile(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(object_gain, "learned_ratio", lambda path, _: (1.6, 0.05))
-    monkeypatch.setattr(object_gain, "_torque_std", lambda path, _: 0.06)
+    monkeypatch.setattr(object_gain, "_torque_constant_std", lambda path, _: 0.06)
     source = find_object("sponge")
     bundle = tmp_path / "mug" / "profile.yaml"
     bundle.parent.mkdir()
@@ -70,7 +70,7 @@ def test_logs_of_two_objects_contradict_each_other(
 
 def test_a_profile_does_not_replace_a_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(object_gain, "learned_ratio", lambda path, _: (1.6, 0.05))
-    monkeypatch.setattr(object_gain, "_torque_std", lambda path, _: 0.06)
+    monkeypatch.setattr(object_gain, "_torque_constant_std", lambda path, _: 0.06)
     network = tmp_path / "mug.safetensors"
     network.write_bytes(b"a network")
     with pytest.raises(ConfigError, match=r"would replace .*mug\.safetensors, which belongs to no profile"):
@@ -85,7 +85,7 @@ def test_nothing_is_saved_without_a_plausible_gain(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ratio: tuple[float, float] | None, words: str
 ) -> None:
     monkeypatch.setattr(object_gain, "learned_ratio", lambda path, _: ratio)
-    monkeypatch.setattr(object_gain, "_torque_std", lambda path, _: 0.06)
+    monkeypatch.setattr(object_gain, "_torque_constant_std", lambda path, _: 0.06)
     with pytest.raises(DataError, match=words):
         save_gain("sponge", [tmp_path], tmp_path / "mine.yaml")
     assert not list(tmp_path.iterdir())

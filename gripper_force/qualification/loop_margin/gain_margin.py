@@ -176,7 +176,7 @@ def oscillation_decays(config: Config, truth: Gripper, feedback: str, delay_s: f
     radius_m = truth.transmission.jaw_m_per_rad(truth.transmission.open_position_rad)
     rig = replace(truth.transmission, linkage=RackAndPinion(radius_m, _OPEN_WIDTH_M))
     if vision_alone:
-        rig = replace(rig, gain_std=0.5)
+        rig = replace(rig, torque_constant_std=0.5)
     given = {
         **config.control.model_dump(),
         "feedback": feedback,

@@ -52,7 +52,7 @@ class _DecimalFusion:
         self._max_std_n = control.vision_std_n
         self._friction_n = Decimal(transmission.friction_n)
         self._friction_n2 = (Decimal(transmission.friction_std) * self._friction_n) ** 2
-        self._gain_std = Decimal(transmission.gain_std)
+        self._torque_constant_std = Decimal(transmission.torque_constant_std)
         self._motor_force_n = self._force_n = self._difference_n = Decimal(0)
         self._share = Decimal(1)
         self._variance_n2 = self._prior_n2(self._force_n)
@@ -77,7 +77,7 @@ class _DecimalFusion:
         self._force_n = min(max(before_n, self._motor_force_n - play_n), self._motor_force_n + play_n)
         back = (1 + (self._force_n - self._motor_force_n) / play_n) / 2 if play_n else Decimal(0)
         drift_n2 = Decimal(fusion._DRIFT_N2_S) + Decimal(fusion._OPENING_DRIFT_N2_S) * back
-        gearing_n2 = self._gain_std**2 * abs(self._force_n**2 - before_n**2)
+        gearing_n2 = self._torque_constant_std**2 * abs(self._force_n**2 - before_n**2)
         grown_n2 = self._variance_n2 + drift_n2 * dt_s + gearing_n2
         self._variance_n2 = min(grown_n2, self._prior_n2(self._force_n))
         self._history.append((t_ns, self._force_n))
@@ -126,7 +126,7 @@ class _DecimalFusion:
 
     def _prior_n2(self, force_n: Decimal) -> Decimal:
         floor_n2 = Decimal(FREE_FLOOR_N) ** 2
-        return self._friction_n2 + floor_n2 + (self._gain_std * force_n) ** 2
+        return self._friction_n2 + floor_n2 + (self._torque_constant_std * force_n) ** 2
 
 
 def cases(config: Config, _maps: Path | None, cycles: int = CYCLES) -> Iterator[NumericalCase]:

@@ -70,7 +70,7 @@ def test_the_command_saves_the_gain_of_the_last_log(
     assert printed["object_gain"] == pytest.approx(row["gain"], rel=1e-3)
     saved, source = read_object(out), find_object("sponge")
     assert saved.ratio == pytest.approx((printed["ratio"], printed["ratio_std"]))
-    found = gain_of(saved.ratio, torque_std=0.06)
+    found = gain_of(saved.ratio, torque_constant_std=0.06)
     assert found is not None
     assert found.gain == pytest.approx(row["gain"], rel=1e-3)
     assert saved.model_copy(update={"ratio": None}) == read_object(source)
