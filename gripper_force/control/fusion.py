@@ -12,7 +12,7 @@ from typing import Final
 
 from gripper_force.config import ControlConfig
 from gripper_force.control.current_estimate import FREE_FLOOR_N, CurrentEstimate, combined_variance_n2
-from gripper_force.control.object_gain import KIND_STD, ObjectGain
+from gripper_force.control.object_gain import GATE, KIND_STD, ObjectGain
 from gripper_force.control.transmission import Transmission
 from gripper_force.types import NS_PER_MS, EstimateSource, Event, FusedForce, ServoState, VisualForce
 
@@ -35,9 +35,6 @@ inertia carries the jaws to anywhere within it."""
 _PLAY_SHARE = 0.15
 """Error of a steady current estimate after the motor force has fallen within the play, as a share of friction and of
 the reversal: 0.11 N at 60 % in simulated grasps."""
-
-_GATE = 3.29
-"""Innovation gate in standard deviations: 0.1 % of good estimates are rejected (chi-square, 10.8)."""
 
 _REENTRY_S = 1 / 3
 _MIN_REENTRY = 4
@@ -91,7 +88,7 @@ class Fusion:
         self._std_limit_n = config.vision_std_n
         self._reentry = max(round(_REENTRY_S * config.frame_hz), _MIN_REENTRY)
         self._transmission = transmission
-        self._gain = ObjectGain(transmission.torque_constant_std, config.object_ratio)
+        self._object_gain = ObjectGain(transmission.torque_constant_std, config.object_ratio)
         self._learns_gain = config.learn_gain
         self.current = CurrentEstimate(config, transmission)
         self._newest_visual_ns = -1
@@ -100,7 +97,7 @@ class Fusion:
         self._visual_std_n = 0.0
         self._source = EstimateSource.CURRENT
         self._rejection = ""
-        self._is_silent = True
+        self._nothing_reported = True
         self._gain_event = ""
         self.restart()
 
@@ -112,12 +109,12 @@ class Fusion:
             new_object: True if the grasp is of another object than those before, so that their gain is forgotten.
         """
         if new_object:
-            self._gain.reset()
+            self._object_gain.reset()
         self.end_grasp(was_held=was_held)
-        self._applied_gain = self._gain.estimate() if self._learns_gain else None
+        self._applied_gain = self._object_gain.estimate() if self._learns_gain else None
         self._difference_n = 0.0
-        self._variance_ratio = self._shared_n2 = self._slow_n = 0.0
-        self._impact_n: float | None = None
+        self._variance_ratio = self._shared_n2 = self._lagged_n = 0.0
+        self._contact_start_n: float | None = None
         self._is_contradicted = False
         self.current.restart()
         self._opening_variance_n2 = 0.0
@@ -126,8 +123,8 @@ class Fusion:
 
     def end_grasp(self, *, was_held: bool) -> tuple[float, float] | None:
         """Ends the present grasp, and returns the ratio that the object's gain rests on (see `ObjectGain.ratio`)."""
-        self._gain_event = self._gain.finish_grasp(counts=was_held)
-        return self._gain.ratio
+        self._gain_event = self._object_gain.finish_grasp(counts=was_held)
+        return self._object_gain.ratio
 
     def reset_variance(self) -> None:
         """Resets the bias variance to its prior.
@@ -175,7 +172,7 @@ class Fusion:
         self._was_lowering = lowering
         self._holds = holding and not self._has_lowered
         self._predict(servo, free)
-        self._note_change(gripping or opening, gripping)
+        self._update_temporary_variance(gripping or opening, gripping)
         self._variance_n2 = max(self._variance_n2, self._opening_variance_n2)
         if visual is not None and visual.t_ns > self._newest_visual_ns and self._feedback != "current":
             if visual.t_ns <= t_ns:  # a wrong time in the future would hide all later frames
@@ -183,26 +180,26 @@ class Fusion:
             self._rejection = self._update(t_ns, visual)
             if not self._rejection:
                 self._used_ns = t_ns
-        events = self._switch(t_ns)
+        events = self._switch_source(t_ns)
         if self._gain_event:
             events = (*events, Event(t_ns, "vision", self._gain_event))
             self._gain_event = ""
         return self._estimate(t_ns), events
 
-    def _note_change(self, has_force: bool, gripping: bool) -> None:
-        """Computes the parts of the claimed error that do not last."""
+    def _update_temporary_variance(self, has_force: bool, gripping: bool) -> None:
+        """Computes the temporary parts of the claimed error, see the class."""
         if not has_force:
-            self._slow_n, self._impact_n, self._passing_n2 = self.current.force_n, None, 0.0
+            self._lagged_n, self._contact_start_n, self._temporary_n2 = self.current.force_n, None, 0.0
             return
-        if self._impact_n is None:
-            self._impact_n = self.current.force_n
+        if self._contact_start_n is None:
+            self._contact_start_n = self.current.force_n
         dt_s, lag_s = self.current.dt_s, self.current.lag_s
-        self._slow_n += (self.current.force_n - self._slow_n) * dt_s / (dt_s + lag_s)
-        left_n = _INERTIA_SHARE * self.current.friction_n - max(self.current.force_n - self._impact_n, 0.0)
-        held_n = max(left_n, 0.0) if gripping else 0.0
-        self._passing_n2 = (self.current.force_n - self._slow_n) ** 2 + held_n**2
+        self._lagged_n += (self.current.force_n - self._lagged_n) * dt_s / (dt_s + lag_s)
+        risen_n = max(self.current.force_n - self._contact_start_n, 0.0)
+        friction_n = max(_INERTIA_SHARE * self.current.friction_n - risen_n, 0.0) if gripping else 0.0
+        self._temporary_n2 = (self.current.force_n - self._lagged_n) ** 2 + friction_n**2
         if self._is_contradicted:  # the bias came from estimates of the same network
-            self._passing_n2 += (self._difference_n / (1 + self._variance_ratio)) ** 2
+            self._temporary_n2 += (self._difference_n / (1 + self._variance_ratio)) ** 2
 
     def _predict(self, servo: ServoState, free: bool) -> None:
         before_n = self.current.force_n
@@ -211,13 +208,13 @@ class Fusion:
         if free:
             self._difference_n = 0.0
         if self._was_lowering and before_n > 0:  # the difference by the gearing falls with the force
-            gain_n2 = (self._transmission.torque_constant_std * before_n) ** 2
-            share = gain_n2 / (gain_n2 + self.current.friction_n2 + FREE_FLOOR_N**2)
+            gearing_n2 = (self._transmission.torque_constant_std * before_n) ** 2
+            share = gearing_n2 / (gearing_n2 + self.current.friction_n2 + FREE_FLOOR_N**2)
             self._difference_n *= 1 - share * (1 - current_n / before_n)
         drift_n2 = (_DRIFT_N2_S + _OPENING_DRIFT_N2_S * self.current.reversal) * self.current.dt_s
-        # An unknown gain error g gives a bias of g * force: its variance grows with the square of the force.
-        gain_n2 = self._transmission.torque_constant_std**2 * abs(current_n**2 - before_n**2)
-        self._variance_n2 = min(self._variance_n2 + drift_n2 + gain_n2, self._prior_n2(current_n))
+        # An error g of the torque constant gives a bias of g * force: its variance grows with the square of the force.
+        gearing_n2 = self._transmission.torque_constant_std**2 * abs(current_n**2 - before_n**2)
+        self._variance_n2 = min(self._variance_n2 + drift_n2 + gearing_n2, self._prior_n2(current_n))
 
     def _update(self, t_ns: int, visual: VisualForce) -> str:
         """Updates the filter with one estimate. Returns the reason of a rejection, or an empty text."""
@@ -229,19 +226,19 @@ class Fusion:
             return "its time is in the future" if age_ns < 0 else f"it is {age_ns / NS_PER_MS:.0f} ms old"
         if visual.std_n > self._std_limit_n:
             return f"its standard deviation is {visual.std_n:.2f} N"
-        if self._learns_gain and (problem := self._gain.problem):
+        if self._learns_gain and (problem := self._object_gain.problem):
             return problem
         current_n = self.current.at(visual.t_ns)
         if self._holds and self._learns_gain:
             seen_n2 = max(visual.std_n**2 - (KIND_STD * visual.force_n) ** 2, _VISION_FLOOR_N**2)
             play_n = _PLAY_SHARE * self.current.friction_n * self.current.reversal
             unknown_n2 = self.current.friction_n2 + FREE_FLOOR_N**2 + play_n**2
-            self._gain.observe(current_n, visual.force_n, unknown_n2 + seen_n2)
+            self._object_gain.observe(current_n, visual.force_n, unknown_n2 + seen_n2)
         self._shared_n2 = 0.0
-        if (gain := self._applied_gain) is not None:
-            force_n, std_n = gain.corrected(visual.force_n, visual.std_n)
+        if (object_gain := self._applied_gain) is not None:
+            force_n, std_n = object_gain.corrected(visual.force_n, visual.std_n)
             visual = replace(visual, force_n=force_n, std_n=std_n)
-            self._shared_n2 = (gain.shared_std * current_n) ** 2
+            self._shared_n2 = (object_gain.shared_std * current_n) ** 2
         if self._was_lowering:
             self._visual_n, self._visual_std_n = visual.force_n, visual.std_n
             return ""
@@ -251,7 +248,7 @@ class Fusion:
         if abs(difference_n) > 3 * math.sqrt(self._prior_n2(current_n) + claimed_n2):
             self._is_contradicted = True
             return f"it differs from the motor current by {difference_n:.2f} N"
-        if abs(innovation_n) > _GATE * math.sqrt(self._variance_n2 + claimed_n2):
+        if abs(innovation_n) > GATE * math.sqrt(self._variance_n2 + claimed_n2):
             self._rejected = _count_rejections(self._rejected, innovation_n)
             if abs(self._rejected) < self._reentry:
                 return f"it jumps by {innovation_n:.2f} N"
@@ -266,25 +263,25 @@ class Fusion:
         return ""
 
     def _correct(self, innovation_n: float, noise_n2: float) -> None:
-        gain = self._variance_n2 / (self._variance_n2 + noise_n2)
-        self._difference_n += gain * innovation_n
+        kalman_gain = self._variance_n2 / (self._variance_n2 + noise_n2)
+        self._difference_n += kalman_gain * innovation_n
         self._variance_n2 = combined_variance_n2(self._variance_n2, noise_n2)
 
     def _prior_n2(self, force_n: float) -> float:
         return self.current.variance_n2(force_n) + self._opening_variance_n2
 
-    def _switch(self, t_ns: int) -> tuple[Event, ...]:
+    def _switch_source(self, t_ns: int) -> tuple[Event, ...]:
         fresh = self._used_ns is not None and t_ns - self._used_ns <= self._timeout_ns
         source = EstimateSource(self._feedback) if fresh else EstimateSource.CURRENT
-        news = "dropped out"
+        change = "dropped out"
         if source == self._source:
-            if not (self._is_silent and self._rejection):
+            if not (self._nothing_reported and self._rejection):
                 return ()
-            news = "is not used"
-        self._source, self._is_silent = source, False
+            change = "is not used"
+        self._source, self._nothing_reported = source, False
         if source != EstimateSource.CURRENT:
             return (Event(t_ns, "vision", f"vision in use; the force estimate is {source}"),)
-        text = f"vision {news}: {self._rejection or NO_NEW_ESTIMATE}; using motor current alone"
+        text = f"vision {change}: {self._rejection or NO_NEW_ESTIMATE}; using motor current alone"
         return (Event(t_ns, "vision", text),)
 
     def _estimate(self, t_ns: int) -> FusedForce:
@@ -294,12 +291,12 @@ class Fusion:
         prior_n2 = self._prior_n2(self.current.force_n)
         shared_n2 = min(self._shared_n2, prior_n2)
         lasting_n2 = self._variance_n2 + self._variance_ratio * share * (prior_n2 - shared_n2) + shared_n2
-        std_n = math.sqrt(lasting_n2 + self._passing_n2)
+        std_n = math.sqrt(lasting_n2 + self._temporary_n2)
         if self._source == EstimateSource.VISION:
             force_n, std_n = self._visual_n, max(self._visual_std_n, _VISION_FLOOR_N)
         force_n = max(force_n, 0.0)
-        shows_gain = self._learns_gain and not self._gain.problem
-        gain = self._gain.estimate(with_present=True) if shows_gain else None
+        shows_object_gain = self._learns_gain and not self._object_gain.problem
+        object_gain = self._object_gain.estimate(with_present=True) if shows_object_gain else None
         return FusedForce(
             t_ns=t_ns,
             force_n=force_n,
@@ -308,8 +305,8 @@ class Fusion:
             bias_n=bias_n,
             friction_n=self.current.friction_n,
             source=self._source,
-            object_gain=0.0 if gain is None else gain.gain,
-            object_gain_std=0.0 if gain is None else gain.std,
+            object_gain=0.0 if object_gain is None else object_gain.gain,
+            object_gain_std=0.0 if object_gain is None else object_gain.std,
         )
 
 

@@ -26,7 +26,7 @@ _MIN_FORCE_N: Final = 0.3
 """Least number of frames of a hold, and least mean force in them, that say something about the gain."""
 
 GATE: Final = 3.29
-"""Deviations beyond which a ratio is implausible (0.1 % of good ones), or is that of another object."""
+"""Largest plausible deviation of an innovation or a ratio, in standard deviations; 0.1 % of good ones are beyond it."""
 
 REPEAT_STD: Final = 0.03
 """Standard deviation of the ratio between grasps of one object in different places, beyond the claimed errors."""

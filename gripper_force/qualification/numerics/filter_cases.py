@@ -20,6 +20,7 @@ from gripper_force.config import Config, ControlConfig, GripperConfig
 from gripper_force.control import fusion
 from gripper_force.control.current_estimate import FREE_FLOOR_N
 from gripper_force.control.fusion import Fusion
+from gripper_force.control.object_gain import GATE
 from gripper_force.control.state_machine import GraspController
 from gripper_force.control.transmission import Transmission
 from gripper_force.qualification.loop_margin.analytic_plant import CYCLE_NS, transmission_of
@@ -99,7 +100,7 @@ class _DecimalFusion:
         surprise_n = difference_n - self._difference_n
         if abs(difference_n) > 3 * (prior_n2 + claimed_n2).sqrt():
             return
-        if abs(surprise_n) > Decimal(fusion._GATE) * (self._variance_n2 + claimed_n2).sqrt():
+        if abs(surprise_n) > Decimal(GATE) * (self._variance_n2 + claimed_n2).sqrt():
             side = 1 if surprise_n > 0 else -1
             self._run = self._run + side if self._run * side > 0 else side
             if abs(self._run) < self._reentry:

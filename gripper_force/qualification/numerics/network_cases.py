@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from gripper_force.config import Config, load_config
-from gripper_force.control import fusion
+from gripper_force.control.object_gain import GATE
 from gripper_force.errors import CheckpointError, GripperError, NonFiniteError
 from gripper_force.jobs.dataset import Clip, load_clip
 from gripper_force.jobs.simulate import SimulationPlan, make_log
@@ -352,7 +352,7 @@ def _frames(reference: ReferenceEnsemble, grasp: Clip, config: Config) -> Iterat
                 off = abs(one.visual.force_n - before.visual.force_n) / one.visual.std_n
                 largest, largest_case = max((largest, largest_case), (off, name))
     detail = f"largest difference to the undisturbed grasp ({largest_case}), over the claimed error"
-    yield NumericalCase("effect of disturbed frames on a grasp", detail, largest, fusion._GATE)
+    yield NumericalCase("effect of disturbed frames on a grasp", detail, largest, GATE)
     started = sum(_starts(engine, np.full_like(clip, level)) for level in (0, 128, 255))
     yield NumericalCase(
         "black, gray or white frames from the start", "number of runs that start", float(started), 0.0
