@@ -9,7 +9,7 @@ from gripper_force.control.transmission import Transmission
 from gripper_force.control.tuning import Gains, Plant, phase_margin_deg, simc
 from gripper_force.types import EstimateSource, FusedForce
 
-_RAMP_S = 0.4
+_RAMP_ACCELERATION_S = 0.4
 """Acceleration time of the ramp: longer than a quarter oscillation period of the softest object."""
 
 _MAX_RAMP_PER_S = 10.0
@@ -21,7 +21,7 @@ _RETURN_S = 0.05
 closing side of friction within `_RETURN_S`, which stops the jaws. A later return would let their inertia carry them
 too far."""
 
-_AGAIN_S = 0.05
+_LOWER_AT_ONCE_S = 0.05
 """A lowering that ends above the tolerance is followed at once by a second one of twice this time. The first leaves a
 stiff object with too much force: the motor force returns before its lag lets it reach its lowest value."""
 
@@ -97,12 +97,14 @@ class ForceLoop:
         self._gains = self.margins["vision" if self._vision_alone else "hold"].gains
         self._transmission = transmission
         self._ramp_n_s = min(config.ramp_n_s, _MAX_RAMP_PER_S * config.force_limit_n)
-        self._largest_m_s = config.approach_speed_m_s
-        self._profile = TrapezoidalProfile(_RAMP_S)
+        self._max_opening_m_s = config.approach_speed_m_s
+        self._profile = TrapezoidalProfile(_RAMP_ACCELERATION_S)
         self._trim_n = 0.0
-        self._rising, self._side, self.is_lowering = True, 1.0, False
-        self._lowers_again = False
-        self._repeat_s = self._high_s = self._highest_n = self._waited_s = self._risen_n = 0.0
+        self._friction_side = 1.0  # share of friction to overcome: 1 to close, -1 to open
+        self._is_reversed = False
+        self.is_lowering = self._may_lower_at_once = False
+        self._repeat_left_s = self._too_high_s = self._waited_s = 0.0
+        self._lowering_start_n = self._highest_reference_n = 0.0
 
     @property
     def reference_n(self) -> float:
@@ -111,10 +113,10 @@ class ForceLoop:
 
     def start(self, force_n: float, target_n: float) -> None:
         """Starts a ramp at the present force."""
-        self._trim_n, self._repeat_s, self._lowers_again = 0.0, 0.0, False
-        self._risen_n = self._highest_n = force_n
+        self._trim_n, self._repeat_left_s, self._may_lower_at_once = 0.0, 0.0, False
+        self._highest_reference_n = self._lowering_start_n = force_n
         self._waited_s = 0.0
-        self._start(force_n, target_n)
+        self._start_ramp(force_n, target_n)
 
     def retarget(self, target_n: float) -> None:
         """Starts a ramp at the present reference and keeps the trim.
@@ -122,16 +124,16 @@ class ForceLoop:
         A ramp in the same direction keeps its speed: targets that follow each other fast would never leave rest. For a
         target that is lower by less than the tolerance the jaws do not open.
         """
-        lowers = target_n < self._risen_n - tolerance_n(target_n)
-        self._lowers_again, self._repeat_s = lowers, _REPEAT_WITHIN_S if lowers else 0.0
-        goes_on = self.is_lowering == lowers
+        lowers = target_n < self._highest_reference_n - tolerance_n(target_n)
+        self._may_lower_at_once, self._repeat_left_s = lowers, _REPEAT_WITHIN_S if lowers else 0.0
+        keeps_direction = self.is_lowering == lowers
         self._waited_s = 0.0
-        if not (goes_on and lowers):
-            self._highest_n = self.reference_n
-        speed_n_s = self._profile.speed if goes_on else 0.0
-        self._start(self.reference_n, target_n, lowers=lowers, speed_n_s=speed_n_s)
+        if not (keeps_direction and lowers):
+            self._lowering_start_n = self.reference_n
+        speed_n_s = self._profile.speed if keeps_direction else 0.0
+        self._start_ramp(self.reference_n, target_n, lowers=lowers, speed_n_s=speed_n_s)
 
-    def _start(
+    def _start_ramp(
         self,
         force_n: float,
         target_n: float,
@@ -140,9 +142,9 @@ class ForceLoop:
         lowers: bool = True,
         speed_n_s: float = 0.0,
     ) -> None:
-        self._rising, self.is_lowering = True, lowers and target_n < force_n
-        self._side = -1.0 if self.is_lowering else 1.0
-        self._profile = TrapezoidalProfile(fall_s if self.is_lowering else _RAMP_S)
+        self._is_reversed, self.is_lowering = False, lowers and target_n < force_n
+        self._friction_side = -1.0 if self.is_lowering else 1.0
+        self._profile = TrapezoidalProfile(fall_s if self.is_lowering else _RAMP_ACCELERATION_S)
         rate_n_s = (force_n - target_n) / fall_s if self.is_lowering else self._ramp_n_s
         self._profile.start(force_n, rate_n_s, speed_n_s)
 
@@ -168,17 +170,19 @@ class ForceLoop:
         self._repeat_lowering(dt_s, target_n, estimate)
         ramping = self.reference_n != target_n
         if self.is_lowering and not ramping:
-            self._side = min(self._side + 2 * dt_s / _RETURN_S, 1.0)
-            self.is_lowering = self._side < 1.0
+            self._friction_side = min(self._friction_side + 2 * dt_s / _RETURN_S, 1.0)
+            self.is_lowering = self._friction_side < 1.0
             if not self.is_lowering:
                 self._lower_at_once(target_n, estimate)
         if self.is_lowering:
-            waits = -closing_m_s > self._largest_m_s and self._waited_s < _LOWERING_WAIT_S
+            waits = -closing_m_s > self._max_opening_m_s and self._waited_s < _LOWERING_WAIT_S
             self._waited_s += dt_s * waits
         else:
             waits = shortfall_n > _WAIT_SHARE * self.reference_n + _WAIT_N
         reference_n = self._profile.step(target_n, 0.0 if waits else dt_s)
-        self._risen_n = reference_n if self.is_lowering else max(self._risen_n, reference_n)
+        self._highest_reference_n = (
+            reference_n if self.is_lowering else max(self._highest_reference_n, reference_n)
+        )
         error_n = 0.0
         # A constant motor force holds a constant contact force. The current alone carries no new information
         # on friction, so it is not fed back.
@@ -188,7 +192,8 @@ class ForceLoop:
         elif ramping and not self._vision_alone:
             self._trim_n = -estimate.bias_n
         friction_n = estimate.friction_n
-        feedforward_n = reference_n + friction_n * (self._side if self._rising else _REVERSED_FRICTION_SHARE)
+        side = _REVERSED_FRICTION_SHARE if self._is_reversed else self._friction_side
+        feedforward_n = reference_n + side * friction_n
         margin_n = 3 * self._transmission.bias_std_n(reference_n) + friction_n
         low_n, high_n = max(reference_n - margin_n, 0.0), reference_n + margin_n
         self._trim_n = min(max(self._trim_n, low_n - feedforward_n), high_n - feedforward_n)
@@ -197,25 +202,26 @@ class ForceLoop:
 
     def _lower_at_once(self, target_n: float, estimate: FusedForce) -> None:
         """Lowers the force again if it is still too high by motor current; one visual estimate may be an outlier."""
-        again, self._lowers_again = self._lowers_again and estimate.source != EstimateSource.VISION, False
-        if again and estimate.force_n > target_n + tolerance_n(target_n):
-            self._start(min(estimate.force_n, self._highest_n), target_n, _AGAIN_S)
+        may_lower = self._may_lower_at_once and estimate.source != EstimateSource.VISION
+        self._may_lower_at_once = False
+        if may_lower and estimate.force_n > target_n + tolerance_n(target_n):
+            self._start_ramp(min(estimate.force_n, self._lowering_start_n), target_n, _LOWER_AT_ONCE_S)
 
     def _repeat_lowering(self, dt_s: float, target_n: float, estimate: FusedForce) -> None:
         """Lowers the force again if the camera shows that it has stayed too high."""
         rests = not self.is_lowering and self.reference_n == target_n
         excess_n = 0.0 if estimate.source == EstimateSource.CURRENT else estimate.force_n - target_n
         is_high = excess_n > _REPEAT_SHARE * tolerance_n(target_n)
-        self._high_s = self._high_s + dt_s if rests and is_high else 0.0
-        if rests and self._repeat_s > 0:
-            self._repeat_s -= dt_s
-            if self._high_s > _REPEAT_S:
-                self._repeat_s = 0.0
-                self._start(min(estimate.force_n, self._highest_n), target_n)
+        self._too_high_s = self._too_high_s + dt_s if rests and is_high else 0.0
+        if rests and self._repeat_left_s > 0:
+            self._repeat_left_s -= dt_s
+            if self._too_high_s > _REPEAT_S:
+                self._repeat_left_s = 0.0
+                self._start_ramp(min(estimate.force_n, self._lowering_start_n), target_n)
 
     def _beyond_deadband(self, error_n: float, band_n: float) -> float:
-        forward_n = error_n if self._rising else -error_n
+        forward_n = -error_n if self._is_reversed else error_n
         if forward_n < -_REVERSE_DEADBAND * band_n:
-            self._rising = not self._rising
+            self._is_reversed = not self._is_reversed
             return error_n
         return error_n if forward_n > _FORWARD_DEADBAND * band_n else 0.0
