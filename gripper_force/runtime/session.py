@@ -42,6 +42,7 @@ from gripper_force.types import (
     Request,
     RequestKind,
     ServoState,
+    VisualForce,
 )
 
 if TYPE_CHECKING:  # a run without vision imports none of it
@@ -53,7 +54,7 @@ _VISION_WAIT_NS: Final = 5 * NS_PER_S
 _REFERENCE_NS: Final = NS_PER_S // 10
 """Every run starts with frames without contact, so that its log can be replayed with vision."""
 
-_OPENING_SPARE_S: Final = 0.5
+_BLOCKED_SPARE_S: Final = 0.5
 """Wait for opening jaws beyond the time after which the controller says that they are blocked."""
 
 _GAP_CYCLES: Final = 2.5
@@ -97,12 +98,12 @@ class Session:
         self._controller, self._perception, self._log_queue = controller, perception, log_queue
         self._period_ns = round(NS_PER_S / resolved.config.control.rate_hz)
         self._due_ns = 0
-        self._stop = False
+        self._stop_requested = False
         self._raise_if_cancelled = raise_if_cancelled
         self._interrupted = False
         self._counter_monitors = {unit: CounterMonitor() for unit in ("servo", "camera", "load_cell")}
         self._load_cell_monitor = LoadCellMonitor()
-        self._problem = ""
+        self._last_problem = ""
         self._error: BaseException | None = None
         self._armed = self._may_open = False
         self.failed = False
@@ -172,7 +173,7 @@ class Session:
 
     def stop_soon(self) -> None:
         """Makes the next cycle a stop, before any other request. Any thread or signal handler may call it."""
-        self._stop = True
+        self._stop_requested = True
 
     def interrupt(self) -> None:
         """Makes the next cycle raise `KeyboardInterrupt` before it accesses the servo.
@@ -211,27 +212,12 @@ class Session:
             KeyboardInterrupt: See `interrupt`.
             GripperError: A sensor or the simulated world failed, or the first frames gave no estimate.
         """
-        devices, log = self._devices, self._log
+        devices = self._devices
         devices.clock.sleep_until_ns(self._due_ns)
         self._due_ns = max(self._due_ns + self._period_ns, devices.clock.now_ns() - self._period_ns)
         self.raise_if_interrupted()
         devices.check()
-        visual = None
-        # A lost camera would raise again while the jaws open at the end.
-        for processed in self._perception.poll() if self._error is None else ():
-            log(processed.frame)
-            self.frames += 1
-            self.newest_frame = processed.frame
-            if processed.visual is not None:
-                visual = processed.visual
-                log(visual)
-                self.has_vision = True
-            if processed.attention is not None:
-                log(processed.attention)
-            kind_of_problem = _NUMBER.sub("", processed.problem)  # one event, although its numbers change
-            if kind_of_problem not in ("", self._problem):
-                log(Event(processed.frame.received_ns, "vision", NO_ESTIMATE + processed.problem))
-            self._problem = kind_of_problem
+        visual = self._poll_perception()
         self._may_open = False  # if this cycle fails from here on, nothing is known of the servo
         state = self.servo_state = self._read_servo()
         request = self._request(state.t_ns, kind, target_n, width_m, new_object)
@@ -241,18 +227,33 @@ class Session:
         self.failed = decision.status.phase == Phase.FAULT
         self.reason = decision.status.reason or self.reason
         self._may_open = decision.status.phase != Phase.OPEN and not state.hardware_error
-        if request is not None:
-            log(request)
-        log(state)
-        log(decision.estimate)
-        log(decision.command)
-        log(decision.status)
-        for event in decision.events:
-            log(event)
+        inputs: tuple[Record, ...] = (state,) if request is None else (request, state)
+        for record in (*inputs, decision.estimate, decision.command, decision.status, *decision.events):
+            self._log(record)
         # A sensor that ended the run would raise again while the jaws open at the end.
         with nullcontext() if self._error is None else suppress(GripperError):
             self._log_sensors(state.t_ns)
         return decision
+
+    def _poll_perception(self) -> VisualForce | None:
+        """Logs the frames that became ready, and returns the newest visual estimate, or None."""
+        visual = None
+        # A lost camera would raise again while the jaws open at the end.
+        for processed in self._perception.poll() if self._error is None else ():
+            self._log(processed.frame)
+            self.frames += 1
+            self.newest_frame = processed.frame
+            if processed.visual is not None:
+                visual = processed.visual
+                self._log(visual)
+                self.has_vision = True
+            if processed.attention is not None:
+                self._log(processed.attention)
+            kind_of_problem = _NUMBER.sub("", processed.problem)  # one event, although its numbers change
+            if kind_of_problem not in ("", self._last_problem):
+                self._log(Event(processed.frame.received_ns, "vision", NO_ESTIMATE + processed.problem))
+            self._last_problem = kind_of_problem
+        return visual
 
     def _read_servo(self) -> ServoState:
         devices = self._devices
@@ -277,7 +278,7 @@ class Session:
     def wait_until_open(self, status: GraspStatus) -> GraspStatus:
         """Runs cycles until opening jaws are open or blocked, or for `opening_s`. Returns the last status."""
         open_width_m = self.resolved.config.gripper.open_width_m
-        end_ns = status.t_ns + round((self.opening_s + _OPENING_SPARE_S) * NS_PER_S)
+        end_ns = status.t_ns + round((self.opening_s + _BLOCKED_SPARE_S) * NS_PER_S)
         while status.t_ns < end_ns and not is_open(open_width_m, status.width_m):
             status = self.cycle().status
             if status.outcome == Outcome.BLOCKED:
@@ -291,9 +292,10 @@ class Session:
         self.log_event("session", f"{type(error).__name__}: {error}")
 
     @property
-    def _end(self) -> str:
+    def _end_action(self) -> str:
+        """Value of ``control.on_fault`` or ``on_exit`` that applies to the end of this run."""
         config = self.resolved.config
-        return config.control.on_fault if self.failed or self._stop else config.on_exit
+        return config.control.on_fault if self.failed or self._stop_requested else config.on_exit
 
     def open_at_fault(self) -> None:
         """Opens the jaws at the end of a run, with ``control.on_fault=open`` after a fault, a stop or an exception.
@@ -301,7 +303,7 @@ class Session:
         Not if the servo is lost or has switched off, nor if nothing was requested since the jaws were open. It takes
         `opening_s` at most.
         """
-        if self._end == "open" and self._may_open:
+        if self._end_action == "open" and self._may_open:
             self.stop_soon()
             try:
                 self.wait_until_open(self.cycle().status)
@@ -312,7 +314,7 @@ class Session:
         """Turns torque off, or holds, as configured, and logs the camera's settings and the last samples."""
         try:
             if self._armed:
-                self._devices.servo.stop(hold=self._end == "hold")
+                self._devices.servo.stop(hold=self._end_action == "hold")
         except DeviceError as second:
             first = self._error
             if not isinstance(first, GripperError):
@@ -343,8 +345,8 @@ class Session:
     def _request(
         self, t_ns: int, kind: RequestKind | None, target_n: float, width_m: float, new_object: bool
     ) -> Request | None:
-        if self._stop:
-            self._stop = False
+        if self._stop_requested:
+            self._stop_requested = False
             return Request(t_ns, RequestKind.STOP)
         return None if kind is None else Request(t_ns, kind, target_n, width_m, new_object)
 
