@@ -20,7 +20,7 @@ from typing import Any, Final, TypeVar
 
 from gripper_force.errors import DataError, GripperError
 from gripper_force.progress import Progress
-from gripper_force.runtime.process import ProcessOptions, allowed, own_process
+from gripper_force.runtime.process import ProcessOptions, allowed_options, own_process
 
 _TERMINAL_SIGNALS: Final = (signal.SIGINT, signal.SIGHUP, signal.SIGQUIT)
 """A terminal sends these to every process. The parent handles them, and then kills its children."""
@@ -260,7 +260,7 @@ class _ProcessPool(Executor):
         )  # of this thread, inherited by the process
         context = get_context("spawn")
         ours, theirs = context.Pipe()
-        process = context.Process(target=_serve, args=(theirs, allowed()))
+        process = context.Process(target=_serve, args=(theirs, allowed_options()))
         with self._lock:
             if self._is_closed:
                 raise EOFError

@@ -14,7 +14,7 @@ from typing import Any
 from gripper_force.errors import ConfigError, GripperError
 from gripper_force.jobs.processes import answer, use_settings
 from gripper_force.plugins import importing
-from gripper_force.runtime.process import ProcessOptions, allowed
+from gripper_force.runtime.process import ProcessOptions, allowed_options
 
 _TRIES = 2
 """Further tries of a job whose machine was lost."""
@@ -91,7 +91,7 @@ class _RayPool(Executor):
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Sends a job to the cluster, and returns its future."""
         call = bytes(ForkingPickler.dumps((fn, args, kwargs)))
-        reference = self._run.remote(call, allowed(), str(Path.cwd()))
+        reference = self._run.remote(call, allowed_options(), str(Path.cwd()))
         future: Future[Any] = Future()
         future.set_running_or_notify_cancel()
         with self._lock:

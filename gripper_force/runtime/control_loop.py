@@ -15,7 +15,7 @@ from gripper_force.control.state_machine import Decision
 from gripper_force.errors import DeviceTimeoutError, RequestError
 from gripper_force.interfaces import SharedPort
 from gripper_force.runtime.process import deferred_signals
-from gripper_force.runtime.requests import CLOSED, PendingRequest, RequestQueue, number
+from gripper_force.runtime.requests import CLOSED, PendingRequest, RequestQueue, checked_number
 from gripper_force.runtime.resolve import ResolvedConfig, resolve
 from gripper_force.runtime.session import Session, open_run
 from gripper_force.runtime.state import GraspResult, GripperState, StateTracker
@@ -128,7 +128,7 @@ class ControlLoop:
 
     def sleep(self, seconds: float) -> None:
         """Waits for a time on the run's clock, and runs the cycle where no thread does."""
-        seconds = number(seconds, "a time")
+        seconds = checked_number(seconds, "a time")
         if self._background:
             self._ended.wait(seconds)
             self.live_session()

@@ -92,7 +92,7 @@ class LogReader:
         except OSError as error:
             raise LogError(f"can't read the log {path}: {error.strerror}; check the path") from error
         if not (self.complete or recover):
-            raise LogError(self._loss())
+            raise LogError(self._describe_loss())
         if CONFIG_NAME not in self.attachments:
             why = "it holds no configuration" if self.complete else "it is cut before its configuration"
             raise LogError(f"{path} can't be used: {why}, so gripper-force did not write it whole")
@@ -168,6 +168,7 @@ class LogReader:
                         codecs[item.id] = codec if codec.record_type in wanted else None
 
     def _each_chunk(self) -> Iterator[_Chunk]:
+        """Yields the chunks to read; a log that is being written has more later (`GrowingLog`)."""
         yield from self._chunks
 
     def _codec(self, channel: Channel, schema: Schema | None) -> Codec:
@@ -197,13 +198,14 @@ class LogReader:
                 start = file.tell()
                 if start + length > size:
                     return
-                self._note(file, opcode, start, length)
+                self._read_framed(file, opcode, start, length)
                 self._scanned = file.seek(start + length)
                 if opcode == Opcode.FOOTER:
                     self.complete = file.read() == _MAGIC
                     return
 
-    def _note(self, file: BinaryIO, opcode: int, start: int, length: int) -> None:
+    def _read_framed(self, file: BinaryIO, opcode: int, start: int, length: int) -> None:
+        """Takes over what a reader needs before the messages: chunk positions, attachments and metadata."""
         if opcode == Opcode.CHUNK:
             start_ns, end_ns = _TIMES.unpack(file.read(_TIMES.size))
             self._chunks.append(_Chunk(start, length, start_ns, end_ns))
@@ -223,7 +225,7 @@ class LogReader:
                 self.metadata = metadata.metadata
                 self.utc_offset_ns = int(self.metadata.get(UTC_NAME, 0))
 
-    def _loss(self) -> str:
+    def _describe_loss(self) -> str:
         self._recover = True
         count = sum(1 for _ in self.records())
         return (

@@ -74,7 +74,7 @@ def own_process(
     _allowed = ProcessOptions(signals, switch_interval, real_time_priority, torch_threads)
 
 
-def allowed() -> ProcessOptions:
+def allowed_options() -> ProcessOptions:
     """The settings that the program allows to change."""
     return _allowed
 

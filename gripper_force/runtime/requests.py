@@ -20,7 +20,7 @@ CLOSED: Final = "the gripper is closed; open it again with open_gripper"
 _MAX_MAGNITUDE: Final = 1e9
 
 
-def number(value: Any, name: str) -> float:
+def checked_number(value: Any, name: str) -> float:
     """Returns an argument as a float. Raises `RequestError` if it is no number, or too large to be plausible."""
     found = math.nan
     with suppress(TypeError, ValueError, OverflowError):

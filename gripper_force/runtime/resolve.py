@@ -16,8 +16,8 @@ from gripper_force.interfaces import ServoSpec
 from gripper_force.plugins import importing
 from gripper_force.profiles import apply
 from gripper_force.runtime.backends import load_servo_class, resolve_simulation, with_camera_rate
-from gripper_force.runtime.process import allowed
-from gripper_force.runtime.requests import number
+from gripper_force.runtime.process import allowed_options
+from gripper_force.runtime.requests import checked_number
 
 if TYPE_CHECKING:  # a run without vision imports none of these
     from gripper_force.profiles.correction import Correction
@@ -72,7 +72,7 @@ class ResolvedConfig:
         """Raises `RequestError` if a target is beyond the force limit or a profile's calibrated range."""
         limit_n, gain_bound = self.config.control.force_limit_n, self.config.gripper.gain_bound
         largest_n = largest_target_n(limit_n, gain_bound)
-        if not number(target_n, "a target") > 0:
+        if not checked_number(target_n, "a target") > 0:
             raise RequestError(f"a target of {target_n} N is not a positive force; request more than 0 N")
         if target_n > largest_n:
             raise RequestError(
@@ -90,7 +90,7 @@ class ResolvedConfig:
     def check_width(self, width_m: float) -> None:
         """Raises `RequestError` if a width is outside the travel of the jaws."""
         open_width_m = self.config.gripper.open_width_m
-        if not 0 <= number(width_m, "a width") <= open_width_m:
+        if not 0 <= checked_number(width_m, "a width") <= open_width_m:
             raise RequestError(
                 f"a width of {1e3 * width_m:g} mm is outside 0 to {1e3 * open_width_m:g} mm, the travel of the "
                 "jaws; request a width in metres within gripper.open_width_m"
@@ -171,7 +171,9 @@ def resolve_vision(config: Config) -> tuple[Config, Model | None, str]:
     if "auto" in (config.vision.checkpoint, config.vision.engine):
         from gripper_force.vision.selection import resolve_auto
 
-        vision, choice = resolve_auto(config.vision, config.budget, set_threads=allowed().torch_threads)
+        vision, choice = resolve_auto(
+            config.vision, config.budget, set_threads=allowed_options().torch_threads
+        )
         config = config.with_values(vision=vision)
     return config, read_model(config.vision.checkpoint), "" if choice is None else str(choice)
 
@@ -182,7 +184,7 @@ def make_estimator(resolved: ResolvedConfig) -> ForceEstimator | None:
         return None
     from gripper_force.vision.estimator import open_estimator
 
-    vision, threads = resolved.config.vision, allowed().torch_threads
+    vision, threads = resolved.config.vision, allowed_options().torch_threads
     return open_estimator(resolved.model, vision, resolved.correction, set_threads=threads)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from gripper_force.errors import GripperError, UnfamiliarFrameError
 from gripper_force.runtime.perception import FrameProcessor
-from gripper_force.runtime.process import allowed
+from gripper_force.runtime.process import allowed_options
 from gripper_force.runtime.resolve import ResolvedConfig, make_estimator
 from gripper_force.types import ForceEstimate, Frame, Gray, Record, VisualForce
 
@@ -48,7 +48,7 @@ def estimates_in_batches(
 
     assert resolved.model is not None
     vision, checkpoint = resolved.config.vision, kept_checkpoint(resolved.model.path, resolved.model.digest)
-    engine = TorchEngine(checkpoint, threads=vision.threads if allowed().torch_threads else None)
+    engine = TorchEngine(checkpoint, threads=vision.threads if allowed_options().torch_threads else None)
     estimator = ForceEstimator(engine, vision.region, resolved.correction, vision.max_covered)
     waiting: deque[_Waiting] = deque()
     chunks = prepared_features(checkpoint.networks, _batches(records, estimator, waiting))
