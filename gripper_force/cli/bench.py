@@ -300,9 +300,8 @@ def replay(
                     progress(made.name)
         count = len(find_logs(logs))
         rows = replay_bench.bench(logs, checkpoints or ["default", "small"], jobs, rounds, console.line)
-    about = (
-        f"{count} logs, median of {rounds} rounds, {CORES} cores, load {load:.1f} before the first command."
-    )
+    repeated = "one round" if rounds == 1 else f"median of {rounds} rounds"
+    about = f"{count} logs, {repeated}, {CORES} cores, load {load:.1f} before the first command."
     text = replay_bench.markdown(rows, about)
     if write is not None:
         write_between(write, "rates", text)

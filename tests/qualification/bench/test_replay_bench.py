@@ -41,7 +41,7 @@ def test_the_commands_run_in_every_way(logs: Path, tmp_path: Path, monkeypatch: 
         "evaluate --set vision.precision=bfloat16": False,
     }
     assert "| `replay` | small | 2 processes |" in page.read_text()
-    assert "2 logs, median of 1 rounds" in page.read_text()
+    assert "2 logs, one round, " in page.read_text()
 
 
 def test_the_table_has_the_median_and_the_range_of_the_rounds() -> None:
