@@ -14,8 +14,8 @@ _IMPACT_M_S_PER_N = 0.010
 _CONTACT_SHARE = 0.25
 """Largest contact force before contact is detected, as a share of the target."""
 
-_SPEED_GAIN_N_S_M = 10.0
-_SPEED_INTEGRAL_N_M = 40.0
+SPEED_GAIN_N_S_M = 10.0
+SPEED_INTEGRAL_N_M = 40.0
 """Proportional and integral gain of the approach speed loop. With 1.3 kg of motor and jaw, half of a speed
 error is corrected after 40 ms; on stalled jaws the motor force rises by 1 N/s."""
 
@@ -190,14 +190,14 @@ class Approach:
         error_m_s = wanted_m_s - closing_m_s
         damping_n_s_m = self._transmission.damping_n_s_m
         unlimited_n = (
-            self._transmission.friction_n + damping_n_s_m * wanted_m_s + _SPEED_GAIN_N_S_M * error_m_s
+            self._transmission.friction_n + damping_n_s_m * wanted_m_s + SPEED_GAIN_N_S_M * error_m_s
         )
         # Force that the current estimate counts as contact and vision does not is friction, too.
         friction_n = estimate.friction_n - estimate.bias_n + 2 * estimate.std_n
         usual_max_n = friction_n + self._limit_n + damping_n_s_m * max(closing_m_s, 0.0)
         self._is_weak = max_n < usual_max_n
         max_n = min(usual_max_n, max_n)
-        self._integral_n += _SPEED_INTEGRAL_N_M * error_m_s * dt_s
+        self._integral_n += SPEED_INTEGRAL_N_M * error_m_s * dt_s
         if closing_m_s > _OVERSPEED * self.speed_m_s:
             self._integral_n -= self.motor_force_n * dt_s / _OVERSPEED_DECAY_S
         self._integral_n = min(max(self._integral_n, -unlimited_n), max_n - unlimited_n)

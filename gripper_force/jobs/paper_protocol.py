@@ -20,7 +20,7 @@ from gripper_force.config import HARD_FORCE_LIMIT_N, Config, config_from, config
 from gripper_force.errors import ConfigError, SimulationError
 from gripper_force.interfaces import Camera
 from gripper_force.jobs.grasp import PAPER_OBJECTS
-from gripper_force.jobs.recording.record import check_same
+from gripper_force.jobs.recording.record import FREE_N, check_same
 from gripper_force.jobs.recording.touches import touch, wait
 from gripper_force.jobs.simulate import SAME
 from gripper_force.runtime.backends import open_devices
@@ -83,9 +83,6 @@ kinetic energy that a peak of 12 N becomes 16 N.
 """
 
 _USUAL_RAMP_N_S: Final = (100.0, 300.0)
-
-_FREE_N: Final = 0.1
-"""Largest load-cell force between two touches."""
 
 _MAX_DRAWS: Final = 8
 _SEED_STEP: Final = 1000
@@ -318,7 +315,7 @@ def _touch_all(session: Session, task: SetPlan, rng: np.random.Generator, timeou
             # High forces last only briefly. With the root, more high peaks are drawn than low ones.
             _PAPER_PEAK_N * float(np.sqrt(rng.uniform(0.01, 1.0))),
             float(rng.uniform(0.02, 0.1)),
-            free_n=_FREE_N,
+            free_n=FREE_N,
             timeout_s=timeout_s,
             release_timeout_s=1.0,
         )

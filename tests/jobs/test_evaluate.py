@@ -1,5 +1,4 @@
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -42,12 +41,7 @@ def checkpoint() -> Checkpoint:
     return Checkpoint(networks, header, digest="")
 
 
-@pytest.fixture(autouse=True)
-def _one_thread() -> Iterator[None]:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def clip(name: str, object_name: str, seed: int, size: int = 16) -> Clip:

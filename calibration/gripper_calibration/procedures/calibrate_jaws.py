@@ -10,6 +10,7 @@ import numpy as np
 
 from gripper_calibration.procedures.powered_servo import RATE_HZ, BusCycles, servo_alone, torque_on
 from gripper_force.config import Config
+from gripper_force.control.approach import SPEED_GAIN_N_S_M, SPEED_INTEGRAL_N_M
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import DataError
 from gripper_force.interfaces import Devices
@@ -52,10 +53,6 @@ _RISE_N_S: Final = 1.0
 _MOVED_RAD: Final = 0.01
 _RUN_S: Final = 0.8
 _RUN_SPEED_SHARE: Final = 0.5
-_SPEED_GAIN_N_S_M: Final = 10.0
-_SPEED_INTEGRAL_N_M: Final = 40.0
-"""Speed loop, as in the approach of a grasp."""
-
 _REST_S: Final = 0.3
 _MAX_ASYMMETRY: Final = 3.0
 
@@ -342,8 +339,8 @@ class _EmptyJaws:
         forces_n = []
         for _ in range(round(_RUN_S * RATE_HZ)):
             moving_m_s = abs(self._transmission.closing_m_s(self.state.velocity_rad_s, self._middle_rad))
-            force_n += _SPEED_INTEGRAL_N_M * (wanted_m_s - moving_m_s) / RATE_HZ
-            drive_n = max(force_n + _SPEED_GAIN_N_S_M * (wanted_m_s - moving_m_s), 0.0)
+            force_n += SPEED_INTEGRAL_N_M * (wanted_m_s - moving_m_s) / RATE_HZ
+            drive_n = max(force_n + SPEED_GAIN_N_S_M * (wanted_m_s - moving_m_s), 0.0)
             self.cycle(side, min(self._current_a(drive_n), self._end_a), 2 * _RUN_SPEED_SHARE)
             forces_n.append(
                 self._force_n(self.state.current_a) - self._transmission.damping_n_s_m * moving_m_s

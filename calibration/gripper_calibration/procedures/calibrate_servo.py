@@ -49,7 +49,7 @@ _TARE_SAMPLES: Final = 5
 _MAX_TARE_S: Final = 3.0
 _OVERSHOOT_SHARE: Final = 0.05
 """The first press is so slow that the force rises by at most this share until a sample shows it."""
-_PLAUSIBLE_RATIO: Final = 1.4
+PLAUSIBLE_RATIO: Final = 1.4
 """Largest ratio between the measured and the expected torque constant, either way; see gripper.gain_bound."""
 _MIN_SHARE: Final = 0.7
 """Least share of the peak force that a press at the current ceiling must reach."""
@@ -193,7 +193,7 @@ def _check_plausible(fit: ServoFit, config: Config) -> None:
     """Raises `DataError` if the torque constant is far from the expected one: the load cell may be mis-scaled."""
     expected, found = config.gripper.nm_per_a, fit.nm_per_a.value
     assert expected is not None
-    if not 1 / _PLAUSIBLE_RATIO < found / expected < _PLAUSIBLE_RATIO:
+    if not 1 / PLAUSIBLE_RATIO < found / expected < PLAUSIBLE_RATIO:
         raise DataError(
             f"the presses give a torque constant of {found:.3g} Nm/A, {found / expected:.2f} times the expected "
             f"{expected:.3g}: calibrate the load cell with weights again (load_cell.n_per_raw), and check "

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import t as student
 
+from gripper_calibration.procedures.calibrate_servo import PLAUSIBLE_RATIO
 from gripper_calibration.procedures.powered_servo import RATE_HZ, BusCycles, servo_alone, torque_on
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError, DataError, DeviceError
@@ -41,9 +42,6 @@ _AGREES: Final = (0.5, 1.2)
 
 _MASS_ERROR: Final = 0.01
 """Relative error of a known mass, and of gravity."""
-
-_PLAUSIBLE_RATIO: Final = 1.4
-"""Largest ratio between the measured and the expected torque constant, either way; see gripper.gain_bound."""
 
 _FORCE_FACTOR: Final = 2.0
 _SPARE_N: Final = 0.5
@@ -170,7 +168,7 @@ def _fit(config: Config, empty: "_Balance", loaded: "_Balance", weight_n: float)
     steps_n = _steps_n(empty, loaded)
     step_n = float(steps_n.mean())
     ratio = weight_n / 2 / step_n if step_n > 0 else math.inf
-    if not 1 / _PLAUSIBLE_RATIO < ratio < _PLAUSIBLE_RATIO:
+    if not 1 / PLAUSIBLE_RATIO < ratio < PLAUSIBLE_RATIO:
         raise DataError(
             f"the mass of {weight_n / STANDARD_GRAVITY_M_S2:g} kg changes the motor force at each jaw by {step_n:.2f} "
             f"N instead of about {weight_n / 2:.2f} N; check that it hangs freely on the jaw that moves up while "

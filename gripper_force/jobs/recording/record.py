@@ -56,7 +56,7 @@ _REST_FRAMES: Final = 10
 _REST_SAMPLES: Final = 8
 """Duration, frames and load-cell samples of the rest before the first touch, at least."""
 
-_FREE_N: Final = 0.1
+FREE_N: Final = 0.1
 """Largest load-cell force of a free object above the force at rest."""
 
 _SILENT_NS: Final = 2 * NS_PER_S
@@ -368,4 +368,4 @@ def _rest(session: _MonitoredSession) -> tuple[float, float]:
             f"the load cell reads {rest_n:.2f} N with open jaws; unload it, or set "
             f"load_cell.tare_raw={np.median([sample.raw for sample in samples.values()]):.8g}"
         )
-    return rest_n, rest_n + max(_FREE_N, 4 * float(np.std(forces_n)))
+    return rest_n, rest_n + max(FREE_N, 4 * float(np.std(forces_n)))

@@ -21,7 +21,7 @@ CURRENT_STEP_A: Final = 0.00269
 
 CYCLE_NS: Final = 5 * NS_PER_MS
 _STALL_A: Final = 2.3
-_CURRENT_LOOP_S: Final = 0.002
+CURRENT_LOOP_S: Final = 0.002
 _TICK_RAD: Final = 2 * math.pi / 4096
 _NO_LOAD_RAD_S: Final = 4.8
 _VELOCITY_STEP_RAD_S: Final = 0.024
@@ -111,7 +111,7 @@ class Gripper:
         pwm_per_m = _PWM_PER_TICK / (_TICK_RAD * radius_m)
         steps = math.ceil(time_s / self._step_s)
         dt_s = time_s / steps
-        keep, brake_m_s = math.exp(-dt_s / _CURRENT_LOOP_S), friction_n / mass_kg * dt_s
+        keep, brake_m_s = math.exp(-dt_s / CURRENT_LOOP_S), friction_n / mass_kg * dt_s
         for _ in range(steps):
             # Comparisons, as the calls of min and max would take a seventh of the time of a search.
             pwm = (goal_m - x_m) * pwm_per_m

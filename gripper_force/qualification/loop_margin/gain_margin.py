@@ -25,6 +25,7 @@ from gripper_force.control.linkage import RackAndPinion
 from gripper_force.control.state_machine import GraspController
 from gripper_force.control.tuning import Gains
 from gripper_force.qualification.loop_margin.analytic_plant import (
+    CURRENT_LOOP_S,
     CYCLE_NS,
     NOISE_A,
     POSITION_LOOP,
@@ -59,8 +60,7 @@ _JUDGED_S: Final = 2.0  # time at the end over which the oscillation is judged
 _MIN_AMPLITUDE_N: Final = 1.0
 _NOISE_N: Final = 0.02
 _BISECTIONS: Final = 7
-_CYCLE_S: Final = CYCLE_NS / NS_PER_S
-_CURRENT_LOOP_S: Final = 0.002
+CYCLE_S: Final = CYCLE_NS / NS_PER_S
 _ALIASES: Final = 8
 
 Complex = npt.NDArray[np.complexfloating[Any, Any]]
@@ -89,7 +89,7 @@ def identify(config: Config, truth: Gripper) -> IdentifiedPlant:
         controller = GraspController(control, truth.transmission, config.servo.current_limit_a, POSITION_LOOP)
         request: Request | None = Request(0, RequestKind.GRASP, min(_PRESS_N, 0.02 * truth.stiffness_n_m))
         rows: list[tuple[float, float, float]] = []
-        for cycle, noise in enumerate(rng.standard_normal(round(_PRESS_S / _CYCLE_S)).tolist()):
+        for cycle, noise in enumerate(rng.standard_normal(round(_PRESS_S / CYCLE_S)).tolist()):
             t_ns = cycle * CYCLE_NS
             servo = gripper.read(t_ns, NOISE_A * noise)
             decision = controller.step(t_ns, servo, None, request)
@@ -100,7 +100,7 @@ def identify(config: Config, truth: Gripper) -> IdentifiedPlant:
                     - truth.transmission.friction_n
                 )
                 rows.append((t_ns / NS_PER_S, motor_force_n, gripper.force_n))
-            gripper.advance(decision.command, _CYCLE_S)
+            gripper.advance(decision.command, CYCLE_S)
         presses.append(PressSeries(*(np.array(column) for column in zip(*rows, strict=True))))
     found = fit_plant(presses, 0.035)
     assert found is not None  # the presses above cover the whole force range
@@ -149,7 +149,7 @@ def _sampled_margin(gains: Gains, force: Callable[[Complex], Complex], delay_s: 
     for alias in range(-_ALIASES, _ALIASES + 1):
         s = 1j * (omega + alias * 2 * math.pi / FRAME_S)
         held = (1 - np.exp(-s * FRAME_S)) / (s * FRAME_S)
-        late = np.exp(-s * (delay_s + _CYCLE_S / 2)) / (1 + _CURRENT_LOOP_S * s)
+        late = np.exp(-s * (delay_s + CYCLE_S / 2)) / (1 + CURRENT_LOOP_S * s)
         loop += (gains.proportional + gains.integral_s / s) * held * late * force(s)
     factor = -1 / loop
     crossings = np.flatnonzero((np.diff(np.sign(factor.imag)) != 0) & (factor.real[1:] > 0))
@@ -199,14 +199,14 @@ def oscillation_decays(config: Config, truth: Gripper, feedback: str, delay_s: f
     loop.start(_TARGET_N, _TARGET_N)
     vision = SimulatedVision(delay_s, _NOISE_N)
     rng = np.random.default_rng([config.seed, 44])
-    cycles, forces_n = round(_TIME_S / _CYCLE_S), []
+    cycles, forces_n = round(_TIME_S / CYCLE_S), []
     source = ""
     for cycle, (servo_noise, vision_noise) in enumerate(rng.standard_normal((cycles, 2)).tolist()):
         t_ns = cycle * CYCLE_NS
         servo = gripper.read(t_ns, NOISE_A * servo_noise)
         estimate, _ = fusion.step(t_ns, servo, vision.sample(t_ns, gripper.force_n, vision_noise))
         source = estimate.source
-        motor_force_n = loop.step(_CYCLE_S, _TARGET_N, estimate)
+        motor_force_n = loop.step(CYCLE_S, _TARGET_N, estimate)
         goal_rad = rig.position_rad(max(rig.width_m(servo.position_rad) - 0.02, 0.0))
         wanted = ServoCommand(t_ns, goal_rad, abs(rig.current_a(motor_force_n, servo.position_rad)))
         motor_n = rig.force_n(servo.current_a, servo.position_rad)
@@ -216,12 +216,12 @@ def oscillation_decays(config: Config, truth: Gripper, feedback: str, delay_s: f
             estimate.friction_n,
             motor_n,
             servo.position_rad,
-            _CYCLE_S,
+            CYCLE_S,
             may_rise=True,
         )
         forces_n.append(gripper.force_n)
-        gripper.advance(command, _CYCLE_S)
-    last = forces_n[-round(_JUDGED_S / _CYCLE_S) :]
+        gripper.advance(command, CYCLE_S)
+    last = forces_n[-round(_JUDGED_S / CYCLE_S) :]
     return max(last) - min(last) < amplitude_n / 2 and source != EstimateSource.CURRENT
 
 

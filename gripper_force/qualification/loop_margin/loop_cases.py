@@ -23,6 +23,7 @@ from gripper_force.qualification.loop_margin.analytic_plant import (
 )
 from gripper_force.qualification.loop_margin.gain_margin import (
     AMPLITUDE_N,
+    CYCLE_S,
     FRAME_S,
     IdentifiedPlant,
     gains_of,
@@ -35,7 +36,7 @@ from gripper_force.qualification.loop_margin.gain_margin import (
 from gripper_force.qualification.loop_margin.grid import FULL, Field, Grid, Margins, Trial, Trials, Verdict
 from gripper_force.qualification.loop_margin.maps import draw_margins, draw_verdicts
 from gripper_force.qualification.numerics.numerical_case import NumericalCase
-from gripper_force.types import NS_PER_S, EstimateSource, Outcome, Request, RequestKind
+from gripper_force.types import EstimateSource, Outcome, Request, RequestKind
 
 _TARGET_N: Final = 4.0
 _MAX_COMPRESSION_M: Final = 0.02  # travel available to compress a soft object
@@ -61,8 +62,6 @@ _DPI: Final = 110
 _LATE_S: Final = 0.035
 """Delay of vision from which predicted margins have a bound."""
 
-_CYCLE_S: Final = CYCLE_NS / NS_PER_S
-
 
 def target_n(stiffness_n_m: float) -> float:
     """Returns the target force of a grasp, which is less for soft objects: the travel is limited."""
@@ -80,7 +79,7 @@ def grasp(config: Config, truth: Gripper, delay_s: float, seed: int) -> Trial:
     bounds = _Bounds(config, truth)
     forces_n, violations = [], 0
     for cycle, (servo_noise, vision_noise) in enumerate(
-        rng.standard_normal((round(_TIME_S / _CYCLE_S), 2)).tolist()
+        rng.standard_normal((round(_TIME_S / CYCLE_S), 2)).tolist()
     ):
         t_ns = cycle * CYCLE_NS
         servo = gripper.read(t_ns, NOISE_A * servo_noise)
@@ -90,8 +89,8 @@ def grasp(config: Config, truth: Gripper, delay_s: float, seed: int) -> Trial:
         command = decision.command
         violations += not bounds.contains(command.goal_current_a, command.goal_position_rad)
         forces_n.append(gripper.force_n)
-        gripper.advance(command, _CYCLE_S)
-    last_n = np.array(forces_n[-round(_JUDGED_S / _CYCLE_S) :])
+        gripper.advance(command, CYCLE_S)
+    last_n = np.array(forces_n[-round(_JUDGED_S / CYCLE_S) :])
     peak_to_peak_n, error_share = float(np.ptp(last_n)), abs(float(last_n.mean()) / wanted_n - 1)
     if gripper.peak_n > (1 + _OVER_SHARE) * control.force_limit_n:
         verdict = Verdict.CRUSHES

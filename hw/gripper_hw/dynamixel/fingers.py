@@ -12,7 +12,7 @@ from gripper_force.config import ServoConfig
 from gripper_force.control.safety import exceeds_goal_current, is_back_driven
 from gripper_force.errors import DeviceError, HardwareFaultError
 from gripper_force.types import ServoCommand, ServoState
-from gripper_hw.dynamixel.control_table import VELOCITY_UNIT_RAD_S, ServoModel
+from gripper_hw.dynamixel.control_table import INPUT_VOLTAGE_ERROR, VELOCITY_UNIT_RAD_S, ServoModel
 
 _STANDING_RAD_S: Final = 1.5 * VELOCITY_UNIT_RAD_S
 """A finger that is not faster stands: one unit is noise."""
@@ -28,9 +28,6 @@ _MAX_CURRENT: Final = 1.3
 
 _STATIC_SPARE: Final = 1.3
 """Lead over the one that the goal current needs at rest, as in the controller's speed limit."""
-
-_INPUT_VOLTAGE_ERROR: Final = 0x01
-"""The only hardware error that leaves torque on (https://emanual.robotis.com/docs/en/dxl/x/xm430-w350/#shutdown)."""
 
 
 class FingerPair:
@@ -142,7 +139,7 @@ class FingerPair:
             leads_rad[ahead] = min(max(leads_rad[ahead], -shorter_rad), shorter_rad)
             left_a = max(goal_a - abs(self._states[ahead].current_a), 0.0)
             self._goals_a[1 - ahead] = min(goal_a + (1 - max(share, 0.0)) * left_a, _MAX_CURRENT * goal_a)
-        if any(state.hardware_error & ~_INPUT_VOLTAGE_ERROR for state in self._states):
+        if any(state.hardware_error & ~INPUT_VOLTAGE_ERROR for state in self._states):
             self._goals_a = [0.0, 0.0]  # one finger alone would push the object and the other one away
         goals_rad = (
             first.position_rad + leads_rad[0],

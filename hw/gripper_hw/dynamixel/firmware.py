@@ -10,7 +10,9 @@ from enum import IntEnum
 from typing import Final, Literal
 
 from gripper_hw.dynamixel.control_table import (
+    CURRENT_BASED_POSITION_MODE,
     FULL_PWM,
+    INPUT_VOLTAGE_ERROR,
     REGISTERS,
     TICKS_PER_REV,
     VELOCITY_UNIT_RAD_S,
@@ -26,10 +28,8 @@ CURRENT_MODE: Final = 0
 VELOCITY_MODE: Final = 1
 POSITION_MODE: Final = 3
 EXTENDED_POSITION_MODE: Final = 4
-CURRENT_BASED_POSITION_MODE: Final = 5
 PWM_MODE: Final = 16
 
-INPUT_VOLTAGE_ERROR: Final = 0x01
 OVERHEATING_ERROR: Final = 0x04
 OVERLOAD_ERROR: Final = 0x20
 

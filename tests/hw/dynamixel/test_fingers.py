@@ -21,9 +21,9 @@ from gripper_force.errors import (
 from gripper_force.fault_config import FaultConfig
 from gripper_force.types import NS_PER_MS, ServoCommand, ServoState
 from gripper_hw.dynamixel.bus_faults import WireFaults
-from gripper_hw.dynamixel.control_table import VELOCITY_UNIT_RAD_S, load_model
+from gripper_hw.dynamixel.control_table import INPUT_VOLTAGE_ERROR, VELOCITY_UNIT_RAD_S, load_model
 from gripper_hw.dynamixel.fingers import FingerPair
-from gripper_hw.dynamixel.firmware import INPUT_VOLTAGE_ERROR, OVERLOAD_ERROR, REBOOT_NS
+from gripper_hw.dynamixel.firmware import OVERLOAD_ERROR, REBOOT_NS
 from gripper_hw.dynamixel.packets import Instruction
 from gripper_hw.dynamixel.pty_server import BenchMotor
 from gripper_hw.dynamixel.servo import DynamixelServo

@@ -3,6 +3,7 @@ import math
 import pytest
 
 from gripper_hw.dynamixel.control_table import (
+    CURRENT_BASED_POSITION_MODE,
     REGISTERS,
     VELOCITY_UNIT_RAD_S,
     load_model,
@@ -11,7 +12,6 @@ from gripper_hw.dynamixel.control_table import (
     ticks_from_rad,
 )
 from gripper_hw.dynamixel.firmware import (
-    CURRENT_BASED_POSITION_MODE,
     CURRENT_LOOP_S,
     CURRENT_MODE,
     EXTENDED_POSITION_MODE,
