@@ -462,11 +462,8 @@ class ControlConfig(Section):
     @property
     def vision_gap_ms(self) -> float:
         """Time without an estimate after which vision drops out."""
-        return (
-            _TIMEOUT_FRAMES * 1e3 / self.frame_hz
-            if self.vision_timeout_ms is None
-            else self.vision_timeout_ms
-        )
+        default_ms = _TIMEOUT_FRAMES * 1e3 / self.frame_hz
+        return default_ms if self.vision_timeout_ms is None else self.vision_timeout_ms
 
     @property
     def max_frame_age_ms(self) -> float:

@@ -150,20 +150,15 @@ class ObjectGain:
         if not weight:
             return None
         log_ratio, variance = weighted_log / weight, self._torque_variance + 1 / weight
-        parts = []
+        parts = []  # of the mixture: density, mean and variance, and the weight of the measured ratio in the mean
         for share, prior in ((1 - _ANY_SHARE, KIND_STD**2), (_ANY_SHARE, _ANY_STD**2)):
             total = prior + variance
             density = share * math.exp(-0.5 * min(log_ratio**2 / total, 1400.0)) / math.sqrt(total)
             parts.append((density, prior / total * log_ratio, prior * variance / total, prior / total))
-        densities = [part[0] for part in parts]
-        shares = [density / sum(densities) for density in densities]
-        mean = sum(share * part[1] for share, part in zip(shares, parts, strict=True))
-        spread = sum(
-            share * (part[2] + (part[1] - mean) ** 2) for share, part in zip(shares, parts, strict=True)
-        )
-        shared = self._torque_variance * sum(
-            share * part[3] for share, part in zip(shares, parts, strict=True)
-        )
+        whole = sum(density for density, *_ in parts)
+        mean = sum(density / whole * centre for density, centre, _, _ in parts)
+        spread = sum(density / whole * (own + (centre - mean) ** 2) for density, centre, own, _ in parts)
+        shared = self._torque_variance * sum(density / whole * weight for density, _, _, weight in parts)
         return GainEstimate(math.exp(mean), math.sqrt(spread), math.sqrt(min(shared, spread)))
 
     @property

@@ -496,7 +496,7 @@ class GraspController:
         # steps with the jaws would cause a current ripple, and the current is sampled at one phase of it.
         self._goal_width_m = width_m - 2 * GOAL_OFFSET_M
         was_backing_off = self._approach.is_backing_off
-        progress = self._approach.step(
+        state = self._approach.step(
             dt_s,
             width_m,
             closing_m_s,
@@ -506,13 +506,10 @@ class GraspController:
         )
         # With less motor force at once, an object that a release has not let go yet would push the jaws open.
         self._motor_force_n = max(self._approach.motor_force_n, self._grip_left_n)
-        if (
-            was_backing_off
-            and not self._approach.is_backing_off
-            and self._travel.free_travel.mean_n is not None
-        ):
-            self._fusion.current.take_friction(self._travel.free_travel.mean_n)
-        match progress:
+        mean_n = self._travel.free_travel.mean_n
+        if was_backing_off and not self._approach.is_backing_off and mean_n is not None:
+            self._fusion.current.take_friction(mean_n)
+        match state:
             case ApproachState.BACKING_OFF:
                 if not was_backing_off:
                     self._travel.start(width_m, 0.0, opens=True)
@@ -535,25 +532,27 @@ class GraspController:
         self._set_outcome(Outcome.SLIP if self._outcome == Outcome.SLIP else outcome, reason)
         self._start_release(reason)
 
-    def _run_ramp(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
+    def _step_loop(self, dt_s: float, width_m: float, closing_m_s: float) -> str:
+        """Sets the motor force of a grip. Returns why there is no object between the jaws, or an empty text."""
         shortfall_n = self._motor_force_n - self._measured_motor_force_n
         self._motor_force_n = self._loop.step(
             dt_s, self._derated_target_n, self._estimate, shortfall_n=shortfall_n, closing_m_s=closing_m_s
         )
+        return self._slip.loss_reason(dt_s, width_m, closing_m_s, shortfall_n, self._loop.reference_n)
+
+    def _run_ramp(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
+        lost = self._step_loop(dt_s, width_m, closing_m_s)
         if width_m < self._config.min_object_width_m and self._outcome == Outcome.NONE:
             self._set_outcome(Outcome.NO_OBJECT, "closed while the force was to rise")
             self._start_release(self._reason)
-        elif lost := self._slip.loss_reason(dt_s, width_m, closing_m_s, shortfall_n, self._loop.reference_n):
+        elif lost:
             self._handle_loss(width_m, lost)
         elif self._loop.reference_n == self._derated_target_n and not self._loop.is_lowering:
             self._error_n = self._estimate.force_n - self._derated_target_n
             self._enter(Phase.HOLD, f"at {self._derated_target_n:g} N")
 
     def _run_hold(self, dt_s: float, width_m: float, closing_m_s: float) -> None:
-        shortfall_n = self._motor_force_n - self._measured_motor_force_n
-        self._motor_force_n = self._loop.step(
-            dt_s, self._derated_target_n, self._estimate, shortfall_n=shortfall_n, closing_m_s=closing_m_s
-        )
+        lost = self._step_loop(dt_s, width_m, closing_m_s)
         error_n = self._estimate.force_n - self._derated_target_n
         self._error_n += (error_n - self._error_n) * dt_s / (dt_s + _SETTLE_FILTER_S)
         is_near = abs(self._error_n) <= self._tolerance_n
@@ -569,7 +568,6 @@ class GraspController:
             if self._derating < 1:
                 reason += f", reduced from {self._target_n:g} N because the servo is hot"
             self._set_outcome(Outcome.HELD, reason)
-        lost = self._slip.loss_reason(dt_s, width_m, closing_m_s, shortfall_n, self._loop.reference_n)
         if not lost and self._outcome == Outcome.HELD:
             lost = self._slip.recession_reason(width_m, self._held_width_m, closing_m_s, self._motor_force_n)
         if lost:
