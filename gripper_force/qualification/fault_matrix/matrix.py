@@ -8,7 +8,7 @@ processes in real time.
 import signal
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from statistics import median
 from typing import Final, NotRequired, TypedDict
@@ -25,7 +25,7 @@ from gripper_force.progress import Progress, no_progress
 from gripper_force.qualification.fault_matrix.cases import ROWS, Expected, FaultCase
 from gripper_force.qualification.fault_matrix.judge import FaultFreeGrasp, Grasp, judge
 from gripper_force.qualification.fault_matrix.kill_process import kill_trial
-from gripper_force.qualification.fault_matrix.outcome_file import OutcomeFile
+from gripper_force.qualification.fault_matrix.outcome_file import OutcomeFile, collect
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.log_reader import LogReader
 from gripper_force.runtime.resolve import resolve
@@ -171,26 +171,21 @@ def run_matrix(
                 run = pool.submit(_run_with_fault, drawn[index], fault_free[index], row, clock)
             return lambda: file.add(key, run.result())
 
-        def end(runs: Iterable[Callable[[], FaultRunResult]], name: str) -> list[FaultRunResult]:
-            outcomes = []
-            for run in runs:
-                outcomes.append(run())
-                progress(name)
-            return outcomes
-
         without = [pool.submit(_run_without_fault, tree) for tree in drawn] if simulated else []
         fault_free = []
         for grasp in without:
             fault_free.append(grasp.result())
             progress("without a fault")
         begun = {row: [begin(row, i, "lockstep") for i in range(seeds)] for row in simulated}
-        done = {row: end(begun[row], row.name) for row in simulated}
+        done = {row: collect(begun[row], row.name, progress) for row in simulated}
         for row in rows:  # one grasp at a time: in real time each needs the machine for itself
             if row in done:
                 live = (begin(row, i, "realtime") for i in range(min(live_seeds, seeds)))
-                yield _summary(row, done[row], end(live, f"{row.name}, in real time"))
+                yield _summary(row, done[row], collect(live, f"{row.name}, in real time", progress))
             else:
-                yield _summary(row, [], end((begin(row, i, "realtime") for i in range(seeds)), row.name))
+                yield _summary(
+                    row, [], collect((begin(row, i, "realtime") for i in range(seeds)), row.name, progress)
+                )
 
 
 def count_grasps(seeds: int, live_seeds: int, rows: Sequence[FaultCase] = ROWS) -> int:

@@ -2,14 +2,25 @@
 
 import hashlib
 import json
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Generic, TypeVar
 
 from gripper_force import __version__
 from gripper_force.config import Config, dump_config
 from gripper_force.errors import DataError
+from gripper_force.progress import Progress
 
 T = TypeVar("T")
+
+
+def collect(runs: Iterable[Callable[[], T]], name: str, progress: Progress) -> list[T]:
+    """Returns the outcome of each run, and calls ``progress`` with the row's name after it."""
+    outcomes = []
+    for run in runs:
+        outcomes.append(run())
+        progress(name)
+    return outcomes
 
 
 class OutcomeFile(Generic[T]):

@@ -7,7 +7,7 @@ measures.
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal, TypedDict
 
@@ -22,7 +22,7 @@ from gripper_force.jobs.grasp import PAPER_OBJECTS
 from gripper_force.jobs.processes import process_pool
 from gripper_force.jobs.trials import TRIAL_TARGETS_N
 from gripper_force.progress import Progress, no_progress
-from gripper_force.qualification.fault_matrix.outcome_file import OutcomeFile
+from gripper_force.qualification.fault_matrix.outcome_file import OutcomeFile, collect
 from gripper_force.qualification.safety_statements import FORCE_SHARE, SPEED_SHARE, SafetyStatements
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.resolve import resolve
@@ -253,19 +253,12 @@ def run_rows(
             run = pool.submit(run_wrong, {**tree, "clock": clock}, {**keys, "clock": clock}, row.expected)
             return lambda: file.add(key, run.result())
 
-        def end(runs: Iterable[Callable[[], WrongOutcome]], name: str) -> list[WrongOutcome]:
-            outcomes = []
-            for run in runs:
-                outcomes.append(run())
-                progress(name)
-            return outcomes
-
         begun = [[begin(row, index, "lockstep") for index in range(seeds)] for row in rows]
-        done = [end(runs, row.name) for row, runs in zip(rows, begun, strict=True)]
+        done = [collect(runs, row.name, progress) for row, runs in zip(rows, begun, strict=True)]
         for row, outcomes in zip(rows, done, strict=True):
             # One grasp at a time: in real time each needs the machine for itself.
             live = (begin(row, index, "realtime") for index in range(min(live_seeds, seeds)))
-            yield _summary(row, outcomes, end(live, f"{row.name}, in real time"))
+            yield _summary(row, outcomes, collect(live, f"{row.name}, in real time", progress))
 
 
 def count_grasps(seeds: int, live_seeds: int, rows: Sequence[WrongCase] = WRONG_CASES) -> int:
