@@ -154,7 +154,8 @@ class GripperConfig(Section):
         None, description="motor current per radian of position error; null: value of the servo model"
     )
     position_loop_gain_per_s: Positive | None = Field(
-        None, description="speed without load per radian of position error; null: value of the servo model"
+        None,
+        description="servo's position loop: speed without load per radian of error; null: that of the model",
     )
     friction_n: NonNegative = Field(0.95, description="Coulomb friction of one jaw while closing")
     damping_n_s_m: NonNegative = Field(14.5, description="viscous friction of one jaw, including the motor")
@@ -218,7 +219,7 @@ class CameraConfig(Section):
     gain: int | None = Field(
         None,
         ge=0,
-        description="oak: ISO (null: 100); uvc: in the driver's unit (null: unchanged); needs exposure_us",
+        description="sensitivity; oak: ISO (null: 100); uvc: in the driver's unit (null: unchanged); needs exposure_us",
     )
     lens_position: int | None = Field(
         None,
@@ -428,7 +429,7 @@ class ControlConfig(Section):
         None, description="lowest and highest supply voltage; null: range of the servo model"
     )
     plant_gain: Positive | None = Field(
-        None, description="contact force per newton of motor force; null: from the object profile, or 1"
+        None, description="gain of the plant, contact over motor force; null: from the object profile, or 1"
     )
     plant_lag_ms: Positive | None = Field(
         None, description="lag from motor current to contact force; null: from the object profile, or 60"

@@ -131,7 +131,7 @@ def gain(
     set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure the error of vision on single simulated objects without and with the gain learned from grasps."""
+    """Measure the error of vision on single simulated objects, without and with the object's gain from grasps."""
     from gripper_force.jobs.grasp import PAPER_OBJECTS
     from gripper_force.qualification.bench import gain_bench
 

@@ -331,7 +331,7 @@ def network(
 
 @app.command("gain")
 def gain(
-    name: Annotated[str, typer.Argument(help="Object profile to add the gain to, by name or path.")],
+    name: Annotated[str, typer.Argument(help="Object profile to add the object's gain to, by name or path.")],
     logs: Annotated[
         list[Path],
         typer.Option("--from", help="Log of grasps of this object, or a folder of them. Repeatable."),
@@ -345,7 +345,7 @@ def gain(
     set_: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Save the gain that earlier grasps have shown of an object into its profile."""
+    """Save an object's gain, as earlier grasps have shown it, into its object profile."""
     from gripper_force.jobs.dataset import find_logs
     from gripper_force.jobs.object_gain import save_gain
     from gripper_force.profiles.object_profile import find_object, read_object

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 _OPEN_LOOP = (
     "A replay is open loop: estimates and commands are computed again, but servo, camera and load cell keep what they "
-    "measured. A changed gain or limit shows other commands, not the force that would have followed; to see that, run "
+    "measured. A changed setting shows other commands, not the force that would have followed; to see that, run "
     "`gripper-force grasp` with it."
 )
 

@@ -126,7 +126,7 @@ class CameraCalibration(Section):
         backend: The camera's backend.
         side_px: Side of the frames.
         rate_hz: Frame rate.
-        gain: Gain.
+        gain: Sensitivity of the sensor, as ``camera.gain``.
         image: The other keys of the camera on which its images depend; none in profiles of version 0.1.
         exposure_us: Exposure at which the image is neither dark nor clipped; None for an automatic one.
         mean: Mean gray value at that exposure.

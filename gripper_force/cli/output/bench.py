@@ -51,7 +51,7 @@ def scene_table(costs: "Sequence[SceneCost]") -> None:
 
 
 def gain_table(rows: "Sequence[GainRow]") -> None:
-    """Prints the errors of vision without and with the gain, of each object and on average."""
+    """Prints the errors of vision without and with the object's gain, of each object and on average."""
     table = Table(
         "object", "true gain", "gain", "+- %", "grasps held", "MAE N", "with gain N", "best N", box=None
     )

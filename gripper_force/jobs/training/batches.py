@@ -144,8 +144,8 @@ class Batches:
         recordings = self._recording[index[:, 0]]
         parts = zip(recordings[self._share], move(where), move(rows), move(columns), strict=True)
         gray = torch.stack([self._frames[r][t[:, None, None], y[:, None], x] for r, t, y, x in parts])
-        gain, gamma = (move(np.exp(part))[:, None, None, None] for part in light)  # (B, 1, 1, 1) each
-        lit: Tensor = gain * (gray / 255) ** gamma + move(noise)[:, None, None, None] * grain[self._share]
+        factor, gamma = (move(np.exp(part))[:, None, None, None] for part in light)  # (B, 1, 1, 1) each
+        lit: Tensor = factor * (gray / 255) ** gamma + move(noise)[:, None, None, None] * grain[self._share]
         return lit.clamp_(0, 1) * 255
 
 

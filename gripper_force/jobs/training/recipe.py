@@ -126,7 +126,7 @@ class TrainConfig(Section):
         contact_share: Share of clips that end in contact.
         force_share: Share of clips whose last frame is drawn evenly over force, because high forces are rare.
         shift_px: Largest shift of a clip.
-        light: Standard deviation of the logarithm of gain and gamma, drawn per clip.
+        light: Standard deviation of the logarithm of the brightness factor and of gamma, drawn per clip.
         noise: Largest standard deviation of pixel noise, as a fraction of full scale.
         replay_share: Share of the clips that is drawn from the recordings of an earlier training, if there are any.
         validation: Share of each object's sets that is held out to measure the checkpoint's error; of the objects,

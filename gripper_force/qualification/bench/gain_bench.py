@@ -1,4 +1,4 @@
-"""Error of visual estimates of single objects, without and with the gain that grasps have shown."""
+"""Error of visual estimates of single objects, without and with the object's gain that grasps have shown."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -42,9 +42,9 @@ class GainRow:
     Attributes:
         object: Kind of the object.
         seed: Seed of object and gripper.
-        stiffness: True gain: stiffness over that of the kind.
+        stiffness: The object's true gain: its stiffness over that of the kind.
         grasps: Number of grasps that were held.
-        gain: Gain by motor current.
+        gain: The object's gain by motor current.
         gain_std: Its relative standard deviation.
         mae_n: MAE of the network on the presses.
         learned_n: The same with the gain.

@@ -24,7 +24,7 @@ def disturbed(clip: Gray, seed: int) -> dict[str, list[Gray]]:
     def some(change: Callable[[Gray], Gray], every: int = 5) -> list[Gray]:
         return start + [change(frame) if i % every == 0 else frame for i, frame in enumerate(rest)]
 
-    def gain(factor: float) -> Callable[[Gray], Gray]:
+    def brightened(factor: float) -> Callable[[Gray], Gray]:
         return lambda frame: (frame * factor).clip(0, 255).astype(np.uint8)
 
     def hot(frame: Gray) -> Gray:
@@ -35,8 +35,8 @@ def disturbed(clip: Gray, seed: int) -> dict[str, list[Gray]]:
     def filled(level: int) -> Callable[[Gray], Gray]:
         return lambda frame: np.full_like(frame, level)
 
-    strong = [gain(2.0 if i % 2 else 0.5)(frame) for i, frame in enumerate(rest)]
-    mild = [gain(1.25 if i % 2 else 0.8)(frame) for i, frame in enumerate(rest)]
+    strong = [brightened(2.0 if i % 2 else 0.5)(frame) for i, frame in enumerate(rest)]
+    mild = [brightened(1.25 if i % 2 else 0.8)(frame) for i, frame in enumerate(rest)]
     return {
         "undisturbed grasp": start + rest,
         "black frames": some(filled(0)),
@@ -48,8 +48,8 @@ def disturbed(clip: Gray, seed: int) -> dict[str, list[Gray]]:
         "frames of NaN": some(lambda frame: np.full(frame.shape, np.nan)),
         "exposure alternating x 0.5 and x 2": start + strong,
         "exposure alternating x 0.8 and x 1.25": start + mild,
-        "one-frame flashes, x 1.5": some(gain(1.5)),
-        "one-frame flashes, x 4": some(gain(4.0)),
+        "one-frame flashes, x 1.5": some(brightened(1.5)),
+        "one-frame flashes, x 4": some(brightened(4.0)),
         "two of three frames lost": start + rest[::3],
         "half of the frames lost at random": start + [frame for frame in rest if rng.random() < 0.5],
         "every frame repeated three times": start + [frame for frame in rest for _ in range(3)],
