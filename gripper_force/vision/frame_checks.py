@@ -14,30 +14,42 @@ from gripper_force.errors import DataError, UnfamiliarFrameError
 from gripper_force.types import Gray
 from gripper_force.vision.preprocess import FLAT_STD
 
-RATIOS: Final = {"brightness": 1.6, "contrast": 2.5, "roughness": 2.5}
+MAX_RATIOS: Final = {"brightness": 1.6, "contrast": 2.5, "roughness": 2.5}
 """Largest ratios of a frame to the first frame of the stream, in either direction. The extremes observed in
 presses are 1.15, 1.33 and 1.2 in simulation, and 1.06, 1.04 and 1.1 with a finger camera."""
 
-SHIFT: Final = 0.0086
+MAX_SHIFT: Final = 0.0086
 """Largest shift of the still part of the image, as a share of its side."""
 
-ZOOM: Final = 0.014
+MAX_ZOOM: Final = 0.014
 """Largest change of its scale."""
 
-SLOPE: Final = 0.06
+MAX_SLOPE: Final = 0.06
 """Largest difference of the change of light between the middle and an edge, as a share of the mean brightness."""
 
-SHARPNESS: Final = 0.75
-"""Smallest fine detail of the still part of the image, as a share of the first frame's."""
+MAX_BLUR: Final = 0.25
+"""Largest loss of fine detail of the still part of the image, as a share of the first frame's."""
 
-_GRID: Final = 8
+_BLOCKS: Final = 8
 """Blocks along a side, in which fine detail is compared."""
 
-_SAMPLES: Final = 32
+_SAMPLED_SIDE: Final = 32
 """Pixels along a side that the motion is fitted to."""
 
-_SCALES: Final = np.geomspace(12, 3, 6, dtype=np.float32)
+_FIT_SCALES: Final = np.geomspace(12, 3, 6, dtype=np.float32)
 """Scale of the robust fit in gray levels, at each of its steps."""
+
+_MIN_PX: Final = 64
+"""Side of the smallest image in which disturbances are looked for: the limits are half a pixel there."""
+
+_MIN_STILL: Final = 0.25
+"""Smallest share of the image that must follow the fitted change. In presses it is 0.5 or more."""
+
+_SMOOTHING_PX: Final = 0.8
+"""Standard deviation of the smoothing against noise, in pixels."""
+
+_DETAIL_NOISE: Final = 1.0
+"""Fine detail that is only noise, in squared gray levels: a block without texture can lose none."""
 
 Floats = npt.NDArray[np.float32]
 
@@ -81,8 +93,8 @@ class FrameChecks:
         if self._first is None:
             self._first = present
             if len(pixels) >= _MIN_PX:
-                self._begin(pixels)
-        for (name, most), now, first in zip(RATIOS.items(), present, self._first, strict=True):
+                self._set_first_frame(pixels)
+        for (name, most), now, first in zip(MAX_RATIOS.items(), present, self._first, strict=True):
             if not first / most <= now <= first * most:
                 raise DataError(
                     f"the image's {name} changed from {first:.3g} to {now:.3g} since the first frame; check "
@@ -101,35 +113,36 @@ class FrameChecks:
         Args:
             pixels: Cropped and resized frame, (S, S).
         """
-        smooth = cv2.GaussianBlur(pixels, (0, 0), _SMOOTHING)
+        smooth = cv2.GaussianBlur(pixels, (0, 0), _SMOOTHING_PX)
         difference = _sampled(smooth - self._smooth)  # (N,)
         change = np.zeros(self._directions.shape[1], np.float32)
-        for scale in _SCALES:
+        for scale in _FIT_SCALES:
             weight = (1 + np.square((difference - self._directions @ change) / scale)) ** -2
             weighted = np.multiply(self._directions, weight[:, None], out=self._weighted).T
             change = np.linalg.solve(weighted @ self._directions + self._prior, weighted @ difference)
-        still = np.abs(difference - self._directions @ change) < 2 * _SCALES[-1]
-        if still.mean() < _STILL:  # nothing to compare with
+        still = np.abs(difference - self._directions @ change) < 2 * _FIT_SCALES[-1]
+        if still.mean() < _MIN_STILL:  # nothing to compare with
             change[:], still[:] = 0, False
         shift, zoom = float(np.hypot(*change[:2])), float(abs(change[2]))
         slope = float(np.hypot(*change[5:])) / self._first[0] if self._first else 0.0
         detail = _block_means(np.square(cv2.Laplacian(smooth, cv2.CV_32F)))
-        ratio = (detail + _NOISE) / (self._detail + _NOISE)
-        kept = ratio[_block_means(still.reshape(_SAMPLES, -1).astype(np.float32)) > 0.7]
-        sharpness = float(np.median(kept)) if len(kept) else 1.0
+        ratio = (detail + _DETAIL_NOISE) / (self._detail + _DETAIL_NOISE)
+        kept = ratio[_block_means(still.reshape(_SAMPLED_SIDE, -1).astype(np.float32)) > 0.7]
+        blur = 1 - float(np.median(kept)) if len(kept) else 0.0
         covered = float((ratio < 0.3).mean())
+        light = f"the light changed by {slope:.0%} more at one side than in the middle"
         hidden = f"{covered:.0%} of the image lost its detail, as if it was covered, over vision.max_covered,"
         return {
-            "shift": (shift, SHIFT, f"the camera's view moved by {shift:.1%} of its side"),
-            "zoom": (zoom, ZOOM, f"the camera's view was zoomed by {zoom:.1%}"),
-            "slope": (slope, SLOPE, f"the light changed by {slope:.0%} more at one side than in the middle"),
-            "blur": (1 - sharpness, 1 - SHARPNESS, f"the image lost {1 - sharpness:.0%} of its fine detail"),
+            "shift": (shift, MAX_SHIFT, f"the camera's view moved by {shift:.1%} of its side"),
+            "zoom": (zoom, MAX_ZOOM, f"the camera's view was zoomed by {zoom:.1%}"),
+            "slope": (slope, MAX_SLOPE, light),
+            "blur": (blur, MAX_BLUR, f"the image lost {blur:.0%} of its fine detail"),
             "covered": (covered, self._max_covered, hidden),
         }
 
-    def _begin(self, pixels: Floats) -> None:
+    def _set_first_frame(self, pixels: Floats) -> None:
         """Prepares the comparison with the first frame."""
-        self._smooth = cv2.GaussianBlur(pixels, (0, 0), _SMOOTHING)
+        self._smooth = cv2.GaussianBlur(pixels, (0, 0), _SMOOTHING_PX)
         self._detail = _block_means(np.square(cv2.Laplacian(self._smooth, cv2.CV_32F)))
         side = len(pixels)
         y, x = np.meshgrid(*[np.linspace(-1, 1, side, dtype=np.float32)] * 2, indexing="ij")
@@ -146,25 +159,12 @@ class FrameChecks:
         self._prior = np.diag(np.array([side**2] * 3 + [1] * 4, np.float32) * len(self._directions) / 400)
 
 
-_MIN_PX: Final = 64
-"""Side of the smallest image in which disturbances are looked for: the limits are half a pixel there."""
-
-_STILL: Final = 0.25
-"""Smallest share of the image that must follow the fitted change. In presses it is 0.5 or more."""
-
-_SMOOTHING: Final = 0.8
-"""Standard deviation of the smoothing against noise, in pixels."""
-
-_NOISE: Final = 1.0
-"""Fine detail that is only noise, in squared gray levels: a block without texture can lose none."""
-
-
 def _sampled(image: Floats) -> Floats:
     """Returns evenly spaced pixels, (N,)."""
-    where = ((np.arange(_SAMPLES) + 0.5) * len(image) / _SAMPLES).astype(int)
+    where = ((np.arange(_SAMPLED_SIDE) + 0.5) * len(image) / _SAMPLED_SIDE).astype(int)
     return np.asarray(image[np.ix_(where, where)].ravel(), image.dtype)
 
 
 def _block_means(image: Floats) -> Floats:
     """Returns the means of the blocks of an image, (B, B)."""
-    return np.asarray(cv2.resize(image, (_GRID, _GRID), interpolation=cv2.INTER_AREA), np.float32)
+    return np.asarray(cv2.resize(image, (_BLOCKS, _BLOCKS), interpolation=cv2.INTER_AREA), np.float32)
