@@ -140,25 +140,25 @@ def feed(reader: LogReader, resolved: ResolvedConfig, sink: Sink, *, in_batches:
     pending: dict[int, VisualForce | None] = {}
     had_network = bool(reader.metadata.get("checkpoint"))
     # NaN, of a covered view, does not equal itself.
-    estimates = _Pairs(lambda v: (v.seq, None if math.isnan(v.force_n) else v.force_n, v.std_n))
-    commands = _Pairs(lambda c: c, lambda a, b: abs(a.goal_current_a - b.goal_current_a))
-    fused = _Pairs(lambda f: f, lambda a, b: abs(a.force_n - b.force_n))
-    status = _Pairs(lambda s: s)
-    pairs_of = {VisualForce: estimates, ServoCommand: commands, FusedForce: fused, GraspStatus: status}
+    estimates = _RecordMatcher(lambda v: (v.seq, None if math.isnan(v.force_n) else v.force_n, v.std_n))
+    commands = _RecordMatcher(lambda c: c, lambda a, b: abs(a.goal_current_a - b.goal_current_a))
+    fused = _RecordMatcher(lambda f: f, lambda a, b: abs(a.force_n - b.force_n))
+    status = _RecordMatcher(lambda s: s)
+    matcher_of = {VisualForce: estimates, ServoCommand: commands, FusedForce: fused, GraspStatus: status}
     estimated = estimates_in_batches if in_batches and resolved.model is not None else estimates_by_frame
     for record, estimate in estimated(reader.records(), resolved):
         if isinstance(record, Frame):
             if estimate is not None:
                 sink.add_visual(estimate)
-                estimates.add_again(estimate)
+                estimates.add_replayed(estimate)
                 if not had_network:  # so the log has no time at which an estimate was ready
                     newest = replace(estimate, ready_ns=record.received_ns)
             pending[record.seq] = estimate
             if len(pending) > _BACKLOG:
                 del pending[next(iter(pending))]
             continue
-        if (pairs := pairs_of.get(type(record))) is not None:
-            pairs.add_logged(record)
+        if (matcher := matcher_of.get(type(record))) is not None:
+            matcher.add_logged(record)
         if isinstance(record, VisualForce):
             # A log whose disk was slow lacks frames; only their estimates are the logged ones.
             is_logged = is_faulty or (resolved.model is not None and record.seq not in pending)
@@ -170,15 +170,15 @@ def feed(reader: LogReader, resolved: ResolvedConfig, sink: Sink, *, in_batches:
         elif isinstance(record, ServoState) and controller is not None:
             decision = controller.step(record.t_ns, record, newest, request)
             sink.add_decision(decision)
-            commands.add_again(decision.command)
-            fused.add_again(decision.estimate)
-            status.add_again(decision.status)
+            commands.add_replayed(decision.command)
+            fused.add_replayed(decision.estimate)
+            status.add_replayed(decision.status)
             newest = request = None
         elif isinstance(record, LoadCellSample):
             sink.add_cell(record)
     # The run may have ended before it used the estimates of its last frames, and the last cycle of a truncated log
     # may be incomplete.
-    same_decisions = all(pairs.agree(spare=1) for pairs in (commands, fused, status))
+    same_decisions = all(matcher.agree(extra=1) for matcher in (commands, fused, status))
     return Agreement(
         estimates.agree() if estimates.logged and not is_faulty else None,
         same_decisions if commands.logged else None,
@@ -190,7 +190,7 @@ _BACKLOG: Final = 1024
 """Records that wait for their counterpart: a log has it a few records later, or not at all."""
 
 
-class _Pairs:
+class _RecordMatcher:
     """Compares a log's records of a type with those of the replay, in their order, while both are made.
 
     Args:
@@ -203,7 +203,7 @@ class _Pairs:
     ) -> None:
         self._key, self._difference = key, difference
         self._logged: deque[Any] = deque()
-        self._again: deque[Any] = deque()
+        self._replayed: deque[Any] = deque()
         self._same, self._ended = True, False
         self.logged = False
         self.largest = 0.0
@@ -214,24 +214,24 @@ class _Pairs:
         self._logged.append(record)
         self._compare()
 
-    def add_again(self, record: Record) -> None:
+    def add_replayed(self, record: Record) -> None:
         """Takes the replay's next record."""
-        self._again.append(record)
+        self._replayed.append(record)
         self._compare()
 
-    def agree(self, spare: int | None = None) -> bool:
-        """Returns True if all logged records equal the replay's, which may have ``spare`` more; None: any number."""
-        return self._same and not self._logged and (spare is None or len(self._again) <= spare)
+    def agree(self, extra: int | None = None) -> bool:
+        """Returns True if all logged records equal the replay's, which may have ``extra`` more; None: any number."""
+        return self._same and not self._logged and (extra is None or len(self._replayed) <= extra)
 
     def _compare(self) -> None:
-        while self._logged and self._again and not self._ended:
-            a, b = self._logged.popleft(), self._again.popleft()
+        while self._logged and self._replayed and not self._ended:
+            a, b = self._logged.popleft(), self._replayed.popleft()
             self._same = self._same and self._key(a) == self._key(b)
             self.largest = max(self.largest, self._difference(a, b))
-        if self._ended or max(len(self._logged), len(self._again)) > _BACKLOG:  # a counterpart is missing
+        if self._ended or max(len(self._logged), len(self._replayed)) > _BACKLOG:  # a counterpart is missing
             self._same, self._ended = False, True
             self._logged.clear()
-            self._again.clear()
+            self._replayed.clear()
 
 
 def has_faulty_estimates(config: Config) -> bool:
