@@ -150,46 +150,46 @@ def _run(
     Yields:
         Each member's forces, (M, K), and the members' features, (K, F), of the next `CHUNK` frames or the last ones.
     """
-    readers = [_Reader(network, precision) for network in networks]
+    streams = [_NetworkStream(network, precision) for network in networks]
     for batch in batches:
-        for reader in readers:
-            reader.push(batch)
-        if readers[0].waiting >= CHUNK:
-            yield _read(readers)
-    if readers[0].waiting:
-        yield _read(readers)
+        for stream in streams:
+            stream.push(batch)
+        if streams[0].pending_frames >= CHUNK:
+            yield _read(streams)
+    if streams[0].pending_frames:
+        yield _read(streams)
 
 
-def _read(readers: "Sequence[_Reader]") -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    forces, features = zip(*(reader.read() for reader in readers), strict=True)
+def _read(streams: "Sequence[_NetworkStream]") -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    forces, features = zip(*(stream.read() for stream in streams), strict=True)
     return torch.stack(forces).cpu().numpy(), torch.cat(features, dim=1).cpu().numpy()
 
 
-class _Reader:
+class _NetworkStream:
     """Runs a network on the batches of a stream, and keeps only what the next ones need."""
 
     def __init__(self, network: Member, precision: Precision) -> None:
         self._network = network
-        self._rounds = precision == "bfloat16"
+        self._uses_bfloat16 = precision == "bfloat16"
         self._parts: list[Tensor] = []
         self._maps: Tensor | None = None
         self._before: Tensor | None = None
-        self.waiting = 0
+        self.pending_frames = 0
 
     def push(self, batch: Tensor) -> None:
         """Runs the network up to its averages, or a network without windows as a whole."""
         if isinstance(self._network, ForceNetwork):
-            with torch.autocast(batch.device.type, torch.bfloat16, enabled=self._rounds):
+            with torch.autocast(batch.device.type, torch.bfloat16, enabled=self._uses_bfloat16):
                 part, self._maps = self._network.pooled(batch, self._maps)
         else:
             part = self._network.features(batch)
         self._parts.append(part[0].float())
-        self.waiting += batch.shape[1]
+        self.pending_frames += batch.shape[1]
 
     def read(self) -> tuple[Tensor, Tensor]:
         """Returns forces, (K,), and the inputs of the last layer, (K, head), of the frames since the last call."""
         features = torch.cat(self._parts)
-        self._parts, self.waiting = [], 0
+        self._parts, self.pending_frames = [], 0
         if isinstance(self._network, ForceNetwork):
             earlier = self._network.config.window - 1
             before = features[:1].expand(earlier, -1) if self._before is None else self._before

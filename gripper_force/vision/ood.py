@@ -77,7 +77,7 @@ class OodScore:
 
     def reset(self) -> None:
         """Starts a new stream."""
-        self._smooth = Smooth()
+        self._mean_ratio = GeometricMean()
 
     def score(self, features: npt.NDArray[np.float32], estimates_n: Floats) -> Floats:
         """Returns the score over its limit, (N,); above 1 a frame is rejected.
@@ -87,7 +87,7 @@ class OodScore:
             estimates_n: Their estimates, (N,).
         """
         share = residual_share(features, self._mean, self._axes, self._floor)
-        ratio = self._smooth.step(share / np.interp(estimates_n, self._forces_n, self._typical))
+        ratio = self._mean_ratio.step(share / np.interp(estimates_n, self._forces_n, self._typical))
         score: Floats = ratio / np.interp(estimates_n, self._forces_n, self._limit)
         return score
 
@@ -97,7 +97,7 @@ class OodScore:
         return np.hypot(base, growth * np.asarray(score, np.float64))
 
 
-class Smooth:
+class GeometricMean:
     """Geometric mean over the last frames, with weights that decay by 1/e in `FRAMES` frames.
 
     It starts at 1: the first frames of a stream show no contact, so nothing in them can be unfamiliar, and a single

@@ -20,7 +20,7 @@ from gripper_force.vision.checkpoint_writer import check_place, replace_header
 from gripper_force.vision.estimator import claimed_std_n
 from gripper_force.vision.header import Header, OodModel, read_checkpoint
 from gripper_force.vision.network import ForceNetwork
-from gripper_force.vision.ood import Smooth, orthonormal, residual_share
+from gripper_force.vision.ood import GeometricMean, orthonormal, residual_share
 
 Floats = npt.NDArray[np.float64]
 
@@ -247,7 +247,7 @@ def _limits(shares: Sequence[Floats], estimates_n: Sequence[Floats]) -> tuple[Oo
 def smooth_ratios(limits: Sequence[OodLimit], share: Floats, estimate_n: Floats) -> Floats:
     """Returns the smoothed ratio to the typical share, (N,), for the frames of one log."""
     typical = np.interp(estimate_n, [limit.force_n for limit in limits], [limit.typical for limit in limits])
-    return Smooth().step(share / typical)
+    return GeometricMean().step(share / typical)
 
 
 def _subspace(logs: Sequence[_Seen]) -> tuple[Floats, Floats, float]:
