@@ -154,8 +154,7 @@ class GripperConfig(Section):
         None, description="motor current per radian of position error; null: value of the servo model"
     )
     position_loop_gain_per_s: Positive | None = Field(
-        None,
-        description="servo's position loop: speed without load per radian of error; null: that of the model",
+        None, description="servo's position loop: no-load speed per radian of error; null: that of the model"
     )
     friction_n: NonNegative = Field(0.95, description="Coulomb friction of one jaw while closing")
     damping_n_s_m: NonNegative = Field(14.5, description="viscous friction of one jaw, including the motor")
