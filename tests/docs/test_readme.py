@@ -15,16 +15,16 @@ PYTHON = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 LINKS = [link for link in re.findall(r"\]\(([^)]+)\)", README) if not link.startswith("https://")]
 
 
-def test_it_is_short() -> None:
+def test_the_readme_is_short() -> None:
     assert len(README.splitlines()) <= 120
 
 
-def test_its_python_is_short() -> None:
+def test_the_python_of_the_readme_is_short() -> None:
     (block,) = PYTHON
     assert len(block.splitlines()) <= 10
 
 
-def test_its_python_runs(quick: list[str], tmp_path: Path) -> None:
+def test_the_python_of_the_readme_runs(quick: list[str], tmp_path: Path) -> None:
     (block,) = PYTHON
     (tmp_path / "my.yaml").write_text(dump_config(load_config(None, quick)))
     done = subprocess.run(

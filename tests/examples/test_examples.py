@@ -56,7 +56,7 @@ def test_embed_fits_on_a_page() -> None:
     assert len((EXAMPLES / "embed.py").read_text().splitlines()) <= 26
 
 
-def test_embed_in_lockstep(lockstep: Path) -> None:
+def test_embed_holds_an_object_in_lockstep(lockstep: Path) -> None:
     with start("embed.py", lockstep) as process:
         out, err = process.communicate(timeout=120)
     assert process.returncode == 0, err
@@ -89,7 +89,7 @@ def test_ctrl_c_ends_embed_without_torque(real_time: Path, server: PtyServer) ->
     assert server.bus.servos[0].get("torque_enable") == 0
 
 
-def test_own_camera() -> None:
+def test_an_own_camera_serves_a_grasp_that_holds() -> None:
     with start("own_camera.py") as process:
         out, err = process.communicate(timeout=120)
     assert process.returncode == 0, err

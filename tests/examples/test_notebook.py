@@ -16,7 +16,7 @@ assert image.images[0].get_array().shape == (128, 128)
 """
 
 
-def test_the_cells_run(tmp_path: Path) -> None:
+def test_the_cells_run_in_order_and_after_an_earlier_run(tmp_path: Path) -> None:
     (tmp_path / "grasp.mcap").write_text("of an earlier run of all cells")
     done = subprocess.run(
         [sys.executable, "-c", "\n".join([*CODE, CHECKS])],
@@ -30,5 +30,5 @@ def test_the_cells_run(tmp_path: Path) -> None:
     assert done.stdout.count("mean absolute error") == 2
 
 
-def test_it_holds_no_outputs() -> None:
+def test_the_notebook_is_stored_without_outputs() -> None:
     assert not any(cell.get("outputs") or cell.get("execution_count") for cell in NOTEBOOK["cells"])

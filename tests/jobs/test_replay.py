@@ -312,7 +312,7 @@ def test_the_interval_of_a_difference_is_students() -> None:
     assert found.high_n == pytest.approx(0.1 + 12.706 * 0.1, rel=1e-3)
 
 
-def test_the_remedy_for_a_profile_of_another_network_works(fused_log: Path) -> None:
+def test_a_profile_of_another_network_is_refused_with_a_remedy_that_replays_the_log(fused_log: Path) -> None:
     with pytest.raises(ConfigError, match=r"leave the profile out with calibration\.object=none"):
         replay(fused_log, overrides=["calibration.object=sponge"])
     assert replay(fused_log, overrides=["calibration.object=none"]).identical is True

@@ -17,7 +17,7 @@ def _parquet() -> None:
 
 
 @pytest.mark.usefixtures("_parquet")
-def test_the_files_agree(tmp_path: Path) -> None:
+def test_page_table_and_json_have_the_same_figures(tmp_path: Path) -> None:
     tables = {"sources": [], "logs": [{"log": "<a>.mcap", "mae_n": 0.25, "lag_s": float("nan")}]}
     columns = {"log": np.array(["<a>.mcap"] * 3), "visual_n": np.array([1.0, 2.0, np.nan])}
     summary_files.write_summary(tmp_path, "Title", tables, [columns])

@@ -24,12 +24,12 @@ def rising(mb_per_grasp: float = 0.0, handles: int = 0, threads: int = 0) -> lis
     ]
 
 
-def test_constant_memory_is_ok() -> None:
+def test_memory_that_rises_only_in_the_warm_up_is_no_growth() -> None:
     assert measure_growth(rising()) == Growth(ok=True, growth_mb=0.0, slope_mb_h=0.0)
 
 
 @pytest.mark.parametrize("samples", [rising(mb_per_grasp=0.04), rising(handles=1), rising(threads=1)])
-def test_growth_is_not_ok(samples: list[Sample]) -> None:
+def test_growth_of_memory_handles_or_threads_is_found(samples: list[Sample]) -> None:
     assert not measure_growth(samples).ok
 
 

@@ -501,7 +501,7 @@ def test_the_background_thread_runs_the_cycle(real_time: Open, server: PtyServer
     assert "control" not in {thread.name for thread in threading.enumerate()}
 
 
-def test_the_callers_own_loop(real_time: Open, server: PtyServer) -> None:
+def test_steps_of_the_caller_move_the_jaws(real_time: Open, server: PtyServer) -> None:
     gripper = real_time(background=False)
     gripper.move(0.06, wait=False)
     states = [gripper.step() for _ in range(40)]
@@ -596,7 +596,7 @@ def test_numpy_numbers_become_floats(simulated: Open, tmp_path: Path) -> None:
     ]
 
 
-def test_asyncio(real_time: Open) -> None:
+def test_a_move_in_a_thread_leaves_asyncio_free(real_time: Open) -> None:
     gripper = real_time()
 
     async def main() -> tuple[float, int]:

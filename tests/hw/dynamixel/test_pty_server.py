@@ -36,7 +36,9 @@ def test_exclusive_mode_ends_some_time_after_its_program_was_killed():
         killed = os.open(server.device_path, os.O_RDWR | os.O_NOCTTY)
         fcntl.ioctl(killed, termios.TIOCEXCL)
         os.close(killed)
+        deadline = time.monotonic() + 30  # a mode that stays would block the test for ever
         while True:
+            assert time.monotonic() < deadline
             with suppress(DeviceError):
                 open_line(server.device_path, 57_600, unit="servo", timeout_s=0).close()
                 break

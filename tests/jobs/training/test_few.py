@@ -145,7 +145,7 @@ def test_keys_of_networks_are_refused(six: list[Clip], process: Path, small_reci
         train(small_recipe, six, process, init=load_checkpoint(process))
 
 
-def test_the_command(few_logs: Path, tmp_path: Path) -> None:
+def test_a_network_of_the_recipe_few_can_be_evaluated(few_logs: Path, tmp_path: Path) -> None:
     out = tmp_path / "out.safetensors"
     call = ["train", str(few_logs), "--out", str(out), "--recipe", "few", "--set", "preprocess.size=16"]
     done = CliRunner().invoke(cli.app, [*call, "--jobs", "1", "--json"])
@@ -197,7 +197,7 @@ def test_too_few_steps_warn(
     assert not [w for w in warnings[2:] if "out-of-distribution" not in w]
 
 
-def test_real_recordings(real_grasps: Path, tmp_path: Path) -> None:
+def test_the_recipe_few_beats_a_constant_on_real_recordings(real_grasps: Path, tmp_path: Path) -> None:
     chosen = tmp_path / "recordings"
     chosen.mkdir()
     names = ("purple_ball_hardest", "green_ball_softer", "red_foam_brick_softer", "blue_foam_brick_harder")

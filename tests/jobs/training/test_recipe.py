@@ -6,7 +6,7 @@ from gripper_force.vision.header import Header, NetworkConfig, Residual, read_ch
 from gripper_force.vision.preprocess import Preprocess
 
 
-def test_recipe_of_the_paper() -> None:
+def test_the_recipe_shin2019_has_the_values_of_the_paper() -> None:
     paper = recipe("shin2019")
     assert (paper.learning_rate, paper.schedule, paper.weight_decay) == (1e-4, "step", 0)
     assert (paper.epochs, paper.minutes, paper.clips, paper.windows) == (120, None, 64, "separate")

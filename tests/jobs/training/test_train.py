@@ -67,7 +67,9 @@ def test_every_network_trains(
     assert member.pooling == (pooling if attention in ("ssam", "scam") else "wap")
 
 
-def test_validation_clips(clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig) -> None:
+def test_the_stated_error_is_that_on_the_validation_clips(
+    clips: list[Clip], tmp_path: Path, small_recipe: TrainConfig
+) -> None:
     out = tmp_path / "out.safetensors"
     checkpoint = train(small_recipe, clips[:-1], out, validation_clips=clips[-1:])
     lead_in = small_recipe.preprocess.lead_in  # a run gives no estimate before

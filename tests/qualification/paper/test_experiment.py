@@ -188,7 +188,7 @@ def test_p_value_is_paired_by_test_set(estimates: Estimates) -> None:
     assert np.isnan(estimates.p_value(BASELINE, BASELINE))
 
 
-def test_models_share_networks() -> None:
+def test_a_network_of_several_models_is_trained_once() -> None:
     assert networks([BASELINE, TWO_PLAIN, PROPOSED]) == ["plain", "ssam-1", "scam-1"]
 
 
