@@ -31,7 +31,7 @@ class CurrentEstimate:
     Attributes:
         force_n: The estimate.
         friction_n: Coulomb friction.
-        friction_n2: Its variance.
+        friction_variance_n2: Variance of its error.
         reversal: Share of the play by which the motor force has reversed. The larger, the less certain the estimate.
         dt_s: Time since the reading before; 0 at the first one.
         lag_s: Time constant of the low-pass.
@@ -52,12 +52,12 @@ class CurrentEstimate:
     def restart(self) -> None:
         """Resets friction to the configured one, at the start of a grasp."""
         self.friction_n = self._transmission.friction_n
-        self.friction_n2 = (self._transmission.friction_std * self.friction_n) ** 2
+        self.friction_variance_n2 = (self._transmission.friction_std * self.friction_n) ** 2
         self.free_travel = FreeTravel()
 
     def take_friction(self, friction_n: float) -> None:
         """Takes over friction that an opening of this grasp has shown."""
-        self.friction_n, self.friction_n2 = max(friction_n, 0.0), FREE_FLOOR_N**2
+        self.friction_n, self.friction_variance_n2 = max(friction_n, 0.0), FREE_FLOOR_N**2
 
     def step(self, servo: ServoState, *, free: bool, holding: bool, lowering: bool) -> None:
         """Runs one cycle.
@@ -110,13 +110,14 @@ class CurrentEstimate:
 
     def variance_n2(self, force_n: float) -> float:
         """Returns the variance of the estimate of a force, from the errors of friction and gearing."""
-        return self.friction_n2 + FREE_FLOOR_N**2 + (self._transmission.torque_constant_std * force_n) ** 2
+        gearing_n2 = (self._transmission.torque_constant_std * force_n) ** 2
+        return self.friction_variance_n2 + FREE_FLOOR_N**2 + gearing_n2
 
     def _learn_friction(self) -> None:
         self.free_travel.add(self._motor_force_n)
-        gain = self.friction_n2 / (self.friction_n2 + FREE_NOISE_N**2)
-        self.friction_n = max(self.friction_n + gain * (self._motor_force_n - self.friction_n), 0.0)
-        self.friction_n2 = combined_variance_n2(self.friction_n2, FREE_NOISE_N**2)
+        kalman_gain = self.friction_variance_n2 / (self.friction_variance_n2 + FREE_NOISE_N**2)
+        self.friction_n = max(self.friction_n + kalman_gain * (self._motor_force_n - self.friction_n), 0.0)
+        self.friction_variance_n2 = combined_variance_n2(self.friction_variance_n2, FREE_NOISE_N**2)
 
 
 def combined_variance_n2(one_n2: float, other_n2: float) -> float:

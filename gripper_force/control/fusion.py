@@ -209,7 +209,7 @@ class Fusion:
             self._difference_n = 0.0
         if self._was_lowering and before_n > 0:  # the difference by the gearing falls with the force
             gearing_n2 = (self._transmission.torque_constant_std * before_n) ** 2
-            share = gearing_n2 / (gearing_n2 + self.current.friction_n2 + FREE_FLOOR_N**2)
+            share = gearing_n2 / (gearing_n2 + self.current.friction_variance_n2 + FREE_FLOOR_N**2)
             self._difference_n *= 1 - share * (1 - current_n / before_n)
         drift_n2 = (_DRIFT_N2_S + _OPENING_DRIFT_N2_S * self.current.reversal) * self.current.dt_s
         # An error g of the torque constant gives a bias of g * force: its variance grows with the square of the force.
@@ -232,7 +232,7 @@ class Fusion:
         if self._holds and self._learns_gain:
             seen_n2 = max(visual.std_n**2 - (KIND_STD * visual.force_n) ** 2, _VISION_FLOOR_N**2)
             play_n = _PLAY_SHARE * self.current.friction_n * self.current.reversal
-            unknown_n2 = self.current.friction_n2 + FREE_FLOOR_N**2 + play_n**2
+            unknown_n2 = self.current.friction_variance_n2 + FREE_FLOOR_N**2 + play_n**2
             self._object_gain.observe(current_n, visual.force_n, unknown_n2 + seen_n2)
         self._shared_n2 = 0.0
         if (object_gain := self._applied_gain) is not None:

@@ -583,7 +583,7 @@ class GraspController:
             self._set_outcome(Outcome.SLIP, slip)
 
     def _handle_loss(self, width_m: float, reason: str) -> None:
-        """Does what ``on_slip`` says once the object has left the jaws."""
+        """Regrips, holds the width or opens, as ``on_slip`` says, once the object has left the jaws."""
         if self._outcome in (Outcome.NONE, Outcome.HELD):
             self._set_outcome(Outcome.SLIP, reason)
         match self._config.on_slip:

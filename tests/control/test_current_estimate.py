@@ -53,14 +53,14 @@ def test_a_lowered_force_is_followed_with_less_lag(press, transmission):
 
 
 def test_free_travel_shows_friction_until_the_next_grasp(press, transmission):
-    nominal_n, nominal_n2 = transmission.friction_n, press(1.5, cycles=1).friction_n2
+    nominal_n, nominal_n2 = transmission.friction_n, press(1.5, cycles=1).friction_variance_n2
     current = press(1.5, free=True)
     assert current.force_n == current.reversal == 0.0
     assert current.friction_n == pytest.approx(1.5, abs=0.02)
-    assert current.friction_n2 < nominal_n2
+    assert current.friction_variance_n2 < nominal_n2
     assert current.free_travel.mean_n == pytest.approx(1.5, abs=0.2)
     current.restart()
-    assert (current.friction_n, current.friction_n2) == (nominal_n, nominal_n2)
+    assert (current.friction_n, current.friction_variance_n2) == (nominal_n, nominal_n2)
     assert current.free_travel.mean_n is None
     current.take_friction(-0.1)
     assert current.friction_n == 0.0

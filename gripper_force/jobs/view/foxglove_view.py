@@ -137,7 +137,7 @@ class FoxgloveViewer(ServerListener):  # type: ignore[misc]  # the SDK is not ch
             self._changed.notify_all()
 
     def on_playback_control_request(self, playback_control_request: PlaybackControlRequest) -> PlaybackState:
-        """Does what the app's play bar asks for."""
+        """Handles a request of the app's play bar."""
         request = playback_control_request
         with self._changed:
             self._plays = request.playback_command == PlaybackCommand.Play

@@ -54,7 +54,7 @@ class MemoryPort(PortHandler):  # type: ignore[misc]
         return data
 
     def isPacketTimeout(self) -> bool:  # noqa: N802
-        """True once all received bytes were read: no more will arrive."""
+        """Returns True once all received bytes were read: no more will arrive."""
         return not self._received
 
     def drain(self) -> None:

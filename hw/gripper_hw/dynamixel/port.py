@@ -223,7 +223,7 @@ class BorrowedPort:
         self._handler.setPacketTimeoutMillis(wire_ms + self._reply_margin_ms)
 
     def isPacketTimeout(self) -> bool:  # noqa: N802
-        """True once the reply timeout has passed."""
+        """Returns True once the reply timeout has passed."""
         return bool(self._handler.isPacketTimeout())
 
     def drain(self) -> None:
