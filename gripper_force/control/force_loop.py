@@ -101,8 +101,7 @@ class ForceLoop:
         self._profile = TrapezoidalProfile(_RAMP_ACCELERATION_S)
         self._trim_n = 0.0
         self._friction_side = 1.0  # share of friction to overcome: 1 to close, -1 to open
-        self._is_reversed = False
-        self.is_lowering = self._may_lower_at_once = False
+        self._is_reversed = self.is_lowering = self._may_lower_at_once = False
         self._repeat_left_s = self._too_high_s = self._waited_s = 0.0
         self._lowering_start_n = self._highest_reference_n = 0.0
 
