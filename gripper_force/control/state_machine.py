@@ -163,7 +163,7 @@ class GraspController:
         self._passed_m = self._stopped_s = 0.0
         self._move_opens = False
         self._released_s = math.inf
-        self._grasp_ns = 0
+        self._grasp_ns, self._timeout_s = 0, 0.0
         self._phase_s = self._settled_s = self._error_n = 0.0
         self._was_over_force = self._was_held = False
         self._goal_current_a = self._measured_motor_force_n = 0.0
@@ -321,9 +321,11 @@ class GraspController:
         if is_same and self._is_grasping and self._outcome in (Outcome.NONE, Outcome.HELD):
             return
         self._grasp_ns, self._target_n, self._outcome = t_ns, target_n, Outcome.NONE
+        is_gripping = self._phase in (Phase.RAMP, Phase.HOLD)
+        self._timeout_s = self._config.timeout_s if is_gripping else self.timeout_s(target_n)
         if self._phase == Phase.CONTACT:
             return
-        if self._phase in (Phase.RAMP, Phase.HOLD):
+        if is_gripping:
             self._loop.retarget(self._derated_target_n)
             self._enter(Phase.RAMP, f"new target {target_n:g} N")
             return
@@ -647,15 +649,13 @@ class GraspController:
         return self._config.timeout_s + self._transmission.open_width_m / 2 * slower_s_m
 
     def _check_timeout(self, t_ns: int) -> None:
-        timeout_s = self.timeout_s(self._target_n)
-        if t_ns - self._grasp_ns > timeout_s * NS_PER_S:
-            reason = f"not held within {timeout_s:.3g} s"
+        if t_ns - self._grasp_ns > self._timeout_s * NS_PER_S:
+            reason = f"not held within {self._timeout_s:.3g} s"
             if objection := self._objection:
                 reason += (
                     f": {objection}. Look whether there is an object, in full view. "
                     "The jaws may press on an end stop: check gripper.open_width_m with `calibrate jaws`. "
-                    "If there is an object, calibrate it, or set "
-                    "control.feedback=current"
+                    "If there is an object, calibrate it, or set control.feedback=current"
                 )
             elif self._limits.is_at_current_limit:
                 reason += (

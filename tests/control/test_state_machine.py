@@ -131,6 +131,13 @@ def test_slower_jaws_have_more_time(make_run, transmission):
     assert run.last.status.outcome == "held"
 
 
+def test_a_smaller_force_of_a_held_object_needs_no_time_to_travel(make_run):
+    run = make_run(timeout_s=3.0).grasp(2.0, 4.0)
+    assert run.last.status.outcome == "held"
+    run.grasp(1e-3, 3.5)  # less than the force can be controlled to
+    assert run.last.status.outcome == "timeout"
+
+
 def test_a_small_target_without_an_object_is_no_object_and_no_timeout(make_run):
     run = make_run(plant={"contact_m": 1.0}).grasp(0.5, 16.0)
     assert run.last.status.outcome == "no_object"
