@@ -8,7 +8,7 @@ Motor, friction and gear play differ from rig to rig. A 95 % interval should con
 import argparse
 
 from gripper_calibration.fits.servo_fit import Nominal, fit_servo
-from gripper_calibration.procedures.calibrate_servo import measure
+from gripper_calibration.procedures.servo_measurement import measure
 from gripper_force.config import load_config
 from gripper_force.runtime.resolve import resolve
 from gripper_hw.dynamixel.control_table import load_model
