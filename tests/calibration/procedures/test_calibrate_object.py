@@ -38,6 +38,7 @@ QUICK = [
     "sim.stiffness_spread=0.5",
     "sim.object_seed=5",
     "sim.rig_seed=3",
+    "vision.checkpoint=small",
 ]
 
 
@@ -85,7 +86,10 @@ def test_missing_touches_are_recorded_and_then_fitted(touched: list[Path], tmp_p
         progress=lambda _text, steps_done=1: steps.append(steps_done),
     )
     same = calibrate_object(
-        load_config(), "stapler", logs=[*map(str, touched[:2])], out=str(tmp_path / "same.yaml")
+        load_config(None, QUICK[-1:]),
+        "stapler",
+        logs=[*map(str, touched[:2])],
+        out=str(tmp_path / "same.yaml"),
     )
     assert result.profile.weights == same.profile.weights
     assert result.profile == read_object(result.profile_path)
