@@ -1,6 +1,6 @@
 """Teaching of an object: the estimator that is best on touches left out, calibrated, in one bundle.
 
-The best of the `candidates` is trained on all touches, and calibrated.
+The best of the `teach_candidates` is trained on all touches, and calibrated.
 """
 
 import shutil
@@ -20,7 +20,7 @@ from gripper_calibration.fits.object_ood_fit import left_out_shares, object_limi
 from gripper_calibration.fits.touches import Touches
 from gripper_calibration.plots.taught_plot import draw
 from gripper_calibration.procedures.calibrate_object import default_folder, make_profile, record_touches
-from gripper_calibration.procedures.candidates import (
+from gripper_calibration.procedures.teach_candidates import (
     FOLDS,
     Candidate,
     CandidateWork,

@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from gripper_calibration.procedures import candidates
 from gripper_calibration.procedures import teach as job
-from gripper_calibration.procedures.candidates import MIN_LOGS
+from gripper_calibration.procedures import teach_candidates as candidates
 from gripper_calibration.procedures.teach import STEPS, Taught, teach
+from gripper_calibration.procedures.teach_candidates import MIN_LOGS
 from gripper_force.cli import app
 from gripper_force.config import Config, load_config
 from gripper_force.errors import ConfigError, DataError

@@ -3,7 +3,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from gripper_calibration.procedures.candidates import FOLDS, LeftOut, compare, make_candidates
+from gripper_calibration.procedures.teach_candidates import FOLDS, LeftOut, compare, make_candidates
 from gripper_force.config import load_config
 from gripper_force.runtime.resolve import resolve_vision
 
