@@ -321,7 +321,7 @@ class VisionConfig(Section):
     max_covered: float = Field(
         MAX_COVERED,
         ge=0,
-        le=1,
+        le=0.5,
         description="largest share of the image that may lose its detail, as if covered; raise it for wide jaws",
     )
     lockstep_compute_ms: NonNegative = Field(
