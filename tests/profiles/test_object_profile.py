@@ -6,7 +6,7 @@ import pytest
 
 from gripper_force.config import load_config
 from gripper_force.errors import ConfigError
-from gripper_force.jobs.profile_files import check_place, write_object
+from gripper_force.jobs.profile_files import check_object_place, write_object
 from gripper_force.profiles.apply import read_profiles, with_object
 from gripper_force.profiles.object_profile import (
     BUNDLED,
@@ -80,13 +80,13 @@ def test_full_disk_keeps_both_files_of_the_old_profile(
 
 
 def test_unwritable_path_is_refused_before_calibration(tmp_path: Path) -> None:
-    check_place(tmp_path / "new" / "mug.yaml")
+    check_object_place(tmp_path / "new" / "mug.yaml")
     assert list((tmp_path / "new").iterdir()) == []
     with pytest.raises(ConfigError, match=r"ends in \.yaml"):
-        check_place(tmp_path / "mug")
+        check_object_place(tmp_path / "mug")
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="can't write"):
-        check_place(tmp_path / "file" / "mug.yaml")
+        check_object_place(tmp_path / "file" / "mug.yaml")
 
 
 def test_user_profiles_come_before_shipped_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

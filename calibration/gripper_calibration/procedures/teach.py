@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+import torch  # noqa: F401  # first: the extra that has it has SciPy, too, so one message is enough
 
 from gripper_calibration.fits.cross_validation import Coverage, coverages
 from gripper_calibration.fits.interval_fit import touch_interval
