@@ -279,3 +279,31 @@ def test_pytorchs_threads_are_set_unless_switched_off(tiny_checkpoint: Path) -> 
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(before)
+
+
+def covered_frames() -> np.ndarray:
+    """Returns five frames of one texture, the last with a gray disc over a fifth of it, (5, 128, 128)."""
+    rng = np.random.default_rng(0)
+    texture = rng.integers(20, 236, (128, 128)).astype(np.uint8)
+    y, x = np.mgrid[:128, :128]
+    covered = np.where(np.hypot(x - 64, y - 64) < 32, 110, texture).astype(np.uint8)
+    return np.stack([texture] * 4 + [covered])
+
+
+@pytest.mark.parametrize("max_covered", [0.15, 0.5])
+def test_jaws_that_hide_more_of_the_view_are_configured(max_covered: float) -> None:
+    vision = VisionConfig(checkpoint="small", max_covered=max_covered)
+    model = read_model("small")
+    for estimator in (
+        open_estimator(model, vision, set_threads=False),
+        ForceEstimator.load("small", max_covered=max_covered),
+    ):
+        *first, last = covered_frames()
+        run(estimator, np.stack(first))
+        try:
+            estimator.update(last)
+        except DataError as error:
+            problem = str(error)
+        else:
+            problem = ""
+        assert ("over vision.max_covered" in problem) == (max_covered == 0.15)
