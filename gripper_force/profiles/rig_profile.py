@@ -17,7 +17,7 @@ warms by 20 K and more."""
 FRICTION_DRIFT: Final = 0.1
 """Relative variation of friction with grease, wear and position on the rack: an assumption."""
 
-_NORMAL: Final = 1.96
+NORMAL: Final = 1.96
 """Half-width of a 95 % interval in standard deviations."""
 
 
@@ -221,7 +221,7 @@ def torque_settings(nm_per_a: CalibratedValue, friction_n: CalibratedValue) -> T
 
 def _std(estimate: CalibratedValue, drift: float) -> float:
     """Returns the relative standard deviation in use: the interval's, but at least the drift."""
-    share = estimate.half / (_NORMAL * abs(estimate.value)) if estimate.value else 0.0
+    share = estimate.half / (NORMAL * abs(estimate.value)) if estimate.value else 0.0
     return min(max(share, drift), 1.0)
 
 

@@ -15,6 +15,7 @@ from gripper_force.control.linkage import make_linkage
 from gripper_force.control.transmission import Transmission
 from gripper_force.errors import DataError, DeviceError
 from gripper_force.interfaces import Devices, LoadCell
+from gripper_force.jobs.recording.record import FIRST_SAMPLE_NS
 from gripper_force.progress import Progress, no_progress
 from gripper_force.runtime.backends import open_devices
 from gripper_force.runtime.resolve import make_controller
@@ -53,8 +54,6 @@ _SPEED_UP_S: Final = 0.1
 _START_FACTOR: Final = 1.6
 _MIN_SPEED_RAD_S: Final = 0.15
 _MAX_PASS_S: Final = 4.0
-_FIRST_SAMPLE_NS: Final = 5 * NS_PER_S
-"""Longest wait for the first sample: boards that reset when their port is opened are silent for 1.6 s."""
 _SILENT_NS: Final = 3 * NS_PER_S // 2
 """Longest silence during a motion. At 10 samples/s, a sample waits 0.3 s for those that show if it is a spike."""
 _BEYOND_RAD: Final = 1.0
@@ -126,9 +125,9 @@ def _wait_for_sample(devices: Devices) -> None:
     assert cell is not None
     begin_ns = clock.now_ns()
     while not any(sample.valid for sample in cell.drain()):
-        if clock.now_ns() - begin_ns > _FIRST_SAMPLE_NS:
+        if clock.now_ns() - begin_ns > FIRST_SAMPLE_NS:
             raise DataError(
-                f"the load cell has given no valid sample for {_FIRST_SAMPLE_NS / NS_PER_S:g} s "
+                f"the load cell has given no valid sample for {FIRST_SAMPLE_NS / NS_PER_S:g} s "
                 f"(rejected: {_rejected(cell)}); check its wiring, calibrate it first with "
                 "`calibrate load-cell`, and run `gripper-force doctor`"
             )

@@ -10,7 +10,7 @@ from gripper_calibration.setup.load_cell import PROFILE, interval
 from gripper_calibration.setup.step import Found, StepResult, Task
 from gripper_force.config import Config
 from gripper_force.errors import ConfigError
-from gripper_force.profiles.rig_profile import FRICTION_DRIFT, RigProfile
+from gripper_force.profiles.rig_profile import FRICTION_DRIFT, NORMAL, RigProfile
 from gripper_force.runtime.backends import is_simulated
 from gripper_force.runtime.resolve import resolve
 
@@ -18,7 +18,6 @@ _SIM_GAUGE_MM: Final = 30.0
 _SIM_GAUGE: Final = "block"
 """The simulated object that stands for a load cell's rigid body."""
 
-_NORMAL: Final = 1.96
 _FORCES_N: Final = (2.0, 4.0, 8.0)
 
 
@@ -133,7 +132,7 @@ def _intervals_n(config: Config) -> dict[str, Any]:
     bounds = {}
     for force_n in _FORCES_N:
         gain_n = gripper.gain_std * (force_n + gripper.friction_n)
-        half_n = _NORMAL * math.hypot(gain_n, gripper.friction_std * gripper.friction_n)
+        half_n = NORMAL * math.hypot(gain_n, gripper.friction_std * gripper.friction_n)
         bounds[f"{force_n:g}"] = [round(max(force_n - half_n, 0.0), 2), round(force_n + half_n, 2)]
     return bounds
 

@@ -60,7 +60,7 @@ FREE_N: Final = 0.1
 """Largest load-cell force of a free object above the force at rest."""
 
 _SILENT_NS: Final = 2 * NS_PER_S
-_FIRST_SAMPLE_NS: Final = 5 * NS_PER_S
+FIRST_SAMPLE_NS: Final = 5 * NS_PER_S
 """A camera or load cell without data for this long has failed. The slowest samples take 1.3 s. The first one may take
 longer: a board that resets when its port is opened is silent for about 2 s."""
 
@@ -315,7 +315,7 @@ class _MonitoredSession:
             )
         last = self.last_load_cell_sample
         sample_ns = self._begin_ns if last is None else max(last.t_ns, self._begin_ns)
-        silent_ns = _FIRST_SAMPLE_NS if last is None else _SILENT_NS
+        silent_ns = FIRST_SAMPLE_NS if last is None else _SILENT_NS
         if status.t_ns - sample_ns > silent_ns:
             counts = ", ".join(f"{n} {name}" for name, n in self._cell.counts().items() if n)
             raise DeviceError(
