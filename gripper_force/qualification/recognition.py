@@ -300,7 +300,7 @@ def judge(
 
     Args:
         frames: A recording, (T, H, W) uint8.
-        config: Configuration; ``vision.region`` is the region of interest.
+        config: Configuration; of it ``vision.region`` and ``vision.max_covered``.
         checkpoint: The network.
 
     Returns:
@@ -310,7 +310,7 @@ def judge(
     small = np.stack([downscale(frame, config.vision.region, header.preprocess.size) for frame in frames])
     forces_n, read_out = features(checkpoint.networks, header.preprocess, small)
     refused = np.zeros(len(frames), bool)
-    checks = FrameChecks()
+    checks = FrameChecks(config.vision.max_covered)
     for i, frame in enumerate(small):
         try:
             checks.check(frame)
