@@ -427,6 +427,19 @@ def test_the_replay_of_a_log_with_covered_frames_is_identical(fused_log: Path, t
     assert run_again(LogReader(logged), run).estimates_identical is True
 
 
+def test_the_share_that_may_be_covered_is_the_logs_in_both_ways_of_a_replay(fused_log: Path) -> None:
+    """With 0, any block that a closing jaw hides covers the view."""
+    reader = LogReader(fused_log)
+    covered = []
+    for share in (0.5, 0.0):
+        run = resolve_replay(changed_config(reader, "small", [f"vision.max_covered={share}"]))
+        single, batch = run_again(reader, run).visual, run_again(reader, run, in_batches=True).visual
+        covered.append([v.seq for v in single if np.isnan(v.force_n)])
+        assert [v.seq for v in batch if np.isnan(v.force_n)] == covered[-1]
+    assert covered[0] == []
+    assert covered[1]
+
+
 def half_covered(gray: Gray) -> Gray:
     covered = gray.copy()
     covered[:, : gray.shape[1] // 2] = round(float(gray.mean()))
