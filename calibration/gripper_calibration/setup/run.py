@@ -185,7 +185,6 @@ class Setup:
         """
         if self._fresh and (copy := self.rig.copy_before_fresh()) is not None:
             person.tell(f"the earlier rig file is kept as {copy}")
-        self.rig.check_place()  # before a step writes to the servo
         for number, (name, step) in enumerate(STEPS.items(), 1):
             if self._only and name not in self._only:
                 continue
@@ -195,6 +194,7 @@ class Setup:
                     yield self._kept(name)
                     continue
                 person.tell(f"{name} runs again, because these changed: {', '.join(changed)}")
+            self.rig.check_place()  # before the step writes to the servo
             person.tell(f"[{number} of {len(STEPS)}] {name}: {step.title}")
             self.rig.forget(name)
             task = Task(

@@ -145,6 +145,19 @@ def test_a_place_that_can_not_be_written_is_named_before_the_servo_is_changed(
     assert script.told == []
 
 
+def test_a_finished_setup_is_shown_from_a_place_that_can_not_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "rig.yaml"
+    list(Setup(path, SIMULATED).run(Script()))
+
+    def refuse(_: RigFile) -> None:
+        raise ConfigError("can't write")
+
+    monkeypatch.setattr(RigFile, "check_place", refuse)
+    assert [report.result for report in Setup(path).run(Script())] == 6 * ["kept"]
+
+
 def test_a_step_that_runs_again_forgets_what_it_found_before(tmp_path: Path) -> None:
     rig = RigFile(tmp_path / "rig.yaml")
     jaws = {"gripper.friction_n": Found(0.5, "homed"), "gripper.pinion_radius_m": Found(0.015, ANSWERED)}
