@@ -249,7 +249,7 @@ def _taught(
     profile, _ = make_profile(name, recorded, fit, ResolvedConfig(config, read_model(checkpoint)))
     origin = {"network": _NETWORK, "logs": work.digests, "version": __version__, "file": _object_file(config)}
     progress("calibrated")
-    error_n = np.abs(found.estimate_n - found.measured.force_n)
+    error_n = found.absolute_error_n
     taught = Taught(
         bundle=out,
         profile=profile.model_copy(update=origin),
@@ -286,7 +286,7 @@ def _fit(touches: Touches, found: Comparison) -> ObjectFit:
         arrays=replace(fit.arrays, known=KnownFrames(*object_subspace(touches), limits)),
         interval=touch_interval(found.estimate_n, *found.measured, COVERAGE),
         before_n=float(np.abs(found.before_n - found.measured.force_n).mean()),
-        after_n=float(np.abs(found.estimate_n - found.measured.force_n).mean()),
+        after_n=float(found.absolute_error_n.mean()),
     )
 
 

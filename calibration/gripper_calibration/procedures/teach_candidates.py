@@ -183,6 +183,11 @@ class Comparison(NamedTuple):
     estimate_n: Floats  # (N,), nested
     within: npt.NDArray[np.bool_]  # (N,), nested
 
+    @property
+    def absolute_error_n(self) -> Floats:
+        """Size of the nested estimates' errors, (N,)."""
+        return np.abs(self.estimate_n - self.measured.force_n)
+
 
 def compare(results: Results, count: int) -> Comparison:
     """Compares candidates by their results on ``count`` logs left out."""

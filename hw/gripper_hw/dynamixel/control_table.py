@@ -17,9 +17,8 @@ VELOCITY_UNIT_RAD_S: Final = 0.229 * 2 * math.pi / 60  # 0.229 rpm
 WATCHDOG_UNIT_MS: Final = 20
 FULL_PWM: Final = 885  # 100 % duty
 CURRENT_BASED_POSITION_MODE: Final = 5
-INPUT_VOLTAGE_ERROR: Final = (
-    0x01  # the only hardware error that leaves torque on, see #shutdown of the manual
-)
+INPUT_VOLTAGE_ERROR: Final = 0x01
+"""The only hardware error that leaves torque on (https://emanual.robotis.com/docs/en/dxl/x/xm430-w350/#shutdown)."""
 CYCLE_WINDOW_BYTES: Final = 20  # of indirect data that a cycle reads and writes
 
 _TICKS_PER_RAD: Final = TICKS_PER_REV / (2 * math.pi)
