@@ -28,6 +28,8 @@ def check_object_place(path: Path) -> None:
 
 def check_place(path: Path) -> None:
     """Creates the folder of a file. Raises `ConfigError` if the file can't be written there."""
+    if path.is_dir():
+        raise ConfigError(f"can't write {path}: it is a folder; name a file in it")
     probe = path.with_name(f".{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 import numpy.typing as npt
 
-from gripper_force.config import MAX_COVERED, VisionConfig
+from gripper_force.config import MAX_COVERED, VisionConfig, config_from
 from gripper_force.errors import ConfigError, NonFiniteError, UnfamiliarFrameError
 from gripper_force.profiles.correction import Correction, load_correction
 from gripper_force.profiles.object_profile import find_object, read_object
@@ -91,8 +91,8 @@ class ForceEstimator:
                 of a file that `gripper-force export network` wrote.
             region: Region of interest of the frames in pixels: left, top, width, height. None: the whole
                 frame.
-            max_covered: Largest share of the image that may lose its fine detail, as behind a cover. Raise it for
-                jaws that fill more of the view.
+            max_covered: Largest share of the image that may lose its fine detail, as behind a cover: 0 to 0.5. Raise
+                it for jaws that fill more of the view.
             profile: Object profile: a name such as ``sponge``, or the path of a YAML file. Its network must
                 be this one; its camera settings are not checked.
             engine: ``torch``, ``openvino``, ``onnxruntime``, or an engine of another package: the name of an
@@ -103,12 +103,13 @@ class ForceEstimator:
 
         Raises:
             CheckpointError: The network's file is missing or damaged.
-            ConfigError: The engine is unknown, not installed, or can't run this file or precision; or the
-                profile does not exist, is damaged, or belongs to another network.
+            ConfigError: The engine is unknown, not installed, or can't run this file or precision; the
+                profile does not exist, is damaged, or belongs to another network; or ``max_covered`` is out of range.
         """
+        vision = config_from({"vision": {"max_covered": max_covered}}, "ForceEstimator.load").vision
         model = read_model(checkpoint)
         correction = None if profile is None else _profile_correction(model, str(profile))
-        return cls(open_engine(model, engine, precision, threads), region, correction, max_covered)
+        return cls(open_engine(model, engine, precision, threads), region, correction, vision.max_covered)
 
     def reset(self) -> None:
         """Starts a new stream: the next frames must show no contact and become its reference."""

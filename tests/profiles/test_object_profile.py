@@ -87,6 +87,9 @@ def test_unwritable_path_is_refused_before_calibration(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="can't write"):
         check_object_place(tmp_path / "file" / "mug.yaml")
+    (tmp_path / "mug.yaml").mkdir()
+    with pytest.raises(ConfigError, match=r"mug\.yaml: it is a folder; name a file in it"):
+        check_object_place(tmp_path / "mug.yaml")
 
 
 def test_user_profiles_come_before_shipped_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

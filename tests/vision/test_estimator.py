@@ -268,6 +268,14 @@ def test_load_names_what_is_unknown(tiny_checkpoint: Path) -> None:
         ForceEstimator.load(tiny_checkpoint, engine="tensorrt")
 
 
+@pytest.mark.parametrize("max_covered", [-0.1, 0.51, float("nan"), "wide"])
+def test_load_refuses_a_covered_share_that_the_configuration_refuses(
+    tiny_checkpoint: Path, max_covered: float
+) -> None:
+    with pytest.raises(ConfigError, match=r"vision\.max_covered.* \(from ForceEstimator\.load\)"):
+        ForceEstimator.load(tiny_checkpoint, max_covered=max_covered)
+
+
 def test_pytorchs_threads_are_set_unless_switched_off(tiny_checkpoint: Path) -> None:
     before = torch.get_num_threads()
     try:

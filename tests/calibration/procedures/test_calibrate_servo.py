@@ -293,16 +293,20 @@ def test_rig_profile_in_the_configuration_is_written_though_it_does_not_exist(
     assert (asked[-1][0].calibration.rig, asked[-1][1]) == (named, other)
 
 
+@pytest.mark.parametrize("obstacle", ["file above it", "folder of its name"])
 @pytest.mark.parametrize("calibrate", ["servo", "camera", "load_cell"])
 def test_a_rig_profile_that_can_not_be_written_is_named_before_anything_happens(
-    calibrate: str, tmp_path: Path
+    calibrate: str, obstacle: str, tmp_path: Path
 ) -> None:
     def refuse(text: str, steps: int = 1) -> None:
         pytest.fail(text)
 
-    (tmp_path / "file").touch()
-    rig = tmp_path / "file" / "rig.yaml"
-    with pytest.raises(ConfigError, match=r"can't write .*rig\.yaml: .*; name another file"):
+    rig = tmp_path / "place" / "rig.yaml"
+    if obstacle == "file above it":
+        rig.parent.touch()
+    else:
+        rig.mkdir(parents=True)
+    with pytest.raises(ConfigError, match=r"can't write .*rig\.yaml: .*; name (another|a) file"):
         if calibrate == "servo":
             calibrate_servo(config_of(), [0.03], rig, prompt=refuse)
         elif calibrate == "camera":
