@@ -232,7 +232,8 @@ def camera(
             f"the camera is now another one than that of {text}; teach or calibrate the object again"
         )
     _show_rig(result, as_json)
-    _next_step(["calibrate", "object", "NAME"], config, set_, path)
+    seeds = [] if seed is None else ["--seed", str(seed)]
+    _next_step(["calibrate", "object", "NAME", *seeds], config, set_, path)
 
 
 @app.command("object")

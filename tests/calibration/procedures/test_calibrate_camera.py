@@ -82,10 +82,10 @@ def test_command_writes_profile_reference_and_report(tmp_path: Path) -> None:
     rig = tmp_path / "rig.yaml"
     asked = ["calibrate", "camera", "--rig", rig, "--exposure-us", 500, "--exposure-us", 4000, "--json"]
     sets = [part for key in (*QUICK, "sim.markers=true", "sim.lux=550") for part in ("--set", key)]
-    done = CliRunner().invoke(app, [str(part) for part in (*asked, "--touches", 4, *sets)])
+    done = CliRunner().invoke(app, [str(part) for part in (*asked, "--touches", 4, "--seed", 0, *sets)])
     assert done.exit_code == 0, done.stderr
     last = done.stderr.splitlines()[-1]
-    assert last.startswith("next: gripper-force calibrate object NAME --set ")
+    assert last.startswith("next: gripper-force calibrate object NAME --seed 0 --set ")
     assert last.endswith(f" --set calibration.rig={rig}")
     result = json.loads(done.stdout)
     found = read_rig(rig).camera
