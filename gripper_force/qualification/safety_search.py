@@ -50,7 +50,7 @@ _SEQUENCE: Final = 4
 
 _NEAR: Final = 32
 _NEAR_REMAINDERS: Final = (2, 5, 10, 13, 21, 29)
-"""Cases with these remainders begin near the object or in contact with it: a quarter of the sequences, an eighth of the
+"""Cases with these remainders begin near the object or in contact with it: a quarter of the sequences, a sixth of the
 others."""
 
 _STREAM_REMAINDER: Final = 14
