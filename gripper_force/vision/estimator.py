@@ -165,7 +165,7 @@ class ForceEstimator:
             score = float(self._ood.score(features, np.array([force_n]))[0])
             if score > 1:
                 raise UnfamiliarFrameError(
-                    f"the frame's out-of-distribution score is {score:.1f} times {self._limit()}", force_n
+                    f"the frame's out-of-distribution score is {score:.2f} times {self._limit()}", force_n
                 )
         if self._correction is not None:
             corrected_n = self._correction.force_n([force_n], features)
