@@ -16,9 +16,9 @@ _IN_NEWTONS: Final = ("simulated", "playback")
 """Backends without raw readings."""
 
 WITHOUT: Final = (
-    "Without a load cell everything works but what needs newtons measured at the jaws: `calibrate servo`, "
-    "`calibrate object` and training. Motor current measures the force instead; the next step can compare it with a "
-    "known mass, and states its error."
+    "Without a load cell, only what needs a measured force does not work: `calibrate servo`, `calibrate camera`, "
+    "`calibrate object`, `record`, `teach` and training. Motor current is then the reference; the next step can "
+    "compare it with a known mass, and states its error."
 )
 
 

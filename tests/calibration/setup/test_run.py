@@ -52,7 +52,10 @@ def test_a_setup_without_a_load_cell_ends_with_a_rig_file_and_continues_there(tm
     reports = list(Setup(path).run(Script()))
     assert [report.result for report in reports] == 3 * ["kept"] + 3 * ["done"]
     by_name = {report.name: report for report in reports}
-    assert "Motor current measures the force instead" in by_name["load-cell"].remarks[0]
+    assert (
+        "`calibrate camera`, `calibrate object`, `record`, `teach` and training"
+        in by_name["load-cell"].remarks[0]
+    )
     intervals_n = by_name["torque"].details["intervals_n"]
     assert intervals_n["4"][0] < 4 < intervals_n["4"][1]
     assert Path(by_name["camera"].files["picture"]).stat().st_size > 1000
