@@ -4,7 +4,6 @@ Each device package provides a probe module; see `PROBES`.
 """
 
 import os
-import re
 import time
 from collections.abc import Iterable, Iterator
 from importlib import import_module, metadata
@@ -15,6 +14,7 @@ import numpy as np
 from gripper_force.config import Config
 from gripper_force.errors import GripperError
 from gripper_force.jobs.checks import Check, Confirm, PortScan, SetupResult, judged, time_ms
+from gripper_force.jobs.cpu import bfloat16_instructions
 from gripper_force.progress import Progress, no_progress
 from gripper_force.runtime.backends import MonotonicClock
 from gripper_force.runtime.process import real_time_priority
@@ -122,7 +122,7 @@ def _network(config: Config) -> Iterator[Check]:
     if not config.uses_vision:
         yield Check("network", "step", "not needed: no camera or no checkpoint", None)
         return
-    from gripper_force.vision.step_benchmark import cpu_info, engine_version
+    from gripper_force.vision.step_benchmark import engine_version
 
     config, model, _ = resolve_vision(config)
     estimator = make_estimator(ResolvedConfig(config, model))
@@ -131,8 +131,7 @@ def _network(config: Config) -> Iterator[Check]:
     package = f"{vision.engine} {engine_version(vision.engine)}".strip()
     threads = f"{vision.precision}, {vision.threads} of {os.cpu_count()} threads"
     yield Check("network", vision.engine, f"{package}, {threads}", True)
-    bfloat16 = re.search(r"\b(\w*bf16)\b", "\n".join(cpu_info()))
-    yield Check("network", "bfloat16", bfloat16[0] if bfloat16 else "not in this CPU", None)
+    yield Check("network", "bfloat16", bfloat16_instructions() or "not in this CPU", None)
     gray = np.random.default_rng(0).integers(0, 256, (128, 128), np.uint8)
     while estimator.update(gray) is None:
         pass

@@ -132,7 +132,8 @@ class TrainConfig(Section):
         validation: Share of each object's sets that is held out to measure the checkpoint's error; of the objects,
             if no object has two sets.
         seed: Seed of weights and draws.
-        precision: Arithmetic of backbone and attention; all else, and all weights, are float32.
+        precision: Arithmetic of backbone and attention; all else, and all weights, are float32. ``auto``: bfloat16 on a
+            device that has instructions for it, float32 on others, which would be slower with bfloat16.
         device: Device to train on; ``auto`` uses CUDA if it is available.
         compile: Compile the network; faster only after some minutes on a GPU.
     """
@@ -172,7 +173,7 @@ class TrainConfig(Section):
     replay_share: Annotated[float, Field(ge=0, lt=1)] = 0.5
     validation: Annotated[float, Field(gt=0, lt=1)] = 0.1
     seed: Annotated[int, Field(ge=0)] = 0
-    precision: Literal["float32", "bfloat16"] = "bfloat16"
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
     device: Literal["auto", "cpu", "cuda"] = "auto"
     compile: bool = False
 

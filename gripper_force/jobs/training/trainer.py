@@ -14,6 +14,7 @@ from torch.nn.modules.batchnorm import _BatchNorm
 
 from gripper_force.errors import CheckpointError, NonFiniteError
 from gripper_force.files import unfinished
+from gripper_force.jobs.cpu import bfloat16_instructions
 from gripper_force.jobs.dataset import CONTACT_N
 from gripper_force.jobs.training.batches import Batch, Batches, Replay
 from gripper_force.jobs.training.parallel import TrainingProcess, share_statistics
@@ -67,6 +68,9 @@ class Trainer:
         )
         self._features = torch.compile(self.network.features) if config.compile else self.network.features
         self._teacher = [network.to(process.device) for network in teacher]
+        self._uses_bfloat16 = config.precision == "bfloat16" or (
+            config.precision == "auto" and _computes_bfloat16(process.device)
+        )
         self._freeze_statistics = False
         self.step = 0
         self.losses: list[float] = []
@@ -128,7 +132,7 @@ class Trainer:
         batch = self._batches.batch(self.step, count, length)
         labels = batch.valid[:, first:].sum()
         self._process.sum_over_all([labels])
-        with torch.autocast(batch.inputs.device.type, torch.bfloat16, enabled=config.precision == "bfloat16"):
+        with torch.autocast(batch.inputs.device.type, torch.bfloat16, enabled=self._uses_bfloat16):
             features = self._features(batch.inputs, first)  # (B, T - first, head)
             learned_n = self._taught(batch, first) if self._teacher else batch.forces_n  # (B, T)
         force, *others = self.network.outputs(features.flatten(0, 1)).view(*features.shape[:2], -1).unbind(2)
@@ -278,3 +282,10 @@ def one_cycle(done: float, warmup: float) -> float:
 def step_decay(done: float) -> float:
     """Returns the learning rate as a share of its peak: a tenth per quarter (30 of the paper's 120 epochs)."""
     return float(0.1 ** math.floor(4 * done))
+
+
+def _computes_bfloat16(device: str) -> bool:
+    """Returns True if a device has instructions for bfloat16. Others emulate it, slower than they compute float32."""
+    if device == "cpu":
+        return bfloat16_instructions() != ""
+    return bool(torch.cuda.is_bf16_supported(including_emulation=False))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from gripper_force.jobs import cpu
 from gripper_force.jobs.dataset import CONTACT_N, Clip
 from gripper_force.jobs.training.batches import Batches, Replay
 from gripper_force.jobs.training.parallel import TrainingProcess
@@ -80,6 +81,22 @@ def test_every_precision_and_window_mode_trains(
     assert errors_n[-1] < 0.95 * errors_n[0]
     assert not trainer.network.training
     assert all(p.dtype == torch.float32 for p in trainer.network.parameters())
+
+
+@pytest.mark.parametrize(("flags", "same"), [("avx512_bf16 amx_bf16", "bfloat16"), ("avx2", "float32")])
+def test_automatic_precision_is_the_one_that_the_cpu_computes(
+    flags: str, same: str, clips: list[Clip], small_recipe: TrainConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cpu, "cpu_info", lambda: ["processor: 0", f"flags: fpu {flags} sse2"])
+    process = TrainingProcess("cpu")
+
+    def errors_n(precision: str) -> list[float]:
+        config = small_recipe.model_copy(update={"precision": precision, "steps": 11})
+        return list(Trainer(config, 0, Batches(clips, config, process), process).steps())
+
+    assert small_recipe.precision == "auto"
+    assert errors_n("auto") == errors_n(same)
+    assert errors_n("bfloat16") != errors_n("float32")
 
 
 @pytest.fixture
