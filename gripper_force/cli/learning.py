@@ -251,6 +251,7 @@ def evaluate(
 
     Exit code 2 if a log could not be read; the others are evaluated.
     """
+    from gripper_force.jobs.cpu import bfloat16_instructions
     from gripper_force.jobs.dataset import find_logs
     from gripper_force.jobs.evaluate import evaluate as job
 
@@ -258,6 +259,8 @@ def evaluate(
     settings = load_settings(None, set_, {"vision.checkpoint": checkpoint, "calibration.object": profile})
     logs = find_logs(data)
     console.tell_missing_parquet(out)
+    if settings.vision.precision == "bfloat16" and not bfloat16_instructions():
+        console.warn("this CPU has no instructions for bfloat16, which makes it slower; leave vision.precision out")
     with console.bar("evaluating", len(logs)) as progress:
         result = job(
             logs,

@@ -23,6 +23,7 @@ from gripper_force.cli.options import load_settings
 from gripper_force.config import load_config
 from gripper_force.control.limits import largest_target_n
 from gripper_force.errors import ConfigError
+from gripper_force.jobs import cpu
 from gripper_force.runtime import process
 from gripper_force.runtime.log_reader import LogReader
 from gripper_hw.dynamixel.control_table import load_model
@@ -719,6 +720,23 @@ def test_a_video_needs_its_table(run: Run, tmp_path: Path) -> None:
     assert done.code == 2
     assert "can't read the table" in done.err
     assert "touch.avi has no table of forces" in run("import", "video", tmp_path).err
+
+
+@pytest.mark.parametrize(("flags", "warned"), [("avx2", True), ("avx512_bf16", False)])
+def test_bfloat16_on_a_cpu_that_emulates_it_is_warned_of(
+    run: Run,
+    tmp_path: Path,
+    tiny_checkpoint: Path,
+    fused_log: Path,
+    flags: str,
+    warned: bool,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(cpu, "cpu_info", lambda: [f"flags: {flags}"])
+    evaluated = ("evaluate", fused_log.parent, "--checkpoint", tiny_checkpoint, "--jobs", 1)
+    slow = run(*evaluated, "--set", "vision.precision=bfloat16")
+    assert ("no instructions for bfloat16" in slow.err) == warned
+    assert "no instructions" not in run(*evaluated).err
 
 
 def test_an_empty_folder_has_nothing_to_evaluate(run: Run, tmp_path: Path, tiny_checkpoint: Path) -> None:
