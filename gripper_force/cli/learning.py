@@ -260,7 +260,9 @@ def evaluate(
     logs = find_logs(data)
     console.tell_missing_parquet(out)
     if settings.vision.precision == "bfloat16" and not bfloat16_instructions():
-        console.warn("this CPU has no instructions for bfloat16, which makes it slower; leave vision.precision out")
+        console.warn(
+            "this CPU has no instructions for bfloat16, which makes it slower; leave vision.precision out"
+        )
     with console.bar("evaluating", len(logs)) as progress:
         result = job(
             logs,
