@@ -213,6 +213,22 @@ class SearchReport(TypedDict):
     worst: dict[str, list[WorstCase]]
 
 
+class _Random:
+    """Random numbers of one case. Each call takes the next ones."""
+
+    def __init__(self, seed: int, index: int) -> None:
+        self.generator = np.random.default_rng([seed, 50, index])
+
+    def between(self, low: float, high: float) -> float:
+        return float(self.generator.uniform(low, high))
+
+    def log_between(self, low: float, high: float) -> float:
+        return math.exp(self.between(math.log(low), math.log(high)))
+
+    def rarely(self, share: float, value: float, otherwise: float) -> float:
+        return value if self.generator.uniform() < share else otherwise
+
+
 def draw(config: ControlConfig, truth: Transmission, seed: int, index: int) -> Draw:
     """Draws a case. The same arguments give the same case.
 
@@ -222,41 +238,26 @@ def draw(config: ControlConfig, truth: Transmission, seed: int, index: int) -> D
         seed: Seed of all draws.
         index: Number of the case.
     """
-    rng = np.random.default_rng([seed, 50, index])
-
-    def between(low: float, high: float) -> float:
-        return float(rng.uniform(low, high))
-
-    def log_between(low: float, high: float) -> float:
-        return math.exp(between(math.log(low), math.log(high)))
-
-    def rarely(share: float, value: float, otherwise: float) -> float:
-        return value if rng.uniform() < share else otherwise
-
-    def draw_request() -> TimedRequest:
-        kinds = [RequestKind.GRASP, RequestKind.RELEASE, RequestKind.MOVE, RequestKind.STOP]
-        kind = RequestKind(rng.choice(kinds, p=[0.6, 0.2, 0.12, 0.08]))
-        value = between(_MIN_N, max_n) if kind == RequestKind.GRASP else between(0.0, truth.open_width_m)
-        return TimedRequest(log_between(0.05, 8.0), kind, value)
-
-    def draw_stream() -> Iterator[TimedRequest]:
-        period_s = log_between(0.005, 0.1)
-        ranges = {RequestKind.GRASP: (_MIN_N, max_n), RequestKind.MOVE: (0.0, truth.open_width_m)}
-        kind, values = RequestKind.GRASP, {key: between(*bounds) for key, bounds in ranges.items()}
-        for _ in range(round(_STREAM_S / period_s)):
-            if rng.uniform() < _STREAM_CHANGES_HZ * period_s:
-                kind = RequestKind(rng.choice([*ranges, RequestKind.RELEASE], p=[0.6, 0.3, 0.1]))
-                values = {key: between(*bounds) for key, bounds in ranges.items()}
-            low, high = ranges.get(kind, (0.0, 0.0))
-            value = values.get(kind, 0.0) + _STREAM_NOISE * (high - low) * float(rng.standard_normal())
-            yield TimedRequest(period_s, kind, min(max(value, low), high))
-
+    random = _Random(seed, index)
     is_sequence = index % _SEQUENCE == _SEQUENCE - 2
+    drawn = _draw_far(random, config, truth, is_sequence=is_sequence)
+    if index % _NEAR == _STREAM_REMAINDER:
+        max_n = largest_target_n(drawn.force_limit_n, truth.torque_constant_bound)
+        return replace(drawn, requests=tuple(_draw_stream(random, max_n, truth.open_width_m)))
+    if index % _NEAR in _NEAR_REMAINDERS:
+        return _move_near(random, drawn, truth.open_width_m)
+    return drawn
+
+
+def _draw_far(random: _Random, config: ControlConfig, truth: Transmission, *, is_sequence: bool) -> Draw:
+    """Draws a case that begins with open jaws. The order of the calls is part of the result."""
+    between, log_between, rarely = random.between, random.log_between, random.rarely
+    rng, width_m = random.generator, truth.open_width_m
     reach = _REACH_SHARE if is_sequence else 1.0
     force_limit_n = rarely(0.5, log_between(0.8, 20.0), config.force_limit_n)
     max_n = largest_target_n(force_limit_n, truth.torque_constant_bound)
     open_m_per_rad = truth.jaw_m_per_rad(truth.open_position_rad)
-    drawn = Draw(
+    return Draw(
         force_limit_n=force_limit_n,
         approach_m_s=rarely(0.5, log_between(0.01, 0.04), config.approach_speed_m_s),
         target_n=between(0.5, max_n),
@@ -270,7 +271,7 @@ def draw(config: ControlConfig, truth: Transmission, seed: int, index: int) -> D
         mass_kg=between(0.8, 1.5) * (_PINION_M / open_m_per_rad) ** 2,
         damping_n_s_m=between(0.55, 1.1) * truth.damping_n_s_m,
         play_m=between(0.0002, 0.0004),
-        contact_m=rarely(0.2, _GONE_M, reach * between(0.002, truth.open_width_m / 2 - 0.003)),
+        contact_m=rarely(0.2, _GONE_M, reach * between(0.002, width_m / 2 - 0.003)),
         leaves_s=rarely(0.25, between(0.5, _GRASP_S), math.inf),
         start_m=rarely(0.3, between(-0.02, 0.02), 0.0),
         sign=int(rarely(0.0 if is_sequence else 0.1, -1, 1)),
@@ -282,17 +283,41 @@ def draw(config: ControlConfig, truth: Transmission, seed: int, index: int) -> D
         motion_n=rarely(0.3, between(0.0, 6.0), 0.0),
         away_s=rarely(0.5, log_between(0.02, 1.5), math.inf),
         on_fault=str(rng.choice(["limp", "hold", "open"])),
-        requests=tuple(draw_request() for _ in range(int(rng.integers(3, 9)) if is_sequence else 0)),
+        requests=tuple(
+            _draw_request(random, max_n, width_m)
+            for _ in range(int(rng.integers(3, 9)) if is_sequence else 0)
+        ),
         begins_m=0.0,
     )
-    if index % _NEAR == _STREAM_REMAINDER:
-        return replace(drawn, requests=tuple(draw_stream()))
-    if index % _NEAR not in _NEAR_REMAINDERS:
-        return drawn
-    gap_m = rarely(0.3, 0.0, between(0.0, _GAP_M))
-    to_m = between(0.0, truth.open_width_m / 4) if drawn.contact_m == _GONE_M else drawn.contact_m
-    limit_n = log_between(*_NEAR_LIMIT_N)
-    scale = limit_n / force_limit_n
+
+
+def _draw_request(random: _Random, max_n: float, open_width_m: float) -> TimedRequest:
+    kinds = [RequestKind.GRASP, RequestKind.RELEASE, RequestKind.MOVE, RequestKind.STOP]
+    kind = RequestKind(random.generator.choice(kinds, p=[0.6, 0.2, 0.12, 0.08]))
+    value = random.between(_MIN_N, max_n) if kind == RequestKind.GRASP else random.between(0.0, open_width_m)
+    return TimedRequest(random.log_between(0.05, 8.0), kind, value)
+
+
+def _draw_stream(random: _Random, max_n: float, open_width_m: float) -> Iterator[TimedRequest]:
+    """Draws a stream of requests, as of a policy."""
+    period_s = random.log_between(0.005, 0.1)
+    ranges = {RequestKind.GRASP: (_MIN_N, max_n), RequestKind.MOVE: (0.0, open_width_m)}
+    kind, values = RequestKind.GRASP, {key: random.between(*bounds) for key, bounds in ranges.items()}
+    for _ in range(round(_STREAM_S / period_s)):
+        if random.generator.uniform() < _STREAM_CHANGES_HZ * period_s:
+            kind = RequestKind(random.generator.choice([*ranges, RequestKind.RELEASE], p=[0.6, 0.3, 0.1]))
+            values = {key: random.between(*bounds) for key, bounds in ranges.items()}
+        low, high = ranges.get(kind, (0.0, 0.0))
+        noise = _STREAM_NOISE * (high - low) * float(random.generator.standard_normal())
+        yield TimedRequest(period_s, kind, min(max(values.get(kind, 0.0) + noise, low), high))
+
+
+def _move_near(random: _Random, drawn: Draw, open_width_m: float) -> Draw:
+    """Returns the case with jaws that begin near the object, and a force limit and targets that suit this."""
+    gap_m = random.rarely(0.3, 0.0, random.between(0.0, _GAP_M))
+    to_m = random.between(0.0, open_width_m / 4) if drawn.contact_m == _GONE_M else drawn.contact_m
+    limit_n = random.log_between(*_NEAR_LIMIT_N)
+    scale = limit_n / drawn.force_limit_n
     return replace(
         drawn,
         begins_m=max(to_m - gap_m, 0.0),
